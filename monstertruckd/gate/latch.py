@@ -23,8 +23,8 @@ class Latch(Protocol):
         """Whether the emergency stop is latched, by the file or by the mark."""
         ...
 
-    def stored(self) -> bool:
-        """Whether the file says so, which outlasts a loss of power."""
+    def stored(self) -> bool | None:
+        """Whether the file says so, which outlasts a loss of power; None = it cannot be read."""
         ...
 
     def mark(self, engaged: bool) -> None:
@@ -138,17 +138,17 @@ class EstopLatch:
         self._mark = Mark(self._mark_path)
 
     def engaged(self) -> bool:
-        """Whether the file exists, or the mark is set."""
-        return self.stored() or (self._mark is not None and self._mark.engaged())
+        """Whether the file exists or cannot be read, or the mark is set."""
+        return self.stored() is not False or (self._mark is not None and self._mark.engaged())
 
-    def stored(self) -> bool:
-        """Whether the file exists; a directory that cannot be searched counts as latched."""
+    def stored(self) -> bool | None:
+        """Whether the file exists; None if its folder cannot be searched."""
         try:
             self._path.lstat()
         except FileNotFoundError:
             return False
         except OSError:
-            return True
+            return None
         return True
 
     def mark(self, engaged: bool) -> None:
@@ -164,7 +164,7 @@ class EstopLatch:
         """Create or remove the file, atomically and synced to the disk.
 
         Raises:
-            OSError: it could not be stored.
+            OSError: it could not be stored. The file may have changed all the same: ``stored`` says so.
         """
         with self._storing:
             if engaged:

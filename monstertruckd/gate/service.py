@@ -140,7 +140,7 @@ class GateService:
         self._latch = latch
         self._offload = offload
         self._latched: bool | None = latch.stored()
-        """State on the disk; None while it is being written."""
+        """State on the disk; None = not known, because it is being written or could not be written or read."""
         self._marked: bool | None = None
         """The mark of the latch; None = not written in this run."""
         self._latch_differs = asyncio.Event()
@@ -346,8 +346,9 @@ class GateService:
         try:
             await self._offload(partial(self._latch.store, wanted))
         except OSError as error:
-            self._latched = before
             self._report(error)
+            if await self._offload(self._latch.stored) is before:
+                self._latched = before  # else the file has changed, and only its folder is not synced
             return False
         self._latched = wanted
         return True

@@ -129,6 +129,12 @@ def test_file_and_mark_each_engage_the_latch(latch, tmp_path):
     assert (latch.engaged(), latch.stored()) == (False, False)
 
 
+def test_a_file_that_cannot_be_looked_for_is_not_known_and_engages_the_latch(tmp_path, run):
+    (tmp_path / "file").touch()
+    latch = EstopLatch(tmp_path / "file" / "estop", run)
+    assert (latch.engaged(), latch.stored()) == (True, None)
+
+
 def test_the_file_is_readable_and_says_what_it_is(latch, tmp_path):
     latch.store(True)
     file = tmp_path / "state" / "deep" / "estop"

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from monstertruck_runtime.clock import SECOND, WallClock, run_virtual
+from monstertruck_runtime.threads import inline
 from monstertruck_schemas.cmd import DriveAction
 from monstertruck_schemas.event import Event
 from monstertruck_schemas.reasons import Reason
@@ -380,6 +381,66 @@ def test_marks_are_kept_where_memory_outlasts_the_daemon(tmp_path):
     assert marks_folder(None, {}, tmp_path) == tmp_path / "run"
     (user := tmp_path / f"run/user/{os.geteuid()}").mkdir(parents=True)
     assert marks_folder(None, {}, tmp_path) == user
+
+
+class Unsynced(EstopLatch):
+    """A latch whose folder cannot be synced, e.g. for want of a file descriptor, while ``broken``."""
+
+    broken = False
+    readable = True
+
+    def stored(self):
+        return super().stored() if self.readable else None
+
+    def _sync_directory(self):
+        if self.broken:
+            raise OSError(24, "too many open files")
+        super()._sync_directory()
+
+
+@pytest.mark.parametrize("readable", [True, False])
+def test_a_stop_after_a_reset_whose_folder_could_not_be_synced_is_latched_again(tmp_path, readable):
+    (tmp_path / "run").mkdir()
+    latch = Unsynced(tmp_path / "state" / "estop", tmp_path / "run")
+    latch.prepare()
+
+    async def scenario(bench):
+        state = bench.out.state
+        bench.order(Order.ESTOP)
+        await bench.clock.sleep(0.1)
+        assert (state.last.latched, latch.stored()) == (True, True)
+        latch.broken, latch.readable = True, readable
+        assert bench.order(Order.RESET).reason is Reason.OK
+        await bench.clock.sleep(0.1)
+        assert not (tmp_path / "state" / "estop").exists()
+        bench.order(Order.ESTOP)
+        await bench.clock.sleep(0.1)
+        assert (state.last.mode, state.last.latched) == (GateMode.ESTOPPED, False)
+        assert latch._mark.engaged()
+        latch.broken, latch.readable = False, True
+        await bench.clock.sleep(2.0)
+        assert (state.last.latched, latch.stored(), latch._mark.engaged()) == (True, True, False)
+
+    on_bench(scenario, latch, inline)
+
+
+def test_a_reset_of_a_stop_whose_folder_could_not_be_synced_removes_the_file(tmp_path):
+    (tmp_path / "run").mkdir()
+    latch = Unsynced(tmp_path / "state" / "estop", tmp_path / "run")
+    latch.prepare()
+
+    async def scenario(bench):
+        latch.broken = True
+        bench.order(Order.ESTOP)
+        await bench.clock.sleep(0.1)
+        assert (bench.out.state.last.latched, latch.stored(), latch._mark.engaged()) == (False, True, True)
+        assert bench.order(Order.RESET).reason is Reason.OK
+        await bench.clock.sleep(2.0)
+        latch.broken = False
+        await bench.clock.sleep(2.0)
+        assert (bench.out.state.last.latched, latch.engaged()) == (False, False)
+
+    on_bench(scenario, latch, inline)
 
 
 class BrokenLatch(MemoryLatch):
