@@ -8,7 +8,7 @@ import asyncio
 import dataclasses
 import secrets
 from collections.abc import AsyncIterator, Mapping
-from contextlib import asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager
 from types import MappingProxyType
 from typing import Any
 
@@ -164,8 +164,9 @@ class Daemon:
     async def _outside(self) -> AsyncIterator[None]:
         log_out = self.bus.publisher(topics.LOG, Writer.DAEMON)
         with published(self.clock, log_out, self.bus.add_drops, reproducible=self._seed is not None):
-            async with scope("bus") as bus_scope:
+            async with AsyncExitStack() as after, scope("bus") as bus_scope:
                 await self._start_outside(bus_scope)
+                after.push_async_callback(self.gate.close)  # from here on this is the robot's only daemon
                 yield
 
     async def _start_outside(self, bus_scope: Scope) -> None:

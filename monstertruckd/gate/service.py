@@ -172,9 +172,11 @@ class GateService:
         return self._meter.lateness()
 
     def control(self, order: ControlRequest) -> Decision:
-        """Carry out an order at once; see ``Gate.control``."""
+        """Carry out an order at once; see ``Gate.control``. An emergency stop is marked before it is answered."""
         bug = Decision(Reason.INTERNAL, Reason.INTERNAL.text)
-        return self._guarded(bug, self._gate.control, order, self._clock.now())
+        decision = self._guarded(bug, self._gate.control, order, self._clock.now())
+        self._mark_latch()
+        return decision
 
     def request(self, request: DriveRequest) -> Reason:
         """Take a drive request from outside, at once; see ``Gate.request``."""
@@ -208,7 +210,10 @@ class GateService:
         raise self._bug
 
     async def run(self, ready: Ready) -> None:
-        """Tick until cancelled; the last commands are neutral, whatever ends it, and the latch is on the disk."""
+        """Tick until cancelled; the last commands are neutral, whatever ends it, and the latch is on the disk.
+
+        Orders are taken after it as well, until ``close``.
+        """
         for setting in self._weakened:
             log.warning("%s: %s", Reason.WEAKENED.text, setting)
             self._events(Reason.WEAKENED, Severity.WARNING, self.name, setting)
@@ -221,8 +226,12 @@ class GateService:
                 finally:
                     self.shut_down()  # before waiting for the disk
         finally:
-            if await self._store_latch():
-                self._latch.close()
+            await self._store_latch()
+
+    async def close(self) -> None:
+        """Store the latch once more and remove its mark, when no more orders can arrive; does not raise ``OSError``."""
+        if await self._store_latch():
+            self._latch.close()
 
     async def _tick_for_ever(self, ready: Ready) -> None:
         schedule = Schedule(self._clock, self._rate, ahead=0)
@@ -259,7 +268,7 @@ class GateService:
                 deadman=output.mode is not GateMode.ESTOPPED and Reason.DRIVE_STALE not in output.reasons,
             )
         )
-        self._mark_latch(output.mode)
+        self._mark_latch()
         for event in output.events:
             self._events(event.reason, event.severity, self.name, event.text, **event.values)
         for trip in output.trips:
@@ -315,13 +324,13 @@ class GateService:
             waiting=output.waiting,
         )
 
-    def _mark_latch(self, mode: GateMode) -> None:
+    def _mark_latch(self) -> None:
         """Mark an emergency stop before it is reported, and clear the mark once the disk agrees.
 
         The thread that stores the latch never touches the mark: a stop that is ordered while the one before is being
         removed from the disk keeps its own.
         """
-        marked = mode is GateMode.ESTOPPED and self._latched is not True
+        marked = self.mode is GateMode.ESTOPPED and self._latched is not True
         if marked != self._marked:
             self._marked = marked
             try:

@@ -15,10 +15,14 @@ from monstertruck_runtime.mailbox import fifo
 from monstertruck_schemas import topics
 from monstertruck_schemas.event import Stop
 from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import ControlRequest, Order
 from monstertruck_schemas.state import GateMode
 from monstertruckd.config.load import load_config
+from monstertruckd.daemon import Daemon
+from monstertruckd.gate.latch import EstopLatch
 from monstertruckd.recorder.black_box import black_boxes
 from monstertruckd.recorder.reader import open_log
+from monstertruckd.recorder.recorder import Recorder
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
 from monstertruckd.tools.simulation.operator import LocalOperator
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
@@ -140,3 +144,32 @@ def test_the_whole_truck_records_the_same_whatever_the_real_computer_does(tmp_pa
 
 def test_an_emergency_stop_and_the_end_at_once_leave_a_box_the_same_in_every_run(tmp_path: Path):
     assert shutdown_after_estop(tmp_path / "a") == shutdown_after_estop(tmp_path / "b")
+
+
+def test_an_emergency_stop_while_the_log_is_being_finished_is_latched(tmp_path: Path, monkeypatch):
+    (tmp_path / "run").mkdir()
+    config = with_overlay(base("demo"), {"recorder": {"directory": str(tmp_path / "logs")}, "map": None})
+
+    def new_latch() -> EstopLatch:
+        latch = EstopLatch(tmp_path / "state" / "estop", tmp_path / "run")
+        latch.prepare()
+        return latch
+
+    async def main(clock: VirtualClock) -> None:
+        rig = VirtualRig(config, clock)
+        operator = LocalOperator(rig.daemon, clock)
+        finish = Recorder.__aexit__
+
+        async def stop_and_finish(recorder: Recorder, *error: object) -> None:
+            header = await operator.header()
+            rig.bus.inject(topics.REQ_CONTROL, ControlRequest(**header, order=Order.ESTOP))
+            assert new_latch().engaged(), "marked at once"
+            await finish(recorder, *error)
+
+        monkeypatch.setattr(Recorder, "__aexit__", stop_and_finish)
+        async with rig.running():
+            await clock.sleep(1.0)
+
+    monkeypatch.setattr(Daemon, "_build_latch", lambda *_: new_latch())
+    run_virtual(main)
+    assert new_latch().stored()

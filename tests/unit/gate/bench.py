@@ -126,6 +126,7 @@ class Bench:
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
+        await self.service.close()
 
 
 def on_bench(scenario, latch=None, offload=in_thread):

@@ -225,6 +225,35 @@ def test_an_emergency_stop_survives_a_restart(tmp_path):
     on_bench(released, latch)
 
 
+def test_an_emergency_stop_is_marked_before_its_order_is_answered(tmp_path):
+    latch = file_latch(tmp_path)
+
+    async def scenario(bench):
+        assert bench.order(Order.ESTOP).reason is Reason.OK
+        assert (latch.stored(), latch.engaged()) == (False, True)
+
+    on_bench(scenario, latch, inline)
+
+
+def test_an_emergency_stop_after_the_last_tick_is_marked_at_once_and_stored_when_the_gate_is_closed(tmp_path):
+    latch = file_latch(tmp_path)
+
+    async def main(clock):
+        bench = Bench(clock, latch, offload=inline)
+        serving = asyncio.create_task(bench.service.run(bench.ready))
+        await clock.sleep(0.1)
+        serving.cancel()
+        await asyncio.wait([serving])
+        assert not latch.engaged()
+        assert bench.order(Order.ESTOP).reason is Reason.OK
+        assert (latch.stored(), latch.engaged()) == (False, True)
+        await bench.service.close()
+
+    run_virtual(main)
+    assert latch.stored()
+    assert list((tmp_path / "run").iterdir()) == []
+
+
 KILLED = """
 import asyncio, os, sys, threading
 from pathlib import Path
