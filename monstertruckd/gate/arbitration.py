@@ -99,7 +99,11 @@ class Sources:
         self._drive: dict[Key, Source] = {}
         self._min_rank = 0
         self._released: set[Key] | None = None
-        """Sources that were heard at the STOP order or have been neutral since; None = there was none."""
+        """Sources that were live at the STOP order or have been neutral since; None = there was none."""
+        self._stop = "", 0
+        """Source and time (ns) of the newest order that stops."""
+        self._stop_of_others = 0
+        """Time of the newest one of another source than that, ns."""
 
     def accept_request(self, request: DriveRequest, now: int) -> Reason:
         """OK, or why a drive request from outside is refused."""
@@ -124,7 +128,22 @@ class Sources:
         reason = self._orders.accept(request, self.nonce, now)
         if reason is Reason.OK and request.order in STARTING:
             reason = freshness(request, now, self._config.max_request_age)
+            if reason is Reason.OK and self._overtaken(request):
+                return Reason.BAD_SEQUENCE
         return reason
+
+    def stopped(self, source: str, now: int) -> None:
+        """A source ordered a stop: orders of others that start are refused if their sender did not know of it."""
+        stopped_by, at = self._stop
+        if source != stopped_by:
+            self._stop_of_others = at
+        self._stop = source, now
+
+    def _overtaken(self, request: ControlRequest) -> bool:
+        """Whether another source has ordered a stop since the gate state that the sender knew."""
+        stopped_by, at = self._stop
+        newest = self._stop_of_others if request.source == stopped_by else at
+        return request.gate_stamp is not None and request.gate_stamp < newest
 
     def add(self, request: DriveRequest, now: int, *, inside: bool) -> Source:
         """Start or renew the lease of an accepted request."""
@@ -173,14 +192,14 @@ class Sources:
         """``role`` has driven or stopped the truck: lower roles wait for the next ARM order."""
         self._min_rank = max(self._min_rank, PRIORITY[role])
 
-    def hold(self) -> None:
+    def hold(self, now: int) -> None:
         """Every source must send a neutral request before it may drive."""
-        self._released = set(self._drive)
+        self._released = {source.key for source in self.live(now)}
         for source in self._drive.values():
             source.held = True
 
     def _unheard(self, key: Key) -> bool:
-        """Whether a source has neither been heard at the STOP order nor been neutral since."""
+        """Whether a source was neither live at the STOP order nor has been neutral since."""
         return self._released is not None and key not in self._released
 
     def release(self, *, planners: bool) -> None:

@@ -248,7 +248,8 @@ class Gate:
 
         ESTOP and STOP are accepted from every source, authenticated or not: stopping is always safe. ARM and RESET need
         an operator's role, a truck at rest and no operator requesting motion. An authenticated ESTOP or STOP uses its
-        sequence number, so that an earlier order of its source that arrives later, by another way, is refused.
+        sequence number, so that an earlier order of its source that arrives later, by another way, is refused. So is
+        an ARM or RESET whose sender did not know yet of another's ESTOP, STOP or DISARM.
         """
         reason = self._sources.accept_order(request, now)
         if request.order is Order.ESTOP:
@@ -273,6 +274,7 @@ class Gate:
         return Decision(self._refuse(now, reason, request, text), text or reason.text)
 
     def _estop(self, request: ControlRequest, now: int) -> Decision:
+        self._sources.stopped(request.source, now)
         if self.mode is not GateMode.ESTOPPED:
             why = _order_cause(Reason.ESTOP_REQUESTED, f"emergency stop by {request.source}", request, now)
             self._trip(now, GateMode.ESTOPPED, [why])
@@ -286,7 +288,8 @@ class Gate:
     def _stop_by(self, request: ControlRequest, now: int) -> Decision:
         if request.role is not Role.TRACKER:
             self._sources.claim(request.role)
-        self._sources.hold()
+        self._sources.stopped(request.source, now)
+        self._sources.hold(now)
         if self.mode is GateMode.DRIVING:
             text = f"stop ordered by {request.source}"
             self._stop(now, [_order_cause(Reason.STOPPED, text, request, now)], ordered=True)
@@ -294,6 +297,7 @@ class Gate:
         return ACCEPTED
 
     def _disarm_by(self, request: ControlRequest, now: int) -> Decision:
+        self._sources.stopped(request.source, now)
         text = f"disarmed by {request.source}"
         if self.mode is GateMode.ARMED:
             self._disarm(now, text)

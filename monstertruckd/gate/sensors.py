@@ -57,6 +57,9 @@ DRIVE_LOSSES: Final = (Reason.DEVICE_RESTARTED, Reason.DEVICE_STOPPED)
 MEASURED: Final = frozenset(BatteryLevel) - {BatteryLevel.UNKNOWN, BatteryLevel.SENSOR_FAULT}
 
 
+ENABLED_WITHIN: Final = 1.5
+"""Seconds in which a drive controller that is commanded to turn its shaft is enabled: it takes 0.6."""
+
 JUMP: Final = 1.5
 """A heading that changes faster than this, rad/s, is a disturbed compass, not a turn."""
 
@@ -426,8 +429,8 @@ class ShaftCheck:
 
     def __init__(self, config: ShaftCheckConfig) -> None:
         self._config = config
-        self._since: dict[int, int] = {}
-        """Since when each shaft has not turned, ns."""
+        self._since: dict[tuple[int, bool], int] = {}
+        """Since when each shaft has not turned, and its controller been enabled or not, ns."""
         self._current: dict[int, float] = {}
         """Newest measured current of each, A."""
         self.blocked: int | None = None
@@ -450,12 +453,15 @@ class ShaftCheck:
         if feedback.current is not None:
             self._current[shaft] = feedback.current
         limits = self._config
-        asked = feedback.mode is DriveMode.ENABLED and abs(commanded) >= limits.speed
+        enabled = feedback.mode is DriveMode.ENABLED
+        self._since.pop((shaft, not enabled), None)
+        asked = feedback.mode is not DriveMode.FAULT and abs(commanded) >= limits.speed
         if not asked or measured * math.copysign(1.0, commanded) >= limits.share * abs(commanded):
-            self._since.pop(shaft, None)
+            self._since.pop((shaft, enabled), None)
             return
-        since = self._since.setdefault(shaft, feedback.received)
-        if self.blocked is None and feedback.received - since >= limits.within * SECOND:
+        since = self._since.setdefault((shaft, enabled), feedback.received)
+        within = limits.within if enabled else ENABLED_WITHIN
+        if self.blocked is None and feedback.received - since >= within * SECOND:
             self.blocked = shaft
 
     @property

@@ -10,7 +10,6 @@ and the last ones are a quick stop and power stage off.
 """
 
 import math
-from contextlib import suppress
 from typing import NamedTuple
 
 from monstertruck_drivers.epos import objects as od
@@ -23,6 +22,7 @@ from monstertruck_runtime.clock import QUESTIONS, SECOND, Clock, Schedule
 from monstertruck_runtime.errors import (
     DeviceError,
     DeviceFaultError,
+    DeviceLostError,
     DeviceMismatchError,
     DeviceRestartedError,
     DeviceStoppedError,
@@ -127,7 +127,9 @@ HANDSHAKE_ATTEMPTS = 2
 FAILURE_LIMIT = 3
 """Failed exchanges in a row that end the session."""
 SAFE_DEADLINE = 0.3
-"""Seconds a session may take to leave the motor stopped and disabled."""
+"""Seconds a session may take to leave the motor stopped and disabled, from when the controller listens."""
+SAFE_ATTEMPTS = 2
+"""Of that: the first one may meet the rest of what was damaged."""
 DISABLE_TIME = 0.04
 """Seconds of ``SAFE_DEADLINE`` kept for the last exchange."""
 REENABLE_LIMIT = 0.3
@@ -302,15 +304,30 @@ class _DriveSession:
                 raise DeviceRestartedError("the controller restarted")
 
     async def make_safe(self) -> None:
-        """Brake, and switch the power stage off once the motor rests; gives up after ``SAFE_DEADLINE``."""
-        end = self._clock.now() + int(SAFE_DEADLINE * SECOND)
-        with suppress(DeviceError, TimeoutError):
-            async with self._clock.deadline(SAFE_DEADLINE):
-                await self._control(Control.QUICK_STOP)
-                while abs(await self._line.read(od.VELOCITY)) > self._config.standstill_rpm:
-                    if self._clock.now() > end - int(DISABLE_TIME * SECOND):
-                        return  # a power stage switched off would let it roll
-                await self._control(Control.DISABLE_VOLTAGE)
+        """Brake, and switch the power stage off once the motor rests.
+
+        Each of ``SAFE_ATTEMPTS`` gives up after ``SAFE_DEADLINE``, counted from when the controller listens again: it
+        is given the silence that a damaged or late answer before asks for.
+        """
+        for _ in range(SAFE_ATTEMPTS):
+            try:
+                await self._line.finish()
+                await self._line.settle()
+                async with self._clock.deadline(SAFE_DEADLINE):
+                    await self._brake_and_switch_off()
+            except DeviceLostError:
+                return
+            except (DeviceError, TimeoutError):
+                continue
+            return
+
+    async def _brake_and_switch_off(self) -> None:
+        end = self._clock.now() + int((SAFE_DEADLINE - DISABLE_TIME) * SECOND)
+        await self._control(Control.QUICK_STOP)
+        while abs(await self._line.read(od.VELOCITY)) > self._config.standstill_rpm:
+            if self._clock.now() > end:
+                return  # a power stage switched off would let it roll
+        await self._control(Control.DISABLE_VOLTAGE)
 
     # The schedule
 

@@ -44,6 +44,8 @@ ESTOPS: Final = 5
 """Every so many faults are followed by an emergency stop, the others by a disarm order."""
 QUIET: Final = frozenset({Reason.OK, Reason.DISARMED, Reason.CLIPPED, Reason.SERVO_LIMIT, Reason.OBSTACLE_SLOW})
 """Reasons that explain nothing."""
+OBSTACLE: Final = frozenset({Reason.OBSTACLE_STOP, Reason.OBSTACLE_SLOW})
+"""Reasons of a truck that stands, or creeps, before something."""
 DEADMAN: Final[dict[str, Any]] = {"map": None, **DEADMAN_LINE}
 """Of every truck: the deadman line, and no map."""
 
@@ -328,7 +330,7 @@ async def _react(truck: DrillTruck, fault: CatalogFault, cruise: float, order: O
     blockers = truck.blockers()
     if not blockers and not await _drive(truck):
         blockers = tuple(truck.gate.reasons) if truck.gate is not None else ("gate",)
-    blocked = Reason.OBSTACLE_STOP in blockers and observer.before_something()
+    blocked = not OBSTACLE.isdisjoint(blockers) and observer.before_something()
     if blocked:
         blockers = ()
     drove_on = standstill is not None and standstill > fault.hold  # it stood only because it was disarmed

@@ -1,5 +1,7 @@
 """Trouble of drive and steering: a shaft that does not turn, a controller that restarts, short faults that repeat."""
 
+import math
+
 import pytest
 
 from monstertruck_runtime.clock import SECOND
@@ -29,6 +31,25 @@ def test_a_blocked_shaft_stops_and_disarms_within_a_second(speed):
     rig.driver = None
     rig.tick(60)
     assert rig.order(Order.ARM) is Reason.OK
+
+
+@pytest.mark.parametrize("mode", [DriveMode.STARTING, DriveMode.DISABLED, DriveMode.QUICK_STOP])
+def test_a_shaft_whose_controller_never_enables_is_blocked(mode, monkeypatch):
+    """With another one that drives, the body would turn on the spot."""
+    robot = Robot("differential").driving(ticks=2, speed=0.2)
+    observe = robot.gate.observe_drive
+
+    def second_never_enables(message, shaft=0):
+        observe(message if shaft == 0 else feedback(robot.now, 0.0, mode=mode), shaft)
+
+    monkeypatch.setattr(robot.gate, "observe_drive", second_never_enables)
+    robot.tick(70)
+    assert robot.trips == []
+    robot.tick(20)
+    assert robot.trips[0].reason is Reason.SHAFT_BLOCKED
+    robot.driver = None
+    robot.tick(60)
+    assert robot.out.mode is GateMode.DISARMED
 
 
 def test_it_can_be_configured_not_to_look():
@@ -151,11 +172,29 @@ def test_a_shaft_turns_at_a_share_of_its_command_or_needs_not(commanded, measure
     assert shown(check, 1.7, commanded=commanded, measured=measured) is not turns
 
 
-@pytest.mark.parametrize("mode", [mode for mode in DriveMode if mode is not DriveMode.ENABLED])
-def test_a_drive_that_is_not_enabled_may_stand(mode):
+@pytest.mark.parametrize(
+    ("mode", "within"),
+    [
+        (DriveMode.ENABLED, 0.6),
+        (DriveMode.STARTING, 1.5),
+        (DriveMode.DISABLED, 1.5),
+        (DriveMode.QUICK_STOP, 1.5),
+        (DriveMode.FAULT, math.inf),
+    ],
+)
+def test_a_controller_has_its_time_to_enable_and_in_fault_another_reason_to_stand(mode, within):
     check = shafts()
     shown(check, 1.0, mode=mode)
-    assert not shown(check, 1.7, mode=mode)
+    for after in (0.59, 0.6, 1.49, 1.5):
+        assert shown(check, 1.0 + after, mode=mode) is (after >= within)
+
+
+def test_a_controller_that_was_enabled_late_has_its_time_to_turn_the_shaft():
+    check = shafts()
+    shown(check, 1.0, mode=DriveMode.STARTING)
+    shown(check, 2.4, mode=DriveMode.ENABLED)
+    assert not shown(check, 2.99)
+    assert shown(check, 3.0)
 
 
 def test_a_shaft_that_turned_in_between_begins_anew():

@@ -139,6 +139,35 @@ def test_a_request_that_was_long_on_its_way_moves_nothing():
     assert rig.order(Order.DISARM, gate_stamp=None) is Reason.OK
 
 
+@pytest.mark.parametrize("stop", [Order.ESTOP, Order.STOP, Order.DISARM])
+def test_who_does_not_know_of_anothers_stop_starts_nothing(stop):
+    rig = Rig(latched=stop is Order.ESTOP)
+    rig.tick(5)
+    start, known = Order.RESET if stop is Order.ESTOP else Order.ARM, rig.now
+    rig.tick()
+    assert rig.order(stop, source="bob") is Reason.OK
+    rig.tick()
+    assert rig.order(start, source="ann", gate_stamp=known) is Reason.BAD_SEQUENCE
+    assert rig.order(start, source="bob", gate_stamp=known) is Reason.OK, "its own orders have their sequence"
+    assert rig.order(stop, source="bob") is Reason.OK
+    assert rig.order(start, source="ann", gate_stamp=rig.now) is Reason.OK
+
+
+def test_of_two_who_stop_each_has_to_know_of_the_other():
+    rig = Rig()
+    rig.tick(5)
+    before = rig.now
+    rig.tick()
+    rig.order(Order.STOP, source="ann")
+    between = rig.now
+    rig.tick()
+    rig.order(Order.STOP, source="bob")
+    rig.tick()
+    assert rig.order(Order.ARM, source="ann", gate_stamp=between) is Reason.BAD_SEQUENCE
+    assert rig.order(Order.ARM, source="bob", gate_stamp=before) is Reason.BAD_SEQUENCE
+    assert rig.order(Order.ARM, source="bob", gate_stamp=between) is Reason.OK
+
+
 def test_planners_need_no_gate_stamp():
     assert Rig().armed().drive(**TRACK, gate_stamp=None) is Reason.OK
 

@@ -161,7 +161,7 @@ def test_why_somebody_does_not_drive():
     assert crowd.priority(ann, NOW, holder) is Reason.OK
     assert crowd.priority(bob, NOW, holder) is Reason.BUSY
     assert crowd.priority(low, NOW, holder) is Reason.LOWER_PRIORITY
-    crowd.hold()
+    crowd.hold(NOW)
     assert [crowd.priority(source, NOW, holder) for source in (ann, bob, low)] == [Reason.NOT_ARMED_SPEED] * 3
 
 
@@ -202,7 +202,7 @@ def test_armed_on_hold_planners_wait_for_the_next_arming(planners):
 def test_after_a_stop_everybody_must_be_neutral_once():
     crowd = Crowd()
     crowd.heard("ann")
-    crowd.hold()
+    crowd.hold(NOW)
     assert crowd.driving() is None
     assert crowd.heard("ann").held
     assert not crowd.heard("ann", speed=0.0).held
@@ -212,14 +212,14 @@ def test_after_a_stop_everybody_must_be_neutral_once():
 def test_silence_for_a_whole_lease_is_as_good_as_neutral():
     crowd = Crowd()
     crowd.heard("ann")
-    crowd.hold()
+    crowd.hold(NOW)
     assert crowd.heard("ann", at=NOW + LEASE).held, "its lease ends with this instant"
     assert not crowd.heard("ann", at=NOW + 2 * LEASE + 1).held
 
 
 def test_a_source_first_heard_after_the_stop_must_be_neutral_however_long_it_is_silent():
     crowd = Crowd()
-    crowd.hold()
+    crowd.hold(NOW)
     assert crowd.heard("new").held
     assert crowd.heard("new", at=NOW + 10 * SECOND).held
     crowd.heard("new", speed=0.0, at=NOW + 10 * SECOND)
@@ -230,14 +230,21 @@ def test_a_source_whose_lease_had_lapsed_before_the_stop_is_a_new_one():
     crowd = Crowd()
     crowd.heard("ann")
     crowd.heard("bob", at=NOW + 2 * LEASE)
-    crowd.hold()
+    crowd.hold(NOW + 2 * LEASE)
+    assert crowd.heard("ann", at=NOW + 4 * LEASE).held
+
+
+def test_so_is_one_that_was_the_last_to_be_heard():
+    crowd = Crowd()
+    crowd.heard("ann")
+    crowd.hold(NOW + 2 * LEASE)
     assert crowd.heard("ann", at=NOW + 4 * LEASE).held
 
 
 def test_arming_ends_what_a_stop_asks():
     crowd = Crowd()
     ann = crowd.heard("ann")
-    crowd.hold()
+    crowd.hold(NOW)
     crowd.release(planners=True)
     assert not ann.held
     assert crowd.driving() == "ann"
@@ -253,7 +260,7 @@ def test_without_a_stop_nobody_has_to_be_neutral():
 
 def test_the_names_released_after_a_stop_are_bounded():
     crowd = Crowd()
-    crowd.hold()
+    crowd.hold(NOW)
     for number in range(MAX_SOURCES + 1):
         crowd.heard(f"s{number}", speed=0.0)
     assert len(crowd._released) == MAX_SOURCES

@@ -10,7 +10,8 @@ import pytest
 
 from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos.config import EposConfig
-from monstertruck_drivers.epos.driver import RAD_S_PER_RPM, SAFE_DEADLINE
+from monstertruck_drivers.epos.driver import RAD_S_PER_RPM, SAFE_ATTEMPTS, SAFE_DEADLINE
+from monstertruck_drivers.epos.exchange import QUIET
 from monstertruck_drivers.epos.protocol import Control, Opcode, State
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.cmd import DriveAction
@@ -262,7 +263,30 @@ def test_a_motor_that_brakes_too_slowly_is_left_braking_not_rolling():
     on_bench(test, EposConfig(quick_stop_deceleration_rpm_s=20_000))
 
 
-def test_cancelling_a_silent_line_takes_no_longer_than_the_deadline():
+@pytest.mark.parametrize("wait", [0.02, 0.12, 0.28, 0.33])
+@pytest.mark.parametrize("fault", ["delay 270 1", "length 2", "acknowledge 1", "stray 5", "refuse 2", "silent on"])
+def test_cancelling_while_the_line_is_kept_quiet_leaves_the_motor_disabled(fault: str, wait: float):
+    """After a late or damaged answer nothing may be sent for up to 0.55 s; the last bytes are sent all the same."""
+
+    async def test(rig: Rig) -> None:
+        async with rig.driving() as task:
+            await rig.drive(6_000)
+            rig.emulator.inject(*fault.split())
+            await rig.settle(wait)
+            rig.emulator.inject("silent", "off")
+            rig.gate.say(DriveAction.QUICK_STOP)
+            await rig.settle(0.05)
+            task.cancel()
+            await asyncio.wait([task])
+        rig.gate.talking = False
+        await rig.settle(1.0)
+        assert rig.emulator.state is State.SWITCH_ON_DISABLED
+        assert rig.shaft_rpm == 0
+
+    on_bench(test)
+
+
+def test_cancelling_a_silent_line_takes_no_longer_than_the_deadlines():
     async def test(rig: Rig) -> None:
         async with rig.driving() as task:
             await rig.drive(1_000)
@@ -271,7 +295,7 @@ def test_cancelling_a_silent_line_takes_no_longer_than_the_deadline():
             start = rig.clock.now()
             task.cancel()
             await asyncio.wait([task])
-            assert (rig.clock.now() - start) / SECOND <= SAFE_DEADLINE + 0.001
+            assert (rig.clock.now() - start) / SECOND <= SAFE_ATTEMPTS * (QUIET + SAFE_DEADLINE) + 0.001
 
     on_bench(test)
 

@@ -74,6 +74,12 @@ class Controller:
         if entry in self.refusals:
             raise self.refusals[entry]
 
+    async def finish(self) -> None:
+        """No exchange is under way."""
+
+    async def settle(self) -> None:
+        """The line is quiet."""
+
     async def read_row(self, entries: Sequence[ObjectEntry], take: Callable[[int], bool]) -> None:
         for entry in entries:
             if not take(await self.read(entry)):
