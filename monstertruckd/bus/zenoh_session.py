@@ -41,6 +41,7 @@ from monstertruck_schemas.topics import (
 from monstertruckd.bus.access import ANONYMOUS, OBSERVING, Sender, in_groups
 from monstertruckd.bus.intake import Intake, Refusals, SourceRates
 from monstertruckd.bus.local import Bus
+from monstertruckd.bus.replies import Replies, Reply
 from monstertruckd.bus.rpc import Rpc, failure, topic_rows
 from monstertruckd.bus.zenoh_config import Door, ZenohConfig, doors, session_config
 
@@ -114,6 +115,7 @@ class ZenohBridge:
             BusyError: see ``open``.
             ConfigError: see ``open``.
         """
+        replies = Replies()
         try:
             await self.open()
             failed: asyncio.Future[None] = asyncio.get_running_loop().create_future()
@@ -134,17 +136,19 @@ class ZenohBridge:
                             if topic.writer is Writer.OUTSIDE
                         }
                         refusals = inputs.enter_context(closing(Refusals(self._bus, self._clock, self.name)))
-                        active: set[asyncio.Task[None]] = set()
+                        active: set[asyncio.Task[Reply]] = set()
                         queries: ThreadHop[Call] = inputs.enter_context(
                             closing(
                                 ThreadHop(
-                                    lambda call: guard(partial(self._serve, *call, calls, active)),
+                                    lambda call: guard(partial(self._serve, *call, replies, calls, active)),
                                     2 * MAX_WAITING_CALLS,
                                     self._bus.add_drops,
+                                    discard=lambda call: replies.end(call[0]),
                                 )
                             )
                         )
-                        for token in await in_thread(partial(self._declare_inputs, intakes, refusals, queries)):
+                        inward = partial(self._declare_inputs, intakes, refusals, queries, replies)
+                        for token in await in_thread(inward):
                             inputs.enter_context(token)
                         ready()
                         await failed
@@ -152,6 +156,7 @@ class ZenohBridge:
                 tap.close()
         finally:
             await self.close()
+            await in_thread(replies.close)
 
     def _open(self) -> None:
         try:
@@ -208,7 +213,7 @@ class ZenohBridge:
         }
 
     def _declare_inputs(
-        self, intakes: Mapping[str, Intake], refusals: Refusals, queries: ThreadHop[Call]
+        self, intakes: Mapping[str, Intake], refusals: Refusals, queries: ThreadHop[Call], replies: Replies
     ) -> list[zenoh.LivelinessToken]:
         """Subscribers and queryables; last the tokens that say so, which live as long as their objects."""
         remote = zenoh.Locality.REMOTE
@@ -225,9 +230,9 @@ class ZenohBridge:
             for topic in TOPICS:
                 key = topic.key(self._robot)
                 if topic.retained:
-                    session.declare_queryable(key, partial(self._on_get, topic, key), allowed_origin=remote)
+                    session.declare_queryable(key, partial(self._on_get, topic, key, replies), allowed_origin=remote)
             session.declare_queryable(
-                rpc_key(self._robot, "**"), partial(self._on_call, door, queries, rates), allowed_origin=remote
+                rpc_key(self._robot, "**"), partial(self._on_call, door, queries, replies, rates), allowed_origin=remote
             )
             tokens.append(session.liveliness().declare_token(alive_key(self._robot)))
         return tokens
@@ -264,60 +269,64 @@ class ZenohBridge:
 
     # Queries
 
-    def _on_get(self, topic: Topic[Any], key: str, query: zenoh.Query) -> None:
-        with query:
-            if (newest := self._bus.newest(topic)) is not None:
-                query.reply(key, wire.encode(topic, newest), encoding=wire.encoding(topic))
+    def _on_get(self, topic: Topic[Any], key: str, replies: Replies, query: zenoh.Query) -> None:
+        replies.wait_for_room()
+        newest = self._bus.newest(topic)
+        replies.end(query, None if newest is None else partial(_reply_message, topic, key, newest))
 
     def _called(self, query: zenoh.Query) -> tuple[str, str | None]:
         """Name and source of a call."""
         key = str(query.key_expr)
         return sender_in(self._robot, key) or (key.removeprefix(rpc_key(self._robot, "")), None)
 
-    def _on_call(self, door: Door, queries: ThreadHop[Call], rates: SourceRates, query: zenoh.Query) -> None:
+    def _on_call(
+        self, door: Door, queries: ThreadHop[Call], replies: Replies, rates: SourceRates, query: zenoh.Query
+    ) -> None:
+        replies.wait_for_room()
         size = 0 if query.payload is None else len(query.payload)
         name, source = self._called(query)
         if size > MAX_CALL:
-            _refuse(query, Reason.BAD_INPUT, f"payload of {size} bytes, at most {MAX_CALL} are taken")
+            text = f"payload of {size} bytes, at most {MAX_CALL} are taken"
+            replies.end(query, _error(failure(Reason.BAD_INPUT, text)))
         elif name not in ORDERS and not rates.spend(source or ANONYMOUS):
-            _refuse(query, Reason.BUSY, f"more than {CALL_RATE:g} calls a second")
+            replies.end(query, _error(failure(Reason.BUSY, f"more than {CALL_RATE:g} calls a second")))
+        elif not self._rpc.serves(name) and (described := self._described(query)):
+            replies.end(query, partial(_reply_schemas, described))
         elif queries.waiting >= (2 * MAX_WAITING_CALLS if name in ORDERS else MAX_WAITING_CALLS):
-            _refuse(query, Reason.BUSY, TOO_MANY)
+            replies.end(query, _error(failure(Reason.BUSY, TOO_MANY)))
         else:
             queries.put((query, door))
 
-    def _serve(self, query: zenoh.Query, door: Door, calls: asyncio.TaskGroup, active: set[asyncio.Task[None]]) -> None:
+    def _serve(
+        self,
+        query: zenoh.Query,
+        door: Door,
+        replies: Replies,
+        calls: asyncio.TaskGroup,
+        active: set[asyncio.Task[Reply]],
+    ) -> None:
         name, source = self._called(query)
         if len(active) >= (2 * MAX_CALLS if name in ORDERS else MAX_CALLS):
-            _refuse(query, Reason.BUSY, TOO_MANY)
+            replies.end(query, _error(failure(Reason.BUSY, TOO_MANY)))
             return
         task = calls.create_task(self._answer(query, name, _sender(door, source)))
         active.add(task)
-        task.add_done_callback(active.discard)
 
-    async def _answer(self, query: zenoh.Query, name: str, sender: Sender) -> None:
-        with query:
-            key = str(query.key_expr)
-            # A reply waits for room in the queue of a station that reads nothing: in a thread.
-            if not self._rpc.serves(name) and await in_thread(partial(self._reply_schemas, query)):
-                return
-            payload = b"" if query.payload is None else query.payload.to_bytes()
-            success, data = await self._rpc.answer(sender, name, payload)
-            if success:
-                await in_thread(partial(query.reply, key, data, encoding="application/json"))
-            else:
-                await in_thread(partial(query.reply_err, data, encoding="application/json"))
+        def end(_: asyncio.Task[Reply]) -> None:
+            active.discard(task)
+            replies.end(query, None if task.cancelled() else task.result(), order=name in ORDERS)
 
-    def _reply_schemas(self, query: zenoh.Query) -> bool:
-        """Reply with every schema the query's key expression covers; False if there is none."""
-        found = False
-        for topic in TOPICS:
-            key = rpc_key(self._robot, _SCHEMA_PREFIX + topic.name)
-            if query.key_expr.intersects(key):
-                schema = wire.schema(topic)
-                query.reply(key, schema.data, encoding=_SCHEMA_MEDIA[schema.encoding])
-                found = True
-        return found
+        task.add_done_callback(end)
+
+    async def _answer(self, query: zenoh.Query, name: str, sender: Sender) -> Reply:
+        payload = b"" if query.payload is None else query.payload.to_bytes()
+        success, data = await self._rpc.answer(sender, name, payload)
+        return partial(_reply_success, str(query.key_expr), data) if success else _error(data)
+
+    def _described(self, query: zenoh.Query) -> list[tuple[str, Topic[Any]]]:
+        """Topics whose schema the query's key expression covers, with the schema's key."""
+        keys = [(rpc_key(self._robot, _SCHEMA_PREFIX + topic.name), topic) for topic in TOPICS]
+        return [(key, topic) for key, topic in keys if query.key_expr.intersects(key)]
 
     async def _topics(self, _payload: dict[str, Any]) -> dict[str, Any]:
         return {"topics": topic_rows(self._robot)}
@@ -331,9 +340,22 @@ def _last(name: str) -> str:
     return name.rpartition("/")[2]
 
 
-def _refuse(query: zenoh.Query, reason: Reason, text: str) -> None:
-    with query:
-        query.reply_err(failure(reason, text), encoding="application/json")
+def _reply_success(key: str, data: bytes, query: zenoh.Query) -> None:
+    query.reply(key, data, encoding="application/json")
+
+
+def _error(data: bytes) -> Reply:
+    return lambda query: query.reply_err(data, encoding="application/json")
+
+
+def _reply_message(topic: Topic[Any], key: str, message: Message, query: zenoh.Query) -> None:
+    query.reply(key, wire.encode(topic, message), encoding=wire.encoding(topic))
+
+
+def _reply_schemas(described: list[tuple[str, Topic[Any]]], query: zenoh.Query) -> None:
+    for key, topic in described:
+        schema = wire.schema(topic)
+        query.reply(key, schema.data, encoding=_SCHEMA_MEDIA[schema.encoding])
 
 
 def _publisher(session: zenoh.Session, topic: Topic[Any], key: str) -> Put:

@@ -20,6 +20,7 @@ class ThreadHop(Generic[T]):
         depth: items that may wait; beyond that the oldest one of the lowest rank is lost.
         on_loss: called on the loop with the number lost since the last delivery.
         rank: worth of an item; None = all are worth the same.
+        discard: called with every item that waited and is not delivered, on the loop or in the thread of a ``put``.
     """
 
     def __init__(
@@ -28,11 +29,13 @@ class ThreadHop(Generic[T]):
         depth: int,
         on_loss: Callable[[int], None],
         rank: Callable[[T], int] | None = None,
+        discard: Callable[[T], object] = lambda _: None,
     ) -> None:
         self._deliver = deliver
         self._depth = depth
         self._on_loss = on_loss
         self._rank = rank
+        self._discard = discard
         self._items: deque[T] = deque()
         """Any thread may use its ends; items between them, and with ranks the left end too, need the lock."""
         self._loop = asyncio.get_running_loop()
@@ -44,6 +47,7 @@ class ThreadHop(Generic[T]):
     def put(self, item: T) -> None:
         """Queue ``item``; callable from any thread, never blocks."""
         if self._closed:
+            self._discard(item)
             return
         self._items.append(item)
         if len(self._items) > self._depth:
@@ -73,16 +77,21 @@ class ThreadHop(Generic[T]):
             if self._rank is not None:
                 # By number, for items may come meanwhile.
                 ranks = [self._rank(self._items[i]) for i in range(len(self._items))]
-                del self._items[ranks.index(min(ranks))]
+                least = ranks.index(min(ranks))
+                item: T | None = self._items[least]
+                del self._items[least]
+            else:
+                item = self._pop()
+            if item is not None:
                 self._lost += 1
-            elif self._pop() is not None:
-                self._lost += 1
+                self._discard(item)
 
     def _take(self) -> None:
         items = self._items
         if self._closed:
             with self._lock:
-                items.clear()
+                while (item := self._pop()) is not None:
+                    self._discard(item)
             return
         if self._rank is None:
             item = self._pop()

@@ -19,10 +19,17 @@ STATIONS = """
     with zenoh.open(config) as session:
         if sys.argv[1] == "reader":
             session.declare_subscriber("mt/truck/**", lambda _: None)
+        if sys.argv[1] == "asker":
+            unread = session.declare_subscriber("mt/truck/**", zenoh.handlers.FifoChannel(4))
         print("ready", flush=True)
         while sys.argv[1] == "writer":
             session.put("mt/truck/chatter", b"x" * 60_000, congestion_control=zenoh.CongestionControl.BLOCK)
             time.sleep(0.002)
+        if sys.argv[1] == "asker":
+            sys.stdin.readline()
+            for _ in range(30):
+                session.get("mt/truck/rpc/schema/**", lambda _: None, timeout=20.0)
+            print("asked", flush=True)
         time.sleep(60)
 """
 
@@ -30,7 +37,7 @@ STATIONS = """
 @asynccontextmanager
 async def other_station(kind: str, endpoint: str) -> AsyncIterator["subprocess.Popen[bytes]"]:
     program = [sys.executable, "-c", textwrap.dedent(STATIONS), kind, endpoint]
-    with subprocess.Popen(program, stdout=subprocess.PIPE) as process:
+    with subprocess.Popen(program, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         try:
             assert process.stdout is not None
             assert await asyncio.to_thread(process.stdout.readline) == b"ready\n"

@@ -267,3 +267,18 @@ async def test_a_full_hop_loses_the_least_valuable_first():
     for _ in range(4):
         await asyncio.sleep(0)
     assert got == [20, 11, 21]
+
+
+@pytest.mark.parametrize("rank", [None, lambda _: 0])
+async def test_what_a_hop_does_not_deliver_is_handed_back(rank):
+    got: list[int] = []
+    discarded: list[int] = []
+    hop: ThreadHop[int] = ThreadHop(got.append, 3, lambda _: None, rank, discarded.append)
+    for i in range(5):
+        hop.put(i)
+    await asyncio.sleep(0)
+    hop.close()
+    hop.put(5)
+    await asyncio.sleep(0)
+    assert got == [2]
+    assert sorted(discarded) == [0, 1, 3, 4, 5]

@@ -1,0 +1,71 @@
+"""Answers on their way to stations, in threads of their own.
+
+A reply, and the final message of a query that is dropped, waits for room towards its station: 2 s towards one that
+takes nothing. Neither the event loop nor the threads in which queries arrive may stand still so long.
+"""
+
+import logging
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from typing import Final
+
+import zenoh
+
+log = logging.getLogger(__name__)
+
+THREADS: Final = 8
+"""Replies under way at once; as many further ones to orders."""
+DEPTH: Final = 1024
+"""Queries that may wait for their reply; beyond that no further query is taken until one has left."""
+
+Reply = Callable[[zenoh.Query], object]
+"""Sends replies to a query."""
+
+
+class Replies:
+    """Ends queries: sends their replies, and their final messages."""
+
+    def __init__(self) -> None:
+        self._orders = ThreadPoolExecutor(THREADS, "order-replies")
+        self._others = ThreadPoolExecutor(THREADS, "replies")
+        self._change = threading.Condition()
+        self._waiting = 0
+
+    def wait_for_room(self) -> None:
+        """Wait until fewer than ``DEPTH`` replies wait; not for the event loop."""
+        with self._change:
+            self._change.wait_for(lambda: self._waiting < DEPTH)
+
+    def end(self, query: zenoh.Query, reply: Reply | None = None, *, order: bool = False) -> None:
+        """Reply and end the query, without waiting for it; callable from any thread.
+
+        Args:
+            query: not to be used any more.
+            reply: None = end it without an answer.
+            order: whether it answers an order: these do not wait behind the others.
+        """
+        with self._change:
+            self._waiting += 1
+        with suppress(RuntimeError):  # closed meanwhile
+            (self._orders if order else self._others).submit(self._end, query, reply)
+
+    def close(self) -> None:
+        """Wait for all replies: with the sessions closed they fail at once."""
+        for pool in (self._orders, self._others):
+            pool.shutdown()
+
+    def _end(self, query: zenoh.Query, reply: Reply | None) -> None:
+        try:
+            with query:
+                if reply is not None:
+                    reply(query)
+        except zenoh.ZError as error:  # the station has left
+            log.debug("no reply: %s", error)
+        except Exception:
+            log.exception("reply: bug")
+        finally:
+            with self._change:
+                self._waiting -= 1
+                self._change.notify_all()
