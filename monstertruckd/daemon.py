@@ -110,6 +110,7 @@ class Daemon:
         self.bus.listen(topics.REQ_DRIVE, self.gate.request)
         self.bus.listen(topics.PLAN_DRIVE, self.gate.planner_request)
         self.bus.listen(topics.EVENT, self.gate.observe_event)
+        self.bus.listen(topics.HEALTH, self.gate.observe_health)
         self.bus.listen(topics.EVENT, self._board.observe_event)
         if config.planner is None:
             self.bus.listen(topics.REQ_GOAL, self._refuse_goal)
@@ -297,7 +298,6 @@ class Daemon:
                 drives=tuple(bus.subscribe(topic, latest()) for topic in DRIVES[:shafts]),
                 steering=bus.subscribe(topics.STEERING, latest()),
                 battery=bus.subscribe(topics.BATTERY, latest()),
-                health=bus.subscribe(topics.HEALTH, latest()),
             ),
             GateOutputs(
                 drives, steering, bus.publisher(topics.GATE, Writer.GATE), bus.publisher(topics.STOP, Writer.GATE)

@@ -193,7 +193,7 @@ class Gate:
         self._sensors.observe_battery(battery)
 
     def observe_health(self, table: HealthTable) -> None:
-        """Take the newest health table."""
+        """Take a health table; every one, for a later one of the same tick may hide a restart of the drive."""
         self._sensors.observe_health(table)
         self._outages.observe_health(table)
 
@@ -348,6 +348,7 @@ class Gate:
         blocks = self._blocks(assessment, now)
         self._report(now, blocks, assessment.values, always=self.mode is GateMode.DRIVING)
         self._advance(now, blocks)
+        self._sensors.judged()
         limits = assessment.limits
         if self._states.holder is not None:
             self._limiter.update(now, dt, self._states.holder.request, limits)

@@ -117,6 +117,8 @@ class SensorMonitor:
         self._failed: tuple[str, ...] = ()
         self._drive_losses: set[Reason] = set()
         """Those of ``DRIVE_LOSSES`` that a drive's service gives for its end."""
+        self._unjudged_losses: set[Reason] = set()
+        """Those that one gave since the last tick."""
         self._lost: dict[Reason, int] = {}
         self._refused: dict[Reason, Measurement] = {}
         self._critical = _critical(config, steered=chassis.steered)
@@ -175,6 +177,7 @@ class SensorMonitor:
             for service in table.services
             if service.reason in DRIVE_LOSSES and self._services.get(service.name) is Reason.DRIVE_STALE
         }
+        self._unjudged_losses |= self._drive_losses
         self._failed = tuple(
             service.name
             for service in table.services
@@ -262,7 +265,7 @@ class SensorMonitor:
                 values["drive_fault_code"] = drive.fault_code
         if values:
             blocks.append(Reason.DRIVE_FAULT)
-        blocks += [reason for reason in DRIVE_LOSSES if reason in self._drive_losses]
+        blocks += [reason for reason in DRIVE_LOSSES if reason in self._drive_losses | self._unjudged_losses]
         if self._failed:
             blocks.append(Reason.SERVICE_FAILED)
         fresh = self._all_fresh(now)
@@ -275,6 +278,10 @@ class SensorMonitor:
                 limits[Reason.TILT_SLOW] = config.tilt.slow_speed
         self._assess_battery(fresh[Reason.BATTERY_STALE], blocks, limits, values)
         return Assessment(tuple(blocks), limits, values)
+
+    def judged(self) -> None:
+        """A tick has acted on the assessment: what was reported and taken back since the tick before is forgotten."""
+        self._unjudged_losses.clear()
 
     def _assess_battery(
         self, fresh: bool, blocks: list[Reason], limits: dict[Reason, float], values: dict[str, Value]

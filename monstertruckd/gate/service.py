@@ -76,7 +76,7 @@ class TickMeter:
 
 @dataclass(frozen=True, slots=True)
 class GateInputs:
-    """Topics of which the gate reads the newest message. Requests and orders are passed to it as they arrive."""
+    """Topics of which the gate reads the newest message. All others are passed to it as they arrive."""
 
     scan: Subscription[LaserScan]
     attitude: Subscription[Attitude]
@@ -84,7 +84,6 @@ class GateInputs:
     """One per driven shaft."""
     steering: Subscription[SteeringFeedback]
     battery: Subscription[Battery]
-    health: Subscription[HealthTable]
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,7 +154,6 @@ class GateService:
             *(_Feed(drive, partial(gate.observe_drive, shaft=i)) for i, drive in enumerate(inputs.drives)),
             _Feed(inputs.steering, gate.observe_steering),
             _Feed(inputs.battery, gate.observe_battery),
-            _Feed(inputs.health, gate.observe_health),
         ]
 
     @property
@@ -189,6 +187,10 @@ class GateService:
     def observe_event(self, event: Event) -> None:
         """Take any service's event at once; see ``Gate.observe_event``."""
         self._guarded(None, self._gate.observe_event, event)
+
+    def observe_health(self, table: HealthTable) -> None:
+        """Take a health table at once; see ``Gate.observe_health``."""
+        self._guarded(None, self._gate.observe_health, table)
 
     def shut_down(self) -> None:
         """Command neutral now and for good; the ticks go on until ``run`` is cancelled."""

@@ -7,6 +7,7 @@ import pytest
 from monstertruck_runtime.clock import VirtualClock, run_virtual
 from monstertruck_runtime.mailbox import fifo
 from monstertruck_schemas.base import Pose2D
+from monstertruck_schemas.health import ServiceHealth, ServiceState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import ControlRequest, GoalRequest, Order, Role
 from monstertruck_schemas.state import GateMode
@@ -32,6 +33,16 @@ def test_an_emergency_stop_is_carried_out_before_the_bus_returns(tmp_path: Path)
         for order in (Order.ESTOP, *[Order.ARM] * 16):
             daemon.bus.inject(REQ_CONTROL, ControlRequest(**HEADER, order=order))
         assert daemon.gate.mode is GateMode.ESTOPPED
+
+    with_daemon(tmp_path, check)
+
+
+def test_the_gate_takes_every_health_table(tmp_path: Path):
+    def check(daemon: Daemon) -> None:
+        for state, reason in ((ServiceState.BACKOFF, Reason.DEVICE_RESTARTED), (ServiceState.STARTING, Reason.OK)):
+            daemon._board.report(ServiceHealth(name="drive", state=state, since=1, reason=reason))
+        authentic = {**HEADER, "nonce": daemon.gate._gate.nonce, "gate_stamp": daemon.clock.now()}
+        assert daemon.gate.control(ControlRequest(**authentic, order=Order.ARM)).reason is Reason.DEVICE_RESTARTED
 
     with_daemon(tmp_path, check)
 

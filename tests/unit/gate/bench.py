@@ -49,7 +49,7 @@ class Bench:
     def __init__(self, clock, latch=None, state=None, offload=in_thread):
         self.clock = clock
         self.latch = latch or MemoryLatch()
-        self.scan, self.attitude, self.drive, self.steering, self.battery, self.health = (Inbox() for _ in range(6))
+        self.scan, self.attitude, self.drive, self.steering, self.battery = (Inbox() for _ in range(5))
         self.out = GateOutputs((Outbox(),), Outbox(), state or Outbox(), Outbox())
         self.events = []
         self.readies = 0
@@ -60,7 +60,6 @@ class Bench:
             (self.drive,),
             self.steering,
             self.battery,
-            self.health,
         )
         gate = make_gate(self.latch.engaged())
         self.boxes = []
@@ -86,7 +85,7 @@ class Bench:
             self.drive.send(feedback(now, self.speed))
             self.steering.send(servos(now))
             self.battery.send(battery(now))
-            self.health.send(health(now))
+            self.service.observe_health(health(now))
             await self.clock.sleep(0.05)
 
     def order(self, order):

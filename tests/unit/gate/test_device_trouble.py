@@ -86,6 +86,20 @@ def test_a_drive_controller_that_restarted_or_was_stopped_by_another_disarms(rea
     assert reason in {trip.reason for trip in rig.trips} | {cause.reason for trip in rig.trips for cause in trip.causes}
 
 
+@pytest.mark.parametrize("state", [ServiceState.STARTING, ServiceState.READY])
+@pytest.mark.parametrize("reason", [Reason.DEVICE_RESTARTED, Reason.DEVICE_STOPPED])
+def test_it_disarms_although_its_service_is_started_again_before_the_next_tick(reason, state):
+    rig = Rig().driving(speed=0.2)
+    rig.gate.observe_health(health(rig.now, ServiceState.BACKOFF, "drive", reason=reason))
+    rig.gate.observe_health(health(rig.now, state, "drive"))
+    rig.tick(60)
+    assert reason in {cause.reason for cause in rig.trips[0].causes}
+    assert rig.out.mode is GateMode.DISARMED
+    rig.driver = None
+    rig.tick(60)
+    assert rig.order(Order.ARM) is Reason.OK
+
+
 def test_one_that_was_unplugged_for_a_moment_does_not():
     rig = Rig().driving(speed=0.2)
     rig.gate.observe_health(health(rig.now, ServiceState.BACKOFF, "drive", reason=Reason.DEVICE_LOST))

@@ -240,8 +240,21 @@ def test_a_drive_that_restarted_or_was_stopped_stops_the_truck_until_its_service
     )
     sensors.observe_health(HealthTable(**header(NOW), services=tables))
     assert (reason in sensors.assess(NOW).blocks) is blocks
+    sensors.judged()
+    assert (reason in sensors.assess(NOW).blocks) is blocks
     sensors.observe_health(lost(name, 0, ServiceState.READY))
     assert reason not in sensors.assess(NOW).blocks
+
+
+def test_a_drives_restart_that_a_later_table_takes_back_stops_the_truck_until_a_tick_has_judged_it():
+    sensors = complete(monitor(), NOW)
+    restarted = ServiceHealth(name="drive", state=ServiceState.BACKOFF, since=0, reason=Reason.DEVICE_RESTARTED)
+    sensors.observe_health(HealthTable(**header(NOW), services=(restarted,)))
+    sensors.observe_health(lost("drive", 0, ServiceState.STARTING))
+    for _ in range(2):
+        assert Reason.DEVICE_RESTARTED in sensors.assess(NOW).blocks
+    sensors.judged()
+    assert Reason.DEVICE_RESTARTED not in sensors.assess(NOW).blocks
 
 
 def test_only_failed_services_that_nobody_tolerates_stop_the_truck():

@@ -155,12 +155,17 @@ def test_shutting_down_stops_at_once_and_for_good():
 
 def test_a_bug_in_taking_a_message_ends_the_service_and_not_its_sender():
     async def main(clock):
-        for name in ("control", "request", "planner_request"):
+        for name, default in (
+            ("control", Reason.INTERNAL),
+            ("request", Reason.INTERNAL),
+            ("planner_request", Reason.INTERNAL),
+            ("observe_health", None),
+        ):
             bench = Bench(clock)
             task = asyncio.create_task(bench.service.run(bench.ready))
             await clock.sleep(0.1)
             answer = getattr(bench.service, name)(None)
-            assert getattr(answer, "reason", answer) is Reason.INTERNAL
+            assert getattr(answer, "reason", answer) is default
             begin = clock.now()
             with pytest.raises(ExceptionGroup) as raised:
                 await task

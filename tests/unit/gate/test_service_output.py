@@ -98,7 +98,7 @@ def test_events_and_stops_go_out_under_the_gates_name():
 def test_every_shaft_gets_its_own_command():
     async def main(clock):
         outputs = GateOutputs((Outbox(), Outbox()), Outbox(), Outbox(), Outbox())
-        inputs = GateInputs(Inbox(), Inbox(), (Inbox(), Inbox()), Inbox(), Inbox(), Inbox())
+        inputs = GateInputs(Inbox(), Inbox(), (Inbox(), Inbox()), Inbox(), Inbox())
         gate = make_gate(chassis=BODIES["differential"])
         taken = []
         gate.observe_drive = lambda message, shaft: taken.append((message, shaft))
@@ -133,7 +133,7 @@ def test_settings_that_weaken_are_reported_at_the_start_and_in_every_state():
 
 
 def _inputs(bench):
-    return GateInputs(bench.scan, bench.attitude, (bench.drive,), bench.steering, bench.battery, bench.health)
+    return GateInputs(bench.scan, bench.attitude, (bench.drive,), bench.steering, bench.battery)
 
 
 class Disk(MemoryLatch):
