@@ -16,7 +16,8 @@ from collections import deque
 from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager
 from enum import StrEnum
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any, Final, Protocol
+from weakref import WeakSet
 
 import numpy as np
 from pydantic import Field
@@ -29,6 +30,10 @@ from monstertruck_schemas.health import ServiceHealth, ServiceState
 from monstertruck_schemas.reasons import Reason
 
 log = logging.getLogger(__name__)
+
+_ENDING: Final[WeakSet[asyncio.Task[None]]] = WeakSet()
+"""Services that their scope ends. ``Task.cancelling`` counts too many: in Python 3.11 a ``TaskGroup`` whose member fails
+while the group waits for its members leaves one behind."""
 
 
 class Service(Protocol):
@@ -80,7 +85,8 @@ async def supervise(
 ) -> None:
     """Run ``service`` again and again by ``policy`` until cancelled, reporting its health.
 
-    A service that returns, or ends by another task's cancellation, is as much a bug as an unexpected exception.
+    A session that is lost while its scope ends is not tried again. A service that returns, or ends by another task's
+    cancellation, is as much a bug as an unexpected exception.
 
     Args:
         service: what to run.
@@ -102,6 +108,10 @@ async def supervise(
         try:
             await service.run(session.ready)
         except TruckError as error:
+            if asyncio.current_task() in _ENDING:  # the error took the cancellation's place
+                log.warning("%s: while it ended: %s", service.name, str(error) or type(error).__name__)
+                session.tell(ServiceState.STOPPED)
+                raise asyncio.CancelledError from error
             lost = error
         except (Exception, asyncio.CancelledError) as error:
             if isinstance(error, asyncio.CancelledError) and _asked_to_end():
@@ -211,6 +221,7 @@ class Scope:
         self._ending = True
         disturbed = False
         for task in reversed(self._tasks):
+            _ENDING.add(task)
             task.cancel()
             while not task.done():
                 try:

@@ -11,7 +11,7 @@ import pytest
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.errors import DeviceLostError, DeviceMismatchError, PortBusyError
 from monstertruck_runtime.ports import Ready
-from monstertruck_runtime.service import OnBug, RestartPolicy, supervise
+from monstertruck_runtime.service import OnBug, RestartPolicy, scope, supervise
 from monstertruck_schemas.health import ServiceHealth, ServiceState
 from monstertruck_schemas.reasons import Reason
 
@@ -153,6 +153,53 @@ def test_cancellation_is_reported_and_passes():
 
     run_virtual(main)
     assert [row.state for row in health] == [ServiceState.STARTING, ServiceState.READY, ServiceState.STOPPED]
+
+
+def test_a_session_that_is_lost_while_its_scope_ends_is_not_tried_again():
+    async def lost_at_the_last_command(ready: Ready) -> None:
+        ready()
+        try:
+            await asyncio.Event().wait()
+        finally:
+            raise DeviceLostError("unplugged")
+
+    health: list[ServiceHealth] = []
+
+    async def main(clock: VirtualClock) -> None:
+        service = Scripted(clock, lost_at_the_last_command, lambda ready: ready())
+        async with scope("actuators") as actuators:
+            actuators.start("drive", supervise(service, STEADY, clock, health.append, np.random.default_rng(1)))
+            await clock.sleep(1)
+        assert service.starts == [0.0]
+        assert clock.now() < 1.1 * SECOND
+
+    run_virtual(main, start=0)
+    assert [row.state for row in health] == [ServiceState.STARTING, ServiceState.READY, ServiceState.STOPPED]
+
+
+def test_a_session_whose_task_group_failed_while_it_waited_for_its_members_is_tried_again():
+    async def member() -> None:
+        await asyncio.sleep(1.0)
+        raise DeviceLostError("cable")
+
+    async def group(_: Ready) -> None:
+        try:
+            async with asyncio.TaskGroup() as tasks:
+                tasks.create_task(member())
+        except* DeviceLostError as errors:
+            raise errors.exceptions[0] from None
+
+    health: list[ServiceHealth] = []
+
+    async def main(clock: VirtualClock) -> None:
+        service = Scripted(clock, group, lambda ready: ready())
+        async with scope("estimation") as estimation:
+            estimation.start("slam", supervise(service, STEADY, clock, health.append, np.random.default_rng(1)))
+            await clock.sleep(5.0)
+        assert service.starts == pytest.approx([0.0, 2.0])
+
+    run_virtual(main, start=0)
+    assert ServiceState.BACKOFF in {row.state for row in health}
 
 
 def test_nothing_of_a_lost_session_is_kept_by_its_error():
