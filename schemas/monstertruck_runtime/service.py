@@ -32,8 +32,8 @@ from monstertruck_schemas.reasons import Reason
 log = logging.getLogger(__name__)
 
 _ENDING: Final[WeakSet[asyncio.Task[None]]] = WeakSet()
-"""Services that their scope ends. ``Task.cancelling`` counts too many: in Python 3.11 a ``TaskGroup`` whose member fails
-while the group waits for its members leaves one behind."""
+"""Services that their scope ends. ``Task.cancelling`` may count one too many: in Python 3.11 a ``TaskGroup`` leaves one
+behind whose member fails while the group waits for its members."""
 
 
 class Service(Protocol):
@@ -106,12 +106,8 @@ async def supervise(
     while True:
         session.start()
         try:
-            await service.run(session.ready)
+            await _serve(service, session.ready)
         except TruckError as error:
-            if asyncio.current_task() in _ENDING:  # the error took the cancellation's place
-                log.warning("%s: while it ended: %s", service.name, str(error) or type(error).__name__)
-                session.tell(ServiceState.STOPPED)
-                raise asyncio.CancelledError from error
             lost = error
         except (Exception, asyncio.CancelledError) as error:
             if isinstance(error, asyncio.CancelledError) and _asked_to_end():
@@ -151,6 +147,17 @@ async def supervise(
         del lost  # its traceback holds all of the session, and this very frame
         await clock.sleep(delay * (1 + policy.jitter * float(rng.uniform(-1, 1))))
         delay = min(delay * policy.factor, policy.max_delay)
+
+
+async def _serve(service: Service, ready: Ready) -> None:
+    """One session; a loss while its scope ends it does not take the cancellation's place."""
+    try:
+        await service.run(ready)
+    except TruckError as error:
+        if asyncio.current_task() not in _ENDING:
+            raise
+        log.warning("%s: while it ended: %s", service.name, str(error) or type(error).__name__)
+        raise asyncio.CancelledError from error
 
 
 def _asked_to_end() -> bool:
