@@ -24,7 +24,6 @@ from monstertruck_runtime.ports import Ready
 from monstertruck_runtime.threads import ThreadHop, in_thread
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import Order
 from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.topics import (
     CAMERA,
@@ -39,7 +38,8 @@ from monstertruck_schemas.topics import (
     sender_in,
 )
 from monstertruckd.bus.access import ANONYMOUS, OBSERVING, Sender, in_groups
-from monstertruckd.bus.intake import Intake, Refusals, SourceRates
+from monstertruckd.bus.call_limits import ESTOP, ORDERS, ROOM, TOO_MANY, CallLimits, may_be_served
+from monstertruckd.bus.intake import Intake, Refusals
 from monstertruckd.bus.local import Bus
 from monstertruckd.bus.replies import Replies, Reply
 from monstertruckd.bus.rpc import Rpc, failure, topic_rows
@@ -49,15 +49,6 @@ log = logging.getLogger(__name__)
 
 BULKY = frozenset({CAMERA.name, MAP.name, MAP_TILES.name})
 """Topics of large messages: on a slow link all others, and answers, go first."""
-ORDERS = frozenset(order.value for order in Order)
-"""Calls that must get through when others fill the places."""
-MAX_CALLS = 16
-"""Remote calls served at once."""
-MAX_WAITING_CALLS = 64
-"""Calls that wait to be served; twice as many with orders."""
-CALL_RATE = 100.0
-"""Calls a second of one source that are not orders."""
-TOO_MANY = "too many calls at once"
 MAX_CALL = 16_384
 """Bytes of the largest payload of a call."""
 Put = Callable[[bytes], None]
@@ -115,7 +106,7 @@ class ZenohBridge:
             BusyError: see ``open``.
             ConfigError: see ``open``.
         """
-        replies = Replies()
+        replies, limits = Replies(), CallLimits(self._clock)
         try:
             await self.open()
             failed: asyncio.Future[None] = asyncio.get_running_loop().create_future()
@@ -140,14 +131,14 @@ class ZenohBridge:
                         queries: ThreadHop[Call] = inputs.enter_context(
                             closing(
                                 ThreadHop(
-                                    lambda call: guard(partial(self._serve, *call, replies, calls, active)),
-                                    2 * MAX_WAITING_CALLS,
+                                    lambda call: guard(partial(self._serve, *call, replies, limits, calls, active)),
+                                    ROOM,
                                     self._bus.add_drops,
-                                    discard=lambda call: replies.end(call[0]),
+                                    discard=lambda call: self._discard(*call, replies, limits),
                                 )
                             )
                         )
-                        inward = partial(self._declare_inputs, intakes, refusals, queries, replies)
+                        inward = partial(self._declare_inputs, intakes, refusals, queries, replies, limits)
                         for token in await in_thread(inward):
                             inputs.enter_context(token)
                         ready()
@@ -213,12 +204,16 @@ class ZenohBridge:
         }
 
     def _declare_inputs(
-        self, intakes: Mapping[str, Intake], refusals: Refusals, queries: ThreadHop[Call], replies: Replies
+        self,
+        intakes: Mapping[str, Intake],
+        refusals: Refusals,
+        queries: ThreadHop[Call],
+        replies: Replies,
+        limits: CallLimits,
     ) -> list[zenoh.LivelinessToken]:
         """Subscribers and queryables; last the tokens that say so, which live as long as their objects."""
         remote = zenoh.Locality.REMOTE
         tokens = []
-        rates = SourceRates(CALL_RATE, self._clock)
         for door, session in self._sessions:
             for group in in_groups():
                 # One for all requests, so that a put to many keys comes once.
@@ -232,7 +227,9 @@ class ZenohBridge:
                 if topic.retained:
                     session.declare_queryable(key, partial(self._on_get, topic, key, replies), allowed_origin=remote)
             session.declare_queryable(
-                rpc_key(self._robot, "**"), partial(self._on_call, door, queries, replies, rates), allowed_origin=remote
+                rpc_key(self._robot, "**"),
+                partial(self._on_call, door, queries, replies, limits),
+                allowed_origin=remote,
             )
             tokens.append(session.liveliness().declare_token(alive_key(self._robot)))
         return tokens
@@ -280,7 +277,7 @@ class ZenohBridge:
         return sender_in(self._robot, key) or (key.removeprefix(rpc_key(self._robot, "")), None)
 
     def _on_call(
-        self, door: Door, queries: ThreadHop[Call], replies: Replies, rates: SourceRates, query: zenoh.Query
+        self, door: Door, queries: ThreadHop[Call], replies: Replies, limits: CallLimits, query: zenoh.Query
     ) -> None:
         replies.wait_for_room()
         size = 0 if query.payload is None else len(query.payload)
@@ -288,32 +285,37 @@ class ZenohBridge:
         if size > MAX_CALL:
             text = f"payload of {size} bytes, at most {MAX_CALL} are taken"
             replies.end(query, _error(failure(Reason.BAD_INPUT, text)))
-        elif name not in ORDERS and not rates.spend(source or ANONYMOUS):
-            replies.end(query, _error(failure(Reason.BUSY, f"more than {CALL_RATE:g} calls a second")))
+        elif text := limits.refusal(name, source, queries.waiting):
+            replies.end(query, _error(failure(Reason.BUSY, text)))
         elif not self._rpc.serves(name) and (described := self._described(query)):
             replies.end(query, partial(_reply_schemas, described))
-        elif queries.waiting >= (2 * MAX_WAITING_CALLS if name in ORDERS else MAX_WAITING_CALLS):
-            replies.end(query, _error(failure(Reason.BUSY, TOO_MANY)))
         else:
             queries.put((query, door))
+
+    def _discard(self, query: zenoh.Query, _: Door, replies: Replies, limits: CallLimits) -> None:
+        limits.ended(*self._called(query))
+        replies.end(query)
 
     def _serve(
         self,
         query: zenoh.Query,
         door: Door,
         replies: Replies,
+        limits: CallLimits,
         calls: asyncio.TaskGroup,
         active: set[asyncio.Task[Reply]],
     ) -> None:
         name, source = self._called(query)
-        if len(active) >= (2 * MAX_CALLS if name in ORDERS else MAX_CALLS):
+        if not may_be_served(name, len(active)):
             replies.end(query, _error(failure(Reason.BUSY, TOO_MANY)))
             return
         task = calls.create_task(self._answer(query, name, _sender(door, source)))
-        active.add(task)
+        if name != ESTOP:
+            active.add(task)
 
         def end(_: asyncio.Task[Reply]) -> None:
             active.discard(task)
+            limits.ended(name, source)
             replies.end(query, None if task.cancelled() else task.result(), order=name in ORDERS)
 
         task.add_done_callback(end)

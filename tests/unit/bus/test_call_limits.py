@@ -1,0 +1,68 @@
+"""Which calls are taken, and which are refused where they arrive."""
+
+import pytest
+
+from monstertruck_runtime.clock import SECOND, WallClock
+from monstertruckd.bus.call_limits import (
+    CALL_RATE,
+    MAX_CALLS,
+    MAX_ESTOPS,
+    MAX_WAITING,
+    ORDER_RATE,
+    CallLimits,
+    may_be_served,
+)
+from monstertruckd.gate.rpc import STANDSTILL
+
+
+class FixedClock(WallClock):
+    stamp = SECOND
+
+    def now(self) -> int:
+        return self.stamp
+
+
+@pytest.fixture
+def limits() -> CallLimits:
+    return CallLimits(FixedClock())
+
+
+def taken(limits: CallLimits, name: str, source: str | None, count: int) -> int:
+    return [limits.refusal(name, source, 0) for _ in range(count)].count("")
+
+
+@pytest.mark.parametrize(("name", "rate"), [("topics", CALL_RATE), ("disarm", ORDER_RATE), ("stop", ORDER_RATE)])
+def test_each_source_has_a_rate_and_orders_have_their_own(limits: CallLimits, name: str, rate: float):
+    assert taken(limits, name, "eve", round(3 * rate)) == rate
+    assert f"more than {rate:g}" in limits.refusal(name, "eve", 0)
+    for other in ("topics", "arm"):
+        assert limits.refusal(other, "ann", 0) == ""
+    assert taken(limits, "estop", "eve", 1) == 1
+
+
+def test_orders_of_one_source_never_fill_all_places():
+    assert ORDER_RATE * (1 + STANDSTILL) < 2 * MAX_CALLS
+
+
+@pytest.mark.parametrize("source", ["eve", None])
+def test_an_emergency_stop_is_refused_only_while_many_of_its_owner_are_carried_out(
+    limits: CallLimits, source: str | None
+):
+    assert taken(limits, "estop", source, 3 * MAX_ESTOPS) == MAX_ESTOPS
+    assert "are being carried out" in limits.refusal("estop", source, 0)
+    assert limits.refusal("estop", "ann", 10 * MAX_WAITING) == ""
+    limits.ended("estop", source)
+    limits.ended("disarm", source)
+    assert taken(limits, "estop", source, 3) == 1
+
+
+def test_programs_of_one_owner_share_what_it_may_stop(limits: CallLimits):
+    assert [limits.refusal("estop", f"eve:{number}", 0) for number in range(3 * MAX_ESTOPS)].count("") == MAX_ESTOPS
+
+
+def test_orders_wait_and_are_served_where_others_are_refused_and_emergency_stops_always(limits: CallLimits):
+    for waiting, expected in ((MAX_WAITING - 1, "dte"), (MAX_WAITING, "de"), (2 * MAX_WAITING, "e")):
+        names = {"d": "disarm", "t": "topics", "e": "estop"}
+        assert [key for key, name in names.items() if not limits.refusal(name, "ann", waiting)] == list(expected)
+    for under_way, expected in ((MAX_CALLS - 1, "dte"), (MAX_CALLS, "de"), (2 * MAX_CALLS, "e")):
+        assert [key for key, name in names.items() if may_be_served(name, under_way)] == list(expected)
