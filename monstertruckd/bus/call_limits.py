@@ -1,6 +1,6 @@
 """How many remote calls are taken: judged where they arrive, so that a flood does not reach the event loop.
 
-An emergency stop is refused only where as many of the same source are being carried out.
+An emergency stop is refused only where as many of the same owner are being carried out.
 """
 
 import threading
@@ -10,7 +10,7 @@ from typing import Final
 from monstertruck_runtime.clock import Clock
 from monstertruck_schemas.req import Order
 from monstertruckd.bus.access import ANONYMOUS, owner_of
-from monstertruckd.bus.intake import SourceRates
+from monstertruckd.bus.intake import OwnerRates
 
 ESTOP: Final = Order.ESTOP.value
 ORDERS: Final = frozenset(order.value for order in Order)
@@ -25,9 +25,9 @@ ROOM: Final = 4 * MAX_WAITING
 MAX_ESTOPS: Final = 8
 """Emergency stops of one owner that wait or are carried out."""
 CALL_RATE: Final = 100.0
-"""Calls a second of one source that are not orders."""
+"""Calls a second of one owner that are not orders."""
 ORDER_RATE: Final = 5.0
-"""Orders a second of one source. An order to stop lasts 4 s at most: no source fills all places."""
+"""Orders a second of one owner. An order to stop lasts 4 s at most: no owner fills all places."""
 TOO_MANY: Final = "too many calls at once"
 
 
@@ -39,8 +39,8 @@ class CallLimits:
     """
 
     def __init__(self, clock: Clock) -> None:
-        self._calls = SourceRates(CALL_RATE, clock)
-        self._orders = SourceRates(ORDER_RATE, clock)
+        self._calls = OwnerRates(CALL_RATE, clock)
+        self._orders = OwnerRates(ORDER_RATE, clock)
         self._lock = threading.Lock()
         self._estops: Counter[str] = Counter()
 

@@ -1,7 +1,7 @@
 """The way in for requests: judged in the sender's thread, then one at a time onto the loop.
 
 Even in another thread a decoder holds the interpreter while it runs, so what may be decoded is bounded by size, by rate
-and by a look at the bytes. Every topic waits in a queue of its own, and every source has a rate of its own: a flood of
+and by a look at the bytes. Every topic waits in a queue of its own, and every owner has a rate of its own: a flood of
 one delays no other.
 """
 
@@ -19,7 +19,7 @@ from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import ControlRequest, Order, Request
 from monstertruck_schemas.topics import REQ_CONTROL, REQ_DRIVE, REQ_PATH, Topic
-from monstertruckd.bus.access import Sender, role_needed
+from monstertruckd.bus.access import Sender, owner_of, role_needed
 from monstertruckd.bus.local import Bus
 
 DEPTH: Final = 64
@@ -29,10 +29,10 @@ MAX_VALUES: Final = 16_384
 MAX_MARKS: Final = 512
 """Commas, and brackets, braces and quotes, of one request: many small objects would take tens of milliseconds."""
 
-MAX_SOURCES: Final = 64
-"""Sources whose rates are known; the one heard least recently is dropped for a new one."""
+MAX_OWNERS: Final = 64
+"""Owners whose rates are known; the one heard least recently is dropped for a new one."""
 TOGETHER: Final = 5.0
-"""All sources together may send so many times what one may: names can be invented."""
+"""All together may send so many times what one owner may: without certificates names can be invented."""
 
 _RANKS: Final = {Order.ESTOP: 2, Order.STOP: 1}
 """Where orders have to be dropped, these are the last to go."""
@@ -45,7 +45,7 @@ class Limit:
     size: int = 2048
     """Bytes of one request."""
     rate: float | None = 5.0
-    """Requests a second of one source, in bursts of as many; None = any number."""
+    """Requests a second of one owner, in bursts of as many; None = any number."""
 
 
 LIMITS: Final = {
@@ -75,11 +75,11 @@ class _Budget:
         return True
 
 
-class SourceRates:
-    """Limits what each source may send a second, and all together; callable from any thread.
+class OwnerRates:
+    """Limits what the programs of each owner may send a second, and all together; callable from any thread.
 
     Args:
-        rate: requests a second of one source, in bursts of as many.
+        rate: requests a second of one owner, in bursts of as many.
         clock: time.
     """
 
@@ -91,13 +91,14 @@ class SourceRates:
         self._together = _Budget(rate * TOGETHER, clock.now())
 
     def spend(self, source: str) -> bool:
-        """Count one request of ``source``; False if it has sent too many."""
+        """Count one request of ``source``; False if its owner has sent too many."""
+        owner = owner_of(source)
         with self._lock:
             now = self._clock.now()
-            budget = self._budgets.pop(source, None) or _Budget(self._rate, now)
-            if len(self._budgets) >= MAX_SOURCES:
+            budget = self._budgets.pop(owner, None) or _Budget(self._rate, now)
+            if len(self._budgets) >= MAX_OWNERS:
                 del self._budgets[next(iter(self._budgets))]
-            self._budgets[source] = budget
+            self._budgets[owner] = budget
             return budget.spend(now, self._rate) and self._together.spend(now, self._rate * TOGETHER)
 
 
@@ -156,7 +157,7 @@ class Intake:
     ) -> None:
         self.topic = topic
         self._limit = LIMITS.get(topic.name, Limit())
-        self._rates = None if self._limit.rate is None else SourceRates(self._limit.rate, clock)
+        self._rates = None if self._limit.rate is None else OwnerRates(self._limit.rate, clock)
         self._refusals = Refusals(bus, clock, reporter)
         self._requests: ThreadHop[Message] = ThreadHop(
             lambda request: guard(lambda: bus.inject(topic, request)), DEPTH, bus.add_drops, _rank
@@ -195,7 +196,7 @@ class Intake:
         self._requests.put(request.model_copy(update=said))
 
     def charge(self, source: str) -> bool:
-        """Count one request of ``source``; False if it has sent too many. Callable from any thread."""
+        """Count one request of ``source``; False if its owner has sent too many. Callable from any thread."""
         return self._rates is None or self._rates.spend(source)
 
     def close(self) -> None:

@@ -32,7 +32,7 @@ def taken(limits: CallLimits, name: str, source: str | None, count: int) -> int:
 
 
 @pytest.mark.parametrize(("name", "rate"), [("topics", CALL_RATE), ("disarm", ORDER_RATE), ("stop", ORDER_RATE)])
-def test_each_source_has_a_rate_and_orders_have_their_own(limits: CallLimits, name: str, rate: float):
+def test_each_owner_has_a_rate_and_orders_have_their_own(limits: CallLimits, name: str, rate: float):
     assert taken(limits, name, "eve", round(3 * rate)) == rate
     assert f"more than {rate:g}" in limits.refusal(name, "eve", 0)
     for other in ("topics", "arm"):
@@ -40,7 +40,14 @@ def test_each_source_has_a_rate_and_orders_have_their_own(limits: CallLimits, na
     assert taken(limits, "estop", "eve", 1) == 1
 
 
-def test_orders_of_one_source_never_fill_all_places():
+@pytest.mark.parametrize(("name", "rate"), [("topics", CALL_RATE), ("disarm", ORDER_RATE)])
+def test_programs_of_one_owner_share_its_rate(limits: CallLimits, name: str, rate: float):
+    texts = [limits.refusal(name, f"eve:{number}", 0) for number in range(round(10 * rate))]
+    assert texts.count("") == rate
+    assert limits.refusal(name, "ann", 0) == ""
+
+
+def test_orders_of_one_owner_never_fill_all_places():
     assert ORDER_RATE * (1 + STANDSTILL) < 2 * MAX_CALLS
 
 

@@ -20,7 +20,7 @@ from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.state import GateMode
 from monstertruck_schemas.topics import EVENT, REQ_CONTROL, REQ_DRIVE, REQ_GOAL, REQ_PATH, Topic
 from monstertruckd.bus.access import EVERYTHING, OBSERVING, Grant, Sender
-from monstertruckd.bus.intake import DEPTH, LIMITS, MAX_SOURCES, Intake
+from monstertruckd.bus.intake import DEPTH, LIMITS, MAX_OWNERS, Intake
 from monstertruckd.bus.local import Bus
 from tests.unit.gate.rig import make_gate
 
@@ -287,7 +287,19 @@ async def test_invented_names_are_bounded_together():
     entrance = Entrance()
     got: list[str] = []
     entrance.bus.listen(REQ_GOAL, lambda request: got.append(request.source))
-    for number in range(3 * MAX_SOURCES):
+    for number in range(3 * MAX_OWNERS):
         entrance.send((REQ_GOAL, goal(1)), sender=Sender(f"eve{number}", EVERYTHING))
     await entrance.settle()
     assert len(got) == 25
+
+
+async def test_programs_of_one_owner_share_its_rate_and_cost_no_other_owner_anything():
+    entrance = Entrance()
+    got: list[str] = []
+    entrance.bus.listen(REQ_GOAL, lambda request: got.append(request.source))
+    eve = [Sender(f"eve:{number}", OBSERVING if number % 2 else EVERYTHING) for number in range(MAX_OWNERS)]
+    for sender in eve:
+        entrance.send((REQ_GOAL, goal(1)), sender=sender)
+    entrance.send((REQ_GOAL, goal(1)))
+    await entrance.settle()
+    assert got == ["eve:0", "eve:2", "eve:4", "ann"]
