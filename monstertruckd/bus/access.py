@@ -61,11 +61,6 @@ class Sender:
         return f"{self.source} has the role {self.grant.role}, this takes {needed}{hint}"
 
 
-def owner_of(source: str) -> str:
-    """Name on the certificate of a source: programs of one owner call themselves ``owner:anything``."""
-    return source.partition(":")[0]
-
-
 def role_needed(request: Request) -> AccessRole:
     """What a request takes; the emergency stop is everybody's."""
     estop = isinstance(request, ControlRequest) and request.order is Order.ESTOP

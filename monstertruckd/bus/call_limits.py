@@ -9,7 +9,8 @@ from typing import Final
 
 from monstertruck_runtime.clock import Clock
 from monstertruck_schemas.req import Order
-from monstertruckd.bus.access import ANONYMOUS, owner_of
+from monstertruck_schemas.topics import owner_of
+from monstertruckd.bus.access import ANONYMOUS
 from monstertruckd.bus.intake import OwnerRates
 
 ESTOP: Final = Order.ESTOP.value

@@ -18,8 +18,8 @@ from monstertruck_schemas.base import Message
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import ControlRequest, Order, Request
-from monstertruck_schemas.topics import REQ_CONTROL, REQ_DRIVE, REQ_PATH, Topic
-from monstertruckd.bus.access import Sender, owner_of, role_needed
+from monstertruck_schemas.topics import REQ_CONTROL, REQ_DRIVE, REQ_PATH, Topic, owner_of
+from monstertruckd.bus.access import Sender, role_needed
 from monstertruckd.bus.local import Bus
 
 DEPTH: Final = 64

@@ -13,7 +13,8 @@ from monstertruck_runtime.endpoints import host_of, local_endpoint, protocol_of
 from monstertruck_schemas.base import Schema
 from monstertruck_schemas.req import Role
 from monstertruck_schemas.roles import AccessRole
-from monstertruckd.bus.access import EVERYTHING, OBSERVING, Grant, access_rules, owner_of
+from monstertruck_schemas.topics import owner_of
+from monstertruckd.bus.access import EVERYTHING, OBSERVING, Grant, access_rules
 
 HANG_UP_US: Final = 2_000_000
 """A station to which an answer, or another one's message that must not be lost, does not get through in this time is

@@ -17,7 +17,7 @@ from monstertruck_schemas.base import Message
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order, Request, Role
 from monstertruck_schemas.state import GateState
-from monstertruck_schemas.topics import Topic
+from monstertruck_schemas.topics import Topic, owner_of
 
 M = TypeVar("M", bound=Message)
 R = TypeVar("R", bound=Request)
@@ -27,6 +27,9 @@ OPERATORS: Final = frozenset({Role.GAMEPAD, Role.KEYBOARD, Role.STATION})
 
 MAX_SOURCES: Final = 64
 """Sources kept for each kind of request; the least recent one is dropped for a new one."""
+
+MAX_PROGRAMS: Final = 16
+"""How many of them may be of one owner: the names of programs can be invented."""
 
 MEMORY: Final = 2.0
 """Seconds for which a sequence number counts at least."""
@@ -140,14 +143,21 @@ class Sequences:
             return Reason.BAD_SEQUENCE
         if source in keep and source in self._newest and abs(request.seq - newest) > MAX_GAP:
             return Reason.BUSY
-        if source not in self._newest and len(self._newest) >= MAX_SOURCES:
-            oldest = next((name for name in self._newest if name not in keep), None)
+        if source not in self._newest and (crowd := self._crowd(owner_of(source))):
+            oldest = next((name for name in crowd if name not in keep), None)
             if oldest is None:
                 return Reason.BUSY
             del self._newest[oldest]
         self._newest.pop(source, None)
         self._newest[source] = request.seq, now
         return Reason.OK
+
+    def _crowd(self, owner: str) -> Collection[str]:
+        """Sources of which one has to go for a new one of ``owner``, the least recent first; empty if there is room."""
+        programs = [name for name in self._newest if owner_of(name) == owner]
+        if len(programs) >= MAX_PROGRAMS:
+            return programs
+        return self._newest if len(self._newest) >= MAX_SOURCES else ()
 
 
 def freshness(request: Request, now: int, limit: float) -> Reason:

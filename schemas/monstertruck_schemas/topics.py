@@ -318,6 +318,11 @@ def sender_in(robot: str, key: str) -> tuple[str, str | None] | None:
     return None
 
 
+def owner_of(source: str) -> str:
+    """Name on the certificate of a source: programs of one owner call themselves ``owner:anything``."""
+    return source.partition(":")[0]
+
+
 def alive_key(robot: str) -> str:
     """Key of the robot's liveliness token."""
     return f"{KEY_ROOT}/{robot}/alive"

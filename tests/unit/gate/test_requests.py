@@ -3,7 +3,7 @@ import math
 import pytest
 
 from monstertruck_runtime.clock import SECOND
-from monstertruck_runtime.requests import MAX_SOURCES
+from monstertruck_runtime.requests import MAX_PROGRAMS, MAX_SOURCES
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order, Role
 from monstertruck_schemas.state import GateMode
@@ -98,6 +98,23 @@ def test_a_source_whose_lease_runs_is_not_forgotten():
     assert rig.drive(source="ann", seq=seq) is Reason.BAD_SEQUENCE
     rig.tick()
     assert rig.out.holder == "ann"
+
+
+def test_programs_of_one_owner_never_take_all_places():
+    rig = Rig().armed()
+    for i in range(MAX_SOURCES):
+        rig.drive(0.0, source=f"eve:{i}", role=Role.STATION, lease=0.25)
+    assert rig.drive(0.1, source="ann", role=Role.GAMEPAD) is Reason.OK
+
+
+def test_an_owners_program_heard_least_recently_is_forgotten_first():
+    rig = Rig().armed()
+    rig.order(Order.DISARM, source="ann", seq=7)
+    for i in range(MAX_PROGRAMS + 1):
+        rig.order(Order.DISARM, source=f"eve:{i}", seq=7)
+    assert rig.order(Order.DISARM, source="ann", seq=7) is Reason.BAD_SEQUENCE
+    assert rig.order(Order.DISARM, source="eve:1", seq=7) is Reason.BAD_SEQUENCE
+    assert rig.order(Order.DISARM, source="eve:0", seq=7) is Reason.OK
 
 
 def test_nobody_outside_drives_as_the_tracker():
