@@ -17,7 +17,7 @@ log = logging.getLogger(__name__)
 
 THREADS: Final = 8
 """Replies under way at once; as many further ones to orders."""
-DEPTH: Final = 1024
+DEPTH: Final = 4096
 """Queries that may wait for their reply; beyond that no further query is taken until one has left."""
 
 Reply = Callable[[zenoh.Query], object]
