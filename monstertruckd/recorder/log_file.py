@@ -5,7 +5,9 @@ import fcntl
 import json
 import os
 import re
+import stat
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -45,7 +47,7 @@ class Channels:
         return channel
 
 
-NAME: Final = re.compile(r"run-(\d{6})-(\d{3,})\.mcap")
+NAME: Final = re.compile(r"run-(\d{6,})-(\d{3,})\.mcap")
 """Of a log: run and part."""
 
 _COMPRESSION: Final = {
@@ -217,9 +219,14 @@ class LogFolder:
         self._part = 0
 
     def finished(self, current: Path) -> dict[Path, int]:
-        """Size of every log but ``current``, oldest first."""
-        found = {}
-        for path in sorted(self.directory.iterdir()):
-            if NAME.fullmatch(path.name) and path != current:
-                found[path] = path.stat().st_size
-        return found
+        """Size of every log but ``current``, oldest first; what has a log's name without being a file is none."""
+        found = []
+        for path in self.directory.iterdir():
+            name = NAME.fullmatch(path.name)
+            if name is None or path == current:
+                continue
+            with suppress(FileNotFoundError):  # removed meanwhile
+                status = path.lstat()
+                if stat.S_ISREG(status.st_mode):
+                    found.append((int(name[1]), int(name[2]), path, status.st_size))
+        return {path: size for _, _, path, size in sorted(found)}

@@ -63,6 +63,8 @@ class LogWriter:
         self._attachments = attachments
         self._metadata = metadata
         self._folder = LogFolder(Path(config.directory))
+        self._told: set[Path] = set()
+        """Files that could not be removed."""
         self._retained: dict[str, LogEntry] = {}
         """Newest of every retained topic: the head of the next file, so that each file stands alone."""
         self._file = self._open(start)
@@ -130,15 +132,27 @@ class LogWriter:
             return file
 
     def _keep_quota(self) -> None:
-        """Remove the oldest files that exceed the quota; never one that is being written or repaired."""
+        """Remove the oldest files that exceed the quota; never one that is being written or repaired.
+
+        A file that cannot be removed stays, counts, and is told of once: the recording goes on.
+        """
         excess = self._file.size + sum(self._others.values()) - self._config.quota_bytes
         for path, size in list(self._others.items()):
             if excess <= 0:
                 return
-            if path.exists() and in_use(path):
+            try:
+                if in_use(path):
+                    continue
+                path.unlink()
+            except FileNotFoundError:
+                pass
+            except OSError as error:
+                if path not in self._told:
+                    self._told.add(path)
+                    log.warning("%s cannot be removed, though logs exceed the quota: %s", path, error.strerror)
                 continue
-            path.unlink(missing_ok=True)
-            log.info("removed %s: logs exceed %d bytes", path, self._config.quota_bytes)
+            else:
+                log.info("removed %s: logs exceed %d bytes", path, self._config.quota_bytes)
             del self._others[path]
             excess -= size
 
@@ -293,7 +307,7 @@ class Recorder:
             try:
                 with LogWriter(self._config, self._attachments, self._metadata, start) as writer:
                     self._path = writer.path
-                    repair = start_repair(Path(self._config.directory))
+                    repair = self._start_repair()
                     self._write(writer)
             except OSError as error:
                 self._fail(disk_reason(error), f"recording stopped: {error}")
@@ -305,6 +319,13 @@ class Recorder:
                 repair.terminate()
                 repair.wait()
             self._loop.call_soon_threadsafe(self._done.set_result, None)
+
+    def _start_repair(self) -> "subprocess.Popen[bytes] | None":
+        try:
+            return start_repair(Path(self._config.directory))
+        except OSError as error:
+            log.warning("unfinished logs are not repaired: %s", error)
+            return None
 
     def _write(self, writer: LogWriter) -> None:
         for topic in TOPICS:

@@ -92,7 +92,7 @@ def recover_directory(directory: Path, stop: threading.Event | None = None) -> l
     done = []
     for path in sorted(directory.glob("*.mcap")):
         try:
-            if is_finished(path) or in_use(path):
+            if not _unfinished(path):
                 continue
             recovery = recover(path, path, stop)
         except (TruckError, OSError) as error:
@@ -103,6 +103,15 @@ def recover_directory(directory: Path, stop: threading.Event | None = None) -> l
         if stop is not None and stop.is_set():
             break
     return done
+
+
+def _unfinished(path: Path) -> bool:
+    """Whether a log waits for repair; a folder or pipe of that name does not.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    return path.is_file() and not is_finished(path) and not in_use(path)
 
 
 def _lock(file: BinaryIO) -> bool:
@@ -159,10 +168,18 @@ def start_repair(folder: Path) -> "subprocess.Popen[bytes] | None":
     Raises:
         OSError: the folder cannot be read, or no process can be started.
     """
-    if all(is_finished(path) or in_use(path) for path in folder.glob("*.mcap")):
+    if not any(_may_wait(path) for path in folder.glob("*.mcap")):
         return None
     command = [sys.executable, "-m", "monstertruckd.recorder.repair", str(folder)]
     return subprocess.Popen(command, stdin=subprocess.DEVNULL)  # noqa: S603  # our own module, no shell
+
+
+def _may_wait(path: Path) -> bool:
+    """Whether a log may wait for repair: of one that cannot be read the process tells."""
+    try:
+        return _unfinished(path)
+    except OSError:
+        return True
 
 
 def main(folder: Path) -> None:

@@ -27,6 +27,9 @@ EXPIRY_PERIOD: Final = SECOND // 10
 _HEAD: Final = Struct("<qqqII")
 """Log time, stamp, sequence, number of the topic, length of the payload."""
 
+JOURNAL_SHARE: Final = 0.25
+"""Part of the whole memory that the journal takes at most: a flood of it must not displace what was measured."""
+
 PICTURES: Final = "foxglove.CompressedImage"
 JOURNAL: Final = "event"
 """Group of topics that are kept longer than the others: they are small."""
@@ -187,8 +190,9 @@ class _Part:
 class Ring:
     """Bounded memory of the newest messages.
 
-    When the bytes do not suffice, the oldest pictures go first, then the oldest of the rest; both are counted. Of every
-    retained topic the newest message from before the window is kept, so that what is left stands alone.
+    When the bytes do not suffice, a journal of more than ``JOURNAL_SHARE`` of them loses its oldest messages first;
+    then the oldest pictures go, then the oldest of the rest; all are counted. Of every retained topic the newest
+    message from before the window is kept, so that what is left stands alone.
 
     Args:
         span: how long what is kept.
@@ -259,7 +263,9 @@ class Ring:
 
     def _fullest(self) -> _Part | None:
         """The part to remove from; never the newest message of its sort."""
-        parts = (self._sampled, self._fresh, self._rest, self._journal)
+        flooded = self._journal.size > JOURNAL_SHARE * self._limit
+        first = (self._journal,) if flooded else ()
+        parts = (*first, self._sampled, self._fresh, self._rest, self._journal)
         return next((part for part in parts if len(part) > 1), None)
 
     def _drop(self, entry: LogEntry) -> None:

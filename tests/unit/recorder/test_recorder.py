@@ -18,6 +18,7 @@ from monstertruck_schemas import topics as t
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.recorder import log_file as file_module
 from monstertruckd.recorder import recorder as recorder_module
+from monstertruckd.recorder import repair as repair_module
 from monstertruckd.recorder.config import RecorderConfig
 from monstertruckd.recorder.reader import open_log
 from monstertruckd.recorder.recorder import LogDigest, Recorder
@@ -215,6 +216,69 @@ def test_quota_never_removes_a_file_somebody_else_is_writing(config, failures):
     assert [p.name for p in logs(config)] == ["run-000001-000.mcap", "run-000002-000.mcap"]
     other.finish()
     assert open_log(logs(config)[0]).attachments()
+
+
+def test_the_oldest_log_is_the_one_with_the_lowest_numbers(config, failures):
+    folder = Path(config.directory)
+    folder.mkdir()
+    for name in ("run-000001-999", "run-000001-1000", "run-999999-000", "run-1000000-000"):
+        (folder / f"{name}.mcap").write_bytes(b"x" * 50_000)
+    record(config.model_copy(update={"quota_bytes": 130_000}), 0.1, failures)
+    assert {p.name for p in logs(config)} == {"run-999999-000.mcap", "run-1000000-000.mcap", "run-1000001-000.mcap"}
+
+
+def test_what_only_has_a_logs_name_does_not_stop_the_recording(config, failures):
+    folder = Path(config.directory)
+    folder.mkdir()
+    (folder / "run-000001-000.mcap").mkdir()
+    (folder / "run-000002-000.mcap").symlink_to(folder / "nowhere")
+    os.mkfifo(folder / "run-000003-000.mcap")
+    (folder / "folder.mcap").mkdir()
+    recorder = record(config.model_copy(update={"quota_bytes": 1000}), 1.0, failures)
+    assert failures == []
+    assert recorder.health(0).messages == 60
+    assert sum(1 for _ in open_log(folder / "run-000004-000.mcap")) == 60
+
+
+def test_a_log_that_cannot_be_removed_stays_and_is_told_of_once(config, failures, monkeypatch, caplog):
+    folder = Path(config.directory)
+    folder.mkdir()
+    for run in (1, 2):
+        (folder / f"run-{run:06d}-000.mcap").write_bytes(b"x" * 50_000)
+    stuck = folder / "run-000001-000.mcap"
+    remove = Path.unlink
+
+    def unlink(path, missing_ok=False):
+        if path == stuck:
+            raise PermissionError(errno.EPERM, os.strerror(errno.EPERM), str(path))
+        remove(path, missing_ok)
+
+    monkeypatch.setattr(Path, "unlink", unlink)
+    limits = {"quota_bytes": 1000, "rotate_seconds": 0.2, "fsync_seconds": 0.2}
+    record(config.model_copy(update=limits), 1.0, failures)
+    assert failures == []
+    assert [p.name for p in logs(config)] == ["run-000001-000.mcap", "run-000003-004.mcap"]
+    assert sum("run-000001-000.mcap cannot be removed" in r.getMessage() for r in caplog.records) == 1
+
+
+def test_an_unreadable_log_does_not_stop_the_recording(config, failures, monkeypatch, caplog):
+    folder = Path(config.directory)
+    folder.mkdir()
+    (folder / "other.mcap").write_bytes(b"x")
+
+    def is_finished(path):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+
+    def no_process(*_, **__):
+        raise BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN))
+
+    monkeypatch.setattr(repair_module, "is_finished", is_finished)
+    monkeypatch.setattr(subprocess, "Popen", no_process)
+    recorder = record(config, 1.0, failures)
+    assert (failures, recorder.health(0).messages) == ([], 60)
+    assert "unfinished logs are not repaired" in caplog.text
+    assert recover_directory(folder) == []
+    assert "not repaired" in caplog.text and "other.mcap" in caplog.text
 
 
 def test_run_number_taken_meanwhile_is_skipped(config, failures, monkeypatch):

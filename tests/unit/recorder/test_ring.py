@@ -57,6 +57,21 @@ def test_memory_is_bounded_and_pictures_go_first():
     assert max(len(entry.payload) for entry in ring.snapshot()) == 10 * limit
 
 
+def test_a_flood_of_log_records_displaces_no_measurement():
+    limit = 1_000_000
+    ring = Ring(SPAN, limit)
+    for number in range(1500):
+        ring.add(command(number * SECOND // 50, 300))
+    for number in range(20_000):
+        now = 30 * SECOND + number * SECOND // 1000
+        ring.add(LogEntry(t.LOG, now, now, 0, bytes(200)))
+        assert ring.size <= limit
+    entries = list(ring.snapshot())
+    assert sum(entry.topic is t.CMD_DRIVE for entry in entries) == 1500
+    assert entries[-1].log_time == 30 * SECOND + 19_999 * SECOND // 1000, "the newest records are there"
+    assert ring.lost == 21_500 - len(entries)
+
+
 def test_pictures_that_are_thinned_out_keep_to_the_limit_too():
     limit = 1_000_000
     ring = Ring(SPAN, limit)
