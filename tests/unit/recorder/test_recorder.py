@@ -278,7 +278,8 @@ def test_an_unreadable_log_does_not_stop_the_recording(config, failures, monkeyp
     assert (failures, recorder.health(0).messages) == ([], 60)
     assert "unfinished logs are not repaired" in caplog.text
     assert recover_directory(folder) == []
-    assert "not repaired" in caplog.text and "other.mcap" in caplog.text
+    assert "not repaired" in caplog.text
+    assert "other.mcap" in caplog.text
 
 
 def test_run_number_taken_meanwhile_is_skipped(config, failures, monkeypatch):
