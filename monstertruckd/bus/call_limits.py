@@ -11,7 +11,7 @@ from monstertruck_runtime.clock import Clock
 from monstertruck_schemas.req import Order
 from monstertruck_schemas.topics import owner_of
 from monstertruckd.bus.access import ANONYMOUS
-from monstertruckd.bus.intake import OwnerRates
+from monstertruckd.bus.intake import ORDER_RATE, OwnerRates
 
 ESTOP: Final = Order.ESTOP.value
 ORDERS: Final = frozenset(order.value for order in Order)
@@ -27,8 +27,6 @@ MAX_ESTOPS: Final = 8
 """Emergency stops of one owner that wait or are carried out."""
 CALL_RATE: Final = 100.0
 """Calls a second of one owner that are not orders."""
-ORDER_RATE: Final = 5.0
-"""Orders a second of one owner. An order to stop lasts 4 s at most: no owner fills all places."""
 TOO_MANY: Final = "too many calls at once"
 
 

@@ -17,7 +17,7 @@ from monstertruck_runtime.threads import ThreadHop
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import ControlRequest, Order, Request
+from monstertruck_schemas.req import UNCONDITIONAL, ControlRequest, Order, Request
 from monstertruck_schemas.topics import REQ_CONTROL, REQ_DRIVE, REQ_PATH, Topic, owner_of
 from monstertruckd.bus.access import Sender, role_needed
 from monstertruckd.bus.local import Bus
@@ -33,9 +33,6 @@ MAX_OWNERS: Final = 64
 """Owners whose rates are known; the one heard least recently is dropped for a new one."""
 TOGETHER: Final = 5.0
 """All together may send so many times what one owner may: without certificates names can be invented."""
-
-_RANKS: Final = {Order.ESTOP: 2, Order.STOP: 1}
-"""Where orders have to be dropped, these are the last to go."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,8 +50,11 @@ LIMITS: Final = {
     REQ_CONTROL.name: Limit(rate=None),
     REQ_PATH.name: Limit(size=131_072),
 }
-"""All others: ``Limit()``. No order is turned away for its rate, for it may be an emergency stop; a path of 2000 poses
+"""All others: ``Limit()``. What an order asks is known once it is decoded: see ``ORDER_RATE``. A path of 2000 poses
 fits."""
+
+ORDER_RATE: Final = 5.0
+"""Orders a second of one owner, those that stop not counted."""
 
 
 @dataclass(slots=True)
@@ -158,10 +158,17 @@ class Intake:
         self.topic = topic
         self._limit = LIMITS.get(topic.name, Limit())
         self._rates = None if self._limit.rate is None else OwnerRates(self._limit.rate, clock)
+        self._order_rates = OwnerRates(ORDER_RATE, clock)
         self._refusals = Refusals(bus, clock, reporter)
+
+        def deliver(request: Message) -> None:
+            guard(lambda: bus.inject(topic, request))
+
         self._requests: ThreadHop[Message] = ThreadHop(
-            lambda request: guard(lambda: bus.inject(topic, request)), DEPTH, bus.add_drops, _rank
+            deliver, DEPTH, bus.add_drops, lambda request: _order(request) in UNCONDITIONAL
         )
+        self._estops: ThreadHop[Message] = ThreadHop(deliver, DEPTH, bus.add_drops)
+        """Emergency stops wait for no other order."""
 
     def take(self, sender: Sender, size: int, read: Callable[[], bytes]) -> None:
         """Judge, decode and queue one request; callable from any thread.
@@ -192,8 +199,13 @@ class Intake:
         if not sender.may(needed := role_needed(request)):
             self._refusals.add(Reason.NOT_PERMITTED, source, f"{name}: {sender.refusal(needed)}")
             return
+        order = _order(request)
+        if order is not None and order not in UNCONDITIONAL and not self._order_rates.spend(source):
+            text = f"{name}: more than {ORDER_RATE:g} orders a second"
+            self._refusals.add(Reason.MESSAGES_DROPPED, source, text)
+            return
         said = {"source": source, "role": sender.grant.capped(request.role)}
-        self._requests.put(request.model_copy(update=said))
+        (self._estops if order is Order.ESTOP else self._requests).put(request.model_copy(update=said))
 
     def charge(self, source: str) -> bool:
         """Count one request of ``source``; False if its owner has sent too many. Callable from any thread."""
@@ -202,8 +214,9 @@ class Intake:
     def close(self) -> None:
         """Discard what waits and everything to come."""
         self._requests.close()
+        self._estops.close()
         self._refusals.close()
 
 
-def _rank(request: Message) -> int:
-    return _RANKS.get(request.order, 0) if isinstance(request, ControlRequest) else 0
+def _order(request: Message) -> Order | None:
+    return request.order if isinstance(request, ControlRequest) else None

@@ -23,10 +23,10 @@ from typing import Final
 
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.ports import Value
-from monstertruck_runtime.requests import MAX_SOURCES, OPERATORS, Sequences, freshness
+from monstertruck_runtime.requests import OPERATORS, Sequences, crowded, freshness
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import ControlRequest, DriveRequest, Order, Role
+from monstertruck_schemas.req import STARTING, ControlRequest, DriveRequest, Role
 from monstertruck_schemas.state import GateMode
 from monstertruckd.gate.config import GateConfig
 
@@ -34,9 +34,6 @@ PRIORITY: Final = {role: rank for rank, role in enumerate(reversed(Role))}
 """The greater number wins."""
 
 DRIVERS: Final = OPERATORS | {Role.TRACKER}
-
-STARTING: Final = frozenset({Order.ARM, Order.RESET})
-"""Orders after which the truck may move: they must carry a recent gate stamp."""
 
 Key = tuple[bool, str]
 
@@ -98,8 +95,9 @@ class Sources:
         self._orders = Sequences(config.max_request_age)
         self._drive: dict[Key, Source] = {}
         self._min_rank = 0
-        self._released: set[Key] | None = None
-        """Sources that were live at the STOP order or have been neutral since; None = there was none."""
+        self._released: dict[Key, None] | None = None
+        """Sources that were live at the STOP order or have been neutral since, the least recent first; None = there
+        was none."""
         self._stop = "", 0
         """Source and time (ns) of the newest order that stops."""
         self._stop_of_others = 0
@@ -133,7 +131,12 @@ class Sources:
         return reason
 
     def stopped(self, source: str, now: int) -> None:
-        """A source ordered a stop: orders of others that start are refused if their sender did not know of it."""
+        """A source ordered a stop: orders of others that start are refused if their sender did not know of it.
+
+        Args:
+            source: empty = not authenticated, another than every source.
+            now: ns.
+        """
         stopped_by, at = self._stop
         if source != stopped_by:
             self._stop_of_others = at
@@ -153,10 +156,10 @@ class Sources:
         source = Source(request, now + round(lease * SECOND), now, inside)
         if not source.neutral:
             source.held = self._unheard(key) or (before is not None and before.held and now <= before.deadline)
-        elif self._released is not None and len(self._released) < MAX_SOURCES:
-            self._released.add(key)
         self._drive = {other: it for other, it in self._drive.items() if now <= it.deadline}
         self._drive[key] = source
+        if source.neutral and self._released is not None:
+            self._remember_neutral(key, self._released)
         return source
 
     def live(self, now: int) -> list[Source]:
@@ -194,13 +197,24 @@ class Sources:
 
     def hold(self, now: int) -> None:
         """Every source must send a neutral request before it may drive."""
-        self._released = {source.key for source in self.live(now)}
+        self._released = dict.fromkeys(source.key for source in self.live(now))
         for source in self._drive.values():
             source.held = True
 
     def _unheard(self, key: Key) -> bool:
         """Whether a source was neither live at the STOP order nor has been neutral since."""
         return self._released is not None and key not in self._released
+
+    def _remember_neutral(self, key: Key, released: dict[Key, None]) -> None:
+        """Add a source to the released ones; where there are too many, the least recent one without a lease goes."""
+        released.pop(key, None)
+        others = [name for inside, name in released if not inside]
+        if not key[0] and (crowd := crowded(others, key[1])):
+            oldest = next((name for name in crowd if (False, name) not in self._drive), None)
+            if oldest is None:
+                return
+            del released[False, oldest]
+        released[key] = None
 
     def release(self, *, planners: bool) -> None:
         """End ``claim`` and ``hold``: the truck was armed again.

@@ -25,7 +25,7 @@ from monstertruck_schemas.cmd import DriveAction
 from monstertruck_schemas.event import Cause, Event, Severity
 from monstertruck_schemas.health import HealthTable
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import ControlRequest, DriveForm, DriveRequest, Order, Role
+from monstertruck_schemas.req import UNCONDITIONAL, ControlRequest, DriveForm, DriveRequest, Order, Role
 from monstertruck_schemas.sensor import Attitude, Battery, DriveFeedback, LaserScan, SteeringFeedback
 from monstertruck_schemas.state import GateMode
 from monstertruckd.gate.arbitration import EventLog, GateEvent, GateStateMachine, Source, Sources
@@ -252,10 +252,11 @@ class Gate:
         an ARM or RESET whose sender did not know yet of another's ESTOP, STOP or DISARM.
         """
         reason = self._sources.accept_order(request, now)
-        if request.order is Order.ESTOP:
-            return self._estop(request, now)
-        if request.order is Order.STOP:
-            return self._stop_by(request, now)
+        if request.order in UNCONDITIONAL:
+            # The second copy of an order that came by topic and by call has a used number.
+            authenticated = reason in (Reason.OK, Reason.BAD_SEQUENCE)
+            self._sources.stopped(request.source if authenticated else "", now)
+            return self._estop(request, now) if request.order is Order.ESTOP else self._stop_by(request, now)
         if reason is not Reason.OK:
             return self._refuse_order(now, reason, request)
         if request.order is Order.DISARM:
@@ -274,7 +275,6 @@ class Gate:
         return Decision(self._refuse(now, reason, request, text), text or reason.text)
 
     def _estop(self, request: ControlRequest, now: int) -> Decision:
-        self._sources.stopped(request.source, now)
         if self.mode is not GateMode.ESTOPPED:
             why = _order_cause(Reason.ESTOP_REQUESTED, f"emergency stop by {request.source}", request, now)
             self._trip(now, GateMode.ESTOPPED, [why])
@@ -288,7 +288,6 @@ class Gate:
     def _stop_by(self, request: ControlRequest, now: int) -> Decision:
         if request.role is not Role.TRACKER:
             self._sources.claim(request.role)
-        self._sources.stopped(request.source, now)
         self._sources.hold(now)
         if self.mode is GateMode.DRIVING:
             text = f"stop ordered by {request.source}"

@@ -33,7 +33,7 @@ STATE_PERIOD: Final = SECOND // 10
 """``state/gate`` is published on every change and at least this often, ns."""
 
 LATCH_RETRY: Final = 1.0
-"""Seconds between two tries to store the latch."""
+"""Seconds between two tries to store the latch, or its mark."""
 
 
 METER_DEPTH: Final = 1 << 12
@@ -142,6 +142,8 @@ class GateService:
         """State on the disk; None = not known, because it is being written or could not be written or read."""
         self._marked: bool | None = None
         """The mark of the latch; None = not written in this run."""
+        self._mark_due = 0
+        """No try to write the mark before this, ns."""
         self._latch_differs = asyncio.Event()
         self._meter = TickMeter()
         self._broken = asyncio.Event()
@@ -170,9 +172,15 @@ class GateService:
         return self._meter.lateness()
 
     def control(self, order: ControlRequest) -> Decision:
-        """Carry out an order at once; see ``Gate.control``. An emergency stop is marked before it is answered."""
+        """Carry out an order at once; see ``Gate.control``.
+
+        An emergency stop does not wait for the next tick: it is commanded, and marked, before it is answered.
+        """
         bug = Decision(Reason.INTERNAL, Reason.INTERNAL.text)
+        before = self.mode
         decision = self._guarded(bug, self._gate.control, order, self._clock.now())
+        if before is not GateMode.ESTOPPED and self.mode is GateMode.ESTOPPED:
+            self._guarded(None, self._tick)
         self._mark_latch()
         return decision
 
@@ -239,12 +247,15 @@ class GateService:
         schedule = Schedule(self._clock, self._rate, ahead=0)
         while True:
             due = await schedule.next()
-            now = self._clock.now()
-            self._meter.record((now - due) / SECOND)
-            for feed in self._feeds:
-                feed.poll()
-            self._publish(self._gate.tick(now), now)
+            self._meter.record((self._clock.now() - due) / SECOND)
+            self._tick()
             ready()
+
+    def _tick(self) -> None:
+        now = self._clock.now()
+        for feed in self._feeds:
+            feed.poll()
+        self._publish(self._gate.tick(now), now)
 
     def _publish(self, output: GateOutput, now: int) -> None:
         steering = self._outputs.steering
@@ -333,12 +344,16 @@ class GateService:
         removed from the disk keeps its own.
         """
         marked = self.mode is GateMode.ESTOPPED and self._latched is not True
-        if marked != self._marked:
+        now = self._clock.now()
+        if marked == self._marked or now < self._mark_due:
+            return
+        try:
+            self._latch.mark(marked)
+        except OSError as error:
+            self._mark_due = now + round(LATCH_RETRY * SECOND)
+            self._report(error)
+        else:
             self._marked = marked
-            try:
-                self._latch.mark(marked)
-            except OSError as error:
-                self._report(error)
 
     async def _keep_latch(self) -> None:
         while True:

@@ -31,12 +31,13 @@ from monstertruck_runtime.errors import (
     TruckError,
 )
 from monstertruck_runtime.mailbox import Delivery, Mailbox, latest
-from monstertruck_runtime.requests import OVERTAKING, Operator
+from monstertruck_runtime.requests import Operator
 from monstertruck_runtime.threads import ThreadHop, in_thread
 from monstertruck_schemas.base import Message, Schema
 from monstertruck_schemas.plan import Path as DrivePath
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import (
+    UNCONDITIONAL,
     ControlRequest,
     DriveRequest,
     GoalOrder,
@@ -350,14 +351,14 @@ class TruckClient(Operator):
             NoAnswerError: no answer in time, or the robot's nonce did not come in time.
             NotFoundError: the robot is not there.
         """
-        if order in OVERTAKING:
+        if order in UNCONDITIONAL:
             self._overtaking += 1
             self._put(REQ_CONTROL, ControlRequest(**self._header(1.0), order=order))
         return self._outcome(order, self._overtaking, {"hold": True} if hold else {})
 
     async def _outcome(self, order: Order, overtaking: int, more: dict[str, Any]) -> GateState:
-        header = self._header(1.0) if order in OVERTAKING else await self._answered(1.0)
-        if overtaking != self._overtaking and order not in OVERTAKING:
+        header = self._header(1.0) if order in UNCONDITIONAL else await self._answered(1.0)
+        if overtaking != self._overtaking and order not in UNCONDITIONAL:
             raise RequestRefusedError(Reason.BAD_SEQUENCE, f"{order.value}: overtaken by a stop")
         return wire.decode(GATE, await self._call(order.value, header | more, ORDER_TIMEOUT))
 

@@ -37,9 +37,6 @@ MEMORY: Final = 2.0
 MAX_GAP: Final = 2**32
 """Greatest step of a source's numbers while its lease runs: nanoseconds may be counted."""
 
-OVERTAKING: Final = frozenset({Order.ESTOP, Order.STOP})
-"""Orders that are published on ``req/control`` first: a topic waits for no other call."""
-
 
 class Operator(Protocol):
     """Client of one robot that gives orders."""
@@ -143,7 +140,7 @@ class Sequences:
             return Reason.BAD_SEQUENCE
         if source in keep and source in self._newest and abs(request.seq - newest) > MAX_GAP:
             return Reason.BUSY
-        if source not in self._newest and (crowd := self._crowd(owner_of(source))):
+        if source not in self._newest and (crowd := crowded(self._newest, source)):
             oldest = next((name for name in crowd if name not in keep), None)
             if oldest is None:
                 return Reason.BUSY
@@ -152,12 +149,18 @@ class Sequences:
         self._newest[source] = request.seq, now
         return Reason.OK
 
-    def _crowd(self, owner: str) -> Collection[str]:
-        """Sources of which one has to go for a new one of ``owner``, the least recent first; empty if there is room."""
-        programs = [name for name in self._newest if owner_of(name) == owner]
-        if len(programs) >= MAX_PROGRAMS:
-            return programs
-        return self._newest if len(self._newest) >= MAX_SOURCES else ()
+
+def crowded(known: Collection[str], source: str) -> Collection[str]:
+    """Sources of which one has to go for a new one, in the order of ``known``; empty if there is room.
+
+    Args:
+        known: names of sources.
+        source: the new one.
+    """
+    programs = [name for name in known if owner_of(name) == owner_of(source)]
+    if len(programs) >= MAX_PROGRAMS:
+        return programs
+    return known if len(known) >= MAX_SOURCES else ()
 
 
 def freshness(request: Request, now: int, limit: float) -> Reason:

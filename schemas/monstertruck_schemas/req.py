@@ -7,7 +7,7 @@ for each source, and a lease: the time for which the request stands without a ne
 
 import math
 from enum import StrEnum
-from typing import Annotated, Self
+from typing import Annotated, Final, Self
 
 from pydantic import Field, model_validator
 
@@ -124,6 +124,13 @@ class Order(StrEnum):
     ESTOP = "estop"
     RESET = "reset"
     STOP = "stop"
+
+
+STARTING: Final = frozenset({Order.ARM, Order.RESET})
+"""Orders after which the truck may move: they must carry a recent gate stamp."""
+
+UNCONDITIONAL: Final = frozenset({Order.ESTOP, Order.STOP})
+"""Orders that everybody may give, at any rate: stopping is always safe. They are sent by topic, ahead of all calls."""
 
 
 class ControlRequest(Request):

@@ -11,11 +11,11 @@ from monstertruck_runtime import wire
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError
 from monstertruck_runtime.mailbox import Delivery, Mailbox, fifo, latest
-from monstertruck_runtime.requests import OVERTAKING, Operator
+from monstertruck_runtime.requests import Operator
 from monstertruck_schemas import topics
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import ControlRequest, Order, Role
+from monstertruck_schemas.req import UNCONDITIONAL, ControlRequest, Order, Role
 from monstertruck_schemas.state import GateState
 from monstertruck_schemas.topics import Topic
 from monstertruckd.daemon import Daemon
@@ -47,7 +47,7 @@ class LocalOperator(Operator):
 
     async def order(self, order: Order, *, hold: bool = False) -> GateState:
         """Give an order as ``TruckClient.order`` does."""
-        if order in OVERTAKING:
+        if order in UNCONDITIONAL:
             request = ControlRequest.model_validate_json(json.dumps({**await self.header(), "order": order}))
             self._daemon.bus.inject(topics.REQ_CONTROL, request)
         answer = await self.call(order.value, {**await self.header(), "hold": hold})

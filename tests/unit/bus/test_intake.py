@@ -20,7 +20,7 @@ from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.state import GateMode
 from monstertruck_schemas.topics import EVENT, REQ_CONTROL, REQ_DRIVE, REQ_GOAL, REQ_PATH, Topic
 from monstertruckd.bus.access import EVERYTHING, OBSERVING, Grant, Sender
-from monstertruckd.bus.intake import DEPTH, LIMITS, MAX_OWNERS, Intake
+from monstertruckd.bus.intake import DEPTH, LIMITS, MAX_OWNERS, ORDER_RATE, Intake
 from monstertruckd.bus.local import Bus
 from tests.unit.gate.rig import make_gate
 
@@ -120,9 +120,36 @@ async def test_an_emergency_stop_reaches_the_gate_through_any_flood(urgent: Orde
     entrance.send(*[(REQ_DRIVE, drive(seq)) for seq in range(4 * DEPTH)], *bogus, (REQ_PATH, path(2000)))
     await entrance.settle()
     assert urgent in taken
-    assert len(taken) == DEPTH
+    assert len(taken) == ORDER_RATE + 1
     if urgent is Order.ESTOP:
         assert gate.mode is GateMode.ESTOPPED
+
+
+async def test_an_emergency_stop_overtakes_the_orders_that_wait():
+    entrance = Entrance()
+    taken: list[Order] = []
+    entrance.bus.listen(REQ_CONTROL, lambda request: taken.append(request.order))
+    entrance.send(*[(REQ_CONTROL, order(Order.STOP))] * (2 * DEPTH), (REQ_CONTROL, order(Order.ESTOP)))
+    await entrance.settle()
+    assert len(taken) == DEPTH + 1
+    assert taken.index(Order.ESTOP) <= 1
+
+
+@pytest.mark.parametrize("limited", [Order.ARM, Order.DISARM, Order.RESET])
+async def test_orders_that_do_not_stop_have_a_rate(limited: Order):
+    entrance = Entrance()
+    taken: list[Order] = []
+    entrance.bus.listen(REQ_CONTROL, lambda request: taken.append(request.order))
+    entrance.send(*[(REQ_CONTROL, order(limited))] * 10, *[(REQ_CONTROL, order(Order.STOP))] * 10)
+    await entrance.settle()
+    assert taken.count(limited) == ORDER_RATE
+    assert taken.count(Order.STOP) == 10
+    event = await entrance.events.next()
+    assert (event.reason, event.text) == (Reason.MESSAGES_DROPPED, "req/control: more than 5 orders a second")
+    entrance.clock.stamp += SECOND
+    entrance.send((REQ_CONTROL, order(limited)))
+    await entrance.settle()
+    assert taken[-1] is limited
 
 
 async def test_a_flood_of_stops_does_not_push_out_an_emergency_stop():
@@ -131,7 +158,7 @@ async def test_a_flood_of_stops_does_not_push_out_an_emergency_stop():
     entrance.bus.listen(REQ_CONTROL, lambda request: taken.append(request.order))
     entrance.send((REQ_CONTROL, order(Order.ESTOP)), *[(REQ_CONTROL, order(Order.STOP))] * (2 * DEPTH))
     await entrance.settle()
-    assert taken[0] is Order.ESTOP
+    assert Order.ESTOP in taken[:2]
     entrance.send(*[(REQ_CONTROL, order(Order.ESTOP))] * (2 * DEPTH))
     await entrance.settle()
     assert taken[-1] is Order.ESTOP

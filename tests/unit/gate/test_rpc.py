@@ -262,3 +262,20 @@ def test_an_emergency_stop_in_the_same_instant_is_the_answer_of_arm():
         assert refused.value.refusal is Reason.ESTOPPED
 
     called(scenario)
+
+
+@pytest.mark.parametrize("stop", ["stop", "estop"])
+def test_a_stop_that_is_not_authentic_overtakes_every_order_that_starts(stop):
+    async def scenario(bench):
+        if stop == "estop":
+            await bench.call("arm")
+            await bench.call("estop")
+        early = bench.payload()
+        await bench.clock.sleep(0.001)
+        forged = bench.payload(nonce="guess")
+        bench.bus.inject(REQ_CONTROL, parse_request(ControlRequest, {**forged, "order": stop}))
+        with pytest.raises(RequestRefusedError) as refused:
+            await bench.rpc.call("arm" if stop == "stop" else "reset", early)
+        assert refused.value.refusal is Reason.BAD_SEQUENCE
+
+    called(scenario)

@@ -5,6 +5,7 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -356,18 +357,53 @@ def test_a_stop_while_the_one_before_is_being_removed_keeps_its_mark():
     asyncio.run(main())
 
 
-def test_a_mark_that_cannot_be_written_is_an_event_and_the_stop_goes_on():
+def test_a_mark_that_cannot_be_written_is_an_event_each_second_and_the_stop_goes_on():
     class Full(MemoryLatch):
+        full = False
+        marks: ClassVar = []
+
         def mark(self, engaged):
+            if self.full:
+                raise OSError(28, "no space left")
+            self.marks.append(engaged)
+
+        def store(self, engaged):
             raise OSError(28, "no space left")
 
+    latch = Full()
+
+    def marks_failed(bench):
+        return len([text for reason, _, text, _ in bench.events if reason is Reason.INTERNAL])
+
     async def scenario(bench):
+        latch.full = True
         bench.order(Order.ESTOP)
         await bench.clock.sleep(0.05)
         assert bench.out.drives[0].last.action is DriveAction.QUICK_STOP
+        assert marks_failed(bench) == 2, "one for the mark, one for the disk"
+        await bench.clock.sleep(0.9)
+        assert marks_failed(bench) == 2
+        await bench.clock.sleep(1.0)
+        assert marks_failed(bench) in (4, 5)
+        latch.full = False
+        await bench.clock.sleep(1.2)
+        assert latch.marks[-1] is True
 
-    bench = on_bench(scenario, Full())
-    assert [text for reason, _, text, _ in bench.events if reason is Reason.INTERNAL]
+    on_bench(scenario, latch)
+
+
+def test_an_emergency_stop_does_not_wait_for_the_tick():
+    async def scenario(bench):
+        commands = bench.out.drives[0].messages
+        await bench.clock.sleep(0.005)
+        before = len(commands)
+        bench.order(Order.ESTOP)
+        assert [command.action for command in list(commands)[before:]] == [DriveAction.QUICK_STOP]
+        assert bench.out.state.last.mode is GateMode.ESTOPPED
+        bench.order(Order.ESTOP)
+        assert len(commands) == before + 1, "further ones change nothing"
+
+    on_bench(scenario)
 
 
 @pytest.mark.parametrize("what", ["draft", "mark"])

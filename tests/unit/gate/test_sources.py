@@ -268,6 +268,20 @@ def test_the_names_released_after_a_stop_are_bounded():
     assert crowd.heard("s-late").held
 
 
+@pytest.mark.parametrize("name", ["invented{}", "mallory:{}"])
+def test_names_invented_after_a_stop_keep_nobody_standing(name):
+    crowd = Crowd()
+    crowd.hold(NOW)
+    for number in range(3 * MAX_SOURCES):
+        crowd.heard(name.format(number), speed=0.0, at=NOW + number * LEASE * 2)
+    late = NOW + 10 * MAX_SOURCES * LEASE
+    crowd.heard("ann", speed=0.0, at=late)
+    assert not crowd.heard("ann", at=late).held
+    for number in range(3 * MAX_SOURCES):
+        crowd.heard(name.format(f"more{number}"), speed=0.0, at=late)
+    assert not crowd.heard("ann", at=late).held, "a source with a lease is not dropped"
+
+
 # What is asked for
 
 
