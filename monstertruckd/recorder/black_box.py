@@ -5,8 +5,10 @@ import errno
 import logging
 import os
 import re
+import stat
 import threading
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from operator import attrgetter
@@ -24,6 +26,7 @@ from monstertruck_schemas.topics import TOPICS, Topic
 from monstertruckd.gate.stops import Trip
 from monstertruckd.recorder.config import BlackBoxConfig, Compression
 from monstertruckd.recorder.log_file import LogEntry, LogFile, disk_reason
+from monstertruckd.recorder.repair import in_use
 from monstertruckd.recorder.ring import Retention, Ring, RingSnapshot
 
 log = logging.getLogger(__name__)
@@ -55,8 +58,15 @@ def black_boxes(directory: Path) -> list[BlackBoxFile]:
     """
     if not directory.exists():
         return []
-    named = ((path, _NAME.fullmatch(path.name)) for path in directory.iterdir())
-    boxes = [BlackBoxFile(path, int(name[1]), name[2], path.stat().st_size) for path, name in named if name is not None]
+    boxes = []
+    for path in directory.iterdir():
+        name = _NAME.fullmatch(path.name)
+        if name is None:
+            continue
+        with suppress(FileNotFoundError):  # removed meanwhile
+            status = path.lstat()
+            if stat.S_ISREG(status.st_mode):
+                boxes.append(BlackBoxFile(path, int(name[1]), name[2], status.st_size))
     return sorted(boxes, key=lambda box: box.number)
 
 
@@ -76,33 +86,47 @@ class BlackBoxFolder:
     def scan(self) -> None:
         """Go on with the numbers of earlier runs, and remove what they left unfinished."""
         self.directory.mkdir(parents=True, exist_ok=True)
+        self._number = max(self._number, *(box.number for box in black_boxes(self.directory)), 0)
         for path in self.directory.glob(f"*{PART}"):
-            path.unlink(missing_ok=True)
-        self._number = max((box.number for box in black_boxes(self.directory)), default=0)
+            try:
+                if not in_use(path):
+                    path.unlink(missing_ok=True)
+            except OSError as error:
+                log.warning("%s, which an earlier run left, cannot be removed: %s", path, error.strerror)
 
     def next_name(self, reason: Reason) -> str:
         """Name of the next box; touches nothing."""
         self._number += 1
         return f"blackbox-{self._number:06d}-{reason.value}.mcap"
 
-    def begin(self, name: str) -> Path:
-        """Where to write the box until it is complete."""
-        self.directory.mkdir(parents=True, exist_ok=True)
-        part = self.directory / (name + PART)
-        part.unlink(missing_ok=True)
-        return part
+    def begin(self, name: str) -> str:
+        """The name the box gets: ``name`` or, where that is taken, one of the folder's next number.
 
-    def finish(self, name: str) -> Path:
+        It is taken if the folder could not be read at the start, or if another daemon writes there as well.
+        """
+        self.directory.mkdir(parents=True, exist_ok=True)
+        while self._is_taken(name):
+            _, number, reason = name.removesuffix(".mcap").split("-")
+            self._number = max(self._number, int(number), *(box.number for box in black_boxes(self.directory))) + 1
+            name = f"blackbox-{self._number:06d}-{reason}.mcap"
+        return name
+
+    def part(self, name: str) -> Path:
+        """Where the box ``name`` is written until it is complete."""
+        return self.directory / (name + PART)
+
+    def finish(self, name: str) -> None:
         """Give the complete box its name, durably, and remove old ones beyond the quota."""
-        path = self.directory / name
-        (self.directory / (name + PART)).replace(path)
+        self.part(name).replace(self.directory / name)
         folder = os.open(self.directory, os.O_RDONLY | os.O_DIRECTORY)
         try:
             os.fsync(folder)
         finally:
             os.close(folder)
         self._keep_quota()
-        return path
+
+    def _is_taken(self, name: str) -> bool:
+        return any(os.path.lexists(path) for path in (self.directory / name, self.part(name)))
 
     def _keep_quota(self) -> None:
         boxes = black_boxes(self.directory)
@@ -110,7 +134,13 @@ class BlackBoxFolder:
         excess = sum(box.size for box in boxes) - self._quota
         for box in boxes:
             if excess > 0 and newest[box.reason] != box.number:
-                box.path.unlink(missing_ok=True)
+                try:
+                    box.path.unlink(missing_ok=True)
+                except OSError as error:
+                    log.warning(
+                        "%s cannot be removed, though black boxes exceed their quota: %s", box.path, error.strerror
+                    )
+                    continue
                 log.info("removed %s: black boxes exceed %d bytes", box.path, self._quota)
                 excess -= box.size
 
@@ -319,7 +349,7 @@ class BlackBox:
             "lost": str(self.ring.lost),
         }
         try:
-            await self._offload(partial(self._write, pending.name, entries, metadata))
+            name = await self._offload(partial(self._write, pending.name, entries, metadata))
         except OSError as error:
             self._failed(error, f"{pending.name} is lost")
         except Exception:
@@ -330,8 +360,8 @@ class BlackBox:
                 Reason.BLACK_BOX_SAVED,
                 Severity.INFO,
                 self.name,
-                f"{pending.what} in {pending.name}",
-                file=pending.name,
+                f"{pending.what} in {name}",
+                file=name,
                 stop=first.number,
                 messages=len(entries),
             )
@@ -339,10 +369,11 @@ class BlackBox:
     def _failed(self, error: OSError, what: str) -> None:
         self._events(disk_reason(error), Severity.WARNING, self.name, f"{what}: {error.strerror or error}")
 
-    def _write(self, name: str, entries: RingSnapshot, metadata: Mapping[str, str]) -> None:
-        """In a thread with pauses for the control loop, unless the daemon waits for it to end."""
+    def _write(self, name: str, entries: RingSnapshot, metadata: Mapping[str, str]) -> str:
+        """In a thread with pauses for the control loop, unless the daemon waits for it to end; the box's name."""
         offloaded = threading.get_ident() != self._loop_thread
-        part = self._folder.begin(name)
+        name = self._folder.begin(name)
+        part = self._folder.part(name)
         start = next((entry.log_time for entry in entries), 0)
         try:
             file = LogFile(part, Compression.ZSTD, CHUNK_SIZE, self._attachments, metadata, start)
@@ -361,3 +392,4 @@ class BlackBox:
         except BaseException:
             part.unlink(missing_ok=True)
             raise
+        return name

@@ -3,6 +3,7 @@
 import asyncio
 import errno
 import json
+import os
 import threading
 from pathlib import Path
 from types import MethodType
@@ -19,7 +20,7 @@ from monstertruck_schemas.state import ClockOffset, GateMode
 from monstertruckd.gate.stops import Trip
 from monstertruckd.recorder import black_box as module
 from monstertruckd.recorder.black_box import BlackBox, black_boxes
-from monstertruckd.recorder.config import BlackBoxConfig
+from monstertruckd.recorder.config import BlackBoxConfig, Compression
 from monstertruckd.recorder.log_file import LogFile
 from monstertruckd.recorder.reader import open_log
 from tests.unit.recorder.conftest import steering
@@ -272,6 +273,66 @@ def test_a_folder_that_cannot_be_made_is_reported_and_tried_again(tmp_path: Path
         bench.trip()
 
     assert on_bench(blocked, scenario).files == ["blackbox-000001-scan_stale.mcap"]
+
+
+def test_a_box_of_an_earlier_run_is_never_overwritten(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """The folder came too late to be read at the start."""
+    scan = module.BlackBoxFolder.scan
+
+    def too_early(folder):
+        raise OSError(errno.EIO, "Input/output error")
+
+    async def scenario(bench):
+        (tmp_path / "blackbox-000001-scan_stale.mcap").write_bytes(b"the only one of a crash")
+        (tmp_path / "blackbox-000008-tilt_stop.mcap").write_bytes(b"another")
+        bench.trip()
+        await bench.drive(6)
+
+    monkeypatch.setattr(module.BlackBoxFolder, "scan", too_early)
+    bench = on_bench(tmp_path, scenario)
+    assert (tmp_path / "blackbox-000001-scan_stale.mcap").read_bytes() == b"the only one of a crash"
+    assert bench.files[-1] == "blackbox-000009-scan_stale.mcap"
+    reason, text, values = bench.reported[-1]
+    assert (reason, values["file"]) == (Reason.BLACK_BOX_SAVED, "blackbox-000009-scan_stale.mcap")
+    assert "blackbox-000009" in text
+    monkeypatch.setattr(module.BlackBoxFolder, "scan", scan)
+
+
+def test_a_box_that_another_daemon_writes_stays(tmp_path: Path):
+    part = tmp_path / "blackbox-000001-scan_stale.mcap.part"
+    other = LogFile(part, Compression.ZSTD, 1000, {}, {}, 0)
+
+    async def scenario(bench):
+        bench.trip()
+        await bench.drive(6)
+
+    assert on_bench(tmp_path, scenario).files == ["blackbox-000002-scan_stale.mcap"]
+    other.finish()
+    assert open_log(part).metadata() == {"run": {}}
+
+
+def test_what_cannot_be_removed_costs_no_box(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog):
+    (tmp_path / "blackbox-000003-scan_stale.mcap").write_bytes(b"old")
+    (tmp_path / "blackbox-000004-tilt_stop.mcap").mkdir()
+    (tmp_path / "blackbox-000005-tilt_stop.mcap").symlink_to(tmp_path / "nowhere")
+    (tmp_path / "blackbox-000006-tilt_stop.mcap.part").mkdir()
+    remove = Path.unlink
+
+    def unlink(path, missing_ok=False):
+        if path.name.startswith("blackbox-000003") or path.is_dir():
+            raise PermissionError(errno.EPERM, os.strerror(errno.EPERM), str(path))
+        remove(path, missing_ok)
+
+    monkeypatch.setattr(Path, "unlink", unlink)
+
+    async def scenario(bench):
+        bench.trip()
+        await bench.drive(6)
+
+    bench = on_bench(tmp_path, scenario, quota_bytes=1)
+    assert bench.reported.reasons == [Reason.BLACK_BOX_SAVED]
+    assert bench.files == ["blackbox-000003-scan_stale.mcap", "blackbox-000004-scan_stale.mcap"]
+    assert sum("cannot be removed" in record.getMessage() for record in caplog.records) == 2
 
 
 def test_a_bug_while_writing_is_reported_and_ends_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog):
