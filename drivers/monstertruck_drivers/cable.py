@@ -212,7 +212,7 @@ class MemoryPort:
             raise DeviceLostError(f"{self.name}: not plugged in")
         if self._link is not None:
             raise PortBusyError(f"{self.name}: held by another process")
-        link = Link(self.name, self.device.take, self._hang_up)
+        link = Link(self.name, self.device.take, self._hang_up, self.device.baud)
         self._link = link
         self.device.connect(link.feed)
         return link

@@ -33,10 +33,18 @@ class Link:
         name: for error messages.
         transmit: takes bytes to the peer.
         hang_up: closes the underlying transport; called once.
+        baud: bits per second of the line; None where it has no rate of its own.
     """
 
-    def __init__(self, name: str, transmit: Callable[[bytes], None], hang_up: Callable[[], None]) -> None:
+    def __init__(
+        self,
+        name: str,
+        transmit: Callable[[bytes], None],
+        hang_up: Callable[[], None],
+        baud: int | None = None,
+    ) -> None:
         self.name = name
+        self.baud = baud
         self._transmit = transmit
         self._hang_up = hang_up
         self._buffer = bytearray()
@@ -325,7 +333,7 @@ class _SerialProtocol(asyncio.Protocol):
         self._fd = tty.fileno()
         self._transport = serial_asyncio.SerialTransport(asyncio.get_running_loop(), self, tty)
         # abort(), never close(): close() with a stalled peer never ends.
-        self.link = Link(name, self._send, self._transport.abort)
+        self.link = Link(name, self._send, self._transport.abort, tty.baudrate)
 
     def _send(self, data: bytes) -> None:
         """Write at once: a last command before ``close`` must not wait in a buffer that ``abort`` drops."""

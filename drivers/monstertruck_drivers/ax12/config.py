@@ -101,6 +101,6 @@ class Ax12Config(Schema):
         """``speed`` in the unit's units; never 0, which would mean unlimited."""
         return max(1, round(self.speed / SPEED_UNIT))
 
-    def timeout(self, size: int) -> float:
+    def timeout(self, size: int, baud: int = BAUD) -> float:
         """Seconds to wait for an exchange of ``size`` bytes: line, return delay, and the adapter both ways."""
-        return max(TIMEOUT_MIN, size * 10 / BAUD + self.return_delay + 2 * self.usb_latency + SCHEDULING)
+        return max(TIMEOUT_MIN, size * 10 / baud + self.return_delay + 2 * self.usb_latency + SCHEDULING)

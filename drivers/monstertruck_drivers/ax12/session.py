@@ -33,16 +33,17 @@ class Ax12Session:
     Args:
         link: open link to the adapter.
         clock: time.
-        timeout: seconds to wait for an exchange of so many bytes.
+        timeout: seconds to wait for an exchange of so many bytes at a baud rate.
     """
 
-    def __init__(self, link: Link, clock: Clock, timeout: Callable[[int], float]) -> None:
+    def __init__(self, link: Link, clock: Clock, timeout: Callable[[int, int], float]) -> None:
         self.echo = False
         self.strange = 0
         """Bytes heard that were no part of a correct packet."""
         self._link = link
         self._clock = clock
         self._timeout = timeout
+        self._baud = link.baud or protocol.BAUD
         self._quiet_until = 0
 
     async def find_echo(self, *units: int) -> None:
@@ -101,8 +102,9 @@ class Ax12Session:
             DeviceLostError: unplugged.
         """
         await self._clock.sleep_until(self._quiet_until)
-        self._link.write(protocol.sync_write(start, data))
-        self._quiet_until = self._clock.now() + round(GAP * SECOND)
+        packet = protocol.sync_write(start, data)
+        self._link.write(packet)
+        self._quiet_until = self._clock.now() + round((len(packet) * 10 / self._baud + GAP) * SECOND)
 
     async def _ask(self, unit: int, request: bytes, count: int, retries: int) -> Answer:
         for attempt in range(1 + retries):
@@ -133,7 +135,7 @@ class Ax12Session:
         # A damaged length must not make the parser wait for more than can come.
         parser = Ax12Parser(longest=max(len(request) - 4, count + 2))
         echo_due = self.echo
-        end = self._clock.now() + round(self._timeout(len(request) + 6 + count) * SECOND)
+        end = self._clock.now() + round(self._timeout(len(request) + 6 + count, self._baud) * SECOND)
         while (left := end - self._clock.now()) > 0:
             try:
                 data = await self._link.read(left / SECOND)

@@ -74,11 +74,16 @@ class Host:
 
 @contextlib.asynccontextmanager
 async def bench(
-    clock: Clock, config: Ax12Config | None = None, *, port: EmulatedPort | None = None, **bus: Any
+    clock: Clock,
+    config: Ax12Config | None = None,
+    *,
+    port: EmulatedPort | None = None,
+    host_baud: int = BAUD,
+    **bus: Any,
 ) -> AsyncIterator[Rig]:
     """Bus plugged in and running; the driver is started by the test."""
-    rig = Rig(clock, port, config or FAST, **bus)
-    rig.port.device.baud = BAUD
+    rig = Rig(clock, port, config or FAST, host_baud=host_baud, **bus)
+    rig.port.device.baud = host_baud
     async with rig.plugged_in(rig.bus.run(rig.port.device)):
         yield rig
 

@@ -122,6 +122,24 @@ def test_a_slow_adapter_slows_the_rate_and_nothing_else():
     on_bench(test, Ax12Config(rate=50.0), latency_s=0.016)
 
 
+def test_a_slow_line_makes_no_answer_late():
+    """9615 baud: reading a unit's settings takes 30 ms on the line alone."""
+
+    async def test(rig: Rig) -> None:
+        for ident in (1, 2):
+            rig.unit(ident).put(p.BAUD_CODE, 207)
+        async with rig.driving():
+            await rig.settle(1.0)
+            rig.request(0.2, -0.3)
+            await rig.settle(2.0)
+            feedback = rig.out.kept[-1]
+            assert feedback.pitch == pytest.approx(0.2, abs=2 * STEP)
+            assert feedback.roll == pytest.approx(-0.3, abs=2 * STEP)
+        assert rig.events.kept == []
+
+    on_bench(test, host_baud=9615)
+
+
 def test_timeouts_follow_the_adapter():
     assert FAST.timeout(22) == 0.005
     assert Ax12Config().timeout(22) == pytest.approx(0.0347, abs=1e-4)
