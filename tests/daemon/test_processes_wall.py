@@ -1,6 +1,7 @@
 """The daemon as a process on the wall clock: signals, crashes, second starts. Real ptys, Zenoh and MCAP."""
 
 import asyncio
+import os
 import re
 import signal
 import subprocess
@@ -35,14 +36,103 @@ def metres_after(truth: np.ndarray, instant: float) -> float:
     return float(np.hypot(*np.diff(later[:, 1:3], axis=0).T).sum())
 
 
-@pytest.mark.parametrize("seconds", [0.15, 0.4, 0.8, 1.5])
-async def test_sigterm_during_the_start_is_an_ordinary_end(seconds: float, tmp_path: Path):
-    config = ROOT / "configs" / "emulated.yaml"
-    daemon = await asyncio.create_subprocess_exec(
-        sys.executable, "-m", "monstertruckd", "run", "-c", str(config), cwd=tmp_path, stderr=subprocess.DEVNULL
-    )
-    await asyncio.sleep(seconds)
-    assert await end(daemon) == 0
+STAGE = """
+import functools, importlib, os, signal, sys
+from importlib.machinery import PathFinder
+
+def term(*_):
+    print("reached", flush=True)
+    os.kill(os.getpid(), signal.SIGTERM)
+
+class InACallback:
+    # an exception that is raised here is lost, as in the callbacks of imports
+    def __del__(self):
+        term()
+
+class Imported(PathFinder):
+    @classmethod
+    def find_spec(cls, name, path=None, target=None):
+        if name == stage:
+            InACallback()
+
+stage = sys.argv.pop(1)
+where, _, function = stage.partition(":")
+if function:
+    owner = importlib.import_module(where)
+    *classes, name = function.split(".")
+    owner = functools.reduce(getattr, classes, owner)
+    def reached(*arguments, before=getattr(owner, name), **named):
+        term()
+        return before(*arguments, **named)
+    setattr(owner, name, reached)
+else:
+    sys.meta_path.insert(0, Imported)
+from monstertruckd.__main__ import main
+main()
+"""
+"""The command line in a process that gets SIGTERM when it reaches a stage: an import, or a function's call."""
+
+
+@pytest.mark.parametrize(
+    "stage",
+    [
+        "monstertruckd.tools.cli.main",
+        "pydantic",
+        "monstertruckd.tools.cli.robot",
+        "monstertruckd.tools.cli.main:app",
+        "monstertruckd.run",
+        "zenoh",
+        "monstertruckd.daemon",
+        "monstertruckd.run:load_truck",
+        "monstertruckd.config.load:load_config",
+        "monstertruckd.run:start_logging",
+        "monstertruckd.run:run_wall",
+        "monstertruckd.run:Daemon",
+        "monstertruckd.run:settle",
+        "monstertruckd.gate.latch:EstopLatch.prepare",
+        "zenoh:open",
+        "monstertruckd.bus.zenoh_session:ZenohBridge._declare_inputs",
+        "monstertruck_drivers.epos.driver:EposDriver.run",
+        "monstertruckd.gate.service:GateService.run",
+        "monstertruck_runtime.actors.process:WorkerProcess.__init__",
+    ],
+)
+async def test_sigterm_at_any_stage_of_the_start_is_an_ordinary_end(stage: str, tmp_path: Path):
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "numba")}  # the worker compiles its kernels anew
+    async with robot(tmp_path, base=ROOT / "configs" / "slam.yaml") as truck:
+        daemon = await asyncio.create_subprocess_exec(
+            *(sys.executable, "-c", STAGE, stage, "run", "--config", str(truck.config)),
+            cwd=ROOT,
+            env=environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+        )
+        try:
+            async with asyncio.timeout(30):
+                out, errors = await daemon.communicate()
+        finally:
+            if daemon.returncode is None:
+                daemon.kill()
+    assert (out[:7], daemon.returncode) == (b"reached", 0), errors.decode()
+    assert b"Traceback" not in errors
+
+
+def catches_sigterm(process: int) -> bool:
+    (caught,) = re.findall(r"SigCgt:\s*(\w+)", Path(f"/proc/{process}/status").read_text())
+    return bool(int(caught, 16) & 1 << (signal.SIGTERM - 1))
+
+
+async def test_sigterm_at_any_moment_of_the_start_is_an_ordinary_end(tmp_path: Path):
+    async with robot(tmp_path, base=ROOT / "configs" / "slam.yaml") as truck:
+        await truck.start_simulator()
+        for seconds in (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.2, 1.5, 2.0, 3.0):
+            await truck.start_daemon()
+            assert truck.daemon is not None
+            while not catches_sigterm(truck.daemon.pid):  # Python itself takes as long to start as the computer is busy
+                await asyncio.sleep(0.002)
+            await asyncio.sleep(seconds)
+            assert await end(truck.daemon) == 0, seconds
+    assert "Traceback" not in (tmp_path / "run.txt").read_text()
 
 
 async def test_sigterm_stops_the_truck_first_and_closes_the_log(tmp_path: Path):

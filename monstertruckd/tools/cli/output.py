@@ -186,7 +186,9 @@ class CommandGroup(TyperGroup):
 
     def invoke(self, ctx: "Context") -> Any:
         """Run the chosen command."""
-        before = signal.signal(signal.SIGTERM, _interrupt)
+        before = signal.getsignal(signal.SIGTERM)
+        if before is signal.SIG_DFL:  # `run` has its own
+            signal.signal(signal.SIGTERM, _interrupt)
         try:
             return self._invoke_and_flush(ctx)
         except TruckError as error:

@@ -1,6 +1,5 @@
 """Commands of the robot: run the daemon or its remote planner, print the tables of topics and reasons."""
 
-from contextlib import suppress
 from functools import partial
 from typing import Annotated
 
@@ -13,10 +12,9 @@ from monstertruckd.tools.cli.output import JsonOption, print_json, print_table, 
 
 def run(config: ConfigOption, verbose: Annotated[bool, typer.Option("--verbose", "-v")] = False) -> None:
     """Run the daemon until SIGTERM or Ctrl-C: neutral first, then everything is closed in order."""
-    with suppress(KeyboardInterrupt):  # before the daemon itself listens to signals: nothing has moved
-        from monstertruckd.run import run_daemon
+    from monstertruckd.run import run_daemon
 
-        raise typer.Exit(run_daemon(config, verbose=verbose).exit_code)
+    raise typer.Exit(run_daemon(config, verbose=verbose).exit_code)
 
 
 def topics(json_output: JsonOption = False) -> None:
