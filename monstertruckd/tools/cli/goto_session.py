@@ -1,12 +1,13 @@
 """One drive to a goal or along a path, as a client of the robot."""
 
 import asyncio
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from contextlib import asynccontextmanager, suppress
 from dataclasses import asdict, dataclass
 from typing import Any, Final, Protocol
 
 from monstertruck_runtime.clock import SECOND, Clock
-from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError
+from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError, TruckError
 from monstertruck_runtime.mailbox import Mailbox, fifo, latest
 from monstertruck_runtime.requests import Operator
 from monstertruck_schemas.event import Event, Severity
@@ -62,22 +63,31 @@ class Arrival:
 async def drive_to(
     driver: Driver, clock: Clock, goal: tuple[float, float, float], via: Sequence[tuple[float, ...]] = (), *, arm: bool
 ) -> Arrival:
-    """Send a goal and wait for its end; cancelled, it cancels the goal.
+    """Send a goal and wait for its end; cancelled or without an answer, it cancels the goal.
 
     Raises:
         RequestRefusedError: the goal or the arming was refused.
         NoAnswerError: the robot does not answer.
     """
     with driver.subscribe(GOAL, fifo(256)) as states, driver.subscribe(GATE, latest()) as gate:
-        number = int((await driver.goal(goal, via=via))["number"])
-        return await _watched(
-            driver,
-            clock,
-            gate,
-            arm=arm,
-            end=_goal_end(states, number),
-            undo=lambda: driver.goal_control(GoalOrder.CANCEL),
-        )
+
+        async def cancel() -> None:
+            await driver.goal_control(GoalOrder.CANCEL)
+
+        async with _taken_back(cancel):
+            number = int((await driver.goal(goal, via=via))["number"])
+        return await _watched(driver, clock, gate, arm=arm, end=_goal_end(states, number), undo=cancel)
+
+
+@asynccontextmanager
+async def _taken_back(undo: Callable[[], Awaitable[object]]) -> AsyncIterator[None]:
+    """``undo`` a request inside that is cancelled or not answered: the robot may carry it out all the same."""
+    try:
+        yield
+    except (asyncio.CancelledError, NoAnswerError):
+        with suppress(TruckError):
+            await undo()
+        raise
 
 
 async def _goal_end(states: Mailbox[GoalState], number: int) -> Arrival:
@@ -97,7 +107,7 @@ async def _goal_end(states: Mailbox[GoalState], number: int) -> Arrival:
 
 
 async def follow(driver: Driver, clock: Clock, path: Path, *, arm: bool) -> Arrival:
-    """Send a path and wait for its end; cancelled, it stops the truck.
+    """Send a path and wait for its end; cancelled or without an answer, it stops the truck.
 
     Raises:
         RequestRefusedError: the path or the arming was refused.
@@ -110,8 +120,9 @@ async def follow(driver: Driver, clock: Clock, path: Path, *, arm: bool) -> Arri
         driver.subscribe(EVENT, fifo(256)) as events,
         driver.subscribe(PATH, latest()) as present,
     ):
-        await driver.path(path)
-        await _accepted(driver, clock, events, present, path.name)
+        async with _taken_back(driver.stop):
+            await driver.path(path)
+            await _accepted(driver, clock, events, present, path.name)
         return await _watched(driver, clock, gate, arm=arm, end=_path_end(clock, states, path.name), undo=driver.stop)
 
 
@@ -156,7 +167,8 @@ async def _watched(
         if arm and not ((state := gate.latest) is not None and state.mode.active):
             # A truck that is armed already may have set off.
             try:
-                await driver.arm()
+                async with _taken_back(driver.disarm):
+                    await driver.arm()
             except RequestRefusedError as error:
                 raise RequestRefusedError(error.refusal, f"arm refused: {error}") from None
         return await ending

@@ -1,17 +1,19 @@
 """``arm``, ``disarm``, ``estop``, ``reset``: one order each; its outcome is the exit code."""
 
+import asyncio
 import sys
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from monstertruck_runtime.clock import Clock, run_wall
-from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError
+from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError, TruckError
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.tools.cli.options import ENDPOINT, EndpointOption, RobotOption
-from monstertruckd.tools.cli.output import JsonOption, finish, print_json
+from monstertruckd.tools.cli.output import JsonOption, finish, print_json, remark
 
 if TYPE_CHECKING:
     from monstertruck_runtime.client import TruckClient
@@ -47,14 +49,23 @@ class OrderOutcome:
 async def give(client: "TruckClient", order: "Order", *, hold: bool = False) -> OrderOutcome:
     """Give an order and wait for its outcome; ``hold`` as of ``TruckClient.order``.
 
+    An order to arm that is cancelled, or not answered, is followed by one to disarm: the robot may carry it out later.
+
     Raises:
         NoAnswerError: no answer in time.
         NotFoundError: the robot is not there.
     """
+    from monstertruck_schemas.req import Order
     from monstertruck_schemas.topics import GATE
 
     try:
         return OrderOutcome(order, Reason.OK, Reason.OK.text, await client.order(order, hold=hold))
+    except (asyncio.CancelledError, NoAnswerError):
+        if order is Order.ARM:
+            with suppress(TruckError):
+                await client.order(Order.DISARM)
+                remark("disarmed: there was no answer to the order to arm")
+        raise
     except RequestRefusedError as error:
         state = await client.get_retained(GATE)
         if state is None:

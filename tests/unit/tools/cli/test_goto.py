@@ -1,9 +1,18 @@
 """Sending the truck somewhere from the command line."""
 
+import asyncio
+from contextlib import suppress
+
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from monstertruck_runtime.clock import run_virtual
+from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError
+from monstertruck_runtime.mailbox import Mailbox
+from monstertruck_schemas.plan import Path
 from monstertruck_schemas.reasons import Reason
+from monstertruckd.tools.cli.goto_session import drive_to, follow
 from monstertruckd.tools.cli.main import app
 
 
@@ -29,3 +38,89 @@ def test_a_robot_without_a_planner_is_reported(monkeypatch: pytest.MonkeyPatch):
     done = CliRunner().invoke(app, ["goto", "1", "0", "0"])
     assert done.exit_code == Reason.NOT_FOUND.exit_code
     assert done.output == "robot 'truck' has no planner: expected a section `planner` in its configuration\n"
+
+
+class SilentRobot:
+    """Takes requests and answers none, or refuses the goal."""
+
+    source = "ann"
+
+    def __init__(self, silent: str, error: Exception | None = None):
+        self.asked: list[str] = []
+        self._silent = silent
+        self._error = error
+
+    def subscribe(self, _topic, delivery):
+        return Mailbox(delivery)
+
+    async def _ask(self, what):
+        self.asked.append(what)
+        if what == self._silent:
+            if self._error is not None:
+                raise self._error
+            await asyncio.Event().wait()
+
+    async def goal(self, goal, frame="map", via=()):
+        await self._ask("goal")
+        return {"number": 1}
+
+    async def goal_control(self, order):
+        await self._ask(order.value)
+
+    async def path(self, path, lease=1.0):
+        await self._ask("path")
+
+    async def stop(self):
+        await self._ask("stop")
+
+    async def arm(self):
+        await self._ask("arm")
+
+    async def disarm(self):
+        await self._ask("disarm")
+
+
+PATH = Path(stamp=0, received=0, seq=0, frame="odom", name="p", poses=np.zeros(6), directions=np.ones(2))
+
+
+def interrupted(robot, drive):
+    """What the robot was asked for until the command, interrupted after a second, had ended."""
+
+    async def main(clock):
+        driving = asyncio.create_task(drive(robot, clock))
+        await clock.sleep(1.0)
+        driving.cancel()
+        with suppress(asyncio.CancelledError, NoAnswerError, RequestRefusedError):
+            await driving
+
+    run_virtual(main)
+    return robot.asked
+
+
+def to_goal(robot, clock):
+    return drive_to(robot, clock, (1.0, 0.0, 0.0), arm=True)
+
+
+def along_path(robot, clock):
+    return follow(robot, clock, PATH, arm=True)
+
+
+def test_a_goal_whose_request_is_interrupted_is_cancelled():
+    assert interrupted(SilentRobot("goal"), to_goal) == ["goal", "cancel"]
+
+
+def test_a_goal_whose_request_is_not_answered_is_cancelled():
+    assert interrupted(SilentRobot("goal", NoAnswerError("no answer")), to_goal) == ["goal", "cancel"]
+
+
+def test_a_goal_that_is_refused_leaves_the_present_one_alone():
+    refused = RequestRefusedError(Reason.GOAL_UNREACHABLE, "no way")
+    assert interrupted(SilentRobot("goal", refused), to_goal) == ["goal"]
+
+
+def test_arming_that_is_interrupted_is_taken_back_with_the_goal():
+    assert interrupted(SilentRobot("arm"), to_goal) == ["goal", "arm", "disarm", "cancel"]
+
+
+def test_a_path_that_is_interrupted_before_it_is_accepted_stops_the_truck():
+    assert interrupted(SilentRobot("none"), along_path) == ["path", "stop"]

@@ -42,6 +42,44 @@ class Robot:
         return self.newest
 
 
+class SlowRobot(Robot):
+    """Answers an order to arm late or never."""
+
+    def __init__(self, error: TruckError | None = None) -> None:
+        super().__init__(state(GateMode.DISARMED))
+        self.error = error
+
+    async def order(self, order: Order, *, hold: bool = False) -> GateState:
+        self.orders.append(order)
+        if order is not Order.ARM:
+            return self.answer
+        if self.error is not None:
+            raise self.error
+        return await asyncio.Event().wait()
+
+
+def test_an_order_to_arm_that_is_interrupted_is_taken_back(capsys: pytest.CaptureFixture[str]):
+    robot = SlowRobot()
+
+    async def main() -> None:
+        giving = asyncio.create_task(give(robot, Order.ARM))
+        await asyncio.sleep(0.01)
+        giving.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await giving
+
+    asyncio.run(main())
+    assert robot.orders == [Order.ARM, Order.DISARM]
+    assert capsys.readouterr().err == "disarmed: there was no answer to the order to arm\n"
+
+
+def test_an_order_to_arm_without_an_answer_is_taken_back():
+    robot = SlowRobot(NoAnswerError("no answer in time"))
+    with pytest.raises(NoAnswerError):
+        given(robot, Order.ARM)
+    assert robot.orders == [Order.ARM, Order.DISARM]
+
+
 def given(robot: Robot, order: Order) -> OrderOutcome:
     return asyncio.run(give(robot, order))
 
