@@ -1,6 +1,6 @@
 """1000 seeded faults on the whole truck, on the virtual clock: no unsafe motion, nothing stuck, back soon.
 
-    python benchmarks/drill.py [--seed 1] [--count 1000] [--jobs N | --cluster ADDRESS]
+    python benchmarks/drill.py [--seed 1] [--count 1000] [--jobs N | --cluster ADDRESS] [--resume FILE]
 
 What is unsafe is judged by an observer that sees only bytes on the wires of drive and steering, and the world's truth.
 """
@@ -54,10 +54,15 @@ def main() -> int:
     parser.add_argument("--count", type=int, default=1000)
     parser.add_argument("--jobs", type=int, default=default_jobs())
     parser.add_argument("--cluster", metavar="ADDRESS", help="dask scheduler whose workers run it")
+    parser.add_argument(
+        "--resume", type=Path, metavar="FILE", help="go on with the outcomes in this file, and add to it"
+    )
     arguments = parser.parse_args()
     truck = load_config(ROOT / "configs" / "full.yaml", SimulatedTruckConfig)[0]
     began = perf_counter()
-    report = Drill(arguments.seed, arguments.count, truck).run(jobs=arguments.jobs, cluster=arguments.cluster)
+    report = Drill(arguments.seed, arguments.count, truck).run(
+        jobs=arguments.jobs, cluster=arguments.cluster, resume=arguments.resume
+    )
     table(report)
     figures = report.figures() | {"real_s": round(perf_counter() - began, 1)}
     goals = {"unsafe": 0, "stuck": 0, "recovery_p99_s": RECOVERY_GOAL}

@@ -122,6 +122,10 @@ class Daemon:
         self.black_box = self._build_black_box()
         self._notify = notify_from(environment, clock, self.gate.ticks, config.gate.rate, self._status)
 
+    def worker_pids(self) -> dict[str, int]:
+        """Process numbers of the workers that run, by name."""
+        return self._actors.worker_pids()
+
     async def run(self, stop: asyncio.Event) -> None:
         """Run until ``stop`` is set, then end everything inside-out, neutral first.
 

@@ -6,6 +6,7 @@ are made of the actions defined here.
 
 import asyncio
 import errno
+import itertools
 import math
 from collections.abc import Awaitable, Callable, Collection, Iterator
 from dataclasses import dataclass
@@ -67,6 +68,7 @@ class FaultKind(StrEnum):
     COMPUTER_POWER = "computer power lost"
     NETWORK = "network lost"
     MEMORY = "memory full"
+    WORKER = "worker killed"
     OBSTACLE = "obstacle"
 
 
@@ -90,9 +92,17 @@ class ComputerPower(Protocol):
         ...
 
 
+class Workers(Protocol):
+    """Worker processes of a daemon."""
+
+    def kill(self, name: str) -> None:
+        """End a worker as SIGKILL does, and wait until it is dead; nothing if it does not run."""
+        ...
+
+
 @dataclass(frozen=True, slots=True)
 class SimContext:
-    """What faults act on: the simulated side, and of the daemon its disk and its computer's supply only.
+    """What faults act on: the simulated side, and of the daemon its disk, workers and its computer's supply only.
 
     Args:
         config: of the simulation.
@@ -102,6 +112,7 @@ class SimContext:
         clock: time.
         disk: None where nothing records.
         power: None where the computer is this one.
+        workers: None where they are left alone.
     """
 
     config: SimConfig
@@ -111,6 +122,7 @@ class SimContext:
     clock: Clock
     disk: RecorderDisk | None = None
     power: ComputerPower | None = None
+    workers: Workers | None = None
 
     def device(self, role: str) -> Emulated:
         """Emulator and cable of a device."""
@@ -241,6 +253,10 @@ class CatalogFault(Fault[SimContext]):
     disarms: bool = False
 
 
+Maker = Callable[[np.random.Generator], CatalogFault]
+"""Draws a fault of one kind."""
+
+
 def hubs_of(devices: Devices) -> tuple[str, ...]:
     """Hubs that devices are connected to."""
     ports = (device.port for device in devices.present().values())
@@ -255,17 +271,25 @@ class FaultCatalog:
         monitors: of its computer, by name.
         records: whether its daemon writes a log.
         restarts: whether its computer can be switched off.
+        workers: names of its daemon's worker processes.
     """
 
     def __init__(
-        self, devices: Devices, monitors: Collection[str] = (), *, records: bool, restarts: bool = False
+        self,
+        devices: Devices,
+        monitors: Collection[str] = (),
+        *,
+        records: bool,
+        restarts: bool = False,
+        workers: tuple[str, ...] = (),
     ) -> None:
         self._roles = tuple(devices.present())
         self._hubs = hubs_of(devices)
         self._monitors = monitors
         self._records = records
         self._restarts = restarts
-        self._makers = dict(self._list())
+        self._workers = workers
+        self._makers = dict(itertools.chain(self._of_devices(), self._of_the_computer()))
 
     @property
     def kinds(self) -> tuple[FaultKind, ...]:
@@ -277,7 +301,7 @@ class FaultCatalog:
         kinds = [kind for kind in self._makers if kind not in without]
         return self._makers[kinds[rng.integers(len(kinds))]](rng)
 
-    def _list(self) -> Iterator[tuple[FaultKind, Callable[[np.random.Generator], CatalogFault]]]:
+    def _of_devices(self) -> Iterator[tuple[FaultKind, Maker]]:
         serial = tuple(role for role in SERIAL if role in self._roles)
         yield (
             FaultKind.UNPLUG,
@@ -312,6 +336,8 @@ class FaultCatalog:
         if "stabiliser" in self._roles:
             yield FaultKind.ECHO, lambda rng: _cable(rng, FaultKind.ECHO, "stabiliser", *_switch("echo"))
             yield FaultKind.RAIL_12V, _rail_12v
+
+    def _of_the_computer(self) -> Iterator[tuple[FaultKind, Maker]]:
         if self._hubs:
             yield FaultKind.HUB_LOSS, lambda rng: _hubs(rng, FaultKind.HUB_LOSS, (_pick(rng, self._hubs),))
             yield FaultKind.RAIL_ELECTRONICS, lambda rng: _hubs(rng, FaultKind.RAIL_ELECTRONICS, self._hubs)
@@ -323,6 +349,8 @@ class FaultCatalog:
             yield FaultKind.NETWORK, _network
         if "host" in self._monitors:
             yield FaultKind.MEMORY, _memory
+        if self._workers:
+            yield FaultKind.WORKER, lambda rng: _worker(rng, _pick(rng, self._workers))
 
 
 def _pick(rng: np.random.Generator, among: tuple[str, ...]) -> str:
@@ -498,6 +526,14 @@ def _memory(rng: np.random.Generator) -> CatalogFault:
         context.monitored("host", "memory", "0.6")
 
     return _fault(FaultKind.MEMORY, "", fill, free, float(rng.uniform(1.5, 3.0)))
+
+
+def _worker(rng: np.random.Generator, name: str) -> CatalogFault:
+    def kill(context: SimContext) -> None:
+        if context.workers is not None:
+            context.workers.kill(name)
+
+    return _fault(FaultKind.WORKER, name, kill, nothing, _hold(rng))
 
 
 # Supply rails: battery -> EPOS; 12 V -> stabiliser, fan; M4-ATX -> computer, 5 V -> servos, electronics -> lidar, hubs

@@ -1,6 +1,7 @@
 """Random faults on the whole daemon, on the virtual clock, and an observer that is not to be fooled."""
 
 import asyncio
+import json
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -14,8 +15,10 @@ from monstertruck_drivers.cable import MemoryPort
 from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos.protocol import write_request
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
+from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.mailbox import fifo
 from monstertruck_schemas import topics
+from monstertruck_schemas.health import HealthTable
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order
 from monstertruck_schemas.state import GateMode
@@ -24,7 +27,7 @@ from monstertruck_sim.world.obstacles import Disc
 from monstertruck_sim.world.world import World
 from monstertruckd.config.load import load_config
 from monstertruckd.tools.drill.observer import Observer, Violation
-from monstertruckd.tools.drill.random_drill import DEADMAN, Drill, DrillReport, FaultOutcome
+from monstertruckd.tools.drill.random_drill import DEADMAN, TRACKER_IN_WORKER, Drill, DrillReport, FaultOutcome, run_leg
 from monstertruckd.tools.drill.truck import DrillTruck
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
@@ -46,7 +49,7 @@ def demo() -> SimulatedTruckConfig:
 
 def catalog_of(config: SimulatedTruckConfig) -> FaultCatalog:
     monitors, records = config.monitors.present(), config.recorder is not None
-    return FaultCatalog(config.devices, monitors, records=records, restarts=True)
+    return FaultCatalog(config.devices, monitors, records=records, restarts=True, workers=("tracking",))
 
 
 def test_random_faults_end_safely_and_leave_nothing_behind():
@@ -62,6 +65,86 @@ def test_one_seed_is_one_report():
     runs = [Drill(7, 3, with_overlay(demo(), {"recorder": None})).run() for _ in range(2)]
     assert runs[0] == runs[1]
     assert {o.fault for o in Drill(8, 3, demo()).run().outcomes} != {o.fault for o in runs[0].outcomes}
+
+
+def test_the_tracker_of_every_second_truck_runs_in_a_worker_that_may_be_killed():
+    kinds = {number: {o.kind for o in run_leg(leg)} for number, leg in enumerate(worker_drill().legs())}
+    assert FaultKind.WORKER not in kinds[0]
+    assert FaultKind.WORKER in kinds[1]
+
+
+def worker_drill() -> Drill:
+    """Two legs; the seed is one that draws a killed worker for the second."""
+    return Drill(3, 8, with_overlay(demo(), {"recorder": None}), leg=4)
+
+
+def test_a_truck_whose_trackers_worker_is_killed_says_so_and_drives_on_with_a_new_one():
+    async def main(clock: VirtualClock) -> None:
+        overlay = {**DEADMAN, **TRACKER_IN_WORKER, "recorder": None}
+        async with DrillTruck.running(with_overlay(demo(), overlay), clock) as truck:
+            assert await truck.until(truck.drives, 15.0, Order.ARM)
+            (before,) = truck.rig.daemon.worker_pids().values()
+            truck.rig.kill("tracking")
+            truck.rig.kill("no such worker")
+            truck.reports()
+            await clock.sleep(1.0)
+            services = [r for report in truck.reports() if isinstance(report, HealthTable) for r in report.services]
+            assert Reason.WORKER_DIED in {row.reason for row in services if row.name == "tracker"}
+            assert await truck.until(truck.drives, 3.0)
+            (after,) = truck.rig.daemon.worker_pids().values()
+            assert after != before
+
+    run_virtual(main)
+
+
+# Interrupted
+
+
+def resumable(count: int = 4, seed: int = 7) -> Drill:
+    return Drill(seed, count, with_overlay(demo(), {"recorder": None}), leg=2)
+
+
+def test_an_interrupted_drill_goes_on_where_it_ended_and_gives_the_same_report(tmp_path: Path):
+    class InterruptedDrillError(Exception): ...
+
+    def interrupt(_: list[FaultOutcome]) -> None:
+        raise InterruptedDrillError
+
+    file = tmp_path / "legs.jsonl"
+    with pytest.raises(InterruptedDrillError):
+        resumable().run(resume=file, report=interrupt)
+    with file.open("ab") as half:
+        half.write(file.read_bytes()[:50])
+    parts: list[list[FaultOutcome]] = []
+    began: list[int] = []
+    again = resumable()
+    legs = again.legs
+    again.legs = lambda: began.append(len(file.read_bytes().splitlines())) or legs()  # type: ignore[method-assign]
+    report = again.run(resume=file, report=parts.append)
+    assert began == [2]
+    assert report == resumable().run()
+    assert [len(part) for part in parts] == [2, 2]
+    lines = file.read_bytes().splitlines()
+    assert [json.loads(line)["leg"] for line in lines] == [0, 1]
+    assert resumable().run(resume=file) == report
+    assert file.read_bytes().splitlines() == lines, "nothing was run again"
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("rubbish\n", "line 1 is no leg of a drill"),
+        ('{"seed": 7, "program": "x", "leg": 0, "count": 2, "outcomes": []}\n', "of another program"),
+    ],
+)
+def test_a_file_of_something_else_is_refused(tmp_path: Path, text: str, expected: str):
+    file = tmp_path / "legs.jsonl"
+    file.write_text(text)
+    with pytest.raises(InputError, match=expected):
+        resumable().run(resume=file)
+    assert file.read_text() == text
+    with pytest.raises(InputError, match="Is a directory"):
+        resumable().run(resume=tmp_path)
 
 
 def test_every_kind_is_on_the_catalog_of_the_whole_truck_and_what_needs_hubs_is_not_without():
@@ -166,6 +249,16 @@ def test_motion_after_an_emergency_stop_is_seen_until_it_is_reset():
 
 def test_motion_after_a_fault_that_must_stop_is_seen():
     assert watched(motor(10_000), stops=True) == {"stop"}
+
+
+@pytest.mark.parametrize("order", ["disarmed", "estopped"])
+@pytest.mark.parametrize(("later", "rules"), [(0.05, set()), (0.15, {"stopping bytes"})])
+def test_bytes_that_ask_a_stopping_truck_for_a_speed_are_seen(order: str, later: float, rules: set[str]):
+    def scene(bare: Bare) -> None:
+        motor(10_000)(bare)
+        targets(bare, (later, 0.01), (later + 0.1, 0.0))
+
+    assert watched(scene, seconds=0.5, **{order: True}) == rules
 
 
 def test_setting_off_again_after_a_fault_that_must_disarm_is_seen():

@@ -24,6 +24,10 @@ def drill(
         str | None,
         typer.Option(metavar="ADDRESS", help="Dask scheduler whose workers run it, such as tcp://HOST:8786."),
     ] = None,
+    resume: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Outcomes of an interrupted drill, which goes on; new ones are added."),
+    ] = None,
     json_output: JsonOption = False,
 ) -> None:
     """Inject random faults into the emulated truck while it drives, and score its reactions.
@@ -34,7 +38,7 @@ def drill(
     from monstertruckd.tools.drill.random_drill import Drill, default_jobs
     from monstertruckd.tools.simulation.config import load_simulated
 
-    report = _run(Drill(seed, count, load_simulated(config)), jobs or default_jobs(), cluster)
+    report = _run(Drill(seed, count, load_simulated(config)), jobs or default_jobs(), cluster, resume)
     if json_output:
         print_json(report.as_json())
     else:
@@ -43,7 +47,7 @@ def drill(
         raise typer.Exit(1)
 
 
-def _run(drill: "Drill", jobs: int, cluster: str | None) -> "DrillReport":
+def _run(drill: "Drill", jobs: int, cluster: str | None, resume: Path | None) -> "DrillReport":
     finished = 0
     with progress("faults", drill.count) as done:
 
@@ -52,7 +56,7 @@ def _run(drill: "Drill", jobs: int, cluster: str | None) -> "DrillReport":
             finished += len(outcomes)
             done(finished)
 
-        return drill.run(jobs=jobs, cluster=cluster, report=show)
+        return drill.run(jobs=jobs, cluster=cluster, resume=resume, report=show)
 
 
 def _print(report: "DrillReport") -> None:

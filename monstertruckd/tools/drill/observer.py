@@ -49,6 +49,8 @@ HELD_WITHIN: Final = 1.0
 """Seconds for which a motor may be commanded to turn a shaft that is held."""
 RAMP_SLACK: Final = 0.1
 """Seconds by which the bytes on the wire may be ahead of the ramp: ticks and exchanges have no common beat."""
+STOPS_ASKING_WITHIN: Final = 0.1
+"""Seconds after an order that stops from which on no bytes ask a moving truck for a speed."""
 BRAKES_WITHIN: Final = 0.4
 """Seconds for which a truck may be too fast for the room before it: something may step in its way."""
 LOOKS: Final = 5
@@ -193,6 +195,9 @@ class _Standstill:
                 self.stood = now
         if not moving:
             return
+        ordered = min((at for at in (self.disarmed, self.estopped) if at is not None), default=now)
+        if now > ordered + STOPS_ASKING_WITHIN * SECOND and any(asked for _, asked in seen.targets):
+            yield "stopping bytes", f"{seen.target:.3f} m/s asked for at {speed:.3f} m/s though it was ordered to stop"
         limit = round(STOPS_WITHIN * SECOND)
         if self.disarmed is not None and now > self.disarmed + limit:
             yield "disarmed", f"{speed:.3f} m/s though disarmed"

@@ -4,6 +4,10 @@ A drill consists of legs. Each leg has a truck and a virtual clock of its own an
 seed, so that legs can run in parallel, here or on a cluster, and still give the same report.
 """
 
+import asyncio
+import hashlib
+import importlib.util
+import json
 import logging
 import os
 import threading
@@ -11,11 +15,14 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final, TypeVar
 
 import numpy as np
+from pydantic import TypeAdapter
 
+from monstertruck_planners.steps import TRACKING
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.errors import InputError, NoAnswerError, WorkerError
 from monstertruck_schemas.event import Event, Severity
@@ -42,12 +49,25 @@ RECOVERS_WITHIN: Final = 4.0
 """Seconds within which everything should be back: the goal of a lost hub."""
 ESTOPS: Final = 5
 """Every so many faults are followed by an emergency stop, the others by a disarm order."""
-QUIET: Final = frozenset({Reason.OK, Reason.DISARMED, Reason.CLIPPED, Reason.SERVO_LIMIT, Reason.OBSTACLE_SLOW})
+QUIET: Final = frozenset(
+    {
+        Reason.OK,
+        Reason.DISARMED,
+        Reason.CLIPPED,
+        Reason.SERVO_LIMIT,
+        Reason.OBSTACLE_SLOW,
+        Reason.NOT_ARMED_SPEED,  # of the order to arm a truck that still stops
+    }
+)
 """Reasons that explain nothing."""
 OBSTACLE: Final = frozenset({Reason.OBSTACLE_STOP, Reason.OBSTACLE_SLOW})
 """Reasons of a truck that stands, or creeps, before something."""
 DEADMAN: Final[dict[str, Any]] = {"map": None, **DEADMAN_LINE}
 """Of every truck: the deadman line, and no map."""
+TRACKER_IN_WORKER: Final[dict[str, Any]] = {"placement": {"tracker": "worker"}}
+"""Of every second truck."""
+STILL_STOPS: Final = 0.05
+"""True speed of a truck that may not be armed yet, m/s."""
 
 
 def default_jobs() -> int:
@@ -192,6 +212,7 @@ class Drill:
         *,
         jobs: int = 1,
         cluster: str | None = None,
+        resume: Path | None = None,
         report: Callable[[list[FaultOutcome]], None] = lambda _: None,
     ) -> DrillReport:
         """Run all of it.
@@ -199,21 +220,30 @@ class Drill:
         Args:
             jobs: processes; 1 = this one alone.
             cluster: address of a dask scheduler, whose workers run it instead.
+            resume: file of the outcomes: legs that are in it are not run again, the others are added.
             report: called with the outcomes of each leg, in the order of their numbers.
 
         Raises:
-            InputError, NoAnswerError, WorkerError: see ``on_cluster``.
+            InputError: see ``LegFile`` and ``on_cluster``.
+            NoAnswerError, WorkerError: see ``on_cluster``.
         """
+        legs = self.legs()
+        file = None if resume is None else LegFile(resume, legs[0])
+        known = {} if file is None else {leg.number: found for leg in legs if (found := file.outcomes(leg))}
         outcomes: list[FaultOutcome] = []
-        with self._parts(jobs, cluster) as parts:
-            for part in parts:
+        with self._parts([leg for leg in legs if leg.number not in known], jobs, cluster) as parts:
+            for leg in legs:
+                part = known.get(leg.number)
+                if part is None:
+                    part = next(parts)
+                    if file is not None:
+                        file.add(leg, part)
                 report(part)
                 outcomes += part
         return DrillReport(self.seed, tuple(outcomes))
 
     @contextmanager
-    def _parts(self, jobs: int, cluster: str | None) -> Iterator[Iterator[list[FaultOutcome]]]:
-        legs = self.legs()
+    def _parts(self, legs: list[DrillLeg], jobs: int, cluster: str | None) -> Iterator[Iterator[list[FaultOutcome]]]:
         if cluster is not None:
             with on_cluster(cluster, run_leg, legs) as parts:
                 yield parts
@@ -222,6 +252,95 @@ class Drill:
         else:
             with ProcessPoolExecutor(min(jobs, max(1, len(legs)))) as pool:
                 yield pool.map(run_leg, legs)
+
+
+class LegFile:
+    """Outcomes of the finished legs of a drill, one JSON object a line, so that an interrupted drill goes on.
+
+    Args:
+        path: the file; made with the first leg that is added.
+        leg: any one of the drill.
+
+    Raises:
+        InputError: it cannot be read, or is of another drill or program.
+    """
+
+    def __init__(self, path: Path, leg: DrillLeg) -> None:
+        self._path = path
+        self._header = {"seed": leg.seed, "program": _digest(leg.config)}
+        self._found: dict[tuple[int, int], list[FaultOutcome]] = {}
+        self._end = 0
+        """Bytes of whole lines: an interrupted program leaves part of one."""
+        try:
+            data = path.read_bytes()
+        except FileNotFoundError:
+            return
+        except OSError as error:
+            raise InputError(f"{path}: {error.strerror}") from error
+        self._end = data.rfind(b"\n") + 1
+        for number, line in enumerate(data[: self._end].splitlines(), 1):
+            self._read(line, number)
+
+    def _read(self, line: bytes, number: int) -> None:
+        try:
+            row = json.loads(line)
+            header = {key: row[key] for key in self._header}
+            outcomes = _OUTCOMES.validate_python(row["outcomes"], strict=False)
+            leg = int(row["leg"]), int(row["count"])
+        except (ValueError, TypeError, KeyError) as error:
+            raise InputError(f"{self._path}: line {number} is no leg of a drill") from error
+        if header != self._header:
+            text = f"{self._path}: line {number} is of seed {header['seed']}, or of another program or configuration"
+            raise InputError(f"{text}: expected seed {self._header['seed']} and the same program")
+        self._found[leg] = outcomes
+
+    def outcomes(self, leg: DrillLeg) -> list[FaultOutcome] | None:
+        """Those of a finished leg; None if it has to be run."""
+        return self._found.get((leg.number, leg.count))
+
+    def add(self, leg: DrillLeg, outcomes: list[FaultOutcome]) -> None:
+        """Append a finished leg.
+
+        Raises:
+            InputError: the file cannot be written.
+        """
+        row = {**self._header, "leg": leg.number, "count": leg.count}
+        line = json.dumps(row | {"outcomes": _OUTCOMES.dump_python(outcomes, mode="json")}).encode() + b"\n"
+        try:
+            with self._path.open("r+b" if self._path.exists() else "wb") as file:
+                file.seek(self._end)
+                file.write(line)
+                file.truncate()
+                file.flush()
+                os.fsync(file.fileno())
+        except OSError as error:
+            raise InputError(f"{self._path}: {error.strerror}") from error
+        self._end += len(line)
+
+
+_OUTCOMES: Final = TypeAdapter(list[FaultOutcome])
+PACKAGES: Final = (
+    "monstertruck_schemas",
+    "monstertruck_runtime",
+    "monstertruck_kinematics",
+    "monstertruck_estimation",
+    "monstertruck_planners",
+    "monstertruck_drivers",
+    "monstertruck_sim",
+    "monstertruckd",
+)
+
+
+def _digest(config: dict[str, Any]) -> str:
+    """Of everything that decides the outcome of a leg but seed and number: the configuration and our sources."""
+    digest = hashlib.blake2b(repr(config).encode(), digest_size=12)
+    for package in PACKAGES:
+        spec = importlib.util.find_spec(package)
+        assert spec is not None
+        for folder in spec.submodule_search_locations or ():
+            for source in sorted(Path(folder).rglob("*.py")):
+                digest.update(source.read_bytes())
+    return digest.hexdigest()
 
 
 _ALONE: Final = threading.Lock()
@@ -253,8 +372,11 @@ class _LegRun:
         self._clock = clock
         self._rng = np.random.default_rng([leg.seed, leg.number])
         base = with_overlay(SimulatedTruckConfig.model_validate(leg.config), DEADMAN)
+        workers: tuple[str, ...] = ()
+        if base.tracker is not None and leg.number % 2:
+            base, workers = with_overlay(base, TRACKER_IN_WORKER), (TRACKING,)
         monitors, records = base.monitors.present(), base.recorder is not None
-        catalog = FaultCatalog(base.devices, monitors, records=records, restarts=True)
+        catalog = FaultCatalog(base.devices, monitors, records=records, restarts=True, workers=workers)
         self._faults = _draw(catalog, leg.count, self._rng)
         records = any(fault.kind is FaultKind.DISK_FULL for fault in self._faults)
         recorder = base.recorder.model_copy(update={"directory": folder}) if records and base.recorder else None
@@ -317,7 +439,11 @@ async def _react(truck: DrillTruck, fault: CatalogFault, cruise: float, order: O
         observer.estop()
     else:
         observer.disarm()
-    await truck.order(order)
+    stopping = asyncio.create_task(truck.order(order), name="stopping")
+    await clock.sleep(STOPS_WITHIN / 10)
+    if abs(observer.speed) > STILL_STOPS:
+        await truck.order(Order.ARM)  # must be refused
+    await stopping
     await clock.sleep(STOPS_WITHIN / 2)
     standstill = observer.standstill_after()
     reason = next((reason for report in truck.reports() for reason in _reasons(report)), None)

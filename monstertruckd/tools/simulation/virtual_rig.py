@@ -1,6 +1,8 @@
 """Daemon, emulated devices and world on one virtual loop: for the fast demo, tests and drills."""
 
 import asyncio
+import os
+import signal
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -64,7 +66,9 @@ class VirtualRig:
         """What faults act on."""
         config = self.config
         disk = self.daemon.recorder
-        return SimContext(config.sim, config.devices, self.robot, self.computer, self.clock, disk, power=self)
+        return SimContext(
+            config.sim, config.devices, self.robot, self.computer, self.clock, disk, power=self, workers=self
+        )
 
     @asynccontextmanager
     async def running(self) -> AsyncIterator["VirtualRig"]:
@@ -103,6 +107,15 @@ class VirtualRig:
         """A new daemon on the same robot; what subscribed to the one before hears nothing of it."""
         self.daemon = self._new_daemon()
         self._start_daemon()
+
+    # The daemon's worker processes
+
+    def kill(self, name: str) -> None:
+        """End a worker as SIGKILL does, and wait until it is dead; nothing if it does not run."""
+        pid = self.daemon.worker_pids().get(name)
+        if pid is not None:
+            os.kill(pid, signal.SIGKILL)
+            os.waitid(os.P_PID, pid, os.WEXITED | os.WNOWAIT)
 
     def _new_daemon(self) -> Daemon:
         devices = self.config.devices.present()

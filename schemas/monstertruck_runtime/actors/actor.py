@@ -151,7 +151,7 @@ class WorkerActor:
     done, and results due together come in the order of submission, so that runs are reproducible.
 
     Args:
-        name: for error texts.
+        name: for error texts, and ``ActorFactory.worker_pids``.
         target: ``module:factory``; what the factory returns has ``step(inputs) -> outputs``, both picklable.
         clock: time.
         latency: declared seconds of a step on the reference computer.
@@ -174,7 +174,7 @@ class WorkerActor:
         start_timeout: float = 30.0,
         answer_timeout: float | None = None,
     ) -> None:
-        self._name = name
+        self.name = name
         self._target = target
         self._clock = clock
         self._latency = latency * cpu_factor
@@ -247,7 +247,7 @@ class WorkerActor:
                 async with self._clock.deadline(self._start_timeout):
                     await asyncio.to_thread(process.receive)
         except TimeoutError:
-            msg = f"worker {self._name} did not start within {self._start_timeout} s"
+            msg = f"worker {self.name} did not start within {self._start_timeout} s"
             raise WorkerTimeoutError(msg) from None
         self._built = True
 
@@ -272,10 +272,10 @@ class WorkerActor:
         raise self._late()
 
     def _late(self) -> WorkerTimeoutError:
-        return WorkerTimeoutError(f"worker {self._name} missed its deadline of {self._deadline} s and was killed")
+        return WorkerTimeoutError(f"worker {self.name} missed its deadline of {self._deadline} s and was killed")
 
     def _spawn(self) -> WorkerProcess:
-        self._process, self._built = WorkerProcess(self._name, self._target, self._answer_timeout), False
+        self._process, self._built = WorkerProcess(self.name, self._target, self._answer_timeout), False
         return self._process
 
     async def _discard(self) -> None:
@@ -307,6 +307,11 @@ class ActorFactory:
     def __init__(self, clock: Clock, remote: RemoteWorkQueue) -> None:
         self._clock = clock
         self._remote = remote
+        self._workers: list[WorkerActor] = []
+
+    def worker_pids(self) -> dict[str, int]:
+        """Process numbers of the workers that run, by name."""
+        return {worker.name: worker.pid for worker in self._workers if worker.pid is not None}
 
     def actor(
         self,
@@ -323,8 +328,10 @@ class ActorFactory:
             case "loop":
                 return LoopActor(target, self._clock, latency)
             case "worker":
-                return WorkerActor(
+                worker = WorkerActor(
                     name, target, self._clock, latency=latency, deadline=deadline, start_timeout=start_timeout
                 )
+                self._workers.append(worker)
+                return worker
             case "remote":
                 return self._remote.actor(name, self._clock, deadline=deadline, start_timeout=start_timeout)
