@@ -83,7 +83,7 @@ class ZenohConfig(Schema):
     """Routers of a fleet to connect to; tried again for ever."""
     tls: TlsConfig | None = None
     insecure: bool = False
-    """Allow endpoints on a network without TLS: anybody there may drive the truck."""
+    """Allow endpoints on a network without TLS, to listen at or to connect to: anybody there may drive the truck."""
     access_control: bool = False
     """Refuse forged state from everybody who can connect; always on with ``tls``. Subscribers must then ask for
     one group (``mt/truck/state/**``): wider expressions get nothing."""
@@ -95,19 +95,23 @@ class ZenohConfig(Schema):
 
     @property
     def open_endpoints(self) -> tuple[str, ...]:
-        """Endpoints at which anybody on a network may ask for everything."""
-        return tuple(endpoint for endpoint in self.listen if _open_to_network(endpoint))
+        """Endpoints by which anybody on a network may ask for everything: own ones, and routers dialled."""
+        return tuple(endpoint for endpoint in (*self.listen, *self.connect) if _open_to_network(endpoint))
+
+    @property
+    def certified_endpoints(self) -> tuple[str, ...]:
+        """Endpoints that ask for a certificate."""
+        return tuple(end for end in (*self.listen, *self.listen_pilots, *self.connect) if protocol_of(end) == "tls")
 
     @model_validator(mode="after")
     def _guarded(self) -> Self:
         if self.open_endpoints and not self.insecure:
             raise ValueError(
-                f"zenoh.listen: {', '.join(self.open_endpoints)}: anybody on the network could drive the truck; "
+                f"zenoh: {', '.join(self.open_endpoints)}: anybody on the network could drive the truck; "
                 "expected tls/... endpoints with zenoh.tls (monstertruckd security init), or zenoh.insecure: true"
             )
-        tls = [end for end in (*self.listen, *self.listen_pilots) if protocol_of(end) == "tls"]
-        if tls and self.tls is None:
-            raise ValueError(f"zenoh: {', '.join(tls)} needs zenoh.tls")
+        if self.certified_endpoints and self.tls is None:
+            raise ValueError(f"zenoh: {', '.join(self.certified_endpoints)} needs zenoh.tls")
         plain = [end for end in self.listen_pilots if protocol_of(end) != "tls"]
         if self.listen_pilots and (plain or self.tls is None or self.tls.pilots_ca is None):
             raise ValueError("zenoh.listen_pilots: expected tls/... endpoints, and zenoh.tls.pilots_ca")

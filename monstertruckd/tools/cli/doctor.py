@@ -65,7 +65,7 @@ async def _run_checks(context: "HostContext") -> "list[Finding]":
         *computer.calendar(context),
         *computer.condition(context),
         *computer.link(context),
-        *[finding async for finding in computer.access(context)],
+        *computer.access(context),
     ]
 
 

@@ -1,6 +1,7 @@
 """Checks of the computer: clock, disk, temperature, memory, network, and who may reach the daemon."""
 
-from collections.abc import AsyncIterator, Iterator
+import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
@@ -10,12 +11,13 @@ from monstertruck_drivers.link_quality.config import LinkQualityConfig
 from monstertruck_drivers.link_quality.driver import LinkJudge
 from monstertruck_drivers.link_quality.interfaces import choose, read_interfaces
 from monstertruck_runtime.clock import SECOND
-from monstertruck_runtime.errors import DeviceError
+from monstertruck_runtime.endpoints import port_of
+from monstertruck_runtime.errors import DeviceError, InputError
 from monstertruck_runtime.small_files import text_of
 from monstertruck_schemas.health import LinkLevel
 from monstertruck_schemas.reasons import Reason
-from monstertruckd.bus.zenoh_config import TlsConfig
 from monstertruckd.tools.doctor.context import Finding, HostContext, fail, fine, warn
+from monstertruckd.tools.security.certificates import DAY, common_name, read_certificates, seconds_left
 
 SYNCHRONIZED: Final = Path("/run/systemd/timesync/synchronized")
 """Made by systemd-timesyncd once the clock is synchronized."""
@@ -23,8 +25,8 @@ DAEMONS: Final = ("chronyd", "ntpd", "ntpsec")
 YEAR_2024: Final = 1_704_067_200 * SECOND
 """ns since 1970: a clock before it was never set."""
 GIGABYTE: Final = 1e9
-MONTH: Final = 30 * 24 * 3600
-LOOPBACK: Final = ("127.", "localhost", "[::1]")
+MONTH: Final = 30
+"""Days."""
 LISTEN: Final = "0A"
 """State of a listening socket in /proc/net/tcp."""
 
@@ -98,62 +100,71 @@ def link(context: HostContext) -> Iterator[Finding]:
         yield fine("link", seen)
 
 
-async def access(context: HostContext) -> AsyncIterator[Finding]:
-    """Endpoints, certificates, and whether another process has the port."""
+def access(context: HostContext) -> Iterator[Finding]:
+    """Endpoints, certificates, whose requests arrive, and whether another process has a port."""
     if context.config is None:
         return
     zenoh = context.config.zenoh
-    outside = [endpoint for endpoint in zenoh.listen if not _address(endpoint).startswith(LOOPBACK)]
-    opened = [endpoint for endpoint in outside if not endpoint.startswith("tls/")]
-    if opened:
+    if zenoh.open_endpoints:
         seen = (
-            f"zenoh.listen {', '.join(opened)}: anyone who reaches it may drive the truck; use tls/... with zenoh.tls"
+            f"{', '.join(zenoh.open_endpoints)}: anyone who reaches it may drive the truck; use tls/... with zenoh.tls"
         )
         yield fail("access", Reason.LINK_OPEN, seen)
-    elif outside:
-        yield fine("access", f"{', '.join(outside)}, by certificate")
+    elif zenoh.certified_endpoints:
+        yield fine("access", f"{', '.join(zenoh.certified_endpoints)}, by certificate")
     else:
         yield fine("access", "from this computer only")
     if zenoh.tls is not None:
-        for finding in _files(context, zenoh.tls):
-            yield finding
-        async for finding in _expiry(context, zenoh.tls.certificate):
-            yield finding
-    for endpoint in zenoh.listen if context.daemon() is None else ():
-        port = _address(endpoint).rpartition(":")[2]
-        if port.isdigit() and int(port) in _listening(context):
+        names = ", ".join(f"{name} ({grant.role})" for name, grant in zenoh.tls.grants().items())
+        seen = f"{names}; Zenoh drops requests under another name than the certificate's, and answers nothing"
+        yield fine("names", seen)
+        for file in dict.fromkeys((zenoh.tls.ca, zenoh.tls.pilots_ca, zenoh.tls.certificate, zenoh.tls.key)):
+            if file is not None:
+                yield from _file(context, file, private=file == zenoh.tls.key)
+    for endpoint in (*zenoh.listen, *zenoh.listen_pilots) if context.daemon() is None else ():
+        port = port_of(endpoint)
+        if port in _listening(context):
             yield fail("port", Reason.BUSY, f"{endpoint} is taken", f"sudo ss -ltnp 'sport = :{port}'")
 
 
-def _address(endpoint: str) -> str:
-    return endpoint.partition("/")[2]
-
-
-def _files(context: HostContext, tls: TlsConfig) -> Iterator[Finding]:
-    for file in (tls.ca, tls.certificate, tls.key):
-        place = context.at(file) if file.is_absolute() else file
-        if not place.is_file():
-            yield fail("tls", Reason.NOT_FOUND, f"{file}: no such file")
-        elif context.account is not None and not context.account.may_read(place):
-            fix = f"sudo chown {context.account.name} {file}"
-            yield fail("tls", Reason.NOT_PERMITTED, f"{context.account.name} may not read {file}", fix)
-        elif file == tls.key and place.stat().st_mode & 0o077:
-            yield warn("tls", Reason.LINK_OPEN, f"{file}: others may read the private key", f"sudo chmod 600 {file}")
-
-
-async def _expiry(context: HostContext, certificate: Path) -> AsyncIterator[Finding]:
-    file = context.at(certificate) if certificate.is_absolute() else certificate
+def _file(context: HostContext, file: Path, *, private: bool) -> Iterator[Finding]:
+    place = context.at(file) if file.is_absolute() else file
     try:
-        code, _ = await context.computer.machine.run(
-            ["openssl", "x509", "-noout", "-checkend", str(MONTH), "-in", str(file)]
-        )
-    except OSError:  # no openssl here
+        status = place.stat()
+    except FileNotFoundError:
+        yield fail("tls", Reason.NOT_FOUND, f"{file}: no such file")
         return
-    if code == 0:
-        yield fine("certificate", "good for a month at least")
-    elif file.is_file():
-        fix = f"openssl x509 -noout -dates -in {certificate}"
-        yield warn("certificate", Reason.LINK_OPEN, f"{certificate} runs out within a month, or is none", fix)
+    except PermissionError:
+        yield _not_checked(context, file)
+        return
+    if context.account is not None and not context.account.may_read(place):
+        fix = f"sudo chown {context.account.name} {file}"
+        yield fail("tls", Reason.NOT_PERMITTED, f"{context.account.name} may not read {file}", fix)
+    elif private and status.st_mode & 0o077:
+        yield warn("tls", Reason.LINK_OPEN, f"{file}: others may read the private key", f"sudo chmod 600 {file}")
+    if not private:
+        yield _expiry(context, file, place) if os.access(place, os.R_OK) else _not_checked(context, file)
+
+
+def _expiry(context: HostContext, file: Path, place: Path) -> Finding:
+    """The certificate of a file, or of the station let in by it, that expires first."""
+    clock = context.computer.machine.clock
+    now = (clock.now() + clock.real_offset()) // SECOND
+    try:
+        days, name = min((seconds_left(one, now) // DAY, common_name(one)) for one in read_certificates(place))
+    except InputError:
+        return fail("certificate", Reason.BAD_INPUT, f"{file}: expected certificates")
+    show = context.command("security", "show")
+    if days < 0:
+        return fail("certificate", Reason.NOT_PERMITTED, f"{file}: that of {name} expired {-days} days ago", show)
+    if days < MONTH:
+        return warn("certificate", Reason.NOT_PERMITTED, f"{file}: that of {name} expires in {days} days", show)
+    return fine("certificate", f"{file}: good for {days} days")
+
+
+def _not_checked(context: HostContext, file: Path) -> Finding:
+    seen = f"{file}: not checked, this user may not read it"
+    return warn("tls", Reason.NOT_PERMITTED, seen, context.command("doctor", sudo=True))
 
 
 def _listening(context: HostContext) -> set[int]:

@@ -75,10 +75,25 @@ def read_certificate(path: Path) -> x509.Certificate:
     Raises:
         InputError: there is none.
     """
+    return read_certificates(path)[0]
+
+
+def read_certificates(path: Path) -> list[x509.Certificate]:
+    """All certificates of a file.
+
+    Raises:
+        InputError: there is none, or one is damaged.
+    """
     try:
-        return x509.load_pem_x509_certificate(path.read_bytes())
+        return x509.load_pem_x509_certificates(path.read_bytes())
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: expected a certificate: {error}") from None
+
+
+def common_name(certificate: x509.Certificate) -> str:
+    """Whom a certificate names; its whole subject if it has no common name."""
+    names = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
+    return str(names[0].value) if names else certificate.subject.rfc4514_string()
 
 
 def seconds_left(certificate: x509.Certificate, now: int) -> int:

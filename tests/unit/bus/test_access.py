@@ -127,11 +127,14 @@ def test_a_network_without_certificates_must_be_asked_for_by_name(endpoint):
     with pytest.raises(ValidationError, match=r"anybody on the network could drive.*security init.*insecure: true"):
         ZenohConfig(listen=("tcp/127.0.0.1:7447", endpoint))
     assert ZenohConfig(listen=(endpoint,), insecure=True).open_endpoints == (endpoint,)
+    with pytest.raises(ValidationError, match=r"anybody on the network could drive.*security init.*insecure: true"):
+        ZenohConfig(connect=(endpoint,))
+    assert ZenohConfig(connect=(endpoint,), insecure=True).open_endpoints == (endpoint,)
 
 
 def test_this_machine_alone_is_no_network():
     listen = ("tcp/127.0.0.1:7447", "tcp/[::1]:7447", "tcp/localhost:7448", "unixsock-stream//run/x.sock")
-    assert ZenohConfig(listen=listen).open_endpoints == ()
+    assert ZenohConfig(listen=listen, connect=listen).open_endpoints == ()
 
 
 @pytest.mark.parametrize(
@@ -139,6 +142,7 @@ def test_this_machine_alone_is_no_network():
     [
         {"listen": ("tls/0.0.0.0:7447",)},
         {"listen_pilots": ("tls/0.0.0.0:7448",)},
+        {"connect": ("tls/fleet.example:7447",)},
         {"listen_pilots": ("tls/0.0.0.0:7448",), "tls": TlsConfig(**FILES, pilots=("ann",))},
         {"listen_pilots": ("tcp/0:1",), "tls": TlsConfig(**FILES, pilots=("ann",), pilots_ca=Path("p.pem"))},
     ],

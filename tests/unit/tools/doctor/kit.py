@@ -95,17 +95,25 @@ def see(
     check: Callable[[HostContext], Any],
     change: Callable[[EmulatedHost], Coroutine[Any, Any, None] | None] = lambda _: None,
 ) -> dict[str, Finding]:
-    """Findings of one check by their name, after ``change`` had its way with the emulated."""
+    """Findings of one check by their name, the last of each, after ``change`` had its way with the emulated."""
+    return {finding.check: finding for finding in see_all(folder, check, change)}
 
-    async def main(clock: VirtualClock) -> dict[str, Finding]:
+
+def see_all(
+    folder: Path,
+    check: Callable[[HostContext], Any],
+    change: Callable[[EmulatedHost], Coroutine[Any, Any, None] | None] = lambda _: None,
+) -> list[Finding]:
+    """All findings of one check, likewise."""
+
+    async def main(clock: VirtualClock) -> list[Finding]:
         clock.step_real(NOW)
         made = emulated(folder, clock)
         changing = change(made)
         if asyncio.iscoroutine(changing):
             await changing
         found = check(made.context)
-        findings = [one async for one in found] if hasattr(found, "__aiter__") else list(found)
-        return {finding.check: finding for finding in findings}
+        return [one async for one in found] if hasattr(found, "__aiter__") else list(found)
 
     return run_virtual(main)
 
