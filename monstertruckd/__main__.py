@@ -3,6 +3,7 @@
 import os
 import signal
 import sys
+from contextlib import AbstractContextManager, nullcontext
 
 
 def main() -> None:
@@ -13,9 +14,19 @@ def main() -> None:
     if sys.argv[1:2] == ["run"]:
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda *_: os._exit(0))
-    from monstertruckd.tools.cli.main import main as command_line  # noqa: PLC0415 - takes half a second
+    with _early(sys.argv[1:]):
+        from monstertruckd.tools.cli.main import main as command_line  # noqa: PLC0415 - takes half a second
 
-    command_line()
+        command_line()
+
+
+def _early(arguments: list[str]) -> AbstractContextManager[None]:
+    """What must not wait until the command line is loaded."""
+    if arguments[:1] != ["estop"]:
+        return nullcontext()
+    from monstertruckd.tools.cli.early_estop import early_estop  # noqa: PLC0415 - of this command only
+
+    return early_estop(arguments[1:])
 
 
 if __name__ == "__main__":

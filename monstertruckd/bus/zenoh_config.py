@@ -9,7 +9,7 @@ from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import Field, model_validator
 
-from monstertruck_runtime.endpoints import host_of, local_endpoint, protocol_of
+from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT, host_of, local_endpoint, protocol_of
 from monstertruck_schemas.base import Schema
 from monstertruck_schemas.req import Role
 from monstertruck_schemas.roles import AccessRole
@@ -73,7 +73,7 @@ class ZenohConfig(Schema):
     """The robot's Zenoh sessions; the default is reachable from this machine only."""
 
     mode: Literal["router", "peer"] = "router"
-    listen: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
+    listen: tuple[str, ...] = (DEFAULT_ENDPOINT,)
     """Endpoints stations connect to."""
     listen_pilots: tuple[str, ...] = ()
     """``tls/...`` endpoints of a session of its own, whose places observers cannot take from pilots and engineers."""

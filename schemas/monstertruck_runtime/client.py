@@ -2,18 +2,12 @@
 
 import asyncio
 import ctypes
-import getpass
 import json
 import logging
-import os
-import re
 import secrets
-import socket
-import stat
 import threading
-from collections.abc import Callable, Coroutine, Mapping, Sequence
+from collections.abc import Callable, Coroutine, Sequence
 from functools import partial
-from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self, TypeVar
 
@@ -22,6 +16,7 @@ from zenoh import ext, handlers
 
 from monstertruck_runtime import wire
 from monstertruck_runtime.clock import Clock, WallClock
+from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruck_runtime.errors import (
     InputError,
     NoAnswerError,
@@ -32,8 +27,9 @@ from monstertruck_runtime.errors import (
 )
 from monstertruck_runtime.mailbox import Delivery, Mailbox, latest
 from monstertruck_runtime.requests import Operator
+from monstertruck_runtime.stations import ClientTls, own_source, session_config, tls_for
 from monstertruck_runtime.threads import ThreadHop, in_thread
-from monstertruck_schemas.base import Message, Schema
+from monstertruck_schemas.base import Message
 from monstertruck_schemas.plan import Path as DrivePath
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import (
@@ -67,79 +63,6 @@ _HOP_DEPTH = 1024
 
 ORDER_TIMEOUT: Final = 6.0
 """Seconds to wait for the outcome of an order: the robot itself gives up after 5 s."""
-
-TLS_VARIABLE: Final = "MONSTERTRUCKD_TLS"
-"""Names the folder of the station's certificate."""
-
-
-class ClientTls(Schema):
-    """Files of a station with its own certificate."""
-
-    ca: Path
-    """Certificate of the authority that signed the robot's."""
-    certificate: Path
-    key: Path
-
-    def owner(self) -> str:
-        """Common name of the certificate.
-
-        Raises:
-            InputError: the file holds no certificate with one.
-        """
-        from cryptography import x509  # noqa: PLC0415 - only for certificates
-        from cryptography.x509.oid import NameOID  # noqa: PLC0415
-
-        try:
-            certificate = x509.load_pem_x509_certificate(self.certificate.read_bytes())
-            return str(certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)[0].value)
-        except (OSError, ValueError, IndexError) as error:
-            raise InputError(f"{self.certificate}: expected a certificate with a common name: {error}") from None
-
-
-def station_tls(environment: Mapping[str, str] = os.environ) -> ClientTls:
-    """The certificate of this user's station: ``ca.pem``, ``station.pem`` and ``station.key`` of one folder.
-
-    The folder is that of ``MONSTERTRUCKD_TLS``, else ``monstertruckd/tls`` in the user's configuration.
-
-    Raises:
-        NotFoundError: a file is missing.
-        NotPermittedError: others may read the key.
-    """
-    home = Path(environment.get("XDG_CONFIG_HOME") or Path.home() / ".config")
-    folder = Path(environment.get(TLS_VARIABLE) or home / "monstertruckd" / "tls")
-    files = ClientTls(ca=folder / "ca.pem", certificate=folder / "station.pem", key=folder / "station.key")
-    for file in (files.ca, files.certificate, files.key):
-        if not file.is_file():
-            raise NotFoundError(f"{file}: not there; tls/... endpoints want it ({TLS_VARIABLE} names another folder)")
-    if files.key.stat().st_mode & (stat.S_IRWXG | stat.S_IRWXO):
-        raise NotPermittedError(f"{files.key}: others may read this key; expected mode 600 (chmod 600 {files.key})")
-    return files
-
-
-def session_config(endpoint: str, timeout: float, tls: ClientTls | None) -> dict[str, Any]:
-    """Of a Zenoh session that dials one endpoint, and neither listens nor discovers.
-
-    Args:
-        endpoint: of the robot.
-        timeout: for the link, s.
-        tls: for ``tls/...`` endpoints.
-    """
-    config: dict[str, Any] = {
-        "mode": "client",
-        "connect": {"endpoints": [endpoint], "timeout_ms": round(timeout * 1000), "exit_on_failure": True},
-        "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
-        "transport": {"shared_memory": {"enabled": False}},
-    }
-    if tls is not None:
-        config["transport"]["link"] = {
-            "tls": {
-                "root_ca_certificate": str(tls.ca),
-                "connect_certificate": str(tls.certificate),
-                "connect_private_key": str(tls.key),
-                "enable_mtls": True,
-            }
-        }
-    return config
 
 
 def in_network_thread(take: Callable[[zenoh.Sample], None]) -> "handlers.Callback[zenoh.Sample]":
@@ -181,7 +104,7 @@ class TruckClient(Operator):
     def __init__(
         self,
         robot: str = "truck",
-        endpoint: str = "tcp/127.0.0.1:7447",
+        endpoint: str = DEFAULT_ENDPOINT,
         *,
         source: str | None = None,
         role: Role = Role.STATION,
@@ -192,7 +115,7 @@ class TruckClient(Operator):
         self.robot = robot
         self.endpoint = endpoint
         self._named = source is not None
-        self.source = source or f"{_user()}:{os.getpid()}"
+        self.source = source or own_source()
         if not SOURCE_NAME.fullmatch(self.source):
             raise InputError(f"source {self.source!r}: expected letters, digits and . _ : - @, but no @ first")
         self.role = role
@@ -451,9 +374,7 @@ class TruckClient(Operator):
             await in_thread(session.close)
 
     def _open(self) -> None:
-        tls = self._tls
-        if tls is None and self.endpoint.startswith("tls/"):
-            tls = station_tls()
+        tls = self._tls or tls_for(self.endpoint)
         if tls is not None:
             self._take_name(tls.owner())
         config = session_config(self.endpoint, self._timeout, tls)
@@ -465,7 +386,7 @@ class TruckClient(Operator):
 
     def _take_name(self, owner: str) -> None:
         if not self._named:
-            self.source = f"{owner}:{_host()}-{os.getpid()}"[:64]
+            self.source = own_source(owner)
         elif self.source.partition(":")[0] != owner:
             raise NotPermittedError(
                 f"source {self.source!r}: the certificate is that of {owner!r}; expected this name, or one that begins "
@@ -550,20 +471,3 @@ def _refusal(data: bytes) -> TruckError:
     }
     kind = kinds.get(reason)
     return RequestRefusedError(reason, text) if kind is None else kind(text)
-
-
-def _user() -> str:
-    try:
-        user = getpass.getuser()
-    except (KeyError, OSError):  # a user id without a name
-        user = str(os.getuid())
-    return f"{_plain(user)}@{_host()}"[:56]
-
-
-def _host() -> str:
-    return _plain(socket.gethostname())
-
-
-def _plain(name: str) -> str:
-    """What of a name may be in a key."""
-    return re.sub(r"[^A-Za-z0-9_.-]", "-", name)

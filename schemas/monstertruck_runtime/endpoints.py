@@ -9,6 +9,7 @@ from typing import Final
 
 SERVICE_FOLDER: Final = Path("/run/monstertruckd")
 """Where the service keeps its sockets."""
+DEFAULT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
 LOCAL_HOSTS: Final = ("127.0.0.1", "localhost", "::1")
 UNIX: Final = "unixsock-stream/"
 

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from monstertruckd.tools.cli.options import ENDPOINT, EndpointOption, RobotOption, complete_config, with_parameters
+from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
+from monstertruckd.tools.cli.options import EndpointOption, RobotOption, complete_config, with_parameters
 from monstertruckd.tools.cli.output import JsonOption, command_group, print_json, print_table, remark
 
 if TYPE_CHECKING:
@@ -58,7 +59,7 @@ def _wizard(make: "Callable[..., Wizard]") -> "Callable[..., Wizard]":
         answer: AnswerOption = None,
         undo: UndoOption = False,
         robot: RobotOption = "truck",
-        endpoint: EndpointOption = ENDPOINT,
+        endpoint: EndpointOption = DEFAULT_ENDPOINT,
         config: FileOption = None,
         json_output: JsonOption = False,
         **own: Any,
@@ -130,7 +131,7 @@ def battery(
 @app.command()
 def show(
     robot: RobotOption = "truck",
-    endpoint: EndpointOption = ENDPOINT,
+    endpoint: EndpointOption = DEFAULT_ENDPOINT,
     config: FileOption = None,
     json_output: JsonOption = False,
 ) -> None:

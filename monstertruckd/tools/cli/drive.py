@@ -6,14 +6,15 @@ from typing import Annotated
 
 import typer
 
+from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruckd.tools.cli.driving_modes import SPEEDS, SteeringMode
-from monstertruckd.tools.cli.options import ENDPOINT, EndpointOption, RobotOption
+from monstertruckd.tools.cli.options import EndpointOption, RobotOption
 from monstertruckd.tools.cli.output import on_terminal, until_stopped
 
 
 def drive(
     robot: RobotOption = "truck",
-    endpoint: EndpointOption = ENDPOINT,
+    endpoint: EndpointOption = DEFAULT_ENDPOINT,
     mode: Annotated[SteeringMode, typer.Option(help="Which axles steer, or twist.")] = SteeringMode.FRONT,
     speed: Annotated[float, typer.Option(min=SPEEDS[0], max=SPEEDS[-1], help="Speed to begin with, m/s.")] = SPEEDS[1],
     angle: Annotated[float, typer.Option(min=1.0, max=45.0, help="Full lock of an axle, degrees.")] = 22.5,

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 import typer
 
 from monstertruck_runtime.clock import Clock, run_wall
+from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruck_runtime.errors import NotFoundError
-from monstertruckd.tools.cli.options import ENDPOINT, EndpointOption, RobotOption, ViaOption, parse_pose
+from monstertruckd.tools.cli.options import EndpointOption, RobotOption, ViaOption, parse_pose
 from monstertruckd.tools.cli.output import JsonOption, finish, print_json
 
 if TYPE_CHECKING:
@@ -28,7 +29,7 @@ def goto(
     via: ViaOption = None,
     arm: ArmOption = False,
     robot: RobotOption = "truck",
-    endpoint: EndpointOption = ENDPOINT,
+    endpoint: EndpointOption = DEFAULT_ENDPOINT,
     json_output: JsonOption = False,
 ) -> None:
     """Drive to a pose in the map: the robot plans, follows and gets itself out of trouble.
@@ -52,7 +53,7 @@ def track(
     closed: Annotated[bool, typer.Option("--closed", help="The path is a lap: its end is its start.")] = False,
     arm: ArmOption = False,
     robot: RobotOption = "truck",
-    endpoint: EndpointOption = ENDPOINT,
+    endpoint: EndpointOption = DEFAULT_ENDPOINT,
     json_output: JsonOption = False,
 ) -> None:
     """Send a path to the robot and follow how it is driven.

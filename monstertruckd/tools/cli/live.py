@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 import typer
 
 from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruck_runtime.errors import NoAnswerError, NotFoundError
-from monstertruckd.tools.cli.options import ENDPOINT, EndpointOption, RobotOption, TopicArgument
+from monstertruckd.tools.cli.options import EndpointOption, RobotOption, TopicArgument
 from monstertruckd.tools.cli.output import JsonOption, on_terminal, print_json, remark, until_stopped
 
 if TYPE_CHECKING:
@@ -24,7 +25,7 @@ SHORT: Final = 16
 
 def status(
     robot: RobotOption = "truck",
-    endpoint: EndpointOption = ENDPOINT,
+    endpoint: EndpointOption = DEFAULT_ENDPOINT,
     once: Annotated[bool, typer.Option("--once", help="Print the state once and end.")] = False,
     json_output: Annotated[bool, typer.Option("--json", help="Machine-readable output; implies --once.")] = False,
 ) -> None:
@@ -40,7 +41,7 @@ def status(
 def echo(
     topic: TopicArgument,
     robot: RobotOption = "truck",
-    endpoint: EndpointOption = ENDPOINT,
+    endpoint: EndpointOption = DEFAULT_ENDPOINT,
     count: Annotated[int | None, typer.Option("--count", "-n", min=1, help="End after so many messages.")] = None,
     timeout: Annotated[
         float | None, typer.Option(min=0.0, help="Give up after so many seconds without a message; exit code 5.")

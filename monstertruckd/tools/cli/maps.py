@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from monstertruckd.tools.cli.options import ENDPOINT, ConfigOption, EndpointOption, RobotOption, with_parameters
+from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
+from monstertruckd.tools.cli.options import ConfigOption, EndpointOption, RobotOption, with_parameters
 from monstertruckd.tools.cli.output import JsonOption, command_group, print_json, progress, remark
 
 if TYPE_CHECKING:
@@ -135,7 +136,7 @@ def show(place: MapPlace, png: Png = None, json_output: JsonOption = False) -> N
 def save(
     output: Annotated[Path, typer.Argument(help="YAML file; its PNG is written next to it.", show_default=False)],
     robot: RobotOption = "truck",
-    endpoint: EndpointOption = ENDPOINT,
+    endpoint: EndpointOption = DEFAULT_ENDPOINT,
     timeout: Annotated[float, typer.Option(min=0.1, help="Seconds to wait for the map.")] = 5.0,
 ) -> None:
     """Save the map of a running robot as map_server files."""

@@ -10,8 +10,6 @@ import typer
 from monstertruck_runtime.endpoints import nearest
 from monstertruck_runtime.errors import InputError
 
-ENDPOINT = "tcp/127.0.0.1:7447"
-
 
 def complete_topic(incomplete: str) -> Iterator[tuple[str, str]]:
     """Topics with what they carry."""

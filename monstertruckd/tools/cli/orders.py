@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from monstertruck_runtime.clock import Clock, run_wall
+from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError, TruckError
 from monstertruck_schemas.reasons import Reason
-from monstertruckd.tools.cli.options import ENDPOINT, EndpointOption, RobotOption
+from monstertruckd.tools.cli.options import EndpointOption, RobotOption
 from monstertruckd.tools.cli.output import JsonOption, finish, print_json, remark
 
 if TYPE_CHECKING:
@@ -113,7 +114,7 @@ def _state_texts(state: "GateState") -> Iterator[str]:
 
 def arm(
     robot: RobotOption = "truck",
-    endpoint: EndpointOption = ENDPOINT,
+    endpoint: EndpointOption = DEFAULT_ENDPOINT,
     json_output: JsonOption = False,
     hold: Annotated[
         bool, typer.Option("--hold", help="Let no tracker drive, along a configured path too, until armed without.")
@@ -123,16 +124,22 @@ def arm(
     _run("arm", robot, endpoint, json_output=json_output, hold=hold)
 
 
-def disarm(robot: RobotOption = "truck", endpoint: EndpointOption = ENDPOINT, json_output: JsonOption = False) -> None:
+def disarm(
+    robot: RobotOption = "truck", endpoint: EndpointOption = DEFAULT_ENDPOINT, json_output: JsonOption = False
+) -> None:
     """Stop the truck by its ordinary ramp, and allow no motion until it is armed again."""
     _run("disarm", robot, endpoint, json_output=json_output)
 
 
-def estop(robot: RobotOption = "truck", endpoint: EndpointOption = ENDPOINT, json_output: JsonOption = False) -> None:
+def estop(
+    robot: RobotOption = "truck", endpoint: EndpointOption = DEFAULT_ENDPOINT, json_output: JsonOption = False
+) -> None:
     """Emergency stop: at once, latched over restarts of the daemon until `reset`."""
     _run("estop", robot, endpoint, json_output=json_output)
 
 
-def reset(robot: RobotOption = "truck", endpoint: EndpointOption = ENDPOINT, json_output: JsonOption = False) -> None:
+def reset(
+    robot: RobotOption = "truck", endpoint: EndpointOption = DEFAULT_ENDPOINT, json_output: JsonOption = False
+) -> None:
     """Clear an emergency stop; the truck must stand and stays disarmed."""
     _run("reset", robot, endpoint, json_output=json_output)

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruckd.tools.cli.logs import LogArgument, TopicsOption
-from monstertruckd.tools.cli.options import ENDPOINT
 from monstertruckd.tools.cli.output import JsonOption, finish, print_json, print_table, progress, remark
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ ROUNDED = "the last digits differ, as between processors whose maths routines ro
 def replay(
     log: LogArgument,
     robot: Annotated[str, typer.Option("--robot", "-r", help="Name to replay under.")] = "truck",
-    endpoint: Annotated[str, typer.Option("--endpoint", "-e", help="Where to listen.")] = ENDPOINT,
+    endpoint: Annotated[str, typer.Option("--endpoint", "-e", help="Where to listen.")] = DEFAULT_ENDPOINT,
     speed: Annotated[float, typer.Option(min=0.01, max=1000, help="Multiple of real time.")] = 1.0,
     topics: TopicsOption = None,
     check: Annotated[bool, typer.Option("--check", help=CHECK)] = False,

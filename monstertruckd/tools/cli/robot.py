@@ -6,7 +6,8 @@ from typing import Annotated
 import typer
 
 from monstertruck_runtime.clock import Clock
-from monstertruckd.tools.cli.options import ENDPOINT, ConfigOption, EndpointOption, RobotOption
+from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
+from monstertruckd.tools.cli.options import ConfigOption, EndpointOption, RobotOption
 from monstertruckd.tools.cli.output import JsonOption, print_json, print_table, until_stopped
 
 
@@ -97,7 +98,7 @@ def reasons(
     print_table(("reason", "exit code", "what"), rows, right=("exit code",))
 
 
-def plan_server(robot: RobotOption = "truck", endpoint: EndpointOption = ENDPOINT) -> None:
+def plan_server(robot: RobotOption = "truck", endpoint: EndpointOption = DEFAULT_ENDPOINT) -> None:
     """Plan and track for a robot whose configuration says `placement: remote`, until Ctrl-C.
 
     It dials the robot, and again whenever the robot restarts; what it knows comes from there.

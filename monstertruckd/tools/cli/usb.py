@@ -7,13 +7,14 @@ from typing import Annotated
 import typer
 
 from monstertruck_runtime.clock import run_wall
-from monstertruckd.tools.cli.options import ENDPOINT, EndpointOption, RobotOption, complete_role
+from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
+from monstertruckd.tools.cli.options import EndpointOption, RobotOption, complete_role
 from monstertruckd.tools.cli.output import JsonOption, console, on_terminal, print_json, remark
 
 
 def usb(
     robot: RobotOption = "truck",
-    endpoint: EndpointOption = ENDPOINT,
+    endpoint: EndpointOption = DEFAULT_ENDPOINT,
     local: Annotated[bool, typer.Option("--local", help="This machine's own tree, without a daemon.")] = False,
     json_output: JsonOption = False,
 ) -> None:

@@ -12,11 +12,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from monstertruck_runtime.client import ClientTls, TruckClient
+from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.endpoints import host_of, port_of, protocol_of
 from monstertruck_runtime.errors import InputError, NoAnswerError, NotFoundError, RequestRefusedError, TruckError
 from monstertruck_runtime.mailbox import latest
+from monstertruck_runtime.stations import ClientTls
 from monstertruck_runtime.threads import in_thread
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.roles import AccessRole

@@ -8,11 +8,13 @@ from typing import Any
 
 import pytest
 
-from monstertruck_runtime.client import TLS_VARIABLE, ClientTls, TruckClient, station_tls
+from monstertruck_runtime.client import TruckClient
+from monstertruck_runtime.early_estop import send_estop
 from monstertruck_runtime.errors import NotFoundError, NotPermittedError, RequestRefusedError
 from monstertruck_runtime.mailbox import fifo
+from monstertruck_runtime.stations import TLS_VARIABLE, ClientTls, station_tls
 from monstertruck_schemas.roles import AccessRole
-from monstertruck_schemas.topics import GATE, REQ_DRIVE, Writer
+from monstertruck_schemas.topics import GATE, REQ_CONTROL, REQ_DRIVE, Writer
 from monstertruckd.bus.zenoh_config import TlsConfig
 from tests.bus_kit import free_endpoint, gate_state, running_robot
 
@@ -113,6 +115,11 @@ async def test_a_command_finds_the_stations_certificate_by_itself(tmp_path: Path
         with pytest.raises(NotPermittedError, match="the certificate is that of 'ann'"):
             async with TruckClient(endpoint=endpoint, source="bob"):
                 pass
+        orders = robot.bus.subscribe(REQ_CONTROL, fifo(10))
+        session = await asyncio.to_thread(send_estop, "truck", endpoint, 1.0)
+        async with asyncio.timeout(3):
+            assert (await orders.next()).source.startswith("ann:")
+        await asyncio.to_thread(session.close)
 
 
 def test_a_certificate_that_is_missing_or_open_to_others_is_refused(tmp_path: Path):

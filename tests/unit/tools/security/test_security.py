@@ -6,9 +6,10 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from monstertruck_runtime.client import ClientTls, TruckClient
+from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import SECOND, WallClock
 from monstertruck_runtime.errors import InputError, NotFoundError, RequestRefusedError
+from monstertruck_runtime.stations import ClientTls
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Role
 from monstertruck_schemas.roles import AccessRole

@@ -1,0 +1,111 @@
+"""Sessions of stations: the configuration of Zenoh, certificates and names of sources.
+
+Nothing heavy is imported here: an emergency stop is sent before the rest of the program is loaded.
+"""
+
+import getpass
+import os
+import re
+import socket
+import stat
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from monstertruck_runtime.errors import InputError, NotFoundError, NotPermittedError
+
+TLS_VARIABLE: Final = "MONSTERTRUCKD_TLS"
+"""Names the folder of the station's certificate."""
+
+
+@dataclass(frozen=True, slots=True)
+class ClientTls:
+    """Files of a station with its own certificate."""
+
+    ca: Path
+    """Certificate of the authority that signed the robot's."""
+    certificate: Path
+    key: Path
+
+    def owner(self) -> str:
+        """Common name of the certificate.
+
+        Raises:
+            InputError: the file holds no certificate with one.
+        """
+        from cryptography import x509  # noqa: PLC0415 - only for certificates
+        from cryptography.x509.oid import NameOID  # noqa: PLC0415
+
+        try:
+            certificate = x509.load_pem_x509_certificate(self.certificate.read_bytes())
+            return str(certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)[0].value)
+        except (OSError, ValueError, IndexError) as error:
+            raise InputError(f"{self.certificate}: expected a certificate with a common name: {error}") from None
+
+
+def station_tls(environment: Mapping[str, str] = os.environ) -> ClientTls:
+    """The certificate of this user's station: ``ca.pem``, ``station.pem`` and ``station.key`` of one folder.
+
+    The folder is that of ``MONSTERTRUCKD_TLS``, else ``monstertruckd/tls`` in the user's configuration.
+
+    Raises:
+        NotFoundError: a file is missing.
+        NotPermittedError: others may read the key.
+    """
+    home = Path(environment.get("XDG_CONFIG_HOME") or Path.home() / ".config")
+    folder = Path(environment.get(TLS_VARIABLE) or home / "monstertruckd" / "tls")
+    files = ClientTls(ca=folder / "ca.pem", certificate=folder / "station.pem", key=folder / "station.key")
+    for file in (files.ca, files.certificate, files.key):
+        if not file.is_file():
+            raise NotFoundError(f"{file}: not there; tls/... endpoints want it ({TLS_VARIABLE} names another folder)")
+    if files.key.stat().st_mode & (stat.S_IRWXG | stat.S_IRWXO):
+        raise NotPermittedError(f"{files.key}: others may read this key; expected mode 600 (chmod 600 {files.key})")
+    return files
+
+
+def session_config(endpoint: str, timeout: float, tls: ClientTls | None) -> dict[str, Any]:
+    """Of a Zenoh session that dials one endpoint, and neither listens nor discovers.
+
+    Args:
+        endpoint: of the robot.
+        timeout: for the link, s.
+        tls: for ``tls/...`` endpoints.
+    """
+    config: dict[str, Any] = {
+        "mode": "client",
+        "connect": {"endpoints": [endpoint], "timeout_ms": round(timeout * 1000), "exit_on_failure": True},
+        "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
+        "transport": {"shared_memory": {"enabled": False}},
+    }
+    if tls is not None:
+        config["transport"]["link"] = {
+            "tls": {
+                "root_ca_certificate": str(tls.ca),
+                "connect_certificate": str(tls.certificate),
+                "connect_private_key": str(tls.key),
+                "enable_mtls": True,
+            }
+        }
+    return config
+
+
+def own_source(owner: str | None = None) -> str:
+    """Name of this program in requests: of the certificate's owner, or of the user, with host and process number."""
+    if owner is not None:
+        return f"{owner}:{_plain(socket.gethostname())}-{os.getpid()}"[:64]
+    try:
+        user = getpass.getuser()
+    except (KeyError, OSError):  # a user id without a name
+        user = str(os.getuid())
+    return f"{_plain(user)}@{_plain(socket.gethostname())}"[:56] + f":{os.getpid()}"
+
+
+def tls_for(endpoint: str) -> ClientTls | None:
+    """The certificate of this user's station for an endpoint that needs one. Raises as ``station_tls`` does."""
+    return station_tls() if endpoint.startswith("tls/") else None
+
+
+def _plain(name: str) -> str:
+    """What of a name may be in a key."""
+    return re.sub(r"[^A-Za-z0-9_.-]", "-", name)
