@@ -22,6 +22,7 @@ from mcap.stream_reader import breakup_chunk
 
 from monstertruck_runtime import wire
 from monstertruck_runtime.errors import ConfigError, InputError, NotFoundError
+from monstertruck_runtime.small_files import require_file
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.topics import BY_NAME
 
@@ -187,6 +188,7 @@ class LogReader:
         self.position = 0
         """Bytes an iteration has read so far, for progress bars."""
         try:
+            require_file(path)
             with path.open("rb") as file:
                 head = file.read(len(MAGIC))
         except FileNotFoundError:
@@ -264,6 +266,8 @@ class LogReader:
                 return (self._checked(Attachment.read(stream), content),)
             case Opcode.HEADER | Opcode.SCHEMA | Opcode.CHANNEL | Opcode.METADATA:
                 return (_PLAIN[opcode].read(stream),)
+        if opcode == 0:  # no opcode: the zeros of a file that a power cut left without its content
+            raise McapError("zeros")
         if opcode != Opcode.MESSAGE_INDEX and opcode < _PRIVATE:
             self.flaws.append(f"holds a damaged record at byte {self.position}")
         return ()
@@ -344,6 +348,6 @@ def attached_config(log: Path, attachments: Mapping[str, bytes]) -> dict[str, An
     return values
 
 
-def open_log(path: str | Path) -> LogReader:
-    """Open a log for reading; see ``LogReader``."""
-    return LogReader(Path(path))
+def open_log(log: str | Path | LogReader) -> LogReader:
+    """Open a log for reading; see ``LogReader``, which stays itself."""
+    return log if isinstance(log, LogReader) else LogReader(Path(log))

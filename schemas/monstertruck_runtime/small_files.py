@@ -24,6 +24,25 @@ def number_of(file: Path) -> int | None:
         return None
 
 
+def require_file(path: Path, most: int | None = None) -> None:
+    """Refuse what would take for ever, or too much memory, to read.
+
+    Args:
+        path: to be read.
+        most: bytes it may have; None = any number.
+
+    Raises:
+        OSError: nothing is there, it is a folder, a pipe or a device, or is longer than ``most``.
+    """
+    status = path.stat()
+    if stat.S_ISDIR(status.st_mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    if not stat.S_ISREG(status.st_mode):
+        raise OSError(errno.EINVAL, "Not a regular file", str(path))
+    if most is not None and status.st_size > most:
+        raise OSError(errno.EFBIG, f"{status.st_size} bytes, expected at most {most}", str(path))
+
+
 def replace_file(path: Path, content: str | bytes, mode: int = 0o644, *, follow_links: bool = True) -> None:
     """Give the file its ``content``, as a whole or not at all; one that was there keeps its mode.
 

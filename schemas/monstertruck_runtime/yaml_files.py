@@ -2,12 +2,16 @@
 
 import io
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from ruamel.yaml import YAML
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 
 from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.small_files import require_file
+
+MOST_BYTES: Final = 1_000_000
+"""Of one file: they are written by hand, or say of a map where it is."""
 
 
 def read_yaml(path: Path) -> Any:
@@ -17,11 +21,14 @@ def read_yaml(path: Path) -> Any:
         InputError: it cannot be read, or is not YAML.
     """
     try:
+        require_file(path, MOST_BYTES)
         return YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
     except MarkedYAMLError as error:
         line = error.problem_mark.line + 1 if error.problem_mark else 1
         raise InputError(f"{path}:{line}: not valid YAML: {error.problem}") from error
-    except (OSError, ValueError, YAMLError) as error:
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+    except (ValueError, YAMLError, RecursionError) as error:
         raise InputError(f"{path}: cannot be read as YAML: {error}") from error
 
 

@@ -431,11 +431,14 @@ def _read_trajectory(path: Path) -> "NDArray[Any]":
     import numpy as np
 
     from monstertruck_runtime.errors import InputError
+    from monstertruck_runtime.small_files import require_file
 
     try:
-        lines = path.read_text().splitlines()
-    except OSError as error:
-        raise InputError(f"{path}: {error.strerror}") from error
+        require_file(path)
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        why = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
+        raise InputError(f"{path}: cannot be read: {why}") from error
     rows = []
     for number, line in enumerate(lines, start=1):
         cells = line.split(",")

@@ -7,14 +7,16 @@ from dataclasses import asdict
 from enum import StrEnum
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
+from monstertruck_schemas.reasons import Reason
 from monstertruckd.tools.cli.options import complete_topic
-from monstertruckd.tools.cli.output import JsonOption, command_group, print_json, print_table, progress, remark
+from monstertruckd.tools.cli.output import JsonOption, command_group, finish, print_json, print_table, progress, remark
 
 if TYPE_CHECKING:
+    from monstertruckd.recorder.reader import LogReader
     from monstertruckd.tools.logs.messages import Progress, Selection
 
 app = command_group("Look inside, repair and export logs (MCAP).")
@@ -24,6 +26,9 @@ TopicsOption = Annotated[
 ]
 StartOption = Annotated[float, typer.Option("--start", min=0.0, help="Seconds after the log's begin.")]
 EndOption = Annotated[float | None, typer.Option("--end", min=0.0, help="Seconds after the log's begin.")]
+
+
+RECOVER: Final = "`monstertruckd log recover` repairs it"
 
 
 class ExportFormat(StrEnum):
@@ -79,13 +84,22 @@ def info_command(log: LogArgument, json_output: JsonOption = False) -> None:
     from monstertruckd.tools.logs.summary import info
 
     summary = info(log)
+    damaged = summary["damage"] is not None and not in_use(log)
     if json_output:
         print_json(summary)
-        return
+    else:
+        _show_info(log, summary)
+    if damaged:
+        raise typer.Exit(Reason.LOG_DAMAGED.exit_code)
+
+
+def _show_info(log: Path, summary: "dict[str, Any]") -> None:
+    from monstertruckd.recorder.repair import in_use
+
     size = f"{summary['size'] / 1e6:.2f} MB"
     print(f"{log}  {size}, {summary['duration']:.1f} s, {summary['messages']} messages")
     if summary["damage"]:
-        repair = "it is being written" if in_use(log) else "`monstertruckd log recover` repairs it"
+        repair = "it is being written" if in_use(log) else RECOVER
         print(f"damaged: {summary['damage']}; {repair}")
     rows = [
         (
@@ -133,6 +147,7 @@ def report_command(
         print_json(written.figures())
     else:
         typer.echo(str(written.file))
+    finish_log(log, written.run.damage)
 
 
 @app.command("export")
@@ -148,20 +163,23 @@ def export_command(
     json_output: JsonOption = False,
 ) -> None:
     """Write a log as tables (csv, npz: a file per topic), as ROS 2 bag, or as MCAP with dates (mcap)."""
+    from monstertruckd.recorder.reader import open_log
     from monstertruckd.tools.logs.messages import Selection
 
     selection = Selection(tuple(topics or ()), start, math.inf if end is None else end)
     with needs_extra("logs"):
         export = _exporter(form)
+    reader = open_log(log)
     with _reading("export", log) as done:
-        files = export(log, output, selection, done)
+        files = export(reader, output, selection, done)
     if not files:
         remark(f"{log}: no message of these topics and times")
     if json_output:
         print_json(files)
-        return
-    for topic, file in files.items():
-        typer.echo(f"{topic:20} {file}")
+    else:
+        for topic, file in files.items():
+            typer.echo(f"{topic:20} {file}")
+    finish_log(log, reader.fault)
 
 
 @app.command("view")
@@ -173,19 +191,36 @@ def view_command(
     end: EndOption = None,
 ) -> None:
     """Show a log in the rerun viewer, with a layout, without any network (extra `view`)."""
+    from monstertruckd.recorder.reader import open_log
     from monstertruckd.tools.logs.messages import Selection
 
     selection = Selection(tuple(topics or ()), start, math.inf if end is None else end)
     with needs_extra("view"):
         from monstertruckd.tools.logs.rerun_view import convert, show
+    reader = open_log(log)
     with TemporaryDirectory(prefix="monstertruckd-") as scratch:
         recording = save or Path(scratch) / f"{log.stem}.rrd"
         with _reading("convert", log) as done:
-            convert(log, recording, selection, done)
+            convert(reader, recording, selection, done)
         if save is None:
             show(recording)
         else:
             typer.echo(str(save))
+    finish_log(log, reader.fault)
+
+
+def finish_log(log: Path, fault: str | None) -> None:
+    """End a command that used a log: if that is damaged, with one sentence and an exit code of its own.
+
+    A log that is being written ends where it ends.
+
+    Raises:
+        Exit: it is damaged.
+    """
+    from monstertruckd.recorder.repair import in_use
+
+    if fault is not None and not in_use(log):
+        finish(Reason.LOG_DAMAGED, f"{log}: {fault}; what is before that was used ({RECOVER})")
 
 
 @contextmanager
@@ -195,7 +230,7 @@ def _reading(what: str, log: Path) -> "Iterator[Progress]":
         yield done
 
 
-def _exporter(form: ExportFormat) -> "Callable[[Path, Path, Selection, Progress], dict[str, Path]]":
+def _exporter(form: ExportFormat) -> "Callable[[LogReader, Path, Selection, Progress], dict[str, Path]]":
     match form:
         case ExportFormat.CSV:
             from monstertruckd.tools.logs.export import export_csv as export

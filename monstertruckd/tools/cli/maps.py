@@ -1,7 +1,9 @@
 """Commands on maps: build one from a log, show it, save a robot's, localise in it."""
 
+import os
 from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -9,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
+from monstertruckd.tools.cli.logs import finish_log
 from monstertruckd.tools.cli.options import ConfigOption, EndpointOption, RobotOption, with_parameters
 from monstertruckd.tools.cli.output import JsonOption, command_group, print_json, progress, remark
 
@@ -87,8 +90,14 @@ def build(
     from monstertruckd.tools.logs.trajectory import write_tum
 
     scans = _read(log, geometry)
+    output.mkdir(parents=True, exist_ok=True)  # minutes before it is needed
     worker = SlamWorker()
-    facts, _ = _run(worker, scans, SlamConfig.model_validate({"front": front.value}))
+    try:
+        facts, _ = _run(worker, scans, SlamConfig.model_validate({"front": front.value}))
+    except BaseException:
+        with suppress(OSError):  # not empty
+            output.rmdir()
+        raise
     done: WorkerOutput = worker.step(
         WorkerInput(finish=True, whole=True, save=output, trajectory=trajectory is not None)
     )
@@ -106,6 +115,7 @@ def build(
 
         _draw(png, load(output))
     _print(facts, json_output)
+    finish_log(log, scans.fault)
 
 
 @app.command("show")
@@ -171,22 +181,33 @@ def load_command(
     config: ConfigOption,
     output: Annotated[Path, typer.Option("--output", "-o", help="Configuration to write.")],
 ) -> None:
-    """Write a configuration with which the robot localises in a saved map."""
+    """Write a configuration with which the robot localises in a saved map; one written so before is replaced."""
     from monstertruck_estimation.slam.storage import load
+    from monstertruck_runtime.errors import InputError
     from monstertruck_runtime.small_files import replace_file
-    from monstertruck_runtime.yaml_files import yaml_text
+    from monstertruck_runtime.yaml_files import read_yaml, yaml_text
     from monstertruckd.config.load import load_truck
     from monstertruckd.config.migrate import VERSION
 
     load(place)
+    load_truck(config)
     values = {
         "include": str(config.resolve()),
         "version": VERSION,
         "slam": {"mode": "localisation", "map": str(place.resolve())},
     }
+    if os.path.lexists(output) and (output.samefile(config) or not _made_by_load(read_yaml(output))):
+        raise InputError(f"{output}: is there already, and this command did not write it; name another file")
     replace_file(output, yaml_text(values))
     load_truck(output)
     remark(f"wrote {output}: `monstertruckd run --config {output}` localises in {place}")
+
+
+def _made_by_load(found: Any) -> bool:
+    match found:
+        case {"include": _, "version": _, "slam": {"mode": "localisation", "map": _, **others}, **more}:
+            return not others and not more
+    return False
 
 
 @app.command("localise")
@@ -220,6 +241,7 @@ def localise(
     if png is not None:
         _draw(png, saved, [estimate.pose for estimate in known])
     _print(facts, json_output)
+    finish_log(log, scans.fault)
 
 
 def _read(path: Path, geometry: "LogGeometry") -> "ScanLog":

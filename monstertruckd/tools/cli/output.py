@@ -6,6 +6,7 @@ mean the same: commands that run until they are stopped end with 0 (``until_stop
 ``CANCELLED``.
 """
 
+import errno
 import json
 import math
 import os
@@ -182,7 +183,7 @@ def command_group(text: str) -> typer.Typer:
 
 
 class CommandGroup(TyperGroup):
-    """The root of the command line: turns expected errors, interrupts and closed pipes into exit codes."""
+    """The root of the command line: turns expected errors, unusable files, interrupts and closed pipes into codes."""
 
     def invoke(self, ctx: "Context") -> Any:
         """Run the chosen command."""
@@ -206,6 +207,15 @@ class CommandGroup(TyperGroup):
         except BrokenPipeError:  # e.g. `monstertruckd echo | head`: the reader has all it wants
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             raise typer.Exit from None
+        except OSError as error:
+            full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+            if full and error.filename is None:  # most likely standard output, which must not be tried again
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            if not full and error.filename is None:
+                raise
+            where = "" if error.filename is None else f"{os.fsdecode(error.filename)}: "
+            remark(f"{where}{error.strerror}")
+            raise typer.Exit((Reason.DISK_FULL if full else Reason.BAD_INPUT).exit_code) from None
         finally:
             signal.signal(signal.SIGTERM, before)
 

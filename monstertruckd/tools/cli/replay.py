@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
-from monstertruckd.tools.cli.logs import LogArgument, TopicsOption
+from monstertruckd.tools.cli.logs import LogArgument, TopicsOption, finish_log
 from monstertruckd.tools.cli.output import JsonOption, finish, print_json, print_table, progress, remark
 
 if TYPE_CHECKING:
@@ -43,11 +43,14 @@ def replay(
         return
     if config is not None or tolerance is not None or json_output:
         raise typer.BadParameter("--config, --tolerance and --json need --check")
+    from monstertruckd.recorder.reader import open_log
     from monstertruckd.tools.logs.replay import replay_log
 
     with suppress(KeyboardInterrupt), progress("replay", log.stat().st_size if log.exists() else None) as done:
-        count = replay_log(log, robot, endpoint, speed, topics, done)
+        reader = open_log(log)
+        count = replay_log(reader, robot, endpoint, speed, topics, done)
         remark(f"{count} messages replayed")
+        finish_log(log, reader.fault)
 
 
 def _check(log: Path, config: Path | None, tolerance: float | None, *, json_output: bool) -> None:

@@ -25,7 +25,7 @@ from monstertruck_schemas.base import Schema
 from monstertruck_schemas.state import ClockOffset
 from monstertruck_schemas.topics import BY_NAME
 from monstertruckd.recorder.log_file import Channels
-from monstertruckd.recorder.reader import LogReader
+from monstertruckd.recorder.reader import LogReader, open_log
 from monstertruckd.tools.logs.messages import ALL, Progress, Selection, real_offset
 
 
@@ -48,7 +48,7 @@ _LOG_TIME, _REAL_TIME = "log_time", "real_time"
 
 
 def export_csv(
-    path: str | Path, output: str | Path, selection: Selection = ALL, progress: Progress | None = None
+    path: str | Path | LogReader, output: str | Path, selection: Selection = ALL, progress: Progress | None = None
 ) -> dict[str, Path]:
     """Write ``<group>_<name>.csv`` for every topic that has messages.
 
@@ -77,7 +77,7 @@ def export_csv(
 
 
 def export_npz(
-    path: str | Path, output: str | Path, selection: Selection = ALL, progress: Progress | None = None
+    path: str | Path | LogReader, output: str | Path, selection: Selection = ALL, progress: Progress | None = None
 ) -> dict[str, Path]:
     """Write ``<group>_<name>.npz`` for every topic that has messages: one array per column.
 
@@ -140,10 +140,10 @@ def _stem(topic: str) -> str:
 
 
 def _rows(
-    path: str | Path, directory: Path, selection: Selection, progress: Progress | None
+    path: str | Path | LogReader, directory: Path, selection: Selection, progress: Progress | None
 ) -> Iterator[tuple[str, dict[str, Any]]]:
     """(topic, column to value) of every selected message; pictures are saved on the way."""
-    reader = LogReader(Path(path))
+    reader = open_log(path)
     offset = real_offset(reader)
     for entry, message in selection.of(reader, progress):
         row = _flat(message, type(message), "")
@@ -215,7 +215,7 @@ _TIME_FIELDS: Final = {"stamp", "received", "since", "gate_stamp"}
 
 
 def export_mcap(
-    path: str | Path, output: str | Path, selection: Selection = ALL, progress: Progress | None = None
+    path: str | Path | LogReader, output: str | Path, selection: Selection = ALL, progress: Progress | None = None
 ) -> dict[str, Path]:
     """Write the selected messages to a new file with log times, stamps and headers in UNIX time.
 
@@ -226,7 +226,7 @@ def export_mcap(
         NotFoundError: no such log.
         InputError: not a log, a message in it is invalid, or the file exists or cannot be written.
     """
-    reader = LogReader(Path(path))
+    reader = open_log(path)
     offset = real_offset(reader)
     topics: dict[str, Path] = {}
     file = Path(output)

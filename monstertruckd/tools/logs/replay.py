@@ -5,19 +5,19 @@ from collections.abc import Callable, Collection
 from pathlib import Path
 
 from monstertruck_runtime.clock import ReplayClock, run_replay
-from monstertruck_runtime.errors import InputError, NotFoundError
+from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.ports import Ready
 from monstertruck_schemas.topics import BY_NAME, Writer
 from monstertruckd.bus.local import Bus
 from monstertruckd.bus.rpc import Rpc
 from monstertruckd.bus.zenoh_config import ZenohConfig
 from monstertruckd.bus.zenoh_session import ZenohBridge
-from monstertruckd.recorder.reader import open_log
-from monstertruckd.tools.logs.messages import first_offset
+from monstertruckd.recorder.reader import LogReader, open_log
+from monstertruckd.tools.logs.messages import Selection, first_offset
 
 
 def replay_log(
-    log: Path,
+    log: str | Path | LogReader,
     robot: str,
     endpoint: str,
     speed: float,
@@ -29,7 +29,7 @@ def replay_log(
     Requests are left out: they were sent to the daemon, not by it.
 
     Args:
-        log: file to read.
+        log: file to read; messages of other schemas are left out.
         robot: name to publish under.
         endpoint: where to listen.
         speed: multiple of real time.
@@ -41,12 +41,11 @@ def replay_log(
         InputError: the log holds no message to replay.
         BusyError: the endpoint is in use.
     """
-    if unknown := set(topics or ()) - BY_NAME.keys():
-        raise NotFoundError(f"no topic {', '.join(sorted(unknown))}; known: {', '.join(BY_NAME)}")
+    selection = Selection(tuple(topics or ()))
     reader = open_log(log)
     start = next((message.log_time for message in reader), None)
     if start is None:
-        raise InputError(f"{log}: holds no messages")
+        raise InputError(f"{reader.path}: holds no messages" + (f"; {reader.damage}" if reader.damage else ""))
 
     async def main(clock: ReplayClock) -> int:
         bus = Bus(clock)
@@ -60,13 +59,13 @@ def replay_log(
             if task.done():
                 task.result()
             count = 0
-            for entry in reader:
-                topic = BY_NAME.get(entry.topic)
-                if topic is None or topic.writer is Writer.OUTSIDE or (topics and entry.topic not in topics):
+            for entry, message in selection.of(reader):
+                topic = BY_NAME[entry.topic]
+                if topic.writer is Writer.OUTSIDE:
                     continue
                 progress(reader.position)
                 await clock.sleep_until(entry.log_time)
-                bus.hand_over(topic, entry.decode())
+                bus.hand_over(topic, message)
                 count += 1
             return count
         finally:
@@ -74,7 +73,7 @@ def replay_log(
                 job.cancel()
             await asyncio.wait([waiting, task])
 
-    offset = first_offset(log, reader.metadata().get("run", {}))
+    offset = first_offset(reader.path, reader.metadata().get("run", {}))
     return run_replay(main, start=start, real_offset=offset, rate=speed)
 
 

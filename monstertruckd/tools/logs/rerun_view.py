@@ -16,6 +16,7 @@ import rerun.blueprint as rrb
 
 from monstertruck_planners.collision import scan_points
 from monstertruck_runtime.errors import CommandFailedError, ConfigError, InputError
+from monstertruck_runtime.small_files import require_file
 from monstertruck_schemas import topics as t
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.event import Event, LogLevel, LogRecord, Severity, Stop
@@ -23,7 +24,8 @@ from monstertruck_schemas.health import HealthTable
 from monstertruck_schemas.plan import Path as TruckPath
 from monstertruck_schemas.sensor import CompressedImage, LaserScan
 from monstertruck_schemas.state import GateState, Grid, Odometry, Transforms
-from monstertruckd.recorder.reader import LogReader, spare_log
+from monstertruckd.recorder.reader import LogReader, open_log, spare_log
+from monstertruckd.tools.logs.export import removed_on_failure
 from monstertruckd.tools.logs.messages import ALL, Progress, Selection, is_plausible, real_offset
 from monstertruckd.tools.logs.report.signals import FIGURES, Curve, DrivenPath, Figure
 
@@ -47,23 +49,36 @@ _JOURNAL: Final = {
 }
 
 
-def convert(log: str | Path, output: str | Path, selection: Selection = ALL, progress: Progress | None = None) -> Path:
-    """Write the rerun recording ``output`` of a log, its layout included.
+def convert(
+    log: str | Path | LogReader, output: str | Path, selection: Selection = ALL, progress: Progress | None = None
+) -> Path:
+    """Write the rerun recording ``output`` of a log, its layout included, as a whole or not at all.
 
     Raises:
         NotFoundError: no such log.
         InputError: not a log, a message in it is invalid, or ``output`` cannot be written or is a log.
     """
-    reader = LogReader(Path(log))
+    reader = open_log(log)
     offset = real_offset(reader)
     output = Path(output)
     try:
         spare_log(output)
+        if output.exists():
+            require_file(output)
         output.parent.mkdir(parents=True, exist_ok=True)
-        output.open("wb").close()
-    except OSError as error:
-        msg = f"{output}: cannot be written: {error.strerror}"
+        with removed_on_failure() as made:
+            made.append(output.with_name(output.name + ".part"))
+            made[0].open("wb").close()
+            _record(reader, made[0], offset, selection, progress)
+            made[0].replace(output)
+    except (OSError, RuntimeError) as error:  # rerun raises the latter
+        why = error.strerror if isinstance(error, OSError) else error
+        msg = f"{output}: cannot be written: {why}"
         raise InputError(msg) from None
+    return output
+
+
+def _record(reader: LogReader, output: Path, offset: int, selection: Selection, progress: Progress | None) -> None:
     with rr.RecordingStream(APPLICATION, recording_id=reader.path.stem) as stream:
         stream.set_log_time_enabled(False)
         stream.set_log_tick_enabled(False)
@@ -77,7 +92,6 @@ def convert(log: str | Path, output: str | Path, selection: Selection = ALL, pro
         stream.send_blueprint(blueprint(scene.entities))
         stream.flush()
     stream.disconnect()
-    return output
 
 
 class Scene:

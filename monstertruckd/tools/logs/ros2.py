@@ -25,7 +25,7 @@ from monstertruck_schemas.plan import Path as TruckPath
 from monstertruck_schemas.sensor import Battery, CompressedImage, LaserScan
 from monstertruck_schemas.state import Grid, Odometry, Transforms
 from monstertruck_schemas.topics import BY_NAME, Topic
-from monstertruckd.recorder.reader import LogReader
+from monstertruckd.recorder.reader import LogReader, open_log
 from monstertruckd.tools.logs.export import removed_on_failure
 from monstertruckd.tools.logs.messages import ALL, Progress, Selection, real_offset
 
@@ -38,7 +38,7 @@ _NEVER: Final = QosTime(9_223_372_036, 854_775_807)
 
 
 def export_ros2(
-    path: str | Path, output: str | Path, selection: Selection = ALL, progress: Progress | None = None
+    path: str | Path | LogReader, output: str | Path, selection: Selection = ALL, progress: Progress | None = None
 ) -> dict[str, Path]:
     """Write a ROS 2 bag (MCAP storage, CDR).
 
@@ -49,7 +49,7 @@ def export_ros2(
         NotFoundError: no such log.
         InputError: not a log, a message in it is invalid, or ``output`` exists or cannot be written.
     """
-    reader = LogReader(Path(path))
+    reader = open_log(path)
     offset = real_offset(reader)
     directory = Path(output)
     topics: dict[str, Path] = {}

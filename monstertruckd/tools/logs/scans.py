@@ -17,9 +17,10 @@ from monstertruck_estimation.slam.worker_io import ScanInput
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError, NotFoundError
+from monstertruck_runtime.small_files import require_file
 from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.state import Odometry
-from monstertruckd.recorder.reader import MAGIC, open_log
+from monstertruckd.recorder.reader import MAGIC, LogReader, open_log
 
 BEGIN: Final = SECOND
 """Stamp of the first scan of a log with times of another origin, ns."""
@@ -72,6 +73,8 @@ class ScanLog:
     """Time of the log's own clock that is stamp 0 here, s."""
     assumed: tuple[str, ...] = field(default=())
     """Parts of the geometry that neither the log nor the caller gave."""
+    fault: str | None = None
+    """What is wrong with the file, whose end is missing perhaps."""
 
 
 def read_scans(path: Path, geometry: LogGeometry | None = None) -> ScanLog:
@@ -86,6 +89,7 @@ def read_scans(path: Path, geometry: LogGeometry | None = None) -> ScanLog:
         InputError: it is of no known format, damaged, has no scans, or brings the geometry that was given.
     """
     try:
+        require_file(path)
         with path.open("rb") as file:
             head = file.read(16)
     except FileNotFoundError:
@@ -94,7 +98,8 @@ def read_scans(path: Path, geometry: LogGeometry | None = None) -> ScanLog:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error
     given = {} if geometry is None else geometry.known
     if head.startswith(MAGIC):
-        log = ScanLog("mcap", list(_mcap(path)))
+        reader = open_log(path)
+        log = ScanLog("mcap", list(_mcap(reader)), fault=reader.fault)
     elif head.startswith(b"PK"):
         log = _arrays(path, given)
     elif path.name.removesuffix(".gz").endswith(".dat"):
@@ -108,8 +113,7 @@ def read_scans(path: Path, geometry: LogGeometry | None = None) -> ScanLog:
     return log
 
 
-def _mcap(path: Path) -> Iterator[ScanInput]:
-    reader = open_log(path)
+def _mcap(reader: LogReader) -> Iterator[ScanInput]:
     lidar = (reader.config().get("devices") or {}).get("lidar") or {}
     at = lidar.get("mount") or {}
     mount = (float(at.get("x", 0.0)), float(at.get("y", 0.0)), float(at.get("yaw", 0.0)))

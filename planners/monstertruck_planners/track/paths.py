@@ -2,6 +2,7 @@
 
 import csv
 from pathlib import Path as FilePath
+from typing import Final
 
 import numpy as np
 
@@ -10,6 +11,7 @@ from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import InputError, RequestRefusedError
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
 from monstertruck_runtime.requests import Sequences, refusal
+from monstertruck_runtime.small_files import require_file
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.plan import Path
 from monstertruck_schemas.reasons import Reason
@@ -17,6 +19,8 @@ from monstertruck_schemas.req import PathRequest
 from monstertruck_schemas.state import GateState
 
 HEADER = ["x", "y", "yaw", "direction"]
+MOST_BYTES: Final = 10_000_000
+"""Of a file of poses: a hundred thousand and more."""
 
 """Modes in which the path stays as it is."""
 
@@ -28,9 +32,12 @@ def load_path(file: FilePath, *, closed: bool, frame: str = "odom") -> Path:
         InputError: naming file and line, and what was expected.
     """
     try:
+        require_file(file, MOST_BYTES)
         with file.open(newline="", encoding="utf-8") as stream:
             rows = list(csv.reader(stream))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+    except OSError as error:
+        raise InputError(f"{file}: cannot be read: {error.strerror}") from error
+    except (UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{file}: cannot be read: {error}") from error
     if not rows or [name.strip() for name in rows[0]] != HEADER:
         raise InputError(f"{file}:1: expected the header {','.join(HEADER)}")

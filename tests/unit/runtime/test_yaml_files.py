@@ -30,7 +30,7 @@ def test_it_is_version_1_2(tmp_path: Path):
         (b"a: \x01", r"a\.yaml: cannot be read as YAML"),
         (b"\xff", r"a\.yaml: cannot be read as YAML"),
         (b"a: 2026-13-99", r"a\.yaml: cannot be read as YAML"),
-        (None, r"a\.yaml: cannot be read as YAML: .*No such file"),
+        (None, r"a\.yaml: cannot be read: .*No such file"),
     ],
 )
 def test_complaints_name_the_file(tmp_path: Path, data: bytes | None, complaint: str):

@@ -10,6 +10,7 @@ from typing import Any
 
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.small_files import replace_file
 from monstertruck_schemas.event import Cause, Event, LogLevel, Severity, Stop
 from monstertruck_schemas.health import ServiceState
 from monstertruckd.recorder.reader import spare_log
@@ -65,7 +66,7 @@ def report(log: str | Path, output: str | Path | None = None, progress: Progress
     try:
         spare_log(file)
         file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_text(page(run), encoding="utf-8")
+        replace_file(file, page(run))
     except OSError as error:
         msg = f"{file}: cannot be written: {error.strerror}"
         raise InputError(msg) from None

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from typer.testing import CliRunner, Result
 
 from monstertruck_runtime.map_files import WorldMap, save_map
 from monstertruckd.tools.cli.main import app
@@ -72,3 +72,46 @@ def test_a_log_without_a_usable_scan_is_one_sentence(log: Path, tmp_path: Path, 
     assert f"none of its 3 scans can be used; the last one: only 0 of {BEAMS} beams" in result.output.replace("\n", " ")
     assert "Traceback" not in result.output
     assert not (tmp_path / "map").exists()
+
+
+CONFIG = Path(__file__).parents[4] / "configs" / "slam.yaml"
+
+
+def test_a_configuration_for_localisation_replaces_only_what_it_wrote_itself(tmp_path: Path):
+    save_map(WorldMap(np.zeros((10, 10), np.int8), 0.05), tmp_path / "map.yaml")
+    own, output = tmp_path / "own.yaml", tmp_path / "localise.yaml"
+    own.write_text(f"include: {CONFIG}\nversion: 2\n")
+    slam = tmp_path / "slam.yaml"
+    slam.write_text(f"include: {CONFIG}\nversion: 2\nslam:\n  latency: 0.3\n")
+
+    def load(config: Path, output: Path) -> Result:
+        return CliRunner().invoke(
+            app, ["map", "load", str(tmp_path / "map.yaml"), "-c", str(config), "-o", str(output)]
+        )
+
+    assert load(own, output).exit_code == 0
+    assert load(own, output).exit_code == 0, "once more"
+    for target in (own, slam, output):
+        before = target.read_text()
+        done = load(own if target != output else output, target)
+        assert done.exit_code == 3
+        assert done.stderr == f"{target}: is there already, and this command did not write it; name another file\n"
+        assert target.read_text() == before
+
+
+def test_a_configuration_that_is_refused_is_not_written(tmp_path: Path):
+    save_map(WorldMap(np.zeros((10, 10), np.int8), 0.05), tmp_path / "map.yaml")
+    (tmp_path / "bad.yaml").write_text("rabbit: 1\n")
+    output = tmp_path / "out.yaml"
+    done = CliRunner().invoke(
+        app, ["map", "load", str(tmp_path / "map.yaml"), "-c", str(tmp_path / "bad.yaml"), "-o", str(output)]
+    )
+    assert done.exit_code == 2
+    assert not output.exists()
+
+
+def test_a_folder_that_cannot_be_made_is_told_before_the_map_is_built(log: Path, tmp_path: Path):
+    (tmp_path / "file").touch()
+    done = CliRunner().invoke(app, ["map", "build", str(log), "-o", str(tmp_path / "file")])
+    assert done.exit_code == 3
+    assert done.stderr.splitlines()[-1] == f"{tmp_path / 'file'}: File exists"

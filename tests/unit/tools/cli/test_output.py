@@ -121,6 +121,18 @@ def called(*arguments: str, **streams: Any) -> "subprocess.CompletedProcess[str]
     return subprocess.run(command, cwd=ROOT, text=True, timeout=30, check=False, **streams)
 
 
+def test_a_full_disk_behind_standard_output_is_one_sentence():
+    with open("/dev/full", "w") as full:  # noqa: PTH123 - a device
+        done = subprocess.run(
+            [sys.executable, "-m", "monstertruckd", "topics"],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            timeout=60,
+        )
+    assert (done.returncode, done.stderr) == (Reason.DISK_FULL.exit_code, "No space left on device\n")
+
+
 def test_help_and_usage_errors_are_bare_lines_in_pipes():
     reported = called("log", "--help", capture_output=True).stdout
     assert reported.isascii()

@@ -1,13 +1,16 @@
 """The commands on logs, as a user types them."""
 
+import errno
 import fcntl
 import json
+import os
 from pathlib import Path
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from monstertruck_schemas.reasons import Reason
 from monstertruckd.tools.cli.main import app
 from monstertruckd.tools.logs.messages import Selection
 
@@ -61,6 +64,99 @@ def test_no_page_and_no_recording_takes_the_place_of_a_log(tmp_path, arguments):
     assert done.exit_code == 3
     assert "is a log, which is not overwritten" in done.output
     assert log.read_bytes() == GOLDEN.read_bytes()
+
+
+@pytest.fixture
+def damaged(tmp_path):
+    """A log whose middle a power cut left as zeros."""
+    log = tmp_path / "run.mcap"
+    data = GOLDEN.read_bytes()
+    log.write_bytes(data[:80_000] + bytes(30_000) + data[110_000:])
+    return log
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("info",),
+        ("info", "--json"),
+        ("report", "-o", "page.html"),
+        ("export", "tables"),
+        ("export", "arrays", "-f", "npz"),
+        ("export", "bag", "-f", "ros2"),
+        ("export", "dated.mcap", "-f", "mcap"),
+        ("view", "--save", "view.rrd"),
+    ],
+)
+def test_a_damaged_log_is_used_up_to_its_damage_and_has_an_exit_code(damaged, tmp_path, monkeypatch, arguments):
+    monkeypatch.chdir(tmp_path)
+    done = run(arguments[0], damaged, *arguments[1:])
+    assert done.exit_code == Reason.LOG_DAMAGED.exit_code
+    if arguments[0] == "info":
+        assert done.stderr == ""
+    else:
+        assert done.stderr.count("\n") == 1
+        assert f"{damaged}: ends or is damaged after byte" in done.stderr
+        assert len(done.stderr) < 300
+        assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_a_log_that_is_being_written_is_not_damaged(tmp_path):
+    log = tmp_path / "run.mcap"
+    log.write_bytes(GOLDEN.read_bytes()[:-20])
+    with log.open("rb") as writer:
+        fcntl.flock(writer, fcntl.LOCK_EX)
+        assert run("info", log).exit_code == 0
+        assert run("report", log).exit_code == 0
+    assert run("report", log).exit_code == Reason.LOG_DAMAGED.exit_code
+
+
+@pytest.mark.parametrize("arguments", [("report", "-o"), ("view", "--save")])
+def test_what_cannot_be_written_leaves_what_was_there(tmp_path, monkeypatch, arguments):
+    command, option = arguments
+    target = tmp_path / "before"
+    target.write_text("precious")
+    done = run(command, GOLDEN, option, "/dev/full")
+    assert (done.exit_code, done.stderr) == (3, "/dev/full: cannot be written: Not a regular file\n")
+
+    def replace(path, _):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+
+    monkeypatch.setattr(Path, "replace", replace)
+    assert run(command, GOLDEN, option, target).exit_code == 3
+    assert [path.name for path in tmp_path.iterdir()] == ["before"]
+    assert target.read_text() == "precious"
+
+
+@pytest.mark.parametrize("command", [("log", "info"), ("map", "build"), ("track",), ("map", "show"), ("log", "report")])
+@pytest.mark.parametrize("what", ["/dev/zero", "pipe", "folder", "loop", "name-too-long"])
+def test_what_is_no_file_is_named_and_not_read(tmp_path, monkeypatch, command, what):
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "loop").symlink_to("loop")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("monstertruck_runtime.client.TruckClient", Planless)
+    file = {"name-too-long": "x" * 300}.get(what, what)
+    done = CliRunner().invoke(app, [*command, file])
+    assert done.exit_code in (3, 4)
+    assert file in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+class Planless:
+    """A robot that is there."""
+
+    def __init__(self, *_, **__):
+        pass
+
+    async def __aenter__(self):
+        return self
+
+    async def __aexit__(self, *_):
+        pass
+
+    async def call(self, _):
+        return {}
 
 
 def test_info_knows_a_log_that_is_being_written(tmp_path):
