@@ -27,6 +27,7 @@ from monstertruck_schemas.base import Schema
 from monstertruck_schemas.body import TruckBody
 from monstertruck_schemas.roles import SHAFTS
 from monstertruckd.bus.zenoh_config import ZenohConfig
+from monstertruckd.config.device_safety import beyond_devices, weakened_devices
 from monstertruckd.gate.config import SIGHT, BodyLimits, GateConfig, beyond, weakened
 from monstertruckd.recorder.config import BlackBoxConfig, MapRender, RecorderConfig
 
@@ -178,16 +179,8 @@ class TruckConfig(Schema):
 
     def weakened(self) -> tuple[str, ...]:
         """Settings by which the robot is less safe than by the defaults, each with its value and the default."""
-        usual = EposConfig()
-        drives = tuple(
-            f"devices.{role}.driver.{name} {value:g}, default {default:g}"
-            for role, device in self.devices.shafts().items()
-            if isinstance(device.driver, EposConfig)
-            for name in ("command_timeout", "quick_stop_after")
-            if (value := getattr(device.driver, name)) > (default := getattr(usual, name))
-        )
         opened = (f"zenoh.insecure: anybody who reaches {end} may drive" for end in self.zenoh.open_endpoints)
-        return (*weakened(self.gate), *drives, *opened)
+        return (*weakened(self.gate), *weakened_devices(self.devices, self.monitors), *opened)
 
     def missing_actuators(self) -> str | None:
         """What the body needs to drive and steer, if some of it is not there."""
@@ -200,7 +193,8 @@ class TruckConfig(Schema):
     @model_validator(mode="after")
     def _complete(self) -> Self:
         self._check_actuators()
-        for excess in beyond(self.gate, self.body_limits):
+        body = self.body_limits
+        for excess in (*beyond(self.gate, body), *beyond_devices(self.devices, self.monitors, self.gate, body)):
             raise ValueError(excess)
         self._check_planner()
         if self.slam is not None and self.devices.lidar is None:

@@ -1,12 +1,12 @@
 """Limits of the safety gate, and what a body can do at most, whatever its configuration says.
 
 A speed is possible if the motor reaches it and the body can stop from it on ground that was seen. A time without
-samples is possible if the body travels no further than its own length meanwhile. Lengths m, angles rad, times s, speeds
-m/s.
+samples is possible if the body travels no further than its own length meanwhile. A tilt is possible up to where the
+wheels slip. Lengths m, angles rad, times s, speeds m/s.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Annotated, Any, Final, Self
 
@@ -71,9 +71,9 @@ class TiltLimits(Schema):
 class SteeringCheckConfig(Schema):
     """When the measured yaw contradicts the steering."""
 
-    window: Positive = 2.0
+    window: Annotated[float, Field(gt=0, le=5)] = 2.0
     """Seconds over which turns are compared."""
-    tolerance: Positive = 0.14
+    tolerance: Annotated[float, Field(gt=0, le=math.pi / 2)] = 0.14
     """Tolerated difference: compass errors and the servos' lag, rad."""
     speed: Positive = 0.03
     """Below this speed nothing is compared: the truck may be turned by hand, m/s."""
@@ -133,8 +133,8 @@ class GateConfig(Schema):
     """Least deceleration of the drive controller's profile after a command of speed 0, m/s^2."""
     quick_deceleration: Positive = 1.2
     """Least deceleration of its quick stop, m/s^2."""
-    steering_rate: Positive = 1.0
-    """Greatest change of a steering angle, rad/s."""
+    steering_rate: Annotated[float, Field(gt=0, le=12)] = 1.0
+    """Greatest change of a steering angle, rad/s; the quickest servos turn by 60 degrees in 0.09 s."""
     reaction: Share = 0.08
     """Seconds from a command leaving the gate to the truck's response."""
     standstill: Positive = 0.01
@@ -145,11 +145,12 @@ class GateConfig(Schema):
     """A request that may set the truck in motion must carry the stamp of a gate state not older than this, s."""
     remote_trackers: Annotated[tuple[str, ...], Field(strict=False)] = ()
     """Sources outside the robot that may drive as trackers."""
-    disarm_after: Positive = 1.5
-    """Seconds without a driver whose requests can be carried out, after which the truck disarms."""
+    disarm_after: Annotated[float, Field(gt=0, le=10)] = 1.5
+    """Seconds without a driver whose requests can be carried out, after which the truck disarms: somebody may come up
+    to it."""
 
     scan: SensorLimit = _limit(topics.SCAN)
-    scan_tilt: Annotated[float, Field(gt=0, le=math.pi / 2)] = 0.35
+    scan_tilt: Annotated[float, Field(gt=0, le=math.pi / 4)] = 0.35
     """A scan whose plane was tilted more than this is not valid, rad: half a metre ahead, as far as the gate checks, it
     passes 0.2 m above or below an obstacle."""
     drive: SensorLimit = _limit(topics.DRIVE)
@@ -178,10 +179,10 @@ class GateConfig(Schema):
     """Compass against steering, finds servos without supply; null = off."""
     blocked: ShaftCheckConfig | None = ShaftCheckConfig()
     """Commanded against measured speed of each driven shaft, finds blocked ones; null = off."""
-    short_faults: Annotated[int, Field(ge=2)] = 4
+    short_faults: Annotated[int, Field(ge=2, le=10)] = 4
     """So many stops for stale sensors within ``short_faults_within`` disarm: the fault is no short one."""
     short_faults_within: Positive = 10.0
-    """Seconds."""
+    """Seconds; at least a second for each of them, as the truck stands in between."""
     battery_low_speed: Positive = 0.1
     """Speed limit with a low battery, or a stale battery voltage, m/s."""
     obstacle: ObstacleLimits = ObstacleLimits()
@@ -199,8 +200,14 @@ class GateConfig(Schema):
         if self.tick_stall <= 1.0 / self.rate:
             msg = f"tick_stall {self.tick_stall} s: expected more than one tick, {1.0 / self.rate:g} s"
             raise ValueError(msg)
-        if self.standstill >= self.speed:
-            msg = f"standstill {self.standstill} m/s: expected less than speed, {self.speed} m/s"
+        if self.standstill > self.obstacle.crawl:
+            msg = f"standstill {self.standstill} m/s: expected at most obstacle.crawl, {self.obstacle.crawl} m/s"
+            raise ValueError(msg)
+        if self.obstacle.crawl >= self.speed:
+            msg = f"obstacle.crawl {self.obstacle.crawl} m/s: expected less than speed, {self.speed} m/s"
+            raise ValueError(msg)
+        if self.short_faults_within < self.short_faults:
+            msg = f"short_faults_within {self.short_faults_within} s: expected a second for each of {self.short_faults}"
             raise ValueError(msg)
         if max(vars(self.leases).values()) >= self.disarm_after:
             msg = f"disarm_after {self.disarm_after} s: expected more than every lease"
@@ -214,6 +221,8 @@ SIGHT: Final = 4.0
 GRAVITY: Final = 9.81
 GRIP: Final = 0.6
 """Friction of rubber wheels on a smooth floor, at most."""
+SLIPPING: Final = math.atan(GRIP)
+"""Slope on which the wheels slip, rad."""
 
 ROUNDING: Final = 1e-9
 
@@ -259,13 +268,37 @@ def beyond(config: GateConfig, body: BodyLimits) -> Iterator[str]:
             f"gate.speed {config.speed:g} m/s: with gate.scan.stale_after, max_latency, reaction and deceleration the "
             f"truck stands after {needed:.3g} m: at most {seen:.2f} m, {whose}"
         )
+    yield from longer(config, body, _times(config))
+    yield from _beyond_checks(config)
+
+
+def longer(config: GateConfig, body: BodyLimits, times: Iterable[tuple[str, float]]) -> Iterator[str]:
+    """Every setting that is a time in which the truck drives on whatever happens, and is too long for that.
+
+    Args:
+        config: the gate's.
+        body: which.
+        times: names and seconds.
+    """
     longest = body.length / config.speed
-    for name, seconds in _times(config):
+    for name, seconds in times:
         if seconds > longest:
-            yield (
-                f"gate.{name} {seconds:g} s: at most {longest:.2f} s, in which the truck travels its own length at "
-                f"gate.speed"
-            )
+            yield f"{name} {seconds:g} s: at most {longest:.2f} s, as long as its own length takes at gate.speed"
+
+
+def _beyond_checks(config: GateConfig) -> Iterator[str]:
+    """Checks that could never stop a truck."""
+    if config.obstacle.deceleration > config.deceleration:
+        yield (
+            f"gate.obstacle.deceleration {config.obstacle.deceleration:g} m/s^2: at most gate.deceleration, "
+            f"{config.deceleration:g}"
+        )
+    if config.tilt.stop > SLIPPING:
+        yield f"gate.tilt.stop {config.tilt.stop:g} rad: at most {SLIPPING:.3f}, where the wheels slip"
+    for name in ("turning", "blocked"):
+        check: SteeringCheckConfig | ShaftCheckConfig | None = getattr(config, name)
+        if check is not None and check.speed >= config.speed:
+            yield f"gate.{name}.speed {check.speed:g} m/s: expected less than gate.speed, {config.speed:g}"
 
 
 def stopping_distance(config: GateConfig) -> float:
@@ -278,9 +311,13 @@ def _times(config: GateConfig) -> Iterator[tuple[str, float]]:
     """Times in which the truck drives on whatever happens, s."""
     for name in ("scan", "drive", "steering", "attitude"):
         limit: SensorLimit = getattr(config, name)
-        yield f"{name}.stale_after", limit.stale_after
+        yield f"gate.{name}.stale_after", limit.stale_after
     for name in ("max_latency", "reaction", "tick_stall", "max_request_age"):
-        yield name, getattr(config, name)
+        yield f"gate.{name}", getattr(config, name)
+    for name, lease in vars(config.leases).items():
+        yield f"gate.leases.{name}", lease
+    if config.blocked is not None:
+        yield "gate.blocked.within", config.blocked.within
 
 
 WEAKER_ABOVE: Final = (
@@ -290,6 +327,7 @@ WEAKER_ABOVE: Final = (
     "acceleration",
     "deceleration",
     "quick_deceleration",
+    "steering_rate",
     "standstill",
     "leases.gamepad",
     "leases.keyboard",
@@ -340,15 +378,7 @@ WEAKER_BELOW: Final = (
 def weakened(config: GateConfig) -> tuple[str, ...]:
     """Settings of the gate that are weaker than the defaults, each with its value and the default."""
     default = GateConfig()
-    found = [
-        (name, value, usual)
-        for names, sign in ((WEAKER_ABOVE, 1), (WEAKER_BELOW, -1))
-        for name in names
-        if (value := _value(config, name)) is not None
-        and (usual := _value(default, name)) is not None
-        and sign * (value - usual) > 0
-    ]
-    texts = [f"gate.{name} {value:g}, default {usual:g}" for name, value, usual in found]
+    texts = [*weaker("gate", config, default, WEAKER_ABOVE, WEAKER_BELOW)]
     texts += [
         f"gate.{name}.critical false: a silent sensor does not stop the truck"
         for name in ("scan", "drive", "steering", "attitude")
@@ -367,7 +397,24 @@ def weakened(config: GateConfig) -> tuple[str, ...]:
     return tuple(texts)
 
 
-def _value(config: GateConfig, name: str) -> Any:
+def weaker(section: str, config: Schema, usual: Schema, above: Iterable[str], below: Iterable[str]) -> Iterator[str]:
+    """Every setting that is weaker than usual, with its value and the usual one.
+
+    Args:
+        section: where they are, for the texts.
+        config: the settings.
+        usual: likewise.
+        above: dotted names of those that are weaker the greater they are; what is None is not compared.
+        below: the less they are.
+    """
+    for names, sign in ((above, 1), (below, -1)):
+        for name in names:
+            value, default = _value(config, name), _value(usual, name)
+            if value is not None and default is not None and sign * (value - default) > 0:
+                yield f"{section}.{name} {value:g}, default {default:g}"
+
+
+def _value(config: Schema, name: str) -> Any:
     """A setting by its dotted name; None if its section is off."""
     found: Any = config
     for part in name.split("."):

@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 from monstertruck_schemas.base import Schema
 
 Volts = Annotated[float, Field(ge=0)]
-Seconds = Annotated[float, Field(ge=0)]
+Seconds = Annotated[float, Field(ge=0, le=60)]
 
 
 class PackConfig(Schema):

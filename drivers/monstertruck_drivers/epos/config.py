@@ -38,7 +38,7 @@ class EposConfig(Schema):
     rate: Annotated[float, Field(ge=1, le=25)] = 20.0
     """Feedback per second; one cycle needs four exchanges of 10 to 13 ms at 38400 baud."""
     status_period: Seconds = 0.1
-    current_period: Seconds = 0.2
+    current_period: Annotated[float, Field(gt=0, le=2)] = 0.2
     command_timeout: Seconds = 0.25
     """Age of the last command at which the target becomes 0."""
     quick_stop_after: Seconds = 1.0
@@ -46,7 +46,7 @@ class EposConfig(Schema):
     standstill_rpm: Annotated[int, Field(ge=1)] = 60
     """Slower than this counts as at rest."""
 
-    fault_resets: Annotated[int, Field(ge=0)] = 3
+    fault_resets: Annotated[int, Field(ge=0, le=10)] = 3
     """Fault resets tried within ``fault_reset_window`` before the drive is given up."""
     fault_reset_window: Seconds = 10.0
     fault_reset_pause: Seconds = 0.3

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from monstertruck_runtime.plugins import models_in
 from monstertruckd.config.load import load_truck
 from monstertruckd.config.truck import TruckConfig
 from monstertruckd.gate.config import (
@@ -22,13 +23,25 @@ STRONG = BodyLimits(length=2.0, mass=10.0, pull=500.0, motor_speed=9.0, sight=3.
 ACCELERATIONS = ("acceleration", "deceleration", "quick_deceleration")
 TIMES = (
     *(f"{sensor}.stale_after" for sensor in ("scan", "drive", "steering", "attitude")),
+    *(f"leases.{role}" for role in ("gamepad", "keyboard", "station", "tracker")),
+    "blocked.within",
     *("max_latency", "reaction", "tick_stall", "max_request_age"),
 )
-NOT_LIMITS = {
-    "leases", "remote_trackers", "scan", "drive", "steering", "attitude", "battery", "tolerated_failures", "tilt",
-    "turning", "blocked", "obstacle", "event_interval", "steering_rate",
-}  # fmt: skip
-"""Sections, what is judged apart, and what makes nothing less safe."""
+APART = {
+    *(f"{sensor}.critical" for sensor in ("scan", "drive", "steering", "attitude")),
+    *("tolerated_failures", "remote_trackers", "obstacle.open_ground"),
+}
+"""Settings that are no figures, with a text of their own where they weaken."""
+HARMLESS = {
+    "battery.critical": "a battery that is not measured is slow in any case; critical stops the truck as well",
+    "event_interval": "events that are left out are in state/gate and in the stops",
+}
+AS_THE_SPEED = {
+    "tilt.slow_speed": "above gate.speed it is no limit, and named; a slow robot has the defaults above its speed",
+    "battery_low_speed": "likewise",
+    "obstacle.unseen_speed": "likewise",
+}
+"""Settings that are weaker the greater they are, and have no ceiling of their own, with the reason."""
 
 
 def refusals(body=BODY, **config):
@@ -56,6 +69,11 @@ def test_the_defaults_are_within_all_ceilings_and_weaken_nothing():
         ({"reaction": 2.3}, "gate.reaction 2.3 s"),
         ({"tick_stall": 2.3}, "gate.tick_stall 2.3 s"),
         ({"max_request_age": 2.3}, "gate.max_request_age 2.3 s"),
+        ({"blocked": {"within": 2.3}}, "gate.blocked.within 2.3 s"),
+        ({"turning": {"speed": 0.21}}, "gate.turning.speed 0.21 m/s: expected less than gate.speed, 0.21"),
+        ({"blocked": {"speed": 0.21}}, "gate.blocked.speed 0.21 m/s: expected less than gate.speed, 0.21"),
+        ({"obstacle": {"deceleration": 1.01}}, "gate.obstacle.deceleration 1.01 m/s^2: at most gate.deceleration, 1"),
+        ({"tilt": {"stop": 0.541}}, "gate.tilt.stop 0.541 rad: at most 0.540, where the wheels slip"),
     ],
 )
 def test_what_a_body_cannot_do_is_refused_by_name(config, expected):
@@ -77,11 +95,8 @@ def test_a_time_is_at_most_that_of_its_own_length(name):
     body = BodyLimits(length=0.5, mass=7.25, pull=25.0, motor_speed=None, sight=1e3)
     for seconds, found in ((2.0, []), (2.0001, [f"gate.{name}"])):
         config = GateConfig(speed=0.25)
-        if name.endswith(".stale_after"):
-            section = name.split(".")[0]
-            update = {section: getattr(config, section).model_copy(update={"stale_after": seconds})}
-        else:
-            update = {name: seconds}
+        section, _, key = name.rpartition(".")
+        update = {section: getattr(config, section).model_copy(update={key: seconds})} if section else {key: seconds}
         assert [text.split()[0] for text in beyond(config.model_copy(update=update), body)] == found
 
 
@@ -141,9 +156,36 @@ def test_every_sensor_that_may_be_silent_is_named(sensor):
     assert text.startswith(f"gate.{sensor}.critical false")
 
 
+def leaves(model, prefix=""):
+    """Dotted names of all settings of a model, through its sections."""
+    for name, field in model.model_fields.items():
+        section = next((kind for kind in models_in(field)), None)
+        yield from [prefix + name] if section is None else leaves(section, f"{prefix}{name}.")
+
+
 def test_no_setting_is_forgotten():
-    judged = {name for name in (*WEAKER_ABOVE, *WEAKER_BELOW) if "." not in name}
-    assert judged | NOT_LIMITS == set(GateConfig.model_fields)
+    """A new one is decided upon: does it weaken, and in which direction."""
+    decided = [*WEAKER_ABOVE, *WEAKER_BELOW, *APART, *HARMLESS]
+    assert sorted(decided) == sorted(set(decided))
+    assert set(decided) == set(leaves(GateConfig))
+    assert all(getattr(GateConfig(), name) is not None for name in ("turning", "blocked")), "null weakens, by a text"
+
+
+def nested(name, value):
+    for part in reversed(name.split(".")):
+        value = {part: value}
+    return value
+
+
+@pytest.mark.parametrize("name", [name for name in WEAKER_ABOVE if name not in AS_THE_SPEED])
+def test_whatever_weakens_has_a_ceiling(name):
+    with pytest.raises(ValueError, match=name.rpartition(".")[2]):
+        truck(**nested(name, 10**9))
+
+
+@pytest.mark.parametrize("name", AS_THE_SPEED)
+def test_a_limit_above_the_speed_is_none_and_named(name):
+    assert [text for text in truck(**nested(name, 5.0)).weakened() if text.startswith(f"gate.{name} 5")]
 
 
 def test_sensors_checks_and_services_that_are_switched_off_are_named():
@@ -185,16 +227,10 @@ def test_a_truck_knows_its_limits_and_what_weakens_it():
     assert limits.motor_speed == pytest.approx(0.2195, abs=1e-4)
     assert limits.sight == pytest.approx(4.0 - 0.235 + 0.14)
     assert config.weakened() == ()
-    drive = config.devices.drive
-    assert drive is not None
-    slow = drive.model_copy(update={"driver": drive.driver.model_copy(update={"command_timeout": 1.0})})
-    devices = config.devices.model_copy(update={"drive": slow})
-    weak = truck(scan={"stale_after": 0.5}).model_copy(update={"devices": devices})
-    opened = config.zenoh.model_copy(update={"listen": ("tcp/0.0.0.0:7447",), "insecure": True})
-    assert config.model_copy(update={"zenoh": opened}).weakened() == (
-        "zenoh.insecure: anybody who reaches tcp/0.0.0.0:7447 may drive",
-    )
-    assert weak.weakened() == (
+    weak = truck(scan={"stale_after": 0.5})
+    opened = {"listen": ("tcp/0.0.0.0:7447",), "connect": ("tcp/10.0.0.1:7447",), "insecure": True}
+    assert weak.model_copy(update={"zenoh": config.zenoh.model_copy(update=opened)}).weakened() == (
         "gate.scan.stale_after 0.5, default 0.25",
-        "devices.drive.driver.command_timeout 1, default 0.25",
+        "zenoh.insecure: anybody who reaches tcp/0.0.0.0:7447 may drive",
+        "zenoh.insecure: anybody who reaches tcp/10.0.0.1:7447 may drive",
     )

@@ -74,7 +74,13 @@ def test_every_driving_role_has_its_own_lease():
         ({"quick_deceleration": 1.0}, {"quick_deceleration": 0.999}, "quick_deceleration"),
         ({"tick_stall": 0.0201}, {"tick_stall": 0.02}, "tick_stall 0.02 s: expected more than one tick, 0.02 s"),
         ({"rate": 10.0}, {"rate": 10.0, "tick_stall": 0.1}, "tick_stall"),
-        ({"standstill": 0.209}, {"standstill": 0.21}, "standstill 0.21 m/s: expected less than speed"),
+        (
+            {"standstill": 0.02},
+            {"standstill": 0.021},
+            "standstill 0.021 m/s: expected at most obstacle.crawl, 0.02 m/s",
+        ),
+        ({"obstacle": {"crawl": 0.209}}, {"obstacle": {"crawl": 0.21}}, "crawl 0.21 m/s: expected less than speed"),
+        ({"short_faults_within": 4.0}, {"short_faults_within": 3.9}, "short_faults_within 3.9 s: expected a second"),
         (
             {"leases": {"tracker": 0.9}, "disarm_after": 0.91},
             {"leases": {"tracker": 0.9}, "disarm_after": 0.9},

@@ -115,7 +115,7 @@ def test_every_shaft_gets_its_own_command():
     run_virtual(main)
 
 
-def test_settings_that_weaken_are_reported_at_the_start_and_in_every_state():
+def test_settings_that_weaken_are_reported_at_the_start_and_in_every_state(caplog):
     async def main(clock):
         bench = Bench(clock)
         weak = ("gate.speed 1, default 0.21", "gate.turning null")
@@ -126,6 +126,8 @@ def test_settings_that_weaken_are_reported_at_the_start_and_in_every_state():
         await clock.sleep(0.05)
         assert [(reason, text) for reason, _, text, _ in bench.events] == [(Reason.WEAKENED, each) for each in weak]
         assert bench.out.state.last.weakened == weak
+        logged = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+        assert logged == [f"configured less safe than by default: {each}" for each in weak]
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)
 

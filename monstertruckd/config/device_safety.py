@@ -1,0 +1,147 @@
+"""Settings of devices that decide how safe a robot is: what is beyond possible, and what is weaker than by default.
+
+As in ``monstertruckd.gate.config`` for the gate's own.
+"""
+
+import math
+from collections.abc import Iterator
+from typing import Any, Final
+
+from monstertruck_drivers.battery.config import PackConfig
+from monstertruck_drivers.config import Device, Devices, Monitors
+from monstertruck_drivers.epos.config import EposConfig
+from monstertruck_drivers.hokuyo_urg.config import HokuyoConfig
+from monstertruck_drivers.maestro.config import MaestroConfig
+from monstertruck_drivers.os4000.config import Os4000Config
+from monstertruck_schemas.base import Schema
+from monstertruckd.gate.config import BodyLimits, GateConfig, longer, weaker
+
+WEAKER_ABOVE: Final[dict[type[Schema], tuple[str, ...]]] = {
+    EposConfig: (
+        "max_motor_rpm",
+        "status_period",
+        "current_period",
+        "command_timeout",
+        "quick_stop_after",
+        "standstill_rpm",
+        "fault_resets",
+    ),
+    MaestroConfig: ("answer_timeout", "command_timeout"),
+    HokuyoConfig: ("skip",),
+    Os4000Config: ("delay", "field_tolerance", "gravity_tolerance"),
+    PackConfig: (
+        "max_compensation",
+        "low_after",
+        "critical_after",
+        "collapsed_after",
+        "overcharged",
+        "overcharged_after",
+        "overcharged_clear",
+        "plausible_max",
+    ),
+}
+"""Settings that are weaker the greater they are."""
+
+WEAKER_BELOW: Final[dict[type[Schema], tuple[str, ...]]] = {
+    EposConfig: (
+        "deceleration_rpm_s",
+        "quick_stop_deceleration_rpm_s",
+        "rate",
+        "fault_reset_window",
+        "fault_reset_pause",
+    ),
+    MaestroConfig: ("poll_rate", "battery_rate"),
+    HokuyoConfig: (),
+    Os4000Config: (),
+    PackConfig: ("low", "clear", "clear_after", "critical", "collapsed"),
+}
+"""Settings that are weaker the less they are."""
+
+BY_CELLS: Final = (
+    *("low", "clear", "critical", "collapsed", "overcharged", "overcharged_clear"),
+    *("max_compensation", "plausible_max"),
+)
+"""Voltages of a pack, which are compared cell by cell."""
+EMPTY: Final = 3.0
+"""Volts of a lithium-polymer cell at which it has nothing left."""
+FULL: Final = 4.5
+"""Volts of one that no charger reaches."""
+SAG: Final = 0.5
+"""Volts of a cell, the most that a motor's current may explain."""
+
+
+def beyond_devices(devices: Devices, monitors: Monitors, gate: GateConfig, body: BodyLimits) -> Iterator[str]:
+    """Every setting of a device that asks for more than the body can do, with what it can.
+
+    Args:
+        devices: of the robot.
+        monitors: likewise.
+        gate: likewise.
+        body: what bounds its motion.
+    """
+    for role, device in devices.present().items():
+        driver, place = device.driver, f"devices.{role}.driver"
+        if isinstance(driver, EposConfig):
+            names = ("command_timeout", "quick_stop_after", "status_period")
+            yield from longer(gate, body, ((f"{place}.{name}", getattr(driver, name)) for name in names))
+            if body.motor_speed is not None:
+                at_rest = math.ceil(gate.standstill / body.motor_speed * driver.max_motor_rpm)
+                if driver.standstill_rpm > at_rest:
+                    yield f"{place}.standstill_rpm {driver.standstill_rpm}: at most {at_rest}, gate.standstill"
+        if isinstance(driver, MaestroConfig):
+            yield from longer(gate, body, [(f"{place}.command_timeout", driver.command_timeout)])
+    for place, pack in _packs(devices, monitors):
+        yield from _beyond_cells(place, pack)
+
+
+def weakened_devices(devices: Devices, monitors: Monitors) -> Iterator[str]:
+    """Every setting of a device that is weaker than by default, with its value and the default.
+
+    Args:
+        devices: of the robot.
+        monitors: likewise.
+    """
+    for role, device in devices.present().items():
+        driver, place = device.driver, f"devices.{role}.driver"
+        if type(driver) in WEAKER_ABOVE:
+            yield from _weaker(place, driver, type(driver)())
+        if isinstance(driver, MaestroConfig):
+            if driver.deadman_feed == "always":
+                yield f"{place}.deadman_feed always: the deadman line guards against a dead process only"
+            if driver.battery is None and monitors.battery is None:
+                yield f"{place}.battery null: an empty battery is not noticed"
+    for place, pack in _packs(devices, monitors):
+        yield from _weaker(place, pack, _usual_pack(pack))
+
+
+def _weaker(place: str, config: Schema, usual: Schema) -> Iterator[str]:
+    kind = PackConfig if isinstance(config, PackConfig) else type(config)
+    return weaker(place, config, usual, WEAKER_ABOVE[kind], WEAKER_BELOW[kind])
+
+
+def _usual_pack(pack: PackConfig) -> PackConfig:
+    """The default thresholds for as many cells."""
+    usual = PackConfig()
+    share = pack.cells / usual.cells
+    return usual.model_copy(update={name: round(getattr(usual, name) * share, 6) for name in BY_CELLS})
+
+
+def _packs(devices: Devices, monitors: Monitors) -> Iterator[tuple[str, PackConfig]]:
+    """Whatever measures the battery, with its place in the configuration."""
+    steering: Device[Any] | None = devices.steering
+    battery = None if steering is None else getattr(steering.driver, "battery", None)
+    if isinstance(battery, PackConfig):
+        yield "devices.steering.driver.battery", battery
+    if isinstance(monitors.battery, PackConfig):
+        yield "monitors.battery", monitors.battery
+
+
+def _beyond_cells(place: str, pack: PackConfig) -> Iterator[str]:
+    for name in ("low", "critical", "collapsed"):
+        volts = getattr(pack, name)
+        if volts < EMPTY * pack.cells:
+            yield f"{place}.{name} {volts:g} V: at least {EMPTY * pack.cells:g}, where {pack.cells} cells are empty"
+    for name, most in (("plausible_max", FULL), ("max_compensation", SAG)):
+        volts = getattr(pack, name)
+        if volts > most * pack.cells:
+            yield f"{place}.{name} {volts:g} V: at most {most * pack.cells:g}, of {pack.cells} cells"
