@@ -21,6 +21,7 @@ import urllib.parse
 import urllib.request
 import zipfile
 from pathlib import Path
+from subprocess import DEVNULL
 
 UV_VERSION = "0.13.8"
 WHEEL_SHA256 = {
@@ -42,6 +43,8 @@ time, and no time limit. Plain pytest draws new ones."""
 FAILED_ALONE = ("-n", "0", "--last-failed", "--last-failed-no-failures", "none", "--cov-append")
 TESTS_FAILED = 1
 """Exit code of pytest; others mean that it did not run them."""
+KERNELS = (VENV / "bin" / "python", "-m", "monstertruckd.tools.install.kernels")
+"""Compiles what goals and maps need: after the first lap in the background, for nobody should wait for it before."""
 EXTRAS = {"demo": ("robot", "sim", "plot"), "check": ("dev",), "sync": ("dev",)}
 
 
@@ -56,10 +59,13 @@ def main(arguments: list[str]) -> int:
     command, *rest = arguments
     sync(EXTRAS[command])
     if command == "demo":
-        return run(VENV / "bin" / "monstertruckd", "demo", *rest)
+        code = run(VENV / "bin" / "monstertruckd", "demo", *rest)
+        subprocess.Popen(KERNELS, cwd=ROOT, stdin=DEVNULL, stdout=DEVNULL, stderr=DEVNULL, start_new_session=True)
+        return code
     if command == "check":
         return check(rest)
-    return 0
+    print("Compiling the kernels of planners and mapping: seconds, the first time a minute or two ...", file=sys.stderr)
+    return run(*KERNELS)
 
 
 def sync(extras: tuple[str, ...]) -> None:

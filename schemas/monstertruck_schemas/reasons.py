@@ -143,6 +143,7 @@ class Reason(StrEnum):
     LINK_OPEN = "link_open", 119, "anybody on the network may drive the truck"
 
     # Routes
+    PLANNER_STARTING = "planner_starting", 29, "the planner is starting"
     START_BLOCKED = "start_blocked", 30, "the truck stands in an obstacle or off the map"
     GOAL_BLOCKED = "goal_blocked", 31, "the truck would stand in an obstacle at the goal"
     GOAL_OUTSIDE = "goal_outside", 32, "the goal is off the map"

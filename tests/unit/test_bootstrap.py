@@ -70,6 +70,32 @@ def test_bytecode_is_compiled_with_the_environment(monkeypatch: pytest.MonkeyPat
     assert "--compile-bytecode" in commands[0]
 
 
+@pytest.mark.parametrize(
+    ("command", "expected"),
+    [("sync", ["compile"]), ("demo", ["demo", "compile in the background"]), ("check", ["check"])],
+)
+def test_kernels_are_compiled_at_installation_and_never_before_the_first_lap(
+    command: str, expected: list[str], monkeypatch: pytest.MonkeyPatch
+):
+    done: list[str] = []
+
+    def run(program: Path, *arguments: str) -> int:
+        done.append("demo" if arguments == ("demo", "--fast") else "compile")
+        return 3
+
+    def popen(command: tuple[str, ...], **settings: object) -> None:
+        assert command == bootstrap.KERNELS
+        assert settings["start_new_session"]
+        done.append("compile in the background")
+
+    monkeypatch.setattr(bootstrap, "sync", lambda _: None)
+    monkeypatch.setattr(bootstrap, "run", run)
+    monkeypatch.setattr(bootstrap.subprocess, "Popen", popen)
+    monkeypatch.setattr(bootstrap, "check", lambda _: done.append("check") or 3)
+    assert bootstrap.main([command, "--fast"]) == 3
+    assert done == expected
+
+
 @pytest.fixture
 def steps(monkeypatch: pytest.MonkeyPatch):
     """Arguments of every check that was run, and the exit codes of those of pytest, which a test fills."""

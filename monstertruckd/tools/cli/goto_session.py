@@ -2,7 +2,7 @@
 
 import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
-from contextlib import asynccontextmanager, suppress
+from contextlib import ExitStack, asynccontextmanager, suppress
 from dataclasses import asdict, dataclass
 from typing import Any, Final, Protocol
 
@@ -20,6 +20,8 @@ from monstertruckd.tools.cli.output import progress, remark
 
 LOOK: Final = 0.5
 """Half the period of reports why the truck stands, s."""
+PLANNER_START: Final = 240.0
+"""Seconds that a planner may take to start."""
 ACCEPT_TIMEOUT: Final = 3.0
 """Seconds in which a path is accepted or refused."""
 
@@ -75,8 +77,34 @@ async def drive_to(
             await driver.goal_control(GoalOrder.CANCEL)
 
         async with _taken_back(cancel):
-            number = int((await driver.goal(goal, via=via))["number"])
+            number = await _taken_on(driver, clock, goal, via)
         return await _watched(driver, clock, gate, arm=arm, end=_goal_end(states, number), undo=cancel)
+
+
+async def _taken_on(
+    driver: Driver, clock: Clock, goal: tuple[float, float, float], via: Sequence[tuple[float, ...]]
+) -> int:
+    """Number of the goal; while the planner is starting it is sent again and again.
+
+    Raises:
+        RequestRefusedError: for another reason, or the planner takes longer than ``PLANNER_START``.
+        NoAnswerError: the robot does not answer.
+    """
+    began = clock.now()
+    with ExitStack() as shown:
+        show: Callable[[float], None] | None = None
+        while True:
+            try:
+                return int((await driver.goal(goal, via=via))["number"])
+            except RequestRefusedError as refused:
+                waited = (clock.now() - began) / SECOND
+                if refused.refusal is not Reason.PLANNER_STARTING or waited > PLANNER_START:
+                    raise
+                if show is None:
+                    remark(f"waiting: {refused}")
+                    show = shown.enter_context(progress("the planner is starting"))
+                show(waited)
+            await clock.sleep(LOOK)
 
 
 @asynccontextmanager

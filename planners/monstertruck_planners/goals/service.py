@@ -158,9 +158,12 @@ class GoalService:
             RequestRefusedError: the sender may not, or the goal is none.
         """
         self._examine(request, "goal", moves=True)
+        if self._actor is None:
+            text = "the planner is starting; the first time after an installation it compiles for a minute or two"
+            raise RequestRefusedError(Reason.PLANNER_STARTING, text)
         pose = self._in.pose.latest
-        if self._actor is None or pose is None:
-            raise RequestRefusedError(Reason.NO_MAP, "no pose, or the planner is not up yet")
+        if pose is None:
+            raise RequestRefusedError(Reason.NO_MAP, "no pose yet")
         if request.frame not in (pose.frame, "map"):
             frames = " or ".join(map(repr, dict.fromkeys((pose.frame, "map"))))
             raise RequestRefusedError(Reason.BAD_INPUT, f"goal in frame {request.frame!r}: expected {frames}")

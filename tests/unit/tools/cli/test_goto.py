@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from monstertruck_runtime.clock import run_virtual
+from monstertruck_runtime.clock import SECOND, run_virtual
 from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError
 from monstertruck_runtime.mailbox import Mailbox
 from monstertruck_schemas.plan import Path
@@ -103,6 +103,35 @@ def to_goal(robot, clock):
 
 def along_path(robot, clock):
     return follow(robot, clock, PATH, arm=True)
+
+
+class StartingRobot(SilentRobot):
+    """Its planner is starting."""
+
+    def __init__(self, until: float, clock):
+        super().__init__("")
+        self._until = until
+        self._clock = clock
+
+    async def goal(self, goal, frame="map", via=()):
+        await self._ask("goal")
+        if self._clock.now() < self._until * SECOND:
+            raise RequestRefusedError(Reason.PLANNER_STARTING, "the planner compiles")
+        raise RequestRefusedError(Reason.DISARMED, "taken on")
+
+
+@pytest.mark.parametrize(("starts", "reason"), [(60.0, Reason.DISARMED), (300.0, Reason.PLANNER_STARTING)])
+def test_a_goal_waits_while_the_planner_is_starting_and_says_for_what(starts, reason, capsys):
+    async def main(clock):
+        robot = StartingRobot(starts, clock)
+        with pytest.raises(RequestRefusedError) as refused:
+            await to_goal(robot, clock)
+        assert refused.value.refusal is reason
+        assert len(robot.asked) > 100
+        assert clock.now() >= min(starts, 240.0) * SECOND
+
+    run_virtual(main)
+    assert capsys.readouterr().err.splitlines() == ["waiting: the planner compiles"]
 
 
 def test_a_goal_whose_request_is_interrupted_is_cancelled():

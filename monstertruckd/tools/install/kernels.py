@@ -1,0 +1,28 @@
+"""Compiles the kernels of all workers ahead of their first use: ``python -m monstertruckd.tools.install.kernels``.
+
+numba keeps them next to the modules, or in ``NUMBA_CACHE_DIR``. Where they are up to date this takes seconds.
+"""
+
+import importlib
+import os
+from contextlib import suppress
+from typing import Final
+
+from monstertruck_estimation.slam.service import TARGET
+from monstertruck_planners.steps import STEPS
+
+WORKERS: Final = (TARGET, *STEPS.values())
+"""``module:factory``; each compiles when it is built."""
+
+
+def compile_kernels() -> None:
+    """Build every worker once; those whose packages are not installed are left out."""
+    for target in WORKERS:
+        module, _, factory = target.partition(":")
+        with suppress(ModuleNotFoundError):
+            getattr(importlib.import_module(module), factory)()
+
+
+if __name__ == "__main__":
+    os.nice(10)
+    compile_kernels()

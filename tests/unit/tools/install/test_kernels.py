@@ -1,0 +1,33 @@
+"""Kernels compiled ahead of their first use."""
+
+import sys
+from types import ModuleType
+
+import pytest
+
+from monstertruckd.tools.install import kernels
+
+
+def test_every_worker_whose_packages_are_installed_is_built(monkeypatch: pytest.MonkeyPatch):
+    built: list[str] = []
+    present = ModuleType("present_worker")
+    present.build = lambda: built.append("present")  # type: ignore[attr-defined]
+
+    def incomplete() -> None:
+        import no_such_package  # noqa: F401
+
+    present.incomplete = incomplete  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "present_worker", present)
+    workers = ("no_such_package:Worker", "present_worker:incomplete", "present_worker:build")
+    monkeypatch.setattr(kernels, "WORKERS", workers)
+    kernels.compile_kernels()
+    assert built == ["present"]
+
+
+def test_mapping_planning_deformation_and_tracking_are_among_them():
+    assert [target.partition(":")[2] for target in kernels.WORKERS] == [
+        "SlamWorker",
+        "PlanningWorker",
+        "DeformingWorker",
+        "TrackingWorker",
+    ]
