@@ -104,7 +104,7 @@ def main() -> int:
     table = Table(*COLUMNS, box=box.MARKDOWN if markdown else box.SIMPLE)
     for one in furthest(runs):
         table.add_row(*cells(one.scenario, one.reaction))
-    Console(width=140).print(table)
+    Console(width=180).print(table)
     for one in runs:
         for text in one.shortcomings:
             print(f"{one.scenario.name}: {text}")

@@ -54,8 +54,10 @@ TARGETS = {
         f"monstertruckd/gate/{name}.py": ("tests/unit/gate",)
         for name in ("arbitration", "config", "core", "latch", "limiter", "rpc", "sensors", "service", "stops")
     },
-    "drivers/monstertruck_drivers/epos/driver.py": ("tests/unit/drivers/epos",),
-    "drivers/monstertruck_drivers/maestro/driver.py": ("tests/unit/drivers/maestro",),
+    **{
+        f"drivers/monstertruck_drivers/{device}/{name}.py": (f"tests/unit/drivers/{device}",)
+        for device, name in (("epos", "driver"), ("epos", "exchange"), ("maestro", "driver"), ("maestro", "session"))
+    },
     "systemd/neutral.py": ("tests/unit/systemd",),
 }  # fmt: skip
 """Sources, and the tests that are asked about them."""
