@@ -42,7 +42,7 @@ class TlsConfig(Schema):
     observers: Owners = ()
     """Common names that may see, and order an emergency stop."""
     engineers: Owners = ()
-    """Common names that may change settings and calibration, besides all a pilot may."""
+    """Common names that may save and undo calibrations, besides all a pilot may."""
     ranks: dict[OwnerName, Literal[Role.GAMEPAD, Role.KEYBOARD, Role.STATION]] = {}
     """Highest priority a name may claim; station where it is not given."""
     pilots_ca: Path | None = None

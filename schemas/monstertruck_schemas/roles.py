@@ -36,7 +36,7 @@ class AccessRole(StrEnum):
     PILOT = "pilot"
     """Drive, give orders and goals."""
     ENGINEER = "engineer"
-    """Change settings and calibration."""
+    """Save and undo calibrations."""
 
     def covers(self, needed: "AccessRole") -> bool:
         """Whether this role may do what takes ``needed``."""
