@@ -41,6 +41,11 @@ FRAME_TIMEOUT_MS = 120
 """Time-out of a half frame that the host sets: more than it waits for an acknowledge, so that only damage meets it."""
 BRIEF_QUIET = 0.17
 """Seconds of silence after which a controller with that time-out has surely dropped a half frame."""
+LEAST_QUIET = 0.02
+"""Seconds in which bytes that an adapter or this host holds back come in."""
+QUICK_ANSWER = 0.05
+"""Longest of the newest exchanges, s, up to which an answer that has not come within ``ANSWER_TIMEOUT`` is lost, not
+late."""
 RECENT = 32
 """Exchanges whose duration is judged."""
 QUIET_LIMIT = 1.1
@@ -228,10 +233,20 @@ class Exchanger:
                     self.quiet_until = self._quiet()
         self._link.discard()
 
-    def _quiet(self) -> int:
-        """Until when to be silent: briefly after damage; longer after it again, and after no answer: it may be late."""
-        brief = self._brief and not (self._answer_awaited or self._failed)
-        return self._clock.now() + int((BRIEF_QUIET if brief else QUIET) * SECOND)
+    def _quiet(self, *, waited: bool = False) -> int:
+        """Until when to be silent: briefly after damage; longer after it again, and after no answer that may be late.
+
+        After one that is lost the line was silent long enough if it was ``waited`` for.
+        """
+        if not self._brief or self._failed or (self._answer_awaited and not (waited and self._is_quick())):
+            silence = QUIET
+        else:
+            silence = LEAST_QUIET if self._answer_awaited else BRIEF_QUIET
+        return self._clock.now() + int(silence * SECOND)
+
+    def _is_quick(self) -> bool:
+        """Whether an answer that was waited for in vain is lost, not late as on a slow link."""
+        return len(self.durations) == RECENT and max(self.durations) <= QUICK_ANSWER * SECOND
 
     def _run_row(self, entries: Sequence[ObjectEntry], take: Callable[[int], bool]) -> Steps[None]:
         self._hurried = False
@@ -249,9 +264,10 @@ class Exchanger:
             frame = yield from self._converse(request)
         except (_BusyError, _HeldUpError) as error:
             raise DeviceTimeoutError(str(error)) from None
-        except BaseException:
-            self.quiet_until = self._quiet()
+        except BaseException as error:
+            self.quiet_until = self._quiet(waited=isinstance(error, DeviceTimeoutError))
             self._failed = True
+            self._link.discard()  # what came of it is no sign that the controller still speaks
             raise
         self._failed = False
         self.ended = self._clock.now()

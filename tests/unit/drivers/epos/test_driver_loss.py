@@ -3,10 +3,13 @@
 import asyncio
 import itertools
 import math
+from collections.abc import Callable
+from functools import partial
 from unittest.mock import AsyncMock
 
 import pytest
 
+from monstertruck_drivers.cable import DeviceEnd
 from monstertruck_drivers.epos.driver import RAD_S_PER_RPM, _DriveSession
 from monstertruck_drivers.epos.protocol import Control, State
 from monstertruck_runtime.clock import SECOND
@@ -344,6 +347,37 @@ def test_one_damaged_byte_costs_less_than_three_tenths_of_a_second(damage: str):
         assert len(rig.ready_at) == 1
 
     on_bench(test)
+
+
+def strike(device: DeviceEnd, way: str, nth: int, change: Callable[[int], bytes]) -> None:
+    """Change the nth byte from now on of one direction."""
+    passed, count = getattr(device, way), itertools.count()
+
+    def passing(data: bytes) -> None:
+        if out := b"".join(change(byte) if next(count) == nth else bytes((byte,)) for byte in data):
+            passed(out)
+
+    setattr(device, way, passing)
+
+
+@pytest.mark.parametrize("way", ["_emit", "_accept"], ids=["to the host", "to the controller"])
+@pytest.mark.parametrize("change", [lambda _: b"", lambda byte: bytes((byte ^ 0x80,))], ids=["lost", "flipped"])
+def test_any_byte_may_be_lost_or_flipped_for_less_than_three_tenths_of_a_second(
+    way: str, change: Callable[[int], bytes]
+):
+    async def test(rig: Rig, nth: int) -> None:
+        async with rig.driving():
+            await rig.drive(6_000)
+            await rig.settle(0.313)
+            began = len(rig.out.kept) - 1
+            strike(rig.port.device, way, nth, change)
+            await rig.settle(1.0)
+            times = [feedback.stamp for feedback in rig.out.kept[began:]]
+            assert max(b - a for a, b in itertools.pairwise(times)) < (0.3 + 0.05) * SECOND, nth
+        assert len(rig.ready_at) == 1
+
+    for nth in range(14):
+        on_bench(partial(test, nth=nth))
 
 
 def test_a_slow_link_is_named_once_and_again_when_it_is_quick():
