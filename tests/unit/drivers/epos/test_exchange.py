@@ -8,7 +8,7 @@ import pytest
 
 from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos.emulator import EposEmulator
-from monstertruck_drivers.epos.exchange import Exchanger, ObjectError
+from monstertruck_drivers.epos.exchange import BRIEF_QUIET, QUIET, Exchanger, ObjectError, _HeldUpError
 from monstertruck_drivers.epos.protocol import ObjectSegment, answer, segment_request
 from monstertruck_drivers.link import Link
 from monstertruck_runtime.clock import SECOND, VirtualClock, VirtualLoop, run_virtual
@@ -100,6 +100,22 @@ def test_a_row_that_nobody_waits_for_any_more_ends_with_the_exchange_that_has_be
         assert task.cancelled()
         await line.write(od.CONTROLWORD, 0x0002)
         assert len(got) == 1
+
+    on_line(test)
+
+
+def test_a_row_after_one_that_was_cut_short_is_read_whole():
+    async def test(emulator: EposEmulator, line: Exchanger, clock: VirtualClock) -> None:
+        entries = (od.STATUSWORD, od.MODE, od.POSITION)
+        cut: list[int] = []
+        task = asyncio.create_task(line.read_row(entries, lambda value: not cut.append(value)))
+        await asyncio.sleep(0)
+        await line.finish()
+        await task
+        assert len(cut) == 1
+        got: list[int] = []
+        await line.read_row(entries, lambda value: not got.append(value))
+        assert len(got) == 3
 
     on_line(test)
 
@@ -259,6 +275,72 @@ def test_after_a_timeout_nothing_is_sent_for_550_ms():
         assert peer.written[2][0] - failed == pytest.approx(0.55, abs=0.001)
 
     with_peer(O, b"")(test)
+
+
+@pytest.mark.parametrize(
+    ("replies", "failed_before", "silence"),
+    [
+        ((), False, BRIEF_QUIET),
+        ((), True, QUIET),
+        ((O, O), False, QUIET),
+        ((O, O + b"\x07"), False, BRIEF_QUIET),
+        ((O, O + b"\0", ANSWER[:5]), False, BRIEF_QUIET),
+    ],
+)
+def test_a_controller_that_drops_half_frames_soon_needs_silence_for_a_late_answer_or_a_second_failure(
+    replies: tuple[bytes, ...], failed_before: bool, silence: float
+):
+    async def test(peer: Peer, line: Exchanger) -> None:
+        line._brief, line._failed = True, failed_before
+        with pytest.raises((DeviceTimeoutError, ProtocolError)):
+            await line.read(od.STATUSWORD)
+        assert line.quiet_until - line._clock.now() == round(silence * SECOND)
+
+    with_peer(*replies)(test)
+
+
+def test_a_byte_instead_of_an_answer_is_kept_as_strange():
+    async def test(peer: Peer, line: Exchanger) -> None:
+        with pytest.raises(ProtocolError, match="07 instead of an answer"):
+            await line.read(od.STATUSWORD)
+        assert line.strange == b"\x07"
+
+    with_peer(O, O + b"\x07")(test)
+
+
+def test_a_repeat_that_breaks_off_is_waited_for_no_longer_than_one_that_does_not_begin():
+    async def test(peer: Peer, line: Exchanger) -> None:
+        assert await line.read(od.STATUSWORD) == DISABLED
+        refused, asked_again = [at for at, data in peer.written if data in (F, b"\x10")][1:]
+        assert asked_again - refused == pytest.approx(0.03, abs=1e-6)
+
+    damaged = ANSWER[:-1] + bytes((ANSWER[-1] ^ 1,))
+    with_peer(O, O + b"\0", damaged, ANSWER[:1], O, O + b"\0", ANSWER, b"")(test)
+
+
+@pytest.mark.parametrize(("early", "held_up"), [(0, True), (1, False)])
+def test_a_process_stood_still_if_a_wait_took_as_long_as_a_half_frame_is_kept(early: int, held_up: bool):
+    async def test(peer: Peer, line: Exchanger) -> None:
+        asked = line._clock.now() - round(QUIET * SECOND) + early
+        if held_up:
+            with pytest.raises(_HeldUpError, match=r"stood still for 0\.6 s"):
+                line._check_held_up(asked)
+        else:
+            line._check_held_up(asked)
+
+    with_peer()(test)
+
+
+def test_a_refused_read_names_the_object_and_a_refused_write_its_value():
+    async def test(emulator: EposEmulator, line: Exchanger, clock: VirtualClock) -> None:
+        with pytest.raises(ObjectError) as read:
+            await line.read(od.ObjectEntry("nothing", 0x7FFF, 0, 16))
+        assert "(nothing): 0x" in str(read.value)
+        with pytest.raises(ObjectError) as written:
+            await line.write(od.MODE, 99)
+        assert "(mode of operation) = 99: 0x" in str(written.value)
+
+    on_line(test)
 
 
 @pytest.mark.parametrize("reply", range(3))
