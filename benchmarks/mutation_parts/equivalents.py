@@ -4,6 +4,7 @@ from typing import Final
 
 GATE: Final = "monstertruckd/gate/"
 DRIVE: Final = "drivers/monstertruck_drivers/epos/driver.py"
+EXCHANGE: Final = "drivers/monstertruck_drivers/epos/exchange.py"
 NANOSECOND: Final = "a nanosecond, at the very beginning of time"
 UNREAD: Final = "set before it is read"
 ROUNDED: Final = "a difference of rounded distances is never exactly 3 cm"
@@ -66,6 +67,9 @@ EQUIVALENTS: Final[dict[str, str]] = {
     "await self._read(od.CURRENT) / 1000 * self._sign -> ((await self._read(od.CURRENT) / 1000) / (self._sign))": (
         "a sign: 1 or -1"
     ),
+    f"{EXCHANGE}::Exchanger.__init__: 0 -> (1)": UNREAD,
+    f"{EXCHANGE}::Exchanger.__init__: self.began = 0 -> pass": UNREAD,
+    f"{EXCHANGE}::Exchanger.__init__: self.ended = 0 -> pass": UNREAD,
     f"{GATE}latch.py::EstopLatch.__init__: 8 -> (9)": "the length of a name",
     f"{GATE}latch.py::Mark.engaged: 2 -> (3)": "any second byte is damage",
 }

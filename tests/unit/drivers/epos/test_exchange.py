@@ -28,6 +28,8 @@ class Peer:
         self.replies: list[bytes] = []
         self.stand_still_before: int | None = None
         """Number of the reply before which the host's process does not run for 1.5 s."""
+        self.on_refusal: Callable[[], None] | None = None
+        """Called when the host refuses an answer."""
         self._clock = clock
         self.link = Link("peer", self._take, lambda: None)
 
@@ -35,6 +37,8 @@ class Peer:
         self.written.append((self._clock.now() / SECOND - 1, data))
         if len(self.written) - 1 == self.stand_still_before:
             asyncio.get_running_loop().call_soon(self._stand_still)
+        elif data == F and self.on_refusal is not None:
+            self.on_refusal()
         elif self.replies:
             self.link.feed(self.replies.pop(0))
 
@@ -299,6 +303,20 @@ def test_a_controller_that_drops_half_frames_soon_needs_silence_for_a_late_answe
     with_peer(*replies)(test)
 
 
+@pytest.mark.parametrize(("brief", "silence"), [(True, BRIEF_QUIET), (False, QUIET)])
+def test_a_byte_into_the_silence_at_a_beginning_prolongs_it_by_what_the_controller_needs(brief: bool, silence: float):
+    async def test(peer: Peer, line: Exchanger) -> None:
+        line._brief = brief
+        began = line._clock.now()
+        line.quiet_until = began + SECOND // 10
+        asyncio.get_running_loop().call_later(0.05, peer.link.feed, b"\x55")
+        await line.settle()
+        assert (line._clock.now() - began) / SECOND == pytest.approx(0.05 + silence, abs=1e-3)
+        assert line.strange == b"\x55"
+
+    with_peer()(test)
+
+
 def test_a_byte_instead_of_an_answer_is_kept_as_strange():
     async def test(peer: Peer, line: Exchanger) -> None:
         with pytest.raises(ProtocolError, match="07 instead of an answer"):
@@ -316,6 +334,27 @@ def test_a_repeat_that_breaks_off_is_waited_for_no_longer_than_one_that_does_not
 
     damaged = ANSWER[:-1] + bytes((ANSWER[-1] ^ 1,))
     with_peer(O, O + b"\0", damaged, ANSWER[:1], O, O + b"\0", ANSWER, b"")(test)
+
+
+@pytest.mark.parametrize(("begins", "ends", "taken"), [(0.015, 0.025, True), (0.015, 0.035, False)])
+def test_a_repeat_has_its_time_from_the_refusal_on(begins: float, ends: float, taken: bool):
+    async def test(peer: Peer, line: Exchanger) -> None:
+        def repeat() -> None:
+            loop = asyncio.get_running_loop()
+            loop.call_later(begins, peer.link.feed, ANSWER[:1])
+            loop.call_later(ends, peer.link.feed, ANSWER[1:])
+
+        peer.on_refusal = repeat
+        reading = asyncio.ensure_future(line.read(od.STATUSWORD))
+        await asyncio.wait([reading], timeout=0.04)
+        asked = [data for _, data in peer.written].count(b"\x10")
+        assert asked == (1 if taken else 2)
+        if taken:
+            assert reading.result() == DISABLED
+        reading.cancel()
+
+    damaged = ANSWER[:-1] + bytes((ANSWER[-1] ^ 1,))
+    with_peer(O, O + b"\0", damaged)(test)
 
 
 @pytest.mark.parametrize(("early", "held_up"), [(0, True), (1, False)])

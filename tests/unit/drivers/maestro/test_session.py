@@ -1,5 +1,6 @@
 """Questions and answers of the Maestro, which carry no mark of their own: late, strange and missing answers."""
 
+import asyncio
 from collections.abc import Callable, Coroutine
 from typing import Any
 
@@ -7,7 +8,7 @@ import pytest
 
 from monstertruck_drivers.link import Link
 from monstertruck_drivers.maestro.protocol import ERROR_MASK, POSITION_MAX, Encoder
-from monstertruck_drivers.maestro.session import ATTEMPTS, RESYNC_TRIES, MaestroSession
+from monstertruck_drivers.maestro.session import ATTEMPTS, QUIET, RESYNC_TRIES, MaestroSession
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.errors import DeviceLostError, DeviceTimeoutError, ProtocolError, WrongDeviceError
 
@@ -81,6 +82,21 @@ def test_after_a_missing_answer_the_next_one_is_asked_for_once_the_late_one_is_w
         peer.replies = [words(6)]
         assert await peer.session.ask(ERRORS) == [6]
         assert peer.written[3:] == [ERRORS], "in step again"
+
+    with_peer(None)(test)
+
+
+def test_nothing_is_asked_while_a_late_answer_is_still_coming():
+    async def test(peer: Peer, clock: VirtualClock) -> None:
+        with pytest.raises(DeviceTimeoutError):
+            await peer.session.ask(ERRORS)
+        peer.link.feed(b"\1")
+        asyncio.get_running_loop().call_later(0.9 * QUIET, peer.link.feed, b"\2")
+        peer.replies = [words(CENTRE), words(5)]
+        began = clock.now()
+        assert await peer.session.ask(ERRORS) == [5]
+        assert peer.written == [ERRORS, POSITION, ERRORS]
+        assert (clock.now() - began) / SECOND == pytest.approx(2.9 * QUIET, abs=1e-3)
 
     with_peer(None)(test)
 
