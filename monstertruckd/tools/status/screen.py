@@ -2,22 +2,26 @@
 
 import math
 from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Group, RenderableType
+from rich.console import Console, ConsoleOptions, Group, RenderableType
 from rich.layout import Layout
 from rich.panel import Panel
+from rich.segment import Segment
+from rich.style import Style
 from rich.table import Table
 from rich.text import Text
 
 from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.collision import scan_points
 from monstertruck_runtime.stop_text import stop_lines
+from monstertruck_schemas.base import Message
 from monstertruck_schemas.event import Event, Severity, Stop
-from monstertruck_schemas.health import HealthTable, LoopHealth, RecorderHealth, ServiceState
+from monstertruck_schemas.health import HealthTable, LoopHealth, RecorderHealth, ServiceHealth, ServiceState
 from monstertruck_schemas.plan import TrackerState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import Attitude, Battery, LaserScan
@@ -47,13 +51,27 @@ HORIZON = 0.72
 """Where the truck stands in the scan view, from the top: the lidar looks ahead."""
 
 
+SILENCE: Final = 2.0
+"""Seconds without any message after which a robot counts as gone: it speaks several times a second."""
+GONE: Final = Style(color="bright_black")
+"""Of everything that a robot said before it fell silent."""
+
+
 @dataclass(slots=True)
 class ScreenState:
     """Newest message of everything the screen shows."""
 
     robot: str
-    started: int
+    heard: int
+    """When the newest message came, ns of the station's clock; before the first one: since when it is awaited."""
+    silence: float = 0.0
+    """Seconds since then."""
+    trouble: str = ""
+    """Why there is no link to the robot."""
+    began: int | None = None
+    """Stamp of the first message, ns of the robot's clock."""
     now: int = 0
+    """Stamp of the newest message, ns of the robot's clock: ages end with what it says."""
     gate: GateState | None = None
     odometry: Odometry | None = None
     scan: LaserScan | None = None
@@ -74,8 +92,10 @@ class ScreenState:
             return []
         return stop_lines(self.stop, self.gate.stamp)
 
-    def take(self, message: object) -> None:
+    def take(self, message: Message) -> None:
         """Remember ``message`` if the screen shows its kind."""
+        self.now = message.stamp
+        self.began = message.stamp if self.began is None else self.began
         if (name := _NEWEST.get(type(message))) is not None:
             setattr(self, name, message)
         match message:
@@ -105,7 +125,9 @@ _NEWEST: Final[dict[type, str]] = {
 
 
 def draw(state: ScreenState, width: int, events: int = 6) -> RenderableType:
-    """The whole screen; a terminal narrower than ``WIDE`` columns gets no scan view.
+    """The whole screen; a terminal narrower than ``WIDE`` columns names the services alone that are not ready.
+
+    Once the robot has been silent for ``SILENCE`` seconds, that stands above everything it said, in grey.
 
     Args:
         state: what is shown.
@@ -113,17 +135,52 @@ def draw(state: ScreenState, width: int, events: int = 6) -> RenderableType:
         events: newest events shown.
     """
     layout = Layout()
-    rows = [Layout(name="top", ratio=1), Layout(_events(state, events), name="events", size=events + 2)]
+    gone = state.silence > SILENCE
+    paint: Callable[[RenderableType], RenderableType] = _Gone if gone else _as_it_is
+    rows = [Layout(name="top", ratio=1), Layout(paint(_events(state, events)), name="events", size=events + 2)]
     if lines := state.why_stopped:
         stop = Panel(Text("\n".join(lines), style="yellow", no_wrap=True), title="stopped", border_style="yellow")
-        rows.insert(1, Layout(stop, name="stop", size=len(lines) + 2))
+        rows.insert(1, Layout(paint(stop), name="stop", size=len(lines) + 2))
+    if gone:
+        rows.insert(0, Layout(_banner(state), name="gone", size=1))
     layout.split_column(*rows)
-    parts = [Layout(_truck(state), size=40), Layout(_services(state), size=34 if width >= WIDE else None)]
+    scan = Layout(paint(Panel(_Braille(state), title="scan and trail, robot frame", border_style="dim")))
+    truck = Layout(paint(_truck(state)), size=40)
     if width >= WIDE:
-        scan = Panel(_Braille(state), title="scan and trail, robot frame", border_style="dim")
-        parts.insert(1, Layout(scan))
-    layout["top"].split_row(*parts)
+        layout["top"].split_row(truck, scan, Layout(paint(_services(state)), size=34))
+        return layout
+    column = Layout()
+    troubled = _troubled(state)
+    column.split_column(Layout(paint(_services(state, troubled)), size=len(troubled) + 4), scan)
+    layout["top"].split_row(truck, column)
     return layout
+
+
+def _as_it_is(content: RenderableType) -> RenderableType:
+    return content
+
+
+class _Gone:
+    """What was, in grey."""
+
+    def __init__(self, content: RenderableType) -> None:
+        self._content = content
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[Segment]:
+        for segment in console.render(self._content, options):
+            yield Segment(segment.text, GONE, segment.control)
+
+
+def _banner(state: ScreenState) -> Text:
+    said = "no robot" if state.began is None else "no word of the robot"
+    text = f"{said} for {state.silence:.0f} s" + (f": {state.trouble}" if state.trouble else "")
+    return Text(text, style="bold white on red", no_wrap=True, overflow="ellipsis")
+
+
+def _troubled(state: ScreenState) -> list[ServiceHealth]:
+    """The services that are not ready, as many as a small screen has room for."""
+    services = state.health.services if state.health is not None else ()
+    return [row for row in services if row.state is not ServiceState.READY][:4]
 
 
 def _row(table: Table, name: str, value: str | Text) -> None:
@@ -173,9 +230,11 @@ def _done(tracker: TrackerState) -> float:
     return tracker.along / tracker.length if tracker.length else 0.0
 
 
-def _services(state: ScreenState) -> Panel:
+def _services(state: ScreenState, shown: Sequence[ServiceHealth] | None = None) -> Panel:
+    """All services; or those ``shown``, and how many of all are ready."""
     table = Table.grid(padding=(0, 1))
-    for row in state.health.services if state.health is not None else ():
+    services = state.health.services if state.health is not None else ()
+    for row in services if shown is None else shown:
         age = max(0, state.now - row.since) / 1e9
         table.add_row(
             row.name,
@@ -184,6 +243,8 @@ def _services(state: ScreenState) -> Panel:
             Text(f"↻{row.restarts}" if row.restarts else "", style="yellow"),
         )
     parts: list[RenderableType] = [table]
+    if shown is not None and services:
+        parts.append(Text(f"{sum(row.state is ServiceState.READY for row in services)} of {len(services)} ready"))
     if state.recorder is not None and state.recorder.recording:
         parts.append(Text(f"● recording {state.recorder.bytes_written / 1e6:.1f} MB unpacked", style="red"))
     elif state.recorder is not None and state.recorder.reason is not Reason.OK:
@@ -194,7 +255,7 @@ def _services(state: ScreenState) -> Panel:
 def _events(state: ScreenState, count: int) -> Panel:
     lines = Text()
     for event in list(state.events)[-count:]:
-        seconds = (event.stamp - state.started) / 1e9
+        seconds = (event.stamp - (state.began or 0)) / 1e9
         lines.append(f"{seconds:8.2f} s  ", style="dim")
         lines.append(f"{event.source}: ", style="bold")
         lines.append(event.text or event.reason.text, style=EVENT_STYLE[event.severity])

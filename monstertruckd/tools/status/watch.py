@@ -8,8 +8,8 @@ from rich.console import Console
 from rich.live import Live
 
 from monstertruck_runtime.client import TruckClient
-from monstertruck_runtime.clock import Clock
-from monstertruck_runtime.errors import NoAnswerError
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.errors import NoAnswerError, NotFoundError
 from monstertruck_runtime.mailbox import fifo, latest
 from monstertruck_schemas import topics
 from monstertruck_schemas.base import Message
@@ -29,13 +29,21 @@ SHOWN: tuple[Topic[Any], ...] = (
     topics.STOP,
 )
 PERIOD = 0.1
+RETRY = 1.0
+"""Seconds in which a robot that is there answers."""
 
 
 class Follower:
-    """Keeps a ``ScreenState`` up to date from a client's subscriptions."""
+    """Keeps a ``ScreenState`` up to date from a client's subscriptions.
 
-    def __init__(self, client: TruckClient, clock: Clock) -> None:
-        self.state = ScreenState(f"{client.robot} at {client.endpoint}", clock.now())
+    Args:
+        client: connected.
+        clock: the station's time.
+        state: what is kept up to date; None = a new one.
+    """
+
+    def __init__(self, client: TruckClient, clock: Clock, state: ScreenState | None = None) -> None:
+        self.state = state or ScreenState(f"{client.robot} at {client.endpoint}", clock.now())
         self._clock = clock
         self._newest = [client.subscribe(topic, latest()) for topic in SHOWN]
         self._events = client.subscribe(topics.EVENT, fifo(64))
@@ -45,11 +53,16 @@ class Follower:
         await asyncio.gather(self._sample(), self._collect())
 
     async def _sample(self) -> None:
+        taken: dict[int, Message] = {}
         while True:
-            self.state.now = self._clock.now()
-            for mailbox in self._newest:
-                if mailbox.latest is not None:
-                    self.state.take(mailbox.latest)
+            now = self._clock.now()
+            for number, mailbox in enumerate(self._newest):
+                message = mailbox.latest
+                if message is not None and message is not taken.get(number):
+                    taken[number] = message
+                    self.state.take(message)
+                    self.state.heard = now
+            self.state.silence = (now - self.state.heard) / SECOND
             await self._clock.sleep(PERIOD / 2)
 
     async def _collect(self) -> None:
@@ -58,17 +71,30 @@ class Follower:
 
 
 async def watch(clock: Clock, robot: str, endpoint: str) -> None:
-    """Draw the screen until cancelled."""
-    async with TruckClient(robot, endpoint, clock=clock) as client:
-        follower = Follower(client, clock)
-        task = asyncio.create_task(follower.run())
+    """Draw the screen until cancelled; a robot that is not there, or goes, is waited for."""
+    state = ScreenState(f"{robot} at {endpoint}", clock.now())
+    following = asyncio.create_task(_follow(clock, robot, endpoint, state))
+    try:
+        with Live(console=Console(), screen=True, auto_refresh=False) as live:
+            while not following.done():
+                live.update(draw(state, live.console.width), refresh=True)
+                await clock.sleep(PERIOD)
+        following.result()
+    finally:
+        following.cancel()
+        await asyncio.wait([following])
+
+
+async def _follow(clock: Clock, robot: str, endpoint: str, state: ScreenState) -> None:
+    while True:
         try:
-            with Live(console=Console(), screen=True, auto_refresh=False) as live:
-                while True:
-                    live.update(draw(follower.state, live.console.width), refresh=True)
-                    await clock.sleep(PERIOD)
-        finally:
-            task.cancel()
+            async with TruckClient(robot, endpoint, clock=clock, timeout=RETRY) as client:
+                state.trouble = ""
+                await Follower(client, clock, state).run()
+        except NotFoundError as error:
+            state.trouble = str(error)
+            state.silence = (clock.now() - state.heard) / SECOND
+            await clock.sleep(PERIOD)
 
 
 async def print_once(clock: Clock, robot: str, endpoint: str, *, json_output: bool) -> None:
@@ -87,7 +113,7 @@ async def print_once(clock: Clock, robot: str, endpoint: str, *, json_output: bo
             rows = {name: m.model_dump(mode="json") for name, m in newest.items() if name != topics.SCAN.name}
             print(json.dumps(rows, indent=2))
             return
-        state = ScreenState(robot, clock.now(), now=clock.now())
+        state = ScreenState(robot, clock.now())
         for message in newest.values():
             state.take(message)
         for line in plain(state):

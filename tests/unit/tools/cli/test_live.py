@@ -21,7 +21,7 @@ def test_long_lists_and_texts_are_cut_and_say_so():
 
 
 def state(mode: GateMode) -> ScreenState:
-    screen = ScreenState("truck", started=0)
+    screen = ScreenState("truck", heard=0)
     screen.take(GateState(stamp=1, received=1, seq=0, mode=mode, nonce="n", speed_limit=0.2))
     return screen
 

@@ -1,5 +1,7 @@
 """The live screen draws whatever there is, in any terminal."""
 
+import re
+
 import numpy as np
 import pytest
 from rich.console import Console
@@ -19,7 +21,7 @@ HEADER = {"stamp": 10**9, "received": 10**9, "seq": 0}
 
 
 def full() -> ScreenState:
-    state = ScreenState("truck", started=0, now=3 * 10**9)
+    state = ScreenState("truck", heard=0)
     ranges = np.full(682, 1.5)
     ranges[::7] = np.inf
     for message in (
@@ -94,7 +96,7 @@ def test_it_shows_what_matters():
         "+1.2 cm",
         "NOT RECORDING: no space left",
         "backoff",
-        "1.00 s  gate: tilted",
+        "0.00 s  gate: tilted",
         "▲",
     ):
         assert words in text
@@ -141,7 +143,7 @@ def test_a_stopped_truck_says_why():
 
 
 def test_the_screen_shows_who_waits_and_what_weakens_the_truck():
-    state = ScreenState("truck", started=0)
+    state = ScreenState("truck", heard=0)
     gate = {"mode": GateMode.DISARMED, "nonce": "n", "speed_limit": 0.0}
     weakened = ("gate.scan.stale_after 1, default 0.25", "gate.turning null: servos without supply are not noticed")
     state.take(GateState(**HEADER, **gate, waiting=("tracker",), weakened=weakened))
@@ -151,3 +153,56 @@ def test_the_screen_shows_who_waits_and_what_weakens_the_truck():
     text = console.export_text()
     for words in ("waiting", "tracker", "weakened", "gate.scan.stale_after 1", "gate.turning null"):
         assert words in text
+
+
+def shown(state: ScreenState, width: int = 80, height: int = 24) -> Console:
+    console = Console(width=width, height=height, record=True, force_terminal=True, color_system="truecolor")
+    console.print(draw(state, width), height=height)
+    return console
+
+
+def test_a_small_terminal_shows_the_scan_too():
+    text = shown(full()).export_text()
+    assert sum(0x2800 < ord(letter) <= 0x28FF for letter in text) > 20
+    assert "lidar" in text
+    assert "0 of 1 ready" in text
+    assert "TILT" in text.upper()
+
+
+def test_a_robot_that_fell_silent_is_not_shown_as_alive():
+    state = full()
+    alive = shown(state).export_text(clear=False)
+    assert "no word" not in alive
+    state.silence = 12.3
+    console = shown(state)
+    styled = console.export_text(clear=False, styles=True)
+    text = console.export_text()
+    assert text.startswith("no word of the robot for 12 s")
+    assert "DRIVING" in text
+    assert styled.count("\x1b[1;37;41m") == 1, "white on red"
+    assert set(re.findall(r"\x1b\[([\d;]+)m", styled)) == {"1;37;41", "90", "0"}, "all else is grey"
+    assert text.splitlines()[-1] == alive.splitlines()[-1], "it still fits"
+
+
+def test_a_robot_that_was_never_heard_is_waited_for():
+    state = ScreenState("truck at tcp/there", heard=0)
+    state.silence, state.trouble = 5.0, "no robot answers at tcp/there within 1 s"
+    assert shown(state, 120).export_text().startswith("no robot for 5 s: no robot answers at tcp/there within 1 s")
+
+
+def test_ages_are_of_the_robots_clock():
+    state = ScreenState("truck", heard=10**18)
+    state.take(
+        HealthTable(
+            stamp=40 * 10**9,
+            received=40 * 10**9,
+            seq=0,
+            services=(ServiceHealth(name="lidar", state=ServiceState.BACKOFF, since=30 * 10**9, detail=""),),
+        )
+    )
+    state.take(
+        Event(stamp=41 * 10**9, received=0, seq=0, reason=Reason.TILT_SLOW, severity=Severity.INFO, source="gate")
+    )
+    text = shown(state).export_text()
+    assert "11 s" in text
+    assert " 1.00 s  gate" in text
