@@ -45,7 +45,7 @@ TESTS_FAILED = 1
 """Exit code of pytest; others mean that it did not run them."""
 KERNELS = (VENV / "bin" / "python", "-m", "monstertruckd.tools.install.kernels")
 """Compiles what goals and maps need: after the first lap in the background, for nobody should wait for it before."""
-EXTRAS = {"demo": ("robot", "sim", "plot"), "check": ("dev",), "sync": ("dev",)}
+EXTRAS = {"demo": ("sim",), "check": ("dev",), "sync": ("dev",)}
 
 
 def main(arguments: list[str]) -> int:

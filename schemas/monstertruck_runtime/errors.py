@@ -35,6 +35,12 @@ class BusyError(TruckError):
     reason = Reason.BUSY
 
 
+class NotInstalledError(TruckError):
+    """A library that an extra brings is not installed."""
+
+    reason = Reason.NOT_INSTALLED
+
+
 class NotPermittedError(TruckError):
     """The user lacks a right; the text says how to get it."""
 

@@ -12,16 +12,19 @@ from monstertruckd.tools.cli.output import (
     JsonOption,
     console,
     finish,
+    needs_extra,
     on_terminal,
     print_json,
     print_table,
     remark,
     until_stopped,
 )
+from monstertruckd.tools.shipped import shipped
 
-DEMO_CONFIG = Path(__file__).resolve().parents[3] / "configs" / "demo.yaml"
+DEMO_CONFIG = shipped("configs/demo.yaml")
 
 
+@needs_extra("sim")
 def demo(
     fast: Annotated[bool, typer.Option("--fast", help="Virtual clock: as fast as it computes, reproducible.")] = False,
     seed: Annotated[int | None, typer.Option(help="Seed of world and devices; default: the configuration's.")] = None,
@@ -70,6 +73,7 @@ def _print(rows: list[tuple[str, str]], messages: dict[str, int]) -> None:
     print_table(("topic", "messages"), [(name, str(n)) for name, n in sorted(messages.items())], right=("messages",))
 
 
+@needs_extra("sim")
 def simulate(
     config: ConfigOption,
     truth: Annotated[Path | None, typer.Option("--truth", help="Write what really happened (npz) at the end.")] = None,

@@ -10,7 +10,15 @@ import typer
 from monstertruck_runtime.clock import Clock, run_wall
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.tools.cli.options import complete_device
-from monstertruckd.tools.cli.output import JsonOption, finish, print_json, print_table, remark, until_stopped
+from monstertruckd.tools.cli.output import (
+    JsonOption,
+    finish,
+    needs_extra,
+    print_json,
+    print_table,
+    remark,
+    until_stopped,
+)
 
 DeviceArgument = Annotated[
     str,
@@ -26,6 +34,7 @@ OWN_CLIENTS: Final = {
 """What an emulator's link is not, by what its driver opens."""
 
 
+@needs_extra("sim")
 def emulate(
     device: DeviceArgument,
     link: Annotated[Path, typer.Option("--link", "-l", help="Symlink to create for the pty.")],
@@ -51,6 +60,7 @@ def emulate(
     until_stopped(main)
 
 
+@needs_extra("robot")
 def probe(
     device: DeviceArgument,
     port: Annotated[

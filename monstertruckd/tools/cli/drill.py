@@ -7,14 +7,16 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from monstertruckd.tools.cli.options import SimulatedOption
-from monstertruckd.tools.cli.output import JsonOption, console, print_json, print_table, progress
+from monstertruckd.tools.cli.output import JsonOption, console, needs_extra, print_json, print_table, progress
+from monstertruckd.tools.shipped import shipped
 
 if TYPE_CHECKING:
     from monstertruckd.tools.drill.random_drill import Drill, DrillReport, FaultOutcome
 
-FULL_CONFIG = Path(__file__).resolve().parents[3] / "configs" / "full.yaml"
+FULL_CONFIG = shipped("configs/full.yaml")
 
 
+@needs_extra("sim")
 def drill(
     seed: Annotated[int, typer.Option(min=0, help="Which faults, when, for how long.")] = 1,
     count: Annotated[int, typer.Option(min=1, help="How many.")] = 50,

@@ -13,7 +13,16 @@ import typer
 
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.tools.cli.options import complete_topic
-from monstertruckd.tools.cli.output import JsonOption, command_group, finish, print_json, print_table, progress, remark
+from monstertruckd.tools.cli.output import (
+    JsonOption,
+    command_group,
+    finish,
+    needs_extra,
+    print_json,
+    print_table,
+    progress,
+    remark,
+)
 
 if TYPE_CHECKING:
     from monstertruckd.recorder.reader import LogReader
@@ -241,20 +250,3 @@ def _exporter(form: ExportFormat) -> "Callable[[LogReader, Path, Selection, Prog
         case ExportFormat.MCAP:
             from monstertruckd.tools.logs.export import export_mcap as export
     return export
-
-
-@contextmanager
-def needs_extra(name: str) -> Iterator[None]:
-    """Name the extra of the distribution that contains a missing library.
-
-    Raises:
-        NotFoundError: an import inside failed.
-    """
-    from monstertruck_runtime.errors import NotFoundError
-
-    try:
-        yield
-    except ModuleNotFoundError as error:
-        text = f"{error.name} is not installed: it comes with the extra {name!r} "
-        text += f"(pip install 'monstertruckd[{name}]'; in a checkout: python3 -m monstertruckd.bootstrap sync)"
-        raise NotFoundError(text) from None

@@ -23,7 +23,7 @@ import typer
 from typer.core import TyperGroup
 
 from monstertruck_runtime.clock import WallClock, run_wall
-from monstertruck_runtime.errors import RequestRefusedError, TruckError
+from monstertruck_runtime.errors import NotInstalledError, RequestRefusedError, TruckError
 from monstertruck_schemas.reasons import Reason
 
 if TYPE_CHECKING:
@@ -158,6 +158,23 @@ def progress(what: str, total: float | None = None) -> Iterator[Callable[[float]
     with Progress(console=console(error=True), transient=True) as bar:
         task = bar.add_task(what, total=total)
         yield lambda done: bar.update(task, completed=done)
+
+
+@contextmanager
+def needs_extra(name: str) -> Iterator[None]:
+    """Name the extra of the distribution that contains a missing library.
+
+    Raises:
+        NotInstalledError: an import inside failed.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        if error.name is None or error.name.startswith("monstertruck"):
+            raise
+        text = f"{error.name} is not installed: it comes with the extra {name!r} "
+        text += f"(pip install 'monstertruckd[{name}]'; in a checkout: python3 -m monstertruckd.bootstrap sync)"
+        raise NotInstalledError(text) from None
 
 
 def finish(reason: Reason, text: str = "") -> None:

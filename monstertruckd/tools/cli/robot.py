@@ -8,9 +8,10 @@ import typer
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruckd.tools.cli.options import ConfigOption, EndpointOption, RobotOption
-from monstertruckd.tools.cli.output import JsonOption, print_json, print_table, until_stopped
+from monstertruckd.tools.cli.output import JsonOption, needs_extra, print_json, print_table, until_stopped
 
 
+@needs_extra("robot")
 def run(config: ConfigOption, verbose: Annotated[bool, typer.Option("--verbose", "-v")] = False) -> None:
     """Run the daemon until SIGTERM or Ctrl-C: neutral first, then everything is closed in order."""
     from monstertruckd.run import run_daemon

@@ -12,9 +12,8 @@ from monstertruck_drivers.usb.config import CycleMethod, UsbPortConfig
 from monstertruck_drivers.usb.tree import place, port_directory
 from monstertruck_runtime.errors import InputError, NotFoundError
 from monstertruckd.config.truck import TruckConfig
+from monstertruckd.tools.shipped import shipped
 
-_PACKAGE: Final = Path(__file__).resolve().parents[2]
-PLACES: Final = (_PACKAGE / "systemd", _PACKAGE.parent / "systemd")
 HOMES: Final = (Path("/home"), Path("/root"), Path("/run/user"))
 """Hidden from the service but for the program itself."""
 HIDDEN: Final = (Path("/tmp"), Path("/var/tmp"))  # noqa: S108  # names what the service must not be run from
@@ -26,16 +25,16 @@ GROUP = "dialout"
 """Owns what the daemon may write below /sys."""
 
 
-def shipped(name: str) -> Path:
-    """Where a file of the folder is.
+def shipped_file(name: str) -> Path:
+    """Where a file of the folder ``systemd`` is.
 
     Raises:
         NotFoundError: the installation is not whole.
     """
-    for folder in PLACES:
-        if (folder / name).is_file():
-            return folder / name
-    raise NotFoundError(f"{name} is missing from the installation; looked in {' and '.join(map(str, PLACES))}")
+    path = shipped(f"systemd/{name}")
+    if not path.is_file():
+        raise NotFoundError(f"{path} is missing from the installation")
+    return path
 
 
 def filled(name: str, values: dict[str, str]) -> str:
@@ -44,7 +43,7 @@ def filled(name: str, values: dict[str, str]) -> str:
     def value(match: re.Match[str]) -> str:
         return values[match["name"]]
 
-    text = shipped(name).read_text(encoding="utf-8")
+    text = shipped_file(name).read_text(encoding="utf-8")
     empty = [key for key, replacement in values.items() if not replacement]
     for key in empty:
         text = text.replace(f"@{key}@\n", "")
@@ -65,7 +64,7 @@ class Program:
     @classmethod
     def present(cls) -> Self:
         """The one that is running now."""
-        neutral = shipped("neutral.py")
+        neutral = shipped_file("neutral.py")
         base = Path(sys.base_prefix)  # may be a link in front of the true folder; both names are used
         reads = dict.fromkeys((Path(sys.prefix), base, base.resolve(), neutral.parents[1]))
         return cls(Path(sys.executable), neutral, tuple(reads))

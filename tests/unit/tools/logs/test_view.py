@@ -12,10 +12,11 @@ import rerun as rr
 from typer.testing import CliRunner
 
 from monstertruck_runtime.clock import SECOND
-from monstertruck_runtime.errors import CommandFailedError, InputError, NotFoundError
+from monstertruck_runtime.errors import CommandFailedError, InputError, NotFoundError, NotInstalledError
 from monstertruck_schemas import topics as t
 from monstertruck_schemas.event import LogLevel, LogRecord
-from monstertruckd.tools.cli.logs import app, needs_extra
+from monstertruckd.tools.cli.logs import app
+from monstertruckd.tools.cli.output import needs_extra
 from monstertruckd.tools.logs.messages import Selection
 from monstertruckd.tools.logs.rerun_view import TIMELINE, convert, environment, show
 from tests.unit.recorder.conftest import scan
@@ -146,7 +147,7 @@ def test_without_a_display_nothing_is_started(tmp_path, monkeypatch):
 
 def test_missing_extra_is_named():
     with (
-        pytest.raises(NotFoundError, match=r"no_such_viewer is not installed: .*monstertruckd\[view\]"),
+        pytest.raises(NotInstalledError, match=r"no_such_viewer is not installed: .*monstertruckd\[view\]"),
         needs_extra("view"),
     ):
         import no_such_viewer  # noqa: F401

@@ -1,0 +1,45 @@
+"""Files that come with the program beside its modules."""
+
+import subprocess
+import sys
+from pathlib import Path
+from zipfile import ZipFile
+
+import pytest
+
+from monstertruckd.tools import shipped as places
+from monstertruckd.tools.cli.demo import DEMO_CONFIG
+
+ROOT = Path(__file__).resolve().parents[3]
+
+
+def test_a_file_is_looked_for_in_the_package_and_in_the_checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    package, checkout = tmp_path / "package", tmp_path
+    monkeypatch.setattr(places, "PLACES", (package, checkout))
+    assert places.shipped("configs/a.yaml") == checkout / "configs" / "a.yaml"
+    for folder in (checkout, package):
+        (folder / "configs").mkdir(parents=True)
+        (folder / "configs" / "a.yaml").touch()
+        assert places.shipped("configs/a.yaml") == folder / "configs" / "a.yaml"
+
+
+def test_the_demos_configuration_is_there():
+    assert DEMO_CONFIG.is_file()
+
+
+def test_the_wheel_holds_all_configurations_and_the_files_of_the_service(tmp_path: Path):
+    subprocess.run(
+        [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)],
+        cwd=ROOT,
+        check=True,
+        capture_output=True,
+    )
+    (wheel,) = tmp_path.glob("*.whl")
+    with ZipFile(wheel) as archive:
+        held = set(archive.namelist())
+    listed = subprocess.run(["git", "ls-files", "configs", "systemd"], cwd=ROOT, capture_output=True, text=True)
+    files = listed.stdout.split() or [
+        str(path.relative_to(ROOT)) for path in (ROOT / "configs").rglob("*") if path.is_file()
+    ]
+    assert len(files) > 20
+    assert {f"monstertruckd/{name}" for name in files} <= held
