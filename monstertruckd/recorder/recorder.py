@@ -63,7 +63,7 @@ class LogWriter:
         self._attachments = attachments
         self._metadata = metadata
         self._folder = LogFolder(Path(config.directory))
-        self._told: set[Path] = set()
+        self._reported: set[Path] = set()
         """Files that could not be removed."""
         self._retained: dict[str, LogEntry] = {}
         """Newest of every retained topic: the head of the next file, so that each file stands alone."""
@@ -147,8 +147,8 @@ class LogWriter:
             except FileNotFoundError:
                 pass
             except OSError as error:
-                if path not in self._told:
-                    self._told.add(path)
+                if path not in self._reported:
+                    self._reported.add(path)
                     log.warning("%s cannot be removed, though logs exceed the quota: %s", path, error.strerror)
                 continue
             else:
