@@ -134,7 +134,7 @@ class LogWriter:
     def _keep_quota(self) -> None:
         """Remove the oldest files that exceed the quota; never one that is being written or repaired.
 
-        A file that cannot be removed stays, counts, and is told of once: the recording goes on.
+        A file that cannot be removed stays, counts, and is reported once: the recording goes on.
         """
         excess = self._file.size + sum(self._others.values()) - self._config.quota_bytes
         for path, size in list(self._others.items()):
