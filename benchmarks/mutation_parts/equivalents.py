@@ -68,6 +68,9 @@ EQUIVALENTS: Final[dict[str, str]] = {
         "a sign: 1 or -1"
     ),
     f"{EXCHANGE}::Exchanger.__init__: 0 -> (1)": UNREAD,
+    f"{EXCHANGE}::Exchanger.settle: 0 -> (1)": "a nanosecond less to wait",
+    f"{EXCHANGE}::Exchanger.settle: (left := min(self.quiet_until, limit) - self._clock.now()) > 0 -> "
+    "((left := min(self.quiet_until, limit) - self._clock.now()) >= 0)": "a wait of no time",
     f"{EXCHANGE}::Exchanger.__init__: self.began = 0 -> pass": UNREAD,
     f"{EXCHANGE}::Exchanger.__init__: self.ended = 0 -> pass": UNREAD,
     f"{GATE}latch.py::EstopLatch.__init__: 8 -> (9)": "the length of a name",

@@ -8,7 +8,15 @@ import pytest
 
 from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos.emulator import EposEmulator
-from monstertruck_drivers.epos.exchange import BRIEF_QUIET, QUIET, Exchanger, ObjectError, _HeldUpError
+from monstertruck_drivers.epos.exchange import (
+    BRIEF_QUIET,
+    LEAST_QUIET,
+    QUIET,
+    RECENT,
+    Exchanger,
+    ObjectError,
+    _HeldUpError,
+)
 from monstertruck_drivers.epos.protocol import ObjectSegment, answer, segment_request
 from monstertruck_drivers.link import Link
 from monstertruck_runtime.clock import SECOND, VirtualClock, VirtualLoop, run_virtual
@@ -18,6 +26,9 @@ from tests.unit.drivers.epos.rig import on_line
 DISABLED = 0x1340
 O, F = b"O", b"F"  # noqa: E741
 ANSWER = answer(0, DISABLED, 0).body
+WRITTEN = answer(0).body
+QUICK = 50_000_000
+"""``QUICK_ANSWER``, ns."""
 
 
 class Peer:
@@ -313,6 +324,55 @@ def test_a_byte_into_the_silence_at_a_beginning_prolongs_it_by_what_the_controll
         await line.settle()
         assert (line._clock.now() - began) / SECOND == pytest.approx(0.05 + silence, abs=1e-3)
         assert line.strange == b"\x55"
+
+    with_peer()(test)
+
+
+@pytest.mark.parametrize(
+    ("slowest", "count", "silence"),
+    [(QUICK, RECENT, LEAST_QUIET), (QUICK + 1, RECENT, QUIET), (QUICK, RECENT - 1, QUIET)],
+)
+def test_an_answer_that_does_not_come_is_lost_if_all_the_newest_were_quick(slowest: int, count: int, silence: float):
+    async def test(peer: Peer, line: Exchanger) -> None:
+        line._brief = True
+        line.durations.extend([slowest, *[QUICK // 5] * (count - 1)])
+        with pytest.raises(DeviceTimeoutError):
+            await line.read(od.STATUSWORD)
+        assert line.quiet_until - line._clock.now() == round(silence * SECOND)
+        assert line._flight is None, "nothing keeps the error and whoever waited for it"
+
+    with_peer(O, O)(test)
+
+
+def test_outside_the_schedule_an_exchange_is_tried_three_times():
+    async def test(peer: Peer, line: Exchanger) -> None:
+        with pytest.raises(DeviceTimeoutError):
+            await line.shorten_silence()
+        assert [data for _, data in peer.written] == [b"\x11"] * 3
+
+    with_peer()(test)
+
+
+def test_an_answer_of_another_length_than_a_write_has_is_damage_and_refused_once_its_rest_is_in():
+    async def test(peer: Peer, line: Exchanger) -> None:
+        await line.write(od.CONTROLWORD, 6)
+        (noticed, refused) = [at for at, data in peer.written if data in (O, F)][:2]
+        assert refused - noticed == pytest.approx(0.005, abs=1e-6)
+        assert [data for _, data in peer.written].count(F) == 1
+
+    with_peer(O, O + b"\0", ANSWER, WRITTEN, b"")(test)
+
+
+@pytest.mark.parametrize(("stood", "held_up"), [(0.6, True), (0.1, False)])
+def test_bytes_that_a_process_finds_after_it_stood_still_are_no_answer(stood: float, held_up: bool):
+    async def test(peer: Peer, line: Exchanger) -> None:
+        steps = line._exactly(1, 0.1)
+        next(steps)
+        loop = asyncio.get_running_loop()
+        assert isinstance(loop, VirtualLoop)
+        loop.jump(stood)
+        with pytest.raises(_HeldUpError if held_up else StopIteration):
+            steps.send(O)
 
     with_peer()(test)
 

@@ -121,6 +121,17 @@ def test_silence_while_it_comes_into_step_is_a_timeout_and_tried_again_at_the_ne
     with_peer()(test)
 
 
+def test_a_strange_byte_is_not_forgotten_while_nothing_answers():
+    async def test(peer: Peer, _: VirtualClock) -> None:
+        peer.link.feed(b"\0")
+        for count in (1, 2):
+            with pytest.raises(DeviceTimeoutError):
+                await peer.session.ask(ERRORS)
+            assert peer.written == [POSITION] * count
+
+    with_peer()(test)
+
+
 def test_answers_that_stay_too_long_are_given_up():
     async def test(peer: Peer, _: VirtualClock) -> None:
         with pytest.raises(DeviceTimeoutError):
