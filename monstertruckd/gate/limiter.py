@@ -395,7 +395,7 @@ class ObstacleGuard:
         # What was seen in a sector stays while the sector is not seen, until that is too old.
         self._points = np.concatenate((near, self._points[(age > 0) & (age <= self._keep)]))
         self._memory.observe(scan, near)
-        self._stamp = scan.stamp
+        self._stamp = min(scan.stamp, scan.received)  # a sensor's clock may run ahead; nothing arrives before it is
         self._checked = None
 
     def free_distance(self, ways: tuple[Way, ...]) -> float:

@@ -123,6 +123,15 @@ def test_a_scan_from_the_future_is_not_younger_than_new():
     assert checked.allowed_speed(0.3, NOW - SECOND) == checked.allowed_speed(0.3, NOW)
 
 
+def test_a_scan_whose_sensors_clock_runs_ahead_is_as_old_as_its_arrival():
+    ahead, right = guard(), guard()
+    ahead.observe(scan(NOW).model_copy(update={"received": NOW - 300 * MS}))
+    right.observe(scan(NOW - 300 * MS))
+    for checked in (ahead, right):
+        checked.free_distance(AHEAD)
+    assert ahead.allowed_speed(0.3, NOW) == right.allowed_speed(0.3, NOW) < right.allowed_speed(0.3, NOW - 300 * MS)
+
+
 def test_at_the_very_distance_of_an_ordinary_stop_it_is_not_too_near():
     checked = guard(deceleration=0.5, reaction=0.0)
     looked(checked)
