@@ -2,16 +2,17 @@
 
 import asyncio
 import contextlib
+import fcntl
 import os
 import tty
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Final, Protocol
 
 from monstertruck_drivers.link import Link
-from monstertruck_runtime.errors import DeviceLostError, PortBusyError
+from monstertruck_runtime.errors import BusyError, DeviceLostError, InputError, PortBusyError
 
 
 class DeviceEnd:
@@ -224,6 +225,36 @@ class MemoryPort:
 
 FRAME: Final = 0.001
 """Seconds of a USB frame: what a device says within one reaches the host together."""
+
+
+@contextlib.contextmanager
+def reserved(*links: Path) -> Iterator[None]:
+    """Keep the names of ptys for this program while the context lasts: nobody else's are replaced.
+
+    Args:
+        links: symlinks that are to be made; their folders must exist.
+
+    Raises:
+        BusyError: another program serves one of them.
+        InputError: something else than a link has the name.
+        OSError: a link cannot be made there.
+    """
+    with contextlib.ExitStack() as stack:
+        for link in links:
+            if os.path.lexists(link) and not link.is_symlink():
+                raise InputError(f"{link}: is there already, and no link: a pty does not take its place")
+            lock = link.with_name(f".{link.name}.lock")
+            try:
+                file = stack.enter_context(lock.open("w"))
+            except OSError as error:
+                error.filename = str(link)
+                raise
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise BusyError(f"{link}: another program serves this port") from None
+            stack.callback(lock.unlink, missing_ok=True)
+        yield
 
 
 class PtyPort:

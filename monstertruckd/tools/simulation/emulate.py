@@ -5,8 +5,8 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 
-from monstertruck_drivers.cable import PtyPort
-from monstertruck_drivers.catalog import DEVICES
+from monstertruck_drivers.cable import PtyPort, reserved
+from monstertruck_drivers.catalog import DEVICES, DeviceKind
 from monstertruck_drivers.emulation import EmulatorSetup
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import InputError
@@ -20,12 +20,21 @@ async def emulate_device(device: str, link: Path, clock: Clock, seed: int) -> As
     """Serve ``device`` (kind or role) behind the symlink ``link`` while the context lasts.
 
     Raises:
-        InputError: unknown device, or one without a port.
+        InputError: unknown device, one without a port, or something that is no link has the name.
+        BusyError: another program serves ``link``.
+        OSError: it cannot be made.
     """
     kind = DEVICES.named(device)
     if kind.opens == "computer":
         raise InputError(f"{device}: the computer's own files, no device on a port; simulate emulates them")
-    port = PtyPort(link)
+    with reserved(link):
+        port = PtyPort(link)
+        async with _served(kind, device, port, clock, seed) as emulated:
+            yield emulated
+
+
+@asynccontextmanager
+async def _served(kind: DeviceKind, device: str, port: PtyPort, clock: Clock, seed: int) -> AsyncIterator[Emulated]:
     setup = EmulatorSetup(kind.role.name, None, clock, World(WorldConfig(), seed), seed, port)
     emulator = kind.emulator_factory()(setup)
     task = asyncio.create_task(emulator.run(port.device), name=f"emulator {device}")

@@ -11,7 +11,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from monstertruck_drivers.cable import EmulatedPort, PtyPort
+from monstertruck_drivers.cable import EmulatedPort, PtyPort, reserved
 from monstertruck_drivers.config import Monitors, PortConfig
 from monstertruck_drivers.hokuyo_urg.recording import RecordedHokuyoEmulator
 from monstertruck_kinematics.elementary import Array
@@ -59,9 +59,19 @@ async def serve(clock: Clock, config: SimulatedTruckConfig, truth: Path | None) 
     Faults are read from standard input, each line beginning with the device's role, the monitor's name, or ``usb``.
 
     Raises:
-        InputError: ``machine`` names an existing file or folder instead of a link to the emulated computer.
+        InputError: ``machine`` names an existing file or folder instead of a link to the emulated computer, or so does
+            a port.
+        BusyError: another program serves one of the ports.
+        OSError: a port cannot be made.
     """
-    with TemporaryDirectory(prefix="monstertruck-") as folder, _linked(config, Path(folder)):
+    links = [it.port.path for it in config.devices.present().values() if isinstance(it.port, PortConfig)]
+    for link in links:
+        link.parent.mkdir(parents=True, exist_ok=True)
+    with (
+        reserved(*links),
+        TemporaryDirectory(prefix="monstertruck-") as folder,
+        _linked(config, Path(folder)),
+    ):
         await _serve(clock, config, Path(folder), truth)
 
 
