@@ -41,7 +41,7 @@ def scripted(answers: list[bytes], test, *, echo: bool = False) -> None:
         port.plug()
         script = Script(port, answers)
         async with background(script.run()), await port.open() as link:
-            session = Ax12Session(link, clock, lambda size: 0.005)
+            session = Ax12Session(link, clock, lambda size, baud: 0.005)
             session.echo = echo
             yield session, script
 
