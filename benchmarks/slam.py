@@ -4,8 +4,9 @@
 
 DIR holds the files of the manifest in slam_parts/logs.py; their sha256 is checked first. Logs: intel1 (the first
 1088 s), intel4 (those cut to 4 m), intel (joined), aces, csail; parts: exp2 (whole daemon), localise (starts by seed
-in maps of a part of Intel; with --quick 20, not 100), kidnap (cuts drawn by seed; with --quick 4 in the first 2500
-scans of Intel), wrong_odometry (five faults; with --quick of those scans), costs, world (odometry by
+in maps of a part of Intel; with --quick 20, not 100), map_edge (robots that leave such maps of Intel and CSAIL), kidnap
+(cuts drawn by seed; with --quick 4 in the first 2500 scans of Intel), wrong_odometry (five faults; with --quick of
+those scans), costs, world (odometry by
 every subset of sensors in the emulators' world; with --quick two drives of each kind, not ten), endurance (memory over
 two hours); the last two need no data. The trajectories judged are those after the joint registration at a log's end;
 ``online`` figures are before it. Two processes at most; times are processor time. Plots go to runs/slam. The last line
@@ -25,7 +26,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 from slam_parts import accuracy
 from slam_parts.logs import verified
 
-PARTS = ("exp2", "localise", "kidnap", "wrong_odometry", "costs", "world", "endurance")
+PARTS = ("exp2", "localise", "map_edge", "kidnap", "wrong_odometry", "costs", "world", "endurance")
 WITHOUT_DATA = {"world", "endurance"}
 OUT = Path(__file__).resolve().parents[1] / "runs" / "slam"
 
@@ -50,6 +51,8 @@ def main() -> int:
         parts.append(importlib.import_module("slam_parts.exp2").run(OUT / "exp2.png"))
     if "localise" in chosen:
         parts.append(importlib.import_module("slam_parts.localisation").run(arguments.data, quick=arguments.quick))
+    if "map_edge" in chosen:
+        parts.append(importlib.import_module("slam_parts.map_edge").run(arguments.data, quick=arguments.quick))
     for name in ("kidnap", "wrong_odometry"):
         if name in chosen:
             part = getattr(importlib.import_module("slam_parts.faults"), name)

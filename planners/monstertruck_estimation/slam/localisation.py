@@ -1,10 +1,12 @@
 """Localisation in a saved map: tracking by scan matching; the whole map is searched for a robot of unknown place.
 
 What the search finds is compared with the whole map again over the next metres, and every match with the saved grid:
-a match that fits walls, but whose beams cross others, is none.
+a match that fits walls, but whose beams cross others, is none. Beams that end where the map knows nothing are not
+matched: at the edge of the map they count neither for a pose nor against it.
 """
 
 import math
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -34,14 +36,29 @@ from monstertruck_schemas.health import LocalisationStatus, OdometryUse
 
 FOUND_COVARIANCE: Final = np.diag(np.square((0.05, 0.05, 0.02)))
 """Of a pose found by global localisation, m and rad."""
+MATCH_COVARIANCE: Final = np.diag(np.square((0.02, 0.02, 0.01)))
+"""Of a match itself, m and rad."""
 LOST_DEVIATION: Final = (1.0, 0.5)
 """Standard deviation from which the robot is searched for on the whole map, m and rad."""
 MAX_CONTRADICTION: Final = 0.3
 """Greatest share of beams that contradict the saved grid of a match that counts: people and new furniture do, too."""
+MIN_MAPPED: Final = 0.65
+"""Least share of a scan's beams that end on mapped ground,"""
+ALL_MAPPED: Final = 0.95
+"""and that with which all of them are matched."""
+PARTIAL_OVERLAP: Final = 0.8
+"""Least overlap of the beams that end on mapped ground where others do not, and of a match far from the motion,"""
+PARTIAL_CONTRADICTION: Final = 0.15
+"""and greatest share of them that contradict the saved grid: few walls fit in many places."""
+FAR: Final = 3.0
+"""Standard deviations of the predicted pose from which a match is far from the motion."""
 CHECKED_WAY: Final = (3.0, 9.0)
 """Way after which the search that confirms a place found ends, and after which it ends without having done so, m."""
 SAME_PLACE: Final = (0.5, 0.2)
 """Two poses are of the same place if they differ by less, m and rad."""
+
+Predicted = tuple[Array, Array, Array]
+"""Pose by the predicted motion, shape (3,), and covariances, (3, 3): of the window of its match, and as published."""
 
 
 def submap_of(saved: SavedMap) -> Submap:
@@ -82,7 +99,7 @@ class LocalisationEstimator:
         """Way since the place was found, m."""
         self._pose = np.array(start or (0.0, 0.0, 0.0))
         self._covariance = np.diag((0.2**2, 0.2**2, 0.1**2))
-        """Of the pose as the matches have it: the prior of the next one."""
+        """Of the pose as the matches have it: of the window of the next one."""
         self._published_covariance = self._covariance
         """That of the predicted motion where matches do not count, and along the weak direction of degenerate ones."""
         self._stamp: int | None = None
@@ -129,7 +146,7 @@ class LocalisationEstimator:
                 events = ("found",)
                 self._scan_odometry.forget()
         else:
-            match, status = self._track(scan, delta, guess, covariance, mount)
+            match, status = self._track(scan, delta, (guess, covariance, published), mount)
             self._motion.learn(dt, delta, noise, between(self._pose, match.pose), match)
             events = () if match.accepted else ("rejected",)
             if self._global is not None and self._refuted(match.pose, found, delta):
@@ -169,20 +186,22 @@ class LocalisationEstimator:
         return False
 
     def _track(
-        self, scan: Scan, delta: Array, guess: Array, covariance: Array, mount: Vector
+        self, scan: Scan, delta: Array, predicted: Predicted, mount: Vector
     ) -> tuple[ScanMatch, LocalisationStatus]:
-        match = self._front.match(scan, delta, guess, covariance, self._submap)
-        good = self._counts(match, scan, mount)
+        guess, covariance, _ = predicted
+        alone = self.odometry is not OdometryUse.USED
+        matched = self._matched_alone if alone else self._matched
+        match, good = matched(scan, delta, predicted, mount)
         if not good:
             # The predicted motion may be wrong: by a late odometry, or by stamps that are not those of the scans.
-            before = compose(guess, inverse(delta))
-            still = self._front.match(scan, np.zeros(3), before, covariance, self._submap)
-            good = self._counts(still, scan, mount)
-            if good or (_strayed(match, guess) and not _strayed(still, before)):
-                match, guess = still, before
-        place, turn = deviations(match.covariance)
-        if match.accepted and not good and _strayed(match, guess):
+            before = compose(guess, inverse(delta)), *predicted[1:]
+            still, good = matched(scan, np.zeros(3), before, mount)
+            # Half a fit near the prediction says more than scans alone do, but less than wheels.
+            if good or (alone and _strayed(match, guess) and not _strayed(still, before[0])):
+                match, guess = still, before[0]
+        if match.accepted and not good and (not alone or _strayed(match, guess)):
             match = rejected(guess, covariance, MatchStatus.FAR)
+        place, turn = deviations(match.covariance)
         # New obstacles lower the overlap; only a pose of large covariance is searched for.
         self._misfits = 0 if good else self._misfits + 1
         self.counts["rejected"] += not match.accepted
@@ -193,12 +212,32 @@ class LocalisationEstimator:
         lost = self._misfits >= LOST_AFTER and not match.accepted
         return match, LocalisationStatus.LOST if lost else status_of(match, LocalisationStatus.LOCALISED)
 
-    def _counts(self, match: ScanMatch, scan: Scan, mount: Vector) -> bool:
-        """Whether ``scan`` fits the map at its match, and its beams do not contradict the grid there."""
-        if not fits(match):
-            return False
-        evidence = self._evidence.judge(match.pose, scan.points, np.array(mount[:2]))
-        return evidence.contradiction <= MAX_CONTRADICTION
+    def _matched_alone(self, scan: Scan, delta: Array, predicted: Predicted, mount: Vector) -> tuple[ScanMatch, bool]:
+        """Match all beams, for the motion is known too badly to say which end on mapped ground."""
+        match = self._front.match(scan, delta, *predicted[:2], self._submap)
+        contradiction = self._evidence.judge(match.pose, scan.points, np.array(mount[:2])).contradiction
+        return match, fits(match) and contradiction <= MAX_CONTRADICTION
+
+    def _matched(self, scan: Scan, delta: Array, predicted: Predicted, mount: Vector) -> tuple[ScanMatch, bool]:
+        """Match the beams that end on mapped ground; whether the match counts."""
+        guess, covariance, published = predicted
+        sensor = np.array(mount[:2])
+        mapped = self._evidence.judged(guess, scan.points, sensor)
+        share = float(mapped.mean()) if len(mapped) else 0.0
+        if share < MIN_MAPPED:
+            return rejected(guess, covariance, MatchStatus.EMPTY), False
+        whole = share >= ALL_MAPPED
+        seen = scan if whole else scan.chosen(mapped)
+        match = self._front.match(seen, delta, guess, covariance, self._submap)
+        contradiction = self._evidence.judge(match.pose, seen.points, sensor).contradiction
+        clear = match.overlap >= PARTIAL_OVERLAP and contradiction <= PARTIAL_CONTRADICTION
+        if _far(match.pose, guess, published):
+            good = clear and whole and not match.degenerate
+        else:
+            good = contradiction <= MAX_CONTRADICTION and (clear or whole)
+        if not (good and fits(match)):
+            return match, False
+        return _without_weak_direction(match, guess, published), True
 
     def _search_anew(self) -> GlobalLocaliser:
         return GlobalLocaliser(self._submap, self._evidence, self._config)
@@ -211,7 +250,7 @@ class LocalisationEstimator:
     def _found(self, scan: Scan, pose: Array, mount: Vector) -> tuple[ScanMatch, LocalisationStatus]:
         """Track from ``pose``; the search goes on, as a check."""
         self._tracking, self._checked, self._misfits = True, 0.0, 0
-        return self._track(scan, np.zeros(3), pose, FOUND_COVARIANCE, mount)
+        return self._track(scan, np.zeros(3), (pose, FOUND_COVARIANCE, FOUND_COVARIANCE), mount)
 
     def _refuted(self, pose: Array, found: Array | None, delta: Array) -> bool:
         """Whether the check says that the robot is not at ``pose``; it ends when it has confirmed the place."""
@@ -224,6 +263,28 @@ class LocalisationEstimator:
         self._global, self._tracking = self._search_anew(), False
         self.counts["searches"] += 1
         return True
+
+
+def _without_weak_direction(match: ScanMatch, guess: Array, covariance: Array) -> ScanMatch:
+    """A degenerate match has its pose along the weak direction from ``guess``, whose ``covariance`` is that there."""
+    if match.information is None or not match.degenerate:
+        return match
+    information = constrained(match, match.information)
+    gain = np.linalg.solve(information + np.linalg.inv(covariance), information)
+    return replace(match, pose=guess + gain @ _difference(match.pose, guess))
+
+
+def _far(pose: Array, guess: Array, covariance: Array) -> bool:
+    """Whether ``pose`` is further from ``guess``, of ``covariance``, than its motion and a match can be."""
+    off = _difference(pose, guess)
+    distance = math.sqrt(float(off @ np.linalg.solve(covariance + MATCH_COVARIANCE, off)))
+    return distance > FAR or _apart(pose, guess)
+
+
+def _difference(pose: Array, other: Array) -> Array:
+    off = pose - other
+    off[2] = math.remainder(off[2], math.tau)
+    return off
 
 
 def _strayed(match: ScanMatch, guess: Array) -> bool:

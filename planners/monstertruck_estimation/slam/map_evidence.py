@@ -11,6 +11,7 @@ from typing import Final, Self
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
 from monstertruck_estimation.se2 import transform
@@ -65,15 +66,31 @@ class EvidenceGrid:
             points: shape (n, 2), ends of beams in base, m.
             mount: shape (2,), the sensor in base, m.
         """
+        kinds = self._kinds(pose, points, mount)
+        return Evidence(*np.bincount(kinds, minlength=3).tolist())
+
+    def judged(self, pose: Array, points: Array, mount: Array) -> NDArray[np.bool_]:
+        """Which beams the map can judge, shape (n,): all but those that end where it knows nothing.
+
+        Arguments are those of ``judge``.
+        """
+        return np.asarray(self._kinds(pose, points, mount) != UNJUDGED)
+
+    def _kinds(self, pose: Array, points: Array, mount: Array) -> NDArray[np.int64]:
         grid = self._grid
         sensor = transform(pose, mount[None])[0]
-        counts = _judged(grid.cells, self._far, grid.resolution, np.array(grid.origin), sensor, transform(pose, points))
-        return Evidence(*(int(count) for count in counts))
+        ends = transform(pose, points)
+        return np.asarray(_judged(grid.cells, self._far, grid.resolution, np.array(grid.origin), sensor, ends))
+
+
+AGREEING: Final = 0
+AGAINST: Final = 1
+UNJUDGED: Final = 2
 
 
 @njit(cache=True)
 def _judged(cells, far, resolution, origin, sensor, points):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
-    counts = np.zeros(3, np.int64)
+    kinds = np.full(points.shape[0], UNJUDGED, np.int64)
     rows, columns = cells.shape
     x0, y0 = (sensor[0] - origin[0]) / resolution, (sensor[1] - origin[1]) / resolution
     for i in range(points.shape[0]):
@@ -89,12 +106,8 @@ def _judged(cells, far, resolution, origin, sensor, points):  # type: ignore[no-
                 break
         column, row = math.floor(x0 + dx), math.floor(y0 + dy)
         inside = 0 <= column < columns and 0 <= row < rows
-        if crossed:
-            counts[1] += 1
-        elif inside and far[row, column] < allowed:
-            counts[0] += 1
-        elif inside and cells[row, column] == FREE:
-            counts[1] += 1
-        else:
-            counts[2] += 1
-    return counts
+        if inside and not crossed and far[row, column] < allowed:
+            kinds[i] = AGREEING
+        elif crossed or (inside and cells[row, column] == FREE):
+            kinds[i] = AGAINST
+    return kinds

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from monstertruck_estimation.se2 import between
+from monstertruck_estimation.se2 import between, compose
 from monstertruck_estimation.slam import localisation
 from monstertruck_estimation.slam.config import MapperConfig
 from monstertruck_estimation.slam.localisation import LocalisationEstimator
@@ -20,6 +20,7 @@ from tests.unit.estimation.slam.kit import LIDAR, ROOM, box, ranges, rounds
 from tests.unit.estimation.slam.test_map_evidence import drawn
 
 PLACED = {LocalisationStatus.LOCALISED, LocalisationStatus.DEGENERATE, LocalisationStatus.LOST}
+ACCEPTED = MatchStatus.ACCEPTED
 EMPTY = [*ROOM[:4], *ROOM[8:]]
 """The same room without the box in its middle."""
 
@@ -159,21 +160,38 @@ def test_a_match_elsewhere_counts_only_if_all_of_it_fits(monkeypatch, away, over
 
 
 @pytest.mark.parametrize("there", [MatchStatus.ACCEPTED, MatchStatus.FAR])
-def test_half_a_scan_counts_where_the_robot_last_was_if_none_does_where_the_motion_led(monkeypatch, there):
-    """As a robot leaves the map, one wrong motion must not move it on."""
-    truth = np.repeat(rounds(80, laps=0.6)[:1], 2, axis=0)
-    wheels = truth + np.array(((0.0, 0.0, 0.0), (1.4, 0.0, 0.0)))
+@pytest.mark.parametrize("odom", [True, False])
+def test_by_scans_alone_half_a_scan_counts_where_the_robot_last_was_if_none_does_where_the_motion_led(
+    monkeypatch, there, odom: bool
+):
+    """As a robot leaves the map, one wrong motion must not move it on; wheels that drive on are believed."""
+    first = rounds(80, laps=0.6)[0]
+    stopped = compose(first, np.array((0.45, 0.0, 0.0)))
+    truth, wheels = (
+        np.array((first, stopped, stopped)),
+        np.array((first, stopped, compose(stopped, np.array((0.45, 0.0, 0.0))))),
+    )
 
     class Matcher:
-        def match(self, _scan, _delta, guess, covariance, _submap):
-            near = math.hypot(*(guess - truth[0])[:2]) < 0.3
-            said, status = (truth[0], MatchStatus.ACCEPTED) if near else (guess + np.array((2.0, 0.0, 0.0)), there)
+        scans = []
+
+        def match(self, scan, _delta, guess, covariance, _submap):
+            if not any(scan is known for known in self.scans):
+                self.scans.append(scan)
+            if len(self.scans) < 3:
+                return ScanMatch(
+                    truth[len(self.scans) - 1], covariance, 0.95, 0.01, 1.0, 0.0, ACCEPTED, 1e4 * np.eye(3)
+                )
+            near = math.hypot(*(guess - stopped)[:2]) < 0.3
+            away = guess + np.array((2.0, 0.0, 0.0)) if there is ACCEPTED else guess
+            said, status = (stopped, ACCEPTED) if near else (away, there)
             return ScanMatch(said, covariance, 0.5, 0.01, 1.0, 0.0, status, np.eye(3))
 
     monkeypatch.setattr(localisation, "PlanarMatcher", Matcher)
-    estimate = followed(SavedMap(drawn(), None), ROOM, truth, start=tuple(truth[0].tolist()), wheels=wheels)[-1]
-    assert np.array(estimate.pose) == pytest.approx(truth[0])
-    assert "rejected" not in estimate.events
+    start = tuple(first.tolist())
+    estimate = followed(SavedMap(drawn(), None), ROOM, truth, start=start, odom=odom, wheels=wheels)[-1]
+    assert np.array(estimate.pose) == pytest.approx(wheels[-1] if odom else stopped)
+    assert ("rejected" in estimate.events) is odom
 
 
 def test_a_match_that_the_grid_contradicts_is_tried_again_where_the_robot_last_was(monkeypatch):
@@ -219,3 +237,28 @@ def test_the_covariance_is_that_of_the_motion_along_a_corridor_and_where_half_of
     assert deviations[44, 0] == pytest.approx(0.07 * math.sqrt(len(vague)), rel=0.05)
     assert deviations[19, 0] < 0.02
     assert deviations[45, 0] < 0.02
+
+
+MAPPED = [
+    *[((-3.5, -1.0), (3.9, -1.0)), ((-3.5, 1.0), (3.9, 1.0)), ((-3.5, -1.0), (-3.5, 1.0))],
+    *[*box(-1.0, 0.6, -0.6, 1.0), *box(2.9, -1.0, 3.3, -0.6)],
+]
+"""The mapped part of a corridor,"""
+UNMAPPED = [((3.9, -1.0), (14.0, -1.0)), ((3.9, 1.0), (14.0, 1.0)), ((14.0, -1.0), (14.0, 1.0))]
+"""and how it goes on."""
+POSTS = [*box(3.8, -1.0, 4.2, -0.6), *box(4.7, -1.0, 5.1, -0.6), *box(5.6, -1.0, 6.0, -0.6)]
+
+
+@pytest.mark.parametrize("posts", [[], POSTS[:4], POSTS])
+def test_a_robot_with_wheels_that_leaves_the_map_along_a_corridor_is_not_moved_back_along_it(posts):
+    """What is off the map is matched to nothing on it: the pose is right within what its covariance says."""
+    truth = along([(-2.0, 0.0, 0.0), (1.0, 0.1, 0.0), (3.5, 0.0, 0.0), (6.0, 0.0, 0.0)])
+    saved = SavedMap(drawn(MAPPED, half_width=3.9), None)
+    estimates = followed(saved, [*MAPPED, *UNMAPPED, *posts], truth, start=tuple(truth[0].tolist()))
+    for estimate, pose in zip(estimates, truth, strict=True):
+        if estimate.status in PLACED:
+            off = np.array(estimate.pose) - pose
+            deviation = np.sqrt(np.diag(np.reshape(estimate.covariance, (3, 3))))
+            assert math.hypot(*off[:2]) < 0.5
+            assert (np.abs(off[:2]) < 6.0 * deviation[:2] + 0.05).all()
+    assert estimates[-1].status not in PLACED

@@ -61,3 +61,13 @@ def test_the_beams_begin_at_the_sensor():
     base = np.array((-0.5, 0.0, 0.0))
     assert grid.judge(base, ahead, np.array((0.2, 0.0))).against == 1
     assert grid.judge(base, ahead, np.array((0.7, 0.0))).agreeing == 1
+
+
+def test_beams_that_end_where_the_map_knows_nothing_are_not_judged():
+    grid = EvidenceGrid(drawn())
+    points = np.array(((4.9, 0.0), (6.9, 0.0), (9.0, 0.0), (0.6, 0.0)))
+    # A wall, beyond it, off the grid in the direction of a wall, and free space.
+    assert grid.judged(np.array((-2.0, -1.3, 0.0)), points, MOUNT).tolist() == [True, True, True, True]
+    # Without walls the same ends are unknown, but for the last one.
+    bare = EvidenceGrid(drawn(walls=[], half_width=2.5))
+    assert bare.judged(np.array((-2.0, -1.3, 0.0)), points, MOUNT).tolist() == [False, False, False, True]
