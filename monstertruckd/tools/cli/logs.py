@@ -191,6 +191,29 @@ def export_command(
     finish_log(log, reader.fault)
 
 
+@app.command("animate")
+def animate_command(
+    log: LogArgument,
+    output: Annotated[Path, typer.Argument(help="GIF file.", show_default=False)],
+    speed: Annotated[float, typer.Option(min=0.1, max=1000.0, help="Seconds of the log in one of the picture.")] = 8.0,
+    width: Annotated[int, typer.Option(min=64, max=1920, help="Pixels.")] = 560,
+    json_output: JsonOption = False,
+) -> None:
+    """Write a drive as a moving picture: the truck from above, its path, and what its lidar sees."""
+    from monstertruckd.recorder.reader import open_log
+
+    with needs_extra("logs"):
+        from monstertruckd.tools.logs.animation import animate
+    reader = open_log(log)
+    with _reading("animate", log) as done:
+        figures = animate(reader, output, speed=speed, width=width, report=done)
+    if json_output:
+        print_json({"file": str(output), **figures})
+    else:
+        typer.echo(f"{output}: {figures['seconds']:g} s, {figures['bytes'] / 1e6:.2f} MB")
+    finish_log(log, reader.fault)
+
+
 @app.command("view")
 def view_command(
     log: LogArgument,

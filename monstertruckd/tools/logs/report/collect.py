@@ -195,7 +195,7 @@ class Collector:
             (t.POSE, self._pose),
             (t.PATH, self._path),
             (t.TRACKER, self._tracker),
-            (t.TRANSFORMS, lambda _, m: run.map.transforms(m)),
+            (t.TRANSFORMS, lambda _, m: run.map.scans.transforms(m)),
             (t.MAP, lambda _, m: run.map.grid(m)),
             (t.SCAN, lambda _, m: run.map.scan(m)),
             (t.LOOP, self._loop),
@@ -254,11 +254,11 @@ class Collector:
         self._run.odometry.take(now, odometry.pose.x, odometry.pose.y)
         self._run.top_speed = max(self._run.top_speed, abs(odometry.twist.vx))
         if t.POSE.name not in self._run.traffic:
-            self._run.map.pose(odometry)
+            self._run.map.scans.pose(odometry)
 
     def _pose(self, now: int, odometry: Odometry) -> None:
         self._run.way.take(now, odometry.pose.x, odometry.pose.y)
-        self._run.map.pose(odometry)
+        self._run.map.scans.pose(odometry)
 
     def _path(self, _: int, path: TruckPath) -> None:
         self._run.path_plan = path

@@ -35,15 +35,17 @@ class Picture:
     area: Area
 
 
-class ScanMap:
-    """Gathers scans at the poses the log gives for them; an occupancy grid in the log takes their place."""
+class PlacedScans:
+    """Places scans at the poses the log gives for them."""
 
     def __init__(self) -> None:
-        self._raster = OccupancyRaster()
-        self._grid: Grid | None = None
         self._mounts = FrameTree()
         self._poses: deque[tuple[int, float, float, float]] = deque(maxlen=_POSES)
-        self._taken: tuple[int, float, float, float] | None = None
+
+    @property
+    def newest(self) -> tuple[int, float, float, float] | None:
+        """Stamp (ns) and newest pose (m, m, rad)."""
+        return self._poses[-1] if self._poses else None
 
     def pose(self, odometry: Odometry) -> None:
         """The truck's newest pose in the map."""
@@ -54,31 +56,14 @@ class ScanMap:
         """The frames, for the lidar's mount."""
         self._mounts = FrameTree(tree.transforms)
 
-    def grid(self, grid: Grid) -> None:
-        """A newer occupancy grid."""
-        self._grid = grid
-
-    def scan(self, scan: LaserScan) -> None:
-        """Take in a scan if the truck has moved since the one before."""
-        if self._grid is not None or not self._poses or (scan.tilt or 0.0) > _MAX_TILT:
-            return
-        newest = self._poses[-1]
-        if self._taken is not None and not _apart(self._taken, newest):
-            return
-        self._taken = newest
+    def place(self, scan: LaserScan) -> tuple[Array, Array]:
+        """Place of the lidar, shape (2,), and its returns, shape (n, 2), m; at least one pose must be known."""
         x, y, yaw = self._pose_at(scan.stamp + round(scan.scan_time / 2 * SECOND))
         mount = self._mount(scan.frame)
         cos, sin = math.cos(yaw), math.sin(yaw)
         turn = np.array([[cos, sin], [-sin, cos]])
-        origin = np.array([x, y]) + np.array(mount[:2]) @ turn
-        self._raster.add(origin, np.array([x, y]) + scan_points(scan, mount) @ turn)
-
-    def picture(self) -> Picture | None:
-        """What was gathered; None without scans and grids."""
-        if self._grid is not None:
-            return _grid_picture(self._grid)
-        occupancy = self._raster.occupancy()
-        return _picture(occupancy, self._raster.area) if np.isfinite(occupancy).any() else None
+        at = np.array([x, y])
+        return at + np.array(mount[:2]) @ turn, at + scan_points(scan, mount) @ turn
 
     def _mount(self, frame: str) -> tuple[float, float, float]:
         try:
@@ -92,6 +77,37 @@ class ScanMap:
         table = np.array(self._poses, np.float64)
         x, y, yaw = (float(np.interp(stamp, table[:, 0], column)) for column in (*table.T[1:3], np.unwrap(table[:, 3])))
         return x, y, yaw
+
+
+class ScanMap:
+    """Gathers scans; an occupancy grid in the log takes their place."""
+
+    def __init__(self) -> None:
+        self.scans = PlacedScans()
+        self._raster = OccupancyRaster()
+        self._grid: Grid | None = None
+        self._taken: tuple[int, float, float, float] | None = None
+
+    def grid(self, grid: Grid) -> None:
+        """A newer occupancy grid."""
+        self._grid = grid
+
+    def scan(self, scan: LaserScan) -> None:
+        """Take in a scan if the truck has moved since the one before."""
+        newest = self.scans.newest
+        if self._grid is not None or newest is None or (scan.tilt or 0.0) > _MAX_TILT:
+            return
+        if self._taken is not None and not _apart(self._taken, newest):
+            return
+        self._taken = newest
+        self._raster.add(*self.scans.place(scan))
+
+    def picture(self) -> Picture | None:
+        """What was gathered; None without scans and grids."""
+        if self._grid is not None:
+            return _grid_picture(self._grid)
+        occupancy = self._raster.occupancy()
+        return _picture(occupancy, self._raster.area) if np.isfinite(occupancy).any() else None
 
 
 def _apart(a: tuple[int, float, float, float], b: tuple[int, float, float, float]) -> bool:
