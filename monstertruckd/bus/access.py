@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from itertools import chain
 from typing import Any, Final
 
-from monstertruck_schemas.req import ControlRequest, Order, Request, Role
+from monstertruck_schemas.req import ControlRequest, DriveForm, DriveRequest, Order, Request, Role
 from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.topics import KEY_ROOT, TOPICS, Writer, alive_key, rpc_key
 
@@ -62,7 +62,9 @@ class Sender:
 
 
 def role_needed(request: Request) -> AccessRole:
-    """What a request takes; the emergency stop is everybody's."""
+    """What a request takes; the emergency stop is everybody's, shaft speeds are an engineer's."""
+    if isinstance(request, DriveRequest) and request.form is DriveForm.SHAFTS:
+        return AccessRole.ENGINEER
     estop = isinstance(request, ControlRequest) and request.order is Order.ESTOP
     return AccessRole.OBSERVER if estop else AccessRole.PILOT
 

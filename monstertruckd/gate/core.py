@@ -220,6 +220,9 @@ class Gate:
             return self._refuse(now, Reason.NOT_FINITE, request, text)
         if (why := self._impossible(request)) is not None:
             return self._refuse(now, Reason.IMPOSSIBLE_MOTION, request, why)
+        if request.form is DriveForm.SHAFTS and (inside or request.role not in OPERATORS):
+            text = "a request by shafts: open loop is for people, not for planners and trackers"
+            return self._refuse(now, Reason.BAD_ROLE, request, text)
         source = self._sources.add(request, now, inside=inside)
         if self.mode is GateMode.ESTOPPED:
             return self._refuse(now, Reason.ESTOPPED, request)

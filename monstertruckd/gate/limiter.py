@@ -480,6 +480,8 @@ class Target(NamedTuple):
     """It is not what was asked, but the nearest that the body can do."""
     saturated: bool
     """The servos' range makes it so."""
+    shafts: Speeds | None = None
+    """Open loop: the shaft speeds themselves, of which the twist is only the prediction, m/s."""
 
 
 class Motion:
@@ -495,13 +497,15 @@ class Motion:
         self._chassis = chassis
         self.twist: Twist[float] = STILL
         self.angles: Angles = chassis.straight
+        self._open: Speeds | None = None
+        """Shaft speeds that are commanded open loop, m/s; None = they follow from the twist."""
         self._servos = self.angles, chassis.servos(*self.angles)
         self._shafts = (STILL, self.angles), chassis.shafts_along(STILL, *self.angles)
 
     @property
     def standing(self) -> bool:
         """Whether standstill is commanded."""
-        return self.twist == STILL
+        return self.twist == STILL and not any(self._open or ())
 
     @property
     def servos(self) -> Angles:
@@ -523,6 +527,8 @@ class Motion:
     @property
     def shaft_speeds(self) -> Speeds:
         """Wheel speed over ground of every driven shaft, m/s."""
+        if self._open is not None:
+            return self._open
         command = self.twist, self.angles
         if self._shafts[0] != command:
             self._shafts = command, self._chassis.shafts_along(self.twist, *self.angles)
@@ -534,6 +540,8 @@ class Motion:
         Raises:
             KinematicsError: the body cannot move like that; the reason is named.
         """
+        if request.shafts is not None:
+            return self._target_of_shafts(request.shafts)
         return self._target_of_axles(request) if request.twist is None else self._target_of_twist(request.twist)
 
     def _target_of_axles(self, request: DriveRequest) -> Target:
@@ -559,6 +567,13 @@ class Motion:
         angles, saturated = self._reached(angles)
         return Target(twist, angles, clipped or saturated or not _same(twist, asked), saturated)
 
+    def _target_of_shafts(self, rates: Sequence[float]) -> Target:
+        """The steering stays as it is."""
+        radius = self._chassis.drivetrain.wheel_radius
+        speeds = [min(max(rate, -MAX_SPEED), MAX_SPEED) * radius for rate in rates]
+        shafts = tuple(speed * min(MAX_SPEED / max(*map(abs, speeds), MAX_SPEED), 1.0) for speed in speeds)
+        return Target(self._chassis.predicted(shafts, *self.angles), self.angles, False, False, shafts)
+
     def _reached(self, angles: Angles) -> tuple[Angles, bool]:
         """Steering angles that the servos reach, and whether these are others."""
         reached = self._chassis.reached(angles)
@@ -568,13 +583,24 @@ class Motion:
         """The part of a twist that the body can do at steering angles, by default the commanded ones."""
         return self._chassis.along(twist, *(self.angles if angles is None else angles))
 
-    def pace(self, twist: Twist[float]) -> float:
-        """Greatest speed of the base and of the driven wheels for a twist at the commanded steering angles, m/s."""
-        return max(math.hypot(twist[0], twist[1]), *map(abs, self._chassis.shafts_along(twist, *self.angles)))
+    def pace(self, twist: Twist[float], shafts: Speeds | None = None) -> float:
+        """Greatest speed of the base and of the driven wheels for a twist at the commanded steering angles, m/s.
 
-    def max_pace(self, twist: Twist[float]) -> float:
-        """Greatest pace allowed in the direction of ``twist``, m/s."""
-        ahead = twist[0] >= AHEAD * self.pace(twist)
+        Args:
+            twist: of the base.
+            shafts: speeds of the wheels that are driven open loop; None = they follow from the twist.
+        """
+        rolling = self._chassis.shafts_along(twist, *self.angles) if shafts is None else shafts
+        return max(math.hypot(twist[0], twist[1]), *map(abs, rolling))
+
+    @property
+    def present_pace(self) -> float:
+        """That of the commanded motion, m/s."""
+        return self.pace(self.twist, self._open)
+
+    def max_pace(self, twist: Twist[float], shafts: Speeds | None = None) -> float:
+        """Greatest pace allowed in the direction of ``twist``, m/s; arguments as of ``pace``."""
+        ahead = twist[0] >= AHEAD * self.pace(twist, shafts)
         return self._config.speed if ahead else self._config.reverse_speed
 
     def progress(self, measured: Speeds, way: Way) -> float:
@@ -594,12 +620,44 @@ class Motion:
         """Whether the body may move while its wheels turn to ``target``."""
         return self._chassis.aligned(self.angles, target)
 
-    def reverses(self, target: Twist[float]) -> bool:
-        """Whether wheels that turn for the present motion turn the other way for ``target``, on the whole."""
-        return _dot(self.shaft_speeds, self._chassis.shafts_along(target, *self.angles)) < 0
+    def reverses(self, target: Twist[float], shafts: Speeds | None = None) -> bool:
+        """Whether wheels that turn for the present motion turn the other way for ``target``, on the whole.
+
+        A motion from open loop to the other forms, or back, counts as one: it passes through standstill.
+        """
+        if (shafts is None) is not (self._open is None) and not self.standing:
+            return True
+        rolling = self._chassis.shafts_along(target, *self.angles) if shafts is None else shafts
+        return _dot(self.shaft_speeds, rolling) < 0
+
+    def turn_shafts(self, target: Speeds, dt: float) -> None:
+        """Change the shaft speeds, open loop, towards ``target``, m/s, as ``accelerate`` does the twist."""
+        now = self.shaft_speeds
+        change = tuple(to - at for to, at in zip(target, now, strict=True))
+        step = self.pace(self._forecast(change), change)
+        share = 1.0
+        if step > 0:
+            growing = self.pace(self._forecast(target), target) > self.present_pace
+            rate = self._config.acceleration if growing else self._config.deceleration
+            share = min(rate * dt / step, 1.0)
+        moved = tuple(at + share * part for at, part in zip(now, change, strict=True))
+        self._open = target if share == 1.0 else moved
+        self.twist = self._forecast(self._open)
+
+    def slow_down(self, dt: float) -> None:
+        """Change the commanded motion towards standstill, whatever its form."""
+        if self._open is None:
+            self.accelerate(STILL, dt)
+        else:
+            self.turn_shafts((0.0,) * len(self._open), dt)
+
+    def _forecast(self, shafts: Speeds) -> Twist[float]:
+        """Twist of the base that shaft speeds make, even if they push against each other while they change."""
+        return self._chassis.twist(self._chassis.input_speeds(shafts, *self.angles), *self.angles)
 
     def accelerate(self, target: Twist[float], dt: float) -> None:
         """Change the twist towards ``target``: no wheel, nor the base, changes its speed faster than allowed."""
+        self._open = None
         change = (target[0] - self.twist[0], target[1] - self.twist[1], target[2] - self.twist[2])
         step = self.pace(change)
         if step == 0:
@@ -613,6 +671,7 @@ class Motion:
     def halt(self) -> None:
         """Command standstill at once: the drive controllers' own deceleration profile is the ramp."""
         self.twist = STILL
+        self._open = None
 
 
 class CommandLimiter:
@@ -657,35 +716,46 @@ class CommandLimiter:
         turning = motion.aligned(target.angles)
         if turning or (motion.standing and self._sensors.at_rest(now)):
             motion.steer(target.angles, dt)
-        wanted = motion.along(target.twist) if turning else STILL
-        if motion.reverses(wanted):
-            wanted = STILL  # a change of direction passes through standstill
-        pace = motion.pace(wanted)
-        max_pace = motion.max_pace(wanted if pace > 0 else motion.twist)
+        shafts = target.shafts
+        wanted = STILL if not turning else motion.along(target.twist) if shafts is None else target.twist
+        passing = motion.reverses(wanted, shafts)
+        if passing:
+            wanted, shafts = STILL, None  # a change of direction passes through standstill
+        pace = motion.pace(wanted, shafts)
+        max_pace = motion.max_pace(wanted, shafts) if pace > 0 else motion.max_pace(motion.twist)
         if target.saturated:
             limits[Reason.SERVO_LIMIT] = max_pace
         if target.clipped or pace > max_pace * (1 + ROUNDING):
             limits[Reason.CLIPPED] = max_pace
         if pace > 0 or not motion.standing:
-            self._check_obstacles(now, wanted, limits)
+            self._check_obstacles(now, wanted, shafts, limits)
         allowed = min((*limits.values(), max_pace))
+        factor = 1.0 if pace <= allowed else allowed / pace
         if allowed == 0:
             motion.halt()
+        elif passing:
+            motion.slow_down(dt)
+        elif shafts is not None:
+            motion.turn_shafts(tuple(factor * speed for speed in shafts), dt)
         else:
-            motion.accelerate(wanted if pace <= allowed else _scaled(wanted, allowed / pace), dt)
+            motion.accelerate(_scaled(wanted, factor), dt)
 
     def stopping_distance(self, now: int) -> float:
         """Distance travelled if stopped now, m, by the greater of measured and commanded speed."""
         speed = max(abs(self._sensors.speed(now) or 0.0), *map(abs, self._motion.shaft_speeds))
         return speed * self._config.reaction + speed**2 / (2 * self._config.deceleration)
 
-    def _check_obstacles(self, now: int, wanted: Twist[float], limits: dict[Reason, float]) -> None:
+    def _check_obstacles(
+        self, now: int, wanted: Twist[float], shafts: Speeds | None, limits: dict[Reason, float]
+    ) -> None:
         """Sweep the footprint along the commanded motion, along ``wanted``, and as the wheels are seen to stand."""
-        if not self._sensors.scan_fresh(now):
-            return
         motion = self._motion
-        twists = [twist for twist in (wanted, motion.twist) if twist != STILL]
-        ways = [_scaled(twist, 1.0 / motion.pace(twist)) for twist in twists]
+        courses = ((wanted, motion.pace(wanted, shafts)), (motion.twist, motion.present_pace))
+        moving = [(twist, pace) for twist, pace in courses if twist != STILL]
+        if not moving or not self._sensors.scan_fresh(now):
+            return
+        ways = [_scaled(twist, 1.0 / pace) for twist, pace in moving]
+        fastest = max(pace for _, pace in moving)
         if self._sensors.steering_fresh(now):
             ways.append(motion.along(ways[0], self._sensors.angles))
         free = self._obstacles.free_distance(tuple(ways))
@@ -695,7 +765,7 @@ class CommandLimiter:
         self.blocked = allowed < (2 * crawl if self.blocked else crawl)
         if self.blocked:
             limits[Reason.OBSTACLE_STOP] = 0.0
-        elif allowed < max(map(motion.pace, twists)):
+        elif allowed < fastest:
             limits[Reason.OBSTACLE_SLOW] = allowed
         unseen = self._obstacles.unseen
         self.blind = unseen is None or unseen > self._config.scan.stale_after
@@ -704,7 +774,7 @@ class CommandLimiter:
         elif unseen:
             limits[Reason.LIDAR_SLOW] = self._config.obstacle.unseen_speed
         allowed = max(self._obstacles.allowed_speed(self._obstacles.known, now), self._config.obstacle.unseen_speed)
-        if allowed < max(map(motion.pace, twists)):
+        if allowed < fastest:
             limits[Reason.UNSEEN_SLOW] = allowed
         measured = self._sensors.shaft_speeds(now)
         speed = max(motion.progress(measured, way) for way in ways) if measured else 0.0

@@ -1,15 +1,18 @@
 """A robot body with its actuators: what gate, odometry and simulation need of any drive family.
 
-A motion is asked for in one of two forms, and ``forms`` says which of them a body takes:
+A motion is asked for in one of three forms, and ``forms`` says which of them a body takes:
 
 - ``axles``: the motion of an equivalent bicycle about the base point, by its speed along the direction of travel and
   the angles of its two axles, whatever angles the wheels of a real linkage have (``truck.LinkedAxles``). ``freedom`` is
   the set of axle angles that a body can take.
 - ``twist``: the velocity (vx, vy, wz) of the base itself.
+- ``shafts``: the speed of every driven shaft, open loop, while the steering stays as it is. ``predicted`` is the twist
+  that follows from it.
 
-Both lead to the angles that the body's wheels are steered to and to a twist of its base. At given steering angles a
-chassis says which part of a twist is possible (``along``) and which shaft speeds make it; from measured shaft speeds
-and servo angles it finds the twist again. Bodies that steer nothing can pass from any motion to any other.
+The first two lead to the angles that the body's wheels are steered to and to a twist of its base. At given steering
+angles a chassis says which part of a twist is possible (``along``) and which shaft speeds make it; from measured
+shaft speeds and servo angles it finds the twist again. Bodies that steer nothing can pass from any motion to any
+other.
 
 The bicycle of a body without axles is virtual, its wheelbase being the body's reference length. ``freedom``:
 
@@ -47,7 +50,7 @@ from monstertruck_kinematics.truck import (
 from monstertruck_kinematics.unsteered import Differential, SkidSteer, mecanum, omni
 
 Freedom = Literal["both", "front", "parallel"]
-Form = Literal["axles", "twist"]
+Form = Literal["axles", "twist", "shafts"]
 Speeds = tuple[float, ...]
 Angles = tuple[float, ...]
 """Steering angles, rad, left positive: of the front and the rear axle, or of every wheel in the order of its name."""
@@ -63,6 +66,12 @@ AXLES: Final = ("front", "rear")
 
 STANDING: Final = 0.1
 """A forward speed below this share of the whole motion is none."""
+
+CONTRADICTION: Final = 0.2
+"""Shaft speeds may be off the motion they agree on best by this share of the fastest."""
+
+ROUNDING: Final = 1e-9
+"""m/s."""
 
 STRAIGHT: Final = 1e-6
 """Axle angles this close count as equal, rad."""
@@ -98,7 +107,7 @@ class Chassis(ABC):
     freedom: Freedom
     linkage: Axles | None
 
-    forms: ClassVar[frozenset[Form]] = frozenset({"axles", "twist"})
+    forms: ClassVar[frozenset[Form]] = frozenset({"axles", "twist", "shafts"})
     """Forms of request that it takes."""
     straight: ClassVar[Angles] = (0.0, 0.0)
     """Steering angles for driving straight ahead; those of a body that steers nothing never change."""
@@ -178,6 +187,26 @@ class Chassis(ABC):
     def shafts_along(self, twist: Twist[float], *angles: float) -> Speeds:
         """Speed of every shaft for a twist that the body can do at steering angles."""
         return self.shaft_speeds(signed_hypot(twist[0], twist[1]), *angles)
+
+    def predicted(self, shaft_speeds: Speeds, *angles: float) -> Twist[float]:
+        """Twist of the base that shaft speeds make at steering angles.
+
+        Raises:
+            KinematicsError: another number of shafts; or the shafts push against each other, so that nobody knows how
+                the body moves.
+        """
+        if len(shaft_speeds) != len(self.shafts):
+            raise KinematicsError(
+                f"{len(shaft_speeds)} shaft speeds: expected {len(self.shafts)} ({', '.join(self.shafts)})"
+            )
+        twist = self.twist(self.input_speeds(shaft_speeds, *angles), *angles)
+        fit = self.shafts_along(twist, *angles)
+        off, name = max((abs(a - b), name) for a, b, name in zip(shaft_speeds, fit, self.shafts, strict=True))
+        if off > CONTRADICTION * max(map(abs, shaft_speeds)) + ROUNDING:
+            raise KinematicsError(
+                f"the shafts push against each other: {name} is {off:.3g} m/s off the motion they agree on best"
+            )
+        return twist
 
     def aligned(self, angles: Angles, target: Angles) -> bool:
         """Whether the body may move while its wheels turn from ``angles`` to ``target``."""

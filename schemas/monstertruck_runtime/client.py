@@ -259,6 +259,13 @@ class TruckClient(Operator):
         twist = RequestedTwist(vx=vx, vy=vy, wz=wz)
         self._put(REQ_DRIVE, DriveRequest(**header, speed=0.0, front=0.0, twist=twist))
 
+    async def drive_shafts(self, *rates: float, lease: float = 0.3) -> None:
+        """Request the rate of the wheels on every driven shaft, rad/s, for ``lease`` seconds: open loop, for engineers.
+
+        Limits, ramps and the sweep hold as for every request. Raises as ``drive`` does.
+        """
+        self._put(REQ_DRIVE, DriveRequest(**await self._answered(lease), speed=0.0, front=0.0, shafts=rates))
+
     def order(self, order: Order, *, hold: bool = False) -> Coroutine[Any, Any, GateState]:
         """Give an order; the coroutine waits until it is carried out and returns the gate's state then.
 

@@ -55,6 +55,8 @@ class DriveForm(StrEnum):
     """Speed and both axle angles."""
     TWIST = "twist"
     """Velocity of the base: forward, sideways and turning."""
+    SHAFTS = "shafts"
+    """Rate of every driven shaft's wheels, open loop; for engineers."""
 
 
 class RequestedTwist(Schema):
@@ -68,10 +70,14 @@ class RequestedTwist(Schema):
     """Yaw rate, rad/s, counter-clockwise positive."""
 
 
-class DriveRequest(Request):
-    """A motion asked for, in one form: speed and axle angles, or ``twist``.
+MAX_SHAFTS: Final = 8
+"""Rates that a request may have; a robot has four driven shafts at most, and refuses another number than its own."""
 
-    Non-finite numbers reach the gate, which refuses them by name. A reader that does not know ``twist`` sees a request
+
+class DriveRequest(Request):
+    """A motion asked for, in one form: speed and axle angles, ``twist``, or ``shafts``.
+
+    Non-finite numbers reach the gate, which refuses them by name. A reader that does not know the form sees a request
     for standstill.
     """
 
@@ -83,28 +89,38 @@ class DriveRequest(Request):
     """Rear axle angle of the equivalent bicycle, rad, left positive (counter-steer: opposite to front)."""
     twist: RequestedTwist | None = None
     """Velocity of the base; speed and angles are 0 then."""
+    shafts: Annotated[tuple[AnyNumber, ...], Field(min_length=1, max_length=MAX_SHAFTS)] | None = None
+    """Rate of the wheels on every driven shaft in the body's order, rad/s, forward positive; speed and angles are 0
+    then."""
 
     @model_validator(mode="after")
     def _one_form(self) -> Self:
-        if self.twist is not None and (self.speed, self.front, self.rear) != (0.0, 0.0, 0.0):
-            raise ValueError("a request has one form: expected speed, front and rear of 0 with a twist")
+        other = "a twist" if self.twist is not None else "shafts"
+        if (self.twist is not None or self.shafts is not None) and (self.speed, self.front, self.rear) != (0.0,) * 3:
+            raise ValueError(f"a request has one form: expected speed, front and rear of 0 with {other}")
+        if self.twist is not None and self.shafts is not None:
+            raise ValueError("a request has one form: expected either a twist or shafts")
         return self
 
     @property
     def form(self) -> DriveForm:
         """How it describes the motion."""
+        if self.shafts is not None:
+            return DriveForm.SHAFTS
         return DriveForm.AXLES if self.twist is None else DriveForm.TWIST
 
     @property
     def numbers(self) -> dict[str, float]:
         """The numbers of its form, by name."""
+        if self.shafts is not None:
+            return {f"shafts[{i}]": rate for i, rate in enumerate(self.shafts)}
         if self.twist is None:
             return {"speed": self.speed, "front": self.front, "rear": self.rear}
         return self.twist.model_dump()
 
     @property
     def pace(self) -> float:
-        """Speed of the base, m/s, negative = reverse; 0 for turning on the spot."""
+        """Speed of the base, m/s, negative = reverse; 0 for turning on the spot, and for shafts."""
         if self.twist is None:
             return self.speed
         return math.copysign(math.hypot(self.twist.vx, self.twist.vy), self.twist.vx)
@@ -112,7 +128,10 @@ class DriveRequest(Request):
     @property
     def neutral(self) -> bool:
         """Whether it asks for standstill."""
-        speeds = (self.speed,) if self.twist is None else (self.twist.vx, self.twist.vy, self.twist.wz)
+        if self.shafts is not None:
+            speeds = self.shafts
+        else:
+            speeds = (self.speed,) if self.twist is None else (self.twist.vx, self.twist.vy, self.twist.wz)
         return all(abs(speed) < NEUTRAL for speed in speeds)
 
 

@@ -36,7 +36,7 @@ class AccessRole(StrEnum):
     PILOT = "pilot"
     """Drive, give orders and goals."""
     ENGINEER = "engineer"
-    """Save and undo calibrations."""
+    """Save and undo calibrations, and drive by shaft speeds, open loop."""
 
     def covers(self, needed: "AccessRole") -> bool:
         """Whether this role may do what takes ``needed``."""

@@ -224,7 +224,7 @@ REQ_DRIVE: Final = Topic(
     "req/drive",
     DriveRequest,
     W.OUTSIDE,
-    "Drive by speed and axle angles, or by twist",
+    "Drive by speed and axle angles, by twist, or by shaft speeds",
     20,
     stale_after=0.3,
 )

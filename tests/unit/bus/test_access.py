@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 from pydantic import ValidationError
 
-from monstertruck_schemas.req import Role
+from monstertruck_schemas.req import DriveRequest, Role
 from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.topics import TOPICS, Writer
-from monstertruckd.bus.access import EVERYTHING, OBSERVING, Grant, access_rules, in_groups, out_groups
+from monstertruckd.bus.access import EVERYTHING, OBSERVING, Grant, access_rules, in_groups, out_groups, role_needed
 from monstertruckd.bus.zenoh_config import TlsConfig, ZenohConfig, doors, session_config
 
 FILES = {"ca": Path("ca.pem"), "certificate": Path("t.pem"), "key": Path("t.key")}
@@ -150,3 +150,10 @@ def test_this_machine_alone_is_no_network():
 def test_endpoints_that_need_certificates_are_refused_without_them(settings):
     with pytest.raises(ValidationError, match=r"zenoh\.tls"):
         ZenohConfig(**settings)
+
+
+def test_shaft_speeds_are_for_engineers():
+    header = {"stamp": 1, "received": 1, "seq": 1, "source": "a", "role": Role.STATION, "lease": 0.3, "nonce": "n"}
+    asked = {"speed": 0.0, "front": 0.0}
+    assert role_needed(DriveRequest(**header, **asked)) is AccessRole.PILOT
+    assert role_needed(DriveRequest(**header, **asked, shafts=(1.0, 1.0))) is AccessRole.ENGINEER

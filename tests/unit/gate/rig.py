@@ -157,6 +157,12 @@ class Rig:
         request = DriveRequest(source=source, role=role, lease=lease, speed=0.0, front=0.0, twist=twist, **fields)
         return self._ask(request, inside=inside)
 
+    def roll(self, *rates, source="ann", role=Role.GAMEPAD, lease=1.0, inside=False, **more):
+        """Ask for shaft speeds, rad/s."""
+        fields = {**header(self.now, self.seq()), "nonce": NONCE, "gate_stamp": self.now, **more}
+        request = DriveRequest(source=source, role=role, lease=lease, speed=0.0, front=0.0, shafts=rates, **fields)
+        return self._ask(request, inside=inside)
+
     def _ask(self, request, inside):
         return (self.gate.planner_request if inside else self.gate.request)(request, self.now)
 
@@ -185,7 +191,9 @@ class Rig:
             self.now += TICK
             if sense:
                 self.sense()
-            if self.driver is not None:
+            if isinstance(self.driver, tuple):
+                self.roll(*self.driver)
+            elif self.driver is not None:
                 (self.twist if self.driver.keys() & {"vx", "vy", "wz"} else self.drive)(**self.driver)
             self.out = self.gate.tick(self.now)
             self.events += self.out.events

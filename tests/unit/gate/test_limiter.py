@@ -252,7 +252,7 @@ def test_what_goes_where_the_lidar_does_not_see_has_the_limit_of_reverse(twist, 
 @pytest.mark.parametrize(("forward", "limit"), [(0.1, 0.21), (0.0999, 0.15)])
 def test_a_motion_of_which_half_goes_ahead_has_the_limit_of_driving_ahead(forward, limit, monkeypatch):
     moved = motion()
-    monkeypatch.setattr(moved, "pace", lambda _: 0.2)
+    monkeypatch.setattr(moved, "pace", lambda *_: 0.2)
     assert moved.max_pace((forward, 0.0, 0.0)) == limit
 
 

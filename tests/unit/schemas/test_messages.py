@@ -95,6 +95,18 @@ def test_a_twist_is_standstill_to_a_reader_that_does_not_know_it():
     assert (request.form, request.neutral) == (DriveForm.TWIST, False)
 
 
+def test_shafts_are_standstill_to_a_reader_that_does_not_know_them():
+    request = DriveRequest(**ASKED, speed=0.0, front=0.0, shafts=(0.5, float("nan")))
+    wire = json.loads(request.model_dump_json())
+    assert (wire["speed"], wire["front"], wire["rear"], wire["twist"]) == (0.0, 0.0, 0.0, None)
+    assert DriveRequest.model_validate_json(request.model_dump_json()).shafts[0] == 0.5
+    assert (request.form, request.neutral, request.pace) == (DriveForm.SHAFTS, False, 0.0)
+    assert DriveRequest(**ASKED, speed=0.0, front=0.0, shafts=(0.0, 5e-4)).neutral
+    for wrong in ({"speed": 0.1, "shafts": (1.0,)}, {"shafts": ()}, {"shafts": (1.0,), "twist": RequestedTwist()}):
+        with pytest.raises(ValidationError):
+            DriveRequest(**ASKED, **{"speed": 0.0, "front": 0.0, **wrong})
+
+
 def test_a_request_without_a_twist_is_read_as_before():
     old = {**HEADER, "source": "me", "role": "station", "lease": 0.3, "nonce": "n", "speed": 0.1, "front": 0.2}
     request = DriveRequest.model_validate_json(json.dumps(old))
