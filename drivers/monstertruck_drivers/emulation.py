@@ -181,6 +181,40 @@ class AttitudeSource(Protocol):
         ...
 
 
+class ImuReading(NamedTuple):
+    """What an inertial measurement unit feels, in its own axes: x forward, y left, z up."""
+
+    angular_velocity: tuple[float, float, float]
+    """rad/s."""
+    acceleration: tuple[float, float, float]
+    """Specific force, m/s^2: at rest and level, z is +9.81."""
+    temperature_c: float
+
+
+class ImuSource(Protocol):
+    """Where an inertial measurement unit gets its truth from."""
+
+    def imu(self, time_ns: int) -> ImuReading:
+        """Reading at ``time_ns``."""
+        ...
+
+
+class SonarSource(Protocol):
+    """What the robot's sonars hear, by their names."""
+
+    def fire(self, name: str, time_ns: int) -> None:
+        """A sonar sends.
+
+        Raises:
+            InputError: the robot has no sonar of that name.
+        """
+        ...
+
+    def range(self, name: str) -> float:
+        """Distance that the newest ping of a sonar came to, m, once its sound is back; inf = no echo."""
+        ...
+
+
 class JointSource(Protocol):
     """The joints of a mount: a pitch joint on the body, a roll joint on it, the device on the roll joint."""
 
@@ -231,6 +265,16 @@ class Physics(Protocol):
     @property
     def compass(self) -> AttitudeSource:
         """Magnetic heading and tilt."""
+        ...
+
+    @property
+    def sonars(self) -> SonarSource:
+        """Of the robot's sides."""
+        ...
+
+    @property
+    def imu(self) -> ImuSource:
+        """Angular velocity and specific force."""
         ...
 
     def battery_volts(self, time_ns: int) -> float:

@@ -5,7 +5,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import ConfigDict, Field
 
-from monstertruck_schemas.base import Float64Array, Message, Schema, UInt8Array, servos_of
+from monstertruck_schemas.base import Float64Array, FrameId, Message, Nanoseconds, Schema, UInt8Array, servos_of
 
 
 class LaserScan(Message):
@@ -150,6 +150,48 @@ class Battery(Message):
     """Share of the capacity that is left, 0..1, from the resting voltage: right to 0.1 at best."""
     capacity_ah: float | None = None
     """Capacity of the pack as configured, Ah."""
+
+
+class SonarEcho(Schema):
+    """One sonar of an array. Its frame is ``sonar_<name>``, x along the axis of its cone."""
+
+    name: FrameId
+    answered: bool = True
+    """False: the sonar is dead or lost, and nothing is known of what is before it."""
+    range: Annotated[float, Field(gt=0)] | None = None
+    """Distance to the nearest thing in the cone, at an unknown bearing within it, m; None without an echo. A sonar that
+    answered without one has nothing before it, or a surface that reflected the sound elsewhere."""
+    stamp: Nanoseconds
+    """When the sound met what it came back from, without an echo when it was sent; of a sonar that does not answer,
+    when it was asked."""
+
+
+class SonarRanges(Message):
+    """All sonars of the robot, each pinged once; ``stamp`` is that of the oldest of them."""
+
+    sonars: Annotated[tuple[SonarEcho, ...], Field(strict=False)]
+    """In the order of the configuration."""
+    field_of_view: Annotated[float, Field(gt=0, le=3.1416)]
+    """Full opening angle of the cones, rad."""
+    range_min: Annotated[float, Field(ge=0)]
+    """Least range that is measured, m: what is nearer is reported as about this range, or not at all."""
+    range_max: Annotated[float, Field(gt=0)]
+    """Greatest range, m."""
+
+    def echo(self, name: str) -> SonarEcho | None:
+        """The sonar of that name; None = the array has none."""
+        return next((sonar for sonar in self.sonars if sonar.name == name), None)
+
+
+class Imu(Message):
+    """Inertial measurement unit with six degrees of freedom, in its own axes (REP 103: x forward, y left, z up)."""
+
+    angular_velocity: Vector3
+    """rad/s."""
+    linear_acceleration: Vector3
+    """Specific force, m/s^2: at rest and level, z is +9.81."""
+    temperature: float | None = None
+    """Of the unit, degree Celsius."""
 
 
 class CompressedImage(Message):

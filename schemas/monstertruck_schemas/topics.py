@@ -3,7 +3,7 @@
 Other distributions add topics through entry points, each of which names a ``Topic``::
 
     [project.entry-points."monstertruck.topics"]
-    "sensor/sonar" = "my_package.topics:SONAR"
+    "sensor/radar" = "my_package.topics:RADAR"
 """
 
 import math
@@ -34,7 +34,9 @@ from monstertruck_schemas.sensor import (
     Battery,
     CompressedImage,
     DriveFeedback,
+    Imu,
     LaserScan,
+    SonarRanges,
     StabiliserFeedback,
     SteeringFeedback,
 )
@@ -128,6 +130,10 @@ CAMERA: Final = Topic(
 STABILISER: Final = Topic(
     "sensor/stabiliser", StabiliserFeedback, W.DRIVER, "Joints of the lidar's mount", 25, stale_after=0.2
 )
+SONAR: Final = Topic(
+    "sensor/sonar", SonarRanges, W.DRIVER, "Nearest echo of each sonar of the robot", 10, stale_after=0.3
+)
+IMU: Final = Topic("sensor/imu", Imu, W.DRIVER, "Angular velocity and specific force", 50, stale_after=0.2)
 
 ODOMETRY: Final = Topic(
     "state/odometry",
@@ -255,7 +261,7 @@ class TopicTable(ExtensibleTable[Topic[Message]]):
         if not isinstance(row, Topic):
             return f"expected a Topic, found {type(row).__name__}"
         if row.group not in OPEN_GROUPS or not re.fullmatch(r"[a-z]+/[a-z][a-z0-9_]*", row.name):
-            return f"expected a name like sensor/sonar, in one of the groups {', '.join(OPEN_GROUPS)}"
+            return f"expected a name like sensor/radar, in one of the groups {', '.join(OPEN_GROUPS)}"
         if row.writer not in OPEN_GROUPS[row.group]:
             return f"written by {row.writer}: expected {' or '.join(OPEN_GROUPS[row.group])}"
         model: Any = row.model

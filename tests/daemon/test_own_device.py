@@ -39,39 +39,39 @@ def messages(log: Path, topic: str) -> list[dict[str, Any]]:
 @pytest.mark.virtual
 def test_it_is_driven_and_recorded(project: Path, target: Path, tmp_path: Path):
     out = run_with(target, "demo", "--fast", "-c", str(project / "robot.yaml"), "-o", str(tmp_path / "run"))
-    assert "sensor/sonar" in out
+    assert "sensor/ranger" in out
     (log,) = (tmp_path / "run" / "logs").glob("*.mcap")
-    found = messages(log, "sensor/sonar")
+    found = messages(log, "sensor/ranger")
     seconds = (found[-1]["stamp"] - found[0]["stamp"]) / 1e9
     assert len(found) / seconds == pytest.approx(1 / 0.134, rel=0.05)
-    assert {message["frame"] for message in found} == {"sonar"}
+    assert {message["frame"] for message in found} == {"ranger"}
     distances = [message["distance"] for message in found if message["distance"] is not None]
     assert max(distances) - min(distances) > 1.0, "the truck drove"
-    rows = [row for table in messages(log, "health/services") for row in table["services"] if row["name"] == "sonar"]
+    rows = [row for table in messages(log, "health/services") for row in table["services"] if row["name"] == "ranger"]
     assert "ready" in {row["state"] for row in rows}
 
 
 @pytest.mark.virtual
 def test_it_is_listed_and_checked(project: Path, target: Path):
-    assert "sensor/sonar" in run_with(target, "topics")
+    assert "sensor/ranger" in run_with(target, "topics")
     listed = run_with(target, "plugins", "--json")
-    assert {"mb7360", "sensor/sonar"} <= {row["name"] for row in json.loads(listed) if "truck-sonar" in row["origin"]}
+    assert {"mb7360", "sensor/ranger"} <= {row["name"] for row in json.loads(listed) if "truck-sonar" in row["origin"]}
     shown = run_with(target, "config", "show", str(project / "robot.yaml"))
     assert "9600" in shown, "its own baud rate"
     bad = project / "bad.yaml"
-    bad.write_text((project / "robot.yaml").read_text().replace("  sonar:", "  sonnar:"))
-    with pytest.raises(AssertionError, match=r"bad\.yaml:5: devices\.sonnar: unknown key \(did you mean sonar\?\)"):
+    bad.write_text((project / "robot.yaml").read_text().replace("  ranger:", "  rangger:"))
+    with pytest.raises(AssertionError, match=r"bad\.yaml:5: devices\.rangger: unknown key \(did you mean ranger\?\)"):
         run_with(target, "config", "show", str(bad))
-    with pytest.raises(AssertionError, match=r"devices\.sonar: unknown key; known here: .*lidar"):
+    with pytest.raises(AssertionError, match=r"devices\.ranger: unknown key; known here: .*lidar"):
         run_with(project, "config", "show", str(project / "robot.yaml"))
 
 
 @pytest.mark.wall
 async def test_its_emulator_answers_its_probe(target: Path, tmp_path: Path):
-    link = tmp_path / "sonar"
+    link = tmp_path / "ranger"
     environment, pipe = os.environ | {"PYTHONPATH": str(target)}, asyncio.subprocess.PIPE
     emulator = await asyncio.create_subprocess_exec(
-        *(sys.executable, "-m", "monstertruckd", "emulate", "sonar", "--link", str(link)),
+        *(sys.executable, "-m", "monstertruckd", "emulate", "ranger", "--link", str(link)),
         cwd=ROOT,
         env=environment,
         stdin=pipe,
@@ -80,8 +80,8 @@ async def test_its_emulator_answers_its_probe(target: Path, tmp_path: Path):
     )
     try:
         assert emulator.stderr is not None
-        assert "sonar" in (await emulator.stderr.readline()).decode()
-        probed = json.loads(await asyncio.to_thread(run_with, target, "probe", "sonar", "--port", str(link), "--json"))
+        assert "ranger" in (await emulator.stderr.readline()).decode()
+        probed = json.loads(await asyncio.to_thread(run_with, target, "probe", "ranger", "--port", str(link), "--json"))
         assert probed["device"] == "MaxBotix MB7360"
         assert 300 <= probed["distance_mm"] <= 5000
     finally:

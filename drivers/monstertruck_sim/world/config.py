@@ -12,7 +12,7 @@ from monstertruck_kinematics.chassis import Chassis, Dimensions
 from monstertruck_kinematics.polynomials import AxlePolynomials, SteeringPolynomials
 from monstertruck_kinematics.truck import DriveTrain
 from monstertruck_runtime.bodies import AnyBody, build_chassis
-from monstertruck_schemas.base import Pose2D, Schema
+from monstertruck_schemas.base import FrameId, Pose2D, Schema
 from monstertruck_schemas.body import TruckBody
 
 Positive = Annotated[float, Field(gt=0)]
@@ -289,6 +289,79 @@ class CompassModelConfig(Schema):
     iron: Iron = Iron()
 
 
+class SonarPlace(Schema):
+    """A sonar on the body: place from the geometric centre, m, and direction of its axis, rad, left positive."""
+
+    x: float
+    y: float
+    yaw: float
+
+
+FIVE_SONARS: dict[str, SonarPlace] = {
+    "l": SonarPlace(x=0.05, y=0.05, yaw=1.5708),
+    "fl": SonarPlace(x=0.10, y=0.05, yaw=0.7854),
+    "f": SonarPlace(x=0.12, y=0.0, yaw=0.0),
+    "fr": SonarPlace(x=0.10, y=-0.05, yaw=-0.7854),
+    "r": SonarPlace(x=0.05, y=-0.05, yaw=-1.5708),
+}
+"""Left, front left, front, front right, right. FL is 0.05 m ahead of L, which is 0.05 m left of the middle; the other
+values are chosen."""
+
+
+class SonarModelConfig(Schema):
+    """Ultrasonic range finders.
+
+    ``beam``: range along the axis to walls that reflect in all directions. ``cone``: nearest echo from anywhere in the
+    cone; walls are mirrors for sound that meets them at more than ``critical_angle`` from the normal, edges and corners
+    reflect in all directions, and a sonar takes the sound of another one for its own.
+    """
+
+    model: Literal["beam", "cone"] = "cone"
+    field_of_view: Annotated[float, Field(gt=0, lt=3)] = 0.87
+    """Full opening angle of the cone, rad."""
+    range_min: NotNegative = 0.15
+    """Least range, m: what is nearer is reported as this range."""
+    range_max: Positive = 3.0
+    """Greatest range, m."""
+    noise: NotNegative = 0.005
+    """Standard deviation of a range, m."""
+    noise_share: NotNegative = 0.01
+    """Standard deviation that grows with the range, of the range; added to ``noise`` in quadrature."""
+    dropout: Fraction = 0.0
+    """Chance that an echo is missed."""
+    critical_angle: Annotated[float, Field(gt=0, le=1.5708)] = 0.45
+    """Greatest angle from a wall's normal at which sound comes back, rad; ``cone`` only."""
+    cross_talk: bool = True
+    """A sonar hears what others sent; ``cone`` only."""
+    audible: Positive = 6.0
+    """Farthest wall whose echo is heard, m: what comes back from beyond ``range_max`` may meet the next ping."""
+    sonars: dict[FrameId, SonarPlace] = FIVE_SONARS
+    """By name."""
+
+    @model_validator(mode="after")
+    def _check_order(self) -> Self:
+        if not self.range_min < self.range_max <= self.audible:
+            raise ValueError(
+                f"range_min {self.range_min} m, range_max {self.range_max} m, audible {self.audible} m: "
+                "expected them to rise"
+            )
+        return self
+
+
+class ImuModelConfig(Schema):
+    """Gyroscopes and accelerometers at the geometric centre; axes x forward, y left, z up."""
+
+    rate_noise: NotNegative = 0.003
+    """Standard deviation of each angular velocity, rad/s."""
+    rate_bias: NotNegative = 0.01
+    """Greatest fixed error of each angular velocity, rad/s."""
+    acceleration_noise: NotNegative = 0.05
+    """Standard deviation of each axis, m/s^2."""
+    acceleration_bias: NotNegative = 0.1
+    """Greatest fixed error of each axis, m/s^2."""
+    temperature_c: float = 30.0
+
+
 class GroundTilt(Schema):
     """The ground is level, or follows the profile in the map's folder."""
 
@@ -340,6 +413,8 @@ class WorldConfig(Schema):
     lidar: LidarConfig = LidarConfig()
     camera: CameraConfig = CameraConfig()
     compass: CompassModelConfig = CompassModelConfig()
+    sonar: SonarModelConfig = SonarModelConfig()
+    imu: ImuModelConfig = ImuModelConfig()
     tilt: TiltConfig = GroundTilt()
     rough: Annotated[tuple[RoughPatch, ...], Field(strict=False)] = ()
     """Patches of rough ground"""

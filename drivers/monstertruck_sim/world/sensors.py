@@ -6,10 +6,27 @@ from math import atan2, cos, degrees, hypot, pi, radians, sin
 import numpy as np
 from numpy.typing import NDArray
 
-from monstertruck_drivers.emulation import CompassReading, JointSource, MotorReading, PulseSource
+from monstertruck_drivers.emulation import CompassReading, ImuReading, JointSource, MotorReading, PulseSource
 from monstertruck_kinematics.elementary import Array
-from monstertruck_sim.world.config import BatteryModelConfig, CameraConfig, CompassModelConfig, LidarConfig, MotorConfig
-from monstertruck_sim.world.noise import ANALOG, COMPASS, COMPASS_FIXED, CURRENT, LIDAR, WhiteNoise, generator
+from monstertruck_sim.world.config import (
+    BatteryModelConfig,
+    CameraConfig,
+    CompassModelConfig,
+    ImuModelConfig,
+    LidarConfig,
+    MotorConfig,
+)
+from monstertruck_sim.world.noise import (
+    ANALOG,
+    COMPASS,
+    COMPASS_FIXED,
+    CURRENT,
+    IMU,
+    IMU_FIXED,
+    LIDAR,
+    WhiteNoise,
+    generator,
+)
 from monstertruck_sim.world.terrain import Terrain
 from monstertruck_sim.world.truck_plant import GRAVITY, TruckPlant
 
@@ -252,6 +269,41 @@ class SimulatedCompass:
             + iron.hard_y
             + self._config.motor_field * self._plant.current,
             iron.soft_z * field[2] + iron.hard_z,
+        )
+
+
+class SimulatedImu:
+    """``ImuSource``: gyroscopes and accelerometers at the geometric centre, axes x forward, y left, z up.
+
+    They feel the yaw rate, the reaction to gravity and the body's own acceleration, turned by the tilt; that the tilt
+    itself turns is not felt.
+    """
+
+    def __init__(self, plant: TruckPlant, config: ImuModelConfig, seed: int | None) -> None:
+        self._plant, self._config = plant, config
+        self._noise = WhiteNoise(seed, IMU, 6) if seed is not None else None
+        self._bias = [0.0] * 6
+        if seed is not None:
+            self._bias = generator(seed, IMU_FIXED).uniform(-1, 1, 6).tolist()
+
+    def imu(self, time_ns: int) -> ImuReading:
+        """Reading at ``time_ns``."""
+        self._plant.advance(time_ns)
+        config, (pitch, roll), (forward, left) = self._config, self._plant.attitude, self._plant.acceleration
+        rates = _to_body((0.0, 0.0, self._plant.truth().wz), pitch, roll)
+        forces = _to_body((forward, left, GRAVITY), pitch, roll)
+        noise = [0.0] * 6
+        if self._noise is not None:
+            noise = self._noise.at(self._plant.slot(time_ns, 1_000_000))
+        biases, scales = (config.rate_bias, config.acceleration_bias), (config.rate_noise, config.acceleration_noise)
+        felt = [
+            value + biases[i // 3] * self._bias[i] + scales[i // 3] * noise[i]
+            for i, value in enumerate((*rates, *forces))
+        ]
+        return ImuReading(
+            angular_velocity=(felt[0], felt[1], felt[2]),
+            acceleration=(felt[3], felt[4], felt[5]),
+            temperature_c=config.temperature_c,
         )
 
 

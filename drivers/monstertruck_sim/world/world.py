@@ -6,7 +6,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from monstertruck_drivers.emulation import AttitudeSource, JointSource, MotorPlant, RangeSource, ServoPlant, ViewSource
+from monstertruck_drivers.emulation import (
+    AttitudeSource,
+    ImuSource,
+    JointSource,
+    MotorPlant,
+    RangeSource,
+    ServoPlant,
+    SonarSource,
+    ViewSource,
+)
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.map_files import FREE, OCCUPIED, load_map
@@ -16,11 +25,13 @@ from monstertruck_sim.world.obstacles import Box, Obstacle, discs_and_segments, 
 from monstertruck_sim.world.raycast import cast_rays, clearance, grid_penetration
 from monstertruck_sim.world.sensors import (
     SimulatedCompass,
+    SimulatedImu,
     SimulatedLidar,
     SimulatedMotor,
     SimulatedServos,
     SimulatedView,
 )
+from monstertruck_sim.world.sonar import SimulatedSonars
 from monstertruck_sim.world.terrain import LEVEL, Terrain, load_profile, profile_path, rocking
 from monstertruck_sim.world.truck_plant import Pose, TruckPlant, TruthState
 
@@ -71,6 +82,8 @@ class World:
         self._battery_input = config.battery.channel
         self.servos: ServoPlant = SimulatedServos(self._plant, config.battery, noise_seed)
         self.compass: AttitudeSource = SimulatedCompass(self._plant, config.compass, noise_seed)
+        self.sonars: SonarSource = SimulatedSonars(self._plant, self._cast, config.sonar, noise_seed)
+        self.imu: ImuSource = SimulatedImu(self._plant, config.imu, noise_seed)
 
     def battery_volts(self, time_ns: int) -> float:
         """Voltage behind the battery's divider."""

@@ -73,8 +73,8 @@ INSTEAD = {
     "monstertruckd calibrate steering --rough": Instead(None, MOVES),
     "monstertruckd calibrate compass": Instead(None, MOVES),
     "monstertruckd demo --fast -c robot.yaml": Instead(None, OWN_DEVICE),
-    "monstertruckd emulate sonar --link /tmp/sonar": Instead(None, OWN_DEVICE),
-    "monstertruckd probe sonar --port /tmp/sonar": Instead(None, OWN_DEVICE),
+    "monstertruckd emulate ranger --link /tmp/ranger": Instead(None, OWN_DEVICE),
+    "monstertruckd probe ranger --port /tmp/ranger": Instead(None, OWN_DEVICE),
 }
 FOREIGN = {
     "python3 -m monstertruckd.bootstrap demo": "sets up .venv, then `monstertruckd demo`, which has its own tests",

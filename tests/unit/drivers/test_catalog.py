@@ -71,7 +71,7 @@ devices:
 @pytest.mark.parametrize(
     ("line", "complaint"),
     [
-        ("sonar: { port: { path: /dev/x }, driver: { kind: os4000 } }", ":4: devices.sonar: unknown key; known here: "),
+        ("horn: { port: { path: /dev/x }, driver: { kind: os4000 } }", ":4: devices.horn: unknown key; known here: "),
         ("compas: { port: { path: /dev/x }, driver: { kind: os4000 } }", "unknown key (did you mean compass?)"),
         ("compass: { port: { path: /dev/x }, driver: { kind: epos } }", ":4: devices.compass.driver.kind: "),
     ],
@@ -94,19 +94,19 @@ def test_a_port_without_a_baud_has_its_devices_own(tmp_path: Path, role: str, ba
     assert (device.port.baud, device.kind.name) == (baud, kind)
 
 
-SONAR = RoleSpec(name="sonar", duty=Duty.SENSOR, doc="A distance", writes={"out": topics.COMPASS})
+RADAR = RoleSpec(name="radar", duty=Duty.SENSOR, doc="A distance", writes={"out": topics.COMPASS})
 
 
 @pytest.mark.parametrize(
     ("role", "fault"),
     [
-        (SONAR, None),
+        (RADAR, None),
         (dataclasses.replace(LIDAR, doc="another"), "role lidar: there is another one of that name"),
-        (dataclasses.replace(SONAR, name="so nar"), "expected a name of small letters"),
-        (dataclasses.replace(SONAR, writes={"out": topics.POSE}), "drivers do not write state/pose"),
+        (dataclasses.replace(RADAR, name="so nar"), "expected a name of small letters"),
+        (dataclasses.replace(RADAR, writes={"out": topics.POSE}), "drivers do not write state/pose"),
         (
-            dataclasses.replace(SONAR, writes={"out": dataclasses.replace(topics.COMPASS, name="sensor/sonar")}),
-            "sensor/sonar is no entry point of monstertruck.topics",
+            dataclasses.replace(RADAR, writes={"out": dataclasses.replace(topics.COMPASS, name="sensor/radar")}),
+            "sensor/radar is no entry point of monstertruck.topics",
         ),
     ],
 )
@@ -119,7 +119,7 @@ def test_a_role_of_another_distribution_must_fit_in(role: RoleSpec, fault: str |
 
 def kind_with(**changes: object) -> DeviceKind:
     """A kind of another distribution whose role is not quite right."""
-    role = dataclasses.replace(LIDAR, name="sonar", writes={"out": topics.CAMERA})
+    role = dataclasses.replace(LIDAR, name="radar", writes={"out": topics.CAMERA})
     roles = changes["roles"] if "roles" in changes else (dataclasses.replace(role, **changes),)
     return dataclasses.replace(DEVICES["hokuyo_urg"], roles=roles)
 

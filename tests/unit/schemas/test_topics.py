@@ -68,7 +68,7 @@ class Sonar(Message):
 class Battery(Message):
     pass
 
-SONAR = Topic("sensor/sonar", Sonar, Writer.DRIVER, "Distance ahead", 10, 0.5)
+SONAR = Topic("sensor/radar", Sonar, Writer.DRIVER, "Distance ahead", 10, 0.5)
 AHEAD = Topic("sonar/ahead", Sonar, Writer.DRIVER, "No such group")
 MOTOR = Topic("cmd/motor", Sonar, Writer.GATE, "Past the gate")
 FORGED = Topic("sensor/forged", Sonar, Writer.GATE, "By the gate")
@@ -79,21 +79,21 @@ PLAIN = Topic("sensor/plain", dict, Writer.DRIVER, "No message")
 
 def test_another_distribution_adds_a_topic(install):
     group = BY_NAME.group
-    places = {f"{group}:{t.lower()}": f"sonar:{n}" for t, n in (("sensor/sonar", "SONAR"), ("sonar/ahead", "AHEAD"))}
+    places = {f"{group}:{t.lower()}": f"sonar:{n}" for t, n in (("sensor/radar", "SONAR"), ("sonar/ahead", "AHEAD"))}
     places |= {f"{group}:cmd/motor": "sonar:MOTOR", f"{group}:sensor/forged": "sonar:FORGED"}
     places |= {f"{group}:sensor/taken": "sonar:TAKEN", f"{group}:sensor/plain": "sonar:PLAIN"}
     install("sonar-driver", "sonar", SONAR, places | {f"{group}:sensor/scan": "sonar:SONAR"})
     table = TopicTable(group, TOPICS)
     assert list(table)[:-1] == list(BY_NAME)
-    assert table["sensor/sonar"].schema_name == "monstertruck.Sonar"
-    assert table.origin("sensor/sonar") == "sonar-driver 1.0"
+    assert table["sensor/radar"].schema_name == "monstertruck.Sonar"
+    assert table.origin("sensor/radar") == "sonar-driver 1.0"
     assert {broken.name: broken.error for broken in table.broken} == {
-        "cmd/motor": "expected a name like sensor/sonar, in one of the groups sensor, state, plan, health",
+        "cmd/motor": "expected a name like sensor/radar, in one of the groups sensor, state, plan, health",
         "sensor/forged": "written by gate: expected driver",
         "sensor/plain": "model: expected a subclass of Message",
         "sensor/scan": "the name is taken by monstertruckd",
         "sensor/taken": "another message is called monstertruck.Battery",
-        "sonar/ahead": "expected a name like sensor/sonar, in one of the groups sensor, state, plan, health",
+        "sonar/ahead": "expected a name like sensor/radar, in one of the groups sensor, state, plan, health",
     }
 
 
@@ -120,7 +120,7 @@ def test_reasons_have_stable_exit_codes_and_texts():
     ],
 )
 def test_a_topic_of_another_distribution_that_the_recorder_could_not_write_is_refused(changes, complaint):
-    row = dataclasses.replace(topics.COMPASS, name="sensor/sonar", **changes)
+    row = dataclasses.replace(topics.COMPASS, name="sensor/radar", **changes)
     assert complaint in (topics.BY_NAME.fault(row) or "")
 
 

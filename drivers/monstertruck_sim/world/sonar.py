@@ -1,0 +1,246 @@
+"""What sonars hear: pure functions of the walls around them, for emulators and for studies without a daemon.
+
+``beam`` is the range along the axis. ``cone`` samples the cone by rays and takes the nearest point from which sound
+comes back: a wall does so where its normal is within the critical angle of the direction to the sonar, an edge or a
+corner from everywhere. Sound that another sonar sent arrives in the same way, over a longer or shorter path, and as
+much later as it was sent: a sonar cannot tell whose sound it is (after Kuc and Siegel, "Physically Based Simulation
+Model for Acoustic Sensor Robot Navigation", 1987; Borenstein and Koren, "Error Eliminating Rapid Ultrasonic Firing",
+1995).
+"""
+
+from collections import deque
+from collections.abc import Mapping, Sequence
+from math import ceil, cos, inf, pi, sin
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_kinematics.elementary import Array
+from monstertruck_runtime.errors import InputError
+from monstertruck_sim.world.config import SonarModelConfig, SonarPlace
+from monstertruck_sim.world.noise import SONAR, generator
+from monstertruck_sim.world.sensors import Caster
+from monstertruck_sim.world.truck_plant import TruckPlant
+
+SPEED_OF_SOUND: Final = 343.0
+"""m/s, in air of 20 degrees Celsius."""
+_STEP: Final = 0.015
+"""Between the rays of a cone, rad."""
+_WINDOW: Final = 0.08
+"""Points this near on both sides tell the direction of a wall, m: some cells of a map."""
+_EDGE: Final = 0.25
+"""Spread across over spread along, from which on points are no wall but a corner."""
+_JUMP: Final = 0.12
+_JUMP_SHARE: Final = 0.2
+"""Neighbouring rays have an edge between them where their ranges differ by more, m, and their inverse ranges by more
+of the greater one: along a straight wall these are near each other even where it is seen at a grazing angle."""
+_NEIGHBOURS: Final = 3
+"""Rays on both sides that tell the direction of a wall at any distance."""
+_KEPT: Final = 32
+"""Pings that are remembered: more than are sent before the sound of one dies away."""
+
+
+class Ping(NamedTuple):
+    """A sonar that sends: place (m) and direction (rad) in the map frame, time (s)."""
+
+    x: float
+    y: float
+    yaw: float
+    time: float = 0.0
+
+
+class Surface(NamedTuple):
+    """What the rays of one ping's cone meet; shapes (n,)."""
+
+    ping: Ping
+    x: Array
+    """Of the points, m, map frame."""
+    y: Array
+    ranges: Array
+    """From the sonar, m; inf = nothing within ``audible``."""
+    normals: Array
+    """Direction of the wall's normal, rad (either of both)."""
+    scatters: NDArray[np.bool_]
+    """Edges and corners, which reflect in all directions."""
+
+
+def placed(sonar: SonarPlace, x: float, y: float, yaw: float, time: float = 0.0) -> Ping:
+    """A sonar's ping where the body is at (x, y, yaw) in the map frame."""
+    c, s = cos(yaw), sin(yaw)
+    return Ping(x + c * sonar.x - s * sonar.y, y + s * sonar.x + c * sonar.y, yaw + sonar.yaw, time)
+
+
+def beam(cast: Caster, ping: Ping, model: SonarModelConfig) -> float:
+    """Range along the axis, m; inf = nothing within ``range_max``."""
+    return float(cast(np.array([ping.x]), np.array([ping.y]), np.array([ping.yaw]), model.range_max)[0])
+
+
+def surface(cast: Caster, ping: Ping, model: SonarModelConfig) -> Surface:
+    """What is in the cone of one sonar, and how it reflects."""
+    count = 2 * ceil(model.field_of_view / 2 / _STEP) + 1
+    angles = ping.yaw + np.linspace(-model.field_of_view / 2, model.field_of_view / 2, count)
+    ranges = cast(np.full(count, ping.x), np.full(count, ping.y), angles, model.audible)
+    hit = np.isfinite(ranges)
+    way = np.where(hit, ranges, 0.0)
+    x, y = ping.x + way * np.cos(angles), ping.y + way * np.sin(angles)
+    normals, scatters = _normals(x, y, ranges)
+    return Surface(ping, x, y, ranges, normals, scatters)
+
+
+def cone(surfaces: Sequence[Surface], listener: Ping, model: SonarModelConfig) -> float:
+    """Nearest echo that ``listener`` takes for its own, m; inf = none within ``range_max``.
+
+    Args:
+        surfaces: of every sonar that sent anything since the last sound died away, that of ``listener`` among them.
+        listener: place, axis, and when it sent.
+        model: settings.
+    """
+    return min((_arrival(found, listener, model) for found in surfaces), default=inf)
+
+
+def heard(distance: float, model: SonarModelConfig, noise: np.random.Generator | None) -> float:
+    """A range as the sonar measures it, m: with noise, drop-outs and limits; inf = no echo.
+
+    Args:
+        distance: true one, m; inf = no echo.
+        model: settings.
+        noise: two draws are taken; None = none.
+    """
+    if noise is not None:
+        drawn, kept = noise.standard_normal(), noise.random() >= model.dropout
+        if not kept:
+            return inf
+        if distance < inf:
+            distance += float(drawn) * float(np.hypot(model.noise, model.noise_share * distance))
+    return max(distance, model.range_min) if distance <= model.range_max else inf
+
+
+def survey(
+    cast: Caster,
+    pose: tuple[float, float, float],
+    model: SonarModelConfig,
+    noise: np.random.Generator | None,
+    groups: Sequence[Sequence[str]] = (("l", "f", "r"), ("fl", "fr")),
+    gap: float = 0.05,
+) -> Mapping[str, float]:
+    """All sonars of a robot at ``pose`` once: groups fire one after the other, their members together.
+
+    Args:
+        cast: the walls.
+        pose: x, y (m) and yaw (rad) of the geometric centre in the map frame; the same for all groups.
+        model: settings, the sonars' places among them.
+        noise: see ``heard``.
+        groups: names of ``model.sonars``.
+        gap: between groups, and between the last one and the first of the next survey, s.
+
+    Returns:
+        Range by name, m; inf = no echo.
+    """
+    if model.model == "beam":
+        ranges = {name: beam(cast, placed(model.sonars[name], *pose), model) for group in groups for name in group}
+        return {name: heard(distance, model, noise) for name, distance in ranges.items()}
+    pings = [{n: placed(model.sonars[n], *pose, i * gap) for n in group} for i, group in enumerate(groups)]
+    found = {name: surface(cast, ping, model) for group in pings for name, ping in group.items()}
+    ranges = {}
+    for i, group in enumerate(pings):
+        before = pings[i - 1] if len(pings) > 1 else {}
+        late = {n: found[n]._replace(ping=p._replace(time=(i - 1) * gap)) for n, p in before.items()}
+        for name, ping in group.items():
+            ranges[name] = cone([*(found[n] for n in group), *late.values()], ping, model)
+    return {name: heard(distance, model, noise) for name, distance in ranges.items()}
+
+
+def _normals(x: Array, y: Array, ranges: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Direction of the wall's normal at every point, by the principal axes of the points around; and edges."""
+    count = len(ranges)
+    near, far = np.minimum(ranges[1:], ranges[:-1]), np.maximum(ranges[1:], ranges[:-1])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        gaps = (far - near > _JUMP) & (1.0 - near / far > _JUMP_SHARE)
+    piece = np.concatenate([[0], np.cumsum(gaps)])
+    scatters = np.zeros(count, dtype=np.bool_)
+    # The nearer side of a jump within the cone is an edge.
+    nearer = np.flatnonzero(gaps) + (ranges[1:] < ranges[:-1])[gaps]
+    scatters[nearer] = np.isfinite(ranges[nearer])
+    around = np.hypot(x[:, None] - x, y[:, None] - y) <= _WINDOW
+    around |= np.abs(np.arange(count)[:, None] - np.arange(count)) <= _NEIGHBOURS
+    around &= piece[:, None] == piece
+    weights = around / around.sum(axis=1, keepdims=True)
+    dx, dy = x - (weights @ x)[:, None], y - (weights @ y)[:, None]
+    xx, yy, xy = (weights * dx**2).sum(1), (weights * dy**2).sum(1), (weights * dx * dy).sum(1)
+    along = np.arctan2(2 * xy, xx - yy) / 2
+    middle, half = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
+    with np.errstate(invalid="ignore"):
+        scatters |= np.sqrt(np.maximum(middle - half, 0.0)) > _EDGE * np.sqrt(middle + half)
+    return along + pi / 2, scatters
+
+
+def _arrival(found: Surface, listener: Ping, model: SonarModelConfig) -> float:
+    """Range that ``listener`` reports for the sound of one ping; inf = it hears none."""
+    sent = found.ping
+    own = sent == listener
+    if not own and not model.cross_talk:
+        return inf
+    dx, dy = listener.x - found.x, listener.y - found.y
+    back = np.hypot(dx, dy)
+    lead = (sent.time - listener.time) * SPEED_OF_SOUND / 2
+    apparent = (found.ranges + back) / 2 + lead
+    returning, sending = np.arctan2(dy, dx), np.arctan2(sent.y - found.y, sent.x - found.x)
+    bisector = sending + _turn(returning - sending) / 2
+    off_normal = np.abs(_turn(2 * (bisector - found.normals))) / 2
+    off_axis = np.abs(_turn(returning + pi - listener.yaw))
+    audible = np.isfinite(found.ranges) & (apparent > 0.0) & (off_axis <= model.field_of_view / 2 + 1e-9)
+    audible &= found.scatters | (off_normal <= model.critical_angle)
+    nearest = float(apparent[audible].min(initial=inf))
+    return nearest if nearest <= model.range_max else inf
+
+
+def _turn(angles: Array) -> Array:
+    """Angles in [-pi, pi)."""
+    turned: Array = (angles + pi) % (2 * pi) - pi
+    return turned
+
+
+class SimulatedSonars:
+    """``SonarSource``: every ping leaves from where the body is then, and is heard by all others until it dies away.
+
+    Args:
+        plant: what carries them.
+        cast: ranges to the walls.
+        config: true parameters.
+        seed: of the noise; None = none.
+    """
+
+    def __init__(self, plant: TruckPlant, cast: Caster, config: SonarModelConfig, seed: int | None) -> None:
+        self._plant, self._cast, self._config, self._seed = plant, cast, config, seed
+        self._pings: deque[tuple[str, Ping, Surface | None]] = deque(maxlen=_KEPT)
+        self._heard = 0
+
+    def fire(self, name: str, time_ns: int) -> None:
+        """A sonar sends.
+
+        Raises:
+            InputError: the robot has no sonar of that name.
+        """
+        place = self._config.sonars.get(name)
+        if place is None:
+            raise InputError(f"no sonar {name} in sim.world.sonar.sonars; known: {', '.join(self._config.sonars)}")
+        self._plant.advance(time_ns)
+        x, y, yaw = self._plant.poses(np.array([time_ns]))[:3, 0]
+        ping = placed(place, float(x), float(y), float(yaw), time_ns * 1e-9)
+        found = surface(self._cast, ping, self._config) if self._config.model == "cone" else None
+        self._pings.append((name, ping, found))
+
+    def range(self, name: str) -> float:
+        """Distance that the newest ping of a sonar came to, m, once its sound is back; inf = no echo."""
+        mine = next((ping for fired, ping, _ in reversed(self._pings) if fired == name), None)
+        if mine is None:
+            return inf
+        if self._config.model == "beam":
+            distance = beam(self._cast, mine, self._config)
+        else:
+            alive = 2 * self._config.audible / SPEED_OF_SOUND
+            found = [seen for _, ping, seen in self._pings if seen and abs(ping.time - mine.time) < alive]
+            distance = cone(found, mine, self._config)
+        self._heard += 1
+        return heard(distance, self._config, None if self._seed is None else generator(self._seed, SONAR, self._heard))
