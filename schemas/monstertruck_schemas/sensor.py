@@ -169,7 +169,7 @@ class SonarEcho(Schema):
 class SonarRanges(Message):
     """All sonars of the robot, each pinged once; ``stamp`` is that of the oldest of them."""
 
-    sonars: Annotated[tuple[SonarEcho, ...], Field(strict=False)]
+    sonars: tuple[SonarEcho, ...]
     """In the order of the configuration."""
     field_of_view: Annotated[float, Field(gt=0, le=3.1416)]
     """Full opening angle of the cones, rad."""
