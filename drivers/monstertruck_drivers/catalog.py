@@ -15,6 +15,7 @@ from monstertruck_drivers.ax12.protocol import BAUD as AX12_BAUD
 from monstertruck_drivers.emulation import EmulatorFactory
 from monstertruck_drivers.epos.protocol import BAUD as EPOS_BAUD
 from monstertruck_drivers.os4000.protocol import FACTORY_BAUD as OS4000_BAUD
+from monstertruck_drivers.steppers.protocol import BAUD as STEPPERS_BAUD
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.plugins import Catalog, Plugin, load
 from monstertruck_schemas import topics
@@ -53,6 +54,8 @@ class RoleSpec:
     """Its mount is in the tree of frames."""
     start: int = 100
     """Rank among the devices that start again behind a returned hub."""
+    shafts: tuple[int, ...] = ()
+    """Driven shafts it may control, of those as many as its settings have (``shafts``); else the first one."""
     loads_hub: bool = False
     """It draws current (a motor, a sensor of pictures) or bandwidth as soon as its driver starts it."""
 
@@ -66,7 +69,13 @@ def _shaft(index: int) -> RoleSpec:
         writes={"out": DRIVES[index]},
         reads={"commands": CMD_DRIVES[index]},
         start=index,
+        shafts=(index,),
     )
+
+
+def _by_shaft(name: str, of_shafts: tuple[Topic[Any], ...]) -> dict[str, Topic[Any]]:
+    """Parameters of a driver of several shafts: ``name``, ``name_2`` and so on."""
+    return {f"{name}_{i}" if i > 1 else name: topic for i, topic in enumerate(of_shafts, 1)}
 
 
 LIDAR: Final = RoleSpec(
@@ -79,6 +88,15 @@ LIDAR: Final = RoleSpec(
     loads_hub=True,
 )
 DRIVE, DRIVE_2, DRIVE_3, DRIVE_4 = map(_shaft, range(len(SHAFTS)))
+WHEELS: Final = RoleSpec(
+    name=DeviceRole.WHEELS.value,
+    duty=Duty.ACTUATOR,
+    doc="One controller of all driven shafts, instead of one for each",
+    writes=_by_shaft("out", DRIVES),
+    reads=_by_shaft("commands", CMD_DRIVES),
+    start=4,
+    shafts=tuple(range(len(SHAFTS))),
+)
 STEERING: Final = RoleSpec(
     name=DeviceRole.STEERING.value,
     duty=Duty.ACTUATOR,
@@ -134,6 +152,7 @@ OUR_ROLES: Final = (
     DRIVE_2,
     DRIVE_3,
     DRIVE_4,
+    WHEELS,
     STEERING,
     COMPASS,
     STABILISER,
@@ -292,6 +311,17 @@ DEVICES: Final = DeviceCatalog(
         probe="monstertruck_drivers.epos.probe:probe",
         baud=EPOS_BAUD,
         usb=UsbIdentity("0403:6001", "FT232R USB UART", "ttyUSB"),
+    ),
+    DeviceKind(
+        name="steppers",
+        doc="Up to four stepper motors on one microcontroller (line protocol of this project)",
+        roles=(WHEELS,),
+        settings="monstertruck_drivers.steppers.config:StepperConfig",
+        implementation="monstertruck_drivers.steppers.driver:StepperDriver",
+        emulator="monstertruck_drivers.steppers.emulator:emulated",
+        probe="monstertruck_drivers.steppers.probe:probe",
+        baud=STEPPERS_BAUD,
+        usb=UsbIdentity("1a86:7523", "USB Serial", "ttyUSB"),
     ),
     DeviceKind(
         name="maestro",

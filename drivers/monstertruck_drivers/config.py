@@ -85,9 +85,8 @@ class _Devices(Schema):
         return dict(_present(self))
 
     def shafts(self) -> dict[str, Device[Any]]:
-        """The controllers of the driven shafts, by role."""
-        present = self.present()
-        return {role: present[role] for role in SHAFTS if role in present}
+        """The controllers of the driven shafts, by shaft; one may be there for several."""
+        return {SHAFTS[i]: device for role, device in self.present().items() for i in _served(role, device)}
 
     @model_validator(mode="after")
     def _one_port_each(self) -> Self:
@@ -103,12 +102,18 @@ class _Devices(Schema):
     @model_validator(mode="after")
     def _one_writer_each(self) -> Self:
         owners: dict[str, str] = {}
-        for role in self.present():
-            topic = next(iter(DEVICES.roles[role].writes.values())).name
-            if other := owners.get(topic):
-                raise ValueError(f"{other} and {role} both publish {topic}; a topic has one writer")
-            owners[topic] = role
+        for role, device in self.present().items():
+            writes = [topic.name for topic in DEVICES.roles[role].writes.values()]
+            for topic in writes[: len(_served(role, device)) or 1]:
+                if other := owners.get(topic):
+                    raise ValueError(f"{other} and {role} both publish {topic}; a topic has one writer")
+                owners[topic] = role
         return self
+
+
+def _served(role: str, device: Device[Any]) -> tuple[int, ...]:
+    """Numbers of the driven shafts that a device controls."""
+    return DEVICES.roles[role].shafts[: getattr(device.driver, "shafts", 1)]
 
 
 class _Monitors(Schema):

@@ -13,6 +13,7 @@ from monstertruck_drivers.epos.config import EposConfig
 from monstertruck_drivers.hokuyo_urg.config import HokuyoConfig
 from monstertruck_drivers.maestro.config import MaestroConfig
 from monstertruck_drivers.os4000.config import Os4000Config
+from monstertruck_drivers.steppers.config import StepperConfig
 from monstertruck_schemas.base import Schema
 from monstertruckd.gate.config import BodyLimits, GateConfig, longer, weaker
 
@@ -26,6 +27,7 @@ WEAKER_ABOVE: Final[dict[type[Schema], tuple[str, ...]]] = {
         "standstill_rpm",
         "fault_resets",
     ),
+    StepperConfig: ("max_rate", "answer_timeout", "command_timeout", "quick_stop_after", "watchdog"),
     MaestroConfig: ("answer_timeout", "command_timeout"),
     HokuyoConfig: ("skip",),
     Os4000Config: ("delay", "field_tolerance", "gravity_tolerance"),
@@ -50,6 +52,7 @@ WEAKER_BELOW: Final[dict[type[Schema], tuple[str, ...]]] = {
         "fault_reset_window",
         "fault_reset_pause",
     ),
+    StepperConfig: ("acceleration", "quick_deceleration", "rate"),
     MaestroConfig: ("poll_rate", "battery_rate"),
     HokuyoConfig: (),
     Os4000Config: (),
@@ -88,6 +91,9 @@ def beyond_devices(devices: Devices, monitors: Monitors, gate: GateConfig, body:
                 at_rest = math.ceil(gate.standstill / body.motor_speed * driver.max_motor_rpm)
                 if driver.standstill_rpm > at_rest:
                     yield f"{place}.standstill_rpm {driver.standstill_rpm}: at most {at_rest}, gate.standstill"
+        if isinstance(driver, StepperConfig):
+            names = ("command_timeout", "quick_stop_after", "watchdog")
+            yield from longer(gate, body, ((f"{place}.{name}", getattr(driver, name)) for name in names))
         if isinstance(driver, MaestroConfig):
             yield from longer(gate, body, [(f"{place}.command_timeout", driver.command_timeout)])
     for place, pack in _packs(devices, monitors):
@@ -105,6 +111,8 @@ def weakened_devices(devices: Devices, monitors: Monitors) -> Iterator[str]:
         driver, place = device.driver, f"devices.{role}.driver"
         if type(driver) in WEAKER_ABOVE:
             yield from _weaker(place, driver, type(driver)())
+        if isinstance(driver, StepperConfig):
+            yield f"{place}: steppers report the steps commanded: a wheel that is held or slips is not noticed"
         if isinstance(driver, MaestroConfig):
             if driver.deadman_feed == "always":
                 yield f"{place}.deadman_feed always: the deadman line guards against a dead process only"

@@ -3,13 +3,13 @@
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Final, Literal, Self
 
 from pydantic import Field, model_validator
 
 from monstertruck_drivers.config import Devices, Monitors
-from monstertruck_drivers.epos.config import EposConfig
 from monstertruck_drivers.maestro.config import MaestroConfig
+from monstertruck_drivers.shafts import MotorLimits, motor_limits
 from monstertruck_drivers.usb.config import UsbConfig
 from monstertruck_estimation.catalog import AnyOdometry
 from monstertruck_estimation.ground.config import GroundConfig
@@ -31,6 +31,8 @@ from monstertruckd.config.device_safety import beyond_devices, weakened_devices
 from monstertruckd.gate.config import SIGHT, BodyLimits, GateConfig, beyond, weakened
 from monstertruckd.recorder.config import BlackBoxConfig, MapRender, RecorderConfig
 
+BLIND: Final = "devices: no range sensor: nothing stops the robot before an obstacle"
+
 Metres = Annotated[float, Field(gt=0, le=10)]
 
 
@@ -43,7 +45,7 @@ class Geometry(Schema):
     """Metres between left and right wheel centres"""
     wheel_radius: Metres = 0.075
     """Metres"""
-    drive_ratio: Annotated[float, Field(gt=1, le=5000)] = 644.0
+    drive_ratio: Annotated[float, Field(ge=1, le=5000)] = 644.0
     """Motor turns per wheel turn"""
     length: Metres = 0.47
     """Metres, bumper to bumper"""
@@ -167,26 +169,28 @@ class TruckConfig(Schema):
     def body_limits(self) -> BodyLimits:
         """What bounds the motion of this body."""
         geometry, lidar = self.geometry, self.devices.lidar
-        metres = 2 * math.pi * geometry.wheel_radius / (60 * geometry.drive_ratio)
-        rates = [d.driver.max_motor_rpm for d in self.devices.shafts().values() if isinstance(d.driver, EposConfig)]
+        train = DriveTrain(geometry.drive_ratio, geometry.wheel_radius)
+        limits = [motor_limits(device.driver) for device in self.devices.shafts().values()]
+        speeds = [train.speed(limit.rate) for limit in limits if limit is not None]
         return BodyLimits(
             length=geometry.length,
             mass=geometry.mass,
             pull=geometry.pull,
-            motor_speed=min(rates) * metres if rates else None,
+            motor_speed=min(speeds, default=None),
             sight=None if lidar is None else SIGHT - geometry.length / 2 + lidar.mount.x,
         )
 
     def weakened(self) -> tuple[str, ...]:
         """Settings by which the robot is less safe than by the defaults, each with its value and the default."""
         opened = (f"zenoh.insecure: anybody who reaches {end} may drive" for end in self.zenoh.open_endpoints)
-        return (*weakened(self.gate), *weakened_devices(self.devices, self.monitors), *opened)
+        blind = () if self.devices.lidar is not None or self.gate.scan.critical else (BLIND,)
+        return (*weakened(self.gate), *blind, *weakened_devices(self.devices, self.monitors), *opened)
 
     def missing_actuators(self) -> str | None:
         """What the body needs to drive and steer, if some of it is not there."""
         chassis = self.chassis()
         needed = (*SHAFTS[: len(chassis.shafts)], *(("steering",) if chassis.steered else ()))
-        if set(needed) <= self.devices.present().keys():
+        if set(needed) <= self.devices.present().keys() | self.devices.shafts().keys():
             return None
         return f"the devices {', '.join(needed[:-1])} and {needed[-1]}"
 
@@ -225,8 +229,8 @@ class TruckConfig(Schema):
                     f"tracker.steering {self.tracker.steering}: impossible for body {self.body.kind}: {why}"
                 )
         for role, device in shafts.items():
-            if isinstance(device.driver, EposConfig):
-                self._check_braking(role, device.driver)
+            if (limits := motor_limits(device.driver)) is not None:
+                self._check_braking(role, limits)
 
     def _check_servos(self, driver: MaestroConfig, chassis: Chassis) -> None:
         wanted = len(chassis.straight)
@@ -259,15 +263,15 @@ class TruckConfig(Schema):
             if why := chassis.refusal(*STEERING_MODES[steering]):
                 raise ValueError(f"planner.steering {planner.steering}: impossible for body {self.body.kind}: {why}")
 
-    def _check_braking(self, role: str, drive: EposConfig) -> None:
+    def _check_braking(self, role: str, limits: MotorLimits) -> None:
         """The gate promises stopping distances; the drive controller must brake at least as hard."""
-        metres = 2 * math.pi * self.geometry.wheel_radius / (60 * self.geometry.drive_ratio)
-        for name, promised, rpm_s in (
-            ("deceleration", self.gate.deceleration, drive.deceleration_rpm_s),
-            ("quick_deceleration", self.gate.quick_deceleration, drive.quick_stop_deceleration_rpm_s),
+        train = DriveTrain(self.geometry.drive_ratio, self.geometry.wheel_radius)
+        for name, promised, rate in (
+            ("deceleration", self.gate.deceleration, limits.deceleration),
+            ("quick_deceleration", self.gate.quick_deceleration, limits.quick_deceleration),
         ):
-            if promised > rpm_s * metres:
+            if promised > (braking := train.speed(rate)):
                 raise ValueError(
-                    f"gate.{name} {promised} m/s^2: the {role} is configured to brake with {rpm_s} rpm/s, "
-                    f"which is {rpm_s * metres:.2f} m/s^2"
+                    f"gate.{name} {promised} m/s^2: the {role} is configured to brake with {rate / math.tau:.4g} motor "
+                    f"turns/s^2, which is {braking:.2f} m/s^2"
                 )

@@ -393,6 +393,23 @@ class SynchroChassis(Chassis):
 
 
 @dataclass(frozen=True)
+class SkidWheelsChassis(FamilyChassis):
+    """Left and right wheels, every wheel with a motor: front left, front right, rear left, rear right.
+
+    Wheels of one side that turn unlike each other drag it along at their mean.
+    """
+
+    def shafts_along(self, twist: Twist[float], *angles: float) -> Speeds:
+        """Both wheels of a side alike."""
+        return super().shafts_along(twist, *angles) * 2
+
+    def twist(self, inputs: Speeds, *angles: float) -> Twist[float]:
+        """Of the means of the sides."""
+        front_left, front_right, rear_left, rear_right = inputs
+        return super().twist(((front_left + rear_left) / 2, (front_right + rear_right) / 2), *angles)
+
+
+@dataclass(frozen=True)
 class IndependentChassis(Chassis):
     """Two steered axles with ideal linkages, every wheel with a motor of its own.
 
@@ -613,6 +630,7 @@ def skid_steer_chassis(
     icr_x: float = 0.0,
     gain_left: float = 1.0,
     gain_right: float = 1.0,
+    motors: Literal["sides", "wheels"] = "sides",
 ) -> Chassis:
     """Left and right wheels that turn the body by skidding.
 
@@ -623,6 +641,7 @@ def skid_steer_chassis(
         icr_x: longitudinal position of both, m, 0 to -wheelbase.
         gain_left: effective over nominal radius of the left wheels.
         gain_right: of the right wheels.
+        motors: one for each side, or for each wheel.
 
     Raises:
         KinematicsError: no robot can have these.
@@ -632,7 +651,11 @@ def skid_steer_chassis(
     family = SkidSteer(size.drivetrain.wheel_radius, left, right, icr_x, gain_left, gain_right)
     if not -size.wheelbase <= icr_x <= 0.0:
         raise KinematicsError(f"icr_x is {icr_x}: expected {-size.wheelbase:g} to 0, measured from the base")
-    return _driven_sides(size, family, icr_x)
+    sides = _driven_sides(size, family, icr_x)
+    if motors == "sides":
+        return sides
+    per_speed = 1.0 / size.drivetrain.wheel_radius
+    return SkidWheelsChassis(sides.bicycle, size.drivetrain, WHEEL_NAMES, "front", None, family, per_speed)
 
 
 def _driven_sides(size: Dimensions, family: Drive, icr_x: float = 0.0) -> Chassis:

@@ -109,6 +109,8 @@ class SkidSteerBody(BodyConfig):
     """Left and right wheels driven side by side (left, right), turning by skidding; parameters as identified."""
 
     kind: Literal["skid_steer"]
+    motors: Literal["sides", "wheels"] = "sides"
+    """One for each side, or for each wheel: front left, front right, rear left, rear right"""
     icr_left: float | None = None
     """Lateral position of the left side's turning centre, m; default half the track, which is no skidding at all"""
     icr_right: float | None = None

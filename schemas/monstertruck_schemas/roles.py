@@ -15,6 +15,7 @@ class DeviceRole(StrEnum):
     DRIVE_2 = "drive_2"
     DRIVE_3 = "drive_3"
     DRIVE_4 = "drive_4"
+    WHEELS = "wheels"
     STEERING = "steering"
     COMPASS = "compass"
     STABILISER = "stabiliser"
@@ -25,7 +26,7 @@ class DeviceRole(StrEnum):
 
 
 SHAFTS: Final = (DeviceRole.DRIVE, DeviceRole.DRIVE_2, DeviceRole.DRIVE_3, DeviceRole.DRIVE_4)
-"""Controllers of the driven shafts, in the order of the body's shafts."""
+"""Driven shafts in the order of the body's; each has a controller of this role, or ``WHEELS`` controls them all."""
 
 
 class AccessRole(StrEnum):

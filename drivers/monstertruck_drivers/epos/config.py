@@ -1,9 +1,11 @@
 """What a configuration file may say about the drive controller."""
 
+import math
 from typing import Annotated, Literal
 
 from pydantic import Field
 
+from monstertruck_drivers.shafts import MotorLimits
 from monstertruck_schemas.base import Schema
 
 Seconds = Annotated[float, Field(gt=0)]
@@ -51,3 +53,11 @@ class EposConfig(Schema):
     fault_reset_window: Seconds = 10.0
     fault_reset_pause: Seconds = 0.3
     """Between two fault resets."""
+
+    @property
+    def motor_limits(self) -> MotorLimits:
+        """What the motor does."""
+        rpm = 2 * math.pi / 60
+        return MotorLimits(
+            self.max_motor_rpm * rpm, self.deceleration_rpm_s * rpm, self.quick_stop_deceleration_rpm_s * rpm
+        )

@@ -1,4 +1,4 @@
-"""Worlds drawn by code: a loop with its lap, rooms, a maze of corridors, a ramp, and an open yard.
+"""Worlds drawn by code: a loop with its lap, rooms, a maze of corridors, a ramp, an open yard, and a table.
 
 ``python -m monstertruck_sim.world.built_in configs`` writes them as map_server files, and the lap of ``loop``.
 """
@@ -148,12 +148,25 @@ def yard() -> BuiltIn:
     return BuiltIn(canvas.map(), (0.0, 0.0, 0.0))
 
 
+TABLE = 3.0
+"""Side of the test stand's table, m."""
+
+
+def table() -> BuiltIn:
+    """The flat top of a test stand with a rim all around; its middle is the origin."""
+    half = TABLE / 2
+    canvas = _Canvas((-half - _WALL, half + _WALL), (-half - _WALL, half + _WALL))
+    canvas.free |= canvas.rectangle(-half, -half, half, half)
+    return BuiltIn(canvas.map(), (0.0, 0.0, 0.0))
+
+
 BUILT_IN: dict[str, Callable[[], BuiltIn]] = {
     "loop": loop,
     "rooms": rooms,
     "corridor_maze": corridor_maze,
     "ramp": ramp,
     "yard": yard,
+    "table": table,
 }
 
 

@@ -99,6 +99,21 @@ class LinkageConfig(Schema):
         return SteeringPolynomials(front, rear)
 
 
+class SkidModelConfig(Schema):
+    """What a skid-steer robot does besides what its body's parameters say."""
+
+    wheel_gains: Annotated[tuple[Positive, ...], Field(strict=False)] = ()
+    """Effective over nominal radius of the wheel on every shaft: motors and wheels are not identical; empty = all 1"""
+    reversal_turn: float = 0.0
+    """Turn at each reversal of the direction of travel, on average, left positive, rad"""
+    reversal_spread: NotNegative = 0.0
+    """Its standard deviation, rad"""
+    drift_x: float = 0.0
+    """Slide of a robot whose wheels turn, in the map frame, m/s"""
+    drift_y: float = 0.0
+    """m/s"""
+
+
 class SimTruckConfig(Schema):
     """Body, wheels and tyres.
 
@@ -152,6 +167,8 @@ class SimTruckConfig(Schema):
     """The rear right wheel's; ``rear_servo`` is the rear left one's."""
     motor: MotorConfig = MotorConfig()
     """Each of the motors"""
+    skid: SkidModelConfig = SkidModelConfig()
+    """Of a skid-steer body"""
 
     def chassis(self) -> Chassis:
         """True kinematics.
@@ -181,6 +198,11 @@ class SimTruckConfig(Schema):
         if self.front_servo.channel == self.rear_servo.channel:
             raise ValueError(f"front_servo and rear_servo share channel {self.front_servo.channel}")
         chassis = self.chassis()
+        if self.skid.wheel_gains and len(self.skid.wheel_gains) != len(chassis.shafts):
+            raise ValueError(
+                f"skid.wheel_gains has {len(self.skid.wheel_gains)} values: expected one for each of the shafts "
+                f"{', '.join(chassis.shafts)}"
+            )
         if len({servo.channel for servo in self.servos}) < len(chassis.straight):
             raise ValueError(f"body {self.body.kind} has {len(chassis.straight)} servos: expected one channel for each")
         if self.dynamics == "single_track" and (chassis.linkage is None or chassis.freedom == "parallel"):

@@ -23,6 +23,7 @@ from monstertruck_sim.world.actuators import RPM, Servo, Shaft
 from monstertruck_sim.world.battery import BatteryModel
 from monstertruck_sim.world.config import BatteryModelConfig, SimTruckConfig
 from monstertruck_sim.world.noise import SLIP, SlowNoise
+from monstertruck_sim.world.skid import SkidEffects
 
 STEP_NS = 5_000_000
 SERVO_FRAME_NS = 20_000_000
@@ -109,6 +110,7 @@ class TruckPlant:
         self._servos = tuple(map(Servo, config.servos))
         self._steering = _Steering(self._chassis)
         self._tyres = _tyres(config, self._chassis)
+        self._skid = SkidEffects(config.skid, seed) if config.body.kind == "skid_steer" else None
         self._contact, self._tilt = contact, tilt
         self._noise = SlowNoise(seed, SLIP, 2 + count, _SLIP_PERIOD_NS) if seed is not None else None
         self._start_ns: int | None = None
@@ -283,7 +285,11 @@ class TruckPlant:
         for wheel, pull, slip_noise in zip(wheels, self._pulls, slip_noises, strict=True):
             slip = config.slip_per_newton * pull * copysign(1.0, wheel) + config.slip_noise * slip_noise
             pace.append(wheel * steering.body_per_wheel * (1.0 - slip) * cos(self._attitude[0]))
-        twist = self._chassis.twist(tuple(pace), *angles)
+        if self._skid is None:
+            twist = self._chassis.twist(tuple(pace), *angles)
+        else:
+            rolled = self._chassis.twist(tuple(self._skid.wheel_speeds(pace)), *angles)
+            twist = self._skid.twist(rolled, self._pose[2], dt)
         if self._tyres is not None:
             speed = copysign(hypot(twist[0], twist[1]), twist[0])
             front, rear = angles

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Final, Self
 
 from monstertruck_drivers.config import AnyPort
+from monstertruck_drivers.epos.config import EposConfig
 from monstertruck_drivers.usb.config import CycleMethod, UsbPortConfig
 from monstertruck_drivers.usb.tree import place, port_directory
 from monstertruck_runtime.errors import InputError, NotFoundError
@@ -117,6 +118,7 @@ def _stop(config: TruckConfig, program: Program) -> str:
     drives = [
         f"{_plain(node_of(role, device.port), without='=')}={device.driver.node}@{device.port.baud}"
         for role, device in config.devices.shafts().items()
+        if isinstance(device.driver, EposConfig)  # a controller of steppers stops by its own watchdog
     ]
     # Without site: the script must run even when the environment's packages do not load.
     return f"ExecStopPost={_plain(program.python)} -I -S {_plain(program.neutral)} {' '.join(drives)}" if drives else ""

@@ -11,6 +11,7 @@ from monstertruck_drivers.epos.config import EposConfig
 from monstertruck_drivers.hokuyo_urg.config import HokuyoConfig
 from monstertruck_drivers.maestro.config import BatteryInputConfig, MaestroConfig, ServoConfig
 from monstertruck_drivers.os4000.config import Os4000Config
+from monstertruck_drivers.steppers.config import StepperConfig
 from monstertruckd.config.device_safety import WEAKER_ABOVE, WEAKER_BELOW, beyond_devices
 from monstertruckd.config.load import load_truck
 from monstertruckd.config.truck import TruckConfig
@@ -29,6 +30,9 @@ HARMLESS = {
     EposConfig: {
         **dict.fromkeys(("kind", "node", "inverted", "encoder_pulses_per_turn", "motor_type"), UNIT),
         "acceleration_rpm_s": "the gate's ramp is what sets speeds; this one only follows it later",
+    },
+    StepperConfig: {
+        **dict.fromkeys(("kind", "motors", "steps_per_turn", "inverted"), UNIT),
     },
     MaestroConfig: {
         **dict.fromkeys(("kind", "front", "rear", "front_right", "rear_right", "device_number", "use_crc"), UNIT),
@@ -98,8 +102,8 @@ def test_the_defaults_weaken_nothing():
     assert truck().weakened() == ()
 
 
-ABOVE = [(model, name) for model, names in WEAKER_ABOVE.items() for name in names]
-BELOW = [(model, name) for model, names in WEAKER_BELOW.items() for name in names]
+ABOVE = [(model, name) for model, names in WEAKER_ABOVE.items() if model in PLACES for name in names]
+BELOW = [(model, name) for model, names in WEAKER_BELOW.items() if model in PLACES for name in names]
 
 
 def unchecked(name: str, value: Any) -> TruckConfig:

@@ -1,0 +1,1 @@
+"""Stepper motors on one microcontroller, by a line protocol of this project."""

@@ -1,0 +1,281 @@
+"""Drive service of several shafts on one stepper controller: ``cmd/drive*`` in, ``sensor/drive*`` out.
+
+One exchange a cycle: what the newest commands of all shafts want goes out, the status comes back and is the feedback of
+every shaft. The shafts have one state together: the most careful of their commands counts, and the oldest.
+
+The controller's watchdog stops the motors when the host is silent. The first request of every session is a quick stop,
+the last ones are a quick stop and, once the motors rest, coils off.
+"""
+
+import contextlib
+from collections.abc import Sequence
+from typing import Final, NamedTuple
+
+from monstertruck_drivers.link import Port
+from monstertruck_drivers.steppers.config import StepperConfig
+from monstertruck_drivers.steppers.protocol import Identity, MotorState, RefusalCode, Status, step_of
+from monstertruck_drivers.steppers.session import ATTEMPTS, RequestRefusedByDeviceError, StepperSession
+from monstertruck_runtime.clock import QUESTIONS, SECOND, Clock, Schedule
+from monstertruck_runtime.errors import (
+    DeviceError,
+    DeviceLostError,
+    DeviceMismatchError,
+    DeviceRestartedError,
+    DeviceStoppedError,
+    DeviceTimeoutError,
+    ProtocolError,
+)
+from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
+from monstertruck_schemas.cmd import DriveAction, DriveCommand
+from monstertruck_schemas.event import Severity
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.sensor import DriveFeedback, DriveMode
+
+MISSES: Final = 3
+"""Exchanges in a row without a usable answer that end the session."""
+SAFE_DEADLINE: Final = 0.4
+"""Seconds a session may take at its end to stop the motors and switch them off."""
+UPTIME_SLACK: Final = 200
+"""Ms by which the controller's uptime may lag behind the host's time between two answers."""
+NOISY: Final = 5
+"""Damaged lines within ``NOISE_WINDOW`` that are reported."""
+NOISE_WINDOW: Final = 10 * SECOND
+
+MODES: Final = {
+    MotorState.OFF: DriveMode.DISABLED,
+    MotorState.RUN: DriveMode.ENABLED,
+    MotorState.STOPPED: DriveMode.QUICK_STOP,
+    MotorState.WATCHDOG: DriveMode.QUICK_STOP,
+}
+
+
+class MotorsWanted(NamedTuple):
+    """What the motors shall do."""
+
+    state: MotorState
+    rates: tuple[int, ...] = ()
+    """1/1000 step/s, in the controller's own sign; of RUN."""
+
+
+def wanted(commands: Sequence[DriveCommand | None], now: int, config: StepperConfig) -> MotorsWanted:
+    """What the newest commands of all shafts mean together; the host's own deadman is here.
+
+    Args:
+        commands: newest one of every shaft, if any.
+        now: time, ns.
+        config: signs, limits and time-outs.
+    """
+    known = [command for command in commands if command is not None]
+    if len(known) < len(commands) or any(command.action is DriveAction.DISABLE for command in known):
+        return MotorsWanted(MotorState.OFF)
+    age = max(now - command.stamp for command in known) / SECOND
+    if age > config.quick_stop_after or any(command.action is DriveAction.QUICK_STOP for command in known):
+        return MotorsWanted(MotorState.STOPPED)
+    if age > config.command_timeout:
+        return MotorsWanted(MotorState.RUN, (0,) * len(known))
+    limit = config.max_rate
+    steps = [min(max(command.motor_velocity / config.turn, -limit), limit) for command in known]
+    rates = [-rate if inverted else rate for rate, inverted in zip(steps, config.inverted, strict=False)]
+    return MotorsWanted(MotorState.RUN, tuple(round(1000 * rate) for rate in rates))
+
+
+class StepperDriver:
+    """Service of all motors on one controller.
+
+    Args:
+        config: see ``StepperConfig``.
+        port: where the controller hangs.
+        clock: time.
+        commands: ``cmd/drive`` of the first shaft; those of the others follow.
+        commands_2: of the second.
+        commands_3: of the third.
+        commands_4: of the fourth.
+        out: ``sensor/drive`` of the first shaft, ``stamp`` in the middle of the exchange.
+        out_2: of the second.
+        out_3: of the third.
+        out_4: of the fourth.
+        events: identity, restarts, a noisy line.
+        name: of the service.
+    """
+
+    def __init__(
+        self,
+        config: StepperConfig,
+        port: Port,
+        clock: Clock,
+        *,
+        commands: Subscription[DriveCommand],
+        commands_2: Subscription[DriveCommand],
+        commands_3: Subscription[DriveCommand],
+        commands_4: Subscription[DriveCommand],
+        out: Publisher[DriveFeedback],
+        out_2: Publisher[DriveFeedback],
+        out_3: Publisher[DriveFeedback],
+        out_4: Publisher[DriveFeedback],
+        events: EventSink,
+        name: str = "wheels",
+    ) -> None:
+        self.name = name
+        self._config = config
+        self._port = port
+        self._clock = clock
+        self._commands = (commands, commands_2, commands_3, commands_4)[: config.motors]
+        self._outs = (out, out_2, out_3, out_4)[: config.motors]
+        self._events = events
+        self._steps = [0] * config.motors
+        """Counted over sessions and restarts of the controller."""
+        self._last: tuple[Status, int] | None = None
+        """Newest status, and when it came."""
+
+    async def run(self, ready: Ready) -> None:
+        """One session, from the stop of motors that may still turn to the stop at its end.
+
+        Raises:
+            DeviceLostError: nothing plugged in; the link went down.
+            DeviceRestartedError: the controller restarted while it was in use.
+            DeviceStoppedError: its watchdog stopped motors that were to turn.
+            DeviceMismatchError: motors or steps per turn are not those configured.
+            WrongDeviceError: something else answers.
+            PortBusyError: another process holds the port.
+            DeviceTimeoutError, ProtocolError: no usable answers.
+        """
+        async with await self._port.open() as link:
+            session = StepperSession(link, self._clock, self._config.answer_timeout)
+            try:
+                motors = (await self._start(session)).motors
+                await self._serve(session, motors, ready)
+            finally:
+                if not link.is_lost:
+                    await self._make_safe(session)
+
+    async def _start(self, session: StepperSession) -> Identity:
+        config = self._config
+        session.tell("Q")
+        identity = await session.identify()
+        if identity.motors < config.motors or identity.steps_per_turn != config.steps_per_turn:
+            raise DeviceMismatchError(
+                f"{self._port.name}: {identity.motors} motors of {identity.steps_per_turn} steps, configured are "
+                f"{config.motors} of {config.steps_per_turn}"
+            )
+        began = self._clock.now()
+        while any((await session.status("Q", identity.motors, attempts=ATTEMPTS)).rates):
+            if self._clock.now() - began > SAFE_DEADLINE * SECOND:
+                raise ProtocolError(f"{self._port.name}: the motors do not come to rest")
+            await self._clock.sleep(1.0 / config.rate)
+        settings = (config.acceleration, config.quick_deceleration, round(1000 * config.watchdog))
+        taken = await session.ask("C", *settings, attempts=ATTEMPTS)
+        if taken.words != tuple(map(str, settings)):
+            raise ProtocolError(f"{self._port.name}: settings {settings} were taken as {' '.join(taken.words)}")
+        text = f"{identity.name} version {identity.version}, {identity.motors} motors"
+        self._events(Reason.DEVICE_READY, Severity.INFO, self.name, text)
+        return identity
+
+    async def _serve(self, session: StepperSession, motors: int, ready: Ready) -> None:
+        schedule = Schedule(self._clock, self._config.rate, QUESTIONS)
+        misses, reported = 0, False
+        noise, noted = session.splitter.bad, self._clock.now()
+        due = 0
+        while True:
+            if self._clock.now() >= due:
+                due = schedule.step()
+            await self._until(due)
+            want = self._want()
+            try:
+                status = await self._exchange(session, motors, want)
+            except (DeviceTimeoutError, ProtocolError):
+                misses += 1
+                if misses >= MISSES:
+                    raise
+                continue
+            misses = 0
+            self._publish(status, session)
+            if not reported:
+                reported = True
+                ready()
+            if self._clock.now() - noted > NOISE_WINDOW:
+                noise, noted = session.splitter.bad, self._clock.now()
+            elif session.splitter.bad - noise >= NOISY:
+                text = f"{session.splitter.bad - noise} damaged lines, newest {session.splitter.strange!r}"
+                self._events(Reason.DEVICE_PROTOCOL, Severity.WARNING, self.name, text)
+                noise = session.splitter.bad
+
+    def _want(self) -> MotorsWanted:
+        return wanted([commands.latest for commands in self._commands], self._clock.now(), self._config)
+
+    def _is_urgent(self) -> bool:
+        """Whether the motors run and are to stop."""
+        running = self._last is not None and self._last[0].state is MotorState.RUN
+        return running and self._want().state is not MotorState.RUN
+
+    async def _until(self, due: int) -> None:
+        """Wait for the next cycle, or for a command that stops running motors; the last shaft's is the newest."""
+        while (left := due - self._clock.now()) > 0:
+            last = self._commands[-1]
+            if await last.next_within(left / SECOND, lambda _: not self._is_urgent()) is None or self._is_urgent():
+                return
+
+    async def _exchange(self, session: StepperSession, motors: int, want: MotorsWanted) -> Status:
+        if want.state is MotorState.OFF:
+            verb = "D" if self._last is not None and not any(self._last[0].rates) else "Q"
+            status = await session.status(verb, motors)
+        elif want.state is MotorState.STOPPED:
+            status = await session.status("Q", motors)
+        else:
+            try:
+                status = await session.status("R", motors, *want.rates, *(0,) * (motors - len(want.rates)))
+            except RequestRefusedByDeviceError as error:
+                if error.code == RefusalCode.TRIPPED:
+                    text = f"{self._port.name}: the controller's watchdog stopped the motors"
+                    raise DeviceStoppedError(text) from error
+                raise
+        self._check(status)
+        return status
+
+    def _check(self, status: Status) -> None:
+        """Notice a controller that restarted.
+
+        Raises:
+            DeviceRestartedError: it did, while it was in use.
+        """
+        now = self._clock.now()
+        if self._last is not None:
+            before, then = self._last
+            passed = (status.uptime_ms - before.uptime_ms) % (1 << 32)
+            elapsed = (now - then) / 1e6
+            if not -UPTIME_SLACK <= passed - elapsed <= UPTIME_SLACK + elapsed:
+                self._last = None
+                self._events(Reason.DEVICE_RESTARTED, Severity.WARNING, self.name, "the controller restarted")
+                if before.state is not MotorState.OFF:
+                    raise DeviceRestartedError(f"{self._port.name}: the controller restarted")
+
+    def _publish(self, status: Status, session: StepperSession) -> None:
+        now = self._clock.now()
+        if self._last is not None:
+            before = self._last[0].positions
+            for i, (old, new) in enumerate(zip(before, status.positions, strict=True)):
+                if i < len(self._steps):
+                    self._steps[i] += step_of(old, new)
+        self._last = status, now
+        for i, out in enumerate(self._outs):
+            sign = -1.0 if self._config.inverted[i] else 1.0
+            out.put(
+                DriveFeedback(
+                    stamp=(session.asked + now) // 2,
+                    received=now,
+                    seq=out.next_seq(),
+                    position=sign * self._steps[i] * self._config.turn,
+                    velocity=sign * status.rates[i] / 1000 * self._config.turn,
+                    mode=MODES[status.state],
+                )
+            )
+
+    async def _make_safe(self, session: StepperSession) -> None:
+        with contextlib.suppress(DeviceError, TimeoutError):
+            async with self._clock.deadline(SAFE_DEADLINE):
+                motors = (await session.identify()).motors if self._last is None else len(self._last[0].positions)
+                while any((await session.status("Q", motors, attempts=ATTEMPTS)).rates):
+                    await self._clock.sleep(0.02)
+                await session.status("D", motors, attempts=ATTEMPTS)
+            return
+        with contextlib.suppress(DeviceLostError):
+            session.tell("Q")

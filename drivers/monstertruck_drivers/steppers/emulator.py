@@ -1,0 +1,262 @@
+"""The microcontroller's side: lines in, lines out, ramps, watchdog, and steppers that lose steps.
+
+Habits of the real thing: it is silent unless asked, drops damaged lines without a word, knows the steps it commanded
+and not those that the rotor made, steps in whole periods of its timer, and begins at 0 after every power-up.
+"""
+
+import asyncio
+from collections.abc import Callable, Sequence
+from typing import Final
+
+from monstertruck_drivers.cable import DeviceEnd
+from monstertruck_drivers.emulation import EmulatorSetup, MotorPlant, Trail
+from monstertruck_drivers.epos.firmware import FreeMotor
+from monstertruck_drivers.steppers.protocol import (
+    BAUD,
+    MAX_RATE,
+    MOTORS,
+    NAME,
+    VERSION,
+    Identity,
+    Line,
+    LineError,
+    MotorState,
+    RefusalCode,
+    Splitter,
+    Status,
+    wrapped,
+)
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.errors import InputError
+
+TICK_US: Final = 10
+"""Timer period, microseconds."""
+PULL_OUT: Final = 300.0
+"""Steps/s beyond which a rotor no longer follows: it stands and hums, and the counter counts on."""
+PULL_IN: Final = 150.0
+"""Steps/s below which a rotor that stands follows again."""
+FACTORY: Final = (4000, 8000, 500)
+"""Ramp and quick stop, steps/s^2, and watchdog, ms, after power-up."""
+THINKING: Final = 0.0005
+"""Seconds from the end of a line to its answer."""
+COASTING: Final = 1e6
+"""Rpm/s at which a rotor without current stops: friction of its gear and wheel."""
+
+
+class StepperEmulator:
+    """The controller with its motors.
+
+    Faults (``inject``): ``overload MOTOR on|off`` (the rotor stands), ``silent on|off`` (hears, says nothing), ``late
+    SECONDS [COUNT]`` (answers), ``reset`` (the processor restarts in the middle of whatever it does), ``noise COUNT``
+    (so many answers have a wrong byte).
+
+    Args:
+        clock: time.
+        plants: what the motors turn; free motors take the missing places.
+        name: in messages.
+        motors: it has.
+        steps_per_turn: of each.
+    """
+
+    def __init__(
+        self,
+        clock: Clock,
+        plants: Sequence[MotorPlant] = (),
+        *,
+        name: str = "steppers",
+        motors: int = MOTORS,
+        steps_per_turn: int = 400,
+    ) -> None:
+        self.name = name
+        self.received = Trail()
+        """Newest bytes from the host."""
+        self._clock = clock
+        self._identity = Identity(NAME, VERSION, motors, steps_per_turn, TICK_US)
+        self._plants = [*plants, *(FreeMotor() for _ in range(motors - len(plants)))][:motors]
+        self._held = [False] * motors
+        self._silent = False
+        self._late: list[float] = []
+        self._noise = 0
+        self._fed_again = asyncio.Event()
+        self._boot()
+
+    def _boot(self) -> None:
+        now = self._clock.now()
+        self._splitter = Splitter()
+        self._booted = self._fed = now
+        self._acceleration, self._quick, self._watchdog = FACTORY
+        self._state = MotorState.OFF
+        self._rates = [0.0] * self._identity.motors
+        self._counters = [FreeMotor() for _ in self._plants]
+        for counter in self._counters:
+            counter.reading(now)
+        self._stalled = [False] * self._identity.motors
+        self._turn(None, self._quick)
+
+    def power_cycle(self) -> None:
+        """Supply off and on: coils off, counters at 0, settings of the factory."""
+        self._boot()
+        self._fed_again.set()
+
+    def inject(self, fault: str, *values: str) -> None:
+        """Start or end a fault, see the class.
+
+        Raises:
+            InputError: unknown fault or bad value.
+        """
+        try:
+            match fault, values:
+                case "overload", (motor, ("on" | "off") as word):
+                    self._held[int(motor) - 1] = word == "on"
+                    self._drive()
+                case "silent", (("on" | "off") as word,):
+                    self._silent = word == "on"
+                case "late", (seconds, *count):
+                    self._late = [float(seconds)] * int(*count or ("1",))
+                case "noise", (count,):
+                    self._noise = int(count)
+                case "reset", ():
+                    self.power_cycle()
+                case _:
+                    raise ValueError(fault)
+        except (ValueError, IndexError, TypeError) as error:
+            raise InputError(
+                f"{self.name}: fault {' '.join((fault, *values))!r} not understood; known: overload MOTOR on|off, "
+                "silent on|off, late SECONDS [COUNT], noise COUNT, reset"
+            ) from error
+
+    async def run(self, end: DeviceEnd) -> None:
+        """Serve for ever."""
+        async with asyncio.TaskGroup() as group:
+            group.create_task(self._watch())
+            while True:
+                data = await end.read()
+                self.received.extend(data)
+                for line in self._splitter.feed(data):
+                    self._answer(end, line)
+
+    def _answer(self, end: DeviceEnd, line: Line) -> None:
+        try:
+            reply = self._obey(line)
+        except LineError:
+            reply = Line("e", line.seq, (str(int(RefusalCode.ARGUMENTS)),))
+        if self._silent:
+            return
+        data = bytes(reply)
+        if self._noise > 0:
+            self._noise -= 1
+            data = data[:3] + bytes((data[3] ^ 0x04,)) + data[4:]
+        end.write(data, self._late.pop() if self._late else THINKING)
+
+    def _obey(self, line: Line) -> Line:
+        verbs: dict[str, Callable[[Line], RefusalCode | None]] = {
+            "R": self._run,
+            "Q": lambda line: self._stop(line, MotorState.STOPPED),
+            "D": lambda line: self._stop(line, MotorState.OFF),
+            "S": lambda line: self._expect(line, 0),
+        }
+        if line.verb == "I":
+            self._expect(line, 0)
+            return self._identity.line(line.seq)
+        if line.verb == "C":
+            code = self._set(line)
+            return Line("c", line.seq, line.words) if code is None else Line("e", line.seq, (str(int(code)),))
+        code = verbs[line.verb](line) if line.verb in verbs else RefusalCode.UNKNOWN
+        return self._status().line(line.seq) if code is None else Line("e", line.seq, (str(int(code)),))
+
+    @staticmethod
+    def _expect(line: Line, count: int) -> None:
+        line.integers(count)
+
+    def _set(self, line: Line) -> RefusalCode | None:
+        ramp, quick, watchdog = line.integers(3)
+        if not (0 < ramp <= quick <= 1_000_000 and 50 <= watchdog <= 2000):
+            return RefusalCode.ARGUMENTS
+        if any(self._status().rates):
+            return RefusalCode.NOT_NOW
+        self._acceleration, self._quick, self._watchdog = ramp, quick, watchdog
+        return None
+
+    def _run(self, line: Line) -> RefusalCode | None:
+        rates = line.integers(self._identity.motors)
+        if max(map(abs, rates)) > MAX_RATE:
+            return RefusalCode.ARGUMENTS
+        if self._state is MotorState.WATCHDOG:
+            return RefusalCode.TRIPPED
+        self._state, self._fed = MotorState.RUN, self._clock.now()
+        self._fed_again.set()
+        self._turn([_stepped(rate / 1000) for rate in rates], self._acceleration)
+        return None
+
+    def _stop(self, line: Line, state: MotorState) -> None:
+        self._expect(line, 0)
+        self._state = state
+        self._turn(None if state is MotorState.OFF else [0.0] * self._identity.motors, self._quick)
+
+    def _turn(self, rates: list[float] | None, acceleration: float) -> None:
+        """Make the steps of rates, steps/s; None = no current."""
+        self._powered, self._ramp = rates is not None, acceleration * self._rpm
+        self._rates = rates or [0.0] * self._identity.motors
+        now = self._clock.now()
+        for counter, rate in zip(self._counters, self._rates, strict=True):
+            counter.command(now, rate * self._rpm, self._ramp if self._powered else COASTING)
+        self._drive()
+
+    def _drive(self) -> None:
+        """Let the rotors follow, as far as their torque goes."""
+        now = self._clock.now()
+        for i, (plant, rate) in enumerate(zip(self._plants, self._rates, strict=True)):
+            self._stalled[i] = abs(rate) > (PULL_IN if self._stalled[i] else PULL_OUT)
+            follows = self._powered and not self._stalled[i] and not self._held[i]
+            target = (rate * self._rpm if follows else 0.0) if self._powered else None
+            plant.command(now, target, self._ramp if follows else COASTING)
+
+    @property
+    def _rpm(self) -> float:
+        """Of one step/s."""
+        return 60.0 / self._identity.steps_per_turn
+
+    def _status(self) -> Status:
+        now = self._clock.now()
+        readings = [counter.reading(now) for counter in self._counters]
+        return Status(
+            self._state,
+            self._splitter.bad % 65_536,
+            (now - self._booted) // 1_000_000 % (1 << 32),
+            tuple(wrapped(int(reading.turns * self._identity.steps_per_turn // 1)) for reading in readings),
+            tuple(round(1000 * reading.rpm / self._rpm) for reading in readings),
+        )
+
+    @property
+    def _running(self) -> bool:
+        return self._state is MotorState.RUN
+
+    async def _watch(self) -> None:
+        """The watchdog: trips although nothing is received."""
+        while True:
+            self._fed_again.clear()
+            if not self._running:
+                await self._fed_again.wait()
+                continue
+            await self._clock.sleep_until(self._fed + self._watchdog * SECOND // 1000)
+            self._trip()
+
+    def _trip(self) -> None:
+        if self._running and self._clock.now() - self._fed >= self._watchdog * SECOND // 1000:
+            self._state = MotorState.WATCHDOG
+            self._turn([0.0] * self._identity.motors, self._quick)
+
+
+def _stepped(rate: float) -> float:
+    """The rate nearest to ``rate``, steps/s, whose period is a whole number of timer ticks."""
+    if rate == 0.0:
+        return 0.0
+    ticks = max(1, round(1e6 / (abs(rate) * TICK_US)))
+    return (1.0 if rate > 0 else -1.0) * 1e6 / (ticks * TICK_US)
+
+
+def emulated(setup: EmulatorSetup) -> StepperEmulator:
+    """The controller of all driven shafts of a simulated robot, on a line of real speed."""
+    setup.port.device.baud = BAUD
+    steps = {} if setup.settings is None else {"steps_per_turn": setup.settings.steps_per_turn}
+    return StepperEmulator(setup.clock, setup.physics.motors[:MOTORS], **steps)

@@ -1,0 +1,233 @@
+"""Line protocol of a microcontroller with up to four stepper motors; pure codec. Written out in ``docs/devices.md``.
+
+A line is ``:BODY*CCCC`` and LF: BODY is words of printable ASCII, one space apart, CCCC the CRC-16/CCITT-FALSE of BODY
+in capital hex digits. The host asks, the controller answers every whole line once, with the sequence number asked
+with; it says nothing unasked. The first word of a request is a capital letter, of an answer the same in small:
+
+======================= ==================================================== ==========================================
+request                 meaning                                              answer
+======================= ==================================================== ==========================================
+``I SEQ``               who are you                                          ``i SEQ NAME VERSION MOTORS STEPS PERIOD``
+``C SEQ ACC QUICK WD``  ramps, steps/s^2; watchdog, ms; only while at rest   ``c SEQ ACC QUICK WD``
+``R SEQ RATE...``       run at rates, 1/1000 step/s each; feeds the watchdog a status
+``Q SEQ``               quick stop, then hold                                a status
+``D SEQ``               coils off                                            a status
+``S SEQ``               look, without feeding the watchdog                   a status
+======================= ==================================================== ==========================================
+
+A status is ``s SEQ STATE BAD UPTIME POSITION... RATE...``: state, damaged lines since power-up (0-65535, wraps), uptime
+in ms (32 bits, wraps), the steps commanded so far (signed 32 bits, wrap) and the present rate of every motor. A request
+that cannot be carried out is answered ``e SEQ CODE``; a damaged line not at all.
+"""
+
+from binascii import crc_hqx
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Final
+
+NAME: Final = "STEP4"
+VERSION: Final = 1
+BAUD: Final = 115_200
+MOTORS: Final = 4
+MAX_LINE: Final = 160
+"""Bytes of the longest line; the controller drops longer ones."""
+SEQUENCES: Final = 256
+MAX_RATE: Final = 10_000_000
+"""1/1000 step/s: greatest rate of a request."""
+
+_START, _END = b":", b"\n"
+_MASK = 0xFFFF_FFFF
+
+
+class MotorState(IntEnum):
+    """What the motors do."""
+
+    OFF = 0
+    """Coils off: they turn freely. So after power-up."""
+    RUN = 1
+    """They follow the rates of the last ``R``."""
+    STOPPED = 2
+    """Quick stop, then hold."""
+    WATCHDOG = 3
+    """Stopped by the watchdog: no ``R`` came in time. ``R`` is refused until a ``Q`` or ``D``."""
+
+
+class RefusalCode(IntEnum):
+    """Why a request was not carried out."""
+
+    UNKNOWN = 1
+    """No such request."""
+    ARGUMENTS = 2
+    """Another number of arguments, or one out of range."""
+    NOT_NOW = 3
+    """Settings change only while all motors are at rest."""
+    TRIPPED = 4
+    """The watchdog has stopped the motors: ``Q`` or ``D`` first."""
+
+
+class LineError(ValueError):
+    """A line that is no line of this protocol."""
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """One line: its letter, sequence number and further words."""
+
+    verb: str
+    seq: int
+    words: tuple[str, ...] = ()
+
+    def __bytes__(self) -> bytes:
+        body = " ".join((self.verb, str(self.seq), *self.words)).encode("ascii")
+        return b"%b%b*%04X%b" % (_START, body, crc(body), _END)
+
+    def integers(self, count: int | None = None) -> tuple[int, ...]:
+        """The words as whole numbers.
+
+        Raises:
+            LineError: another number of words, or one that is no plain decimal number.
+        """
+        if count is not None and len(self.words) != count:
+            raise LineError(f"{self.verb}: {len(self.words)} words, expected {count}")
+        if not all(word.removeprefix("-").isdecimal() and len(word) <= 11 for word in self.words):
+            raise LineError(f"{self.verb}: {' '.join(self.words)!r}: expected whole numbers")
+        return tuple(map(int, self.words))
+
+
+def crc(data: bytes) -> int:
+    """CRC-16/CCITT-FALSE: polynomial 0x1021, start 0xFFFF, nothing reflected."""
+    return crc_hqx(data, 0xFFFF)
+
+
+def decode(line: bytes) -> Line:
+    """One whole line with or without its LF.
+
+    Raises:
+        LineError: damaged, or of another protocol.
+    """
+    text = line.removesuffix(_END)
+    body, star, check = text[1:].rpartition(b"*")
+    if not text.startswith(_START) or not star or len(text) >= MAX_LINE:
+        raise LineError(f"{line[:40]!r}: no line of this protocol")
+    if check != b"%04X" % crc(body):
+        raise LineError(f"{line[:40]!r}: check is {check!r}, expected {crc(body):04X}")
+    if not body.isascii() or not body.decode().isprintable():
+        raise LineError(f"{line[:40]!r}: expected printable ASCII")
+    verb, *words = body.decode().split(" ")
+    if not (len(verb) == 1 and verb.isalpha() and words and words[0].isdecimal() and all(words)):
+        raise LineError(f"{line[:40]!r}: expected a letter and a sequence number")
+    seq = int(words[0]) if len(words[0]) <= len(str(SEQUENCES)) else SEQUENCES
+    if seq >= SEQUENCES:
+        raise LineError(f"{line[:40]!r}: sequence number {words[0]}, expected 0 to {SEQUENCES - 1}")
+    return Line(verb, seq, tuple(words[1:]))
+
+
+class Splitter:
+    """Cuts a stream of bytes into lines; what is no line of the protocol is counted and dropped."""
+
+    def __init__(self) -> None:
+        self.bad = 0
+        """Lines that were dropped."""
+        self.strange = b""
+        """Beginning of the newest of them."""
+        self._rest = bytearray()
+
+    def feed(self, data: bytes) -> list[Line]:
+        """Lines that are complete with ``data``."""
+        self._rest += data
+        *whole, rest = self._rest.split(_END)
+        self._rest = rest if len(rest) < MAX_LINE else bytearray()
+        if len(rest) >= MAX_LINE:
+            self._drop(bytes(rest))
+        lines = []
+        for raw in whole:
+            # A line that lost its end is followed by the next one.
+            text = raw[max(raw.rfind(_START), 0) :]
+            try:
+                lines.append(decode(bytes(text)))
+            except LineError:
+                self._drop(bytes(raw))
+            else:
+                if len(text) < len(raw):
+                    self._drop(bytes(raw[: -len(text)]))
+        return lines
+
+    def _drop(self, raw: bytes) -> None:
+        self.bad += 1
+        self.strange = raw[:20]
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """Who answers."""
+
+    name: str
+    version: int
+    motors: int
+    steps_per_turn: int
+    tick_us: int
+    """Timer period, microseconds: time between two steps is a whole number of them."""
+
+    @classmethod
+    def of(cls, line: Line) -> "Identity":
+        """From an answer to ``I``.
+
+        Raises:
+            LineError: something else.
+        """
+        if line.verb != "i" or len(line.words) != 5:
+            raise LineError(f"answer {line.verb!r}: expected an identity")
+        name, *rest = line.words
+        return cls(name, *Line(line.verb, line.seq, tuple(rest)).integers(4))
+
+    def line(self, seq: int) -> Line:
+        """The answer that states it."""
+        numbers = (self.version, self.motors, self.steps_per_turn, self.tick_us)
+        return Line("i", seq, (self.name, *map(str, numbers)))
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """What the controller does."""
+
+    state: MotorState
+    bad_lines: int
+    uptime_ms: int
+    positions: tuple[int, ...]
+    """Steps commanded, signed 32 bits."""
+    rates: tuple[int, ...]
+    """1/1000 step/s."""
+
+    @classmethod
+    def of(cls, line: Line, motors: int) -> "Status":
+        """From an answer of a controller with so many motors.
+
+        Raises:
+            LineError: something else.
+        """
+        if line.verb != "s":
+            raise LineError(f"answer {line.verb!r}: expected a status")
+        state, bad, uptime, *rest = line.integers(3 + 2 * motors)
+        if state not in list(MotorState):
+            raise LineError(f"state {state}: expected 0 to {max(MotorState)}")
+        return cls(MotorState(state), bad, uptime, tuple(rest[:motors]), tuple(rest[motors:]))
+
+    def line(self, seq: int) -> Line:
+        """The answer that states it."""
+        numbers = (int(self.state), self.bad_lines, self.uptime_ms, *self.positions, *self.rates)
+        return Line("s", seq, tuple(map(str, numbers)))
+
+
+def run(seq: int, rates: tuple[int, ...]) -> Line:
+    """Request to run at rates in 1/1000 step/s."""
+    return Line("R", seq, tuple(map(str, rates)))
+
+
+def wrapped(steps: int) -> int:
+    """Steps as the controller counts them, signed 32 bits."""
+    return (steps + (1 << 31) & _MASK) - (1 << 31)
+
+
+def step_of(before: int, now: int) -> int:
+    """Steps from one position to the next, over the wrap of the counter."""
+    return wrapped(now - before)

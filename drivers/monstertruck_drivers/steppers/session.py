@@ -1,0 +1,133 @@
+"""Question and answer with the controller over one open link; shared by driver and probe."""
+
+from typing import Final
+
+from monstertruck_drivers.link import Link
+from monstertruck_drivers.steppers.protocol import (
+    NAME,
+    SEQUENCES,
+    Identity,
+    Line,
+    LineError,
+    RefusalCode,
+    Splitter,
+    Status,
+)
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError, WrongDeviceError
+
+ATTEMPTS: Final = 3
+"""Tries of the requests of a session's beginning."""
+
+
+class RequestRefusedByDeviceError(ProtocolError):
+    """The controller does not carry out a request.
+
+    Args:
+        text: who, what and why.
+        code: its own code.
+    """
+
+    def __init__(self, text: str, code: int) -> None:
+        super().__init__(text)
+        self.code = code
+
+
+class StepperSession:
+    """One conversation. An answer belongs to its question by the sequence number: late ones are dropped.
+
+    Args:
+        link: open link.
+        clock: time.
+        timeout: seconds in which an answer must come.
+    """
+
+    def __init__(self, link: Link, clock: Clock, timeout: float) -> None:
+        self.splitter = Splitter()
+        self.asked = 0
+        """When the newest question was sent, ns."""
+        self.heard = False
+        """A line of the protocol came."""
+        self._link = link
+        self._clock = clock
+        self._timeout = timeout
+        self._seq = 0
+
+    def tell(self, verb: str, *words: int) -> int:
+        """Send a request whose answer nobody waits for; returns its number.
+
+        Raises:
+            DeviceLostError: unplugged.
+        """
+        self._seq = (self._seq + 1) % SEQUENCES
+        self._link.write(bytes(Line(verb, self._seq, tuple(map(str, words)))))
+        return self._seq
+
+    async def ask(self, verb: str, *words: int, attempts: int = 1) -> Line:
+        """Send a request and wait for its answer.
+
+        Raises:
+            DeviceLostError: unplugged.
+            DeviceTimeoutError: no answer in time.
+            ProtocolError: the controller refuses the request.
+        """
+        for _ in range(attempts):
+            self.asked = self._clock.now()
+            answer = await self._answer(self.tell(verb, *words))
+            if answer is not None:
+                if answer.verb == "e":
+                    code, why = _reason(answer)
+                    raise RequestRefusedByDeviceError(f"{self._link.name}: request {verb} refused: {why}", code)
+                return answer
+        raise DeviceTimeoutError(f"{self._link.name}: no answer to {verb} within {self._timeout} s")
+
+    async def status(self, verb: str, motors: int, *words: int, attempts: int = 1) -> Status:
+        """Send a request that is answered by a status. Raises as ``ask`` does."""
+        answer = await self.ask(verb, *words, attempts=attempts)
+        try:
+            return Status.of(answer, motors)
+        except LineError as error:
+            raise ProtocolError(f"{self._link.name}: {error}") from error
+
+    async def identify(self) -> Identity:
+        """Who answers.
+
+        Raises:
+            DeviceLostError: unplugged.
+            DeviceTimeoutError: silence.
+            WrongDeviceError: something else answers.
+        """
+        try:
+            identity = Identity.of(await self.ask("I", attempts=ATTEMPTS))
+        except (DeviceTimeoutError, ProtocolError, LineError) as error:
+            if self.splitter.bad and not self.heard:
+                text = f"{self._link.name}: no {NAME}, sends {self.splitter.strange!r}"
+                raise WrongDeviceError(text) from error
+            if isinstance(error, LineError):
+                raise ProtocolError(f"{self._link.name}: {error}") from error
+            raise
+        if identity.name != NAME:
+            raise WrongDeviceError(f"{self._link.name}: it calls itself {identity.name}, expected {NAME}")
+        return identity
+
+    async def _answer(self, seq: int) -> Line | None:
+        due = self._clock.now() + round(self._timeout * SECOND)
+        while (left := due - self._clock.now()) > 0:
+            try:
+                data = await self._link.read(left / SECOND)
+            except TimeoutError:
+                return None
+            for line in self.splitter.feed(data):
+                if line.verb.islower():
+                    self.heard = True
+                    if line.seq == seq:
+                        return line
+        return None
+
+
+def _reason(answer: Line) -> tuple[int, str]:
+    try:
+        code = RefusalCode(answer.integers(1)[0])
+    except ValueError:
+        return 0, " ".join(answer.words)
+    return code, code.name.lower()
