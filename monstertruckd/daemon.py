@@ -176,7 +176,14 @@ class Daemon:
 
     async def _start_outside(self, bus_scope: Scope) -> None:
         if self._seed is None:
-            bridge = ZenohBridge(self.config.robot, self.bus, self.config.zenoh, self.clock, self.rpc)
+            bridge = ZenohBridge(
+                self.config.robot,
+                self.bus,
+                self.config.zenoh,
+                self.clock,
+                self.rpc,
+                witness=self.config.stand != "none",
+            )
             await bridge.open()
             self._start(bus_scope, bridge, OnBug.EXIT)
         self._start(bus_scope, ClockService(self.clock, self.bus.publisher(topics.CLOCK, Writer.DAEMON), self._events))

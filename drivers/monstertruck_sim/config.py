@@ -18,6 +18,17 @@ class DrillConfig(Schema):
     """Seconds from one fault to the next, on average"""
 
 
+class StandConfig(Schema):
+    """The test stand that sees the simulated robot from outside."""
+
+    rate: Annotated[float, Field(gt=0, le=100)] = 20.0
+    """Poses a second"""
+    position_noise: Annotated[float, Field(ge=0)] = 0.001
+    """Standard deviation of x and of y, m: a camera over the table"""
+    heading_noise: Annotated[float, Field(ge=0)] = 0.01
+    """Rad"""
+
+
 class SimConfig(Schema):
     """The simulated side."""
 
@@ -28,6 +39,8 @@ class SimConfig(Schema):
     servo_timeout: Annotated[float, Field(ge=0, le=10)] = 0.0
     """Seconds of the servo controller's own serial time-out (0 = off, as delivered)"""
     world: WorldConfig = WorldConfig()
+    stand: StandConfig = StandConfig()
+    """How `stand: simulator` sees the robot"""
     drill: DrillConfig | None = None
     """Faults that happen by themselves; null = none"""
     recording: Path | None = None

@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from monstertruck_schemas.req import ControlRequest, DriveForm, DriveRequest, Order, Request, Role
 from monstertruck_schemas.roles import AccessRole
-from monstertruck_schemas.topics import KEY_ROOT, TOPICS, Writer, alive_key, rpc_key
+from monstertruck_schemas.topics import KEY_ROOT, STAND_POSE, TOPICS, Writer, alive_key, rpc_key
 
 ANONYMOUS: Final = "anonymous"
 """Source of requests whose key names none."""
@@ -71,7 +71,7 @@ def role_needed(request: Request) -> AccessRole:
 
 def out_groups() -> tuple[str, ...]:
     """Groups that only leave the robot, in the table's order."""
-    return tuple(dict.fromkeys(topic.group for topic in TOPICS if topic.writer is not Writer.OUTSIDE))
+    return tuple(dict.fromkeys(topic.group for topic in TOPICS if not topic.inward))
 
 
 def in_groups() -> tuple[str, ...]:
@@ -107,7 +107,9 @@ def access_rules(robot: str, owners: Iterable[str] | None = None) -> dict[str, A
             ["put", "delete", "liveliness_token", "declare_queryable", "reply"],
             [*seen, *history, alive_key(robot)],
         ),
-        _rule("requests-out", "egress", ["declare_subscriber"], requests),
+        _rule("requests-out", "egress", ["declare_subscriber"], [*requests, STAND_POSE.key(robot)]),
+        # Whoever may connect may say where it sees the robot: nothing in the robot reads it.
+        _rule("stand-in", "ingress", ["put"], [STAND_POSE.key(robot)]),
         _rule("calls-out", "egress", ["declare_queryable", "reply"], calls),
     ]
     if owners is None:

@@ -18,7 +18,8 @@ from monstertruck_schemas.base import Message
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import UNCONDITIONAL, ControlRequest, Order, Request
-from monstertruck_schemas.topics import REQ_CONTROL, REQ_DRIVE, REQ_PATH, Topic, owner_of
+from monstertruck_schemas.sensor import StandPose
+from monstertruck_schemas.topics import REQ_CONTROL, REQ_DRIVE, REQ_PATH, STAND_POSE, Topic, owner_of
 from monstertruckd.bus.access import Sender, role_needed
 from monstertruckd.bus.local import Bus
 
@@ -216,6 +217,48 @@ class Intake:
         self._requests.close()
         self._estops.close()
         self._refusals.close()
+
+
+class Sights:
+    """Takes in what a test stand sees of the robot, for the recorder; to be made on the loop.
+
+    Args:
+        bus: whose taps get it.
+        clock: time.
+        guard: as of ``Intake``.
+        refusals: reports what is refused.
+    """
+
+    SIZE: Final = 1024
+    """Bytes of one pose, at most."""
+    RATE: Final = 120.0
+    """Poses a second, at most."""
+
+    def __init__(
+        self, bus: Bus, clock: Clock, guard: Callable[[Callable[[], object]], None], refusals: Refusals
+    ) -> None:
+        self._refusals = refusals
+        self._rates = OwnerRates(self.RATE, clock)
+        self._poses: ThreadHop[StandPose] = ThreadHop(
+            lambda pose: guard(lambda: bus.witness(STAND_POSE, pose)), DEPTH, bus.add_drops
+        )
+
+    def take(self, size: int, read: Callable[[], bytes]) -> None:
+        """Judge, decode and queue one pose; callable from any thread. Arguments as of ``Intake.take``."""
+        name = STAND_POSE.name
+        if size > self.SIZE:
+            self._refusals.add(Reason.BAD_INPUT, name, f"{name}: {size} bytes, at most {self.SIZE} are taken")
+        elif not self._rates.spend(name):
+            self._refusals.add(Reason.MESSAGES_DROPPED, name, f"{name}: more than {self.RATE:g} poses a second")
+        else:
+            try:
+                self._poses.put(wire.decode(STAND_POSE, read()))
+            except InputError as error:
+                self._refusals.add(Reason.BAD_INPUT, name, str(error))
+
+    def close(self) -> None:
+        """Discard what waits and everything to come."""
+        self._poses.close()
 
 
 def _order(request: Message) -> Order | None:

@@ -100,7 +100,7 @@ class Bus:
             RuntimeError: ``writer`` is not the topic's writer, the write end is taken, or the topic has none
                 (commands: ``actuators``; events: ``event_sink``; requests: ``inject``).
         """
-        if topic.group == "cmd" or topic.writer is Writer.OUTSIDE or topic.name == EVENT.name:
+        if topic.group == "cmd" or topic.inward or topic.name == EVENT.name:
             msg = f"{topic.name} has no plain write end"
             raise RuntimeError(msg)
         if writer is not topic.writer:
@@ -121,7 +121,12 @@ class Bus:
         return self._emit
 
     def subscribe(self, topic: Topic[M], delivery: Delivery) -> Mailbox[M]:
-        """A read end of ``topic``; of a retained topic it holds the newest message at once."""
+        """A read end of ``topic``; of a retained topic it holds the newest message at once.
+
+        Raises:
+            RuntimeError: it is what a test stand sees, which nothing in the robot may know.
+        """
+        _require_own(topic)
         mailbox: Mailbox[M] = Mailbox(delivery, lambda closed: self._forget(topic.name, closed))
         self._ends[topic.name].mailboxes += (mailbox,)
         if (newest := self.newest(topic)) is not None:
@@ -129,7 +134,12 @@ class Bus:
         return mailbox
 
     def listen(self, topic: Topic[M], listener: Callable[[M], object]) -> None:
-        """Call ``listener``, which must not block, with every message of ``topic``: no queue, so none is ever lost."""
+        """Call ``listener``, which must not block, with every message of ``topic``: no queue, so none is ever lost.
+
+        Raises:
+            RuntimeError: as ``subscribe`` does.
+        """
+        _require_own(topic)
         self._ends[topic.name].listeners.append(listener)
 
     def newest(self, topic: Topic[M]) -> M | None:
@@ -170,6 +180,17 @@ class Bus:
             msg = f"{topic.name} is written by {topic.writer}, not from outside"
             raise RuntimeError(msg)
         return self.hand_over(topic, message.model_copy(update={"received": self._clock.now()}))
+
+    def witness(self, topic: Topic[M], message: M) -> None:
+        """Take in what a test stand sees: for the taps alone. ``received`` becomes the daemon's own time.
+
+        Raises:
+            RuntimeError: ``topic`` is not one that a stand writes.
+        """
+        if topic.writer is not Writer.STAND:
+            msg = f"{topic.name} is written by {topic.writer}, not by a stand"
+            raise RuntimeError(msg)
+        self.hand_over(topic, message.model_copy(update={"received": self._clock.now()}))
 
     @property
     def drops(self) -> int:
@@ -250,6 +271,12 @@ class Bus:
                 values={name: _plain(value) for name, value in values.items()},
             )
         )
+
+
+def _require_own(topic: Topic[Any]) -> None:
+    if topic.writer is Writer.STAND:
+        msg = f"{topic.name} is recorded, and read by nothing in the robot"
+        raise RuntimeError(msg)
 
 
 def _plain(value: Value) -> Value:

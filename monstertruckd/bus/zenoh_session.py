@@ -30,6 +30,7 @@ from monstertruck_schemas.topics import (
     KEY_ROOT,
     MAP,
     MAP_TILES,
+    STAND_POSE,
     TOPICS,
     Topic,
     Writer,
@@ -39,7 +40,7 @@ from monstertruck_schemas.topics import (
 )
 from monstertruckd.bus.access import ANONYMOUS, OBSERVING, Sender, in_groups
 from monstertruckd.bus.call_limits import ESTOP, ORDERS, ROOM, TOO_MANY, CallLimits, may_be_served
-from monstertruckd.bus.intake import Intake, Refusals
+from monstertruckd.bus.intake import Intake, Refusals, Sights
 from monstertruckd.bus.local import Bus
 from monstertruckd.bus.replies import Replies, Reply
 from monstertruckd.bus.rpc import Rpc, failure, topic_rows
@@ -72,11 +73,15 @@ class ZenohBridge:
         config: endpoints and access.
         clock: time.
         rpc: handlers behind ``rpc/<name>``; ``rpc/topics`` is added.
+        witness: take in what a test stand sees of the robot.
     """
 
     name = "zenoh"
 
-    def __init__(self, robot: str, bus: Bus, config: ZenohConfig, clock: Clock, rpc: Rpc) -> None:
+    def __init__(
+        self, robot: str, bus: Bus, config: ZenohConfig, clock: Clock, rpc: Rpc, *, witness: bool = False
+    ) -> None:
+        self._witness = witness
         self._robot = robot
         self._bus = bus
         self._config = config
@@ -114,7 +119,7 @@ class ZenohBridge:
             publishers = await in_thread(self._declare_publishers)
             tap = self._bus.tap(
                 partial(self._send, publishers, failed),
-                (topic for topic in TOPICS if topic.writer is not Writer.OUTSIDE),
+                (topic for topic in TOPICS if not topic.inward),
             )
             try:
                 async with asyncio.TaskGroup() as calls:
@@ -127,6 +132,7 @@ class ZenohBridge:
                             if topic.writer is Writer.OUTSIDE
                         }
                         refusals = inputs.enter_context(closing(Refusals(self._bus, self._clock, self.name)))
+                        sights = inputs.enter_context(closing(Sights(self._bus, self._clock, guard, refusals)))
                         active: set[asyncio.Task[Reply]] = set()
                         queries: ThreadHop[Call] = inputs.enter_context(
                             closing(
@@ -138,7 +144,7 @@ class ZenohBridge:
                                 )
                             )
                         )
-                        inward = partial(self._declare_inputs, intakes, refusals, queries, replies, limits)
+                        inward = partial(self._declare_inputs, intakes, refusals, queries, replies, limits, sights)
                         for token in await in_thread(inward):
                             inputs.enter_context(token)
                         ready()
@@ -200,7 +206,7 @@ class ZenohBridge:
         return {
             topic.name: tuple(_publisher(session, topic, topic.key(self._robot)) for _, session in self._sessions)
             for topic in TOPICS
-            if topic.writer is not Writer.OUTSIDE
+            if not topic.inward
         }
 
     def _declare_inputs(
@@ -210,6 +216,7 @@ class ZenohBridge:
         queries: ThreadHop[Call],
         replies: Replies,
         limits: CallLimits,
+        sights: Sights,
     ) -> list[zenoh.LivelinessToken]:
         """Subscribers and queryables; last the tokens that say so, which live as long as their objects."""
         remote = zenoh.Locality.REMOTE
@@ -221,6 +228,10 @@ class ZenohBridge:
                     f"{KEY_ROOT}/{self._robot}/{group}/**",
                     partial(self._on_request, door, intakes, refusals),
                     allowed_origin=remote,
+                )
+            if self._witness:
+                session.declare_subscriber(
+                    STAND_POSE.key(self._robot), partial(_on_sight, sights), allowed_origin=remote
                 )
             for topic in TOPICS:
                 key = topic.key(self._robot)
@@ -379,6 +390,10 @@ def _publisher(session: zenoh.Session, topic: Topic[Any], key: str) -> Put:
     return session.declare_publisher(
         key, encoding=wire.encoding(topic), congestion_control=zenoh.CongestionControl.DROP, priority=priority
     ).put
+
+
+def _on_sight(sights: Sights, sample: zenoh.Sample) -> None:
+    sights.take(len(sample.payload), sample.payload.to_bytes)
 
 
 def _guarded(failed: "asyncio.Future[None]", job: Callable[[], object]) -> None:

@@ -134,6 +134,8 @@ class TruckConfig(Schema):
     the user, or /run"""
     calibration: Path | None = None
     """Folder of the calibration files; null = `calibration` in the state directory"""
+    stand: Literal["none", "simulator", "overhead"] = "none"
+    """Who says where the robot is, on `mt/stand/sensor/pose_<robot>`: recorded, and read by nothing in the robot"""
     sim: Any = None
     """The simulated side; `simulate` and `config show` check it, the daemon does not read it"""
 

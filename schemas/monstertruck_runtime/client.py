@@ -42,6 +42,7 @@ from monstertruck_schemas.req import (
     RequestedTwist,
     Role,
 )
+from monstertruck_schemas.sensor import StandPose
 from monstertruck_schemas.state import GateState
 from monstertruck_schemas.topics import (
     GATE,
@@ -49,6 +50,7 @@ from monstertruck_schemas.topics import (
     REQ_DRIVE,
     REQ_PATH,
     SOURCE_NAME,
+    STAND_POSE,
     Topic,
     Writer,
     alive_key,
@@ -265,6 +267,12 @@ class TruckClient(Operator):
         Limits, ramps and the sweep hold as for every request. Raises as ``drive`` does.
         """
         self._put(REQ_DRIVE, DriveRequest(**await self._answered(lease), speed=0.0, front=0.0, shafts=rates))
+
+    def witness(self, pose: StandPose) -> None:
+        """Say where the robot really is, as a test stand sees it: the robot records it, and nothing in it reads it."""
+        self._open_session().put(
+            STAND_POSE.key(self.robot), wire.encode(STAND_POSE, pose), encoding=wire.encoding(STAND_POSE)
+        )
 
     def order(self, order: Order, *, hold: bool = False) -> Coroutine[Any, Any, GateState]:
         """Give an order; the coroutine waits until it is carried out and returns the gate's state then.

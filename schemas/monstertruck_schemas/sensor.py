@@ -5,7 +5,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import ConfigDict, Field
 
-from monstertruck_schemas.base import Float64Array, FrameId, Message, Nanoseconds, Schema, UInt8Array, servos_of
+from monstertruck_schemas.base import Float64Array, FrameId, Message, Nanoseconds, Pose2D, Schema, UInt8Array, servos_of
 
 
 class LaserScan(Message):
@@ -245,3 +245,18 @@ class StabiliserFeedback(Message):
     """Joint angle about x of the pitched part, rad, REP 103: right side down positive; None = unknown."""
     pitch_joint: StabiliserJoint
     roll_joint: StabiliserJoint
+
+
+class StandPose(Message):
+    """Pose of a robot as a test stand saw it from outside; ``frame`` is the stand's own, whose origin is its middle.
+
+    For studies and for judging estimates: no estimator, planner or gate reads it.
+    """
+
+    pose: Pose2D
+    observer: Literal["simulator", "overhead"]
+    """Who saw it: the simulated world, or cameras over the table."""
+    position_sigma: Annotated[float, Field(ge=0)]
+    """Standard deviation of x and of y, m."""
+    heading_sigma: Annotated[float, Field(ge=0)]
+    """Rad."""

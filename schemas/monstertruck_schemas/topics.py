@@ -38,6 +38,7 @@ from monstertruck_schemas.sensor import (
     LaserScan,
     SonarRanges,
     StabiliserFeedback,
+    StandPose,
     SteeringFeedback,
 )
 from monstertruck_schemas.state import ClockOffset, GateState, Grid, Ground, Odometry, ScanMotion, Transforms
@@ -60,6 +61,8 @@ class Writer(StrEnum):
     GATE = "gate"
     DAEMON = "daemon"
     OUTSIDE = "outside"
+    STAND = "stand"
+    """A test stand, or the simulator: sees the robot from outside, and nothing in the robot reads what it says."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +82,8 @@ class Topic(Generic[M]):
     """Late joiners get the newest message at once."""
     foxglove: str | None = None
     """Well-known protobuf schema it travels as; None = JSON with JSON Schema."""
+    place: str | None = None
+    """Key below ``mt/`` with ``{robot}`` in it, of what is said about a robot elsewhere; None = below its own name."""
 
     @property
     def group(self) -> str:
@@ -95,9 +100,16 @@ class Topic(Generic[M]):
 
         A request ``req/drive`` of ``ann`` travels on ``mt/<robot>/req/ann/drive``.
         """
+        if self.place is not None:
+            return f"{KEY_ROOT}/{self.place.format(robot=robot)}"
         group, _, name = self.name.partition("/")
         parts = (group, source, name) if self.writer is Writer.OUTSIDE else (group, name)
         return "/".join((KEY_ROOT, robot, *parts))
+
+    @property
+    def inward(self) -> bool:
+        """Whether it comes to the robot from outside."""
+        return self.writer in (Writer.OUTSIDE, Writer.STAND)
 
     def fresh_for(self) -> float:
         """Seconds for which a message counts; +inf for topics without a limit."""
@@ -238,6 +250,15 @@ REQ_CONTROL: Final = Topic("req/control", ControlRequest, W.OUTSIDE, "Arm, disar
 REQ_GOAL: Final = Topic("req/goal", GoalRequest, W.OUTSIDE, "A pose to drive to")
 REQ_GOAL_CONTROL: Final = Topic("req/goal_control", GoalControl, W.OUTSIDE, "Pause, resume or cancel the goal")
 REQ_PATH: Final = Topic("req/path", PathRequest, W.OUTSIDE, "A path computed off board")
+
+STAND_POSE: Final = Topic(
+    "stand/pose",
+    StandPose,
+    W.STAND,
+    "Pose of the robot as a test stand sees it; recorded beside the robot's topics, read by none of its parts",
+    20,
+    place="stand/sensor/pose_{robot}",
+)
 
 DRIVES: Final = (DRIVE, DRIVE_2, DRIVE_3, DRIVE_4)
 """Feedback of the driven shafts in their order; most robots have the first one only."""

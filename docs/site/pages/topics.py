@@ -13,6 +13,7 @@ GROUPS = {
     "health": "How the daemon, its services and the computer are.",
     "event": "What happened, and why.",
     "req": "What stations ask for: the only keys that lead into the robot.",
+    "stand": "What a test stand sees of the robot from outside; nothing in the robot reads it.",
 }
 HEADER = frozenset(Message.model_fields)
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from monstertruck_runtime.clock import ReplayClock, run_replay
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.ports import Ready
-from monstertruck_schemas.topics import BY_NAME, Writer
+from monstertruck_schemas.topics import BY_NAME
 from monstertruckd.bus.local import Bus
 from monstertruckd.bus.rpc import Rpc
 from monstertruckd.bus.zenoh_config import ZenohConfig
@@ -61,7 +61,7 @@ def replay_log(
             count = 0
             for entry, message in selection.of(reader):
                 topic = BY_NAME[entry.topic]
-                if topic.writer is Writer.OUTSIDE:
+                if topic.inward:
                     continue
                 progress(reader.position)
                 await clock.sleep_until(entry.log_time)

@@ -15,17 +15,22 @@ from monstertruck_drivers.cable import EmulatedPort, PtyPort, reserved
 from monstertruck_drivers.config import Monitors, PortConfig
 from monstertruck_drivers.hokuyo_urg.recording import RecordedHokuyoEmulator
 from monstertruck_kinematics.elementary import Array
+from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import SECOND, Clock
-from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
+from monstertruck_runtime.errors import InputError, NotFoundError
 from monstertruck_runtime.memory import settle
 from monstertruck_sim.computer import EmulatedComputer, hangs_by_hub
 from monstertruck_sim.console import Commanded, Emulated, EmulatedFiles, FaultConsole
 from monstertruck_sim.faults import FaultInjector, SimContext
 from monstertruck_sim.robot import SimulatedRobot
+from monstertruck_sim.stand import SimulatedStand
 from monstertruck_sim.world.world import World
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 
 TRUTH_PERIOD = SECOND // 20
+STAND_RETRY = 1.0
+"""Seconds between two looks for a daemon."""
 
 
 class TruthLog:
@@ -114,6 +119,8 @@ async def _serve(clock: Clock, config: SimulatedTruckConfig, folder: Path, truth
         asyncio.create_task(log.run(), name="truth"),
         asyncio.create_task(FaultConsole(emulated, sys.stdin, _say).run(), name="console"),
     ]
+    if config.stand == "simulator":
+        tasks.append(asyncio.create_task(_see(clock, config, robot.world), name="stand"))
     if config.sim.drill is not None:
         context = SimContext(config.sim, config.devices, robot, computer, clock)
         tasks.append(asyncio.create_task(FaultInjector(context, config.sim.drill, _say).run(), name="faults"))
@@ -131,6 +138,18 @@ async def _serve(clock: Clock, config: SimulatedTruckConfig, folder: Path, truth
     for result in results:
         if isinstance(result, Exception):
             raise result
+
+
+async def _see(clock: Clock, config: SimulatedTruckConfig, world: World) -> None:
+    """Say where the robot really is, whenever there is a daemon."""
+    endpoint = next(iter(config.zenoh.listen), DEFAULT_ENDPOINT)
+    while True:
+        try:
+            async with TruckClient(config.robot, endpoint, clock=clock) as client:
+                seed = config.sim.seed if config.sim.world.noise else None
+                await SimulatedStand(config.sim.stand, world, clock, client.witness, seed).run()
+        except NotFoundError:
+            await clock.sleep(STAND_RETRY)
 
 
 async def _report_end(recorded: RecordedHokuyoEmulator) -> None:

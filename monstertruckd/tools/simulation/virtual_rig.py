@@ -12,9 +12,12 @@ from monstertruck_drivers.cable import MemoryPort
 from monstertruck_drivers.usb.config import UsbPortConfig
 from monstertruck_runtime.clock import VirtualClock
 from monstertruck_runtime.threads import inline
+from monstertruck_schemas.sensor import StandPose
+from monstertruck_schemas.topics import STAND_POSE
 from monstertruck_sim.computer import EmulatedComputer
 from monstertruck_sim.faults import FaultInjector, SimContext
 from monstertruck_sim.robot import SimulatedRobot
+from monstertruck_sim.stand import SimulatedStand
 from monstertruckd.bus.local import Bus
 from monstertruckd.config.load import Tree
 from monstertruckd.daemon import Daemon
@@ -81,6 +84,11 @@ class VirtualRig:
             asyncio.create_task(self.robot.run(), name="robot"),
             asyncio.create_task(self.truth.run(), name="truth"),
         ]
+        if self.config.stand == "simulator":
+            sim = self.config.sim
+            seed = sim.seed if sim.world.noise else None
+            stand = SimulatedStand(sim.stand, self.world, self.clock, self._witness, seed)
+            around.append(asyncio.create_task(stand.run(), name="stand"))
         if (drill := self.config.sim.drill) is not None:
             around.append(asyncio.create_task(FaultInjector(self.context, drill).run(), name="faults"))
         self._start_daemon()
@@ -94,6 +102,9 @@ class VirtualRig:
                     task.cancel()
                 await asyncio.wait(around)
                 self._folder.cleanup()
+
+    def _witness(self, pose: StandPose) -> None:
+        self.bus.witness(STAND_POSE, pose)
 
     # The computer's supply
 

@@ -25,13 +25,16 @@ __all__ = ["install"]
 
 def test_names_are_unique_and_in_a_known_group():
     assert len(BY_NAME) == len(TOPICS)
-    assert {topic.group for topic in TOPICS} == {"sensor", "state", "plan", "cmd", "health", "event", "req"}
+    assert {topic.group for topic in TOPICS} == {"sensor", "state", "plan", "cmd", "health", "event", "req", "stand"}
 
 
 @pytest.mark.parametrize("topic", TOPICS, ids=lambda topic: topic.name)
 def test_rows(topic: Topic[Message]):
     assert topic.doc
     name = topic.name.replace("req/", "req/*/")
+    if topic.place is not None:
+        assert topic.key("truck") == topic.key("truck", "ann") == "mt/stand/sensor/pose_truck"
+        return
     assert topic.key("truck") == f"mt/truck/{name}"
     assert topic.key("truck", "ann") == f"mt/truck/{name.replace('*', 'ann')}"
     assert issubclass(topic.model, Message)

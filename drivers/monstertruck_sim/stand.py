@@ -1,0 +1,56 @@
+"""The test stand of the simulated world: sees the robot from outside, with the noise of a camera over the table."""
+
+import math
+from collections.abc import Callable
+
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_schemas.base import Pose2D
+from monstertruck_schemas.sensor import StandPose
+from monstertruck_sim.config import StandConfig
+from monstertruck_sim.world.noise import STAND, WhiteNoise
+from monstertruck_sim.world.world import World
+
+
+class SimulatedStand:
+    """Sees the robot at a steady rate.
+
+    Args:
+        config: rate and noise.
+        world: with the robot in it.
+        clock: time.
+        put: gets every pose.
+        seed: of the noise; None = none.
+    """
+
+    def __init__(
+        self, config: StandConfig, world: World, clock: Clock, put: Callable[[StandPose], None], seed: int | None
+    ) -> None:
+        self._config, self._world, self._clock, self._put = config, world, clock, put
+        self._noise = None if seed is None else WhiteNoise(seed, STAND, 3)
+        self._count = 0
+
+    async def run(self) -> None:
+        """Look until cancelled."""
+        due = self._clock.now()
+        while True:
+            self._put(self.look())
+            due += round(SECOND / self._config.rate)
+            await self._clock.sleep_until(due)
+
+    def look(self) -> StandPose:
+        """The pose at this moment."""
+        now, config = self._clock.now(), self._config
+        truth = self._world.truth(now)
+        x, y, turn = (0.0, 0.0, 0.0) if self._noise is None else self._noise.at(self._count)
+        self._count += 1
+        yaw = math.remainder(truth.yaw + turn * config.heading_noise, math.tau)
+        return StandPose(
+            stamp=now,
+            received=now,
+            seq=self._count,
+            frame="map",
+            pose=Pose2D(x=truth.x + x * config.position_noise, y=truth.y + y * config.position_noise, yaw=yaw),
+            observer="simulator",
+            position_sigma=config.position_noise,
+            heading_sigma=config.heading_noise,
+        )
