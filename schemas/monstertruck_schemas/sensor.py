@@ -5,7 +5,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import ConfigDict, Field
 
-from monstertruck_schemas.base import Float64Array, FrameId, Message, Nanoseconds, Pose2D, Schema, UInt8Array, servos_of
+from monstertruck_schemas.base import Float64Array, Message, Nanoseconds, Pose2D, Schema, UInt8Array, servos_of
 
 
 class LaserScan(Message):
@@ -155,7 +155,7 @@ class Battery(Message):
 class SonarEcho(Schema):
     """One sonar of an array. Its frame is ``sonar_<name>``, x along the axis of its cone."""
 
-    name: FrameId
+    name: str
     answered: bool = True
     """False: the sonar is dead or lost, and nothing is known of what is before it."""
     range: Annotated[float, Field(gt=0)] | None = None

@@ -10,7 +10,7 @@ from monstertruck_schemas import topics as t
 from monstertruck_schemas.base import Message, Pose2D, Twist2D
 from monstertruck_schemas.event import Cause, LogLevel, LogRecord, Measurement
 from monstertruck_schemas.plan import Path, Steering
-from monstertruck_schemas.sensor import CompressedImage, LaserScan, StabiliserJoint, TorqueState, Vector3
+from monstertruck_schemas.sensor import CompressedImage, LaserScan, SonarEcho, StabiliserJoint, TorqueState, Vector3
 from monstertruck_schemas.state import Grid, Ground, Odometry, Transform, Transforms
 
 ns = st.integers(-(2**63), 2**63 - 1)
@@ -68,6 +68,9 @@ scans = st.integers(0, 20).flatmap(
         tilt=st.none() | st.floats(0, 2),
     )
 )
+echoes = st.lists(
+    st.builds(SonarEcho, name=frame, answered=st.booleans(), range=st.none() | positive, stamp=ns), max_size=3
+).map(tuple)
 images = st.builds(CompressedImage, **header, data=st.binary(max_size=300), sequence=st.integers(0, 2**32 - 1))
 odometries = st.builds(
     Odometry,
@@ -146,6 +149,8 @@ PROTOBUF: dict[t.Topic[Any], st.SearchStrategy[Message]] = {
 FIELDS: dict[t.Topic[Any], dict[str, Any]] = {
     t.REQ_GOAL: {"goal": poses},
     t.COMPASS: {"magnetic_field": st.none() | vectors, "acceleration": st.none() | vectors},
+    t.SONAR: {"sonars": echoes},
+    t.IMU: {"angular_velocity": vectors, "linear_acceleration": vectors},
     t.STABILISER: {"pitch_joint": joints, "roll_joint": joints},
     t.EVENT: {
         "values": st.dictionaries(
