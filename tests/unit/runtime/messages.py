@@ -150,6 +150,7 @@ FIELDS: dict[t.Topic[Any], dict[str, Any]] = {
     t.REQ_GOAL: {"goal": poses},
     t.COMPASS: {"magnetic_field": st.none() | vectors, "acceleration": st.none() | vectors},
     t.SONAR: {"sonars": echoes},
+    t.STAND_POSE: {"pose": poses},
     t.IMU: {"angular_velocity": vectors, "linear_acceleration": vectors},
     t.STABILISER: {"pitch_joint": joints, "roll_joint": joints},
     t.EVENT: {
