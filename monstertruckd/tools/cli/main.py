@@ -22,6 +22,7 @@ from monstertruckd.tools.cli import (
     robot,
     security,
     service,
+    study,
     usb,
 )
 from monstertruckd.tools.cli.output import HELP_STYLE, HELP_WIDTH, CommandGroup
@@ -81,6 +82,7 @@ app.add_typer(config.app, name="config")
 app.add_typer(calibrate.app, name="calibrate")
 app.add_typer(logs.app, name="log")
 app.add_typer(kinematics.app, name="kinematics")
+app.add_typer(study.app, name="study")
 app.add_typer(maps.app, name="map")
 app.add_typer(security.app, name="security")
 

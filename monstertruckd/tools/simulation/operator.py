@@ -15,7 +15,7 @@ from monstertruck_runtime.requests import Operator
 from monstertruck_schemas import topics
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import UNCONDITIONAL, ControlRequest, Order, Role
+from monstertruck_schemas.req import UNCONDITIONAL, ControlRequest, DriveRequest, Order, Role
 from monstertruck_schemas.state import GateState
 from monstertruck_schemas.topics import Topic
 from monstertruckd.daemon import Daemon
@@ -52,6 +52,11 @@ class LocalOperator(Operator):
             self._daemon.bus.inject(topics.REQ_CONTROL, request)
         answer = await self.call(order.value, {**await self.header(), "hold": hold})
         return wire.decode(topics.GATE, json.dumps(answer).encode())
+
+    async def drive_shafts(self, *rates: float, lease: float = 0.25) -> None:
+        """Request wheel rates of every driven shaft, rad/s, as ``TruckClient.drive_shafts`` does."""
+        request = DriveRequest(**await self.header(lease), speed=0.0, front=0.0, shafts=rates)
+        self._daemon.bus.inject(topics.REQ_DRIVE, request)
 
     async def header(self, lease: float = 1.0) -> dict[str, Any]:
         """The header of the next request, once the gate has published its nonce."""

@@ -76,6 +76,16 @@ INSTEAD = {
     "monstertruckd emulate ranger --link /tmp/ranger": Instead(None, OWN_DEVICE),
     "monstertruckd probe ranger --port /tmp/ranger": Instead(None, OWN_DEVICE),
 }
+INSTEAD |= {
+    f"monstertruckd study {run}": Instead(None, "drives for minutes; tests/daemon/test_study_virtual.py does it")
+    for run in (
+        "circle --ratio 2 --reference 1.57",
+        "circle --ratio 3 --reference 1.25",
+        "circle --ratio inf --reference 1.57",
+        "straight --length 0.682 --passes 12",
+        "analyse logs/run-000001-000.mcap --out figures",
+    )
+}
 FOREIGN = {
     "python3 -m monstertruckd.bootstrap demo": "sets up .venv, then `monstertruckd demo`, which has its own tests",
     "python3 -m monstertruckd.bootstrap check": "runs this very test",

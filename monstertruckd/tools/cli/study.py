@@ -1,0 +1,97 @@
+"""``monstertruckd study``: the skid-steer robot's open-loop runs and their analysis."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
+from monstertruckd.tools.cli.options import EndpointOption, RobotOption
+from monstertruckd.tools.cli.output import JsonOption, command_group, print_json, print_table, remark
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from monstertruckd.config.truck import TruckConfig
+    from monstertruckd.tools.study.log import Run
+    from monstertruckd.tools.study.runs import Stretch
+
+app = command_group("The skid-steer study: circles and passes by wheel speeds, open loop, and what a test stand saw.")
+
+Reference = Annotated[float, typer.Option(help="Rate of the faster side's wheels, rad/s.")]
+
+
+@app.command("circle")
+def circle_command(
+    ratio: Annotated[float, typer.Option(help="Of the sides' wheel rates: 2, 3, or inf (left side locked).")] = 2.0,
+    reference: Reference = 1.57,
+    laps: Annotated[float, typer.Option(help="Laps of the ideal robot; one that skids turns less.")] = 5.0,
+    robot: RobotOption = "skid_stand",
+    endpoint: EndpointOption = DEFAULT_ENDPOINT,
+) -> None:
+    """Arm and drive a circle to the left, open loop; the daemon's log has the run. Takes the role engineer."""
+    from monstertruckd.tools.study.runs import circle_plan
+
+    _drive(lambda config: circle_plan(config, ratio, reference, laps), robot, endpoint)
+
+
+@app.command("straight")
+def straight_command(
+    length: Annotated[float, typer.Option(help="Of a pass, m.")] = 0.682,
+    passes: Annotated[int, typer.Option(help="To and fro.")] = 12,
+    reference: Reference = 1.57,
+    robot: RobotOption = "skid_stand",
+    endpoint: EndpointOption = DEFAULT_ENDPOINT,
+) -> None:
+    """Arm and drive to and fro along a line, open loop; the daemon's log has the run. Takes the role engineer."""
+    from monstertruckd.tools.study.runs import straight_plan
+
+    _drive(lambda config: straight_plan(config, length, passes, reference), robot, endpoint)
+
+
+@app.command("analyse")
+def analyse_command(
+    logs: Annotated[list[Path], typer.Argument(help="Logs with runs of the study.", show_default=False)],
+    out: Annotated[Path | None, typer.Option("--out", help="Folder for the figures 6 to 15.")] = None,
+    json_output: JsonOption = False,
+) -> None:
+    """Radii, speeds, drifts of the centre, spread, bend and turns, beside the paper's, and its figures."""
+    from monstertruckd.config.truck import Geometry
+    from monstertruckd.tools.study import report
+    from monstertruckd.tools.study.log import read_runs
+
+    runs: list[Run] = []
+    config: dict[str, Any] = {}
+    for log in logs:
+        found, config = read_runs(log)
+        runs += found
+    results = report.analyse(runs)
+    geometry = Geometry.model_validate(config.get("geometry", {}), strict=False)
+    values = report.as_values(results, geometry.wheel_radius, geometry.track / 2)
+    if out is not None:
+        from monstertruckd.tools.study.plots import draw
+
+        for path in draw(results, out):
+            remark(f"wrote {path}")
+    if json_output:
+        print_json(values)
+        return
+    print_table(report.HEADINGS, list(report.rows(values)), right=report.HEADINGS[2:7])
+    for slip in values["slips_of_the_paper"]:
+        typer.echo(f"the paper: {slip}")
+
+
+def _drive(plan: "Callable[[TruckConfig], list[Stretch]]", robot: str, endpoint: str) -> None:
+    from monstertruck_runtime.client import TruckClient
+    from monstertruck_runtime.clock import Clock, run_wall
+    from monstertruckd.config.truck import TruckConfig
+    from monstertruckd.tools.study.runs import drive
+
+    async def main(clock: Clock) -> float:
+        async with TruckClient(robot, endpoint, clock=clock) as client:
+            config = TruckConfig.model_validate(await client.call("config"), strict=False)
+            stretches = plan(config)
+            remark(f"drives for {sum(stretch.seconds for stretch in stretches):.0f} s; Ctrl-C stops the robot")
+            return await drive(client, clock, config, stretches)
+
+    remark(f"done in {run_wall(main):.0f} s; analyse the log with `monstertruckd study analyse`")

@@ -1,0 +1,1 @@
+"""The skid-steer study: open-loop runs, their analysis from a log, and the published figures beside them."""

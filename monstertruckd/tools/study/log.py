@@ -1,0 +1,109 @@
+"""Finds the open-loop runs of a log, with what the stand saw of each."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from monstertruck_kinematics.elementary import Array
+from monstertruck_runtime.clock import SECOND
+from monstertruck_runtime.errors import InputError
+from monstertruck_schemas.req import DriveRequest
+from monstertruck_schemas.sensor import StandPose
+from monstertruck_schemas.topics import REQ_DRIVE, STAND_POSE
+from monstertruckd.recorder.reader import open_log
+from monstertruckd.tools.study.runs import SETTLING
+
+PAUSE: Final = 3 * SECOND
+"""Requests further apart are of two runs, ns."""
+EQUAL: Final = 1e-6
+"""Rad/s."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run: what was asked for, and where the robot was."""
+
+    left: float
+    """Rate of the left wheels, rad/s; of a line that of the first pass."""
+    right: float
+    times: Array
+    """Of the poses, (n,), s since the run's begin."""
+    poses: Array
+    """(3, n): x, y (m), heading (rad)."""
+    directions: Array
+    """(n,): sign of the rates asked for at each pose."""
+
+    @property
+    def straight(self) -> bool:
+        """Whether it goes to and fro."""
+        return abs(self.left - self.right) < EQUAL
+
+    @property
+    def name(self) -> str:
+        """In words."""
+        fast, slow = max(abs(self.left), abs(self.right)), min(abs(self.left), abs(self.right))
+        if self.straight:
+            return f"line, {fast:.2f} rad/s"
+        return f"one side locked, {fast:.2f} rad/s" if slow < EQUAL else f"{fast / slow:.3g}:1, {fast:.2f} rad/s"
+
+
+def read_runs(path: Path) -> tuple[list[Run], dict[str, Any]]:
+    """All runs of a log, and the robot's configuration as plain values.
+
+    Raises:
+        NotFoundError: no such file.
+        InputError: it is no log, or has no run by shaft speeds, or no poses of a stand.
+    """
+    reader = open_log(path)
+    asked: list[tuple[int, float, float]] = []
+    seen: list[tuple[int, float, float, float]] = []
+    for entry in reader:
+        if entry.topic == REQ_DRIVE.name:
+            request = entry.decode()
+            if isinstance(request, DriveRequest) and request.shafts is not None and len(request.shafts) > 1:
+                asked.append((request.received, request.shafts[0], request.shafts[1]))
+        elif entry.topic == STAND_POSE.name:
+            pose = entry.decode()
+            assert isinstance(pose, StandPose)
+            seen.append((pose.stamp, pose.pose.x, pose.pose.y, pose.pose.yaw))
+    if not asked:
+        raise InputError(f"{path}: nobody drove by shaft speeds in it (`study circle`, `study straight`)")
+    if not seen:
+        raise InputError(f"{path}: no poses of a test stand in it: expected `stand: simulator` or `overhead`")
+    return [_run(part, np.array(seen)) for part in _parts(asked)], reader.config()
+
+
+def _parts(asked: list[tuple[int, float, float]]) -> Iterator[list[tuple[int, float, float]]]:
+    """Requests of one run each: rates that differ only in sign, pauses in between."""
+    part: list[tuple[int, float, float]] = []
+    for request in asked:
+        if part and (request[0] - part[-1][0] > PAUSE or _other(part, request)):
+            yield part
+            part = []
+        if part or request[1] or request[2]:
+            part.append(request)
+    if part:
+        yield part
+
+
+def _other(part: list[tuple[int, float, float]], request: tuple[int, float, float]) -> bool:
+    _, left, right = request
+    _, first, second = part[0]
+    return bool(left or right) and (
+        abs(abs(left) - abs(first)) > EQUAL or abs(abs(right) - abs(second)) > EQUAL or left * second != right * first
+    )
+
+
+def _run(part: list[tuple[int, float, float]], seen: Array) -> Run:
+    stamps = np.array([request[0] for request in part], np.float64)
+    signs = np.array([np.sign(request[1] + request[2]) for request in part])
+    _, left, right = part[0]
+    straight = abs(left - right) < EQUAL
+    begin = stamps[0] + (0.0 if straight else SETTLING * SECOND)
+    inside = (seen[:, 0] >= begin) & (seen[:, 0] <= stamps[-1])
+    when = seen[inside, 0]
+    directions = signs[np.clip(np.searchsorted(stamps, when, "right") - 1, 0, None)] if when.size else when
+    return Run(left, right, (when - stamps[0]) / SECOND, seen[inside, 1:].T, directions)

@@ -1,0 +1,147 @@
+"""Open-loop runs through a daemon: circles and passes to and fro, by shaft speeds."""
+
+import math
+from collections.abc import Sequence
+from typing import Final, NamedTuple, Protocol
+
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.errors import InputError, RequestRefusedError
+from monstertruck_runtime.mailbox import Delivery, Mailbox, latest
+from monstertruck_schemas import topics
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.state import GateState
+from monstertruck_schemas.topics import Topic
+from monstertruckd.config.truck import TruckConfig
+
+PERIOD: Final = 0.05
+"""Seconds between two requests."""
+LEASE: Final = 0.25
+PAUSE: Final = 0.6
+"""Seconds of standstill at a reversal."""
+SETTLING: Final = 2.0
+"""Seconds at the beginning of a run that the analysis leaves out; they are driven besides."""
+
+
+class OpenLoop(Protocol):
+    """Client of one robot that drives by shaft speeds."""
+
+    source: str
+
+    def subscribe(self, topic: Topic[GateState], delivery: Delivery) -> Mailbox[GateState]:
+        """Subscribe to a topic."""
+        ...
+
+    async def arm(self, *, hold: bool = False) -> GateState:
+        """Allow driving."""
+        ...
+
+    async def disarm(self) -> GateState:
+        """Stop and forbid driving."""
+        ...
+
+    async def drive_shafts(self, *rates: float, lease: float = LEASE) -> None:
+        """Request wheel rates, rad/s."""
+        ...
+
+
+class Stretch(NamedTuple):
+    """Wheel rates for a time."""
+
+    left: float
+    """Rad/s."""
+    right: float
+    seconds: float
+
+
+def circle_plan(config: TruckConfig, ratio: float, reference: float, laps: float) -> list[Stretch]:
+    """A circle to the left: the right side at the reference rate, the left one slower by the ratio.
+
+    Args:
+        config: of the robot, with its geometry.
+        ratio: of the sides' rates, above 1; inf = the left side is locked.
+        reference: rate of the faster side, rad/s.
+        laps: of the ideal robot; one that skids turns less.
+
+    Raises:
+        InputError: numbers that make no circle.
+    """
+    if not ratio > 1.0:
+        raise InputError(f"ratio {ratio:g}: expected more than 1 (2, 3, inf)")
+    _require(reference, laps, "laps")
+    left = 0.0 if math.isinf(ratio) else reference / ratio
+    rate = config.geometry.wheel_radius * (reference - left) / config.geometry.track
+    return [Stretch(left, reference, SETTLING + laps * math.tau / rate)]
+
+
+def straight_plan(config: TruckConfig, length: float, passes: int, reference: float) -> list[Stretch]:
+    """Passes to and fro, each as long as the ideal robot needs.
+
+    Args:
+        config: of the robot.
+        length: of a pass, m.
+        passes: how many.
+        reference: rate of all wheels, rad/s.
+
+    Raises:
+        InputError: numbers that make no line.
+    """
+    _require(reference, length, "length")
+    if passes < 1:
+        raise InputError(f"passes {passes}: expected at least 1")
+    seconds = length / (config.geometry.wheel_radius * reference)
+    plan: list[Stretch] = []
+    for i in range(passes):
+        sign = -1.0 if i % 2 else 1.0
+        plan += [Stretch(sign * reference, sign * reference, seconds), Stretch(0.0, 0.0, PAUSE)]
+    return plan
+
+
+def _require(reference: float, size: float, name: str) -> None:
+    for word, value in (("reference", reference), (name, size)):
+        if not 0.0 < value < math.inf:
+            raise InputError(f"{word} {value:g}: expected a number above 0")
+
+
+def shaft_rates(config: TruckConfig, stretch: Stretch) -> tuple[float, ...]:
+    """Rates of the body's shafts.
+
+    Raises:
+        InputError: it has no left and right side.
+    """
+    if config.body.kind not in ("skid_steer", "differential"):
+        raise InputError(f"body {config.body.kind}: expected one with a left and a right side, as skid_steer")
+    return (stretch.left, stretch.right) * (len(config.chassis().shafts) // 2)
+
+
+async def drive(robot: OpenLoop, clock: Clock, config: TruckConfig, plan: Sequence[Stretch]) -> float:
+    """Arm, drive a plan, disarm.
+
+    Returns:
+        Seconds it took.
+
+    Raises:
+        RequestRefusedError: arming was refused; or the robot stopped on the way, with the gate's reason.
+        InputError: the body has no sides, or is too slow for what is asked.
+    """
+    rates = [shaft_rates(config, stretch) for stretch in plan]
+    fastest = max(max(map(abs, row)) for row in rates) * config.geometry.wheel_radius
+    if fastest > config.gate.speed:
+        raise InputError(f"{fastest:.3f} m/s at the wheels: expected at most gate.speed, {config.gate.speed:g}")
+    began = clock.now()
+    with robot.subscribe(topics.GATE, latest()) as gate:
+        await robot.arm()
+        try:
+            for stretch, row in zip(plan, rates, strict=True):
+                due = clock.now()
+                end = due + round(stretch.seconds * SECOND)
+                while due < end:
+                    await robot.drive_shafts(*row, lease=LEASE)
+                    due += round(PERIOD * SECOND)
+                    await clock.sleep_until(min(due, end))
+                    state = gate.latest
+                    if state is not None and not state.mode.active and state.stamp > began + SECOND:
+                        reason = next(iter(state.reasons), Reason.DISARMED)
+                        raise RequestRefusedError(reason, f"the robot stopped on the way: {reason.text}")
+        finally:
+            await robot.disarm()
+    return (clock.now() - began) / SECOND
