@@ -98,6 +98,8 @@ def _other(part: list[tuple[int, float, float]], request: tuple[int, float, floa
 
 
 def _run(part: list[tuple[int, float, float]], seen: Array) -> Run:
+    while not (part[-1][1] or part[-1][2]):
+        part = part[:-1]  # at rest after the run
     stamps = np.array([request[0] for request in part], np.float64)
     signs = np.array([np.sign(request[1] + request[2]) for request in part])
     _, left, right = part[0]

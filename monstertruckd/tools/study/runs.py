@@ -123,6 +123,7 @@ async def drive(robot: OpenLoop, clock: Clock, config: TruckConfig, plan: Sequen
         RequestRefusedError: arming was refused; or the robot stopped on the way, with the gate's reason.
         InputError: the body has no sides, or is too slow for what is asked.
     """
+    plan = (*plan, Stretch(0.0, 0.0, PAUSE))  # at rest before it is disarmed
     rates = [shaft_rates(config, stretch) for stretch in plan]
     fastest = max(max(map(abs, row)) for row in rates) * config.geometry.wheel_radius
     if fastest > config.gate.speed:

@@ -233,6 +233,7 @@ BODIES = {
     "ackermann": ackermann_chassis(SIZE),
     "differential": differential_chassis(SIZE),
     "skid_steer": skid_steer_chassis(SIZE, icr_left=0.2, icr_right=-0.21, icr_x=-0.03),
+    "skid_wheels": skid_steer_chassis(SIZE, icr_left=0.2, icr_right=-0.2, motors="wheels"),
     "synchro": synchro_chassis(SIZE),
     "omni": omni_chassis(SIZE, circle=0.15),
     "mecanum": mecanum_chassis(SIZE),

@@ -54,6 +54,16 @@ def test_shafts_that_push_against_each_other_are_refused():
     assert "push against each other" in robot.reported(Reason.IMPOSSIBLE_MOTION)[0].text
 
 
+def test_wheels_of_one_side_may_differ_a_little_and_each_turns_as_asked():
+    robot = Robot("skid_wheels").armed()
+    robot.driver = (1.0, 1.2, 0.95, 1.2)
+    robot.tick(60)
+    assert robot.out.speeds == pytest.approx([RADIUS * rate for rate in robot.driver])
+    assert robot.roll(1.0, 1.2, 0.0, 1.2) is Reason.IMPOSSIBLE_MOTION
+    robot.tick()
+    assert "front left" in robot.reported(Reason.IMPOSSIBLE_MOTION)[0].text
+
+
 @pytest.mark.parametrize("number", [math.nan, math.inf])
 def test_numbers_that_are_not_finite_are_refused_by_name(number):
     robot = Robot("differential").armed()

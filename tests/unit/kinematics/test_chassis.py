@@ -33,6 +33,7 @@ BODIES = {
     "tricycle": tricycle_chassis(Dimensions(DRIVETRAIN), driven="front"),
     "differential": differential_chassis(Dimensions(DRIVETRAIN)),
     "skid-steer": skid_steer_chassis(Dimensions(DRIVETRAIN), **SKID),
+    "skid-steer, a motor in each wheel": skid_steer_chassis(Dimensions(DRIVETRAIN), **SKID, motors="wheels"),
     "synchro": synchro_chassis(Dimensions(DRIVETRAIN)),
     "omni": omni_chassis(Dimensions(DRIVETRAIN)),
     "omni of four": omni_chassis(Dimensions(DRIVETRAIN), count=4, circle=0.15),
@@ -58,10 +59,13 @@ def test_shafts_move_the_base_as_the_bicycle_and_tell_it_again(chassis):
         assert twist == pytest.approx(chassis.bicycle.body_twist(speed, front, rear), abs=1e-12)
 
 
+SKIDDING = ("skid-steer", "skid-steer, a motor in each wheel")
+
+
 @every_body
 def test_travel_is_the_fastest_wheel_with_the_sign_of_the_way(chassis):
     fastest = max(map(abs, chassis.shaft_speeds(0.2, 0.0, 0.0)))
-    share = {"skid-steer": 1 / 0.9, "omni": math.cos(math.pi / 6)}
+    share = {**dict.fromkeys(SKIDDING, 1 / 0.9), "omni": math.cos(math.pi / 6)}
     assert fastest == pytest.approx(0.2 * next((share[n] for n in share if BODIES[n] is chassis), 1.0))
     for speed in (0.2, -0.2):
         travel = chassis.fastest_wheel_speed(chassis.shaft_speeds(speed, 0.0, 0.0))

@@ -275,7 +275,7 @@ def test_another_device_is_refused():
     on_bench(test)
 
 
-@pytest.mark.parametrize("fault", ["chunk", "noise", "late", "drops", "flips", "garbage"])
+@pytest.mark.parametrize("fault", ["chunk", "noise", "late", "stall", "drops", "flips", "garbage"])
 def test_a_bad_line_costs_exchanges_not_the_drive(fault):
     async def test(rig):
         faults = rig.port.device.faults
@@ -289,6 +289,10 @@ def test_a_bad_line_costs_exchanges_not_the_drive(fault):
                     rig.emulator.inject("noise", "2")
                 case "late":
                     rig.emulator.inject("late", "0.06", "1")
+                case "stall":
+                    faults.stalled = True
+                    await rig.settle(0.11)
+                    faults.stalled = False
                 case "drops":
                     faults.seed(3)
                     faults.drop_rate = 1e-3
