@@ -291,7 +291,7 @@ def test_a_bad_line_costs_exchanges_not_the_drive(fault):
                     rig.emulator.inject("late", "0.06", "1")
                 case "stall":
                     faults.stalled = True
-                    await rig.settle(0.11)
+                    await rig.settle(0.06)
                     faults.stalled = False
                 case "drops":
                     faults.seed(3)
