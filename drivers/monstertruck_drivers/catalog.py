@@ -16,6 +16,7 @@ from monstertruck_drivers.emulation import EmulatorFactory
 from monstertruck_drivers.epos.protocol import BAUD as EPOS_BAUD
 from monstertruck_drivers.os4000.protocol import FACTORY_BAUD as OS4000_BAUD
 from monstertruck_drivers.steppers.protocol import BAUD as STEPPERS_BAUD
+from monstertruck_drivers.wt61.protocol import BAUD as WT61_BAUD
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.plugins import Catalog, Plugin, load
 from monstertruck_schemas import topics
@@ -52,6 +53,9 @@ class RoleSpec:
     """Topics of which the driver gets the newest message, by its parameter."""
     frame: bool = False
     """Its mount is in the tree of frames."""
+    elements: str | None = None
+    """Field of the driver's settings with several sensing elements by name: their mounts are in the tree of frames, as
+    ``<role>_<name>``."""
     start: int = 100
     """Rank among the devices that start again behind a returned hub."""
     shafts: tuple[int, ...] = ()
@@ -133,6 +137,22 @@ CAMERA: Final = RoleSpec(
     start=14,
     loads_hub=True,
 )
+SONAR: Final = RoleSpec(
+    name=DeviceRole.SONAR.value,
+    duty=Duty.SENSOR,
+    doc="Ultrasonic range finders around the robot",
+    writes={"out": topics.SONAR},
+    elements="sonars",
+    start=11,
+)
+IMU: Final = RoleSpec(
+    name=DeviceRole.IMU.value,
+    duty=Duty.SENSOR,
+    doc="Angular velocity and specific force",
+    writes={"out": topics.IMU},
+    frame=True,
+    start=11,
+)
 BATTERY: Final = RoleSpec(
     name=DeviceRole.BATTERY.value,
     duty=Duty.MONITOR,
@@ -157,6 +177,8 @@ OUR_ROLES: Final = (
     COMPASS,
     STABILISER,
     CAMERA,
+    SONAR,
+    IMU,
     BATTERY,
     LINK,
     HOST,
@@ -354,6 +376,27 @@ DEVICES: Final = DeviceCatalog(
         probe="monstertruck_drivers.webcam.probe:probe",
         opens="video",
         usb=UsbIdentity("046d:080a", "Webcam C905", "video"),
+    ),
+    DeviceKind(
+        name="srf08",
+        doc="Devantech SRF08 sonars behind a USB-ISS",
+        roles=(SONAR,),
+        settings="monstertruck_drivers.srf08.config:Srf08Config",
+        implementation="monstertruck_drivers.srf08.driver:Srf08Driver",
+        emulator="monstertruck_drivers.srf08.emulator:emulated",
+        probe="monstertruck_drivers.srf08.probe:probe",
+        usb=UsbIdentity("04d8:ffee", "USB-ISS", "ttyACM"),
+    ),
+    DeviceKind(
+        name="wt61",
+        doc="WitMotion WT61 inertial measurement unit",
+        roles=(IMU,),
+        settings="monstertruck_drivers.wt61.config:Wt61Config",
+        implementation="monstertruck_drivers.wt61.driver:Wt61Driver",
+        emulator="monstertruck_drivers.wt61.emulator:emulated",
+        probe="monstertruck_drivers.wt61.probe:probe",
+        baud=WT61_BAUD,
+        usb=UsbIdentity("1a86:7523", "USB2.0-Serial", "ttyUSB"),
     ),
     DeviceKind(
         name="iio",

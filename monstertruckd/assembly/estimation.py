@@ -53,6 +53,11 @@ def build_estimation(config: TruckConfig, bus: Bus, clock: Clock, body: Body) ->
         for role, m in ((role, device.mount) for role, device in config.devices.present().items())
         if DEVICES.roles[role].frame
     }
+    for role, device in config.devices.present().items():
+        if (elements := DEVICES.roles[role].elements) is not None:
+            for name, element in getattr(device.driver, elements).items():
+                m = element.mount
+                mounts[f"{role}_{name}"] = mount(f"{role}_{name}", (m.x, m.y, m.z), (m.roll, m.pitch, m.yaw))
     joints = mounts.pop(DeviceRole.STABILISER, None)
     if joints is not None and DeviceRole.LIDAR in mounts:
         lidar = mounts[DeviceRole.LIDAR]

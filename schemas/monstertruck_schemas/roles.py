@@ -20,6 +20,8 @@ class DeviceRole(StrEnum):
     COMPASS = "compass"
     STABILISER = "stabiliser"
     CAMERA = "camera"
+    SONAR = "sonar"
+    IMU = "imu"
     BATTERY = "battery"
     LINK = "link"
     HOST = "host"

@@ -1,0 +1,1 @@
+"""Devantech SRF08 sonars behind a USB-ISS."""

@@ -1,0 +1,210 @@
+"""The device side of SRF08 sonars behind a USB-ISS, byte for byte."""
+
+from dataclasses import dataclass
+from math import inf
+from typing import Final
+
+import numpy as np
+
+from monstertruck_drivers.cable import DeviceEnd
+from monstertruck_drivers.emulation import EmulatorSetup, SonarSource, Trail
+from monstertruck_drivers.srf08.config import Srf08Config
+from monstertruck_drivers.srf08.protocol import (
+    ABSENT,
+    ACK,
+    I2C_AD1,
+    ISS,
+    MODULE,
+    RANGE_IN_MICROSECONDS,
+    Srf08Register,
+    ranging_time,
+)
+from monstertruck_runtime.clock import MILLISECOND, SECOND, Clock
+from monstertruck_runtime.errors import InputError
+
+FIRMWARE: Final = 8
+REVISION: Final = 10
+"""Software of the sonars."""
+GAP: Final = 0.02
+"""Seconds after which the USB-ISS drops half a command."""
+ANSWER: Final = MILLISECOND
+"""Nanoseconds that a command takes on USB and I2C."""
+SOUND: Final = 343.0
+JITTER: Final = 3.0
+"""Standard deviation of a flight time, us."""
+
+
+@dataclass(slots=True)
+class Module:
+    """One sonar. Its gain and range are lost with the supply."""
+
+    name: str
+    gain: int = 31
+    range: int = 255
+    busy_until: int = 0
+    light: int = 120
+    microseconds: int = 0
+    pending: bool = False
+    stuck: int | None = None
+    dead: bool = False
+    ghost: int | None = None
+
+
+class Wall:
+    """A wall one metre from every sonar."""
+
+    def fire(self, name: str, time_ns: int) -> None:
+        """Nothing moves."""
+
+    def range(self, name: str) -> float:
+        """Always 1 m."""
+        return 1.0
+
+
+class Srf08Emulator:
+    """A USB-ISS with one SRF08 for each sonar of the settings.
+
+    Faults (`inject`): ``silent on|off`` (the USB-ISS), ``dead NAME on|off`` (off the bus), ``stuck NAME on|off`` (the
+    same flight time for ever), ``ghost NAME METRES|off`` (an echo that is not there), ``brownout NAME`` (loses gain and
+    range), ``extra`` (a byte that nobody asked for).
+
+    Args:
+        clock: time.
+        source: physics; without it a wall.
+        settings: names and addresses.
+        seed: of the timers' jitter.
+    """
+
+    def __init__(
+        self, clock: Clock, source: SonarSource | None = None, settings: Srf08Config | None = None, *, seed: int = 0
+    ) -> None:
+        self.name = "srf08"
+        self.received = Trail()
+        """Bytes the host sent, for tests."""
+        self.modules = {sonar.address: Module(name) for name, sonar in (settings or Srf08Config()).sonars.items()}
+        self._clock = clock
+        self._source = source or Wall()
+        self._rng = np.random.default_rng(seed)
+        self._silent = False
+        self._i2c = False
+        self._end: DeviceEnd | None = None
+
+    async def run(self, end: DeviceEnd) -> None:
+        """Answer for ever."""
+        self._end = end
+        end.on_plug = self._plugged
+        buffer, last = b"", 0
+        while True:
+            data = await end.read()
+            now = self._clock.now()
+            self.received.extend(data)
+            buffer = data if now - last > GAP * SECOND else buffer + data
+            last = now
+            while (size := _size(buffer)) is not None and size <= len(buffer):
+                command, buffer = buffer[:size], buffer[size:]
+                await self._clock.sleep_until(self._clock.now() + ANSWER)
+                answer = self._answer(command)
+                if not self._silent:
+                    end.write(answer)
+
+    def power_cycle(self) -> None:
+        """Supply off and on."""
+        self._i2c = False
+        for module in self.modules.values():
+            module.gain, module.range, module.busy_until, module.pending = 31, 255, 0, False
+
+    def inject(self, fault: str, *values: str) -> None:
+        """Start or end a fault.
+
+        Raises:
+            InputError: unknown fault or bad value.
+        """
+        by_name = {module.name: module for module in self.modules.values()}
+        try:
+            match fault, values:
+                case "silent", (("on" | "off") as state,):
+                    self._silent = state == "on"
+                case "dead", (name, ("on" | "off") as state):
+                    by_name[name].dead = state == "on"
+                case "stuck", (name, ("on" | "off") as state):
+                    by_name[name].stuck = by_name[name].microseconds if state == "on" else None
+                case "ghost", (name, metres):
+                    by_name[name].ghost = None if metres == "off" else round(float(metres) * 2e6 / SOUND)
+                case "brownout", (name,):
+                    by_name[name].gain, by_name[name].range = 31, 255
+                case "extra", () if self._end is not None:
+                    self._end.write(b"\x00")
+                case _:
+                    raise ValueError("unknown")
+        except (ValueError, KeyError) as error:
+            raise InputError(
+                f"{self.name}: fault {' '.join((fault, *values))!r} not understood; known: silent on|off, "
+                "dead NAME on|off, stuck NAME on|off, ghost NAME METRES|off, brownout NAME, extra; "
+                f"names: {', '.join(by_name)}"
+            ) from error
+
+    def _plugged(self, plugged: bool) -> None:
+        """The port is the supply of all."""
+        if plugged:
+            self.power_cycle()
+
+    def _answer(self, command: bytes) -> bytes:
+        if command[0] == ISS:
+            if command[1] == 0x01:
+                return bytes((MODULE, FIRMWARE, 0x60 if self._i2c else 0x00))
+            self._i2c = command[1] == 0x02 and 0x20 <= command[2] <= 0x80
+            return bytes((ACK, 0)) if self._i2c else b"\x00\x05"
+        if command[0] != I2C_AD1:
+            return b"\x00"
+        address, first, count = command[1], command[2], command[3]
+        module = self.modules.get(address & 0xFE)
+        if module is not None and (module.dead or not self._i2c or self._clock.now() < module.busy_until):
+            module = None
+        if address & 1:
+            return bytes(ABSENT for _ in range(count)) if module is None else self._read(module)[first : first + count]
+        if module is None:
+            return b"\x00"
+        for register, value in enumerate(command[4:], first):
+            self._write(module, register, value)
+        return b"\x01"
+
+    def _write(self, module: Module, register: int, value: int) -> None:
+        if register == Srf08Register.GAIN:
+            module.gain = min(value, 31)
+        elif register == Srf08Register.RANGE:
+            module.range = value
+        elif register == Srf08Register.COMMAND and value == RANGE_IN_MICROSECONDS:
+            now = self._clock.now()
+            self._source.fire(module.name, now)
+            module.busy_until = now + round(ranging_time(module.range) * SECOND)
+            module.pending = True
+
+    def _read(self, module: Module) -> bytes:
+        if module.pending:
+            module.pending = False
+            distance = self._source.range(module.name)
+            module.microseconds = 0
+            if distance < inf:
+                flight = 2e6 * distance / SOUND + JITTER * float(self._rng.standard_normal())
+                if flight < ranging_time(module.range) * 1e6:
+                    module.microseconds = max(1, round(flight))
+            if module.ghost is not None:
+                module.microseconds = module.ghost + round(JITTER * float(self._rng.standard_normal()))
+        echo = module.microseconds if module.stuck is None else module.stuck
+        return bytes((REVISION, module.light, echo >> 8 & 0xFF, echo & 0xFF)) + bytes(32)
+
+
+def _size(buffer: bytes) -> int | None:
+    """Length of the command that ``buffer`` begins with; None = not yet known."""
+    if not buffer:
+        return None
+    if buffer[0] == ISS:
+        return None if len(buffer) < 2 else {0x02: 4}.get(buffer[1], 2)
+    if buffer[0] == I2C_AD1:
+        return None if len(buffer) < 4 else 4 if buffer[1] & 1 else 4 + buffer[3]
+    return 1
+
+
+def emulated(setup: EmulatorSetup) -> Srf08Emulator:
+    """The sonars of a simulated robot."""
+    return Srf08Emulator(setup.clock, setup.physics.sonars, setup.settings, seed=setup.seed)

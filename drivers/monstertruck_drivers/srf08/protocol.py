@@ -1,0 +1,86 @@
+"""Bytes to a USB-ISS in I2C mode, and registers of the SRF08 behind it.
+
+Sources: Devantech, "USB-ISS Technical Specification" and "I2C Mode"; "SRF08 Ultrasonic Ranger, Technical
+Specification". An answer of the USB-ISS has no mark of its own and no checksum: only its length is known. What a module
+does not drive on the bus reads as ones, so a module that ranges, or is not there, has the software revision 0xFF.
+"""
+
+from enum import IntEnum
+from math import ceil
+from typing import Final, NamedTuple
+
+ISS: Final = 0x5A
+VERSION: Final = bytes((ISS, 0x01))
+"""Answered by module number, firmware and mode."""
+MODULE: Final = 0x07
+I2C_100KHZ: Final = 0x60
+"""By the hardware's own controller."""
+IO_INPUTS: Final = 0xAA
+SET_MODE: Final = bytes((ISS, 0x02, I2C_100KHZ, IO_INPUTS))
+"""Answered by 0xFF 0x00, or 0x00 and a reason."""
+I2C_AD1: Final = 0x55
+ACK: Final = 0xFF
+
+ADDRESSES: Final = tuple(range(0xE0, 0x100, 2))
+"""That a module may be set to; with their lowest bit they are for reading."""
+RANGE_IN_MICROSECONDS: Final = 0x52
+ABSENT: Final = 0xFF
+"""Software revision that nobody drives onto the bus."""
+RANGE_STEP: Final = 0.043
+"""Metres of the range register's unit, by the maker's speed of sound."""
+
+
+class Srf08Register(IntEnum):
+    """For writing; reading gives revision, light, and the first echo's high and low byte."""
+
+    COMMAND = 0
+    GAIN = 1
+    RANGE = 2
+
+
+class Srf08Reading(NamedTuple):
+    """Registers 0 to 3."""
+
+    revision: int
+    light: int
+    microseconds: int
+    """From the ping to the first echo; 0 = none."""
+
+    @property
+    def present(self) -> bool:
+        """Whether a module answered."""
+        return self.revision != ABSENT
+
+
+READ_SIZE: Final = 4
+
+
+def write(address: int, register: int, value: int) -> bytes:
+    """Set a register; answered by one byte, 0 where no module took it."""
+    return bytes((I2C_AD1, address, register, 1, value))
+
+
+def read(address: int) -> bytes:
+    """Ask for revision, light and the first echo; answered by ``READ_SIZE`` bytes."""
+    return bytes((I2C_AD1, address | 1, 0, READ_SIZE))
+
+
+def parse_reading(data: bytes) -> Srf08Reading:
+    """What ``read`` was answered.
+
+    Raises:
+        ValueError: of another length.
+    """
+    if len(data) != READ_SIZE:
+        raise ValueError(f"expected {READ_SIZE} bytes, got {len(data)}")
+    return Srf08Reading(data[0], data[1], data[2] << 8 | data[3])
+
+
+def range_setting(metres: float) -> int:
+    """Value of the range register with which echoes from up to ``metres`` are waited for."""
+    return max(0, min(255, ceil(metres / RANGE_STEP) - 1))
+
+
+def ranging_time(setting: int) -> float:
+    """Seconds that a module ranges, and does not answer, by its range register: 65 ms from the factory."""
+    return (setting + 1) * 65e-3 / 256

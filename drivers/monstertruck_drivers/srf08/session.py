@@ -1,0 +1,76 @@
+"""Question and answer with a USB-ISS and the sonars behind it; shared by driver and probe."""
+
+from typing import Final
+
+from monstertruck_drivers.link import Link
+from monstertruck_drivers.srf08 import protocol
+from monstertruck_drivers.srf08.protocol import ACK, MODULE, READ_SIZE, Srf08Reading
+from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError, WrongDeviceError
+
+ATTEMPTS: Final = 3
+"""A host that died may have left half a command, which the USB-ISS drops after a pause."""
+
+
+class Srf08Session:
+    """One conversation.
+
+    Args:
+        link: open link.
+        timeout: seconds in which an answer comes.
+    """
+
+    def __init__(self, link: Link, timeout: float) -> None:
+        self._link = link
+        self._timeout = timeout
+
+    async def ask(self, command: bytes, size: int) -> bytes:
+        """Send a command and take its answer.
+
+        Raises:
+            DeviceLostError: unplugged.
+            DeviceTimeoutError: the answer did not come in time.
+            ProtocolError: bytes that nobody asked for.
+        """
+        if count := self._link.discard():
+            raise ProtocolError(f"{self._link.name}: {count} bytes too many: answers are out of step")
+        self._link.write(command)
+        try:
+            return await self._link.exactly(size, self._timeout)
+        except TimeoutError:
+            raise DeviceTimeoutError(f"{self._link.name}: the USB-ISS does not answer") from None
+
+    async def start(self) -> int:
+        """Make sure of a USB-ISS, and set it to I2C; returns its firmware's number.
+
+        Raises:
+            DeviceLostError: unplugged.
+            DeviceTimeoutError: silence.
+            WrongDeviceError: another device.
+            ProtocolError: it refuses the mode.
+        """
+        answer = b""
+        for attempt in range(ATTEMPTS):
+            self._link.discard()
+            try:
+                answer = await self.ask(protocol.VERSION, 3)
+                break
+            except DeviceTimeoutError:
+                if self._link.discard():
+                    answer = b"?"
+                if attempt == ATTEMPTS - 1 and not answer:
+                    raise
+        if len(answer) != 3 or answer[0] != MODULE:
+            raise WrongDeviceError(f"{self._link.name}: {answer.hex(' ')} is not the answer of a USB-ISS")
+        self._link.discard()
+        mode = await self.ask(protocol.SET_MODE, 2)
+        if mode[0] != ACK:
+            raise ProtocolError(f"{self._link.name}: the USB-ISS refuses I2C mode: {mode.hex(' ')}")
+        return answer[1]
+
+    async def set(self, address: int, register: int, value: int) -> bool:
+        """Write a register; False = no module took it."""
+        return (await self.ask(protocol.write(address, register, value), 1))[0] != 0
+
+    async def read(self, address: int) -> Srf08Reading:
+        """Registers of a module."""
+        return protocol.parse_reading(await self.ask(protocol.read(address), READ_SIZE))

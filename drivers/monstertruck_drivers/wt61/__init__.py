@@ -1,0 +1,1 @@
+"""WitMotion WT61 inertial measurement unit."""

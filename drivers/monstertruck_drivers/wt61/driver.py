@@ -1,0 +1,165 @@
+"""IMU driver: what the unit streams becomes angular velocities and specific forces."""
+
+from typing import Final, NamedTuple
+
+from monstertruck_drivers.link import Link, Port
+from monstertruck_drivers.wt61.config import Wt61Config
+from monstertruck_drivers.wt61.protocol import RATE, TOGGLE_SLEEP, Vector, Wt61Kind, Wt61Packet, Wt61Parser
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError, WrongDeviceError
+from monstertruck_runtime.ports import EventSink, Publisher, Ready
+from monstertruck_schemas.sensor import Imu, Vector3
+
+LISTEN: Final = 0.6
+"""Seconds to hear a unit that streams; it needs half of one after power-up."""
+
+
+class ImuSample(NamedTuple):
+    """What was measured at one instant."""
+
+    force: Wt61Packet
+    rate: Wt61Packet
+
+
+class Wt61Session:
+    """Listening to one unit.
+
+    Args:
+        link: open link.
+        clock: time.
+    """
+
+    def __init__(self, link: Link, clock: Clock) -> None:
+        self.parser = Wt61Parser()
+        self.bytes_heard = 0
+        self._link = link
+        self._clock = clock
+        self._acceleration: Wt61Packet | None = None
+
+    async def receive(self, within: float) -> list[ImuSample]:
+        """Samples that became complete.
+
+        Raises:
+            DeviceLostError: unplugged.
+            DeviceTimeoutError: silence.
+            ProtocolError: bytes, but no measurement.
+        """
+        heard, name = self.bytes_heard, self._link.name
+        until = self._clock.now() + round(within * SECOND)
+        while True:
+            try:
+                data = await self._link.read(max(until - self._clock.now(), 0) / SECOND)
+            except TimeoutError:
+                if self.bytes_heard == heard:
+                    raise DeviceTimeoutError(f"{name}: silent for {within} s") from None
+                raise ProtocolError(f"{name}: {self.bytes_heard - heard} bytes, but no measurement") from None
+            self.bytes_heard += len(data)
+            if samples := self._samples(self.parser.feed(data)):
+                return samples
+            if self._clock.now() >= until:
+                raise ProtocolError(f"{name}: {self.bytes_heard - heard} bytes, but no measurement")
+
+    def _samples(self, packets: list[Wt61Packet]) -> list[ImuSample]:
+        samples = []
+        for packet in packets:
+            if packet.kind is Wt61Kind.ACCELERATION:
+                self._acceleration = packet
+            elif packet.kind is Wt61Kind.ANGULAR_VELOCITY and self._acceleration is not None:
+                samples.append(ImuSample(self._acceleration, packet))
+                self._acceleration = None
+        return samples
+
+    async def start(self) -> list[ImuSample]:
+        """Hear a unit, which may have been left in standby.
+
+        Raises:
+            DeviceLostError: unplugged.
+            DeviceTimeoutError: silence to the end.
+            WrongDeviceError: bytes, but none of a WT61.
+        """
+        for remedy in (b"", TOGGLE_SLEEP):
+            if remedy:
+                self._link.write(remedy)
+            try:
+                return await self.receive(LISTEN)
+            except DeviceTimeoutError:
+                continue
+            except ProtocolError as error:
+                raise WrongDeviceError(f"{error} of a WT61: another device, or another baud rate") from None
+        raise DeviceTimeoutError(f"{self._link.name}: silence; expected a WT61 that streams")
+
+
+class Wt61Driver:
+    """Listens; a unit that is silent is woken up once.
+
+    Args:
+        config: averaging and checks.
+        port: where it hangs.
+        clock: time.
+        out: measurements, in the unit's own axes.
+        events: not used.
+        name: of the service, and of the frame.
+    """
+
+    def __init__(
+        self,
+        config: Wt61Config,
+        port: Port,
+        clock: Clock,
+        out: Publisher[Imu],
+        events: EventSink,
+        name: str = "imu",
+    ) -> None:
+        self.name = name
+        self._config = config
+        self._port = port
+        self._clock = clock
+        self._out = out
+
+    async def run(self, ready: Ready) -> None:
+        """Serve one session.
+
+        Raises:
+            DeviceLostError: unplugged.
+            DeviceTimeoutError: silence.
+            ProtocolError: bytes without a measurement, or the same measurement again and again.
+            WrongDeviceError: nothing that comes at the start is of a WT61.
+            PortBusyError: another process holds the port.
+        """
+        async with await self._port.open() as link:
+            session = Wt61Session(link, self._clock)
+            samples = await session.start()
+            ready()
+            kept: list[ImuSample] = []
+            last: ImuSample | None = None
+            equal = 0
+            while True:
+                for sample in samples:
+                    equal, last = equal + 1 if sample == last else 0, sample
+                    kept.append(sample)
+                    if len(kept) >= self._config.average:
+                        self._publish(kept)
+                        kept = []
+                if equal >= self._config.stuck_after:
+                    raise ProtocolError(f"{link.name}: {equal} measurements are the same to the last bit")
+                samples = await session.receive(self._config.silence)
+
+    def _publish(self, samples: list[ImuSample]) -> None:
+        received = self._clock.now()
+        middle = (len(samples) - 1) * SECOND // (2 * RATE)
+        self._out.put(
+            Imu(
+                stamp=received - round(self._config.delay * SECOND) - middle,
+                received=received,
+                seq=self._out.next_seq(),
+                frame=self.name,
+                angular_velocity=_mean([rate.angular_velocity for _, rate in samples]),
+                linear_acceleration=_mean([force.acceleration for force, _ in samples]),
+                temperature=samples[-1][0].celsius,
+            )
+        )
+
+
+def _mean(vectors: list[Vector]) -> Vector3:
+    x, y, z = (sum(axis) / len(vectors) for axis in zip(*vectors, strict=True))
+    return Vector3(x=x, y=y, z=z)

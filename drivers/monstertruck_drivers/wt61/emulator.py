@@ -1,0 +1,134 @@
+"""The device side of a WT61, byte for byte."""
+
+import asyncio
+from typing import Final
+
+import numpy as np
+
+from monstertruck_drivers.cable import DeviceEnd
+from monstertruck_drivers.emulation import EmulatorSetup, ImuReading, ImuSource, Trail
+from monstertruck_drivers.wt61.protocol import BAUD, GRAVITY, RATE, TOGGLE_SLEEP, Wt61Kind, Wt61Packet, build, measured
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.errors import InputError
+
+BOOT: Final = 300_000_000
+"""Nanoseconds from power-up to the first packet."""
+_COUNT_NOISE: Final = 2.0
+"""Standard deviation of the converters, in their own counts."""
+
+
+class Bench:
+    """A unit that lies level on a table."""
+
+    def imu(self, time_ns: int) -> ImuReading:
+        """Reading at ``time_ns``."""
+        return ImuReading((0.0, 0.0, 0.0), (0.0, 0.0, GRAVITY), 30.0)
+
+
+class Wt61Emulator:
+    """A WT61 that streams from power-up on.
+
+    Faults (`inject`): ``frozen on|off`` (the same packets again and again), ``silent on|off``, ``asleep on|off``
+    (standby, which the command for it ends), ``bad_checksum N`` (the next so many packets), ``inverted on|off``
+    (mounted upside down by somebody: yaw rate with the wrong sign), ``half_packet``.
+
+    Args:
+        clock: time.
+        source: physics; without it a table.
+        seed: of the converters' noise.
+    """
+
+    def __init__(self, clock: Clock, source: ImuSource | None = None, *, seed: int = 0) -> None:
+        self.name = "wt61"
+        self.received = Trail()
+        """Bytes the host sent, for tests."""
+        self._clock = clock
+        self._source = source or Bench()
+        self._rng = np.random.default_rng(seed)
+        self._faults = {"frozen": False, "silent": False, "inverted": False, "asleep": False}
+        self._bad_checksums = 0
+        self._torn = True
+        self._last = b""
+        self._awake_at = 0
+
+    async def run(self, end: DeviceEnd) -> None:
+        """Stream, and take commands."""
+        end.baud = BAUD
+        end.on_plug = self._plugged
+        self.power_cycle()
+        async with asyncio.TaskGroup() as group:
+            group.create_task(self._stream(end))
+            while True:
+                self.received.extend(await end.read())
+                if self.received.endswith(TOGGLE_SLEEP):
+                    self._faults["asleep"] = not self._faults["asleep"]
+
+    def power_cycle(self) -> None:
+        """Supply off and on: it is awake again."""
+        self._faults["asleep"] = False
+        self._torn = True
+        self._awake_at = self._clock.now() + BOOT
+
+    def inject(self, fault: str, *values: str) -> None:
+        """Start or end a fault.
+
+        Raises:
+            InputError: unknown fault or bad value.
+        """
+        match fault, values:
+            case _, (("on" | "off") as state,) if fault in self._faults:
+                self._faults[fault] = state == "on"
+            case "bad_checksum", (count,) if count.isdigit():
+                self._bad_checksums = int(count)
+            case "half_packet", ():
+                self._torn = True
+            case _:
+                raise InputError(
+                    f"{self.name}: fault {' '.join((fault, *values))!r} not understood; known: frozen on|off, "
+                    "silent on|off, asleep on|off, inverted on|off, bad_checksum N, half_packet"
+                )
+
+    def _plugged(self, plugged: bool) -> None:
+        """The port is its supply."""
+        if plugged:
+            self.power_cycle()
+
+    async def _stream(self, end: DeviceEnd) -> None:
+        due = self._clock.now()
+        while True:
+            due += SECOND // RATE
+            await self._clock.sleep_until(due)
+            if due < self._awake_at or self._faults["silent"] or self._faults["asleep"]:
+                continue
+            if not (self._faults["frozen"] and self._last):
+                self._last = self._packets(due)
+            data = self._last
+            if self._bad_checksums:
+                self._bad_checksums -= 1
+                data = data[:15] + bytes((data[15] ^ 0x10,)) + data[16:]
+            if self._torn:
+                self._torn, data = False, data[5:]
+            end.write(data)
+
+    def _packets(self, now: int) -> bytes:
+        reading = self._source.imu(now)
+        x, y, z = reading.angular_velocity
+        if self._faults["inverted"]:
+            z = -z
+        force = measured(Wt61Kind.ACCELERATION, reading.acceleration, reading.temperature_c)
+        rate = measured(Wt61Kind.ANGULAR_VELOCITY, (x, y, z), reading.temperature_c)
+        angle = Wt61Packet(Wt61Kind.ANGLE, 0, 0, 0, 0)
+        return b"".join(map(build, (self._noisy(force), self._noisy(rate), angle)))
+
+    def _noisy(self, packet: Wt61Packet) -> Wt61Packet:
+        x, y, z = np.rint(_COUNT_NOISE * self._rng.standard_normal(3)).astype(int).tolist()
+        return packet._replace(x=_count(packet.x + x), y=_count(packet.y + y), z=_count(packet.z + z))
+
+
+def _count(value: int) -> int:
+    return max(-32768, min(32767, value))
+
+
+def emulated(setup: EmulatorSetup) -> Wt61Emulator:
+    """The IMU of a simulated robot."""
+    return Wt61Emulator(setup.clock, setup.physics.imu, seed=setup.seed)

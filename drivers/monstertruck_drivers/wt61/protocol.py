@@ -1,0 +1,105 @@
+"""Packets of the WT61 (WitMotion, "WT61 communication protocol").
+
+A packet has eleven bytes: 0x55, kind, four signed 16-bit numbers with the low byte first, and the sum of the ten bytes
+before it. The unit streams acceleration, angular velocity and angle one after the other, unasked. Commands are FF AA
+and one byte.
+"""
+
+import struct
+from enum import IntEnum
+from math import radians
+from typing import Final, NamedTuple
+
+BAUD: Final = 115200
+RATE: Final = 100
+"""Triples of packets a second at this baud rate."""
+HEADER: Final = 0x55
+SIZE: Final = 11
+GRAVITY: Final = 9.80665
+TOGGLE_SLEEP: Final = b"\xff\xaa\x60"
+"""Standby and back."""
+_BODY: Final = struct.Struct("<BB4h")
+_ACCELERATION: Final = 16 * GRAVITY / 32768
+_RATE: Final = radians(2000) / 32768
+_MOST: Final = 32767
+
+
+class Wt61Kind(IntEnum):
+    """Second byte of a packet."""
+
+    ACCELERATION = 0x51
+    ANGULAR_VELOCITY = 0x52
+    ANGLE = 0x53
+
+
+Vector = tuple[float, float, float]
+
+
+class Wt61Packet(NamedTuple):
+    """Raw numbers of one packet."""
+
+    kind: Wt61Kind
+    x: int
+    y: int
+    z: int
+    temperature: int
+
+    @property
+    def acceleration(self) -> Vector:
+        """m/s^2."""
+        return self.x * _ACCELERATION, self.y * _ACCELERATION, self.z * _ACCELERATION
+
+    @property
+    def angular_velocity(self) -> Vector:
+        """rad/s."""
+        return self.x * _RATE, self.y * _RATE, self.z * _RATE
+
+    @property
+    def celsius(self) -> float:
+        """Of acceleration and angular velocity packets."""
+        return self.temperature / 340 + 36.53
+
+
+def build(packet: Wt61Packet) -> bytes:
+    """Bytes of a packet.
+
+    Raises:
+        struct.error: a number beyond 16 bits.
+    """
+    body = _BODY.pack(HEADER, *packet)
+    return body + bytes((sum(body) & 0xFF,))
+
+
+def measured(kind: Wt61Kind, vector: Vector, celsius: float) -> Wt61Packet:
+    """Packet of a measurement in SI units, clipped to the unit's range."""
+    unit = _ACCELERATION if kind is Wt61Kind.ACCELERATION else _RATE
+    x, y, z = (max(-_MOST, min(_MOST, round(value / unit))) for value in vector)
+    return Wt61Packet(kind, x, y, z, round((celsius - 36.53) * 340))
+
+
+class Wt61Parser:
+    """Collects bytes to packets; counts the bytes that belong to none."""
+
+    def __init__(self) -> None:
+        self.refused = 0
+        self._buffer = bytearray()
+
+    def feed(self, data: bytes) -> list[Wt61Packet]:
+        """Packets that became complete."""
+        self._buffer += data
+        packets = []
+        while (packet := self._next()) is not None:
+            packets.append(packet)
+        return packets
+
+    def _next(self) -> Wt61Packet | None:
+        buffer = self._buffer
+        while len(buffer) >= SIZE:
+            known = buffer[0] == HEADER and buffer[1] in tuple(Wt61Kind)
+            if known and sum(buffer[: SIZE - 1]) & 0xFF == buffer[SIZE - 1]:
+                _, kind, *numbers = _BODY.unpack(buffer[: SIZE - 1])
+                del buffer[:SIZE]
+                return Wt61Packet(Wt61Kind(kind), *numbers)
+            del buffer[0]
+            self.refused += 1
+        return None
