@@ -6,6 +6,7 @@ from dataclasses import asdict
 from typing import Any
 
 from monstertruck_kinematics.identification import MeasuredCircle, fit_circles, skid_model
+from monstertruck_runtime.errors import InputError
 from monstertruckd.tools.study import published
 from monstertruckd.tools.study.analysis import Circle, StraightPasses, circle, line
 from monstertruckd.tools.study.log import Run
@@ -14,11 +15,21 @@ Result = tuple[Run, Circle | StraightPasses]
 
 
 def analyse(runs: Sequence[Run]) -> list[Result]:
-    """Every run with what it says. Raises as ``analysis.circle`` and ``line`` do."""
-    return [
-        (run, line(run.times, run.poses, run.directions) if run.straight else circle(run.times, run.poses))
-        for run in runs
-    ]
+    """Every run with what it says.
+
+    Raises:
+        InputError: one of them says nothing; named, with the reason of ``analysis.circle`` or ``line``.
+    """
+    return [(run, _found(run)) for run in runs]
+
+
+def _found(run: Run) -> Circle | StraightPasses:
+    try:
+        if run.straight:
+            return line(run.times, run.poses, run.directions)
+        return circle(run.times, run.poses)
+    except InputError as error:
+        raise InputError(f"{run.name}: {error}") from error
 
 
 def as_values(results: Sequence[Result], radius: float, half_track: float) -> dict[str, Any]:

@@ -7,6 +7,8 @@ import pytest
 
 from monstertruck_runtime.errors import InputError
 from monstertruckd.tools.study.analysis import centre_track, circle, line, velocities
+from monstertruckd.tools.study.log import Run
+from monstertruckd.tools.study.report import analyse
 
 ARM = (0.005, -0.21)
 
@@ -117,3 +119,10 @@ def test_a_line_without_a_pass_says_so():
         line(times, poses, 0.0 * directions)
     with pytest.raises(InputError, match="finite"):
         line(times, poses * math.nan, directions)
+
+
+def test_a_run_that_says_nothing_is_named():
+    times, poses = circling(seconds=1.0)
+    short = Run(0.785, 1.57, times, poses, np.ones_like(times))
+    with pytest.raises(InputError, match=r"2:1, 1\.57 rad/s: 20 poses of the stand: expected at least 40"):
+        analyse([short])
