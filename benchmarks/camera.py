@@ -29,7 +29,8 @@ from monstertruck_runtime.mailbox import fifo
 from monstertruck_runtime.yaml_files import read_yaml, yaml_text
 from monstertruck_schemas import topics
 from monstertruck_schemas.sensor import CompressedImage
-from monstertruckd.tools.demo.runs import connect, free_endpoint, program, write_overlay
+from monstertruckd.tools.demo.runs import connect, free_endpoint, write_overlay
+from monstertruckd.tools.simulation.program import program
 
 FULL = Path(__file__).resolve().parents[1] / "configs" / "full.yaml"
 GOAL = 0.5

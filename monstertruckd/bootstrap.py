@@ -23,6 +23,10 @@ import zipfile
 from pathlib import Path
 from subprocess import DEVNULL
 
+if sys.version_info < (3, 11):  # noqa: UP036  # here, because older versions cannot evaluate the annotations below
+    print(f"Python 3.11 or newer is needed; this is {platform.python_version()}.", file=sys.stderr)
+    sys.exit(2)
+
 UV_VERSION = "0.13.8"
 WHEEL_SHA256 = {
     "x86_64": "e18a57b8b352eb7c8feb317b9f6f533c8f0ad9673fd6cf34bbe3cf1a9f6a8984",
@@ -50,9 +54,6 @@ EXTRAS = {"demo": ("sim",), "check": ("dev",), "sync": ("dev",)}
 
 def main(arguments: list[str]) -> int:
     """Entry point; returns the exit code of what was run."""
-    if sys.version_info < (3, 11):  # noqa: UP036  # this file also runs where nothing is installed yet
-        print(f"Python 3.11 or newer is needed; this is {platform.python_version()}.", file=sys.stderr)
-        return 2
     if not arguments or arguments[0] not in EXTRAS:
         print(__doc__)
         return 0 if arguments[:1] in ([], ["-h"], ["--help"]) else 2
@@ -81,14 +82,18 @@ def sync(extras: tuple[str, ...]) -> None:
         "--frozen",
         "--inexact",
         "--compile-bytecode",
-        "--quiet",
+        *(() if sys.stderr.isatty() else ("--quiet",)),
         "--system-certs",
         "--python",
         sys.executable,
         *flags,
     ]
     environment = {name: value for name, value in os.environ.items() if name != "VIRTUAL_ENV"}
-    subprocess.run(command, cwd=ROOT, env=environment, check=True)
+    if not VENV.exists():
+        print(f"Setting up {VENV}: some hundred megabytes the first time ...", file=sys.stderr)
+    code = subprocess.run(command, cwd=ROOT, env=environment, check=False).returncode
+    if code:
+        raise SystemExit(f"uv could not set up {VENV}: the reason is above; the command can be run again.")
 
 
 def find_uv() -> str:
@@ -103,14 +108,21 @@ def find_uv() -> str:
         if place.is_file() and sha256(place.read_bytes()) == PROGRAM_SHA256[machine]:
             return str(place)
     print(f"Fetching uv {UV_VERSION} ...", file=sys.stderr)
-    program = fetch_uv(machine)
+    try:
+        program = fetch_uv(machine)
+    except OSError as error:
+        raise SystemExit(f"uv {UV_VERSION} cannot be fetched: {error}. Is the package index in reach?") from None
     if sha256(program) != PROGRAM_SHA256[machine]:
         raise SystemExit(f"uv {UV_VERSION}: the program in the wheel has another sha256; not used.")
-    cache.mkdir(parents=True, exist_ok=True)
-    scratch = target.with_suffix(f".{os.getpid()}")
-    scratch.write_bytes(program)
-    scratch.chmod(0o755)
-    scratch.replace(target)
+    try:
+        cache.mkdir(parents=True, exist_ok=True)
+        scratch = target.with_suffix(f".{os.getpid()}")
+        scratch.write_bytes(program)
+        scratch.chmod(0o755)
+        scratch.replace(target)
+    except OSError as error:
+        reason = f"{cache} cannot be written: {error.strerror}"
+        raise SystemExit(f"{reason}. Name a folder of yours: XDG_CACHE_HOME=FOLDER") from None
     return str(target)
 
 

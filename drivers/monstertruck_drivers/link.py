@@ -311,14 +311,20 @@ class SerialPort:
         except serial.SerialException as error:
             raise self._open_error(error) from error
         except (OSError, termios.error) as error:
-            raise DeviceLostError(f"{self.name}: {error}") from error
+            raise DeviceLostError(f"{self.name}: {error.args[-1]}") from error
         with contextlib.suppress(OSError, termios.error):
             termios.tcflush(tty.fileno(), termios.TCIOFLUSH)
         return _SerialProtocol(self.name, tty).link
 
     def _open_error(self, error: serial.SerialException) -> Exception:
         busy = error.errno in (errno.EBUSY, errno.EWOULDBLOCK, errno.EAGAIN) or "exclusively lock" in str(error)
-        return PortBusyError(f"{self.name}: held by another process") if busy else DeviceLostError(str(error))
+        if busy:
+            return PortBusyError(f"{self.name}: held by another process")
+        cause = error.__context__
+        number = cause.args[0] if error.errno is None and isinstance(cause, termios.error) else error.errno
+        if number is None:
+            return DeviceLostError(f"{self.name}: {error}")
+        return DeviceLostError(f"{self.name}: {'no serial port' if number == errno.ENOTTY else os.strerror(number)}")
 
 
 class _SerialProtocol(asyncio.Protocol):

@@ -78,7 +78,7 @@ class Reason(StrEnum):
     TICK_STALLED = "tick_stalled", 61, "the control tick came too late"
     DRIVE_FAULT = "drive_fault", 62, "drive controller is in fault"
     SERVICE_FAILED = "service_failed", 63, "a service failed"
-    NOT_ARMED_SPEED = "not_armed_speed", 64, "arming refused: the truck or the stick is not at rest"
+    NOT_ARMED_SPEED = "not_armed_speed", 64, "the truck or the stick is not at rest"
     SHUTDOWN = "shutdown", 65, "the daemon is stopping"
     STEERING_DEAD = "steering_dead", 66, "the truck does not turn as it is steered"
     IMPOSSIBLE_MOTION = "impossible_motion", 67, "this body cannot move like that"

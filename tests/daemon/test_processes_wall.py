@@ -247,6 +247,30 @@ async def test_a_second_daemon_is_refused_clearly(tmp_path: Path):
             assert all(row.restarts == 0 for row in health.services), health
 
 
+async def test_one_terminal_holds_truck_and_daemon_and_the_daemon_ends_first(tmp_path: Path):
+    async with robot(tmp_path) as truck:
+        truck.simulator = await truck.spawn("simulate", "--run", "--config", str(truck.config))
+        async with truck.client() as client:
+            health = await client.get_retained(topics.HEALTH)
+        assert health is not None
+        assert await end(truck.simulator) == 0
+        said = (tmp_path / "simulate.txt").read_text()
+        assert "bug" not in said
+        assert "lost" not in said
+        assert info(truck.logs()[0])["damage"] is None
+
+
+async def test_a_daemon_that_cannot_start_ends_the_truck_with_its_exit_code(tmp_path: Path):
+    async with robot(tmp_path) as truck:
+        await truck.start_simulator()
+        await truck.start_daemon()
+        async with truck.client():
+            other = tmp_path / "other.yaml"
+            other.write_text(truck.config.read_text().replace(f"{tmp_path}/", f"{tmp_path}/other/"))
+            second = await truck.spawn("simulate", "--run", "--config", str(other))
+            assert await asyncio.wait_for(second.wait(), 30) == Reason.BUSY.exit_code
+
+
 def _run(config: Path) -> subprocess.CompletedProcess[str]:
     arguments = [sys.executable, "-m", "monstertruckd", "run", "--config", str(config)]
     return subprocess.run(arguments, cwd=ROOT, capture_output=True, text=True, timeout=30, check=False)

@@ -1,5 +1,8 @@
 """The bootstrap runs the pinned uv and no other, wherever it comes from."""
 
+import ast
+import subprocess
+import urllib.error
 from pathlib import Path
 
 import pytest
@@ -65,9 +68,51 @@ def test_bytecode_is_compiled_with_the_environment(monkeypatch: pytest.MonkeyPat
     """Where Python may not write it, every process would compile all libraries anew."""
     commands: list[list[str]] = []
     monkeypatch.setattr(bootstrap, "find_uv", lambda: "uv")
-    monkeypatch.setattr(bootstrap.subprocess, "run", lambda command, **_: commands.append(command))
+
+    def run(command: list[str], **_: object) -> subprocess.CompletedProcess[str]:
+        commands.append(command)
+        return subprocess.CompletedProcess(command, 0)
+
+    monkeypatch.setattr(bootstrap.subprocess, "run", run)
     bootstrap.sync(("dev",))
     assert "--compile-bytecode" in commands[0]
+
+
+def test_packages_that_cannot_be_had_are_one_sentence(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(bootstrap, "find_uv", lambda: "uv")
+    failed = subprocess.CompletedProcess([], 2)
+    monkeypatch.setattr(bootstrap.subprocess, "run", lambda *_, **__: failed)
+    with pytest.raises(SystemExit, match=r"^uv could not set up .*can be run again\.$"):
+        bootstrap.sync(("dev",))
+
+
+def test_without_a_network_the_error_is_one_sentence(cache: Path, monkeypatch: pytest.MonkeyPatch):
+    def offline(_: str) -> bytes:
+        raise urllib.error.URLError(ConnectionRefusedError(111, "Connection refused"))
+
+    monkeypatch.setattr(bootstrap, "fetch_uv", offline)
+    with pytest.raises(SystemExit, match=r"^uv .* cannot be fetched: .*refused.*in reach\?$"):
+        bootstrap.find_uv()
+
+
+def test_a_home_that_cannot_be_written_is_named_with_a_way_out(cache: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", "/proc/nobody")
+    with pytest.raises(SystemExit, match=r"^/proc/nobody/monstertruckd cannot be written: .*XDG_CACHE_HOME=FOLDER$"):
+        bootstrap.find_uv()
+
+
+def test_python_3_6_reads_as_far_as_the_message_about_its_version(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    source = Path(bootstrap.__file__).read_text()
+    body = ast.parse(source, feature_version=(3, 6)).body
+    check = next(index for index, node in enumerate(body) if isinstance(node, ast.If))
+    assert all(isinstance(node, ast.Expr | ast.Import | ast.ImportFrom) for node in body[:check])
+    monkeypatch.setattr(bootstrap.sys, "version_info", (3, 6, 15))
+    with pytest.raises(SystemExit) as end:
+        exec(compile(source, "bootstrap.py", "exec"), {"__name__": "bootstrap", "__file__": bootstrap.__file__})
+    assert end.value.code == 2
+    assert "Python 3.11 or newer is needed" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from monstertruck_runtime.clock import Clock
 from monstertruckd.tools.cli.options import ConfigOption, SimulatedOption
 from monstertruckd.tools.cli.output import (
     JsonOption,
@@ -77,6 +78,7 @@ def _print(rows: list[tuple[str, str]], messages: dict[str, int]) -> None:
 def simulate(
     config: ConfigOption,
     truth: Annotated[Path | None, typer.Option("--truth", help="Write what really happened (npz) at the end.")] = None,
+    run: Annotated[bool, typer.Option("--run", help="Run the daemon of the same configuration, too.")] = False,
 ) -> None:
     """Serve a simulated truck's devices behind ptys at the ports its configuration names.
 
@@ -87,4 +89,12 @@ def simulate(
     from monstertruckd.tools.simulation.simulate import serve
 
     simulated = load_simulated(config)
-    until_stopped(lambda clock: serve(clock, simulated, truth))
+    code = 0
+
+    async def main(clock: Clock) -> None:
+        nonlocal code
+        code = await serve(clock, simulated, truth, config if run else None)
+
+    until_stopped(main)
+    if code:
+        raise typer.Exit(code)

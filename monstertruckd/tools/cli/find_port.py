@@ -114,7 +114,9 @@ def require_place(path: Path, role: str) -> YamlText:
     """
     try:
         text = YamlText(path.read_text(encoding="utf-8"), path)
-    except (OSError, UnicodeDecodeError) as error:
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror}") from error
+    except UnicodeDecodeError as error:
         raise InputError(f"{path}: {error}") from error
     except ConfigError as error:
         raise InputError(str(error)) from error
@@ -142,4 +144,4 @@ def write_port(path: Path, role: str, port: UsbPortConfig) -> None:
     try:
         replace_file(path, text.text)
     except OSError as error:
-        raise InputError(f"{path}: {error}") from error
+        raise InputError(f"{path}: {error.strerror}") from error

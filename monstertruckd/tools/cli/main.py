@@ -25,7 +25,7 @@ from monstertruckd.tools.cli import (
     study,
     usb,
 )
-from monstertruckd.tools.cli.output import HELP_STYLE, HELP_WIDTH, CommandGroup
+from monstertruckd.tools.cli.output import HELP_SETTINGS, HELP_STYLE, CommandGroup
 
 app = typer.Typer(
     name="monstertruckd",
@@ -34,7 +34,7 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=HELP_STYLE,
-    context_settings=HELP_WIDTH,
+    context_settings=HELP_SETTINGS,
 )
 
 

@@ -7,9 +7,7 @@ import asyncio
 import contextlib
 import gc
 import os
-import signal
 import socket
-import sys
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -28,6 +26,7 @@ from monstertruckd.config.migrate import VERSION
 from monstertruckd.tools.demo.summary import Summary, log_figures
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 from monstertruckd.tools.simulation.operator import Lap, LocalOperator, drive_lap
+from monstertruckd.tools.simulation.program import program
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 from monstertruckd.tools.status.screen import draw
 from monstertruckd.tools.status.watch import PERIOD, Follower
@@ -164,31 +163,6 @@ def free_endpoint() -> str:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-
-
-@asynccontextmanager
-async def program(output: Path, *arguments: str) -> AsyncIterator[asyncio.subprocess.Process]:
-    """Run ``monstertruckd arguments`` while the context lasts; SIGTERM ends it, its output goes to a file."""
-    with output.open("wb") as stream:
-        process = await asyncio.create_subprocess_exec(
-            sys.executable,
-            "-m",
-            "monstertruckd",
-            *arguments,
-            stdin=asyncio.subprocess.DEVNULL,
-            stdout=stream,
-            stderr=stream,
-        )
-    ended = asyncio.create_task(process.wait())
-    try:
-        yield process
-    finally:
-        with contextlib.suppress(ProcessLookupError):
-            process.send_signal(signal.SIGTERM)
-        done, _ = await asyncio.wait([ended], timeout=15)
-        if not done:
-            process.kill()
-            await ended
 
 
 async def connect(clock: Clock, robot: str, endpoint: str) -> TruckClient:

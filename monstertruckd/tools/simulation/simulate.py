@@ -5,9 +5,10 @@ import signal
 import sys
 from array import array
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AsyncExitStack, ExitStack, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
-from monstertruck_runtime.errors import InputError, NotFoundError
+from monstertruck_runtime.errors import InputError, NotFoundError, NotPermittedError
 from monstertruck_runtime.memory import settle
 from monstertruck_sim.computer import EmulatedComputer, hangs_by_hub
 from monstertruck_sim.console import Commanded, Emulated, EmulatedFiles, FaultConsole
@@ -27,6 +28,7 @@ from monstertruck_sim.robot import SimulatedRobot
 from monstertruck_sim.stand import SimulatedStand
 from monstertruck_sim.world.world import World
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
+from monstertruckd.tools.simulation.program import program
 
 TRUTH_PERIOD = SECOND // 20
 STAND_RETRY = 1.0
@@ -58,26 +60,41 @@ class TruthLog:
         return np.array(self._samples).reshape(-1, len(self.COLUMNS))
 
 
-async def serve(clock: Clock, config: SimulatedTruckConfig, truth: Path | None) -> None:
+async def serve(
+    clock: Clock, config: SimulatedTruckConfig, truth: Path | None = None, daemon_of: Path | None = None
+) -> int:
     """Serve the devices of ``config`` behind ptys at their configured ports until SIGTERM or SIGINT.
 
     Faults are read from standard input, each line beginning with the device's role, the monitor's name, or ``usb``.
 
+    Args:
+        clock: time.
+        config: the truck.
+        truth: file of what really happened.
+        daemon_of: configuration of a daemon that is run meanwhile: stopped before the devices go, and when it ends by
+            itself they go, too.
+
+    Returns:
+        The daemon's exit code if it ended by itself, else 0.
+
     Raises:
+        NotPermittedError: this user may not make a port there.
         InputError: ``machine`` names an existing file or folder instead of a link to the emulated computer, or so does
             a port.
         BusyError: another program serves one of the ports.
         OSError: a port cannot be made.
     """
     links = [it.port.path for it in config.devices.present().values() if isinstance(it.port, PortConfig)]
-    for link in links:
-        link.parent.mkdir(parents=True, exist_ok=True)
-    with (
-        reserved(*links),
-        TemporaryDirectory(prefix="monstertruck-") as folder,
-        _linked(config, Path(folder)),
-    ):
-        await _serve(clock, config, Path(folder), truth)
+    with ExitStack() as stack:
+        try:
+            for link in links:
+                link.parent.mkdir(parents=True, exist_ok=True)
+            stack.enter_context(reserved(*links))
+        except PermissionError as error:
+            raise NotPermittedError(f"{error.filename}: this user may not make a port there") from error
+        folder = Path(stack.enter_context(TemporaryDirectory(prefix="monstertruck-")))
+        stack.enter_context(_linked(config, folder))
+        return await _serve(clock, config, folder, truth, daemon_of)
 
 
 @contextmanager
@@ -98,7 +115,9 @@ def _linked(config: SimulatedTruckConfig, folder: Path) -> Iterator[None]:
         link.unlink(missing_ok=True)
 
 
-async def _serve(clock: Clock, config: SimulatedTruckConfig, folder: Path, truth: Path | None) -> None:
+async def _serve(
+    clock: Clock, config: SimulatedTruckConfig, folder: Path, truth: Path | None, daemon_of: Path | None
+) -> int:
     devices = config.devices.present()
     cables: dict[str, EmulatedPort] = {}
     for role, device in devices.items():
@@ -114,7 +133,7 @@ async def _serve(clock: Clock, config: SimulatedTruckConfig, folder: Path, truth
     stop = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
-    tasks = [
+    tasks: list[asyncio.Task[Any]] = [
         asyncio.create_task(robot.run(), name="robot"),
         asyncio.create_task(log.run(), name="truth"),
         asyncio.create_task(FaultConsole(emulated, sys.stdin, _say).run(), name="console"),
@@ -129,7 +148,13 @@ async def _serve(clock: Clock, config: SimulatedTruckConfig, folder: Path, truth
     waiting = asyncio.create_task(stop.wait())
     settle()
     _say("ready")
-    await asyncio.wait([waiting, *tasks], return_when=asyncio.FIRST_COMPLETED)
+    async with AsyncExitStack() as stack:
+        code = None
+        if daemon_of is not None:
+            daemon = await stack.enter_async_context(program(None, "run", "--config", str(daemon_of)))
+            tasks.append(code := asyncio.create_task(daemon.wait(), name="daemon"))
+        await asyncio.wait([waiting, *tasks], return_when=asyncio.FIRST_COMPLETED)
+        ended_by = code.result() if code is not None and code.done() else 0
     for task in (waiting, *tasks):
         task.cancel()
     results = await asyncio.gather(*tasks, return_exceptions=True)
@@ -138,6 +163,7 @@ async def _serve(clock: Clock, config: SimulatedTruckConfig, folder: Path, truth
     for result in results:
         if isinstance(result, Exception):
             raise result
+    return ended_by
 
 
 async def _see(clock: Clock, config: SimulatedTruckConfig, world: World) -> None:

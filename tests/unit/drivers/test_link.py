@@ -232,6 +232,13 @@ async def test_all_that_arrives_can_be_listened_to():
     assert heard == [(True, b"ping"), (False, b"pong")]
 
 
+async def test_what_is_no_serial_port_is_said_in_words(tmp_path: Path):
+    with pytest.raises(DeviceLostError, match=r"^/dev/null: no serial port$"):
+        await SerialPort(Path("/dev/null")).open()
+    with pytest.raises(DeviceLostError, match=r": Is a directory$"):
+        await SerialPort(tmp_path).open()
+
+
 async def test_serial_port_over_a_pty(tmp_path: Path):
     pty = PtyPort(tmp_path / "dev")
     port = SerialPort(tmp_path / "dev")

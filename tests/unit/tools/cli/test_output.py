@@ -184,6 +184,18 @@ def test_remarks_never_stand_among_results():
     assert (done.returncode, done.stdout) == (Reason.NOT_FOUND.exit_code, "")
 
 
+@pytest.mark.parametrize("words", [[], ["status"], ["log"], ["log", "list"], ["goto"]])
+def test_h_is_help_everywhere(words: list[str], capsys: pytest.CaptureFixture[str]):
+    texts = []
+    for option in ("-h", "--help"):
+        with pytest.raises(SystemExit) as ended:
+            app([*words, option])
+        assert not ended.value.code
+        texts.append(capsys.readouterr().out)
+    assert texts[0] == texts[1]
+    assert "Usage" in texts[0]
+
+
 def test_every_group_has_the_same_help():
     def styles(command: Any) -> Iterator[str | None]:
         yield command.rich_markup_mode

@@ -1,0 +1,43 @@
+"""Other commands of this program as processes, for those that need several at once."""
+
+import asyncio
+import signal
+import sys
+from collections.abc import AsyncIterator
+from contextlib import ExitStack, asynccontextmanager, suppress
+from pathlib import Path
+from typing import Final
+
+TIME_TO_END: Final = 15.0
+"""Seconds that a program may take to end."""
+
+
+@asynccontextmanager
+async def program(output: Path | None, *arguments: str) -> AsyncIterator[asyncio.subprocess.Process]:
+    """Run ``monstertruckd arguments`` while the context lasts; SIGTERM ends it.
+
+    Args:
+        output: file of what it prints; None = where this program prints.
+        arguments: command and options.
+    """
+    with ExitStack() as stack:
+        stream = None if output is None else stack.enter_context(output.open("wb"))
+        process = await asyncio.create_subprocess_exec(
+            sys.executable,
+            "-m",
+            "monstertruckd",
+            *arguments,
+            stdin=asyncio.subprocess.DEVNULL,
+            stdout=stream,
+            stderr=stream,
+        )
+    ended = asyncio.create_task(process.wait())
+    try:
+        yield process
+    finally:
+        with suppress(ProcessLookupError):
+            process.send_signal(signal.SIGTERM)
+        done, _ = await asyncio.wait([ended], timeout=TIME_TO_END)
+        if not done:
+            process.kill()
+            await ended
