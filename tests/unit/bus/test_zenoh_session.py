@@ -23,8 +23,9 @@ from monstertruck_runtime.mailbox import fifo
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import DriveRequest, GoalRequest, Role
+from monstertruck_schemas.sensor import StandPose
 from monstertruck_schemas.state import Grid
-from monstertruck_schemas.topics import GATE, MAP, POSE, REQ_DRIVE, REQ_GOAL, TOPICS, Writer
+from monstertruck_schemas.topics import GATE, MAP, POSE, REQ_DRIVE, REQ_GOAL, STAND_POSE, TOPICS, Writer
 from monstertruckd.bus.call_limits import CALL_RATE, MAX_WAITING
 from monstertruckd.bus.local import Bus
 from monstertruckd.bus.rpc import Rpc
@@ -498,3 +499,30 @@ async def test_who_asks_right_after_an_answer_gets_what_it_says():
             newest = await client.get_retained(GATE)
             assert newest is not None
             assert newest.seq == number
+
+
+async def test_what_a_test_stand_sees_comes_in_for_the_recorder_where_it_is_asked_for_and_does_not_go_out():
+    pose = StandPose(
+        stamp=3,
+        received=3,
+        seq=1,
+        frame="map",
+        pose=Pose2D(x=0.1, y=0.2, yaw=0.3),
+        observer="overhead",
+        position_sigma=0.0,
+        heading_sigma=0.0,
+    )
+    async with running_robot(witness=True) as robot, running_robot() as deaf:
+        for bridge, heard in ((robot, True), (deaf, False)):
+            seen: list[StandPose] = []
+            bridge.bus.tap(lambda _t, message, _d, _a, seen=seen: seen.append(message), [STAND_POSE])
+            async with (
+                TruckClient("truck", bridge.endpoint) as stand,
+                TruckClient("truck", bridge.endpoint) as station,
+            ):
+                echoes = station.subscribe(STAND_POSE, fifo(10))
+                await asyncio.sleep(0.1)
+                stand.witness(pose)
+                await asyncio.sleep(0.3)
+                assert [message.pose for message in seen] == [pose.pose] * heard
+                assert len(echoes.drain()) <= 1  # the stand's own, never the robot's
