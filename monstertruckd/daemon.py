@@ -296,6 +296,7 @@ class Daemon:
             nonce=nonce,
             battery_measured=measures_battery(config),
             latched=latch.engaged(),
+            sonars=self._body.sonars,
         )
         shafts = len(self._body.chassis.shafts)
         drives, steering = bus.actuators(shafts)
@@ -309,6 +310,7 @@ class Daemon:
                 drives=tuple(bus.subscribe(topic, latest()) for topic in DRIVES[:shafts]),
                 steering=bus.subscribe(topics.STEERING, latest()),
                 battery=bus.subscribe(topics.BATTERY, latest()),
+                sonar=bus.subscribe(topics.SONAR, latest()) if self._body.sonars else None,
             ),
             GateOutputs(
                 drives, steering, bus.publisher(topics.GATE, Writer.GATE), bus.publisher(topics.STOP, Writer.GATE)

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from monstertruck_drivers.host_health.config import HostHealthConfig
     from monstertruck_drivers.link_quality.config import LinkQualityConfig
     from monstertruck_drivers.maestro.config import MaestroConfig
+    from monstertruck_drivers.srf08.config import Srf08Config
 
 C = TypeVar("C", bound=Schema)
 
@@ -164,6 +165,8 @@ if TYPE_CHECKING:
         compass: Device[Schema] | None = None
         stabiliser: Device[Ax12Config] | None = None
         camera: Device[Schema] | None = None
+        sonar: Device[Srf08Config] | None = None
+        imu: Device[Schema] | None = None
 
     class Monitors(_Monitors):
         """By name only what the robot's own code asks for."""

@@ -1,6 +1,6 @@
 """Builds transforms, odometry and SLAM of a configuration, each with its ends of the bus."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Final, Self
 
@@ -37,13 +37,17 @@ class Body:
     footprint: Footprint
     points: ScanPoints
     """Of the newest scan."""
+    sonars: Mapping[str, tuple[float, float, float]]
+    """Pose of every sonar in base that guards the robot, m, m, rad: of one without a lidar."""
 
     @classmethod
     def of(cls, config: TruckConfig) -> Self:
         """Of a configured robot."""
         lidar = config.devices.lidar
         points = ScanPoints(lidar.mount.planar if lidar is not None else (0.0, 0.0, 0.0))
-        return cls(config.chassis(), Footprint(config.geometry.length, config.geometry.width), points)
+        sonar = config.devices.sonar if lidar is None else None
+        mounts = {} if sonar is None else {name: one.mount.planar for name, one in sonar.driver.sonars.items()}
+        return cls(config.chassis(), Footprint(config.geometry.length, config.geometry.width), points, mounts)
 
 
 def build_estimation(config: TruckConfig, bus: Bus, clock: Clock, body: Body) -> Iterator[Service]:

@@ -104,6 +104,17 @@ class ObstacleLimits(Schema):
     """Whether a scan without any range is believed: otherwise it counts as none, whatever its beams say."""
 
 
+class SonarLimits(Schema):
+    """What counts of the echoes of a robot without a lidar."""
+
+    stale_after: Annotated[float, Field(gt=0, le=1)] = topics.SONAR.fresh_for()
+    """Age of the newest round of pings, and of a sonar's newest answer, s, from which on it does not count."""
+    core: Annotated[float, Field(gt=0, le=1)] = 0.2
+    """Angle from the axis of a sonar that does not look where the robot goes, within which its echo may be, rad."""
+    unseen_speed: Positive = 0.1
+    """Speed limit where a sonar does not answer or none looks, m/s."""
+
+
 class ShaftCheckConfig(Schema):
     """When a driven shaft does not turn although it is commanded to."""
 
@@ -129,6 +140,8 @@ class GateConfig(Schema):
     """Greatest axle angle, rad; less where the servos' pulses reach less."""
     acceleration: Positive = 0.5
     """Growth of the commanded speed of base and wheels, m/s^2."""
+    yaw_acceleration: Annotated[float, Field(gt=0, le=20)] = 6.0
+    """Growth of the commanded yaw rate, rad/s^2."""
     deceleration: Positive = 1.0
     """Least deceleration of the drive controller's profile after a command of speed 0, m/s^2."""
     quick_deceleration: Positive = 1.2
@@ -186,6 +199,7 @@ class GateConfig(Schema):
     battery_low_speed: Positive = 0.1
     """Speed limit with a low battery, or a stale battery voltage, m/s."""
     obstacle: ObstacleLimits = ObstacleLimits()
+    sonar: SonarLimits = SonarLimits()
     event_interval: Share = 1.0
     """Least seconds between two equal events."""
 
@@ -325,6 +339,7 @@ WEAKER_ABOVE: Final = (
     "reverse_speed",
     "angle",
     "acceleration",
+    "yaw_acceleration",
     "deceleration",
     "quick_deceleration",
     "steering_rate",
@@ -353,6 +368,8 @@ WEAKER_ABOVE: Final = (
     "battery_low_speed",
     "obstacle.deceleration",
     "obstacle.unseen_speed",
+    "sonar.stale_after",
+    "sonar.unseen_speed",
     "blocked.within",
     "blocked.speed",
     "short_faults",
@@ -369,6 +386,7 @@ WEAKER_BELOW: Final = (
     "obstacle.crawl",
     "obstacle.memory_distance",
     "obstacle.seen",
+    "sonar.core",
     "blocked.share",
     "short_faults_within",
 )

@@ -26,12 +26,13 @@ from monstertruck_schemas.event import Cause, Event, Severity
 from monstertruck_schemas.health import HealthTable
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import UNCONDITIONAL, ControlRequest, DriveForm, DriveRequest, Order, Role
-from monstertruck_schemas.sensor import Attitude, Battery, DriveFeedback, LaserScan, SteeringFeedback
+from monstertruck_schemas.sensor import Attitude, Battery, DriveFeedback, LaserScan, SonarRanges, SteeringFeedback
 from monstertruck_schemas.state import GateMode
 from monstertruckd.gate.arbitration import EventLog, GateEvent, GateStateMachine, Source, Sources
 from monstertruckd.gate.config import GateConfig
 from monstertruckd.gate.limiter import CommandLimiter, Motion, ObstacleGuard
 from monstertruckd.gate.sensors import DRIVE_LOSSES, STALE_SENSORS, Assessment, SensorMonitor, ShaftCheck, SteeringCheck
+from monstertruckd.gate.sonars import SonarGuard
 from monstertruckd.gate.stops import CauseBuilder, Outages, StopLog, Trip
 
 URGENT: Final = frozenset(
@@ -51,7 +52,7 @@ DISARMING: Final = frozenset(
 )
 """After these the truck must be armed again, however short they were."""
 
-HALTS: Final = frozenset({Reason.OBSTACLE_STOP, Reason.LIDAR_BLIND})
+HALTS: Final = frozenset({Reason.OBSTACLE_STOP, Reason.LIDAR_BLIND, Reason.SONAR_STALE, Reason.SONAR_BLIND})
 """Limits of the pace that allow none: the truck stands, and its driver keeps it."""
 
 
@@ -113,6 +114,7 @@ class Gate:
         nonce: of this run; requests must carry it.
         battery_measured: something is there to measure the battery.
         latched: whether the emergency stop was latched when the daemon last ran.
+        sonars: pose (x, y, yaw) of every sonar in base by name, of a robot that has no lidar; m, m, rad.
     """
 
     def __init__(
@@ -126,6 +128,7 @@ class Gate:
         nonce: str,
         battery_measured: bool,
         latched: bool,
+        sonars: Mapping[str, tuple[float, float, float]] | None = None,
     ) -> None:
         self._config = config
         self._chassis = chassis
@@ -133,8 +136,9 @@ class Gate:
         self._sensors = SensorMonitor(config, chassis, services, battery_measured=battery_measured)
         self._outages = Outages(services)
         self._obstacles = ObstacleGuard(config, footprint, points)
+        self._sonars = SonarGuard(config, footprint, sonars) if sonars else None
         self._motion = Motion(config, chassis)
-        self._limiter = CommandLimiter(config, self._motion, self._obstacles, self._sensors)
+        self._limiter = CommandLimiter(config, self._motion, self._obstacles, self._sensors, self._sonars)
         self._steering_check = SteeringCheck(config.turning) if config.turning is not None else None
         self._shaft_check = ShaftCheck(config.blocked) if config.blocked is not None else None
         self._causes = CauseBuilder(config, self._sensors, self._limiter, self._steering_check, self._shaft_check)
@@ -165,6 +169,11 @@ class Gate:
         """Take the newest scan."""
         if self._sensors.observe_scan(scan):
             self._obstacles.observe(scan)
+
+    def observe_sonar(self, ranges: SonarRanges) -> None:
+        """Take the newest round of the sonars."""
+        if self._sonars is not None:
+            self._sonars.observe(ranges)
 
     def observe_attitude(self, attitude: Attitude) -> None:
         """Take the newest attitude."""

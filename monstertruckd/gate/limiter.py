@@ -37,6 +37,7 @@ from monstertruck_schemas.req import DriveRequest, RequestedTwist
 from monstertruck_schemas.sensor import NO_ECHO, VALID_BEAM, LaserScan
 from monstertruckd.gate.config import GateConfig
 from monstertruckd.gate.sensors import SensorMonitor
+from monstertruckd.gate.sonars import SonarGuard
 
 POSES: Final = 20
 """Poses checked along the swept path, at least: a corner that turns faster than the base travels has more of them."""
@@ -449,9 +450,8 @@ class ObstacleGuard:
 
     def allowed_speed(self, free: float, now: int) -> float:
         """Greatest pace from which the body stops comfortably within ``free`` metres, m/s."""
-        room = max(free - self._config.obstacle.ahead, 0.0)
-        delay, deceleration = self._delay(now), self._config.obstacle.deceleration
-        return deceleration * (math.sqrt(delay**2 + 2 * room / deceleration) - delay)
+        limits = self._config.obstacle
+        return comfortable_speed(free - limits.ahead, self._delay(now), limits.deceleration)
 
     def too_near(self, free: float, speed: float, now: int) -> bool:
         """Whether an ordinary stop from the pace ``speed`` needs more than ``free`` metres."""
@@ -463,6 +463,11 @@ class ObstacleGuard:
     @staticmethod
     def _stopping(speed: float, delay: float, deceleration: float) -> float:
         return speed * delay + speed**2 / (2 * deceleration)
+
+
+def comfortable_speed(room: float, delay: float, deceleration: float) -> float:
+    """Greatest speed from which a body that brakes after ``delay`` s stands within ``room`` metres, m/s."""
+    return deceleration * (math.sqrt(delay**2 + 2 * max(room, 0.0) / deceleration) - delay)
 
 
 SATURATED: Final = 1e-4
@@ -665,6 +670,8 @@ class Motion:
         growing = self.pace(target) > self.pace(self.twist)
         rate = self._config.acceleration if growing else self._config.deceleration
         share = min(rate * dt / step, 1.0)
+        if growing and change[2] != 0:
+            share = min(share, self._config.yaw_acceleration * dt / abs(change[2]))
         x, y, turn = (now + share * part for now, part in zip(self.twist, change, strict=True))
         self.twist = target if share == 1.0 else (x, y, turn)
 
@@ -682,13 +689,22 @@ class CommandLimiter:
         motion: commanded motion.
         obstacles: swept footprint against the newest scan.
         sensors: newest samples.
+        sonars: swept footprint against the newest echoes; None = the robot has a lidar, or no range sensor at all.
     """
 
-    def __init__(self, config: GateConfig, motion: Motion, obstacles: ObstacleGuard, sensors: SensorMonitor) -> None:
+    def __init__(
+        self,
+        config: GateConfig,
+        motion: Motion,
+        obstacles: ObstacleGuard,
+        sensors: SensorMonitor,
+        sonars: SonarGuard | None = None,
+    ) -> None:
         self._config = config
         self._motion = motion
         self._obstacles = obstacles
         self._sensors = sensors
+        self._sonars = sonars
         self.blocked = False
         """An obstacle ahead allows no motion."""
         self.blind = False
@@ -729,6 +745,7 @@ class CommandLimiter:
             limits[Reason.CLIPPED] = max_pace
         if pace > 0 or not motion.standing:
             self._check_obstacles(now, wanted, shafts, limits)
+            self._check_sonars(now, wanted, shafts, limits)
         allowed = min((*limits.values(), max_pace))
         factor = 1.0 if pace <= allowed else allowed / pace
         if allowed == 0:
@@ -744,6 +761,32 @@ class CommandLimiter:
         """Distance travelled if stopped now, m, by the greater of measured and commanded speed."""
         speed = max(abs(self._sensors.speed(now) or 0.0), *map(abs, self._motion.shaft_speeds))
         return speed * self._config.reaction + speed**2 / (2 * self._config.deceleration)
+
+    def _check_sonars(self, now: int, wanted: Twist[float], shafts: Speeds | None, limits: dict[Reason, float]) -> None:
+        """Sweep the footprint along the commanded motion and along ``wanted`` against the sonars' echoes."""
+        sonars, motion, config = self._sonars, self._motion, self._config
+        if sonars is None:
+            return
+        if not sonars.fresh(now):
+            limits[Reason.SONAR_STALE] = 0.0
+            return
+        courses = ((wanted, motion.pace(wanted, shafts)), (motion.twist, motion.present_pace))
+        ways = [_scaled(twist, 1.0 / pace) for twist, pace in courses if twist != STILL]
+        delay = sonars.delay(now) + config.reaction
+        reach = config.obstacle.ahead + config.speed * (delay + config.speed / (2 * config.obstacle.deceleration))
+        views = [sonars.look(way, reach, now) for way in ways]
+        free = min((view.free for view in views), default=math.inf)
+        self.free = free if math.isfinite(free) else None
+        allowed = comfortable_speed(free - config.obstacle.ahead, delay, config.obstacle.deceleration)
+        self.blocked = allowed < (2 * config.obstacle.crawl if self.blocked else config.obstacle.crawl)
+        if self.blocked:
+            limits[Reason.OBSTACLE_STOP] = 0.0
+        elif allowed < max(pace for _, pace in courses):
+            limits[Reason.OBSTACLE_SLOW] = allowed
+        if any(view.dead for view in views):
+            limits[Reason.SONAR_BLIND] = 0.0
+        elif any(view.unknown for view in views):
+            limits[Reason.SONAR_SLOW] = config.sonar.unseen_speed
 
     def _check_obstacles(
         self, now: int, wanted: Twist[float], shafts: Speeds | None, limits: dict[Reason, float]

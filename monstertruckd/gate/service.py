@@ -19,7 +19,7 @@ from monstertruck_schemas.event import Event, Severity, Stop
 from monstertruck_schemas.health import HealthTable
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import ControlRequest, DriveRequest
-from monstertruck_schemas.sensor import Attitude, Battery, DriveFeedback, LaserScan, SteeringFeedback
+from monstertruck_schemas.sensor import Attitude, Battery, DriveFeedback, LaserScan, SonarRanges, SteeringFeedback
 from monstertruck_schemas.state import GateMode, GateState
 from monstertruckd.gate.core import Decision, Gate, GateOutput
 from monstertruckd.gate.latch import Latch
@@ -84,6 +84,8 @@ class GateInputs:
     """One per driven shaft."""
     steering: Subscription[SteeringFeedback]
     battery: Subscription[Battery]
+    sonar: Subscription[SonarRanges] | None = None
+    """Of a robot that has sonars."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,6 +158,7 @@ class GateService:
             *(_Feed(drive, partial(gate.observe_drive, shaft=i)) for i, drive in enumerate(inputs.drives)),
             _Feed(inputs.steering, gate.observe_steering),
             _Feed(inputs.battery, gate.observe_battery),
+            *(() if inputs.sonar is None else (_Feed(inputs.sonar, gate.observe_sonar),)),
         ]
 
     @property

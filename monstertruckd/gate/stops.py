@@ -66,6 +66,7 @@ class CauseBuilder:
             Reason.STEERING_DEAD: self._turn,
             Reason.OBSTACLE_STOP: self._obstacle,
             Reason.LIDAR_BLIND: self._unseen,
+            Reason.SONAR_BLIND: self._obstacle,
             Reason.SHAFT_BLOCKED: self._blocked_shaft,
         }
 

@@ -40,6 +40,7 @@ AS_THE_SPEED = {
     "tilt.slow_speed": "above gate.speed it is no limit, and named; a slow robot has the defaults above its speed",
     "battery_low_speed": "likewise",
     "obstacle.unseen_speed": "likewise",
+    "sonar.unseen_speed": "likewise",
 }
 """Settings that are weaker the greater they are, and have no ceiling of their own, with the reason."""
 

@@ -46,6 +46,8 @@ DELIVERED = {
         "memory_distance": 1.0,
         "open_ground": False,
     },
+    "sonar": {"stale_after": 0.3, "core": 0.2, "unseen_speed": 0.1},
+    "yaw_acceleration": 6.0,
     "event_interval": 1.0,
 }
 

@@ -1,0 +1,137 @@
+"""Obstacles by sonars: the swept footprint against arcs, for robots without a lidar.
+
+An echo is somewhere on the arc of its range across the sonar's cone. The rule for the unknown bearing:
+
+- Of a sonar that looks where the robot goes, to within ``ALIGNED``, the whole arc counts.
+- Of every other one the part within ``gate.sonar.core`` of its axis counts: the rest of the arc would put a wall that
+  the robot drives along into its way. What stands there is in the cone of the sonar ahead before it is reached.
+- The newest two rounds count, for sound that is reflected away leaves a round without its echo.
+
+A sonar that does not answer leaves its cone unknown: one that looks where the robot goes stops it, any other one slows
+it, and so does a direction into which none looks.
+"""
+
+import math
+from collections import deque
+from collections.abc import Mapping
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from monstertruck_kinematics.elementary import Array
+from monstertruck_planners.collision import Footprint, first_contact, swept_poses
+from monstertruck_runtime.clock import SECOND
+from monstertruck_schemas.sensor import SonarRanges
+from monstertruckd.gate.config import GateConfig
+
+ALIGNED: Final = 0.3
+"""Greatest angle between axis and direction of travel, rad, for a sonar to look where the robot goes."""
+SPACING: Final = 0.02
+"""Between the points of an arc, m."""
+STEP: Final = 0.02
+"""Between the poses of a sweep, m."""
+ROUNDS: Final = 2
+TURNING: Final = 0.3
+"""A motion whose base travels less than this per metre of pace turns on the spot: no sonar looks where it goes."""
+
+Place = tuple[float, float, float]
+Way = tuple[float, float, float]
+
+
+class SonarView(NamedTuple):
+    """What the sonars say of a motion."""
+
+    free: float
+    """Distance that the footprint can travel, m; +inf = no obstacle within reach."""
+    dead: tuple[str, ...]
+    """Sonars that look where the robot goes and do not answer."""
+    unknown: bool
+    """Another sonar does not answer, or none looks where the robot goes."""
+
+
+class SonarGuard:
+    """Sweeps the footprint along a motion against the echoes.
+
+    Args:
+        config: the gate's limits.
+        footprint: the body's outline.
+        mounts: pose (x, y, yaw) of every sonar in base by name, m, m, rad.
+    """
+
+    def __init__(self, config: GateConfig, footprint: Footprint, mounts: Mapping[str, Place]) -> None:
+        self._config = config
+        self._footprint = footprint
+        self._mounts = mounts
+        self._rounds: deque[SonarRanges] = deque(maxlen=ROUNDS)
+        self._answered: dict[str, int] = {}
+        """When every sonar answered last, ns."""
+        self.view = SonarView(math.inf, (), False)
+        """Of the newest motion that was looked at."""
+
+    def observe(self, ranges: SonarRanges) -> None:
+        """Take a round of pings; one that is too late is left out."""
+        if abs(ranges.received - ranges.stamp) > self._config.max_latency * SECOND:
+            return
+        self._rounds.append(ranges)
+        self._answered |= {sonar.name: ranges.received for sonar in ranges.sonars if sonar.answered}
+
+    def fresh(self, now: int) -> bool:
+        """Whether there is a round that is not too old."""
+        return bool(self._rounds) and now - self._rounds[-1].received <= self._config.sonar.stale_after * SECOND
+
+    def look(self, way: Way, reach: float, now: int) -> SonarView:
+        """Sweep a motion.
+
+        Args:
+            way: twist per metre of pace, m/m, m/m, rad/m.
+            reach: distance swept, m.
+            now: ns.
+        """
+        ahead = self._ahead(way)
+        oldest = now - round(self._config.sonar.stale_after * SECOND)
+        silent = [name for name in self._mounts if self._answered.get(name, -1) < oldest]
+        points = self._points(ahead, now)
+        corner = math.hypot(way[0], way[1]) + abs(way[2]) * self._footprint.circumscribed_radius
+        distances = np.linspace(0.0, reach, max(2, math.ceil(reach * max(corner, 1.0) / STEP) + 1))
+        contact = first_contact(
+            self._footprint, swept_poses(way, distances), points, self._config.obstacle.side_clearance
+        )
+        free = math.inf if contact is None else float(distances[contact - 1])
+        dead = tuple(name for name in silent if name in ahead)
+        unknown = len(silent) > len(dead) or (not ahead and math.hypot(way[0], way[1]) >= TURNING)
+        self.view = SonarView(free, dead, unknown)
+        return self.view
+
+    def delay(self, now: int) -> float:
+        """Age of the newest round, s."""
+        return max(now - self._rounds[-1].stamp, 0) / SECOND if self._rounds else 0.0
+
+    def _ahead(self, way: Way) -> frozenset[str]:
+        """Sonars that look where the base goes."""
+        if math.hypot(way[0], way[1]) < TURNING:
+            return frozenset()
+        travel = math.atan2(way[1], way[0])
+        return frozenset(
+            name for name, (_, _, yaw) in self._mounts.items() if abs(math.remainder(yaw - travel, math.tau)) <= ALIGNED
+        )
+
+    def _points(self, ahead: frozenset[str], now: int) -> Array:
+        """Points of all arcs in base, (n, 2), m."""
+        arcs = [np.empty((0, 2))]
+        for ranges in self._rounds:
+            if now - ranges.received > self._config.sonar.stale_after * SECOND:
+                continue
+            for sonar in ranges.sonars:
+                if sonar.range is not None and sonar.answered and sonar.name in self._mounts:
+                    half = ranges.field_of_view / 2
+                    half = half if sonar.name in ahead else min(half, self._config.sonar.core)
+                    arcs.append(arc(self._mounts[sonar.name], sonar.range, half))
+        return np.concatenate(arcs)
+
+
+def arc(place: Place, distance: float, half: float) -> Array:
+    """Points at ``distance``, m, within ``half``, rad, of a sonar's axis, in base, (n, 2)."""
+    x, y, yaw = place
+    count = max(3, math.ceil(2 * half * distance / SPACING) + 1)
+    angles = yaw + np.linspace(-half, half, count)
+    return np.column_stack((x + distance * np.cos(angles), y + distance * np.sin(angles)))
