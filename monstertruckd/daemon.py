@@ -20,6 +20,7 @@ from monstertruck_drivers.epos.config import EposConfig
 from monstertruck_drivers.link import Port
 from monstertruck_drivers.maestro.config import MaestroConfig
 from monstertruck_kinematics.chassis import Chassis
+from monstertruck_planners.behave.service import BehaviourService, register_behaviour_calls
 from monstertruck_planners.goals.service import GoalService, register_goal_calls
 from monstertruck_planners.steps import CODEC
 from monstertruck_runtime.actors.actor import ActorFactory
@@ -156,6 +157,8 @@ class Daemon:
                 self._start(planners, service)
                 if isinstance(service, GoalService):
                     register_goal_calls(self.rpc, service, self.clock)
+                if isinstance(service, BehaviourService):
+                    register_behaviour_calls(self.rpc, service)
             if self._notify is not None:
                 self._notify.up()
             await stop.wait()

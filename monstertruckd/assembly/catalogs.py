@@ -5,7 +5,7 @@ from typing import Any, Final, NamedTuple
 
 from monstertruck_drivers.catalog import DEVICES
 from monstertruck_estimation.catalog import ODOMETRY
-from monstertruck_planners.behave.catalog import BEHAVIOURS
+from monstertruck_planners.behave.catalog import BEHAVIOURS, LEVELLING
 from monstertruck_planners.local.catalog import LOCAL_PLANNERS
 from monstertruck_planners.route.catalog import ROUTE_PLANNERS
 from monstertruck_planners.track.catalog import TRACKERS
@@ -23,6 +23,7 @@ TABLES: Final[tuple[ExtensibleTable[Any], ...]] = (
     LOCAL_PLANNERS,
     TRACKERS,
     BEHAVIOURS,
+    LEVELLING,
     BY_NAME,
 )
 

@@ -5,7 +5,8 @@ from typing import Any, Final
 
 from monstertruck_drivers.config import Devices
 from monstertruck_kinematics.chassis import Chassis
-from monstertruck_planners.behave.catalog import BEHAVIOURS
+from monstertruck_planners.behave.catalog import LEVELLING
+from monstertruck_planners.behave.service import BehaviourService
 from monstertruck_planners.collision import Footprint
 from monstertruck_planners.goals.config import PlannerConfig
 from monstertruck_planners.goals.deformation import RouteDeformation
@@ -36,9 +37,10 @@ STEP_DEADLINE: Final = 5.0
 
 def build_planners(config: TruckConfig, bus: Bus, clock: Clock, body: Body, actors: ActorFactory) -> Iterator[Service]:
     """Path source and tracker where one is configured; the lidar's levelling; the map's picture."""
-    if config.tracker is not None:
+    requests = bus.publisher(topics.PLAN_DRIVE, Writer.PLANNER) if config.tracker or config.behaviours else None
+    if config.tracker is not None and requests is not None:
         tracker = config.tracker.model_copy(update={"angle": min(config.tracker.angle, body.chassis.reached_angle)})
-        paths, requests = bus.publisher(topics.PATH, Writer.PLANNER), bus.publisher(topics.PLAN_DRIVE, Writer.PLANNER)
+        paths = bus.publisher(topics.PATH, Writer.PLANNER)
         frame = "odom" if config.slam is None else "map"
         drawn = None
         if config.path is not None:
@@ -48,6 +50,7 @@ def build_planners(config: TruckConfig, bus: Bus, clock: Clock, body: Body, acto
             clock,
             bus.subscribe(topics.REQ_PATH, fifo(4)),
             bus.subscribe(topics.GATE, latest()),
+            bus.subscribe(topics.BEHAVIOUR, latest()),
             paths,
             bus.event_sink(),
             config.gate.max_request_age,
@@ -55,8 +58,10 @@ def build_planners(config: TruckConfig, bus: Bus, clock: Clock, body: Body, acto
         yield _build_tracker(config, tracker, bus, clock, body, requests, actors)
         if config.planner is not None:
             yield build_goals(config, config.planner, bus, clock, body.chassis, body.footprint, paths, requests, actors)
+    if config.behaviours and requests is not None:
+        yield BehaviourService(config.behaviours, clock, bus, requests, config.gate.max_request_age)
     if config.devices.stabiliser is not None and config.devices.compass is not None:
-        yield BEHAVIOURS.implementation(config.levelling)(config.levelling, clock, bus)
+        yield LEVELLING.implementation(config.levelling)(config.levelling, clock, bus)
     if config.map is not None and config.devices.lidar is not None:
         yield MapService(
             config.map,
@@ -160,6 +165,7 @@ def build_goals(
             scan=bus.subscribe(topics.SCAN, latest()) if lidar is not None else None,
             grid=bus.subscribe(topics.MAP, latest()) if mapped else None,
             ground=bus.subscribe(topics.GROUND, latest()),
+            behaviour=bus.subscribe(topics.BEHAVIOUR, latest()),
         ),
         outputs=GoalOutputs(path, planner_request, bus.publisher(topics.GOAL, Writer.PLANNER), bus.event_sink()),
         deformation=_deformation(config, setup, bus, clock, actors),

@@ -17,7 +17,7 @@ from monstertruck_estimation.odometry import OdometryConfig
 from monstertruck_estimation.slam.config import SlamConfig
 from monstertruck_kinematics.chassis import AXLES, WHEEL_REACH, Chassis, Dimensions
 from monstertruck_kinematics.truck import DriveTrain
-from monstertruck_planners.behave.catalog import AnyLevelling
+from monstertruck_planners.behave.catalog import AnyBehaviour, AnyLevelling
 from monstertruck_planners.behave.stabiliser import StabiliserConfig
 from monstertruck_planners.goals.config import DRIVEN, PlannerConfig
 from monstertruck_planners.track.catalog import AnyTracker
@@ -116,6 +116,10 @@ class TruckConfig(Schema):
     tracker: AnyTracker | None = None
     planner: PlannerConfig | None = None
     """How goals are reached; null = the robot follows paths only"""
+    behaviours: dict[Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,31}$")], AnyBehaviour] = Field(
+        default_factory=dict
+    )
+    """What reacts to sensors without a path, by name; started by `behave start`"""
     placement: PlacementConfig = PlacementConfig()
     path: PathConfig | None = None
     map: MapRender | None = None
@@ -204,6 +208,8 @@ class TruckConfig(Schema):
         for excess in (*beyond(self.gate, body), *beyond_devices(self.devices, self.monitors, self.gate, body)):
             raise ValueError(excess)
         self._check_planner()
+        if self.behaviours and (lack := self.missing_actuators()):
+            raise ValueError(f"behaviours need {lack}")
         if self.slam is not None and self.devices.lidar is None:
             raise ValueError("slam needs the device lidar")
         if self.slam is not None and self.slam.mode == "localisation" and self.slam.map is None:

@@ -34,6 +34,7 @@ from monstertruck_schemas.plan import Path as DrivePath
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import (
     UNCONDITIONAL,
+    BehaviourOrder,
     ControlRequest,
     DriveRequest,
     GoalOrder,
@@ -327,6 +328,16 @@ class TruckClient(Operator):
     async def goal_control(self, order: GoalOrder) -> None:
         """Pause, resume or cancel the goal. Raises as ``goal`` does."""
         await self.call("goal_control", {**await self._answered(1.0), "order": order})
+
+    async def behave(self, order: BehaviourOrder, behaviour: str = "") -> dict[str, Any]:
+        """Start a configured behaviour, or stop it; answers with its ``number``. Progress is on ``plan/behaviour``.
+
+        Raises:
+            RequestRefusedError: why it does not start, or nothing runs.
+            NotFoundError: the robot is not there, or has no such behaviour.
+            NoAnswerError: no answer in time.
+        """
+        return await self.call("behave", {**await self._answered(1.0), "order": order, "behaviour": behaviour})
 
     async def path(self, path: DrivePath, lease: float = 1.0) -> None:
         """Request to follow a path computed here. Raises as ``drive`` does."""

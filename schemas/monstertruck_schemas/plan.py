@@ -108,6 +108,31 @@ class GoalState(Message):
     """Recovery behaviours run so far."""
 
 
+class BehaviourState(Message):
+    """Progress of a behaviour, in the ``frame`` of odometry."""
+
+    number: Annotated[int, Field(ge=0)] = 0
+    """Counts the behaviours started since the start of the daemon; 0 = none yet."""
+    behaviour: str = ""
+    """Its name in the configuration."""
+    kind: str = ""
+    source: str = ""
+    """Who started it."""
+    running: bool = False
+    phase: str = ""
+    """What it is doing; the names are those of its kind."""
+    outcome: Reason = Reason.OK
+    """DRIVING while it runs, then BEHAVIOUR_DONE, CANCELLED, or why it stopped."""
+    text: str = ""
+    """The outcome in words."""
+    elapsed: Annotated[float, Field(ge=0)] = 0.0
+    """Seconds since it was started."""
+    travelled: Annotated[float, Field(ge=0)] = 0.0
+    """Metres by odometry since it was started."""
+    values: dict[str, float] = Field(default_factory=dict)
+    """Measurements of its kind, such as the distance from a wall, m."""
+
+
 class StabiliserCommand(Message):
     """Joint angles the lidar's mount has to take, see ``sensor.StabiliserFeedback`` for order and signs."""
 

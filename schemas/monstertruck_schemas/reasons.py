@@ -168,3 +168,10 @@ class Reason(StrEnum):
     RECOVERING = "recovering", 0, "a way out of trouble is tried"
     PAUSED = "paused", 0, "the way to the goal is interrupted"
     RESUMED = "resumed", 0, "the way to the goal goes on"
+
+    # Behaviours
+    INPUT_STALE = "input_stale", 120, "a behaviour has no fresh input"
+    INPUT_CONTRADICTORY = "input_contradictory", 121, "the inputs of a behaviour contradict each other"
+    NOT_OBEYED = "not_obeyed", 122, "the gate does not carry out what a behaviour asks for"
+    BEHAVIOUR_STARTED = "behaviour_started", 0, "a behaviour was started"
+    BEHAVIOUR_DONE = "behaviour_done", 0, "a behaviour did what it was started for"

@@ -193,6 +193,21 @@ class GoalControl(Request):
     order: GoalOrder
 
 
+class BehaviourOrder(StrEnum):
+    """What can be asked about behaviours."""
+
+    START = "start"
+    STOP = "stop"
+
+
+class BehaviourRequest(Request):
+    """Start a configured behaviour, or stop the one that runs."""
+
+    order: BehaviourOrder
+    behaviour: Annotated[str, Field(max_length=64)] = ""
+    """Name of the behaviour to start; of a stop: only that one, empty = whichever runs."""
+
+
 class PathRequest(Request):
     """A path computed off board, to be tracked."""
 

@@ -27,7 +27,7 @@ from monstertruck_schemas.health import (
     RecorderHealth,
     SlamHealth,
 )
-from monstertruck_schemas.plan import GoalState, Path, StabiliserCommand, TrackerState
+from monstertruck_schemas.plan import BehaviourState, GoalState, Path, StabiliserCommand, TrackerState
 from monstertruck_schemas.req import ControlRequest, DriveRequest, GoalControl, GoalRequest, PathRequest
 from monstertruck_schemas.sensor import (
     Attitude,
@@ -195,6 +195,10 @@ CLOCK: Final = Topic("state/clock", ClockOffset, W.DAEMON, "Real time minus daem
 PATH: Final = Topic("plan/path", Path, W.PLANNER, "Path being tracked", retained=True, foxglove="foxglove.PosesInFrame")
 TRACKER: Final = Topic("plan/tracker", TrackerState, W.PLANNER, "Tracking error and progress", 20, stale_after=0.5)
 GOAL: Final = Topic("plan/goal", GoalState, W.PLANNER, "Progress towards the goal", 2, retained=True)
+BEHAVIOUR: Final = Topic(
+    "plan/behaviour", BehaviourState, W.PLANNER, "Progress of the running behaviour, or how the last one ended", 5,
+    retained=True,
+)  # fmt: skip
 PLAN_DRIVE: Final = Topic(
     "plan/drive", DriveRequest, W.PLANNER, "The planners' drive requests to the gate", 20, stale_after=0.3
 )

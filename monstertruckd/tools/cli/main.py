@@ -4,6 +4,7 @@ import typer
 
 from monstertruckd import __version__
 from monstertruckd.tools.cli import (
+    behave,
     calibrate,
     config,
     demo,
@@ -78,6 +79,7 @@ app.command("find-port")(usb.find_port)
 app.command("doctor")(doctor.doctor)
 app.command("install-service")(service.install_service)
 app.command("uninstall-service")(service.uninstall_service)
+app.add_typer(behave.app, name="behave")
 app.add_typer(config.app, name="config")
 app.add_typer(calibrate.app, name="calibrate")
 app.add_typer(logs.app, name="log")

@@ -74,6 +74,7 @@ def replayable(config: TruckConfig) -> TruckConfig:
             "slam": slam,
             "path": None,
             "map": None,
+            "behaviours": {},
             "placement": PlacementConfig(),
         }
     )

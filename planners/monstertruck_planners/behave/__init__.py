@@ -1,1 +1,1 @@
-"""Behaviours other than driving along a path: keeping the lidar level."""
+"""Behaviours: motion in reaction to sensors, without a path; and keeping the lidar level."""

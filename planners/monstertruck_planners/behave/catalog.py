@@ -1,12 +1,34 @@
-"""Behaviours by ``kind``: services that react to sensors directly, without a path."""
+"""Behaviours by ``kind``: what reacts to sensors directly, without a path; and what keeps the lidar level."""
 
 from typing import Annotated, Final
 
+from monstertruck_planners.behave.api import BehaviourConfig
 from monstertruck_runtime.plugins import Catalog, Plugin
 from monstertruck_schemas.base import Schema
 
 BEHAVIOURS: Final = Catalog(
     "monstertruck.behaviours",
+    Plugin(
+        name="wall_pd",
+        settings="monstertruck_planners.behave.wall.config:WallPdConfig",
+        implementation="monstertruck_planners.behave.wall.published:WallPd",
+        doc="Follows a wall by PD control of its distance (coursework, method 1)",
+    ),
+    Plugin(
+        name="wall_switching",
+        settings="monstertruck_planners.behave.wall.config:WallSwitchingConfig",
+        implementation="monstertruck_planners.behave.wall.published:WallSwitching",
+        doc="Follows a wall by turning away and back (coursework, method 2)",
+    ),
+    base=BehaviourConfig,
+)
+"""A behaviour is a ``Behaviour`` made from its settings; it asks for motion through the gate."""
+
+AnyBehaviour = Annotated[BehaviourConfig, BEHAVIOURS.section()]
+"""One of the configuration's section `behaviours`."""
+
+LEVELLING: Final = Catalog(
+    "monstertruck.levelling",
     Plugin(
         name="stabiliser",
         settings="monstertruck_planners.behave.stabiliser:StabiliserConfig",
@@ -14,7 +36,7 @@ BEHAVIOURS: Final = Catalog(
         doc="Keeps the lidar level by the compass",
     ),
 )
-"""A behaviour is a function that makes a ``Service`` from its settings, the clock and the bus (a ``BusPort``)."""
+"""Levelling is a function that makes a ``Service`` from its settings, the clock and the bus (a ``BusPort``)."""
 
-AnyLevelling = Annotated[Schema, BEHAVIOURS.section("stabiliser")]
+AnyLevelling = Annotated[Schema, LEVELLING.section("stabiliser")]
 """The configuration's section `levelling`."""

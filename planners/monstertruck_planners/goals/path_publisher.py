@@ -11,7 +11,7 @@ from monstertruck_planners.goals.exchange import PlanAnswer, Pose, pose_of
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.mailbox import Mailbox
 from monstertruck_runtime.ports import EventSink, Publisher, Subscription
-from monstertruck_schemas.plan import GoalState, Path, TrackerState
+from monstertruck_schemas.plan import BehaviourState, GoalState, Path, TrackerState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import DriveRequest, GoalControl, GoalRequest, Role
 from monstertruck_schemas.sensor import LaserScan
@@ -43,6 +43,7 @@ class GoalInputs:
     grid: Subscription[Grid] | None
     """None = the configured map."""
     ground: Subscription[Ground] | None = None
+    behaviour: Subscription[BehaviourState] | None = None
 
 
 @dataclass(frozen=True, slots=True)

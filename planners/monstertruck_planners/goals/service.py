@@ -204,11 +204,15 @@ class GoalService:
         return state
 
     def _examine(self, request: Request, kind: str, *, moves: bool) -> None:
+        behaviour = None if self._in.behaviour is None else self._in.behaviour.latest
         reason = refusal(
             request, self._in.gate.latest, self._sequences[kind], self._clock.now(), self._max_age if moves else None
         )
         if reason is not Reason.OK:
             raise RequestRefusedError(reason)
+        if moves and behaviour is not None and behaviour.running:
+            text = f"the behaviour {behaviour.behaviour} of {behaviour.source} is running, stop it first"
+            raise RequestRefusedError(Reason.BUSY, text)
 
     # Observations
 

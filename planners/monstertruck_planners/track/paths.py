@@ -13,7 +13,7 @@ from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
 from monstertruck_runtime.requests import Sequences, refusal
 from monstertruck_runtime.small_files import require_file
 from monstertruck_schemas.event import Severity
-from monstertruck_schemas.plan import Path
+from monstertruck_schemas.plan import BehaviourState, Path
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import PathRequest
 from monstertruck_schemas.state import GateState
@@ -79,6 +79,7 @@ class PathService:
         clock: time.
         requests: ``req/path``.
         gate: state of the gate.
+        behaviour: ``plan/behaviour``.
         out: ``plan/path``.
         events: where events go.
         max_age: seconds; see ``GateConfig.max_request_age``.
@@ -92,6 +93,7 @@ class PathService:
         clock: Clock,
         requests: Subscription[PathRequest],
         gate: Subscription[GateState],
+        behaviour: Subscription[BehaviourState],
         out: Publisher[Path],
         events: EventSink,
         max_age: float,
@@ -100,6 +102,7 @@ class PathService:
         self._clock = clock
         self._requests = requests
         self._gate = gate
+        self._behaviour = behaviour
         self._out = out
         self._events = events
         self._max_age = max_age
@@ -134,6 +137,9 @@ class PathService:
             raise RequestRefusedError(reason)
         if gate is not None and gate.mode.moving:
             raise RequestRefusedError(Reason.BUSY, f"the truck is {gate.mode}, stop it first")
+        behaviour = self._behaviour.latest
+        if behaviour is not None and behaviour.running:
+            raise RequestRefusedError(Reason.BUSY, f"the behaviour {behaviour.behaviour} is running, stop it first")
         check_path(request.path)
 
     def _publish(self, path: Path) -> None:

@@ -16,7 +16,7 @@ from monstertruck_schemas.plan import MAX_POSES, Path
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import PathRequest, Role
 from monstertruck_schemas.state import GateMode, GateState
-from monstertruck_schemas.topics import EVENT, GATE, PATH, REQ_PATH, Writer
+from monstertruck_schemas.topics import BEHAVIOUR, EVENT, GATE, PATH, REQ_PATH, Writer
 from monstertruckd.bus.local import Bus
 from tests.unit.planners.kit import path, straight
 
@@ -37,6 +37,7 @@ class Bench:
             clock,
             self.bus.subscribe(REQ_PATH, fifo(4)),
             self.bus.subscribe(GATE, latest()),
+            self.bus.subscribe(BEHAVIOUR, latest()),
             self.bus.publisher(PATH, Writer.PLANNER),
             self.bus.event_sink(),
             0.5,

@@ -1,0 +1,330 @@
+"""The two published ways of following a wall by sonars, step by step as their author describes them.
+
+Only the times that were set by hand are replaced: the approach ends by the ranges, the lap by odometry. Ramps keep
+their published weakness: one that a change of phase cuts short jumps to the end value it would have had.
+All is written for a wall on the left; a wall on the right is the mirror image.
+"""
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar, Final, Literal, NamedTuple
+
+from monstertruck_kinematics.profiles import CubicRamp
+from monstertruck_planners.behave.api import BehaviourStep, Inputs, RequestedMotion
+from monstertruck_planners.behave.wall.config import WallConfig, WallPdConfig, WallSwitchingConfig
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.sensor import SonarRanges
+from monstertruck_schemas.state import Odometry
+from monstertruck_schemas.topics import ODOMETRY, SONAR, Topic
+
+DIAGONAL: Final = math.radians(45)
+"""Angle between the side sonar and the diagonal one."""
+SILENT: Final = 0.5
+"""Seconds without any answer of a sonar after which it counts as dead."""
+FROZEN: Final = 0.6
+"""Angle, rad, over which a sonar's range cannot stay the same to the last digit."""
+STALL: Final = 1.0
+"""Seconds of motion asked for without any after which a motor counts as stalled."""
+AT_REST: Final = 0.01
+"""m/s."""
+
+NAMES: Final = {"left": ("l", "fl", "f", "fr"), "right": ("r", "fr", "f", "fl")}
+
+Phase = Literal["approach", "follow", "turn_away", "free", "turn_back", "stop"]
+
+
+class Ranges(NamedTuple):
+    """What the sonars measure, m, as seen with the wall on the left."""
+
+    side: float
+    diagonal: float
+    front: float
+    far: float
+    """The diagonal one of the other side."""
+
+
+def wall_angle(diagonal: float, side: float, offset: float = 0.0) -> float:
+    """Heading away from the wall, rad: atan((a cos th - b)/(a sin th + offset)) with th = 45 degrees.
+
+    Args:
+        diagonal: a, m.
+        side: b, m.
+        offset: of the diagonal sonar ahead of the side one, m; the source leaves it out, exactly only when parallel.
+    """
+    return math.atan2(diagonal * math.cos(DIAGONAL) - side, diagonal * math.sin(DIAGONAL) + offset)
+
+
+def wall_distance(diagonal: float, side: float, offset: float = 0.0) -> float:
+    """Perpendicular distance from the side sonar to the wall, m."""
+    return side * math.cos(wall_angle(diagonal, side, offset))
+
+
+@dataclass(frozen=True, slots=True)
+class TimedRamp:
+    """A speed that changes by the published cubic, from ``begin`` on."""
+
+    begin: float
+    shape: CubicRamp
+
+    def at(self, t: float) -> float:
+        """Speed at t."""
+        return self.shape.speed(t - self.begin)
+
+
+def ramp(begin: float, start: float, end: float, duration: float) -> TimedRamp:
+    """From ``start`` to ``end`` without acceleration at both ends."""
+    return TimedRamp(begin, CubicRamp(start, end, duration))
+
+
+@dataclass(frozen=True, slots=True)
+class SonarWatch:
+    """Notices sonars that are silent, and ranges that do not change although the robot turns."""
+
+    answered: dict[str, float] = field(default_factory=dict)
+    """When each answered last, s."""
+    echoes: dict[str, tuple[float, float]] = field(default_factory=dict)
+    """Newest range of each, m, and when it came, s."""
+    changed: dict[str, tuple[float, float]] = field(default_factory=dict)
+    """Range of each when it changed last, m, and how far the robot had turned then, rad."""
+
+    def observe(self, sonars: SonarRanges, names: tuple[str, ...], turned: float, t: float) -> "SonarWatch":
+        """After a message at t, with ``turned`` rad turned so far, left and right both counted."""
+        answered, echoes, changed = dict(self.answered), dict(self.echoes), dict(self.changed)
+        for name in names:
+            echo = sonars.echo(name)
+            answered.setdefault(name, t)
+            if echo is None or not echo.answered:
+                continue
+            answered[name] = t
+            if echo.range is not None:
+                echoes[name] = (echo.range, t)
+            value = math.inf if echo.range is None else echo.range
+            if name not in changed or changed[name][0] != value or not math.isfinite(value):
+                changed[name] = (value, turned)
+        return SonarWatch(answered, echoes, changed)
+
+    def fault(self, turned: float, t: float) -> tuple[Reason, str] | None:
+        """What is wrong with the sonars at t."""
+        for name, at in self.answered.items():
+            if t - at >= SILENT:
+                return Reason.INPUT_STALE, f"sonar {name} has not answered for {t - at:.1f} s"
+        for name, (value, at) in self.changed.items():
+            if turned - at > FROZEN:
+                degrees = math.degrees(turned - at)
+                return (
+                    Reason.INPUT_CONTRADICTORY,
+                    f"sonar {name} measures {value:.3f} m although the robot turned by {degrees:.0f} degrees",
+                )
+        return None
+
+    def range(self, name: str, hold: float, furthest: float, t: float) -> float:
+        """The newest echo if it is not older than ``hold``, else the greatest range, m."""
+        value, at = self.echoes.get(name, (furthest, -math.inf))
+        return value if t - at <= hold else furthest
+
+
+@dataclass(frozen=True, slots=True)
+class WallState:
+    """Between two steps."""
+
+    phase: Phase = "approach"
+    v: TimedRamp | None = None
+    w: TimedRamp | None = None
+    error: float | None = None
+    """Of the sample before, m."""
+    watch: SonarWatch = field(default_factory=SonarWatch)
+    pose: tuple[float, float, float] | None = None
+    turned: float = 0.0
+    """Rad, both ways counted."""
+    travelled: float = 0.0
+    begun: tuple[float, float, float] | None = None
+    """Pose where following began."""
+    since: float = 0.0
+    """Way since then or since the last lap, m."""
+    laps: int = 0
+    asked: float = 0.0
+    """Speed asked for at the step before, m/s."""
+    moving_since: float | None = None
+    """Since when motion is asked for without any, s."""
+
+
+class _Wall:
+    """What both methods share: input checks, odometry, laps, the mirror."""
+
+    reads: ClassVar[tuple[Topic[Any], ...]] = (SONAR, ODOMETRY)
+
+    def __init__(self, config: WallConfig) -> None:
+        self._shared = config
+        self._names = NAMES[config.side]
+        self._mirror = 1.0 if config.side == "left" else -1.0
+
+    def begin(self) -> WallState:
+        """Before the first step."""
+        return WallState()
+
+    def step(self, inputs: Inputs, state: WallState, t: float) -> BehaviourStep:
+        """One step; see ``Behaviour``."""
+        sonars, odometry = inputs.of(SONAR), inputs.of(ODOMETRY)
+        state = _moved(state, odometry)
+        state = replace(state, watch=state.watch.observe(sonars, self._names, state.turned, t))
+        fault = state.watch.fault(state.turned, t)
+        state = _watched(state, odometry.twist.vx, t)
+        if fault is None and state.moving_since is not None and t - state.moving_since >= STALL:
+            fault = Reason.STUCK, f"{state.asked:.2f} m/s asked for, {odometry.twist.vx:.2f} m/s driven"
+        if fault is not None:
+            return BehaviourStep(None, state, state.phase, *fault)
+        hold, furthest = self._shared.hold, sonars.range_max
+        ranges = Ranges(*(state.watch.range(name, hold, furthest, t) for name in self._names))
+        state = self._lap(state, t)
+        if state.phase == "stop":
+            return self._stopping(state, ranges, t)
+        state, v, w = self._drive(state, ranges, t)
+        return self._answer(replace(state, asked=v), v, w, ranges)
+
+    def _drive(self, state: WallState, ranges: Ranges, t: float) -> tuple[WallState, float, float]:
+        raise NotImplementedError
+
+    def _distance(self, ranges: Ranges) -> float:
+        return ranges.side
+
+    def _answer(self, state: WallState, v: float, w: float, ranges: Ranges) -> BehaviourStep:
+        values = {"distance": self._distance(ranges), "travelled": state.travelled, "laps": float(state.laps)}
+        return BehaviourStep(RequestedMotion(v, w * self._mirror), state, state.phase, values=values)
+
+    def _to(
+        self, state: WallState, phase: Phase, t: float, v: tuple[float, float], w: tuple[float, float]
+    ) -> WallState:
+        """Change the phase, with ramps of v and w from and to nominal values."""
+        duration = self._shared.ramp
+        begun = state.pose if state.begun is None and phase != "approach" else state.begun
+        return replace(
+            state, phase=phase, v=ramp(t, *v, duration), w=ramp(t, *w, duration), error=None, begun=begun,
+            since=0.0 if state.begun is None else state.since,
+        )  # fmt: skip
+
+    def _lap(self, state: WallState, t: float) -> WallState:
+        """Count a lap when the robot is back; after the last one begin to stop."""
+        config, begun, pose = self._shared, state.begun, state.pose
+        if begun is None or pose is None or state.phase == "stop" or state.since < config.lap_length:
+            return state
+        if math.dist(begun[:2], pose[:2]) > config.lap_radius:
+            return state
+        if math.cos(begun[2] - pose[2]) < math.cos(0.8):
+            return state
+        state = replace(state, laps=state.laps + 1, since=0.0)
+        if state.laps < config.laps:
+            return state
+        return self._to(state, "stop", t, (config.speed, 0.0), (0.0, 0.0))
+
+    def _stopping(self, state: WallState, ranges: Ranges, t: float) -> BehaviourStep:
+        assert state.v is not None
+        if t - state.v.begin < self._shared.ramp:
+            return self._answer(state, state.v.at(t), 0.0, ranges)
+        text = f"{state.laps} lap, {state.travelled:.1f} m" if state.laps == 1 else f"{state.laps} laps"
+        return BehaviourStep(None, state, state.phase, Reason.BEHAVIOUR_DONE, text)
+
+
+class WallPd(_Wall):
+    """Method 1: omega = k_p error + k_d (error - previous error).
+
+    Args:
+        config: gains and ranges.
+    """
+
+    def __init__(self, config: WallPdConfig) -> None:
+        super().__init__(config)
+        self._config = config
+
+    def _distance(self, ranges: Ranges) -> float:
+        return wall_distance(ranges.diagonal, ranges.side, self._config.offset)
+
+    def _drive(self, state: WallState, ranges: Ranges, t: float) -> tuple[WallState, float, float]:
+        config = self._config
+        blocked = ranges.front < config.trigger or ranges.far < config.safety
+        if state.phase == "approach":
+            if blocked:
+                state = self._to(state, "turn_away", t, (config.speed, 0.0), (0.0, -config.turn_rate))
+            elif ranges.side < config.seen and ranges.diagonal < config.seen / math.cos(DIAGONAL):
+                state = self._to(state, "follow", t, (config.speed, config.speed), (0.0, 0.0))
+            else:
+                return _approach(state, config, t)
+        elif state.phase == "follow" and blocked:
+            state = self._to(state, "turn_away", t, (config.speed, 0.0), (0.0, -config.turn_rate))
+        elif state.phase == "turn_away":
+            seen = ranges.side < config.seen and ranges.diagonal < config.seen / math.cos(DIAGONAL)
+            if seen and ranges.front > config.free:
+                state = self._to(state, "follow", t, (0.0, config.speed), (0.0, 0.0))
+        assert state.v is not None
+        assert state.w is not None
+        if state.phase == "turn_away":
+            return state, state.v.at(t), state.w.at(t)
+        error = self._distance(ranges) - config.distance
+        change = 0.0 if state.error is None else error - state.error
+        return replace(state, error=error), state.v.at(t), config.k_p * error + config.k_d * change
+
+
+class WallSwitching(_Wall):
+    """Method 2: free, obstacle, and a correction while the wall is too far.
+
+    Args:
+        config: ranges.
+    """
+
+    def __init__(self, config: WallSwitchingConfig) -> None:
+        super().__init__(config)
+        self._config = config
+
+    def _drive(self, state: WallState, ranges: Ranges, t: float) -> tuple[WallState, float, float]:
+        config = self._config
+        v, w = config.speed, config.turn_rate
+        obstacle = min(ranges.front, ranges.diagonal, ranges.side) < config.obstacle
+        far = config.distance + config.beyond
+        match state.phase:
+            case "approach" if obstacle:
+                state = self._to(state, "turn_away", t, (v, 0.0), (0.0, -w))
+            case "approach":
+                return _approach(state, config, t)
+            case "turn_away" if not obstacle:
+                state = self._to(state, "free", t, (0.0, v), (-w, 0.0))
+            case "free" if obstacle:
+                state = self._to(state, "turn_away", t, (v, 0.0), (0.0, -w))
+            case "free" if ranges.side > far:
+                state = self._to(state, "turn_back", t, (v, v), (0.0, w))
+            case "turn_back" if obstacle:
+                state = self._to(state, "turn_away", t, (v, 0.0), (0.0, -w))
+            case "turn_back" if ranges.side <= config.distance:
+                state = self._to(state, "free", t, (v, v), (w, 0.0))
+            case _:
+                pass
+        assert state.v is not None
+        assert state.w is not None
+        return state, state.v.at(t), state.w.at(t)
+
+
+def _approach(state: WallState, config: WallConfig, t: float) -> tuple[WallState, float, float]:
+    """Drive to the wall: by an arc of ``approach_turn`` first, then straight."""
+    turn = config.turn_rate if config.approach_turn > 0 else 0.0
+    v = state.v or ramp(t, 0.0, config.speed, config.ramp)
+    w = state.w or ramp(t, 0.0, turn, config.ramp)
+    if w.shape.v1 != 0.0 and state.turned >= config.approach_turn:
+        w = ramp(t, config.turn_rate, 0.0, config.ramp)
+    return replace(state, v=v, w=w), v.at(t), w.at(t)
+
+
+def _moved(state: WallState, odometry: Odometry) -> WallState:
+    pose = (odometry.pose.x, odometry.pose.y, odometry.pose.yaw)
+    if state.pose is None:
+        return replace(state, pose=pose)
+    way = math.dist(pose[:2], state.pose[:2])
+    turn = abs(math.remainder(pose[2] - state.pose[2], math.tau))
+    return replace(
+        state, pose=pose, travelled=state.travelled + way, since=state.since + way, turned=state.turned + turn
+    )
+
+
+def _watched(state: WallState, speed: float, t: float) -> WallState:
+    """Since when the robot stands although it was asked to drive."""
+    stalled = state.asked > AT_REST * 5 and abs(speed) < AT_REST
+    if not stalled:
+        return replace(state, moving_since=None)
+    return state if state.moving_since is not None else replace(state, moving_since=t)

@@ -1,0 +1,99 @@
+"""Behaviours in the whole daemon: a robot with two wheels follows a wall of the hall by sonars of its world."""
+
+import asyncio
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from monstertruck_planners.behave.wall.config import WallPdConfig
+from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
+from monstertruck_runtime.errors import RequestRefusedError
+from monstertruck_runtime.mailbox import fifo
+from monstertruck_schemas import topics
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import BehaviourOrder
+from monstertruck_schemas.topics import Writer
+from monstertruckd.config.load import load_config
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig
+from monstertruckd.tools.simulation.operator import LocalOperator
+from monstertruckd.tools.simulation.virtual_rig import VirtualRig
+from tests.unit.planners.behave.wall_kit import sonars
+
+pytestmark = [pytest.mark.virtual, pytest.mark.timeout(120)]
+
+FILE = Path(__file__).resolve().parents[2] / "configs" / "robots" / "differential.yaml"
+PLACES = {"l": (0.0, 0.05, 90), "fl": (0.05, 0.05, 45), "f": (0.1, 0.0, 0), "fr": (0.05, -0.05, -45)}
+
+
+async def hear(rig: VirtualRig, out, clock: VirtualClock) -> None:
+    """Beams from where the robot really is, at 10 Hz."""
+    while True:
+        truth, now = rig.world.truth(clock.now()), clock.now()
+        c, s = np.cos(truth.yaw), np.sin(truth.yaw)
+        ranges = {}
+        for name, (px, py, angle) in PLACES.items():
+            place = np.array([truth.x + c * px - s * py]), np.array([truth.y + s * px + c * py])
+            reach = float(rig.world._cast(*place, np.array([truth.yaw + np.radians(angle)]), 3.0)[0])
+            ranges[name] = reach if 0.0 < reach < np.inf else None
+        out.put(sonars(ranges, now=now))
+        await clock.sleep(0.1)
+
+
+def follow(seconds: float, *, deaf_after: float | None = None):
+    config, _ = load_config(FILE, SimulatedTruckConfig)
+    behaviours = {"wall": WallPdConfig(distance=0.5, offset=0.05, seen=0.8)}
+    config = config.model_copy(update={"recorder": None, "tracker": None, "path": None, "behaviours": behaviours})
+
+    async def main(clock: VirtualClock):
+        rig = VirtualRig(config, clock)
+        bus = rig.daemon.bus
+        out = bus.publisher(topics.SONAR, Writer.DRIVER)
+        with bus.subscribe(topics.BEHAVIOUR, fifo(4096)) as states:
+            async with rig.running():
+                operator = LocalOperator(rig.daemon, clock)
+                await clock.sleep(2.0)
+
+                async def order(order: BehaviourOrder) -> dict:
+                    return await operator.call(
+                        "behave", {**await operator.header(), "order": order, "behaviour": "wall"}
+                    )
+
+                await operator.arm()
+                with pytest.raises(RequestRefusedError) as caught:
+                    await order(BehaviourOrder.START)
+                assert caught.value.refusal is Reason.INPUT_STALE
+                hearing = asyncio.create_task(hear(rig, out, clock))
+                await clock.sleep(0.3)
+                assert (await operator.call("behaviours"))["wall"]["kind"] == "wall_pd"
+                assert await order(BehaviourOrder.START) == {"number": 1}
+                await clock.sleep(deaf_after or seconds)
+                if deaf_after is not None:
+                    hearing.cancel()
+                    await clock.sleep(seconds - deaf_after)
+                else:
+                    await order(BehaviourOrder.STOP)
+                    await clock.sleep(2.0)
+                hearing.cancel()
+                truth = rig.truth.array()
+            return list(states.drain()), truth
+
+    return run_virtual(main, start=SECOND)
+
+
+def test_it_follows_a_wall_through_gate_and_drives_until_it_is_stopped():
+    states, truth = follow(12.0)
+    assert states[-1].outcome is Reason.CANCELLED
+    assert states[-1].travelled > 1.0
+    assert not truth[:, 5].any()
+    assert np.abs(np.diff(truth[-20:, 1:3], axis=0)).max() < 1e-3
+    distances = [state.values["distance"] for state in states if state.phase == "follow"]
+    assert distances
+    assert distances[-1] == pytest.approx(0.5, abs=0.05)
+
+
+def test_without_sonars_it_stops_with_its_reason():
+    states, truth = follow(8.0, deaf_after=4.0)
+    assert states[-1].outcome is Reason.INPUT_STALE
+    assert not truth[:, 5].any()
+    assert np.abs(np.diff(truth[-20:, 1:3], axis=0)).max() < 1e-3

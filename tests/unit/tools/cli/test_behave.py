@@ -1,0 +1,101 @@
+"""``behave``: a run as a client sees it, and what is refused."""
+
+import asyncio
+from contextlib import contextmanager
+
+import pytest
+from typer.testing import CliRunner
+
+from monstertruck_runtime.clock import VirtualClock, run_virtual
+from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError
+from monstertruck_runtime.mailbox import Mailbox, fifo
+from monstertruck_schemas.plan import BehaviourState
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import BehaviourOrder
+from monstertruckd.tools.cli.behave_session import run_behaviour
+from monstertruckd.tools.cli.main import app
+
+
+def state(number=1, *, running=True, outcome=Reason.DRIVING, text=""):
+    return BehaviourState(
+        stamp=0, received=0, seq=0, number=number, behaviour="wall", kind="wall_pd", source="ann", running=running,
+        outcome=outcome, text=text, elapsed=2.0, travelled=0.3, values={"distance": 0.3},
+    )  # fmt: skip
+
+
+class Robot:
+    """Answers with the reports given, one a second."""
+
+    def __init__(self, clock, *reports, refuses=None):
+        self.clock, self.reports, self.refuses = clock, reports, refuses
+        self.orders = []
+        self.tasks = []
+
+    @contextmanager
+    def subscribe(self, topic, delivery):
+        self.box = Mailbox(fifo(16))
+        yield self.box
+
+    async def arm(self, *, hold=False):
+        self.orders.append("arm")
+
+    async def behave(self, order, behaviour=""):
+        self.orders.append(order)
+        if order is BehaviourOrder.START:
+            if self.refuses is not None:
+                raise self.refuses
+            self.tasks.append(asyncio.create_task(self._report()))
+        return {"number": 1}
+
+    async def _report(self):
+        for report in self.reports:
+            await self.clock.sleep(1.0)
+            self.box.put(report)
+
+
+def run(*reports, arm=False, refuses=None, seconds=60.0):
+    async def main(clock: VirtualClock):
+        robot = Robot(clock, *reports, refuses=refuses)
+        try:
+            async with clock.deadline(seconds):
+                return robot, await run_behaviour(robot, "wall", arm=arm)
+        except (TimeoutError, RequestRefusedError, NoAnswerError) as error:
+            return robot, error
+
+    return run_virtual(main)
+
+
+def test_it_ends_with_the_behaviours_own_end():
+    done = state(running=False, outcome=Reason.BEHAVIOUR_DONE, text="1 lap")
+    robot, end = run(state(), state(), done, arm=True)
+    assert (end.reason, end.text, end.travelled) == (Reason.BEHAVIOUR_DONE, "1 lap", 0.3)
+    assert robot.orders == ["arm", BehaviourOrder.START]
+    assert end.as_json()["values"] == {"distance": 0.3}
+
+
+def test_reports_of_the_one_before_are_passed_over_and_a_later_one_ends_it():
+    before = state(0, running=False, outcome=Reason.CANCELLED)
+    _, end = run(before, state(), state(2))
+    assert end.reason is Reason.CANCELLED
+    assert "ann" in end.text
+
+
+def test_giving_up_stops_the_robot():
+    robot, end = run(state(), seconds=5.0)
+    assert isinstance(end, TimeoutError)
+    assert robot.orders[-1] is BehaviourOrder.STOP
+
+
+@pytest.mark.parametrize(
+    ("error", "stops"), [(RequestRefusedError(Reason.BUSY), False), (NoAnswerError("no answer"), True)]
+)
+def test_a_start_that_is_not_answered_is_stopped_and_a_refused_one_is_not(error, stops):
+    robot, end = run(refuses=error)
+    assert end is error
+    assert (robot.orders[-1] is BehaviourOrder.STOP) == stops
+
+
+def test_the_commands_have_help():
+    shown = CliRunner().invoke(app, ["behave", "--help"]).stdout
+    for name in ("list", "start", "stop"):
+        assert name in shown
