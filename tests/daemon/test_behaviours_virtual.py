@@ -83,14 +83,14 @@ def follow(seconds: float, *, deaf_after: float | None = None):
 
 
 def test_it_follows_a_wall_through_gate_and_drives_until_it_is_stopped():
-    states, truth = follow(9.5)
+    states, truth = follow(8.5)
     assert states[-1].outcome is Reason.CANCELLED
     assert states[-1].travelled > 1.0
     assert not truth[:, 5].any()
     assert np.abs(np.diff(truth[-20:, 1:3], axis=0)).max() < 1e-3
     distances = [state.values["distance"] for state in states if state.phase == "follow"]
     assert distances
-    assert distances[-1] == pytest.approx(0.65, abs=0.05)
+    assert np.median(distances[-10:]) == pytest.approx(0.65, abs=0.05)
 
 
 def test_without_sonars_it_stops_with_its_reason():
