@@ -1,5 +1,6 @@
 """Builds transforms, odometry and SLAM of a configuration, each with its ends of the bus."""
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Final, Self
@@ -25,6 +26,8 @@ from monstertruckd.config.truck import TruckConfig
 
 SCANS: Final = 16
 """Scans that may wait for the estimation worker."""
+LEAST_UPRIGHT: Final = 0.7
+"""Share of the yaw rate that the z axis of an IMU has to feel."""
 ODOMETRIES: Final = 256
 """Poses and angles that may wait for a scan."""
 
@@ -80,11 +83,20 @@ def build_estimation(config: TruckConfig, bus: Bus, clock: Clock, body: Body) ->
     if config.missing_actuators() is not None:
         return
     compass, slam_runs = config.devices.compass is not None, config.slam is not None
-    context = OdometryContext(body.chassis, clock, bus, compass=compass, slam=slam_runs)
+    context = OdometryContext(body.chassis, clock, bus, compass=compass, slam=slam_runs, imu=_upright(config))
     yield ODOMETRY.implementation(config.odometry)(config.odometry, context)
     ground = _build_ground(config, bus, clock)
     if ground is not None:
         yield ground
+
+
+def _upright(config: TruckConfig) -> float | None:
+    """See ``OdometryContext.imu``; None also for an IMU that lies on its side."""
+    imu = config.devices.imu
+    if imu is None:
+        return None
+    share = math.cos(imu.mount.roll) * math.cos(imu.mount.pitch)
+    return share if abs(share) > LEAST_UPRIGHT else None
 
 
 def _build_ground(config: TruckConfig, bus: Bus, clock: Clock) -> GroundService | None:

@@ -13,16 +13,19 @@ from typing import Annotated, Any, Final, Literal, NamedTuple, Protocol
 import numpy as np
 from pydantic import Field
 
+from monstertruck_estimation.gyro import Gyro, GyroConfig
 from monstertruck_estimation.transforms import wrap_angle
 from monstertruck_estimation.wheel_motion import WheelIncrement, WheelMotion
 from monstertruck_kinematics.chassis import Chassis
 from monstertruck_kinematics.elementary import Array, integrate, integration_jacobians
 from monstertruck_runtime.clock import ESTIMATES, SECOND, Clock, Schedule
-from monstertruck_runtime.mailbox import latest
-from monstertruck_runtime.ports import BusPort, Publisher, Ready, Subscription
+from monstertruck_runtime.mailbox import Mailbox, fifo, latest
+from monstertruck_runtime.ports import BusPort, EventSink, Publisher, Ready, Subscription
 from monstertruck_schemas import topics
 from monstertruck_schemas.base import Pose2D, Schema, Twist2D
-from monstertruck_schemas.sensor import Attitude, DriveFeedback, SteeringFeedback
+from monstertruck_schemas.event import Severity
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.sensor import Attitude, DriveFeedback, Imu, SteeringFeedback
 from monstertruck_schemas.state import Odometry
 
 Vector = tuple[float, float, float]
@@ -32,6 +35,9 @@ Positive = Annotated[float, Field(gt=0)]
 
 STILL: Final = 0.02
 """Distance, m, up to which the truck counts as standing at its start."""
+
+RATES: Final = 32
+"""Measurements of an IMU that may wait."""
 
 SOURCE_TIMEOUT: Final = SECOND
 """A sensor is listed as a source for this long after a reading, ns."""
@@ -116,6 +122,8 @@ class OdometryConfig(OdometrySettings):
     """A drive position that would need more than this, m/s, is a new origin (the drive restarted), not a way."""
     compass: CompassConfig | None = CompassConfig()
     """None leaves the heading to the wheels."""
+    gyro: GyroConfig | None = GyroConfig()
+    """Yaw rate of an inertial measurement unit, where there is one; null leaves it out"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,6 +180,9 @@ class DeadReckoning:
         self._aligning: list[float] = []
         self._north: float | None = None
         self._compass_used: int | None = None
+        self.gyro = None if config.gyro is None else Gyro(config.gyro)
+        """Yaw rates of an inertial measurement unit, if there is one."""
+        self._gyro_used: int | None = None
         self.rejected_headings = 0
         """Headings left out because they were too far off."""
 
@@ -189,7 +200,11 @@ class DeadReckoning:
             self._lose(dt)
             return
         self._driven += roll.way
-        pose = integrate(self._pose, *roll.twist, dt)
+        vx, vy, wz = roll.twist
+        rate = None if self.gyro is None else self.gyro.turned(roll.since, roll.stamp, wz, roll.way)
+        if rate is not None:
+            wz, self._gyro_used = rate, roll.stamp
+        pose = integrate(self._pose, vx, vy, wz, dt)
         moved = self._covariance.moved(pose[0] - self._pose[0], pose[1] - self._pose[1])
         self._covariance = moved.plus(self._slipped(roll))
         self._pose = pose
@@ -228,7 +243,11 @@ class DeadReckoning:
         moved = self._covariance.moved(x - self._pose[0], y - self._pose[1])
         covariance = moved.plus(term * age**2 for term in self._drift)
         sources = ["drive"]
-        for name, used in (("steering", self._wheels.steered), ("compass", self._compass_used)):
+        for name, used in (
+            ("steering", self._wheels.steered),
+            ("compass", self._compass_used),
+            ("imu", self._gyro_used),
+        ):
             if used is not None and now - used <= SOURCE_TIMEOUT:
                 sources.append(name)
         return OdometryEstimate(
@@ -343,6 +362,50 @@ class OdometryService:
         return bool(self._reckoned)
 
 
+class InertialOdometryService(OdometryService):
+    """``OdometryService`` whose wheels are helped by the yaw rate of an IMU; says when the two disagree.
+
+    Args:
+        reckoning: the filter.
+        gyro: its yaw rates.
+        rates: measurements of the IMU.
+        upright: see ``OdometryContext.imu``.
+        events: where a disagreement is reported.
+        clock: time.
+        inputs: as of ``OdometryService``.
+    """
+
+    def __init__(
+        self,
+        reckoning: DeadReckoning,
+        gyro: Gyro,
+        rates: Mailbox[Imu],
+        upright: float,
+        events: EventSink,
+        clock: Clock,
+        **inputs: Any,
+    ) -> None:
+        super().__init__(reckoning, clock, **inputs)
+        self._gyro = gyro
+        self._rates = rates
+        self._upright = upright
+        self._events = events
+
+    def take(self) -> None:
+        """Pass new messages to the estimator, and report changes."""
+        for imu in self._rates.drain():
+            self._gyro.observe(imu.stamp, imu.angular_velocity.z / self._upright)
+        before = self._gyro.trusted
+        super().take()
+        if self._gyro.trusted is not before:
+            off = round(self._gyro.difference, 3)
+            if before:
+                text = f"the IMU turned {off:+.2f} rad more than the wheels: the heading goes by the wheels"
+                self._events(Reason.IMU_DISAGREES, Severity.WARNING, self.name, text, difference=off)
+            else:
+                self._events(Reason.IMU_AGREES, Severity.INFO, self.name, "the IMU counts again", difference=off)
+
+
 def _message(estimate: OdometryEstimate, now: int, seq: int) -> Odometry:
     x, y, yaw = estimate.pose
     vx, vy, wz = estimate.twist
@@ -371,6 +434,8 @@ class OdometryContext:
     """The robot has one."""
     slam: bool
     """SLAM publishes the pose in map and the motion between scans."""
+    imu: float | None = None
+    """Share of the base's yaw rate that the z axis of its IMU feels, -1 upside down; None = it has none."""
 
     def inputs(self) -> dict[str, Any]:
         """Topics of an ``OdometryService``, by the names of its arguments."""
@@ -386,5 +451,11 @@ class OdometryContext:
 
 def build_reckoning(config: OdometryConfig, context: OdometryContext) -> OdometryService:
     """The service with its topics, for the catalog."""
-    reckoning = DeadReckoning(config, context.chassis)
-    return OdometryService(reckoning, context.clock, rate=config.rate, **context.inputs())
+    reckoning, inputs = DeadReckoning(config, context.chassis), context.inputs()
+    if context.imu is None or reckoning.gyro is None:
+        return OdometryService(reckoning, context.clock, rate=config.rate, **inputs)
+    rates = context.bus.subscribe(topics.IMU, fifo(RATES))
+    upright, events = context.imu, context.bus.event_sink()
+    return InertialOdometryService(
+        reckoning, reckoning.gyro, rates, upright, events, context.clock, rate=config.rate, **inputs
+    )

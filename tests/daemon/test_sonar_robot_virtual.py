@@ -31,7 +31,8 @@ class Drive:
         self.twists = []
         self.truth = np.empty((0, 0))
         self.sonars = []
-        self.imu = None
+        self.imu = self.odometry = None
+        self.events = set()
         self.frames = set()
 
 
@@ -53,6 +54,8 @@ def drive(start, seconds, twist, *, at=(), model="cone"):
             bus.subscribe(topics.SONAR, fifo(4096)) as sonars,
             bus.subscribe(topics.IMU, latest()) as imu,
             bus.subscribe(topics.TRANSFORMS, latest()) as transforms,
+            bus.subscribe(topics.ODOMETRY, latest()) as odometry,
+            bus.subscribe(topics.EVENT, fifo(4096)) as events,
         ):
             async with rig.running():
                 operator = LocalOperator(rig.daemon, clock)
@@ -71,7 +74,8 @@ def drive(start, seconds, twist, *, at=(), model="cone"):
                     seen.reasons |= set(state.reasons)
                     seen.twists.append(state.twist)
                 seen.sonars = sonars.drain()
-                seen.imu = imu.latest
+                seen.imu, seen.odometry = imu.latest, odometry.latest
+                seen.events = {event.reason for event in events.drain()}
                 seen.frames = {t.child for t in transforms.latest.transforms}
             return seen
 
@@ -142,3 +146,30 @@ def test_an_unplugged_bridge_stops_it_and_it_goes_on_when_it_is_back():
 
 def test_two_runs_are_the_same():
     assert len({digest(drive((-2.0, 0.0, 0.3), 2.0, (0.2, 0.2))) for _ in range(2)}) == 1
+
+
+def turned(seen):
+    """Error of the heading by odometry, rad."""
+    true = seen.truth[-1, 3] - seen.truth[0, 3]
+    return abs(math.remainder(seen.odometry.pose.yaw - true, math.tau))
+
+
+def test_the_odometry_turns_with_the_imu():
+    seen = drive((0.0, 0.0, 0.0), 8.0, (0.1, 0.5))
+    assert "imu" in seen.odometry.sources
+    assert Reason.IMU_DISAGREES not in seen.events
+    assert turned(seen) < 0.05
+
+
+@pytest.mark.parametrize("fault", ["inverted", "unplugged", "silent"])
+def test_an_imu_that_fails_leaves_the_heading_to_the_wheels(fault):
+    def act(rig):
+        if fault == "unplugged":
+            rig.ports["imu"].unplug()
+        else:
+            rig.robot.emulators["imu"].inject(fault, "on")
+
+    seen = drive((0.0, 0.0, 0.0), 8.0, (0.1, 0.5), at=[(2.0, act)])
+    assert "imu" not in seen.odometry.sources
+    assert (Reason.IMU_DISAGREES in seen.events) is (fault == "inverted")
+    assert turned(seen) < (0.8 if fault == "inverted" else 0.1)
