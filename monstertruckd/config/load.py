@@ -295,6 +295,8 @@ def _sentence(detail: ErrorDetails, model: type[Schema], key: Key) -> str:
         return f"unknown key (did you mean {close[0]}?)" if close else f"unknown key; known here: {', '.join(known)}"
     if detail["type"] == "missing":
         return "missing; it has no default"
+    if detail["type"] == "union_tag_invalid":
+        return f"no kind {detail['ctx']['tag']!r}; expected one of {detail['ctx']['expected_tags']}"
     message = detail["msg"].removeprefix("Value error, ")
     message = message[:1].lower() + message[1:]
     if detail["type"] == "value_error":

@@ -1,6 +1,8 @@
 """Health of every service as a topic, and real time against the daemon's own."""
 
+import logging
 from collections.abc import Callable, Collection
+from itertools import count
 from typing import Final
 
 from monstertruck_runtime.clock import SECOND, Clock
@@ -14,7 +16,11 @@ from monstertruckd.bus.local import Bus
 from monstertruckd.gate.service import GateService
 from monstertruckd.recorder.recorder import Recorder
 
+log = logging.getLogger(__name__)
+
 PERIOD = 1.0
+SUMMARY_AFTER: Final = 5
+"""Periods after the start at which the log says what is there and what is not."""
 STEP = SECOND // 20
 """A change of the real-time offset within one period beyond this is a step, not drift (NTP slews < 1 ms/s)."""
 
@@ -103,11 +109,22 @@ class HealthBoard:
         return row
 
     async def run(self, ready: Ready) -> None:
-        """Publish the table once a second."""
+        """Publish the table once a second; log once what is not ready after the start."""
         ready()
-        while True:
+        for periods in count(1):
             await self._clock.sleep(PERIOD)
             self._publish()
+            if periods == SUMMARY_AFTER:
+                self._summarise()
+
+    def _summarise(self) -> None:
+        rows = self.rows()
+        missing = [row for row in rows if row.state is not ServiceState.READY]
+        if not missing:
+            log.info("all %d services are ready", len(rows))
+            return
+        names = "; ".join(f"{row.name} ({row.detail or row.state.value})" for row in missing)
+        log.warning("%d of %d services are ready; not ready: %s", len(rows) - len(missing), len(rows), names)
 
     def _publish(self) -> None:
         now = self._clock.now()

@@ -131,7 +131,8 @@ async def supervise(
             raise PortBusyError(f"{service.name}: {lost}")
         detail = str(lost) or type(lost).__name__
         # The first failure of an outage is news, its repetitions are not.
-        log.log(logging.WARNING if session.ready_at is not None else logging.DEBUG, "%s: %s", service.name, detail)
+        first = session.ready_at is not None or session.starts == 1
+        log.log(logging.WARNING if first else logging.DEBUG, "%s: %s", service.name, detail)
         now = clock.now()
         restarts.append(now)
         while now - restarts[0] > policy.window * SECOND:

@@ -63,10 +63,12 @@ def track(
     from monstertruck_planners.track.paths import load_path
     from monstertruckd.tools.cli.goto_session import follow
 
+    path = load_path(file, closed=closed)
+
     async def main(client: "TruckClient", clock: Clock) -> "Arrival":
         localised = (await client.call("config")).get("slam") is not None
-        path = load_path(file, closed=closed, frame="map" if localised else "odom")
-        return await follow(client, clock, path, arm=arm)
+        there = path.model_copy(update={"frame": "map" if localised else "odom"})
+        return await follow(client, clock, there, arm=arm)
 
     _run(main, robot, endpoint, json_output=json_output)
 

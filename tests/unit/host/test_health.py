@@ -1,5 +1,10 @@
 """The health board: what a service that works suffers from."""
 
+import asyncio
+import logging
+
+import pytest
+
 from monstertruck_runtime.clock import VirtualClock, run_virtual
 from monstertruck_schemas.event import Event, Severity
 from monstertruck_schemas.health import ServiceHealth, ServiceState
@@ -52,3 +57,29 @@ def test_a_loss_is_worse_and_other_events_are_no_state():
     lost = row(ServiceState.BACKOFF, reason=Reason.DEVICE_LOST)
     assert after(READY, SLOW, lost)["drive"][0] is Reason.DEVICE_LOST
     assert after(READY, event(Reason.DEVICE_FAULT, Severity.WARNING))["drive"][0] is Reason.OK
+
+
+@pytest.mark.parametrize(
+    ("lidar", "expected"),
+    [
+        (ServiceState.READY, "all 2 services are ready"),
+        (ServiceState.BACKOFF, "1 of 2 services are ready; not ready: lidar (/dev/lidar: not plugged in)"),
+    ],
+)
+def test_five_seconds_after_the_start_the_log_says_once_what_is_not_ready(
+    lidar: ServiceState, expected: str, caplog: pytest.LogCaptureFixture
+):
+    async def main(clock: VirtualClock) -> None:
+        board = HealthBoard(clock, Kept(), Events())
+        board.report(READY)
+        detail = "" if lidar is ServiceState.READY else "/dev/lidar: not plugged in"
+        board.report(row(lidar, "lidar").model_copy(update={"detail": detail}))
+        running = asyncio.create_task(board.run(lambda: None))
+        await clock.sleep(4.9)
+        assert not caplog.messages
+        await clock.sleep(20)
+        running.cancel()
+
+    caplog.set_level(logging.INFO, "monstertruckd")
+    run_virtual(main)
+    assert caplog.messages == [expected]

@@ -61,6 +61,12 @@ def test_lost_sessions_are_tried_again_with_growing_capped_delays():
     assert all(row.detail == "cable" for row in health if row.state is ServiceState.BACKOFF)
 
 
+def test_a_device_that_is_not_there_at_the_start_is_one_warning(caplog: pytest.LogCaptureFixture):
+    run(lost, lost, lost, lambda ready: ready())
+    warnings = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    assert warnings == ["scripted: cable"]
+
+
 def test_a_session_that_settled_starts_the_delays_anew():
     async def works_a_while(ready: Ready) -> None:
         ready()

@@ -1,0 +1,173 @@
+"""Command lines that somebody gets wrong: one sentence and the reason's exit code."""
+
+import shlex
+from pathlib import Path
+
+import pytest
+
+from monstertruckd.tools.cli.main import app
+
+ROOT = Path(__file__).resolve().parents[4]
+
+WRONG = (
+    ("track /nonexistent.csv", 3, "/nonexistent.csv: cannot be read: No such file or directory"),
+    ("track configs/truck.yaml", 3, "configs/truck.yaml:1: "),
+    ("stat", 2, "Error: No such command 'stat'. Did you mean 'status'?"),
+    ("--nope", 2, "Error: No such option: --nope"),
+    ("status extra", 2, "Error: Got unexpected extra argument(s) (extra)"),
+    ("status --robot", 2, "Error: Option '--robot' requires an argument."),
+    ("echo", 2, "Error: Missing argument 'topic'."),
+    ("echo no/topic", 4, "no topic 'no/topic'; known"),
+    ("run", 2, "Error: Missing option '--config' / '-c'."),
+    ("run -c", 2, "Error: Option '-c' requires an argument."),
+    ("run -c /nonexistent.yaml", 2, "/nonexistent.yaml: cannot be read: No such file or directory"),
+    ("run -c .", 2, ".: cannot be read: Is a directory"),
+    ("run -c /dev/null", 2, "/dev/null: cannot be read: not a file of text"),
+    ("simulate", 2, "Error: Missing option '--config' / '-c'."),
+    ("simulate -c /nonexistent.yaml", 2, "/nonexistent.yaml: cannot be read: No such file or directory"),
+    (
+        "simulate -c configs/truck.yaml",
+        2,
+        "configs/truck.yaml: describes a real truck: it has no section `sim`, as conf",
+    ),
+    ("demo --seed x", 2, "Error: Invalid value for '--seed': Input should be a valid integer, unable t"),
+    ("demo --seed -1 --fast -c /nonexistent", 2, "/nonexistent: cannot be read: No such file or directory"),
+    (
+        "demo -c configs/truck.yaml --fast",
+        2,
+        "configs/truck.yaml: describes a real truck: it has no section `sim`, as conf",
+    ),
+    ("drill --nope", 2, "Error: No such option: --nope"),
+    ("drill x y", 2, "Error: Got unexpected extra argument(s) (x y)"),
+    ("bogus", 2, "Error: No such command 'bogus'."),
+    ("arm --hold now", 2, "Error: Got unexpected extra argument(s) (now)"),
+    ("disarm --fast", 2, "Error: No such option: --fast"),
+    ("estop now", 2, "Error: Got unexpected extra argument(s) (now)"),
+    ("reset now", 2, "Error: Got unexpected extra argument(s) (now)"),
+    ("echo sensor/scan extra", 2, "Error: Got unexpected extra argument(s) (extra)"),
+    ("log list --nope", 2, "Error: No such option: --nope"),
+    ("map show", 2, "Error: Missing argument 'place'."),
+    ("map localise", 2, "Error: Missing argument 'log'."),
+    ("config show configs/truck.yaml extra", 2, "Error: Got unexpected extra argument(s) (extra)"),
+    ("plan configs/truck.yaml 0,0,0 1,1,0", 3, "configs/truck.yaml: devices: unknown"),
+    ("log animate", 2, "Error: Missing argument 'log'."),
+    ("log recover /nonexistent", 4, "/nonexistent: no such log"),
+    ("log view /nonexistent", 4, "/nonexistent: no such log"),
+    ("replay /nonexistent --rate x", 2, "Error: No such option: --rate (Possible options: --robot)"),
+    ("arm now", 2, "Error: Got unexpected extra argument(s) (now)"),
+    ("reset -r", 2, "Error: Option '-r' requires an argument."),
+    ("plan", 2, "Error: Missing argument 'MAP'."),
+    ("plan /nonexistent.yaml 0,0,0 1,1,0", 3, "/nonexistent.yaml: cannot be read: No such file or directory"),
+    ("plan configs/worlds/rooms.yaml 0,0 1,1,0", 3, "pose '0,0': expected x,y,yaw, m and rad"),
+    ("plan configs/worlds/rooms.yaml a,b,c 1,1,0", 3, "pose 'a,b,c': expected x,y,yaw, m and rad"),
+    (
+        "plan configs/worlds/rooms.yaml 1.5,2,0 9,5.5,nan",
+        48,
+        "request holds NaN or infinity: start and goal: expected finite numbers",
+    ),
+    (
+        "plan configs/worlds/rooms.yaml 1.5,2,0 900,5.5,0",
+        32,
+        "the goal is off the map: goal (900, 5.5, 0): off the map",
+    ),
+    (
+        "plan configs/worlds/rooms.yaml 1.5,2,0 9,5.5,0 --planner nope",
+        3,
+        "monstertruck.route_planners: no kind 'nope': expected one of",
+    ),
+    (
+        "plan configs/worlds/rooms.yaml 1.5,2,0 9,5.5,0 --steering 6ws",
+        2,
+        "Error: Invalid value for '--steering': Value error, '6ws' is not one of '2ws",
+    ),
+    ("goto", 2, "Error: Missing argument 'x'."),
+    ("goto 1 2", 2, "Error: Missing argument 'yaw'."),
+    ("goto 1 2 x", 2, "Error: Invalid value for 'yaw': Input should be a valid number, unable to pa"),
+    ("goto 1 2 3 --via 1", 3, "pose '1': expected x,y or x,y,yaw, m and rad"),
+    ("replay", 2, "Error: Missing argument 'log'."),
+    ("replay /nonexistent.mcap", 4, "/nonexistent.mcap: no such log"),
+    ("replay configs/truck.yaml", 3, "configs/truck.yaml: not an MCAP log"),
+    ("emulate", 2, "Error: Missing argument 'device'."),
+    ("emulate lidar", 2, "Error: Missing option '--link' / '-l'."),
+    ("emulate lidar -l /proc/foo", 3, "/proc/foo: No such file or directory"),
+    ("probe", 2, "Error: Missing argument 'device'."),
+    ("probe nothing", 3, "unknown"),
+    ("probe lidar", 3, "lidar: say where it hangs with --port"),
+    ("probe lidar -p /nonexistent", 20, "/nonexistent: not plugged in"),
+    ("probe lidar -p /dev/null", 20, "/dev/null: no serial port"),
+    ("probe lidar -p /tmp", 20, "/tmp: Is a directory"),
+    (
+        "probe lidar -p /dev/null --baud x",
+        2,
+        "Error: Invalid value for '--baud': Input should be a valid integer, unable t",
+    ),
+    ("probe host -p /dev/null", 3, "host: is the computer's own and hangs on no port; leave out --port"),
+    ("find-port", 2, "Error: Missing argument 'role'."),
+    ("find-port nope", 3, "no role 'nope'; known"),
+    ("find-port lidar --write /nonexistent.yaml", 3, "/nonexistent.yaml: No such file or directory"),
+    ("find-port lidar --write README.md", 3, "README.md:10: not valid YAML: could not find expected ':'"),
+    ("doctor x", 2, "Error: Got unexpected extra argument(s) (x)"),
+    ("config nope", 2, "Error: No such command 'nope'."),
+    ("config show", 2, "Error: Missing argument 'config'."),
+    ("config show /nonexistent.yaml", 2, "/nonexistent.yaml: cannot be read: No such file or directory"),
+    ("config show configs/truck.yaml --key no.such.key", 4, "configs/truck.yaml: nothing at no.such.key; sections"),
+    ("config show README.md", 2, "README.md:10: not valid YAML: could not find expected ':'"),
+    (
+        "config show configs/paths/loop.csv",
+        2,
+        "configs/paths/loop.csv:1: expected a mapping of sections, found a plain valu",
+    ),
+    ("config migrate /nonexistent.yaml", 2, "/nonexistent.yaml: cannot be read: No such file or directory"),
+    ("config migrate README.md", 2, "README.md:10: not valid YAML: could not find expected ':'"),
+    ("calibrate nope", 2, "Error: No such command 'nope'."),
+    ("log nope", 2, "Error: No such command 'nope'."),
+    ("log list /nonexistent", 4, "/nonexistent: no such folder"),
+    ("log list README.md", 4, "README.md: no such folder"),
+    ("log info", 2, "Error: Missing argument 'log'."),
+    ("log info /nonexistent", 4, "/nonexistent: no such log"),
+    ("log info README.md", 3, "README.md: not an MCAP log"),
+    ("log info .", 3, ".: cannot be read: Is a directory"),
+    ("log recover README.md", 3, "README.md: not an MCAP log"),
+    ("log report README.md", 3, "README.md: not an MCAP log"),
+    ("log report /nonexistent", 4, "/nonexistent: no such log"),
+    ("log view README.md", 3, "README.md: not an MCAP log"),
+    ("log export README.md", 2, "Error: Missing argument 'output'."),
+    (
+        "log export README.md --format nope",
+        2,
+        "Error: Invalid value for '--format' / '-f': Value error, 'nope' is not one o",
+    ),
+    ("log animate README.md", 2, "Error: Missing argument 'output'."),
+    ("kinematics nope", 2, "Error: No such command 'nope'."),
+    ("kinematics radius-table --nope", 2, "Error: No such option: --nope"),
+    ("kinematics show /nonexistent", 3, "family '/nonexistent': expected one of"),
+    ("map nope", 2, "Error: No such command 'nope'."),
+    ("map build /nonexistent.mcap", 4, "/nonexistent.mcap: no such log"),
+    ("map show /nonexistent", 3, "/nonexistent: cannot be read: No such file or directory"),
+    ("map show README.md", 3, "README.md:10: not valid YAML: could not find expected ':'"),
+    ("map localise /nonexistent README.md", 3, "README.md:10: not valid YAML: could not find expected ':'"),
+    ("security nope", 2, "Error: No such command 'nope'."),
+    ("reasons x", 2, "Error: Got unexpected extra argument(s) (x)"),
+    ("topics x", 2, "Error: Got unexpected extra argument(s) (x)"),
+    ("plugins x", 2, "Error: Got unexpected extra argument(s) (x)"),
+    ("study analyse README.md", 3, "README.md: not an MCAP log"),
+    ("study analyse /nonexistent", 4, "/nonexistent: no such log"),
+)
+"""What is typed after ``monstertruckd`` in the project's folder, exit code, beginning of the complaint's last line."""
+
+
+@pytest.mark.parametrize(("words", "code", "expected"), WRONG, ids=[words for words, *_ in WRONG])
+def test_a_wrong_command_line_is_one_clear_line(
+    words: str, code: int, expected: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.chdir(ROOT)
+    with pytest.raises(SystemExit) as ended:
+        app(shlex.split(words))
+    said = capsys.readouterr()
+    *usage, complaint = said.err.strip().splitlines()
+    assert (ended.value.code, complaint[: len(expected)], said.out) == (code, expected, "")
+    assert not usage or usage[0].startswith("Usage: ")
+
+
+def test_they_are_sixty_at_least():
+    assert len({words for words, *_ in WRONG}) >= 60
