@@ -136,7 +136,7 @@ WRONG = (
 def test_a_wrong_configuration_is_one_clear_line(text: str, expected: str, tmp_path: Path):
     file = tmp_path / "truck.yaml"
     above = {"include": str(DEMO), "version": "2"}
-    above.pop(text.split(":")[0], None)
+    above.pop(text.split(":", maxsplit=1)[0], None)
     file.write_text("".join(f"{key}: {value}\n" for key, value in above.items()) + text + "\n")
     with pytest.raises(ConfigError) as caught:
         load_simulated(file)
