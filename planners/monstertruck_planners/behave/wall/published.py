@@ -25,6 +25,10 @@ FROZEN: Final = 0.6
 """Angle, rad, over which a sonar's range cannot stay the same to the last digit."""
 STALL: Final = 1.0
 """Seconds of motion asked for without any after which a motor counts as stalled."""
+SAME_WAY: Final = 1.2
+"""Greatest difference of the heading from that at the lap's beginning, rad: the robot weaves."""
+FOLLOWING: Final = ("follow", "free")
+"""Phases in which a lap may begin: the robot drives along the wall."""
 AT_REST: Final = 0.01
 """m/s."""
 
@@ -98,7 +102,8 @@ class SonarWatch:
             answered[name] = t
             if echo.range is not None:
                 echoes[name] = (echo.range, t)
-            value = math.inf if echo.range is None else echo.range
+            measured = echo.range is not None and sonars.range_min < echo.range < sonars.range_max
+            value = echo.range if measured and echo.range is not None else math.inf  # limits may repeat
             if name not in changed or changed[name][0] != value or not math.isfinite(value):
                 changed[name] = (value, turned)
         return SonarWatch(answered, echoes, changed)
@@ -196,7 +201,7 @@ class _Wall:
     ) -> WallState:
         """Change the phase, with ramps of v and w from and to nominal values."""
         duration = self._shared.ramp
-        begun = state.pose if state.begun is None and phase != "approach" else state.begun
+        begun = state.pose if state.begun is None and phase in FOLLOWING else state.begun
         return replace(
             state, phase=phase, v=ramp(t, *v, duration), w=ramp(t, *w, duration), error=None, begun=begun,
             since=0.0 if state.begun is None else state.since,
@@ -209,7 +214,7 @@ class _Wall:
             return state
         if math.dist(begun[:2], pose[:2]) > config.lap_radius:
             return state
-        if math.cos(begun[2] - pose[2]) < math.cos(0.8):
+        if math.cos(begun[2] - pose[2]) < math.cos(SAME_WAY):
             return state
         state = replace(state, laps=state.laps + 1, since=0.0)
         if state.laps < config.laps:

@@ -128,6 +128,13 @@ def test_a_robot_that_stands_still_does_not_make_a_constant_range_wrong():
     assert watch.fault(1.0, 10.0) is not None
 
 
+def test_a_range_at_the_sonars_limit_may_repeat():
+    watch = SonarWatch()
+    for i in range(100):
+        watch = watch.observe(sonars({"l": 0.03, "fl": 3.0, "f": None}), ("l", "fl", "f"), i * 0.1, i * 0.1)
+    assert watch.fault(10.0, 10.0) is None
+
+
 @pytest.mark.parametrize("field", ["distance", "speed", "turn_rate", "ramp", "trigger"])
 @pytest.mark.parametrize("value", [0.0, -1.0, float("nan")])
 def test_settings_that_make_no_sense_are_refused(field, value):
