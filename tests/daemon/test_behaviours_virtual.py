@@ -15,7 +15,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import BehaviourOrder
 from monstertruck_schemas.topics import Writer
 from monstertruckd.config.load import load_config
-from monstertruckd.tools.simulation.config import SimulatedTruckConfig
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
 from monstertruckd.tools.simulation.operator import LocalOperator
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 from tests.unit.planners.behave.wall_kit import sonars
@@ -98,3 +98,28 @@ def test_without_sonars_it_stops_with_its_reason():
     assert states[-1].outcome is Reason.INPUT_STALE
     assert not truth[:, 5].any()
     assert np.abs(np.diff(truth[-20:, 1:3], axis=0)).max() < 1e-3
+
+
+def test_the_robot_with_five_sonars_follows_a_wall_of_the_yard_by_its_own_devices():
+    config, _ = load_config(FILE.with_name("sonar.yaml"), SimulatedTruckConfig)
+    world = {"start": {"x": -1.0, "y": 3.15, "yaw": 0.0}, "sonar": {"model": "beam"}}
+    config = with_overlay(config, {"recorder": None, "sim": {"world": world}})
+
+    async def main(clock: VirtualClock):
+        rig = VirtualRig(config, clock)
+        with rig.daemon.bus.subscribe(topics.BEHAVIOUR, fifo(4096)) as states:
+            async with rig.running():
+                operator = LocalOperator(rig.daemon, clock)
+                await clock.sleep(2.0)
+                await operator.arm()
+                order = {**await operator.header(), "order": BehaviourOrder.START, "behaviour": "wall_left"}
+                await operator.call("behave", order)
+                await clock.sleep(9.0)
+                truth = rig.truth.array()
+            return list(states.drain()), truth
+
+    states, truth = run_virtual(main, start=SECOND)
+    assert states[-1].running or states[-1].outcome is Reason.SHUTDOWN
+    assert not truth[:, 5].any()
+    assert truth[-1, 1] - truth[0, 1] > 1.2
+    assert 3.5 - 0.05 - truth[-40:, 2].mean() == pytest.approx(0.30, abs=0.03)  # of the sonar from the wall

@@ -147,6 +147,8 @@ class WallState:
     since: float = 0.0
     """Way since then or since the last lap, m."""
     laps: int = 0
+    turned_before: float = 0.0
+    """``turned`` when the present phase began, rad."""
     asked: float = 0.0
     """Speed asked for at the step before, m/s."""
     moving_since: float | None = None
@@ -176,6 +178,8 @@ class _Wall:
         state = _watched(state, odometry.twist.vx, t)
         if fault is None and state.moving_since is not None and t - state.moving_since >= STALL:
             fault = Reason.STUCK, f"{state.asked:.2f} m/s asked for, {odometry.twist.vx:.2f} m/s driven"
+        if fault is None and state.phase == "turn_away" and state.turned - state.turned_before > math.tau:
+            fault = Reason.STUCK, "turned once around and found no wall to follow"
         if fault is not None:
             return BehaviourStep(None, state, state.phase, *fault)
         hold, furthest = self._shared.hold, sonars.range_max
@@ -203,9 +207,15 @@ class _Wall:
         duration = self._shared.ramp
         begun = state.pose if state.begun is None and phase in FOLLOWING else state.begun
         return replace(
-            state, phase=phase, v=ramp(t, *v, duration), w=ramp(t, *w, duration), error=None, begun=begun,
+            state,
+            phase=phase,
+            v=ramp(t, *v, duration),
+            w=ramp(t, *w, duration),
+            error=None,
+            turned_before=state.turned,
+            begun=begun,
             since=0.0 if state.begun is None else state.since,
-        )  # fmt: skip
+        )
 
     def _lap(self, state: WallState, t: float) -> WallState:
         """Count a lap when the robot is back; after the last one begin to stop."""
