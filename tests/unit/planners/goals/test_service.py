@@ -23,3 +23,18 @@ def test_a_goal_that_comes_too_early_is_refused_by_what_is_missing(
     with pytest.raises(RequestRefusedError, match=text) as refused:
         service.take(None)
     assert refused.value.refusal is reason
+
+
+def test_a_running_behaviour_excludes_a_goal_and_lets_one_be_cancelled(monkeypatch: pytest.MonkeyPatch):
+    service = GoalService.__new__(GoalService)
+    monkeypatch.setattr("monstertruck_planners.goals.service.refusal", lambda *_: Reason.OK)
+    running = SimpleNamespace(running=True, behaviour="wall", source="ann")
+    service._in = SimpleNamespace(behaviour=SimpleNamespace(latest=running), gate=SimpleNamespace(latest=None))
+    service._sequences, service._max_age = {"goal": None}, 0.5
+    service._clock = SimpleNamespace(now=lambda: 0)
+    with pytest.raises(RequestRefusedError, match="the behaviour wall of ann is running") as refused:
+        service._examine(None, "goal", moves=True)
+    assert refused.value.refusal is Reason.BUSY
+    service._examine(None, "goal", moves=False)
+    running.running = False
+    service._examine(None, "goal", moves=True)

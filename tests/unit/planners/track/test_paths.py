@@ -12,7 +12,7 @@ from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.mailbox import Mailbox, fifo, latest
 from monstertruck_schemas.event import Event
-from monstertruck_schemas.plan import MAX_POSES, Path
+from monstertruck_schemas.plan import MAX_POSES, BehaviourState, Path
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import PathRequest, Role
 from monstertruck_schemas.state import GateMode, GateState
@@ -147,3 +147,15 @@ def test_a_drawn_path_out_of_bounds_is_refused_by_file(tmp_path: FilePath):
         load_path(file, closed=False)
     file.write_text("x,y,yaw,direction\n0,0,0,1\n1,0,0,1\n")
     assert load_path(file, closed=False).name == "far"
+
+
+def test_a_running_behaviour_excludes_a_path():
+    async def scenario(bench: Bench) -> None:
+        bench.gate(GateMode.ARMED)
+        out = bench.bus.publisher(BEHAVIOUR, Writer.PLANNER)
+        for running, expected in ((True, Reason.BUSY), (False, Reason.OK)):
+            now = bench.clock.now()
+            out.put(BehaviourState(stamp=now, received=now, seq=0, behaviour="wall", running=running))
+            assert await bench.send() is expected
+
+    on_bench(scenario)
