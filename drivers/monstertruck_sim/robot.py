@@ -17,6 +17,7 @@ from monstertruck_runtime.threads import Offload, in_thread
 from monstertruck_schemas.base import Schema
 from monstertruck_schemas.roles import DeviceRole
 from monstertruck_sim.config import SimConfig
+from monstertruck_sim.world.scene import Surroundings
 from monstertruck_sim.world.world import World
 
 
@@ -31,6 +32,8 @@ class SimulatedRobot:
         ports: one emulated port per device role; ``run`` plugs them in.
         root: folder of the emulated computer, for its monitors.
         offload: where the camera's pictures are drawn.
+        scene: world that it shares with other robots; None = its own.
+        name: of the robot.
     """
 
     def __init__(
@@ -42,8 +45,10 @@ class SimulatedRobot:
         ports: Mapping[str, EmulatedPort],
         root: Path,
         offload: Offload = in_thread,
+        scene: Surroundings | None = None,
+        name: str = "truck",
     ) -> None:
-        self.world = World(config.world, config.seed)
+        self.world = World(config.world, config.seed, scene, name)
         self.ports = ports
         self.recorded: RecordedHokuyoEmulator | None = None
 

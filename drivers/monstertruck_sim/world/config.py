@@ -422,8 +422,38 @@ class SinusoidTilt(Schema):
 TiltConfig = Annotated[GroundTilt | SinusoidTilt, Field(discriminator="kind")]
 
 
+class Spot(Schema):
+    """A place in the map frame, m."""
+
+    x: float
+    y: float
+
+
+class PersonConfig(Schema):
+    """Somebody who walks through the world: an upright cylinder."""
+
+    waypoints: Annotated[tuple[Spot, ...], Field(strict=False)] = ()
+    """Walked to in turn, the first one again after the last one; the first is the start. Empty: drawn by the seed"""
+    speed: Annotated[float, Field(gt=0, le=3)] = 0.8
+    """m/s on average; every leg is up to a fifth slower or faster"""
+    radius: Annotated[float, Field(gt=0, le=1)] = 0.2
+    """m"""
+    pause: NotNegative = 2.0
+    """Seconds of standing at a way-point, on average"""
+    distance: NotNegative = 0.8
+    """Metres kept from robots and other people ahead"""
+    before: Literal["stop", "turn", "walk_on"] = "stop"
+    """What is done before them: stop and, after 3 s, turn back; turn aside; or walk on until they are touched"""
+
+    @model_validator(mode="after")
+    def _somewhere(self) -> Self:
+        if len(self.waypoints) == 1:
+            raise ValueError("waypoints: expected two or more, or none to have them drawn")
+        return self
+
+
 class WorldConfig(Schema):
-    """One simulated world with one truck in it."""
+    """One simulated world, and one robot in it."""
 
     map: str = "loop"
     """Name of a built-in world, or path of a map_server YAML file (its ground: ``NAME.profile.yaml`` next to it)."""
@@ -440,3 +470,5 @@ class WorldConfig(Schema):
     tilt: TiltConfig = GroundTilt()
     rough: Annotated[tuple[RoughPatch, ...], Field(strict=False)] = ()
     """Patches of rough ground"""
+    people: Annotated[tuple[PersonConfig, ...], Field(strict=False, max_length=50)] = ()
+    """Who walks through it"""

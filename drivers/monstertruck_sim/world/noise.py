@@ -3,7 +3,10 @@
 import numpy as np
 
 LIDAR, CURRENT, COMPASS, COMPASS_FIXED, SLIP, ANALOG, SONAR, IMU, IMU_FIXED, SKID, STAND = range(11)
-"""Streams."""
+"""Streams of a robot."""
+
+PEOPLE = 100
+"""Stream of the people in a world."""
 
 _BLOCK = 512
 

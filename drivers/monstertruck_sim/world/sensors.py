@@ -1,7 +1,7 @@
 """What the devices' sensing elements feel: the physics behind the emulators."""
 
-from collections.abc import Callable
 from math import atan2, cos, degrees, hypot, pi, radians, sin
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,8 +42,19 @@ _LEVEL = 1e-4
 Vector = tuple[float, float, float]
 Beams = tuple[Array, Array, Array]
 """Directions: components x, y, z, each (n,)."""
-Caster = Callable[[Array, Array, Array, float], Array]
-"""Ranges along rays from (xs, ys) at angles up to a reach, in the map frame; inf = nothing."""
+
+
+class Caster(Protocol):
+    """Sight in the world."""
+
+    def __call__(
+        self, xs: Array, ys: Array, angles: Array, reach: float, times_ns: NDArray[np.int64] | None = None, /
+    ) -> Array:
+        """Ranges along rays from (xs, ys) at angles up to a reach, in the map frame; inf = nothing.
+
+        What moves is met where it was at ``times_ns``, one a ray and rising; None = now.
+        """
+        ...
 
 
 class SimulatedLidar:
@@ -81,31 +92,31 @@ class SimulatedLidar:
         x, y, yaw, pitch, roll = poses
         xs, ys = x + self._config.x * np.cos(yaw), y + self._config.x * np.sin(yaw)
         if self.joints is None and self._terrain is None and np.abs(poses[3:]).max() < _LEVEL:
-            ranges = self._cast(xs, ys, yaw + _BEAM_ANGLES, self._config.max_range)
+            ranges = self._cast(xs, ys, yaw + _BEAM_ANGLES, self._config.max_range, times)
         else:
             beams = np.cos(_BEAM_ANGLES), np.sin(_BEAM_ANGLES), np.zeros(STEPS)
             if self.joints is not None:
                 beams = _turned(beams, *self.joints.angles(times))
             beams = _turned(beams, pitch, roll)
             if self._terrain is None:
-                ranges = self._tilted(xs, ys, yaw, beams)
+                ranges = self._tilted(xs, ys, yaw, beams, times)
             else:
-                ranges = self._over(self._terrain, poses, beams)
+                ranges = self._over(self._terrain, poses, beams, times)
         return self._measure(ranges, time_ns)
 
-    def _tilted(self, xs: Array, ys: Array, yaw: Array, beams: Beams) -> Array:
+    def _tilted(self, xs: Array, ys: Array, yaw: Array, beams: Beams, times_ns: NDArray[np.int64]) -> Array:
         """Ranges along beams whose directions are given in the truck's level frame."""
         config = self._config
         forward, left, up = beams
         level = np.hypot(forward, left)
-        ranges = self._cast(xs, ys, yaw + np.arctan2(left, forward), config.max_range) / level
+        ranges = self._cast(xs, ys, yaw + np.arctan2(left, forward), config.max_range, times_ns) / level
         with np.errstate(divide="ignore", invalid="ignore"):
             ground = np.where(up < 0, config.height / -up, np.inf)
             ranges[config.height + ranges * up > config.wall_height] = np.inf
         nearest: Array = np.minimum(ranges, ground)
         return nearest
 
-    def _over(self, terrain: Terrain, poses: Array, beams: Beams) -> Array:
+    def _over(self, terrain: Terrain, poses: Array, beams: Beams, times_ns: NDArray[np.int64]) -> Array:
         """Ranges over uneven ground; arguments as of ``_tilted``."""
         config, (x, y, yaw, pitch, _) = self._config, poses
         forward, left, up = beams
@@ -113,7 +124,7 @@ class SimulatedLidar:
         zs = terrain.height(x, y) - config.x * np.sin(pitch) + config.height
         level = np.hypot(forward, left)
         headings, rises = yaw + np.arctan2(left, forward), up / level
-        walls = self._cast(xs, ys, headings, config.max_range)
+        walls = self._cast(xs, ys, headings, config.max_range, times_ns)
         hit = np.isfinite(walls)
         way = np.where(hit, walls, 0.0)
         foot = terrain.height(xs + way * np.cos(headings), ys + way * np.sin(headings))

@@ -35,6 +35,7 @@ _FELT = 0.05
 """Time constant with which an accelerometer feels the body's acceleration, s: its mount and filter."""
 
 Pose = tuple[float, float, float]
+Twist = tuple[float, float, float]
 Contact = Callable[[float, float, float], float]
 """How deep the footprint at (x, y, yaw) reaches into things, m; 0 = free."""
 Tilt = Callable[[int, float, float, float], tuple[float, float]]
@@ -125,6 +126,20 @@ class TruckPlant:
         self.acceleration = (0.0, 0.0)
         """Of the body, forward and left, as a sensor on it feels it, m/s^2; gravity is not in it."""
         self._trail: deque[tuple[float, ...]] = deque(maxlen=_HISTORY)
+        self.together: Callable[[int], None] = lambda _: None
+        """Brings what else moves in the world to an instant (ns), before this robot is integrated to it."""
+        self.on_blocked: Callable[[Pose, Twist], None] = lambda _pose, _twist: None
+        """Gets a pose that something keeps the robot from, and the twist with which it went there."""
+
+    @property
+    def pose(self) -> Pose:
+        """Of the geometric centre in the map frame, at the newest instant."""
+        return self._pose
+
+    @property
+    def twist(self) -> Twist:
+        """Velocity in the body frame: m/s, m/s, rad/s."""
+        return self._twist
 
     @property
     def attitude(self) -> tuple[float, float]:
@@ -143,6 +158,11 @@ class TruckPlant:
 
     def advance(self, time_ns: int) -> None:
         """Integrate up to an instant; the first call sets the start, earlier instants change nothing."""
+        self.together(time_ns)
+        self.integrate(time_ns)
+
+    def integrate(self, time_ns: int) -> None:
+        """``advance`` of this robot alone."""
         if self._start_ns is None:
             self._start_ns = time_ns
             self._remember()
@@ -297,6 +317,7 @@ class TruckPlant:
         pose = integrate(self._pose, *twist, dt)
         depth = self._contact(*pose) if pose != self._pose else 0.0
         if depth > 0.0 and depth >= self._contact(*self._pose):
+            self.on_blocked(pose, twist)
             self._stuck_at = self._pose
             self._wheel_speeds = [0.0] * len(self.shafts)
             self._twist = (0.0, 0.0, 0.0)

@@ -1,4 +1,4 @@
-"""One simulated world: map, obstacles, truck and the physics of its devices."""
+"""One robot in a simulated world, and the physics of its devices."""
 
 from math import hypot
 from pathlib import Path
@@ -18,11 +18,11 @@ from monstertruck_drivers.emulation import (
 )
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.errors import InputError
-from monstertruck_runtime.map_files import FREE, OCCUPIED, load_map
+from monstertruck_runtime.map_files import load_map
 from monstertruck_sim.world.built_in import BUILT_IN, BuiltIn
 from monstertruck_sim.world.config import SinusoidTilt, TiltConfig, WorldConfig
-from monstertruck_sim.world.obstacles import Box, Obstacle, discs_and_segments, penetration
-from monstertruck_sim.world.raycast import cast_rays, clearance, grid_penetration
+from monstertruck_sim.world.obstacles import Box, Obstacle
+from monstertruck_sim.world.scene import Surroundings
 from monstertruck_sim.world.sensors import (
     SimulatedCompass,
     SimulatedImu,
@@ -33,14 +33,14 @@ from monstertruck_sim.world.sensors import (
 )
 from monstertruck_sim.world.sonar import SimulatedSonars
 from monstertruck_sim.world.terrain import LEVEL, Terrain, load_profile, profile_path, rocking
-from monstertruck_sim.world.truck_plant import Pose, TruckPlant, TruthState
+from monstertruck_sim.world.truck_plant import Pose, TruckPlant, TruthState, Twist
 
 _ROOM = 0.05
 """Metres around the footprint: known to be free, they spare the contact test until the truck has crossed them."""
 
 
 class World:
-    """Map, truck and sensors in one simulation, which advances when a later instant is asked for.
+    """One robot in its surroundings, with its sensors; it advances when a later instant is asked for.
 
     Everything is a function of configuration, seed, commands and their instants. The start of time is the first
     instant anybody names.
@@ -48,13 +48,17 @@ class World:
     Args:
         config: see ``WorldConfig``.
         seed: of all noise.
+        scene: surroundings that it shares with other robots; None = its own, of ``config``.
+        name: of the robot.
 
     Raises:
-        InputError: unknown map name, a bad map or profile file, or a start pose in a wall.
+        InputError: unknown map name, a bad map or profile file, or a start pose in a wall, a robot or a person.
     """
 
-    def __init__(self, config: WorldConfig, seed: int) -> None:
-        place = _find(config.map)
+    def __init__(self, config: WorldConfig, seed: int, scene: Surroundings | None = None, name: str = "truck") -> None:
+        self.scene = scene if scene is not None else make_scene(config, seed)
+        self.name = name
+        place = self.scene.place
         start = (config.start.x, config.start.y, config.start.yaw) if config.start else place.start
         noise_seed = seed if config.noise else None
         self.map = place.map
@@ -63,16 +67,16 @@ class World:
         self._tilt: TiltConfig = config.tilt
         self._truck = config.truck
         self._half_diagonal = hypot(config.truck.length, config.truck.width) / 2
-        self._obstacles: tuple[Obstacle, ...] = ()
-        self._discs, self._segments = discs_and_segments(())
         self._free: Pose | None = None
         """Pose with free room around."""
-        if self._overlap(place.map.cells != FREE, start) > 0:
+        self._known: tuple[Obstacle, ...] = ()
+        """Obstacles at the time of ``_free``."""
+        if self.scene.overlap(self.scene.solid, self._box(start)) > 0:
             raise InputError(f"start: the truck at {start} touches what is not free on the map {config.map}")
-        self._occupied = place.map.cells == OCCUPIED
-        self._clear = clearance(self._occupied)
-        self._cast(np.zeros(1), np.zeros(1), np.zeros(1), 0.0)  # compiles outside of any deadline
         self._plant = TruckPlant(config.truck, config.battery, start, self._contact, self._attitude, noise_seed)
+        self._plant.together = self.scene.advance
+        self._plant.on_blocked = self._blocked
+        self.scene.add_body(self)
         self._lidar = SimulatedLidar(self._plant, self._cast, self._terrain, config.lidar, noise_seed)
         self.lidar: RangeSource = self._lidar
         self.view: ViewSource = SimulatedView(self._plant, self._cast, config.camera)
@@ -97,7 +101,27 @@ class World:
     @property
     def obstacles(self) -> tuple[Obstacle, ...]:
         """Obstacles in the world that are not on its map."""
-        return self._obstacles
+        return self.scene.obstacles
+
+    # As the others in the scene see it
+
+    @property
+    def outline(self) -> Box:
+        """Footprint at its newest instant."""
+        return self._box(self._plant.pose)
+
+    @property
+    def pace(self) -> float:
+        """Speed of its fastest point, m/s, at its newest instant."""
+        return self._pace(self._plant.twist)
+
+    def integrate(self, time_ns: int) -> None:
+        """Move this robot alone on to an instant."""
+        self._plant.integrate(time_ns)
+
+    def outlines(self, times_ns: NDArray[np.int64]) -> list[Box]:
+        """Footprints at instants of the last half second."""
+        return [self._box((x, y, yaw)) for x, y, yaw in self._plant.poses(times_ns)[:3].T.tolist()]
 
     def truth(self, time_ns: int) -> TruthState:
         """What is really the case at ``time_ns`` (or at the newest instant asked for, if that is later)."""
@@ -114,7 +138,9 @@ class World:
         Raises:
             InputError: it would touch what is not free there.
         """
-        if self._overlap(self.map.cells != FREE, pose) > 0 or self._depth(pose) > 0:
+        box = self._box(pose)
+        depth = self.scene.overlap(self.scene.solid, box) + self._depth(pose)
+        if depth + self.scene.moving_overlap(box, self.name) > 0:
             raise InputError(f"carry: the truck at {pose} touches what is not free")
         self._plant.advance(time_ns)
         self._plant.carry(pose)
@@ -122,7 +148,7 @@ class World:
     def add(self, time_ns: int, obstacle: Obstacle) -> None:
         """Put something into the world: seen by the lidar, stops the truck."""
         self._plant.advance(time_ns)
-        self._set_obstacles((*self._obstacles, obstacle))
+        self.scene.set_obstacles((*self.obstacles, obstacle))
 
     def remove(self, time_ns: int, obstacle: Obstacle) -> None:
         """Take it away again.
@@ -130,11 +156,11 @@ class World:
         Raises:
             InputError: it is not there.
         """
-        if obstacle not in self._obstacles:
+        if obstacle not in self.obstacles:
             raise InputError(f"obstacle {obstacle}: not in the world")
         self._plant.advance(time_ns)
-        index = self._obstacles.index(obstacle)
-        self._set_obstacles(self._obstacles[:index] + self._obstacles[index + 1 :])
+        index = self.obstacles.index(obstacle)
+        self.scene.set_obstacles(self.obstacles[:index] + self.obstacles[index + 1 :])
 
     def set_charge(self, time_ns: int, charge: float) -> None:
         """Exchange the battery for one charged to 0..1."""
@@ -165,13 +191,13 @@ class World:
         self._plant.advance(time_ns)
         self._tilt = tilt
 
-    def _set_obstacles(self, obstacles: tuple[Obstacle, ...]) -> None:
-        self._obstacles = obstacles
-        self._discs, self._segments = discs_and_segments(obstacles)
-        self._free = None
-
     def _contact(self, x: float, y: float, yaw: float) -> float:
         pose = (x, y, yaw)
+        return self._fixed_contact(pose) + self.scene.moving_overlap(self._box(pose), self.name)
+
+    def _fixed_contact(self, pose: Pose) -> float:
+        if self._known is not self.obstacles:
+            self._free, self._known = None, self.obstacles
         if self._free is not None and self._way(self._free, pose) < _ROOM:
             return 0.0
         self._free = pose if self._depth(pose, _ROOM) == 0.0 else None
@@ -182,26 +208,24 @@ class World:
         return hypot(b[0] - a[0], b[1] - a[1]) + abs(b[2] - a[2]) * self._half_diagonal
 
     def _depth(self, pose: Pose, room: float = 0.0) -> float:
-        """How deep the footprint, grown by ``room`` all around, reaches into things, m."""
-        depth = self._overlap(self._occupied, pose, room)
-        if self._obstacles:
-            x, y, yaw = pose
-            footprint = Box(x, y, self._truck.length + 2 * room, self._truck.width + 2 * room, yaw)
-            depth += sum(penetration(footprint, obstacle) for obstacle in self._obstacles)
-        return depth
+        """How deep the footprint, grown by ``room`` all around, reaches into things that do not move, m."""
+        return self.scene.fixed_overlap(self._box(pose, room))
 
-    def _overlap(self, solid: NDArray[np.bool_], pose: Pose, room: float = 0.0) -> float:
-        (x, y, yaw), (x0, y0), truck = pose, self.map.origin, self._truck
-        depth: float = grid_penetration(
-            solid, self.map.resolution, x - x0, y - y0, yaw, truck.length + 2 * room, truck.width + 2 * room
-        )
-        return depth
+    def _box(self, pose: Pose, room: float = 0.0) -> Box:
+        x, y, yaw = pose
+        return Box(x, y, self._truck.length + 2 * room, self._truck.width + 2 * room, yaw)
 
-    def _cast(self, xs: Array, ys: Array, angles: Array, reach: float) -> Array:
-        ranges: Array = cast_rays(
-            self._clear, self.map.resolution, *self.map.origin, xs, ys, angles, reach, self._discs, self._segments
-        )
-        return ranges
+    def _pace(self, twist: Twist) -> float:
+        vx, vy, wz = twist
+        return hypot(vx, vy) + abs(wz) * self._half_diagonal
+
+    def _blocked(self, pose: Pose, twist: Twist) -> None:
+        self.scene.report(self._box(pose), self.name, self._pace(twist))
+
+    def _cast(
+        self, xs: Array, ys: Array, angles: Array, reach: float, times_ns: NDArray[np.int64] | None = None
+    ) -> Array:
+        return self.scene.cast(xs, ys, angles, reach, times_ns, self.name)
 
     def _attitude(self, elapsed_ns: int, x: float, y: float, yaw: float) -> tuple[float, float]:
         if isinstance(self._tilt, SinusoidTilt):
@@ -209,6 +233,15 @@ class World:
         if self._terrain is None:
             return 0.0, 0.0
         return self._terrain.tilt(x, y, yaw, self._truck.wheelbase, self._truck.track)
+
+
+def make_scene(config: WorldConfig, seed: int) -> Surroundings:
+    """Surroundings for the robots of one world.
+
+    Raises:
+        InputError: unknown map name, a bad map or profile file, or a person's way that is not free.
+    """
+    return Surroundings(_find(config.map), config.people, seed)
 
 
 def _find(name: str) -> BuiltIn:

@@ -126,6 +126,7 @@ async def _serve(
         cables[role] = PtyPort(path)
     computer = EmulatedComputer(folder, config.devices, cables, clock)
     robot = SimulatedRobot(config.sim, config.devices, config.monitors, clock, computer.ports, folder)
+    robot.world.scene.on_contact = lambda contact: _say(str(contact))
     log = TruthLog(robot.world, clock)
     emulated: dict[str, Commanded] = {role: Emulated(robot.emulators[role], robot.ports[role]) for role in devices}
     emulated |= {name: EmulatedFiles(files) for name, files in robot.monitored.items()}
