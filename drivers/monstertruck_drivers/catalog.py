@@ -232,6 +232,7 @@ class DeviceKind(Plugin):
 
 RESERVED: Final = frozenset(
     {
+        "behaviours",
         "blackbox",
         "bus",
         "clock",
