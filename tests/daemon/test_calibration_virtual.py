@@ -371,7 +371,7 @@ def test_a_strange_result_is_refused(result: Any, said: str, tmp_path: Path):
     ("key", "value", "said"),
     [
         ("gate.speed", 9.0, "the wizard drive has no business there"),
-        ("geometry.drive_ratio", -3.0, "greater than 1"),
+        ("geometry.drive_ratio", -3.0, "greater than or equal to 1"),
     ],
 )
 def test_a_value_that_may_not_be_set_or_does_not_fit_is_refused(key: str, value: float, said: str, tmp_path: Path):
