@@ -185,7 +185,7 @@ class Daemon:
                 self.config.zenoh,
                 self.clock,
                 self.rpc,
-                witness=self.config.stand != "none",
+                stand=self.config.stand != "none",
             )
             await bridge.open()
             self._start(bus_scope, bridge, OnBug.EXIT)

@@ -35,7 +35,7 @@ class Robot:
 
 @asynccontextmanager
 async def running_robot(
-    endpoint: str | None = None, *, robot: str = "truck", deadline: float = 0.3, witness: bool = False, **config: object
+    endpoint: str | None = None, *, robot: str = "truck", deadline: float = 0.3, stand: bool = False, **config: object
 ) -> AsyncIterator[Robot]:
     """A bridge that is ready; cancelled and awaited at the end. Calls may take ``deadline`` seconds."""
     endpoint = endpoint or free_endpoint()
@@ -43,7 +43,7 @@ async def running_robot(
     settings = ZenohConfig(**{"gather_seconds": 0.0, "listen": (endpoint,), **config})
     bus = Bus(clock, settings.gather_seconds)
     rpc = Rpc(clock, deadline=deadline)
-    bridge = ZenohBridge(robot, bus, settings, clock, rpc, witness=witness)
+    bridge = ZenohBridge(robot, bus, settings, clock, rpc, stand=stand)
     ready = asyncio.Event()
     events = bus.subscribe(EVENT, fifo(100))
     task = asyncio.create_task(bridge.run(ready.set))

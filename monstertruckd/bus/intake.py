@@ -219,7 +219,7 @@ class Intake:
         self._refusals.close()
 
 
-class Sights:
+class StandIntake:
     """Takes in what a test stand sees of the robot, for the recorder; to be made on the loop.
 
     Args:
@@ -240,7 +240,7 @@ class Sights:
         self._refusals = refusals
         self._rates = OwnerRates(self.RATE, clock)
         self._poses: ThreadHop[StandPose] = ThreadHop(
-            lambda pose: guard(lambda: bus.witness(STAND_POSE, pose)), DEPTH, bus.add_drops
+            lambda pose: guard(lambda: bus.put_stand(STAND_POSE, pose)), DEPTH, bus.add_drops
         )
 
     def take(self, size: int, read: Callable[[], bytes]) -> None:

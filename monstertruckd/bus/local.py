@@ -181,7 +181,7 @@ class Bus:
             raise RuntimeError(msg)
         return self.hand_over(topic, message.model_copy(update={"received": self._clock.now()}))
 
-    def witness(self, topic: Topic[M], message: M) -> None:
+    def put_stand(self, topic: Topic[M], message: M) -> None:
         """Take in what a test stand sees: for the taps alone. ``received`` becomes the daemon's own time.
 
         Raises:

@@ -40,7 +40,7 @@ from monstertruck_schemas.topics import (
 )
 from monstertruckd.bus.access import ANONYMOUS, OBSERVING, Sender, in_groups
 from monstertruckd.bus.call_limits import ESTOP, ORDERS, ROOM, TOO_MANY, CallLimits, may_be_served
-from monstertruckd.bus.intake import Intake, Refusals, Sights
+from monstertruckd.bus.intake import Intake, Refusals, StandIntake
 from monstertruckd.bus.local import Bus
 from monstertruckd.bus.replies import Replies, Reply
 from monstertruckd.bus.rpc import Rpc, failure, topic_rows
@@ -73,15 +73,15 @@ class ZenohBridge:
         config: endpoints and access.
         clock: time.
         rpc: handlers behind ``rpc/<name>``; ``rpc/topics`` is added.
-        witness: take in what a test stand sees of the robot.
+        stand: take in what a test stand sees of the robot.
     """
 
     name = "zenoh"
 
     def __init__(
-        self, robot: str, bus: Bus, config: ZenohConfig, clock: Clock, rpc: Rpc, *, witness: bool = False
+        self, robot: str, bus: Bus, config: ZenohConfig, clock: Clock, rpc: Rpc, *, stand: bool = False
     ) -> None:
-        self._witness = witness
+        self._stand = stand
         self._robot = robot
         self._bus = bus
         self._config = config
@@ -132,7 +132,9 @@ class ZenohBridge:
                             if topic.writer is Writer.OUTSIDE
                         }
                         refusals = inputs.enter_context(closing(Refusals(self._bus, self._clock, self.name)))
-                        sights = inputs.enter_context(closing(Sights(self._bus, self._clock, guard, refusals)))
+                        stand_intake = inputs.enter_context(
+                            closing(StandIntake(self._bus, self._clock, guard, refusals))
+                        )
                         active: set[asyncio.Task[Reply]] = set()
                         queries: ThreadHop[Call] = inputs.enter_context(
                             closing(
@@ -144,7 +146,9 @@ class ZenohBridge:
                                 )
                             )
                         )
-                        inward = partial(self._declare_inputs, intakes, refusals, queries, replies, limits, sights)
+                        inward = partial(
+                            self._declare_inputs, intakes, refusals, queries, replies, limits, stand_intake
+                        )
                         for token in await in_thread(inward):
                             inputs.enter_context(token)
                         ready()
@@ -216,7 +220,7 @@ class ZenohBridge:
         queries: ThreadHop[Call],
         replies: Replies,
         limits: CallLimits,
-        sights: Sights,
+        stand_intake: StandIntake,
     ) -> list[zenoh.LivelinessToken]:
         """Subscribers and queryables; last the tokens that say so, which live as long as their objects."""
         remote = zenoh.Locality.REMOTE
@@ -229,9 +233,9 @@ class ZenohBridge:
                     partial(self._on_request, door, intakes, refusals),
                     allowed_origin=remote,
                 )
-            if self._witness:
+            if self._stand:
                 session.declare_subscriber(
-                    STAND_POSE.key(self._robot), partial(_on_sight, sights), allowed_origin=remote
+                    STAND_POSE.key(self._robot), partial(_on_stand_pose, stand_intake), allowed_origin=remote
                 )
             for topic in TOPICS:
                 key = topic.key(self._robot)
@@ -392,8 +396,8 @@ def _publisher(session: zenoh.Session, topic: Topic[Any], key: str) -> Put:
     ).put
 
 
-def _on_sight(sights: Sights, sample: zenoh.Sample) -> None:
-    sights.take(len(sample.payload), sample.payload.to_bytes)
+def _on_stand_pose(stand_intake: StandIntake, sample: zenoh.Sample) -> None:
+    stand_intake.take(len(sample.payload), sample.payload.to_bytes)
 
 
 def _guarded(failed: "asyncio.Future[None]", job: Callable[[], object]) -> None:

@@ -189,8 +189,8 @@ class TruckConfig(Schema):
     def weakened(self) -> tuple[str, ...]:
         """Settings by which the robot is less safe than by the defaults, each with its value and the default."""
         opened = (f"zenoh.insecure: anybody who reaches {end} may drive" for end in self.zenoh.open_endpoints)
-        eyes = self.devices.lidar is not None or self.devices.sonar is not None
-        blind = () if eyes or self.gate.scan.critical else (BLIND,)
+        sees = self.devices.lidar is not None or self.devices.sonar is not None
+        blind = () if sees or self.gate.scan.critical else (BLIND,)
         return (*weakened(self.gate), *blind, *weakened_devices(self.devices, self.monitors), *opened)
 
     def missing_actuators(self) -> str | None:

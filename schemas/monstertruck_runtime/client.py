@@ -269,7 +269,7 @@ class TruckClient(Operator):
         """
         self._put(REQ_DRIVE, DriveRequest(**await self._answered(lease), speed=0.0, front=0.0, shafts=rates))
 
-    def witness(self, pose: StandPose) -> None:
+    def publish_stand_pose(self, pose: StandPose) -> None:
         """Say where the robot really is, as a test stand sees it: the robot records it, and nothing in it reads it."""
         self._open_session().put(
             STAND_POSE.key(self.robot), wire.encode(STAND_POSE, pose), encoding=wire.encoding(STAND_POSE)

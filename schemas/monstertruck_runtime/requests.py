@@ -15,7 +15,7 @@ from monstertruck_runtime.errors import InputError, RequestRefusedError
 from monstertruck_runtime.mailbox import Delivery, Mailbox
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import Order, Request, Role
+from monstertruck_schemas.req import DriveRequest, Order, Request, Role
 from monstertruck_schemas.state import GateState
 from monstertruck_schemas.topics import Topic, owner_of
 
@@ -167,6 +167,30 @@ def freshness(request: Request, now: int, limit: float) -> Reason:
     """OK, or LEASE_EXPIRED for a request whose gate stamp is missing or older than ``limit`` s."""
     known = request.gate_stamp
     return Reason.OK if known is not None and 0 <= now - known <= limit * SECOND else Reason.LEASE_EXPIRED
+
+
+def planner_request(seq: int, gate: GateState, now: int, source: str, lease: float, **motion: Any) -> DriveRequest:
+    """A planner's drive request to the gate that ``gate`` is the newest state of.
+
+    Args:
+        seq: of the publisher.
+        gate: its nonce and stamp authenticate the request.
+        now: ns.
+        source: the planner.
+        lease: s.
+        motion: fields of the request that say which.
+    """
+    return DriveRequest(
+        stamp=now,
+        received=now,
+        seq=seq,
+        source=source,
+        role=Role.TRACKER,
+        lease=lease,
+        nonce=gate.nonce,
+        gate_stamp=gate.stamp,
+        **motion,
+    )
 
 
 def refusal(request: Request, gate: GateState | None, sequences: Sequences, now: int, max_age: float | None) -> Reason:

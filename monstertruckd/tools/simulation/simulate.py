@@ -174,7 +174,7 @@ async def _see(clock: Clock, config: SimulatedTruckConfig, world: World) -> None
         try:
             async with TruckClient(config.robot, endpoint, clock=clock) as client:
                 seed = config.sim.seed if config.sim.world.noise else None
-                await SimulatedStand(config.sim.stand, world, clock, client.witness, seed).run()
+                await SimulatedStand(config.sim.stand, world, clock, client.publish_stand_pose, seed).run()
         except NotFoundError:
             await clock.sleep(STAND_RETRY)
 

@@ -87,7 +87,7 @@ class VirtualRig:
         if self.config.stand == "simulator":
             sim = self.config.sim
             seed = sim.seed if sim.world.noise else None
-            stand = SimulatedStand(sim.stand, self.world, self.clock, self._witness, seed)
+            stand = SimulatedStand(sim.stand, self.world, self.clock, self._put_stand, seed)
             around.append(asyncio.create_task(stand.run(), name="stand"))
         if (drill := self.config.sim.drill) is not None:
             around.append(asyncio.create_task(FaultInjector(self.context, drill).run(), name="faults"))
@@ -103,8 +103,8 @@ class VirtualRig:
                 await asyncio.wait(around)
                 self._folder.cleanup()
 
-    def _witness(self, pose: StandPose) -> None:
-        self.bus.witness(STAND_POSE, pose)
+    def _put_stand(self, pose: StandPose) -> None:
+        self.bus.put_stand(STAND_POSE, pose)
 
     # The computer's supply
 

@@ -11,12 +11,12 @@ from monstertruck_runtime.clock import SECOND, Clock, Schedule
 from monstertruck_runtime.errors import NotFoundError, RequestRefusedError
 from monstertruck_runtime.mailbox import latest
 from monstertruck_runtime.ports import BusPort, EventSink, Publisher, Ready, RpcRegistry, Subscription
-from monstertruck_runtime.requests import Sequences, parse_request, refusal
+from monstertruck_runtime.requests import Sequences, parse_request, planner_request, refusal
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.plan import BehaviourState, GoalPhase, GoalState, TrackerState
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import BehaviourOrder, BehaviourRequest, DriveRequest, RequestedTwist, Role
+from monstertruck_schemas.req import BehaviourOrder, BehaviourRequest, DriveRequest, RequestedTwist
 from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.state import GateMode, GateState, Odometry
 from monstertruck_schemas.topics import BEHAVIOUR, GATE, GOAL, ODOMETRY, TRACKER, Writer
@@ -261,21 +261,9 @@ class BehaviourService:
         gate = self._gate.latest
         if gate is None or not gate.mode.active:
             return
-        self._drive.put(
-            DriveRequest(
-                stamp=now,
-                received=now,
-                seq=self._drive.next_seq(),
-                source=SOURCE,
-                role=Role.TRACKER,
-                lease=LEASE,
-                nonce=gate.nonce,
-                gate_stamp=gate.stamp,
-                speed=0.0,
-                front=0.0,
-                twist=RequestedTwist(vx=motion.vx, vy=motion.vy, wz=motion.wz),
-            )
-        )
+        twist = RequestedTwist(vx=motion.vx, vy=motion.vy, wz=motion.wz)
+        seq = self._drive.next_seq()
+        self._drive.put(planner_request(seq, gate, now, SOURCE, LEASE, speed=0.0, front=0.0, twist=twist))
 
     def _report(self, now: int) -> None:
         state, before = self._state(now), self._reported

@@ -11,9 +11,10 @@ from monstertruck_planners.goals.exchange import PlanAnswer, Pose, pose_of
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.mailbox import Mailbox
 from monstertruck_runtime.ports import EventSink, Publisher, Subscription
+from monstertruck_runtime.requests import planner_request
 from monstertruck_schemas.plan import BehaviourState, GoalState, Path, TrackerState
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import DriveRequest, GoalControl, GoalRequest, Role
+from monstertruck_schemas.req import DriveRequest, GoalControl, GoalRequest
 from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.state import GateState, Grid, Ground, Odometry
 
@@ -146,21 +147,8 @@ class PathPublisher:
         gate, now = self._in.gate.latest, self._clock.now()
         if self.driving or gate is None or not gate.mode.active:
             return
-        self._out.planner_request.put(
-            DriveRequest(
-                stamp=now,
-                received=now,
-                seq=self._out.planner_request.next_seq(),
-                source=SOURCE,
-                role=Role.TRACKER,
-                lease=LEASE,
-                nonce=gate.nonce,
-                gate_stamp=gate.stamp,
-                speed=0.0,
-                front=0.0,
-                rear=0.0,
-            )
-        )
+        requests = self._out.planner_request
+        requests.put(planner_request(requests.next_seq(), gate, now, SOURCE, LEASE, speed=0.0, front=0.0, rear=0.0))
 
     def _publish(
         self,

@@ -18,10 +18,11 @@ from monstertruck_runtime.actors.actor import Actor
 from monstertruck_runtime.clock import SECOND, Clock, Schedule
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription, Value
+from monstertruck_runtime.requests import planner_request
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.plan import AxleResponse, Path, TrackerState
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import DriveRequest, Role
+from monstertruck_schemas.req import DriveRequest
 from monstertruck_schemas.sensor import Attitude, LaserScan
 from monstertruck_schemas.state import GateMode, GateState, Odometry
 from monstertruck_schemas.topics import COMPASS, ODOMETRY, SCAN
@@ -393,21 +394,9 @@ class TrackerService:
     def _publish(self, now: int, gate: GateState | None, output: TrackOutput) -> None:
         command = output.command
         if command is not None and gate is not None and output.drive:
-            self._drive.put(
-                DriveRequest(
-                    stamp=now,
-                    received=now,
-                    seq=self._drive.next_seq(),
-                    source=self.name,
-                    role=Role.TRACKER,
-                    lease=self._setup.config.lease,
-                    nonce=gate.nonce,
-                    gate_stamp=gate.stamp,
-                    speed=command.speed,
-                    front=command.front,
-                    rear=command.rear,
-                )
-            )
+            seq, lease = self._drive.next_seq(), self._setup.config.lease
+            motion = {"speed": command.speed, "front": command.front, "rear": command.rear}
+            self._drive.put(planner_request(seq, gate, now, self.name, lease, **motion))
         for event in output.events:
             self._events(event.reason, event.severity, self.name, event.text, **event.values)
         if command is not None:

@@ -12,7 +12,7 @@ from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import StandPose
 from monstertruck_schemas.topics import BY_NAME, EVENT, STAND_POSE, TOPICS, Writer
-from monstertruckd.bus.intake import Refusals, Sights
+from monstertruckd.bus.intake import Refusals, StandIntake
 from monstertruckd.bus.local import Bus
 from monstertruckd.daemon import Daemon
 from monstertruckd.tools.simulation.config import load_simulated
@@ -57,13 +57,13 @@ def test_a_whole_daemon_has_no_reader_of_it():
 def test_what_a_stand_sees_reaches_the_taps_with_the_time_it_arrived():
     bus, seen = Bus(WallClock()), []
     bus.tap(lambda topic, message, data, at: seen.append((topic, message, data)), [STAND_POSE])
-    bus.witness(STAND_POSE, POSE)
+    bus.put_stand(STAND_POSE, POSE)
     ((topic, message, data),) = seen
     assert (topic, message.stamp, message.pose) == (STAND_POSE, 5, POSE.pose)
     assert message.received > 7
     assert wire.decode(STAND_POSE, data) == message
     with pytest.raises(RuntimeError, match="not by a stand"):
-        bus.witness(EVENT, POSE)
+        bus.put_stand(EVENT, POSE)
 
 
 def test_poses_from_outside_are_bounded_in_size_and_rate_and_must_be_poses():
@@ -72,19 +72,19 @@ def test_poses_from_outside_are_bounded_in_size_and_rate_and_must_be_poses():
         bus, seen = Bus(clock), []
         bus.tap(lambda topic, message, data, at: seen.append(message), [STAND_POSE])
         events = bus.subscribe(EVENT, fifo(10))
-        sights = Sights(bus, clock, lambda act: act(), Refusals(bus, clock, "zenoh"))
+        stand_intake = StandIntake(bus, clock, lambda act: act(), Refusals(bus, clock, "zenoh"))
         data = wire.encode(STAND_POSE, POSE)
-        sights.take(len(data), lambda: data)
-        sights.take(5000, lambda: data)
+        stand_intake.take(len(data), lambda: data)
+        stand_intake.take(5000, lambda: data)
         await asyncio.sleep(0.02)
         assert len(seen) == 1
         assert [event.reason for event in events.drain()] == [Reason.BAD_INPUT]
-        sights.take(4, lambda: b"junk")
+        stand_intake.take(4, lambda: b"junk")
         for _ in range(300):
-            sights.take(len(data), lambda: data)
+            stand_intake.take(len(data), lambda: data)
             await asyncio.sleep(0)
         await asyncio.sleep(0.02)
         assert 50 <= len(seen) <= 125
-        sights.close()
+        stand_intake.close()
 
     asyncio.run(main())

@@ -512,8 +512,8 @@ async def test_what_a_test_stand_sees_comes_in_for_the_recorder_where_it_is_aske
         position_sigma=0.0,
         heading_sigma=0.0,
     )
-    async with running_robot(witness=True) as robot, running_robot() as deaf:
-        for bridge, heard in ((robot, True), (deaf, False)):
+    async with running_robot(stand=True) as robot, running_robot() as without:
+        for bridge, heard in ((robot, True), (without, False)):
             seen: list[StandPose] = []
             bridge.bus.tap(lambda _t, message, _d, _a, seen=seen: seen.append(message), [STAND_POSE])
             async with (
@@ -522,7 +522,7 @@ async def test_what_a_test_stand_sees_comes_in_for_the_recorder_where_it_is_aske
             ):
                 echoes = station.subscribe(STAND_POSE, fifo(10))
                 await asyncio.sleep(0.1)
-                stand.witness(pose)
+                stand.publish_stand_pose(pose)
                 await asyncio.sleep(0.3)
                 assert [message.pose for message in seen] == [pose.pose] * heard
                 assert len(echoes.drain()) <= 1  # the stand's own, never the robot's

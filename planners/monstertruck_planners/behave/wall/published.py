@@ -6,6 +6,7 @@ All is written for a wall on the left; a wall on the right is the mirror image.
 """
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Final, Literal, NamedTuple
 
@@ -81,7 +82,7 @@ def ramp(begin: float, start: float, end: float, duration: float) -> TimedRamp:
 
 
 @dataclass(frozen=True, slots=True)
-class SonarWatch:
+class SonarMonitor:
     """Notices sonars that are silent, and ranges that do not change although the robot turns."""
 
     answered: dict[str, float] = field(default_factory=dict)
@@ -91,7 +92,7 @@ class SonarWatch:
     changed: dict[str, tuple[float, float]] = field(default_factory=dict)
     """Range of each when it changed last, m, and how far the robot had turned then, rad."""
 
-    def observe(self, sonars: SonarRanges, names: tuple[str, ...], turned: float, t: float) -> "SonarWatch":
+    def observe(self, sonars: SonarRanges, names: tuple[str, ...], turned: float, t: float) -> "SonarMonitor":
         """After a message at t, with ``turned`` rad turned so far, left and right both counted."""
         answered, echoes, changed = dict(self.answered), dict(self.echoes), dict(self.changed)
         for name in names:
@@ -106,7 +107,7 @@ class SonarWatch:
             value = echo.range if measured and echo.range is not None else math.inf  # limits may repeat
             if name not in changed or changed[name][0] != value or not math.isfinite(value):
                 changed[name] = (value, turned)
-        return SonarWatch(answered, echoes, changed)
+        return SonarMonitor(answered, echoes, changed)
 
     def fault(self, turned: float, t: float) -> tuple[Reason, str] | None:
         """What is wrong with the sonars at t."""
@@ -137,7 +138,7 @@ class WallState:
     w: TimedRamp | None = None
     error: float | None = None
     """Of the sample before, m."""
-    watch: SonarWatch = field(default_factory=SonarWatch)
+    sonars: SonarMonitor = field(default_factory=SonarMonitor)
     pose: tuple[float, float, float] | None = None
     turned: float = 0.0
     """Rad, both ways counted."""
@@ -155,7 +156,7 @@ class WallState:
     """Since when motion is asked for without any, s."""
 
 
-class _Wall:
+class _Wall(ABC):
     """What both methods share: input checks, odometry, laps, the mirror."""
 
     reads: ClassVar[tuple[Topic[Any], ...]] = (SONAR, ODOMETRY)
@@ -173,9 +174,9 @@ class _Wall:
         """One step; see ``Behaviour``."""
         sonars, odometry = inputs.of(SONAR), inputs.of(ODOMETRY)
         state = _moved(state, odometry)
-        state = replace(state, watch=state.watch.observe(sonars, self._names, state.turned, t))
-        fault = state.watch.fault(state.turned, t)
-        state = _watched(state, odometry.twist.vx, t)
+        state = replace(state, sonars=state.sonars.observe(sonars, self._names, state.turned, t))
+        fault = state.sonars.fault(state.turned, t)
+        state = _stall_timed(state, odometry.twist.vx, t)
         if fault is None and state.moving_since is not None and t - state.moving_since >= STALL:
             fault = Reason.STUCK, f"{state.asked:.2f} m/s asked for, {odometry.twist.vx:.2f} m/s driven"
         if fault is None and state.phase == "turn_away" and state.turned - state.turned_before > math.tau:
@@ -183,15 +184,16 @@ class _Wall:
         if fault is not None:
             return BehaviourStep(None, state, state.phase, *fault)
         hold, furthest = self._shared.hold, sonars.range_max
-        ranges = Ranges(*(state.watch.range(name, hold, furthest, t) for name in self._names))
+        ranges = Ranges(*(state.sonars.range(name, hold, furthest, t) for name in self._names))
         state = self._lap(state, t)
         if state.phase == "stop":
             return self._stopping(state, ranges, t)
         state, v, w = self._drive(state, ranges, t)
         return self._answer(replace(state, asked=v), v, w, ranges)
 
+    @abstractmethod
     def _drive(self, state: WallState, ranges: Ranges, t: float) -> tuple[WallState, float, float]:
-        raise NotImplementedError
+        """Next state, speed in m/s and yaw rate in rad/s, with the wall on the left."""
 
     def _distance(self, ranges: Ranges) -> float:
         return ranges.side
@@ -337,7 +339,7 @@ def _moved(state: WallState, odometry: Odometry) -> WallState:
     )
 
 
-def _watched(state: WallState, speed: float, t: float) -> WallState:
+def _stall_timed(state: WallState, speed: float, t: float) -> WallState:
     """Since when the robot stands although it was asked to drive."""
     stalled = state.asked > AT_REST * 5 and abs(speed) < AT_REST
     if not stalled:

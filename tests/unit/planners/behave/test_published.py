@@ -8,7 +8,7 @@ from pydantic import ValidationError
 
 from monstertruck_planners.behave.wall.config import WallPdConfig, WallSwitchingConfig
 from monstertruck_planners.behave.wall.published import (
-    SonarWatch,
+    SonarMonitor,
     WallPd,
     WallSwitching,
     ramp,
@@ -128,18 +128,18 @@ def test_a_robot_that_turns_once_around_without_a_wall_to_follow_gives_up():
 
 
 def test_a_robot_that_stands_still_does_not_make_a_constant_range_wrong():
-    watch = SonarWatch()
+    monitor = SonarMonitor()
     for i in range(100):
-        watch = watch.observe(sonars({"l": 0.3}), ("l",), 0.0, i * 0.1)
-    assert watch.fault(0.0, 10.0) is None
-    assert watch.fault(1.0, 10.0) is not None
+        monitor = monitor.observe(sonars({"l": 0.3}), ("l",), 0.0, i * 0.1)
+    assert monitor.fault(0.0, 10.0) is None
+    assert monitor.fault(1.0, 10.0) is not None
 
 
 def test_a_range_at_the_sonars_limit_may_repeat():
-    watch = SonarWatch()
+    monitor = SonarMonitor()
     for i in range(100):
-        watch = watch.observe(sonars({"l": 0.03, "fl": 3.0, "f": None}), ("l", "fl", "f"), i * 0.1, i * 0.1)
-    assert watch.fault(10.0, 10.0) is None
+        monitor = monitor.observe(sonars({"l": 0.03, "fl": 3.0, "f": None}), ("l", "fl", "f"), i * 0.1, i * 0.1)
+    assert monitor.fault(10.0, 10.0) is None
 
 
 @pytest.mark.parametrize("field", ["distance", "speed", "turn_rate", "ramp", "trigger"])
