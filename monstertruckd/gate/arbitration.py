@@ -100,8 +100,8 @@ class Sources:
         was none."""
         self._stop = "", 0
         """Source and time (ns) of the newest order that stops."""
-        self._stop_of_others = 0
-        """Time of the newest one of another source than that, ns."""
+        self._stop_of_others = "", 0
+        """The same of the newest one of another source than that."""
 
     def accept_request(self, request: DriveRequest, now: int) -> Reason:
         """OK, or why a drive request from outside is refused."""
@@ -125,9 +125,7 @@ class Sources:
         """OK, or why an order is refused."""
         reason = self._orders.accept(request, self.nonce, now)
         if reason is Reason.OK and request.order in STARTING:
-            reason = freshness(request, now, self._config.max_request_age)
-            if reason is Reason.OK and self._overtaken(request):
-                return Reason.BAD_SEQUENCE
+            return freshness(request, now, self._config.max_request_age)
         return reason
 
     def stopped(self, source: str, now: int) -> None:
@@ -137,16 +135,19 @@ class Sources:
             source: empty = not authenticated, another than every source.
             now: ns.
         """
-        stopped_by, at = self._stop
-        if source != stopped_by:
-            self._stop_of_others = at
+        if source != self._stop[0]:
+            self._stop_of_others = self._stop
         self._stop = source, now
 
-    def _overtaken(self, request: ControlRequest) -> bool:
-        """Whether another source has ordered a stop since the gate state that the sender knew."""
-        stopped_by, at = self._stop
-        newest = self._stop_of_others if request.source == stopped_by else at
-        return request.gate_stamp is not None and request.gate_stamp < newest
+    def overtaken(self, request: ControlRequest) -> str:
+        """Which other source has ordered a stop since the gate state that the sender of an order that starts knew.
+
+        Empty if none has.
+        """
+        stopped_by, at = self._stop_of_others if request.source == self._stop[0] else self._stop
+        if request.order not in STARTING or request.gate_stamp is None or request.gate_stamp >= at:
+            return ""
+        return stopped_by or "a source that is not authenticated"
 
     def add(self, request: DriveRequest, now: int, *, inside: bool) -> Source:
         """Start or renew the lease of an accepted request."""

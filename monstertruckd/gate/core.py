@@ -271,6 +271,9 @@ class Gate:
             return self._estop(request, now) if request.order is Order.ESTOP else self._stop_by(request, now)
         if reason is not Reason.OK:
             return self._refuse_order(now, reason, request)
+        if stopped_by := self._sources.overtaken(request):
+            text = f"{stopped_by} has ordered a stop meanwhile"
+            return self._refuse_order(now, Reason.BAD_SEQUENCE, request, text)
         if request.order is Order.DISARM:
             return self._disarm_by(request, now)
         if request.role not in OPERATORS:

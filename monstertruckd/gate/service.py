@@ -18,7 +18,7 @@ from monstertruck_schemas.cmd import DriveCommand, SteeringCommand
 from monstertruck_schemas.event import Event, Severity, Stop
 from monstertruck_schemas.health import HealthTable
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import ControlRequest, DriveRequest
+from monstertruck_schemas.req import STARTING, ControlRequest, DriveRequest
 from monstertruck_schemas.sensor import Attitude, Battery, DriveFeedback, LaserScan, SonarRanges, SteeringFeedback
 from monstertruck_schemas.state import GateMode, GateState
 from monstertruckd.gate.core import Decision, Gate, GateOutput
@@ -184,6 +184,8 @@ class GateService:
         decision = self._guarded(bug, self._gate.control, order, self._clock.now())
         if before is not GateMode.ESTOPPED and self.mode is GateMode.ESTOPPED:
             self._guarded(None, self._tick)
+        elif decision.reason is Reason.OK and order.order not in STARTING:
+            self._published = ()  # orders that start are refused until their sender knows of this one
         self._mark_latch()
         return decision
 

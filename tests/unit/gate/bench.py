@@ -5,7 +5,7 @@ from collections import deque
 from contextlib import asynccontextmanager
 
 from monstertruck_runtime.clock import run_virtual
-from monstertruck_runtime.threads import in_thread
+from monstertruck_runtime.threads import in_thread, inline
 from monstertruck_schemas.req import ControlRequest, DriveRequest, Role
 from monstertruckd.gate.latch import MemoryLatch
 from monstertruckd.gate.service import GateInputs, GateOutputs, GateService
@@ -128,7 +128,9 @@ class Bench:
         await self.service.close()
 
 
-def on_bench(scenario, latch=None, offload=in_thread):
+def on_bench(scenario, latch=None, offload=inline):
+    """Run a scenario on the virtual clock, whose time runs on while a thread works: nothing is given to one."""
+
     async def main(clock):
         bench = Bench(clock, latch, offload=offload)
         async with bench.running():

@@ -165,6 +165,8 @@ def test_who_does_not_know_of_anothers_stop_starts_nothing(stop):
     assert rig.order(stop, source="bob") is Reason.OK
     rig.tick()
     assert rig.order(start, source="ann", gate_stamp=known) is Reason.BAD_SEQUENCE
+    rig.tick()
+    assert rig.events[-1].text == "bob has ordered a stop meanwhile"
     assert rig.order(start, source="bob", gate_stamp=known) is Reason.OK, "its own orders have their sequence"
     assert rig.order(stop, source="bob") is Reason.OK
     assert rig.order(start, source="ann", gate_stamp=rig.now) is Reason.OK

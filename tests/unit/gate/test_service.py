@@ -238,7 +238,7 @@ def test_an_emergency_stop_is_marked_before_its_order_is_answered(tmp_path):
         assert bench.order(Order.ESTOP).reason is Reason.OK
         assert (latch.stored(), latch.engaged()) == (False, True)
 
-    on_bench(scenario, latch, inline)
+    on_bench(scenario, latch)
 
 
 def test_an_emergency_stop_after_the_last_tick_is_marked_at_once_and_stored_when_the_gate_is_closed(tmp_path):
@@ -491,7 +491,7 @@ def test_a_stop_after_a_reset_whose_folder_could_not_be_synced_is_latched_again(
         await bench.clock.sleep(2.0)
         assert (state.last.latched, latch.stored(), latch._mark.engaged()) == (True, True, False)
 
-    on_bench(scenario, latch, inline)
+    on_bench(scenario, latch)
 
 
 def test_a_reset_of_a_stop_whose_folder_could_not_be_synced_removes_the_file(tmp_path):
@@ -510,7 +510,7 @@ def test_a_reset_of_a_stop_whose_folder_could_not_be_synced_removes_the_file(tmp
         await bench.clock.sleep(2.0)
         assert (bench.out.state.last.latched, latch.engaged()) == (False, False)
 
-    on_bench(scenario, latch, inline)
+    on_bench(scenario, latch)
 
 
 class BrokenLatch(MemoryLatch):

@@ -6,7 +6,6 @@ from itertools import pairwise
 import pytest
 
 from monstertruck_runtime.clock import SECOND, run_virtual
-from monstertruck_runtime.threads import inline
 from monstertruck_schemas.cmd import DriveAction
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order, Role
@@ -68,6 +67,21 @@ def test_the_state_is_published_every_tenth_of_a_second_and_at_every_change():
         await bench.clock.sleep(0.021)
         assert len(bench.out.state.messages) > before
         assert bench.out.state.last.mode is GateMode.ARMED
+
+    on_bench(scenario)
+
+
+@pytest.mark.parametrize("order", [Order.STOP, Order.DISARM])
+def test_an_order_that_stops_is_published_at_the_next_tick_though_it_changes_nothing(order):
+    async def scenario(bench):
+        await bench.clock.sleep(0.45)
+        before = bench.out.state.last.stamp
+        assert bench.order(order).reason is Reason.OK
+        ordered = bench.clock.now()
+        await bench.clock.sleep(0.021)
+        state = bench.out.state.last
+        assert state.mode is GateMode.DISARMED
+        assert before < ordered <= state.stamp < before + 5 * PERIOD, "who knows this state may arm"
 
     on_bench(scenario)
 
@@ -181,7 +195,7 @@ def test_the_latch_is_tried_again_every_second_and_marked_until_it_is_stored():
         errors = [text for reason, _, text, _ in bench.events if reason is Reason.INTERNAL]
         assert errors == ["the emergency stop's latch could not be stored: disk"] * 2
 
-    on_bench(scenario, disk, inline)
+    on_bench(scenario, disk)
     assert disk.closed == 1
 
 
@@ -196,7 +210,7 @@ def test_a_stop_that_was_reset_before_it_could_be_stored_leaves_the_disk_alone()
         assert disk.asked == [True]
         assert disk.marks[-1] is False
 
-    on_bench(scenario, disk, inline)
+    on_bench(scenario, disk)
 
 
 def test_a_mark_stays_when_the_latch_could_not_be_stored_to_the_end():
