@@ -13,7 +13,7 @@ from monstertruck_runtime.clock import SECOND, Clock, VirtualClock, run_virtual
 from monstertruck_schemas import topics
 from monstertruck_schemas.req import DriveRequest
 from monstertruck_sim.world.config import ServoModelConfig
-from monstertruck_sim.world.truck_plant import GRAVITY, TruthState
+from monstertruck_sim.world.plant import GRAVITY, TruthState
 from monstertruckd.config.calibration import CalibrationStore, Result, Value, WizardName, with_values
 from monstertruckd.daemon import Daemon
 from monstertruckd.tools.calibrate.steps import Confirm, Number

@@ -27,82 +27,62 @@ from monstertruck_sim.world.noise import (
     WhiteNoise,
     generator,
 )
+from monstertruck_sim.world.plant import GRAVITY, Caster, Plant, Vector
 from monstertruck_sim.world.terrain import Terrain
-from monstertruck_sim.world.truck_plant import GRAVITY, TruckPlant
 
 STEPS = 769
 SWEEP_NS = 100_000_000
 NO_RETURN, TOO_NEAR, FAILED = 0, 6, 19
 """Error codes of the scanner: nothing there; other error (never "free"); step cannot be measured."""
 _STEP_ANGLE = 2 * pi / 1024
-_BEAM_ANGLES = (np.arange(STEPS) - 384) * _STEP_ANGLE
+BEAM_ANGLES = (np.arange(STEPS) - 384) * _STEP_ANGLE
 _BEAM_DELAYS = (np.arange(STEPS) * (SWEEP_NS // 1024)).astype(np.int64)
 _LEVEL = 1e-4
 
-Vector = tuple[float, float, float]
 Beams = tuple[Array, Array, Array]
 """Directions: components x, y, z, each (n,)."""
+LEVEL_BEAMS: Beams = np.cos(BEAM_ANGLES), np.sin(BEAM_ANGLES), np.zeros(STEPS)
 
 
-class Caster(Protocol):
-    """Sight in the world."""
+class Sweep(Protocol):
+    """One revolution of a lidar's beams through the world."""
 
-    def __call__(
-        self, xs: Array, ys: Array, angles: Array, reach: float, times_ns: NDArray[np.int64] | None = None, /
-    ) -> Array:
-        """Ranges along rays from (xs, ys) at angles up to a reach, in the map frame; inf = nothing.
+    def __call__(self, poses: Array, beams: Beams | None, times_ns: NDArray[np.int64], /) -> Array:
+        """Ranges, m; inf = nothing.
 
-        What moves is met where it was at ``times_ns``, one a ray and rising; None = now.
+        Args:
+            poses: of the robot at the beams' instants, (5, 769): x, y, yaw, pitch, roll.
+            beams: directions in the body frame; None: ``BEAM_ANGLES`` in the body's plane.
+            times_ns: instants of the beams, (769,), rising.
         """
         ...
 
 
-class SimulatedLidar:
-    """``RangeSource``: every beam leaves from where the truck is at that beam's instant.
+class PlaneSweep:
+    """Beams over a plane with upright walls, or over uneven ground.
 
-    Noise is Gaussian with the data sheet's bound (10 mm to 1 m, 1 % of the range beyond) at two standard deviations,
-    as a maker's accuracy covers nearly all readings. A beam meets the ground or passes over upright walls of finite
-    height that stand on it. Joints of a mount turn it about its own centre.
+    A beam meets the ground or passes over walls of finite height that stand on it. The mount is as high over the
+    ground as on level ground, before the geometric centre.
 
     Args:
-        plant: what carries it.
         cast: ranges to the walls.
         terrain: the ground; None = level.
-        config: true parameters.
-        seed: of the noise; None = none.
+        config: of the lidar.
     """
 
-    def __init__(
-        self, plant: TruckPlant, cast: Caster, terrain: Terrain | None, config: LidarConfig, seed: int | None
-    ) -> None:
-        self.joints: JointSource | None = None
-        self._plant, self._cast, self._terrain, self._config, self._seed = plant, cast, terrain, config, seed
-        self._lost = (np.arange(STEPS) < config.first_step) | (np.arange(STEPS) > config.last_step)
-        """Steps that never measure."""
+    def __init__(self, cast: Caster, terrain: Terrain | None, config: LidarConfig) -> None:
+        self._cast, self._terrain, self._config = cast, terrain, config
 
-    def scan(self, time_ns: int) -> NDArray[np.int32]:
-        """Distances in mm of the revolution that began at ``time_ns``, (769,); codes below 20 are errors.
-
-        Ask once it is over (within half a second) for exact poses; asked earlier, the truck's motion during the
-        sweep is extrapolated.
-        """
-        self._plant.advance(time_ns)
-        times = time_ns + _BEAM_DELAYS
-        poses = self._plant.poses(times)
+    def __call__(self, poses: Array, beams: Beams | None, times_ns: NDArray[np.int64]) -> Array:
+        """As ``Sweep``."""
         x, y, yaw, pitch, roll = poses
         xs, ys = x + self._config.x * np.cos(yaw), y + self._config.x * np.sin(yaw)
-        if self.joints is None and self._terrain is None and np.abs(poses[3:]).max() < _LEVEL:
-            ranges = self._cast(xs, ys, yaw + _BEAM_ANGLES, self._config.max_range, times)
-        else:
-            beams = np.cos(_BEAM_ANGLES), np.sin(_BEAM_ANGLES), np.zeros(STEPS)
-            if self.joints is not None:
-                beams = _turned(beams, *self.joints.angles(times))
-            beams = _turned(beams, pitch, roll)
-            if self._terrain is None:
-                ranges = self._tilted(xs, ys, yaw, beams, times)
-            else:
-                ranges = self._over(self._terrain, poses, beams, times)
-        return self._measure(ranges, time_ns)
+        if beams is None and self._terrain is None and np.abs(poses[3:]).max() < _LEVEL:
+            return self._cast(xs, ys, yaw + BEAM_ANGLES, self._config.max_range, times_ns)
+        beams = turned(LEVEL_BEAMS if beams is None else beams, pitch, roll)
+        if self._terrain is None:
+            return self._tilted(xs, ys, yaw, beams, times_ns)
+        return self._over(self._terrain, poses, beams, times_ns)
 
     def _tilted(self, xs: Array, ys: Array, yaw: Array, beams: Beams, times_ns: NDArray[np.int64]) -> Array:
         """Ranges along beams whose directions are given in the truck's level frame."""
@@ -133,6 +113,38 @@ class SimulatedLidar:
         ranges: Array = np.minimum(walls, ground) / level
         return ranges
 
+
+class SimulatedLidar:
+    """``RangeSource``: every beam leaves from where the truck is at that beam's instant.
+
+    Noise is Gaussian with the data sheet's bound (10 mm to 1 m, 1 % of the range beyond) at two standard deviations,
+    as a maker's accuracy covers nearly all readings. Joints of a mount turn it about its own centre.
+
+    Args:
+        plant: what carries it.
+        sweep: ranges along the beams.
+        config: true parameters.
+        seed: of the noise; None = none.
+    """
+
+    def __init__(self, plant: Plant, sweep: Sweep, config: LidarConfig, seed: int | None) -> None:
+        self.joints: JointSource | None = None
+        self._plant, self._sweep, self._config, self._seed = plant, sweep, config, seed
+        self._lost = (np.arange(STEPS) < config.first_step) | (np.arange(STEPS) > config.last_step)
+        """Steps that never measure."""
+
+    def scan(self, time_ns: int) -> NDArray[np.int32]:
+        """Distances in mm of the revolution that began at ``time_ns``, (769,); codes below 20 are errors.
+
+        Ask once it is over (within half a second) for exact poses; asked earlier, the truck's motion during the
+        sweep is extrapolated.
+        """
+        self._plant.advance(time_ns)
+        times = time_ns + _BEAM_DELAYS
+        poses = self._plant.poses(times)
+        beams = None if self.joints is None else turned(LEVEL_BEAMS, *self.joints.angles(times))
+        return self._measure(self._sweep(poses, beams, times), time_ns)
+
     def _measure(self, ranges: Array, time_ns: int) -> NDArray[np.int32]:
         config = self._config
         lost = self._lost
@@ -153,7 +165,7 @@ class SimulatedLidar:
 class SimulatedView:
     """``ViewSource``: the scene around the camera, which looks forward and stays level."""
 
-    def __init__(self, plant: TruckPlant, cast: Caster, config: CameraConfig) -> None:
+    def __init__(self, plant: Plant, cast: Caster, config: CameraConfig) -> None:
         self._plant, self._cast, self._config = plant, cast, config
 
     def ranges(self, time_ns: int, angles: Array) -> Array:
@@ -168,7 +180,7 @@ class SimulatedView:
 class SimulatedMotor:
     """``MotorPlant``: one of the driven shafts in the controller's own sign."""
 
-    def __init__(self, plant: TruckPlant, config: MotorConfig, seed: int | None, shaft: int = 0) -> None:
+    def __init__(self, plant: Plant, config: MotorConfig, seed: int | None, shaft: int = 0) -> None:
         self._plant, self._config, self._shaft = plant, config, shaft
         self._noise = WhiteNoise(seed, CURRENT, 1 + shaft) if seed is not None else None
         self._sign = -1.0 if config.inverted else 1.0
@@ -196,7 +208,7 @@ class SimulatedMotor:
 class SimulatedServos:
     """``ServoPlant``: both steering servos, and the battery at the analog input."""
 
-    def __init__(self, plant: TruckPlant, config: BatteryModelConfig, seed: int | None) -> None:
+    def __init__(self, plant: Plant, config: BatteryModelConfig, seed: int | None) -> None:
         self._plant, self._config = plant, config
         self._noise = WhiteNoise(seed, ANALOG) if seed is not None else None
 
@@ -228,7 +240,7 @@ class SimulatedCompass:
     of it: errors of the heading while the body accelerates are not modelled.
     """
 
-    def __init__(self, plant: TruckPlant, config: CompassModelConfig, seed: int | None) -> None:
+    def __init__(self, plant: Plant, config: CompassModelConfig, seed: int | None) -> None:
         self._plant, self._config = plant, config
         self._noise = WhiteNoise(seed, COMPASS, 3) if seed is not None else None
         self._phases, self._bias = [0.0, 0.0], [0.0, 0.0]
@@ -253,12 +265,12 @@ class SimulatedCompass:
             sigma = radians(config.noise_deg)
             noise = [sigma * value for value in self._noise.at(self._plant.slot(time_ns, 10_000_000))]
         pitch, roll = self._plant.attitude
-        heading = config.north_yaw - self._plant.yaw
+        heading = config.north_yaw - self._plant.pose[2]
         heading += self.deviation(heading) + noise[0]
         level = (config.horizontal_field * cos(heading), config.horizontal_field * sin(heading), config.vertical_field)
         field = self._distorted(_to_body(level, pitch, roll))
-        forward, left = self._plant.acceleration
-        force = _to_body((forward / GRAVITY, left / GRAVITY, 1.0), pitch, roll)
+        forward, left, up = self._plant.acceleration
+        force = _to_body((forward / GRAVITY, left / GRAVITY, 1.0 + up / GRAVITY), pitch, roll)
         x, y, _ = _to_level(field, pitch, roll)
         pitch, roll = atan2(-force[0], hypot(force[1], force[2])), atan2(force[1], force[2])
         pitch, roll = pitch + self._bias[0] + noise[1], roll + self._bias[1] + noise[2]
@@ -286,11 +298,11 @@ class SimulatedCompass:
 class SimulatedImu:
     """``ImuSource``: gyroscopes and accelerometers at the geometric centre, axes x forward, y left, z up.
 
-    They feel the yaw rate, the reaction to gravity and the body's own acceleration, turned by the tilt; that the tilt
-    itself turns is not felt.
+    They feel the body's turning (in the plane: its yaw rate), the reaction to gravity and the body's own acceleration,
+    turned by the tilt.
     """
 
-    def __init__(self, plant: TruckPlant, config: ImuModelConfig, seed: int | None) -> None:
+    def __init__(self, plant: Plant, config: ImuModelConfig, seed: int | None) -> None:
         self._plant, self._config = plant, config
         self._noise = WhiteNoise(seed, IMU, 6) if seed is not None else None
         self._bias = [0.0] * 6
@@ -300,9 +312,9 @@ class SimulatedImu:
     def imu(self, time_ns: int) -> ImuReading:
         """Reading at ``time_ns``."""
         self._plant.advance(time_ns)
-        config, (pitch, roll), (forward, left) = self._config, self._plant.attitude, self._plant.acceleration
-        rates = _to_body((0.0, 0.0, self._plant.truth().wz), pitch, roll)
-        forces = _to_body((forward, left, GRAVITY), pitch, roll)
+        config, (pitch, roll), (forward, left, up) = self._config, self._plant.attitude, self._plant.acceleration
+        rates = _to_body(self._plant.rates, pitch, roll)
+        forces = _to_body((forward, left, GRAVITY + up), pitch, roll)
         noise = [0.0] * 6
         if self._noise is not None:
             noise = self._noise.at(self._plant.slot(time_ns, 1_000_000))
@@ -318,7 +330,7 @@ class SimulatedImu:
         )
 
 
-def _turned(beams: Beams, pitch: Array, roll: Array) -> Beams:
+def turned(beams: Beams, pitch: Array, roll: Array) -> Beams:
     """``_to_level`` for many vectors, each turned by angles of its own."""
     x, y, z = beams
     y, z = np.cos(roll) * y - np.sin(roll) * z, np.sin(roll) * y + np.cos(roll) * z

@@ -20,8 +20,7 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.errors import InputError
 from monstertruck_sim.world.config import SonarModelConfig, SonarPlace
 from monstertruck_sim.world.noise import SONAR, generator
-from monstertruck_sim.world.sensors import Caster
-from monstertruck_sim.world.truck_plant import TruckPlant
+from monstertruck_sim.world.plant import Caster, Plant
 
 SPEED_OF_SOUND: Final = 343.0
 """m/s, in air of 20 degrees Celsius."""
@@ -211,7 +210,7 @@ class SimulatedSonars:
         seed: of the noise; None = none.
     """
 
-    def __init__(self, plant: TruckPlant, cast: Caster, config: SonarModelConfig, seed: int | None) -> None:
+    def __init__(self, plant: Plant, cast: Caster, config: SonarModelConfig, seed: int | None) -> None:
         self._plant, self._cast, self._config, self._seed = plant, cast, config, seed
         self._pings: deque[tuple[str, Ping, Surface | None]] = deque(maxlen=_KEPT)
         self._heard = 0

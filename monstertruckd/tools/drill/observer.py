@@ -21,7 +21,7 @@ from monstertruck_drivers.maestro.protocol import Code, Decoder, ServoCommand
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.truck import DriveTrain
 from monstertruck_runtime.clock import SECOND, Clock
-from monstertruck_sim.world.truck_plant import TruthState
+from monstertruck_sim.world.plant import TruthState
 from monstertruck_sim.world.world import World
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 

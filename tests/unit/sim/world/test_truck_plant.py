@@ -307,16 +307,16 @@ def test_contact_is_tested_whenever_something_is_near(field):
     world = field(walls=[(0.85, -2, 0.9, 2), (-2, 0.3, 2, 0.35)]).world
     t = np.linspace(0, 20, 3000)
     poses = np.stack([0.5 + 0.2 * np.sin(t), 0.1 * np.cos(0.7 * t), 0.3 * t], axis=1).tolist()
-    depths = [world._contact(*pose) for pose in poses]
-    assert depths == [world._depth(tuple(pose)) for pose in poses]
+    depths = [world._space.contact(*pose) for pose in poses]
+    assert depths == [world._footprint._depth(tuple(pose)) for pose in poses]
     assert 300 < np.count_nonzero(depths) < 2700
 
 
 def test_an_obstacle_put_beside_the_truck_is_felt_at_once(field):
     world = field().world
-    assert world._contact(0.0, 0.0, 0.0) == 0.0
+    assert world._space.contact(0.0, 0.0, 0.0) == 0.0
     world.add(0, Disc(0.3, 0.0, 0.1))
-    assert world._contact(0.0, 0.0, 0.0) == pytest.approx(0.1 - (0.3 - 0.235))
+    assert world._space.contact(0.0, 0.0, 0.0) == pytest.approx(0.1 - (0.3 - 0.235))
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,153 @@
+"""The engine ``plane``: a footprint that moves over a map, tilted by a profile of the ground or as commanded."""
+
+from math import hypot
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_kinematics.elementary import Array
+from monstertruck_runtime.errors import InputError
+from monstertruck_sim.world.config import SimTruckConfig, SinusoidTilt, TiltConfig, WorldConfig
+from monstertruck_sim.world.obstacles import Box, Obstacle
+from monstertruck_sim.world.plant import Plant, Pose, Space, Twist
+from monstertruck_sim.world.scene import Surroundings
+from monstertruck_sim.world.sensors import PlaneSweep, Sweep
+from monstertruck_sim.world.terrain import LEVEL, Terrain, rocking
+from monstertruck_sim.world.truck_plant import TruckPlant
+
+_ROOM = 0.05
+"""Metres around the footprint: known to be free, they spare the contact test until the truck has crossed them."""
+
+
+class Engine(NamedTuple):
+    """What moves one robot, and what is around it."""
+
+    plant: Plant
+    space: Space
+    sweep: Sweep
+
+
+class Footprint:
+    """The robot's rectangle in the plane, among what is in its surroundings.
+
+    Args:
+        scene: the surroundings.
+        truck: its size.
+        name: of the robot.
+    """
+
+    def __init__(self, scene: Surroundings, truck: SimTruckConfig, name: str) -> None:
+        self.scene, self._truck, self._name = scene, truck, name
+        self._half_diagonal = hypot(truck.length, truck.width) / 2
+        self._free: Pose | None = None
+        """Pose with free room around."""
+        self._known: tuple[Obstacle, ...] = ()
+        """Obstacles at the time of ``_free``."""
+
+    def box(self, pose: Pose, room: float = 0.0) -> Box:
+        """It at a pose, grown by ``room`` all around."""
+        x, y, yaw = pose
+        return Box(x, y, self._truck.length + 2 * room, self._truck.width + 2 * room, yaw)
+
+    def pace(self, twist: Twist) -> float:
+        """Speed of its fastest point, m/s."""
+        vx, vy, wz = twist
+        return hypot(vx, vy) + abs(wz) * self._half_diagonal
+
+    def blocked(self, pose: Pose, twist: Twist) -> None:
+        """It cannot move on to a pose: a contact with who is there."""
+        self.scene.report(self.box(pose), self._name, self.pace(twist))
+
+    def overlap(self, x: float, y: float, yaw: float) -> float:
+        """How deep it reaches into things, robots and people, m; 0 = free."""
+        pose = (x, y, yaw)
+        return self._fixed(pose) + self.scene.moving_overlap(self.box(pose), self._name)
+
+    def cast(
+        self, xs: Array, ys: Array, angles: Array, reach: float, times_ns: NDArray[np.int64] | None = None
+    ) -> Array:
+        """Ranges to walls, things, people and the other robots."""
+        return self.scene.cast(xs, ys, angles, reach, times_ns, self._name)
+
+    def _fixed(self, pose: Pose) -> float:
+        if self._known is not self.scene.obstacles:
+            self._free, self._known = None, self.scene.obstacles
+        if self._free is not None and self._way(self._free, pose) < _ROOM:
+            return 0.0
+        self._free = pose if self._depth(pose, _ROOM) == 0.0 else None
+        return 0.0 if self._free else self._depth(pose)
+
+    def _way(self, a: Pose, b: Pose) -> float:
+        """No point of the footprint is further from its place at the other pose than this, m."""
+        return hypot(b[0] - a[0], b[1] - a[1]) + abs(b[2] - a[2]) * self._half_diagonal
+
+    def _depth(self, pose: Pose, room: float = 0.0) -> float:
+        """How deep the footprint, grown by ``room`` all around, reaches into things that do not move, m."""
+        return self.scene.fixed_overlap(self.box(pose, room))
+
+
+class PlaneSpace:
+    """``Space`` of the plane.
+
+    Args:
+        footprint: of the robot, in its surroundings.
+        config: of the world.
+    """
+
+    def __init__(self, footprint: Footprint, config: WorldConfig) -> None:
+        self._footprint, self._scene, self._truck = footprint, footprint.scene, config.truck
+        self.contact, self.cast = footprint.overlap, footprint.cast
+        profile = self._scene.place.profile
+        uneven = profile is not None or bool(config.rough)
+        self.terrain = Terrain(profile or LEVEL, config.rough) if uneven else None
+        """The ground; None: level."""
+        self._tilt: TiltConfig = config.tilt
+
+    @property
+    def obstacles(self) -> tuple[Obstacle, ...]:
+        """Things in it that are not on its map."""
+        return self._scene.obstacles
+
+    def add(self, obstacle: Obstacle) -> None:
+        """Put something into it."""
+        self._scene.set_obstacles((*self.obstacles, obstacle))
+
+    def remove(self, obstacle: Obstacle) -> None:
+        """Take it away again.
+
+        Raises:
+            InputError: it is not there.
+        """
+        self._scene.set_obstacles(without(self.obstacles, obstacle))
+
+    def set_tilt(self, tilt: TiltConfig) -> None:
+        """From now on tilt the robot in another way."""
+        self._tilt = tilt
+
+    def attitude(self, elapsed_ns: int, x: float, y: float, yaw: float) -> tuple[float, float]:
+        """Pitch and roll of the robot at a pose, rad."""
+        if isinstance(self._tilt, SinusoidTilt):
+            return rocking(self._tilt, elapsed_ns)
+        if self.terrain is None:
+            return 0.0, 0.0
+        return self.terrain.tilt(x, y, yaw, self._truck.wheelbase, self._truck.track)
+
+
+def without(obstacles: tuple[Obstacle, ...], obstacle: Obstacle) -> tuple[Obstacle, ...]:
+    """``obstacles`` less one.
+
+    Raises:
+        InputError: it is not among them.
+    """
+    if obstacle not in obstacles:
+        raise InputError(f"obstacle {obstacle}: not in the world")
+    index = obstacles.index(obstacle)
+    return obstacles[:index] + obstacles[index + 1 :]
+
+
+def plane(config: WorldConfig, footprint: Footprint, start: Pose, seed: int | None) -> Engine:
+    """One robot of the plane."""
+    space = PlaneSpace(footprint, config)
+    plant = TruckPlant(config.truck, config.battery, start, space.contact, space.attitude, seed)
+    return Engine(plant, space, PlaneSweep(space.cast, space.terrain, config.lidar))
