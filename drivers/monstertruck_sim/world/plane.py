@@ -28,7 +28,7 @@ class Engine(NamedTuple):
     sweep: Sweep
 
 
-class Footprint:
+class PlanOutline:
     """The robot's rectangle in the plane, among what is in its surroundings.
 
     Args:
@@ -95,7 +95,7 @@ class PlaneSpace:
         config: of the world.
     """
 
-    def __init__(self, footprint: Footprint, config: WorldConfig) -> None:
+    def __init__(self, footprint: PlanOutline, config: WorldConfig) -> None:
         self._footprint, self._scene, self._truck = footprint, footprint.scene, config.truck
         self.contact, self.cast = footprint.overlap, footprint.cast
         profile = self._scene.place.profile
@@ -146,7 +146,7 @@ def without(obstacles: tuple[Obstacle, ...], obstacle: Obstacle) -> tuple[Obstac
     return obstacles[:index] + obstacles[index + 1 :]
 
 
-def plane(config: WorldConfig, footprint: Footprint, start: Pose, seed: int | None) -> Engine:
+def plane(config: WorldConfig, footprint: PlanOutline, start: Pose, seed: int | None) -> Engine:
     """One robot of the plane."""
     space = PlaneSpace(footprint, config)
     plant = TruckPlant(config.truck, config.battery, start, space.contact, space.attitude, seed)

@@ -20,7 +20,7 @@ from monstertruck_runtime.map_files import load_map
 from monstertruck_sim.world.built_in import BUILT_IN, BuiltIn
 from monstertruck_sim.world.config import TiltConfig, WorldConfig
 from monstertruck_sim.world.obstacles import Box, Obstacle
-from monstertruck_sim.world.plane import Engine, Footprint, plane
+from monstertruck_sim.world.plane import Engine, PlanOutline, plane
 from monstertruck_sim.world.plant import Pose, TruthState
 from monstertruck_sim.world.scene import Surroundings
 from monstertruck_sim.world.sensors import (
@@ -58,7 +58,7 @@ class World:
         start = (config.start.x, config.start.y, config.start.yaw) if config.start else place.start
         noise_seed = seed if config.noise else None
         self.map = place.map
-        self._footprint = Footprint(self.scene, config.truck, name)
+        self._footprint = PlanOutline(self.scene, config.truck, name)
         if self.scene.overlap(self.scene.solid, self._footprint.box(start)) > 0:
             raise InputError(f"start: the truck at {start} touches what is not free on the map {config.map}")
         self._plant, self._space, sweep = make_engine(config, self._footprint, start, noise_seed)
@@ -96,7 +96,7 @@ class World:
 
     @property
     def outline(self) -> Box:
-        """Footprint at its newest instant."""
+        """PlanOutline at its newest instant."""
         return self._footprint.box(self._plant.pose)
 
     @property
@@ -177,7 +177,7 @@ class World:
         self._space.set_tilt(tilt)
 
 
-def make_engine(config: WorldConfig, footprint: Footprint, start: Pose, seed: int | None) -> Engine:
+def make_engine(config: WorldConfig, footprint: PlanOutline, start: Pose, seed: int | None) -> Engine:
     """What computes one robot: ``engine`` of the configuration.
 
     Raises:
