@@ -32,7 +32,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mcap.reader import make_reader
 from same_python import SYSTEM_PYTHON, can_import, go_on_in_the_systems_python
 
 from monstertruck_runtime import wire
@@ -43,6 +42,7 @@ from monstertruck_schemas.state import Odometry
 from monstertruck_schemas.topics import CAMERA, POSE, SCAN, Topic
 from monstertruckd.recorder.config import Compression, RecorderConfig
 from monstertruckd.recorder.log_file import LogFile
+from monstertruckd.recorder.reader import open_log
 from monstertruckd.recorder.recorder import Recorder
 from monstertruckd.recorder.repair import recover
 
@@ -330,9 +330,7 @@ class _Child:
 
     @staticmethod
     def _times(path: Path) -> Iterator[int]:
-        with path.open("rb") as file:
-            for _, _, message in make_reader(file).iter_messages():
-                yield message.log_time
+        return (message.log_time for message in open_log(path))
 
 
 def main() -> None:

@@ -25,7 +25,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.topics import TOPICS, Topic
 from monstertruckd.gate.stops import Trip
 from monstertruckd.recorder.config import BlackBoxConfig, Compression
-from monstertruckd.recorder.log_file import LogEntry, LogFile, disk_reason
+from monstertruckd.recorder.log_file import LogEntry, LogFile, disk_reason, log_offset
 from monstertruckd.recorder.repair import in_use
 from monstertruckd.recorder.ring import Retention, Ring, RingSnapshot
 
@@ -339,9 +339,10 @@ class BlackBox:
 
     async def _save(self, pending: _Pending, entries: RingSnapshot) -> None:
         first = pending.trips[0]
+        offset = self._clock.real_offset()
         metadata = {
             **self._metadata,
-            "real_offset_ns": str(self._clock.real_offset()),
+            "real_offset_ns": str(offset),
             "stops": ",".join(str(trip.number) for trip in pending.trips),
             "stopped_at_ns": str(first.at),
             "reason": first.reason.value,
@@ -349,7 +350,8 @@ class BlackBox:
             "lost": str(self.ring.lost),
         }
         try:
-            name = await self._offload(partial(self._write, pending.name, entries, metadata))
+            dated = log_offset(first.at, offset)
+            name = await self._offload(partial(self._write, pending.name, entries, metadata, dated))
         except OSError as error:
             self._failed(error, f"{pending.name} is lost")
         except Exception:
@@ -369,14 +371,14 @@ class BlackBox:
     def _failed(self, error: OSError, what: str) -> None:
         self._events(disk_reason(error), Severity.WARNING, self.name, f"{what}: {error.strerror or error}")
 
-    def _write(self, name: str, entries: RingSnapshot, metadata: Mapping[str, str]) -> str:
+    def _write(self, name: str, entries: RingSnapshot, metadata: Mapping[str, str], offset: int) -> str:
         """In a thread with pauses for the control loop, unless the daemon waits for it to end; the box's name."""
         offloaded = threading.get_ident() != self._loop_thread
         name = self._folder.begin(name)
         part = self._folder.part(name)
         start = next((entry.log_time for entry in entries), 0)
         try:
-            file = LogFile(part, Compression.ZSTD, CHUNK_SIZE, self._attachments, metadata, start)
+            file = LogFile(part, Compression.ZSTD, CHUNK_SIZE, self._attachments, metadata, start, offset)
             try:
                 for count, entry in enumerate(entries):
                     if self._given_up.is_set():

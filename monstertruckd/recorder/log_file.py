@@ -14,6 +14,7 @@ from typing import Any, Final, NamedTuple
 from mcap.writer import CompressionType, Writer
 
 from monstertruck_runtime import wire
+from monstertruck_runtime.clock import is_date
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.topics import Topic
 from monstertruckd import __version__
@@ -57,6 +58,25 @@ _COMPRESSION: Final = {
 }
 
 
+TIMES: Final = "times"
+"""Metadata record that says of which clock the file's times are."""
+LOG_OFFSET: Final = "log_offset_ns"
+"""Its entry with what was added to daemon times for the file's log times, ns."""
+
+
+def log_offset(now: int, real_offset: int) -> int:
+    """What a file that begins now adds to daemon times for its log times.
+
+    Args:
+        now: daemon time, ns.
+        real_offset: real (UNIX) minus daemon time, ns.
+
+    Returns:
+        ``real_offset`` or, while the computer does not know the date, 0.
+    """
+    return real_offset if is_date(now + real_offset) else 0
+
+
 class LogEntry(NamedTuple):
     """A message to be logged."""
 
@@ -77,13 +97,16 @@ def disk_reason(error: OSError) -> Reason:
 class LogFile:
     """An open MCAP file, locked against repair and removal.
 
+    Its log times are daemon times plus one offset, its publish times the messages' own stamps in daemon time.
+
     Args:
         path: file to make.
         compression: of the chunks.
         chunk_size: bytes after which a chunk is closed.
         attachments: written first, each as ``<name>.json``.
         metadata: text about the run.
-        start: first log time, ns.
+        start: when it begins, ns of daemon time.
+        offset: added to daemon times for log times, ns.
 
     Raises:
         OSError: the file exists, or cannot be written.
@@ -97,11 +120,13 @@ class LogFile:
         attachments: Mapping[str, Any],
         metadata: Mapping[str, str],
         start: int,
+        offset: int = 0,
     ) -> None:
         self.path = path
         self.start = start
+        self.offset = offset
         self.open_since: int | None = None
-        """Log time of the oldest message that is not in the file yet."""
+        """When the oldest message came that is not in the file yet, ns of daemon time."""
         self._output = _Output(path)
         try:
             self._writer = Writer(
@@ -112,9 +137,11 @@ class LogFile:
             self._channels = Channels(self._writer)
             self._writer.start(library=f"monstertruckd {__version__}")
             self._writer.add_metadata("run", dict(metadata))
+            clocks = {"log_time": "UNIX" if offset else "daemon", "publish_time": "daemon", LOG_OFFSET: str(offset)}
+            self._writer.add_metadata(TIMES, clocks)
             for name, value in attachments.items():
                 data = json.dumps(value, indent=1, sort_keys=True).encode()
-                self._writer.add_attachment(start, start, f"{name}.json", "application/json", data)
+                self._writer.add_attachment(start + offset, start + offset, f"{name}.json", "application/json", data)
         except BaseException:
             self._output.close()
             raise
@@ -129,7 +156,7 @@ class LogFile:
         before = self._output.size
         self._writer.add_message(
             self._channels.of(entry.topic),
-            entry.log_time,
+            entry.log_time + self.offset,
             entry.payload,
             max(0, entry.stamp),
             entry.sequence & 0xFFFFFFFF,

@@ -25,6 +25,7 @@ from monstertruck_runtime.errors import ConfigError, InputError, NotFoundError
 from monstertruck_runtime.small_files import require_file
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.topics import BY_NAME
+from monstertruckd.recorder.log_file import LOG_OFFSET, TIMES
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 
@@ -147,7 +148,7 @@ class LogMessage:
     topic: str
     """Name in the topic table, e.g. ``sensor/scan``."""
     log_time: int
-    """Daemon time of recording, ns."""
+    """Daemon time of recording, ns, whatever clock the file's log times are of."""
     stamp: int
     """The message's own stamp, ns."""
     sequence: int
@@ -187,6 +188,8 @@ class LogReader:
         """What else an iteration to the end found damaged; it costs no message."""
         self.position = 0
         """Bytes an iteration has read so far, for progress bars."""
+        self.log_offset = 0
+        """The file's log times minus daemon times, ns, once an iteration has passed the metadata."""
         try:
             require_file(path)
             with path.open("rb") as file:
@@ -214,7 +217,7 @@ class LogReader:
                 schema = schemas.get(channel.schema_id)
                 yield LogMessage(
                     channel.topic,
-                    record.log_time,
+                    record.log_time - self.log_offset,
                     record.publish_time,
                     record.sequence,
                     record.data,
@@ -222,8 +225,11 @@ class LogReader:
                 )
 
     def records(self) -> Iterator[McapRecord]:
-        """Every MCAP record before the index, up to the first error, chunks opened; channels precede their messages."""
-        self.damage, self.flaws = None, []
+        """Every MCAP record before the index, up to the first error, chunks opened; channels precede their messages.
+
+        Their times are as they are in the file; see ``log_offset``.
+        """
+        self.damage, self.flaws, self.log_offset = None, [], 0
         size = self.size
         with self.path.open("rb") as file:
             try:
@@ -251,6 +257,8 @@ class LogReader:
                     channels.add(record.id)
                 elif isinstance(record, McapMessage) and record.channel_id not in channels:
                     raise McapError(f"message of an unknown channel {record.channel_id}")
+                elif isinstance(record, Metadata) and record.name == TIMES:
+                    self.log_offset = int(record.metadata.get(LOG_OFFSET, "0"))
                 given[type(record)] += 1
                 yield record
 

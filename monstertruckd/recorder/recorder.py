@@ -18,7 +18,7 @@ from monstertruck_schemas.health import RecorderHealth
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.topics import TOPICS, Topic
 from monstertruckd.recorder.config import RecorderConfig
-from monstertruckd.recorder.log_file import LogEntry, LogFile, LogFolder, disk_reason
+from monstertruckd.recorder.log_file import LogEntry, LogFile, LogFolder, disk_reason, log_offset
 from monstertruckd.recorder.repair import in_use, start_repair
 
 _DIGEST_FRAME = struct.Struct("<qII")
@@ -43,25 +43,42 @@ class LogDigest:
 log = logging.getLogger(__name__)
 
 
+_STEP: Final = SECOND
+"""So far apart are a file's dates and the computer's after a step of its clock, not by its drift."""
+
+_STEP_PERIOD: Final = 10 * SECOND
+"""Shortest time between two files for want of the right date: a clock that is set again and again makes no flood."""
+
+
 class LogWriter:
     """Writes entries into numbered files; a context manager that finishes the last one.
+
+    All dates of a file are by one offset; when the computer's clock is set to another time the next file begins.
 
     Args:
         config: sizes, durations and folder.
         attachments: JSON-able values attached to every file, by name.
         metadata: text about the run, in every file.
-        start: log time the first file starts at, ns.
+        start: daemon time the first file starts at, ns.
+        real_offset: real (UNIX) minus daemon time, ns.
 
     Raises:
         OSError: from every method: the disk is full or refuses.
     """
 
     def __init__(
-        self, config: RecorderConfig, attachments: Mapping[str, Any], metadata: Mapping[str, str], start: int
+        self,
+        config: RecorderConfig,
+        attachments: Mapping[str, Any],
+        metadata: Mapping[str, str],
+        start: int,
+        real_offset: int = 0,
     ) -> None:
         self._config = config
         self._attachments = attachments
         self._metadata = metadata
+        self.real_offset = real_offset
+        """Real (UNIX) minus daemon time, ns; set by the owner when it changes."""
         self._folder = LogFolder(Path(config.directory))
         self._reported: set[Path] = set()
         """Files that could not be removed."""
@@ -89,8 +106,7 @@ class LogWriter:
     def write(self, entry: LogEntry) -> None:
         """Add one message; closes chunk and file when they are due."""
         self.tick(entry.log_time)
-        age = entry.log_time - self._file.start
-        if self._file.size >= self._config.rotate_bytes or age >= self._config.rotate_seconds * SECOND:
+        if self._is_complete(entry.log_time):
             self._file.finish()
             self._file = self._open(entry.log_time)
             self._synced = entry.log_time
@@ -110,6 +126,13 @@ class LogWriter:
             self._synced = now
             self._keep_quota()
 
+    def _is_complete(self, now: int) -> bool:
+        """Whether the next file is due: by size, by age, or because the computer's clock was set."""
+        age = now - self._file.start
+        if self._file.size >= self._config.rotate_bytes or age >= self._config.rotate_seconds * SECOND:
+            return True
+        return age >= _STEP_PERIOD and abs(log_offset(now, self.real_offset) - self._file.offset) > _STEP
+
     def _open(self, start: int) -> LogFile:
         while True:
             path = self._folder.next_path()
@@ -121,6 +144,7 @@ class LogWriter:
                     self._attachments,
                     self._metadata,
                     start,
+                    log_offset(start, self.real_offset),
                 )
             except FileExistsError:
                 self._folder.next_run()
@@ -205,7 +229,8 @@ class Recorder:
         self._digest = digest
         self._deterministic = deterministic
         self._batch: list[LogEntry] = []
-        self._queue: queue.SimpleQueue[list[LogEntry] | None] = queue.SimpleQueue()
+        self._queue: queue.SimpleQueue[tuple[int, list[LogEntry]] | None] = queue.SimpleQueue()
+        """Batches, each with the offset of real time when it was handed over."""
         self._written = 0
         """Counted by the thread alone."""
         self._progress = threading.Event()
@@ -226,8 +251,9 @@ class Recorder:
         self._loop = asyncio.get_running_loop()
         self._done = self._loop.create_future()
         self._recording = True
-        self._metadata.setdefault("real_offset_ns", str(self._clock.real_offset()))
-        threading.Thread(target=self._run, args=(self._clock.now(),), name="recorder", daemon=True).start()
+        now, offset = self._clock.now(), self._clock.real_offset()
+        self._metadata.setdefault("real_offset_ns", str(offset))
+        threading.Thread(target=self._run, args=(now, offset), name="recorder", daemon=True).start()
         return self
 
     async def __aexit__(
@@ -297,15 +323,15 @@ class Recorder:
 
     def _hand_over(self) -> None:
         if self._batch:
-            self._queue.put(self._batch)
+            self._queue.put((self._clock.real_offset(), self._batch))
             self._batch = []
 
-    def _run(self, start: int) -> None:
+    def _run(self, start: int, offset: int) -> None:
         """The thread."""
         repair: subprocess.Popen[bytes] | None = None
         try:
             try:
-                with LogWriter(self._config, self._attachments, self._metadata, start) as writer:
+                with LogWriter(self._config, self._attachments, self._metadata, start, offset) as writer:
                     self._path = writer.path
                     repair = self._start_repair()
                     self._write(writer)
@@ -333,13 +359,14 @@ class Recorder:
         wait = None if self._deterministic else self._config.chunk_seconds / 2
         while True:
             try:
-                batch = self._queue.get(timeout=wait)
+                taken = self._queue.get(timeout=wait)
             except queue.Empty:
                 writer.tick(self._clock.now())
                 continue
-            if batch is None:
+            if taken is None:
                 self._ended = True
                 return
+            writer.real_offset, batch = taken
             for entry in batch:
                 if self._refusal is not None:
                     raise self._refusal

@@ -28,8 +28,16 @@ SECOND = 1_000_000_000
 
 MILLISECOND: Final = SECOND // 1000
 
+_FIRST_DATE: Final = 946_684_800 * SECOND
+"""2000-01-01: earlier dates are from a virtual clock, or a computer whose clock was never set."""
+
 MANY_TIMERS: Final = 100
 """From so many on, cancelled timers are cleared away."""
+
+
+def is_date(real: int) -> bool:
+    """Whether a real time, ns, can be the date of a run."""
+    return real >= _FIRST_DATE
 
 
 def processor_time() -> float:

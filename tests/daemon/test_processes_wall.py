@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
 
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas import topics
@@ -176,8 +175,7 @@ async def test_kill_9_loses_at_most_a_second_of_log_and_the_next_start_stops_the
         truth = await truck.truth()
     recovery = recover(damaged, tmp_path / "repaired.mcap")
     assert recovery.damage is not None
-    with (tmp_path / "repaired.mcap").open("rb") as file:
-        newest = max(message.log_time for _, _, message in make_reader(file).iter_messages())
+    newest = max(message.log_time for message in open_log(tmp_path / "repaired.mcap"))
     assert killed - newest < SECOND
     assert info(log)["damage"] is None, "the next start repairs it in place"
     # The drive controller keeps its last speed while nobody talks to it; the first thing it then hears is a stop.

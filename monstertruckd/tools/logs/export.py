@@ -1,7 +1,7 @@
-"""Export of logs: CSV for spreadsheets, NPZ for numpy, MCAP in UNIX time for viewers that show dates.
+"""Export of logs: CSV for spreadsheets, NPZ for numpy, MCAP with the stamps inside its messages in UNIX time as well.
 
-The recorder cannot write UNIX time: a robot without a real-time clock learns the date after its first messages, and a
-viewer looks up transforms by the stamps inside them, so log times and stamps must be of one clock.
+Of a recorded log only the log times are dates: its messages are those of the bus. A viewer that looks up transforms by
+the stamps inside them needs log times and stamps of one clock.
 """
 
 import csv
@@ -24,7 +24,7 @@ from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.base import Schema
 from monstertruck_schemas.state import ClockOffset
 from monstertruck_schemas.topics import BY_NAME
-from monstertruckd.recorder.log_file import Channels
+from monstertruckd.recorder.log_file import TIMES, Channels
 from monstertruckd.recorder.reader import LogReader, open_log
 from monstertruckd.tools.logs.messages import ALL, Progress, Selection, real_offset
 
@@ -280,7 +280,9 @@ def _copy_preamble(writer: Writer, reader: LogReader, offset: int) -> None:
     writer.start(library=library)
     for record in records:
         if isinstance(record, Metadata):
+            if record.name == TIMES:
+                continue
             writer.add_metadata(record.name, dict(record.metadata) | {"real_offset_ns": "0", "moved_ns": str(offset)})
         else:
-            at = record.log_time + offset
+            at = record.log_time - reader.log_offset + offset
             writer.add_attachment(at, at, record.name, record.media_type, record.data)

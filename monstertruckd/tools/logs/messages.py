@@ -1,7 +1,7 @@
 """Messages of a log for the tools: which ones, decoded, and their real time.
 
-Logs keep the daemon's monotonic time, because a robot without a real-time clock learns the date late and its clock then
-jumps by hours. The newest offset in a log dates all of its messages.
+The tools count in the daemon's monotonic time, because a robot without a real-time clock learns the date late and its
+clock then jumps by hours. The newest offset in a log dates all of its messages.
 """
 
 import math
@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 from mcap.reader import make_reader
@@ -82,10 +81,6 @@ class Selection:
 ALL = Selection()
 
 
-_PLAUSIBLE: Final = 946_684_800 * SECOND
-"""2000-01-01: earlier dates are from a virtual clock, or a computer whose clock was never set."""
-
-
 def real_offset(reader: LogReader) -> int:
     """Real (UNIX) minus daemon time, ns, by the newest message about it in the log; 0 without one.
 
@@ -124,11 +119,6 @@ def _newest_clock(reader: LogReader) -> bytes | None:
     for message in reader:
         newest = message.payload if message.topic == CLOCK.name else newest
     return newest
-
-
-def is_plausible(real: int) -> bool:
-    """Whether a real time, ns, can be the date of a run."""
-    return real >= _PLAUSIBLE
 
 
 def utc(real: int) -> str:

@@ -15,6 +15,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from monstertruck_planners.collision import scan_points
+from monstertruck_runtime.clock import is_date
 from monstertruck_runtime.errors import CommandFailedError, ConfigError, InputError
 from monstertruck_runtime.small_files import require_file
 from monstertruck_schemas import topics as t
@@ -26,7 +27,7 @@ from monstertruck_schemas.sensor import CompressedImage, LaserScan
 from monstertruck_schemas.state import GateState, Grid, Odometry, Transforms
 from monstertruckd.recorder.reader import LogReader, open_log, spare_log
 from monstertruckd.tools.logs.export import removed_on_failure
-from monstertruckd.tools.logs.messages import ALL, Progress, Selection, is_plausible, real_offset
+from monstertruckd.tools.logs.messages import ALL, Progress, Selection, real_offset
 from monstertruckd.tools.logs.report.signals import FIGURES, Curve, DrivenPath, Figure
 
 TIMELINE: Final = "time"
@@ -153,7 +154,7 @@ class Scene:
                 values.append(value)
         if (handler := self._handlers.get(topic)) is not None:
             if self._dated is None:
-                self._dated = is_plausible(log_time + self._offset)
+                self._dated = is_date(log_time + self._offset)
             self._set_time(log_time)
             handler(message)
 
@@ -177,7 +178,7 @@ class Scene:
 
     def _column(self, times: list[int]) -> rr.TimeColumn:
         instants = np.array(times, np.int64)
-        if is_plausible(times[0] + self._offset):
+        if is_date(times[0] + self._offset):
             return rr.TimeColumn(TIMELINE, timestamp=(instants + self._offset).astype("datetime64[ns]"))
         return rr.TimeColumn(TIMELINE, duration=instants.astype("timedelta64[ns]"))
 

@@ -8,19 +8,19 @@ from typing import Any
 from mcap.reader import make_reader
 from mcap.records import Attachment, Channel, Message, Metadata, Schema
 
-from monstertruck_runtime.clock import SECOND
+from monstertruck_runtime.clock import SECOND, is_date
 from monstertruck_runtime.errors import InputError, NotFoundError
 from monstertruckd.recorder.reader import DAMAGE, LogReader, index_is_sound, is_finished
 from monstertruckd.recorder.repair import in_use
-from monstertruckd.tools.logs.messages import is_plausible, real_offset, utc
+from monstertruckd.tools.logs.messages import real_offset, utc
 
 
 def info(path: str | Path) -> dict[str, Any]:
     """Contents of a log as plain JSON-able values.
 
     Returns:
-        ``path``, ``size`` (bytes), ``damage`` (text or None), ``messages``, ``start``/``end`` (ns or None),
-        ``duration`` (s), ``topics`` (name to ``messages``, ``rate`` in Hz or None, ``bytes``, ``schema``,
+        ``path``, ``size`` (bytes), ``damage`` (text or None), ``messages``, ``start``/``end`` (ns of daemon time or
+        None), ``duration`` (s), ``topics`` (name to ``messages``, ``rate`` in Hz or None, ``bytes``, ``schema``,
         ``start``, ``end``), ``attachments`` (name to bytes), ``metadata`` (name to text values).
 
     Raises:
@@ -35,11 +35,11 @@ def info(path: str | Path) -> dict[str, Any]:
     metadata: dict[str, dict[str, str]] = {}
     for record in reader.records():
         if isinstance(record, Message):
-            row = channels[record.channel_id]
+            row, at = channels[record.channel_id], record.log_time - reader.log_offset
             row["messages"] += 1
             row["bytes"] += len(record.data)
-            row["start"] = record.log_time if row["start"] is None else min(row["start"], record.log_time)
-            row["end"] = record.log_time if row["end"] is None else max(row["end"], record.log_time)
+            row["start"] = at if row["start"] is None else min(row["start"], at)
+            row["end"] = at if row["end"] is None else max(row["end"], at)
         elif isinstance(record, Schema):
             schemas[record.id] = record.name
         elif isinstance(record, Channel):
@@ -135,14 +135,16 @@ def _summary_of(path: Path) -> LogSummary:
         path,
         size,
         LogState.FINISHED,
-        started=utc(real) if is_plausible(real) else None,
+        started=utc(real) if is_date(real) else None,
         duration=(statistics.message_end_time - statistics.message_start_time) / SECOND,
         messages=statistics.message_count,
     )
 
 
 def _offset(reader: LogReader) -> int:
+    """Real time minus the file's log time, ns."""
+    reader.metadata()  # passes what says of which clock the log times are
     try:
-        return real_offset(reader)
+        return real_offset(reader) - reader.log_offset
     except InputError:
         return 0

@@ -9,6 +9,7 @@ from pathlib import Path
 from types import MethodType
 
 import pytest
+from mcap.reader import make_reader
 
 from monstertruck_runtime import wire
 from monstertruck_runtime.clock import SECOND, WallClock, run_virtual
@@ -24,6 +25,7 @@ from monstertruckd.recorder.config import BlackBoxConfig, Compression
 from monstertruckd.recorder.log_file import LogFile
 from monstertruckd.recorder.reader import open_log
 from tests.unit.recorder.conftest import steering
+from tests.unit.tools.logs.log_kit import MAY_2026
 
 
 def trip(now, reason=Reason.SCAN_STALE, number=1):
@@ -298,6 +300,20 @@ def test_a_box_of_an_earlier_run_is_never_overwritten(tmp_path: Path, monkeypatc
     monkeypatch.setattr(module.BlackBoxFolder, "scan", scan)
 
 
+def test_a_box_is_dated_by_what_the_computer_knows_when_it_is_written(tmp_path: Path):
+    async def scenario(bench):
+        await bench.drive(5)
+        bench.clock.step_real(MAY_2026 / SECOND)
+        bench.trip()
+        await bench.drive(6)
+
+    (name,) = on_bench(tmp_path, scenario).files
+    with (tmp_path / name).open("rb") as file:
+        in_file = [message.log_time for _, _, message in make_reader(file).iter_messages()]
+    assert in_file == [message.log_time + MAY_2026 for message in open_log(tmp_path / name)]
+    assert in_file[0] // SECOND == 1_777_600_001
+
+
 def test_a_box_that_another_daemon_writes_stays(tmp_path: Path):
     part = tmp_path / "blackbox-000001-scan_stale.mcap.part"
     other = LogFile(part, Compression.ZSTD, 1000, {}, {}, 0)
@@ -308,7 +324,7 @@ def test_a_box_that_another_daemon_writes_stays(tmp_path: Path):
 
     assert on_bench(tmp_path, scenario).files == ["blackbox-000002-scan_stale.mcap"]
     other.finish()
-    assert open_log(part).metadata() == {"run": {}}
+    assert open_log(part).metadata()["run"] == {}
 
 
 def test_what_cannot_be_removed_costs_no_box(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog):

@@ -8,13 +8,13 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from monstertruck_runtime.clock import SECOND
+from monstertruck_runtime.clock import SECOND, is_date
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.small_files import replace_file
 from monstertruck_schemas.event import Cause, Event, LogLevel, Severity, Stop
 from monstertruck_schemas.health import ServiceState
 from monstertruckd.recorder.reader import spare_log
-from monstertruckd.tools.logs.messages import Progress, is_plausible, utc
+from monstertruckd.tools.logs.messages import Progress, utc
 from monstertruckd.tools.logs.report.collect import RunSummary, collect
 from monstertruckd.tools.logs.report.drawing import SEVERITY_TONE, Lines, clock_text, plots, plotted, scene, timeline
 from monstertruckd.tools.logs.report.states import Tone
@@ -81,7 +81,7 @@ def robot(run: RunSummary) -> str:
 def began(run: RunSummary) -> str | None:
     """Date of the first message, UTC; None if the log knows none."""
     real = run.start + (run.offset or 0)
-    return utc(real) if is_plausible(real) else None
+    return utc(real) if is_date(real) else None
 
 
 def page(run: RunSummary) -> str:
