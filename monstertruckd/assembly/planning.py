@@ -5,6 +5,7 @@ from typing import Any, Final
 
 from monstertruck_drivers.config import Devices
 from monstertruck_kinematics.chassis import Chassis
+from monstertruck_planners.behave.api import BehaviourBody
 from monstertruck_planners.behave.catalog import LEVELLING
 from monstertruck_planners.behave.service import BehaviourService
 from monstertruck_planners.collision import Footprint
@@ -37,7 +38,8 @@ STEP_DEADLINE: Final = 5.0
 
 def build_planners(config: TruckConfig, bus: Bus, clock: Clock, body: Body, actors: ActorFactory) -> Iterator[Service]:
     """Path source and tracker where one is configured; the lidar's levelling; the map's picture."""
-    requests = bus.publisher(topics.PLAN_DRIVE, Writer.PLANNER) if config.tracker or config.behaviours else None
+    wanted = (config.tracker or config.behaviours) and config.missing_actuators() is None
+    requests = bus.publisher(topics.PLAN_DRIVE, Writer.PLANNER) if wanted else None
     if config.tracker is not None and requests is not None:
         tracker = config.tracker.model_copy(update={"angle": min(config.tracker.angle, body.chassis.reached_angle)})
         paths = bus.publisher(topics.PATH, Writer.PLANNER)
@@ -59,7 +61,8 @@ def build_planners(config: TruckConfig, bus: Bus, clock: Clock, body: Body, acto
         if config.planner is not None:
             yield build_goals(config, config.planner, bus, clock, body.chassis, body.footprint, paths, requests, actors)
     if config.behaviours and requests is not None:
-        yield BehaviourService(config.behaviours, clock, bus, requests, config.gate.max_request_age)
+        moved = BehaviourBody(body.chassis, config.gate.angle)
+        yield BehaviourService(config.behaviours, clock, bus, requests, config.gate.max_request_age, moved)
     if config.devices.stabiliser is not None and config.devices.compass is not None:
         yield LEVELLING.implementation(config.levelling)(config.levelling, clock, bus)
     if config.map is not None and config.devices.lidar is not None:

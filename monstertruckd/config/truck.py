@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from monstertruck_drivers.config import Devices, Monitors
 from monstertruck_drivers.maestro.config import MaestroConfig
@@ -17,7 +17,9 @@ from monstertruck_estimation.odometry import OdometryConfig
 from monstertruck_estimation.slam.config import SlamConfig
 from monstertruck_kinematics.chassis import AXLES, WHEEL_REACH, Chassis, Dimensions
 from monstertruck_kinematics.truck import DriveTrain
+from monstertruck_planners.behave.api import BehaviourConfig
 from monstertruck_planners.behave.catalog import AnyBehaviour, AnyLevelling
+from monstertruck_planners.behave.move import MoveConfig
 from monstertruck_planners.behave.stabiliser import StabiliserConfig
 from monstertruck_planners.goals.config import DRIVEN, PlannerConfig
 from monstertruck_planners.track.catalog import AnyTracker
@@ -32,6 +34,9 @@ from monstertruckd.gate.config import SIGHT, BodyLimits, GateConfig, beyond, wea
 from monstertruckd.recorder.config import BlackBoxConfig, MapRender, RecorderConfig
 
 BLIND: Final = "devices: no range sensor: nothing stops the robot before an obstacle"
+
+MOVE: Final = "move"
+"""Name of the behaviour that every robot has."""
 
 Metres = Annotated[float, Field(gt=0, le=10)]
 
@@ -117,9 +122,9 @@ class TruckConfig(Schema):
     planner: PlannerConfig | None = None
     """How goals are reached; null = the robot follows paths only"""
     behaviours: dict[Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,31}$")], AnyBehaviour] = Field(
-        default_factory=dict
+        default_factory=dict, validate_default=True
     )
-    """What reacts to sensors without a path, by name; started by `behave start`"""
+    """What reacts to sensors without a path, by name; started by `behave start`. `move` is always there"""
     placement: PlacementConfig = PlacementConfig()
     path: PathConfig | None = None
     map: MapRender | None = None
@@ -142,6 +147,14 @@ class TruckConfig(Schema):
     """Who says where the robot is, on `mt/stand/sensor/pose_<robot>`: recorded, and read by nothing in the robot"""
     sim: Any = None
     """The simulated side; `simulate` and `config show` check it, the daemon does not read it"""
+
+    @field_validator("behaviours")
+    @classmethod
+    def _with_move(cls, behaviours: dict[str, BehaviourConfig]) -> dict[str, BehaviourConfig]:
+        moves = {MOVE: MoveConfig(), **behaviours}
+        if not isinstance(moves[MOVE], MoveConfig):
+            raise ValueError(f"{MOVE}: expected kind move, which the command of this name starts")
+        return moves
 
     def chassis(self) -> Chassis:
         """The body's kinematics.
@@ -208,7 +221,7 @@ class TruckConfig(Schema):
         for excess in (*beyond(self.gate, body), *beyond_devices(self.devices, self.monitors, self.gate, body)):
             raise ValueError(excess)
         self._check_planner()
-        if self.behaviours and (lack := self.missing_actuators()):
+        if self.behaviours.keys() - {MOVE} and (lack := self.missing_actuators()):
             raise ValueError(f"behaviours need {lack}")
         if self.slam is not None and self.devices.lidar is None:
             raise ValueError("slam needs the device lidar")

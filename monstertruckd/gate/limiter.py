@@ -664,8 +664,11 @@ class Motion:
         """Change the twist towards ``target``: no wheel, nor the base, changes its speed faster than allowed."""
         self._open = None
         change = (target[0] - self.twist[0], target[1] - self.twist[1], target[2] - self.twist[2])
-        step = self.pace(change)
+        # A difference of two motions need not be one that the body can do.
+        rolling = zip(self._chassis.shafts_along(target, *self.angles), self.shaft_speeds, strict=True)
+        step = max(math.hypot(change[0], change[1]), *(abs(to - at) for to, at in rolling))
         if step == 0:
+            self.twist = target
             return
         growing = self.pace(target) > self.pace(self.twist)
         rate = self._config.acceleration if growing else self._config.deceleration

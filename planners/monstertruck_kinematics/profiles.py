@@ -40,6 +40,25 @@ class CubicRamp:
         change, time = self.v1 - self.v0, self.duration
         return (3.0 * change - 2.0 * self.a0 * time) / time**2, (self.a0 * time - 2.0 * change) / time**3
 
+    @property
+    def distance(self) -> float:
+        """Distance covered: (v0 + v1) T/2 + a0 T^2/12."""
+        return self.duration * ((self.v0 + self.v1) / 2.0 + self.a0 * self.duration / 12.0)
+
+    @classmethod
+    def to_rest(cls, v0: float, distance: float, a0: float = 0.0) -> "CubicRamp":
+        """The ramp to standstill that covers a distance; with an acceleration that cannot be had, from a0 = 0.
+
+        Raises:
+            KinematicsError: speed and distance are not of one sign.
+        """
+        if not v0 * distance > 0.0:
+            raise KinematicsError(f"distance is {distance}: expected one in the direction of the speed, {v0}")
+        # a0 T^2/12 + v0 T/2 - distance = 0, its first positive root
+        root = v0 * v0 / 4.0 + a0 * distance / 3.0
+        half = v0 / 2.0 + math.copysign(math.sqrt(max(root, 0.0)), v0)
+        return cls(v0, 0.0, 2.0 * distance / half, a0) if root >= 0.0 else cls(v0, 0.0, 2.0 * distance / v0)
+
     def speed(self, t: float) -> float:
         """Speed at time t; before and after the ramp its end values."""
         t = min(max(t, 0.0), self.duration)
@@ -185,6 +204,7 @@ class BasicMove:
         radius: R, m.
         length: D, m, negative backwards.
         angle: phi, rad.
+        bearing: direction of travel in the body frame, rad; 0 = ahead, pi/2 = sideways to the left.
 
     Raises:
         KinematicsError: figures that contradict phi = D/R, or NaN.
@@ -193,10 +213,12 @@ class BasicMove:
     radius: float
     length: float
     angle: float
+    bearing: float = 0.0
 
     def __post_init__(self) -> None:
         require_finite("length", self.length)
         require_finite("angle", self.angle)
+        require_finite("bearing", self.bearing)
         if math.isnan(self.radius):
             raise KinematicsError("radius is nan: expected metres, 0 or infinity")
         turned = 0.0 if math.isinf(self.radius) else self.angle * self.radius
@@ -206,9 +228,9 @@ class BasicMove:
             raise KinematicsError(f"angle is {self.angle}: expected 0 for a straight move")
 
     @classmethod
-    def straight(cls, length: float) -> "BasicMove":
-        """Straight ahead (or back)."""
-        return cls(math.inf, length, 0.0)
+    def straight(cls, length: float, bearing: float = 0.0) -> "BasicMove":
+        """Straight ahead (or back), or along another direction without turning."""
+        return cls(math.inf, length, 0.0, bearing)
 
     @classmethod
     def spot(cls, angle: float) -> "BasicMove":
@@ -216,7 +238,7 @@ class BasicMove:
         return cls(0.0, 0.0, angle)
 
     @classmethod
-    def arc(cls, radius: float, length: float) -> "BasicMove":
+    def arc(cls, radius: float, length: float, bearing: float = 0.0) -> "BasicMove":
         """Arc of a length; the turn follows.
 
         Raises:
@@ -224,7 +246,7 @@ class BasicMove:
         """
         if radius == 0.0:
             raise KinematicsError("radius is 0: expected an arc; a turn on the spot has an angle, no length")
-        return cls(radius, length, length / radius)
+        return cls(radius, length, length / radius, bearing)
 
     @property
     def profile_distance(self) -> float:
@@ -234,7 +256,10 @@ class BasicMove:
     @property
     def direction(self) -> tuple[float, float, float]:
         """Twist at unit rate of ``profile_distance``."""
-        return (0.0, 0.0, 1.0) if self.radius == 0.0 else (1.0, 0.0, 1.0 / self.radius)
+        if self.radius == 0.0:
+            return 0.0, 0.0, 1.0
+        ahead, aside = (round(part, 15) for part in (math.cos(self.bearing), math.sin(self.bearing)))
+        return ahead, aside, 1.0 / self.radius
 
 
 @dataclass(frozen=True)

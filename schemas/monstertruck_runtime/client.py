@@ -6,7 +6,7 @@ import json
 import logging
 import secrets
 import threading
-from collections.abc import Callable, Coroutine, Sequence
+from collections.abc import Callable, Coroutine, Mapping, Sequence
 from functools import partial
 from types import TracebackType
 from typing import Any, Final, Self, TypeVar
@@ -329,15 +329,24 @@ class TruckClient(Operator):
         """Pause, resume or cancel the goal. Raises as ``goal`` does."""
         await self.call("goal_control", {**await self._answered(1.0), "order": order})
 
-    async def behave(self, order: BehaviourOrder, behaviour: str = "") -> dict[str, Any]:
+    async def behave(
+        self, order: BehaviourOrder, behaviour: str = "", settings: Mapping[str, Any] | None = None
+    ) -> dict[str, Any]:
         """Start a configured behaviour, or stop it; answers with its ``number``. Progress is on ``plan/behaviour``.
+
+        Args:
+            order: what.
+            behaviour: its name.
+            settings: those that replace the configured ones for this run.
 
         Raises:
             RequestRefusedError: why it does not start, or nothing runs.
+            InputError: a setting is wrong.
             NotFoundError: the robot is not there, or has no such behaviour.
             NoAnswerError: no answer in time.
         """
-        return await self.call("behave", {**await self._answered(1.0), "order": order, "behaviour": behaviour})
+        request = {"order": order, "behaviour": behaviour} | ({"settings": dict(settings)} if settings else {})
+        return await self.call("behave", {**await self._answered(1.0), **request})
 
     async def path(self, path: DrivePath, lease: float = 1.0) -> None:
         """Request to follow a path computed here. Raises as ``drive`` does."""

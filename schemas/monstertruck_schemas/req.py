@@ -206,6 +206,8 @@ class BehaviourRequest(Request):
     order: BehaviourOrder
     behaviour: Annotated[str, Field(max_length=64)] = ""
     """Name of the behaviour to start; of a stop: only that one, empty = whichever runs."""
+    settings: Annotated[dict[str, float | str | bool | None], Field(max_length=32)] = Field(default_factory=dict)
+    """Of a start: settings that replace the configured ones for this run."""
 
 
 class PathRequest(Request):

@@ -6,6 +6,7 @@ import typer
 
 from monstertruck_runtime.clock import Clock, run_wall
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
+from monstertruck_runtime.errors import NotFoundError
 from monstertruckd.tools.cli.options import EndpointOption, RobotOption
 from monstertruckd.tools.cli.output import JsonOption, command_group, finish, print_json, print_table
 
@@ -28,9 +29,12 @@ def list_command(
 
     async def main(clock: Clock) -> dict[str, Any]:
         async with TruckClient(robot, endpoint, clock=clock) as client:
-            if not (await client.call("config")).get("behaviours"):
-                return {}
-            return await client.call("behaviours")
+            try:
+                return await client.call("behaviours")
+            except NotFoundError:
+                if await client.alive():
+                    return {}
+                raise
 
     found = run_wall(main)
     if json_output:
@@ -86,8 +90,6 @@ async def _check(client: "TruckClient", name: str) -> None:
     Raises:
         NotFoundError: naming those there are.
     """
-    from monstertruck_runtime.errors import NotFoundError
-
     known = (await client.call("config")).get("behaviours") or {}
     if not known:
         raise NotFoundError("the robot has no behaviours: expected a section `behaviours` in its configuration")

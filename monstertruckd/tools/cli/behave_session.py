@@ -1,6 +1,6 @@
 """One run of a behaviour, as a client of the robot."""
 
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from typing import Any, Protocol
@@ -18,7 +18,9 @@ from monstertruckd.tools.cli.output import progress
 class BehaviourClient(Operator, Protocol):
     """Client of a robot that has behaviours."""
 
-    async def behave(self, order: BehaviourOrder, behaviour: str = "") -> dict[str, Any]:
+    async def behave(
+        self, order: BehaviourOrder, behaviour: str = "", settings: Mapping[str, Any] | None = None
+    ) -> dict[str, Any]:
         """Start or stop a behaviour."""
         ...
 
@@ -41,8 +43,16 @@ class BehaviourEnd:
         return asdict(self)
 
 
-async def run_behaviour(driver: BehaviourClient, name: str, *, arm: bool) -> BehaviourEnd:
+async def run_behaviour(
+    driver: BehaviourClient, name: str, *, arm: bool, settings: Mapping[str, Any] | None = None
+) -> BehaviourEnd:
     """Start a behaviour and wait for its end; cancelled or without an answer, it is stopped.
+
+    Args:
+        driver: the robot's client.
+        name: of the behaviour.
+        arm: the robot first.
+        settings: those that replace the configured ones.
 
     Raises:
         RequestRefusedError: the start or the arming was refused.
@@ -56,14 +66,18 @@ async def run_behaviour(driver: BehaviourClient, name: str, *, arm: bool) -> Beh
             with suppress(TruckError):
                 await driver.behave(BehaviourOrder.STOP, name)
 
-        return await _followed(driver, states, name, stop)
+        start = driver.behave(BehaviourOrder.START, name, settings)
+        return await _followed(states, name, start, stop)
 
 
 async def _followed(
-    driver: BehaviourClient, states: Mailbox[BehaviourState], name: str, stop: Callable[[], Awaitable[None]]
+    states: Mailbox[BehaviourState],
+    name: str,
+    start: Awaitable[dict[str, Any]],
+    stop: Callable[[], Awaitable[None]],
 ) -> BehaviourEnd:
     try:
-        number = int((await driver.behave(BehaviourOrder.START, name))["number"])
+        number = int((await start)["number"])
         with progress(name) as show:
             async for state in states:
                 if state.number > number:

@@ -17,6 +17,7 @@ from monstertruckd.tools.cli import (
     live,
     logs,
     maps,
+    move,
     orders,
     plan,
     replay,
@@ -70,6 +71,7 @@ app.command("reset")(orders.reset)
 app.command("plan", context_settings={"ignore_unknown_options": True})(plan.plan)  # "-1,2,0" is a pose
 app.command("goto", context_settings={"ignore_unknown_options": True})(goto.goto)
 app.command("track")(goto.track)
+app.command("move")(move.move)
 app.command("plan-server")(robot.plan_server)
 app.command("replay")(replay.replay)
 app.command("emulate")(devices.emulate)

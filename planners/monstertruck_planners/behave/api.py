@@ -6,6 +6,7 @@ from typing import Annotated, Any, ClassVar, NamedTuple, Protocol, TypeVar
 
 from pydantic import Field
 
+from monstertruck_kinematics.chassis import Chassis
 from monstertruck_schemas.base import Message, Schema
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.topics import Topic
@@ -53,6 +54,14 @@ class BehaviourStep:
     values: Mapping[str, float] = field(default_factory=dict)
 
 
+class BehaviourBody(NamedTuple):
+    """The robot that a behaviour moves."""
+
+    chassis: Chassis
+    max_angle: float
+    """Of its axles, rad: that of the gate."""
+
+
 class Inputs:
     """The newest message of every topic that a behaviour reads; all of them are fresh.
 
@@ -71,7 +80,11 @@ class Inputs:
 
 
 class Behaviour(Protocol):
-    """Made from its settings; keeps nothing between steps but what they return."""
+    """Made from its settings; keeps nothing between steps but what they return.
+
+    A class with a class method ``fit(settings, body)`` is made by this instead, from a ``BehaviourBody`` as well, at
+    every start; a ``ValueError`` of it says why the body cannot do that, or what is wrong with the settings.
+    """
 
     reads: ClassVar[tuple[Topic[Any], ...]]
     """Topics without which it cannot run: when one has no fresh message, it is stopped with ``INPUT_STALE``."""

@@ -20,6 +20,12 @@ BEHAVIOURS: Final = Catalog(
         implementation="monstertruck_planners.behave.wall.published:WallSwitching",
         doc="Follows a wall by turning away and back (coursework, method 2)",
     ),
+    Plugin(
+        name="move",
+        settings="monstertruck_planners.behave.move:MoveConfig",
+        implementation="monstertruck_planners.behave.move:Move",
+        doc="Drives one arc, straight or turn on the spot under a motion profile",
+    ),
     base=BehaviourConfig,
 )
 """A behaviour is a ``Behaviour`` made from its settings; it asks for motion through the gate."""

@@ -5,10 +5,20 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
-from monstertruck_planners.behave.api import Behaviour, BehaviourConfig, BehaviourStep, Inputs, RequestedMotion
+from pydantic import ValidationError
+
+from monstertruck_kinematics.elementary import KinematicsError
+from monstertruck_planners.behave.api import (
+    Behaviour,
+    BehaviourBody,
+    BehaviourConfig,
+    BehaviourStep,
+    Inputs,
+    RequestedMotion,
+)
 from monstertruck_planners.behave.catalog import BEHAVIOURS
 from monstertruck_runtime.clock import SECOND, Clock, Schedule
-from monstertruck_runtime.errors import NotFoundError, RequestRefusedError
+from monstertruck_runtime.errors import InputError, NotFoundError, RequestRefusedError
 from monstertruck_runtime.mailbox import latest
 from monstertruck_runtime.ports import BusPort, EventSink, Publisher, Ready, RpcRegistry, Subscription
 from monstertruck_runtime.requests import Sequences, parse_request, planner_request, refusal
@@ -72,6 +82,7 @@ class BehaviourService:
         bus: the topics that behaviours read.
         drive: ``plan/drive``, shared with the other planners.
         max_age: see ``GateConfig.max_request_age``.
+        body: what they move.
     """
 
     name = SOURCE
@@ -83,12 +94,11 @@ class BehaviourService:
         bus: BusPort,
         drive: Publisher[DriveRequest],
         max_age: float,
+        body: BehaviourBody,
     ) -> None:
-        self.configs, self._clock, self._drive, self._max_age = configs, clock, drive, max_age
-        self._behaviours: dict[str, Behaviour] = {
-            name: BEHAVIOURS.implementation(config)(config) for name, config in configs.items()
-        }
-        topics = {topic.name: topic for behaviour in self._behaviours.values() for topic in behaviour.reads}
+        self.configs, self._clock, self._drive, self._max_age, self._body = configs, clock, drive, max_age, body
+        reads = [BEHAVIOURS.implementation(config).reads for config in configs.values()]
+        topics = {topic.name: topic for some in reads for topic in some}
         self._read: dict[str, Subscription[Any]] = {
             name: bus.subscribe(topic, latest()) for name, topic in topics.items()
         }
@@ -151,15 +161,33 @@ class BehaviourService:
         if gate is None or not gate.mode.accepts_motion:
             held = Reason.DISARMED if gate is None else next(iter(gate.reasons), Reason.DISARMED)
             raise RequestRefusedError(held, f"the robot does not drive: {held.text}")
-        behaviour = self._behaviours[name]
+        config = _with_settings(self.configs[name], request.settings)
+        behaviour = self._made(config)
         if (stale := self._stale(behaviour, now)) is not None:
             raise RequestRefusedError(Reason.INPUT_STALE, stale)
         number = 1 if run is None else run.number + 1
-        self._run = BehaviourRun(number, name, self.configs[name], behaviour, request.source, now, behaviour.begin())
+        self._run = BehaviourRun(number, name, config, behaviour, request.source, now, behaviour.begin())
         self._pose = self._odometry.latest
         self._events(Reason.BEHAVIOUR_STARTED, Severity.INFO, SOURCE, f"{name} started by {request.source}")
         self._report(now)
         return number
+
+    def _made(self, config: BehaviourConfig) -> Behaviour:
+        """The behaviour of settings.
+
+        Raises:
+            RequestRefusedError: the body cannot do that.
+            InputError: the settings are not complete.
+        """
+        implementation = BEHAVIOURS.implementation(config)
+        fit = getattr(implementation, "fit", None)
+        try:
+            made: Behaviour = implementation(config) if fit is None else fit(config, self._body)
+        except KinematicsError as error:
+            raise RequestRefusedError(Reason.IMPOSSIBLE_MOTION, str(error)) from error
+        except ValueError as error:
+            raise InputError(f"settings: {error}") from error
+        return made
 
     def _stop(self, request: BehaviourRequest, now: int) -> int:
         run = self._run
@@ -296,6 +324,23 @@ class BehaviourService:
             travelled=run.travelled,
             values=dict(run.values or {}),
         )
+
+
+def _with_settings(config: BehaviourConfig, settings: Mapping[str, Any]) -> BehaviourConfig:
+    """Settings with those that are given for one run.
+
+    Raises:
+        InputError: one of them is wrong; the text names the first.
+    """
+    if not settings:
+        return config
+    if unknown := settings.keys() - type(config).model_fields.keys() | settings.keys() & {"kind"}:
+        raise InputError(f"settings.{min(unknown)}: no setting of a run of {config.kind}")
+    try:
+        return type(config).model_validate({**config.model_dump(), **settings})
+    except ValidationError as error:
+        detail = error.errors(include_url=False)[0]
+        raise InputError(f"{'.'.join(('settings', *map(str, detail['loc'])))}: {detail['msg']}") from None
 
 
 def register_behaviour_calls(rpc: RpcRegistry, service: BehaviourService) -> None:

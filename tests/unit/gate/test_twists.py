@@ -10,7 +10,9 @@ from monstertruck_schemas.cmd import DriveAction
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import DriveForm
 from monstertruck_schemas.state import GateMode
-from tests.unit.gate.rig import ANY_GROUND, Rig, Robot
+from monstertruckd.gate.config import GateConfig
+from monstertruckd.gate.limiter import Motion
+from tests.unit.gate.rig import ANY_GROUND, BODIES, Rig, Robot
 
 SPOT, SIDE = {"wz": 0.5}, {"vy": 0.1}
 
@@ -222,3 +224,13 @@ def test_neutral_twists_release_the_truck():
     robot.tick(80)
     assert robot.out.mode is GateMode.ARMED
     assert robot.trips == []
+
+
+@pytest.mark.parametrize("kind", ["ackermann", "truck", "synchro"])
+def test_a_change_of_rounding_in_the_turn_alone_is_no_motion_of_its_own(kind: str):
+    motion = Motion(GateConfig(), BODIES[kind])
+    motion.twist = motion.along((0.1, 0.0, 0.0))
+    vx, vy, wz = motion.twist
+    target = (vx, vy + 1e-18, wz + 1e-17)
+    motion.accelerate(target, 0.02)
+    assert motion.twist == pytest.approx(target, abs=1e-12)

@@ -110,3 +110,29 @@ def test_bad_moves_and_profiles_are_named():
     ):
         with pytest.raises(KinematicsError, match=text):
             call()
+
+
+@pytest.mark.parametrize(
+    ("v0", "v1", "a0", "time"), [(0.0, 0.2, 0.0, 0.5), (0.2, 0.0, -0.1, 0.7), (-0.1, 0.3, 0.4, 1.0)]
+)
+def test_the_distance_of_a_ramp_is_the_integral_of_its_speed(v0, v1, a0, time):
+    ramp = CubicRamp(v0, v1, time, a0)
+    times = np.linspace(0.0, time, 2001)
+    assert ramp.distance == pytest.approx(np.trapezoid([ramp.speed(float(t)) for t in times], times), abs=1e-7)
+
+
+@pytest.mark.parametrize("a0", [0.0, 0.3, -0.05, -5.0])
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_a_ramp_to_rest_covers_the_way_that_is_left(a0, side):
+    ramp = CubicRamp.to_rest(0.2 * side, 0.07 * side, a0 * side)
+    assert ramp.distance == pytest.approx(0.07 * side)
+    assert ramp.speed(ramp.duration) == pytest.approx(0.0, abs=1e-12)
+    assert ramp.a0 == (a0 * side if a0 > -1.0 else 0.0)  # braking so hard it would stand before
+    with pytest.raises(KinematicsError, match="expected one in the direction of the speed"):
+        CubicRamp.to_rest(0.2, -0.1)
+
+
+def test_a_bearing_turns_the_direction_of_travel():
+    assert BasicMove.straight(1.0, math.pi / 2).direction == (0.0, 1.0, 0.0)
+    assert BasicMove.arc(2.0, 1.0, -math.pi / 2).direction == (0.0, -1.0, 0.5)
+    assert BasicMove.spot(1.0).direction == (0.0, 0.0, 1.0)

@@ -5,14 +5,18 @@ from dataclasses import dataclass
 
 import pytest
 
-from monstertruck_planners.behave.api import RequestedMotion
+from monstertruck_kinematics.chassis import Dimensions
+from monstertruck_kinematics.truck import DriveTrain
+from monstertruck_planners.behave.api import BehaviourBody, RequestedMotion
 from monstertruck_planners.behave.service import SOURCE, BehaviourService
 from monstertruck_planners.behave.wall.config import WallPdConfig
+from monstertruck_runtime.bodies import build_chassis
 from monstertruck_runtime.clock import VirtualClock, run_virtual
 from monstertruck_runtime.errors import NotFoundError, RequestRefusedError
 from monstertruck_runtime.mailbox import fifo, latest
 from monstertruck_schemas import topics
 from monstertruck_schemas.base import Twist2D
+from monstertruck_schemas.body import TruckBody
 from monstertruck_schemas.plan import GoalPhase, GoalState, TrackerState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import BehaviourOrder, BehaviourRequest, Role
@@ -49,7 +53,8 @@ class Bench:
         self.events = bus.subscribe(topics.EVENT, fifo(4096))
         drive = bus.publisher(topics.PLAN_DRIVE, Writer.PLANNER)
         configs = {"wall": WallPdConfig(), "other": WallPdConfig(side="right")}
-        self.service = BehaviourService(configs, self.clock, bus, drive, 0.5)
+        body = BehaviourBody(build_chassis(TruckBody(), Dimensions(DriveTrain())), 0.4)
+        self.service = BehaviourService(configs, self.clock, bus, drive, 0.5, body)
         self.asked = RequestedMotion()
 
     async def robot(self):

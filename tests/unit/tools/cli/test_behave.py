@@ -39,7 +39,7 @@ class Robot:
     async def arm(self, *, hold=False):
         self.orders.append("arm")
 
-    async def behave(self, order, behaviour=""):
+    async def behave(self, order, behaviour="", settings=None):
         self.orders.append(order)
         if order is BehaviourOrder.START:
             if self.refuses is not None:

@@ -1,0 +1,95 @@
+"""``monstertruckd move``: one basic move under a motion profile."""
+
+from enum import StrEnum
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from monstertruck_runtime.clock import Clock, run_wall
+from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
+from monstertruck_runtime.errors import InputError
+from monstertruckd.tools.cli.options import EndpointOption, RobotOption
+from monstertruckd.tools.cli.output import JsonOption, finish, print_json
+
+if TYPE_CHECKING:
+    from monstertruckd.tools.cli.behave_session import BehaviourEnd
+
+
+class Profile(StrEnum):
+    """How the speed grows and falls."""
+
+    TRAPEZOID = "trapezoid"
+    CUBIC = "cubic"
+    RAMP = "ramp"
+
+
+def move(
+    radius: Annotated[
+        float | None,
+        typer.Option(help="Of the arc, m; centre on the left positive, 0 = on the spot, left out = straight."),
+    ] = None,
+    length: Annotated[float | None, typer.Option(help="Way, m; backwards negative.")] = None,
+    angle: Annotated[float | None, typer.Option(help="Turn, rad; counter-clockwise positive.")] = None,
+    bearing: Annotated[
+        float | None, typer.Option(help="Direction of travel, rad; 0 = ahead, 1.5708 = sideways to the left.")
+    ] = None,
+    profile: Annotated[
+        Profile | None, typer.Option(help="Default: that of the configuration's behaviour `move`.")
+    ] = None,
+    speed: Annotated[float | None, typer.Option(help="Greatest speed, m/s; on the spot rad/s.")] = None,
+    acceleration: Annotated[float | None, typer.Option(help="Greatest acceleration, m/s^2 or rad/s^2.")] = None,
+    arm: Annotated[bool, typer.Option("--arm", help="Arm the robot first; it drives off at once.")] = False,
+    robot: RobotOption = "truck",
+    endpoint: EndpointOption = DEFAULT_ENDPOINT,
+    json_output: JsonOption = False,
+) -> None:
+    """Drive an arc, straight on, sideways or round on the spot, by --length or by --angle.
+
+    Ends at the end of the move, or with the reason why it was refused or given up. Ctrl-C stops it.
+    """
+    from monstertruck_runtime.client import TruckClient
+    from monstertruckd.tools.cli.behave_session import run_behaviour
+
+    spot = radius == 0.0
+    given = {
+        "radius": radius,
+        "length": length,
+        "angle": angle,
+        "bearing": bearing,
+        "profile": None if profile is None else profile.value,
+        "turn_rate" if spot else "speed": speed,
+        "turn_acceleration" if spot else "acceleration": acceleration,
+    }
+    settings = {name: value for name, value in given.items() if value is not None}
+    _check(settings)
+
+    async def main(clock: Clock) -> "BehaviourEnd":
+        async with TruckClient(robot, endpoint, clock=clock) as client:
+            return await run_behaviour(client, "move", arm=arm, settings=settings)
+
+    end = run_wall(main)
+    if json_output:
+        print_json(end.as_json())
+    elif not end.reason.exit_code:
+        print(f"{end.reason.text}: {end.text}")
+    finish(end.reason, f"{end.reason.text}: {end.text}")
+
+
+def _check(settings: dict[str, Any]) -> None:
+    """Refuse what is no move before any robot is asked.
+
+    Raises:
+        InputError: the text says what was expected.
+    """
+    from pydantic import ValidationError
+
+    from monstertruck_planners.behave.move import MoveConfig
+
+    try:
+        MoveConfig.model_validate(settings).move()
+    except ValidationError as error:
+        detail = error.errors(include_url=False)[0]
+        where = "".join(f"--{name}: " for name in detail["loc"])
+        raise InputError(where + detail["msg"].removeprefix("Value error, ")) from None
+    except ValueError as error:
+        raise InputError(f"move: {error}") from None
