@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from monstertruckd.tools.cli.behave_session import BehaviourEnd
 
 
-class Profile(StrEnum):
+class MoveProfile(StrEnum):
     """How the speed grows and falls."""
 
     TRAPEZOID = "trapezoid"
@@ -34,7 +34,7 @@ def move(
         float | None, typer.Option(help="Direction of travel, rad; 0 = ahead, 1.5708 = sideways to the left.")
     ] = None,
     profile: Annotated[
-        Profile | None, typer.Option(help="Default: that of the configuration's behaviour `move`.")
+        MoveProfile | None, typer.Option(help="Default: that of the configuration's behaviour `move`.")
     ] = None,
     speed: Annotated[float | None, typer.Option(help="Greatest speed, m/s; on the spot rad/s.")] = None,
     acceleration: Annotated[float | None, typer.Option(help="Greatest acceleration, m/s^2 or rad/s^2.")] = None,
