@@ -210,6 +210,29 @@ class SimTruckConfig(Schema):
         return self
 
 
+class MechanicsConfig(Schema):
+    """Masses, springs and friction of the truck, for engine ``mujoco``; the whole mass is ``truck.mass``."""
+
+    wheel_mass: Positive = 0.281
+    """Of one wheel, kg."""
+    axle_mass: Positive = 0.45
+    """Of one axle without its wheels, kg."""
+    mass_height: Positive = 0.12
+    """Of the centre of the mass on the springs, over the ground, m."""
+    wheel_width: Positive = 0.08
+    """m."""
+    droop: Positive = 0.010
+    """How far an axle sinks below its place at rest before its stop, m."""
+    bump: Positive = 0.030
+    """How far it rises before its stop, m."""
+    damping: Positive = 0.35
+    """Of the suspension, share of the critical one."""
+    axle_roll_deg: Annotated[float, Field(gt=0, le=45)] = 10.0
+    """Greatest roll of an axle against the chassis."""
+    friction: Positive = 0.5
+    """Between tyres and ground."""
+
+
 class BatteryModelConfig(Schema):
     """6S LiPo pack and its measurement."""
 
@@ -459,8 +482,11 @@ class WorldConfig(Schema):
     """Name of a built-in world, or path of a map_server YAML file (its ground: ``NAME.profile.yaml`` next to it)."""
     start: Pose2D | None = None
     """Pose of the truck's geometric centre in the map frame; None: the built-in world's own, else the origin."""
+    engine: Literal["plane", "mujoco"] = "plane"
+    """What moves the robot: kinematics in the plane, or rigid bodies in three dimensions (extra sim3d)."""
     noise: bool = True
     truck: SimTruckConfig = SimTruckConfig()
+    mechanics: MechanicsConfig = MechanicsConfig()
     battery: BatteryModelConfig = BatteryModelConfig()
     lidar: LidarConfig = LidarConfig()
     camera: CameraConfig = CameraConfig()
@@ -472,3 +498,12 @@ class WorldConfig(Schema):
     """Patches of rough ground"""
     people: Annotated[tuple[PersonConfig, ...], Field(strict=False, max_length=50)] = ()
     """Who walks through it"""
+
+    @model_validator(mode="after")
+    def _check_engine(self) -> Self:
+        if self.engine == "mujoco":
+            if self.truck.body.kind != "truck":
+                raise ValueError(f"engine mujoco: has no body {self.truck.body.kind}; expected truck")
+            if self.tilt.kind != "ground":
+                raise ValueError(f"engine mujoco: tilt {self.tilt.kind}: the ground tilts the robot; expected ground")
+        return self

@@ -38,7 +38,7 @@ class PlanOutline:
     """
 
     def __init__(self, scene: Surroundings, truck: SimTruckConfig, name: str) -> None:
-        self.scene, self._truck, self._name = scene, truck, name
+        self.scene, self._truck, self.name = scene, truck, name
         self._half_diagonal = hypot(truck.length, truck.width) / 2
         self._free: Pose | None = None
         """Pose with free room around."""
@@ -57,18 +57,18 @@ class PlanOutline:
 
     def blocked(self, pose: Pose, twist: Twist) -> None:
         """It cannot move on to a pose: a contact with who is there."""
-        self.scene.report(self.box(pose), self._name, self.pace(twist))
+        self.scene.report(self.box(pose), self.name, self.pace(twist))
 
     def overlap(self, x: float, y: float, yaw: float) -> float:
         """How deep it reaches into things, robots and people, m; 0 = free."""
         pose = (x, y, yaw)
-        return self._fixed(pose) + self.scene.moving_overlap(self.box(pose), self._name)
+        return self._fixed(pose) + self.scene.moving_overlap(self.box(pose), self.name)
 
     def cast(
         self, xs: Array, ys: Array, angles: Array, reach: float, times_ns: NDArray[np.int64] | None = None
     ) -> Array:
         """Ranges to walls, things, people and the other robots."""
-        return self.scene.cast(xs, ys, angles, reach, times_ns, self._name)
+        return self.scene.cast(xs, ys, angles, reach, times_ns, self.name)
 
     def _fixed(self, pose: Pose) -> float:
         if self._known is not self.scene.obstacles:

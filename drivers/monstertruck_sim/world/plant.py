@@ -122,7 +122,10 @@ class Plant(Protocol):
         ...
 
     def poses(self, times_ns: NDArray[np.int64]) -> Array:
-        """Poses at instants of the last half second, (5, n): x, y, yaw, pitch, roll."""
+        """Poses at instants of the last half second, (6, n): x, y, yaw, pitch, roll, and the base's height.
+
+        The height is 0 in the plane, whatever its ground.
+        """
         ...
 
 
@@ -213,6 +216,8 @@ class GriddedPlant(ABC):
         self._pose = start
         self._twist: Twist = (0.0, 0.0, 0.0)
         self._attitude = attitude
+        self._height = 0.0
+        """Of the base, m."""
         self._stuck_at: Pose | None = None
         self._slipping = [False] * count
         self._trail: deque[tuple[float, ...]] = deque(maxlen=_KEPT_NS // self.STEP_NS)
@@ -287,7 +292,7 @@ class GriddedPlant(ABC):
         )
 
     def poses(self, times_ns: NDArray[np.int64]) -> Array:
-        """Poses at instants of the last half second, (5, n): x, y, yaw, pitch, roll.
+        """Poses at instants of the last half second, (6, n): x, y, yaw, pitch, roll, height.
 
         Instants not yet integrated are extrapolated at the present velocity; none of them binds the future.
         """
@@ -295,20 +300,20 @@ class GriddedPlant(ABC):
         seconds = (times_ns - self._start_ns) * 1e-9
         oldest = float(seconds[0]) - 2e-9 * self.STEP_NS
         trail = [row for row in self._trail if row[0] >= oldest]
-        trail.append((self._elapsed * 1e-9, *self._pose, *self._attitude))
+        trail.append((self._elapsed * 1e-9, *self._pose, *self._attitude, self._height))
         if (ahead := float(seconds[-1]) - trail[-1][0]) > 0:
             for part in (0.5, 1.0):
                 pose = integrate(self._pose, *self._twist, ahead * part)
-                trail.append((self._elapsed * 1e-9 + ahead * part, *pose, *self._attitude))
-        found = np.zeros((5, len(seconds)))
-        level = not any(pitch or roll for *_, pitch, roll in trail)
+                trail.append((self._elapsed * 1e-9 + ahead * part, *pose, *self._attitude, self._height))
+        found = np.zeros((6, len(seconds)))
+        level = not any(pitch or roll or height for *_, pitch, roll, height in trail)
         at, *rows = np.array(trail).T
         for i, row in enumerate(rows[:3] if level else rows):
             found[i] = np.interp(seconds, at, row)
         return found
 
     def _remember(self) -> None:
-        self._trail.append((self._elapsed * 1e-9, *self._pose, *self._attitude))
+        self._trail.append((self._elapsed * 1e-9, *self._pose, *self._attitude, self._height))
 
     def _turn_servos(self, dt: float) -> list[float]:
         """Angles of the servos after dt, rad."""

@@ -51,10 +51,22 @@ class Sweep(Protocol):
         """Ranges, m; inf = nothing.
 
         Args:
-            poses: of the robot at the beams' instants, (5, 769): x, y, yaw, pitch, roll.
+            poses: of the robot at the beams' instants, (6, 769): x, y, yaw, pitch, roll, height.
             beams: directions in the body frame; None: ``BEAM_ANGLES`` in the body's plane.
             times_ns: instants of the beams, (769,), rising.
         """
+        ...
+
+
+class Uneven(Protocol):
+    """Ground with a height."""
+
+    def height(self, x: Array, y: Array) -> Array:
+        """Metres at points in the map frame; all of one shape."""
+        ...
+
+    def cast(self, xs: Array, ys: Array, zs: Array, headings: Array, rises: Array, reach: float) -> Array:
+        """Horizontal distances at which beams from points meet it; inf = not within ``reach``; all (n,)."""
         ...
 
 
@@ -75,9 +87,9 @@ class PlaneSweep:
 
     def __call__(self, poses: Array, beams: Beams | None, times_ns: NDArray[np.int64]) -> Array:
         """As ``Sweep``."""
-        x, y, yaw, pitch, roll = poses
+        x, y, yaw, pitch, roll, _ = poses
         xs, ys = x + self._config.x * np.cos(yaw), y + self._config.x * np.sin(yaw)
-        if beams is None and self._terrain is None and np.abs(poses[3:]).max() < _LEVEL:
+        if beams is None and self._terrain is None and np.abs(poses[3:5]).max() < _LEVEL:
             return self._cast(xs, ys, yaw + BEAM_ANGLES, self._config.max_range, times_ns)
         beams = turned(LEVEL_BEAMS if beams is None else beams, pitch, roll)
         if self._terrain is None:
@@ -98,20 +110,43 @@ class PlaneSweep:
 
     def _over(self, terrain: Terrain, poses: Array, beams: Beams, times_ns: NDArray[np.int64]) -> Array:
         """Ranges over uneven ground; arguments as of ``_tilted``."""
-        config, (x, y, yaw, pitch, _) = self._config, poses
-        forward, left, up = beams
+        config, (x, y, yaw, pitch, *_) = self._config, poses
         xs, ys = x + config.x * np.cos(yaw), y + config.x * np.sin(yaw)
         zs = terrain.height(x, y) - config.x * np.sin(pitch) + config.height
-        level = np.hypot(forward, left)
-        headings, rises = yaw + np.arctan2(left, forward), up / level
-        walls = self._cast(xs, ys, headings, config.max_range, times_ns)
-        hit = np.isfinite(walls)
-        way = np.where(hit, walls, 0.0)
-        foot = terrain.height(xs + way * np.cos(headings), ys + way * np.sin(headings))
-        walls[hit & (zs + rises * way > foot + config.wall_height)] = np.inf
-        ground = terrain.cast(xs, ys, zs, headings, rises, config.max_range)
-        ranges: Array = np.minimum(walls, ground) / level
-        return ranges
+        return over(self._cast, terrain, config, (xs, ys, zs), yaw, beams, times_ns)
+
+
+def over(
+    cast: Caster,
+    ground: Uneven,
+    config: LidarConfig,
+    origins: Beams,
+    yaw: Array,
+    beams: Beams,
+    times_ns: NDArray[np.int64],
+) -> Array:
+    """Ranges over uneven ground to it and to walls that stand on it, m; inf = nothing.
+
+    Args:
+        cast: horizontal ranges to the walls.
+        ground: under them.
+        config: of the lidar.
+        origins: of the beams in the map frame, m.
+        yaw: of the robot, (n,).
+        beams: directions in the robot's level frame.
+        times_ns: instants of the beams.
+    """
+    (xs, ys, zs), (forward, left, up) = origins, beams
+    level = np.hypot(forward, left)
+    headings, rises = yaw + np.arctan2(left, forward), up / level
+    walls = cast(xs, ys, headings, config.max_range, times_ns)
+    hit = np.isfinite(walls)
+    way = np.where(hit, walls, 0.0)
+    foot = ground.height(xs + way * np.cos(headings), ys + way * np.sin(headings))
+    walls[hit & (zs + rises * way > foot + config.wall_height)] = np.inf
+    found = ground.cast(xs, ys, zs, headings, rises, config.max_range)
+    ranges: Array = np.minimum(walls, found) / level
+    return ranges
 
 
 class SimulatedLidar:

@@ -15,7 +15,7 @@ from monstertruck_drivers.emulation import (
     SonarSource,
     ViewSource,
 )
-from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.errors import InputError, NotInstalledError
 from monstertruck_runtime.map_files import load_map
 from monstertruck_sim.world.built_in import BUILT_IN, BuiltIn
 from monstertruck_sim.world.config import TiltConfig, WorldConfig
@@ -181,8 +181,17 @@ def make_engine(config: WorldConfig, footprint: PlanOutline, start: Pose, seed: 
     """What computes one robot: ``engine`` of the configuration.
 
     Raises:
-        InputError: the engine cannot do it.
+        NotInstalledError: its library is not there.
     """
+    if config.engine == "mujoco":
+        try:
+            from monstertruck_sim.world3d.engine import rigid  # noqa: PLC0415  # the library of an extra
+        except ModuleNotFoundError as error:
+            raise NotInstalledError(
+                f"sim.world.engine mujoco: {error.name} is not installed: it comes with the extra sim3d "
+                "(pip install 'monstertruckd[sim3d]'; in a checkout: python3 -m monstertruckd.bootstrap sync)"
+            ) from error
+        return rigid(config, footprint, start)
     return plane(config, footprint, start, seed)
 
 

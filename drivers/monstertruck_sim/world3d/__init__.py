@@ -1,0 +1,1 @@
+"""The engine ``mujoco``: rigid bodies, springs, tyres and uneven ground in three dimensions."""

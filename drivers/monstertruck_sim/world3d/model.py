@@ -1,0 +1,358 @@
+"""The MuJoCo model: MJCF of a robot's description, of its drive line, and of the ground and walls around it.
+
+Geometries are in groups: ground, walls, blocks on the ground, the robot, and what can move or be put there.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Final
+from xml.etree import ElementTree as ET
+from xml.etree.ElementTree import Element, SubElement
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_kinematics.description import Description, Joint, Link, Shape
+from monstertruck_kinematics.elementary import Array
+from monstertruck_sim.world3d.heights import HeightGrid
+
+TIMESTEP: Final = 0.002
+"""s."""
+SPARE: Final = 24
+"""Discs, and boxes, that can be put into a world while it runs; people and other robots are among them."""
+PARKED: Final = -50.0
+"""Height at which spare ones wait, m."""
+TALL: Final = 0.6
+"""Height of what is put into a world, m."""
+
+
+_FLAT: Final = 1e-3
+"""Least height of a height field, m."""
+
+
+class Group(IntEnum):
+    """Of geometries."""
+
+    GROUND = 0
+    WALLS = 1
+    BLOCKS = 2
+    ROBOT = 3
+    MOVING = 4
+
+
+@dataclass(frozen=True, slots=True)
+class DriveLine:
+    """Between the shafts and the wheels.
+
+    Args:
+        shafts: for every driven shaft its wheels' spin joints; between them are open differentials: the shaft turns
+            with the mean of its wheels and gives all the same torque.
+        locked: groups of spin joints whose means turn alike (a rigid transfer case).
+        stiffness: of the wind-up between a shaft and the mean of its wheels, Nm/rad.
+        damping: Nm s/rad.
+        clutch: greatest torque of all wheels of a shaft together, Nm.
+    """
+
+    shafts: tuple[tuple[str, ...], ...]
+    locked: tuple[tuple[tuple[str, ...], tuple[str, ...]], ...]
+    stiffness: float
+    damping: float
+    clutch: float
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """A box on the ground that wheels can climb: middle, sides and yaw; m and rad."""
+
+    x: float
+    y: float
+    z: float
+    length: float
+    width: float
+    height: float
+    yaw: float = 0.0
+    pitch: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Site:
+    """Everything around the robot that does not move.
+
+    Args:
+        walls: rectangles of solid map cells, (n, 4): least x, least y, greatest x, greatest y, m.
+        wall_height: over the ground, m.
+        heights: of the ground; None = level at 0.
+        blocks: on it.
+    """
+
+    walls: Array
+    wall_height: float
+    heights: HeightGrid | None
+    blocks: tuple[Block, ...] = ()
+
+
+def rectangles(solid: NDArray[np.bool_], resolution: float, origin: tuple[float, float], longest: int = 80) -> Array:
+    """Few rectangles that cover exactly the solid cells, (n, 4): x0, y0, x1, y1, m.
+
+    Args:
+        solid: (rows, columns), row 0 lowest y.
+        resolution: side of a cell, m.
+        origin: of the lower left corner, m.
+        longest: side of a rectangle, cells: on uneven ground a wall follows it piece by piece.
+    """
+    left = solid.copy()
+    found: list[tuple[int, int, int, int]] = []
+    for row in range(solid.shape[0]):
+        column = 0
+        while (begin := _first(left[row], column)) is not None:
+            end = begin + 1
+            while end < solid.shape[1] and left[row, end] and end - begin < longest:
+                end += 1
+            top = row + 1
+            while top < solid.shape[0] and top - row < longest and left[top, begin:end].all():
+                top += 1
+            left[row:top, begin:end] = False
+            found.append((begin, row, end, top))
+            column = end
+    cells = np.array(found, dtype=np.float64).reshape(-1, 4)
+    return np.asarray(cells * resolution + np.array([*origin, *origin]))
+
+
+def _first(row: NDArray[np.bool_], start: int) -> int | None:
+    where = np.flatnonzero(row[start:])
+    return None if len(where) == 0 else start + int(where[0])
+
+
+def mjcf(description: Description, drive: DriveLine, friction: float, site: Site) -> str:
+    """The whole model as text.
+
+    Args:
+        description: of the robot; its first link moves freely.
+        drive: its drive line.
+        friction: between tyres and everything.
+        site: around it.
+    """
+    root = Element("mujoco", model=description.name)
+    SubElement(root, "compiler", angle="radian", boundmass="0", boundinertia="0", autolimits="true")
+    SubElement(
+        root,
+        "option",
+        timestep=f"{TIMESTEP}",
+        gravity="0 0 -9.81",
+        integrator="implicitfast",
+        cone="elliptic",
+        impratio="10",
+    )
+    SubElement(root, "size", memory="16M")
+    visual = SubElement(root, "visual")
+    SubElement(visual, "global", offwidth="1280", offheight="960", fovy="60")
+    SubElement(visual, "map", znear="0.005", zfar="100")
+    SubElement(visual, "quality", shadowsize="1024")
+    default = SubElement(root, "default")
+    SubElement(default, "geom", contype="1", conaffinity="2", friction=f"{friction} 0.005 0.0001")
+    asset = SubElement(root, "asset")
+    _materials(asset)
+    world = SubElement(root, "worldbody")
+    SubElement(world, "light", pos="0 0 6", dir="0.2 0.1 -1", directional="true", diffuse="0.7 0.7 0.7")
+    SubElement(world, "light", pos="3 3 6", dir="-0.4 -0.5 -1", directional="true", diffuse="0.3 0.3 0.3")
+    _ground(asset, world, site.heights)
+    _walls(world, site)
+    for i, block in enumerate(site.blocks):
+        SubElement(
+            world,
+            "geom",
+            name=f"block_{i}",
+            type="box",
+            group=f"{Group.BLOCKS.value}",
+            size=_text(block.length / 2, block.width / 2, block.height / 2),
+            pos=_text(block.x, block.y, block.z),
+            euler=_text(0.0, block.pitch, block.yaw),
+            rgba="0.55 0.5 0.42 1",
+        )
+    _spare(world)
+    _robot(world, description)
+    _drive(root, description, drive)
+    return ET.tostring(root, encoding="unicode")
+
+
+def load(description: Description, drive: DriveLine, friction: float, site: Site) -> mujoco.MjModel:
+    """``mjcf`` compiled, with the heights in it."""
+    model = mujoco.MjModel.from_xml_string(mjcf(description, drive, friction, site))
+    if (heights := site.heights) is not None:
+        low, high = float(heights.z.min()), float(heights.z.max())
+        model.hfield_data[:] = ((heights.z - low) / max(high - low, _FLAT)).astype(np.float32).ravel()
+    return model
+
+
+def _materials(asset: Element) -> None:
+    SubElement(
+        asset,
+        "texture",
+        name="checks",
+        type="2d",
+        builtin="checker",
+        width="256",
+        height="256",
+        rgb1="0.62 0.66 0.6",
+        rgb2="0.54 0.58 0.53",
+    )
+    SubElement(asset, "material", name="floor", texture="checks", texrepeat="1 1", texuniform="true", reflectance="0")
+    SubElement(
+        asset,
+        "texture",
+        name="sky",
+        type="skybox",
+        builtin="gradient",
+        width="128",
+        height="768",
+        rgb1="0.75 0.82 0.9",
+        rgb2="0.4 0.5 0.65",
+    )
+
+
+def _ground(asset: Element, world: Element, heights: HeightGrid | None) -> None:
+    ground = {"name": "ground", "group": f"{Group.GROUND.value}", "material": "floor"}
+    if heights is None:
+        SubElement(world, "geom", ground, type="plane", size="0 0 1")
+        return
+    rows, columns = heights.z.shape
+    half_x, half_y = (columns - 1) * heights.resolution / 2, (rows - 1) * heights.resolution / 2
+    low, high = float(heights.z.min()), float(heights.z.max())
+    size = _text(half_x, half_y, max(high - low, _FLAT), 1.0)
+    SubElement(asset, "hfield", name="heights", nrow=f"{rows}", ncol=f"{columns}", size=size)
+    place = _text(heights.origin[0] + half_x, heights.origin[1] + half_y, low)
+    SubElement(world, "geom", ground, type="hfield", hfield="heights", pos=place)
+
+
+def _walls(world: Element, site: Site) -> None:
+    for i, (x0, y0, x1, y1) in enumerate(site.walls):
+        low, high = (0.0, 0.0) if site.heights is None else site.heights.between(x0, y0, x1, y1)
+        top, bottom = high + site.wall_height, low - 0.2
+        SubElement(
+            world,
+            "geom",
+            name=f"wall_{i}",
+            type="box",
+            group=f"{Group.WALLS.value}",
+            size=_text((x1 - x0) / 2, (y1 - y0) / 2, (top - bottom) / 2),
+            pos=_text((x0 + x1) / 2, (y0 + y1) / 2, (top + bottom) / 2),
+            rgba="0.86 0.84 0.78 1",
+        )
+
+
+def _spare(world: Element) -> None:
+    for i in range(SPARE):
+        for kind, size in (("disc", _text(0.1, TALL / 2)), ("box", _text(0.1, 0.1, TALL / 2))):
+            body = SubElement(world, "body", name=f"{kind}_{i}", mocap="true", pos=_text(0.0, 0.0, PARKED))
+            shape = "cylinder" if kind == "disc" else "box"
+            group = f"{Group.MOVING.value}"
+            SubElement(body, "geom", name=f"{kind}_{i}", type=shape, size=size, group=group, rgba="0.8 0.45 0.15 1")
+
+
+def _robot(world: Element, description: Description) -> None:
+    base = description.links[0]
+    body = SubElement(world, "body", name=base.name)
+    SubElement(body, "freejoint", name="free")
+    _link(body, base)
+    _children(body, description, base.name)
+
+
+def _children(parent: Element, description: Description, name: str) -> None:
+    for joint in description.children(name):
+        body = SubElement(parent, "body", name=joint.child, pos=_text(*joint.origin), euler=_text(*joint.turn))
+        if joint.kind != "fixed":
+            _joint(body, joint)
+        _link(body, description.link(joint.child))
+        _children(body, description, joint.child)
+
+
+def _joint(body: Element, joint: Joint) -> None:
+    element = SubElement(
+        body,
+        "joint",
+        name=joint.name,
+        type="slide" if joint.kind == "prismatic" else "hinge",
+        axis=_text(*joint.axis),
+        damping=f"{joint.damping:.9g}",
+        frictionloss=f"{joint.friction:.9g}",
+    )
+    if joint.limits is not None:
+        element.set("range", _text(*joint.limits))
+    if joint.stiffness:
+        element.set("stiffness", f"{joint.stiffness:.9g}")
+        element.set("springref", f"{joint.load / joint.stiffness:.9g}")
+    if joint.name.endswith("_steer"):
+        element.set("armature", f"{_STEERING_ARMATURE}")
+
+
+def _link(body: Element, link: Link) -> None:
+    if link.mass > 0.0:
+        SubElement(body, "inertial", pos=_text(*link.centre), mass=f"{link.mass:.9g}", diaginertia=_text(*link.inertia))
+    for i, shape in enumerate(link.shapes):
+        _shape(body, shape, f"{link.name}_{i}")
+
+
+def _shape(body: Element, shape: Shape, name: str) -> None:
+    geom = SubElement(
+        body,
+        "geom",
+        name=name,
+        group=f"{Group.ROBOT.value}",
+        contype="2",
+        conaffinity="1",
+        pos=_text(*shape.centre),
+        rgba=shape.colour,
+    )
+    if shape.kind == "box":
+        geom.set("type", "box")
+        geom.set("size", _text(*(side / 2 for side in shape.size)))
+        return
+    radius, width = shape.size
+    geom.set("type", "cylinder")
+    geom.set("size", _text(radius, width / 2))
+    geom.set("euler", _text(math.pi / 2, 0.0, 0.0))
+
+
+_STEERING_ARMATURE: Final = 0.002
+"""Of a steering servo behind its linkage, as each wheel feels it, kg m^2."""
+_STEERING_STIFFNESS: Final = 60.0
+"""Nm/rad: the linkage gives a little."""
+_STEERING_DAMPING: Final = 0.8
+"""Nm s/rad."""
+
+
+def _drive(root: Element, description: Description, drive: DriveLine) -> None:
+    tendons, equalities, actuators = (SubElement(root, name) for name in ("tendon", "equality", "actuator"))
+
+    def mean(name: str, joints: Sequence[str]) -> None:
+        fixed = SubElement(tendons, "fixed", name=name)
+        for joint in joints:
+            SubElement(fixed, "joint", joint=joint, coef=f"{1 / len(joints):.9g}")
+
+    for i, pair in enumerate(drive.locked):
+        for name, joints in zip((f"case_{i}_a", f"case_{i}_b"), pair, strict=True):
+            mean(name, joints)
+        SubElement(equalities, "tendon", tendon1=f"case_{i}_a", tendon2=f"case_{i}_b", solref="0.01 1")
+    for joint in description.joints:
+        if joint.name.endswith("_steer"):
+            gains = {"kp": f"{_STEERING_STIFFNESS}", "kv": f"{_STEERING_DAMPING}"}
+            SubElement(actuators, "position", gains, name=joint.name, joint=joint.name)
+    for i, joints in enumerate(drive.shafts):
+        mean(f"shaft_{i}", joints)
+        SubElement(
+            actuators,
+            "general",
+            name=f"shaft_{i}",
+            tendon=f"shaft_{i}",
+            gainprm=f"{drive.stiffness:.9g}",
+            biastype="affine",
+            biasprm=_text(0.0, -drive.stiffness, -drive.damping),
+            forcerange=_text(-drive.clutch, drive.clutch),
+        )
+
+
+def _text(*values: float) -> str:
+    return " ".join(f"{value:.9g}" for value in values)

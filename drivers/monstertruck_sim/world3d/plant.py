@@ -1,0 +1,197 @@
+"""The robot as rigid bodies: MuJoCo's own grid of 2 ms; motors, servos and battery are those of every engine.
+
+A command takes effect on the step that is integrated next: no step is taken before an instant beyond its end is asked
+for, so what is commanded up to then is in it.
+"""
+
+from collections.abc import Callable, Sequence
+from math import asin, atan2, cos, exp, hypot, sin, tau
+from typing import ClassVar, Final
+
+import mujoco
+import numpy as np
+
+from monstertruck_kinematics.elementary import Array
+from monstertruck_sim.world.actuators import RPM
+from monstertruck_sim.world.config import BatteryModelConfig, SimTruckConfig
+from monstertruck_sim.world.plant import GriddedPlant, Pose, Vector
+from monstertruck_sim.world3d.model import TIMESTEP, DriveLine, Group
+
+_FREED: Final = 0.005
+_FELT: Final = 0.05
+"""Time constant with which an accelerometer feels the body's acceleration, s: its mount and filter."""
+_SETTLE: Final = 400
+"""Steps that a robot which was put down gets to come to rest."""
+
+Ground = Callable[[float, float], float]
+"""Height under a point of the map, m."""
+Steering = Callable[[Sequence[float]], Sequence[float]]
+"""Servo angles to the angles of the steered wheels, in the order of their joints; rad."""
+
+
+class RigidPlant(GriddedPlant):
+    """One robot among rigid bodies.
+
+    Args:
+        config: true parameters.
+        battery: the pack.
+        start: pose of the geometric centre.
+        model: MuJoCo's, of robot and surroundings.
+        drive: its drive line.
+        steering: servo angles to those of the steered wheels.
+        ground: height under a point of the map, m.
+    """
+
+    STEP_NS: ClassVar[int] = round(TIMESTEP * 1e9)
+    WHOLE_STEPS: ClassVar[bool] = True
+
+    def __init__(
+        self,
+        config: SimTruckConfig,
+        battery: BatteryModelConfig,
+        start: Pose,
+        model: mujoco.MjModel,
+        drive: DriveLine,
+        steering: Steering,
+        ground: Ground,
+    ) -> None:
+        super().__init__(config, battery, start, (0.0, 0.0))
+        self.model = model
+        self.data = mujoco.MjData(model)
+        self._drive, self._steers, self._ground = drive, steering, ground
+        self.before_steps: Callable[[], None] = lambda: None
+        """Brings what moves around the robot to where it is now."""
+        count = len(self.shafts)
+        self._first_shaft = model.nu - count
+        self._wound = [0.0] * count
+        """Angle to which each shaft has wound its wheels up, rad, mean of its wheels."""
+        self._steered: list[float] = []
+        """Servo angles that the steered wheels follow."""
+        self._felt = self._turning = (0.0, 0.0, 0.0)
+        self._solid = np.isin(model.geom_group, (Group.WALLS, Group.MOVING))
+        self._put(start)
+
+    @property
+    def acceleration(self) -> Vector:
+        """Of the body, forward, left and up in its level frame, as a sensor on it feels it, m/s^2; without gravity."""
+        return self._felt
+
+    @property
+    def rates(self) -> Vector:
+        """Angular velocity about forward, left and up of the level frame, rad/s."""
+        return self._turning
+
+    @property
+    def height(self) -> float:
+        """Of the base over the map's plane, m."""
+        return self._height
+
+    def integrate(self, time_ns: int) -> None:
+        """``advance`` of this robot alone."""
+        self.before_steps()
+        super().integrate(time_ns)
+
+    def carry(self, pose: Pose) -> None:
+        """Put the robot down elsewhere, at rest; sensors see no way between the two places."""
+        self._put(pose)
+        self._trail.clear()
+        self._remember()
+
+    def _put(self, pose: Pose) -> None:
+        """Let it settle on its springs at a pose, held in its place."""
+        data = self.data
+        mujoco.mj_resetData(self.model, data)
+        x, y, yaw = pose
+        self._wound = [0.0] * len(self.shafts)
+        data.qpos[:3] = x, y, self._ground(x, y) + 0.002
+        data.qpos[3:7] = cos(yaw / 2), 0.0, 0.0, sin(yaw / 2)
+        self._steered = []
+        self._command(0.0, [servo.angle for servo in self._servos])
+        for _ in range(_SETTLE):
+            mujoco.mj_step(self.model, data)
+            data.qpos[:2] = x, y
+            data.qvel[:2] *= 0.5
+        data.qvel[:] = 0.0
+        mujoco.mj_forward(self.model, data)
+        self._twist, self._stuck_at = (0.0, 0.0, 0.0), None
+        self._felt = self._turning = (0.0, 0.0, 0.0)
+        self._wound = data.actuator_length[self._first_shaft :].tolist()
+        self._pose = x, y, yaw
+        self._read(None)
+
+    def _steering_angles(self) -> tuple[float, ...]:
+        return self._chassis.steering(*(servo.angle for servo in self._servos))
+
+    def _step(self, dt: float) -> None:
+        servos = self._turn_servos(dt)
+        self._turn_motors(dt)
+        self._command(dt, servos)
+        before = self.data.qvel[:3].copy()
+        mujoco.mj_step(self.model, self.data)
+        self._read(before)
+        self._draw(dt, self._slip())
+        self._touch()
+
+    def _command(self, dt: float, servos: list[float]) -> None:
+        controls, drive = self.data.ctrl, self._drive
+        if servos != self._steered:
+            angles = self._steers(servos)
+            controls[: len(angles)] = angles
+            self._steered = servos
+        for i, shaft in enumerate(self.shafts):
+            speed = shaft.rpm * RPM / self.config.motor.ratio
+            self._wound[i] += speed * dt
+            controls[self._first_shaft + i] = self._wound[i] + drive.damping / drive.stiffness * speed
+
+    def _slip(self) -> list[float]:
+        """Pull of every shaft at the ground, N; a clutch that slips lets its shaft wind the wheels up no further."""
+        drive, data, pulls = self._drive, self.data, []
+        for i, shaft in enumerate(self.shafts):
+            index = self._first_shaft + i
+            torque = float(data.actuator_force[index])
+            slipping = self._slipping[i] = abs(torque) > drive.clutch * (1.0 - 1e-9)
+            if slipping:
+                speed = shaft.rpm * RPM / self.config.motor.ratio
+                lag = drive.damping * (speed - float(data.actuator_velocity[index]))
+                self._wound[i] = float(data.actuator_length[index]) + (torque - lag) / drive.stiffness
+            pulls.append(torque / self.config.wheel_radius)
+        return pulls
+
+    def _read(self, before: Array | None) -> None:
+        """Pose, twist, acceleration and rates of the base."""
+        x, y, z, qw, qx, qy, qz = self.data.qpos[:7].tolist()
+        forward_x, forward_y = 1.0 - 2.0 * (qy * qy + qz * qz), 2.0 * (qx * qy + qw * qz)
+        down = 2.0 * (qx * qz - qw * qy)
+        left_up, up_up = 2.0 * (qy * qz + qw * qx), 1.0 - 2.0 * (qx * qx + qy * qy)
+        heading = atan2(forward_y, forward_x)
+        turned = self._pose[2]
+        yaw = turned + (heading - turned + tau / 2) % tau - tau / 2
+        pitch, roll = asin(max(-1.0, min(1.0, -down))), atan2(left_up, up_up)
+        vx, vy, vz, wx, wy, wz = self.data.qvel[:6].tolist()
+        c, s = cos(yaw), sin(yaw)
+        # Of the body's own axes to those of its level frame, by pitch and roll.
+        ahead = cos(roll) * wy - sin(roll) * wz, sin(roll) * wy + cos(roll) * wz
+        self._turning = cos(pitch) * wx + sin(pitch) * ahead[1], ahead[0], cos(pitch) * ahead[1] - sin(pitch) * wx
+        self._pose, self._attitude, self._height = (x, y, yaw), (pitch, roll), z
+        self._twist = c * vx + s * vy, c * vy - s * vx, self._turning[2]
+        if before is None:
+            return
+        ax, ay, az = ((now - then) / TIMESTEP for now, then in zip((vx, vy, vz), before.tolist(), strict=True))
+        share = 1.0 - exp(-TIMESTEP / _FELT)
+        true = c * ax + s * ay, c * ay - s * ax, az
+        a, b, u = (felt + share * (value - felt) for felt, value in zip(self._felt, true, strict=True))
+        self._felt = a, b, u
+
+    def _touch(self) -> None:
+        """Walls and what stands or moves around stop the robot; ground and blocks carry it."""
+        touching = False
+        if self.data.ncon:
+            touching = bool(self._solid[self.data.contact.geom].any())
+        if touching:
+            if self._stuck_at is None:
+                self.on_blocked(self._pose, self._twist)
+            self._stuck_at = self._pose
+        elif self._stuck_at is not None:
+            x, y, _ = self._stuck_at
+            if hypot(self._pose[0] - x, self._pose[1] - y) > _FREED:
+                self._stuck_at = None

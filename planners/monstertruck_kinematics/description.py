@@ -1,0 +1,413 @@
+"""One description of a robot as rigid links and joints, from which its MJCF, its URDF and its static frames are made.
+
+Frames: x forward, y left, z up. The base frame is the geometric centre on level ground, at rest under the robot's own
+weight: there every joint is at zero. Lengths m, masses kg, angles rad, SI units. Of the truck's masses, 7.25 kg in all
+and 0.281 kg a wheel are the sum and a part of the author's robot description; how the rest is divided is assumed.
+"""
+
+import math
+from dataclasses import dataclass, field
+from typing import Final, Literal
+from xml.etree import ElementTree as ET
+
+from monstertruck_kinematics.elementary import KinematicsError, require_positive
+
+GRAVITY: Final = 9.81
+"""m/s^2."""
+
+Triple = tuple[float, float, float]
+JointKind = Literal["fixed", "revolute", "continuous", "prismatic"]
+WHEELS: Final = ("front_left", "front_right", "rear_left", "rear_right")
+ZERO: Final[Triple] = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Shape:
+    """What a link looks like, and collides with.
+
+    ``box``: lengths along x, y, z. ``wheel``: radius and width of a cylinder about y.
+    """
+
+    kind: Literal["box", "wheel"]
+    size: tuple[float, ...]
+    centre: Triple = ZERO
+    colour: str = "0.35 0.36 0.4 1"
+    """Red, green, blue and opacity, 0..1."""
+
+
+@dataclass(frozen=True, slots=True)
+class Link:
+    """A rigid part.
+
+    Args:
+        name: of its frame.
+        mass: kg; 0 = a frame without a body.
+        centre: of mass, in its frame.
+        inertia: about the centre of mass, along the frame's axes.
+        shapes: outside.
+    """
+
+    name: str
+    mass: float = 0.0
+    centre: Triple = ZERO
+    inertia: Triple = ZERO
+    shapes: tuple[Shape, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Joint:
+    """Connects a link to its parent; at zero the child's frame has the parent's orientation, turned by ``turn``.
+
+    Args:
+        name: of the joint.
+        kind: of motion: ``prismatic`` slides along the axis, ``revolute`` turns about it between its limits.
+        parent: link.
+        child: link.
+        origin: of the child's frame in the parent's.
+        turn: roll, pitch and yaw of the child's frame.
+        axis: unit vector.
+        limits: least and greatest position; None = none.
+        stiffness: of a spring, N/m or Nm/rad.
+        damping: N s/m or Nm s/rad.
+        load: with which the spring is pressed at zero, N or Nm, along the axis.
+        friction: dry, N or Nm.
+    """
+
+    name: str
+    kind: JointKind
+    parent: str
+    child: str
+    origin: Triple = ZERO
+    turn: Triple = ZERO
+    axis: Triple = (0.0, 0.0, 1.0)
+    limits: tuple[float, float] | None = None
+    stiffness: float = 0.0
+    damping: float = 0.0
+    load: float = 0.0
+    friction: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Mechanics:
+    """Masses, springs and friction of the truck.
+
+    Args:
+        mass: of everything, kg.
+        wheel_mass: of one wheel, kg.
+        axle_mass: of one axle without its wheels, kg.
+        mass_height: of the centre of the mass that the springs carry, over the ground, m.
+        wheel_width: m.
+        droop: how far an axle sinks below its place at rest before its stop, m.
+        bump: how far it rises, m.
+        spring: of one axle, both its springs together, N/m; None: at the end of the droop they carry nothing.
+        damping: of one axle, share of the critical one of the body on both its axles.
+        axle_roll: greatest roll of an axle against the chassis, rad.
+        roll_spring: of one axle, Nm/rad: both its springs at a third of the track from the middle.
+        friction: between tyre and ground.
+        rolling_resistance: of the weight.
+        steering_limit: greatest angle of a wheel, rad.
+    """
+
+    mass: float = 7.25
+    wheel_mass: float = 0.281
+    axle_mass: float = 0.45
+    mass_height: float = 0.12
+    wheel_width: float = 0.08
+    droop: float = 0.010
+    bump: float = 0.030
+    spring: float | None = None
+    damping: float = 0.35
+    axle_roll: float = math.radians(10.0)
+    roll_spring: float | None = None
+    friction: float = 0.5
+    rolling_resistance: float = 0.05
+    steering_limit: float = math.radians(45.0)
+
+    def __post_init__(self) -> None:
+        for name in ("mass", "wheel_mass", "axle_mass", "mass_height", "wheel_width", "friction", "bump", "droop"):
+            require_positive(name, getattr(self, name))
+        if self.sprung <= 0.0:
+            raise KinematicsError(
+                f"mass is {self.mass}: expected more than wheels and axles together, {self.mass - self.sprung:g} kg"
+            )
+
+    @property
+    def sprung(self) -> float:
+        """Mass that the springs carry, kg."""
+        return self.mass - 4.0 * self.wheel_mass - 2.0 * self.axle_mass
+
+    @property
+    def axle_load(self) -> float:
+        """Force on the springs of one axle at rest, N."""
+        return self.sprung * GRAVITY / 2.0
+
+    @property
+    def axle_spring(self) -> float:
+        """Stiffness of one axle's springs, N/m."""
+        return self.axle_load / self.droop if self.spring is None else self.spring
+
+
+@dataclass(frozen=True, slots=True)
+class Size:
+    """Outer dimensions.
+
+    Args:
+        wheelbase: m.
+        track: m.
+        wheel_radius: m.
+    """
+
+    wheelbase: float = 0.32
+    track: float = 0.26
+    wheel_radius: float = 0.075
+
+
+@dataclass(frozen=True, slots=True)
+class SensorFrame:
+    """Where a sensor is fixed to the base: its name, place and roll, pitch, yaw."""
+
+    name: str
+    origin: Triple
+    turn: Triple = ZERO
+
+
+@dataclass(frozen=True)
+class Description:
+    """A tree of links.
+
+    Args:
+        name: of the robot.
+        links: the first one is the base.
+        joints: one for every other link, parents before children.
+
+    Raises:
+        KinematicsError: a name that is used twice, or a joint whose links are not there.
+    """
+
+    name: str
+    links: tuple[Link, ...]
+    joints: tuple[Joint, ...] = ()
+    _by_name: dict[str, Link] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        known = {link.name: link for link in self.links}
+        if len(known) < len(self.links):
+            raise KinematicsError(f"description {self.name}: a link's name is used twice")
+        reached = {self.links[0].name}
+        for joint in self.joints:
+            if joint.parent not in reached or joint.child not in known or joint.child in reached:
+                raise KinematicsError(f"joint {joint.name}: expected a parent before it and a child of its own")
+            reached.add(joint.child)
+        if reached != set(known):
+            raise KinematicsError(
+                f"description {self.name}: no joint leads to {', '.join(sorted(set(known) - reached))}"
+            )
+        object.__setattr__(self, "_by_name", known)
+
+    @property
+    def mass(self) -> float:
+        """Of all links, kg."""
+        return sum(link.mass for link in self.links)
+
+    def link(self, name: str) -> Link:
+        """By its name."""
+        return self._by_name[name]
+
+    def children(self, parent: str) -> tuple[Joint, ...]:
+        """Joints that lead on from a link."""
+        return tuple(joint for joint in self.joints if joint.parent == parent)
+
+    def frame(self, name: str) -> Triple:
+        """Place of a link's frame in the base frame with all joints at zero; for frames that are not turned."""
+        by_child = {joint.child: joint for joint in self.joints}
+        x, y, z = ZERO
+        while name in by_child:
+            joint = by_child[name]
+            x, y, z = x + joint.origin[0], y + joint.origin[1], z + joint.origin[2]
+            name = joint.parent
+        return x, y, z
+
+    @property
+    def mass_centre(self) -> Triple:
+        """Of all links together with all joints at zero, in the base frame, m."""
+        total = [0.0, 0.0, 0.0]
+        for link in self.links:
+            for i, (a, b) in enumerate(zip(self.frame(link.name), link.centre, strict=True)):
+                total[i] += link.mass * (a + b)
+        return total[0] / self.mass, total[1] / self.mass, total[2] / self.mass
+
+
+def box_inertia(mass: float, size: Triple) -> Triple:
+    """Principal moments of a solid box, kg m^2."""
+    x, y, z = (side * side for side in size)
+    return mass * (y + z) / 12.0, mass * (x + z) / 12.0, mass * (x + y) / 12.0
+
+
+def wheel_inertia(mass: float, radius: float, width: float) -> Triple:
+    """Principal moments of a wheel about y: half solid disc, half thin ring, kg m^2."""
+    spin = 0.75 * mass * radius * radius
+    across = 0.5 * spin + mass * width * width / 12.0
+    return across, spin, across
+
+
+def truck_description(
+    size: Size | None = None, mechanics: Mechanics | None = None, sensors: tuple[SensorFrame, ...] = ()
+) -> Description:
+    """The truck: a chassis on two solid axles, each with a vertical slide and a roll joint, and four steered wheels.
+
+    Args:
+        size: its dimensions; None = the truck's.
+        mechanics: masses and springs; None = the truck's.
+        sensors: frames on the chassis.
+    """
+    size, parts = size or Size(), mechanics or Mechanics()
+    radius = size.wheel_radius
+    bodywork = (0.31, 0.17, 0.074), (0.21, 0.24, 0.084)
+    plate = radius + 0.02
+    shapes = (
+        Shape("box", (size.wheelbase + 0.06, 0.12, 0.04), (0.0, 0.0, plate)),
+        Shape("box", bodywork[0], (0.0, 0.0, plate + 0.057), "0.75 0.28 0.2 1"),
+        Shape("box", bodywork[1], (0.0, 0.0, plate + 0.136), "0.2 0.35 0.6 1"),
+    )
+    chassis = Link(
+        "base",
+        parts.sprung,
+        (0.0, 0.0, parts.mass_height),
+        box_inertia(parts.sprung, (size.wheelbase, 0.2, 0.14)),
+        shapes,
+    )
+    links, joints = [chassis], []
+    load, spring = parts.axle_load, parts.axle_spring
+    damping = parts.damping * 2.0 * math.sqrt(spring * parts.sprung / 2.0)
+    arm = size.track / 3.0
+    roll = parts.roll_spring if parts.roll_spring is not None else spring * arm * arm
+    lean = parts.sprung * GRAVITY * (parts.mass_height - radius)
+    if 2.0 * roll <= lean:
+        raise KinematicsError(
+            f"roll_spring is {roll:g} Nm/rad: expected more than {lean / 2:g}, or the body falls over"
+        )
+    for axle, x in (("front", size.wheelbase / 2.0), ("rear", -size.wheelbase / 2.0)):
+        tube = (0.03, size.track - parts.wheel_width - 0.02, 0.03)
+        slide = Link(
+            f"{axle}_slide", parts.axle_mass / 2.0, ZERO, box_inertia(parts.axle_mass / 2.0, (0.04, 0.04, 0.04))
+        )
+        links += [
+            slide,
+            Link(
+                f"{axle}_axle",
+                parts.axle_mass / 2.0,
+                ZERO,
+                box_inertia(parts.axle_mass / 2.0, tube),
+                (Shape("box", tube, ZERO, "0.5 0.5 0.5 1"),),
+            ),
+        ]
+        joints += [
+            Joint(
+                f"{axle}_suspension",
+                "prismatic",
+                "base",
+                slide.name,
+                (x, 0.0, radius),
+                limits=(-parts.droop, parts.bump),
+                stiffness=spring,
+                damping=damping,
+                load=-load,
+            ),
+            Joint(
+                f"{axle}_roll",
+                "revolute",
+                slide.name,
+                f"{axle}_axle",
+                axis=(1.0, 0.0, 0.0),
+                limits=(-parts.axle_roll, parts.axle_roll),
+                stiffness=roll,
+                damping=damping * arm * arm,
+            ),
+        ]
+        for side, y in (("left", size.track / 2.0), ("right", -size.track / 2.0)):
+            wheel = f"{axle}_{side}"
+            links += [
+                Link(f"{wheel}_knuckle", _KNUCKLE, ZERO, box_inertia(_KNUCKLE, (0.03, 0.03, 0.03))),
+                Link(
+                    f"{wheel}_wheel",
+                    parts.wheel_mass - _KNUCKLE,
+                    ZERO,
+                    wheel_inertia(parts.wheel_mass - _KNUCKLE, radius, parts.wheel_width),
+                    (Shape("wheel", (radius, parts.wheel_width), ZERO, "0.12 0.12 0.13 1"),),
+                ),
+            ]
+            joints += [
+                Joint(
+                    f"{wheel}_steer",
+                    "revolute",
+                    f"{axle}_axle",
+                    f"{wheel}_knuckle",
+                    (0.0, y, 0.0),
+                    limits=(-parts.steering_limit, parts.steering_limit),
+                ),
+                Joint(
+                    f"{wheel}_spin",
+                    "continuous",
+                    f"{wheel}_knuckle",
+                    f"{wheel}_wheel",
+                    axis=(0.0, 1.0, 0.0),
+                    friction=parts.rolling_resistance * parts.mass * GRAVITY / 4.0 * radius,
+                ),
+            ]
+    for sensor in sensors:
+        links.append(Link(sensor.name))
+        joints.append(Joint(f"{sensor.name}_mount", "fixed", "base", sensor.name, sensor.origin, sensor.turn))
+    return Description("monstertruck", tuple(links), tuple(joints))
+
+
+_KNUCKLE: Final = 0.04
+"""Mass of a knuckle, kg; counted to its wheel."""
+
+
+def urdf(description: Description) -> str:
+    """As a Unified Robot Description Format file, for viewers; springs have no element there."""
+    robot = ET.Element("robot", name=description.name)
+    for link in description.links:
+        element = ET.SubElement(robot, "link", name=link.name)
+        if link.mass > 0.0:
+            inertial = ET.SubElement(element, "inertial")
+            ET.SubElement(inertial, "origin", xyz=_numbers(link.centre), rpy="0 0 0")
+            ET.SubElement(inertial, "mass", value=f"{link.mass:.6g}")
+            ixx, iyy, izz = (f"{value:.6g}" for value in link.inertia)
+            ET.SubElement(inertial, "inertia", ixx=ixx, iyy=iyy, izz=izz, ixy="0", ixz="0", iyz="0")
+        for kind in ("visual", "collision"):
+            for shape in link.shapes:
+                _urdf_shape(ET.SubElement(element, kind), shape, coloured=kind == "visual")
+    for joint in description.joints:
+        element = ET.SubElement(robot, "joint", name=joint.name, type=joint.kind)
+        ET.SubElement(element, "parent", link=joint.parent)
+        ET.SubElement(element, "child", link=joint.child)
+        ET.SubElement(element, "origin", xyz=_numbers(joint.origin), rpy=_numbers(joint.turn))
+        if joint.kind == "fixed":
+            continue
+        ET.SubElement(element, "axis", xyz=_numbers(joint.axis))
+        if joint.limits is not None:
+            lower, upper = joint.limits
+            bounds = {"lower": f"{lower:.6g}", "upper": f"{upper:.6g}", "effort": "100", "velocity": "10"}
+            ET.SubElement(element, "limit", bounds)
+        ET.SubElement(element, "dynamics", damping=f"{joint.damping:.6g}", friction=f"{joint.friction:.6g}")
+    ET.indent(robot)
+    return '<?xml version="1.0"?>\n' + ET.tostring(robot, encoding="unicode") + "\n"
+
+
+def _urdf_shape(element: ET.Element, shape: Shape, *, coloured: bool) -> None:
+    turn = (math.pi / 2.0, 0.0, 0.0) if shape.kind == "wheel" else ZERO
+    ET.SubElement(element, "origin", xyz=_numbers(shape.centre), rpy=_numbers(turn))
+    geometry = ET.SubElement(element, "geometry")
+    if shape.kind == "box":
+        ET.SubElement(geometry, "box", size=_numbers(shape.size))
+    else:
+        radius, width = shape.size
+        ET.SubElement(geometry, "cylinder", radius=f"{radius:.6g}", length=f"{width:.6g}")
+    if coloured:
+        material = ET.SubElement(element, "material", name=f"colour_{shape.colour.replace(' ', '_')}")
+        ET.SubElement(material, "color", rgba=shape.colour)
+
+
+def _numbers(values: tuple[float, ...]) -> str:
+    return " ".join(f"{value:.6g}" for value in values)

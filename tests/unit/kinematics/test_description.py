@@ -1,0 +1,102 @@
+"""The description of a robot: a tree of links, their masses, and the files made from it."""
+
+from math import radians
+from xml.etree import ElementTree as ET
+
+import pytest
+
+from monstertruck_kinematics.description import (
+    WHEELS,
+    Description,
+    Joint,
+    Link,
+    Mechanics,
+    SensorFrame,
+    Size,
+    box_inertia,
+    truck_description,
+    urdf,
+    wheel_inertia,
+)
+from monstertruck_kinematics.elementary import KinematicsError
+
+
+def test_the_truck_weighs_what_its_author_found():
+    truck = truck_description()
+    assert truck.mass == pytest.approx(7.25)
+    for wheel in WHEELS:
+        assert truck.link(f"{wheel}_wheel").mass + truck.link(f"{wheel}_knuckle").mass == pytest.approx(0.281)
+    x, y, z = truck.mass_centre
+    assert (x, y) == pytest.approx((0.0, 0.0))
+    assert 0.09 < z < 0.12
+
+
+def test_its_joints_have_the_published_ranges_and_wheels_their_places():
+    truck = truck_description()
+    joints = {joint.name: joint for joint in truck.joints}
+    assert joints["front_suspension"].limits == (-0.010, 0.030)
+    assert joints["rear_roll"].limits == pytest.approx((-radians(10), radians(10)))
+    assert truck.frame("front_left_wheel") == pytest.approx((0.16, 0.13, 0.075))
+    assert truck.frame("rear_right_wheel") == pytest.approx((-0.16, -0.13, 0.075))
+
+
+def test_its_springs_carry_it_at_zero():
+    truck, parts = truck_description(), Mechanics()
+    suspension = next(joint for joint in truck.joints if joint.name == "front_suspension")
+    assert suspension.load == pytest.approx(-parts.sprung * 9.81 / 2)
+    assert suspension.load / suspension.stiffness == pytest.approx(-0.010)
+
+
+def test_sensors_are_fixed_frames():
+    truck = truck_description(sensors=(SensorFrame("lidar", (0.14, 0.0, 0.25)),))
+    assert truck.frame("lidar") == (0.14, 0.0, 0.25)
+    assert truck.link("lidar").mass == 0.0
+
+
+def test_the_urdf_has_all_of_it():
+    truck = truck_description(Size(wheelbase=0.4), sensors=(SensorFrame("lidar", (0.14, 0.0, 0.25), (0.0, 0.1, 0.0)),))
+    robot = ET.fromstring(urdf(truck))
+    assert [link.get("name") for link in robot.findall("link")] == [link.name for link in truck.links]
+    mass = sum(float(element.get("value")) for element in robot.iter("mass"))
+    assert mass == pytest.approx(7.25, abs=1e-4)
+    by_name = {joint.get("name"): joint for joint in robot.findall("joint")}
+    assert by_name["front_suspension"].find("origin").get("xyz") == "0.2 0 0.075"
+    assert by_name["front_suspension"].find("limit").get("upper") == "0.03"
+    assert by_name["lidar_mount"].get("type") == "fixed"
+    assert by_name["lidar_mount"].find("origin").get("rpy") == "0 0.1 0"
+    assert by_name["front_left_spin"].get("type") == "continuous"
+    cylinder = robot.find("link[@name='front_left_wheel']/visual/geometry/cylinder")
+    assert (cylinder.get("radius"), cylinder.get("length")) == ("0.075", "0.08")
+
+
+def test_moments_of_inertia():
+    assert box_inertia(12.0, (1.0, 2.0, 3.0)) == (13.0, 10.0, 5.0)
+    across, spin, other = wheel_inertia(1.0, 0.2, 0.0)
+    assert spin == pytest.approx(0.03)
+    assert across == other == pytest.approx(0.015)
+
+
+@pytest.mark.parametrize(
+    ("links", "joints", "text"),
+    [
+        ((Link("a"), Link("a")), (), "used twice"),
+        ((Link("a"), Link("b")), (), "no joint leads to"),
+        ((Link("a"), Link("b")), (Joint("j", "fixed", "c", "b"),), "joint j: expected a parent before it"),
+        ((Link("a"),), (Joint("j", "fixed", "a", "b"),), "joint j: expected a parent before it"),
+        (
+            (Link("a"), Link("b")),
+            (Joint("i", "fixed", "a", "b"), Joint("j", "fixed", "a", "b")),
+            "joint j: expected a parent before it",
+        ),
+    ],
+)
+def test_what_is_no_tree_is_refused(links, joints, text):
+    with pytest.raises(KinematicsError, match=text):
+        Description("robot", links, joints)
+
+
+def test_masses_that_do_not_add_up_and_springs_that_do_not_hold_are_refused():
+    with pytest.raises(KinematicsError, match="mass is 2"):
+        Mechanics(mass=2.0)
+    with pytest.raises(KinematicsError, match="roll_spring"):
+        truck_description(mechanics=Mechanics(roll_spring=0.5))

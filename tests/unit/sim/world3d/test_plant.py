@@ -1,0 +1,242 @@
+"""The rigid robot: at rest, on its springs, driving, against walls and things, on uneven ground."""
+
+from math import atan, degrees, pi
+
+import numpy as np
+import pytest
+
+from monstertruck_kinematics.description import WHEELS
+from monstertruck_runtime.errors import InputError
+from monstertruck_schemas.base import Pose2D
+from monstertruck_sim.world.config import MechanicsConfig, RoughPatch, SinusoidTilt, WorldConfig
+from monstertruck_sim.world.obstacles import Box, Disc
+from monstertruck_sim.world.world import World
+
+SECOND = 1_000_000_000
+
+
+@pytest.fixture
+def solid(field):
+    """The field of the plane's tests in three dimensions."""
+
+    def make(**config):
+        return field(engine="mujoco", **config)
+
+    return make
+
+
+def plant(driver):
+    return driver.world._plant
+
+
+def test_at_rest_it_stands_on_its_springs_with_every_joint_at_zero(solid):
+    driver = solid()
+    driver.wait(2.0)
+    data = plant(driver).data
+    for joint in ("suspension", "roll"):
+        assert abs(data.joint(f"front_{joint}").qpos[0]) < 1e-4
+        assert abs(data.joint(f"rear_{joint}").qpos[0]) < 1e-4
+    assert data.qpos[2] == pytest.approx(0.0, abs=1e-3)
+    truth = driver.wait(3.0)
+    assert (truth.x, truth.y, truth.yaw) == pytest.approx((0.0, 0.0, 0.0), abs=1e-4)
+    assert (truth.pitch, truth.roll) == pytest.approx((0.0, 0.0), abs=1e-4)
+    assert not truth.stuck
+
+
+def test_a_load_makes_it_sag_as_its_springs_say(solid):
+    driver = solid()
+    before = plant(driver).data.qpos[2]
+    plant(driver).data.xfrc_applied[plant(driver).model.body("base").id, 2] = -20.0
+    driver.wait(3.0)
+    expected = 20.0 / (2 * plant(driver).model.joint("front_suspension").stiffness[0])
+    tyres = plant(driver).data.qpos[2] - before + expected
+    assert before - plant(driver).data.qpos[2] == pytest.approx(expected, rel=0.03), tyres
+
+
+def test_it_drives_as_the_plane_does(solid, field):
+    driver, flat = solid(), field()
+    for each in (driver, flat):
+        each.drive(0.2)
+        each.wait(2.0)
+        each.steer(0.3, -0.3)
+    rigid, plane = driver.wait(8.0), flat.wait(8.0)
+    assert rigid.v == pytest.approx(plane.v, rel=0.03)
+    assert 0.85 * plane.wz < rigid.wz < plane.wz  # dry friction: least sum of slips, not of their squares
+    assert (rigid.front, rigid.rear) == (plane.front, plane.rear)
+    for each in (driver, flat):
+        each.drive(0.0)
+    assert driver.wait(2.0).v == pytest.approx(0.0, abs=1e-3)
+
+
+def test_two_runs_are_the_same_and_what_is_asked_in_between_changes_nothing(solid):
+    def run(looks):
+        driver = solid()
+        driver.drive(0.2)
+        driver.steer(0.2, -0.1)
+        for look in looks:
+            driver.world.lidar.scan(driver.now + look)
+        return driver.wait(1.0)[1:]
+
+    assert run([]) == run([1_000_000, 3_500_000, 3_600_000, 450_000_000])
+
+
+def test_no_step_is_taken_ahead_of_a_command(solid):
+    """A speed commanded within a step is in force in it, whoever has looked before."""
+    seen, unseen = solid(), solid()
+    seen.world.truth(seen.now + 5_900_000)
+    for driver in (seen, unseen):
+        driver.now += 5_900_000
+        driver.drive(0.2)
+    assert seen.wait(0.1)[1:] == unseen.wait(0.1)[1:]
+
+
+def test_a_wall_stops_it_and_its_clutch_slips(solid):
+    driver = solid(walls=[(1.0, -2.0, 1.2, 2.0)])
+    driver.drive(0.2)
+    truth = driver.wait(8.0)
+    assert truth.stuck
+    assert truth.clutch_slipping
+    assert truth.x == pytest.approx(1.0 - 0.235, abs=0.01)
+    data = plant(driver).data
+    assert data.actuator_force[-1] == pytest.approx(25.0 * 0.075)
+    driver.drive(-0.2)
+    assert not driver.wait(2.0).stuck
+
+
+def test_a_lifted_wheel_spins_and_the_others_stand(solid):
+    """Open differentials: what carries nothing gets all the turning."""
+    driver = solid()
+    rigid = plant(driver)
+    rigid.data.xfrc_applied[rigid.model.body("base").id, :3] = 0.0, 0.0, 0.99 * 7.25 * 9.81
+    driver.drive(0.2)
+    driver.wait(2.0)
+    spins = [rigid.data.joint(f"{wheel}_spin").qvel[0] for wheel in ("front_left", "front_right")]
+    assert np.mean(spins) == pytest.approx(0.2 / 0.075, rel=0.05)
+
+
+def test_both_axles_turn_alike(solid):
+    driver = solid()
+    driver.steer(0.4, 0.0)
+    driver.drive(0.2)
+    driver.wait(4.0)
+    rate = {name: plant(driver).data.joint(f"{name}_spin").qvel[0] for name in WHEELS}
+    front, rear = (rate[f"{axle}_left"] + rate[f"{axle}_right"] for axle in ("front", "rear"))
+    assert front == pytest.approx(rear, rel=0.01)
+    assert rate["front_right"] > 1.1 * rate["front_left"]
+
+
+def test_standing_scans_are_those_of_the_plane():
+    rigid, plane = (World(WorldConfig(engine=engine, noise=False), 1) for engine in ("mujoco", "plane"))
+    assert (abs(rigid.lidar.scan(0) - plane.lidar.scan(0)) <= 1).mean() > 0.999
+
+
+def test_what_is_put_into_the_world_is_seen_and_stops_it(solid):
+    driver = solid()
+    disc, box = Disc(1.0, 0.0, 0.1), Box(-1.0, 0.0, 0.2, 0.6, pi / 4)
+    driver.world.add(driver.now, disc)
+    driver.world.add(driver.now, box)
+    assert driver.world.obstacles == (disc, box)
+    assert driver.world.lidar.scan(driver.now)[384] == pytest.approx(900 - 140, abs=1)
+    driver.drive(0.2)
+    truth = driver.wait(6.0)
+    assert truth.stuck
+    assert truth.x == pytest.approx(0.9 - 0.19, abs=0.02)  # the bodywork meets it between the wheels
+    driver.world.remove(driver.now, disc)
+    driver.wait(2.0)
+    assert driver.wait(1.0).x > 1.1
+    with pytest.raises(InputError, match="not in the world"):
+        driver.world.remove(driver.now, disc)
+
+
+def test_no_more_is_put_into_it_than_there_is_room_for(solid):
+    driver = solid()
+    for i in range(24):
+        driver.world.add(driver.now, Disc(3.0, 0.1 * i, 0.02))
+    with pytest.raises(InputError, match="24 of kind disc are in the world"):
+        driver.world.add(driver.now, Disc(3.0, -1.0, 0.02))
+
+
+def test_a_carried_robot_stands_elsewhere_at_rest(solid):
+    driver = solid()
+    driver.drive(0.2)
+    driver.wait(2.0)
+    driver.drive(0.0)
+    driver.wait(1.0)
+    driver.world.carry(driver.now, (-2.0, 1.0, pi / 2))
+    truth = driver.wait(1.0)
+    assert (truth.x, truth.y, truth.yaw) == pytest.approx((-2.0, 1.0, pi / 2), abs=0.02)
+
+
+def test_the_robot_of_the_built_in_ramp_tilts_by_its_slope():
+    world = World(WorldConfig(engine="mujoco", map="ramp", noise=False, start=Pose2D(x=1.75, y=0.0, yaw=0.0)), 1)
+    truth = world.truth(0)
+    assert degrees(-truth.pitch) == pytest.approx(8.0, abs=0.4)
+    scan, plane = (
+        World(WorldConfig(engine=engine, map="ramp", noise=False), 1).lidar.scan(0) for engine in ("mujoco", "plane")
+    )
+    assert (abs(scan - plane) <= 30).mean() > 0.98
+
+
+def test_springs_level_a_little_of_a_side_slope(solid):
+    """On a slope of rough ground the body rolls further than the ground: its mass is above the springs."""
+    driver = solid(rough=(RoughPatch(x=0.0, y=0.0, length=6.0, width=6.0, height=0.4, wavelength=6.0),))
+    truth = driver.world.truth(driver.now)
+    slope = atan(0.2 * 2 * pi / 6.0)
+    assert abs(truth.pitch) == pytest.approx(slope, rel=0.15)
+
+
+def test_gravity_and_motion_are_what_imu_and_compass_feel(solid):
+    driver = solid()
+    driver.wait(1.0)
+    reading = driver.world.imu.imu(driver.now)
+    assert reading.acceleration == pytest.approx((0.0, 0.0, 9.81), abs=1e-3)
+    driver.drive(0.2, 5000.0)
+    felt = []
+    for _ in range(30):
+        driver.wait(0.02)
+        felt.append(driver.world.imu.imu(driver.now).acceleration[0])
+    assert 0.05 < max(felt) < 1.0
+    driver.steer(0.3, -0.3)
+    driver.wait(4.0)
+    assert driver.world.imu.imu(driver.now).angular_velocity[2] == pytest.approx(driver.world.truth(driver.now).wz)
+
+
+@pytest.mark.parametrize(
+    ("config", "text"),
+    [
+        ({"truck": {"body": {"kind": "differential"}}}, "has no body differential"),
+        ({"tilt": {"kind": "sinusoid"}}, "the ground tilts the robot"),
+    ],
+)
+def test_what_the_engine_cannot_do_is_refused(config, text):
+    with pytest.raises(ValueError, match=text):
+        WorldConfig.model_validate({"engine": "mujoco", **config})
+
+
+def test_a_commanded_tilt_is_refused(solid):
+    driver = solid()
+    with pytest.raises(InputError, match="the ground tilts the robot"):
+        driver.world.set_tilt(driver.now, SinusoidTilt(kind="sinusoid"))
+
+
+def test_people_walk_into_it_and_are_felt():
+    person = {"waypoints": [{"x": 2.0, "y": 0.0}, {"x": -2.0, "y": 0.0}], "before": "walk_on", "pause": 0.0}
+    config = WorldConfig.model_validate(
+        {
+            "engine": "mujoco",
+            "map": "yard",
+            "noise": False,
+            "people": [person],
+            "start": {"x": 0.0, "y": 0.0, "yaw": 0.0},
+        }
+    )
+    world = World(config, 1)
+    world.motor.command(0, -0.2 * 644 / (2 * pi * 0.075) * 60, 20_000.0)
+    for t in range(1, 60):
+        world.truth(t * SECOND // 10)
+    assert world.scene.contacts
+
+
+def test_a_heavier_load_is_refused_where_no_body_is_left():
+    with pytest.raises(ValueError, match="expected more than wheels and axles"):
+        World(WorldConfig(engine="mujoco", mechanics=MechanicsConfig(wheel_mass=2.0)), 1)
