@@ -36,7 +36,7 @@ class Shape:
 
 
 @dataclass(frozen=True, slots=True)
-class Link:
+class Part:
     """A rigid part.
 
     Args:
@@ -55,7 +55,7 @@ class Link:
 
 
 @dataclass(frozen=True, slots=True)
-class Joint:
+class PartJoint:
     """Connects a link to its parent; at zero the child's frame has the parent's orientation, turned by ``turn``.
 
     Args:
@@ -185,9 +185,9 @@ class Description:
     """
 
     name: str
-    links: tuple[Link, ...]
-    joints: tuple[Joint, ...] = ()
-    _by_name: dict[str, Link] = field(init=False, repr=False)
+    links: tuple[Part, ...]
+    joints: tuple[PartJoint, ...] = ()
+    _by_name: dict[str, Part] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         known = {link.name: link for link in self.links}
@@ -209,11 +209,11 @@ class Description:
         """Of all links, kg."""
         return sum(link.mass for link in self.links)
 
-    def link(self, name: str) -> Link:
+    def link(self, name: str) -> Part:
         """By its name."""
         return self._by_name[name]
 
-    def children(self, parent: str) -> tuple[Joint, ...]:
+    def children(self, parent: str) -> tuple[PartJoint, ...]:
         """Joints that lead on from a link."""
         return tuple(joint for joint in self.joints if joint.parent == parent)
 
@@ -269,7 +269,7 @@ def truck_description(
         Shape("box", bodywork[0], (0.0, 0.0, plate + 0.057), "0.75 0.28 0.2 1"),
         Shape("box", bodywork[1], (0.0, 0.0, plate + 0.136), "0.2 0.35 0.6 1"),
     )
-    chassis = Link(
+    chassis = Part(
         "base",
         parts.sprung,
         (0.0, 0.0, parts.mass_height),
@@ -288,12 +288,12 @@ def truck_description(
         )
     for axle, x in (("front", size.wheelbase / 2.0), ("rear", -size.wheelbase / 2.0)):
         tube = (0.03, size.track - parts.wheel_width - 0.02, 0.03)
-        slide = Link(
+        slide = Part(
             f"{axle}_slide", parts.axle_mass / 2.0, ZERO, box_inertia(parts.axle_mass / 2.0, (0.04, 0.04, 0.04))
         )
         links += [
             slide,
-            Link(
+            Part(
                 f"{axle}_axle",
                 parts.axle_mass / 2.0,
                 ZERO,
@@ -302,7 +302,7 @@ def truck_description(
             ),
         ]
         joints += [
-            Joint(
+            PartJoint(
                 f"{axle}_suspension",
                 "prismatic",
                 "base",
@@ -313,7 +313,7 @@ def truck_description(
                 damping=damping,
                 load=-load,
             ),
-            Joint(
+            PartJoint(
                 f"{axle}_roll",
                 "revolute",
                 slide.name,
@@ -327,8 +327,8 @@ def truck_description(
         for side, y in (("left", size.track / 2.0), ("right", -size.track / 2.0)):
             wheel = f"{axle}_{side}"
             links += [
-                Link(f"{wheel}_knuckle", _KNUCKLE, ZERO, box_inertia(_KNUCKLE, (0.03, 0.03, 0.03))),
-                Link(
+                Part(f"{wheel}_knuckle", _KNUCKLE, ZERO, box_inertia(_KNUCKLE, (0.03, 0.03, 0.03))),
+                Part(
                     f"{wheel}_wheel",
                     parts.wheel_mass - _KNUCKLE,
                     ZERO,
@@ -337,7 +337,7 @@ def truck_description(
                 ),
             ]
             joints += [
-                Joint(
+                PartJoint(
                     f"{wheel}_steer",
                     "revolute",
                     f"{axle}_axle",
@@ -345,7 +345,7 @@ def truck_description(
                     (0.0, y, 0.0),
                     limits=(-parts.steering_limit, parts.steering_limit),
                 ),
-                Joint(
+                PartJoint(
                     f"{wheel}_spin",
                     "continuous",
                     f"{wheel}_knuckle",
@@ -355,8 +355,8 @@ def truck_description(
                 ),
             ]
     for sensor in sensors:
-        links.append(Link(sensor.name))
-        joints.append(Joint(f"{sensor.name}_mount", "fixed", "base", sensor.name, sensor.origin, sensor.turn))
+        links.append(Part(sensor.name))
+        joints.append(PartJoint(f"{sensor.name}_mount", "fixed", "base", sensor.name, sensor.origin, sensor.turn))
     return Description("monstertruck", tuple(links), tuple(joints))
 
 

@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from monstertruck_kinematics.description import Description, Joint, Link, Shape
+from monstertruck_kinematics.description import Description, Part, PartJoint, Shape
 from monstertruck_kinematics.elementary import Array
 from monstertruck_sim.world3d.heights import HeightGrid
 
@@ -269,7 +269,7 @@ def _children(parent: Element, description: Description, name: str) -> None:
         _children(body, description, joint.child)
 
 
-def _joint(body: Element, joint: Joint) -> None:
+def _joint(body: Element, joint: PartJoint) -> None:
     element = SubElement(
         body,
         "joint",
@@ -288,7 +288,7 @@ def _joint(body: Element, joint: Joint) -> None:
         element.set("armature", f"{_STEERING_ARMATURE}")
 
 
-def _link(body: Element, link: Link) -> None:
+def _link(body: Element, link: Part) -> None:
     if link.mass > 0.0:
         SubElement(body, "inertial", pos=_text(*link.centre), mass=f"{link.mass:.9g}", diaginertia=_text(*link.inertia))
     for i, shape in enumerate(link.shapes):

@@ -8,9 +8,9 @@ import pytest
 from monstertruck_kinematics.description import (
     WHEELS,
     Description,
-    Joint,
-    Link,
     Mechanics,
+    Part,
+    PartJoint,
     SensorFrame,
     Size,
     box_inertia,
@@ -79,13 +79,13 @@ def test_moments_of_inertia():
 @pytest.mark.parametrize(
     ("links", "joints", "text"),
     [
-        ((Link("a"), Link("a")), (), "used twice"),
-        ((Link("a"), Link("b")), (), "no joint leads to"),
-        ((Link("a"), Link("b")), (Joint("j", "fixed", "c", "b"),), "joint j: expected a parent before it"),
-        ((Link("a"),), (Joint("j", "fixed", "a", "b"),), "joint j: expected a parent before it"),
+        ((Part("a"), Part("a")), (), "used twice"),
+        ((Part("a"), Part("b")), (), "no joint leads to"),
+        ((Part("a"), Part("b")), (PartJoint("j", "fixed", "c", "b"),), "joint j: expected a parent before it"),
+        ((Part("a"),), (PartJoint("j", "fixed", "a", "b"),), "joint j: expected a parent before it"),
         (
-            (Link("a"), Link("b")),
-            (Joint("i", "fixed", "a", "b"), Joint("j", "fixed", "a", "b")),
+            (Part("a"), Part("b")),
+            (PartJoint("i", "fixed", "a", "b"), PartJoint("j", "fixed", "a", "b")),
             "joint j: expected a parent before it",
         ),
     ],
