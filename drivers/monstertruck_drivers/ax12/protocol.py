@@ -85,6 +85,10 @@ class Register:
         """Little-endian bytes."""
         return value.to_bytes(self.size, "little")
 
+    def decode(self, table: bytes | bytearray) -> int:
+        """Its value in a whole control table."""
+        return int.from_bytes(table[self.address : self.address + self.size], "little")
+
 
 RAM_START: Final = 24
 TABLE_SIZE: Final = 50

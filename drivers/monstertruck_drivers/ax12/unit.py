@@ -37,6 +37,7 @@ OVERLOAD_DRIVE: Final = 0.8
 OVERLOAD_TIME: Final = 1.0
 """Seconds until the alarm."""
 AMBIENT: Final = 25.0
+NO_ALARM: Final = Alarm(0)
 HISTORY: Final = 1024
 """Points of the shaft's past that are kept: two seconds of motion."""
 
@@ -72,11 +73,13 @@ class Unit:
         self._speed = 0.0
         self._drive = 0.0
         self._overload_for = 0.0
-        self._alarms = Alarm(0)
+        self._alarms = NO_ALARM
         self._sensed = position
         self._pending: tuple[int, bytes] | None = None
         self._past: deque[tuple[int, float]] = deque([(time_ns, position)], maxlen=HISTORY)
         self._table = bytearray(p.TABLE_SIZE)
+        self._values: dict[int, int] = {}
+        """Of the registers, by their address: the same as in the table."""
         self.factory_reset()
         self.put(p.ID, ident)
 
@@ -84,11 +87,12 @@ class Unit:
 
     def get(self, register: Register) -> int:
         """Value of a register."""
-        return int.from_bytes(self._table[register.address : register.address + register.size], "little")
+        return self._values[register.address]
 
     def put(self, register: Register, value: int) -> None:
         """Set a register, whatever its access."""
         self._table[register.address : register.address + register.size] = register.encode(value)
+        self._values[register.address] = value
 
     def read(self, address: int, count: int, time_ns: int) -> tuple[Alarm, bytes]:
         """Bytes of the table; error bits of the request alone."""
@@ -96,7 +100,7 @@ class Unit:
             return Alarm.RANGE, b""
         self.advance(time_ns)
         self._refresh()
-        return Alarm(0), bytes(self._table[address : address + count])
+        return NO_ALARM, bytes(self._table[address : address + count])
 
     def write(self, address: int, data: bytes, time_ns: int) -> Alarm:
         """All of it or, with an error bit, nothing."""
@@ -105,6 +109,9 @@ class Unit:
             return error
         self.advance(time_ns)
         self._table[address : address + len(data)] = data
+        for register in p.REGISTERS:
+            if self._touches(register, address, data):
+                self._values[register.address] = register.decode(self._table)
         if self._touches(p.TORQUE_LIMIT, address, data) and self.get(p.TORQUE_LIMIT):
             self._alarms &= ~(Alarm.OVERLOAD | Alarm.OVERHEAT)
             self._overload_for = 0.0
@@ -137,7 +144,7 @@ class Unit:
             if not register.is_stored:
                 self.put(register, register.default)
         self.put(p.TORQUE_LIMIT, self.get(p.MAX_TORQUE))
-        self._alarms = Alarm(0)
+        self._alarms = NO_ALARM
         self._overload_for = 0.0
         self._pending = None
 
@@ -152,13 +159,13 @@ class Unit:
         for register in p.REGISTERS:
             if not self._touches(register, address, data):
                 continue
-            value = int.from_bytes(table[register.address : register.address + register.size], "little")
+            value = register.decode(table)
             unlocks = register is p.LOCK and value < self.get(p.LOCK)
             if register.read_only or unlocks or value > register.high:
                 return Alarm.RANGE
             if register is p.GOAL_POSITION and not self.wheel_mode and not self._reachable(value):
                 return Alarm.ANGLE
-        return Alarm(0)
+        return NO_ALARM
 
     def _touches(self, register: Register, address: int, data: bytes) -> bool:
         return register.address < address + len(data) and address < register.address + register.size
@@ -213,7 +220,12 @@ class Unit:
         self.advance(int(times_ns.max()))
         if times_ns.min() >= self._time:
             return np.full(times_ns.shape, self.position)
-        past = np.array(self._past)
+        oldest, since = int(times_ns.min()), list[tuple[int, float]]()
+        for point in reversed(self._past):
+            since.append(point)
+            if point[0] <= oldest:
+                break
+        past = np.array(since[::-1])
         return np.asarray(np.interp(times_ns.astype(np.float64), past[:, 0], past[:, 1]))
 
     def advance(self, time_ns: int) -> None:
@@ -276,15 +288,16 @@ class Unit:
         stalled = abs(self._drive) >= min(OVERLOAD_DRIVE, self.get(p.TORQUE_LIMIT) / 1023) and abs(self._speed) < 1
         self._overload_for = self._overload_for + seconds if stalled and self._drive else 0.0
         volts = self._volts() / p.VOLT_UNIT
-        fired = Alarm(0)
+        fired = NO_ALARM
         if self._overload_for > OVERLOAD_TIME:
             fired |= Alarm.OVERLOAD
         if self.temperature > self.get(p.TEMPERATURE_LIMIT):
             fired |= Alarm.OVERHEAT
         if not self.get(p.VOLTAGE_MIN) <= volts <= self.get(p.VOLTAGE_MAX):
             fired |= Alarm.VOLTAGE
-        self._alarms = self._alarms & (Alarm.OVERLOAD | Alarm.OVERHEAT) if self.latched else Alarm(0)
-        self.trip(fired)
+        if fired or self._alarms:
+            self._alarms = self._alarms & (Alarm.OVERLOAD | Alarm.OVERHEAT) if self.latched else NO_ALARM
+            self.trip(fired)
 
 
 def steady_voltage(_: int) -> float:

@@ -50,10 +50,12 @@ class Renderer:
         across = mode.width / 2 - 0.5 - np.arange(mode.width)
         self.angles: NDArray[np.float64] = np.arctan2(across, self._focal)
         """Direction of every column, rad, left positive; shape (width,)."""
-        self._below = (np.arange(mode.height) + 0.5 - mode.height / 2)[:, None]
+        self._below = np.arange(mode.height) + 0.5 - mode.height / 2
+        """Of every row, pixels below the horizon; ascending."""
+        self._rows = np.arange(mode.height, dtype=np.uint16)[:, None]
         self._above_camera, self._camera_height = wall_height - camera_height, camera_height
         depth = np.abs(self._below) / (mode.height / 2) * 63
-        self._ground = (np.where(self._below > 0, FLOOR, SKY) + depth).astype(np.uint8)
+        self._ground = (np.where(self._below > 0, FLOOR, SKY) + depth).astype(np.uint8)[:, None]
         self._quality = quality
 
     def jpeg(self, ranges: NDArray[np.float64], counter: int) -> bytes:
@@ -65,9 +67,9 @@ class Renderer:
         """
         depth = np.maximum(ranges * np.cos(self.angles), 0.05)
         shade = (WALLS + 127 / (1 + depth / HALF_SHADE)).astype(np.uint8)
-        is_wall = (self._below > -self._focal * self._above_camera / depth) & (
-            self._below < self._focal * self._camera_height / depth
-        )
+        top = np.searchsorted(self._below, -self._focal * self._above_camera / depth, side="right")
+        foot = np.searchsorted(self._below, self._focal * self._camera_height / depth)
+        is_wall = (self._rows >= top.astype(np.uint16)) & (self._rows < foot.astype(np.uint16))
         image = Image.fromarray(np.where(is_wall, shade, self._ground))
         image.putpalette(_palette())
         picture = image.convert("RGB")

@@ -100,7 +100,7 @@ class Servo:
         self._elapsed = end
 
     def _turn(self, dt: float) -> None:
-        if self._held_us is not None:
+        if self._held_us is not None and self.angle != self._target:
             lag = self._config.lag
             target = self._target if lag == 0.0 else self._target + (self.angle - self._target) * exp(-dt / lag)
             self.angle = _towards(self.angle, target, self._config.rate * dt)

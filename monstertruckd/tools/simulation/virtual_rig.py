@@ -7,6 +7,7 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Final
 
 from monstertruck_drivers.cable import MemoryPort
 from monstertruck_drivers.usb.config import UsbPortConfig
@@ -24,6 +25,9 @@ from monstertruckd.daemon import Daemon
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 from monstertruckd.tools.simulation.simulate import TruthLog
 
+IN_MEMORY: Final = "/dev/shm"  # noqa: S108 - a folder of its own is made in it
+"""A disk would be waited for at every change of an emulated file."""
+
 
 class VirtualRig:
     """A whole robot in one process; everything random comes from the configuration's seed.
@@ -39,7 +43,9 @@ class VirtualRig:
         self.clock = clock
         self.began = clock.now()
         """Start of the world, ns."""
-        self._folder = TemporaryDirectory(prefix="monstertruck-")
+        self._folder = TemporaryDirectory(
+            prefix="monstertruck-", dir=IN_MEMORY if os.access(IN_MEMORY, os.W_OK | os.X_OK) else None
+        )
         self.ports = {role: MemoryPort(role) for role in config.devices.present()}
         self.computer = EmulatedComputer(Path(self._folder.name), config.devices, self.ports, clock)
         self.robot = SimulatedRobot(
