@@ -7,7 +7,7 @@ order, so the gate commands neutral while actuators and recorder still listen.
 import asyncio
 import dataclasses
 import secrets
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import AsyncExitStack, asynccontextmanager
 from types import MappingProxyType
 from typing import Any
@@ -19,8 +19,10 @@ from monstertruck_drivers.computer import Computer
 from monstertruck_drivers.epos.config import EposConfig
 from monstertruck_drivers.link import Port
 from monstertruck_drivers.maestro.config import MaestroConfig
+from monstertruck_estimation.slam.service import SlamService
 from monstertruck_kinematics.chassis import Chassis
 from monstertruck_planners.behave.service import BehaviourService, register_behaviour_calls
+from monstertruck_planners.explore.service import ExplorerService, register_explorer_calls
 from monstertruck_planners.goals.service import GoalService, register_goal_calls
 from monstertruck_planners.steps import CODEC
 from monstertruck_runtime.actors.actor import ActorFactory
@@ -151,12 +153,17 @@ class Daemon:
             if self._seed is None:
                 self._start(gate, StallWatch(self.clock, self.gate.ticks, self.config.state_directory / "stalls"))
             self._start_drivers(sensors, OnBug.FAIL, Duty.SENSOR, Duty.MONITOR)
+            save_map: Callable[[], bool] | None = None
             for service in build_estimation(self.config, self.bus, self.clock, self._body):
                 self._start(estimation, service)
-            for service in build_planners(self.config, self.bus, self.clock, self._body, self._actors):
+                if isinstance(service, SlamService):
+                    save_map = service.save_soon
+            for service in build_planners(self.config, self.bus, self.clock, self._body, self._actors, save_map):
                 self._start(planners, service)
                 if isinstance(service, GoalService):
                     register_goal_calls(self.rpc, service, self.clock)
+                if isinstance(service, ExplorerService):
+                    register_explorer_calls(self.rpc, service)
                 if isinstance(service, BehaviourService):
                     register_behaviour_calls(self.rpc, service)
             if self._notify is not None:

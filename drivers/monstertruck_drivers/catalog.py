@@ -236,6 +236,7 @@ RESERVED: Final = frozenset(
         "blackbox",
         "bus",
         "clock",
+        "explorer",
         "gate",
         "goals",
         "ground",

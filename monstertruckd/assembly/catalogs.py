@@ -6,6 +6,7 @@ from typing import Any, Final, NamedTuple
 from monstertruck_drivers.catalog import DEVICES
 from monstertruck_estimation.catalog import ODOMETRY
 from monstertruck_planners.behave.catalog import BEHAVIOURS, LEVELLING
+from monstertruck_planners.explore.catalog import EXPLORERS
 from monstertruck_planners.local.catalog import LOCAL_PLANNERS
 from monstertruck_planners.route.catalog import ROUTE_PLANNERS
 from monstertruck_planners.track.catalog import TRACKERS
@@ -22,6 +23,7 @@ TABLES: Final[tuple[ExtensibleTable[Any], ...]] = (
     ROUTE_PLANNERS,
     LOCAL_PLANNERS,
     TRACKERS,
+    EXPLORERS,
     BEHAVIOURS,
     LEVELLING,
     BY_NAME,

@@ -134,6 +134,7 @@ def _build_slam(config: TruckConfig, bus: Bus, clock: Clock) -> SlamService | No
         config.slam,
         devices.lidar.mount,
         clock,
+        body=(config.geometry.length, config.geometry.width) if config.slam.grid.free_footprint else None,
         scan=bus.subscribe(topics.SCAN, fifo(SCANS)),
         odometry=bus.subscribe(topics.ODOMETRY, fifo(ODOMETRIES)) if config.missing_actuators() is None else None,
         angles=scan_angles(config, bus, fifo(ODOMETRIES)),

@@ -1,6 +1,6 @@
 """Builds path source, tracker, goals, levelling and map picture of a configuration, each with its ends of the bus."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, Final
 
 from monstertruck_drivers.config import Devices
@@ -9,12 +9,15 @@ from monstertruck_planners.behave.api import BehaviourBody
 from monstertruck_planners.behave.catalog import LEVELLING
 from monstertruck_planners.behave.service import BehaviourService
 from monstertruck_planners.collision import Footprint
+from monstertruck_planners.explore.config import ExplorerConfig
+from monstertruck_planners.explore.exchange import ExploreSetup
+from monstertruck_planners.explore.service import TILES, ExplorerInputs, ExplorerService
 from monstertruck_planners.goals.config import PlannerConfig
 from monstertruck_planners.goals.deformation import RouteDeformation
 from monstertruck_planners.goals.exchange import Setup
 from monstertruck_planners.goals.path_publisher import GoalInputs, GoalOutputs
 from monstertruck_planners.goals.service import GoalService
-from monstertruck_planners.steps import DEFORMING, PLANNING, STEPS, TRACKING
+from monstertruck_planners.steps import DEFORMING, EXPLORING, PLANNING, STEPS, TRACKING
 from monstertruck_planners.track.config import TrackerConfig
 from monstertruck_planners.track.paths import PathService, load_path
 from monstertruck_planners.track.service import TrackerService, TrackSetup
@@ -36,8 +39,18 @@ STEP_DEADLINE: Final = 5.0
 """Seconds after which a tracker elsewhere is given up; the gate stops the truck long before."""
 
 
-def build_planners(config: TruckConfig, bus: Bus, clock: Clock, body: Body, actors: ActorFactory) -> Iterator[Service]:
-    """Path source and tracker where one is configured; the lidar's levelling; the map's picture."""
+def build_planners(
+    config: TruckConfig,
+    bus: Bus,
+    clock: Clock,
+    body: Body,
+    actors: ActorFactory,
+    save_map: Callable[[], bool] | None = None,
+) -> Iterator[Service]:
+    """Path source and tracker where one is configured; goals, exploration; the lidar's levelling; the map's picture.
+
+    ``save_map`` has the map saved as soon as possible, and returns whether it can be; None = there is none.
+    """
     wanted = (config.tracker or config.behaviours) and config.missing_actuators() is None
     requests = bus.publisher(topics.PLAN_DRIVE, Writer.PLANNER) if wanted else None
     if config.tracker is not None and requests is not None:
@@ -59,7 +72,12 @@ def build_planners(config: TruckConfig, bus: Bus, clock: Clock, body: Body, acto
         )
         yield _build_tracker(config, tracker, bus, clock, body, requests, actors)
         if config.planner is not None:
-            yield build_goals(config, config.planner, bus, clock, body.chassis, body.footprint, paths, requests, actors)
+            goals = build_goals(
+                config, config.planner, bus, clock, body.chassis, body.footprint, paths, requests, actors
+            )
+            yield goals
+            if config.explorer is not None:
+                yield _build_explorer(config, config.explorer, bus, clock, body, goals, actors, save_map)
     if config.behaviours and requests is not None:
         moved = BehaviourBody(body.chassis, config.gate.angle)
         yield BehaviourService(config.behaviours, clock, bus, requests, config.gate.max_request_age, moved)
@@ -172,6 +190,52 @@ def build_goals(
         ),
         outputs=GoalOutputs(path, planner_request, bus.publisher(topics.GOAL, Writer.PLANNER), bus.event_sink()),
         deformation=_deformation(config, setup, bus, clock, actors),
+    )
+
+
+def _build_explorer(
+    config: TruckConfig, explorer: ExplorerConfig, bus: Bus, clock: Clock, body: Body, goals: GoalService,
+    actors: ActorFactory, save_map: Callable[[], bool] | None,
+) -> ExplorerService:  # fmt: skip
+    planner, lidar = config.planner, config.devices.lidar
+    assert planner is not None
+    assert lidar is not None
+    planner = _within_reach(planner, body.chassis.reached_angle)
+    setup = ExploreSetup(
+        explorer,
+        body.footprint,
+        body.chassis.bicycle.minimum_radius("front" if planner.steering == "2ws" else "counter", planner.angle),
+        planner.route.margin,
+        lidar.mount.planar,
+    )
+    actor = actors.actor(
+        config.placement.explorer,
+        EXPLORING,
+        STEPS[EXPLORING],
+        latency=explorer.latency,
+        deadline=explorer.deadline,
+        start_timeout=START_TIMEOUT,
+    )
+    inputs = ExplorerInputs(
+        gate=bus.subscribe(topics.GATE, latest()),
+        pose=bus.subscribe(topics.POSE, latest()),
+        goal=bus.subscribe(topics.GOAL, latest()),
+        grid=bus.subscribe(topics.MAP, latest()),
+        tiles=bus.subscribe(topics.MAP_TILES, fifo(TILES)),
+        slam=bus.subscribe(topics.SLAM, latest()),
+        battery=bus.subscribe(topics.BATTERY, latest()),
+        events=bus.subscribe(topics.EVENT, fifo(256)),
+    )
+    return ExplorerService(
+        setup,
+        clock,
+        actor,
+        goals,
+        save_map,
+        max_age=config.gate.max_request_age,
+        inputs=inputs,
+        state=bus.publisher(topics.EXPLORE, Writer.PLANNER),
+        events=bus.event_sink(),
     )
 
 

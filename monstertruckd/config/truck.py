@@ -21,6 +21,7 @@ from monstertruck_planners.behave.api import BehaviourConfig
 from monstertruck_planners.behave.catalog import AnyBehaviour, AnyLevelling
 from monstertruck_planners.behave.move import MoveConfig
 from monstertruck_planners.behave.stabiliser import StabiliserConfig
+from monstertruck_planners.explore.catalog import AnyExplorer
 from monstertruck_planners.goals.config import DRIVEN, PlannerConfig
 from monstertruck_planners.track.catalog import AnyTracker
 from monstertruck_planners.track.config import STEERING_MODES
@@ -94,6 +95,7 @@ class PlacementConfig(Schema):
     local_planner: Literal["loop", "worker", "remote"] = "worker"
     """Likewise"""
     tracker: Literal["loop", "worker", "remote"] = "loop"
+    explorer: Literal["loop", "worker", "remote"] = "worker"
 
 
 class TruckConfig(Schema):
@@ -121,6 +123,8 @@ class TruckConfig(Schema):
     tracker: AnyTracker | None = None
     planner: PlannerConfig | None = None
     """How goals are reached; null = the robot follows paths only"""
+    explorer: AnyExplorer | None = None
+    """How unknown ground is explored; null = the robot does not explore"""
     behaviours: dict[Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,31}$")], AnyBehaviour] = Field(
         default_factory=dict, validate_default=True
     )
@@ -223,6 +227,8 @@ class TruckConfig(Schema):
         self._check_planner()
         if self.behaviours.keys() - {MOVE} and (lack := self.missing_actuators()):
             raise ValueError(f"behaviours need {lack}")
+        if self.explorer is not None and (self.planner is None or self.slam is None or self.slam.mode != "mapping"):
+            raise ValueError("an explorer needs a planner, which drives to its goals, and slam in mode mapping")
         if self.slam is not None and self.devices.lidar is None:
             raise ValueError("slam needs the device lidar")
         if self.slam is not None and self.slam.mode == "localisation" and self.slam.map is None:

@@ -2,6 +2,7 @@
 
 from typing import Final
 
+from monstertruck_planners.explore.exchange import ExploreAnswer, ExploreTask
 from monstertruck_planners.goals.exchange import DeformAnswer, DeformTask, PlanAnswer, PlanTask
 from monstertruck_planners.track.service import TrackInput, TrackOutput
 from monstertruck_runtime.actors.remote import StepCodec
@@ -12,16 +13,18 @@ from monstertruck_schemas.state import GateState, Odometry
 PLANNING: Final = "planning"
 DEFORMING: Final = "deforming"
 TRACKING: Final = "tracking"
+EXPLORING: Final = "exploring"
 
 STEPS: Final = {
     PLANNING: "monstertruck_planners.goals.plan_step:PlanningWorker",
     DEFORMING: "monstertruck_planners.goals.deform_step:DeformingWorker",
     TRACKING: "monstertruck_planners.track.service:TrackingWorker",
+    EXPLORING: "monstertruck_planners.explore.explore_step:ExploringWorker",
 }
 """``module:factory`` by name."""
 
 CODEC: Final = StepCodec(
-    *(PlanTask, PlanAnswer, DeformTask, DeformAnswer, TrackInput, TrackOutput),
+    *(PlanTask, PlanAnswer, DeformTask, DeformAnswer, TrackInput, TrackOutput, ExploreTask, ExploreAnswer),
     # What ``TrackInput.news`` holds.
     *(Odometry, Path, GateState, LaserScan, Attitude),
 )

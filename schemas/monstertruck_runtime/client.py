@@ -37,6 +37,7 @@ from monstertruck_schemas.req import (
     BehaviourOrder,
     ControlRequest,
     DriveRequest,
+    ExploreOrder,
     GoalOrder,
     Order,
     PathRequest,
@@ -347,6 +348,23 @@ class TruckClient(Operator):
         """
         request = {"order": order, "behaviour": behaviour} | ({"settings": dict(settings)} if settings else {})
         return await self.call("behave", {**await self._answered(1.0), **request})
+
+    async def explore(
+        self, order: ExploreOrder, *, home: bool | None = None, budget: float | None = None
+    ) -> dict[str, Any]:
+        """Start an exploration, or end it; answers with its ``number``. Progress is on ``plan/explore``.
+
+        Args:
+            order: which of both.
+            home: drive back to the start at the end; None = as configured.
+            budget: seconds after which it ends; None = as configured.
+
+        Raises:
+            RequestRefusedError: why it does not start, or none runs.
+            NotFoundError: the robot is not there, or does not explore.
+            NoAnswerError: no answer in time.
+        """
+        return await self.call("explore", {**await self._answered(1.0), "order": order, "home": home, "budget": budget})
 
     async def path(self, path: DrivePath, lease: float = 1.0) -> None:
         """Request to follow a path computed here. Raises as ``drive`` does."""

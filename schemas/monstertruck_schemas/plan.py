@@ -133,6 +133,59 @@ class BehaviourState(Message):
     """Measurements of its kind, such as the distance from a wall, m."""
 
 
+class ExplorationPhase(StrEnum):
+    """What an exploration is doing."""
+
+    IDLE = "idle"
+    """Nothing: there is none, or ``outcome`` says how the last one ended."""
+    LOOKING = "looking"
+    """It stands and decides where to look next."""
+    DRIVING = "driving"
+    LOST = "lost"
+    """It stands, for its place in the map is not known."""
+    RETURNING = "returning"
+    SAVING = "saving"
+    """It waits until the map is saved."""
+
+
+class ExplorationState(Message):
+    """Progress of an exploration, in ``frame``."""
+
+    number: Annotated[int, Field(ge=0)] = 0
+    """Counts the explorations since the start of the daemon; 0 = none yet."""
+    kind: str = ""
+    source: str = ""
+    """Who asked for it."""
+    phase: ExplorationPhase = ExplorationPhase.IDLE
+    outcome: Reason = Reason.OK
+    """DRIVING while it runs, then EXPLORED, BUDGET_SPENT, CHARGE_SPENT, CANCELLED, or why it was given up."""
+    text: str = ""
+    """The outcome in words."""
+    target: Pose2D | None = None
+    """Where it is going."""
+    frontiers: Annotated[int, Field(ge=0)] = 0
+    """Frontiers that can be reached..."""
+    left_alone: Annotated[int, Field(ge=0)] = 0
+    """...and those that are not tried for now."""
+    known: Annotated[float, Field(ge=0)] = 0.0
+    """Area of the free ground in the map, m^2."""
+    travelled: Annotated[float, Field(ge=0)] = 0.0
+    """Metres since it was started."""
+    elapsed: Annotated[float, Field(ge=0)] = 0.0
+    """Seconds since it was started."""
+    home: Annotated[float, Field(ge=0)] | None = None
+    """Metres of the way back to the start; None = not known."""
+    goals: Annotated[int, Field(ge=0)] = 0
+    """Places it set off for."""
+    failures: Annotated[int, Field(ge=0)] = 0
+    """Of these, places it did not come to."""
+
+    @property
+    def running(self) -> bool:
+        """Whether it has not ended."""
+        return self.phase is not ExplorationPhase.IDLE
+
+
 class StabiliserCommand(Message):
     """Joint angles the lidar's mount has to take, see ``sensor.StabiliserFeedback`` for order and signs."""
 

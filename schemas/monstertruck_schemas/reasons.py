@@ -177,3 +177,10 @@ class Reason(StrEnum):
     NOT_OBEYED = "not_obeyed", 122, "the gate does not carry out what a behaviour asks for"
     BEHAVIOUR_STARTED = "behaviour_started", 0, "a behaviour was started"
     BEHAVIOUR_DONE = "behaviour_done", 0, "a behaviour did what it was started for"
+
+    # Exploration
+    CHARGE_SPENT = "charge_spent", 123, "the charge is needed for the way home"
+    EXPLORATION_STARTED = "exploration_started", 0, "an exploration was started"
+    FRONTIER_CHOSEN = "frontier_chosen", 0, "the edge of what is known is looked at in another place"
+    EXPLORED = "explored", 0, "nothing is left to explore"
+    BUDGET_SPENT = "budget_spent", 0, "the time for exploring is over"

@@ -210,6 +210,23 @@ class BehaviourRequest(Request):
     """Of a start: settings that replace the configured ones for this run."""
 
 
+class ExploreOrder(StrEnum):
+    """What can be asked about exploration."""
+
+    START = "start"
+    STOP = "stop"
+
+
+class ExploreRequest(Request):
+    """Explore from here on, or end that."""
+
+    order: ExploreOrder
+    home: bool | None = None
+    """Drive back to the start at the end; None = as configured."""
+    budget: Annotated[float, Field(gt=0)] | None = None
+    """Seconds after which it ends; None = as configured."""
+
+
 class PathRequest(Request):
     """A path computed off board, to be tracked."""
 

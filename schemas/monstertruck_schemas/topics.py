@@ -27,7 +27,7 @@ from monstertruck_schemas.health import (
     RecorderHealth,
     SlamHealth,
 )
-from monstertruck_schemas.plan import BehaviourState, GoalState, Path, StabiliserCommand, TrackerState
+from monstertruck_schemas.plan import BehaviourState, ExplorationState, GoalState, Path, StabiliserCommand, TrackerState
 from monstertruck_schemas.req import ControlRequest, DriveRequest, GoalControl, GoalRequest, PathRequest
 from monstertruck_schemas.sensor import (
     Attitude,
@@ -197,6 +197,10 @@ TRACKER: Final = Topic("plan/tracker", TrackerState, W.PLANNER, "Tracking error 
 GOAL: Final = Topic("plan/goal", GoalState, W.PLANNER, "Progress towards the goal", 2, retained=True)
 BEHAVIOUR: Final = Topic(
     "plan/behaviour", BehaviourState, W.PLANNER, "Progress of the running behaviour, or how the last one ended", 5,
+    retained=True,
+)  # fmt: skip
+EXPLORE: Final = Topic(
+    "plan/explore", ExplorationState, W.PLANNER, "Progress of the exploration, or how the last one ended", 2,
     retained=True,
 )  # fmt: skip
 PLAN_DRIVE: Final = Topic(

@@ -12,6 +12,7 @@ from monstertruckd.tools.cli import (
     doctor,
     drill,
     drive,
+    explore,
     goto,
     kinematics,
     live,
@@ -72,6 +73,7 @@ app.command("plan", context_settings={"ignore_unknown_options": True})(plan.plan
 app.command("goto", context_settings={"ignore_unknown_options": True})(goto.goto)
 app.command("track")(goto.track)
 app.command("move")(move.move)
+app.command("explore")(explore.explore)
 app.command("plan-server")(robot.plan_server)
 app.command("replay")(replay.replay)
 app.command("emulate")(devices.emulate)

@@ -75,6 +75,7 @@ def replayable(config: TruckConfig) -> TruckConfig:
             "path": None,
             "map": None,
             "behaviours": {},
+            "explorer": None,
             "placement": PlacementConfig(),
         }
     )

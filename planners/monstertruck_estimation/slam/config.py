@@ -68,6 +68,11 @@ class GridConfig(Schema):
     """Probability that a cell a beam has passed is occupied."""
     limit: Annotated[float, Field(gt=0.5, lt=1)] = 0.98
     """No cell becomes more certain than this, so that objects that move away disappear."""
+    passed: Positive | None = None
+    """Beams that meet nothing within the sensor's range free the cells up to this distance, m; null = they say
+    nothing: a dark or a polished surface answers no beam either"""
+    free_footprint: bool = False
+    """The ground under the robot is free, although its sensor does not see it"""
     spacing: Positive = 0.1
     """A scan is integrated after so much distance, m,"""
     turn: Positive = 0.1

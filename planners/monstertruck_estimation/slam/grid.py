@@ -5,6 +5,7 @@ Probabilistic Robotics, table 9.2). A scan counts once per cell, and an end outw
 grazing angle, and everything near the sensor, would be counted by the dozen.
 """
 
+import itertools
 import math
 from collections.abc import Iterable, Iterator
 from typing import Final
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from monstertruck_estimation.se2 import Vector, between, interpolate, transform
 from monstertruck_estimation.slam.config import GridConfig
 from monstertruck_estimation.slam.scans import Scan
-from monstertruck_estimation.slam.worker_io import UNKNOWN, GridPatch
+from monstertruck_estimation.slam.worker_io import UNKNOWN, GridPatch, ScanInput
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND
 
@@ -26,6 +27,8 @@ TILE: Final = 64
 """Cells of a tile's edge; the grid's bounds are whole tiles."""
 SCALE: Final = 256.0
 """Steps of the stored log odds per unit."""
+NONE: Final = np.empty((0, 2))
+"""No points."""
 _FRACTION_BITS: Final = 16
 """Bits behind the point while a beam is followed."""
 
@@ -55,16 +58,18 @@ class OccupancyGrid:
         self._touched: tuple[NDArray[np.int64], NDArray[np.int64]] | None = None
         self._redrawn = True
 
-    def add(self, sensor: Array, points: Array) -> None:
+    def add(self, sensor: Array, points: Array, passed: Array = NONE) -> None:
         """Integrate one scan.
 
         Args:
             sensor: shape (2,), where the beams began, in map, m.
             points: shape (n, 2), where they ended, in map, m; all finite.
+            passed: shape (k, 2), up to where other beams met nothing, in map, m; all finite.
         """
-        if not len(points):
+        if not len(points) and not len(passed):
             return
-        ends, low, high = _cells(points, sensor, 1.0 / self.config.resolution)
+        beams = np.vstack((points, passed)) if len(passed) else points
+        ends, low, high = _cells(beams, sensor, 1.0 / self.config.resolution)
         self._cover(low, high)
         self._touch(low, high)
         self._mark += 1
@@ -222,6 +227,32 @@ def trace(odds, marks, stride, ends, corner, mark, model, hits):  # type: ignore
             part += slope
 
 
+def outline(length: float, width: float, step: float) -> Array:
+    """Points of a rectangle round the origin, shape (n, 2), at most ``step`` apart, m."""
+    x, y = length / 2, width / 2
+    corners = np.array([(x, y), (-x, y), (-x, -y), (x, -y), (x, y)])
+    sides = [
+        a + (b - a) * np.arange(count := math.ceil(math.dist(a, b) / step))[:, None] / count
+        for a, b in itertools.pairwise(corners)
+    ]
+    return np.vstack(sides)
+
+
+def passed_ends(inputs: ScanInput, reach: float) -> Array:
+    """Ends, shape (k, 2), in base, m, of the beams that met nothing, at ``reach`` m or the sensor's own if it is less.
+
+    Of a level scan only: what a tilted beam passes is not at the height of the others.
+    """
+    if inputs.slopes is not None and max(map(abs, inputs.slopes)) > LEVEL:
+        return NONE
+    beams = np.flatnonzero(np.isposinf(inputs.ranges))
+    x, y, yaw = inputs.mount
+    angles, far = yaw + inputs.start_angle + inputs.angle_increment * beams, min(reach, inputs.range_max)
+    return np.column_stack((x + far * np.cos(angles), y + far * np.sin(angles)))
+
+
+LEVEL: Final = 0.02
+"""Slope of the scanning plane up to which beams without a return say something: 0.1 m over 5 m."""
 MILLIMETRES: Final = 1000.0
 PAGE_POINTS: Final = 1 << 16
 """Points of a page, 256 kB."""
@@ -268,22 +299,28 @@ class PointPages:
 class GridBuilder:
     """Occupancy grid of stored scans, rebuilt when optimisation moves their poses.
 
+    The place where the robot stands is free: its outline counts as ends of beams that met nothing.
+
     Args:
         config: the grid, and which scans are integrated.
+        body: length and width of the robot, m; None = not known.
     """
 
-    def __init__(self, config: GridConfig) -> None:
+    def __init__(self, config: GridConfig, body: tuple[float, float] | None = None) -> None:
         self.grid = OccupancyGrid(config)
-        self._config = config
+        self._config, self._body = config, body
+        self._outline = NONE if body is None else outline(*body, config.resolution / 2)
         self._stamps: list[int] = []
         self._poses: list[Array] = []
         self._points = PointPages()
+        self._returns: list[int] = []
+        """How many of each scan's points are returns; the others end beams that met nothing."""
         self._mounts: list[Vector] = []
 
     def __len__(self) -> int:
         return len(self._stamps)
 
-    def add(self, scan: Scan, stamp: int, pose: Array, mount: Vector) -> bool:
+    def add(self, scan: Scan, stamp: int, pose: Array, mount: Vector, passed: Array = NONE) -> bool:
         """Integrate a scan if the robot moved far enough since the last one; returns whether it did.
 
         Args:
@@ -291,13 +328,15 @@ class GridBuilder:
             stamp: ns, later than those before.
             pose: shape (3,), base in map.
             mount: planar pose of the sensor in base.
+            passed: shape (k, 2), ends in base of beams that met nothing, see ``passed_ends``.
         """
         if not len(scan) or not self._due(stamp, pose):
             return False
-        near = scan.points[np.abs(scan.points).max(axis=1) < LONGEST_POINT]
+        near, far = (ends[np.abs(ends).max(axis=1) < LONGEST_POINT] for ends in (scan.points, passed))
         self._stamps.append(stamp)
         self._poses.append(np.array(pose))
-        self._points.append(np.round(near * MILLIMETRES).astype(np.int16))
+        self._points.append(np.round(np.vstack((near, far)) * MILLIMETRES).astype(np.int16))
+        self._returns.append(len(near))
         self._mounts.append(mount)
         self._draw(len(self._stamps) - 1)
         if len(self._stamps) > self._config.remembered:
@@ -336,8 +375,12 @@ class GridBuilder:
         )
 
     def _draw(self, i: int) -> None:
-        sensor = transform(self._poses[i], np.array([self._mounts[i][:2]]))[0]
-        self.grid.add(sensor, transform(self._poses[i], self._points[i] / MILLIMETRES))
+        mount, pose = self._mounts[i], self._poses[i]
+        points, returns = transform(pose, self._points[i] / MILLIMETRES), self._returns[i]
+        passed = points[returns:]
+        if self._body is not None and all(abs(m) < side / 2 for m, side in zip(mount, self._body, strict=False)):
+            passed = np.vstack((passed, transform(pose, self._outline)))
+        self.grid.add(transform(pose, np.array([mount[:2]]))[0], points[:returns], passed)
 
     def _prune(self) -> None:
         """Drop every other scan but the newest quarter."""
@@ -346,4 +389,5 @@ class GridBuilder:
         self._stamps = [self._stamps[i] for i in kept]
         self._poses = [self._poses[i] for i in kept]
         self._mounts = [self._mounts[i] for i in kept]
+        self._returns = [self._returns[i] for i in kept]
         self._points.keep(kept)

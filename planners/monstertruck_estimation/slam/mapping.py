@@ -15,7 +15,7 @@ from monstertruck_estimation.slam.budget import ScanBudget
 from monstertruck_estimation.slam.closure import PART_CONTRADICTION, LoopCloser
 from monstertruck_estimation.slam.config import GridConfig, MapperConfig
 from monstertruck_estimation.slam.correlation import Submap
-from monstertruck_estimation.slam.grid import GridBuilder
+from monstertruck_estimation.slam.grid import NONE, GridBuilder, passed_ends
 from monstertruck_estimation.slam.keyframes import LOOSENED, KeyframeMap, Trajectory
 from monstertruck_estimation.slam.motion import ClockOffsetEstimator, MotionPredictor, ScanOdometry, velocity
 from monstertruck_estimation.slam.relocation import LossDetector, Relocation, contradicts
@@ -351,13 +351,16 @@ class MappingEstimator:
         grid: of the occupancy grid.
         front: scan front end; None = the default one.
         start: base in map at the first scan.
+        body: see ``GridBuilder``.
     """
 
     def __init__(
-        self, mapper: MapperConfig, grid: GridConfig, front: ScanMatcher | None = None, start: Vector = (0.0, 0.0, 0.0)
-    ) -> None:
+        self, mapper: MapperConfig, grid: GridConfig, front: ScanMatcher | None = None,
+        start: Vector = (0.0, 0.0, 0.0), body: tuple[float, float] | None = None,
+    ) -> None:  # fmt: skip
         self.mapper = Mapper(mapper, front, start)
-        self.builder = GridBuilder(grid)
+        self.builder = GridBuilder(grid, body)
+        self._passed = grid.passed
         self.counts = {"scans": 0, "keys": 0, "closures": 0, "rejected": 0}
         self._moved = False
         self._redrawn = False
@@ -398,7 +401,8 @@ class MappingEstimator:
             if MappingEvent.KEY in step.events or MappingEvent.APART in step.events:
                 self._apart.append((step.scan, step.stamp, inputs.mount))
         elif accepted:
-            self.builder.add(step.scan, step.stamp, step.pose, inputs.mount)
+            passed = NONE if self._passed is None else passed_ends(inputs, self._passed)
+            self.builder.add(step.scan, step.stamp, step.pose, inputs.mount, passed)
             if inputs.odom is not None and self.mapper.odometry is OdometryUse.USED:
                 self._offset.add(step.stamp, float(step.pose[2]), inputs.odom[2])
         if joined:

@@ -55,6 +55,7 @@ class SlamService:
     Args:
         config: what is mapped, how, and where it is saved.
         mount: of the lidar.
+        body: length and width of the robot, m.
         clock: time.
         scan: lidar, bounded and counted.
         odometry: pose in odom; None = the robot has none, the pose is then published once a scan.
@@ -75,6 +76,7 @@ class SlamService:
         mount: Mount,
         clock: Clock,
         *,
+        body: tuple[float, float] | None = None,
         scan: Mailbox[LaserScan],
         odometry: Mailbox[Odometry] | None,
         angles: ScanAngles | None,
@@ -85,7 +87,7 @@ class SlamService:
         health: Publisher[SlamHealth],
         events: EventSink,
     ) -> None:
-        self._config, self._mount, self._clock = config, mount, clock
+        self._config, self._mount, self._body, self._clock = config, mount, body, clock
         self._scan, self._odometry, self._angles = scan, odometry, angles
         self._motions = motion
         self._pose, self._whole, self._tiles, self._health, self._events = pose, whole, tiles, health, events
@@ -110,6 +112,11 @@ class SlamService:
             return ()
         stamp = self._newest.stamp
         return planar("map", "odom", stamp, self._newest.pose), planar("odom", "base", stamp, (0.0, 0.0, 0.0))
+
+    def save_soon(self) -> bool:
+        """Have the map saved with the next scan; returns whether there is a map to save, and a place for it."""
+        self._due["save"] = 0
+        return self._config.save is not None and self._config.mode == "mapping"
 
     async def run(self, ready: Ready) -> None:
         """Feed the worker until cancelled, then save.
@@ -188,7 +195,7 @@ class SlamService:
                 self._skip(reason)
                 continue
             inputs = self._inputs(scan)
-            start = None if started else Start(self._config, self._start(inputs.odom))
+            start = None if started else Start(self._config, self._start(inputs.odom), self._body)
             outputs = await self._step(worker, self._work(inputs, start))
             started = True
             self._take(outputs, scan)

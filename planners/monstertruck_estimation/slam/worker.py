@@ -83,7 +83,7 @@ class SlamWorker:
             assert config.map is not None
             self._estimator = LocalisationEstimator(storage.load(config.map), settings)
         else:
-            self._estimator = MappingEstimator(settings, config.grid, matcher_of(config.front), start.pose)
+            self._estimator = MappingEstimator(settings, config.grid, matcher_of(config.front), start.pose, start.body)
 
     def _refusal(self, scan: ScanInput) -> str | None:
         """Why a scan cannot be used; None if it can."""

@@ -11,7 +11,7 @@ from monstertruck_estimation.se2 import Vector
 from monstertruck_estimation.slam.config import SlamConfig
 from monstertruck_kinematics.elementary import Array
 from monstertruck_schemas.health import LocalisationStatus, OdometryUse
-from monstertruck_schemas.sensor import LaserScan
+from monstertruck_schemas.sensor import NO_ECHO, VALID_BEAM, LaserScan
 
 UNKNOWN: Final = -1
 """Value of a cell nothing is known of."""
@@ -36,7 +36,7 @@ class ScanInput:
     stamp: int
     """ns, of the first beam."""
     ranges: Array
-    """Shape (n,), m; anything not finite is a no-return."""
+    """Shape (n,), m; +inf where the beam met nothing within the sensor's range, NaN where nothing is known."""
     start_angle: float
     angle_increment: float
     range_min: float
@@ -61,7 +61,7 @@ class ScanInput:
         """From the message alone."""
         return cls(
             stamp=scan.stamp,
-            ranges=scan.ranges,
+            ranges=np.where((scan.codes == VALID_BEAM) | (scan.codes <= NO_ECHO), scan.ranges, np.nan),
             start_angle=scan.start_angle,
             angle_increment=scan.angle_increment,
             range_min=scan.range_min,
@@ -78,6 +78,8 @@ class Start:
     config: SlamConfig
     pose: Vector = (0.0, 0.0, 0.0)
     """Base in map at the first scan."""
+    body: tuple[float, float] | None = None
+    """Length and width of the robot, m: where it stands the ground is free; None = not known."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,7 +17,14 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
 from monstertruck_kinematics.elementary import Array
-from monstertruck_planners.collision import OCCUPIED, DistanceField, placed, points_relative, rectangle_distance
+from monstertruck_planners.collision import (
+    OCCUPIED,
+    DistanceField,
+    Footprint,
+    placed,
+    points_relative,
+    rectangle_distance,
+)
 from monstertruck_planners.goals.escape import escape
 from monstertruck_planners.goals.exchange import PlanAnswer, PlanTask, Pose, Setup, explained_within
 from monstertruck_planners.route.api import Clock, RouteMap, RoutePlanner, RouteResult, Vehicle, warm_up
@@ -43,6 +50,8 @@ NEARBY: Final = 1.5
 """Obstacles this near count when backing out, and are not forgotten, m."""
 
 
+RIM: Final = 1.5
+"""Cells by which the truck may overlap an obstacle of the map where it stands."""
 CLEARANCE: Final = 0.2
 """Clearance of the poses of an answer is looked for up to this, m."""
 
@@ -175,6 +184,34 @@ class StaticMap:
         flat = np.column_stack((centres, np.zeros(len(centres))))
         there = points_relative(placed(flat, self.origin)[:, :2], pose)
         return np.asarray(there[np.hypot(there[:, 0], there[:, 1]) < reach])
+
+
+def standing_free(cells: Cells, resolution: float, origin: Pose, footprint: Footprint, pose: Pose) -> Cells:
+    """Cells with those free on which the truck stands: unknown ones, and obstacles that only its rim touches.
+
+    A map is as exact as its cells: a truck beside a wall overlaps one by up to a cell. What it overlaps by more stays,
+    for then map or pose is wrong.
+
+    Args:
+        cells: shape (rows, columns), percent, -1 unknown.
+        resolution: m.
+        origin: pose of the outer corner of cell (0, 0).
+        footprint: the truck.
+        pose: of it, in the map's frame.
+    """
+    at = points_relative(np.array([pose[:2]]), origin)[0] / resolution
+    reach = math.ceil(footprint.circumscribed_radius / resolution) + 1
+    rows, columns = cells.shape
+    row, column = np.mgrid[
+        max(int(at[1]) - reach, 0) : min(int(at[1]) + reach + 1, rows),
+        max(int(at[0]) - reach, 0) : min(int(at[0]) + reach + 1, columns),
+    ].reshape(2, -1)
+    centres = np.column_stack((column + 0.5, row + 0.5, np.zeros(len(row)))) * resolution
+    gap = rectangle_distance(footprint, np.array([pose]), placed(centres, origin)[:, :2])[0]
+    freed = (gap < resolution * math.sqrt(0.5)) & ((gap > -RIM * resolution) | (cells[row, column] < 0))
+    kept = cells.copy()
+    kept[row[freed], column[freed]] = 0
+    return kept
 
 
 def ground_layers(ground: Ground, grid: StaticMap, reach: float) -> tuple[Array, Array]:
@@ -319,18 +356,7 @@ class PlanningStep:
             touching = rectangle_distance(self._setup.footprint, pose, points)[0] < 1.5 * static_map.resolution
             points = points[~touching]
         cells = static_map.with_points(points) if len(points) else static_map.cells
-        if self._ground is not None and self._layers is None:
-            self._layers = ground_layers(self._ground, static_map, self._setup.footprint.width / 2)
-        tilt, roughness = self._layers or (None, None)
-        self._route_map = route_map = RouteMap.from_cells(
-            cells,
-            static_map.resolution,
-            static_map.origin,
-            self._setup.config.route.unknown,
-            tilt,
-            roughness,
-            previous=self._route_map,
-        )
+        self._route_map = route_map = self._map_of(cells, static_map)
         start, goal = (self._vehicle.reference_pose(p) for p in (task.pose, task.goal))
         way = with_headings(task.pose, [ViaPoint(*place) for place in (*task.via, task.goal)])
         via = [self._vehicle.reference_pose(pose) for pose in way[:-1]]
@@ -341,6 +367,9 @@ class PlanningStep:
         result = plan(self._planner)
         if result.reason is Reason.START_BLOCKED:
             result = plan(self._tight)
+            if result.reason is Reason.START_BLOCKED:
+                self._route_map = route_map = self._standing(static_map, cells, task.pose)
+                result = plan(self._tight)
         elif (room := self._cusp_clearance(route_map, result)) < self._setup.cusp_clearance:
             wider = plan(self._wide)
             result = wider if self._cusp_clearance(route_map, wider) > room else result
@@ -357,6 +386,43 @@ class PlanningStep:
         poses = moved(result.poses, -self._vehicle.reference)
         length = float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum())
         return PlanAnswer(Reason.OK, "", poses, np.ones(len(poses)), (), length, result.cost, drivable=False)
+
+    def _map_of(self, cells: Cells, static_map: StaticMap) -> RouteMap:
+        assert self._setup is not None
+        if self._ground is not None and self._layers is None:
+            self._layers = ground_layers(self._ground, static_map, self._setup.footprint.width / 2)
+        tilt, roughness = self._layers or (None, None)
+        return RouteMap.from_cells(
+            cells,
+            static_map.resolution,
+            static_map.origin,
+            self._setup.config.route.unknown,
+            tilt,
+            roughness,
+            previous=self._route_map,
+        )
+
+    def _standing(self, static_map: StaticMap, cells: Cells, pose: Pose) -> RouteMap:
+        """The map with the ground free on which the truck stands, and a margin where it stands at the map's edge."""
+        assert self._setup is not None
+        footprint = self._setup.footprint
+        margin = math.ceil(2 * footprint.circumscribed_radius / static_map.resolution)
+        corner = placed(np.array([(-margin * static_map.resolution,) * 2 + (0.0,)]), static_map.origin)[0]
+        origin = (float(corner[0]), float(corner[1]), static_map.origin[2])
+        outside = np.pad(np.zeros(cells.shape, np.bool_), margin, constant_values=True)
+        around = np.pad(cells, margin, constant_values=-1)
+        freed = standing_free(around, static_map.resolution, origin, footprint, pose)
+        freed[outside & (freed < 0)] = 100
+        tilt, roughness = self._layers or (None, None)
+        return RouteMap.from_cells(
+            freed,
+            static_map.resolution,
+            origin,
+            self._setup.config.route.unknown,
+            None if tilt is None else np.pad(tilt, margin),
+            None if roughness is None else np.pad(roughness, margin),
+            previous=self._route_map,
+        )
 
     def _clearance(self, route_map: RouteMap, answer: PlanAnswer) -> Array:
         assert self._setup is not None

@@ -102,6 +102,7 @@ class GoalService:
         self._sequences = {"goal": Sequences(max_age), "goal_control": Sequences(max_age)}
         self._goal: GoalRun | None = None
         self._number = 0
+        self._held = False
         self._paths = PathPublisher(clock, inputs, outputs, deceleration)
         self._reported: GoalState | None = None
         self._planning: asyncio.Task[PlanAnswer] | None = None
@@ -191,6 +192,10 @@ class GoalService:
             raise RequestRefusedError(Reason.NOT_FOUND, f"{request.order}: no goal is being pursued")
         self._do(goal_run.order(self._goal, request.order, request.source, self._seconds()))
 
+    def hold(self, *, on: bool) -> None:
+        """Keep the truck armed between goals too, by asking for standstill: for what sends one goal after the other."""
+        self._held = on
+
     async def settled(self, number: int) -> GoalState:
         """State of a goal once it is known whether a way leads there.
 
@@ -228,6 +233,8 @@ class GoalService:
                 self._do(goal_run.tick(run, self._observe(now), self._config))
             if self._goal is not None and self._goal.active and self._goal.phase is not GoalPhase.PAUSED:
                 self._paths.stand_still()
+        elif self._held:
+            self._paths.stand_still()
         self._report(now)
 
     def _observe(self, now: int) -> Observations:

@@ -1,11 +1,13 @@
 """The occupancy grid: what a scan leaves in it, growth, changed tiles, rebuilding, stored points."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from monstertruck_drivers.hokuyo_urg.protocol import split_ranges
 from monstertruck_estimation.slam.config import GridConfig
-from monstertruck_estimation.slam.grid import PAGE_POINTS, TILE, GridBuilder, OccupancyGrid, PointPages
+from monstertruck_estimation.slam.grid import PAGE_POINTS, TILE, GridBuilder, OccupancyGrid, PointPages, passed_ends
 from monstertruck_estimation.slam.scans import Scan, prepare_input
 from monstertruck_estimation.slam.storage import elements
 from monstertruck_estimation.slam.worker_io import ScanInput
@@ -193,3 +195,41 @@ def test_a_scan_may_be_larger_than_a_page():
     assert [len(pages[k]) for k in range(3)] == [PAGE_POINTS + 5, 2 * PAGE_POINTS, 7]
     assert [int(pages[k][0, 0]) for k in range(3)] == [1, 3, 4]
     assert all((pages[k] == pages[k][0, 0]).all() for k in range(3))
+
+
+def test_beams_that_met_nothing_free_what_they_passed_and_occupy_nothing():
+    grid = OccupancyGrid()
+    grid.add(ORIGIN, np.array([[0.0, 1.0]]), np.array([[2.0, 0.0]]))
+    assert value(grid, 1.0, 0.0) == 40
+    assert value(grid, 2.0, 0.0) == -1
+    grid.add(ORIGIN, np.empty((0, 2)), np.array([[0.0, -1.0]]))
+    assert value(grid, 0.0, -0.5) == 40
+
+
+@pytest.mark.parametrize(("code", "seen"), [(0, 40), (2, 40), (6, -1), (19, -1)])
+def test_only_a_code_that_says_so_is_a_beam_that_met_nothing(code: int, seen: int):
+    ranges, codes = split_ranges(np.full(683, code, np.int32), 20)
+    step = np.pi / 512
+    scan = LaserScan(
+        stamp=0, received=0, seq=0, frame="lidar", start_angle=-341 * step, end_angle=341 * step,
+        time_increment=0.0, scan_time=0.1, range_min=0.02, range_max=4.1, ranges=ranges, codes=codes,
+    )  # fmt: skip
+    inputs = ScanInput.of(scan, (0.5, 0.0, 0.0))
+    grid = OccupancyGrid()
+    grid.add(np.array((0.5, 0.0)), np.empty((0, 2)), passed_ends(inputs, 3.0))
+    assert value(grid, 3.2, 0.0) == seen
+    assert value(grid, 3.6, 0.0) == -1
+    assert not len(passed_ends(replace(inputs, slopes=(0.05, 0.0)), 3.0)), "a tilted beam passes over things"
+
+
+def test_where_the_robot_stands_is_free_also_after_the_grid_is_drawn_again():
+    builder = GridBuilder(GridConfig(), (0.4, 0.3))
+    builder.add(scan_of((2.0, 0.0)), 10**9, np.zeros(3), (0.1, 0.0, 0.0))
+    assert value(builder.grid, -0.15, 0.1) == 40
+    assert value(builder.grid, -0.26, 0.0) == -1
+    builder.update_poses(np.array([10**9]), np.array([[0.0, 1.0, 0.0]]))
+    assert value(builder.grid, -0.15, 1.1) == 40
+    assert value(builder.grid, -0.15, 0.1) == -1
+    plain = GridBuilder(GridConfig())
+    plain.add(scan_of((2.0, 0.0)), 10**9, np.zeros(3), (0.1, 0.0, 0.0))
+    assert value(plain.grid, -0.15, 0.1) == -1

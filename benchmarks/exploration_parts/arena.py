@@ -1,0 +1,85 @@
+"""Worlds to explore: what blocks, what can be reached, where runs start."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt, label
+
+from monstertruck_kinematics.elementary import Array
+from monstertruck_planners.collision import DistanceField, Footprint
+from monstertruck_planners.goals.exchange import Pose
+from monstertruck_runtime.map_files import FREE, load_map
+from monstertruck_sim.world.raycast import Clearance, cast_rays, clearance
+
+BODY, BARE = Footprint(), Footprint(padding=0.0)
+ROOM = 0.3
+"""Metres between the footprint and obstacles where a run starts."""
+BEAMS, FIRST, STEP = 682, -340.5 * 2 * np.pi / 1024, 2 * np.pi / 1024
+"""Of the URG-04LX, which looks 240 degrees."""
+MOUNT = (0.14, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Arena:
+    """A world as it really is; what is not free blocks."""
+
+    name: str
+    resolution: float
+    origin: tuple[float, float]
+    blocked: NDArray[np.bool_]
+    clear: Clearance
+    truth: DistanceField
+
+    @classmethod
+    def load(cls, name: str, file: Path) -> "Arena":
+        """Of a map_server file."""
+        world = load_map(file)
+        blocked = world.cells != FREE
+        field = DistanceField(blocked, world.resolution, (*world.origin, 0.0))
+        return cls(name, world.resolution, world.origin, blocked, clearance(blocked), field)
+
+    def start(self, seed: int) -> Pose:
+        """A random pose with room around in the largest part that the robot can drive in."""
+        regions, _ = label(self._open())
+        sizes = np.bincount(regions.ravel())
+        sizes[0] = 0
+        rows, columns = np.nonzero(regions == int(np.argmax(sizes)))
+        rng = np.random.default_rng([7, seed])
+        while True:
+            k = int(rng.integers(len(rows)))
+            x, y = ((v[k] + 0.5) * self.resolution + o for v, o in ((columns, self.origin[0]), (rows, self.origin[1])))
+            pose = np.array([[x, y, rng.uniform(-np.pi, np.pi)]])
+            if self.truth.free(BODY, pose, ROOM)[0]:
+                return float(x), float(y), float(pose[0, 2])
+
+    def reachable(self, start: Pose) -> tuple[Array, Array]:
+        """Middles of the cells that the footprint can cover, x and y, m: flood-filled by the inscribed circle."""
+        regions, _ = label(self._open())
+        row, column = (
+            int((v - o) / self.resolution) for v, o in ((start[1], self.origin[1]), (start[0], self.origin[0]))
+        )
+        inside = regions == regions[row, column]
+        covered = distance_transform_edt(~inside) * self.resolution <= BARE.half_width
+        rows, columns = np.nonzero(covered & ~self.blocked)
+        return (columns + 0.5) * self.resolution + self.origin[0], (rows + 0.5) * self.resolution + self.origin[1]
+
+    def _open(self) -> NDArray[np.bool_]:
+        away: NDArray[np.bool_] = distance_transform_edt(~self.blocked) * self.resolution > BODY.half_width + 0.02
+        return away
+
+    def scan(self, pose: Pose, reach: float, rng: np.random.Generator) -> tuple[Array, Array, Array]:
+        """Sensor (2,), returns (n, 2) and ends of beams that met nothing (k, 2), all in map, with the maker's noise."""
+        c, s = np.cos(pose[2]), np.sin(pose[2])
+        sensor = np.array((pose[0] + c * MOUNT[0], pose[1] + s * MOUNT[0]))
+        angles = pose[2] + FIRST + STEP * np.arange(BEAMS)
+        xs, ys = (np.full(BEAMS, v) for v in sensor)
+        none = np.empty((0, 3)), np.empty((0, 4))
+        ranges = cast_rays(self.clear, self.resolution, *self.origin, xs, ys, angles, reach, *none)
+        hit = np.isfinite(ranges)
+        noise = np.maximum(0.01, 0.01 * ranges[hit]) / 2 * rng.standard_normal(int(hit.sum()))
+        ranges[hit] = np.maximum(ranges[hit] + noise, 0.02)
+        ranges[~hit] = reach
+        ends = sensor + ranges[:, None] * np.column_stack((np.cos(angles), np.sin(angles)))
+        return sensor, ends[hit], ends[~hit]

@@ -1,0 +1,87 @@
+"""``monstertruckd explore``: have the robot explore what it does not know, and follow it."""
+
+import re
+from typing import TYPE_CHECKING, Annotated, Final
+
+import typer
+
+from monstertruck_runtime.clock import Clock, run_wall
+from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
+from monstertruck_runtime.errors import InputError, NotFoundError
+from monstertruckd.tools.cli.options import EndpointOption, RobotOption
+from monstertruckd.tools.cli.output import JsonOption, finish, print_json
+
+if TYPE_CHECKING:
+    from monstertruck_runtime.client import TruckClient
+    from monstertruckd.tools.cli.explore_session import ExplorationEnd
+
+UNITS: Final = {"": 1.0, "s": 1.0, "min": 60.0, "h": 3600.0}
+
+
+def seconds_of(text: str) -> float:
+    """Seconds of a duration such as 90, 90s, 20min or 1.5h.
+
+    Raises:
+        InputError: it is none.
+    """
+    found = re.fullmatch(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*(s|min|h|)\s*", text)
+    seconds = 0.0 if found is None else float(found[1]) * UNITS[found[2]]
+    if seconds <= 0.0:
+        raise InputError(f"duration {text!r}: expected a number above 0 with s, min or h, such as 20min")
+    return seconds
+
+
+def explore(
+    home: Annotated[
+        bool | None,
+        typer.Option(
+            "--home/--stay", help="Drive back to the start at the end; else as configured.", show_default=False
+        ),
+    ] = None,
+    budget: Annotated[
+        str | None, typer.Option(help="Time after which it ends, such as 20min; else as configured.", metavar="TIME")
+    ] = None,
+    stop: Annotated[bool, typer.Option("--stop", help="End the exploration that runs.")] = False,
+    arm: Annotated[bool, typer.Option("--arm", help="Arm the robot first; it drives off at once.")] = False,
+    robot: RobotOption = "truck",
+    endpoint: EndpointOption = DEFAULT_ENDPOINT,
+    json_output: JsonOption = False,
+) -> None:
+    """Explore: drive to the edges of the map until nothing is left to be seen, then home, and save the map.
+
+    Prints its progress, and ends with it; its reason is the exit code. Ctrl-C stops it.
+    """
+    from monstertruck_runtime.client import TruckClient
+    from monstertruck_schemas.req import ExploreOrder
+    from monstertruckd.tools.cli.explore_session import run_exploration
+
+    seconds = None if budget is None else seconds_of(budget)
+
+    async def main(clock: Clock) -> "ExplorationEnd | None":
+        async with TruckClient(robot, endpoint, clock=clock) as client:
+            await _check(client, robot)
+            if stop:
+                await client.explore(ExploreOrder.STOP)
+                return None
+            tell = None if json_output else print
+            return await run_exploration(client, home=home, budget=seconds, arm=arm, tell=tell)
+
+    end = run_wall(main)
+    if end is None:
+        return
+    if json_output:
+        print_json(end.as_json())
+    elif not end.reason.exit_code:
+        print(f"{end.reason.text}: {end.text}")
+    finish(end.reason, f"{end.reason.text}: {end.text}")
+
+
+async def _check(client: "TruckClient", robot: str) -> None:
+    """Refuse a robot that does not explore.
+
+    Raises:
+        NotFoundError: naming what is missing.
+    """
+    if (await client.call("config")).get("explorer") is None:
+        text = f"robot {robot!r} does not explore: expected a section `explorer` in its configuration"
+        raise NotFoundError(text)

@@ -1,0 +1,333 @@
+"""What explorers choose from: the frontiers of a map, a place to look at each, and the ways there. Loads numba."""
+
+import math
+from dataclasses import dataclass, field
+from typing import Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import label
+
+from monstertruck_kinematics.elementary import Array
+from monstertruck_planners.collision import OCCUPIED, DistanceField
+from monstertruck_planners.explore.exchange import ExploreSetup, Point, Viewpoint
+from monstertruck_planners.explore.frontier import FrontierMap
+from monstertruck_planners.explore.kernels import joined_cells, new_areas, shares_seen
+from monstertruck_planners.goals.exchange import Pose
+from monstertruck_planners.goals.plan_step import standing_free
+from monstertruck_planners.route.api import RouteCosts, RouteMap, Vehicle
+from monstertruck_planners.route.config import DriveCosts
+from monstertruck_planners.route.heuristic import (
+    UNIT,
+    UNREACHED,
+    CostToGo,
+    cell_ahead,
+    cell_at,
+    complete,
+    cost_to_go,
+)
+
+LONGEST: Final = 2.5
+"""Frontiers longer than this are divided, m."""
+AROUND: Final = 3.0
+"""A frontier is looked at from this near, m."""
+PLACES: Final = 40
+"""Places to look from that are compared for each frontier."""
+SAMPLES: Final = 12
+"""Cells of a frontier that are to be seen from there."""
+SEEN: Final = 0.6
+"""Least share of them..."""
+SHORT: Final = 0.5
+"""...within the sensor's range less this, m."""
+BEAMS: Final = 96
+DEPTH: Final = 1.0
+"""See ``new_area``, m."""
+WORTH: Final = 0.6
+"""Places that show less than this share of what the best one shows are passed over."""
+LEAST: Final = 0.06
+"""New area that makes a place worth going to, m^2."""
+BANNED: Final = 0.5
+"""Frontiers whose centre is this near to a banned place are left alone, m."""
+NEARBY: Final = 0.6
+"""A way begins at an open cell this near to the robot, m."""
+BEHIND: Final = 4
+"""Coarse cells over which the direction of a way is measured."""
+SIDEWARD: Final = 0.4
+"""A frontier has to lie this far inside the angle of view, rad."""
+
+
+@dataclass(frozen=True)
+class Frontier:
+    """Cells at the edge of what is known."""
+
+    points: Array
+    """Shape (n, 2): their centres in map, m."""
+    middle: Point
+    """The one nearest to their mean, m."""
+    length: float
+    """About, m."""
+
+
+@dataclass(frozen=True)
+class Option:
+    """A frontier, and where to look at it from."""
+
+    frontier: Frontier
+    pose: Pose
+    way: float
+    """Metres, dearer in narrow places."""
+    gain: float
+    """New area that may be seen, m^2."""
+    turn: float
+    """Angle between the robot's heading and the way's first part, rad, 0 to pi."""
+
+    @property
+    def target(self) -> Viewpoint:
+        """What is asked of the goal service."""
+        return Viewpoint(self.pose, self.frontier.middle, self.way, self.gain)
+
+
+class Explorer(Protocol):
+    """Chooses what to look at next; asked again and again while the robot drives."""
+
+    def choose(
+        self, view: "ExplorationView", pursued: Viewpoint | None, still: Option | None, seconds: float
+    ) -> Viewpoint | None:
+        """What to look at; ``pursued`` itself to go on.
+
+        Args:
+            view: the map, and its options.
+            pursued: where the robot is going.
+            still: the option which that is by now; None = its frontier is gone.
+            seconds: for how long it has been pursued.
+        """
+        ...
+
+
+@dataclass
+class Remembered:
+    """What is computed again only where the map differs."""
+
+    route_map: RouteMap | None = None
+    obstacles: DistanceField | None = None
+
+
+@dataclass
+class ExplorationView:
+    """The map as an explorer sees it.
+
+    Args:
+        known: the map.
+        setup: robot, sensor and settings.
+        pose: of the base, in map.
+        banned: frontiers here are no options.
+        memory: of the view before.
+    """
+
+    known: FrontierMap
+    setup: ExploreSetup
+    pose: Pose
+    banned: tuple[Point, ...]
+    memory: Remembered
+    options: list[Option] = field(init=False, default_factory=list)
+    left_alone: int = field(init=False, default=0)
+    """Banned frontiers."""
+
+    def __post_init__(self) -> None:
+        setup, known = self.setup, self.known
+        vehicle = Vehicle(setup.footprint, setup.radius)
+        cells = standing_free(known.cells, known.resolution, known.origin, setup.footprint, self.pose)
+        route_map = RouteMap.from_cells(
+            cells, known.resolution, known.origin, "blocked", previous=self.memory.route_map
+        )
+        self.memory.route_map = self._route_map = route_map
+        self._obstacles = DistanceField(known.cells >= OCCUPIED, known.resolution, known.origin, self.memory.obstacles)
+        self.memory.obstacles = self._obstacles
+        self._field = route_map.field.data()
+        self._costs = RouteCosts.of(vehicle, DriveCosts(margin=setup.margin))
+        self._cell = route_map.coarse_cell
+        self._cell_cost = route_map.cell_costs(self._costs)
+        self._ways = self._flood(self._cell_cost, self._cell, self.pose[:2])
+        self._rough: NDArray[np.int16] | None = None
+        if self._ways is not None:
+            self.options = self._find_options(self._ways)
+
+    # Ways
+
+    def way_to(self, place: Point) -> float | None:
+        """Metres from the robot to a place, dearer where it is narrow; None = no way is known."""
+        if self._ways is None:
+            return None
+        at = self._open_cell(self._cell_cost, self._cell, place)
+        cost = UNREACHED if at is None else int(self._ways.cost[at])
+        return None if cost >= UNREACHED else cost * self._cell / UNIT
+
+    def ways_between(self, options: list[Option]) -> Array:
+        """Metres from each option's place to each other's, shape (n, n); inf where no way is known."""
+        if self._rough is None:
+            self._rough = joined_cells(self._cell_cost)
+        cell = 2 * self._cell
+        at = [self._open_cell(self._rough, cell, option.pose[:2]) for option in options]
+        result = np.full((len(options), len(options)), np.inf)
+        for i, option in enumerate(options):
+            if (ways := self._flood(self._rough, cell, option.pose[:2])) is None:
+                continue
+            for j, there in enumerate(at):
+                if there is not None and (cost := int(ways.cost[there])) < UNREACHED:
+                    result[i, j] = cost * cell / UNIT
+        both: Array = np.minimum(result, result.T)
+        return both
+
+    def _flood(self, cell_cost: NDArray[np.int16], cell: float, place: Point) -> CostToGo | None:
+        at = self._open_cell(cell_cost, cell, place)
+        if at is None:
+            return None
+        ways = cost_to_go(cell_cost, cell, at, at, 0, math.inf)
+        complete(ways)
+        return ways
+
+    def _open_cell(self, cell_cost: NDArray[np.int16], cell: float, place: Point) -> tuple[int, int] | None:
+        """The open cell nearest to a place, if there is one nearby."""
+        row, column = cell_at(self._field, cell, *place)
+        reach = math.ceil(NEARBY / cell)
+        top, left = max(row - reach, 0), max(column - reach, 0)
+        rows, columns = np.nonzero(cell_cost[top : max(row + reach + 1, 0), left : max(column + reach + 1, 0)])
+        if not len(rows):
+            return None
+        nearest = int(np.argmin((rows + top - row) ** 2 + (columns + left - column) ** 2))
+        return int(rows[nearest]) + top, int(columns[nearest]) + left
+
+    # Frontiers
+
+    def _find_options(self, ways: CostToGo) -> list[Option]:
+        options = []
+        reached = np.argwhere(ways.cost < UNREACHED)
+        if not len(reached):
+            return []
+        way = ways.cost[reached[:, 0], reached[:, 1]] * (self._cell / UNIT)
+        places = self._centres(reached)
+        for frontier in self._frontiers():
+            near = np.hypot(*(places - frontier.middle).T) < AROUND
+            if not near.any():
+                continue
+            if any(math.dist(frontier.middle, place) < BANNED for place in self.banned):
+                self.left_alone += 1
+                continue
+            option = self._option(frontier, ways, reached[near], places[near], way[near])
+            if option is not None:
+                options.append(option)
+        return options
+
+    def _centres(self, coarse: NDArray[np.int64]) -> Array:
+        """Middles of coarse cells (row, column), shape (n, 2), m."""
+        return np.asarray((coarse[:, ::-1] + 0.5) * self._cell + (self._field.x, self._field.y), dtype=np.float64)
+
+    def _frontiers(self) -> list[Frontier]:
+        known, resolution = self.known, self.known.resolution
+        labels, count = label(known.frontier, np.ones((3, 3)))
+        if not count:
+            return []
+        rows, columns = np.nonzero(known.frontier)
+        of = labels[rows, columns]
+        centres = (np.column_stack((columns, rows)) + 0.5) * resolution + known.origin[:2]
+        room = self._obstacles.lookup(centres)
+        result = []
+        order = np.argsort(of, kind="stable")
+        for group in np.split(order, np.flatnonzero(np.diff(of[order])) + 1):
+            for part in _divided(centres[group], LONGEST):
+                members = group[part]
+                # Between obstacles too close for the robot nothing is to be reached.
+                if len(members) * resolution < self.setup.config.smallest or room[members].max() < self._passable:
+                    continue
+                points = centres[members]
+                middle = points[np.argmin(np.hypot(*(points - points.mean(axis=0)).T))]
+                result.append(Frontier(points, (float(middle[0]), float(middle[1])), len(members) * resolution))
+        return result
+
+    @property
+    def _passable(self) -> float:
+        return self.setup.footprint.half_width - self.known.resolution / 2
+
+    def _option(
+        self, frontier: Frontier, ways: CostToGo, coarse: NDArray[np.int64], places: Array, way: Array
+    ) -> Option | None:
+        """The nearest place from which nearly as much is seen of a frontier as from the best one."""
+        config, resolution, corner = self.setup.config, self.known.resolution, self.known.origin[:2]
+        order = np.argsort(way, kind="stable")
+        chosen = order[np.unique(np.linspace(0, len(order) - 1, 4 * PLACES).astype(np.intp))]
+        sample = frontier.points[np.linspace(0, len(frontier.points) - 1, SAMPLES).astype(np.intp)]
+        here, there = ((v - corner) / resolution for v in (places[chosen], sample))
+        share = shares_seen(self.known.cells, here, there, (config.reach - SHORT) / resolution)
+        chosen = chosen[share >= min(SEEN, float(share.max(initial=0.0)))]
+        if share.max(initial=0.0) == 0.0:
+            return None
+        chosen = chosen[np.unique(np.linspace(0, len(chosen) - 1, PLACES).astype(np.intp))]
+        headings = [self._heading(ways, coarse[i], places[i], frontier.middle) for i in chosen]
+        poses = np.column_stack((places[chosen], headings))
+        free = self._route_map.field.free(self.setup.footprint, poses, self.setup.margin)
+        chosen, poses = chosen[free], poses[free]
+        if not len(chosen):
+            return None
+        gains = self.gains(poses)
+        worth = gains >= max(WORTH * float(gains.max()), LEAST)
+        if not worth.any():
+            return None
+        first = int(np.argmax(worth))  # they are ordered by their way
+        x, y, yaw = poses[first].tolist()
+        at = chosen[first]
+        return Option(frontier, (x, y, yaw), float(way[at]), float(gains[first]), self._turn(ways, coarse[at]))
+
+    def gains(self, poses: Array) -> Array:
+        """New area seen from poses of the base, shape (n, 3): m^2, shape (n,)."""
+        config, resolution = self.setup.config, self.known.resolution
+        mx, my, turn = self.setup.lidar
+        c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+        sensor = np.column_stack((poses[:, 0] + c * mx - s * my, poses[:, 1] + s * mx + c * my, poses[:, 2] + turn))
+        sensor[:, :2] = (sensor[:, :2] - self.known.origin[:2]) / resolution
+        depth = getattr(config, "depth", DEPTH)
+        cells = new_areas(self.known.cells, sensor, config.view, config.reach / resolution, depth / resolution, BEAMS)
+        area: Array = cells * resolution**2
+        return area
+
+    def _heading(self, ways: CostToGo, at: NDArray[np.int64], place: Array, towards: Point) -> float:
+        """That of the way there, if the frontier is in view then; else towards it."""
+        bearing = math.atan2(towards[1] - place[1], towards[0] - place[0])
+        before = cell_ahead(ways.step, int(at[0]), int(at[1]), float(BEHIND))
+        if before == (int(at[0]), int(at[1])):
+            return bearing
+        arriving = math.atan2(at[0] - before[0], at[1] - before[1])
+        in_view = abs(math.remainder(bearing - arriving, math.tau)) < self.setup.config.view / 2 - SIDEWARD
+        return arriving if in_view else bearing
+
+    def _turn(self, ways: CostToGo, at: NDArray[np.int64]) -> float:
+        """Angle between the robot's heading and the beginning of the way to a coarse cell, rad."""
+        row, column = int(at[0]), int(at[1])
+        length = 0.0
+        trail = [(row, column)]
+        while ways.step[row, column] >= 0 and length < ways.step.size:
+            row, column = cell_ahead(ways.step, row, column, 1.0)
+            trail.append((row, column))
+            length += 1.0
+        ahead = trail[max(len(trail) - 1 - 2 * BEHIND, 0)]
+        if ahead == (row, column):
+            return 0.0
+        there = self._centres(np.array([ahead]))[0]
+        bearing = math.atan2(there[1] - self.pose[1], there[0] - self.pose[0])
+        return abs(math.remainder(bearing - self.pose[2], math.tau))
+
+
+def _divided(points: Array, longest: float) -> list[NDArray[np.intp]]:
+    """Numbers of the points, shape (n, 2), in parts no longer than that, m: halved across their longer direction."""
+    waiting, parts = [np.arange(len(points))], []
+    while waiting:
+        part = waiting.pop()
+        spread = points[part] - points[part].mean(axis=0)
+        _, directions = np.linalg.eigh(spread.T @ spread)
+        along = spread @ directions[:, 1]
+        if np.ptp(along) <= longest:
+            parts.append(part)
+        else:
+            middle = np.median(along)
+            halves = part[along <= middle], part[along > middle]
+            waiting.extend(half for half in halves if len(half))
+    return parts

@@ -1,0 +1,55 @@
+"""Exploration by ``kind``: which frontier is looked at next."""
+
+from typing import TYPE_CHECKING, Annotated, Final, cast
+
+from monstertruck_planners.explore.config import ExplorerConfig
+from monstertruck_runtime.plugins import Catalog, Plugin
+
+if TYPE_CHECKING:
+    from monstertruck_planners.explore.api import Explorer
+
+EXPLORERS: Final = Catalog(
+    "monstertruck.explorers",
+    Plugin(
+        name="tour",
+        settings="monstertruck_planners.explore.config:TourConfig",
+        implementation="monstertruck_planners.explore.tour:Tour",
+        doc="A short tour over all frontiers, planned anew as the map grows",
+        extra="planning",
+    ),
+    Plugin(
+        name="information",
+        settings="monstertruck_planners.explore.config:InformationConfig",
+        implementation="monstertruck_planners.explore.scores:Information",
+        doc="The most new area per second of way",
+        extra="planning",
+    ),
+    Plugin(
+        name="nearest",
+        settings="monstertruck_planners.explore.config:NearestConfig",
+        implementation="monstertruck_planners.explore.scores:Nearest",
+        doc="The nearest frontier",
+        extra="planning",
+    ),
+    Plugin(
+        name="author",
+        settings="monstertruck_planners.explore.config:AuthorConfig",
+        implementation="monstertruck_planners.explore.scores:Author",
+        doc="The scores of the thesis's author",
+        extra="planning",
+    ),
+    base=ExplorerConfig,
+)
+"""An explorer is made from its settings; it is an ``Explorer``."""
+
+AnyExplorer = Annotated[ExplorerConfig, EXPLORERS.section("tour")]
+"""The configuration's section `explorer`."""
+
+
+def make_explorer(config: ExplorerConfig) -> "Explorer":
+    """Explorer of a configuration; loads numba.
+
+    Raises:
+        InputError: settings without a kind of explorer, or what it needs is not installed.
+    """
+    return cast("Explorer", EXPLORERS.implementation(config)(config))

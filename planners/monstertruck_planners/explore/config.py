@@ -1,0 +1,92 @@
+"""Settings of exploration: one ``kind`` each; light, no planner is loaded."""
+
+from math import radians
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from monstertruck_schemas.base import Schema
+
+Positive = Annotated[float, Field(gt=0)]
+Share = Annotated[float, Field(ge=0, le=1)]
+NotNegative = Annotated[float, Field(ge=0)]
+
+
+class ExplorerConfig(Schema):
+    """Shared by all kinds of exploration."""
+
+    kind: str
+    home: bool = True
+    """Drive back to the start at the end"""
+    budget: Positive = 1800.0
+    """Seconds of exploring, after which it ends (by way of the start, if it drives home)"""
+    reach: Positive = 5.6
+    """Range of the lidar that is counted on, m"""
+    view: Annotated[float, Field(gt=0, le=6.2831853072)] = radians(240.0)
+    """Its angle of view, rad"""
+    smallest: Positive = 0.3
+    """Shorter frontiers are passed over, m"""
+    rate: Annotated[float, Field(gt=0, le=5)] = 1.0
+    """Decisions a second"""
+    blacklist: Positive = 60.0
+    """Seconds for which a place is left alone that could not be reached, or from which nothing new was seen"""
+    attempts: Annotated[int, Field(ge=1)] = 2
+    """How often a place is tried before it is given up for good"""
+    lost: Positive = 60.0
+    """Seconds without a place in the map after which it ends"""
+    reserve: Annotated[float, Field(ge=1)] = 1.5
+    """It drives home when the charge falls below that of the way back times this"""
+    full_range: Positive = 2000.0
+    """Metres that a full battery drives, until that has been measured"""
+    latency: Positive = 0.2
+    """Seconds a decision takes on the virtual clock"""
+    deadline: Positive = 20.0
+    """Seconds after which a silent worker is killed"""
+
+
+class NearestConfig(ExplorerConfig):
+    """The nearest frontier."""
+
+    kind: Literal["nearest"] = "nearest"
+
+
+class AuthorConfig(ExplorerConfig):
+    """The thesis author's frontier scores (pandora_explorer), with his weights.
+
+    The score is size (1 - exp(-e n / n_max)) + distance exp(-e l / l_max) + angle cos(turn / 2) + visits exp(-times
+    chosen); his program read the weight of visits into that of angles and left it undefined itself: here each is used.
+    """
+
+    kind: Literal["author"] = "author"
+    size_weight: NotNegative = 0.15
+    distance_weight: NotNegative = 0.45
+    angle_weight: NotNegative = 0.5
+    visits_weight: NotNegative = 0.3
+    near: Positive = 0.2
+    """Places this near to each other are one, m."""
+    patience: Positive = 30.0
+    """Seconds after which a goal is left."""
+
+
+class InformationConfig(ExplorerConfig):
+    """The most new area per second of way."""
+
+    kind: Literal["information"] = "information"
+    depth: Positive = 1.5
+    """Unknown ground is taken to go on for this far behind a frontier, m"""
+    speed: Positive = 0.2
+    """Of driving, m/s"""
+    turning: NotNegative = 4.0
+    """Seconds that half a turn at the start costs"""
+
+
+class TourConfig(ExplorerConfig):
+    """A short tour over all frontiers, planned anew as the map grows."""
+
+    kind: Literal["tour"] = "tour"
+    turning: NotNegative = 1.0
+    """Metres that half a turn at the start of the tour costs"""
+    keep: NotNegative = 1.0
+    """Metres by which another tour has to be shorter than one that begins with the present goal"""
+    most: Annotated[int, Field(ge=3, le=60)] = 24
+    """Frontiers of a tour at most, the nearest ones"""

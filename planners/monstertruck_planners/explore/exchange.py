@@ -1,0 +1,82 @@
+"""Inputs and outputs of the exploring step; light, as the daemon's loop imports them."""
+
+from dataclasses import dataclass
+
+from monstertruck_planners.collision import Footprint
+from monstertruck_planners.explore.catalog import AnyExplorer
+from monstertruck_planners.goals.exchange import Pose
+from monstertruck_schemas.state import Grid
+
+Point = tuple[float, float]
+"""x, y, m."""
+
+
+@dataclass(frozen=True, slots=True)
+class ExploreSetup:
+    """What exploring is made for; comes first, and again after every restart."""
+
+    config: AnyExplorer
+    footprint: Footprint
+    radius: float
+    """Least turning radius, m."""
+    margin: float = 0.04
+    """Kept to obstacles by the routes, m."""
+    lidar: Pose = (0.0, 0.0, 0.0)
+    """In base."""
+
+
+@dataclass(frozen=True, slots=True)
+class ExploreTask:
+    """What is newer than at the task before, and whether a decision is asked for."""
+
+    pose: Pose
+    """Of the base, in map."""
+    whole: Grid | None = None
+    """A whole map, which takes the place of all before..."""
+    tiles: tuple[Grid, ...] = ()
+    """...and tiles that are newer."""
+    setup: ExploreSetup | None = None
+    choose: bool = False
+    """Say where to look next."""
+    current: "Viewpoint | None" = None
+    """Where the robot is going."""
+    pursued: float = 0.0
+    """For how long, s."""
+    banned: tuple[Point, ...] = ()
+    """Frontiers here are left alone."""
+    home: Pose | None = None
+    """Way there is wanted."""
+
+
+@dataclass(frozen=True, slots=True)
+class Viewpoint:
+    """A place to look from, and what for."""
+
+    pose: Pose
+    """Of the base, in map."""
+    frontier: Point
+    """Centre of what is looked at."""
+    way: float = 0.0
+    """Metres there, for a point."""
+    gain: float = 0.0
+    """New area that may be seen there, m^2."""
+
+
+@dataclass(frozen=True, slots=True)
+class ExploreAnswer:
+    """What is known, and the decision."""
+
+    target: Viewpoint | None = None
+    """None = nothing is left that can be reached, or none was asked for."""
+    kept: bool = False
+    """It is the one that is pursued."""
+    frontiers: int = 0
+    """Frontiers that can be reached."""
+    banned: int = 0
+    """Others that are left alone for now."""
+    known: float = 0.0
+    """Area of the free ground in the map, m^2."""
+    home: float | None = None
+    """Metres of the way home; None = not asked for, or none is known."""
+    changed: int = 0
+    """Cells looked at again for frontiers."""

@@ -1,0 +1,334 @@
+"""One exploration: a pure state machine. Equal observations give equal decisions.
+
+It asks where to look next, again and again while the robot drives, sends goals, leaves places alone that it cannot come
+to, drives home, and has the map saved. Every decision is reported with its reason.
+"""
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import Final
+
+from monstertruck_planners.explore.attempts import Attempts
+from monstertruck_planners.explore.config import ExplorerConfig
+from monstertruck_planners.explore.exchange import ExploreAnswer, Viewpoint
+from monstertruck_planners.goals.exchange import Pose
+from monstertruck_schemas.event import Severity
+from monstertruck_schemas.plan import ExplorationPhase
+from monstertruck_schemas.reasons import Reason
+
+SETTLE: Final = 1.5
+"""Seconds after a goal in which the map takes in what is seen there."""
+CONFIRM: Final = 2
+"""Looks in a row that have to show nothing left."""
+PATIENCE: Final = 30.0
+"""Seconds to wait for a first map."""
+RETURNS: Final = 6
+"""Goals for the way home."""
+SAVE: Final = 30.0
+"""Seconds to wait for the map to be saved."""
+AGAIN: Final = 2.0
+"""Seconds between two goals for the way home, or after a goal that was not taken."""
+LEAST_USED: Final = 0.05
+"""Share of the charge after which its use per metre counts as measured."""
+PASSING: Final = frozenset({Reason.PLANNER_STARTING, Reason.NO_MAP, Reason.LEASE_EXPIRED})
+"""Ends of a goal that say nothing of the place."""
+HOPELESS: Final = frozenset({Reason.DISARMED, Reason.ESTOPPED, Reason.BUSY})
+"""Ends of a goal after which no other place helps."""
+
+
+@dataclass(frozen=True, slots=True)
+class Choose:
+    """Ask where to look next."""
+
+
+@dataclass(frozen=True, slots=True)
+class Go:
+    """Send a goal."""
+
+    pose: Pose
+
+
+@dataclass(frozen=True, slots=True)
+class Cancel:
+    """Give up the goal that is pursued."""
+
+
+@dataclass(frozen=True, slots=True)
+class Save:
+    """Have the map saved."""
+
+
+@dataclass(frozen=True, slots=True)
+class Notice:
+    """An event."""
+
+    reason: Reason
+    severity: Severity
+    text: str
+
+
+Action = Choose | Go | Cancel | Save | Notice
+
+
+@dataclass(frozen=True, slots=True)
+class Observed:
+    """What is known at one instant."""
+
+    now: float
+    """Seconds."""
+    pose: Pose | None
+    """Of the base, in map; None = not known, or not to be trusted."""
+    ended: Reason | None = None
+    """How the newest goal ended; None = it is pursued, or there was none."""
+    ended_text: str = ""
+    displaced: str = ""
+    """Who took the goal over."""
+    answer: ExploreAnswer | None = None
+    """To the last question, once."""
+    charge: float | None = None
+    """Of the battery, 0 to 1; None = not measured."""
+    low: bool = False
+    """The battery's voltage is low."""
+    saved: str | None = None
+    """Where the map was saved after that was asked for; empty = nowhere."""
+
+
+@dataclass(frozen=True, slots=True)
+class Exploration:
+    """One exploration and how far it has come."""
+
+    number: int
+    source: str
+    home: Pose
+    returns: bool
+    """It drives home at the end."""
+    budget: float
+    """Seconds."""
+    begun: float
+    now: float
+    attempts: Attempts
+    phase: ExplorationPhase = ExplorationPhase.LOOKING
+    since: float = 0.0
+    """Begin of the phase, s."""
+    outcome: Reason = Reason.DRIVING
+    text: str = ""
+    final: Reason = Reason.DRIVING
+    """The outcome that it comes to after the way home."""
+    final_text: str = ""
+    target: Viewpoint | None = None
+    pursued: float = 0.0
+    """Since when, s."""
+    asked: float = -math.inf
+    """When a decision was asked for last, s."""
+    waiting: bool = False
+    """For its answer."""
+    not_before: float = 0.0
+    """No decision, and no goal for the way home, is asked for before, s."""
+    nothing: int = 0
+    """Answers in a row without a place to look at."""
+    newest: ExploreAnswer = field(default_factory=ExploreAnswer)
+    travelled: float = 0.0
+    before: Pose | None = None
+    charge: float | None = None
+    """At the start."""
+    goals: int = 0
+    failures: int = 0
+    home_goals: int = 0
+
+    @property
+    def running(self) -> bool:
+        """Whether it has not ended."""
+        return self.phase is not ExplorationPhase.IDLE
+
+
+Step = tuple[Exploration, tuple[Action, ...]]
+
+
+def begin(
+    number: int, source: str, pose: Pose, now: float, config: ExplorerConfig, *, home: bool, budget: float
+) -> Step:
+    """Take on an exploration."""
+    attempts = Attempts(config.blacklist, config.attempts)
+    run = Exploration(number, source, pose, home, budget, now, now, attempts, since=now)
+    text = f"{config.kind}, for {budget:g} s at most{', then home' if home else ''}, asked for by {source}"
+    return run, (Notice(Reason.EXPLORATION_STARTED, Severity.INFO, text),)
+
+
+def stop(run: Exploration, source: str, now: float) -> Step:
+    """End it where the robot is."""
+    run = replace(run, now=now)
+    return _end(run, Reason.CANCELLED, f"stopped by {source}", Cancel(), Save())
+
+
+def tick(run: Exploration, seen: Observed, config: ExplorerConfig) -> Step:
+    """One look at the observed."""
+    run = _moved(replace(run, now=seen.now), seen)
+    if seen.answer is not None:
+        run = replace(run, newest=_merged(run.newest, seen.answer), waiting=False)
+    if not run.running:
+        return run, ()
+    if run.phase is ExplorationPhase.SAVING:
+        return _saving(run, seen)
+    if seen.displaced:
+        return _end(run, Reason.CANCELLED, f"the goal of {seen.displaced} is pursued now", Save())
+    if run.phase is ExplorationPhase.LOST:
+        return _lost(run, seen, config)
+    if seen.pose is None:
+        lost = replace(_enter(run, ExplorationPhase.LOST), target=None)
+        return lost, (Cancel(), Notice(Reason.POSE_LOST, Severity.WARNING, "waits where it stands"))
+    if run.phase is ExplorationPhase.RETURNING:
+        return _returning(run, seen)
+    if (why := _enough(run, seen, config)) is not None:
+        return _finish(run, *why)
+    return _driving(run, seen, config) if run.phase is ExplorationPhase.DRIVING else _looking(run, seen)
+
+
+def _moved(run: Exploration, seen: Observed) -> Exploration:
+    way = 0.0 if run.before is None or seen.pose is None else math.dist(run.before[:2], seen.pose[:2])
+    charge = seen.charge if run.charge is None else run.charge
+    return replace(run, before=seen.pose, travelled=run.travelled + way, charge=charge)
+
+
+def _merged(before: ExploreAnswer, answer: ExploreAnswer) -> ExploreAnswer:
+    """The newest answer; the way home is remembered where none is found at the moment."""
+    return answer if answer.home is not None else replace(answer, home=before.home)
+
+
+def _enough(run: Exploration, seen: Observed, config: ExplorerConfig) -> tuple[Reason, str] | None:
+    """Why the exploring ends now."""
+    if run.now - run.begun > run.budget:
+        return Reason.BUDGET_SPENT, f"after {run.budget:g} s"
+    if seen.low:
+        return Reason.BATTERY_LOW, Reason.BATTERY_LOW.text
+    way = run.newest.home
+    if seen.charge is None or way is None or run.charge is None:
+        return None
+    needed = config.reserve * way * charge_per_metre(run, seen.charge, config)
+    if seen.charge > needed:
+        return None
+    return Reason.CHARGE_SPENT, f"{seen.charge:.0%} are left, {needed:.0%} are kept for {way:.1f} m"
+
+
+def charge_per_metre(run: Exploration, charge: float, config: ExplorerConfig) -> float:
+    """Share of the charge that a metre takes: as measured, once enough was used; until then as configured."""
+    used = (run.charge or 0.0) - charge
+    measured = used >= LEAST_USED and run.travelled > 0.0
+    return used / run.travelled if measured else 1.0 / config.full_range
+
+
+def _looking(run: Exploration, seen: Observed) -> Step:
+    answer = seen.answer
+    if run.now < run.not_before:
+        return run, ()
+    if answer is None:
+        return (run, ()) if run.waiting else _ask(run)
+    if answer.target is not None:
+        return _go(run, answer.target)
+    if answer.known == 0.0:
+        if run.now - run.since > PATIENCE:
+            return _finish(run, Reason.NO_MAP, "no map to explore")
+        return replace(run, not_before=run.now + 1.0), ()
+    if run.nothing + 1 < CONFIRM:
+        return replace(run, nothing=run.nothing + 1, not_before=run.now + SETTLE), ()
+    if (released := run.attempts.released(run.now)) is not None:
+        text = "nothing else is left: places that were left alone are tried again"
+        again = replace(run, attempts=released, nothing=0, not_before=run.now)
+        return again, (Notice(Reason.RECOVERING, Severity.INFO, text),)
+    return _finish(run, Reason.EXPLORED, f"{run.newest.known:.1f} m^2 of free ground")
+
+
+def _driving(run: Exploration, seen: Observed, config: ExplorerConfig) -> Step:
+    assert run.target is not None
+    if seen.ended is not None:
+        if seen.ended in HOPELESS:
+            return _finish(replace(run, returns=False), seen.ended, seen.ended_text)
+        if seen.ended is Reason.CANCELLED:
+            return _end(run, Reason.CANCELLED, f"its goal was cancelled: {seen.ended_text}", Save())
+        if seen.ended in PASSING:
+            return replace(_enter(run, ExplorationPhase.LOOKING), target=None, not_before=run.now + AGAIN), ()
+        reached = seen.ended is Reason.GOAL_REACHED
+        attempts = run.attempts.failed(run.target.frontier, run.now)
+        run = replace(run, target=None, attempts=attempts, failures=run.failures + (not reached))
+        run = replace(_enter(run, ExplorationPhase.LOOKING), not_before=run.now + SETTLE, nothing=0)
+        if reached:
+            return run, ()
+        text = f"not reached ({seen.ended.text}): left alone for {config.blacklist:g} s"
+        return run, (Notice(seen.ended, Severity.INFO, text),)
+    answer = seen.answer
+    if answer is not None and not answer.kept:
+        if answer.target is None:
+            looking = replace(
+                _enter(run, ExplorationPhase.LOOKING), target=None, nothing=0, not_before=run.now + SETTLE
+            )
+            return looking, (Cancel(),)
+        return _go(run, answer.target)
+    if not run.waiting and run.now - run.asked >= 1.0 / config.rate:
+        return _ask(run)
+    return run, ()
+
+
+def _go(run: Exploration, target: Viewpoint) -> Step:
+    x, y, yaw = target.pose
+    text = f"({x:.2f}, {y:.2f}, {yaw:.2f}), {target.way:.1f} m away, for about {target.gain:.1f} m^2"
+    run = replace(_enter(run, ExplorationPhase.DRIVING), target=target, pursued=run.now, nothing=0, goals=run.goals + 1)
+    return run, (Go(target.pose), Notice(Reason.FRONTIER_CHOSEN, Severity.INFO, text))
+
+
+def _ask(run: Exploration) -> Step:
+    return replace(run, asked=run.now, waiting=True), (Choose(),)
+
+
+def _lost(run: Exploration, seen: Observed, config: ExplorerConfig) -> Step:
+    if seen.pose is not None:
+        phase = ExplorationPhase.LOOKING if run.final is Reason.DRIVING else ExplorationPhase.RETURNING
+        found = replace(_enter(run, phase), waiting=False, not_before=run.now + SETTLE, nothing=0)
+        return found, (Notice(Reason.POSE_FOUND, Severity.INFO, "goes on"),)
+    if run.now - run.since > config.lost:
+        return _finish(replace(run, returns=False), Reason.POSE_LOST, f"not found for {config.lost:g} s")
+    return run, ()
+
+
+def _finish(run: Exploration, outcome: Reason, text: str) -> Step:
+    """Nothing more is looked at: home, or the end."""
+    run = replace(run, final=outcome, final_text=text, target=None)
+    if not run.returns:
+        return _end(run, outcome, text, Cancel(), Save())
+    severity = Severity.INFO if outcome.exit_code == 0 else Severity.WARNING
+    returning = replace(_enter(run, ExplorationPhase.RETURNING), not_before=run.now, home_goals=0)
+    return returning, (Cancel(), Notice(outcome, severity, f"{text}; drives home"))
+
+
+def _returning(run: Exploration, seen: Observed) -> Step:
+    """A goal is under way if one was sent and has not ended."""
+    if run.target is not None:
+        if seen.ended is None:
+            return run, ()
+        if seen.ended is Reason.GOAL_REACHED:
+            return _end(run, run.final, f"{run.final_text}; back at the start", Save())
+        if seen.ended in HOPELESS or seen.ended is Reason.CANCELLED or run.home_goals >= RETURNS:
+            text = f"{run.final_text}; not back at the start: {seen.ended_text or seen.ended.text}"
+            return _end(run, seen.ended, text, Save())
+        return replace(run, target=None, not_before=run.now + AGAIN * run.home_goals), ()
+    if run.now < run.not_before:
+        return run, ()
+    target = Viewpoint(run.home, run.home[:2])
+    return replace(run, target=target, home_goals=run.home_goals + 1), (Go(run.home),)
+
+
+def _saving(run: Exploration, seen: Observed) -> Step:
+    if seen.saved is None and run.now - run.since < SAVE:
+        return run, ()
+    kept = f"map in {seen.saved}" if seen.saved else "map not saved"
+    severity = Severity.INFO if run.final.exit_code == 0 else Severity.WARNING
+    text = f"{run.final_text}; {kept}"
+    ended = replace(_enter(run, ExplorationPhase.IDLE), outcome=run.final, text=text)
+    way = f"{ended.travelled:.1f} m and {ended.goals} goals in {ended.now - ended.begun:.0f} s"
+    return ended, (Notice(run.final, severity, f"{text}; {way}"),)
+
+
+def _end(run: Exploration, outcome: Reason, text: str, *actions: Action) -> Step:
+    return replace(_enter(run, ExplorationPhase.SAVING), final=outcome, final_text=text, target=None), actions
+
+
+def _enter(run: Exploration, phase: ExplorationPhase) -> Exploration:
+    return replace(run, phase=phase, since=run.now)

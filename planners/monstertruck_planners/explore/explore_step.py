@@ -1,0 +1,104 @@
+"""The exploring step: changes of the map in, frontiers and the next place to look from out. For workers."""
+
+import math
+from typing import Final
+
+import numpy as np
+
+from monstertruck_planners.collision import Footprint
+from monstertruck_planners.explore.api import LEAST, ExplorationView, Explorer, Option, Remembered
+from monstertruck_planners.explore.catalog import make_explorer
+from monstertruck_planners.explore.config import TourConfig
+from monstertruck_planners.explore.exchange import ExploreAnswer, ExploreSetup, ExploreTask, Viewpoint
+from monstertruck_planners.explore.frontier import FrontierMap
+from monstertruck_runtime.errors import InputError
+from monstertruck_schemas.base import Pose2D
+from monstertruck_schemas.state import Grid
+
+SAME: Final = 1.0
+"""A frontier this near to the one that is pursued is what became of it, m."""
+
+
+class ExploringStep:
+    """Answers tasks one by one; equal tasks give equal answers."""
+
+    def __init__(self) -> None:
+        self._setup: ExploreSetup | None = None
+        self._explorer: Explorer | None = None
+        self._map: FrontierMap | None = None
+        self._memory = Remembered()
+
+    def step(self, task: ExploreTask) -> ExploreAnswer:
+        """Do one task.
+
+        Raises:
+            InputError: no setup came first, or a map that does not fit those before.
+        """
+        if task.setup is not None:
+            self._setup, self._explorer = task.setup, make_explorer(task.setup.config)
+        if self._setup is None or self._explorer is None:
+            raise InputError("exploring: expected a setup before anything else")
+        changed = self._take(task)
+        known = self._map
+        if known is None:
+            return ExploreAnswer()
+        area = known.free * known.resolution**2
+        if not task.choose:
+            return ExploreAnswer(known=area, changed=changed)
+        view = ExplorationView(known, self._setup, task.pose, task.banned, self._memory)
+        target = self._explorer.choose(view, task.current, self._still(view, task.current), task.pursued)
+        return ExploreAnswer(
+            target,
+            kept=target is not None and target is task.current,
+            frontiers=len(view.options),
+            banned=view.left_alone,
+            known=area,
+            home=None if task.home is None else view.way_to(task.home[:2]),
+            changed=changed,
+        )
+
+    def _take(self, task: ExploreTask) -> int:
+        changed = 0
+        for grid, whole in (
+            *(((task.whole, True),) if task.whole is not None else ()),
+            *((t, False) for t in task.tiles),
+        ):
+            if self._map is None:
+                self._map = FrontierMap(grid)
+                changed += grid.width * grid.height
+            else:
+                changed += self._map.put(grid, whole=whole)
+        return changed
+
+    @staticmethod
+    def _still(view: ExplorationView, current: Viewpoint | None) -> Option | None:
+        """The option that the pursued target is by now; None if little new would be seen there."""
+        if current is None or float(view.gains(np.array([current.pose]))[0]) < max(LEAST, current.gain / 4):
+            return None
+        near = [option for option in view.options if math.dist(option.frontier.middle, current.frontier) < SAME]
+        return min(near, key=lambda option: math.dist(option.frontier.middle, current.frontier), default=None)
+
+
+class ExploringWorker(ExploringStep):
+    """The step as a worker's: its code is compiled when it is built."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        warm_up()
+
+
+def warm_up() -> None:
+    """Compile everything before the first decision is due."""
+    cells = np.full((160, 160), -1, np.int8)
+    cells[20:120, 20:120] = 0
+    cells[20:120, [20, 119]] = cells[[20, 119], 20:120] = 100
+    cells[60:80, 119] = cells[60:80, 20] = cells[20, 60:80] = cells[119, 60:80] = 0
+    grid = Grid(
+        stamp=0, received=0, seq=0, frame="map", resolution=0.05, width=160, height=160,
+        origin=Pose2D(x=0.0, y=0.0, yaw=0.0), cells=cells.reshape(-1),
+    )  # fmt: skip
+    step = ExploringStep()
+    pose = (3.5, 3.5, 0.0)
+    first = step.step(ExploreTask(pose, grid, (), ExploreSetup(TourConfig(), Footprint(), 0.5), choose=True, home=pose))
+    assert first.target is not None
+    step.step(ExploreTask(pose, choose=True, current=first.target))

@@ -1,0 +1,124 @@
+"""Frontiers of a map that grows: kept cell by cell, so that a changed tile costs only its own surroundings.
+
+A frontier cell is a free cell beside an unknown one (B. Yamauchi, "A frontier-based approach for autonomous
+exploration", 1997); only around what differs from before is looked again (compare M. Keidar, G. A. Kaminka, "Efficient
+frontier detection for robot exploration", 2014).
+"""
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_planners.collision import OCCUPIED, Box
+from monstertruck_runtime.errors import InputError
+from monstertruck_schemas.state import Grid
+
+Cells = NDArray[np.int8]
+
+UNKNOWN: Final = -1
+BLOCK: Final = 64
+"""The area grows by whole blocks of so many cells..."""
+SPARE: Final = 2
+"""...and by so many more than are needed."""
+
+
+class FrontierMap:
+    """Occupancy and frontiers of a growing area; cells are counted from the origin of map.
+
+    Args:
+        grid: the first message: its resolution is that of all others.
+    """
+
+    def __init__(self, grid: Grid) -> None:
+        self.resolution = grid.resolution
+        self.corner = np.zeros(2, np.int64)
+        """Column and row of the first cell."""
+        self.cells: Cells = np.full((0, 0), UNKNOWN, np.int8)
+        """Shape (rows, columns): -1 unknown, 0 free to 100 occupied."""
+        self.frontier: NDArray[np.bool_] = np.zeros((0, 0), np.bool_)
+        self.free = 0
+        """Free cells."""
+        self.put(grid, whole=True)
+
+    @property
+    def origin(self) -> tuple[float, float, float]:
+        """Pose of the outer corner of the first cell, m, rad."""
+        x, y = (self.corner * self.resolution).tolist()
+        return x, y, 0.0
+
+    def put(self, grid: Grid, *, whole: bool) -> int:
+        """Take in a tile, or a whole map in place of all before; returns the number of cells looked at again.
+
+        Raises:
+            InputError: another resolution, or cells that do not lie on those before.
+        """
+        if grid.resolution != self.resolution or grid.origin.yaw != 0.0:
+            text = f"map of cells of {grid.resolution} m, turned by {grid.origin.yaw} rad"
+            raise InputError(f"{text}: expected cells of {self.resolution} m that are not turned")
+        at = np.array((grid.origin.x, grid.origin.y)) / self.resolution
+        low = np.round(at).astype(np.int64)
+        if np.abs(at - low).max() > 0.01:
+            raise InputError(f"map at {grid.origin.x}, {grid.origin.y}: expected whole cells of {self.resolution} m")
+        new = grid.cells.reshape(grid.height, grid.width)
+        self._cover(low, low + np.array((grid.width, grid.height)))
+        if whole:
+            there = np.full_like(self.cells, UNKNOWN)
+            column, row = low - self.corner
+            there[row : row + grid.height, column : column + grid.width] = new
+            return self._replace(there, (0, 0))
+        column, row = (low - self.corner).tolist()
+        return self._replace(new, (row, column))
+
+    def _replace(self, new: Cells, corner: tuple[int, int]) -> int:
+        """Write a box, block by block where it differs."""
+        looked = 0
+        for top in range(0, new.shape[0], BLOCK):
+            for left in range(0, new.shape[1], BLOCK):
+                part = new[top : top + BLOCK, left : left + BLOCK]
+                row, column = corner[0] + top, corner[1] + left
+                place = np.s_[row : row + part.shape[0], column : column + part.shape[1]]
+                if np.array_equal(self.cells[place], part):
+                    continue
+                self.free += _free(part) - _free(self.cells[place])
+                self.cells[place] = part
+                looked += self._look((row, column, row + part.shape[0], column + part.shape[1]))
+        return looked
+
+    def _look(self, box: Box) -> int:
+        """Find the frontier cells of a box and the ring around it."""
+        rows, columns = self.cells.shape
+        top, left = max(box[0] - 1, 0), max(box[1] - 1, 0)
+        bottom, right = min(box[2] + 1, rows), min(box[3] + 1, columns)
+        around = self.cells[max(top - 1, 0) : bottom + 1, max(left - 1, 0) : right + 1]
+        pads = [(int(top == 0), int(bottom == rows)), (int(left == 0), int(right == columns))]
+        unknown = np.pad(around == UNKNOWN, pads)
+        beside = unknown[:-2, 1:-1] | unknown[2:, 1:-1] | unknown[1:-1, :-2] | unknown[1:-1, 2:]
+        inner = self.cells[top:bottom, left:right]
+        self.frontier[top:bottom, left:right] = beside & (inner >= 0) & (inner < OCCUPIED)
+        return int(inner.size)
+
+    def _cover(self, low: NDArray[np.int64], high: NDArray[np.int64]) -> None:
+        """Grow until the cells from ``low`` to ``high``, exclusive, are inside with an unknown ring around them."""
+        size = np.array(self.cells.shape[::-1])
+        low, high = low - 1, high + 1
+        end = self.corner + size
+        if size.all():
+            if (low >= self.corner).all() and (high <= end).all():
+                return
+            wider = np.where(low < self.corner, SPARE, 0), np.where(high > end, SPARE, 0)
+            low, high = np.minimum(low, self.corner), np.maximum(high, end)
+        else:
+            wider = np.zeros(2, np.int64), np.zeros(2, np.int64)
+        corner = (low // BLOCK - wider[0]) * BLOCK
+        shape = ((-(-high // BLOCK) + wider[1]) * BLOCK - corner)[::-1]
+        cells, frontier = np.full(shape, UNKNOWN, np.int8), np.zeros(shape, np.bool_)
+        if size.all():
+            column, row = self.corner - corner
+            inside = np.s_[row : row + size[1], column : column + size[0]]
+            cells[inside], frontier[inside] = self.cells, self.frontier
+        self.corner, self.cells, self.frontier = corner, cells, frontier
+
+
+def _free(cells: Cells) -> int:
+    return int(np.count_nonzero((cells >= 0) & (cells < OCCUPIED)))

@@ -1,0 +1,179 @@
+"""What can be seen from a place in a map that is partly unknown. Loads numba."""
+
+from math import cos, floor, sin
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from monstertruck_kinematics.elementary import Array
+from monstertruck_planners.collision import OCCUPIED
+
+
+@njit(cache=True)
+def sees(cells: NDArray[np.int8], x: float, y: float, to_x: float, to_y: float) -> bool:
+    """Whether no obstacle lies on the line between two places, in cells; unknown cells count as free."""
+    dx, dy = to_x - x, to_y - y
+    steps = int(max(abs(dx), abs(dy)) * 1.5) + 1
+    rows, columns = cells.shape
+    for i in range(steps):
+        row, column = floor(y + dy * i / steps), floor(x + dx * i / steps)
+        if not (0 <= row < rows and 0 <= column < columns):
+            return True
+        if cells[row, column] >= OCCUPIED:
+            return False
+    return True
+
+
+@njit(cache=True)
+def new_area(
+    cells: NDArray[np.int8], x: float, y: float, heading: float, view: float, reach: float, depth: float, beams: int
+) -> float:
+    """Unknown area that a scan would show, cells: as far as known obstacles let it, ``depth`` into unknown ground.
+
+    Args:
+        cells: the map.
+        x: of the sensor, cells.
+        y: the same.
+        heading: of the sensor, rad.
+        view: angle of view, rad.
+        reach: range, cells.
+        depth: cells.
+        beams: how many are followed.
+    """
+    rows, columns = cells.shape
+    width = view / beams
+    area = 0.0
+    for i in range(beams):
+        angle = heading - view / 2 + (i + 0.5) * width
+        c, s = cos(angle), sin(angle)
+        unknown, along = 0.0, 0.5
+        while along < reach and unknown < depth:
+            row, column = floor(y + along * s), floor(x + along * c)
+            value = -1
+            if 0 <= row < rows and 0 <= column < columns:
+                value = cells[row, column]
+            if value >= OCCUPIED:
+                break
+            if value < 0:
+                area += along * width
+                unknown += 1.0
+            along += 1.0
+    return area
+
+
+@njit(cache=True)
+def new_areas(
+    cells: NDArray[np.int8], places: Array, view: float, reach: float, depth: float, beams: int
+) -> Array:  # fmt: skip
+    """``new_area`` at each of the places (x, y, heading), shape (n, 3), in cells and rad; shape (n,)."""
+    result = np.empty(len(places))
+    for i in range(len(places)):
+        result[i] = new_area(cells, places[i, 0], places[i, 1], places[i, 2], view, reach, depth, beams)
+    return result
+
+
+@njit(cache=True)
+def shares_seen(cells: NDArray[np.int8], places: Array, points: Array, reach: float) -> Array:
+    """Share of the points (m, 2) that is seen from each of the places (n, 2) within a range, all in cells."""
+    result = np.empty(len(places))
+    for i in range(len(places)):
+        count = 0
+        for j in range(len(points)):
+            dx, dy = points[j, 0] - places[i, 0], points[j, 1] - places[i, 1]
+            if dx * dx + dy * dy <= reach * reach and sees(
+                cells, places[i, 0], places[i, 1], points[j, 0], points[j, 1]
+            ):
+                count += 1
+        result[i] = count / max(len(points), 1)
+    return result
+
+
+@njit(cache=True)
+def joined_cells(cost: NDArray[np.int16]) -> NDArray[np.int16]:
+    """Costs of cells twice as large each way: open where any of the four is, as dear as the cheapest."""
+    rows, columns = (cost.shape[0] + 1) // 2, (cost.shape[1] + 1) // 2
+    result = np.zeros((rows, columns), np.int16)
+    for row in range(cost.shape[0]):
+        for column in range(cost.shape[1]):
+            here = cost[row, column]
+            there = result[row // 2, column // 2]
+            if here > 0 and (there == 0 or here < there):
+                result[row // 2, column // 2] = here
+    return result
+
+
+@njit(cache=True)
+def short_tour(distance: Array, first: Array) -> NDArray[np.int64]:
+    """Order in which to visit n places: short, from a start to anywhere.
+
+    The best of the nearest-next tours, improved by reversing and moving parts while that shortens it (2-opt, Or-opt;
+    G. A. Croes 1958, I. Or 1976).
+
+    Args:
+        distance: shape (n, n), symmetric.
+        first: shape (n,), from the start to each.
+    """
+    n = len(first)
+    order = np.empty(n, np.int64)
+    used = np.zeros(n, np.bool_)
+    for k in range(n):
+        best, least = -1, np.inf
+        for i in range(n):
+            if not used[i]:
+                d = first[i] if k == 0 else distance[order[k - 1], i]
+                if d < least:
+                    best, least = i, d
+        order[k] = best
+        used[best] = True
+    for _ in range(60):
+        if not (_reversed_parts(distance, first, order) | _moved_parts(distance, first, order)):
+            break
+    return order
+
+
+@njit(cache=True)
+def _reversed_parts(distance: Array, first: Array, order: NDArray[np.int64]) -> bool:
+    """Reverse every part of a tour whose reversal shortens it; returns whether one did."""
+    n, improved = len(order), False
+    for i in range(n):
+        for j in range(i + 1, n):
+            here, there = order[i], order[j]
+            old = first[here] if i == 0 else distance[order[i - 1], here]
+            new = first[there] if i == 0 else distance[order[i - 1], there]
+            if j < n - 1:
+                old += distance[there, order[j + 1]]
+                new += distance[here, order[j + 1]]
+            if new < old - 1e-9:
+                order[i : j + 1] = order[i : j + 1][::-1].copy()
+                improved = True
+    return improved
+
+
+@njit(cache=True)
+def _moved_parts(distance: Array, first: Array, order: NDArray[np.int64]) -> bool:
+    """Move every part of up to three places to where the tour is shorter; returns whether one was moved."""
+    n, improved = len(order), False
+    trial, least = order.copy(), tour_length(distance, first, order)
+    for length in range(1, min(4, n)):
+        for i in range(n - length + 1):
+            part = order[i : i + length].copy()
+            rest = np.concatenate((order[:i], order[i + length :]))
+            for j in range(len(rest) + 1):
+                trial[:j] = rest[:j]
+                trial[j : j + length] = part
+                trial[j + length :] = rest[j:]
+                there = tour_length(distance, first, trial)
+                if there < least - 1e-9:
+                    least, improved = there, True
+                    order[:] = trial
+    return improved
+
+
+@njit(cache=True)
+def tour_length(distance: Array, first: Array, order: NDArray[np.int64]) -> float:
+    """Length of a tour, see ``short_tour``."""
+    total = first[order[0]]
+    for k in range(1, len(order)):
+        total += distance[order[k - 1], order[k]]
+    return float(total)

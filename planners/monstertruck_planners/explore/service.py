@@ -1,0 +1,394 @@
+"""Exploration as a service: observations to the state machine, its decisions to the goal service."""
+
+import asyncio
+import math
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, Final, Protocol
+
+from monstertruck_planners.explore import exploration
+from monstertruck_planners.explore.exchange import ExploreAnswer, ExploreSetup, ExploreTask
+from monstertruck_planners.explore.exploration import Action, Cancel, Choose, Exploration, Go, Notice, Observed, Save
+from monstertruck_planners.goals.exchange import Pose, pose_of
+from monstertruck_runtime.actors.actor import Actor
+from monstertruck_runtime.clock import SECOND, Clock, Schedule
+from monstertruck_runtime.errors import RequestRefusedError, WorkerError
+from monstertruck_runtime.mailbox import Mailbox
+from monstertruck_runtime.ports import EventSink, Publisher, Ready, RpcRegistry, Subscription
+from monstertruck_runtime.requests import Sequences, parse_request, refusal
+from monstertruck_schemas.base import Pose2D
+from monstertruck_schemas.event import Event, Severity
+from monstertruck_schemas.health import LocalisationStatus, SlamHealth
+from monstertruck_schemas.plan import ExplorationPhase, ExplorationState, GoalPhase, GoalState
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import ExploreOrder, ExploreRequest, GoalControl, GoalOrder, GoalRequest, Role
+from monstertruck_schemas.sensor import Battery, BatteryLevel
+from monstertruck_schemas.state import GateState, Grid, Odometry
+from monstertruck_schemas.topics import BATTERY, POSE, SLAM
+
+SOURCE: Final = "explorer"
+"""Of the goals."""
+RATE: Final = 5.0
+"""Looks a second."""
+REPORT: Final = SECOND // 2
+"""Between two reports without a change, ns."""
+CHANGES: Final = ("number", "phase", "outcome", "goals", "failures")
+"""Fields of the report whose change is reported at once."""
+LOST_FOR: Final = 1.0
+"""Seconds without a place in the map after which it counts as lost."""
+NO_PLACE: Final = frozenset({LocalisationStatus.LOST, LocalisationStatus.SEARCHING, LocalisationStatus.OUTSIDE})
+LOW: Final = frozenset({BatteryLevel.LOW, BatteryLevel.CRITICAL})
+TILES: Final = 4096
+"""Tiles kept since the newest whole map."""
+
+
+class Goals(Protocol):
+    """The goal service."""
+
+    def take(self, request: GoalRequest) -> int:
+        """Take on a goal; returns its number."""
+        ...
+
+    def control(self, request: GoalControl) -> None:
+        """Cancel it."""
+        ...
+
+    def hold(self, *, on: bool) -> None:
+        """Keep the robot armed between goals."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class ExplorerInputs:
+    """Topics read."""
+
+    gate: Subscription[GateState]
+    pose: Subscription[Odometry]
+    goal: Subscription[GoalState]
+    grid: Subscription[Grid]
+    tiles: Mailbox[Grid]
+    slam: Subscription[SlamHealth]
+    battery: Subscription[Battery]
+    events: Mailbox[Event]
+
+
+class ExplorerService:
+    """Explores when asked to.
+
+    Args:
+        setup: how, and the robot.
+        clock: time.
+        actor: where decisions are made; started with the first exploration.
+        goals: what drives.
+        save: has the map saved; returns whether it can be; None = there is none.
+        max_age: see ``GateConfig.max_request_age``.
+        inputs: topics read.
+        state: ``plan/explore``.
+        events: where decisions are reported.
+    """
+
+    name = SOURCE
+
+    def __init__(
+        self,
+        setup: ExploreSetup,
+        clock: Clock,
+        actor: Actor,
+        goals: Goals,
+        save: Callable[[], bool] | None,
+        *,
+        max_age: float,
+        inputs: ExplorerInputs,
+        state: Publisher[ExplorationState],
+        events: EventSink,
+    ) -> None:
+        self._setup, self._config, self._clock, self._place = setup, setup.config, clock, actor
+        self._goals, self._save, self._max_age = goals, save, max_age
+        self._in, self._out, self._events = inputs, state, events
+        self._sequences = Sequences(max_age)
+        self._run: Exploration | None = None
+        self._tiles: deque[Grid] = deque(maxlen=TILES)
+        self._whole: Grid | None = None
+        self._sent_whole: Grid | None = None
+        self._sent_tiles = 0
+        self._fresh = True
+        self._deciding: asyncio.Task[ExploreAnswer] | None = None
+        self._tasks: asyncio.TaskGroup | None = None
+        self._actor: Actor | None = None
+        self._seq = 0
+        self._goal: int | None = None
+        self._others = 0
+        """The newest goal when the exploration was started."""
+        self._refused: tuple[Reason, str] | None = None
+        self._placed = 0
+        self._saves: int | None = None
+        """Since when the map is being saved, ns."""
+        self._cannot_save = False
+        self._reported: ExplorationState | None = None
+
+    async def run(self, ready: Ready) -> None:
+        """Serve until cancelled."""
+        async with self._place as actor, asyncio.TaskGroup() as tasks:
+            self._actor, self._tasks, self._fresh = actor, tasks, True
+            self._report(self._clock.now())
+            ready()
+            schedule = Schedule(self._clock, RATE)
+            try:
+                while True:
+                    await schedule.next()
+                    self._tick(self._clock.now())
+            finally:
+                self._goals.hold(on=False)
+
+    # Requests
+
+    def take(self, request: ExploreRequest) -> int:
+        """Carry out a request; returns the number of the exploration it started or ended.
+
+        Raises:
+            RequestRefusedError: the sender may not, or it cannot be done now.
+        """
+        starts, now, run = request.order is ExploreOrder.START, self._clock.now(), self._run
+        gate = self._in.gate.latest
+        reason = refusal(request, gate, self._sequences, now, self._max_age if starts else None)
+        if reason is not Reason.OK:
+            raise RequestRefusedError(reason)
+        running = run is not None and run.running
+        if not starts:
+            if run is None or not running:
+                raise RequestRefusedError(Reason.NOT_FOUND, "no exploration is running")
+            self._do(exploration.stop(run, request.source, now / SECOND))
+            return run.number
+        if running and run is not None:
+            raise RequestRefusedError(Reason.BUSY, f"the exploration of {run.source} is running, stop it first")
+        goal = self._in.goal.latest
+        if goal is not None and goal.phase is not GoalPhase.IDLE:
+            raise RequestRefusedError(Reason.BUSY, f"goal {goal.number} of {goal.source} is pursued, cancel it first")
+        if gate is None or not gate.mode.active:
+            held = Reason.DISARMED if gate is None else next(iter(gate.reasons), Reason.DISARMED)
+            raise RequestRefusedError(held, f"the robot does not drive: {held.text}")
+        if (pose := self._pose(now)) is None:
+            raise RequestRefusedError(Reason.NO_MAP, "no pose in a map yet")
+        self._fresh, self._goal, self._refused, self._saves = True, None, None, None
+        self._others = 0 if goal is None else goal.number
+        home = self._config.home if request.home is None else request.home
+        number = 1 if run is None else run.number + 1
+        budget = request.budget or self._config.budget
+        self._do(exploration.begin(number, request.source, pose, now / SECOND, self._config, home=home, budget=budget))
+        return number
+
+    # Observations
+
+    def _tick(self, now: int) -> None:
+        self._keep_map()
+        saved = self._saved()
+        run = self._run
+        if run is not None and run.running:
+            self._do(exploration.tick(run, self._observe(now, saved), self._config))
+        run = self._run
+        self._goals.hold(on=run is not None and run.running and run.phase is not ExplorationPhase.SAVING)
+        self._report(now)
+
+    def _keep_map(self) -> None:
+        whole = self._in.grid.latest
+        if whole is not self._whole:
+            self._whole = whole
+            kept = [tile for tile in self._tiles if whole is None or tile.received > whole.received]
+            self._tiles.clear()
+            self._tiles.extend(kept)
+            self._sent_tiles = 0
+        for tile in self._in.tiles.drain():
+            if self._whole is None or tile.received > self._whole.received:
+                if len(self._tiles) == TILES:
+                    self._sent_tiles = max(self._sent_tiles - 1, 0)
+                self._tiles.append(tile)
+
+    def _saved(self) -> str | None:
+        """Where the map was saved since that was asked for."""
+        saved = None
+        for event in self._in.events.drain():
+            if self._saves is not None and event.reason is Reason.MAP_SAVED and event.received >= self._saves:
+                saved = event.text
+        return "" if self._cannot_save and self._saves is not None else saved
+
+    def _observe(self, now: int, saved: str | None) -> Observed:
+        answer = None
+        if self._deciding is not None and self._deciding.done():
+            answer, self._deciding = self._deciding.result(), None
+        ended, text, displaced = self._goal_end()
+        battery = self._in.battery.latest
+        fresh = battery is not None and now - battery.received <= BATTERY.fresh_for() * SECOND
+        return Observed(
+            now=now / SECOND,
+            pose=self._pose(now),
+            ended=ended,
+            ended_text=text,
+            displaced=displaced,
+            answer=answer,
+            charge=battery.charge if battery is not None and fresh else None,
+            low=battery is not None and fresh and battery.level in LOW,
+            saved=saved,
+        )
+
+    def _goal_end(self) -> tuple[Reason | None, str, str]:
+        """How the goal that was sent ended, in words, and whose goal took its place."""
+        if self._refused is not None:
+            return *self._refused, ""
+        goal = self._in.goal.latest
+        if goal is None:
+            return None, "", ""
+        newer = self._goal is None or goal.number > self._goal
+        if goal.source != SOURCE and goal.number > self._others and newer:
+            return None, "", goal.source
+        if goal.number != self._goal or goal.phase is not GoalPhase.IDLE:
+            return None, "", ""
+        return goal.outcome, goal.text, ""
+
+    def _pose(self, now: int) -> Pose | None:
+        """Of the base in map, while it is known."""
+        pose, slam = self._in.pose.latest, self._in.slam.latest
+        if pose is None or now - pose.received > POSE.fresh_for() * SECOND:
+            return None
+        if slam is None or slam.standing not in NO_PLACE or now - slam.received > SLAM.fresh_for() * SECOND:
+            self._placed = now
+        return pose_of(pose) if now - self._placed <= LOST_FOR * SECOND else None
+
+    # Decisions
+
+    def _do(self, step: tuple[Exploration, tuple[Action, ...]]) -> None:
+        self._run, actions = step
+        for action in actions:
+            match action:
+                case Notice(reason, severity, text):
+                    self._events(reason, severity, SOURCE, text, exploration=self._run.number)
+                case Choose():
+                    self._choose(self._run)
+                case Go(pose):
+                    self._go(pose)
+                case Cancel():
+                    self._cancel()
+                case Save():
+                    self._saves, self._cannot_save = self._clock.now(), self._save is None or not self._save()
+        if actions:
+            self._report(self._clock.now())
+
+    def _choose(self, run: Exploration) -> None:
+        assert self._tasks is not None
+        assert run.before is not None
+        whole = self._whole if self._fresh or self._whole is not self._sent_whole else None
+        if whole is not None:
+            self._sent_tiles = 0
+        tiles = tuple(self._tiles)[self._sent_tiles :]
+        now = self._clock.now() / SECOND
+        task = ExploreTask(
+            run.before,
+            whole=whole,
+            tiles=tiles,
+            setup=self._setup if self._fresh else None,
+            choose=True,
+            current=run.target,
+            pursued=now - run.pursued,
+            banned=run.attempts.banned(now),
+            home=run.home,
+        )
+        self._fresh, self._sent_whole, self._sent_tiles = False, self._whole, len(self._tiles)
+        self._deciding = self._tasks.create_task(self._ask(task))
+
+    async def _ask(self, task: ExploreTask) -> ExploreAnswer:
+        """The worker's answer; of one that failed and begins anew: none."""
+        assert self._actor is not None
+        try:
+            answer: ExploreAnswer = await self._actor.step(task)
+        except WorkerError as error:
+            self._fresh = True
+            self._events(error.reason, Severity.ERROR, SOURCE, str(error))
+            return ExploreAnswer(task.current, kept=task.current is not None)
+        if answer.kept:  # what comes back from a worker is a copy
+            return replace(answer, target=task.current)
+        return answer
+
+    def _header(self) -> dict[str, Any]:
+        now, gate = self._clock.now(), self._in.gate.latest
+        self._seq += 1
+        return {
+            "stamp": now,
+            "received": now,
+            "seq": self._seq,
+            "source": SOURCE,
+            "role": Role.STATION,
+            "lease": 1.0,
+            "nonce": "" if gate is None else gate.nonce,
+            "gate_stamp": None if gate is None else gate.stamp,
+            "frame": "map",
+        }
+
+    def _go(self, pose: Pose) -> None:
+        x, y, yaw = pose
+        self._refused = None
+        try:
+            self._goal = self._goals.take(
+                GoalRequest(**self._header(), goal=Pose2D(x=x, y=y, yaw=math.remainder(yaw, math.tau)))
+            )
+        except RequestRefusedError as error:
+            self._refused = error.refusal, str(error)
+
+    def _cancel(self) -> None:
+        """What was sent, if it is still pursued."""
+        goal = self._in.goal.latest
+        if goal is None or self._goal != goal.number or goal.phase is GoalPhase.IDLE:
+            self._goal = None
+            return
+        self._goal = None
+        self._goals.control(GoalControl(**self._header(), order=GoalOrder.CANCEL))
+
+    def _report(self, now: int) -> None:
+        state = state_of(self._run, self._config.kind, now)
+        before = self._reported
+        unchanged = before is not None and all(getattr(before, name) == getattr(state, name) for name in CHANGES)
+        if before is not None and unchanged and (now - before.stamp < REPORT or not state.running):
+            return
+        self._reported = state.model_copy(update={"seq": self._out.next_seq()})
+        self._out.put(self._reported)
+
+
+def state_of(run: Exploration | None, kind: str, now: int) -> ExplorationState:
+    """The report on an exploration, its sequence number still 0."""
+    if run is None:
+        return ExplorationState(stamp=now, received=now, seq=0, frame="map", kind=kind)
+    target = None if run.target is None else run.target.pose
+    return ExplorationState(
+        stamp=now,
+        received=now,
+        seq=0,
+        frame="map",
+        number=run.number,
+        kind=kind,
+        source=run.source,
+        phase=run.phase,
+        outcome=run.outcome,
+        text=run.text,
+        target=None if target is None else Pose2D(x=target[0], y=target[1], yaw=target[2]),
+        frontiers=run.newest.frontiers,
+        left_alone=run.newest.banned,
+        known=run.newest.known,
+        travelled=run.travelled,
+        elapsed=run.now - run.begun,
+        home=run.newest.home,
+        goals=run.goals,
+        failures=run.failures,
+    )
+
+
+def register_explorer_calls(rpc: RpcRegistry, service: ExplorerService) -> None:
+    """Serve ``explore``, whose payload is an ``ExploreRequest``.
+
+    Args:
+        rpc: where.
+        service: what explores.
+    """
+
+    async def explore(payload: dict[str, Any]) -> dict[str, Any]:
+        return {"number": service.take(parse_request(ExploreRequest, payload))}
+
+    rpc.register("explore", explore)

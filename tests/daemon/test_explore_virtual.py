@@ -1,0 +1,138 @@
+"""Exploration in the whole daemon: an unknown world, goals, the way home, a saved map."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from monstertruck_estimation.slam.storage import load
+from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
+from monstertruck_runtime.errors import RequestRefusedError
+from monstertruck_runtime.mailbox import fifo
+from monstertruck_runtime.map_files import FREE, OCCUPIED, WorldMap, save_map
+from monstertruck_schemas import topics
+from monstertruck_schemas.plan import ExplorationPhase
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import ExploreOrder, GoalOrder
+from monstertruckd.config.load import load_config
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
+from monstertruckd.tools.simulation.operator import LocalOperator
+from monstertruckd.tools.simulation.virtual_rig import VirtualRig
+
+pytestmark = [pytest.mark.virtual, pytest.mark.timeout(300)]
+
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+
+START = {"x": 1.0, "y": 1.2, "yaw": 0.0}
+
+
+def corner_room(folder: Path) -> Path:
+    """A room round a corner: what is behind it is not seen from the start."""
+    cells = np.full((120, 120), OCCUPIED, np.int8)
+    cells[4:44, 4:116] = FREE
+    cells[4:116, 76:116] = FREE
+    cells[60:80, 76:84] = OCCUPIED
+    save_map(WorldMap(cells, 0.05), folder / "corner.yaml")
+    return folder / "corner.yaml"
+
+
+class Story:
+    """A truck in the room, and somebody who asks it to explore."""
+
+    def __init__(self, rig: VirtualRig) -> None:
+        self.rig, self.clock = rig, rig.clock
+        self.operator = LocalOperator(rig.daemon, rig.clock)
+        self.states = rig.bus.subscribe(topics.EXPLORE, fifo(8192))
+        self.events = rig.bus.subscribe(topics.EVENT, fifo(8192))
+
+    async def order(self, order: ExploreOrder, **more) -> dict:
+        return await self.operator.call("explore", {**await self.operator.header(), "order": order, **more})
+
+    async def end(self, limit: float):
+        async with self.clock.deadline(limit):
+            while True:
+                state = await self.states.next()
+                if state.number and not state.running:
+                    return state
+
+
+def tell(story, folder: Path, **overlay) -> tuple[Story, np.ndarray]:
+    """Let it happen; returns the story and the truth."""
+    config = load_config(CONFIGS / "explore.yaml", SimulatedTruckConfig)[0]
+    base = {
+        "recorder": None,
+        "blackbox": None,
+        "placement": {"planner": "loop", "explorer": "loop"},
+        "planner": {"route": {"effort": 3000}},
+        "odometry": {"start": START},
+        "slam": {"save": folder / "map"},
+        "sim": {"world": {"map": str(corner_room(folder)), "start": START}},
+    }
+    config = with_overlay(with_overlay(config, base), overlay)
+
+    async def main(clock: VirtualClock) -> tuple[Story, np.ndarray]:
+        rig = VirtualRig(config, clock)
+        told = Story(rig)
+        async with rig.running():
+            await clock.sleep(4.0)
+            await story(told)
+        return told, rig.truth.array()
+
+    return run_virtual(main, start=SECOND)
+
+
+def test_it_explores_a_room_drives_home_and_saves_the_map(tmp_path: Path):
+    ends = []
+
+    async def story(told: Story) -> None:
+        with pytest.raises(RequestRefusedError) as refused:
+            await told.order(ExploreOrder.START)
+        assert refused.value.refusal is Reason.DISARMED
+        await told.operator.arm()
+        assert await told.order(ExploreOrder.START) == {"number": 1}
+        with pytest.raises(RequestRefusedError, match="is running") as refused:
+            await told.order(ExploreOrder.START)
+        ends.append(await told.end(280.0))
+
+    told, truth = tell(story, tmp_path)
+    state = ends[0]
+    assert state.outcome is Reason.EXPLORED, state.text
+    assert not truth[:, 5].any(), "collided"
+    assert math.dist(truth[-1, 1:3], truth[0, 1:3]) < 0.2, "not at home"
+    assert state.travelled > 4.0
+    grid = load(tmp_path / "map").grid
+    assert (grid.cells == FREE).sum() * grid.resolution**2 > 14.0  # of 16.8 m^2, walls rounded off
+    reasons = {event.reason for event in told.events.drain() if event.source == "explorer"}
+    assert {Reason.EXPLORATION_STARTED, Reason.FRONTIER_CHOSEN, Reason.EXPLORED} <= reasons
+
+
+def test_it_stops_when_told_to_and_gives_way_to_other_goals(tmp_path: Path):
+    ends = []
+
+    async def story(told: Story) -> None:
+        await told.operator.arm()
+        await told.order(ExploreOrder.START)
+        await told.clock.sleep(5.0)
+        await told.order(ExploreOrder.STOP)
+        ends.append(await told.end(60.0))
+        with pytest.raises(RequestRefusedError, match="no exploration"):
+            await told.order(ExploreOrder.STOP)
+        await told.order(ExploreOrder.START, home=False)
+        await told.clock.sleep(4.0)
+        goal = {"goal": {"x": 2.6, "y": 1.2, "yaw": 0.0}, "frame": "map"}
+        await told.operator.call("goal", {**await told.operator.header(), **goal})
+        ends.append(await told.end(60.0))
+        cancel = {**await told.operator.header(), "order": GoalOrder.CANCEL}
+        await told.operator.call("goal_control", cancel)
+        await told.clock.sleep(2.0)
+        await told.order(ExploreOrder.START, home=True, budget=6.0)
+        ends.append(await told.end(120.0))
+
+    _, truth = tell(story, tmp_path)
+    assert [state.outcome for state in ends] == [Reason.CANCELLED, Reason.CANCELLED, Reason.BUDGET_SPENT]
+    assert "operator" in ends[0].text
+    assert "goal of operator" in ends[1].text
+    assert "back at the start" in ends[2].text
+    assert not truth[:, 5].any()
+    assert ends[0].phase is ExplorationPhase.IDLE

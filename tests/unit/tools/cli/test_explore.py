@@ -1,0 +1,101 @@
+"""``explore``: durations, lines of progress, the end, and what stops it."""
+
+import asyncio
+
+import pytest
+
+from monstertruck_runtime.errors import InputError, NoAnswerError, RequestRefusedError
+from monstertruck_runtime.mailbox import Mailbox, fifo
+from monstertruck_schemas.base import Pose2D
+from monstertruck_schemas.plan import ExplorationPhase, ExplorationState
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import ExploreOrder
+from monstertruckd.tools.cli.explore import seconds_of
+from monstertruckd.tools.cli.explore_session import progress_line, run_exploration
+
+
+def state(number: int, phase: ExplorationPhase, outcome: Reason = Reason.DRIVING, **more) -> ExplorationState:
+    return ExplorationState(
+        stamp=1, received=1, seq=0, frame="map", number=number, phase=phase, outcome=outcome, **more
+    )
+
+
+class Robot:
+    """Answers orders, and says what it was given to say."""
+
+    source = "ann"
+
+    def __init__(self, *states: ExplorationState, refuse: bool = False) -> None:
+        self.orders: list[tuple[str, ...]] = []
+        self.mailbox: Mailbox[ExplorationState] = Mailbox(fifo(64), lambda _: None)
+        self.states, self.refuse = states, refuse
+
+    def subscribe(self, topic, delivery):
+        del topic, delivery
+        return self.mailbox
+
+    async def arm(self):
+        self.orders.append(("arm",))
+
+    async def explore(self, order: ExploreOrder, *, home=None, budget=None):
+        self.orders.append((order, home, budget))
+        if self.refuse:
+            raise RequestRefusedError(Reason.BUSY)
+        for one in self.states:
+            self.mailbox.put(one)
+        return {"number": 3}
+
+
+@pytest.mark.parametrize(("text", "seconds"), [("90", 90), ("90s", 90), ("20min", 1200), ("1.5 h", 5400)])
+def test_durations(text: str, seconds: float):
+    assert seconds_of(text) == seconds
+
+
+@pytest.mark.parametrize("text", ["", "min", "-5", "0", "5 days", "1e3"])
+def test_what_is_no_duration_is_refused_with_an_example(text: str):
+    with pytest.raises(InputError, match="such as 20min"):
+        seconds_of(text)
+
+
+def test_it_is_followed_to_its_end_and_told_of_in_short_lines():
+    there = Pose2D(x=12.0, y=-3.0, yaw=0.0)
+    robot = Robot(
+        state(2, ExplorationPhase.IDLE, Reason.EXPLORED),
+        state(3, ExplorationPhase.DRIVING, target=there, goals=1),
+        state(3, ExplorationPhase.DRIVING, target=there, goals=1, elapsed=1.0),
+        state(3, ExplorationPhase.DRIVING, target=there, goals=1, elapsed=6.0),
+        state(3, ExplorationPhase.IDLE, Reason.EXPLORED, text="12 m^2", travelled=5.0, known=12.0, goals=1),
+    )
+    lines: list[str] = []
+    end = asyncio.run(run_exploration(robot, home=True, budget=60.0, arm=True, tell=lines.append))
+    assert (end.reason, end.text, end.travelled, end.known) == (Reason.EXPLORED, "12 m^2", 5.0, 12.0)
+    assert robot.orders == [("arm",), (ExploreOrder.START, True, 60.0)]
+    assert len(lines) == 3
+    assert "to (12.0, -3.0)" in lines[0]
+    assert all(len(line) < 80 for line in lines)
+    busy = state(3, ExplorationPhase.RETURNING, elapsed=9e3, travelled=2e3, known=5e3, frontiers=20, target=there)
+    assert len(progress_line(busy)) < 80
+
+
+def test_refused_it_stops_nothing_and_without_the_robot_it_tries_to():
+    robot = Robot(refuse=True)
+    with pytest.raises(RequestRefusedError):
+        asyncio.run(run_exploration(robot, home=None, budget=None, arm=False))
+    assert robot.orders == [(ExploreOrder.START, None, None)]
+    gone = Robot(state(3, ExplorationPhase.DRIVING))
+
+    async def lost() -> None:
+        task = asyncio.create_task(run_exploration(gone, home=None, budget=None, arm=False))
+        await asyncio.sleep(0.01)
+        gone.mailbox.close()
+        await task
+
+    with pytest.raises(NoAnswerError):
+        asyncio.run(lost())
+    assert gone.orders[-1][0] is ExploreOrder.STOP
+
+
+def test_another_exploration_ends_it():
+    robot = Robot(state(4, ExplorationPhase.LOOKING, source="bob"))
+    end = asyncio.run(run_exploration(robot, home=None, budget=None, arm=False))
+    assert (end.reason, end.text) == (Reason.CANCELLED, "bob started another one")
