@@ -123,7 +123,7 @@ async def in_thread(function: Callable[[], T]) -> T:
     try:
         return await asyncio.shield(work)
     except asyncio.CancelledError:
-        await asyncio.wait([work])
+        await asyncio.gather(work, return_exceptions=True)  # nobody is left to hear of an error
         raise
 
 

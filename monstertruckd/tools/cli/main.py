@@ -25,6 +25,7 @@ from monstertruckd.tools.cli import (
     robot,
     security,
     service,
+    station,
     study,
     usb,
 )
@@ -80,6 +81,7 @@ app.command("emulate")(devices.emulate)
 app.command("probe")(devices.probe)
 app.command("usb")(usb.usb)
 app.command("find-port")(usb.find_port)
+app.command("station")(station.station)
 app.command("doctor")(doctor.doctor)
 app.command("install-service")(service.install_service)
 app.command("uninstall-service")(service.uninstall_service)

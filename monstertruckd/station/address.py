@@ -1,0 +1,32 @@
+"""Which robots a station shows."""
+
+import re
+from dataclasses import dataclass
+from typing import Self
+
+from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT, nearest
+from monstertruck_runtime.errors import InputError
+
+_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
+
+
+@dataclass(frozen=True, slots=True)
+class RobotAddress:
+    """Name of a robot, and the endpoint at which it, or a router it is connected to, listens."""
+
+    name: str
+    endpoint: str
+
+    @classmethod
+    def parse(cls, text: str) -> Self:
+        """Read ``NAME@ENDPOINT``; without an endpoint it is a daemon on this machine.
+
+        Raises:
+            InputError: the name cannot be part of a key, or the endpoint has no protocol.
+        """
+        name, at, endpoint = text.partition("@")
+        if not _NAME.fullmatch(name):
+            raise InputError(f"robot {text!r}: expected NAME@ENDPOINT, the name of letters, digits, _ and -")
+        if at and "/" not in endpoint:
+            raise InputError(f"robot {text!r}: expected an endpoint such as tcp/192.168.1.7:7447 behind the @")
+        return cls(name, nearest(endpoint or DEFAULT_ENDPOINT))

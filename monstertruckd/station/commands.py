@@ -1,0 +1,111 @@
+"""What a browser may ask of the station: one JSON object a message."""
+
+from typing import Annotated, Final, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+
+from monstertruck_runtime.errors import InputError
+from monstertruck_schemas.req import BehaviourOrder, GoalOrder, Order, Role
+
+MOST_BYTES: Final = 16_384
+"""Size of a message; a longer one ends the connection."""
+
+Number = Annotated[float, Field(allow_inf_nan=False)]
+Place = Annotated[tuple[Number, ...], Field(min_length=2, max_length=3)]
+"""x, y (m) and optionally yaw (rad)."""
+Id = Annotated[int, Field(ge=0, lt=2**53)]
+
+
+class _Command(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Watch(_Command):
+    """Look at a robot."""
+
+    do: Literal["watch"]
+    robot: Annotated[str, Field(max_length=64)]
+
+
+class Ping(_Command):
+    """Answer at once: the browser measures the way to the station."""
+
+    do: Literal["ping"]
+    at: Number
+    """The browser's time, ms."""
+
+
+class Motion(_Command):
+    """One heartbeat of a hand on stick, keys or gamepad: what the input says at this moment."""
+
+    do: Literal["drive"]
+    at: Number
+    """The browser's time when the input was read, ms."""
+    input: Literal["stick", "keys", "gamepad"]
+    speed: Number = 0.0
+    front: Number = 0.0
+    rear: Number = 0.0
+    twist: tuple[Number, Number, Number] | None = None
+
+    @property
+    def role(self) -> Role:
+        """Priority of the input."""
+        return {"stick": Role.STATION, "keys": Role.KEYBOARD, "gamepad": Role.GAMEPAD}[self.input]
+
+
+class GiveOrder(_Command):
+    """Arm, disarm, stop, emergency stop or its reset."""
+
+    do: Literal["order"]
+    id: Id
+    order: Order
+    hold: bool = False
+
+
+class SetGoal(_Command):
+    """Drive to a pose in the frame of the map, by way of others."""
+
+    do: Literal["goal"]
+    id: Id
+    goal: tuple[Number, Number, Number]
+    via: Annotated[
+        tuple[Annotated[tuple[Number, ...], Field(min_length=2, max_length=3)], ...], Field(max_length=32)
+    ] = ()
+
+
+class ChangeGoal(_Command):
+    """Pause, resume or cancel the goal."""
+
+    do: Literal["goal_control"]
+    id: Id
+    order: GoalOrder
+
+
+class Behave(_Command):
+    """Start or stop a behaviour."""
+
+    do: Literal["behave"]
+    id: Id
+    order: BehaviourOrder
+    behaviour: Annotated[str, Field(max_length=64)] = ""
+
+
+Asked = GiveOrder | SetGoal | ChangeGoal | Behave
+"""Commands whose outcome is answered."""
+Command = Annotated[Watch | Ping | Motion | Asked, Field(discriminator="do")]
+
+_COMMANDS: Final[TypeAdapter[Watch | Ping | Motion | Asked]] = TypeAdapter(Command)
+
+
+def parse(data: str) -> Watch | Ping | Motion | Asked:
+    """The command of one message.
+
+    Raises:
+        InputError: it is none; the text names the first wrong field.
+    """
+    try:
+        return _COMMANDS.validate_json(data)
+    except ValidationError as error:
+        detail = error.errors(include_url=False)[0]
+        where = ".".join(map(str, detail["loc"])) or "message"
+        raise InputError(f"{where}: {detail['msg']}") from None

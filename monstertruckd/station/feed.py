@@ -1,0 +1,257 @@
+"""What one robot publishes, encoded once for all browsers that look at it."""
+
+import asyncio
+import zlib
+from collections import deque
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any, Final, Generic, TypeVar
+
+from monstertruck_runtime.client import TruckClient
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.errors import InputError, NoAnswerError, NotFoundError, NotPermittedError, TruckError
+from monstertruck_runtime.mailbox import Mailbox, fifo, latest
+from monstertruck_schemas import topics
+from monstertruck_schemas.base import Message
+from monstertruck_schemas.event import Event
+from monstertruck_schemas.state import Grid
+from monstertruck_schemas.topics import Topic
+from monstertruckd.station import frames
+from monstertruckd.station.address import RobotAddress
+from monstertruckd.station.frames import Frame
+from monstertruckd.station.viewer import Viewer
+
+M = TypeVar("M", bound=Message)
+
+TICK: Final = 0.05
+"""Seconds between two looks at what is new."""
+PING: Final = 1.0
+"""Seconds between two measurements of the round trip to the robot."""
+RETRY: Final = 1.0
+"""Seconds between two attempts to reach a robot, and in which one that is there answers."""
+KEPT_EVENTS: Final = 200
+"""Events a browser gets when it begins to look at a robot."""
+MOST_TILES: Final = 400
+"""Changed parts of the map that are kept until the whole map comes again."""
+
+
+@dataclass(frozen=True, slots=True)
+class Shown(Generic[M]):
+    """A topic on the page: how it is encoded, and how often at most, s."""
+
+    topic: Topic[M]
+    kind: str
+    encode: Callable[[M], Frame]
+    period: float = 0.0
+
+
+def _whole(topic: Topic[M], kind: str, period: float = 0.0) -> Shown[M]:
+    return Shown(topic, kind, partial(frames.message, kind), period)
+
+
+SHOWN: Final[tuple[Shown[Any], ...]] = (
+    _whole(topics.GATE, "gate"),
+    _whole(topics.STOP, "stop"),
+    Shown(topics.SCAN, "scan", frames.scan, 0.1),
+    Shown(topics.TRANSFORMS, "transforms", frames.transforms, 0.2),
+    Shown(topics.PATH, "path", frames.path),
+    _whole(topics.GOAL, "goal"),
+    _whole(topics.TRACKER, "tracker", 0.5),
+    _whole(topics.BEHAVIOUR, "behaviour", 0.5),
+    _whole(topics.CMD_STEERING, "steering", 0.1),
+    _whole(topics.DRIVE, "drive", 0.2),
+    _whole(topics.COMPASS, "compass", 0.1),
+    _whole(topics.BATTERY, "battery", 0.5),
+    _whole(topics.STABILISER, "stabiliser", 0.2),
+    _whole(topics.HEALTH, "health"),
+    _whole(topics.LOOP, "loop"),
+    _whole(topics.RECORDER, "recorder"),
+    _whole(topics.LINK, "network"),
+    _whole(topics.HOST, "host"),
+    _whole(topics.SLAM, "slam", 0.5),
+    _whole(topics.USB, "usb"),
+    Shown(topics.CAMERA, "camera", frames.picture, 0.1),
+)
+
+
+@dataclass
+class MapStore:
+    """The newest whole map of a robot and what changed since; browsers fetch the former by URL."""
+
+    version: int = 0
+    grid: Grid | None = None
+    tiles: dict[tuple[float, float], bytes] = field(default_factory=dict)
+    _packed: bytes | None = None
+
+    def take(self, grid: Grid) -> str:
+        """A whole map; returns the frame that announces it."""
+        self.version += 1
+        self.grid, self._packed = grid, None
+        self.tiles.clear()
+        return frames.text("map", version=self.version, **frames.grid_head(grid))
+
+    def change(self, part: Grid) -> bytes:
+        """A changed part; returns its frame."""
+        frame = frames.tile(part)
+        if len(self.tiles) < MOST_TILES:
+            self.tiles[part.origin.x, part.origin.y] = frame
+        return frame
+
+    async def packed(self) -> bytes | None:
+        """All cells, compressed (zlib); None before the first map."""
+        grid = self.grid
+        if grid is None:
+            return None
+        if self._packed is None:
+            data = await asyncio.to_thread(zlib.compress, grid.cells.tobytes(), 1)
+            if self.grid is not grid:
+                return data
+            self._packed = data
+        return self._packed
+
+
+class RobotFeed:
+    """Follows one robot for all browsers; a robot that is not there, or goes, is waited for.
+
+    Args:
+        address: which robot.
+        clock: the station's time.
+    """
+
+    def __init__(self, address: RobotAddress, clock: Clock) -> None:
+        self.address = address
+        self.map = MapStore()
+        self.alive = False
+        """Whether the robot answered the last time it was asked."""
+        self._clock = clock
+        self._viewers: set[Viewer] = set()
+        self._watched = asyncio.Event()
+        self._newest: dict[str, Frame] = {}
+        self._events: deque[str] = deque(maxlen=KEPT_EVENTS)
+        self._facts: str | None = None
+        self._link = frames.text("link", alive=False, round_trip=None, text="")
+
+    # Browsers
+
+    def attach(self, viewer: Viewer) -> None:
+        """Show this robot in a browser, beginning with all that is known."""
+        self._viewers.add(viewer)
+        self._watched.set()
+        viewer.show("link", self._link)
+        if self._facts is not None:
+            viewer.tell(self._facts)
+        for kind, frame in self._newest.items():
+            viewer.show(kind, frame)
+        for event in self._events:
+            viewer.tell(event)
+        for part in self.map.tiles.values():
+            viewer.tell(part)
+
+    def detach(self, viewer: Viewer) -> None:
+        """Show it there no longer."""
+        self._viewers.discard(viewer)
+        if not self._viewers:
+            self._watched.clear()
+
+    # The robot
+
+    async def run(self) -> None:
+        """Follow until cancelled."""
+        while True:
+            try:
+                name, endpoint = self.address.name, self.address.endpoint
+                async with TruckClient(name, endpoint, clock=self._clock, timeout=RETRY) as client:
+                    await self._follow(client)
+            except (InputError, NotFoundError, NotPermittedError) as error:
+                self._set_link(None, str(error))
+                await self._clock.sleep(RETRY)
+
+    async def _follow(self, client: TruckClient) -> None:
+        jobs = [asyncio.create_task(job) for job in (self._ask(client), self._sample(client))]
+        try:
+            done, _ = await asyncio.wait(jobs, return_when=asyncio.FIRST_COMPLETED)
+            for job in done:
+                job.result()
+        finally:
+            for job in jobs:
+                job.cancel()
+            await asyncio.wait(jobs)
+
+    async def _ask(self, client: TruckClient) -> None:
+        """Measure the round trip; ask a robot that appears what it is."""
+        known = False
+        while True:
+            sent = self._clock.now()
+            try:
+                await client.get_retained(topics.GATE)
+                self._set_link((self._clock.now() - sent) / SECOND, "")
+                if not known:
+                    self._facts = frames.facts(await client.call("config"), await client.call("versions"))
+                    known = True
+                    self._tell(self._facts)
+            except TruckError as error:
+                known = known and not isinstance(error, NotFoundError | NoAnswerError)
+                self._set_link(None, str(error))
+            await self._clock.sleep(PING)
+
+    async def _sample(self, client: TruckClient) -> None:
+        """Subscribe while anybody looks."""
+        while True:
+            await self._watched.wait()
+            with ExitStack() as stack:
+                boxes = [(shown, stack.enter_context(client.subscribe(shown.topic, latest()))) for shown in SHOWN]
+                poses = [stack.enter_context(client.subscribe(t, latest())) for t in (topics.POSE, topics.ODOMETRY)]
+                events = stack.enter_context(client.subscribe(topics.EVENT, fifo(64)))
+                maps = stack.enter_context(client.subscribe(topics.MAP, latest()))
+                tiles = stack.enter_context(client.subscribe(topics.MAP_TILES, fifo(MOST_TILES)))
+                taken: dict[str, tuple[Message, int]] = {}
+                while self._viewers:
+                    now = self._clock.now()
+                    for shown, box in boxes:
+                        self._take(shown, box, taken, now)
+                    pose = next((box for box in poses if box.latest is not None), poses[0])
+                    self._take(_POSE, pose, taken, now)
+                    self._take_map(maps, tiles)
+                    for event in events.drain():
+                        self._take_event(event)
+                    await self._clock.sleep(TICK)
+
+    def _take(self, shown: Shown[M], box: Mailbox[M], taken: dict[str, tuple[Message, int]], now: int) -> None:
+        newest = box.latest
+        before, at = taken.get(shown.kind, (None, -SECOND))
+        # Half a tick of tolerance: the looks themselves come a little early or late.
+        if newest is None or newest is before or now - at < (shown.period - TICK / 2) * SECOND:
+            return
+        taken[shown.kind] = newest, now
+        self._show(shown.kind, shown.encode(newest))
+
+    def _take_map(self, maps: Mailbox[Grid], tiles: Mailbox[Grid]) -> None:
+        for grid in maps.drain():
+            self._show("map", self.map.take(grid))
+        for part in tiles.drain():
+            self._tell(self.map.change(part))
+
+    def _take_event(self, event: Event) -> None:
+        frame = frames.message("event", event)
+        self._events.append(frame)
+        self._tell(frame)
+
+    def _set_link(self, round_trip: float | None, text: str) -> None:
+        self.alive = round_trip is not None
+        self._link = frames.text("link", alive=self.alive, round_trip=round_trip, text=text)
+        for viewer in self._viewers:
+            viewer.show("link", self._link)
+
+    def _show(self, kind: str, frame: Frame) -> None:
+        self._newest[kind] = frame
+        for viewer in self._viewers:
+            viewer.show(kind, frame)
+
+    def _tell(self, frame: Frame) -> None:
+        for viewer in self._viewers:
+            viewer.tell(frame)
+
+
+_POSE: Final = Shown(topics.ODOMETRY, "pose", frames.pose)

@@ -1,0 +1,123 @@
+"""What is sent to browsers: small messages as JSON text, bulky ones as binary frames.
+
+A text frame is one object with its ``kind``; the fields of a message stand under ``m``. A binary frame is the length of
+its head (uint32, little-endian), the head (JSON, with the ``kind``), then the payload.
+"""
+
+import json
+import struct
+from typing import Any, Final
+
+import numpy as np
+
+from monstertruck_schemas.base import Message
+from monstertruck_schemas.plan import Path
+from monstertruck_schemas.sensor import CompressedImage, LaserScan
+from monstertruck_schemas.state import Grid, Odometry, Transforms
+
+Frame = str | bytes
+
+LONGEST_RANGE: Final = 65.0
+"""Ranges travel as millimetres in 16 bits, m."""
+
+
+def text(kind: str, **fields: Any) -> str:
+    """A text frame."""
+    return json.dumps({"kind": kind, **fields}, separators=(",", ":"), allow_nan=False)
+
+
+def message(kind: str, of: Message) -> str:
+    """A text frame with all fields of a message."""
+    return f'{{"kind":"{kind}","m":{of.model_dump_json()}}}'
+
+
+def binary(kind: str, payload: bytes, **fields: Any) -> bytes:
+    """A binary frame."""
+    head = json.dumps({"kind": kind, **fields}, separators=(",", ":"), allow_nan=False).encode()
+    return struct.pack("<I", len(head)) + head + payload
+
+
+def scan(of: LaserScan) -> bytes:
+    """A scan; payload: uint16 ranges in mm, little-endian, 0 = none."""
+    ranges = np.where(np.isfinite(of.ranges) & (of.ranges < LONGEST_RANGE), of.ranges * 1000.0, 0.0)
+    return binary(
+        "scan",
+        np.rint(ranges).astype("<u2").tobytes(),
+        stamp=of.stamp,
+        frame=of.frame,
+        start=of.start_angle,
+        step=of.angle_increment,
+        time_step=of.time_increment,
+        tilt=of.tilt,
+    )
+
+
+def picture(of: CompressedImage) -> bytes:
+    """A picture of the camera; payload: the JPEG file."""
+    return binary("camera", of.data, sequence=of.sequence)
+
+
+def pose(of: Odometry) -> str:
+    """Pose and velocity, rounded to a tenth of a millimetre and of a milliradian."""
+    return text(
+        "pose",
+        frame=of.frame,
+        stamp=of.stamp,
+        age=round(of.age, 3),
+        pose=_rounded(of.pose.x, of.pose.y, of.pose.yaw),
+        twist=_rounded(of.twist.vx, of.twist.vy, of.twist.wz),
+    )
+
+
+def path(of: Path) -> str:
+    """A path, rounded as a pose."""
+    return text(
+        "path", frame=of.frame, name=of.name, poses=np.round(of.poses, 4).tolist(), directions=of.directions.tolist()
+    )
+
+
+def transforms(of: Transforms) -> str:
+    """The frame tree."""
+    return text(
+        "transforms",
+        tree={row.child: [row.parent, *row.translation, *row.rotation] for row in of.transforms},
+    )
+
+
+def facts(config: dict[str, Any], versions: dict[str, str]) -> str:
+    """What a robot is and can do, of its configuration; and what software it runs."""
+    devices = {role: row for role, row in config.get("devices", {}).items() if row is not None}
+    lidar = devices.get("lidar", {}).get("mount")
+    return text(
+        "facts",
+        robot=config.get("robot"),
+        body=config.get("body", {}).get("kind"),
+        geometry=config.get("geometry"),
+        gate={name: config["gate"][name] for name in ("speed", "reverse_speed", "angle", "tilt", "leases")},
+        lidar=lidar,
+        devices=sorted(devices),
+        goals=config.get("planner") is not None,
+        mapping=config.get("slam") is not None,
+        behaviours=sorted(config.get("behaviours") or {}),
+        versions=versions,
+    )
+
+
+def grid_head(of: Grid) -> dict[str, Any]:
+    """Where the cells of a grid are."""
+    return {
+        "width": of.width,
+        "height": of.height,
+        "resolution": of.resolution,
+        "origin": [of.origin.x, of.origin.y, of.origin.yaw],
+        "frame": of.frame,
+    }
+
+
+def tile(of: Grid) -> bytes:
+    """A part of the map; payload: int8 cells, row 0 at the lowest y."""
+    return binary("tile", of.cells.tobytes(), **grid_head(of))
+
+
+def _rounded(*values: float) -> list[float]:
+    return [round(value, 4) for value in values]

@@ -1,0 +1,173 @@
+// Driving by hand. Every 50 ms the loop below reads the input and sends what it says at that moment; nothing else sends a
+// motion. A page that hangs, sleeps in a background tab or lost its link sends nothing, and the robot's lease runs out.
+import { number, words } from "./words.js";
+
+const BEAT = 50;
+const REST = 6; // neutral heartbeats behind the last one, so that the truck stops by its ramp
+const GRACE = 5000; // ms for which neutral heartbeats keep an armed truck armed until the hand is on the stick
+const DEAD = 0.08;
+const BLIND = 0.1; // metres that the truck may travel on the lease and the way of a request
+const LEASE = 0.25;
+const MODES = ["front", "rear", "counter", "crab", "twist"];
+const KEYS = { w: [0, 1], s: [0, -1], a: [-1, 0], d: [1, 0] };
+const ARROWS = { ArrowUp: "w", ArrowDown: "s", ArrowLeft: "a", ArrowRight: "d" };
+
+export class Drive {
+  constructor(link) {
+    this.link = link;
+    this.held = new Set();
+    this.stick = null;
+    this.rest = 0;
+    this.last = "stick";
+    this.grace = 0;
+    this.byId = (id) => document.getElementById(id);
+    this.steering = this.byId("steering");
+    this.speed = this.byId("speed");
+    for (const mode of MODES) this.steering.add(new Option(words(`steering.${mode}`), mode));
+    this.steering.value = "counter";
+    link.on("facts", (facts) => this.takeFacts(facts));
+    link.on("robot", () => this.letGo());
+    this.listen();
+    this.showSpeed();
+    setInterval(() => this.beat(), BEAT);
+  }
+
+  takeFacts(facts) {
+    this.facts = facts;
+    this.speed.max = facts.gate.speed;
+    const axles = facts.body === "truck";
+    for (const option of this.steering.options) option.disabled = !axles && option.value !== "twist" && !(option.value === "front" && ["tricycle", "ackermann", "bicycle"].includes(facts.body));
+    if (this.steering.selectedOptions[0].disabled) this.steering.value = "twist";
+    this.showSpeed();
+  }
+
+  listen() {
+    const stick = this.byId("stick");
+    const take = (event) => {
+      const { left, top, width, height } = stick.getBoundingClientRect();
+      let x = ((event.clientX - left) / width) * 2 - 1;
+      let y = 1 - ((event.clientY - top) / height) * 2;
+      const size = Math.hypot(x, y);
+      if (size > 1) [x, y] = [x / size, y / size];
+      this.stick = [x, y];
+    };
+    stick.addEventListener("pointerdown", (event) => {
+      if (event.button) return;
+      stick.setPointerCapture(event.pointerId);
+      this.pointer = event.pointerId;
+      take(event);
+    });
+    stick.addEventListener("pointermove", (event) => event.pointerId === this.pointer && take(event));
+    for (const end of ["pointerup", "pointercancel", "lostpointercapture"]) {
+      stick.addEventListener(end, (event) => {
+        if (event.pointerId === this.pointer) this.pointer = this.stick = null;
+      });
+    }
+    window.addEventListener("keydown", (event) => this.key(event, true));
+    window.addEventListener("keyup", (event) => this.key(event, false));
+    for (const end of ["blur", "pagehide"]) window.addEventListener(end, () => this.letGo());
+    document.addEventListener("visibilitychange", () => document.hidden && this.letGo());
+    this.speed.addEventListener("input", () => this.showSpeed());
+  }
+
+  key(event, down) {
+    const typing = event.target instanceof Element && event.target.closest("select, input:not([type=range])");
+    const name = ARROWS[event.key] && document.activeElement?.id === "stick" ? ARROWS[event.key] : event.key.toLowerCase();
+    if (!down) return void this.held.delete(ARROWS[event.key] ?? name), void this.held.delete(name);
+    if (typing || event.ctrlKey || event.altKey || event.metaKey) return;
+    if (name in KEYS) {
+      this.held.add(name);
+      event.preventDefault();
+    } else if (MODES[Number(name) - 1] && !event.repeat) {
+      const option = this.steering.options[Number(name) - 1];
+      if (!option.disabled) this.steering.value = option.value;
+    }
+  }
+
+  letGo() {
+    this.held.clear();
+    this.stick = this.pointer = null;
+    this.grace = 0;
+  }
+
+  /** Keep a truck armed while the hand moves to the stick. */
+  keepArmed() {
+    this.grace = performance.now() + GRACE;
+  }
+
+  /** What the hand says now: [input, sideways, ahead], each -1..1; null = no hand. */
+  input() {
+    if (this.stick) return ["stick", ...this.stick];
+    if (this.held.size) {
+      const sum = [...this.held].map((key) => KEYS[key]).reduce(([x, y], [kx, ky]) => [x + kx, y + ky], [0, 0]);
+      return ["keys", ...sum];
+    }
+    const pad = [...(navigator.getGamepads?.() ?? [])].find((each) => each?.connected && each.mapping === "standard");
+    this.pad = pad ?? null;
+    if (pad?.buttons[5]?.pressed || pad?.buttons[7]?.pressed) {
+      const [x, y] = [pad.axes[0], -pad.axes[1]].map((v) => (Math.abs(v) < DEAD ? 0 : v));
+      return ["gamepad", x, y];
+    }
+    return null;
+  }
+
+  /** Speed allowed by the slider and by the delay: lease and round trip together cost BLIND metres at most. */
+  limit() {
+    const delay = this.link.roundTrip();
+    const safe = delay === null ? Infinity : BLIND / (LEASE + delay / 1000);
+    return Math.min(Number(this.speed.value), safe);
+  }
+
+  beat() {
+    const hand = this.input();
+    this.show(hand);
+    if (hand) {
+      this.rest = REST;
+      this.grace = 0;
+      this.last = hand[0];
+      this.send(hand);
+    } else if (this.rest > 0) {
+      this.rest--;
+      this.send([this.last, 0, 0]);
+    } else if (performance.now() < this.grace) this.send(["stick", 0, 0]);
+  }
+
+  send([input, x, y]) {
+    const limit = this.limit();
+    const speed = Math.abs(y) < DEAD ? 0 : y * limit;
+    const steer = -x * (this.facts?.gate.angle ?? 0.36);
+    const motion = { do: "drive", at: performance.now(), input };
+    switch (this.steering.value) {
+      case "front": Object.assign(motion, { speed, front: steer, rear: 0 }); break;
+      case "rear": Object.assign(motion, { speed, front: 0, rear: -steer }); break;
+      case "counter": Object.assign(motion, { speed, front: steer, rear: -steer }); break;
+      case "crab": Object.assign(motion, { speed, front: steer, rear: steer }); break;
+      default: motion.twist = [speed, 0, (-x * limit) / 0.2];
+    }
+    this.link.send(motion);
+  }
+
+  show(hand) {
+    const knob = this.byId("knob");
+    const radius = this.byId("stick").clientWidth / 2 - 32;
+    knob.style.transform = hand ? `translate(${hand[1] * radius}px, ${-hand[2] * radius}px)` : "";
+    this.byId("stick").classList.toggle("held", Boolean(hand));
+    const left = Math.ceil((this.grace - performance.now()) / 1000);
+    const text = hand ? words(`input.${hand[0]}`)
+      : left > 0 ? words("input.grace", { seconds: left })
+      : this.pad ? words("input.ready", { name: this.pad.id.slice(0, 24) })
+      : words("input.none");
+    setText(this.byId("input"), text);
+    const slowed = this.limit() < Number(this.speed.value) - 0.001;
+    const delay = this.link.roundTrip();
+    setText(this.byId("speed-note"), slowed ? words("speed.slowed", { speed: number(this.limit()), delay: number(delay, 0) }) : "");
+  }
+
+  showSpeed() {
+    setText(this.byId("speed-value"), words("speed.value", { speed: number(Number(this.speed.value)) }));
+  }
+}
+
+function setText(element, text) {
+  if (element.textContent !== text) element.textContent = text;
+}

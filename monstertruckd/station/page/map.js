@@ -1,0 +1,473 @@
+// The map: grid, tiles, scan, trail, route, footprint, stopping distance and goal on one canvas.
+import { compose, moved, outline, wheelAngles, wrapped } from "./geometry.js";
+
+const COLOURS = ["map", "map-free", "map-wall", "map-grid", "scan", "trail", "route", "deformed", "goal", "ghost", "truck", "ink", "card", "accent"];
+const TRAIL_STEP = 0.03;
+const TRAIL_LENGTH = 6000;
+const POSES = 60;
+const AIM = 0.15; // metres of dragging from which on it is a heading
+
+export class MapView {
+  constructor(canvas, link, onAim) {
+    this.canvas = canvas;
+    this.link = link;
+    this.onAim = onAim;
+    this.centre = [0, 0];
+    this.scale = 90; // pixels per metre
+    this.rotation = 0;
+    this.follow = true;
+    this.headingUp = false;
+    this.aiming = false;
+    this.pointers = new Map();
+    this.clear();
+    this.readColours();
+    new ResizeObserver(() => this.resize()).observe(canvas);
+    this.resize();
+    this.listen();
+    const frame = () => {
+      if (this.dirty) {
+        this.dirty = false;
+        this.draw();
+      }
+      requestAnimationFrame(frame);
+    };
+    requestAnimationFrame(frame);
+  }
+
+  clear() {
+    this.poses = [];
+    this.pose = null;
+    this.points = null;
+    this.trail = [];
+    this.grid = null;
+    this.tiles = new Map();
+    this.path = this.route = null;
+    this.pending = null;
+    this.goal = null;
+    this.wanted = 0;
+    this.dirty = true;
+  }
+
+  readColours() {
+    const style = getComputedStyle(document.documentElement);
+    this.colour = Object.fromEntries(COLOURS.map((name) => [name, style.getPropertyValue(`--${name}`).trim()]));
+    for (const image of [this.grid, ...this.tiles.values()]) if (image) this.paint(image);
+    this.dirty = true;
+  }
+
+  resize() {
+    const ratio = window.devicePixelRatio || 1;
+    this.width = this.canvas.clientWidth;
+    this.height = this.canvas.clientHeight;
+    this.canvas.width = Math.round(this.width * ratio);
+    this.canvas.height = Math.round(this.height * ratio);
+    this.ratio = ratio;
+    this.dirty = true;
+  }
+
+  listen() {
+    const { link } = this;
+    link.on("robot", () => this.clear());
+    link.on("pose", (message) => this.takePose(message));
+    link.on("scan", (message) => this.takeScan(message));
+    link.on("path", (message) => this.takePath(message));
+    link.on("map", (message) => this.takeMap(message));
+    link.on("tile", (message) => this.takeTile(message));
+    link.on("goal", (state) => this.take("goal", state.goal));
+    link.on("gate", () => (this.dirty = true));
+    const { canvas } = this;
+    canvas.addEventListener("pointerdown", (event) => this.press(event));
+    canvas.addEventListener("pointermove", (event) => this.drag(event));
+    for (const end of ["pointerup", "pointercancel"]) canvas.addEventListener(end, (event) => this.release(event));
+    canvas.addEventListener("wheel", (event) => {
+      event.preventDefault();
+      this.zoom(Math.exp(-event.deltaY / 400), event.offsetX, event.offsetY);
+    }, { passive: false });
+    canvas.addEventListener("keydown", (event) => this.key(event));
+  }
+
+  take(name, value) {
+    this[name] = value;
+    this.dirty = true;
+  }
+
+  takePose(message) {
+    this.pose = message.pose;
+    this.twist = message.twist;
+    this.poses.push([message.stamp, message.pose]);
+    if (this.poses.length > POSES) this.poses.shift();
+    const last = this.trail.at(-1);
+    if (!last || Math.hypot(last[0] - message.pose[0], last[1] - message.pose[1]) > TRAIL_STEP) {
+      this.trail.push(message.pose);
+      if (this.trail.length > TRAIL_LENGTH) this.trail.shift();
+    }
+    if (this.follow) this.centre = message.pose.slice(0, 2);
+    this.rotation = this.headingUp ? Math.PI / 2 - message.pose[2] : this.headingUp === null ? this.rotation : 0;
+    this.dirty = true;
+  }
+
+  /** Pose at a time between those that came, or the nearest. */
+  poseAt(stamp) {
+    const after = this.poses.findIndex(([at]) => at >= stamp);
+    if (after <= 0) return (this.poses[after] ?? this.poses.at(-1))?.[1];
+    const [[t0, a], [t1, b]] = [this.poses[after - 1], this.poses[after]];
+    const k = (stamp - t0) / (t1 - t0);
+    return [a[0] + k * (b[0] - a[0]), a[1] + k * (b[1] - a[1]), a[2] + k * wrapped(b[2] - a[2])];
+  }
+
+  takeScan(message) {
+    const ranges = new Uint16Array(message.payload);
+    const base = this.poseAt(message.stamp + (ranges.length / 2) * message.time_step * 1e9);
+    if (!base) return;
+    const mount = this.link.newest.facts?.lidar ?? { x: 0, y: 0, yaw: 0 };
+    const [x, y, yaw] = compose(base, [mount.x, mount.y, mount.yaw]);
+    const points = new Float32Array(2 * ranges.length);
+    let count = 0;
+    for (let i = 0; i < ranges.length; i++) {
+      if (!ranges[i]) continue;
+      const angle = yaw + message.start + i * message.step;
+      points[count++] = x + (ranges[i] / 1000) * Math.cos(angle);
+      points[count++] = y + (ranges[i] / 1000) * Math.sin(angle);
+    }
+    this.take("points", points.subarray(0, count));
+  }
+
+  takePath(message) {
+    const points = [];
+    for (let i = 0; i < message.poses.length; i += 3) points.push(message.poses.slice(i, i + 3));
+    const deformed = message.name.includes("deformed");
+    this.path = { points, deformed };
+    if (!deformed) this.route = points;
+    this.dirty = true;
+  }
+
+  async takeMap(message) {
+    this.wanted = message.version;
+    const robot = this.link.robot;
+    const reply = await fetch(`/robots/${encodeURIComponent(robot)}/map/${message.version}`);
+    if (!reply.ok) return;
+    const cells = new Int8Array(await reply.arrayBuffer());
+    if (robot !== this.link.robot || this.wanted !== message.version || cells.length !== message.width * message.height) return;
+    this.tiles.clear();
+    this.grid = this.paint({ ...message, cells });
+    this.dirty = true;
+  }
+
+  takeTile(message) {
+    const image = this.paint({ ...message, cells: new Int8Array(message.payload) });
+    this.tiles.set(message.origin.join(), image);
+    this.dirty = true;
+  }
+
+  /** Draw the cells of a grid into a canvas of their own, in the theme's colours. */
+  paint(image) {
+    const { width, height, cells } = image;
+    const canvas = (image.canvas ??= Object.assign(document.createElement("canvas"), { width, height }));
+    const context = canvas.getContext("2d");
+    const data = context.createImageData(width, height);
+    const pixels = new Uint32Array(data.data.buffer);
+    const [free, wall] = [rgb(this.colour["map-free"]), rgb(this.colour["map-wall"])];
+    const colours = new Uint32Array(101);
+    for (let value = 0; value <= 100; value++) {
+      const k = value / 100;
+      const [r, g, b] = free.map((from, i) => Math.round(from + k * (wall[i] - from)));
+      colours[value] = (255 << 24) | (b << 16) | (g << 8) | r;
+    }
+    for (let i = 0; i < cells.length; i++) pixels[i] = cells[i] < 0 ? 0 : colours[cells[i]];
+    context.putImageData(data, 0, 0);
+    return image;
+  }
+
+  // Hands
+
+  toWorld(px, py) {
+    const [dx, dy] = [(px - this.width / 2) / this.scale, -(py - this.height / 2) / this.scale];
+    const [c, s] = [Math.cos(-this.rotation), Math.sin(-this.rotation)];
+    return [this.centre[0] + c * dx - s * dy, this.centre[1] + s * dx + c * dy];
+  }
+
+  toScreen(x, y) {
+    const [dx, dy] = [x - this.centre[0], y - this.centre[1]];
+    const [c, s] = [Math.cos(this.rotation), Math.sin(this.rotation)];
+    return [this.width / 2 + this.scale * (c * dx - s * dy), this.height / 2 - this.scale * (s * dx + c * dy)];
+  }
+
+  press(event) {
+    this.canvas.setPointerCapture(event.pointerId);
+    this.pointers.set(event.pointerId, [event.offsetX, event.offsetY]);
+    if (this.aiming && this.pointers.size === 1) {
+      const [x, y] = this.toWorld(event.offsetX, event.offsetY);
+      this.pending = [x, y, this.pose ? Math.atan2(y - this.pose[1], x - this.pose[0]) : 0];
+      this.dirty = true;
+    }
+  }
+
+  drag(event) {
+    const before = this.pointers.get(event.pointerId);
+    if (!before) return;
+    const now = [event.offsetX, event.offsetY];
+    this.pointers.set(event.pointerId, now);
+    if (this.aiming && this.pointers.size === 1) {
+      const [x, y] = this.toWorld(...now);
+      const [gx, gy] = this.pending;
+      if (Math.hypot(x - gx, y - gy) > AIM) this.pending[2] = Math.atan2(y - gy, x - gx);
+    } else if (this.pointers.size === 2) {
+      const [a, b] = [...this.pointers.values()];
+      const other = a === now ? b : a;
+      const span = (p) => Math.hypot(p[0] - other[0], p[1] - other[1]);
+      this.zoom(span(now) / Math.max(span(before), 1), (now[0] + other[0]) / 2, (now[1] + other[1]) / 2);
+      if (!this.headingUp) {
+        const angle = (p) => Math.atan2(-(p[1] - other[1]), p[0] - other[0]);
+        this.headingUp = null; // turned by hand
+        this.rotation += wrapped(angle(now) - angle(before));
+      }
+    } else {
+      const [from, to] = [this.toWorld(...before), this.toWorld(...now)];
+      this.setFollow(false);
+      this.centre = [this.centre[0] - to[0] + from[0], this.centre[1] - to[1] + from[1]];
+    }
+    this.dirty = true;
+  }
+
+  release(event) {
+    if (!this.pointers.delete(event.pointerId) || !this.aiming || this.pointers.size) return;
+    if (event.type === "pointercancel") this.pending = null;
+    this.onAim(this.pending);
+    this.dirty = true;
+  }
+
+  key(event) {
+    const step = 60 / this.scale;
+    const moves = { ArrowLeft: [-step, 0], ArrowRight: [step, 0], ArrowUp: [0, step], ArrowDown: [0, -step] };
+    if (event.key in moves) {
+      const [c, s] = [Math.cos(-this.rotation), Math.sin(-this.rotation)];
+      const [x, y] = moves[event.key];
+      this.setFollow(false);
+      this.centre = [this.centre[0] + c * x - s * y, this.centre[1] + s * x + c * y];
+    } else if (event.key === "+") this.zoom(1.25);
+    else if (event.key === "-") this.zoom(0.8);
+    else return;
+    event.preventDefault();
+    this.dirty = true;
+  }
+
+  setFollow(follow) {
+    this.follow = follow;
+    if (follow && this.pose) this.centre = this.pose.slice(0, 2);
+    this.onFollow?.(follow);
+    this.dirty = true;
+  }
+
+  setHeadingUp(up) {
+    this.headingUp = up;
+    if (this.pose) this.rotation = up ? Math.PI / 2 - this.pose[2] : 0;
+    this.dirty = true;
+  }
+
+  setAiming(aiming) {
+    this.aiming = aiming;
+    if (aiming) this.pending = null;
+    this.canvas.classList.toggle("aiming", aiming);
+    this.dirty = true;
+  }
+
+  zoom(by, px = this.width / 2, py = this.height / 2) {
+    const fixed = this.toWorld(px, py);
+    this.scale = Math.min(Math.max(this.scale * by, 4), 800);
+    if (!this.follow) {
+      const now = this.toWorld(px, py);
+      this.centre = [this.centre[0] + fixed[0] - now[0], this.centre[1] + fixed[1] - now[1]];
+    }
+    this.dirty = true;
+  }
+
+  /** Show all of the map, or all that the scan sees. */
+  fit() {
+    const places = [];
+    if (this.grid) {
+      const { origin, width, height, resolution } = this.grid;
+      for (const [i, j] of [[0, 0], [width, 0], [0, height], [width, height]]) places.push(compose(origin, [i * resolution, j * resolution, 0]));
+    }
+    for (let i = 0; !this.grid && i < (this.points?.length ?? 0); i += 2) places.push([this.points[i], this.points[i + 1]]);
+    if (this.pose) places.push(this.pose);
+    if (!places.length) return;
+    const [xs, ys] = [places.map((p) => p[0]), places.map((p) => p[1])];
+    const [x0, x1, y0, y1] = [Math.min(...xs), Math.max(...xs), Math.min(...ys), Math.max(...ys)];
+    this.setFollow(false);
+    this.setHeadingUp(false);
+    this.centre = [(x0 + x1) / 2, (y0 + y1) / 2];
+    this.scale = Math.min(Math.max(Math.min(this.width / (x1 - x0 + 0.5), this.height / (y1 - y0 + 0.5)), 4), 800);
+    this.dirty = true;
+  }
+
+  // Drawing
+
+  draw() {
+    const c = this.canvas.getContext("2d");
+    c.setTransform(this.ratio, 0, 0, this.ratio, 0, 0);
+    c.fillStyle = this.colour.map;
+    c.fillRect(0, 0, this.width, this.height);
+    c.translate(this.width / 2, this.height / 2);
+    c.rotate(-this.rotation);
+    c.scale(this.scale, -this.scale);
+    c.translate(-this.centre[0], -this.centre[1]);
+    const px = 1 / this.scale;
+    if (this.grid) this.drawImage(c, this.grid);
+    for (const tile of this.tiles.values()) this.drawImage(c, tile);
+    this.drawLines(c, px);
+    this.stroke(c, this.trail, this.colour.trail, 2 * px);
+    if (this.path?.deformed && this.route) this.stroke(c, this.route, this.colour.route, 1.5 * px, [6 * px, 5 * px]);
+    if (this.path) this.stroke(c, this.path.points, this.colour[this.path.deformed ? "deformed" : "route"], 3 * px);
+    this.drawScan(c, px);
+    this.drawGhost(c, px);
+    if (this.pose) this.drawTruck(c, px);
+    if (this.goal) this.drawGoal(c, [this.goal.x, this.goal.y, this.goal.yaw], px, this.colour.goal);
+    if (this.pending) this.drawGoal(c, this.pending, px, this.colour.accent);
+    c.setTransform(this.ratio, 0, 0, this.ratio, 0, 0);
+    this.drawScale(c);
+  }
+
+  drawImage(c, { canvas, origin, resolution }) {
+    c.save();
+    c.translate(origin[0], origin[1]);
+    c.rotate(origin[2]);
+    c.scale(resolution, resolution);
+    c.imageSmoothingEnabled = false;
+    c.drawImage(canvas, 0, 0);
+    c.restore();
+  }
+
+  drawLines(c, px) {
+    const corners = [[0, 0], [this.width, 0], [0, this.height], [this.width, this.height]].map(([x, y]) => this.toWorld(x, y));
+    const [xs, ys] = [corners.map((p) => p[0]), corners.map((p) => p[1])];
+    const step = this.scale > 25 ? 1 : 5;
+    c.beginPath();
+    for (let x = Math.ceil(Math.min(...xs) / step) * step; x <= Math.max(...xs); x += step) c.moveTo(x, Math.min(...ys)), c.lineTo(x, Math.max(...ys));
+    for (let y = Math.ceil(Math.min(...ys) / step) * step; y <= Math.max(...ys); y += step) c.moveTo(Math.min(...xs), y), c.lineTo(Math.max(...xs), y);
+    c.strokeStyle = this.colour["map-grid"];
+    c.lineWidth = px;
+    c.stroke();
+  }
+
+  stroke(c, points, colour, width, dash = []) {
+    if (points.length < 2) return;
+    c.beginPath();
+    points.forEach(([x, y], i) => (i ? c.lineTo(x, y) : c.moveTo(x, y)));
+    c.strokeStyle = colour;
+    c.lineWidth = width;
+    c.lineJoin = "round";
+    c.setLineDash(dash);
+    c.stroke();
+    c.setLineDash([]);
+  }
+
+  drawScan(c, px) {
+    if (!this.points || this.link.age("scan") > 1) return;
+    const size = Math.max(2.5 * px, 0.012);
+    c.fillStyle = this.colour.scan;
+    for (let i = 0; i < this.points.length; i += 2) c.fillRect(this.points[i] - size / 2, this.points[i + 1] - size / 2, size, size);
+  }
+
+  shape() {
+    const { length = 0.47, width = 0.34, wheelbase = 0.32, track = 0.26, wheel_radius = 0.075 } = this.link.newest.facts?.geometry ?? {};
+    return { length, width, wheelbase, track, radius: wheel_radius };
+  }
+
+  /** Where the truck would be before it stands, if the newest heartbeat were the last: lease, link and braking. */
+  drawGhost(c, px) {
+    const gate = this.link.newest.gate;
+    if (!gate?.twist || !this.pose || !["driving", "stopping"].includes(gate.mode)) return;
+    const { vx, vy, wz } = gate.twist;
+    const speed = Math.hypot(vx, vy);
+    const blind = gate.mode === "driving" ? (gate.lease_left ?? 0) + (this.link.roundTrip() ?? 0) / 1000 : 0;
+    const distance = gate.stopping_distance + speed * blind;
+    if (speed < 0.005 || distance < 0.005) return;
+    const seconds = distance / speed;
+    const { length, width } = this.shape();
+    for (let i = 1; i <= 4; i++) {
+      this.polygon(c, moved(this.pose, [vx, vy, wz], (seconds * i) / 4), outline(length, width));
+      c.globalAlpha = i === 4 ? 1 : 0.25;
+      c.strokeStyle = this.colour.ghost;
+      c.lineWidth = 2 * px;
+      c.setLineDash([5 * px, 4 * px]);
+      c.stroke();
+    }
+    c.setLineDash([]);
+    c.globalAlpha = 1;
+  }
+
+  polygon(c, pose, corners) {
+    c.beginPath();
+    corners.forEach((corner, i) => {
+      const [x, y] = compose(pose, [...corner, 0]);
+      i ? c.lineTo(x, y) : c.moveTo(x, y);
+    });
+    c.closePath();
+  }
+
+  drawTruck(c, px) {
+    const { length, width, wheelbase, track, radius } = this.shape();
+    const old = this.link.age("pose") > 1;
+    c.globalAlpha = old ? 0.4 : 1;
+    this.polygon(c, this.pose, outline(length, width));
+    c.fillStyle = this.colour.accent;
+    c.globalAlpha *= 0.35;
+    c.fill();
+    c.globalAlpha = old ? 0.4 : 1;
+    c.strokeStyle = this.colour.truck;
+    c.lineWidth = 1.5 * px;
+    c.stroke();
+    const steering = this.link.newest.steering;
+    const places = [[1, 1], [1, -1], [-1, 1], [-1, -1]].map(([i, j]) => [(i * wheelbase) / 2, (j * track) / 2]);
+    const angles = wheelAngles(steering?.front ?? 0, steering?.rear ?? 0, wheelbase, places);
+    c.fillStyle = this.colour.truck;
+    places.forEach(([x, y], i) => {
+      this.polygon(c, compose(this.pose, [x, y, angles[i]]), outline(2 * radius, radius * 0.8));
+      c.fill();
+    });
+    this.polygon(c, compose(this.pose, [length / 2, 0, 0]), [[0, width / 5], [0, -width / 5], [width / 5, 0]]);
+    c.fill();
+    c.globalAlpha = 1;
+  }
+
+  drawGoal(c, pose, px, colour) {
+    const { length, width } = this.shape();
+    this.polygon(c, pose, outline(length, width));
+    c.strokeStyle = c.fillStyle = colour;
+    c.lineWidth = 2 * px;
+    c.stroke();
+    const size = Math.max(length / 2, 14 * px);
+    this.stroke(c, [pose, compose(pose, [1.6 * size, 0, 0])], colour, 2.5 * px);
+    this.polygon(c, compose(pose, [1.6 * size, 0, 0]), [[0.4 * size, 0], [-0.1 * size, 0.25 * size], [-0.1 * size, -0.25 * size]]);
+    c.fill();
+    c.beginPath();
+    c.arc(pose[0], pose[1], 4 * px, 0, 2 * Math.PI);
+    c.fill();
+  }
+
+  drawScale(c) {
+    const metres = [0.1, 0.2, 0.5, 1, 2, 5, 10, 20].find((m) => m * this.scale > 60) ?? 50;
+    const [x, y] = [this.width - 16, this.height - 16];
+    const length = metres * this.scale;
+    c.fillStyle = this.colour.card;
+    c.globalAlpha = 0.75;
+    c.fillRect(x - length - 8, y - 24, length + 16, 32);
+    c.globalAlpha = 1;
+    c.strokeStyle = c.fillStyle = this.colour.ink;
+    c.lineWidth = 2;
+    c.beginPath();
+    c.moveTo(x - length, y - 5);
+    c.lineTo(x - length, y);
+    c.lineTo(x, y);
+    c.lineTo(x, y - 5);
+    c.stroke();
+    c.font = "12px system-ui, sans-serif";
+    c.textAlign = "center";
+    c.fillText(`${metres} m`, x - length / 2, y - 8);
+  }
+}
+
+function rgb(colour) {
+  const hex = colour.length === 4 ? [...colour.slice(1)].map((d) => d + d).join("") : colour.slice(1, 7);
+  return [0, 2, 4].map((i) => parseInt(hex.slice(i, i + 2), 16));
+}

@@ -1,0 +1,291 @@
+// The panels beside the map: safety gate, truck, system, events, banners.
+import { wheelAngles } from "./geometry.js";
+import { degrees, number, reason, words } from "./words.js";
+
+const byId = (id) => document.getElementById(id);
+const KEPT = 300;
+const SILENT = 1.0;
+
+export function element(name, fields = {}, ...children) {
+  const made = Object.assign(document.createElement(name), fields);
+  made.append(...children);
+  return made;
+}
+
+function svg(name, fields) {
+  const made = document.createElementNS("http://www.w3.org/2000/svg", name);
+  for (const [key, value] of Object.entries(fields)) made.setAttribute(key, value);
+  return made;
+}
+
+function setText(id, text, look = null) {
+  const target = byId(id);
+  if (target.textContent !== text) target.textContent = text;
+  if (look !== null) for (const name of ["good", "warn", "bad"]) target.classList.toggle(name, name === look);
+}
+
+/** Rows of a description list: [key of the label, value, look]; what is null is left out. */
+function rows(id, given) {
+  const list = byId(id);
+  const wanted = given.filter(([, value]) => value !== null && value !== undefined);
+  const keys = wanted.map(([key]) => key).join();
+  if (list.dataset.keys !== keys) {
+    list.dataset.keys = keys;
+    list.replaceChildren(...wanted.flatMap(([key]) => [element("dt", { textContent: words(key) }), element("dd")]));
+  }
+  wanted.forEach(([, value, look = ""], i) => {
+    const cell = list.children[2 * i + 1];
+    if (cell.textContent !== value) cell.textContent = value;
+    cell.className = look;
+  });
+}
+
+const LOOKS = { disarmed: "", armed: "warn", driving: "good", stopping: "warn", estopped: "bad" };
+
+export class Panels {
+  constructor(link) {
+    this.link = link;
+    this.seen = new Set();
+    this.source = null;
+    link.on("robot", () => this.clear());
+    link.on("pilot", ({ source }) => (this.source = source));
+    link.on("stop", (stop) => this.showStop(stop));
+    link.on("event", (event) => this.addEvent(event));
+    link.on("health", (table) => this.showServices(table));
+    link.on("late", ({ seconds }) => this.banner("late", words("banner.late", { seconds: number(seconds) }), "warn"));
+    link.on("camera", (message) => this.showPicture(message));
+    link.on("trouble", ({ text }) => setText("refusal", text));
+    this.buildTop();
+    this.buildHorizon();
+    this.tabs();
+    setInterval(() => this.refresh(), 100);
+  }
+
+  clear() {
+    this.seen.clear();
+    this.source = null;
+    byId("events").replaceChildren();
+    byId("services").replaceChildren();
+    byId("banners").replaceChildren();
+    byId("chain").hidden = true;
+    byId("camera").hidden = true;
+    setText("refusal", "");
+  }
+
+  get alive() {
+    return this.link.open && this.link.age("gate") < SILENT;
+  }
+
+  refresh() {
+    const { newest } = this.link;
+    const gate = this.alive ? newest.gate : null;
+    this.showLink();
+    this.showGate(gate);
+    if (!byId("pane-truck").hidden) this.showTruck();
+    if (!byId("pane-system").hidden) this.showSystem();
+    const battery = newest.battery;
+    byId("chip-battery").hidden = !battery;
+    if (battery) {
+      const look = { normal: "", low: "warn", critical: "bad", overcharged: "warn", sensor_fault: "warn" }[battery.level] ?? "";
+      setText("chip-battery", battery.voltage === null ? "– V" : `${number(battery.voltage, 1)} V`, look);
+      const key = `battery-${battery.level}`;
+      if (look && !this.seen.has(key)) this.banner(key, words("banner.battery", { voltage: number(battery.voltage, 1), level: words(`level.${battery.level}`) }), look);
+      if (!look) this.drop("battery-");
+    }
+    const silent = this.link.open && !this.alive && this.link.age("robot") > 2;
+    if (silent && newest.gate) this.banner("silent", words("banner.silent"), "bad");
+    else this.drop("silent");
+    const facts = newest.facts;
+    if (facts && newest.hello && facts.versions.monstertruckd !== newest.hello.version) {
+      this.banner("versions", words("versions.differ", { robot: facts.versions.monstertruckd, station: newest.hello.version }), "warn");
+    }
+  }
+
+  showLink() {
+    const { link } = this;
+    if (!link.open) return setText("chip-link", words("link.lost"), "bad");
+    const delay = link.roundTrip();
+    if (delay === null) return setText("chip-link", words("link.absent"), "bad");
+    if (!this.alive && link.newest.gate) return setText("chip-link", words("link.silent", { seconds: number(link.age("gate"), 0) }), "bad");
+    setText("chip-link", words("link.value", { delay: number(delay, 0) }), delay > 250 ? "bad" : delay > 100 ? "warn" : "good");
+  }
+
+  showGate(gate) {
+    const mode = gate?.mode ?? "unknown";
+    setText("mode-name", words(`mode.${mode}`));
+    byId("authority").dataset.mode = mode;
+    setText("chip-mode", words(`mode.${mode}`), LOOKS[mode] ?? "bad");
+    setText("mode-limit", gate && gate.mode !== "disarmed" && gate.mode !== "estopped" ? words("limit", { speed: number(gate.speed_limit) }) : "");
+    const list = (gate?.reasons ?? []).map(reason);
+    if (byId("reasons").dataset.shown !== list.join()) {
+      byId("reasons").dataset.shown = list.join();
+      byId("reasons").replaceChildren(...list.map((textContent) => element("li", { textContent })));
+    }
+    const mine = gate?.holder && gate.holder === this.source;
+    setText("holder-name", gate?.holder ? words(mine ? "holder.you" : "holder", { name: gate.holder })
+      : gate?.waiting.length ? words("holder.waiting", { names: gate.waiting.join(", ") }) : gate ? words("holder.none") : "");
+    byId("lease").hidden = !gate?.holder;
+    byId("lease").value = gate?.lease_left ?? 0;
+    const moving = ["armed", "driving", "stopping"].includes(mode);
+    byId("arm").disabled = mode !== "disarmed";
+    byId("disarm").disabled = !moving;
+    byId("stop").disabled = mode !== "driving";
+    byId("reset").hidden = mode !== "estopped";
+    byId("arm").hidden = mode === "estopped";
+  }
+
+  showStop(stop) {
+    byId("chain").hidden = false;
+    byId("causes").replaceChildren(...stop.causes.map((cause) => {
+      const before = (stop.stamp - cause.since) / 1e9;
+      return element("li", {}, element("span", { textContent: cause.text || reason(cause.reason) }),
+        element("small", { textContent: ` ${cause.source}${before > 0.005 ? `, ${words("cause.since", { seconds: number(before) })}` : ""}` }));
+    }));
+  }
+
+  addEvent(event) {
+    const list = byId("events");
+    const clock = this.link.newest.clock;
+    const item = element("li", { className: event.severity },
+      element("span", { textContent: event.text || reason(event.reason) }),
+      element("small", { textContent: `${event.source} · ${reason(event.reason)}` }));
+    void clock;
+    list.prepend(item);
+    while (list.children.length > KEPT) list.lastChild.remove();
+  }
+
+  showServices({ services }) {
+    const look = { ready: "good", starting: "", backoff: "warn", failed: "bad", stopped: "" };
+    byId("services").replaceChildren(...services.map((s) => element("tr", {},
+      element("td", { textContent: s.name }, ...(s.detail && s.state !== "ready" ? [element("small", { textContent: s.detail })] : [])),
+      element("td", { textContent: words(`state.${s.state}`), className: look[s.state] }),
+      element("td", { textContent: String(s.restarts), className: "right" }))));
+    const failed = services.filter((s) => s.state === "failed" || s.state === "backoff");
+    byId("tab-system").classList.toggle("warn", failed.length > 0);
+  }
+
+  showPicture(message) {
+    const image = byId("camera");
+    const before = image.src;
+    image.src = URL.createObjectURL(new Blob([message.payload], { type: "image/jpeg" }));
+    if (before) URL.revokeObjectURL(before);
+    image.alt = words("camera");
+    image.hidden = false;
+  }
+
+  // Banners stay until they are acknowledged or their cause is gone.
+
+  banner(key, text, look) {
+    const shown = byId("banners").querySelector(`[data-key="${key}"]`);
+    if (shown) return void (shown.firstChild.textContent = text);
+    if (this.seen.has(key)) return;
+    const close = element("button", { textContent: words("banner.close") });
+    const made = element("div", { className: `banner ${look}` }, element("span", { textContent: text }), close);
+    made.dataset.key = key;
+    close.onclick = () => {
+      this.seen.add(key);
+      made.remove();
+    };
+    byId("banners").append(made);
+  }
+
+  drop(prefix) {
+    for (const key of this.seen) if (key.startsWith(prefix)) this.seen.delete(key);
+    for (const shown of byId("banners").querySelectorAll(`[data-key^="${prefix}"]`)) shown.remove();
+  }
+
+  // Truck
+
+  buildTop() {
+    const top = byId("top");
+    top.append(svg("rect", { x: -22, y: -52, width: 44, height: 104, rx: 8, fill: "none", stroke: "currentColor", "stroke-width": 2 }));
+    top.append(svg("path", { d: "M-8 -56 L0 -66 L8 -56 Z", fill: "currentColor" }));
+    this.wheels = [0, 1, 2, 3].map(() => top.appendChild(svg("rect", { x: -7, y: -15, width: 14, height: 30, rx: 4, fill: "currentColor" })));
+  }
+
+  buildHorizon() {
+    const horizon = byId("horizon");
+    const clip = svg("clipPath", { id: "disc" });
+    clip.append(svg("circle", { r: 54 }));
+    this.ball = svg("g", {});
+    this.ball.append(svg("rect", { x: -90, y: -150, width: 180, height: 150, fill: "#3f86c7" }), svg("rect", { x: -90, y: 0, width: 180, height: 150, fill: "#8a6a42" }),
+      svg("path", { d: "M-90 0H90", stroke: "#fff", "stroke-width": 2 }));
+    for (const angle of [-20, -10, 10, 20]) this.ball.append(svg("path", { d: `M-14 ${-angle * 2}H14`, stroke: "#fff", "stroke-width": 1 }));
+    const group = svg("g", { "clip-path": "url(#disc)" });
+    group.append(this.ball);
+    horizon.append(clip, group, svg("path", { d: "M-34 0H-12 M12 0H34 M0 -3V3", stroke: "#ffd24a", "stroke-width": 4, "stroke-linecap": "round" }),
+      svg("circle", { r: 54, fill: "none", stroke: "currentColor", "stroke-width": 2 }));
+  }
+
+  showTruck() {
+    const { newest } = this.link;
+    const { front = 0, rear = 0 } = newest.steering ?? {};
+    const { wheelbase = 0.32 } = newest.facts?.geometry ?? {};
+    const places = [[1, 1], [1, -1], [-1, 1], [-1, -1]].map(([i, j]) => [(i * wheelbase) / 2, j * 0.13]);
+    const angles = wheelAngles(front, rear, wheelbase, places);
+    this.wheels.forEach((wheel, i) => {
+      const [x, y] = [i % 2 ? 34 : -34, i < 2 ? -34 : 34];
+      wheel.setAttribute("transform", `translate(${x} ${y}) rotate(${(-angles[i] * 180) / Math.PI})`);
+    });
+    setText("axles", words("truck.axles", { front: degrees(front), rear: degrees(rear) }));
+    const { roll = 0, pitch = 0, tilt_valid = false } = newest.compass ?? {};
+    this.ball.setAttribute("transform", `rotate(${(-roll * 180) / Math.PI}) translate(0 ${(-pitch * 180 * 2) / Math.PI})`);
+    setText("tilt", newest.compass ? words("truck.tilted", { roll: degrees(roll, 1), pitch: degrees(pitch, 1) }) : "–", tilt_valid || !newest.compass ? "" : "warn");
+    const { pose, battery, gate, tracker, slam, scan } = newest;
+    rows("figures", [
+      ["figure.speed", pose ? `${number(pose.twist[0])} m/s` : null],
+      ["figure.turn", pose ? `${degrees(pose.twist[2])} °/s` : null],
+      ["figure.position", pose ? `${number(pose.pose[0])}, ${number(pose.pose[1])} m` : null],
+      ["figure.heading", pose ? `${degrees(pose.pose[2])}°` : null],
+      ["figure.battery", battery ? `${number(battery.voltage, 1)} V, ${words(`level.${battery.level}`)}` : null],
+      ["figure.charge", battery?.charge != null ? `${number(battery.charge * 100, 0)} %` : null],
+      ["figure.stopping", gate ? `${number(gate.stopping_distance)} m` : null],
+      ["figure.error", tracker && tracker.outcome === "driving" ? `${number(tracker.cross_track * 100, 1)} cm` : null],
+      ["figure.lidar", scan?.tilt != null ? `${degrees(scan.tilt, 1)}°` : null],
+      ["figure.map", slam ? `${number(slam.overlap * 100, 0)} %` : null],
+    ]);
+  }
+
+  showSystem() {
+    const { host, loop, recorder, network, facts, hello } = this.link.newest;
+    const delay = this.link.roundTrip();
+    const gigabytes = (bytes) => `${number(bytes / 1e9, 1)} GB`;
+    rows("computer", [
+      ["computer.link", delay === null ? null : words("link.value", { delay: number(delay, 0) })],
+      [`network.${network?.medium ?? "none"}`, network ? words("network.value", { level: words(`level.${network.level}`), signal: network.signal === null ? "" : `${number(network.signal, 0)} dBm` }) : null],
+      ["computer.cpu", host?.cpu != null ? `${number(host.cpu * 100, 0)} %` : null],
+      ["computer.temperature", host?.temperature != null ? `${number(host.temperature, 0)} °C` : null],
+      ["computer.memory", host ? gigabytes(host.memory_available) : null],
+      ["computer.disk", host ? gigabytes(host.disk_free) : null],
+      ["computer.tick", loop ? `${number(loop.lateness_p99 * 1000, 1)} ms` : null],
+      ["computer.recorder", recorder ? (recorder.recording ? `${number(recorder.bytes_written / 1e6, 1)} MB` : words("computer.recorder.off")) : null],
+    ]);
+    rows("versions", [
+      ["versions.station", hello?.version],
+      ["versions.robot", facts?.versions.monstertruckd],
+      ...Object.entries(facts?.versions ?? {}).filter(([name]) => ["python", "system", "git"].includes(name)),
+    ]);
+  }
+
+  tabs() {
+    const tabs = [...document.querySelectorAll("[role=tab]")];
+    const choose = (tab) => {
+      for (const each of tabs) {
+        const chosen = each === tab;
+        each.setAttribute("aria-selected", chosen);
+        each.tabIndex = chosen ? 0 : -1;
+        byId(each.getAttribute("aria-controls")).hidden = !chosen;
+      }
+    };
+    tabs.forEach((tab, i) => {
+      tab.onclick = () => choose(tab);
+      tab.onkeydown = (event) => {
+        const by = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
+        if (!by) return;
+        const next = tabs[(i + by + tabs.length) % tabs.length];
+        choose(next);
+        next.focus();
+      };
+    });
+  }
+}

@@ -1,0 +1,20 @@
+// Every text of the page comes from one table, by key; `{name}` in it is replaced.
+let table = {};
+
+export async function loadWords() {
+  table = await (await fetch("/strings.json")).json();
+  for (const element of document.querySelectorAll("[data-s]")) element.textContent = words(element.dataset.s);
+  for (const element of document.querySelectorAll("[data-aria]")) element.setAttribute("aria-label", words(element.dataset.aria));
+  for (const element of document.querySelectorAll("[data-label]")) {
+    element.setAttribute("aria-label", words(element.dataset.label));
+    element.title = words(element.dataset.label);
+  }
+}
+
+export function words(key, values = {}) {
+  return (table[key] ?? key).replace(/\{(\w+)\}/g, (whole, name) => values[name] ?? whole);
+}
+
+export const reason = (code) => words(`reason.${code}`);
+export const number = (value, digits = 2) => (Number.isFinite(value) ? value.toFixed(digits).replace(/^-(0\.?0*)$/, "$1") : "–");
+export const degrees = (radians, digits = 0) => number((radians * 180) / Math.PI, digits);

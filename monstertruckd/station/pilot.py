@@ -1,0 +1,148 @@
+"""One browser's hand on one robot: its own source of requests, so that the robot tells two tabs apart.
+
+Nothing here repeats a request. Each heartbeat of the browser becomes one request with a short lease, or none if it was
+held up on its way: what the hand did then says nothing of what it does now.
+"""
+
+import asyncio
+import math
+from collections import deque
+from collections.abc import Coroutine
+from contextlib import suppress
+from typing import Any, Final
+
+from monstertruck_runtime.client import TruckClient
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.errors import NotFoundError, RequestRefusedError, TruckError
+from monstertruck_runtime.stations import own_source, tls_for
+from monstertruckd.station import frames
+from monstertruckd.station.address import RobotAddress
+from monstertruckd.station.commands import Asked, Behave, ChangeGoal, GiveOrder, Motion, SetGoal
+from monstertruckd.station.viewer import Viewer
+
+LEASE: Final = 0.25
+"""Seconds for which a heartbeat stands."""
+LATEST: Final = 0.2
+"""A heartbeat that took so much longer than the quickest ones, s, is dropped."""
+MEMORY: Final = 200
+"""Heartbeats among which the quickest is looked for."""
+RETRY: Final = 1.0
+"""Seconds between two attempts to reach the robot, and in which it answers."""
+TELL_LATE: Final = 1.0
+"""Seconds between two remarks on late heartbeats."""
+
+
+class Lateness:
+    """How much longer than the quickest messages one took, from the sender's own times; clocks are not compared."""
+
+    def __init__(self) -> None:
+        self._offsets: deque[float] = deque(maxlen=MEMORY)
+
+    def of(self, sent: float, received: float) -> float:
+        """Seconds late; both times in seconds, each of its own clock."""
+        self._offsets.append(received - sent)
+        return received - sent - min(self._offsets)
+
+
+class Pilot:
+    """Orders and heartbeats of one browser to one robot.
+
+    Args:
+        address: which robot.
+        name: of the browser, behind the station's own name.
+        viewer: where answers go.
+        clock: the station's time.
+    """
+
+    def __init__(self, address: RobotAddress, name: str, viewer: Viewer, clock: Clock) -> None:
+        self._address = address
+        self._name = name
+        self._client: TruckClient | None = None
+        """While the robot's endpoint answers."""
+        self._viewer = viewer
+        self._clock = clock
+        self._lateness = Lateness()
+        self._said_late = -math.inf
+        self._driving: asyncio.Task[None] | None = None
+        self._answers: set[asyncio.Task[None]] = set()
+
+    async def run(self) -> None:
+        """Keep the session until cancelled; a robot that is not there is waited for."""
+        try:
+            while True:
+                with suppress(TruckError):  # the feed says what is wrong
+                    async with self._session() as client:
+                        self._client = client
+                        self._viewer.tell(frames.text("pilot", source=client.source))
+                        await asyncio.Event().wait()
+                await self._clock.sleep(RETRY)
+        finally:
+            self._client = None
+            tasks = [*self._answers, *([] if self._driving is None else [self._driving])]
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+
+    def _session(self) -> TruckClient:
+        name, endpoint = self._address.name, self._address.endpoint
+        tls = tls_for(endpoint)
+        source = f"{own_source(None if tls is None else tls.owner())}-{self._name}"
+        return TruckClient(name, endpoint, source=source[-64:], clock=self._clock, timeout=RETRY, tls=tls)
+
+    def drive(self, motion: Motion) -> None:
+        """Pass one heartbeat on, unless it is late or the one before still waits for the robot."""
+        now = self._clock.now()
+        late = self._lateness.of(motion.at / 1e3, now / SECOND)
+        if late > LATEST:
+            if now / SECOND - self._said_late > TELL_LATE:
+                self._said_late = now / SECOND
+                self._viewer.tell(frames.text("late", seconds=round(late, 3)))
+            return
+        if self._client is not None and (self._driving is None or self._driving.done()):
+            self._driving = asyncio.create_task(self._request(self._client, motion))
+
+    async def _request(self, client: TruckClient, motion: Motion) -> None:
+        client.role = motion.role
+        try:
+            if motion.twist is None:
+                await client.drive(motion.speed, motion.front, motion.rear, lease=LEASE)
+            else:
+                await client.drive_twist(*motion.twist, lease=LEASE)
+        except TruckError as error:
+            self._viewer.tell(frames.text("trouble", text=str(error)))
+
+    def ask(self, command: Asked) -> None:
+        """Carry out a command, and send its outcome to the browser. An emergency stop has left when this returns."""
+        if self._client is None:
+            self._answer(command.id, NotFoundError("no link to the robot"))
+            return
+        task = asyncio.create_task(self._outcome(command.id, _call(self._client, command)))
+        self._answers.add(task)
+        task.add_done_callback(self._answers.discard)
+
+    async def _outcome(self, number: int, call: Coroutine[Any, Any, Any]) -> None:
+        try:
+            await call
+        except TruckError as error:
+            self._answer(number, error)
+        else:
+            self._answer(number, None)
+
+    def _answer(self, number: int, error: TruckError | None) -> None:
+        if error is None:
+            self._viewer.tell(frames.text("answer", id=number, ok=True))
+            return
+        reason = error.refusal if isinstance(error, RequestRefusedError) else error.reason
+        self._viewer.tell(frames.text("answer", id=number, ok=False, reason=reason.value, text=str(error)))
+
+
+def _call(client: TruckClient, command: Asked) -> Coroutine[Any, Any, Any]:
+    match command:
+        case GiveOrder():
+            return client.order(command.order, hold=command.hold)
+        case SetGoal():
+            return client.goal(command.goal, via=command.via)
+        case ChangeGoal():
+            return client.goal_control(command.order)
+        case Behave():
+            return client.behave(command.order, command.behaviour)

@@ -1,0 +1,277 @@
+"""The web server of the station: one page, its files, maps by URL, and one WebSocket for each browser."""
+
+import asyncio
+import itertools
+import json
+import logging
+import re
+import secrets
+from collections.abc import Awaitable, Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from aiohttp import WSMessage, WSMsgType, web
+
+from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.errors import BusyError, InputError
+from monstertruck_schemas.reasons import Reason
+from monstertruckd import __version__
+from monstertruckd.station import commands, frames
+from monstertruckd.station.address import RobotAddress
+from monstertruckd.station.commands import Motion, Ping, Watch
+from monstertruckd.station.feed import RobotFeed
+from monstertruckd.station.pilot import Pilot
+from monstertruckd.station.viewer import Viewer
+
+log = logging.getLogger(__name__)
+
+PAGE: Final = Path(__file__).parent / "page"
+FILES: Final = re.compile(r"[a-z_]+\.(?:js|css|svg)")
+TYPES: Final = {".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml", ".html": "text/html"}
+BEAT: Final = 10.0
+"""Seconds between two pings of the WebSocket itself; a browser that does not answer for half of it is let go."""
+LANGUAGE: Final = "en"
+
+HEADERS: Final = {
+    "Content-Security-Policy": "default-src 'self'; img-src 'self' blob: data:; frame-ancestors 'none'; "
+    "base-uri 'none'; form-action 'self'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cache-Control": "no-cache",
+}
+
+Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where the page is served."""
+
+    host: str = "127.0.0.1"
+    port: int = 8470
+
+    @property
+    def url(self) -> str:
+        """What to open in a browser."""
+        return f"http://{self.host}:{self.port}/"
+
+    @property
+    def names(self) -> frozenset[str]:
+        """Values of the Host header that mean this server: a page of another name that resolves here is refused."""
+        return frozenset(f"{name}:{self.port}" for name in (self.host, "localhost", "127.0.0.1", "[::1]"))
+
+
+class Station:
+    """The page's server and what it follows.
+
+    Args:
+        robots: what is shown; the first one at the start.
+        clock: the station's time.
+        place: where to listen.
+    """
+
+    def __init__(self, robots: Sequence[RobotAddress], clock: Clock, place: Place = Place()) -> None:
+        self._clock = clock
+        self.place = place
+        self.feeds = {address.name: RobotFeed(address, clock) for address in robots}
+        if len(self.feeds) != len(robots):
+            raise InputError("two robots of one name: expected a name of its own for each")
+        self._browsers = itertools.count(1)
+        self._run = secrets.token_hex(2)
+        """Tells this run's browsers from those of another, whose sequence numbers the robot remembers."""
+        self._strings = _strings()
+
+    async def run(self, ready: Callable[[], object] = lambda: None) -> None:
+        """Serve until cancelled; ``ready`` is called once browsers are answered.
+
+        Raises:
+            BusyError: the port is taken.
+        """
+        runner = web.AppRunner(self.application(), access_log=None, shutdown_timeout=1.0)
+        await runner.setup()
+        following = [asyncio.create_task(feed.run()) for feed in self.feeds.values()]
+        try:
+            try:
+                await web.TCPSite(runner, self.place.host, self.place.port).start()
+            except OSError as error:
+                raise BusyError(f"{self.place.url} cannot be served: {error.strerror or error}") from None
+            ready()
+            await asyncio.gather(*following)
+        finally:
+            for task in following:
+                task.cancel()
+            await asyncio.gather(*following, return_exceptions=True)
+            await runner.cleanup()
+
+    def application(self) -> web.Application:
+        """All routes."""
+        application = web.Application(middlewares=[self._guard], client_max_size=commands.MOST_BYTES)
+        application.add_routes(
+            [
+                web.get("/", self._index),
+                web.get("/page/{file}", self._file),
+                web.get("/strings.json", self._table),
+                web.get("/robots/{robot}/map/{version}", self._map),
+                web.get("/socket", self._socket),
+            ]
+        )
+        return application
+
+    @web.middleware
+    async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+        """Refuse what other sites make a browser ask."""
+        if request.host not in self.place.names:
+            raise self._refused(request, f"host {request.host!r} is not this station's name")
+        origin = request.headers.get("Origin")
+        foreign = origin is not None and origin.partition("://")[2] not in self.place.names
+        if foreign or (request.path == "/socket" and origin is None):
+            raise self._refused(request, f"origin {origin!r} is not this station's page")
+        response = await handler(request)
+        if not response.prepared:
+            response.headers.update(HEADERS)
+        return response
+
+    def _refused(self, request: web.Request, why: str) -> web.HTTPForbidden:
+        log.warning("%s %s from %s refused: %s", request.method, request.path, request.remote, why)
+        return web.HTTPForbidden(text=why, headers=HEADERS)
+
+    # Files
+
+    async def _index(self, _: web.Request) -> web.StreamResponse:
+        return _page_file("index.html")
+
+    async def _file(self, request: web.Request) -> web.StreamResponse:
+        name = request.match_info["file"]
+        if not FILES.fullmatch(name) or not (PAGE / name).is_file():
+            raise web.HTTPNotFound
+        return _page_file(name)
+
+    async def _table(self, _: web.Request) -> web.StreamResponse:
+        return web.Response(body=self._strings, content_type="application/json")
+
+    async def _map(self, request: web.Request) -> web.StreamResponse:
+        feed = self.feeds.get(request.match_info["robot"])
+        cells = None if feed is None else await feed.map.packed()
+        if cells is None:
+            raise web.HTTPNotFound
+        return web.Response(
+            body=cells, content_type="application/octet-stream", headers={"Content-Encoding": "deflate"}
+        )
+
+    # One browser
+
+    async def _socket(self, request: web.Request) -> web.StreamResponse:
+        socket = web.WebSocketResponse(max_msg_size=commands.MOST_BYTES, heartbeat=BEAT, compress=False)
+        await socket.prepare(request)
+        name = f"{self._run}.{next(self._browsers)}"
+        log.info("browser %s connected from %s", name, request.remote)
+        browser = _Browser(name, self.feeds, self._clock)
+        sending = asyncio.create_task(_send(socket, browser.viewer))
+        try:
+            async for received in socket:
+                if received.type is not WSMsgType.TEXT:
+                    log.warning("browser %s at %s refused: %s", name, request.remote, _fault(received))
+                    break
+                try:
+                    browser.take(received.data)
+                except InputError as error:
+                    log.warning("browser %s: message refused: %s", name, error)
+                    browser.viewer.tell(frames.text("trouble", text=str(error)))
+        finally:
+            sending.cancel()
+            await asyncio.gather(sending, return_exceptions=True)
+            await browser.close()
+            log.info("browser %s is gone", name)
+        return socket
+
+
+class _Browser:
+    """One connection: what it looks at, and what it asks."""
+
+    def __init__(self, name: str, feeds: dict[str, RobotFeed], clock: Clock) -> None:
+        self.viewer = Viewer()
+        self._name = name
+        self._feeds = feeds
+        self._clock = clock
+        self._feed: RobotFeed | None = None
+        self._pilot: Pilot | None = None
+        self._session: asyncio.Task[None] | None = None
+        self._ending: set[asyncio.Task[None]] = set()
+        self.viewer.tell(frames.text("hello", version=__version__, robots=list(feeds)))
+
+    def take(self, data: str) -> None:
+        """Obey one message.
+
+        Raises:
+            InputError: it is none, or names a robot that is not here.
+        """
+        command = commands.parse(data)
+        match command:
+            case Motion():
+                if self._pilot is not None:
+                    self._pilot.drive(command)
+            case Ping():
+                self.viewer.tell(frames.text("pong", at=command.at))
+            case Watch():
+                self._watch(command.robot)
+            case _:
+                if self._pilot is None:
+                    raise InputError("no robot is looked at")
+                self._pilot.ask(command)
+
+    def _watch(self, robot: str) -> None:
+        feed = self._feeds.get(robot)
+        if feed is None:
+            raise InputError(f"robot {robot!r}: expected one of {', '.join(self._feeds)}")
+        self._leave()
+        self.viewer.tell(frames.text("robot", name=robot))
+        self._feed = feed
+        feed.attach(self.viewer)
+        self._pilot = Pilot(feed.address, self._name, self.viewer, self._clock)
+        self._session = asyncio.create_task(self._pilot.run())
+
+    def _leave(self) -> None:
+        if self._feed is not None:
+            self._feed.detach(self.viewer)
+        self.viewer.forget()
+        if self._session is not None:
+            self._session.cancel()
+            self._ending.add(self._session)
+            self._session.add_done_callback(self._ending.discard)
+        self._feed = self._pilot = self._session = None
+
+    async def close(self) -> None:
+        """End its sessions."""
+        self._leave()
+        await asyncio.gather(*self._ending, return_exceptions=True)
+
+
+async def _send(socket: web.WebSocketResponse, viewer: Viewer) -> None:
+    with suppress(ConnectionError):
+        while True:
+            frame = await viewer.next()
+            if isinstance(frame, bytes):
+                await socket.send_bytes(frame)
+            else:
+                await socket.send_str(frame)
+
+
+def _fault(received: WSMessage) -> str:
+    """Why a message that is no text ends the connection."""
+    if received.type is WSMsgType.ERROR:
+        return str(received.data)
+    return f"a message of type {received.type.name.lower()}, expected text"
+
+
+def _page_file(name: str) -> web.Response:
+    file = PAGE / name
+    return web.Response(body=file.read_bytes(), content_type=TYPES[file.suffix], charset="utf-8")
+
+
+def _strings(language: str = LANGUAGE) -> bytes:
+    """All texts of the page by key; those of reasons are the robot's own unless the table has better ones."""
+    table = {f"reason.{reason.value}": reason.text for reason in Reason}
+    table |= json.loads((PAGE / "strings" / f"{language}.json").read_text(encoding="utf-8"))
+    return json.dumps(table).encode()

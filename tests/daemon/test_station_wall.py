@@ -1,0 +1,178 @@
+"""The station's page in a real browser, before an emulated truck."""
+
+import asyncio
+import contextlib
+import os
+import signal
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from playwright.async_api import Page, expect
+
+from monstertruck_runtime.client import TruckClient
+from monstertruck_runtime.mailbox import Mailbox, fifo, latest
+from monstertruck_schemas import topics
+from monstertruck_schemas.cmd import DriveAction, DriveCommand
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import Role
+from monstertruck_schemas.state import GateMode, GateState
+from tests.daemon.browser_kit import NEEDS_CHROMIUM, PATIENCE, chromium, opened, shows, station
+from tests.daemon.wall_kit import ROOT, Robot, robot
+
+pytestmark = [pytest.mark.wall, pytest.mark.timeout(240), NEEDS_CHROMIUM]
+
+FREE = {"path": None, "map": None, "tracker": None}
+"""Nothing but a hand drives."""
+
+
+async def becomes(condition: Callable[[], bool]) -> None:
+    async with asyncio.timeout(30):
+        while not condition():
+            await asyncio.sleep(0.02)
+
+
+def mode(gate: Mailbox[GateState]) -> GateMode | None:
+    return None if gate.latest is None else gate.latest.mode
+
+
+async def started(made: Robot) -> None:
+    await made.start_simulator()
+    await made.start_daemon()
+
+
+async def arm_and_hold(page: Page, gate: Mailbox[GateState]) -> None:
+    """Arm, and hold the joystick forward until the truck drives; again where the busy computer itself stops it."""
+    await page.click("#tab-drive")
+    box = await page.locator("#stick").bounding_box()
+    assert box is not None
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    await page.mouse.move(x, y)
+    async with asyncio.timeout(60):
+        while mode(gate) is not GateMode.DRIVING:
+            await page.mouse.up()
+            await page.evaluate("document.querySelector('#arm').click()")
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(3):
+                    while mode(gate) is not GateMode.ARMED:
+                        await asyncio.sleep(0.02)
+                    await page.mouse.down()
+                    await page.mouse.move(x, y - 0.45 * box["height"], steps=3)
+                    while mode(gate) is not GateMode.DRIVING:
+                        await asyncio.sleep(0.02)
+
+
+async def test_emergency_stop_by_button_and_space_bar_and_two_tabs_are_two_sources(tmp_path: Path):
+    async with robot(tmp_path, FREE) as made:
+        await started(made)
+        async with made.client() as client, station(made) as url, chromium(tmp_path) as browser:
+            gate = client.subscribe(topics.GATE, latest())
+            stops = client.subscribe(topics.STOP, latest())
+            page, other = await opened(browser, url), await opened(browser, url)
+
+            await arm_and_hold(page, gate)
+            assert gate.latest is not None
+            driver = gate.latest.holder
+            assert gate.latest.role is Role.STATION
+            await expect(page.locator("#holder-name")).to_have_text("You drive", timeout=PATIENCE)
+            await expect(other.locator("#holder-name")).to_contain_text(f"{driver} drives", timeout=PATIENCE)
+            await other.keyboard.press("Space")
+            await shows(page, "estopped")
+            await page.mouse.up()
+            await becomes(lambda: stops.latest is not None and stops.latest.reason is Reason.ESTOP_REQUESTED)
+            assert stops.latest is not None
+            assert stops.latest.causes[0].source != driver
+
+            await page.click("#reset")
+            await shows(page, "disarmed")
+            await page.focus("#theme")
+            await page.keyboard.press("Space")
+            await shows(page, "estopped")
+            theme = await page.evaluate("document.documentElement.dataset.theme")
+            assert theme == "light", "the space bar is nothing but the emergency stop, whatever has the focus"
+            await page.click("#reset")
+            await shows(page, "disarmed")
+            await page.click("#estop")
+            await shows(other, "estopped")
+
+
+async def test_a_browser_that_freezes_stops_the_truck_and_repeats_nothing(tmp_path: Path):
+    async with robot(tmp_path, FREE) as made:
+        await started(made)
+        async with made.client() as client, station(made) as url, chromium(tmp_path) as browser:
+            gate = client.subscribe(topics.GATE, latest())
+            commands = client.subscribe(topics.CMD_DRIVE, fifo(4096))
+            page = await opened(browser, url)
+            await arm_and_hold(page, gate)
+            frozen = processes_below(os.getpid(), "chromium")
+            assert frozen
+            try:
+                for process in frozen:
+                    os.kill(process, signal.SIGSTOP)
+                await becomes(lambda: mode(gate) is not GateMode.DRIVING)
+                commands.drain()
+                await becomes(lambda: mode(gate) is GateMode.DISARMED)
+                assert all(neutral(command) for command in commands.drain())
+            finally:
+                for process in frozen:
+                    os.kill(process, signal.SIGCONT)
+            await page.mouse.up()
+            await asyncio.sleep(1.0)
+            assert mode(gate) is GateMode.DISARMED
+            assert all(neutral(command) for command in commands.drain())
+
+
+def neutral(command: DriveCommand) -> bool:
+    return command.action is not DriveAction.RUN or command.motor_velocity == 0.0
+
+
+def processes_below(parent: int, name: str) -> list[int]:
+    """Children and their children whose program is ``name``."""
+    parents = {}
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            head, _, tail = (folder / "stat").read_text().rpartition(")")
+        except OSError:
+            continue
+        parents[int(folder.name)] = (int(tail.split()[1]), head.partition("(")[2])
+    below, found = {parent}, []
+    while more := {child for child, (above, _) in parents.items() if above in below} - below:
+        below |= more
+        found += [child for child in more if name in parents[child][1]]
+    return found
+
+
+async def test_a_goal_set_with_the_mouse_is_reached_in_the_world(tmp_path: Path):
+    async with robot(tmp_path, base=ROOT / "configs/goals.yaml") as made:
+        await started(made)
+        async with made.client() as client, station(made) as url, chromium(tmp_path) as browser:
+            gate = client.subscribe(topics.GATE, latest())
+            goals = client.subscribe(topics.GOAL, latest())
+            page = await opened(browser, url)
+            await planner_ready(client)
+            await page.click("#tool-goal")
+            box = await page.locator("#map").bounding_box()
+            assert box is not None
+            # The map follows the truck at 90 pixels a metre: 1.5 m ahead, facing as now.
+            x, y = box["x"] + box["width"] / 2 + 135, box["y"] + box["height"] / 2
+            await page.mouse.move(x, y)
+            await page.mouse.down()
+            await page.mouse.move(x + 60, y, steps=3)
+            await page.mouse.up()
+            await page.click("#goal-go")
+            await becomes(lambda: mode(gate) is GateMode.DRIVING)
+            async with asyncio.timeout(90):
+                while goals.latest is None or goals.latest.outcome is Reason.DRIVING:
+                    await asyncio.sleep(0.1)
+            assert goals.latest.outcome is Reason.GOAL_REACHED, goals.latest.text
+            await expect(page.locator("#goal-text")).to_contain_text("Goal 1:", timeout=PATIENCE)
+        truth = await made.truth()
+        assert np.hypot(*(truth[-1, 1:3] - (2.5, 3.95))) < 0.3
+
+
+async def planner_ready(client: TruckClient) -> None:
+    with client.subscribe(topics.HEALTH, latest()) as health:
+        async with asyncio.timeout(200):
+            while health.latest is None or {s.name: s.state.value for s in health.latest.services}["goals"] != "ready":
+                await asyncio.sleep(0.2)

@@ -1,0 +1,130 @@
+"""The station's web server against browsers and against others; no robot is there."""
+
+import asyncio
+import json
+from collections.abc import AsyncIterator
+from contextlib import AbstractAsyncContextManager, asynccontextmanager
+from typing import Any
+
+import aiohttp
+import pytest
+from yarl import URL
+
+from monstertruck_runtime.clock import WallClock
+from monstertruck_runtime.errors import BusyError, InputError
+from monstertruckd.station import commands
+from monstertruckd.station.address import RobotAddress
+from monstertruckd.station.server import Place, Station
+from monstertruckd.tools.demo.runs import free_endpoint
+
+NOBODY = RobotAddress("truck", "tcp/127.0.0.1:1")
+
+
+def free_port() -> int:
+    return int(free_endpoint().rpartition(":")[2])
+
+
+@asynccontextmanager
+async def serving() -> AsyncIterator[tuple[Station, aiohttp.ClientSession]]:
+    station = Station([NOBODY], WallClock(), Place(port=free_port()))
+    ready = asyncio.Event()
+    running = asyncio.create_task(station.run(ready.set))
+    try:
+        await ready.wait()
+        async with aiohttp.ClientSession(station.place.url) as session:
+            yield station, session
+    finally:
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
+
+
+def connected(station: Station, session: aiohttp.ClientSession) -> AbstractAsyncContextManager[Any]:
+    return session.ws_connect("/socket", origin=station.place.url.rstrip("/"))
+
+
+async def test_the_page_its_files_and_texts_are_served_with_a_policy_that_lets_nothing_else_in():
+    async with serving() as (_, session):
+        for path in ("/", "/page/main.js", "/page/style.css", "/page/truck.svg", "/strings.json"):
+            async with session.get(path) as reply:
+                assert reply.status == 200, path
+                assert "default-src 'self'" in reply.headers["Content-Security-Policy"]
+                assert "://" not in (await reply.text()).replace("http://www.w3.org/", ""), "no request leaves the page"
+        async with session.get("/strings.json") as reply:
+            assert "reason.scan_stale" in await reply.json()
+
+
+async def test_what_is_not_the_page_is_not_found():
+    async with serving() as (_, session):
+        for path in (
+            "..%2fserver.py",
+            "%2e%2e/server.py",
+            "strings%2fen.json",
+            "..%5cserver.py",
+            "x.js",
+            "../../etc/passwd",
+        ):
+            async with session.get(URL(f"/page/{path}", encoded=True), allow_redirects=False) as reply:
+                assert reply.status == 404, path
+        for path in ("/robots/a/map/1", "/robots/truck/map/1", "/etc"):
+            async with session.get(path) as reply:
+                assert reply.status == 404, path
+
+
+async def test_other_sites_and_other_names_are_refused_and_logged(caplog: pytest.LogCaptureFixture):
+    async with serving() as (station, session):
+        ours = f"127.0.0.1:{station.place.port}"
+        for path, headers in (
+            ("/", {"Host": "evil.example"}),
+            ("/socket", {"Origin": "http://evil.example"}),
+            ("/socket", {}),
+            ("/socket", {"Origin": f"http://{ours}.evil.example"}),
+        ):
+            async with session.get(path, headers=headers) as reply:
+                assert reply.status == 403, (path, headers)
+        assert caplog.text.count("refused") == 4
+        assert "127.0.0.1" in caplog.text
+        async with session.ws_connect("/socket", origin=f"http://{ours}") as socket:
+            assert (await socket.receive_json())["robots"] == ["truck"]
+
+
+async def test_a_browser_is_answered_although_the_robot_is_absent_and_wrong_messages_are_refused():
+    async with serving() as (station, session), connected(station, session) as socket:
+        hello = await socket.receive_json()
+        assert hello["kind"] == "hello"
+        await socket.send_json({"do": "order", "id": 1, "order": "estop"})
+        assert (await socket.receive_json())["kind"] == "trouble"
+        await socket.send_json({"do": "watch", "robot": "truck"})
+        await socket.send_json({"do": "order", "id": 2, "order": "estop"})
+        await socket.send_json({"do": "ping", "at": 12.5})
+        kinds = {}
+        while "pong" not in kinds or "answer" not in kinds:
+            message = await socket.receive_json()
+            kinds[message["kind"]] = message
+        assert kinds["answer"] == {
+            "kind": "answer",
+            "id": 2,
+            "ok": False,
+            "reason": "not_found",
+            "text": "no link to the robot",
+        }
+
+
+async def test_an_oversized_message_ends_the_connection(caplog: pytest.LogCaptureFixture):
+    async with serving() as (station, session):
+        async with connected(station, session) as socket:
+            await socket.receive_json()
+            await socket.send_str(json.dumps({"do": "x" * commands.MOST_BYTES}))
+            ended = await socket.receive()
+            assert ended.type is aiohttp.WSMsgType.CLOSE
+            assert ended.data == 1009
+        async with asyncio.timeout(5):
+            while "exceeds" not in caplog.text:
+                await asyncio.sleep(0.01)
+
+
+async def test_a_taken_port_and_two_robots_of_one_name_are_refused():
+    async with serving() as (station, _):
+        with pytest.raises(BusyError, match=str(station.place.port)):
+            await Station([NOBODY], WallClock(), station.place).run()
+    with pytest.raises(InputError, match="one name"):
+        Station([NOBODY, NOBODY], WallClock())
