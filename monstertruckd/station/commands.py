@@ -27,7 +27,7 @@ class Watch(_Command):
     robot: Annotated[str, Field(max_length=64)]
 
 
-class Ping(_Command):
+class EchoRequest(_Command):
     """Answer at once: the browser measures the way to the station."""
 
     do: Literal["ping"]
@@ -35,7 +35,7 @@ class Ping(_Command):
     """The browser's time, ms."""
 
 
-class Motion(_Command):
+class Heartbeat(_Command):
     """One heartbeat of a hand on stick, keys or gamepad: what the input says at this moment."""
 
     do: Literal["drive"]
@@ -92,12 +92,12 @@ class Behave(_Command):
 
 Asked = GiveOrder | SetGoal | ChangeGoal | Behave
 """Commands whose outcome is answered."""
-Command = Annotated[Watch | Ping | Motion | Asked, Field(discriminator="do")]
+Command = Annotated[Watch | EchoRequest | Heartbeat | Asked, Field(discriminator="do")]
 
-_COMMANDS: Final[TypeAdapter[Watch | Ping | Motion | Asked]] = TypeAdapter(Command)
+_COMMANDS: Final[TypeAdapter[Watch | EchoRequest | Heartbeat | Asked]] = TypeAdapter(Command)
 
 
-def parse(data: str) -> Watch | Ping | Motion | Asked:
+def parse(data: str) -> Watch | EchoRequest | Heartbeat | Asked:
     """The command of one message.
 
     Raises:

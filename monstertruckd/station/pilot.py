@@ -17,7 +17,7 @@ from monstertruck_runtime.errors import NotFoundError, RequestRefusedError, Truc
 from monstertruck_runtime.stations import own_source, tls_for
 from monstertruckd.station import frames
 from monstertruckd.station.address import RobotAddress
-from monstertruckd.station.commands import Asked, Behave, ChangeGoal, GiveOrder, Motion, SetGoal
+from monstertruckd.station.commands import Asked, Behave, ChangeGoal, GiveOrder, Heartbeat, SetGoal
 from monstertruckd.station.viewer import Viewer
 
 LEASE: Final = 0.25
@@ -32,7 +32,7 @@ TELL_LATE: Final = 1.0
 """Seconds between two remarks on late heartbeats."""
 
 
-class Lateness:
+class DelayWatch:
     """How much longer than the quickest messages one took, from the sender's own times; clocks are not compared."""
 
     def __init__(self) -> None:
@@ -61,7 +61,7 @@ class Pilot:
         """While the robot's endpoint answers."""
         self._viewer = viewer
         self._clock = clock
-        self._lateness = Lateness()
+        self._lateness = DelayWatch()
         self._said_late = -math.inf
         self._driving: asyncio.Task[None] | None = None
         self._answers: set[asyncio.Task[None]] = set()
@@ -89,7 +89,7 @@ class Pilot:
         source = f"{own_source(None if tls is None else tls.owner())}-{self._name}"
         return TruckClient(name, endpoint, source=source[-64:], clock=self._clock, timeout=RETRY, tls=tls)
 
-    def drive(self, motion: Motion) -> None:
+    def drive(self, motion: Heartbeat) -> None:
         """Pass one heartbeat on, unless it is late or the one before still waits for the robot."""
         now = self._clock.now()
         late = self._lateness.of(motion.at / 1e3, now / SECOND)
@@ -101,7 +101,7 @@ class Pilot:
         if self._client is not None and (self._driving is None or self._driving.done()):
             self._driving = asyncio.create_task(self._request(self._client, motion))
 
-    async def _request(self, client: TruckClient, motion: Motion) -> None:
+    async def _request(self, client: TruckClient, motion: Heartbeat) -> None:
         client.role = motion.role
         try:
             if motion.twist is None:

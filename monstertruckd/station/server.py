@@ -20,7 +20,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruckd import __version__
 from monstertruckd.station import commands, frames
 from monstertruckd.station.address import RobotAddress
-from monstertruckd.station.commands import Motion, Ping, Watch
+from monstertruckd.station.commands import EchoRequest, Heartbeat, Watch
 from monstertruckd.station.feed import RobotFeed
 from monstertruckd.station.pilot import Pilot
 from monstertruckd.station.viewer import Viewer
@@ -209,10 +209,10 @@ class _Browser:
         """
         command = commands.parse(data)
         match command:
-            case Motion():
+            case Heartbeat():
                 if self._pilot is not None:
                     self._pilot.drive(command)
-            case Ping():
+            case EchoRequest():
                 self.viewer.tell(frames.text("pong", at=command.at))
             case Watch():
                 self._watch(command.robot)

@@ -63,6 +63,9 @@ INSTEAD = {
     "monstertruckd probe lidar --port /dev/ttyACM0": Instead(
         None, "needs the device; tests/daemon/test_commands_wall.py probes its emulator"
     ),
+    "monstertruckd station --robot truck@tcp/127.0.0.1:7447": Instead(
+        None, "serves until it is stopped; tests/daemon/test_station_wall.py opens its page"
+    ),
     "monstertruckd map save hall.yaml": Instead(None, "needs a robot that maps"),
     "monstertruckd calibrate battery": Instead(
         "monstertruckd calibrate battery --yes --answer meter=24.2 --answer another=no", "asks somebody"

@@ -16,9 +16,9 @@ from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.state import Grid
 from monstertruckd.station import commands, frames
 from monstertruckd.station.address import RobotAddress
-from monstertruckd.station.commands import GiveOrder, Motion
+from monstertruckd.station.commands import GiveOrder, Heartbeat
 from monstertruckd.station.feed import MapStore
-from monstertruckd.station.pilot import LATEST, Lateness
+from monstertruckd.station.pilot import LATEST, DelayWatch
 from monstertruckd.station.server import PAGE
 from monstertruckd.station.viewer import MOST_WAITING, Viewer
 
@@ -105,7 +105,7 @@ def test_commands_are_read_and_wrong_ones_refused_by_field():
     order = commands.parse('{"do": "order", "id": 3, "order": "estop"}')
     assert isinstance(order, GiveOrder)
     motion = commands.parse('{"do": "drive", "at": 1.5, "input": "keys", "speed": 0.1, "front": 0.2}')
-    assert isinstance(motion, Motion)
+    assert isinstance(motion, Heartbeat)
     assert motion.role is Role.KEYBOARD
     for wrong, field in (
         ('{"do": "order", "id": 3, "order": "explode"}', "order"),
@@ -120,7 +120,7 @@ def test_commands_are_read_and_wrong_ones_refused_by_field():
 
 
 def test_a_heartbeat_that_was_held_up_is_known_by_the_times_of_the_others():
-    lateness = Lateness()
+    lateness = DelayWatch()
     for number in range(20):
         assert lateness.of(1000.0 + 0.05 * number, 7.0 + 0.05 * number + 0.003 * (number % 2)) < 0.01
     assert lateness.of(1001.0, 8.5) > LATEST
