@@ -221,7 +221,7 @@ async def press(client: TruckClient, stops: Stops, forward: bool, more: float) -
 async def trials(clock: Clock, folder: Path, kind: str, count: int) -> dict[str, Any]:
     """All trials of one flood."""
     endpoint = free_endpoint()
-    config = write_overlay(ROOT / "configs" / "emulated.yaml", folder, endpoint)
+    config = write_overlay(ROOT / "configs" / "demo.yaml", folder, endpoint)
     cores = sorted(os.sched_getaffinity(0))
     own, other = cores[0], cores[-1]
     here = str(Path(__file__).resolve())

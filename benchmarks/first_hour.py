@@ -96,7 +96,7 @@ async def robot(clock: Clock, folder: Path, config: str) -> AsyncIterator[tuple[
 async def estop(clock: Clock, folder: Path, trials: int) -> dict[str, float]:
     """The truck drives, the command is started."""
     found = []
-    async with robot(clock, folder, "emulated.yaml") as (client, endpoint, stops):
+    async with robot(clock, folder, "demo.yaml") as (client, endpoint, stops):
         for trial in range(trials):
             await order(client, Order.ARM)
             until = time.monotonic() + 0.6
@@ -118,7 +118,7 @@ async def estop(clock: Clock, folder: Path, trials: int) -> dict[str, float]:
 
 async def status(clock: Clock, folder: Path, trials: int) -> dict[str, float]:
     """The live screen."""
-    async with robot(clock, folder, "emulated.yaml") as (_, endpoint, _):
+    async with robot(clock, folder, "demo.yaml") as (_, endpoint, _):
         found = [await asyncio.to_thread(first_picture, endpoint, b"disarmed") for _ in range(trials)]
     return {"status": median(found)}
 

@@ -17,13 +17,14 @@ from pydantic_core import ErrorDetails
 from ruamel.yaml.error import YAMLError
 from ruamel.yaml.nodes import Node, ScalarNode, SequenceNode
 
+from monstertruck_runtime.endpoints import emulated_ports
 from monstertruck_runtime.errors import ConfigError
 from monstertruck_runtime.plugins import kind_of, models_in
 from monstertruck_schemas.base import Schema
 from monstertruckd.config.calibration import CalibrationStore, with_values
 from monstertruckd.config.edit import YamlText, node_kind, reader
 from monstertruckd.config.migrate import OLDEST, VERSION, bring_up_to_date
-from monstertruckd.config.truck import TruckConfig
+from monstertruckd.config.truck import ROBOT, TruckConfig
 
 Key = tuple[str | int, ...]
 S = TypeVar("S", bound=Schema)
@@ -247,6 +248,7 @@ def validated(tree: Tree, path: Path, model: type[S]) -> tuple[S, Tree]:
         origin = tree.origin(("version",)) or f"{path}:1"
         raise ConfigError(f"{origin}: version: expected {OLDEST} to {VERSION}, found {version!r}")
     _locate_files(tree, getattr(model, "FILE_KEYS", ()))
+    _give_ports(tree.data)
     try:
         text = json.dumps(tree.data)
     except TypeError as error:
@@ -275,6 +277,17 @@ def _locate_files(tree: Tree, keys: tuple[tuple[str, ...], ...]) -> None:
         section[key[-1]] = str(file)
         if origin.file.resolve() in tree.files and not Path(name).is_absolute():
             tree.files.append(file)
+
+
+def _give_ports(data: dict[str, Any]) -> None:
+    """Hang the devices of an emulated robot that name no port where `simulate` makes them: in a folder of the user."""
+    devices = data.get("devices")
+    if data.get("sim") is None or not isinstance(devices, dict):
+        return
+    folder = emulated_ports(str(data.get("robot", ROBOT)))
+    for role, device in devices.items():
+        if isinstance(device, dict) and device.get("port") is None:
+            device["port"] = {"path": str(folder / str(role))}
 
 
 def _explain(tree: Tree, path: Path, model: type[Schema], error: ValidationError) -> Iterator[str]:

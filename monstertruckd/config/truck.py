@@ -34,6 +34,8 @@ from monstertruckd.config.device_safety import beyond_devices, weakened_devices
 from monstertruckd.gate.config import SIGHT, BodyLimits, GateConfig, beyond, weakened
 from monstertruckd.recorder.config import BlackBoxConfig, MapRender, RecorderConfig
 
+ROBOT: Final = "truck"
+"""A robot's name where none is given."""
 BLIND: Final = "devices: no range sensor: nothing stops the robot before an obstacle"
 
 MOVE: Final = "move"
@@ -105,7 +107,7 @@ class TruckConfig(Schema):
     """Keys that name files which must exist; they are relative to the file that says them."""
 
     version: Literal[2]
-    robot: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,31}$")] = "truck"
+    robot: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,31}$")] = ROBOT
     """Name of this robot in every key"""
     body: AnyBody = TruckBody()
     """Kind of robot, with what only this kind has"""

@@ -31,11 +31,16 @@ def port_of(endpoint: str) -> int | None:
 
 
 def runtime_folder(environment: Mapping[str, str] = os.environ) -> Path:
-    """Where a daemon keeps its sockets: the folder that systemd made for it, or one of its user's own."""
+    """Where sockets and emulated ports are kept: the folder that systemd made for it, or one of its user's own."""
     if given := environment.get("RUNTIME_DIRECTORY"):
         return Path(given.partition(":")[0])
     runtime = environment.get("XDG_RUNTIME_DIR")
     return Path(runtime) / "monstertruckd" if runtime else Path(f"/tmp/monstertruckd-{os.getuid()}")  # noqa: S108
+
+
+def emulated_ports(robot: str, environment: Mapping[str, str] = os.environ) -> Path:
+    """Folder of the emulated devices of a robot, for this user alone: where a configuration names no ports."""
+    return runtime_folder(environment) / "ports" / robot
 
 
 def local_endpoint(listen: Iterable[str], environment: Mapping[str, str] = os.environ) -> str | None:
@@ -60,7 +65,7 @@ def nearest(endpoint: str, environment: Mapping[str, str] = os.environ) -> str:
 
 
 def make_private(folder: Path) -> None:
-    """Make a folder for sockets; one that is there must be this user's own and nobody else's to write.
+    """Make the folder of sockets and ports; one that is there must be this user's own and nobody else's to write.
 
     Raises:
         OSError: it cannot be made, or others may put sockets into it.

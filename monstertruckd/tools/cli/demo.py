@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from monstertruck_runtime.clock import Clock
-from monstertruckd.tools.cli.options import ConfigOption, SimulatedOption
+from monstertruckd.tools.cli.options import SimulatedOption
 from monstertruckd.tools.cli.output import (
     JsonOption,
     console,
@@ -76,11 +76,11 @@ def _print(rows: list[tuple[str, str]], messages: dict[str, int]) -> None:
 
 @needs_extra("sim")
 def simulate(
-    config: ConfigOption,
+    config: SimulatedOption = DEMO_CONFIG,
     truth: Annotated[Path | None, typer.Option("--truth", help="Write what really happened (npz) at the end.")] = None,
     run: Annotated[bool, typer.Option("--run", help="Run the daemon of the same configuration, too.")] = False,
 ) -> None:
-    """Serve a simulated truck's devices behind ptys at the ports its configuration names.
+    """Serve a simulated truck's devices behind ptys: at the ports its configuration names, else in a folder of yours.
 
     Faults are read from standard input as with `emulate`, each line beginning with the device's role, the monitor's
     name, or `usb` (an unknown word lists what it knows).

@@ -37,7 +37,10 @@ OWN_CLIENTS: Final = {
 @needs_extra("sim")
 def emulate(
     device: DeviceArgument,
-    link: Annotated[Path, typer.Option("--link", "-l", help="Symlink to create for the pty.")],
+    link: Annotated[
+        Path | None,
+        typer.Option("--link", "-l", help="Symlink to create for the pty; default: where the emulated truck has it."),
+    ] = None,
     seed: Annotated[int, typer.Option(help="Seed of the device's noise.")] = 0,
 ) -> None:
     """Emulate one device, byte for byte, alone on a pty: for third-party clients and bench work.
@@ -47,12 +50,16 @@ def emulate(
     (an unknown word lists them).
     """
     from monstertruck_drivers.catalog import DEVICES
+    from monstertruck_runtime.endpoints import emulated_ports
     from monstertruck_sim.console import FaultConsole
+    from monstertruckd.config.truck import ROBOT
     from monstertruckd.tools.simulation.emulate import emulate_device
 
+    port = link or emulated_ports(ROBOT) / DEVICES.named(device).role.name
+
     async def main(clock: Clock) -> None:
-        async with emulate_device(device, link, clock, seed) as emulated:
-            remark(f"{device} on {link}; faults on standard input, Ctrl-C ends")
+        async with emulate_device(device, port, clock, seed) as emulated:
+            remark(f"{device} on {port}; faults on standard input, Ctrl-C ends")
             if (limits := OWN_CLIENTS.get(DEVICES.named(device).opens)) is not None:
                 remark(f"{device}: {limits}")
             await FaultConsole({device: emulated}, sys.stdin, typer.echo).run()

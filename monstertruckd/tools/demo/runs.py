@@ -138,7 +138,9 @@ def write_overlay(config: Path, folder: Path, endpoint: str, seed: int | None = 
     """
     given = load_tree(config).data
     here = folder.resolve()
-    by_path = (role for role, device in given.get("devices", {}).items() if device and "hub" not in device["port"])
+    by_path = (
+        role for role, device in given.get("devices", {}).items() if device and "hub" not in (device.get("port") or ())
+    )
     overlay: dict[str, Any] = {
         "include": str(config.resolve()),
         "version": VERSION,

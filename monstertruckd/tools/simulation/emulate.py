@@ -5,7 +5,7 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 
-from monstertruck_drivers.cable import PtyPort, reserved
+from monstertruck_drivers.cable import PtyPort
 from monstertruck_drivers.catalog import DEVICES, DeviceKind
 from monstertruck_drivers.emulation import EmulatorSetup
 from monstertruck_runtime.clock import Clock
@@ -13,6 +13,7 @@ from monstertruck_runtime.errors import InputError
 from monstertruck_sim.console import Emulated
 from monstertruck_sim.world.config import WorldConfig
 from monstertruck_sim.world.world import World
+from monstertruckd.tools.simulation.ports import claimed
 
 
 @asynccontextmanager
@@ -21,13 +22,14 @@ async def emulate_device(device: str, link: Path, clock: Clock, seed: int) -> As
 
     Raises:
         InputError: unknown device, one without a port, or something that is no link has the name.
+        NotPermittedError: this user may not make it there.
         BusyError: another program serves ``link``.
         OSError: it cannot be made.
     """
     kind = DEVICES.named(device)
     if kind.opens == "computer":
         raise InputError(f"{device}: the computer's own files, no device on a port; simulate emulates them")
-    with reserved(link):
+    with claimed(link):
         port = PtyPort(link)
         async with _served(kind, device, port, clock, seed) as emulated:
             yield emulated

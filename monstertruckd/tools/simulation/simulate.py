@@ -12,14 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from monstertruck_drivers.cable import EmulatedPort, PtyPort, reserved
+from monstertruck_drivers.cable import EmulatedPort, PtyPort
 from monstertruck_drivers.config import Monitors, PortConfig
 from monstertruck_drivers.hokuyo_urg.recording import RecordedHokuyoEmulator
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
-from monstertruck_runtime.errors import InputError, NotFoundError, NotPermittedError
+from monstertruck_runtime.errors import InputError, NotFoundError
 from monstertruck_runtime.memory import settle
 from monstertruck_sim.computer import EmulatedComputer, hangs_by_hub
 from monstertruck_sim.console import Commanded, Emulated, EmulatedFiles, FaultConsole
@@ -28,6 +28,7 @@ from monstertruck_sim.robot import SimulatedRobot
 from monstertruck_sim.stand import SimulatedStand
 from monstertruck_sim.world.world import World
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
+from monstertruckd.tools.simulation.ports import claimed
 from monstertruckd.tools.simulation.program import program
 
 TRUTH_PERIOD = SECOND // 20
@@ -86,12 +87,7 @@ async def serve(
     """
     links = [it.port.path for it in config.devices.present().values() if isinstance(it.port, PortConfig)]
     with ExitStack() as stack:
-        try:
-            for link in links:
-                link.parent.mkdir(parents=True, exist_ok=True)
-            stack.enter_context(reserved(*links))
-        except PermissionError as error:
-            raise NotPermittedError(f"{error.filename}: this user may not make a port there") from error
+        stack.enter_context(claimed(*links))
         folder = Path(stack.enter_context(TemporaryDirectory(prefix="monstertruck-")))
         stack.enter_context(_linked(config, folder))
         return await _serve(clock, config, folder, truth, daemon_of)
@@ -106,13 +102,13 @@ def _linked(config: SimulatedTruckConfig, folder: Path) -> Iterator[None]:
     link = config.machine
     if link.exists() and not link.is_symlink():
         raise InputError(f"machine: {link} exists: expected the name of a link to be made to the emulated computer")
-    link.parent.mkdir(parents=True, exist_ok=True)
-    link.unlink(missing_ok=True)
-    link.symlink_to(folder, target_is_directory=True)
-    try:
-        yield
-    finally:
+    with claimed(link):
         link.unlink(missing_ok=True)
+        link.symlink_to(folder, target_is_directory=True)
+        try:
+            yield
+        finally:
+            link.unlink(missing_ok=True)
 
 
 async def _serve(

@@ -15,7 +15,7 @@ from monstertruckd.config.calibration import CalibrationStore, Estimate, Result
 from monstertruckd.config.load import calibrated, load_config
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 
-CONFIG = Path(__file__).parents[3] / "configs" / "emulated.yaml"
+CONFIG = Path(__file__).parents[3] / "configs" / "demo.yaml"
 
 
 def saved(folder: Path) -> Path:

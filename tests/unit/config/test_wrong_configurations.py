@@ -40,7 +40,7 @@ WRONG = (
         "devices.lidar.port.baud: input should be a valid integer, found 'fast'",
     ),
     (
-        "devices: {lidar: {port: {path: /dev/truck/drive}}}",
+        "devices: {lidar: {port: {path: /dev/truck/drive}}, drive: {port: {path: /dev/truck/drive}}}",
         "devices: lidar and drive share the port /dev/truck/drive; every device needs its",
     ),
     (

@@ -23,7 +23,7 @@ WRONG = (
     ("run -c /nonexistent.yaml", 2, "/nonexistent.yaml: cannot be read: No such file or directory"),
     ("run -c .", 2, ".: cannot be read: Is a directory"),
     ("run -c /dev/null", 2, "/dev/null: cannot be read: not a file of text"),
-    ("simulate", 2, "Error: Missing option '--config' / '-c'."),
+    ("simulate --config", 2, "Error: Option '--config' requires an argument."),
     ("simulate -c /nonexistent.yaml", 2, "/nonexistent.yaml: cannot be read: No such file or directory"),
     (
         "simulate -c configs/truck.yaml",
@@ -88,7 +88,7 @@ WRONG = (
     ("replay /nonexistent.mcap", 4, "/nonexistent.mcap: no such log"),
     ("replay configs/truck.yaml", 3, "configs/truck.yaml: not an MCAP log"),
     ("emulate", 2, "Error: Missing argument 'device'."),
-    ("emulate lidar", 2, "Error: Missing option '--link' / '-l'."),
+    ("emulate lidar --link", 2, "Error: Option '--link' requires an argument."),
     ("emulate lidar -l /proc/foo", 3, "/proc/foo: No such file or directory"),
     ("probe", 2, "Error: Missing argument 'device'."),
     ("probe nothing", 3, "unknown"),
