@@ -4,15 +4,19 @@ import math
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 
 from monstertruck_kinematics.polynomials import F_CORRECTED, G_PRINTED, mirrored
 from monstertruck_runtime.clock import SECOND, Clock, VirtualClock, run_virtual
+from monstertruck_runtime.mailbox import Delivery, Mailbox
 from monstertruck_schemas import topics
+from monstertruck_schemas.base import Message
 from monstertruck_schemas.req import DriveRequest
+from monstertruck_schemas.topics import Topic, Writer
 from monstertruck_sim.world.config import ServoModelConfig
+from monstertruck_sim.world.noise import IMU_FIXED, generator
 from monstertruck_sim.world.plant import GRAVITY, TruthState
 from monstertruckd.config.calibration import CalibrationStore, Result, Value, WizardName, with_values
 from monstertruckd.daemon import Daemon
@@ -21,6 +25,8 @@ from monstertruckd.tools.calibrate.wizard import Wizard, calibrate
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
 from monstertruckd.tools.simulation.operator import LocalOperator
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
+
+M = TypeVar("M", bound=Message)
 
 STOPPED: Final = 0.2
 """Chance that something stops a servo on its way to one side."""
@@ -35,6 +41,7 @@ MODES: Final = {
     "counter_right": (-1, 1),
 }
 """Sides to which the front and rear wheels are steered."""
+SLIP_NAMES: Final = ("icr_left", "icr_right", "icr_x", "gain_left", "gain_right")
 START_UP: Final = 3.0
 """Seconds in which every device of the emulated truck is up."""
 
@@ -44,6 +51,14 @@ class LocalTruck(LocalOperator):
 
     def __init__(self, daemon: Daemon, clock: Clock, source: str = "calibrate") -> None:
         super().__init__(daemon, clock, source)
+
+    def subscribe(self, topic: Topic[M], delivery: Delivery) -> Mailbox[M]:
+        """As a client over Zenoh, which may hear a test stand, too."""
+        if topic.writer is not Writer.STAND:
+            return super().subscribe(topic, delivery)
+        mailbox: Mailbox[M] = Mailbox(delivery, lambda _: tap.close())
+        tap = self._daemon.bus.tap(lambda _topic, message, _data, _now: mailbox.put(message), (topic,))  # type: ignore[arg-type]
+        return mailbox
 
     async def drive(self, speed: float, front: float, rear: float = 0.0, lease: float = 0.3) -> None:
         """Inject a drive request as the bridge to Zenoh does."""
@@ -89,6 +104,7 @@ class SimulatedOperator:
         self._charges = list(charges)
         self._meter = float(rng.uniform(-hands.meter_share, hands.meter_share))
         self._mark = (0.0, 0.0)
+        self._line = 0.0
         self._string = (0.0, 0.0, 0.0)
         self._before = self._truth()
 
@@ -110,6 +126,17 @@ class SimulatedOperator:
                 x, y, along = self._string
                 across = -math.sin(along) * (truth.x - x) + math.cos(along) * (truth.y - y)
                 return 100 * (across + self._error(self._hands.tape))
+            case "side":
+                x, y = self._bumper()
+                return math.dist((x, y), self._mark) + self._error(self._hands.tape)
+            case "ahead" | "left" | "centre" if self._height(step):
+                return 100 * (self._height(step) + self._error(self._hands.tape))
+            case "ahead" | "left":
+                x, y = self._bumper()
+                dx, dy = x - self._mark[0], y - self._mark[1]
+                c, s = math.cos(self._line), math.sin(self._line)
+                off = c * dx + s * dy if step.name == "ahead" else c * dy - s * dx
+                return 100 * (off + self._error(self._hands.tape))
             case "meter":
                 error = float(self._rng.uniform(-1, 1)) * self._hands.meter_volts
                 return round(truth.supply_v * (1 + self._meter) + error, 2)
@@ -122,6 +149,7 @@ class SimulatedOperator:
             case "mark":
                 x, y = self._bumper()
                 self._mark = (x + self._error(self._hands.tape), y)
+                self._line = truth.yaw + (self._error(self._hands.string) if "string" in step.question else 0.0)
             case "string":
                 self._string = (truth.x, truth.y, truth.yaw + self._error(self._hands.string))
             case "forward":
@@ -144,6 +172,19 @@ class SimulatedOperator:
         """Middle of the front bumper on the floor."""
         truth, ahead = self._truth(), self._rig.config.sim.world.truck.length / 2
         return truth.x + math.cos(truth.yaw) * ahead, truth.y + math.sin(truth.yaw) * ahead
+
+    def _height(self, step: Number) -> float:
+        """Of the lidar's beam over the floor, m: at its window, on the wall ahead or to the left; 0 = not asked for."""
+        if "beam" not in step.question:
+            return 0.0
+        lidar, truth = self._rig.config.sim.world.lidar, self._truth()
+        if step.name == "centre":
+            return lidar.height
+        beam = 384 if step.name == "ahead" else 640
+        ranges = self._rig.world.lidar.scan(self._rig.clock.now() - SECOND)
+        pitch, roll = truth.pitch + lidar.pitch, truth.roll + lidar.roll
+        rise = -math.sin(pitch) if step.name == "ahead" else math.sin(roll)
+        return lidar.height + float(np.median(ranges[beam - 3 : beam + 4])) / 1000 * rise
 
     def _error(self, sigma: float) -> float:
         return sigma * float(self._rng.standard_normal())
@@ -174,6 +215,24 @@ def hidden(
     if "drive" in parts:
         truck["wheel_radius"] = 0.075 * rng.uniform(0.95, 1.05)
         truck["motor"] = {"ratio": rng.uniform(500, 680), "inverted": bool(rng.integers(2))}
+    if "lidar" in parts:
+        own = np.random.default_rng([seed, 11])
+        x, y, yaw = own.uniform((0.11, -0.03, -0.05), (0.17, 0.03, 0.05)).tolist()
+        pitch, roll = own.uniform(-0.02, 0.02, 2).tolist()
+        world["lidar"] = {"x": x, "y": y, "yaw": yaw, "pitch": pitch, "roll": roll}
+    if "imu" in parts:
+        world["imu"] = {"rate_scale": float(np.random.default_rng([seed, 13]).uniform(0.96, 1.04))}
+    if "odometry" in parts:
+        own = np.random.default_rng([seed, 17])
+        truck["wheel_radius"] = 0.075 * own.uniform(0.95, 1.05)
+        truck["wheelbase"] = 0.32 * own.uniform(0.96, 1.04)
+        servos = config.devices.steering.driver if config.devices.steering else None
+        assert servos is not None
+        off = own.uniform(-1.0, 1.0)
+        for name, sign in (("front", 1), ("rear", -1)):
+            servo = getattr(config.sim.world.truck, f"{name}_servo")
+            centre = getattr(servos, name).centre_us - sign * off * servo.us_per_degree
+            truck[f"{name}_servo"] = servo.model_dump() | {"centre_us": centre}
     if "steering" in parts:
         own = np.random.default_rng([seed, 7])
         answer = {"dead_time": own.uniform(0.0, 0.12), "lag": own.uniform(0.0, 0.06)}
@@ -242,6 +301,8 @@ def truths(config: SimulatedTruckConfig) -> dict[WizardName, dict[str, Value]]:
     turns = truck.motor.ratio / (2 * math.pi * truck.wheel_radius) / (1 - rolling)
     soft = np.linalg.inv(((iron.soft_x, iron.soft_xy), (iron.soft_xy, iron.soft_y)))
     soft /= math.sqrt(np.linalg.det(soft))
+    if truck.body.kind == "skid_steer":
+        return {"slip": {name: getattr(truck.body, name) for name in SLIP_NAMES}}
     steering: dict[str, Value] = {}
     chassis = truck.chassis()
     for axle, (name, servo) in enumerate((("front", truck.front_servo), ("rear", truck.rear_servo))):
@@ -261,7 +322,7 @@ def truths(config: SimulatedTruckConfig) -> dict[WizardName, dict[str, Value]]:
         "delay": servo.dead_time + servo.lag + CHAIN,
     }
     drive = config.devices.drive
-    assert drive is not None
+    pulses = drive.driver.encoder_pulses_per_turn or 0 if drive is not None else 0
     return {
         "battery": {
             "gain": world.battery.divider / 10,
@@ -280,10 +341,33 @@ def truths(config: SimulatedTruckConfig) -> dict[WizardName, dict[str, Value]]:
             "turns_per_metre": turns,
             "start_lag": truck.motor.lag,
             "stop_lag": truck.motor.lag,
-            "ticks_per_metre": 4 * (drive.driver.encoder_pulses_per_turn or 0) * turns,
+            "ticks_per_metre": 4 * pulses * turns,
         },
         "steering": steering,
+        "odometry": _odometry_truth(config),
+        "lidar": {name: getattr(world.lidar, name) for name in ("x", "y", "yaw", "pitch", "roll")},
+        "imu": _imu_truth(config),
     }
+
+
+def _odometry_truth(config: SimulatedTruckConfig) -> dict[str, Value]:
+    truck, geometry = config.sim.world.truck, config.geometry
+    return {
+        "drive_ratio": truck.motor.ratio * geometry.wheel_radius / truck.wheel_radius,
+        "wheel_radius": truck.wheel_radius * geometry.drive_ratio / truck.motor.ratio,
+        "wheelbase": truck.wheelbase,
+        "front_centre": truck.front_servo.centre_us,
+        "rear_centre": truck.rear_servo.centre_us,
+    }
+
+
+def _imu_truth(config: SimulatedTruckConfig) -> dict[str, Value]:
+    imu = config.sim.world.imu
+    drawn = generator(config.sim.seed, IMU_FIXED).uniform(-1, 1, 6).tolist()
+    names = ("rate_x", "rate_y", "rate_z", "force_x", "force_y")
+    sizes = (imu.rate_bias,) * 3 + (imu.acceleration_bias,) * 2
+    biases = {name: size * part for name, size, part in zip(names, sizes, drawn, strict=False)}
+    return {**biases, "rate_scale": 1 / imu.rate_scale}
 
 
 @dataclass(frozen=True, slots=True)

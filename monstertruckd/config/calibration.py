@@ -28,10 +28,12 @@ CONFIDENCE: Final = 0.95
 """Of every interval: of a hundred trucks measured like this, so many have their true value inside."""
 
 Value = bool | int | float
-WizardName = Literal["battery", "compass", "drive", "steering"]
+WizardName = Literal["battery", "compass", "drive", "steering", "odometry", "lidar", "imu", "slip"]
 
 STEERING: Final = "devices.steering.driver"
 COMPASS: Final = "devices.compass.driver.iron"
+LIDAR: Final = "devices.lidar.mount"
+IMU: Final = "devices.imu.driver.correction"
 
 KEYS: Final[dict[WizardName, tuple[str, ...]]] = {
     "battery": (
@@ -52,8 +54,18 @@ KEYS: Final[dict[WizardName, tuple[str, ...]]] = {
         f"{STEERING}.lag",
         *(f"body.turn_deficit.{name}" for name in TurnDeficitConfig.model_fields),
     ),
+    "odometry": (
+        "geometry.drive_ratio",
+        "geometry.wheelbase",
+        f"{STEERING}.front.centre_us",
+        f"{STEERING}.rear.centre_us",
+    ),
+    "lidar": tuple(f"{LIDAR}.{name}" for name in ("x", "y", "yaw", "roll", "pitch")),
+    "imu": tuple(f"{IMU}.{name}" for name in ("rate_x", "rate_y", "rate_z", "rate_scale", "force_x", "force_y")),
+    "slip": tuple(f"body.{name}" for name in ("icr_left", "icr_right", "icr_x", "gain_left", "gain_right")),
 }
-"""Values of the configuration that each wizard may set; a calibration never touches any other."""
+"""Values of the configuration that each wizard may set; a calibration never touches any other. Where two wizards
+measure the same value, the newer measurement counts."""
 
 
 class Estimate(Schema):
@@ -222,7 +234,8 @@ class CalibrationStore:
 
     def _write(self, changed: dict[WizardName, Result | None], change: str, real_ns: int) -> Path:
         current = self.current()
-        results = {**(current.results if current is not None else {}), **changed}
+        others = current.results.items() if current is not None else ()
+        results = {**{name: result for name, result in others if name not in changed}, **changed}  # the newest is last
         number = 1 if current is None else current.number + 1
         file = CalibrationFile(
             number=number,

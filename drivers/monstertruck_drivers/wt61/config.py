@@ -7,6 +7,20 @@ from pydantic import Field
 from monstertruck_schemas.base import Schema
 
 
+class ImuCorrection(Schema):
+    """What is taken out of the measurements, as calibrated; the unit's own axes."""
+
+    rate_x: float = 0.0
+    """Bias of the angular velocity, rad/s"""
+    rate_y: float = 0.0
+    rate_z: float = 0.0
+    rate_scale: Annotated[float, Field(ge=0.5, le=2)] = 1.0
+    """Factor on the angular velocity about z, its bias taken out"""
+    force_x: float = 0.0
+    """Bias of the specific force, m/s^2"""
+    force_y: float = 0.0
+
+
 class Wt61Config(Schema):
     """WitMotion WT61: three gyroscopes, three accelerometers."""
 
@@ -19,3 +33,5 @@ class Wt61Config(Schema):
     """Seconds without a measurement that end the session"""
     stuck_after: Annotated[int, Field(ge=2, le=10_000)] = 50
     """Measurements that are equal to the last bit, in a row, that end the session: sensors are never so quiet"""
+    correction: ImuCorrection = ImuCorrection()
+    """Biases and scale of this unit"""

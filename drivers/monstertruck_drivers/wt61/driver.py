@@ -3,7 +3,7 @@
 from typing import Final, NamedTuple
 
 from monstertruck_drivers.link import Link, Port
-from monstertruck_drivers.wt61.config import Wt61Config
+from monstertruck_drivers.wt61.config import ImuCorrection, Wt61Config
 from monstertruck_drivers.wt61.protocol import RATE, TOGGLE_SLEEP, Vector, Wt61Kind, Wt61Packet, Wt61Parser
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError, WrongDeviceError
@@ -147,19 +147,32 @@ class Wt61Driver:
     def _publish(self, samples: list[ImuSample]) -> None:
         received = self._clock.now()
         middle = (len(samples) - 1) * SECOND // (2 * RATE)
+        correction = self._config.correction
         self._out.put(
             Imu(
                 stamp=received - round(self._config.delay * SECOND) - middle,
                 received=received,
                 seq=self._out.next_seq(),
                 frame=self.name,
-                angular_velocity=_mean([rate.angular_velocity for _, rate in samples]),
-                linear_acceleration=_mean([force.acceleration for force, _ in samples]),
+                angular_velocity=corrected_rate(_mean([rate.angular_velocity for _, rate in samples]), correction),
+                linear_acceleration=corrected_force(_mean([force.acceleration for force, _ in samples]), correction),
                 temperature=samples[-1][0].celsius,
             )
         )
 
 
-def _mean(vectors: list[Vector]) -> Vector3:
+def _mean(vectors: list[Vector]) -> Vector:
     x, y, z = (sum(axis) / len(vectors) for axis in zip(*vectors, strict=True))
-    return Vector3(x=x, y=y, z=z)
+    return x, y, z
+
+
+def corrected_rate(rate: Vector, by: ImuCorrection) -> Vector3:
+    """Angular velocity without its biases, rad/s."""
+    x, y, z = rate
+    return Vector3(x=x - by.rate_x, y=y - by.rate_y, z=(z - by.rate_z) * by.rate_scale)
+
+
+def corrected_force(force: Vector, by: ImuCorrection) -> Vector3:
+    """Specific force without its biases, m/s^2."""
+    x, y, z = force
+    return Vector3(x=x - by.force_x, y=y - by.force_y, z=z)

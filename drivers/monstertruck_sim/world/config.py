@@ -264,6 +264,14 @@ class LidarConfig(Schema):
 
     x: float = 0.14
     """Mount before the geometric centre, m."""
+    y: float = 0.0
+    """And left of it, m."""
+    yaw: float = 0.0
+    """Direction of its middle beam, left positive, rad."""
+    pitch: float = 0.0
+    """Nose down positive, rad: its plane on the mount."""
+    roll: float = 0.0
+    """Right side down positive, rad."""
     height: Positive = 0.25
     """Of the scanning plane over the ground, m."""
     first_step: Annotated[int, Field(ge=0, le=768)] = 44
@@ -400,6 +408,8 @@ class ImuModelConfig(Schema):
     """Standard deviation of each angular velocity, rad/s."""
     rate_bias: NotNegative = 0.01
     """Greatest fixed error of each angular velocity, rad/s."""
+    rate_scale: Positive = 1.0
+    """Of what is measured of a turn about z."""
     acceleration_noise: NotNegative = 0.05
     """Standard deviation of each axis, m/s^2."""
     acceleration_bias: NotNegative = 0.1

@@ -88,13 +88,18 @@ class PlaneSweep:
     def __call__(self, poses: Array, beams: Beams | None, times_ns: NDArray[np.int64]) -> Array:
         """As ``Sweep``."""
         x, y, yaw, pitch, roll, _ = poses
-        xs, ys = x + self._config.x * np.cos(yaw), y + self._config.x * np.sin(yaw)
+        xs, ys = self._places(x, y, yaw)
         if beams is None and self._terrain is None and np.abs(poses[3:5]).max() < _LEVEL:
             return self._cast(xs, ys, yaw + BEAM_ANGLES, self._config.max_range, times_ns)
         beams = turned(LEVEL_BEAMS if beams is None else beams, pitch, roll)
         if self._terrain is None:
             return self._tilted(xs, ys, yaw, beams, times_ns)
         return self._over(self._terrain, poses, beams, times_ns)
+
+    def _places(self, x: Array, y: Array, yaw: Array) -> tuple[Array, Array]:
+        """Of the mount in the map frame where the body is at (x, y, yaw)."""
+        ahead, aside, c, s = self._config.x, self._config.y, np.cos(yaw), np.sin(yaw)
+        return x + ahead * c - aside * s, y + ahead * s + aside * c
 
     def _tilted(self, xs: Array, ys: Array, yaw: Array, beams: Beams, times_ns: NDArray[np.int64]) -> Array:
         """Ranges along beams whose directions are given in the truck's level frame."""
@@ -111,7 +116,7 @@ class PlaneSweep:
     def _over(self, terrain: Terrain, poses: Array, beams: Beams, times_ns: NDArray[np.int64]) -> Array:
         """Ranges over uneven ground; arguments as of ``_tilted``."""
         config, (x, y, yaw, pitch, *_) = self._config, poses
-        xs, ys = x + config.x * np.cos(yaw), y + config.x * np.sin(yaw)
+        xs, ys = self._places(x, y, yaw)
         zs = terrain.height(x, y) - config.x * np.sin(pitch) + config.height
         return over(self._cast, terrain, config, (xs, ys, zs), yaw, beams, times_ns)
 
@@ -167,6 +172,7 @@ class SimulatedLidar:
         self._plant, self._sweep, self._config, self._seed = plant, sweep, config, seed
         self._lost = (np.arange(STEPS) < config.first_step) | (np.arange(STEPS) > config.last_step)
         """Steps that never measure."""
+        self._mounted = _mounted(config)
 
     def scan(self, time_ns: int) -> NDArray[np.int32]:
         """Distances in mm of the revolution that began at ``time_ns``, (769,); codes below 20 are errors.
@@ -177,7 +183,9 @@ class SimulatedLidar:
         self._plant.advance(time_ns)
         times = time_ns + _BEAM_DELAYS
         poses = self._plant.poses(times)
-        beams = None if self.joints is None else turned(LEVEL_BEAMS, *self.joints.angles(times))
+        beams = self._mounted
+        if self.joints is not None:
+            beams = turned(LEVEL_BEAMS if beams is None else beams, *self.joints.angles(times))
         return self._measure(self._sweep(poses, beams, times), time_ns)
 
     def _measure(self, ranges: Array, time_ns: int) -> NDArray[np.int32]:
@@ -370,6 +378,15 @@ def turned(beams: Beams, pitch: Array, roll: Array) -> Beams:
     x, y, z = beams
     y, z = np.cos(roll) * y - np.sin(roll) * z, np.sin(roll) * y + np.cos(roll) * z
     return np.cos(pitch) * x + np.sin(pitch) * z, y, np.cos(pitch) * z - np.sin(pitch) * x
+
+
+def _mounted(config: LidarConfig) -> Beams | None:
+    """Beams of a lidar that is not mounted straight, in the frame of what carries it; None: of one that is."""
+    if config.yaw == config.pitch == config.roll == 0.0:
+        return None
+    x, y, z = turned(LEVEL_BEAMS, np.full(STEPS, config.pitch), np.full(STEPS, config.roll))
+    c, s = cos(config.yaw), sin(config.yaw)
+    return c * x - s * y, s * x + c * y, z
 
 
 def _to_body(v: Vector, pitch: float, roll: float) -> Vector:

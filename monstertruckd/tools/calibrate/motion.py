@@ -2,8 +2,8 @@
 
 import asyncio
 from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager, suppress
-from typing import Final, Protocol
+from contextlib import ExitStack, asynccontextmanager, suppress
+from typing import Any, Final, Protocol
 
 from monstertruck_kinematics.chassis import Chassis
 from monstertruck_runtime.clock import SECOND, Clock
@@ -72,6 +72,7 @@ class Mover:
             NoAnswerError: the truck does not move, or sends no feedback.
         """
         with (
+            ExitStack() as besides,
             self._truck.subscribe(topics.DRIVE, fifo(DEPTH)) as drive,
             self._truck.subscribe(topics.STEERING, fifo(DEPTH)) as steering,
             self._truck.subscribe(topics.COMPASS, fifo(DEPTH)) as attitude,
@@ -80,7 +81,8 @@ class Mover:
             self._truck.subscribe(topics.CMD_DRIVE, fifo(DEPTH)) as drive_commands,
         ):
             feeds = drive, steering, attitude, gate, steering_commands, drive_commands
-            run = _Run(self._truck, self._clock, feeds)
+            also = {t.name: besides.enter_context(self._truck.subscribe(t, fifo(DEPTH))) for t in move.also}
+            run = _Run(self._truck, self._clock, feeds, also)
             async with self._armed(run):
                 if move.approach:
                     await run.hold(0.0, move.approach, move.approach, STEERING)
@@ -136,12 +138,14 @@ class _Run:
             Mailbox[SteeringCommand],
             Mailbox[DriveCommand],
         ],
+        also: dict[str, Mailbox[Any]],
     ) -> None:
         self.track = MoveRecord()
         self.state: GateState | None = None
         self._truck = truck
         self._clock = clock
         self._feeds = feeds
+        self._also = also
 
     def begin(self) -> None:
         """Discard what was read so far."""
@@ -243,6 +247,8 @@ class _Run:
         self.track.drive += drive.drain()
         self.track.steering += [reading for reading in steering.drain() if reading.trusted]
         self.track.attitude += [reading for reading in attitude.drain() if not reading.heading_disturbed]
+        for name, mailbox in self._also.items():
+            self.track.others.setdefault(name, []).extend(mailbox.drain())
         self.state = next(reversed(gate.drain()), self.state)
 
     def _check(self) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.fitting import FitResult
 
 _T: Final = (
     12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228,
@@ -51,6 +52,10 @@ class Interval:
         """With a systematic error of at most ``bound`` on top, either way."""
         return Interval(self.value, self.half + bound)
 
+    def joined(self, half: float) -> "Interval":
+        """With an independent error of half-width ``half``, 95 % like this one, added in quadrature."""
+        return Interval(self.value, math.hypot(self.half, half))
+
     def times(self, factor: float) -> "Interval":
         """Of the value times an exact factor."""
         return Interval(self.value * factor, self.half * abs(factor))
@@ -89,3 +94,19 @@ def correlation_factor(residuals: Array) -> float:
             break
         total += 2.0 * correlation
     return math.sqrt(total)
+
+
+def known_errors(fit: FitResult, freedom: int) -> Array:
+    """Half-widths of the parameters of a fit whose residuals are in units of errors known beforehand; (n,).
+
+    Where the measurements disagree by more than those, their spread counts.
+
+    Args:
+        fit: of residuals over their standard deviations.
+        freedom: measurements, beliefs left aside, less parameters.
+    """
+    power = float(np.sum(fit.residuals**2))
+    unit = math.sqrt(power / max(1, fit.residuals.size - fit.parameters.size))
+    spread = math.sqrt(power / max(freedom, 1))
+    factor = NORMAL if spread <= 1.0 or freedom < 1 else student(freedom) * spread
+    return np.asarray(fit.standard_errors / max(unit, 1e-12) * factor)

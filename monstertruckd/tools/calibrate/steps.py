@@ -33,12 +33,23 @@ class MoveRecord:
     drive_commands: list[DriveCommand] = field(default_factory=list)
     """And to the drive"""
     attitude: list[Attitude] = field(default_factory=list)
+    others: dict[str, list[Any]] = field(default_factory=dict)
+    """What was asked for besides (``MoveStep.also``), by name of the topic"""
     left: int = 0
     """When the command to set off was given, ns"""
     arrived: int = 0
     """When it was at rest again, ns"""
 
     # Time series
+
+    def of(self, topic: Topic[M]) -> list[M]:
+        """Messages of a topic that was asked for besides, in their order."""
+        return list(self.others.get(topic.name, ()))
+
+    def at_rest(self, topic: Topic[M]) -> tuple[list[M], list[M]]:
+        """Those before it set off, and those after it had arrived."""
+        found = self.of(topic)
+        return [m for m in found if m.stamp < self.left], [m for m in found if m.stamp > self.arrived]
 
     def way(self, drivetrain: DriveTrain) -> float:
         """Way rolled by the wheels, m, by the drive's count; negative backwards."""
@@ -143,6 +154,8 @@ class MoveStep:
     """Seconds after which the axle angles change their sign while it drives, in turn, again and again; none: never"""
     done: Callable[[MoveRecord], bool] | None = None
     """Ends the way earlier"""
+    also: tuple[Topic[Any], ...] = ()
+    """Topics that are recorded besides"""
 
     def side(self, seconds: float) -> int:
         """Sign of the axle angles so long after the truck set off."""

@@ -128,6 +128,64 @@ def battery(
     return battery_wizard(BatteryWizard(meter_error / 100, meter_digits, fresh=fresh))
 
 
+@_wizard
+def odometry(
+    rounds: Annotated[int, typer.Option(min=1, max=10, help="Squares to each side.")] = 1,
+    side: Annotated[float, typer.Option(min=0.5, max=10, help="Straight part of a side, m.")] = 1.5,
+    tape_error: Annotated[float, typer.Option(min=0.1, max=50, help="Standard error of one tape reading, mm.")] = 2.0,
+    string_error: Annotated[
+        float, typer.Option(min=0.5, max=50, help="Standard error of the string's direction, mm per m.")
+    ] = 3.5,
+) -> "Wizard":
+    """Way, wheelbase and steering offset of dead reckoning: squares driven to both sides.
+
+    Asks `clear` and, for each square, `mark`, `side` (m), `ahead` and `left` (cm).
+    """
+    from monstertruckd.tools.calibrate.odometry import OdometryWizard, odometry_wizard
+
+    return odometry_wizard(OdometryWizard(rounds, side, tape_error / 1000, string_error / 1000))
+
+
+@_wizard
+def lidar(
+    rounds: Annotated[int, typer.Option(min=1, max=10, help="Full circles to each side, in quarters.")] = 1,
+    heights: Annotated[bool, typer.Option("--heights", help="Ask for the beam's heights: pitch and roll.")] = False,
+    tape_error: Annotated[float, typer.Option(min=0.1, max=50, help="Standard error of a height, mm.")] = 2.0,
+) -> "Wizard":
+    """Where the lidar sits on the body, and its clock against odometry's: quarter circles and straights.
+
+    Asks `clear` and, with heights, `centre`, `ahead` and `left` (cm).
+    """
+    from monstertruckd.tools.calibrate.lidar import LidarWizard, lidar_wizard
+
+    return lidar_wizard(LidarWizard(rounds, heights, tape_error / 1000))
+
+
+@_wizard
+def imu(
+    rounds: Annotated[int, typer.Option(min=1, max=10, help="Full circles to each side.")] = 2,
+    still: Annotated[bool, typer.Option("--still", help="Biases only: nothing moves, the scale stays.")] = False,
+) -> "Wizard":
+    """Biases of the inertial unit at rest, and the scale of its yaw rate from full circles. Asks `clear`."""
+    from monstertruckd.tools.calibrate.imu import ImuWizard, imu_wizard
+
+    return imu_wizard(ImuWizard(rounds, turns=not still))
+
+
+@_wizard
+def slip(
+    by: Annotated[str, typer.Option(help="What says where the robot is: stand, or pose (in its map).")] = "stand",
+    rounds: Annotated[int, typer.Option(min=1, max=20, help="Times that each arc is driven to and fro.")] = 2,
+) -> "Wizard":
+    """Turning centres and wheels of a skid-steer body: arcs seen by a test stand, or in the map. Asks `clear`."""
+    from monstertruck_runtime.errors import InputError
+    from monstertruckd.tools.calibrate.slip import OBSERVERS, SlipWizard, slip_wizard
+
+    if by not in OBSERVERS:
+        raise InputError(f"--by {by}: expected one of {', '.join(OBSERVERS)}")
+    return slip_wizard(SlipWizard("pose" if by == "pose" else "stand", rounds))
+
+
 @app.command()
 def show(
     robot: RobotOption = "truck",

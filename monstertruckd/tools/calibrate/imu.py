@@ -1,0 +1,203 @@
+"""Biases of an inertial measurement unit at rest, and the scale of its yaw rate from full turns by the compass."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.fitting import least_squares
+from monstertruck_runtime.clock import SECOND
+from monstertruck_runtime.errors import InputError
+from monstertruck_schemas import topics
+from monstertruck_schemas.sensor import Attitude, Imu
+from monstertruckd.config.calibration import IMU, Estimate, Result
+from monstertruckd.tools.calibrate.statistics import NORMAL, Interval, correlation_factor, known_errors
+from monstertruckd.tools.calibrate.steering_model import HEADING
+from monstertruckd.tools.calibrate.steps import Collect, MoveRecord, MoveStep
+from monstertruckd.tools.calibrate.wizard import CLEAR, Wizard, WizardContext
+
+ROOM: Final = "2 m x 2 m, level"
+GRAVITY: Final = 9.80665
+"""m/s^2."""
+TILT: Final = math.radians(0.2)
+"""Standard deviation of the compass's own tilt, rad (its data sheet: 0.5 degrees at most), and with it of where gravity
+points."""
+ANGLE: Final = 0.35
+"""Of both axles, against each other, rad."""
+RESTING: Final = 500
+"""Readings at rest."""
+LEAST: Final = 2
+"""Turns that tell the scale, at least."""
+MOVED: Final = 0.02
+"""Greatest standard deviation of a resting yaw rate, rad/s: more is a unit that is being moved."""
+
+
+@dataclass(frozen=True, slots=True)
+class Turn:
+    """One turn between two rests."""
+
+    integral: float
+    """Of the raw yaw rate from rest to rest, rad."""
+    seconds: float
+    turned: float
+    """By the compass, rad, left positive."""
+    sigma: float
+    """Of ``turned``, rad."""
+
+    @classmethod
+    def of(cls, record: MoveRecord, bias: float, scale: float) -> "Turn":
+        """From a move; rates as published with a correction by ``bias`` (rad/s) and ``scale``.
+
+        Raises:
+            InputError: no readings of the unit, or too few headings at rest.
+        """
+        readings = record.of(topics.IMU)
+        if len(readings) < 2:
+            raise InputError("the inertial measurement unit sent nothing while the truck turned")
+        stamps = np.array([r.stamp for r in readings], dtype=np.float64) / SECOND
+        rates = np.array([r.angular_velocity.z for r in readings]) / scale + bias
+        turned, noise = record.turn()
+        turned += math.tau * round((record.turned() - turned) / math.tau)
+        over = abs(math.remainder(turned, math.tau))
+        between = (stamps >= record.left / SECOND - 0.2) & (stamps <= record.arrived / SECOND + 0.2)
+        integral = float(np.trapezoid(rates[between], stamps[between]))
+        seconds = float(np.ptp(stamps[between]))
+        return cls(integral, seconds, turned, math.hypot(noise, HEADING, 0.01 * min(over, 1.0)))
+
+
+@dataclass(frozen=True, slots=True)
+class ImuWizard:
+    """At rest for ten seconds; then full circles to both sides."""
+
+    rounds: int = 2
+    """Circles to each side"""
+    turns: bool = True
+    """Drive circles for the scale; otherwise biases only, and nothing moves"""
+
+    async def __call__(self, context: WizardContext) -> Result:
+        """Measure."""
+        rate = context.value(f"{IMU}.rate_z"), context.value(f"{IMU}.rate_scale")
+        await context.confirm(CLEAR)
+        resting = await context.collect(Collect("the unit at rest", topics.IMU, RESTING, 60.0))
+        tilt = await context.collect(Collect("the truck's tilt", topics.COMPASS, 20))
+        turns = []
+        if self.turns:
+            length = math.tau / context.chassis.bicycle.curvature(ANGLE, -ANGLE)
+            for number in range(2 * self.rounds):
+                side = 1 if number % 2 == 0 else -1
+                move = MoveStep(
+                    f"a full circle to the {'left' if side > 0 else 'right'}",
+                    0.12,
+                    side * ANGLE,
+                    -side * ANGLE,
+                    1.8 * length,
+                    done=lambda record: abs(record.turned()) > math.tau,
+                    also=(topics.IMU,),
+                )
+                turns.append(Turn.of(await context.move(move), float(rate[0]), float(rate[1])))
+        before = {name: float(context.value(f"{IMU}.{name}")) for name in _NAMES}
+        return context.fit("biases and scale", lambda: result_of(resting, tilt, turns, before))
+
+
+_NAMES: Final = ("rate_x", "rate_y", "rate_z", "rate_scale", "force_x", "force_y")
+
+
+def imu_wizard(settings: ImuWizard | None = None) -> Wizard:
+    """Biases and scale."""
+    doc = "biases of the inertial measurement unit at rest, and the scale of its yaw rate from full turns"
+    return Wizard("imu", doc, ROOM, settings or ImuWizard())
+
+
+def result_of(
+    resting: Sequence[Imu], tilt: Sequence[Attitude], turns: Sequence[Turn], before: dict[str, float]
+) -> Result:
+    """Fit and judge.
+
+    Args:
+        resting: readings of the unit while the truck stands.
+        tilt: of the truck meanwhile.
+        turns: between rests; none: the scale stays as it was.
+        before: correction that the daemon runs with, which is in ``resting``, by the names of the estimates.
+
+    Raises:
+        InputError: the unit was moved, or too few turns.
+    """
+    rates = np.array([(r.angular_velocity.x, r.angular_velocity.y, r.angular_velocity.z) for r in resting])
+    rates = rates / (1.0, 1.0, before["rate_scale"]) + [before[f"rate_{axis}"] for axis in "xyz"]
+    if rates[:, 2].std() > MOVED:
+        raise InputError(f"the unit was moved: its yaw rate varies by {rates[:, 2].std():.3f} rad/s at rest")
+    forces = np.array([(r.linear_acceleration.x, r.linear_acceleration.y) for r in resting])
+    forces += np.array((before["force_x"], before["force_y"]))
+    pitch, roll = (float(np.mean([getattr(a, name) for a in tilt])) for name in ("pitch", "roll"))
+    gravity = -GRAVITY * math.sin(pitch), GRAVITY * math.cos(pitch) * math.sin(roll)
+    biases = {f"rate_{axis}": _mean(rates[:, i]) for i, axis in enumerate("xyz")}
+    shifted = (_mean(forces[:, i] - down).joined(NORMAL * GRAVITY * TILT) for i, down in enumerate(gravity))
+    biases |= dict(zip(("force_x", "force_y"), shifted, strict=True))
+    estimates = [
+        Estimate(
+            name=name,
+            value=found.value,
+            low=found.low,
+            high=found.high,
+            unit="rad/s" if name.startswith("rate") else "m/s^2",
+            samples=len(resting),
+            meaning="bias of the angular velocity at rest; 95 % of the readings' noise"
+            if name.startswith("rate")
+            else "bias of the specific force; 95 % of the noise and of the compass's tilt",
+            key=f"{IMU}.{name}",
+        )
+        for name, found in biases.items()
+    ]
+    if turns:
+        scale = rate_scale(turns, biases["rate_z"])
+        estimates.append(
+            Estimate(
+                name="rate_scale",
+                value=scale.value,
+                low=scale.low,
+                high=scale.high,
+                samples=len(turns),
+                meaning="factor on the yaw rate, from full turns by the compass; 95 % of the turns' noise",
+                key=f"{IMU}.rate_scale",
+            )
+        )
+    return Result(
+        wizard="imu",
+        measured=f"{len(resting)} readings at rest and {len(turns)} full turns",
+        estimates=tuple(estimates),
+        unobserved=(
+            "scales of pitch and roll rate",
+            "bias and scale of the vertical force, which only other positions of the unit tell apart",
+            "what the temperature changes: bias drifts, and is followed at every rest",
+        ),
+        partial=not turns,
+    )
+
+
+def rate_scale(turns: Sequence[Turn], bias: Interval) -> Interval:
+    """Factor that makes the integrated yaw rate the turn that the compass saw.
+
+    Raises:
+        InputError: too few turns, or turns to one side only would let a bias look like a scale.
+    """
+    if len(turns) < LEAST or len({turn.turned > 0 for turn in turns}) < LEAST:
+        raise InputError(f"{len(turns)} turns: expected at least one to each side")
+    rows = np.array([(t.integral, t.seconds, t.turned, t.sigma) for t in turns])
+    integral, seconds, turned, sigma = rows.T
+    drift = bias.half / NORMAL
+
+    def residual(parameters: Array) -> Array:
+        scale, off = parameters
+        return np.append((scale * (integral - off * seconds) - turned) / sigma, (off - bias.value) / max(drift, 1e-5))
+
+    fit = least_squares(residual, np.array((1.0, bias.value)), np.array((0.5, -1.0)), np.array((2.0, 1.0)))
+    return Interval(float(fit.parameters[0]), float(known_errors(fit, len(turns) - 1)[0]))
+
+
+def _mean(values: Array) -> Interval:
+    """Mean of readings whose noise is correlated."""
+    error = float(values.std(ddof=1)) / math.sqrt(values.size) * correlation_factor(values)
+    return Interval(float(values.mean()), NORMAL * error)

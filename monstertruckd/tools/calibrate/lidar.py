@@ -1,0 +1,419 @@
+"""Mount of the lidar on the body, and the offset of its clock, from scans between rests.
+
+At two rests the lidar sees the same surroundings; how it moved between them follows from its scans alone, and how the
+body moved from wheels and steering. The mount is what makes one of the other: X in A X = X B (Tsai and Lenz, "A New
+Technique for Fully Autonomous and Efficient 3D Robotics Hand/Eye Calibration", IEEE Transactions on Robotics and
+Automation, 1989), here in the plane. The turn is taken from the scans, which measure it best; so neither the compass
+nor an error of the steering counts, only the way, whose scale is fitted too, and the direction of travel.
+
+How level it is follows from the height of its beam over the floor: near the lidar, on a wall ahead and on one to the
+left. The beam is infrared: a telephone's camera shows it.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from monstertruck_estimation.se2 import between, compose
+from monstertruck_estimation.slam.motion import find_offset
+from monstertruck_estimation.slam.registration import Cloud, register
+from monstertruck_estimation.slam.scans import Scan, ScanGeometry, prepare
+from monstertruck_kinematics.chassis import Chassis
+from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.fitting import FitResult, least_squares
+from monstertruck_runtime.clock import SECOND
+from monstertruck_runtime.errors import InputError
+from monstertruck_schemas import topics
+from monstertruck_schemas.sensor import VALID_BEAM, LaserScan
+from monstertruckd.config.calibration import LIDAR, Estimate, Result
+from monstertruckd.tools.calibrate.statistics import NORMAL, Interval, correlation_factor, known_errors
+from monstertruckd.tools.calibrate.steering_model import AXLES, EYE
+from monstertruckd.tools.calibrate.steps import Collect, MoveRecord, MoveStep, Number
+from monstertruckd.tools.calibrate.weave import weaves
+from monstertruckd.tools.calibrate.wizard import CLEAR, Wizard, WizardContext
+
+ROOM: Final = "3 m x 3 m, with walls in sight to several sides; with heights, a wall ahead and one to the left"
+SPEED: Final = 0.12
+ANGLE: Final = 0.35
+"""Of both axles, against each other, rad."""
+QUARTER: Final = math.pi / 2
+STRAIGHT: Final = 1.0
+"""m."""
+LEAST_OVERLAP: Final = 0.5
+"""Of two scans that are registered."""
+LEAST_SCANS: Final = 3
+"""At each rest."""
+SCAN: Final = 0.002
+"""Least standard deviation of a registered position, m: walls are not straight to less."""
+SCAN_TURN: Final = 0.001
+"""And of a turn, rad."""
+CRAB: Final = 0.005
+"""Standard deviation of the direction of travel on one leg, by tyres, rad."""
+DRIFT: Final = 0.006
+"""Standard deviation of the way of one leg, by slip, as a share."""
+SCALE: Final = 0.02
+"""Standard deviation of the scale of all ways before it is measured."""
+CENTRE: Final = 0.002
+"""m: how far the turning centre of all arcs may be ahead or behind by tyres that slip outward."""
+TILT: Final = math.radians(0.2)
+"""Standard deviation of the compass's tilt, rad."""
+FLAT: Final = 0.5
+"""Share of the tape's standard deviation that a floor is uneven by."""
+HEIGHTS: Final = (
+    Number("centre", "Height of the lidar's beam over the floor, at its window, cm", 1.0, 200.0),
+    Number("ahead", "Height of the beam on the wall straight ahead, cm", 0.0, 250.0),
+    Number("left", "Height of the beam on the wall straight to the left, cm", 0.0, 250.0),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class LidarLeg:
+    """One move between two rests."""
+
+    way: float
+    """Of the body by the drive's count, m, negative backwards."""
+    seen: tuple[float, float, float]
+    """Motion of the lidar in its own first frame, m and rad."""
+    sigma: float
+    """Standard deviation of its position, m."""
+    travel: float = 0.0
+    """Direction in which the body travels by its steering, against its axis, rad."""
+
+    @classmethod
+    def of(cls, record: MoveRecord, chassis: Chassis, mount: tuple[float, float, float]) -> "LidarLeg":
+        """From a move with steady steering.
+
+        Args:
+            record: with scans.
+            chassis: for way and direction.
+            mount: as believed, for the first guess.
+
+        Raises:
+            InputError: too few scans at rest, or scans that do not fit together.
+        """
+        scans, after = (_at_rest(found) for found in record.at_rest(topics.SCAN))
+        _, front, rear = record.steps()
+        axles = chassis.steering(float(np.median(front)), float(np.median(rear)))
+        way = record.way(chassis.drivetrain) / chassis.bicycle.drive_speed(1.0, *axles)
+        ahead, aside, _ = chassis.bicycle.body_twist(1.0, *axles)
+        turn = record.turned()
+        believed = np.array(mount)
+        body = _arc(way, 0.0, turn)
+        guess = between(believed, compose(body, believed))
+        fit = register(after, Cloud.of(scans), guess, reach=0.3)
+        fit = register(after, Cloud.of(scans), fit.pose)
+        if fit.overlap < LEAST_OVERLAP:
+            raise InputError(
+                f"the scans before and after a leg overlap by {fit.overlap:.0%}: expected {LEAST_OVERLAP:.0%}"
+            )
+        errors = np.sqrt(np.diag(np.linalg.inv(fit.information)))
+        x, y, yaw = fit.pose.tolist()
+        return cls(way, (x, y, yaw), math.hypot(SCAN, float(np.max(errors[:2]))), math.atan2(aside, ahead))
+
+
+@dataclass(frozen=True, slots=True)
+class Offset:
+    """How far the odometry's stamps run ahead of the scans', by turning."""
+
+    value: Interval
+    """s."""
+    samples: int
+    coarse: float | None
+    """By the correlation that the map uses, s; None = none that it would report."""
+
+
+@dataclass(frozen=True, slots=True)
+class LidarWizard:
+    """Quarter circles to both sides and straights; then weaves for the clocks, and heights where asked for."""
+
+    rounds: int = 1
+    """Full circles to each side, in quarters"""
+    heights: bool = False
+    """Ask for the height of the beam, for pitch and roll"""
+    tape_error: float = 0.002
+    """Standard deviation of a height, m"""
+
+    async def __call__(self, context: WizardContext) -> Result:
+        """Measure."""
+        believed = tuple(float(context.value(f"{LIDAR}.{name}")) for name in ("x", "y", "yaw"))
+        mount = (believed[0], believed[1], believed[2])
+        await context.confirm(CLEAR)
+        chassis = context.chassis
+        legs = [LidarLeg.of(await context.move(move), chassis, mount) for move in self._moves(chassis)]
+        weaving = [await context.move(_with_scans(move)) for move in weaves(1)]
+        level = await self._level(context) if self.heights else ()
+        crab = crab_error(context)
+        offset = context.fit("offset of the clocks", lambda: time_offset(weaving))
+        return context.fit("mount", lambda: result_of(legs, mount, crab, offset, level))
+
+    def _moves(self, chassis: Chassis) -> list[MoveStep]:
+        arc = QUARTER / chassis.bicycle.curvature(ANGLE, -ANGLE)
+        moves = []
+        for side, name in ((1, "left"), (-1, "right")):
+            moves += [
+                MoveStep(f"straight {word}", sign * SPEED, metres=STRAIGHT, also=(topics.SCAN,))
+                for sign, word in ((1, "ahead"), (-1, "back"))
+            ]
+            moves += [
+                MoveStep(
+                    f"quarter {k} of a circle to the {name}",
+                    SPEED,
+                    side * ANGLE,
+                    -side * ANGLE,
+                    arc,
+                    also=(topics.SCAN,),
+                )
+                for k in range(1, 4 * self.rounds + 1)
+            ]
+        return moves
+
+    async def _level(self, context: WizardContext) -> tuple[Estimate, ...]:
+        scans = await context.collect(Collect("distances of the walls", topics.SCAN, 10))
+        tilt = await context.collect(Collect("the truck's tilt", topics.COMPASS, 20))
+        ahead, left = (_distance(scans, angle) for angle in (0.0, QUARTER))
+        centre, front, side = [(await context.ask(step)) / 100 for step in HEIGHTS]
+        body = tuple(float(np.mean([getattr(a, name) for a in tilt])) for name in ("pitch", "roll"))
+        error = math.hypot(self.tape_error * math.sqrt(2), FLAT * self.tape_error)
+        found = (
+            ("pitch", math.asin((centre - front) / ahead) - body[0], ahead, "nose down positive"),
+            ("roll", math.asin((side - centre) / left) - body[1], left, "right side down positive"),
+        )
+        return tuple(
+            _estimate(
+                name,
+                Interval(angle, NORMAL * math.hypot(error / distance, TILT)),
+                "rad",
+                2,
+                f"{sign}; 95 % of two heights {distance:.1f} m apart, and of the compass's tilt",
+                f"{LIDAR}.{name}",
+            )
+            for name, angle, distance, sign in found
+        )
+
+
+def lidar_wizard(settings: LidarWizard | None = None) -> Wizard:
+    """Mount and clock of the lidar."""
+    doc = "where the lidar sits on the body, and the offset of its clock, from scans between rests"
+    return Wizard("lidar", doc, ROOM, settings or LidarWizard())
+
+
+def crab_error(context: WizardContext) -> float:
+    """Standard deviation of the angle at which the truck may crab, rad: by the steering's calibration, or by eye."""
+    steering = context.known.get("steering")
+    halves = []
+    for axle in AXLES:
+        centre = None if steering is None else steering.estimate(f"{axle}_centre")
+        scale = context.config.devices.steering
+        if centre is None or centre.low is None or centre.high is None or scale is None:
+            return EYE / 2
+        per_degree = getattr(scale.driver, axle).scale_us_per_deg
+        halves.append(math.radians((centre.high - centre.low) / 2 / per_degree))
+    return sum(halves) / len(halves) / NORMAL / 2
+
+
+def result_of(
+    legs: Sequence[LidarLeg],
+    mount: tuple[float, float, float],
+    crab: float,
+    offset: Offset | None,
+    level: tuple[Estimate, ...] = (),
+) -> Result:
+    """Fit and judge.
+
+    Args:
+        legs: driven.
+        mount: as believed, m and rad.
+        crab: standard deviation of the direction of travel, rad.
+        offset: of the clocks; None = not measured.
+        level: pitch and roll, where measured.
+
+    Raises:
+        InputError: too few legs to one of the sides.
+    """
+    turned = np.array([leg.seen[2] for leg in legs])
+    if not ((turned > 0.5).sum() >= 2 and (turned < -0.5).sum() >= 2 and (np.abs(turned) < 0.3).any()):
+        raise InputError("expected arcs to both sides, two each, and a straight")
+    fit = fit_mount(legs, mount, crab)
+    halves = known_errors(fit, 2 * len(legs) - 4)
+    x, y, yaw = (Interval(float(v), float(h)) for v, h in zip(fit.parameters[:3], halves[:3], strict=True))
+    noise = "95 % of scans and slip"
+    estimates = [
+        _estimate("x", x.joined(NORMAL * CENTRE), "m", len(legs), f"before the body's middle; {noise}", f"{LIDAR}.x"),
+        _estimate("y", y, "m", len(legs), f"left of it; {noise}", f"{LIDAR}.y"),
+        _estimate(
+            "yaw", yaw, "rad", len(legs),
+            f"against the direction of travel, left positive; {noise}, and of what the truck may crab", f"{LIDAR}.yaw",
+        ),
+        *level,
+    ]  # fmt: skip
+    if offset is not None:
+        text = "by which odometry runs ahead of the scans, for information"
+        estimates.append(_estimate("time_offset", offset.value, "s", offset.samples, f"{text}; 95 % of the turns"))
+    return Result(
+        wizard="lidar",
+        measured=f"{len(legs)} legs between rests; unexplained {1000 * _unexplained(fit, legs):.1f} mm",
+        estimates=tuple(estimates),
+        unobserved=(
+            "a truck that crabs looks like a lidar that is turned",
+            *(() if level else ("pitch and roll of its plane: measure heights (--heights)",)),
+        ),
+        partial=not level,
+    )
+
+
+def fit_mount(legs: Sequence[LidarLeg], mount: tuple[float, float, float], crab: float) -> FitResult:
+    """Least squares of the lidar's translations; parameters x, y (m), yaw (rad), scale of the ways, crab (rad)."""
+    ways, seen = np.array([leg.way for leg in legs]), np.array([leg.seen for leg in legs])
+    travels = np.array([leg.travel for leg in legs])
+    sigmas = np.array([math.hypot(leg.sigma, DRIFT * leg.way, CRAB * leg.way) for leg in legs])
+    start = np.array((*mount, 1.0, 0.0))
+    reach = np.array((0.5, 0.5, math.pi, 0.3, 0.3))
+
+    def residual(parameters: Array) -> Array:
+        found = seen_motion(parameters, ways, seen[:, 2], travels)
+        off = (found[:, :2] - seen[:, :2]) / sigmas[:, None]
+        return np.append(off.ravel(), ((parameters[3] - 1.0) / SCALE, parameters[4] / max(crab, 1e-6)))
+
+    return least_squares(residual, start, start - reach, start + reach)
+
+
+def seen_motion(parameters: Array, ways: Array, turns: Array, travels: Array) -> Array:
+    """Motion of the lidar on legs, (n, 3): parameters as of ``fit_mount``; ways (m), turns and directions (rad)."""
+    x, y, yaw, scale, crab = parameters.tolist()
+    mount = np.array((x, y, yaw))
+    return np.array(
+        [
+            between(mount, compose(_arc(scale * way, crab + travel, turn), mount))
+            for way, turn, travel in zip(ways, turns, travels, strict=True)
+        ]
+    )
+
+
+def _arc(way: float, crab: float, turn: float) -> Array:
+    """Motion of the body on an arc that it travels at an angle to its axis."""
+    half = turn / 2
+    chord = way * (math.sin(half) / half if abs(half) > 1e-9 else 1.0)
+    return np.array((chord * math.cos(half + crab), chord * math.sin(half + crab), turn))
+
+
+def _unexplained(fit: FitResult, legs: Sequence[LidarLeg]) -> float:
+    sigmas = np.array([math.hypot(leg.sigma, DRIFT * leg.way, CRAB * leg.way) for leg in legs])
+    off = fit.residuals[: 2 * len(legs)].reshape(-1, 2) * sigmas[:, None]
+    return float(np.sqrt((off**2).sum(axis=1).mean()))
+
+
+# Scans
+
+
+def _geometry(scan: LaserScan) -> ScanGeometry:
+    return ScanGeometry(scan.start_angle, scan.angle_increment, scan.range_min, scan.range_max)
+
+
+def _at_rest(scans: Sequence[LaserScan]) -> Scan:
+    """Points of the mean of scans at rest, in the lidar's frame.
+
+    Raises:
+        InputError: too few.
+    """
+    if len(scans) < LEAST_SCANS:
+        raise InputError(f"only {len(scans)} scans at rest: expected {LEAST_SCANS} at each end")
+    ranges = np.array([np.where(s.codes == VALID_BEAM, s.ranges, np.nan) for s in scans])
+    counts = np.isfinite(ranges).sum(axis=0)
+    sums = np.where(np.isfinite(ranges), ranges, 0.0).sum(axis=0)
+    spread = np.nanmax(np.where(counts > 0, ranges, 0.0), axis=0) - np.nanmin(np.where(counts > 0, ranges, 0.0), axis=0)
+    steady = (counts > len(scans) / 2) & (spread < 0.15)
+    return prepare(np.where(steady, sums / np.maximum(counts, 1), np.inf), _geometry(scans[0]))
+
+
+def _distance(scans: Sequence[LaserScan], angle: float) -> float:
+    """Median range around an angle, m.
+
+    Raises:
+        InputError: nothing there.
+    """
+    found = []
+    for scan in scans:
+        beam = round((angle - scan.start_angle) / scan.angle_increment)
+        near = slice(max(beam - 2, 0), beam + 3)
+        found += scan.ranges[near][scan.codes[near] == VALID_BEAM].tolist()
+    if not found:
+        raise InputError(f"no wall is seen at {math.degrees(angle):.0f} degrees: the heights need one there")
+    return float(np.median(found))
+
+
+def _with_scans(move: MoveStep) -> MoveStep:
+    return replace(move, also=(topics.SCAN, topics.ODOMETRY))
+
+
+def time_offset(records: Sequence[MoveRecord]) -> Offset | None:
+    """Offset of the clocks of odometry and scans, from weaving; None where too little turned, or nothing was seen.
+
+    The correlation of ``find_offset`` says whether there is a gross one; least squares of the yaws refine it.
+    """
+    series = [found for record in records if (found := _yaws(record)) is not None]
+    if not series:
+        return None
+    coarse = find_offset(*series[0][:3]) if len(series[0][0]) else None
+    return fit_offset([(s / SECOND, m, t / SECOND, w) for s, m, _, t, w in series], coarse)
+
+
+def fit_offset(series: Sequence[tuple[Array, Array, Array, Array]], coarse: float | None) -> Offset:
+    """Least squares of the offset.
+
+    Args:
+        series: of each move, times (s) and yaws (rad) of the scans, times and yaws of odometry.
+        coarse: first guess, s; None = 0.
+    """
+
+    def residual(parameters: Array) -> Array:
+        (offset,) = parameters
+        off = []
+        for times, scan, stamps, wheel in series:
+            inside = (times > stamps[0] + 0.7) & (times < stamps[-1] - 0.7)
+            predicted = np.interp(times[inside] + offset, stamps, wheel)
+            basis = np.column_stack((np.ones(predicted.size), predicted))
+            off.append(scan[inside] - basis @ np.linalg.lstsq(basis, scan[inside], rcond=None)[0])
+        return np.concatenate(off)
+
+    fit = least_squares(residual, np.array((coarse or 0.0,)), np.array((-0.65,)), np.array((0.65,)))
+    half = NORMAL * correlation_factor(fit.residuals) * float(fit.standard_errors[0])
+    return Offset(Interval(float(fit.parameters[0]), half), fit.residuals.size, coarse)
+
+
+def _yaws(record: MoveRecord) -> tuple[Array, Array, Array, Array, Array] | None:
+    """Stamps and yaws of the scans, odometry's yaws then, and its own stamps and yaws; None = too few."""
+    scans, odometry = record.of(topics.SCAN), record.of(topics.ODOMETRY)
+    before = [scan for scan in scans if scan.stamp < record.left]
+    if len(before) < LEAST_SCANS or len(odometry) < 2 or len(scans) < 4 * LEAST_SCANS:
+        return None
+    cloud = Cloud.of(_at_rest(before))
+    pose, stamps, yaws = np.zeros(3), [], []
+    for scan in scans:
+        # The middle of a scan, which takes a tenth of a second, stands for it.
+        points = prepare(np.where(scan.codes == VALID_BEAM, scan.ranges, np.inf), _geometry(scan))
+        fit = register(points, cloud, pose, reach=0.3)
+        if fit.overlap < LEAST_OVERLAP:
+            continue
+        pose = fit.pose
+        stamps.append(scan.stamp + round((len(scan.ranges) - 1) * scan.time_increment / 2 * SECOND))
+        yaws.append(float(pose[2]))
+    times = np.array([o.stamp for o in odometry], dtype=np.float64)
+    wheel = np.unwrap([o.pose.yaw for o in odometry])
+    at = np.array(stamps, dtype=np.float64)
+    return at, np.unwrap(yaws), np.interp(at, times, wheel), times, wheel
+
+
+def _estimate(name: str, found: Interval, unit: str, samples: int, meaning: str, key: str | None = None) -> Estimate:
+    return Estimate(
+        name=name,
+        value=found.value,
+        low=found.low,
+        high=found.high,
+        unit=unit,
+        samples=samples,
+        meaning=meaning,
+        key=key,
+    )

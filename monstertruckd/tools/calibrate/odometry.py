@@ -1,0 +1,292 @@
+"""Way, wheelbase and steering offset of dead reckoning, from squares driven both ways.
+
+After the test of Borenstein and Feng ("Measurement and Correction of Systematic Odometry Errors in Mobile Robots", IEEE
+Transactions on Robotics and Automation, 1996): errors of the offset turn a square driven to the left and one driven to
+the right in the same sense, errors of the wheelbase in opposite ones. Theirs is for two wheels that are driven apart;
+here corners are arcs of a truck that steers both axles, a tape tells the first side, and the compass every leg's turn.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from monstertruck_kinematics.chassis import TruckChassis
+from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.fitting import FitResult, least_squares
+from monstertruck_runtime.errors import RequestRefusedError
+from monstertruck_schemas.reasons import Reason
+from monstertruckd.config.calibration import STEERING, Estimate, Result
+from monstertruckd.tools.calibrate.statistics import Interval, known_errors
+from monstertruckd.tools.calibrate.steering_model import AXLES, EYE, SLIP, Maps, SteeringModel, SteeringRun
+from monstertruckd.tools.calibrate.steps import Confirm, MoveRecord, MoveStep, Number
+from monstertruckd.tools.calibrate.wizard import CLEAR, Wizard, WizardContext
+
+ROOM: Final = "3.5 m x 3.5 m on either side: squares of 2.4 m to the left and to the right of the truck, level"
+SPEED: Final = 0.15
+CORNER: Final = 0.08
+"""Speed in the corners, m/s: fast ones are wider, as tyres slip outward."""
+ANGLE: Final = 0.35
+"""Of both axles, against each other, in the corners, rad."""
+PLACE: Final = 0.03
+"""Standard deviation of the way back to the mark by what slips on 10 m, m."""
+FLOOR: Final = 0.003
+"""Share by which the way differs on another floor, half a 95 % interval."""
+LINKAGE: Final = 0.004
+"""Share of a turn by which a linkage is off its polynomials, half a 95 % interval."""
+PRIORS: Final = 3
+"""Beliefs among the residuals."""
+BELIEVED: Final = (0.05, 0.05, math.radians(6.0))
+"""Standard deviations before anything is measured: share of way and of wheelbase, servo angle, rad."""
+
+_MARK: Final = Confirm(
+    "mark",
+    "Mark the floor straight below the middle of the front bumper, and lay a string ahead along the axis. Done?",
+)
+_SIDE: Final = Number("side", "Distance from the mark to below the middle of the front bumper now, m", 0.2, 20.0)
+_AHEAD: Final = Number(
+    "ahead", "How far along the string has the middle of the front bumper moved off its mark, cm, ahead positive?",
+    -300.0, 300.0,
+)  # fmt: skip
+_LEFT: Final = Number("left", "And how far off the string, cm, left positive?", -300.0, 300.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Square:
+    """One square as it was driven, and where the truck came to."""
+
+    legs: tuple[SteeringRun, ...]
+    """Side and corner in turn."""
+    side: float
+    """First side by the tape, m."""
+    off: tuple[float, float]
+    """Front bumper from its mark at the end, ahead and left, m."""
+
+
+@dataclass(frozen=True, slots=True)
+class OdometryWizard:
+    """A square to the left, the same to the right, as often as asked for."""
+
+    rounds: int = 1
+    """Squares to each side"""
+    side: float = 1.5
+    """Length of its straight parts, m; corners add 0.7 m each"""
+    tape_error: float = 0.002
+    """Standard deviation of a tape reading, m"""
+    string_error: float = 0.0035
+    """Standard deviation of the string's direction along the truck, rad"""
+
+    async def __call__(self, context: WizardContext) -> Result:
+        """Measure."""
+        if not isinstance(context.chassis, TruckChassis):
+            raise RequestRefusedError(
+                Reason.NOT_SUPPORTED,
+                "only a body with two steered axles drives squares of arcs; slip is for skid steer",
+            )
+        maps = Maps.of(context.config)
+        await context.confirm(CLEAR)
+        squares = [await self._square(context, maps, side) for _ in range(self.rounds) for side in (1, -1)]
+        return context.fit("way, wheelbase and steering offset", lambda: self.judge(context, maps, squares))
+
+    async def _square(self, context: WizardContext, maps: Maps, sense: int) -> Square:
+        await context.confirm(_MARK)
+        corner = math.pi / 2 / context.chassis.bicycle.curvature(ANGLE, -ANGLE)
+        legs, taped = [], 0.0
+        way = "left" if sense > 0 else "right"
+        for number in range(1, 5):
+            side = MoveStep(f"square to the {way}, side {number} of 4", SPEED, metres=self.side)
+            legs.append(SteeringRun.of(await context.move(side), maps))
+            if number == 1:
+                taped = await context.ask(_SIDE)
+            name = f"corner {number} of 4"
+            arc = MoveStep(name, CORNER, sense * ANGLE, -sense * ANGLE, 1.5 * corner, done=_turned_a_quarter)
+            legs.append(SteeringRun.of(await context.move(arc), maps))
+        return Square(tuple(legs), taped, (await context.ask(_AHEAD) / 100, await context.ask(_LEFT) / 100))
+
+    def judge(self, context: WizardContext, maps: Maps, squares: Sequence[Square]) -> Result:
+        """Fit and judge."""
+        chassis, geometry = context.chassis, context.config.geometry
+        assert isinstance(chassis, TruckChassis)
+        model = SquareModel(SteeringModel(chassis), maps, geometry.length / 2)
+        fit = model.fit(squares, self.tape_error, self.string_error)
+        legs = sum(len(square.legs) for square in squares)
+        way, base, offset = intervals(fit, legs + 3 * len(squares))
+        way = way.joined(FLOOR)
+        base = base.joined(LINKAGE)
+        ratio = geometry.drive_ratio / way.value
+        steering = context.known.get("steering")
+        estimates = [
+            Estimate(
+                name="drive_ratio",
+                value=ratio,
+                low=geometry.drive_ratio / way.high,
+                high=geometry.drive_ratio / way.low,
+                samples=len(squares),
+                meaning=f"motor turns per turn of wheels of {geometry.wheel_radius:g} m; 95 % of tape and slip, and "
+                f"{FLOOR:.1%} of other floors",
+                key="geometry.drive_ratio",
+            ),
+            _estimate(
+                "wheel_radius", way.times(geometry.wheel_radius), "m", len(squares), "wheels, by the configured ratio"
+            ),
+            _estimate(
+                "wheelbase",
+                base.times(geometry.wheelbase),
+                "m",
+                legs,
+                f"that the turns show; 95 % of the legs' noise, and {LINKAGE:.1%} of the linkage",
+                "geometry.wheelbase",
+            ),
+            _estimate(
+                "offset", offset.times(math.degrees(1.0)), "deg", legs,
+                "of the servos, in front to the left and at the rear to the right; 95 % of the legs' noise",
+            ),
+        ]  # fmt: skip
+        for axle, name in enumerate(AXLES):
+            scale = maps.scales[axle]
+            moved = (1 if axle == 0 else -1) * math.degrees(offset.value) * scale
+            common = None if steering is None else steering.estimate(f"{name}_centre")
+            known = math.degrees(EYE) * abs(scale)
+            if common is not None and common.low is not None and common.high is not None:
+                known = (common.high - common.low) / 2
+            half = math.hypot(math.degrees(offset.half) * abs(scale), known)
+            centre = Interval(maps.centres[axle] - moved, half)
+            text = "pulse that steers straight ahead; 95 % of the legs' noise, and what both axles may be off together"
+            estimates.append(_estimate(f"{name}_centre", centre, "us", legs, text, f"{STEERING}.{name}.centre_us"))
+        errors = [math.hypot(*square.off) for square in squares]
+        left = [math.dist(model.end(square, fit.parameters), square.off) for square in squares]
+        return Result(
+            wizard="odometry",
+            measured=f"{len(squares)} squares of {4 * self.side + 2.8:.0f} m; off the mark by "
+            f"{', '.join(f'{100 * e:.0f}' for e in errors)} cm, unexplained {100 * max(left):.0f} cm",
+            estimates=tuple(estimates),
+            unobserved=(
+                "gear ratio and wheel radius apart from each other",
+                "equal errors of both centres: the truck crabs, and its squares close",
+                "the wheelbase apart from the servos' scale: their product is measured",
+            ),
+        )
+
+
+def odometry_wizard(settings: OdometryWizard | None = None) -> Wizard:
+    """Way, wheelbase, steering offset."""
+    doc = "way, wheelbase and steering offset of dead reckoning, from squares driven to both sides"
+    return Wizard("odometry", doc, ROOM, settings or OdometryWizard())
+
+
+def _turned_a_quarter(record: MoveRecord) -> bool:
+    return abs(record.turned()) >= math.pi / 2
+
+
+class SquareModel:
+    """Squares as dead reckoning sees them.
+
+    Parameters: way and wheelbase as shares of the configured ones, offset of the servos (rad), in front to the left and
+    at the rear to the right.
+
+    Args:
+        model: of the truck.
+        maps: of the servos, that the daemon runs with.
+        ahead: front bumper before the base, m.
+    """
+
+    def __init__(self, model: SteeringModel, maps: Maps, ahead: float) -> None:
+        self._model = model
+        self._maps = maps
+        self._ahead = ahead
+
+    def maps(self, offset: float) -> Maps:
+        """With servos that stand by ``offset``, rad, more to the left in front, and to the right at the rear."""
+        shift = math.degrees(offset)
+        front, rear = (
+            c - s * d for c, s, d in zip(self._maps.centres, self._maps.scales, (shift, -shift), strict=True)
+        )
+        return Maps((front, rear), self._maps.scales, self._maps.deficit)
+
+    def turns(self, legs: Sequence[SteeringRun], parameters: Array) -> Array:
+        """Turns of legs, rad; (n,)."""
+        way, base, offset = parameters
+        turns, _ = self._model.predict(legs, self.maps(float(offset)))
+        return np.asarray(turns * way / base)
+
+    def end(self, square: Square, parameters: Array) -> tuple[float, float]:
+        """Front bumper from its mark at the end of a square, ahead and left, m: headings as measured."""
+        way, base, offset = parameters.tolist()
+        maps = self.maps(offset)
+        chassis = self._model.chassis
+        x = y = yaw = 0.0
+        for leg in square.legs:
+            servos = [maps.servo(axle, leg.pulses[axle]) for axle in (0, 1)]
+            front, rear = self._model.axles(maps).angles(*servos)
+            rolled = (
+                way
+                * chassis.drivetrain.distance(leg.motor)
+                / chassis.bicycle.drive_speed(np.ones_like(front), front, rear)
+            )
+            forward, sideways, turned = chassis.bicycle.body_twist(rolled, front, rear)
+            turned = turned / base
+            whole = float(turned.sum())
+            heading = (
+                yaw
+                + (np.cumsum(turned) - turned / 2)
+                + (leg.turn - whole) * (np.arange(turned.size) + 0.5) / turned.size
+            )
+            x += float(forward @ np.cos(heading) - sideways @ np.sin(heading))
+            y += float(forward @ np.sin(heading) + sideways @ np.cos(heading))
+            yaw += leg.turn
+        return x + self._ahead * (math.cos(yaw) - 1.0), y + self._ahead * math.sin(yaw)
+
+    def fit(self, squares: Sequence[Square], tape: float, string: float) -> FitResult:
+        """Least squares; residuals in standard deviations, the beliefs last."""
+        legs = [leg for square in squares for leg in square.legs]
+        turned = np.array([leg.turn for leg in legs])
+        sigmas = np.array([math.hypot(leg.sigma, SLIP * math.sqrt(self._model.way(leg))) for leg in legs])
+        sides = np.array([square.side for square in squares])
+        ways = np.array([self._model.way(square.legs[0]) for square in squares])
+        chords = np.array([_chord(square.legs[0].turn) for square in squares])
+        tapes = np.hypot(tape * math.sqrt(2), 0.002 * sides)
+        ends = np.array([square.off for square in squares])
+        place = np.hypot(PLACE, string * 2.0)
+        believed = np.array(BELIEVED)
+        start = np.array((1.0, 1.0, 0.0))
+
+        def residual(parameters: Array) -> Array:
+            back = np.array([self.end(square, parameters) for square in squares])
+            return np.concatenate(
+                (
+                    (self.turns(legs, parameters) - turned) / sigmas,
+                    (ways * parameters[0] * chords - sides) / tapes,
+                    ((back - ends) / place).ravel(),
+                    (parameters - start) / believed,
+                )
+            )
+
+        return least_squares(residual, start, start - 0.3, start + 0.3)
+
+
+def intervals(fit: FitResult, measured: int) -> tuple[Interval, Interval, Interval]:
+    """Of way and wheelbase (shares) and offset (rad), from so many measurements."""
+    halves = known_errors(fit, measured - fit.parameters.size)
+    way, base, offset = (Interval(float(x), float(h)) for x, h in zip(fit.parameters, halves, strict=True))
+    return way, base, offset
+
+
+def _estimate(name: str, found: Interval, unit: str, samples: int, meaning: str, key: str | None = None) -> Estimate:
+    return Estimate(
+        name=name,
+        value=found.value,
+        low=found.low,
+        high=found.high,
+        unit=unit,
+        samples=samples,
+        meaning=meaning,
+        key=key,
+    )
+
+
+def _chord(turn: float) -> float:
+    """Chord of an arc over its length."""
+    half = turn / 2
+    return math.sin(half) / half if abs(half) > 1e-6 else 1.0

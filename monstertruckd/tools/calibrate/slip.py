@@ -1,0 +1,204 @@
+"""Turning centres and effective wheels of a skid-steer body, from arcs between two rests.
+
+What says where the body was is a test stand, or the map's pose (``--by``). Each arc has one ratio of wheel rates, so
+that its motion is the exponential of one twist; wheels turned and poses at rest, averaged, are all that counts, and no
+delay of anybody's does.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Final, Literal
+
+import numpy as np
+
+from monstertruck_kinematics.chassis import Chassis
+from monstertruck_kinematics.elementary import Array, integrate, to_body
+from monstertruck_kinematics.fitting import least_squares
+from monstertruck_kinematics.identification import skid_model
+from monstertruck_runtime.errors import InputError, RequestRefusedError
+from monstertruck_schemas import topics
+from monstertruck_schemas.base import Pose2D
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.topics import Topic
+from monstertruckd.config.calibration import Estimate, Result
+from monstertruckd.tools.calibrate.statistics import known_errors
+from monstertruckd.tools.calibrate.steps import MoveRecord, MoveStep
+from monstertruckd.tools.calibrate.wizard import CLEAR, Wizard, WizardContext
+
+Observer = Literal["stand", "pose"]
+OBSERVERS: Final[dict[Observer, Topic[Any]]] = {"stand": topics.STAND_POSE, "pose": topics.POSE}
+ROOM: Final = "ten lengths of the robot around it"
+RADII: Final = (4.0, 2.0, 0.0)
+"""Of the arcs, in tracks; 0 = straight."""
+REST: Final = 1.5
+"""Seconds at each end: 30 poses of a stand."""
+LEAST: Final = 5
+"""Poses at each end, at least."""
+SLIDING: Final = 0.004
+"""Share of the way by which a body that skids differs from its model, along and across; and of its turn."""
+FLOOR: Final = 0.0005
+"""Least standard deviation of a position at rest, m,"""
+AIM: Final = 0.001
+"""and of a heading, rad."""
+
+
+@dataclass(frozen=True, slots=True)
+class SkidArc:
+    """One move between two rests."""
+
+    left: float
+    """Turned by the left wheels themselves, rad, forward positive."""
+    right: float
+    motion: tuple[float, float, float]
+    """Of the body in its own first frame, m and rad."""
+    sigma: tuple[float, float]
+    """Standard deviations of the motion's position (m) and heading (rad)."""
+
+    @classmethod
+    def of(cls, record: MoveRecord, observer: Observer, chassis: Chassis) -> "SkidArc":
+        """From a move.
+
+        Raises:
+            InputError: too few poses at rest, or a shaft without feedback.
+        """
+        before, after = record.at_rest(OBSERVERS[observer])
+        if min(len(before), len(after)) < LEAST:
+            raise InputError(f"only {len(before)} and {len(after)} poses at rest: expected {LEAST} at each end")
+        (x0, y0, yaw0), (x1, y1, yaw1) = (_mean_pose([m.pose for m in poses]) for poses in (before, after))
+        moving = [m.pose.yaw for m in record.of(OBSERVERS[observer])]
+        turned = float(np.unwrap(moving)[-1] - np.unwrap(moving)[0])
+        turn = yaw1 - yaw0
+        turn += math.tau * round((turned - turn) / math.tau)
+        ahead, aside = to_body(yaw0, x1 - x0, y1 - y0)
+        train = chassis.drivetrain
+        ways = [train.distance(_turned(record, i)) / train.wheel_radius for i in range(len(chassis.shafts))]
+        sides = [float(np.mean(ways[side::2])) for side in (0, 1)]
+        spreads = [_spread([m.pose for m in poses]) for poses in (before, after)]
+        place, heading = (math.hypot(*column) for column in zip(*spreads, strict=True))
+        return cls(sides[0], sides[1], (float(ahead), float(aside), turn), (place, heading))
+
+
+@dataclass(frozen=True, slots=True)
+class SlipWizard:
+    """Arcs to both sides, forward and back."""
+
+    by: Observer = "stand"
+    """What says where the robot is: a test stand, or its own map"""
+    rounds: int = 2
+    """Times that each arc is driven"""
+    turn: float = 2.0
+    """Of each arc, rad"""
+
+    async def __call__(self, context: WizardContext) -> Result:
+        """Measure."""
+        config = context.config
+        if config.body.kind != "skid_steer":
+            raise RequestRefusedError(Reason.NOT_SUPPORTED, f"body {config.body.kind}: only a skid_steer one slips so")
+        await context.confirm(CLEAR)
+        bicycle, track = context.chassis.bicycle, config.geometry.track
+        speed = 0.6 * min(config.gate.speed, config.gate.reverse_speed)
+        shafts = len(context.chassis.shafts)
+        also = (OBSERVERS[self.by], *topics.DRIVES[1:shafts])
+        arcs = []
+        for share in RADII:
+            for side in (1, -1) if share else (0,):
+                curvature = side / (share * track) if side else 0.0
+                front = math.atan(curvature * (bicycle.l_f + bicycle.l_r))
+                metres = self.turn * share * track if side else 6.0 * track
+                for number in range(2 * self.rounds):
+                    way = 1 if number % 2 == 0 else -1
+                    side_name = {1: "left", -1: "right", 0: "straight"}[side]
+                    name = f"{side_name}, {share:g} tracks, {'ahead' if way > 0 else 'back'}"
+                    move = MoveStep(name, way * speed, front, 0.0, metres, rest=REST, also=also)
+                    arcs.append(SkidArc.of(await context.move(move), self.by, context.chassis))
+        return context.fit("turning centres", lambda: result_of(arcs, config.geometry.wheel_radius, track / 2))
+
+
+def slip_wizard(settings: SlipWizard | None = None) -> Wizard:
+    """Turning centres."""
+    doc = "turning centres and effective wheels of a skid-steer body, from arcs seen by a stand or in the map"
+    return Wizard("slip", doc, ROOM, settings or SlipWizard())
+
+
+def result_of(arcs: Sequence[SkidArc], radius: float, half_track: float) -> Result:
+    """Fit and judge.
+
+    Args:
+        arcs: driven.
+        radius: of the wheels, nominal, m.
+        half_track: m.
+
+    Raises:
+        InputError: too few arcs, or none to one of the sides.
+    """
+    turns = np.array([arc.motion[2] for arc in arcs])
+    if len(arcs) < 4 or not ((turns > 0.3).any() and (turns < -0.3).any()):
+        raise InputError(f"{len(arcs)} arcs: expected at least 4, to both sides")
+    model = skid_model("icr and slip", radius, half_track, with_icr_x=True)
+    seen = np.array([arc.motion for arc in arcs]).T
+    ways = np.array([radius * max(abs(arc.left), abs(arc.right)) for arc in arcs])
+    place = np.hypot([max(arc.sigma[0], FLOOR) for arc in arcs], SLIDING * ways)
+    heading = np.hypot([max(arc.sigma[1], AIM) for arc in arcs], SLIDING * np.abs(turns))
+    left, right = np.array([(arc.left, arc.right) for arc in arcs]).T
+
+    def residual(values: Array) -> Array:
+        vx, vy, wz = model.build(values).forward((left, right))
+        zero = np.zeros_like(left)
+        x, y, yaw = integrate((zero, zero, zero), vx, vy, wz, 1.0)
+        off = np.array((x, y, yaw)) - seen
+        return np.asarray((off / (place, place, heading)).ravel())
+
+    fit = least_squares(residual, model.start, model.lower, model.upper)
+    halves = known_errors(fit, fit.residuals.size - fit.parameters.size)
+    values = dict(zip(model.parameters, fit.parameters.tolist(), strict=True))
+    errors = dict(zip(model.parameters, halves.tolist(), strict=True))
+    tilt = math.sqrt(values["slip_ratio"])
+    share = math.hypot(errors["gain"] / values["gain"], errors["slip_ratio"] / values["slip_ratio"] / 2)
+    gains = {"gain_left": values["gain"] / tilt, "gain_right": values["gain"] * tilt}
+    rows = [(name, values[name], errors[name], "m") for name in ("icr_left", "icr_right", "icr_x")]
+    rows += [(name, value, share * value, "") for name, value in gains.items()]
+    meanings = {
+        "icr_left": "turning centre of the left wheels, left of the middle",
+        "icr_right": "turning centre of the right wheels",
+        "icr_x": "turning centres before the middle",
+        "gain_left": "effective over nominal radius of the left wheels",
+        "gain_right": "effective over nominal radius of the right wheels",
+    }
+    return Result(
+        wizard="slip",
+        measured=f"{len(arcs)} arcs between rests; unexplained {fit.rms:.2f} of what is expected",
+        estimates=tuple(
+            Estimate(
+                name=name,
+                value=value,
+                low=value - half,
+                high=value + half,
+                unit=unit,
+                samples=len(arcs),
+                meaning=f"{meanings[name]}, on this floor; 95 % of poses and skidding",
+                key=f"body.{name}",
+            )
+            for name, value, half, unit in rows
+        ),
+        unobserved=("another floor, another load", "what a reversal turns the body by, and slow sliding"),
+    )
+
+
+def _turned(record: MoveRecord, shaft: int) -> float:
+    readings = record.drive if shaft == 0 else record.of(topics.DRIVES[shaft])
+    if len(readings) < 2:
+        raise InputError(f"shaft {shaft + 1} sent no feedback")
+    return readings[-1].position - readings[0].position
+
+
+def _mean_pose(poses: Sequence[Pose2D]) -> tuple[float, float, float]:
+    yaws = np.unwrap([pose.yaw for pose in poses])
+    return float(np.mean([p.x for p in poses])), float(np.mean([p.y for p in poses])), float(yaws.mean())
+
+
+def _spread(poses: Sequence[Pose2D]) -> tuple[float, float]:
+    """Standard errors of a mean pose, m and rad."""
+    root = math.sqrt(len(poses))
+    place = math.hypot(float(np.std([p.x for p in poses])), float(np.std([p.y for p in poses]))) / math.sqrt(2)
+    return place / root, float(np.unwrap([p.yaw for p in poses]).std()) / root

@@ -1,0 +1,70 @@
+"""Wizards of odometry, lidar, inertial unit and skid-steer bodies through the whole daemon, true values hidden."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from monstertruckd.config.calibration import CalibrationStore, WizardName, with_values
+from monstertruckd.config.load import load_config
+from monstertruckd.tools.calibrate.imu import ImuWizard, imu_wizard
+from monstertruckd.tools.calibrate.lidar import LidarWizard, lidar_wizard
+from monstertruckd.tools.calibrate.odometry import odometry_wizard
+from monstertruckd.tools.calibrate.slip import SlipWizard, slip_wizard
+from monstertruckd.tools.calibrate.wizard import Wizard
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
+from tests.calibration_kit import hidden, run_session, verdicts
+
+pytestmark = [pytest.mark.virtual, pytest.mark.timeout(600)]
+
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+
+
+def truck(folder: Path, seed: int, name: WizardName) -> SimulatedTruckConfig:
+    base = load_config(CONFIGS / "yard.yaml", SimulatedTruckConfig)[0]
+    plain = SimulatedTruckConfig.model_validate(
+        base.model_dump() | {"sim": {"world": {"map": "yard"}}, "state_directory": folder, "recorder": None}
+    )
+    if name == "imu":
+        imu = {"port": {"path": Path("/tmp/monstertruck/imu")}, "driver": {"kind": "wt61"}}
+        plain = with_overlay(plain, {"devices": {"imu": imu}})
+    return hidden(plain, np.random.default_rng(seed), seed, (name,))
+
+
+def judged(wizard: Wizard, config: SimulatedTruckConfig, seed: int) -> set[str]:
+    session = run_session(config, wizard, np.random.default_rng(seed))
+    found = verdicts(session.result, config)
+    assert all(verdict.holds for verdict in found), [verdict for verdict in found if not verdict.holds]
+    return {verdict.name.partition(".")[2] for verdict in found}
+
+
+def test_odometry(tmp_path: Path):
+    config = truck(tmp_path, 1, "odometry")
+    assert judged(odometry_wizard(), config, 1) >= {"drive_ratio", "wheelbase", "front_centre", "rear_centre"}
+    current = CalibrationStore(config.calibration_folder, config.robot).current()
+    assert current is not None
+    calibrated = with_values(config, current.results.values(), "calibration")
+    assert calibrated.geometry.wheelbase != config.geometry.wheelbase
+
+
+def test_lidar(tmp_path: Path):
+    wizard = lidar_wizard(LidarWizard(heights=True))
+    assert judged(wizard, truck(tmp_path, 2, "lidar"), 2) == {"x", "y", "yaw", "pitch", "roll"}
+
+
+def test_imu(tmp_path: Path):
+    wizard = imu_wizard(ImuWizard(rounds=1))
+    assert judged(wizard, truck(tmp_path, 3, "imu"), 3) >= {"rate_z", "rate_scale", "force_x"}
+
+
+def test_slip(tmp_path: Path):
+    body = {"kind": "skid_steer", "motors": "wheels", "icr_left": 0.08, "icr_right": -0.07, "gain_left": 1.05}
+    base = load_config(CONFIGS / "robots" / "skid_stand.yaml", SimulatedTruckConfig)[0]
+    overlay = {
+        "recorder": None,
+        "blackbox": None,
+        "state_directory": tmp_path,
+        "sim": {"world": {"truck": {"body": body}}},
+    }
+    config = with_overlay(base, overlay)
+    assert judged(slip_wizard(SlipWizard(rounds=1)), config, 4) >= {"icr_left", "icr_right", "gain_left"}

@@ -1,0 +1,55 @@
+"""Mount of the lidar: what tells it, and what is refused."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from monstertruck_runtime.errors import InputError
+from monstertruckd.tools.calibrate.lidar import LidarLeg, fit_mount, fit_offset, result_of, seen_motion
+
+TRUE = np.array((0.13, 0.02, 0.04, 1.01, 0.0))
+
+
+def leg(way, turn, travel=0.0):
+    x, y, yaw = seen_motion(TRUE, np.array((way,)), np.array((turn,)), np.array((travel,)))[0].tolist()
+    return LidarLeg(way, (x, y, yaw), 0.004, travel)
+
+
+LEGS = [leg(1.0, 0.0), *(leg(0.66, 1.5, -0.01) for _ in range(4)), *(leg(0.66, -1.5) for _ in range(4))]
+
+
+def test_the_mount_is_what_makes_the_bodys_motion_the_lidars():
+    fit = fit_mount(LEGS, (0.1, 0.0, 0.0), 0.001)
+    assert fit.parameters[:3] == pytest.approx(TRUE[:3], abs=1e-3)
+
+
+def test_a_truck_that_may_crab_widens_the_yaw_alone():
+    narrow, wide = (result_of(LEGS, (0.1, 0.0, 0.0), crab, None) for crab in (0.001, 0.05))
+    halves = [[(e.high - e.low) / 2 for e in result.estimates] for result in (narrow, wide)]
+    assert halves[1][2] > 5 * halves[0][2]
+    assert halves[1][0] < 2 * halves[0][0]
+    assert wide.partial, "pitch and roll of an earlier run stay"
+
+
+def test_arcs_to_one_side_are_refused():
+    with pytest.raises(InputError, match="arcs to both sides"):
+        result_of(
+            [replace(leg, seen=(leg.seen[0], leg.seen[1], abs(leg.seen[2]))) for leg in LEGS], (0, 0, 0), 0.01, None
+        )
+
+
+@pytest.mark.parametrize("offset", [-0.2, -0.02, 0.0, 0.013, 0.15])
+def test_an_offset_of_the_clocks(offset):
+    rng = np.random.default_rng(3)
+
+    def yaw(t):
+        return 0.3 * np.sin(1.3 * t) + 0.1 * np.sin(4.1 * t)
+
+    scans, stamps = np.arange(0, 12, 0.1), np.arange(0, 12, 0.02)
+    seen = yaw(scans) + 0.002 * rng.standard_normal(scans.size)
+    found = fit_offset([(scans, seen, stamps, 0.97 * yaw(stamps - offset))], None)
+    assert found.value.low - 0.002 < offset < found.value.high + 0.002
+    assert found.value.half < 0.005
+    assert math.isfinite(found.value.half)
