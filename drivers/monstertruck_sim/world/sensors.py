@@ -356,7 +356,8 @@ class SimulatedImu:
         """Reading at ``time_ns``."""
         self._plant.advance(time_ns)
         config, (pitch, roll), (forward, left, up) = self._config, self._plant.attitude, self._plant.acceleration
-        rates = _to_body(self._plant.rates, pitch, roll)
+        x, y, z = _to_body(self._plant.rates, pitch, roll)
+        rates = x, y, z * config.rate_scale
         forces = _to_body((forward, left, GRAVITY + up), pitch, roll)
         noise = [0.0] * 6
         if self._noise is not None:

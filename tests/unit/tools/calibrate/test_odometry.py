@@ -40,7 +40,7 @@ def test_an_offset_turns_both_squares_in_the_same_sense_and_a_wheelbase_in_oppos
         left, right = (
             MODEL.turns(square(sense, RIGHT).legs, parameters).sum() - sense * 2 * math.pi for sense in (1, -1)
         )
-        assert (left * right > 0) is same
+        assert bool(left * right > 0) is same
 
 
 def test_errors_are_found():
