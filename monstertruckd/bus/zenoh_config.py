@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
-from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT, host_of, local_endpoint, protocol_of
+from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT, host_of, is_endpoint, local_endpoint, protocol_of
 from monstertruck_schemas.base import Schema
 from monstertruck_schemas.req import Role
 from monstertruck_schemas.roles import AccessRole
@@ -92,6 +92,14 @@ class ZenohConfig(Schema):
     gather_seconds: float = Field(default=0.04, ge=0, le=0.1)
     """Messages of regular topics (1 Hz and more) leave for network and log together, each about this late
     at most; 0: at once."""
+
+    @field_validator("listen", "listen_pilots", "connect")
+    @classmethod
+    def _endpoints(cls, given: tuple[str, ...]) -> tuple[str, ...]:
+        for endpoint in given:
+            if not is_endpoint(endpoint):
+                raise ValueError(f"{endpoint!r} is no endpoint: expected tcp/HOST:PORT or tls/HOST:PORT")
+        return given
 
     @property
     def open_endpoints(self) -> tuple[str, ...]:

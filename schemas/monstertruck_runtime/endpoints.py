@@ -12,6 +12,18 @@ SERVICE_FOLDER: Final = Path("/run/monstertruckd")
 DEFAULT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
 LOCAL_HOSTS: Final = ("127.0.0.1", "localhost", "::1")
 UNIX: Final = "unixsock-stream/"
+_ADDRESSED: Final = ("tcp", "tls", "udp", "quic", "ws")
+"""Protocols whose addresses are a host and a port."""
+_OTHERS: Final = ("unixsock-stream", "unixpipe", "vsock", "serial")
+_LAST_PORT: Final = 65_535
+
+
+def is_endpoint(text: str) -> bool:
+    """Whether ``text`` has the form of an endpoint: a protocol that Zenoh knows, and an address."""
+    if protocol_of(text) in _ADDRESSED:
+        port = port_of(text)
+        return bool(host_of(text)) and port is not None and port <= _LAST_PORT
+    return protocol_of(text) in _OTHERS and bool(_address(text))
 
 
 def protocol_of(endpoint: str) -> str:

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from monstertruck_runtime.endpoints import nearest
+from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT, is_endpoint, nearest
 from monstertruck_runtime.errors import InputError
 
 
@@ -49,6 +49,10 @@ def complete_config(incomplete: str) -> list[str]:
 
 def _nearest(endpoint: str) -> str:
     """One parameter, for a callback of an option gets its value by position."""
+    if not is_endpoint(endpoint):
+        raise InputError(
+            f"--endpoint {endpoint!r}: expected tcp/HOST:PORT or tls/HOST:PORT, such as {DEFAULT_ENDPOINT}"
+        )
     return nearest(endpoint)
 
 

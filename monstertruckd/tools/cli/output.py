@@ -205,6 +205,11 @@ def command_group(text: str) -> typer.Typer:
 class CommandGroup(TyperGroup):
     """The root of the command line: turns expected errors, unusable files, interrupts and closed pipes into codes."""
 
+    def make_context(self, *arguments: Any, **settings: Any) -> "Context":
+        """Read the options of the program itself."""
+        with _usage_in_one_line():
+            return super().make_context(*arguments, **settings)
+
     def invoke(self, ctx: "Context") -> Any:
         """Run the chosen command."""
         before = signal.getsignal(signal.SIGTERM)
@@ -241,10 +246,27 @@ class CommandGroup(TyperGroup):
 
     def _invoke_and_flush(self, ctx: "Context") -> Any:
         try:
-            return super().invoke(ctx)
+            with _usage_in_one_line():
+                return super().invoke(ctx)
         finally:
             if sys.stdout is not None:
                 sys.stdout.flush()
+
+
+@contextmanager
+def _usage_in_one_line() -> Iterator[None]:
+    """Say what is wrong with a command line in one line, and which help explains it."""
+    from typer._click.exceptions import NoArgsIsHelpError, UsageError
+
+    try:
+        yield
+    except NoArgsIsHelpError:  # a group without a command: its help is the answer
+        raise
+    except UsageError as error:
+        complaint = " ".join(error.format_message().split()).removesuffix(".")
+        command = "monstertruckd" if error.ctx is None else error.ctx.command_path
+        remark(f"Error: {complaint}. Try '{command} -h'.")
+        raise typer.Exit(error.exit_code) from None
 
 
 def _interrupt(_: int, frame: FrameType | None) -> None:

@@ -28,6 +28,14 @@ WRONG = (
     ("devices: []", "devices: input should be an object"),
     ("devices: {lidr: {}}", "devices.lidr: unknown key (did you mean lidar?)"),
     (
+        "zenoh: {listen: [nonsense]}",
+        "zenoh.listen: 'nonsense' is no endpoint: expected tcp/HOST:PORT or tls/HOST:PORT",
+    ),
+    (
+        "zenoh: {connect: [tcp/router]}",
+        "zenoh.connect: 'tcp/router' is no endpoint: expected tcp/HOST:PORT or tls/HOST:PORT",
+    ),
+    (
         "devices: {lidar: {port: /dev/truck/lidar}}",
         "devices.lidar.port: input should be an object, found '/dev/truck/lidar'",
     ),

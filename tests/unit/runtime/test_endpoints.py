@@ -8,6 +8,7 @@ import pytest
 
 from monstertruck_runtime.endpoints import (
     host_of,
+    is_endpoint,
     local_endpoint,
     make_private,
     nearest,
@@ -75,3 +76,26 @@ def test_a_folder_that_others_may_write_is_refused(tmp_path: Path, mode: int):
     folder.chmod(mode)
     with pytest.raises(OSError, match="only its owner may write"):
         make_private(folder)
+
+
+@pytest.mark.parametrize(
+    ("text", "is_one"),
+    [
+        ("tcp/127.0.0.1:7447", True),
+        ("tls/[::]:7447#iface=eth0", True),
+        ("tcp/robot.local:0", True),
+        ("unixsock-stream//run/x.sock", True),
+        ("serial//dev/ttyS0", True),
+        ("nonsense", False),
+        ("tcp/", False),
+        ("tcp/host", False),
+        ("tcp/:7447", False),
+        ("tcp/host:70000", False),
+        ("tcp:host:7447", False),
+        ("http/host:80", False),
+        ("unixsock-stream/", False),
+        ("", False),
+    ],
+)
+def test_the_form_of_an_endpoint(text: str, is_one: bool):
+    assert is_endpoint(text) is is_one
