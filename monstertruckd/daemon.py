@@ -24,6 +24,7 @@ from monstertruck_kinematics.chassis import Chassis
 from monstertruck_planners.behave.service import BehaviourService, register_behaviour_calls
 from monstertruck_planners.explore.service import ExplorerService, register_explorer_calls
 from monstertruck_planners.goals.service import GoalService, register_goal_calls
+from monstertruck_planners.missions.service import MissionService, register_mission_calls
 from monstertruck_planners.steps import CODEC
 from monstertruck_runtime.actors.actor import ActorFactory
 from monstertruck_runtime.actors.remote import RPC as REMOTE_STEP
@@ -164,6 +165,8 @@ class Daemon:
                     register_goal_calls(self.rpc, service, self.clock)
                 if isinstance(service, ExplorerService):
                     register_explorer_calls(self.rpc, service)
+                if isinstance(service, MissionService):
+                    register_mission_calls(self.rpc, service)
                 if isinstance(service, BehaviourService):
                     register_behaviour_calls(self.rpc, service)
             if self._notify is not None:

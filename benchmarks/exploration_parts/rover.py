@@ -28,7 +28,7 @@ from monstertruck_planners.route.api import Vehicle
 from monstertruck_planners.route.config import HybridConfig
 from monstertruck_schemas.state import Grid
 
-SPACING, TURN, DECIDE, AHEAD = 0.1, 0.1, 0.4, 1.0
+SPACING, TURN, DECIDE, AHEAD, SCANS = 0.1, 0.1, 0.4, 1.0, 3
 EFFORTS = 3000, 60_000
 SHARES = 0.9, 0.95, 0.99
 SPEED = 0.2
@@ -91,7 +91,7 @@ class Rover:
         x, y = arena.reachable(self.home)
         self.truth = np.column_stack((x, y))
         self.unseen = np.ones(len(x), np.bool_)
-        self.attempts = Attempts(config.blacklist, config.attempts)
+        self.attempts = self.unreached = Attempts(config.blacklist, config.attempts)
         self.points = np.empty((0, 2))
         self.scanned: Pose | None = None
         self.sent: list[Grid | None] = [None, None]
@@ -115,13 +115,11 @@ class Rover:
     def take_stock(self) -> None:
         """Send the changes to the explorer, and see how much is known."""
         tiles = tuple(grid_message(patch, 0, 0) for patch in self.grid.changes())
-        begin = time.process_time()
         for tile in tiles:
             one = time.process_time()
             self.exploring.step(ExploreTask(self.pose, tiles=(tile,), setup=self.setup))
             self.setup = None
             self.run.updates.append(time.process_time() - one)
-        del begin
         rest = self.truth[self.unseen]
         patch = self.grid.patch()
         column, row = np.floor((rest - patch.origin) / patch.resolution).astype(int).T
@@ -142,7 +140,14 @@ class Rover:
         """Ask for a decision."""
         begin = time.process_time()
         answer = self.exploring.step(
-            ExploreTask(self.pose, choose=True, current=current, pursued=pursued, banned=self.attempts.banned(self.now))
+            ExploreTask(
+                self.pose,
+                choose=True,
+                current=current,
+                pursued=pursued,
+                banned=self.attempts.banned(self.now),
+                avoided=self.unreached.banned(self.now),
+            )
         )
         self.run.decisions.append(time.process_time() - begin)
         return answer.target
@@ -170,7 +175,7 @@ class Rover:
         travelled = 0.0
         for k in range(1, len(poses)):
             ahead = poses[k : k + round(AHEAD / 0.05)]
-            if path_blocked(BODY, np.vstack(([self.pose], ahead)), self.points, self.pose):
+            if self.blocked(np.vstack(([self.pose], ahead))):
                 self.left = poses[k - 1 :]
                 return False
             pose = tuple(map(float, poses[k]))
@@ -186,6 +191,15 @@ class Rover:
         self.left = poses[len(poses) :]
         return True
 
+    def blocked(self, ahead: np.ndarray) -> bool:
+        """Whether ``SCANS`` scans in a row show something on the way, as the goal service asks for."""
+        for _ in range(SCANS):
+            if not path_blocked(BARE, ahead, self.points, self.pose):
+                return False
+            _, hits, _ = self.arena.scan(self.pose, self.config.reach, self.rng)
+            self.points = points_relative(hits, self.pose)
+        return True
+
     def explore(self) -> Run:
         """Until nothing is left, then home."""
         begin = time.process_time()
@@ -193,13 +207,13 @@ class Rover:
         self.take_stock()
         target: Viewpoint | None = None
         since = 0.0
-        ended = self.now
         while self.run.driven < LIMIT and len(self.run.decisions) < 5000:
             chosen = self.choose(target, self.now - since)
             if chosen is None:
-                if (released := self.attempts.released(self.now)) is None:
+                attempts, unreached = self.attempts.released(self.now), self.unreached.released(self.now)
+                if attempts is None and unreached is None:
                     break
-                self.attempts, target = released, None
+                self.attempts, self.unreached, target = attempts or self.attempts, unreached or self.unreached, None
                 continue
             if chosen is not target:
                 target, since = chosen, self.now
@@ -219,10 +233,8 @@ class Rover:
                     target = None
                 self.take_stock()
             elif not len(self.left) or len(self.left) == 1:
-                gone = self.arrived(target)
+                self.arrived(target)
                 target = None
-                del gone
-        del ended
         if self.config.home:
             self.go_home()
         self.run.seconds = time.process_time() - begin
@@ -231,7 +243,8 @@ class Rover:
     def fail(self, target: Viewpoint) -> None:
         """Leave a place alone."""
         self.run.failures += 1
-        self.attempts = self.attempts.failed(target.frontier, self.now)
+        self.attempts = self.attempts.failed(target.frontier, self.now, patient=True)
+        self.unreached = self.unreached.failed(target.pose[:2], self.now)
 
     def arrived(self, target: Viewpoint) -> None:
         """What is still to be seen from here was not seen: do not come again soon."""

@@ -244,6 +244,7 @@ RESERVED: Final = frozenset(
         "levelling",
         "map",
         "meter",
+        "missions",
         "notify",
         "odometry",
         "path",

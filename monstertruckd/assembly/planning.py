@@ -17,6 +17,7 @@ from monstertruck_planners.goals.deformation import RouteDeformation
 from monstertruck_planners.goals.exchange import Setup
 from monstertruck_planners.goals.path_publisher import GoalInputs, GoalOutputs
 from monstertruck_planners.goals.service import GoalService
+from monstertruck_planners.missions.service import MissionInputs, MissionParts, MissionService
 from monstertruck_planners.steps import DEFORMING, EXPLORING, PLANNING, STEPS, TRACKING
 from monstertruck_planners.track.config import TrackerConfig
 from monstertruck_planners.track.paths import PathService, load_path
@@ -26,6 +27,7 @@ from monstertruck_runtime.clock import Clock, VirtualClock
 from monstertruck_runtime.mailbox import fifo, latest
 from monstertruck_runtime.ports import Publisher, Subscription
 from monstertruck_runtime.service import Service
+from monstertruck_runtime.threads import in_thread, inline
 from monstertruck_schemas import topics
 from monstertruck_schemas.plan import Path
 from monstertruck_schemas.req import DriveRequest
@@ -53,6 +55,8 @@ def build_planners(
     """
     wanted = (config.tracker or config.behaviours) and config.missing_actuators() is None
     requests = bus.publisher(topics.PLAN_DRIVE, Writer.PLANNER) if wanted else None
+    goals: GoalService | None = None
+    explorer: ExplorerService | None = None
     if config.tracker is not None and requests is not None:
         tracker = config.tracker.model_copy(update={"angle": min(config.tracker.angle, body.chassis.reached_angle)})
         paths = bus.publisher(topics.PATH, Writer.PLANNER)
@@ -77,10 +81,17 @@ def build_planners(
             )
             yield goals
             if config.explorer is not None:
-                yield _build_explorer(config, config.explorer, bus, clock, body, goals, actors, save_map)
+                explorer = _build_explorer(config, config.explorer, bus, clock, body, goals, actors, save_map)
+                yield explorer
+    behaviours = None
     if config.behaviours and requests is not None:
         moved = BehaviourBody(body.chassis, config.gate.angle)
-        yield BehaviourService(config.behaviours, clock, bus, requests, config.gate.max_request_age, moved)
+        behaviours = BehaviourService(config.behaviours, clock, bus, requests, config.gate.max_request_age, moved)
+        yield behaviours
+    if goals is not None:
+        yield _build_missions(
+            config, bus, clock, MissionParts(goals, behaviours, explorer, frozenset(config.behaviours))
+        )
     if config.devices.stabiliser is not None and config.devices.compass is not None:
         yield LEVELLING.implementation(config.levelling)(config.levelling, clock, bus)
     if config.map is not None and config.devices.lidar is not None:
@@ -235,6 +246,26 @@ def _build_explorer(
         max_age=config.gate.max_request_age,
         inputs=inputs,
         state=bus.publisher(topics.EXPLORE, Writer.PLANNER),
+        events=bus.event_sink(),
+    )
+
+
+def _build_missions(config: TruckConfig, bus: Bus, clock: Clock, parts: MissionParts) -> MissionService:
+    virtual = isinstance(clock, VirtualClock)
+    return MissionService(
+        parts,
+        clock,
+        file=None if virtual else config.state_directory / "mission.json",
+        offload=inline if virtual else in_thread,
+        max_age=config.gate.max_request_age,
+        inputs=MissionInputs(
+            gate=bus.subscribe(topics.GATE, latest()),
+            pose=bus.subscribe(topics.ODOMETRY if config.slam is None else topics.POSE, latest()),
+            goal=bus.subscribe(topics.GOAL, latest()),
+            behaviour=bus.subscribe(topics.BEHAVIOUR, latest()),
+            explore=bus.subscribe(topics.EXPLORE, latest()),
+        ),
+        state=bus.publisher(topics.MISSION, Writer.PLANNER),
         events=bus.event_sink(),
     )
 

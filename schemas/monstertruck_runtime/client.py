@@ -30,6 +30,7 @@ from monstertruck_runtime.requests import Operator
 from monstertruck_runtime.stations import ClientTls, own_source, session_config, tls_for
 from monstertruck_runtime.threads import ThreadHop, in_thread
 from monstertruck_schemas.base import Message
+from monstertruck_schemas.mission import Mission
 from monstertruck_schemas.plan import Path as DrivePath
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import (
@@ -39,6 +40,7 @@ from monstertruck_schemas.req import (
     DriveRequest,
     ExploreOrder,
     GoalOrder,
+    MissionOrder,
     Order,
     PathRequest,
     RequestedTwist,
@@ -365,6 +367,17 @@ class TruckClient(Operator):
             NoAnswerError: no answer in time.
         """
         return await self.call("explore", {**await self._answered(1.0), "order": order, "home": home, "budget": budget})
+
+    async def mission(self, order: MissionOrder, mission: Mission | None = None) -> dict[str, Any]:
+        """Start a mission, go on with one, or end it; answers with its ``number``. Progress is on ``plan/mission``.
+
+        Raises:
+            RequestRefusedError: why it does not start, or none runs.
+            NotFoundError: the robot is not there, or does no missions.
+            NoAnswerError: no answer in time.
+        """
+        steps = None if mission is None else mission.model_dump(mode="json")
+        return await self.call("mission", {**await self._answered(1.0), "order": order, "mission": steps})
 
     async def path(self, path: DrivePath, lease: float = 1.0) -> None:
         """Request to follow a path computed here. Raises as ``drive`` does."""

@@ -193,6 +193,27 @@ def planner_request(seq: int, gate: GateState, now: int, source: str, lease: flo
     )
 
 
+def inner_request(seq: int, gate: GateState | None, now: int, source: str) -> dict[str, Any]:
+    """Header of a request that a service of the robot itself makes to another one, in place of an operator.
+
+    Args:
+        seq: grows from request to request.
+        gate: newest state of the gate.
+        now: ns.
+        source: the service.
+    """
+    return {
+        "stamp": now,
+        "received": now,
+        "seq": seq,
+        "source": source,
+        "role": Role.STATION,
+        "lease": 1.0,
+        "nonce": "" if gate is None else gate.nonce,
+        "gate_stamp": None if gate is None else gate.stamp,
+    }
+
+
 def refusal(request: Request, gate: GateState | None, sequences: Sequences, now: int, max_age: float | None) -> Reason:
     """OK, or why a request to the planners is refused; the rules are those of driving.
 

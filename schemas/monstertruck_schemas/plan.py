@@ -186,6 +186,34 @@ class ExplorationState(Message):
         return self.phase is not ExplorationPhase.IDLE
 
 
+class MissionState(Message):
+    """Progress of a mission."""
+
+    number: Annotated[int, Field(ge=0)] = 0
+    """Counts the missions since the start of the daemon; 0 = none yet."""
+    name: str = ""
+    source: str = ""
+    """Who asked for it."""
+    running: bool = False
+    resumable: bool = False
+    """It was interrupted, and can be gone on with."""
+    step: Annotated[int, Field(ge=0)] = 0
+    """The present one, counted from 1; 0 = none."""
+    steps: Annotated[int, Field(ge=0)] = 0
+    doing: str = ""
+    """The present step in words."""
+    attempt: Annotated[int, Field(ge=0)] = 0
+    """Of the present step, counted from 1."""
+    failures: Annotated[int, Field(ge=0)] = 0
+    """Steps that have failed so far."""
+    outcome: Reason = Reason.OK
+    """DRIVING while it runs, then MISSION_DONE, CANCELLED, or why it ended."""
+    text: str = ""
+    """The outcome in words."""
+    elapsed: Annotated[float, Field(ge=0)] = 0.0
+    """Seconds since it was started or gone on with."""
+
+
 class StabiliserCommand(Message):
     """Joint angles the lidar's mount has to take, see ``sensor.StabiliserFeedback`` for order and signs."""
 

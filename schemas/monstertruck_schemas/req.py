@@ -12,6 +12,7 @@ from typing import Annotated, Final, Self
 from pydantic import Field, model_validator
 
 from monstertruck_schemas.base import Message, Nanoseconds, Pose2D, Schema
+from monstertruck_schemas.mission import Mission
 from monstertruck_schemas.plan import Path
 
 
@@ -225,6 +226,22 @@ class ExploreRequest(Request):
     """Drive back to the start at the end; None = as configured."""
     budget: Annotated[float, Field(gt=0)] | None = None
     """Seconds after which it ends; None = as configured."""
+
+
+class MissionOrder(StrEnum):
+    """What can be asked about missions."""
+
+    START = "start"
+    RESUME = "resume"
+    STOP = "stop"
+
+
+class MissionRequest(Request):
+    """Start a mission, go on with one that was interrupted, or end the one that runs."""
+
+    order: MissionOrder
+    mission: Mission | None = None
+    """Of a start."""
 
 
 class PathRequest(Request):

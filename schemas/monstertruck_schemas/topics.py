@@ -27,7 +27,15 @@ from monstertruck_schemas.health import (
     RecorderHealth,
     SlamHealth,
 )
-from monstertruck_schemas.plan import BehaviourState, ExplorationState, GoalState, Path, StabiliserCommand, TrackerState
+from monstertruck_schemas.plan import (
+    BehaviourState,
+    ExplorationState,
+    GoalState,
+    MissionState,
+    Path,
+    StabiliserCommand,
+    TrackerState,
+)
 from monstertruck_schemas.req import ControlRequest, DriveRequest, GoalControl, GoalRequest, PathRequest
 from monstertruck_schemas.sensor import (
     Attitude,
@@ -203,6 +211,9 @@ EXPLORE: Final = Topic(
     "plan/explore", ExplorationState, W.PLANNER, "Progress of the exploration, or how the last one ended", 2,
     retained=True,
 )  # fmt: skip
+MISSION: Final = Topic(
+    "plan/mission", MissionState, W.PLANNER, "Progress of the mission, or how the last one ended", 2, retained=True
+)
 PLAN_DRIVE: Final = Topic(
     "plan/drive", DriveRequest, W.PLANNER, "The planners' drive requests to the gate", 20, stale_after=0.3
 )

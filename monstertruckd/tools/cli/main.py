@@ -18,6 +18,7 @@ from monstertruckd.tools.cli import (
     live,
     logs,
     maps,
+    mission,
     move,
     orders,
     plan,
@@ -86,6 +87,7 @@ app.command("doctor")(doctor.doctor)
 app.command("install-service")(service.install_service)
 app.command("uninstall-service")(service.uninstall_service)
 app.add_typer(behave.app, name="behave")
+app.add_typer(mission.app, name="mission")
 app.add_typer(config.app, name="config")
 app.add_typer(calibrate.app, name="calibrate")
 app.add_typer(logs.app, name="log")

@@ -48,6 +48,8 @@ LEAST: Final = 0.06
 """New area that makes a place worth going to, m^2."""
 BANNED: Final = 0.5
 """Frontiers whose centre is this near to a banned place are left alone, m."""
+AVOIDED: Final = 0.25
+"""Metres round an avoided place from where nothing is looked at."""
 NEARBY: Final = 0.6
 """A way begins at an open cell this near to the robot, m."""
 BEHIND: Final = 4
@@ -121,6 +123,7 @@ class ExplorationView:
         setup: robot, sensor and settings.
         pose: of the base, in map.
         banned: frontiers here are no options.
+        avoided: no place to look from is here.
         memory: of the view before.
     """
 
@@ -128,6 +131,7 @@ class ExplorationView:
     setup: ExploreSetup
     pose: Pose
     banned: tuple[Point, ...]
+    avoided: tuple[Point, ...]
     memory: Remembered
     options: list[Option] = field(init=False, default_factory=list)
     left_alone: int = field(init=False, default=0)
@@ -206,6 +210,9 @@ class ExplorationView:
             return []
         way = ways.cost[reached[:, 0], reached[:, 1]] * (self._cell / UNIT)
         places = self._centres(reached)
+        for avoided in self.avoided:
+            away = np.hypot(*(places - avoided).T) > AVOIDED
+            reached, way, places = reached[away], way[away], places[away]
         for frontier in self._frontiers():
             near = np.hypot(*(places - frontier.middle).T) < AROUND
             if not near.any():

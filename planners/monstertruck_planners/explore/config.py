@@ -30,7 +30,7 @@ class ExplorerConfig(Schema):
     """Decisions a second"""
     blacklist: Positive = 60.0
     """Seconds for which a place is left alone that could not be reached, or from which nothing new was seen"""
-    attempts: Annotated[int, Field(ge=1)] = 2
+    attempts: Annotated[int, Field(ge=1)] = 3
     """How often a place is tried before it is given up for good"""
     lost: Positive = 60.0
     """Seconds without a place in the map after which it ends"""

@@ -44,6 +44,8 @@ class ExploreTask:
     """For how long, s."""
     banned: tuple[Point, ...] = ()
     """Frontiers here are left alone."""
+    avoided: tuple[Point, ...] = ()
+    """Nothing is looked at from here: these places could not be reached."""
     home: Pose | None = None
     """Way there is wanted."""
 

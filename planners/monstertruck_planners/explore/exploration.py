@@ -107,6 +107,9 @@ class Exploration:
     begun: float
     now: float
     attempts: Attempts
+    """At frontiers."""
+    unreached: Attempts
+    """At places to look from."""
     phase: ExplorationPhase = ExplorationPhase.LOOKING
     since: float = 0.0
     """Begin of the phase, s."""
@@ -148,8 +151,8 @@ def begin(
     number: int, source: str, pose: Pose, now: float, config: ExplorerConfig, *, home: bool, budget: float
 ) -> Step:
     """Take on an exploration."""
-    attempts = Attempts(config.blacklist, config.attempts)
-    run = Exploration(number, source, pose, home, budget, now, now, attempts, since=now)
+    none = Attempts(config.blacklist, config.attempts)
+    run = Exploration(number, source, pose, home, budget, now, now, none, none, since=now)
     text = f"{config.kind}, for {budget:g} s at most{', then home' if home else ''}, asked for by {source}"
     return run, (Notice(Reason.EXPLORATION_STARTED, Severity.INFO, text),)
 
@@ -230,9 +233,11 @@ def _looking(run: Exploration, seen: Observed) -> Step:
         return replace(run, not_before=run.now + 1.0), ()
     if run.nothing + 1 < CONFIRM:
         return replace(run, nothing=run.nothing + 1, not_before=run.now + SETTLE), ()
-    if (released := run.attempts.released(run.now)) is not None:
+    attempts, unreached = run.attempts.released(run.now), run.unreached.released(run.now)
+    if attempts is not None or unreached is not None:
         text = "nothing else is left: places that were left alone are tried again"
-        again = replace(run, attempts=released, nothing=0, not_before=run.now)
+        again = replace(run, attempts=attempts or run.attempts, unreached=unreached or run.unreached)
+        again = replace(again, nothing=0, not_before=run.now)
         return again, (Notice(Reason.RECOVERING, Severity.INFO, text),)
     return _finish(run, Reason.EXPLORED, f"{run.newest.known:.1f} m^2 of free ground")
 
@@ -247,8 +252,10 @@ def _driving(run: Exploration, seen: Observed, config: ExplorerConfig) -> Step:
         if seen.ended in PASSING:
             return replace(_enter(run, ExplorationPhase.LOOKING), target=None, not_before=run.now + AGAIN), ()
         reached = seen.ended is Reason.GOAL_REACHED
-        attempts = run.attempts.failed(run.target.frontier, run.now)
-        run = replace(run, target=None, attempts=attempts, failures=run.failures + (not reached))
+        attempts, unreached = run.attempts.failed(run.target.frontier, run.now, patient=not reached), run.unreached
+        if not reached:
+            unreached = unreached.failed(run.target.pose[:2], run.now)
+        run = replace(run, target=None, attempts=attempts, unreached=unreached, failures=run.failures + (not reached))
         run = replace(_enter(run, ExplorationPhase.LOOKING), not_before=run.now + SETTLE, nothing=0)
         if reached:
             return run, ()

@@ -45,7 +45,7 @@ class ExploringStep:
         area = known.free * known.resolution**2
         if not task.choose:
             return ExploreAnswer(known=area, changed=changed)
-        view = ExplorationView(known, self._setup, task.pose, task.banned, self._memory)
+        view = ExplorationView(known, self._setup, task.pose, task.banned, task.avoided, self._memory)
         target = self._explorer.choose(view, task.current, self._still(view, task.current), task.pursued)
         return ExploreAnswer(
             target,

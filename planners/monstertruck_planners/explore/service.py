@@ -16,13 +16,13 @@ from monstertruck_runtime.clock import SECOND, Clock, Schedule
 from monstertruck_runtime.errors import RequestRefusedError, WorkerError
 from monstertruck_runtime.mailbox import Mailbox
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, RpcRegistry, Subscription
-from monstertruck_runtime.requests import Sequences, parse_request, refusal
+from monstertruck_runtime.requests import Sequences, inner_request, parse_request, refusal
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.event import Event, Severity
 from monstertruck_schemas.health import LocalisationStatus, SlamHealth
 from monstertruck_schemas.plan import ExplorationPhase, ExplorationState, GoalPhase, GoalState
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import ExploreOrder, ExploreRequest, GoalControl, GoalOrder, GoalRequest, Role
+from monstertruck_schemas.req import ExploreOrder, ExploreRequest, GoalControl, GoalOrder, GoalRequest
 from monstertruck_schemas.sensor import Battery, BatteryLevel
 from monstertruck_schemas.state import GateState, Grid, Odometry
 from monstertruck_schemas.topics import BATTERY, POSE, SLAM
@@ -54,7 +54,7 @@ class Goals(Protocol):
         """Cancel it."""
         ...
 
-    def hold(self, *, on: bool) -> None:
+    def hold(self, who: str, *, on: bool) -> None:
         """Keep the robot armed between goals."""
         ...
 
@@ -139,7 +139,7 @@ class ExplorerService:
                     await schedule.next()
                     self._tick(self._clock.now())
             finally:
-                self._goals.hold(on=False)
+                self._goals.hold(SOURCE, on=False)
 
     # Requests
 
@@ -187,7 +187,7 @@ class ExplorerService:
         if run is not None and run.running:
             self._do(exploration.tick(run, self._observe(now, saved), self._config))
         run = self._run
-        self._goals.hold(on=run is not None and run.running and run.phase is not ExplorationPhase.SAVING)
+        self._goals.hold(SOURCE, on=run is not None and run.running and run.phase is not ExplorationPhase.SAVING)
         self._report(now)
 
     def _keep_map(self) -> None:
@@ -290,6 +290,7 @@ class ExplorerService:
             current=run.target,
             pursued=now - run.pursued,
             banned=run.attempts.banned(now),
+            avoided=run.unreached.banned(now),
             home=run.home,
         )
         self._fresh, self._sent_whole, self._sent_tiles = False, self._whole, len(self._tiles)
@@ -309,26 +310,15 @@ class ExplorerService:
         return answer
 
     def _header(self) -> dict[str, Any]:
-        now, gate = self._clock.now(), self._in.gate.latest
         self._seq += 1
-        return {
-            "stamp": now,
-            "received": now,
-            "seq": self._seq,
-            "source": SOURCE,
-            "role": Role.STATION,
-            "lease": 1.0,
-            "nonce": "" if gate is None else gate.nonce,
-            "gate_stamp": None if gate is None else gate.stamp,
-            "frame": "map",
-        }
+        return inner_request(self._seq, self._in.gate.latest, self._clock.now(), SOURCE)
 
     def _go(self, pose: Pose) -> None:
         x, y, yaw = pose
         self._refused = None
         try:
             self._goal = self._goals.take(
-                GoalRequest(**self._header(), goal=Pose2D(x=x, y=y, yaw=math.remainder(yaw, math.tau)))
+                GoalRequest(**self._header(), frame="map", goal=Pose2D(x=x, y=y, yaw=math.remainder(yaw, math.tau)))
             )
         except RequestRefusedError as error:
             self._refused = error.refusal, str(error)

@@ -102,7 +102,7 @@ class GoalService:
         self._sequences = {"goal": Sequences(max_age), "goal_control": Sequences(max_age)}
         self._goal: GoalRun | None = None
         self._number = 0
-        self._held = False
+        self._held: set[str] = set()
         self._paths = PathPublisher(clock, inputs, outputs, deceleration)
         self._reported: GoalState | None = None
         self._planning: asyncio.Task[PlanAnswer] | None = None
@@ -192,9 +192,14 @@ class GoalService:
             raise RequestRefusedError(Reason.NOT_FOUND, f"{request.order}: no goal is being pursued")
         self._do(goal_run.order(self._goal, request.order, request.source, self._seconds()))
 
-    def hold(self, *, on: bool) -> None:
-        """Keep the truck armed between goals too, by asking for standstill: for what sends one goal after the other."""
-        self._held = on
+    def hold(self, who: str, *, on: bool) -> None:
+        """Keep the truck armed between goals too, by asking for standstill: for what sends one goal after the other.
+
+        Args:
+            who: sends them.
+            on: until it is called with False.
+        """
+        (self._held.add if on else self._held.discard)(who)
 
     async def settled(self, number: int) -> GoalState:
         """State of a goal once it is known whether a way leads there.

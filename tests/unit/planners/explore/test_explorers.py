@@ -63,6 +63,16 @@ def test_banned_and_closed_places_are_no_options(config):
     assert step_of(config, hall()).step(ExploreTask(MIDDLE, choose=True)).target is None
 
 
+def test_it_looks_from_elsewhere_than_places_that_could_not_be_reached():
+    step = step_of(TourConfig(), hall(EAST))
+    first = step.step(ExploreTask(MIDDLE, choose=True)).target
+    assert first is not None
+    other = step.step(ExploreTask(MIDDLE, choose=True, avoided=(first.pose[:2],))).target
+    assert other is not None
+    assert math.dist(first.pose[:2], other.pose[:2]) > 0.25
+    assert math.dist(first.frontier, other.frontier) < 0.1
+
+
 def test_a_gap_too_narrow_for_the_robot_is_passed_over():
     assert (
         step_of(NearestConfig(), hall((8.95, 5.0, 8.95, 5.25), (4.0, 8.95, 4.2, 8.95)))

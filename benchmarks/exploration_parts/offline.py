@@ -1,0 +1,116 @@
+"""A peer that knows the world: places from which all of it is seen, in a short tour, by the same routes and scans."""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from exploration_parts.arena import BODY, Arena
+from exploration_parts.rover import DECIDE, Rover, Run
+from monstertruck_estimation.slam.service import grid_message
+from monstertruck_estimation.slam.worker_io import GridPatch
+from monstertruck_planners.explore.api import ExplorationView, Frontier, Option, Remembered
+from monstertruck_planners.explore.config import NearestConfig
+from monstertruck_planners.explore.exchange import ExploreSetup
+from monstertruck_planners.explore.frontier import FrontierMap
+from monstertruck_planners.explore.kernels import sees, short_tour
+
+SPACING = 0.8
+"""Metres between places that are compared."""
+COVER = 0.995
+"""Share of the reachable area that the places show."""
+DONE = 0.98
+"""A place is left out once this share of what only it shows is known."""
+
+
+@njit(cache=True)
+def _seen(cells, places, points, reach):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+    result = np.zeros((len(places), len(points)), np.bool_)
+    for i in range(len(places)):
+        for j in range(len(points)):
+            dx, dy = points[j, 0] - places[i, 0], points[j, 1] - places[i, 1]
+            if dx * dx + dy * dy <= reach * reach:
+                result[i, j] = sees(cells, places[i, 0], places[i, 1], points[j, 0], points[j, 1])
+    return result
+
+
+def offline_tour(arena: Arena, reach: float, seed: int) -> Run:
+    """Drive it; coverage is judged as that of the explorers, by what the robot's own scans show."""
+    rover = Rover(arena, NearestConfig(reach=reach), seed)
+    rover.run.kind = "offline"
+    truth = np.where(arena.blocked, 100, 0).astype(np.int8)
+    grid = grid_message(GridPatch(truth, arena.origin, arena.resolution), 0, 0)
+    assert rover.setup is not None
+    setup = ExploreSetup(NearestConfig(reach=reach), BODY, rover.setup.radius, 0.04)
+    view = ExplorationView(FrontierMap(grid), setup, rover.home, (), (), Remembered())
+    places = _places(arena, view)
+    origin = np.array(arena.origin)
+    points = rover.truth[:: max(len(rover.truth) // 12_000, 1)]
+    seen = _seen(
+        truth, (places - origin) / arena.resolution, (points - origin) / arena.resolution, reach / arena.resolution
+    )
+    chosen = _cover(seen)
+    options = [Option(Frontier(places[:1], (0.0, 0.0), 0.0), (*places[i], 0.0), 0.0, 0.0, 0.0) for i in chosen]
+    distance = np.minimum(view.ways_between(options), 1e4)
+    first = np.array([view.way_to((x, y)) or 1e4 for x, y in places[chosen]])
+    order = [chosen[k] for k in short_tour(distance, first)] if len(chosen) > 1 else list(chosen)
+    shown = {i: points[seen[i]] for i in chosen}
+    rover.map = grid
+    rover.look()
+    rover.take_stock()
+    for k, i in enumerate(order):
+        rest = shown[i]
+        ahead = places[order[k + 1]] if k + 1 < len(order) else places[i]
+        yaw = math.atan2(*(ahead - places[i])[::-1])
+        rover.left = np.empty((0, 3))
+        while _unknown(rover, rest) > 1.0 - DONE:
+            if len(rover.left) < 2:
+                if math.dist(rover.pose[:2], places[i]) < 0.1:
+                    break
+                rover.map = grid
+                poses = rover.route((*places[i], yaw))
+                if poses is None:
+                    poses = rover.route((*places[i], yaw + math.pi / 2))
+                if poses is None:
+                    rover.run.failures += 1
+                    break
+                rover.left = poses
+            if not rover.drive(rover.left, DECIDE):
+                rover.run.failures += 1
+                break
+            rover.take_stock()
+    rover.run.home = 0.0
+    return rover.run
+
+
+def _places(arena: Arena, view: ExplorationView) -> np.ndarray:
+    """Middles of cells on a coarse lattice that the robot can stand on."""
+    size = np.array(arena.blocked.shape[::-1]) * arena.resolution
+    x, y = (np.arange(o + SPACING / 2, o + s, SPACING) for o, s in zip(arena.origin, size, strict=True))
+    places = np.column_stack([v.ravel() for v in np.meshgrid(x, y)])
+    room = arena.truth.lookup(places) > BODY.circumscribed_radius + 0.06
+    return np.array([place for place in places[room] if view.way_to((float(place[0]), float(place[1]))) is not None])
+
+
+def _cover(seen: np.ndarray) -> list[int]:
+    """Greedy: whichever place shows most that no other one shows."""
+    left, chosen = np.ones(seen.shape[1], np.bool_), []
+    while left.mean() > 1.0 - COVER:
+        gain = (seen & left).sum(axis=1)
+        best = int(np.argmax(gain))
+        if gain[best] == 0:
+            break
+        chosen.append(best)
+        left &= ~seen[best]
+    return chosen
+
+
+def _unknown(rover: Rover, points: np.ndarray) -> float:
+    """Share of points that the robot's map does not know."""
+    patch = rover.grid.patch()
+    column, row = np.floor((points - patch.origin) / patch.resolution).astype(int).T
+    rows, columns = patch.cells.shape
+    inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
+    known = np.zeros(len(points), np.bool_)
+    known[inside] = patch.cells[row[inside], column[inside]] >= 0
+    return 1.0 - float(known.mean()) if len(points) else 0.0

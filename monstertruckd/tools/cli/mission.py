@@ -1,0 +1,127 @@
+"""``monstertruckd mission``: run lists of steps, check and list them."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from monstertruck_runtime.clock import Clock, run_wall
+from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
+from monstertruck_runtime.errors import ConfigError, InputError, NotFoundError
+from monstertruckd.tools.cli.options import EndpointOption, RobotOption
+from monstertruckd.tools.cli.output import JsonOption, command_group, finish, print_json, print_table
+
+if TYPE_CHECKING:
+    from monstertruck_runtime.client import TruckClient
+    from monstertruck_schemas.mission import Mission
+    from monstertruckd.tools.cli.mission_session import MissionEnd
+
+app = command_group("Missions: steps that the robot does one after the other.")
+
+FileArgument = Annotated[Path, typer.Argument(help="Mission (YAML).", show_default=False)]
+
+
+@app.command("run")
+def run_command(
+    file: Annotated[Path | None, typer.Argument(help="Mission (YAML).", show_default=False)] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with the one that a restart interrupted.")] = False,
+    arm: Annotated[bool, typer.Option("--arm", help="Arm the robot first; it drives off at once.")] = False,
+    robot: RobotOption = "truck",
+    endpoint: EndpointOption = DEFAULT_ENDPOINT,
+    json_output: JsonOption = False,
+) -> None:
+    """Check a mission, start it and follow it to its end, whose reason is the exit code. Ctrl-C stops it."""
+    from monstertruck_runtime.client import TruckClient
+    from monstertruckd.tools.cli.mission_session import run_mission
+
+    if (file is None) is not resume:
+        raise InputError("expected a mission's file, or --resume")
+    mission = None if file is None else load(file)
+
+    async def main(clock: Clock) -> "MissionEnd":
+        async with TruckClient(robot, endpoint, clock=clock) as client:
+            await _check(client, robot)
+            return await run_mission(client, mission, arm=arm, tell=None if json_output else print)
+
+    end = run_wall(main)
+    if json_output:
+        print_json(end.as_json())
+    elif not end.reason.exit_code:
+        print(f"{end.reason.text}: {end.text}")
+    finish(end.reason, f"{end.reason.text}: {end.text}")
+
+
+@app.command("check")
+def check_command(file: FileArgument, json_output: JsonOption = False) -> None:
+    """Check a mission's file: every mistake with its line. Prints its steps."""
+    from monstertruck_planners.missions.progress import in_words
+
+    mission = load(file)
+    if json_output:
+        print_json(mission.model_dump(mode="json"))
+        return
+    rows = [
+        (str(number), in_words(step), str(step.retries), step.on_failure or mission.on_failure)
+        for number, step in enumerate(mission.steps, 1)
+    ]
+    print_table(("step", "what", "retries", "on failure"), rows)
+
+
+@app.command("list")
+def list_command(
+    folder: Annotated[Path, typer.Argument(help="Folder with missions.")] = Path("configs/missions"),
+    json_output: JsonOption = False,
+) -> None:
+    """Print the missions of a folder, and what is wrong with those that cannot be run."""
+    if not folder.is_dir():
+        raise NotFoundError(f"{folder}: no such folder")
+    rows = []
+    for file in sorted(folder.glob("*.yaml")):
+        try:
+            mission = load(file)
+        except ConfigError as error:
+            rows.append((file.name, "", 0, str(error).partition("\n")[0]))
+        else:
+            rows.append((file.name, mission.name, len(mission.steps), ""))
+    if json_output:
+        print_json([dict(zip(("file", "name", "steps", "error"), row, strict=True)) for row in rows])
+    elif rows:
+        print_table(("file", "name", "steps", "mistake"), [tuple(map(str, row)) for row in rows])
+    else:
+        print(f"none: no *.yaml in {folder}")
+
+
+@app.command("stop")
+def stop_command(robot: RobotOption = "truck", endpoint: EndpointOption = DEFAULT_ENDPOINT) -> None:
+    """End the mission that runs; the robot brakes and stands."""
+    from monstertruck_runtime.client import TruckClient
+    from monstertruck_schemas.req import MissionOrder
+
+    async def main(clock: Clock) -> None:
+        async with TruckClient(robot, endpoint, clock=clock) as client:
+            await _check(client, robot)
+            await client.mission(MissionOrder.STOP)
+
+    run_wall(main)
+
+
+def load(file: Path) -> "Mission":
+    """The mission of a file.
+
+    Raises:
+        ConfigError: one line per mistake, each naming file, line, key and what was expected.
+    """
+    from monstertruck_schemas.mission import Mission
+    from monstertruckd.config.load import load_config
+
+    return load_config(file, Mission)[0]
+
+
+async def _check(client: "TruckClient", robot: str) -> None:
+    """Refuse a robot that does no missions.
+
+    Raises:
+        NotFoundError: naming what is missing.
+    """
+    if (await client.call("config")).get("planner") is None:
+        raise NotFoundError(f"robot {robot!r} does no missions: expected a section `planner` in its configuration")

@@ -1,0 +1,1 @@
+"""Missions: steps done one after the other by goals, behaviours and explorations."""

@@ -1,0 +1,134 @@
+"""Where a mission stands, and what follows a step: pure."""
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from monstertruck_planners.goals.exchange import Pose
+from monstertruck_schemas.base import Pose2D, Schema
+from monstertruck_schemas.mission import AnyStep, GoToStep, LookStep, Mission, WaitStep
+from monstertruck_schemas.reasons import Reason
+
+FINAL = frozenset({Reason.CANCELLED, Reason.DISARMED, Reason.ESTOPPED, Reason.SHUTDOWN})
+"""Ends of a step after which no policy counts: somebody, or the gate, has ended the mission."""
+GOOD = frozenset(
+    {Reason.OK, Reason.GOAL_REACHED, Reason.BEHAVIOUR_DONE, Reason.EXPLORED, Reason.BUDGET_SPENT, Reason.MISSION_DONE}
+)
+"""Ends of a step that was done."""
+
+Next = Literal["step", "again", "return", "done", "ended"]
+
+
+@dataclass(frozen=True, slots=True)
+class StepEnd:
+    """How a step ended."""
+
+    reason: Reason
+    text: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """One mission and how far it has come."""
+
+    mission: Mission
+    start: Pose
+    """Where it began, in map."""
+    index: int = 0
+    """Of the present step."""
+    attempt: int = 0
+    """Times that the present step was tried in vain."""
+    failures: int = 0
+    why: StepEnd = StepEnd(Reason.OK)
+    """The last failure."""
+    returning: bool = False
+    """It drives back to where it began, and ends there."""
+
+    @property
+    def step(self) -> AnyStep:
+        """The present one."""
+        return self.mission.steps[self.index]
+
+
+def after(progress: Progress, end: StepEnd) -> tuple[Progress, Next]:
+    """What follows the end of the present step, or that of the way back.
+
+    Returns:
+        The progress then, and what is next: the step that is now the present one, the same once more, the way back,
+        the end after all steps, or an end before.
+    """
+    if end.reason in FINAL:
+        return replace(progress, why=end, failures=progress.failures + 1), "ended"
+    if progress.returning:
+        why = progress.why if end.reason in GOOD else end
+        return replace(progress, why=why), "ended"
+    if end.reason in GOOD:
+        return _onward(progress)
+    if progress.attempt < progress.step.retries:
+        return replace(progress, attempt=progress.attempt + 1), "again"
+    failed = replace(progress, failures=progress.failures + 1, why=end)
+    match progress.step.on_failure or progress.mission.on_failure:
+        case "continue":
+            return _onward(failed)
+        case "return":
+            return replace(failed, returning=True), "return"
+        case "abort":
+            return failed, "ended"
+
+
+def _onward(progress: Progress) -> tuple[Progress, Next]:
+    if progress.index + 1 == len(progress.mission.steps):
+        return progress, "done"
+    return replace(progress, index=progress.index + 1, attempt=0), "step"
+
+
+def outcome(progress: Progress, following: Next) -> StepEnd:
+    """Of the whole mission."""
+    count = len(progress.mission.steps)
+    if following == "done":
+        if progress.failures == 0:
+            return StepEnd(Reason.MISSION_DONE, f"{count} steps")
+        return StepEnd(Reason.MISSION_INCOMPLETE, f"{progress.failures} of {count} steps failed; {progress.why.text}")
+    back = ", back where it began" if progress.returning and progress.why.reason not in FINAL else ""
+    at = f"step {progress.index + 1} of {count} ({in_words(progress.step)})"
+    return StepEnd(progress.why.reason, f"{at}: {progress.why.text or progress.why.reason.text}{back}")
+
+
+def in_words(step: AnyStep) -> str:
+    """A step in a few words."""
+    match step:
+        case GoToStep(x=x, y=y, yaw=yaw):
+            return f"goto {x:g} {y:g} {yaw:g}"
+        case LookStep(x=x, y=y):
+            return f"look at {x:g} {y:g}"
+        case WaitStep(seconds=seconds):
+            return f"wait {seconds:g} s"
+        case _:
+            name = getattr(step, "name", "")
+            return f"{step.do} {name}".strip()
+
+
+class SavedProgress(Schema):
+    """A mission that is under way, on the disk: what a restarted daemon knows of it."""
+
+    mission: Mission
+    source: str
+    start: Pose2D
+    index: int
+    failures: int
+
+    @classmethod
+    def of(cls, progress: Progress, source: str) -> "SavedProgress":
+        """What is kept of a mission."""
+        x, y, yaw = progress.start
+        return cls(
+            mission=progress.mission,
+            source=source,
+            start=Pose2D(x=x, y=y, yaw=yaw),
+            index=progress.index,
+            failures=progress.failures,
+        )
+
+    def progress(self) -> Progress:
+        """The mission at the beginning of the step at which it was interrupted."""
+        start = self.start.x, self.start.y, self.start.yaw
+        return Progress(self.mission, start, self.index, failures=self.failures)

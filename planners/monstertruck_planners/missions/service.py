@@ -1,0 +1,481 @@
+"""Missions as a service: one step after the other, by the services for goals, behaviours and exploration."""
+
+import asyncio
+import contextlib
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, Protocol, TypeVar, assert_never
+
+from pydantic import ValidationError
+
+from monstertruck_planners.goals.exchange import Pose, pose_of
+from monstertruck_planners.missions.progress import (
+    GOOD,
+    Next,
+    Progress,
+    SavedProgress,
+    StepEnd,
+    after,
+    in_words,
+    outcome,
+)
+from monstertruck_runtime.clock import SECOND, Clock, Schedule
+from monstertruck_runtime.errors import InputError, NotFoundError, RequestRefusedError, TruckError
+from monstertruck_runtime.ports import EventSink, Publisher, Ready, RpcRegistry, Subscription
+from monstertruck_runtime.requests import Sequences, inner_request, parse_request, refusal
+from monstertruck_runtime.small_files import replace_file
+from monstertruck_runtime.threads import Offload
+from monstertruck_schemas.base import Pose2D
+from monstertruck_schemas.event import Severity
+from monstertruck_schemas.mission import (
+    AnyStep,
+    BehaviourStepOfMission,
+    ExploreStep,
+    FollowWallStep,
+    GoToStep,
+    LookStep,
+    Mission,
+    RecordStep,
+    ReturnStep,
+    WaitStep,
+)
+from monstertruck_schemas.plan import BehaviourState, ExplorationState, GoalPhase, GoalState, MissionState
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import (
+    BehaviourOrder,
+    BehaviourRequest,
+    ExploreOrder,
+    ExploreRequest,
+    GoalControl,
+    GoalOrder,
+    GoalRequest,
+    MissionOrder,
+    MissionRequest,
+    Waypoint,
+)
+from monstertruck_schemas.state import GateState, Odometry
+from monstertruck_schemas.topics import ODOMETRY
+
+SOURCE: Final = "missions"
+"""Of its goals, behaviours and explorations."""
+RATE: Final = 5.0
+"""Looks a second."""
+REPORT: Final = SECOND // 2
+"""Between two reports without a change, ns."""
+CHANGES: Final = ("number", "running", "step", "attempt", "outcome", "resumable")
+"""Fields of the report whose change is reported at once."""
+MOST_BYTES: Final = 1_000_000
+"""Of the saved progress."""
+
+S = TypeVar("S")
+
+
+class GoalsOfMission(Protocol):
+    """The goal service."""
+
+    def take(self, request: GoalRequest) -> int:
+        """Take on a goal; returns its number."""
+        ...
+
+    def control(self, request: GoalControl) -> None:
+        """Cancel it."""
+        ...
+
+    def hold(self, who: str, *, on: bool) -> None:
+        """Keep the robot armed between goals."""
+        ...
+
+
+class BehavioursOfMission(Protocol):
+    """The service of behaviours."""
+
+    def take(self, request: BehaviourRequest) -> int:
+        """Start or stop one; returns its number."""
+        ...
+
+
+class ExplorerOfMission(Protocol):
+    """The service of exploration."""
+
+    def take(self, request: ExploreRequest) -> int:
+        """Start or stop it; returns its number."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class MissionInputs:
+    """Topics read."""
+
+    gate: Subscription[GateState]
+    pose: Subscription[Odometry]
+    """In map."""
+    goal: Subscription[GoalState]
+    behaviour: Subscription[BehaviourState]
+    explore: Subscription[ExplorationState]
+
+
+@dataclass(frozen=True, slots=True)
+class MissionParts:
+    """What steps are done by."""
+
+    goals: GoalsOfMission
+    behaviours: BehavioursOfMission | None
+    explorer: ExplorerOfMission | None
+    names: frozenset[str]
+    """Of the configured behaviours."""
+
+
+class MissionService:
+    """Does one mission at a time.
+
+    Args:
+        parts: what steps are done by.
+        clock: time.
+        file: where the progress is kept, for a restart; None = nowhere.
+        offload: where it is written.
+        max_age: see ``GateConfig.max_request_age``.
+        inputs: topics read.
+        state: ``plan/mission``.
+        events: where steps and ends are reported.
+    """
+
+    name = SOURCE
+
+    def __init__(
+        self,
+        parts: MissionParts,
+        clock: Clock,
+        *,
+        file: Path | None,
+        offload: Offload,
+        max_age: float,
+        inputs: MissionInputs,
+        state: Publisher[MissionState],
+        events: EventSink,
+    ) -> None:
+        self._parts, self._clock, self._file, self._offload = parts, clock, file, offload
+        self._max_age, self._in, self._out, self._events = max_age, inputs, state, events
+        self._sequences = Sequences(max_age)
+        self._seq = 0
+        self._number = 0
+        self._source = ""
+        self._progress: Progress | None = None
+        self._began = 0
+        self._end: StepEnd | None = None
+        self._interrupted: SavedProgress | None = None
+        self._task: asyncio.Task[None] | None = None
+        self._tasks: asyncio.TaskGroup | None = None
+        self._reported: MissionState | None = None
+
+    async def run(self, ready: Ready) -> None:
+        """Serve until cancelled; what runs then can be gone on with after a restart."""
+        self._interrupted = await self._offload(self._load)
+        if self._interrupted is not None:
+            text = f"{self._interrupted.mission.name} was interrupted at step {self._interrupted.index + 1}"
+            self._events(Reason.MISSION_INCOMPLETE, Severity.WARNING, SOURCE, f"{text}; it can be gone on with")
+        async with asyncio.TaskGroup() as tasks:
+            self._tasks = tasks
+            self._report(self._clock.now())
+            ready()
+            schedule = Schedule(self._clock, RATE)
+            try:
+                while True:
+                    await schedule.next()
+                    self._report(self._clock.now())
+            finally:
+                self._parts.goals.hold(SOURCE, on=False)
+
+    # Requests
+
+    def take(self, request: MissionRequest) -> int:
+        """Carry out a request; returns the number of the mission it started or ended.
+
+        Raises:
+            RequestRefusedError: the sender may not, or it cannot be done now.
+            NotFoundError: a step needs what the robot does not have.
+            InputError: a start without a mission.
+        """
+        starts, now, gate = request.order is not MissionOrder.STOP, self._clock.now(), self._in.gate.latest
+        reason = refusal(request, gate, self._sequences, now, self._max_age if starts else None)
+        if reason is not Reason.OK:
+            raise RequestRefusedError(reason)
+        running = self._task is not None and not self._task.done()
+        if not starts:
+            if not running or self._task is None:
+                raise RequestRefusedError(Reason.NOT_FOUND, "no mission is running")
+            self._task.cancel(request.source)
+            return self._number
+        if running:
+            raise RequestRefusedError(Reason.BUSY, f"the mission of {self._source} is running, stop it first")
+        if gate is None or not gate.mode.active:
+            held = Reason.DISARMED if gate is None else next(iter(gate.reasons), Reason.DISARMED)
+            raise RequestRefusedError(held, f"the robot does not drive: {held.text}")
+        progress = self._begin(request)
+        self._check(progress.mission)
+        assert self._tasks is not None
+        self._number, self._source, self._progress = self._number + 1, request.source, progress
+        self._began, self._end, self._interrupted = now, None, None
+        text = f"{progress.mission.name}, {len(progress.mission.steps)} steps, asked for by {request.source}"
+        if progress.index > 0:
+            text += f", from step {progress.index + 1} on"
+        self._events(Reason.MISSION_STARTED, Severity.INFO, SOURCE, text)
+        self._task = self._tasks.create_task(self._do_all(progress))
+        return self._number
+
+    def _begin(self, request: MissionRequest) -> Progress:
+        if request.order is MissionOrder.RESUME:
+            if self._interrupted is None:
+                raise RequestRefusedError(Reason.NOT_FOUND, "no mission was interrupted")
+            return self._interrupted.progress()
+        if request.mission is None:
+            raise InputError("mission: missing")
+        if (pose := self._pose()) is None:
+            raise RequestRefusedError(Reason.NO_MAP, "no pose in a map yet")
+        return Progress(request.mission, pose)
+
+    def _check(self, mission: Mission) -> None:
+        """Whether the robot has what the steps need.
+
+        Raises:
+            NotFoundError: naming step and part.
+        """
+        for number, step in enumerate(mission.steps, 1):
+            if isinstance(step, ExploreStep) and self._parts.explorer is None:
+                raise NotFoundError(f"step {number}: explore: the robot's configuration has no section `explorer`")
+            if isinstance(step, BehaviourStepOfMission | FollowWallStep) and step.name not in self._parts.names:
+                known = ", ".join(sorted(self._parts.names)) or "none"
+                raise NotFoundError(f"step {number}: no behaviour {step.name!r}: expected one of {known}")
+
+    # Steps
+
+    async def _do_all(self, progress: Progress) -> None:
+        """Do a mission from its present step on."""
+        self._parts.goals.hold(SOURCE, on=True)
+        following: Next = "step"
+        try:
+            while following in ("step", "again", "return"):
+                self._progress = progress
+                self._report(self._clock.now())
+                await self._save(progress)
+                step = ReturnStep(do="return") if progress.returning else progress.step
+                at = f"step {progress.index + 1} of {len(progress.mission.steps)}: {in_words(step)}"
+                self._events(Reason.MISSION_STEP, Severity.INFO, SOURCE, at)
+                end = await self._limited(step, progress)
+                if end.reason not in GOOD:
+                    self._events(end.reason, Severity.WARNING, SOURCE, f"{at}: {end.text or end.reason.text}")
+                progress, following = after(progress, end)
+            self._finish(outcome(progress, following))
+        except asyncio.CancelledError as stopped:
+            if not stopped.args:
+                raise  # the daemon ends: the progress stays on the disk
+            self._finish(StepEnd(Reason.CANCELLED, f"stopped by {stopped.args[0]}"))
+        finally:
+            self._parts.goals.hold(SOURCE, on=False)
+        await self._forget()
+
+    def _finish(self, end: StepEnd) -> None:
+        severity = Severity.INFO if end.reason.exit_code == 0 else Severity.WARNING
+        self._end = end
+        self._events(end.reason, severity, SOURCE, end.text)
+        self._report(self._clock.now())
+
+    async def _limited(self, step: AnyStep, progress: Progress) -> StepEnd:
+        if step.limit is None:
+            return await self._do(step, progress)
+        try:
+            async with self._clock.deadline(step.limit):
+                return await self._do(step, progress)
+        except TimeoutError:
+            return StepEnd(Reason.TIMEOUT, f"not done within {step.limit:g} s")
+
+    async def _do(self, step: AnyStep, progress: Progress) -> StepEnd:
+        try:
+            match step:
+                case GoToStep(x=x, y=y, yaw=yaw, via=via):
+                    return await self._go((x, y, yaw), via)
+                case LookStep(x=x, y=y):
+                    return await self._look(x, y)
+                case WaitStep(seconds=seconds):
+                    await self._clock.sleep(seconds)
+                    return StepEnd(Reason.OK)
+                case ExploreStep():
+                    return await self._explore(step)
+                case BehaviourStepOfMission(name=name, settings=settings):
+                    return await self._behave(name, dict(settings), None)
+                case FollowWallStep(name=name, distance=distance):
+                    return await self._behave(name, {}, distance)
+                case RecordStep(note=note):
+                    self._events(Reason.MISSION_NOTE, Severity.INFO, SOURCE, note)
+                    return StepEnd(Reason.OK)
+                case ReturnStep():
+                    return await self._go(progress.start, ())
+                case _:
+                    assert_never(step)
+        except RequestRefusedError as error:
+            return StepEnd(error.refusal, str(error))
+        except TruckError as error:
+            return StepEnd(error.reason, str(error))
+
+    async def _look(self, x: float, y: float) -> StepEnd:
+        pose = self._pose()
+        if pose is None:
+            return StepEnd(Reason.NO_MAP, "no fresh pose")
+        return await self._go((pose[0], pose[1], math.atan2(y - pose[1], x - pose[0])), ())
+
+    async def _go(self, goal: Pose, via: tuple[tuple[float, float], ...]) -> StepEnd:
+        x, y, yaw = goal
+        waypoints = tuple(Waypoint(x=a, y=b) for a, b in via)
+        pose = Pose2D(x=x, y=y, yaw=math.remainder(yaw, math.tau))
+        goals = self._parts.goals
+        number = goals.take(GoalRequest(**self._header(), frame="map", goal=pose, waypoints=waypoints))
+
+        def end() -> StepEnd | None:
+            goal = self._in.goal.latest
+            if goal is None or goal.number < number:
+                return None
+            if goal.number > number:
+                return StepEnd(Reason.CANCELLED, f"the goal of {goal.source} is pursued now")
+            return StepEnd(goal.outcome, goal.text) if goal.phase is GoalPhase.IDLE else None
+
+        return await self._until(end, lambda: goals.control(GoalControl(**self._header(), order=GoalOrder.CANCEL)))
+
+    async def _explore(self, step: ExploreStep) -> StepEnd:
+        explorer = self._parts.explorer
+        assert explorer is not None
+        header = self._header()
+        number = explorer.take(ExploreRequest(**header, order=ExploreOrder.START, home=step.home, budget=step.budget))
+
+        def end() -> StepEnd | None:
+            state = self._in.explore.latest
+            ended = state is not None and state.number == number and not state.running
+            return StepEnd(state.outcome, state.text) if ended and state is not None else None
+
+        return await self._until(end, lambda: explorer.take(ExploreRequest(**self._header(), order=ExploreOrder.STOP)))
+
+    async def _behave(self, name: str, settings: dict[str, Any], distance: float | None) -> StepEnd:
+        behaviours = self._parts.behaviours
+        assert behaviours is not None
+        self._parts.goals.hold(SOURCE, on=False)  # its own requests keep the robot armed
+
+        def stop() -> int:
+            return behaviours.take(BehaviourRequest(**self._header(), order=BehaviourOrder.STOP, behaviour=name))
+
+        def end() -> StepEnd | None:
+            state = self._in.behaviour.latest
+            if state is None or state.number != number:
+                return None
+            if not state.running:
+                return StepEnd(state.outcome, state.text)
+            far = distance is not None and state.travelled >= distance
+            return StepEnd(Reason.BEHAVIOUR_DONE, f"{state.travelled:.2f} m") if far else None
+
+        try:
+            number = behaviours.take(
+                BehaviourRequest(**self._header(), order=BehaviourOrder.START, behaviour=name, settings=settings)
+            )
+            result = await self._until(end, stop)
+            state = self._in.behaviour.latest
+            if state is not None and state.number == number and state.running:
+                stop()
+            return result
+        finally:
+            self._parts.goals.hold(SOURCE, on=True)
+
+    async def _until(self, end: Callable[[], StepEnd | None], stop: Callable[[], object]) -> StepEnd:
+        """Wait for an end; cancelled or out of time, have it stopped."""
+        schedule = Schedule(self._clock, RATE)
+        try:
+            while (ended := end()) is None:
+                await schedule.next()
+        except BaseException:
+            with contextlib.suppress(TruckError):
+                stop()
+            raise
+        return ended
+
+    def _header(self) -> dict[str, Any]:
+        self._seq += 1
+        return inner_request(self._seq, self._in.gate.latest, self._clock.now(), SOURCE)
+
+    def _pose(self) -> Pose | None:
+        pose = self._in.pose.latest
+        if pose is None or self._clock.now() - pose.received > ODOMETRY.fresh_for() * SECOND:
+            return None
+        return pose_of(pose)
+
+    # What outlasts a restart
+
+    def _load(self) -> SavedProgress | None:
+        if self._file is None or not self._file.is_file() or self._file.stat().st_size > MOST_BYTES:
+            return None
+        try:
+            return SavedProgress.model_validate_json(self._file.read_text(encoding="utf-8"))
+        except (OSError, ValueError, ValidationError) as error:
+            first = str(error).partition("\n")[0]
+            self._events(Reason.BAD_INPUT, Severity.WARNING, SOURCE, f"{self._file}: not readable: {first}")
+            return None
+
+    async def _save(self, progress: Progress) -> None:
+        if progress.returning:
+            return
+        text = SavedProgress.of(progress, self._source).model_dump_json()
+        await self._write(lambda file: replace_file(file, text))
+
+    async def _forget(self) -> None:
+        await self._write(lambda file: file.unlink(missing_ok=True))
+
+    async def _write(self, change: Callable[[Path], object]) -> None:
+        if (file := self._file) is None:
+            return
+        try:
+            await self._offload(lambda: change(file))
+        except OSError as error:
+            self._events(Reason.DISK_FULL, Severity.WARNING, SOURCE, f"{file}: progress not kept: {error}")
+
+    # Reports
+
+    def _report(self, now: int) -> None:
+        state = self._state(now)
+        before = self._reported
+        unchanged = before is not None and all(getattr(before, name) == getattr(state, name) for name in CHANGES)
+        if before is not None and unchanged and (now - before.stamp < REPORT or not state.running):
+            return
+        self._reported = state.model_copy(update={"seq": self._out.next_seq()})
+        self._out.put(self._reported)
+
+    def _state(self, now: int) -> MissionState:
+        header: dict[str, Any] = {"stamp": now, "received": now, "seq": 0, "frame": "map", "number": self._number}
+        if self._interrupted is not None:
+            saved = self._interrupted
+            doing, index = in_words(saved.mission.steps[saved.index]), saved.index
+            return MissionState(
+                **header, name=saved.mission.name, source=saved.source, resumable=True, step=index + 1,
+                steps=len(saved.mission.steps), doing=doing, failures=saved.failures, outcome=Reason.MISSION_INCOMPLETE,
+                text=f"interrupted at step {index + 1}",
+            )  # fmt: skip
+        if (progress := self._progress) is None:
+            return MissionState(**header)
+        end = self._end
+        return MissionState(
+            **header, name=progress.mission.name, source=self._source, running=end is None, step=progress.index + 1,
+            steps=len(progress.mission.steps), attempt=progress.attempt + 1, failures=progress.failures,
+            doing="return" if progress.returning else in_words(progress.step),
+            outcome=Reason.DRIVING if end is None else end.reason, text="" if end is None else end.text,
+            elapsed=(now - self._began) / SECOND,
+        )  # fmt: skip
+
+
+def register_mission_calls(rpc: RpcRegistry, service: MissionService) -> None:
+    """Serve ``mission``, whose payload is a ``MissionRequest``.
+
+    Args:
+        rpc: where.
+        service: what does them.
+    """
+
+    async def mission(payload: dict[str, Any]) -> dict[str, Any]:
+        return {"number": service.take(parse_request(MissionRequest, payload))}
+
+    rpc.register("mission", mission)

@@ -1,0 +1,116 @@
+"""Missions: steps that a robot does one after the other."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from monstertruck_schemas.base import Schema
+
+Coordinate = Annotated[float, Field(ge=-10_000, le=10_000)]
+Seconds = Annotated[float, Field(gt=0, le=86_400)]
+Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,31}$")]
+
+Policy = Literal["abort", "continue", "return"]
+"""After a step that failed: end the mission; go on with the next step; drive back to where it began, and end."""
+
+
+class MissionStep(Schema):
+    """What all steps have; each adds its ``do``."""
+
+    do: str
+    retries: Annotated[int, Field(ge=0, le=20)] = 0
+    """How often it is tried again before it has failed"""
+    on_failure: Policy | None = None
+    """What follows then; null = as the mission says"""
+    limit: Seconds | None = None
+    """Seconds after which it has failed; null = none but its own"""
+
+
+class GoToStep(MissionStep):
+    """Drive to a pose."""
+
+    do: Literal["goto"]
+    x: Coordinate
+    """M, in map"""
+    y: Coordinate
+    """M"""
+    yaw: Coordinate
+    """Rad"""
+    via: Annotated[tuple[tuple[Coordinate, Coordinate], ...], Field(max_length=32, strict=False)] = ()
+    """Places x, y to pass before"""
+
+
+class LookStep(MissionStep):
+    """Turn towards a place, where the robot stands."""
+
+    do: Literal["look"]
+    x: Coordinate
+    """M, in map"""
+    y: Coordinate
+    """M"""
+
+
+class WaitStep(MissionStep):
+    """Stand."""
+
+    do: Literal["wait"]
+    seconds: Seconds
+
+
+class ExploreStep(MissionStep):
+    """Explore what the map does not know."""
+
+    do: Literal["explore"]
+    budget: Seconds | None = None
+    """Seconds after which it ends; null = as the robot is configured"""
+    home: bool = False
+    """Drive back to where the exploration began"""
+
+
+class BehaviourStepOfMission(MissionStep):
+    """Run a behaviour to its own end."""
+
+    do: Literal["behaviour"]
+    name: Name
+    """In the robot's configuration"""
+    settings: dict[str, float | str | bool] = Field(default_factory=dict)
+    """That replace the configured ones"""
+
+
+class FollowWallStep(MissionStep):
+    """Run a behaviour that follows a wall, for some metres."""
+
+    do: Literal["follow_wall"]
+    name: Name
+    """Of the behaviour in the robot's configuration"""
+    distance: Annotated[float, Field(gt=0, le=10_000)]
+    """M"""
+
+
+class RecordStep(MissionStep):
+    """Leave a note in the log."""
+
+    do: Literal["record"]
+    note: Annotated[str, Field(min_length=1, max_length=200)]
+
+
+class ReturnStep(MissionStep):
+    """Drive back to where the mission began."""
+
+    do: Literal["return"]
+
+
+AnyStep = Annotated[
+    GoToStep | LookStep | WaitStep | ExploreStep | BehaviourStepOfMission | FollowWallStep | RecordStep | ReturnStep,
+    Field(discriminator="do"),
+]
+
+
+class Mission(Schema):
+    """A list of steps."""
+
+    version: Literal[2]
+    name: Name
+    on_failure: Policy = "abort"
+    """What follows a step that failed"""
+    steps: Annotated[tuple[AnyStep, ...], Field(min_length=1, max_length=500, strict=False)]

@@ -1,0 +1,56 @@
+"""A mission in the whole daemon: goals, a look, a note, and the way back."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from monstertruck_runtime.mailbox import fifo
+from monstertruck_schemas import topics
+from monstertruck_schemas.mission import Mission
+from monstertruck_schemas.reasons import Reason
+from monstertruckd.tools.cli.mission_session import run_mission
+from monstertruckd.tools.simulation.operator import LocalOperator
+from tests.daemon.goal_kit import Trip, assert_at, travel
+
+pytestmark = [pytest.mark.virtual, pytest.mark.timeout(300)]
+
+
+class MissionOperator(LocalOperator):
+    """Gives orders about missions as ``TruckClient`` does."""
+
+    async def mission(self, order, mission=None):
+        steps = None if mission is None else mission.model_dump(mode="json")
+        return await self.call("mission", {**await self.header(), "order": order, "mission": steps})
+
+
+def test_a_mission_is_driven_and_followed():
+    steps = [
+        {"do": "goto", "x": 2.4, "y": 3.9, "yaw": 0.0},
+        {"do": "record", "note": "in the hall"},
+        {"do": "goto", "x": 99.0, "y": 99.0, "yaw": 0.0, "on_failure": "continue"},
+        {"do": "wait", "seconds": 3.0},
+        {"do": "return"},
+    ]
+    mission = Mission.model_validate_json(json.dumps({"version": 2, "name": "hall", "steps": steps}))
+    lines, ends = [], []
+
+    async def story(trip: Trip) -> None:
+        client = MissionOperator(trip.rig.daemon, trip.clock)
+        with trip.rig.bus.subscribe(topics.MISSION, fifo(4096)) as states:
+            ends.append(await run_mission(client, mission, arm=True, tell=lines.append))
+            ends.append(states.latest)
+
+    rig = travel(story)
+    end, state = ends
+    assert end.reason is Reason.MISSION_INCOMPLETE, end.text
+    assert (end.failures, end.step) == (1, 5)
+    assert state.steps == 5
+    assert [line.partition("step ")[2][:1] for line in lines] == list("12345")
+    assert_at(rig, 1.0, 3.95, 0.0)
+
+
+def test_the_shipped_mission_is_one():
+    from monstertruckd.tools.cli.mission import load
+
+    assert len(load(Path(__file__).resolve().parents[2] / "configs" / "missions" / "rooms.yaml").steps) == 6

@@ -1,0 +1,247 @@
+"""Missions: what follows a step, and the service with services that only pretend to drive."""
+
+import asyncio
+import json
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from monstertruck_planners.missions.progress import Progress, SavedProgress, StepEnd, after, in_words, outcome
+from monstertruck_planners.missions.service import MissionInputs, MissionParts, MissionService
+from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
+from monstertruck_runtime.errors import NotFoundError, RequestRefusedError
+from monstertruck_runtime.threads import inline
+from monstertruck_schemas.base import Pose2D
+from monstertruck_schemas.mission import Mission
+from monstertruck_schemas.plan import GoalPhase, GoalState
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import GoalOrder, MissionOrder, MissionRequest, Role
+
+GO = {"do": "goto", "x": 1.0, "y": 0.0, "yaw": 0.0}
+WAIT = {"do": "wait", "seconds": 3.0}
+DONE, MISSED = StepEnd(Reason.GOAL_REACHED), StepEnd(Reason.GOAL_UNREACHABLE, "walls")
+
+
+def mission(*steps: dict, on_failure: str = "abort") -> Mission:
+    return Mission.model_validate_json(
+        json.dumps({"version": 2, "name": "round", "on_failure": on_failure, "steps": steps})
+    )
+
+
+def progress(*steps: dict, **more) -> Progress:
+    return Progress(mission(*steps, **more), (1.0, 2.0, 3.0))
+
+
+def test_steps_follow_each_other_to_the_end():
+    at, following = after(progress(GO, WAIT), DONE)
+    assert (at.index, following) == (1, "step")
+    at, following = after(at, StepEnd(Reason.OK))
+    assert following == "done"
+    assert outcome(at, following).reason is Reason.MISSION_DONE
+
+
+def test_a_step_is_tried_again_before_it_has_failed():
+    at, following = after(progress({**GO, "retries": 2}, WAIT), MISSED)
+    assert (at.attempt, following) == (1, "again")
+    at, following = after(at, MISSED)
+    assert (at.attempt, following) == (2, "again")
+    at, following = after(at, MISSED)
+    assert (at.failures, following) == (1, "ended")
+    end = outcome(at, following)
+    assert end.reason is Reason.GOAL_UNREACHABLE
+    assert end.text == "step 1 of 2 (goto 1 0 0): walls"
+
+
+def test_the_policy_of_a_step_counts_before_that_of_the_mission():
+    at, following = after(progress({**GO, "on_failure": "continue"}, WAIT), MISSED)
+    assert (at.index, at.failures, following) == (1, 1, "step")
+    at, following = after(at, StepEnd(Reason.OK))
+    assert outcome(at, following) == StepEnd(Reason.MISSION_INCOMPLETE, "1 of 2 steps failed; walls")
+    at, following = after(progress({**GO, "on_failure": "return"}, WAIT, on_failure="continue"), MISSED)
+    assert (following, at.returning) == ("return", True)
+    back, following = after(at, DONE)
+    assert following == "ended"
+    assert outcome(back, following).text.endswith("walls, back where it began")
+    assert outcome(back, following).reason is Reason.GOAL_UNREACHABLE
+
+
+@pytest.mark.parametrize("reason", [Reason.CANCELLED, Reason.DISARMED])
+def test_who_cancels_or_disarms_ends_it_whatever_the_policy(reason: Reason):
+    at, following = after(progress({**GO, "retries": 3, "on_failure": "continue"}, WAIT), StepEnd(reason))
+    assert following == "ended"
+    assert outcome(at, following).reason is reason
+
+
+def test_what_is_saved_comes_back():
+    at, _ = after(progress({**GO, "on_failure": "continue"}, WAIT), MISSED)
+    again = SavedProgress.model_validate_json(SavedProgress.of(at, "ann").model_dump_json()).progress()
+    assert (again.mission, again.start, again.index, again.failures) == (at.mission, at.start, 1, 1)
+
+
+def test_steps_have_short_names():
+    steps = mission(
+        GO, {"do": "look", "x": 2, "y": 3}, WAIT, {"do": "follow_wall", "name": "left", "distance": 2}
+    ).steps
+    assert [in_words(step) for step in steps] == ["goto 1 0 0", "look at 2 3", "wait 3 s", "follow_wall left"]
+
+
+class Pretended:
+    """A robot whose goals end when they are told to."""
+
+    def __init__(self, clock: VirtualClock, file: Path | None = None) -> None:
+        self.clock, self.number, self.reached = clock, 0, [Reason.GOAL_REACHED] * 99
+        self.latest = {"gate": None, "pose": None, "goal": None, "behaviour": None, "explore": None}
+        self.reports, self.events, self.goals, self.held = [], [], [], set()
+        box = {name: self._box(name) for name in self.latest}
+        self.latest["gate"] = SimpleNamespace(nonce="n", stamp=0, reasons=(), mode=SimpleNamespace(active=True))
+        self.seq = 0
+        self.service = MissionService(
+            MissionParts(self, None, None, frozenset()), clock, file=file, offload=inline, max_age=5.0,
+            inputs=MissionInputs(**box), state=SimpleNamespace(next_seq=lambda: 1, put=self.reports.append),
+            events=lambda reason, severity, source, text="", **_: self.events.append((reason, text)),
+        )  # fmt: skip
+
+    def _box(self, name: str):
+        return type("Box", (), {"latest": property(lambda _: self.latest[name])})()
+
+    def take(self, request):
+        """As the goal service."""
+        self.number += 1
+        self.goals.append((request.goal.x, request.goal.y))
+        self._say(GoalPhase.DRIVING, Reason.DRIVING)
+        self.task = asyncio.get_running_loop().call_later(2.0, self._say, GoalPhase.IDLE, self.reached.pop(0))
+        return self.number
+
+    def control(self, request):
+        assert request.order is GoalOrder.CANCEL
+        self.task.cancel()
+        self._say(GoalPhase.IDLE, Reason.CANCELLED)
+
+    def hold(self, who: str, *, on: bool):
+        (self.held.add if on else self.held.discard)(who)
+
+    def _say(self, phase: GoalPhase, reason: Reason):
+        state = GoalState(stamp=1, received=1, seq=0, frame="map", number=self.number, phase=phase, outcome=reason)
+        self.latest["goal"] = state
+
+    def order(self, order: MissionOrder, *steps: dict, **more) -> int:
+        self.seq += 1
+        now = self.clock.now()
+        self.latest["gate"].stamp = now
+        pose = SimpleNamespace(received=now, pose=Pose2D(x=5.0, y=6.0, yaw=0.0))
+        self.latest["pose"] = pose
+        request = MissionRequest(
+            stamp=now, received=now, seq=self.seq, source="ann", role=Role.STATION, lease=1.0, nonce="n",
+            gate_stamp=now, order=order, mission=mission(*steps, **more) if steps else None,
+        )  # fmt: skip
+        return self.service.take(request)
+
+
+def played(story, file: Path | None = None) -> Pretended:
+    async def main(clock: VirtualClock) -> Pretended:
+        robot = Pretended(clock, file)
+        task = asyncio.create_task(robot.service.run(lambda: None))
+        await clock.sleep(0.1)
+        await story(robot)
+        task.cancel()
+        await asyncio.wait([task])
+        return robot
+
+    return run_virtual(main, start=SECOND)
+
+
+def test_a_mission_is_done_step_by_step_and_keeps_the_robot_armed(tmp_path: Path):
+    file = tmp_path / "mission.json"
+
+    async def story(robot: Pretended) -> None:
+        assert robot.order(MissionOrder.START, GO, WAIT, {"do": "record", "note": "here"}, {"do": "return"}) == 1
+        await robot.clock.sleep(1.0)
+        assert robot.held == {"missions"}
+        assert json.loads(file.read_text())["index"] == 0
+        with pytest.raises(RequestRefusedError, match="is running"):
+            robot.order(MissionOrder.START, GO)
+        await robot.clock.sleep(9.0)
+
+    robot = played(story, file)
+    assert robot.goals == [(1.0, 0.0), (5.0, 6.0)]
+    assert robot.reports[-1].outcome is Reason.MISSION_DONE
+    assert (Reason.MISSION_NOTE, "here") in robot.events
+    assert not robot.held
+    assert not file.exists()
+    assert [report.step for report in robot.reports if report.running][-1] == 4
+
+
+def test_stopped_it_cancels_its_goal():
+    async def story(robot: Pretended) -> None:
+        with pytest.raises(RequestRefusedError, match="no mission"):
+            robot.order(MissionOrder.STOP)
+        robot.order(MissionOrder.START, GO, WAIT)
+        await robot.clock.sleep(1.0)
+        robot.order(MissionOrder.STOP)
+        await robot.clock.sleep(1.0)
+
+    robot = played(story)
+    assert robot.latest["goal"].outcome is Reason.CANCELLED
+    assert robot.reports[-1].outcome is Reason.CANCELLED
+    assert "ann" in robot.reports[-1].text
+
+
+def test_a_step_that_takes_too_long_has_failed_and_its_goal_is_cancelled():
+    async def story(robot: Pretended) -> None:
+        robot.order(MissionOrder.START, {**GO, "limit": 1.0, "on_failure": "continue"}, WAIT)
+        await robot.clock.sleep(8.0)
+
+    robot = played(story)
+    assert robot.reports[-1].outcome is Reason.MISSION_INCOMPLETE
+    assert robot.latest["goal"].outcome is Reason.CANCELLED
+
+
+def test_after_a_restart_it_can_be_gone_on_with_at_the_step_that_was_interrupted(tmp_path: Path):
+    file = tmp_path / "mission.json"
+
+    async def interrupted(robot: Pretended) -> None:
+        with pytest.raises(RequestRefusedError, match="no mission was interrupted"):
+            robot.order(MissionOrder.RESUME)
+        robot.order(MissionOrder.START, GO, WAIT, {**GO, "x": 7.0}, {"do": "return"})
+        await robot.clock.sleep(3.5)
+
+    played(interrupted, file)
+    assert json.loads(file.read_text())["index"] == 1
+
+    async def resumed(robot: Pretended) -> None:
+        assert robot.reports[-1].resumable
+        assert (robot.reports[-1].step, robot.reports[-1].steps) == (2, 4)
+        robot.order(MissionOrder.RESUME)
+        await robot.clock.sleep(12.0)
+
+    robot = played(resumed, file)
+    assert robot.goals == [(7.0, 0.0), (5.0, 6.0)]
+    assert robot.reports[-1].outcome is Reason.MISSION_DONE
+
+
+def test_a_damaged_file_is_reported_and_forgotten(tmp_path: Path):
+    file = tmp_path / "mission.json"
+    file.write_text("{")
+
+    async def story(robot: Pretended) -> None:
+        assert not robot.reports[-1].resumable
+
+    robot = played(story, file)
+    assert robot.events[0][0] is Reason.BAD_INPUT
+
+
+@pytest.mark.parametrize(
+    ("step", "text"),
+    [
+        ({"do": "explore"}, "step 2: explore: .* section `explorer`"),
+        ({"do": "behaviour", "name": "wall"}, "step 2: no behaviour 'wall': expected one of none"),
+    ],
+)
+def test_what_the_robot_cannot_do_is_refused_before_it_sets_off(step: dict, text: str):
+    async def story(robot: Pretended) -> None:
+        with pytest.raises(NotFoundError, match=text):
+            robot.order(MissionOrder.START, GO, step)
+        assert robot.goals == []
+
+    played(story)
