@@ -27,7 +27,7 @@ class StepEnd:
 
 
 @dataclass(frozen=True, slots=True)
-class Progress:
+class MissionProgress:
     """One mission and how far it has come."""
 
     mission: Mission
@@ -49,7 +49,7 @@ class Progress:
         return self.mission.steps[self.index]
 
 
-def after(progress: Progress, end: StepEnd) -> tuple[Progress, Next]:
+def after(progress: MissionProgress, end: StepEnd) -> tuple[MissionProgress, Next]:
     """What follows the end of the present step, or that of the way back.
 
     Returns:
@@ -75,13 +75,13 @@ def after(progress: Progress, end: StepEnd) -> tuple[Progress, Next]:
             return failed, "ended"
 
 
-def _onward(progress: Progress) -> tuple[Progress, Next]:
+def _onward(progress: MissionProgress) -> tuple[MissionProgress, Next]:
     if progress.index + 1 == len(progress.mission.steps):
         return progress, "done"
     return replace(progress, index=progress.index + 1, attempt=0), "step"
 
 
-def outcome(progress: Progress, following: Next) -> StepEnd:
+def outcome(progress: MissionProgress, following: Next) -> StepEnd:
     """Of the whole mission."""
     count = len(progress.mission.steps)
     if following == "done":
@@ -117,7 +117,7 @@ class SavedProgress(Schema):
     failures: int
 
     @classmethod
-    def of(cls, progress: Progress, source: str) -> "SavedProgress":
+    def of(cls, progress: MissionProgress, source: str) -> "SavedProgress":
         """What is kept of a mission."""
         x, y, yaw = progress.start
         return cls(
@@ -128,7 +128,7 @@ class SavedProgress(Schema):
             failures=progress.failures,
         )
 
-    def progress(self) -> Progress:
+    def progress(self) -> MissionProgress:
         """The mission at the beginning of the step at which it was interrupted."""
         start = self.start.x, self.start.y, self.start.yaw
-        return Progress(self.mission, start, self.index, failures=self.failures)
+        return MissionProgress(self.mission, start, self.index, failures=self.failures)

@@ -13,8 +13,8 @@ from pydantic import ValidationError
 from monstertruck_planners.goals.exchange import Pose, pose_of
 from monstertruck_planners.missions.progress import (
     GOOD,
+    MissionProgress,
     Next,
-    Progress,
     SavedProgress,
     StepEnd,
     after,
@@ -161,7 +161,7 @@ class MissionService:
         self._seq = 0
         self._number = 0
         self._source = ""
-        self._progress: Progress | None = None
+        self._progress: MissionProgress | None = None
         self._began = 0
         self._end: StepEnd | None = None
         self._interrupted: SavedProgress | None = None
@@ -224,7 +224,7 @@ class MissionService:
         self._task = self._tasks.create_task(self._do_all(progress))
         return self._number
 
-    def _begin(self, request: MissionRequest) -> Progress:
+    def _begin(self, request: MissionRequest) -> MissionProgress:
         if request.order is MissionOrder.RESUME:
             if self._interrupted is None:
                 raise RequestRefusedError(Reason.NOT_FOUND, "no mission was interrupted")
@@ -233,7 +233,7 @@ class MissionService:
             raise InputError("mission: missing")
         if (pose := self._pose()) is None:
             raise RequestRefusedError(Reason.NO_MAP, "no pose in a map yet")
-        return Progress(request.mission, pose)
+        return MissionProgress(request.mission, pose)
 
     def _check(self, mission: Mission) -> None:
         """Whether the robot has what the steps need.
@@ -250,7 +250,7 @@ class MissionService:
 
     # Steps
 
-    async def _do_all(self, progress: Progress) -> None:
+    async def _do_all(self, progress: MissionProgress) -> None:
         """Do a mission from its present step on."""
         self._parts.goals.hold(SOURCE, on=True)
         following: Next = "step"
@@ -281,7 +281,7 @@ class MissionService:
         self._events(end.reason, severity, SOURCE, end.text)
         self._report(self._clock.now())
 
-    async def _limited(self, step: AnyStep, progress: Progress) -> StepEnd:
+    async def _limited(self, step: AnyStep, progress: MissionProgress) -> StepEnd:
         if step.limit is None:
             return await self._do(step, progress)
         try:
@@ -290,7 +290,7 @@ class MissionService:
         except TimeoutError:
             return StepEnd(Reason.TIMEOUT, f"not done within {step.limit:g} s")
 
-    async def _do(self, step: AnyStep, progress: Progress) -> StepEnd:
+    async def _do(self, step: AnyStep, progress: MissionProgress) -> StepEnd:
         try:
             match step:
                 case GoToStep(x=x, y=y, yaw=yaw, via=via):
@@ -417,7 +417,7 @@ class MissionService:
             self._events(Reason.BAD_INPUT, Severity.WARNING, SOURCE, f"{self._file}: not readable: {first}")
             return None
 
-    async def _save(self, progress: Progress) -> None:
+    async def _save(self, progress: MissionProgress) -> None:
         if progress.returning:
             return
         text = SavedProgress.of(progress, self._source).model_dump_json()

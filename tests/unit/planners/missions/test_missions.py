@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from monstertruck_planners.missions.progress import Progress, SavedProgress, StepEnd, after, in_words, outcome
+from monstertruck_planners.missions.progress import MissionProgress, SavedProgress, StepEnd, after, in_words, outcome
 from monstertruck_planners.missions.service import MissionInputs, MissionParts, MissionService
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.errors import NotFoundError, RequestRefusedError
@@ -29,8 +29,8 @@ def mission(*steps: dict, on_failure: str = "abort") -> Mission:
     )
 
 
-def progress(*steps: dict, **more) -> Progress:
-    return Progress(mission(*steps, **more), (1.0, 2.0, 3.0))
+def progress(*steps: dict, **more) -> MissionProgress:
+    return MissionProgress(mission(*steps, **more), (1.0, 2.0, 3.0))
 
 
 def test_steps_follow_each_other_to_the_end():
