@@ -48,6 +48,8 @@ from monstertruckd.bus.local import Bus
 from monstertruckd.bus.rpc import Rpc
 from monstertruckd.bus.zenoh_session import ZenohBridge
 from monstertruckd.config import calibration_rpc
+from monstertruckd.config.calibration import CalibrationStore
+from monstertruckd.config.expiry import CalibrationWatch, Odometer
 from monstertruckd.config.load import Tree, resolved
 from monstertruckd.config.truck import TruckConfig
 from monstertruckd.gate import rpc as gate_rpc
@@ -120,8 +122,12 @@ class Daemon:
             self.bus.listen(topics.REQ_GOAL, self._refuse_goal)
         self._remote_steps = RemoteWorkQueue(CODEC)
         self._actors = ActorFactory(clock, self._remote_steps)
+        self._calibration = self._build_calibration()
         self.rpc = self._build_rpc()
         self._attachments = _attachments(config, self._body, tree)
+        self._attachments["calibration"]["wizards"] = [
+            state.model_dump(mode="json", exclude={"metres_left"}) for state in self._calibration.states()
+        ]
         self.recorder = self._build_recorder()
         self.black_box = self._build_black_box()
         self._notify = notify_from(environment, clock, self.gate.ticks, config.gate.rate, self._status)
@@ -150,6 +156,7 @@ class Daemon:
         ):
             self._start_drivers(actuators, OnBug.EXIT, Duty.ACTUATOR)
             self._start(gate, self.gate, OnBug.EXIT)
+            self._start(gate, self._calibration)
             self._start(gate, MeterService(self.clock, self.gate, self.recorder, self.bus))
             if self._seed is None:
                 self._start(gate, StallWatch(self.clock, self.gate.ticks, self.config.state_directory / "stalls"))
@@ -286,7 +293,14 @@ class Daemon:
         gate_rpc.register(rpc, self.bus, self.clock)
         loaded = self._tree.calibration if self._tree is not None else None
         calibration_rpc.register(
-            rpc, self.config, loaded, self.clock, self._events, self._offload, lambda: self.gate.mode
+            rpc,
+            self.config,
+            loaded,
+            self.clock,
+            self._events,
+            self._offload,
+            lambda: self.gate.mode,
+            self._calibration.stamped,
         )
         return rpc
 
@@ -334,6 +348,12 @@ class Daemon:
             offload=self._offload,
             weakened=config.weakened(),
         )
+
+    def _build_calibration(self) -> CalibrationWatch:
+        loaded = self._tree.calibration if self._tree is not None else None
+        results = {} if loaded is None else CalibrationStore(loaded.parent, self.config.robot).load(loaded).results
+        file = self.config.state_directory / "odometer.json" if self._seed is None else None
+        return CalibrationWatch(self.config, results, self.bus, self.clock, self._events, self._offload, Odometer(file))
 
     def _build_latch(self, environment: Mapping[str, str]) -> Latch:
         if self._seed is not None:

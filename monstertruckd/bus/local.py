@@ -91,6 +91,8 @@ class Bus:
         self._taps: list[Tap] = []
         self._retained: dict[str, tuple[Topic[Any], Any]] = {}
         self._drops = 0
+        self.degraded: frozenset[str] = frozenset()
+        """Topics whose messages rest on a calibration that has expired, and say so."""
         self._events = LocalPublisher(self, EVENT)
 
     def publisher(self, topic: Topic[M], writer: Writer) -> Publisher[M]:
@@ -203,6 +205,8 @@ class Bus:
 
     def hand_over(self, topic: Topic[M], message: M) -> list[object]:
         """Deliver to listeners, readers and taps; returns what the listeners returned."""
+        if topic.name in self.degraded:
+            message = message.model_copy(update={"degraded": True})
         if topic.retained:
             self._retained[topic.name] = (topic, message)
         ends = self._ends[topic.name]

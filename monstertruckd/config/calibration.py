@@ -28,6 +28,7 @@ CONFIDENCE: Final = 0.95
 """Of every interval: of a hundred trucks measured like this, so many have their true value inside."""
 
 Value = bool | int | float
+Grade = Literal["A", "B", "C"]
 WizardName = Literal["battery", "compass", "drive", "steering", "odometry", "lidar", "imu", "slip"]
 
 STEERING: Final = "devices.steering.driver"
@@ -85,6 +86,21 @@ class Estimate(Schema):
     """Place in the configuration that it sets; None: for information only"""
     date: str = ""
     """When it was measured, UTC by the robot's clock; set when it is saved"""
+    grade: Grade | None = None
+    """By the width of its interval; None: it has none, or no goal"""
+    valid_until: "ValidUntil | None" = None
+    """Set when it is saved; None: of an older release"""
+
+
+class ValidUntil(Schema):
+    """What ends an estimate, whichever comes first."""
+
+    date: str
+    """UTC"""
+    odometer: float | None = None
+    """Way of the robot in all, m; None: the way does not count"""
+    part: str = ""
+    """Device that was measured, and its port; another device, or one that was plugged elsewhere, is another part"""
 
 
 class Result(Schema):

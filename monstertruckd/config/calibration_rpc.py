@@ -32,6 +32,7 @@ def register(
     events: EventSink,
     offload: Offload,
     mode: Callable[[], GateMode],
+    stamped: Callable[[Result], Result],
 ) -> None:
     """Serve ``calibration``, ``calibration_save`` and ``calibration_undo``.
 
@@ -43,6 +44,7 @@ def register(
         events: gets an event for every new file.
         offload: where files are read and written.
         mode: the gate's present one; nothing is written while the truck may move.
+        stamped: gives a result its grades, and says until when it counts.
     """
     store = CalibrationStore(config.calibration_folder, config.robot)
 
@@ -76,7 +78,7 @@ def register(
         at_rest()
         result = _result(payload.get("result"))
         await offload(lambda: with_values(config, [result], "result"))
-        path = await offload(lambda: store.save(result, real_time()))
+        path = await offload(lambda: store.save(stamped(result), real_time()))
         saved = (await offload(lambda: store.load(path))).results[result.wizard]
         answer = tell(path, f"{result.wizard} calibrated", payload.get("source"))
         return answer | {"result": saved.model_dump(mode="json")}

@@ -1,7 +1,7 @@
 """Messages of the ``health`` group."""
 
 from enum import StrEnum
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -35,6 +35,30 @@ class HealthTable(Message):
     """Health of every service; published on change and once a second."""
 
     services: tuple[ServiceHealth, ...]
+
+
+class CalibrationState(Schema):
+    """What one wizard measured, how well, and until when it counts."""
+
+    wizard: str
+    grade: Literal["A", "B", "C"]
+    """By the width of its intervals: A as narrow as meant, B twice as wide at most, C wider."""
+    date: str
+    """Of the newest measurement, UTC."""
+    until: str
+    """Day until which it counts, UTC."""
+    metres_left: float | None = None
+    """Way that may be driven until it expires, m; None: the way does not count."""
+    expired: str = ""
+    """Why it no longer counts; empty while it does."""
+
+
+class CalibrationHealth(Message):
+    """The calibration that the daemon runs on; published on change and once a minute."""
+
+    wizards: tuple[CalibrationState, ...] = ()
+    odometer: float = 0.0
+    """Way that the robot has driven in all, m."""
 
 
 class LoopHealth(Message):

@@ -105,6 +105,7 @@ class Reason(StrEnum):
     CUSP_MISSED = "cusp_missed", 85, "the truck came to rest too far from where its path changes direction"
     RESPONSE_DIFFERS = "response_differs", 86, "the axles answer later or sooner than configured"
     CLOCK_DRIFT = "clock_drift", 87, "a sensor's clock and the computer's run apart"
+    CALIBRATION_EXPIRED = "calibration_expired", 88, "a calibration no longer counts: measure it again"
     RESPONSE_AGREES = "response_agrees", 0, "the axles answer as configured again"
 
     # Localisation and mapping

@@ -73,6 +73,8 @@ class Attitude(Message):
     """Field strength differs from the calibrated one: do not trust the heading."""
     tilt_valid: bool = True
     """False while the acceleration is not near 1 g: roll and pitch are then not tilt."""
+    degraded: bool = False
+    """It rests on a calibration that has expired."""
 
 
 class DriveMode(StrEnum):
@@ -150,6 +152,8 @@ class Battery(Message):
     """Share of the capacity that is left, 0..1, from the resting voltage: right to 0.1 at best."""
     capacity_ah: float | None = None
     """Capacity of the pack as configured, Ah."""
+    degraded: bool = False
+    """It rests on a calibration that has expired."""
 
 
 class SonarEcho(Schema):

@@ -34,6 +34,8 @@ class Odometry(Message):
     """Seconds since the newest drive reading this estimate rests on; the rest is predicted."""
     sources: tuple[str, ...] = ()
     """Sensors used in this estimate, e.g. ("drive", "steering", "compass")."""
+    degraded: bool = False
+    """It rests on a calibration that has expired."""
 
 
 class ScanMotion(Message):

@@ -19,6 +19,7 @@ from monstertruck_schemas.cmd import DriveCommand, SteeringCommand
 from monstertruck_schemas.entry_points import ExtensibleTable
 from monstertruck_schemas.event import Event, LogRecord, Stop
 from monstertruck_schemas.health import (
+    CalibrationHealth,
     HealthTable,
     HostHealth,
     LinkHealth,
@@ -240,6 +241,13 @@ CMD_STEERING: Final = Topic("cmd/steering", SteeringCommand, W.GATE, "Command se
 
 HEALTH: Final = Topic(
     "health/services", HealthTable, W.DAEMON, "Every service's state", 1, stale_after=3.0, retained=True
+)
+CALIBRATION: Final = Topic(
+    "health/calibration",
+    CalibrationHealth,
+    W.DAEMON,
+    "What was calibrated, how well, until when; way driven in all",
+    retained=True,
 )
 LOOP: Final = Topic("health/loop", LoopHealth, W.DAEMON, "Lateness of the control tick", 1, stale_after=3.0)
 RECORDER: Final = Topic("health/recorder", RecorderHealth, W.DAEMON, "Recorder", 1, stale_after=3.0, retained=True)

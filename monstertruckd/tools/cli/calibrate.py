@@ -299,10 +299,20 @@ def _json(value: Any) -> str:
 
 def _print(result: "Result") -> None:
     rows = [
-        (f"{result.wizard}.{e.name}", _number(e), e.unit, str(e.samples), e.date.replace("T", " "), e.meaning)
+        (
+            f"{result.wizard}.{e.name}",
+            _number(e),
+            e.unit,
+            e.grade or "",
+            str(e.samples),
+            e.date.replace("T", " "),
+            "" if e.valid_until is None else e.valid_until.date[:10],
+            e.meaning,
+        )
         for e in result.estimates
     ]
-    print_table(("what", "value", "unit", "samples", "measured", "meaning"), rows, right=("value", "samples"))
+    headings = ("what", "value", "unit", "grade", "samples", "measured", "until", "meaning")
+    print_table(headings, rows, right=("value", "samples"))
     for missing in result.unobserved:
         remark(f"not seen: {missing}")
 

@@ -74,12 +74,16 @@ async def give(client: "TruckClient", order: "Order", *, hold: bool = False) -> 
         return OrderOutcome(order, error.refusal, str(error), state)
 
 
-async def _announce(client: "TruckClient") -> None:
-    """Say before arming who sets off then."""
-    from monstertruck_schemas.topics import GATE
+async def _announce(client: "TruckClient", *, hold: bool) -> None:
+    """Say before arming who sets off then, and which calibrations no longer count."""
+    from monstertruck_schemas.topics import CALIBRATION, GATE
 
+    calibration = await client.get_retained(CALIBRATION)
+    for row in () if calibration is None else calibration.wizards:
+        if row.expired:
+            remark(f"calibration of {row.wizard} has expired ({row.expired}): monstertruckd calibrate {row.wizard}")
     state = await client.get_retained(GATE)
-    if state is not None and state.waiting:
+    if state is not None and state.waiting and not hold:
         print(f"sets off at once: {', '.join(state.waiting)}; --hold arms without", file=sys.stderr)
 
 
@@ -90,8 +94,8 @@ def _run(name: str, robot: str, endpoint: str, *, json_output: bool, hold: bool 
     async def main(clock: Clock) -> OrderOutcome:
         async with TruckClient(robot, endpoint, clock=clock) as client:
             order = Order(name)
-            if order is Order.ARM and not hold:
-                await _announce(client)
+            if order is Order.ARM:
+                await _announce(client, hold=hold)
             return await give(client, order, hold=hold)
 
     outcome = run_wall(main)

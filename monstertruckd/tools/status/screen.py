@@ -21,7 +21,14 @@ from monstertruck_planners.collision import scan_points
 from monstertruck_runtime.stop_text import stop_lines
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.event import Event, Severity, Stop
-from monstertruck_schemas.health import HealthTable, LoopHealth, RecorderHealth, ServiceHealth, ServiceState
+from monstertruck_schemas.health import (
+    CalibrationHealth,
+    HealthTable,
+    LoopHealth,
+    RecorderHealth,
+    ServiceHealth,
+    ServiceState,
+)
 from monstertruck_schemas.plan import TrackerState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import Attitude, Battery, LaserScan
@@ -77,6 +84,7 @@ class ScreenState:
     scan: LaserScan | None = None
     attitude: Attitude | None = None
     battery: Battery | None = None
+    calibration: CalibrationHealth | None = None
     tracker: TrackerState | None = None
     health: HealthTable | None = None
     loop: LoopHealth | None = None
@@ -109,12 +117,21 @@ class ScreenState:
                 pass
 
 
+def calibration_badge(health: CalibrationHealth) -> str:
+    """Wizards by grade, the expired ones by name: ``A drive, steering; expired: compass``."""
+    good: dict[str, list[str]] = {}
+    for state in health.wizards:
+        good.setdefault("expired:" if state.expired else state.grade, []).append(state.wizard)
+    return "; ".join(f"{grade} {', '.join(names)}" for grade, names in sorted(good.items()))
+
+
 _NEWEST: Final[dict[type, str]] = {
     GateState: "gate",
     Odometry: "odometry",
     LaserScan: "scan",
     Attitude: "attitude",
     Battery: "battery",
+    CalibrationHealth: "calibration",
     TrackerState: "tracker",
     HealthTable: "health",
     LoopHealth: "loop",
@@ -209,6 +226,8 @@ def _truck(state: ScreenState) -> Panel:
     if state.battery is not None:
         volts = "-" if state.battery.voltage is None else f"{state.battery.voltage:.1f} V"
         _row(table, "battery", f"{volts} {state.battery.level.value}")
+    if state.calibration is not None and state.calibration.wizards:
+        _row(table, "calibrated", calibration_badge(state.calibration))
     if odometry is not None:
         _row(table, "pose", f"{odometry.pose.x:+.2f} {odometry.pose.y:+.2f} m {math.degrees(odometry.pose.yaw):+.0f}°")
     if state.attitude is not None:

@@ -14,7 +14,7 @@ from monstertruck_runtime.mailbox import fifo, latest
 from monstertruck_schemas import topics
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.topics import Topic
-from monstertruckd.tools.status.screen import ScreenState, draw
+from monstertruckd.tools.status.screen import ScreenState, calibration_badge, draw
 
 SHOWN: tuple[Topic[Any], ...] = (
     topics.GATE,
@@ -25,6 +25,7 @@ SHOWN: tuple[Topic[Any], ...] = (
     topics.TRACKER,
     topics.HEALTH,
     topics.LOOP,
+    topics.CALIBRATION,
     topics.RECORDER,
     topics.STOP,
 )
@@ -135,6 +136,8 @@ def plain(state: ScreenState) -> list[str]:
     if state.battery is not None:
         volts = "-" if state.battery.voltage is None else f"{state.battery.voltage:.2f}"
         lines.append(f"battery   {volts} V, {state.battery.level.value}")
+    if state.calibration is not None and state.calibration.wizards:
+        lines.append(f"calibrated {calibration_badge(state.calibration)}")
     if state.loop is not None:
         late = state.loop
         lines.append(f"tick      late p99 {late.lateness_p99 * 1e3:.2f} ms, max {late.lateness_max * 1e3:.2f} ms")

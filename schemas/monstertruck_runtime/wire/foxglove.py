@@ -193,6 +193,7 @@ def _write_odometry(odometry: Odometry, proto: Any) -> None:
     proto.twist_covariance = odometry.twist_covariance.tobytes()
     proto.age = odometry.age
     proto.sources.extend(odometry.sources)
+    proto.degraded = odometry.degraded
 
 
 def _read_odometry(proto: Any) -> _Fields:
@@ -206,6 +207,7 @@ def _read_odometry(proto: Any) -> _Fields:
         "twist_covariance": _array(proto.twist_covariance),
         "age": proto.age,
         "sources": tuple(proto.sources),
+        "degraded": proto.degraded,
     }
 
 

@@ -1,0 +1,306 @@
+"""How well a calibration was measured, and until when it counts: grades, validity, and the service that watches both.
+
+What rests on an expired calibration says so (``degraded``): the truck drives on, as nothing has failed. A calibration
+expires by time, by the way driven since, or when the device that was measured is another one or hangs on another port.
+"""
+
+import itertools
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from monstertruck_kinematics.truck import DriveTrain
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.mailbox import latest
+from monstertruck_runtime.ports import EventSink, Ready
+from monstertruck_runtime.small_files import text_of
+from monstertruck_runtime.threads import Offload
+from monstertruck_schemas.event import Severity
+from monstertruck_schemas.health import CalibrationHealth, CalibrationState
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.topics import BATTERY, CALIBRATION, COMPASS, DRIVE, ODOMETRY, POSE, Topic, Writer
+from monstertruckd.bus.local import Bus
+from monstertruckd.config.calibration import Estimate, Grade, Result, ValidUntil, WizardName, utc
+from monstertruckd.config.truck import TruckConfig
+
+DAY: Final = 86_400 * SECOND
+"""ns."""
+PERIOD: Final = 1.0
+"""Seconds between two looks at the drive's position: half of it at most is missing of every reversal."""
+PUBLISH: Final = 60
+"""Periods between two messages, and between two writings of the odometer."""
+WORTH_WRITING: Final = 1.0
+"""Metres: less is not written, to spare the memory card."""
+
+
+class Lifetime(NamedTuple):
+    """How long what a wizard measured counts."""
+
+    days: int
+    metres: float | None
+    """Way; None: it does not wear with the way."""
+    role: str
+    """Device that was measured."""
+    topics: tuple[Topic[Any], ...]
+    """What rests on it."""
+
+
+_MOTION = (ODOMETRY, POSE)
+LIFETIMES: Final[dict[WizardName, Lifetime]] = {
+    "battery": Lifetime(365, None, "steering", (BATTERY,)),
+    "compass": Lifetime(90, None, "compass", (COMPASS, *_MOTION)),
+    "drive": Lifetime(180, 20_000.0, "drive", _MOTION),
+    "steering": Lifetime(90, 10_000.0, "steering", _MOTION),
+    "odometry": Lifetime(180, 20_000.0, "drive", _MOTION),
+    "lidar": Lifetime(180, 20_000.0, "lidar", (POSE,)),
+    "imu": Lifetime(90, None, "imu", _MOTION),
+    "slip": Lifetime(90, 5_000.0, "wheels", _MOTION),
+}
+"""By experience of such parts, none of it measured: tyres wear, linkages and mounts are knocked, iron changes."""
+
+
+class Goal(NamedTuple):
+    """Half-width that is meant."""
+
+    half: float
+    share: bool = False
+    """Of the value."""
+
+
+GOALS: Final[dict[str, Goal]] = {
+    "battery.gain": Goal(0.02, share=True),
+    "battery.offset": Goal(0.1),
+    "compass.hard_x": Goal(0.87),
+    "compass.hard_y": Goal(0.87),
+    "compass.soft_xx": Goal(0.035),
+    "compass.soft_yy": Goal(0.035),
+    "drive.drive_ratio": Goal(0.01, share=True),
+    "steering.front_centre": Goal(8.5),
+    "steering.rear_centre": Goal(8.5),
+    "steering.front_scale": Goal(0.025, share=True),
+    "steering.rear_scale": Goal(0.025, share=True),
+    "steering.delay": Goal(0.015),
+    "odometry.drive_ratio": Goal(0.01, share=True),
+    "odometry.wheelbase": Goal(0.01, share=True),
+    "odometry.offset": Goal(0.5),
+    "lidar.x": Goal(0.010),
+    "lidar.y": Goal(0.010),
+    "lidar.yaw": Goal(0.0087),
+    "lidar.roll": Goal(0.0087),
+    "lidar.pitch": Goal(0.0087),
+    "imu.rate_z": Goal(0.002),
+    "imu.rate_scale": Goal(0.01, share=True),
+    "slip.icr_left": Goal(0.03, share=True),
+    "slip.icr_right": Goal(0.03, share=True),
+    "slip.gain_left": Goal(0.01, share=True),
+    "slip.gain_right": Goal(0.01, share=True),
+}
+"""Of the intervals, in the estimates' units: 1 % of ways, 0.5 degrees of steering (8.5 us), 2 degrees by iron
+in a horizontal field of 25 uT, 10 mm and 0.5 degrees of the lidar, 0.1 V."""
+
+
+def grade(wizard: WizardName, estimate: Estimate) -> Grade | None:
+    """A: the interval is as narrow as meant; B: at most twice as wide; C: wider. None: it has no goal."""
+    goal = GOALS.get(f"{wizard}.{estimate.name}")
+    if goal is None or estimate.low is None or estimate.high is None:
+        return None
+    half = (estimate.high - estimate.low) / 2
+    share = half / (goal.half * abs(estimate.value) if goal.share else goal.half)
+    return "A" if share <= 1.0 else "B" if share <= 2.0 else "C"
+
+
+def part_of(config: TruckConfig, role: str) -> str:
+    """Device of a role and its port; empty where there is none."""
+    device = config.devices.present().get(role)
+    if device is None:
+        return ""
+    port = device.port.model_dump(mode="json", exclude={"baud"}, exclude_none=True)
+    serial = getattr(device.driver, "serial_number", None)
+    return " ".join((device.kind.name, *map(str, port.values()), *((serial,) if serial else ())))
+
+
+def stamped(result: Result, config: TruckConfig, real_ns: int, odometer: float) -> Result:
+    """A result with grades and validity of its estimates, as it is saved now."""
+    life = LIFETIMES[result.wizard]
+    until = ValidUntil(
+        date=utc(real_ns + life.days * DAY),
+        odometer=None if life.metres is None else odometer + life.metres,
+        part=part_of(config, life.role),
+    )
+    estimates = tuple(
+        e.model_copy(update={"grade": grade(result.wizard, e), "valid_until": until}) for e in result.estimates
+    )
+    return result.model_copy(update={"estimates": estimates})
+
+
+def worst(result: Result) -> Grade:
+    """Grade of a result: that of its worst estimate; C where no estimate has one."""
+    grades = [g for e in result.estimates if (g := e.grade or grade(result.wizard, e)) is not None]
+    return max(grades, default="C")
+
+
+def state_of(result: Result, config: TruckConfig, real_ns: int, odometer: float) -> CalibrationState:
+    """Grade and validity of a result now."""
+    ends = [e.valid_until for e in result.estimates if e.valid_until is not None]
+    life = LIFETIMES[result.wizard]
+    until = min((end.date for end in ends), default=_later(result.date, life.days))
+    ways = [end.odometer for end in ends if end.odometer is not None]
+    left = min(ways) - odometer if ways else None
+    now, part = utc(real_ns), part_of(config, life.role)
+    before = next((end.part for end in ends if end.part and end.part != part), None)
+    expired = ""
+    if before is not None:
+        expired = f"{life.role} was {before}, it is {part or 'gone'}"
+    elif now > until:
+        expired = f"measured {result.date[:10]}, counted until {until[:10]}"
+    elif left is not None and left < 0.0:
+        expired = f"{-left / 1000:.1f} km farther than it counts"
+    return CalibrationState(
+        wizard=result.wizard, grade=worst(result), date=result.date, until=until, metres_left=left, expired=expired
+    )
+
+
+def _later(date: str, days: int) -> str:
+    return f"{np.datetime64(date.rstrip('Z'), 's') + np.timedelta64(days, 'D')}Z" if date else ""
+
+
+@dataclass
+class Odometer:
+    """Way of the robot in all, m, kept over restarts.
+
+    Args:
+        file: where; None: nowhere.
+    """
+
+    file: Path | None
+    metres: float = 0.0
+    written: float = 0.0
+
+    def load(self) -> None:
+        """Read it; a damaged or missing file begins at 0."""
+        try:
+            self.metres = float(json.loads((text_of(self.file) if self.file else None) or "{}").get("metres", 0.0))
+        except (ValueError, AttributeError, TypeError):
+            self.metres = 0.0
+        self.written = self.metres
+
+    def save(self) -> None:
+        """Write it, whole or not at all.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        if self.file is None:
+            return
+        self.file.parent.mkdir(parents=True, exist_ok=True)
+        draft = self.file.with_suffix(".new")
+        draft.write_text(json.dumps({"metres": round(self.metres, 1)}), encoding="utf-8")
+        draft.replace(self.file)
+        self.written = self.metres
+
+
+class CalibrationWatch:
+    """Counts the way, says how well the robot is calibrated, and marks what rests on an expired calibration.
+
+    Args:
+        config: the running one.
+        results: of the calibration that it runs on.
+        bus: whose messages are marked.
+        clock: time.
+        events: told of every expiry.
+        offload: where files are written.
+        odometer: way in all.
+    """
+
+    name = "calibration"
+
+    def __init__(
+        self,
+        config: TruckConfig,
+        results: Mapping[WizardName, Result],
+        bus: Bus,
+        clock: Clock,
+        events: EventSink,
+        offload: Offload,
+        odometer: Odometer,
+    ) -> None:
+        self._config = config
+        self._results = dict(results)
+        self._bus = bus
+        self._clock = clock
+        self._events = events
+        self._offload = offload
+        self.odometer = odometer
+        self._train = DriveTrain(config.geometry.drive_ratio, config.geometry.wheel_radius)
+        self._out = bus.publisher(CALIBRATION, Writer.DAEMON)
+        self._expired: frozenset[str] = frozenset()
+
+    def stamped(self, result: Result) -> Result:
+        """As it is saved now."""
+        return stamped(result, self._config, self._real(), self.odometer.metres)
+
+    def states(self) -> list[CalibrationState]:
+        """Of every wizard whose result counts."""
+        return [state_of(r, self._config, self._real(), self.odometer.metres) for r in self._results.values()]
+
+    async def run(self, ready: Ready) -> None:
+        """Watch until cancelled; the way is written at the end."""
+        await self._offload(self.odometer.load)
+        self._expired = frozenset()
+        self._look()
+        ready()
+        with self._bus.subscribe(DRIVE, latest()) as drive:
+            before: float | None = None
+            try:
+                for count in itertools.count(1):
+                    await self._clock.sleep(PERIOD)
+                    if drive.latest is not None:
+                        here = drive.latest.position
+                        if before is not None:
+                            self.odometer.metres += abs(float(self._train.distance(here - before)))
+                        before = here
+                    if count % PUBLISH == 0:
+                        self._look()
+                        await self._keep()
+            finally:
+                await self._keep()
+
+    async def _keep(self) -> None:
+        odometer = self.odometer
+        if odometer.file is None or abs(odometer.metres - odometer.written) < WORTH_WRITING:
+            return
+        try:
+            await self._offload(odometer.save)
+        except OSError as error:
+            self._events(Reason.DISK_LOW, Severity.WARNING, self.name, f"{odometer.file}: {error.strerror}")
+
+    def _look(self) -> None:
+        now = self._clock.now()
+        states = self.states()
+        expired = {state.wizard: state.expired for state in states if state.expired}
+        for wizard in expired.keys() - self._expired:
+            self._events(Reason.CALIBRATION_EXPIRED, Severity.WARNING, self.name, f"{wizard}: {expired[wizard]}")
+        self._expired = frozenset(expired)
+        self._bus.degraded = degraded_topics(expired)
+        self._out.put(
+            CalibrationHealth(
+                stamp=now,
+                received=now,
+                seq=self._out.next_seq(),
+                wizards=tuple(states),
+                odometer=round(self.odometer.metres, 1),
+            )
+        )
+
+    def _real(self) -> int:
+        return self._clock.now() + self._clock.real_offset()
+
+
+def degraded_topics(expired: Iterable[str]) -> frozenset[str]:
+    """Topics that rest on expired wizards' results."""
+    lives = (life for wizard, life in LIFETIMES.items() if wizard in set(expired))
+    return frozenset(topic.name for life in lives for topic in life.topics)

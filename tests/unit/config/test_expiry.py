@@ -1,0 +1,141 @@
+"""Grades and validity of calibrations."""
+
+import asyncio
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from monstertruck_drivers.config import PortConfig
+from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
+from monstertruck_runtime.mailbox import latest
+from monstertruck_runtime.threads import inline
+from monstertruck_schemas import topics
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.sensor import Battery, BatteryLevel, DriveFeedback, DriveMode
+from monstertruck_schemas.topics import Writer
+from monstertruckd.bus.local import Bus
+from monstertruckd.config.calibration import KEYS, Estimate, Result, utc
+from monstertruckd.config.expiry import (
+    DAY,
+    GOALS,
+    LIFETIMES,
+    CalibrationWatch,
+    Odometer,
+    degraded_topics,
+    grade,
+    stamped,
+    state_of,
+    worst,
+)
+from monstertruckd.config.load import load_config
+from monstertruckd.config.truck import TruckConfig
+
+TRUCK = load_config(Path(__file__).resolve().parents[3] / "configs" / "truck.yaml", TruckConfig)[0]
+NOW = 1_700_000_000 * SECOND
+
+
+def result(half=2.0, wizard="drive", name="drive_ratio"):
+    estimate = Estimate(name=name, value=600.0, low=600 - half, high=600 + half, samples=4, meaning="test")
+    return Result(wizard=wizard, measured="test", estimates=(estimate,), date=utc(NOW))
+
+
+def test_every_wizard_has_a_lifetime_and_goals():
+    assert LIFETIMES.keys() == KEYS.keys()
+    assert {name.partition(".")[0] for name in GOALS} == KEYS.keys()
+
+
+@pytest.mark.parametrize(("half", "letter"), [(5.9, "A"), (6.1, "B"), (11.9, "B"), (12.1, "C")])
+def test_a_grade_is_the_width_of_the_interval(half, letter):
+    assert worst(result(half)) == letter
+    assert stamped(result(half), TRUCK, NOW, 0.0).estimates[0].grade == letter
+
+
+def test_what_has_no_interval_has_no_grade():
+    sign = Estimate(name="inverted", value=True, samples=1, meaning="test")
+    assert grade("drive", sign) is None
+
+
+def test_time_way_and_another_part_end_it():
+    saved = stamped(result(), TRUCK, NOW, 1000.0)
+    life = LIFETIMES["drive"]
+    assert state_of(saved, TRUCK, NOW, 1000.0).expired == ""
+    assert state_of(saved, TRUCK, NOW, 1000.0).metres_left == life.metres
+    assert "counted until" in state_of(saved, TRUCK, NOW + (life.days + 1) * DAY, 1000.0).expired
+    assert "0.5 km farther" in state_of(saved, TRUCK, NOW, 1500.0 + life.metres).expired
+    drive = TRUCK.devices.drive
+    port = PortConfig(path=Path("/dev/other"))
+    moved = TRUCK.model_copy(
+        update={"devices": TRUCK.devices.model_copy(update={"drive": drive.model_copy(update={"port": port})})}
+    )
+    assert "/dev/other" in state_of(saved, moved, NOW, 1000.0).expired
+
+
+def test_a_result_of_an_older_release_ends_by_its_date():
+    old = result()
+    assert state_of(old, TRUCK, NOW, 0.0).expired == ""
+    assert state_of(old, TRUCK, NOW + 200 * DAY, 0.0).expired
+
+
+def test_what_rests_on_it_is_named():
+    assert degraded_topics(["battery"]) == {"sensor/battery"}
+    assert degraded_topics(["drive"]) == {"state/odometry", "state/pose"}
+    assert degraded_topics([]) == frozenset()
+
+
+@pytest.mark.parametrize("text", ["", "{", "[1]", '{"metres": "x"}'])
+def test_a_damaged_odometer_begins_at_nothing(text, tmp_path):
+    file = tmp_path / "odometer.json"
+    file.write_text(text)
+    odometer = Odometer(file)
+    odometer.load()
+    assert odometer.metres == 0.0
+    replace(odometer, metres=12.34).save()
+    odometer.load()
+    assert odometer.metres == 12.3
+
+
+def test_the_watch_marks_messages_tells_once_and_counts_the_way(tmp_path):
+    old = result().model_copy(update={"wizard": "battery", "date": utc(-400 * DAY)})
+
+    async def main(clock: VirtualClock):
+        bus = Bus(clock)
+        told = []
+        watch = CalibrationWatch(
+            TRUCK,
+            {"battery": old},
+            bus,
+            clock,
+            lambda *args, **_: told.append(args[0]),
+            inline,
+            Odometer(tmp_path / "odometer.json"),
+        )
+        task = asyncio.create_task(watch.run(lambda: None))
+        await clock.sleep(0.1)
+        battery = bus.publisher(topics.BATTERY, Writer.DRIVER)
+        with bus.subscribe(topics.BATTERY, latest()) as seen:
+            battery.put(
+                Battery(stamp=0, received=0, seq=0, voltage=24.0, raw_voltage=24.0, cells=6, level=BatteryLevel.NORMAL)
+            )
+            degraded = seen.latest.degraded
+        drive = bus.publisher(topics.DRIVE, Writer.DRIVER)
+        for k in range(130):
+            position = 1000.0 * (k % 2)
+            drive.put(
+                DriveFeedback(stamp=k, received=k, seq=k, position=position, velocity=0.0, mode=DriveMode.ENABLED)
+            )
+            await clock.sleep(1.0)
+        newest = bus.newest(topics.CALIBRATION)
+        task.cancel()
+        await asyncio.wait([task])
+        return degraded, told, newest
+
+    degraded, told, newest = run_virtual(main)
+    assert degraded
+    assert told == [Reason.CALIBRATION_EXPIRED]
+    assert newest.wizards[0].expired
+    way = 1000.0 * TRUCK.geometry.wheel_radius / TRUCK.geometry.drive_ratio
+    assert newest.odometer == pytest.approx(119 * way, abs=2 * way)
+    kept = Odometer(tmp_path / "odometer.json")
+    kept.load()
+    assert kept.metres == pytest.approx(128 * way, abs=2 * way)
