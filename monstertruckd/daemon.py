@@ -49,7 +49,7 @@ from monstertruckd.bus.rpc import Rpc
 from monstertruckd.bus.zenoh_session import ZenohBridge
 from monstertruckd.config import calibration_rpc
 from monstertruckd.config.calibration import CalibrationStore
-from monstertruckd.config.expiry import CalibrationWatch, Odometer
+from monstertruckd.config.expiry import CalibrationWatch, WayCounter
 from monstertruckd.config.load import Tree, resolved
 from monstertruckd.config.truck import TruckConfig
 from monstertruckd.gate import rpc as gate_rpc
@@ -353,7 +353,9 @@ class Daemon:
         loaded = self._tree.calibration if self._tree is not None else None
         results = {} if loaded is None else CalibrationStore(loaded.parent, self.config.robot).load(loaded).results
         file = self.config.state_directory / "odometer.json" if self._seed is None else None
-        return CalibrationWatch(self.config, results, self.bus, self.clock, self._events, self._offload, Odometer(file))
+        return CalibrationWatch(
+            self.config, results, self.bus, self.clock, self._events, self._offload, WayCounter(file)
+        )
 
     def _build_latch(self, environment: Mapping[str, str]) -> Latch:
         if self._seed is not None:

@@ -169,7 +169,7 @@ def _later(date: str, days: int) -> str:
 
 
 @dataclass
-class Odometer:
+class WayCounter:
     """Way of the robot in all, m, kept over restarts.
 
     Args:
@@ -211,7 +211,7 @@ class CalibrationWatch:
         results: of the calibration that it runs on.
         bus: whose messages are marked.
         clock: time.
-        events: told of every expiry.
+        events: told when one ends.
         offload: where files are written.
         odometer: way in all.
     """
@@ -226,7 +226,7 @@ class CalibrationWatch:
         clock: Clock,
         events: EventSink,
         offload: Offload,
-        odometer: Odometer,
+        odometer: WayCounter,
     ) -> None:
         self._config = config
         self._results = dict(results)

@@ -21,7 +21,7 @@ from monstertruckd.config.expiry import (
     GOALS,
     LIFETIMES,
     CalibrationWatch,
-    Odometer,
+    WayCounter,
     degraded_topics,
     grade,
     stamped,
@@ -87,7 +87,7 @@ def test_what_rests_on_it_is_named():
 def test_a_damaged_odometer_begins_at_nothing(text, tmp_path):
     file = tmp_path / "odometer.json"
     file.write_text(text)
-    odometer = Odometer(file)
+    odometer = WayCounter(file)
     odometer.load()
     assert odometer.metres == 0.0
     replace(odometer, metres=12.34).save()
@@ -108,7 +108,7 @@ def test_the_watch_marks_messages_tells_once_and_counts_the_way(tmp_path):
             clock,
             lambda *args, **_: told.append(args[0]),
             inline,
-            Odometer(tmp_path / "odometer.json"),
+            WayCounter(tmp_path / "odometer.json"),
         )
         task = asyncio.create_task(watch.run(lambda: None))
         await clock.sleep(0.1)
@@ -136,6 +136,6 @@ def test_the_watch_marks_messages_tells_once_and_counts_the_way(tmp_path):
     assert newest.wizards[0].expired
     way = 1000.0 * TRUCK.geometry.wheel_radius / TRUCK.geometry.drive_ratio
     assert newest.odometer == pytest.approx(119 * way, abs=2 * way)
-    kept = Odometer(tmp_path / "odometer.json")
+    kept = WayCounter(tmp_path / "odometer.json")
     kept.load()
     assert kept.metres == pytest.approx(128 * way, abs=2 * way)

@@ -9,10 +9,11 @@ import pytest
 import typer
 
 from monstertruck_runtime.errors import NoAnswerError, NotFoundError, RequestRefusedError, TruckError
+from monstertruck_schemas.health import CalibrationHealth, CalibrationState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order
 from monstertruck_schemas.state import GateMode, GateState
-from monstertruck_schemas.topics import GATE, Topic
+from monstertruck_schemas.topics import CALIBRATION, GATE, Topic
 from monstertruckd.tools.cli import orders
 from monstertruckd.tools.cli.orders import OrderOutcome, give
 
@@ -30,6 +31,7 @@ class Robot:
         self.answer = answer
         self.newest = newest
         self.orders: list[Order] = []
+        self.calibration: CalibrationHealth | None = None
 
     async def order(self, order: Order, *, hold: bool = False) -> GateState:
         self.orders.append(order)
@@ -37,9 +39,9 @@ class Robot:
             raise self.answer
         return self.answer
 
-    async def get_retained(self, topic: Topic[Any]) -> GateState | None:
-        assert topic is GATE
-        return self.newest
+    async def get_retained(self, topic: Topic[Any]) -> Any:
+        assert topic in (GATE, CALIBRATION)
+        return self.newest if topic is GATE else self.calibration
 
 
 class SlowRobot(Robot):
@@ -151,8 +153,20 @@ def test_arming_says_who_drives_or_waits(monkeypatch: pytest.MonkeyPatch, capsys
 
 def test_who_sets_off_is_said_before_arming(capsys: pytest.CaptureFixture[str]):
     waiting = state(GateMode.DISARMED).model_copy(update={"waiting": ("tracker",)})
-    asyncio.run(orders._announce(Robot(waiting, waiting)))  # type: ignore[arg-type]
+    asyncio.run(orders._announce(Robot(waiting, waiting), hold=False))  # type: ignore[arg-type]
     assert capsys.readouterr().err == "sets off at once: tracker; --hold arms without\n"
     for newest in (state(GateMode.DISARMED), None):
-        asyncio.run(orders._announce(Robot(waiting, newest)))  # type: ignore[arg-type]
+        asyncio.run(orders._announce(Robot(waiting, newest), hold=False))  # type: ignore[arg-type]
     assert capsys.readouterr().err == ""
+
+
+def test_a_calibration_that_has_expired_is_said_before_arming(capsys: pytest.CaptureFixture[str]):
+    robot = Robot(state(GateMode.DISARMED))
+    rows = [
+        CalibrationState(wizard=name, grade="A", date="", until="", expired=why)
+        for name, why in (("drive", ""), ("compass", "too old"))
+    ]
+    robot.calibration = CalibrationHealth(stamp=0, received=0, seq=0, wizards=tuple(rows))
+    asyncio.run(orders._announce(robot, hold=True))  # type: ignore[arg-type]
+    assert "calibration of compass has expired (too old)" in (said := capsys.readouterr().err)
+    assert "drive" not in said
