@@ -211,7 +211,7 @@ class CalibrationWatch:
         results: of the calibration that it runs on.
         bus: whose messages are marked.
         clock: time.
-        events: told when one ends.
+        events: gets an event when one ends.
         offload: where files are written.
         odometer: way in all.
     """
