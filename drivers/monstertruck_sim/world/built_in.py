@@ -1,4 +1,4 @@
-"""Worlds drawn by code: a loop with its lap, rooms, a maze of corridors, a ramp, an open yard, and a table.
+"""Worlds drawn by code: a loop with its lap, rooms, a maze of corridors, a ramp, an open yard, a table, and a hall.
 
 ``python -m monstertruck_sim.world.built_in configs`` writes them as map_server files, and the lap of ``loop``.
 """
@@ -148,6 +148,17 @@ def yard() -> BuiltIn:
     return BuiltIn(canvas.map(), (0.0, 0.0, 0.0))
 
 
+def hall() -> BuiltIn:
+    """A hall, 11 m x 6 m, with posts and niches along its walls: what is in it is the ground's business."""
+    canvas = _Canvas((-1.4, 10.4), (-3.5, 3.5))
+    canvas.free = canvas.rectangle(-1.0, -3.0, 10.0, 3.0)
+    for niche in ((0.5, 2.9, 1.4, 3.3), (6.0, 2.9, 6.5, 3.2), (3.0, -3.3, 4.2, -2.9), (9.9, -1.6, 10.3, -0.4)):
+        canvas.free |= canvas.rectangle(*niche)
+    for post in ((2.6, 2.8, 0.15), (8.2, 2.7, 0.2), (1.2, -2.8, 0.12), (6.8, -2.7, 0.2), (-0.8, 1.4, 0.1)):
+        canvas.free &= ~canvas.disc(*post)
+    return BuiltIn(canvas.map(), (0.0, 0.0, 0.0))
+
+
 TABLE = 3.0
 """Side of the test stand's table, m."""
 
@@ -167,6 +178,7 @@ BUILT_IN: dict[str, Callable[[], BuiltIn]] = {
     "ramp": ramp,
     "yard": yard,
     "table": table,
+    "hall": hall,
 }
 
 

@@ -4,6 +4,7 @@ These are the *true* values of the plant. What the daemon believes stands in its
 is made by changing a value here and not there. ``noise: false`` leaves the physics and drops every random part.
 """
 
+from pathlib import Path
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
@@ -485,6 +486,108 @@ class PersonConfig(Schema):
         return self
 
 
+class Hills(Schema):
+    """Random smooth ground, drawn by a seed of its own: hills, or with a short wave the roughness of a meadow."""
+
+    kind: Literal["hills"]
+    height: NotNegative = 0.05
+    """Standard deviation, m."""
+    wavelength: Annotated[float, Field(ge=0.15)] = 2.0
+    """Shortest wave, m."""
+    seed: Annotated[int, Field(ge=0)] = 1
+    flat: NotNegative = 0.5
+    """Radius of level ground around the robot's start, m."""
+
+
+class Slope(Schema):
+    """An inclined plane between two levels: a ramp, or the side of a hill."""
+
+    kind: Literal["slope"]
+    x: float = 0.0
+    """Where it begins, m."""
+    y: float = 0.0
+    """m."""
+    direction: float = 0.0
+    """In which it rises, rad."""
+    angle_deg: Annotated[float, Field(ge=-40, le=40)] = 10.0
+    length: Positive = 2.0
+    """Of it seen from above, m."""
+
+
+class UprightStep(Schema):
+    """A box with upright sides on the ground: a step, a kerb, a threshold, a stone."""
+
+    kind: Literal["step"]
+    x: float
+    """Of its middle, m."""
+    y: float
+    """m."""
+    yaw: float = 0.0
+    """rad."""
+    length: Positive = 0.1
+    """m."""
+    width: Positive = 1.0
+    """m."""
+    height: Positive = 0.03
+    """m."""
+
+
+class Ditch(Schema):
+    """A furrow with sloping sides, straight from one place to another."""
+
+    kind: Literal["ditch"]
+    x: float
+    """Of its middle, m."""
+    y: float
+    """m."""
+    yaw: float = 0.0
+    """Along it, rad."""
+    length: Positive = 2.0
+    """m."""
+    width: Positive = 0.3
+    """At the top, m."""
+    depth: Positive = 0.05
+    """m."""
+
+
+class Rubble(Schema):
+    """Flat stones scattered over a rectangle, drawn by a seed of its own."""
+
+    kind: Literal["rubble"]
+    x: float = 0.0
+    """Of its middle, m."""
+    y: float = 0.0
+    """m."""
+    length: Positive = 2.0
+    """Along x, m."""
+    width: Positive = 2.0
+    """Along y, m."""
+    count: Annotated[int, Field(ge=1, le=200)] = 40
+    height: Positive = 0.04
+    """Of the highest one, m."""
+    size: Positive = 0.25
+    """Longest side, m."""
+    seed: Annotated[int, Field(ge=0)] = 1
+
+
+class HeightImage(Schema):
+    """Heights from a grey picture: black is 0, white is ``height``."""
+
+    file: Path
+    """PNG, 8 or 16 bit"""
+    resolution: Positive = 0.05
+    """Of a pixel, m."""
+    height: float = 1.0
+    """m."""
+    x: float = 0.0
+    """Of its lower left corner, m."""
+    y: float = 0.0
+    """m."""
+
+
+GroundFeature = Annotated[Hills | Slope | UprightStep | Ditch | Rubble, Field(discriminator="kind")]
+
+
 class WorldConfig(Schema):
     """One simulated world, and one robot in it."""
 
@@ -506,6 +609,12 @@ class WorldConfig(Schema):
     tilt: TiltConfig = GroundTilt()
     rough: Annotated[tuple[RoughPatch, ...], Field(strict=False)] = ()
     """Patches of rough ground"""
+    ground: Annotated[tuple[GroundFeature, ...], Field(strict=False)] = ()
+    """What makes the ground uneven, added up; engine mujoco only"""
+    height_image: HeightImage | None = None
+    """A picture of the ground, added to it; engine mujoco only"""
+    mjcf: Path | None = None
+    """MJCF file whose geometries stand in the world and do not move; engine mujoco only"""
     people: Annotated[tuple[PersonConfig, ...], Field(strict=False, max_length=50)] = ()
     """Who walks through it"""
 
@@ -516,4 +625,6 @@ class WorldConfig(Schema):
                 raise ValueError(f"engine mujoco: has no body {self.truck.body.kind}; expected truck")
             if self.tilt.kind != "ground":
                 raise ValueError(f"engine mujoco: tilt {self.tilt.kind}: the ground tilts the robot; expected ground")
+        elif self.ground or self.height_image is not None or self.mjcf is not None:
+            raise ValueError("engine plane: has no ground, height_image or mjcf; expected engine mujoco")
         return self

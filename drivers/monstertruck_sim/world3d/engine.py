@@ -22,13 +22,11 @@ from monstertruck_sim.world.obstacles import Box, Disc, Obstacle
 from monstertruck_sim.world.plane import Engine, PlanOutline, without
 from monstertruck_sim.world.plant import Caster, Pose
 from monstertruck_sim.world.sensors import LEVEL_BEAMS, Beams, Uneven, over, turned
-from monstertruck_sim.world.terrain import LEVEL, Terrain
-from monstertruck_sim.world3d.heights import HeightGrid
+from monstertruck_sim.world3d.ground import blocks, ground_heights, scenery
 from monstertruck_sim.world3d.model import (
     PARKED,
     SPARE,
     TALL,
-    Block,
     DriveLine,
     Group,
     Site,
@@ -37,8 +35,6 @@ from monstertruck_sim.world3d.model import (
 )
 from monstertruck_sim.world3d.plant import RigidPlant
 
-HEIGHT_STEP: Final = 0.05
-"""Distance of the points of the height field, m."""
 _RAYS: Final = 64
 """Beams that are cast at blocks from one origin; each is corrected for its own."""
 
@@ -226,32 +222,26 @@ def drive_line(truck: SimTruckConfig, parts: Mechanics) -> DriveLine:
     )  # fmt: skip
 
 
-def height_grid(terrain: Terrain, bounds: tuple[float, float, float, float]) -> HeightGrid:
-    """A terrain, looked at on a grid over a rectangle: least and greatest x, then y, m."""
-    x0, x1, y0, y1 = bounds
-    columns, rows = (int(np.ceil((high - low) / HEIGHT_STEP)) + 1 for low, high in ((x0, x1), (y0, y1)))
-    xs, ys = x0 + np.arange(columns) * HEIGHT_STEP, y0 + np.arange(rows) * HEIGHT_STEP
-    x, y = np.meshgrid(xs, ys)
-    return HeightGrid(np.ascontiguousarray(terrain.height(x, y)), HEIGHT_STEP, (x0, y0))
-
-
 def rigid(config: WorldConfig, footprint: PlanOutline, start: Pose) -> Engine:
-    """One robot of rigid bodies."""
+    """One robot of rigid bodies.
+
+    Raises:
+        InputError: a file of the world is not there or does not fit.
+    """
     scene = footprint.scene
     place, truck = scene.place, config.truck
     resolution, (x0, y0) = place.map.resolution, place.map.origin
     rows, columns = place.map.cells.shape
     bounds = x0, x0 + columns * resolution, y0, y0 + rows * resolution
-    uneven = place.profile is not None or bool(config.rough)
-    heights = height_grid(Terrain(place.profile or LEVEL, config.rough), bounds) if uneven else None
+    heights = ground_heights(config, place.profile, bounds, start)
     ground: Uneven = heights if heights is not None else LevelGround()
     parts = mechanics(truck, config.mechanics)
     description = truck_description(Size(truck.wheelbase, truck.track, truck.wheel_radius), parts)
     drive = drive_line(truck, parts)
     longest = 80 if heights is None else round(0.25 / resolution)
     walls = rectangles(place.map.cells == OCCUPIED, resolution, place.map.origin, longest)
-    blocks: tuple[Block, ...] = ()
-    site = Site(walls, config.lidar.wall_height, heights, blocks)
+    scene_files = scenery(config.mjcf) if config.mjcf is not None else ((), ())
+    site = Site(walls, config.lidar.wall_height, heights, blocks(config.ground, heights), scene_files)
     model = load(description, drive, parts.friction, site)
     linkage = truck.chassis().linkage
     assert isinstance(linkage, LinkedAxles)

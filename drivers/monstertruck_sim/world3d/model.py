@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from monstertruck_kinematics.description import Description, Part, PartJoint, Shape
 from monstertruck_kinematics.elementary import Array
+from monstertruck_runtime.errors import InputError
 from monstertruck_sim.world3d.heights import HeightGrid
 
 TIMESTEP: Final = 0.002
@@ -86,12 +87,14 @@ class Site:
         wall_height: over the ground, m.
         heights: of the ground; None = level at 0.
         blocks: on it.
+        scenery: assets, and bodies and geometries, of another MJCF file.
     """
 
     walls: Array
     wall_height: float
     heights: HeightGrid | None
     blocks: tuple[Block, ...] = ()
+    scenery: tuple[Sequence[Element], Sequence[Element]] = ((), ())
 
 
 def rectangles(solid: NDArray[np.bool_], resolution: float, origin: tuple[float, float], longest: int = 80) -> Array:
@@ -150,14 +153,14 @@ def mjcf(description: Description, drive: DriveLine, friction: float, site: Site
     visual = SubElement(root, "visual")
     SubElement(visual, "global", offwidth="1280", offheight="960", fovy="60")
     SubElement(visual, "map", znear="0.005", zfar="100")
-    SubElement(visual, "quality", shadowsize="1024")
+    SubElement(visual, "quality", shadowsize="1024", offsamples="0")
+    SubElement(visual, "headlight", ambient="0.35 0.35 0.35", diffuse="0.25 0.25 0.25", specular="0 0 0")
     default = SubElement(root, "default")
     SubElement(default, "geom", contype="1", conaffinity="2", friction=f"{friction} 0.005 0.0001")
     asset = SubElement(root, "asset")
     _materials(asset)
     world = SubElement(root, "worldbody")
-    SubElement(world, "light", pos="0 0 6", dir="0.2 0.1 -1", directional="true", diffuse="0.7 0.7 0.7")
-    SubElement(world, "light", pos="3 3 6", dir="-0.4 -0.5 -1", directional="true", diffuse="0.3 0.3 0.3")
+    SubElement(world, "light", pos="0 0 6", dir="0.2 0.1 -1", directional="true", diffuse="0.45 0.45 0.45")
     _ground(asset, world, site.heights)
     _walls(world, site)
     for i, block in enumerate(site.blocks):
@@ -172,6 +175,7 @@ def mjcf(description: Description, drive: DriveLine, friction: float, site: Site
             euler=_text(0.0, block.pitch, block.yaw),
             rgba="0.55 0.5 0.42 1",
         )
+    _scenery(asset, world, site.scenery)
     _spare(world)
     _robot(world, description)
     _drive(root, description, drive)
@@ -179,8 +183,15 @@ def mjcf(description: Description, drive: DriveLine, friction: float, site: Site
 
 
 def load(description: Description, drive: DriveLine, friction: float, site: Site) -> mujoco.MjModel:
-    """``mjcf`` compiled, with the heights in it."""
-    model = mujoco.MjModel.from_xml_string(mjcf(description, drive, friction, site))
+    """``mjcf`` compiled, with the heights in it.
+
+    Raises:
+        InputError: the scenery of another file does not fit.
+    """
+    try:
+        model = mujoco.MjModel.from_xml_string(mjcf(description, drive, friction, site))
+    except ValueError as error:
+        raise InputError(f"sim.world: MuJoCo refuses the model: {' '.join(str(error).split())}") from error
     if (heights := site.heights) is not None:
         low, high = float(heights.z.min()), float(heights.z.max())
         model.hfield_data[:] = ((heights.z - low) / max(high - low, _FLAT)).astype(np.float32).ravel()
@@ -241,6 +252,16 @@ def _walls(world: Element, site: Site) -> None:
             pos=_text((x0 + x1) / 2, (y0 + y1) / 2, (top + bottom) / 2),
             rgba="0.86 0.84 0.78 1",
         )
+
+
+def _scenery(asset: Element, world: Element, scenery: tuple[Sequence[Element], Sequence[Element]]) -> None:
+    asset.extend(scenery[0])
+    for element in scenery[1]:
+        for geom in element.iter("geom"):
+            geom.set("group", f"{Group.BLOCKS.value}")
+            geom.set("contype", "1")
+            geom.set("conaffinity", "2")
+        world.append(element)
 
 
 def _spare(world: Element) -> None:

@@ -21,7 +21,12 @@ DEADMAN_LINE: Final[Mapping[str, Any]] = {
 class SimulatedTruckConfig(TruckConfig):
     """A truck whose devices are emulated."""
 
-    FILE_KEYS: ClassVar[tuple[tuple[str, ...], ...]] = (*TruckConfig.FILE_KEYS, ("sim", "recording"))
+    FILE_KEYS: ClassVar[tuple[tuple[str, ...], ...]] = (
+        *TruckConfig.FILE_KEYS,
+        ("sim", "recording"),
+        ("sim", "world", "mjcf"),
+        ("sim", "world", "height_image", "file"),
+    )
 
     sim: SimConfig
 

@@ -15,16 +15,6 @@ from monstertruck_sim.world.world import World
 SECOND = 1_000_000_000
 
 
-@pytest.fixture
-def solid(field):
-    """The field of the plane's tests in three dimensions."""
-
-    def make(**config):
-        return field(engine="mujoco", **config)
-
-    return make
-
-
 def plant(driver):
     return driver.world._plant
 

@@ -1,0 +1,146 @@
+"""The ground of a world: its heights on a grid, what stands on it, and geometries from other MJCF files."""
+
+from collections.abc import Sequence
+from math import ceil, cos, radians, sin, tan
+from pathlib import Path
+from typing import Final
+from xml.etree import ElementTree as ET
+
+import numpy as np
+from PIL import Image, UnidentifiedImageError
+
+from monstertruck_kinematics.elementary import Array
+from monstertruck_runtime.errors import InputError
+from monstertruck_sim.world.config import (
+    Ditch,
+    GroundFeature,
+    HeightImage,
+    Hills,
+    Rubble,
+    Slope,
+    UprightStep,
+    WorldConfig,
+)
+from monstertruck_sim.world.noise import GROUND, generator
+from monstertruck_sim.world.plant import Pose
+from monstertruck_sim.world.terrain import LEVEL, Profile, Terrain
+from monstertruck_sim.world3d.heights import HeightGrid
+from monstertruck_sim.world3d.model import Block
+
+HEIGHT_STEP: Final = 0.05
+"""Distance of the points of the height field, m."""
+_MARGIN: Final = 1.0
+"""The height field goes on so far beyond the map, m."""
+_EMBEDDED: Final = 0.05
+"""How deep blocks stand in the ground, m."""
+
+Bounds = tuple[float, float, float, float]
+"""Least and greatest x, then y, m."""
+
+
+def ground_heights(config: WorldConfig, profile: Profile | None, bounds: Bounds, start: Pose) -> HeightGrid | None:
+    """Sum of the map's profile, rough patches, features and picture; None: level.
+
+    Raises:
+        InputError: no such picture.
+    """
+    shaped = any(not isinstance(feature, UprightStep | Rubble) for feature in config.ground)
+    if profile is None and not config.rough and not shaped and config.height_image is None:
+        return None
+    x0, x1, y0, y1 = bounds[0] - _MARGIN, bounds[1] + _MARGIN, bounds[2] - _MARGIN, bounds[3] + _MARGIN
+    columns, rows = (ceil((high - low) / HEIGHT_STEP) + 1 for low, high in ((x0, x1), (y0, y1)))
+    x, y = np.meshgrid(x0 + np.arange(columns) * HEIGHT_STEP, y0 + np.arange(rows) * HEIGHT_STEP)
+    z = Terrain(profile or LEVEL, config.rough).height(x, y)
+    for feature in config.ground:
+        z = z + _height(feature, x, y, start)
+    if config.height_image is not None:
+        z = z + _pictured(config.height_image).height(x, y)
+    return HeightGrid(np.ascontiguousarray(z), HEIGHT_STEP, (x0, y0))
+
+
+def _height(feature: GroundFeature, x: Array, y: Array, start: Pose) -> Array:
+    if isinstance(feature, Hills):
+        return _hills(feature, x, y, start)
+    if isinstance(feature, Slope):
+        along = (x - feature.x) * cos(feature.direction) + (y - feature.y) * sin(feature.direction)
+        return np.asarray(np.clip(along, 0.0, feature.length) * tan(radians(feature.angle_deg)))
+    if isinstance(feature, Ditch):
+        c, s = cos(feature.yaw), sin(feature.yaw)
+        along, across = c * (x - feature.x) + s * (y - feature.y), c * (y - feature.y) - s * (x - feature.x)
+        side = np.clip(2.0 * (1.0 - abs(across) / (feature.width / 2)), 0.0, 1.0)  # the middle half is its bottom
+        end = np.clip((feature.length / 2 - abs(along)) / (feature.width / 4), 0.0, 1.0)
+        return np.asarray(-feature.depth * side * end)
+    return np.zeros_like(x)
+
+
+def _hills(feature: Hills, x: Array, y: Array, start: Pose) -> Array:
+    """White noise without waves shorter than ``wavelength``, level around the start."""
+    noise = generator(feature.seed, GROUND).standard_normal(x.shape)
+    spectrum = np.fft.rfft2(noise)
+    fy, fx = np.fft.fftfreq(x.shape[0], HEIGHT_STEP), np.fft.rfftfreq(x.shape[1], HEIGHT_STEP)
+    short = np.hypot(fy[:, None], fx) * feature.wavelength
+    z = np.fft.irfft2(spectrum * np.exp(-(short**4)), s=x.shape)
+    z *= feature.height / max(float(z.std()), 1e-12)
+    rise = np.clip((np.hypot(x - start[0], y - start[1]) - feature.flat) / feature.wavelength, 0.0, 1.0)
+    return np.asarray(z * rise * rise * (3.0 - 2.0 * rise))
+
+
+def _pictured(config: HeightImage) -> HeightGrid:
+    try:
+        with Image.open(config.file) as image:
+            grey = np.asarray(image.convert("I" if image.mode.startswith("I") else "L"), dtype=np.float64)
+            white = 65535.0 if image.mode.startswith("I") else 255.0
+    except (OSError, UnidentifiedImageError) as error:
+        raise InputError(f"sim.world.height_image: {config.file}: {error}") from error
+    return HeightGrid(np.ascontiguousarray(grey[::-1]) / white * config.height, config.resolution, (config.x, config.y))
+
+
+def blocks(features: Sequence[GroundFeature], heights: HeightGrid | None) -> tuple[Block, ...]:
+    """Steps and stones, each standing a little in the ground."""
+    found: list[Block] = []
+    for feature in features:
+        if isinstance(feature, UprightStep):
+            found.append(
+                _standing(heights, feature.x, feature.y, (feature.length, feature.width, feature.height), feature.yaw)
+            )
+        elif isinstance(feature, Rubble):
+            rng = generator(feature.seed, GROUND, 1)
+            for _ in range(feature.count):
+                x = feature.x + float(rng.uniform(-0.5, 0.5)) * feature.length
+                y = feature.y + float(rng.uniform(-0.5, 0.5)) * feature.width
+                length, width = (feature.size * float(rng.uniform(0.3, 1.0)) for _ in range(2))
+                size = length, width, feature.height * float(rng.uniform(0.3, 1.0))
+                yaw, pitch = float(rng.uniform(-3.14, 3.14)), float(rng.uniform(-0.08, 0.08))
+                found.append(_standing(heights, x, y, size, yaw, pitch))
+    return tuple(found)
+
+
+def _standing(
+    heights: HeightGrid | None, x: float, y: float, size: tuple[float, float, float], yaw: float, pitch: float = 0.0
+) -> Block:
+    foot = 0.0 if heights is None else float(heights.height(np.array(x), np.array(y)))
+    length, width, height = size
+    middle = foot + (height - _EMBEDDED) / 2
+    return Block(x, y, middle, length, width, height + _EMBEDDED, yaw, pitch)
+
+
+def scenery(path: Path) -> tuple[list[ET.Element], list[ET.Element]]:
+    """Assets, and bodies and geometries, of an MJCF file.
+
+    Raises:
+        InputError: it is no MJCF file, or something in it moves.
+    """
+    try:
+        root = ET.parse(path).getroot()  # noqa: S314  # a file that the user names himself
+    except (OSError, ET.ParseError) as error:
+        raise InputError(f"sim.world.mjcf: {path}: {error}") from error
+    if root.tag != "mujoco":
+        raise InputError(f"sim.world.mjcf: {path}: expected <mujoco>, found <{root.tag}>")
+    for tag in ("joint", "freejoint", "actuator", "include"):
+        if next(root.iter(tag), None) is not None:
+            raise InputError(f"sim.world.mjcf: {path}: <{tag}>: expected geometries that do not move, in one file")
+    assets = [asset for section in root.findall("asset") for asset in section]
+    for asset in assets:
+        if (file := asset.get("file")) is not None:
+            asset.set("file", str((path.parent / file).resolve()))
+    return assets, [element for section in root.findall("worldbody") for element in section if element.tag != "light"]

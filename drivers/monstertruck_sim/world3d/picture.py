@@ -1,0 +1,105 @@
+"""Pictures of the world, rendered by software without a screen (EGL)."""
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_runtime.errors import NotInstalledError
+from monstertruck_sim.world3d.model import Group
+
+Picture = NDArray[np.uint8]
+"""(height, width, 3), red, green and blue, the top row first."""
+
+
+@dataclass(frozen=True, slots=True)
+class Eye:
+    """From where a picture is taken.
+
+    Args:
+        place: of the eye, m.
+        ahead: unit vector, the axis of the picture.
+        up: unit vector, at a right angle to it.
+        field_of_view: from the lower to the upper edge, rad.
+    """
+
+    place: tuple[float, float, float]
+    ahead: tuple[float, float, float]
+    up: tuple[float, float, float]
+    field_of_view: float = 1.0
+
+
+def looking(place: tuple[float, float, float], at: tuple[float, float, float], field_of_view: float = 1.0) -> Eye:
+    """An upright eye that looks at a point."""
+    ahead = np.subtract(at, place) / np.linalg.norm(np.subtract(at, place))
+    left = np.cross((0.0, 0.0, 1.0), ahead)
+    left /= np.linalg.norm(left)
+    up = np.cross(ahead, left)
+    return Eye(place, _triple(ahead), _triple(up), field_of_view)
+
+
+class WorldRenderer:
+    """Draws a model; to be used in one thread.
+
+    Args:
+        model: MuJoCo's.
+        width: of the pictures, pixels.
+        height: pixels.
+
+    Raises:
+        NotInstalledError: this computer has no EGL.
+    """
+
+    def __init__(self, model: mujoco.MjModel, width: int = 640, height: int = 480) -> None:
+        try:
+            from mujoco.egl import GLContext  # noqa: PLC0415  # raises where there is no EGL
+        except (ImportError, AttributeError) as error:
+            raise NotInstalledError(
+                f"pictures: no EGL on this computer (Debian: apt install libegl1): {error}"
+            ) from error
+        model.vis.global_.offwidth, model.vis.global_.offheight = width, height
+        self._model = model
+        try:
+            self._gl = GLContext(width, height)
+        except RuntimeError as error:
+            raise NotInstalledError(
+                f"pictures: EGL does not draw (Debian: apt install libegl-mesa0): {error}"
+            ) from error
+        self._gl.make_current()
+        self._scene = mujoco.MjvScene(model, maxgeom=5000)
+        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
+        self._view = mujoco.MjrRect(0, 0, width, height)
+        self._option = mujoco.MjvOption()
+        self._option.geomgroup[:] = [group in list(Group) for group in range(mujoco.mjNGROUP)]
+        self._pixels = np.empty((height, width, 3), np.uint8)
+
+    def draw(self, data: mujoco.MjData, eye: Eye, *, shadows: bool = True) -> Picture:
+        """The world at the state of ``data``."""
+        camera = mujoco.MjvCamera()
+        mujoco.mjv_updateScene(
+            self._model, data, self._option, None, camera, mujoco.mjtCatBit.mjCAT_ALL.value, self._scene
+        )
+        near = 0.01
+        half = near * np.tan(eye.field_of_view / 2)
+        for part in self._scene.camera:
+            part.pos[:], part.forward[:], part.up[:] = eye.place, eye.ahead, eye.up
+            part.frustum_near, part.frustum_far = near, 100.0
+            part.frustum_bottom, part.frustum_top = -half, half
+            part.frustum_center, part.frustum_width = 0.0, half * self._view.width / self._view.height
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows
+        self._gl.make_current()
+        mujoco.mjr_render(self._view, self._scene, self._context)
+        mujoco.mjr_readPixels(self._pixels, None, self._view, self._context)
+        return self._pixels[::-1].copy()
+
+    def close(self) -> None:
+        """Give the context back."""
+        self._context.free()
+        self._gl.free()
+
+
+def _triple(vector: NDArray[np.float64]) -> tuple[float, float, float]:
+    x, y, z = vector.tolist()
+    return x, y, z
