@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from monstertruck_kinematics.drive import Drive
 from monstertruck_kinematics.elementary import Array, KinematicsError, integrate, require_finite, require_positive
@@ -65,12 +66,82 @@ class CubicRamp:
         a1, a2 = self.coefficients
         return self.v0 + t * (self.a0 + t * (a1 + t * a2))
 
+    @property
+    def peaks(self) -> tuple[float, float]:
+        """Greatest amounts of acceleration and jerk within it."""
+        a1, a2 = self.coefficients
+        time, peak = self.duration, abs(self.a0)
+        if a2 and 0.0 < -a1 / (3.0 * a2) < time:
+            peak = max(peak, abs(self.a0 - a1**2 / (3.0 * a2)))
+        return peak, max(abs(2.0 * a1), abs(2.0 * a1 + 6.0 * a2 * time))
+
     def acceleration(self, t: float) -> float:
         """Acceleration at time t; 0 outside the ramp."""
         if not 0.0 <= t <= self.duration:
             return 0.0
         a1, a2 = self.coefficients
         return self.a0 + t * (2.0 * a1 + t * 3.0 * a2)
+
+
+@dataclass(frozen=True, slots=True)
+class TimedRamp:
+    """A speed that changes by the published cubic, from ``begin`` on."""
+
+    begin: float
+    shape: CubicRamp
+
+    def at(self, t: float) -> float:
+        """Speed at t."""
+        return self.shape.speed(t - self.begin)
+
+    def acceleration(self, t: float) -> float:
+        """Acceleration at t; 0 before and after the ramp."""
+        return self.shape.acceleration(t - self.begin)
+
+    def over(self, t: float) -> bool:
+        """Whether it has come to its end."""
+        return t - self.begin >= self.shape.duration
+
+
+def shortest_ramp(v0: float, a0: float, v1: float, max_acceleration: float, max_jerk: float) -> CubicRamp:
+    """The shortest cubic ramp from the present speed and acceleration within limits.
+
+    With acceleration a(t) = a0 + 2 a1 t + 3 a2 t^2 its jerk is greatest at one of the ends, |2 a1| or |2 a1 + 6 a2 T|,
+    and its acceleration at the start or where the jerk is 0.
+
+    Args:
+        v0: present speed.
+        a0: present acceleration; one beyond the limit is taken as the limit.
+        v1: speed at the end.
+        max_acceleration: of the whole ramp.
+        max_jerk: of the whole ramp.
+
+    Raises:
+        KinematicsError: a limit not above 0, or figures that are not finite.
+    """
+    require_positive("max_acceleration", max_acceleration)
+    require_positive("max_jerk", max_jerk)
+    for name, value in (("v0", v0), ("a0", a0), ("v1", v1)):
+        require_finite(name, value)
+    limit = max(max_acceleration, abs(a0)) * (1.0 + 1e-9)
+    change, jerk = v1 - v0, max_jerk * (1.0 + 1e-9)
+
+    def kept(time: Array) -> NDArray[np.bool_]:
+        a1, a2 = (3.0 * change - 2.0 * a0 * time) / time**2, (a0 * time - 2.0 * change) / time**3
+        ends = np.maximum(np.abs(2.0 * a1), np.abs(2.0 * a1 + 6.0 * a2 * time))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            turning = -a1 / (3.0 * a2)
+            peak = np.abs(a0 - a1**2 / (3.0 * a2))
+        inside = (turning > 0.0) & (turning < time)
+        return (ends <= jerk) & (~inside | (peak <= limit))
+
+    long = 2.0 * abs(change) / max_acceleration + 8.0 * (limit / max_jerk) + (6.0 * abs(change) / max_jerk) ** 0.5
+    times = np.geomspace(1e-3, max(long, 1e-2), 97)
+    first = int(np.argmax(kept(times)))
+    if first == 0:
+        return CubicRamp(v0, v1, float(times[0] if kept(times[:1])[0] else times[-1]), a0)
+    between = np.linspace(times[first - 1], times[first], 65)
+    return CubicRamp(v0, v1, float(between[int(np.argmax(kept(between)))]), a0)
 
 
 class MotionProfile(Protocol):

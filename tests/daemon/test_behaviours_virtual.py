@@ -123,3 +123,32 @@ def test_the_robot_with_five_sonars_follows_a_wall_of_the_yard_by_its_own_device
     assert not truth[:, 5].any()
     assert truth[-1, 1] - truth[0, 1] > 1.2
     assert 3.5 - 0.05 - truth[-40:, 2].mean() == pytest.approx(0.30, abs=0.03)  # of the sonar from the wall
+
+
+def test_method_3_finds_a_wall_of_the_yard_passes_a_niche_and_turns_in_a_corner_by_its_own_devices():
+    config, _ = load_config(FILE.with_name("sonar.yaml"), SimulatedTruckConfig)
+    config = with_overlay(config, {"recorder": None, "sim": {"world": {"start": {"x": 1.6, "y": 0.7, "yaw": 0.4}}}})
+
+    async def main(clock: VirtualClock):
+        rig = VirtualRig(config, clock)
+        with rig.daemon.bus.subscribe(topics.BEHAVIOUR, fifo(4096)) as states:
+            async with rig.running():
+                operator = LocalOperator(rig.daemon, clock)
+                await clock.sleep(2.0)
+                await operator.arm()
+                order = {**await operator.header(), "order": BehaviourOrder.START, "behaviour": "line_left"}
+                await operator.call("behave", order)
+                await clock.sleep(38.0)
+                truth = rig.truth.array()
+            return list(states.drain()), truth
+
+    states, truth = run_virtual(main, start=SECOND)
+    assert states[-1].running or states[-1].outcome is Reason.SHUTDOWN
+    assert not truth[:, 5].any()
+    phases = [state.phase for state in states]
+    order = [phase for i, phase in enumerate(phases) if phase and phase != phases[i - 1]]
+    assert order == ["settle", "search", "brake", "turn", "follow", "brake", "turn", "follow"]
+    sides = truth[:, 1] + 0.05 * np.cos(truth[:, 3]) - 0.05 * np.sin(truth[:, 3])  # x of the left sonar, heading south
+    south = (truth[:, 2] < 0.0) & (truth[:, 2] > -2.6) & (np.abs(truth[:, 3] + np.pi / 2) < 0.1)
+    assert south.sum() > 100
+    assert np.abs(3.5 - sides[south] - 0.30).max() < 0.015

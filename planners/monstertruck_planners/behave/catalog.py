@@ -26,6 +26,12 @@ BEHAVIOURS: Final = Catalog(
         implementation="monstertruck_planners.behave.move:Move",
         doc="Drives one arc, straight or turn on the spot under a motion profile",
     ),
+    Plugin(
+        name="wall_line",
+        settings="monstertruck_planners.behave.wall.config:WallLineConfig",
+        implementation="monstertruck_planners.behave.wall.line:WallLine",
+        doc="Follows a wall along a line fitted to the echoes (method 3, our own)",
+    ),
     base=BehaviourConfig,
 )
 """A behaviour is a ``Behaviour`` made from its settings; it asks for motion through the gate."""

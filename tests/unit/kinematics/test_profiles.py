@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 
 from monstertruck_kinematics.elementary import KinematicsError
-from monstertruck_kinematics.profiles import BasicMove, CubicProfile, CubicRamp, TrapezoidalProfile, drive_move
+from monstertruck_kinematics.profiles import (
+    BasicMove,
+    CubicProfile,
+    CubicRamp,
+    TimedRamp,
+    TrapezoidalProfile,
+    drive_move,
+    shortest_ramp,
+)
 from monstertruck_kinematics.steered import Ackermann, Bicycle, FourWheelSteer, IndependentSteer, Synchro, Tricycle
 from monstertruck_kinematics.unsteered import Differential, SkidSteer, mecanum, omni
 
@@ -136,3 +144,35 @@ def test_a_bearing_turns_the_direction_of_travel():
     assert BasicMove.straight(1.0, math.pi / 2).direction == (0.0, 1.0, 0.0)
     assert BasicMove.arc(2.0, 1.0, -math.pi / 2).direction == (0.0, -1.0, 0.5)
     assert BasicMove.spot(1.0).direction == (0.0, 0.0, 1.0)
+
+
+@pytest.mark.parametrize(("v0", "a0", "v1"), [(0, 0, 0.2), (0.2, -0.5, 0.3), (0.3, 0.6, -0.1), (0.1, 0.3, 0.1)])
+def test_the_shortest_ramp_keeps_its_limits_and_none_shorter_does(v0, a0, v1):
+    ramp = shortest_ramp(v0, a0, v1, 0.6, 4.8)
+    assert (ramp.speed(0.0), ramp.speed(ramp.duration)) == (pytest.approx(v0), pytest.approx(v1))
+    assert ramp.acceleration(0.0) == pytest.approx(a0)
+    assert ramp.acceleration(ramp.duration) == pytest.approx(0.0, abs=1e-9)
+    t = np.arange(0.0, ramp.duration, 1e-3)
+    a = np.array([ramp.acceleration(at) for at in t])
+    assert np.abs(a).max() == pytest.approx(ramp.peaks[0], abs=1e-3)
+    assert np.abs(np.diff(a)).max() / 1e-3 == pytest.approx(ramp.peaks[1], abs=0.05)
+    assert ramp.peaks[0] <= 0.6 + 1e-6
+    assert ramp.peaks[1] <= 4.8 + 1e-6
+    shorter = CubicRamp(v0, v1, 0.98 * ramp.duration, a0).peaks
+    assert shorter[0] > 0.6 + 1e-6 or shorter[1] > 4.8 + 1e-6
+
+
+def test_from_rest_it_is_the_published_ramp_and_begun_ramps_go_on_as_they_were():
+    ramp = shortest_ramp(0.0, 0.0, 0.2, 0.6, 4.8)
+    assert ramp.duration == pytest.approx(0.5, abs=1e-3)
+    timed = TimedRamp(3.0, ramp)
+    rest = shortest_ramp(timed.at(3.2), timed.acceleration(3.2), 0.2, 0.6, 4.8)
+    assert rest.duration == pytest.approx(ramp.duration - 0.2, abs=2e-3)
+    assert not timed.over(3.2)
+    assert timed.over(3.6)
+
+
+@pytest.mark.parametrize("wrong", [{"max_acceleration": 0.0}, {"max_jerk": -1.0}, {"v0": math.nan}])
+def test_limits_and_speeds_of_a_ramp_are_checked(wrong):
+    with pytest.raises(KinematicsError, match=next(iter(wrong))):
+        shortest_ramp(**{"v0": 0.0, "a0": 0.0, "v1": 1.0, "max_acceleration": 0.6, "max_jerk": 4.8, **wrong})

@@ -66,3 +66,49 @@ class WallSwitchingConfig(WallConfig):
     """Range of any of front, diagonal and side sonar below which it turns away, m"""
     beyond: Metres = 0.05
     """Metres beyond ``distance`` from which on it turns back towards the wall"""
+
+
+class WallLineConfig(BehaviourConfig):
+    """Method 3, our own: a line fitted to the echoes, in odom; figures are ours."""
+
+    kind: Literal["wall_line"] = "wall_line"
+    rate: Annotated[float, Field(ge=10, le=50)] = 20.0
+    """Steps a second"""
+    side: Literal["left", "right"] = "left"
+    """Where the wall is: left is a clockwise lap"""
+    distance: Metres = 0.30
+    """From the side sonar to the wall, m"""
+    speed: Annotated[float, Field(gt=0, le=0.3)] = 0.29
+    """Along the wall, m/s"""
+    creep: Annotated[float, Field(gt=0, le=0.3)] = 0.12
+    """Along a wall whose direction is not known well yet, m/s"""
+    turn_rate: Annotated[float, Field(gt=0, le=1)] = 0.8
+    """Greatest yaw rate of turns on the spot, rad/s"""
+    acceleration: Annotated[float, Field(gt=0, le=0.6)] = 0.6
+    """Greatest of a ramp, m/s^2 and rad/s^2"""
+    jerk: Annotated[float, Field(gt=0, le=4.8)] = 4.8
+    """Greatest of a ramp, m/s^3 and rad/s^3"""
+    braking: Annotated[float, Field(gt=0, le=0.6)] = 0.35
+    """Greatest deceleration of a ramp to standstill before a wall, m/s^2: gentler than what the gate allows there"""
+    lead: Annotated[float, Field(ge=0, le=0.3)] = 0.08
+    """Seconds from a request to the body's motion: requests are those of a ramp so much later"""
+    play: Annotated[float, Field(ge=0, le=0.3)] = 0.0
+    """The part of it by which the body follows its wheels, s: odometry by encoders is ahead of the body by so much"""
+    beam: bool = False
+    """Sonars hear along their axis only; otherwise in the cone that ``sensor/sonar`` states"""
+    critical_angle: Annotated[float, Field(gt=0, le=1.4)] = 0.45
+    """Greatest angle from a wall's normal at which sound comes back, rad; without ``beam``"""
+    window: Metres = 3.0
+    """Way over which echoes count for the line, m: longer is steadier, and trusts the odometry longer"""
+    stiffness: Annotated[float, Field(gt=0, le=2)] = 0.3
+    """Way in which a distance error decays by the control, m; critically damped"""
+    door: Metres = 1.3
+    """Way without a wall that is driven straight on along the line before another wall is searched for, m"""
+    search: Annotated[float, Field(gt=0, le=100)] = 25.0
+    """Way without a wall after which it gives up, m"""
+    lap_length: Annotated[float, Field(gt=0, le=1000)] = 4.0
+    """Least way of a lap, m"""
+    lap_radius: Metres = 0.6
+    """So near to where following began, by odometry, a lap is complete, m, and 1 % of the lap's way more"""
+    laps: Annotated[int, Field(ge=1, le=100)] = 1
+    """After which it stops"""

@@ -10,20 +10,16 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Final, Literal, NamedTuple
 
-from monstertruck_kinematics.profiles import CubicRamp
+from monstertruck_kinematics.profiles import CubicRamp, TimedRamp
 from monstertruck_planners.behave.api import BehaviourStep, Inputs, RequestedMotion
 from monstertruck_planners.behave.wall.config import WallConfig, WallPdConfig, WallSwitchingConfig
+from monstertruck_planners.behave.wall.monitor import NAMES, SonarMonitor
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.sensor import SonarRanges
 from monstertruck_schemas.state import Odometry
 from monstertruck_schemas.topics import ODOMETRY, SONAR, Topic
 
 DIAGONAL: Final = math.radians(45)
 """Angle between the side sonar and the diagonal one."""
-SILENT: Final = 0.5
-"""Seconds without any answer of a sonar after which it counts as dead."""
-FROZEN: Final = 0.6
-"""Angle, rad, over which a sonar's range cannot stay the same to the last digit."""
 STALL: Final = 1.0
 """Seconds of motion asked for without any after which a motor counts as stalled."""
 SAME_WAY: Final = 1.2
@@ -32,8 +28,6 @@ FOLLOWING: Final = ("follow", "free")
 """Phases in which a lap may begin: the robot drives along the wall."""
 AT_REST: Final = 0.01
 """m/s."""
-
-NAMES: Final = {"left": ("l", "fl", "f", "fr"), "right": ("r", "fr", "f", "fl")}
 
 Phase = Literal["approach", "follow", "turn_away", "free", "turn_back", "stop"]
 
@@ -64,69 +58,9 @@ def wall_distance(diagonal: float, side: float, offset: float = 0.0) -> float:
     return side * math.cos(wall_angle(diagonal, side, offset))
 
 
-@dataclass(frozen=True, slots=True)
-class TimedRamp:
-    """A speed that changes by the published cubic, from ``begin`` on."""
-
-    begin: float
-    shape: CubicRamp
-
-    def at(self, t: float) -> float:
-        """Speed at t."""
-        return self.shape.speed(t - self.begin)
-
-
 def ramp(begin: float, start: float, end: float, duration: float) -> TimedRamp:
     """From ``start`` to ``end`` without acceleration at both ends."""
     return TimedRamp(begin, CubicRamp(start, end, duration))
-
-
-@dataclass(frozen=True, slots=True)
-class SonarMonitor:
-    """Notices sonars that are silent, and ranges that do not change although the robot turns."""
-
-    answered: dict[str, float] = field(default_factory=dict)
-    """When each answered last, s."""
-    echoes: dict[str, tuple[float, float]] = field(default_factory=dict)
-    """Newest range of each, m, and when it came, s."""
-    changed: dict[str, tuple[float, float]] = field(default_factory=dict)
-    """Range of each when it changed last, m, and how far the robot had turned then, rad."""
-
-    def observe(self, sonars: SonarRanges, names: tuple[str, ...], turned: float, t: float) -> "SonarMonitor":
-        """After a message at t, with ``turned`` rad turned so far, left and right both counted."""
-        answered, echoes, changed = dict(self.answered), dict(self.echoes), dict(self.changed)
-        for name in names:
-            echo = sonars.echo(name)
-            answered.setdefault(name, t)
-            if echo is None or not echo.answered:
-                continue
-            answered[name] = t
-            if echo.range is not None:
-                echoes[name] = (echo.range, t)
-            measured = echo.range is not None and sonars.range_min < echo.range < sonars.range_max
-            value = echo.range if measured and echo.range is not None else math.inf  # limits may repeat
-            if name not in changed or changed[name][0] != value or not math.isfinite(value):
-                changed[name] = (value, turned)
-        return SonarMonitor(answered, echoes, changed)
-
-    def fault(self, turned: float, t: float) -> tuple[Reason, str] | None:
-        """What is wrong with the sonars at t."""
-        for name, at in self.answered.items():
-            if t - at >= SILENT:
-                return Reason.INPUT_STALE, f"sonar {name} has not answered for {t - at:.1f} s"
-        for name, (value, at) in self.changed.items():
-            if turned - at > FROZEN:
-                degrees = math.degrees(turned - at)
-                return (
-                    Reason.INPUT_CONTRADICTORY,
-                    f"sonar {name} measures {value:.3f} m although the robot turned by {degrees:.0f} degrees",
-                )
-        return None
-
-    def range(self, name: str, hold: float, furthest: float, t: float) -> float:
-        """The newest echo if it is not older than ``hold``, else the greatest range, m."""
-        value, at = self.echoes.get(name, (furthest, -math.inf))
-        return value if t - at <= hold else furthest
 
 
 @dataclass(frozen=True, slots=True)

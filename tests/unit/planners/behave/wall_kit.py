@@ -6,11 +6,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from monstertruck_planners.behave.api import Behaviour, BehaviourStep, Inputs, RequestedMotion
+from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.base import Pose2D, Twist2D
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.sensor import SonarEcho, SonarRanges
-from monstertruck_schemas.state import Odometry
-from monstertruck_schemas.topics import ODOMETRY, SONAR
+from monstertruck_schemas.sensor import Imu, SonarEcho, SonarRanges, Vector3
+from monstertruck_schemas.state import Odometry, Transform, Transforms
+from monstertruck_schemas.topics import IMU, ODOMETRY, SONAR, TRANSFORMS
 
 PLACES = {
     "l": (0.0, 0.05, math.pi / 2),
@@ -47,6 +48,26 @@ def odometry(x=0.0, y=0.0, yaw=0.0, vx=0.0, wz=0.0, now=0):
     )
 
 
+def imu(wz=0.0, now=0):
+    still, gravity = Vector3(x=0.0, y=0.0, z=wz), Vector3(x=0.0, y=0.0, z=9.81)
+    return Imu(stamp=now, received=now, seq=0, frame="imu", angular_velocity=still, linear_acceleration=gravity)
+
+
+def frames(ahead=0.0, left_out=()):
+    mounts = [
+        Transform(
+            parent="base",
+            child=f"sonar_{name}",
+            stamp=0,
+            translation=(x + ahead, y, 0.0),
+            rotation=(0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)),
+        )
+        for name, (x, y, yaw) in PLACES.items()
+        if name not in left_out
+    ]
+    return Transforms(stamp=0, received=0, seq=0, frame="odom", transforms=tuple(mounts))
+
+
 def rectangle(length, width):
     corners = np.array([(0, 0), (length, 0), (length, width), (0, width)], dtype=float) - (length / 2, width / 2)
     return [(*corners[i], *corners[(i + 1) % 4]) for i in range(4)]
@@ -79,6 +100,8 @@ class Robot:
     """Every so many-th message has no echo at all; 0 = none."""
     ahead: float = 0.0
     """Of the side sonars before the axle, m."""
+    bias: float = 0.0
+    """Of the gyroscope, rad/s."""
     count: int = 0
 
     def inputs(self):
@@ -92,8 +115,16 @@ class Robot:
         if self.dropped and self.count % self.dropped == 0:
             ranges = dict.fromkeys(ranges)
         ranges |= self.stuck
-        vx = 0.0 if self.stalled else self.motion.vx
-        return Inputs({SONAR.name: sonars(ranges, dead=self.dead), ODOMETRY.name: odometry(x, y, yaw, vx)})
+        vx, wz = (0.0, 0.0) if self.stalled else self.motion[:2]
+        now = self.count * round(PERIOD * SECOND)
+        return Inputs(
+            {
+                SONAR.name: sonars(ranges, dead=self.dead, now=now),
+                ODOMETRY.name: odometry(x, y, yaw, vx, wz, now),
+                IMU.name: imu(wz + self.bias, now),
+                TRANSFORMS.name: frames(self.ahead),
+            }
+        )
 
     def move(self):
         if self.stalled:

@@ -1,0 +1,571 @@
+"""Wall following by a line fitted to echoes: method 3, our own.
+
+The wall is a line in odom that touches the arcs of the echoes of the last metres. The robot drives along the line at
+its distance, and through a gap along the line as it was. A wall ahead is a second line; where both distances are kept
+the robot stands, turns on the spot until it is parallel to the new wall, and goes on. Speeds change by cubic ramps from
+the present speed and acceleration; what odometry (speed) and gyroscope (yaw rate) lack of them is made up for.
+All is written for a wall on the left; a wall on the right is the mirror image.
+"""
+
+import math
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from typing import Any, ClassVar, Final, Literal, NamedTuple
+
+import numpy as np
+
+from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.profiles import CubicRamp, TimedRamp, shortest_ramp
+from monstertruck_planners.behave.api import BehaviourStep, Inputs, RequestedMotion
+from monstertruck_planners.behave.wall.config import WallLineConfig
+from monstertruck_planners.behave.wall.echoes import ECHO, TIGHT, Cone, Fit, Line, refine, residuals, search
+from monstertruck_planners.behave.wall.monitor import NAMES, SonarMonitor
+from monstertruck_runtime.clock import SECOND
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.sensor import SonarRanges
+from monstertruck_schemas.state import Odometry, Transforms
+from monstertruck_schemas.topics import IMU, ODOMETRY, SONAR, TRANSFORMS, Topic
+
+SIDE, DIAGONAL, FRONT, FAR = range(4)
+"""Sonars by number, as in ``NAMES``."""
+OWN: Final = -1
+"""Number of an echo of another sonar that came from the wall beside, when that was ahead."""
+SETTLE: Final = 0.5
+"""Seconds at rest at the beginning, over which the gyroscope's bias is measured."""
+KEPT: Final = 1.0
+"""Seconds for which poses are kept: an echo is placed where the robot was then."""
+NEAR: Final = 1.2
+"""Front range from which on a wall ahead is estimated, m."""
+AHEAD: Final = 1.5, 0.8
+"""Way over which echoes count for the wall ahead, m: on free ground, and along a wall, behind which the foot of the
+perpendicular on the next one may lie."""
+UNSURE: Final = 0.008
+"""Standard deviation of the wall's direction above which the robot drives along it slowly, rad."""
+FRESH: Final = 0.35
+"""Seconds for which an echo shows what is before the robot."""
+FACING: Final = 1.1
+"""Greatest angle between the direction of travel and the normal of a wall that is ahead, rad."""
+LEAST: Final = 6
+"""Echoes that make a wall."""
+TOUCHING: Final = 0.16
+"""A range from which on the robot stops at once, m."""
+BEAM_CRITICAL: Final = 1.3
+"""Greatest angle from the normal at which a beam comes back, rad."""
+CATCH_UP: Final = 1.5
+"""Speed by which a lag is made up for, of the lag, 1/s."""
+LAG: Final = (0.05, 0.15)
+"""Greatest lag that is made up for: way, m, and angle, rad."""
+TURNS: Final = 0.5
+"""Greatest yaw rate along the wall, rad/s."""
+FASTEST: Final = 0.3
+"""m/s."""
+STRAY: Final = (0.3, 0.4)
+"""Yaw rate that is not the one asked for, rad/s, and the seconds after which a motor counts as stalled."""
+STALL: Final = 1.0
+"""Seconds without the motion asked for, after which the robot counts as stuck."""
+SLOW: Final = 0.2
+"""Share of the speed asked for below which the robot does not move."""
+EQUAL: Final = 12, 0.1
+"""Equal echoes in a row, and the way over which they came, m, from which on a sonar counts as stuck."""
+JUDGED: Final = 20
+"""Newest echoes of a sonar that tell whether it agrees with the wall."""
+DISAGREES, AGREES = 0.2, 0.7
+"""Share of them on the wall below which a sonar contradicts another one, whose share is above the second figure."""
+FOLLOWED: Final = 0.5
+"""Way along a wall after which a lap begins, m."""
+
+STANDSTILL: Final = TimedRamp(0.0, CubicRamp(0.0, 0.0, 1.0))
+
+Phase = Literal["settle", "search", "brake", "turn", "follow", "stop"]
+Pose = tuple[float, float, float]
+
+
+class Ear(NamedTuple):
+    """Mount of a sonar in base, with the wall on the left."""
+
+    x: float
+    y: float
+    yaw: float
+
+    @property
+    def reach(self) -> float:
+        """Of the robot's middle from what is at range 0 on the axis, along the axis, m."""
+        return self.x * math.cos(self.yaw) + self.y * math.sin(self.yaw)
+
+
+@dataclass(frozen=True, slots=True)
+class LineState:
+    """Between two steps; poses with the wall on the left."""
+
+    phase: Phase = "settle"
+    ears: tuple[Ear, ...] = ()
+    poses: tuple[tuple[int, Pose, float], ...] = ()
+    """Of the last second by the odometry, with their stamps and speeds, m/s."""
+    pose: Pose = (0.0, 0.0, 0.0)
+    """Where the body is."""
+    heard: int = -1
+    """Stamp of the newest echoes taken in."""
+    echoes: Array = field(default_factory=lambda: np.empty((0, len(ECHO))))
+    monitor: SonarMonitor = field(default_factory=SonarMonitor)
+    wall: Line | None = None
+    """Along which it drives."""
+    sure: bool = False
+    """Whether the direction of ``wall`` is known well."""
+    ahead: Line | None = None
+    """To which it turns."""
+    v: TimedRamp = STANDSTILL
+    w: TimedRamp = STANDSTILL
+    lag: tuple[float, float] = (0.0, 0.0)
+    """Way, m, and angle, rad, that the robot is behind its ramps."""
+    bias: tuple[float, int] = (0.0, 0)
+    """Of the gyroscope, rad/s, and the samples it is the mean of."""
+    before: float | None = None
+    """Time of the newest step, s."""
+    sent: tuple[tuple[float, float, float], ...] = ()
+    """Speed and yaw rate that the ramps had, and the time for which they were asked for: of the last second."""
+    travelled: float = 0.0
+    turned: float = 0.0
+    """Rad, both ways counted."""
+    marks: tuple[float, float] = (0.0, 0.0)
+    """``travelled`` and ``turned`` when the phase began."""
+    seen: float = 0.0
+    """``travelled`` when the wall was heard last."""
+    sense: float = -1.0
+    """Of the turn: 1 = left."""
+    begun: Pose | None = None
+    """Where the lap began."""
+    since: float = 0.0
+    """``travelled`` then."""
+    laps: int = 0
+    strays: tuple[float | None, float | None] = (None, None)
+    """Since when yaw rate and speed are not those asked for, s."""
+    equal: tuple[tuple[float, int, float], ...] = ((0.0, 0, 0.0),) * 4
+    """Newest range of every sonar, how often it came in a row, and ``travelled`` when it came first."""
+
+
+class WallLine:
+    """Method 3.
+
+    Args:
+        config: settings.
+    """
+
+    reads: ClassVar[tuple[Topic[Any], ...]] = (SONAR, ODOMETRY, IMU, TRANSFORMS)
+
+    def __init__(self, config: WallLineConfig) -> None:
+        self._config = config
+        self._names = NAMES[config.side]
+        self._mirror = 1.0 if config.side == "left" else -1.0
+
+    def begin(self) -> LineState:
+        """Before the first step."""
+        return LineState()
+
+    def step(self, inputs: Inputs, state: LineState, t: float) -> BehaviourStep:
+        """One step; see ``Behaviour``."""
+        sonars, odometry = inputs.of(SONAR), inputs.of(ODOMETRY)
+        if not state.ears:
+            ears = self._mounts(inputs.of(TRANSFORMS))
+            if isinstance(ears, str):
+                return BehaviourStep(None, state, state.phase, Reason.INPUT_CONTRADICTORY, ears)
+            state = replace(state, ears=ears)
+        state = self._moved(state, odometry, inputs.of(IMU).angular_velocity.z * self._mirror, t)
+        cone = self._cone(sonars)
+        if sonars.stamp != state.heard:
+            state = self._hear(state, sonars, t)
+            state = self._estimate(state, cone)
+        fault = self._fault(state, odometry, cone, t)
+        if fault is not None:
+            return BehaviourStep(None, state, state.phase, *fault)
+        due = t + self._config.lead
+        state = self._advance(state, cone, due)
+        if state.phase == "stop" and state.v.over(due):
+            text = f"{state.laps} lap{'s' if state.laps > 1 else ''}, {state.travelled:.1f} m"
+            return BehaviourStep(None, state, state.phase, Reason.BEHAVIOUR_DONE, text)
+        v, w = state.v.at(due), state.w.at(due)
+        state = replace(state, sent=(*(entry for entry in state.sent if entry[0] > t - KEPT), (due, v, w)))
+        v, w = v + CATCH_UP * state.lag[0], w + CATCH_UP * state.lag[1]
+        motion = RequestedMotion(min(max(v, 0.0), FASTEST), w * self._mirror)
+        error = None if state.wall is None else self.error(state)
+        return BehaviourStep(motion, state, state.phase, values=_values(state, error))
+
+    # Inputs
+
+    def _mounts(self, transforms: Transforms) -> tuple[Ear, ...] | str:
+        """Mounts of the sonars, or what is missing."""
+        found = {transform.child: transform for transform in transforms.transforms}
+        ears = []
+        for name in self._names:
+            mount = found.get(f"sonar_{name}")
+            if mount is None:
+                return f"state/transforms has no frame sonar_{name}: expected the mounts of {', '.join(self._names)}"
+            x, y, _ = mount.translation
+            yaw = 2.0 * math.atan2(mount.rotation[2], mount.rotation[3])
+            ears.append(Ear(x, y * self._mirror, yaw * self._mirror))
+        return tuple(ears)
+
+    def _cone(self, sonars: SonarRanges) -> Cone:
+        config = self._config
+        return Cone(0.0, BEAM_CRITICAL) if config.beam else Cone(sonars.field_of_view / 2, config.critical_angle)
+
+    def _moved(self, state: LineState, odometry: Odometry, rate: float, t: float) -> LineState:
+        """Take in odometry and gyroscope."""
+        mirror = self._mirror
+        pose = odometry.pose.x, odometry.pose.y * mirror, odometry.pose.yaw * mirror
+        bias, count = state.bias
+        if state.phase == "settle":
+            bias, count = (bias * count + rate) / (count + 1), count + 1
+        oldest = odometry.stamp - round(KEPT * SECOND)
+        poses = tuple(entry for entry in state.poses if oldest <= entry[0] < odometry.stamp)
+        poses = (*poses, (odometry.stamp, pose, odometry.twist.vx))
+        pose, speed = _at(poses, odometry.stamp, self._config.play)
+        way = turn = 0.0
+        if state.poses:
+            way, turn = math.dist(pose[:2], state.pose[:2]), abs(math.remainder(pose[2] - state.pose[2], math.tau))
+        dt = 0.0 if state.before is None else t - state.before
+        v, w = _asked(state, t)
+        behind = state.lag[0] + (v - speed) * dt, state.lag[1] + (w - (rate - bias)) * dt
+        return replace(
+            state,
+            bias=(bias, count),
+            poses=poses,
+            pose=pose,
+            travelled=state.travelled + way,
+            turned=state.turned + turn,
+            lag=(_clip(behind[0], LAG[0]), _clip(behind[1], LAG[1])),
+            before=t,
+            strays=self._strays(state, speed, rate - bias, t),
+        )
+
+    def _strays(self, state: LineState, speed: float, rate: float, t: float) -> tuple[float | None, float | None]:
+        """Since when yaw rate and speed are not those asked for."""
+        v, w = _asked(state, t)
+        turns = abs(w - rate) > STRAY[0]
+        stands = (v > 0.05 and speed < SLOW * v) or (abs(w) > 0.2 and abs(rate) < SLOW * abs(w))
+        return (
+            (t if state.strays[0] is None else state.strays[0]) if turns else None,
+            (t if state.strays[1] is None else state.strays[1]) if stands else None,
+        )
+
+    def _hear(self, state: LineState, sonars: SonarRanges, t: float) -> LineState:
+        """Place the echoes of one round in odom."""
+        rows, equal = [], list(state.equal)
+        for number, name in enumerate(self._names):
+            echo = sonars.echo(name)
+            if echo is None or not echo.answered or echo.range is None:
+                continue
+            value, count, first = equal[number]
+            measured = sonars.range_min < echo.range < sonars.range_max
+            same = measured and value == echo.range
+            equal[number] = (value, count + 1, first) if same else (echo.range, 1, state.travelled)
+            if not measured:
+                continue
+            (x, y, yaw), _ = _at(state.poses, echo.stamp, self._config.play)
+            ear = state.ears[number]
+            c, s = math.cos(yaw), math.sin(yaw)
+            place = x + c * ear.x - s * ear.y, y + s * ear.x + c * ear.y, yaw + ear.yaw
+            rows.append((*place, echo.range, number, state.travelled, t))
+        echoes = state.echoes[state.echoes[:, 5] > state.travelled - self._config.window]
+        if rows:
+            echoes = np.vstack([echoes, np.array(rows)])
+        return replace(
+            state,
+            heard=sonars.stamp,
+            echoes=echoes[-600:],
+            equal=tuple(equal),
+            monitor=state.monitor.observe(sonars, self._names, state.turned, t),
+        )
+
+    # Walls
+
+    def _estimate(self, state: LineState, cone: Cone) -> LineState:
+        """Fit the wall beside and the one ahead anew."""
+        echoes, at = state.echoes, state.pose[:2]
+        if state.phase == "turn":
+            fit = self._turned_to(state, cone)
+            return state if fit is None else replace(state, ahead=fit.line)
+        wall = state.wall
+        if wall is not None:
+            beside = echoes[echoes[:, 4] <= DIAGONAL]
+            if len(beside):
+                fit = refine(beside, wall, at, cone)
+                wall, state = fit.line, replace(state, sure=fit.sigma[0] < UNSURE)
+                fresh = beside[beside[:, 6] == state.before]
+                if len(fresh) and (np.abs(residuals(fresh, wall, cone)) < TIGHT).any():
+                    state = replace(state, seen=state.travelled)
+        return replace(state, wall=wall, ahead=self._facing(state, cone))
+
+    def _facing(self, state: LineState, cone: Cone) -> Line | None:
+        """The wall ahead, once it is near: on free ground the nearer one of those by the sonars of either side."""
+        groups = ((DIAGONAL, FRONT), (FRONT, FAR)) if state.wall is None else ((FRONT, FAR),)
+        found = [line for group in groups if (line := self._faced(state, cone, group)) is not None]
+        return min(found, key=lambda line: self._way_to(state, line), default=None)
+
+    def _faced(self, state: LineState, cone: Cone, group: tuple[int, ...]) -> Line | None:
+        """A wall ahead by some sonars."""
+        echoes, pose = state.echoes, state.pose
+        rows = echoes[(echoes[:, 5] > state.travelled - _reach(state)) & np.isin(echoes[:, 4], group)]
+        fresh = _fresh(rows, state)
+        if len(rows) < LEAST or not len(fresh) or fresh[:, 3].min() > NEAR:
+            return None
+        fit = search(rows, pose[:2], cone)
+        facing = abs(math.remainder(fit.line.normal - pose[2], math.tau)) < FACING
+        present = (np.abs(residuals(fresh, fit.line, cone)) < TIGHT).mean() > 0.5
+        return fit.line if facing and present and fit.explained >= max(LEAST, 0.5 * len(rows)) else None
+
+    def _turned_to(self, state: LineState, cone: Cone) -> Fit | None:
+        """The wall that the robot turns to: of all echoes since it is near, but those of the wall it leaves."""
+        echoes, at = state.echoes, state.pose[:2]
+        late, sides = echoes[:, 5] > state.travelled - _reach(state), echoes[:, 4] < FRONT
+        turning = echoes[:, 5] >= state.marks[0]
+        rows = echoes[(late & ~sides) | ((late if state.wall is None else turning) & sides)]
+        if state.wall is not None and len(rows):
+            rows = rows[np.abs(residuals(rows, state.wall, cone)) > TIGHT]
+        if len(rows) < LEAST:
+            return None
+        fit = search(rows, at, cone)
+        return fit if fit.explained >= max(LEAST, 0.3 * len(rows)) else None
+
+    def _way_left(self, state: LineState) -> float:
+        """Way until the robot stands before the wall ahead at the distance at which it follows walls, m."""
+        left, fresh = math.inf, _fresh(state.echoes, state)
+        if state.ahead is not None:
+            left = self._way_to(state, state.ahead)
+        else:  # what is ahead makes no line: as if it were right before the sonar
+            for number in (FRONT,) if state.wall is not None else (DIAGONAL, FRONT, FAR):
+                ranges = fresh[fresh[:, 4] == number][-3:, 3]
+                if len(ranges) >= 2:
+                    left = min(left, float(np.median(ranges)) + state.ears[number].reach - self._keep(state))
+        near = fresh[np.isin(fresh[:, 4], (DIAGONAL, FRONT, FAR))][-6:, 3]
+        return min(left, 0.0) if np.count_nonzero(near < TOUCHING) >= 2 else left
+
+    def _way_to(self, state: LineState, line: Line) -> float:
+        """Way until the robot stands at the distance at which it follows walls before one, m."""
+        x, y, yaw = state.pose
+        return (line.distance(x, y) - self._keep(state)) / max(math.cos(line.normal - yaw), 0.4)
+
+    def _keep(self, state: LineState) -> float:
+        """Distance of the robot's middle from walls, m."""
+        ear = state.ears[SIDE]
+        return self._config.distance + ear.y
+
+    # Faults
+
+    def _fault(self, state: LineState, odometry: Odometry, cone: Cone, t: float) -> tuple[Reason, str] | None:
+        """Why it cannot go on."""
+        if (found := state.monitor.fault(state.turned, t)) is not None:
+            return found
+        for name, (value, count, first) in zip(self._names, state.equal, strict=True):
+            if count >= EQUAL[0] and state.travelled - first >= EQUAL[1]:
+                way = state.travelled - first
+                return Reason.INPUT_CONTRADICTORY, f"sonar {name} measured {value:.3f} m all along {way:.2f} m"
+        turns, stands = state.strays
+        if turns is not None and t - turns > STRAY[1]:
+            text = f"{state.w.at(t) * self._mirror:.2f} rad/s asked for and not turned: does a motor stall?"
+            return Reason.STUCK, text
+        if stands is not None and t - stands > STALL:
+            return Reason.STUCK, f"{state.v.at(t):.2f} m/s asked for, {odometry.twist.vx:.2f} m/s driven"
+        if state.phase == "turn" and state.turned - state.marks[1] > 1.2 * math.tau:
+            return Reason.STUCK, "turned once around and found no wall to follow"
+        if state.phase == "search" and state.travelled - state.marks[0] > self._config.search:
+            return Reason.STUCK, f"no wall within {self._config.search:.0f} m"
+        if state.phase == "follow" and state.wall is not None:
+            return self._disagreement(state, state.wall, cone)
+        return None
+
+    def _disagreement(self, state: LineState, wall: Line, cone: Cone) -> tuple[Reason, str] | None:
+        """A sonar that does not hear the wall that the other one hears."""
+        shares = []
+        for number in (SIDE, DIAGONAL):
+            rows = state.echoes[state.echoes[:, 4] == number][-JUDGED:]
+            if len(rows) < JUDGED or not cone.hears(float(rows[-1, 2]), wall.normal):
+                return None
+            shares.append(float((np.abs(residuals(rows, wall, cone)) < TIGHT).mean()))
+        for number, (share, other) in enumerate((shares, shares[::-1])):
+            if share < DISAGREES and other > AGREES:
+                name = self._names[number]
+                return Reason.INPUT_CONTRADICTORY, f"sonar {name} does not measure the wall that its neighbour does"
+        return None
+
+    # Phases
+
+    def _advance(self, state: LineState, cone: Cone, t: float) -> LineState:
+        """Ramps and phases at ``t``, the time for which motion is asked for now."""
+        config = self._config
+        match state.phase:
+            case "settle":
+                return self._to(state, "search") if t >= SETTLE else state
+            case "search" | "follow":
+                return self._drive(state, cone, t)
+            case "brake":
+                state = self._steer(state, t) if state.wall is not None else state
+                if not state.v.over(t):
+                    return replace(state, v=self._stopping(state.v, self._left(state, t), t))
+                state = self._to(state, "turn")
+                sense = self._sense(state)
+                return replace(state, sense=sense, w=self._ramp(state.w, sense * config.turn_rate, t))
+            case "turn":
+                return self._turn(state, cone, t)
+            case "stop":
+                return self._steer(state, t)
+
+    def _drive(self, state: LineState, cone: Cone, t: float) -> LineState:
+        """Along the wall, or straight on until there is one."""
+        config = self._config
+        slow = state.phase == "follow" and not state.sure
+        state = replace(state, v=self._ramp(state.v, config.creep if slow else config.speed, t))
+        if state.phase == "follow":
+            if state.travelled - state.seen > config.door:
+                state = self._to(replace(state, wall=None, begun=None), "search")
+            else:
+                state = self._lap(state)
+                if state.laps >= config.laps:
+                    return self._steer(self._to(replace(state, v=self._ramp(state.v, 0.0, t)), "stop"), t)
+        state = self._steer(state, t)
+        left, speed = self._left(state, t), state.v.at(t)
+        brake = shortest_ramp(speed, state.v.acceleration(t), 0.0, config.braking, config.jerk)
+        if left - speed / config.rate > brake.distance:
+            return state
+        return self._to(replace(state, v=self._stopping(TimedRamp(t, brake), left, t)), "brake")
+
+    def _left(self, state: LineState, t: float) -> float:
+        """``_way_left`` of where the robot is at ``t`` by its ramp, m."""
+        return self._way_left(state) - state.lag[0] - state.v.at(t) * self._config.lead
+
+    def _stopping(self, ramp: TimedRamp, left: float, t: float) -> TimedRamp:
+        """A ramp to standstill, computed anew so that it covers what is left, if that is within the limits."""
+        config, speed, change = self._config, ramp.at(t), ramp.acceleration(t)
+        if speed * left <= 0.0:
+            return ramp
+        shape = CubicRamp.to_rest(speed, left, change)
+        acceleration, jerk = shape.peaks
+        kept = shape.a0 == change and acceleration <= config.acceleration and jerk <= config.jerk
+        return TimedRamp(t, shape) if kept else ramp
+
+    def _turn(self, state: LineState, cone: Cone, t: float) -> LineState:
+        """On the spot, until it is parallel to the new wall."""
+        config, yaw = self._config, state.pose[2]
+        if state.w.shape.v1 == 0.0 and state.w.over(t):
+            return self._follow(state, cone)
+        if state.ahead is None:
+            return state
+        rate, change = state.w.at(t), state.w.acceleration(t)
+        sense = state.sense
+        left = (sense * (state.ahead.heading - yaw) + 0.5) % math.tau - 0.5
+        left -= sense * (state.lag[1] + rate * config.lead)
+        if state.w.shape.v1 == 0.0:
+            return replace(state, w=self._stopping(state.w, sense * left, t))
+        brake = shortest_ramp(rate, change, 0.0, config.acceleration, config.jerk)
+        if left - abs(rate) / config.rate > abs(brake.distance):
+            return state
+        return replace(state, w=self._stopping(TimedRamp(t, brake), sense * left, t))
+
+    def _follow(self, state: LineState, cone: Cone) -> LineState:
+        """Go on along the wall that the robot has turned to."""
+        wall = state.ahead
+        if wall is None:
+            return state
+        kept = state.echoes[np.abs(residuals(state.echoes, wall, cone)) < TIGHT].copy()
+        kept[:, 4] = np.where(kept[:, 4] <= DIAGONAL, kept[:, 4], OWN)
+        return replace(self._to(state, "follow"), wall=wall, ahead=None, echoes=kept, seen=state.travelled)
+
+    def _steer(self, state: LineState, t: float) -> LineState:
+        """Yaw rate by which the distance error decays; 0 without a wall."""
+        config, wall = self._config, state.wall
+        target = 0.0
+        if wall is not None:
+            error = self.error(state)
+            away = math.remainder(state.pose[2] - wall.heading, math.tau)
+            stiff = config.stiffness
+            target = state.v.at(t) * (max(min(error, stiff), -stiff) / stiff**2 - 2.0 * away / stiff)
+        return replace(state, w=self._ramp(state.w, _clip(target, TURNS), t))
+
+    def error(self, state: LineState) -> float:
+        """Distance of the side sonar from the wall less the one wanted, m; of a state with a wall."""
+        assert state.wall is not None
+        x, y, yaw = state.pose
+        ear = state.ears[SIDE]
+        c, s = math.cos(yaw), math.sin(yaw)
+        return state.wall.distance(x + c * ear.x - s * ear.y, y + s * ear.x + c * ear.y) - self._config.distance
+
+    def _sense(self, state: LineState) -> float:
+        """-1 to turn right: always from one wall to the next, from free ground the shorter way."""
+        if state.wall is not None or state.ahead is None:
+            return -1.0
+        return math.copysign(1.0, math.remainder(state.ahead.heading - state.pose[2], math.tau))
+
+    def _lap(self, state: LineState) -> LineState:
+        """Begin and count laps by odometry."""
+        config, (x, y, yaw) = self._config, state.pose
+        if state.begun is None:
+            if state.travelled - state.marks[0] < FOLLOWED:
+                return state
+            return replace(state, begun=(x, y, yaw), since=state.travelled)
+        way = state.travelled - state.since
+        bx, by, byaw = state.begun
+        passed = (x - bx) * math.cos(byaw) + (y - by) * math.sin(byaw) >= 0.0
+        near = math.hypot(x - bx, y - by) <= config.lap_radius + 0.01 * way
+        if way < config.lap_length or not passed or not near or math.cos(yaw - byaw) < math.cos(0.6):
+            return state
+        return replace(state, laps=state.laps + 1, since=state.travelled)
+
+    def _to(self, state: LineState, phase: Phase) -> LineState:
+        return replace(state, phase=phase, marks=(state.travelled, state.turned))
+
+    def _ramp(self, ramp: TimedRamp, target: float, t: float) -> TimedRamp:
+        """The ramp that runs if it ends at ``target``, else a new one from the present speed and acceleration."""
+        config = self._config
+        if abs(ramp.shape.v1 - target) < 1e-9:
+            return ramp
+        shape = shortest_ramp(ramp.at(t), ramp.acceleration(t), target, config.acceleration, config.jerk)
+        return TimedRamp(t, shape)
+
+
+def _asked(state: LineState, t: float) -> tuple[float, float]:
+    """Speed and yaw rate that were asked for a time."""
+    if not state.sent:
+        return 0.0, 0.0
+    times, speeds, rates = zip(*state.sent, strict=True)
+    return float(np.interp(t, times, speeds)), float(np.interp(t, times, rates))
+
+
+def _reach(state: LineState) -> float:
+    """Way over which echoes count for the wall ahead, m."""
+    return AHEAD[0] if state.wall is None else AHEAD[1]
+
+
+def _fresh(echoes: Array, state: LineState) -> Array:
+    """The echoes that came lately."""
+    return echoes[echoes[:, 6] > (state.before or 0.0) - FRESH]
+
+
+def _at(poses: tuple[tuple[int, Pose, float], ...], stamp: int, play: float) -> tuple[Pose, float]:
+    """Pose and speed of the body at a time: its place and speed are those of the odometry ``play`` earlier."""
+    (x, y, _), speed = _between(poses, stamp - round(play * SECOND))
+    return (x, y, _between(poses, stamp)[0][2]), speed
+
+
+def _between(poses: tuple[tuple[int, Pose, float], ...], stamp: int) -> tuple[Pose, float]:
+    """Pose and speed at a time, between two that are known; the newest or oldest ones outside them."""
+    if stamp >= poses[-1][0]:
+        return poses[-1][1:]
+    for (before, a, slow), (after, b, fast) in pairwise(poses):
+        if before <= stamp < after:
+            part = (stamp - before) / (after - before)
+            turn = math.remainder(b[2] - a[2], math.tau)
+            pose = a[0] + part * (b[0] - a[0]), a[1] + part * (b[1] - a[1]), a[2] + part * turn
+            return pose, slow + part * (fast - slow)
+    return poses[0][1:]
+
+
+def _clip(value: float, limit: float) -> float:
+    return min(max(value, -limit), limit)
+
+
+def _values(state: LineState, error: float | None) -> dict[str, float]:
+    values = {"travelled": state.travelled, "laps": float(state.laps)}
+    if error is not None:
+        values["error"] = error
+    if state.ahead is not None:
+        values["ahead"] = state.ahead.distance(*state.pose[:2])
+    return values

@@ -1,0 +1,121 @@
+"""Method 3: laps of a hall, gaps, ramps, and bad inputs."""
+
+import math
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from monstertruck_planners.behave.api import Inputs, RequestedMotion
+from monstertruck_planners.behave.wall.config import WallLineConfig
+from monstertruck_planners.behave.wall.line import WallLine
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.topics import IMU, ODOMETRY, SONAR, TRANSFORMS
+from tests.unit.planners.behave.wall_kit import PERIOD, Robot, drive, frames, rectangle
+
+HALL = rectangle(4.0, 3.0)
+LIMITS = 0.6 + 1e-6, 4.8 + 1e-6
+
+
+def follower(**settings):
+    return WallLine(WallLineConfig(rate=10.0, beam=True, lead=0.0, **settings))
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+@pytest.mark.parametrize("heading", [0.3, 2.0, -2.5])
+def test_a_lap_of_a_hall_ends_with_its_reason_and_keeps_the_distance(side, heading):
+    done = drive(follower(side=side, lap_length=6.0), Robot(HALL, (0.1, -0.1, heading), bias=0.01), 300.0)
+    assert done.outcome is Reason.BEHAVIOUR_DONE
+    assert done.clearance > 0.3
+    assert done.steps[-1].text.startswith("1 lap, ")
+    errors = [step.values["error"] for step in done.steps if step.phase == "follow"]
+    assert abs(np.median(errors)) < 0.003
+    assert {step.phase for step in done.steps} == {"settle", "search", "brake", "turn", "follow", "stop"}
+
+
+def test_every_ramp_keeps_acceleration_and_jerk_at_100_hz_and_speeds_do_not_jump():
+    done = drive(follower(lap_length=6.0), Robot(HALL, (0.1, -0.1, 0.3)), 300.0)
+    for ramp in {ramp for step in done.steps for ramp in (step.state.v, step.state.w)}:
+        t = np.arange(0.0, ramp.shape.duration, 0.01)
+        a = np.array([ramp.shape.acceleration(at) for at in t])
+        assert np.abs(a).max(initial=0.0) <= LIMITS[0]
+        assert np.abs(np.diff(a) / 0.01).max(initial=0.0) <= LIMITS[1]
+    motions = done.motions()
+    assert np.abs(np.diff(motions, axis=0)).max() < 0.8 * PERIOD
+    assert motions[:, 0].max() < 0.3
+
+
+def test_it_drives_straight_past_a_door_and_looks_for_another_wall_where_one_ends():
+    door = [(-9.0, 0.35, 1.0, 0.35), (1.9, 0.35, 6.0, 0.35)]
+    done = drive(follower(), Robot(door, (-1.0, 0.0, 0.4)), 50.0)
+    phases = [step.phase for step in done.steps]
+    first = phases.index("follow")
+    assert "search" in phases[first:]
+    gone = first + phases[first:].index("search")
+    assert done.poses[gone, 0] > 6.0
+    beside = done.poses[(done.poses[:, 0] > 1.0) & (done.poses[:, 0] < 1.9) & (np.arange(len(phases)) < gone)]
+    assert np.abs(beside[:, 1]).max() < 0.02
+
+
+def test_it_gives_up_where_there_is_no_wall():
+    done = drive(follower(search=2.0), Robot([(90.0, -1.0, 90.0, 1.0)], (0.0, 0.0, 0.0)), 30.0)
+    assert done.outcome is Reason.STUCK
+    assert "no wall within 2 m" in done.steps[-1].text
+
+
+def test_a_silent_sonar_and_a_stalled_motor_end_it_with_their_reason():
+    robot = Robot(HALL, (0.1, -0.1, 0.3), dead=("fl",))
+    done = drive(follower(), robot, 5.0)
+    assert (done.outcome, done.steps[-1].text) == (Reason.INPUT_STALE, "sonar fl has not answered for 0.5 s")
+    done = drive(follower(), Robot(HALL, (0.1, -0.1, 0.3), stalled=True), 5.0)
+    assert done.outcome is Reason.STUCK
+    assert len(done.steps) * PERIOD < 2.5
+
+
+def test_a_sonar_that_stays_the_same_ends_it():
+    done = drive(follower(), Robot(HALL, (0.1, -0.1, 0.3), stuck={"l": 0.4}), 5.0)
+    assert done.outcome is Reason.INPUT_CONTRADICTORY
+    assert "sonar l measured 0.400 m all along" in done.steps[-1].text
+
+
+def test_yaw_that_nobody_asked_for_ends_it():
+    behaviour, robot = follower(), Robot(HALL, (0.1, -0.1, 0.3))
+    state = behaviour.begin()
+    for i in range(60):
+        robot.bias = 0.8 if i >= 20 else 0.0
+        step = behaviour.step(robot.inputs(), state, i * PERIOD)
+        state, robot.motion = step.state, step.motion or RequestedMotion()
+        if step.outcome is not Reason.DRIVING:
+            break
+        robot.move()
+    assert step.outcome is Reason.STUCK
+    assert "does a motor stall" in step.text
+    assert 20 < i < 28
+
+
+def test_without_a_mount_it_does_not_start():
+    robot = Robot(HALL, (0.0, 0.0, 0.0))
+    inputs = robot.inputs()
+    lacking = Inputs(
+        {
+            **{topic.name: inputs.of(topic) for topic in (SONAR, ODOMETRY, IMU)},
+            TRANSFORMS.name: frames(left_out=("fr",)),
+        }
+    )
+    behaviour = follower()
+    step = behaviour.step(lacking, behaviour.begin(), 0.0)
+    assert step.outcome is Reason.INPUT_CONTRADICTORY
+    assert step.text == "state/transforms has no frame sonar_fr: expected the mounts of l, fl, f, fr"
+
+
+def test_the_gyroscopes_bias_is_measured_at_rest():
+    behaviour, robot = follower(), Robot(HALL, (0.1, -0.1, 0.3), bias=0.02)
+    done = drive(behaviour, robot, 3.0)
+    assert done.steps[-1].state.bias[0] == pytest.approx(0.02)
+    assert abs(math.remainder(robot.pose[2] - 0.3, math.tau)) < 0.01
+
+
+@pytest.mark.parametrize("wrong", [{"speed": 0.4}, {"acceleration": 0.7}, {"jerk": 5.0}, {"rate": 5.0}, {"seen": 1}])
+def test_settings_beyond_the_ramps_limits_are_refused(wrong):
+    with pytest.raises(ValidationError):
+        WallLineConfig(**wrong)
