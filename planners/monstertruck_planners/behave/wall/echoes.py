@@ -33,7 +33,7 @@ STEPS: Final = 4, 10
 """Of Gauss and Newton, from an estimate and from a guess."""
 
 
-class Line(NamedTuple):
+class WallEstimate(NamedTuple):
     """A wall in odom: n . p = c for its points p, with n = (cos normal, sin normal) pointing from the robot to it."""
 
     normal: float
@@ -92,10 +92,10 @@ ECHO: Final = ("x", "y", "axis", "range", "sonar", "way", "time")
 (s) when it came."""
 
 
-class Fit(NamedTuple):
+class EstimateFit(NamedTuple):
     """A line and how well it fits."""
 
-    line: Line
+    line: WallEstimate
     explained: int
     """Echoes within ``TIGHT``."""
     sigma: tuple[float, float]
@@ -107,15 +107,15 @@ def deviation(ranges: Array) -> Array:
     return np.asarray(np.hypot(NOISE, NOISE_SHARE * ranges))
 
 
-def residuals(echoes: Array, line: Line, cone: Cone) -> Array:
+def residuals(echoes: Array, line: WallEstimate, cone: Cone) -> Array:
     """(n,) measured less expected range of every echo, in standard deviations; inf where none is expected."""
     distance = line.offset - math.cos(line.normal) * echoes[:, 0] - math.sin(line.normal) * echoes[:, 1]
     expected, _, heard = cone.ranges(echoes, np.array(line.normal), distance)
     return np.where(heard, (echoes[:, 3] - expected) / deviation(echoes[:, 3]), np.inf)
 
 
-def refine(echoes: Array, before: Line, at: tuple[float, float], cone: Cone) -> Fit:
-    """Fit a line to echoes, from an estimate that it stays near to where echoes say little.
+def refine(echoes: Array, before: WallEstimate, at: tuple[float, float], cone: Cone) -> EstimateFit:
+    """EstimateFit a line to echoes, from an estimate that it stays near to where echoes say little.
 
     Args:
         echoes: (n, 7), see ``ECHO``.
@@ -129,8 +129,8 @@ def refine(echoes: Array, before: Line, at: tuple[float, float], cone: Cone) -> 
     return _best(echoes, normals, distances, cost, information, at, cone)
 
 
-def search(echoes: Array, at: tuple[float, float], cone: Cone) -> Fit:
-    """Fit a line to at least three echoes without an estimate: the best of several directions; see ``refine``."""
+def search(echoes: Array, at: tuple[float, float], cone: Cone) -> EstimateFit:
+    """EstimateFit a line to at least three echoes without an estimate: the best of several directions; see ``refine``."""
     normals = np.linspace(-math.pi, math.pi, GUESSES, endpoint=False)
     offsets = echoes[:, :2] - at
     along = offsets[:, 0] * np.cos(normals)[:, None] + offsets[:, 1] * np.sin(normals)[:, None]
@@ -178,11 +178,13 @@ def _best(
     information: Array,
     at: tuple[float, float],
     cone: Cone,
-) -> Fit:
+) -> EstimateFit:
     best = int(np.argmin(np.where(distances > 0.0, cost, np.inf)))
     normal, distance = float(normals[best]), float(distances[best])
-    line = Line(math.remainder(normal, math.tau), distance + math.cos(normal) * at[0] + math.sin(normal) * at[1])
+    line = WallEstimate(
+        math.remainder(normal, math.tau), distance + math.cos(normal) * at[0] + math.sin(normal) * at[1]
+    )
     explained = int((np.abs(residuals(echoes, line, cone)) < TIGHT).sum())
     aa, ad, dd = information[best]
     determinant = max(float(aa * dd - ad * ad), 1e-12)
-    return Fit(line, explained, (math.sqrt(float(dd) / determinant), math.sqrt(float(aa) / determinant)))
+    return EstimateFit(line, explained, (math.sqrt(float(dd) / determinant), math.sqrt(float(aa) / determinant)))

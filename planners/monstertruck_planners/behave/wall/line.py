@@ -18,7 +18,16 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.profiles import CubicRamp, TimedRamp, shortest_ramp
 from monstertruck_planners.behave.api import BehaviourStep, Inputs, RequestedMotion
 from monstertruck_planners.behave.wall.config import WallLineConfig
-from monstertruck_planners.behave.wall.echoes import ECHO, TIGHT, Cone, Fit, Line, refine, residuals, search
+from monstertruck_planners.behave.wall.echoes import (
+    ECHO,
+    TIGHT,
+    Cone,
+    EstimateFit,
+    WallEstimate,
+    refine,
+    residuals,
+    search,
+)
 from monstertruck_planners.behave.wall.monitor import NAMES, SonarMonitor
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.reasons import Reason
@@ -107,11 +116,11 @@ class LineState:
     """Stamp of the newest echoes taken in."""
     echoes: Array = field(default_factory=lambda: np.empty((0, len(ECHO))))
     monitor: SonarMonitor = field(default_factory=SonarMonitor)
-    wall: Line | None = None
+    wall: WallEstimate | None = None
     """Along which it drives."""
     sure: bool = False
     """Whether the direction of ``wall`` is known well."""
-    ahead: Line | None = None
+    ahead: WallEstimate | None = None
     """To which it turns."""
     v: TimedRamp = STANDSTILL
     w: TimedRamp = STANDSTILL
@@ -279,7 +288,7 @@ class WallLine:
     # Walls
 
     def _estimate(self, state: LineState, cone: Cone) -> LineState:
-        """Fit the wall beside and the one ahead anew."""
+        """EstimateFit the wall beside and the one ahead anew."""
         echoes, at = state.echoes, state.pose[:2]
         if state.phase == "turn":
             fit = self._turned_to(state, cone)
@@ -295,13 +304,13 @@ class WallLine:
                     state = replace(state, seen=state.travelled)
         return replace(state, wall=wall, ahead=self._facing(state, cone))
 
-    def _facing(self, state: LineState, cone: Cone) -> Line | None:
+    def _facing(self, state: LineState, cone: Cone) -> WallEstimate | None:
         """The wall ahead, once it is near: on free ground the nearer one of those by the sonars of either side."""
         groups = ((DIAGONAL, FRONT), (FRONT, FAR)) if state.wall is None else ((FRONT, FAR),)
         found = [line for group in groups if (line := self._faced(state, cone, group)) is not None]
         return min(found, key=lambda line: self._way_to(state, line), default=None)
 
-    def _faced(self, state: LineState, cone: Cone, group: tuple[int, ...]) -> Line | None:
+    def _faced(self, state: LineState, cone: Cone, group: tuple[int, ...]) -> WallEstimate | None:
         """A wall ahead by some sonars."""
         echoes, pose = state.echoes, state.pose
         rows = echoes[(echoes[:, 5] > state.travelled - _reach(state)) & np.isin(echoes[:, 4], group)]
@@ -313,7 +322,7 @@ class WallLine:
         present = (np.abs(residuals(fresh, fit.line, cone)) < TIGHT).mean() > 0.5
         return fit.line if facing and present and fit.explained >= max(LEAST, 0.5 * len(rows)) else None
 
-    def _turned_to(self, state: LineState, cone: Cone) -> Fit | None:
+    def _turned_to(self, state: LineState, cone: Cone) -> EstimateFit | None:
         """The wall that the robot turns to: of all echoes since it is near, but those of the wall it leaves."""
         echoes, at = state.echoes, state.pose[:2]
         late, sides = echoes[:, 5] > state.travelled - _reach(state), echoes[:, 4] < FRONT
@@ -339,7 +348,7 @@ class WallLine:
         near = fresh[np.isin(fresh[:, 4], (DIAGONAL, FRONT, FAR))][-6:, 3]
         return min(left, 0.0) if np.count_nonzero(near < TOUCHING) >= 2 else left
 
-    def _way_to(self, state: LineState, line: Line) -> float:
+    def _way_to(self, state: LineState, line: WallEstimate) -> float:
         """Way until the robot stands at the distance at which it follows walls before one, m."""
         x, y, yaw = state.pose
         return (line.distance(x, y) - self._keep(state)) / max(math.cos(line.normal - yaw), 0.4)
@@ -373,7 +382,7 @@ class WallLine:
             return self._disagreement(state, state.wall, cone)
         return None
 
-    def _disagreement(self, state: LineState, wall: Line, cone: Cone) -> tuple[Reason, str] | None:
+    def _disagreement(self, state: LineState, wall: WallEstimate, cone: Cone) -> tuple[Reason, str] | None:
         """A sonar that does not hear the wall that the other one hears."""
         shares = []
         for number in (SIDE, DIAGONAL):

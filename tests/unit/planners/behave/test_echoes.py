@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from monstertruck_planners.behave.wall.echoes import ECHO, TIGHT, Cone, Line, refine, residuals, search
+from monstertruck_planners.behave.wall.echoes import ECHO, TIGHT, Cone, WallEstimate, refine, residuals, search
 
 CONE, BEAM = Cone(0.435, 0.45), Cone(0.0, 1.3)
 
@@ -37,34 +37,34 @@ def along(line, distance, metres, count=30, weave=0.1):
 @pytest.mark.parametrize("cone", [CONE, BEAM], ids=["cone", "beam"])
 @pytest.mark.parametrize("normal", [-3.0, -1.2, 0.4, 2.9])
 def test_exact_echoes_give_the_line_from_an_estimate_and_without_one(cone, normal):
-    line = Line(normal, 0.7)
+    line = WallEstimate(normal, 0.7)
     poses = along(line, 0.35, 1.0)
     echoes, at = heard(line, poses, cone), poses[-1][:2]
-    for fit in (refine(echoes, Line(normal + 0.03, 0.7), at, cone), search(echoes, at, cone)):
+    for fit in (refine(echoes, WallEstimate(normal + 0.03, 0.7), at, cone), search(echoes, at, cone)):
         assert math.remainder(fit.line.normal - normal, math.tau) == pytest.approx(0.0, abs=2e-3)
         assert fit.line.distance(*at) == pytest.approx(0.35, abs=1e-3)
         assert fit.explained == len(echoes)
 
 
 def test_a_third_of_other_echoes_does_not_move_it():
-    line = Line(math.pi / 2, 0.35)
+    line = WallEstimate(math.pi / 2, 0.35)
     poses = along(line, 0.35, 1.5, 60)
     echoes = heard(line, poses, CONE, noise=0.005)
     echoes[::3, 3] += np.random.default_rng(1).uniform(0.05, 1.0, len(echoes[::3]))
-    fit = refine(echoes, Line(math.pi / 2 + 0.03, 0.36), poses[-1][:2], CONE)
+    fit = refine(echoes, WallEstimate(math.pi / 2 + 0.03, 0.36), poses[-1][:2], CONE)
     assert fit.line.distance(*poses[-1][:2]) == pytest.approx(0.35, abs=4e-3)
     assert fit.sigma[1] < 4e-3
 
 
 def test_an_echo_from_where_no_sound_comes_back_belongs_to_no_line():
-    line = Line(math.pi / 2, 0.35)
+    line = WallEstimate(math.pi / 2, 0.35)
     behind = np.array([(0.0, 0.0, -math.pi / 2, 0.35, 0, 0.0, 0.0)])
     assert np.abs(residuals(behind, line, CONE)[0]) > TIGHT
     assert not CONE.hears(-math.pi / 2, line.normal)
 
 
 def test_few_echoes_leave_the_estimate_where_it_was():
-    before = Line(math.pi / 2, 0.35)
+    before = WallEstimate(math.pi / 2, 0.35)
     echoes = np.array([(0.05, 0.05, math.pi / 2, 0.31, 0, 0.0, 0.0)])
     fit = refine(echoes, before, (0.0, 0.0), CONE)
     assert fit.line.normal == pytest.approx(before.normal, abs=0.01)
