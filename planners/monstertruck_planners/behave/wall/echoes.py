@@ -115,7 +115,7 @@ def residuals(echoes: Array, line: WallEstimate, cone: Cone) -> Array:
 
 
 def refine(echoes: Array, before: WallEstimate, at: tuple[float, float], cone: Cone) -> EstimateFit:
-    """EstimateFit a line to echoes, from an estimate that it stays near to where echoes say little.
+    """Fit a line to echoes, from an estimate that it stays near to where echoes say little.
 
     Args:
         echoes: (n, 7), see ``ECHO``.
@@ -130,7 +130,7 @@ def refine(echoes: Array, before: WallEstimate, at: tuple[float, float], cone: C
 
 
 def search(echoes: Array, at: tuple[float, float], cone: Cone) -> EstimateFit:
-    """EstimateFit a line to at least three echoes without an estimate: the best of several directions; see ``refine``."""
+    """Fit a line to at least three echoes without an estimate: the best of several directions; see ``refine``."""
     normals = np.linspace(-math.pi, math.pi, GUESSES, endpoint=False)
     offsets = echoes[:, :2] - at
     along = offsets[:, 0] * np.cos(normals)[:, None] + offsets[:, 1] * np.sin(normals)[:, None]
