@@ -15,7 +15,7 @@ from monstertruck_drivers.maestro.config import MaestroConfig
 from monstertruck_drivers.os4000.config import Os4000Config
 from monstertruck_drivers.steppers.config import StepperConfig
 from monstertruck_schemas.base import Schema
-from monstertruckd.gate.config import BodyLimits, GateConfig, longer, weaker
+from monstertruckd.gate.config import BodyLimits, weaker
 
 WEAKER_ABOVE: Final[dict[type[Schema], tuple[str, ...]]] = {
     EposConfig: (
@@ -60,6 +60,13 @@ WEAKER_BELOW: Final[dict[type[Schema], tuple[str, ...]]] = {
 }
 """Settings that are weaker the less they are."""
 
+UNATTENDED: Final[dict[type[Schema], tuple[str, ...]]] = {
+    EposConfig: ("command_timeout", "quick_stop_after", "status_period"),
+    StepperConfig: ("command_timeout", "quick_stop_after", "watchdog"),
+    MaestroConfig: ("command_timeout",),
+}
+"""Times in which the truck drives on whatever happens."""
+
 BY_CELLS: Final = (
     *("low", "clear", "critical", "collapsed", "overcharged", "overcharged_clear"),
     *("max_compensation", "plausible_max"),
@@ -73,29 +80,30 @@ SAG: Final = 0.5
 """Volts of a cell, the most that a motor's current may explain."""
 
 
-def beyond_devices(devices: Devices, monitors: Monitors, gate: GateConfig, body: BodyLimits) -> Iterator[str]:
+def unattended_times(devices: Devices) -> Iterator[tuple[str, float]]:
+    """Times of drivers in which the truck drives on whatever happens, s, with their names."""
+    for role, device in devices.present().items():
+        driver = device.driver
+        for name in UNATTENDED.get(type(driver), ()):
+            yield f"devices.{role}.driver.{name}", getattr(driver, name)
+
+
+def beyond_devices(devices: Devices, monitors: Monitors, standstill: float, body: BodyLimits) -> Iterator[str]:
     """Every setting of a device that asks for more than the body can do, with what it can.
 
     Args:
         devices: of the robot.
         monitors: likewise.
-        gate: likewise.
+        standstill: ``gate.standstill``, m/s.
         body: what bounds its motion.
     """
     for role, device in devices.present().items():
-        driver, place = device.driver, f"devices.{role}.driver"
-        if isinstance(driver, EposConfig):
-            names = ("command_timeout", "quick_stop_after", "status_period")
-            yield from longer(gate, body, ((f"{place}.{name}", getattr(driver, name)) for name in names))
-            if body.motor_speed is not None:
-                at_rest = math.ceil(gate.standstill / body.motor_speed * driver.max_motor_rpm)
-                if driver.standstill_rpm > at_rest:
-                    yield f"{place}.standstill_rpm {driver.standstill_rpm}: at most {at_rest}, gate.standstill"
-        if isinstance(driver, StepperConfig):
-            names = ("command_timeout", "quick_stop_after", "watchdog")
-            yield from longer(gate, body, ((f"{place}.{name}", getattr(driver, name)) for name in names))
-        if isinstance(driver, MaestroConfig):
-            yield from longer(gate, body, [(f"{place}.command_timeout", driver.command_timeout)])
+        driver = device.driver
+        if isinstance(driver, EposConfig) and body.motor_speed is not None:
+            at_rest = math.ceil(standstill / body.motor_speed * driver.max_motor_rpm)
+            if driver.standstill_rpm > at_rest:
+                name = f"devices.{role}.driver.standstill_rpm"
+                yield f"{name} {driver.standstill_rpm}: at most {at_rest}, gate.standstill"
     for place, pack in _packs(devices, monitors):
         yield from _beyond_cells(place, pack)
 

@@ -30,7 +30,7 @@ from monstertruck_schemas.base import Schema
 from monstertruck_schemas.body import TruckBody
 from monstertruck_schemas.roles import SHAFTS
 from monstertruckd.bus.zenoh_config import ZenohConfig
-from monstertruckd.config.device_safety import beyond_devices, weakened_devices
+from monstertruckd.config.device_safety import beyond_devices, unattended_times, weakened_devices
 from monstertruckd.gate.config import SIGHT, BodyLimits, GateConfig, beyond, weakened
 from monstertruckd.recorder.config import BlackBoxConfig, MapRender, RecorderConfig
 
@@ -224,7 +224,9 @@ class TruckConfig(Schema):
     def _complete(self) -> Self:
         self._check_actuators()
         body = self.body_limits
-        for excess in (*beyond(self.gate, body), *beyond_devices(self.devices, self.monitors, self.gate, body)):
+        times = unattended_times(self.devices)
+        devices = beyond_devices(self.devices, self.monitors, self.gate.standstill, body)
+        for excess in (*beyond(self.gate, body, times), *devices):
             raise ValueError(excess)
         self._check_planner()
         if self.behaviours.keys() - {MOVE} and (lack := self.missing_actuators()):

@@ -262,8 +262,14 @@ class BodyLimits:
         return min(self.pull / self.mass, GRIP * GRAVITY)
 
 
-def beyond(config: GateConfig, body: BodyLimits) -> Iterator[str]:
-    """Every setting that asks for more than the body can do, with what it can."""
+def beyond(config: GateConfig, body: BodyLimits, times: Iterable[tuple[str, float]] = ()) -> Iterator[str]:
+    """Every setting that asks for more than the body can do, with what it can.
+
+    Args:
+        config: the gate's.
+        body: which.
+        times: names and seconds of other settings that are times in which the truck drives on whatever happens.
+    """
     for name in ("acceleration", "deceleration", "quick_deceleration"):
         if getattr(config, name) > body.acceleration + ROUNDING:
             yield (
@@ -282,22 +288,11 @@ def beyond(config: GateConfig, body: BodyLimits) -> Iterator[str]:
             f"gate.speed {config.speed:g} m/s: with gate.scan.stale_after, max_latency, reaction and deceleration the "
             f"truck stands after {needed:.3g} m: at most {seen:.2f} m, {whose}"
         )
-    yield from longer(config, body, _times(config))
-    yield from _beyond_checks(config)
-
-
-def longer(config: GateConfig, body: BodyLimits, times: Iterable[tuple[str, float]]) -> Iterator[str]:
-    """Every setting that is a time in which the truck drives on whatever happens, and is too long for that.
-
-    Args:
-        config: the gate's.
-        body: which.
-        times: names and seconds.
-    """
     longest = body.length / config.speed
-    for name, seconds in times:
+    for name, seconds in (*_times(config), *times):
         if seconds > longest:
             yield f"{name} {seconds:g} s: at most {longest:.2f} s, as long as its own length takes at gate.speed"
+    yield from _beyond_checks(config)
 
 
 def _beyond_checks(config: GateConfig) -> Iterator[str]:

@@ -12,9 +12,10 @@ from monstertruck_drivers.hokuyo_urg.config import HokuyoConfig
 from monstertruck_drivers.maestro.config import BatteryInputConfig, MaestroConfig, ServoConfig
 from monstertruck_drivers.os4000.config import Os4000Config
 from monstertruck_drivers.steppers.config import StepperConfig
-from monstertruckd.config.device_safety import WEAKER_ABOVE, WEAKER_BELOW, beyond_devices
+from monstertruckd.config.device_safety import WEAKER_ABOVE, WEAKER_BELOW, beyond_devices, unattended_times
 from monstertruckd.config.load import load_truck
 from monstertruckd.config.truck import TruckConfig
+from monstertruckd.gate.config import beyond
 
 CONFIGS = Path(__file__).resolve().parents[3] / "configs"
 PLACES = {
@@ -90,6 +91,13 @@ def truck(name: str = "", value: Any = None) -> TruckConfig:
     return TruckConfig.model_validate(data, strict=False)
 
 
+def refusals(config: TruckConfig, **changes: Any) -> list[str]:
+    """What is beyond the robot, with another body or other monitors."""
+    body, monitors = changes.get("body", config.body_limits), changes.get("monitors", config.monitors)
+    found = beyond(config.gate, body, unattended_times(config.devices))
+    return [*found, *beyond_devices(config.devices, monitors, config.gate.standstill, body)]
+
+
 @pytest.mark.parametrize("model", HARMLESS)
 def test_no_setting_is_forgotten(model):
     inherited = set(PackConfig.model_fields) if model in (BatteryInputConfig, IioConfig) else set()
@@ -143,7 +151,7 @@ def test_whatever_weakens_has_a_ceiling(model, name):
 def test_cells_have_nothing_left_below_three_volts(name):
     for volts, found in ((18.0, []), (17.99, [f"devices.steering.driver.battery.{name} 17.99 V: at least 18"])):
         config = unchecked(f"devices.steering.driver.battery.{name}", volts)
-        refused = beyond_devices(config.devices, config.monitors, config.gate, config.body_limits)
+        refused = refusals(config)
         assert [text.partition(",")[0] for text in refused] == found
 
 
@@ -162,14 +170,14 @@ def test_cells_have_nothing_left_below_three_volts(name):
 def test_a_ceiling_itself_is_allowed(name, most, text):
     for value, found in ((most, False), (most + (1 if isinstance(most, int) else 1e-3), True)):
         config = unchecked(name, value)
-        refused = list(beyond_devices(config.devices, config.monitors, config.gate, config.body_limits))
+        refused = refusals(config)
         assert any(one.startswith(f"{name} {value:g}") and text in one for one in refused) is found, refused
 
 
 def test_a_motor_of_unknown_rate_has_no_ceiling_of_its_own():
     config = unchecked("devices.drive.driver.standstill_rpm", 10**6)
     unknown = dataclasses.replace(config.body_limits, motor_speed=None)
-    assert list(beyond_devices(config.devices, config.monitors, config.gate, unknown)) == []
+    assert refusals(config, body=unknown) == []
 
 
 def test_the_thresholds_of_a_smaller_pack_are_compared_cell_by_cell():
@@ -190,7 +198,7 @@ def test_a_battery_measured_by_the_computer_is_judged_alike():
     assert weak.weakened() == ("monitors.battery.low 21.5, default 22",)
     low = IioConfig.model_construct(**(IioConfig().model_dump() | {"collapsed": 17.0}))
     monitors = config.monitors.model_copy(update={"battery": low})
-    (refused,) = beyond_devices(config.devices, monitors, config.gate, config.body_limits)
+    (refused,) = refusals(config, monitors=monitors)
     assert refused.startswith("monitors.battery.collapsed 17 V: at least 18")
 
 
