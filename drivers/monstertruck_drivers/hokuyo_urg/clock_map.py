@@ -33,6 +33,8 @@ PROMPT: Final = 8
 """Scans of which one at least is prompt: all above the envelope means that the clocks run apart."""
 APART: Final = 30 * MILLISECOND
 """Height of such scans above the envelope from which on it follows them, ns: more than the jitter of USB."""
+STEADY: Final = 15 * MILLISECOND
+"""Difference of the envelopes of early and late samples that one drift explains, ns."""
 LATE: Final = 100 * MILLISECOND
 """Height from which on it does not, ns: no clock jumps, so the scans are late."""
 
@@ -53,8 +55,9 @@ class ClockMap:
     """Stamps of counter values, never going backwards.
 
     Args:
-        nominal_latency: ns from a counter value to the arrival of its scan; used only where it cannot be measured
-            (no ``anchor``, or the counter restarted before the first scan).
+        nominal_latency: ns from a counter value to the arrival of its scan, if nothing delays it; used where it cannot
+            be measured (no ``anchor``, or the counter restarted before the first scan), and none that is measured is
+            less, but for a slew: while the drift is not known yet, a fast sensor's scans seem to arrive too soon.
         anchor: comparison made at start.
     """
 
@@ -64,6 +67,7 @@ class ClockMap:
         self.late = 0
         """By how much all of the newest scans arrived later than the latency explains, ns; 0 = they do not."""
         self._latency = nominal_latency
+        self._least_latency = round(nominal_latency * (1.0 - GREATEST_DRIFT))
         self._reference: int | None = None if anchor is None else anchor.host
         self._counter: int | None = None if anchor is None else anchor.counter
         self._host = 0 if anchor is None else anchor.host
@@ -122,7 +126,8 @@ class ClockMap:
         if not self.late:
             breaks, drift = self.slews, self.drift
             self._drift.add(elapsed, sample)
-            if self.slews > breaks and self._reference is not None:
+            slewed = self.slews > breaks or (abs(self.drift - drift) > BREAK and not self._is_steady())
+            if slewed and self._reference is not None:
                 # Samples since the slew say nothing of the latency.
                 before = self._settling[: max(len(self._settling) - RECENT * BLOCK, BLOCK)]
                 self._find_latency(self._reference, before, drift)
@@ -139,6 +144,12 @@ class ClockMap:
             if elapsed > SETTLE:
                 self._keep_latency()
 
+    def _is_steady(self) -> bool:
+        """Whether the present drift, which has just been found, explains all samples since the comparison."""
+        third = max(len(self._settling) // 3, 1)
+        envelopes = [self._lowest(self._settling[at : at + third]) for at in range(0, len(self._settling), third)]
+        return not envelopes or max(envelopes) - min(envelopes) < STEADY
+
     def _lowest(self, samples: Iterable[tuple[int, int]]) -> float:
         """The envelope of samples at the newest one's time."""
         return min(sample + self.drift * (self._elapsed - elapsed) for elapsed, sample in samples)
@@ -154,7 +165,8 @@ class ClockMap:
 
     def _find_latency(self, reference: int, samples: Iterable[tuple[int, int]], drift: float) -> None:
         """The least time from the counter to the arrival, as the comparison at the start tells it."""
-        self._latency = round(min(sample - reference - drift * elapsed for elapsed, sample in samples))
+        found = round(min(sample - reference - drift * elapsed for elapsed, sample in samples))
+        self._latency = max(found, self._least_latency)
 
     def _keep_latency(self) -> None:
         """It is no longer looked for."""
