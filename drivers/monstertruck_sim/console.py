@@ -97,11 +97,33 @@ def set_line_fault(faults: LineFaults, name: str, value: str) -> None:
         raise InputError(f"line {name}: cannot read {value!r}; {HELP}") from error
 
 
-class FaultConsole:
-    """Reads commands line by line; with several devices each line begins with the device's name."""
+@dataclass(frozen=True, slots=True)
+class CommandedGroup:
+    """Several things of which a command names one first; of a single one it may leave the name out."""
 
-    def __init__(self, devices: Mapping[str, Commanded], source: TextIO, say: Callable[[str], None]) -> None:
-        self._devices = devices
+    kind: str
+    """What they are, in a word."""
+    members: Mapping[str, Commanded]
+
+    def command(self, words: list[str]) -> None:
+        """Carry out one command.
+
+        Raises:
+            InputError: it names none of them, or is unknown.
+        """
+        if words and words[0] in self.members:
+            self.members[words[0]].command(words[1:])
+        elif len(self.members) == 1:
+            next(iter(self.members.values())).command(words)
+        else:
+            raise InputError(f"name a {self.kind} first: {', '.join(self.members)}")
+
+
+class FaultConsole:
+    """Reads commands line by line."""
+
+    def __init__(self, target: Commanded, source: TextIO, say: Callable[[str], None]) -> None:
+        self._target = target
         self._source = source
         self._say = say
 
@@ -125,18 +147,11 @@ class FaultConsole:
         if not words:
             return
         try:
-            self._find(words).command(words)
+            self._target.command(words)
         except InputError as error:
             self._say(f"error: {error}")
         else:
             self._say("ok")
-
-    def _find(self, words: list[str]) -> Commanded:
-        if words[0] in self._devices:
-            return self._devices[words.pop(0)]
-        if len(self._devices) == 1:
-            return next(iter(self._devices.values()))
-        raise InputError(f"name a device first: {', '.join(self._devices)}")
 
 
 def _pollable(source: TextIO) -> bool:

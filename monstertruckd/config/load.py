@@ -30,6 +30,8 @@ Key = tuple[str | int, ...]
 S = TypeVar("S", bound=Schema)
 T = TypeVar("T", bound=TruckConfig)
 
+PLACEHOLDER = "{robot}"
+"""In texts, for the robot's name."""
 MOST_VALUES = 20_000
 """Of one file; a full configuration has a few hundred."""
 MOST_MISTAKES = 50
@@ -122,12 +124,30 @@ def load_tree(path: Path) -> Tree:
     """Read ``path`` and everything it includes; later values win over included ones, mappings merge.
 
     ``include`` is a file name or a list of them, relative to the including file. Keys of older versions are read under
-    their present names; the files stay as they are.
+    their present names; the files stay as they are. In texts ``{robot}`` stands for the robot's name, so that robots
+    that share a file have ports and folders of their own.
 
     Raises:
         ConfigError: a file is missing, is not YAML, repeats a key or includes itself.
     """
-    return _load(path, (), None)
+    tree = _load(path, (), None)
+    robot = tree.data.get("robot", ROBOT)
+    if isinstance(robot, str):
+        tree.data = {key: value if key == "robot" else _named(value, robot) for key, value in tree.data.items()}
+    return tree
+
+
+def _named(value: Any, robot: str) -> Any:
+    """The value with the robot's name in its texts."""
+    match value:
+        case str():
+            return value.replace(PLACEHOLDER, robot)
+        case dict():
+            return {key: _named(inner, robot) for key, inner in value.items()}
+        case list():
+            return [_named(inner, robot) for inner in value]
+        case _:
+            return value
 
 
 def _load(path: Path, including: tuple[Path, ...], inherited: int | None) -> Tree:

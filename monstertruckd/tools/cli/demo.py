@@ -77,23 +77,33 @@ def _print(rows: list[tuple[str, str]], messages: dict[str, int]) -> None:
 @needs_extra("sim")
 def simulate(
     config: SimulatedOption = DEMO_CONFIG,
+    robots: Annotated[
+        str | None,
+        typer.Option(
+            metavar="A.yaml,B.yaml",
+            help="Several robots in one world, that of the first, instead of --config.",
+            show_default=False,
+        ),
+    ] = None,
     truth: Annotated[Path | None, typer.Option("--truth", help="Write what really happened (npz) at the end.")] = None,
-    run: Annotated[bool, typer.Option("--run", help="Run the daemon of the same configuration, too.")] = False,
+    run: Annotated[bool, typer.Option("--run", help="Run the daemons of the same configurations, too.")] = False,
 ) -> None:
-    """Serve a simulated truck's devices behind ptys: at the ports its configuration names, else in a folder of yours.
+    """Serve simulated robots' devices behind ptys: at the ports their configurations name, else in a folder of yours.
 
     Faults are read from standard input as with `emulate`, each line beginning with the device's role, the monitor's
-    name, or `usb` (an unknown word lists what it knows).
+    name, or `usb` (an unknown word lists what it knows); with several robots the robot's name stands before it.
     """
     from monstertruckd.tools.simulation.config import load_simulated
+    from monstertruckd.tools.simulation.fleet import as_fleet
     from monstertruckd.tools.simulation.simulate import serve
 
-    simulated = load_simulated(config)
+    files = [config] if robots is None else [Path(name) for name in robots.split(",")]
+    simulated = as_fleet([load_simulated(file) for file in files])
     code = 0
 
     async def main(clock: Clock) -> None:
         nonlocal code
-        code = await serve(clock, simulated, truth, config if run else None)
+        code = await serve(clock, simulated, truth, files if run else ())
 
     until_stopped(main)
     if code:

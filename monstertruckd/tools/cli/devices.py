@@ -51,7 +51,7 @@ def emulate(
     """
     from monstertruck_drivers.catalog import DEVICES
     from monstertruck_runtime.endpoints import emulated_ports
-    from monstertruck_sim.console import FaultConsole
+    from monstertruck_sim.console import CommandedGroup, FaultConsole
     from monstertruckd.config.truck import ROBOT
     from monstertruckd.tools.simulation.emulate import emulate_device
 
@@ -62,7 +62,7 @@ def emulate(
             remark(f"{device} on {port}; faults on standard input, Ctrl-C ends")
             if (limits := OWN_CLIENTS.get(DEVICES.named(device).opens)) is not None:
                 remark(f"{device}: {limits}")
-            await FaultConsole({device: emulated}, sys.stdin, typer.echo).run()
+            await FaultConsole(CommandedGroup("device", {device: emulated}), sys.stdin, typer.echo).run()
 
     until_stopped(main)
 

@@ -6,7 +6,9 @@ from typing import Any, ClassVar, Final, Self
 
 from pydantic import model_validator
 
+from monstertruck_drivers.config import Monitors
 from monstertruck_runtime.errors import ConfigError
+from monstertruck_sim.computer import hangs_by_hub
 from monstertruck_sim.config import SimConfig
 from monstertruckd.config.load import Tree, calibrated, load_tree, validated
 from monstertruckd.config.truck import TruckConfig
@@ -58,6 +60,11 @@ def load_robot(path: Path) -> tuple[TruckConfig, Tree]:
     tree = load_tree(path)
     model = TruckConfig if tree.data.get("sim") is None else SimulatedTruckConfig
     return calibrated(*validated(tree, path, model))
+
+
+def needs_computer(config: SimulatedTruckConfig) -> bool:
+    """Whether the daemon needs an emulated computer, for USB devices or for monitors."""
+    return hangs_by_hub(config.devices) or config.monitors != Monitors()
 
 
 def with_overlay(config: SimulatedTruckConfig, overlay: Mapping[str, Any]) -> SimulatedTruckConfig:

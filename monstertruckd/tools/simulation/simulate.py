@@ -1,10 +1,10 @@
-"""``monstertruckd simulate``: the emulated robot as a process, its devices behind ptys."""
+"""``monstertruckd simulate``: emulated robots as a process, their devices behind ptys."""
 
 import asyncio
 import signal
 import sys
 from array import array
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AsyncExitStack, ExitStack, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from monstertruck_drivers.cable import EmulatedPort, PtyPort
-from monstertruck_drivers.config import Monitors, PortConfig
+from monstertruck_drivers.config import PortConfig
 from monstertruck_drivers.hokuyo_urg.recording import RecordedHokuyoEmulator
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.client import TruckClient
@@ -21,13 +21,15 @@ from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruck_runtime.errors import InputError, NotFoundError
 from monstertruck_runtime.memory import settle
-from monstertruck_sim.computer import EmulatedComputer, hangs_by_hub
-from monstertruck_sim.console import Commanded, Emulated, EmulatedFiles, FaultConsole
+from monstertruck_sim.computer import EmulatedComputer
+from monstertruck_sim.console import Commanded, CommandedGroup, Emulated, EmulatedFiles, FaultConsole
 from monstertruck_sim.faults import FaultInjector, SimContext
 from monstertruck_sim.robot import SimulatedRobot
 from monstertruck_sim.stand import SimulatedStand
+from monstertruck_sim.world.scene import Surroundings
 from monstertruck_sim.world.world import World
-from monstertruckd.tools.simulation.config import SimulatedTruckConfig
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig, needs_computer
+from monstertruckd.tools.simulation.fleet import shared_scene
 from monstertruckd.tools.simulation.ports import claimed
 from monstertruckd.tools.simulation.program import program
 
@@ -62,41 +64,48 @@ class TruthLog:
 
 
 async def serve(
-    clock: Clock, config: SimulatedTruckConfig, truth: Path | None = None, daemon_of: Path | None = None
+    clock: Clock, configs: Sequence[SimulatedTruckConfig], truth: Path | None = None, daemons_of: Sequence[Path] = ()
 ) -> int:
-    """Serve the devices of ``config`` behind ptys at their configured ports until SIGTERM or SIGINT.
+    """Serve the devices of robots in one world behind ptys at their configured ports until SIGTERM or SIGINT.
 
-    Faults are read from standard input, each line beginning with the device's role, the monitor's name, or ``usb``.
+    Faults are read from standard input, each line beginning with the device's role, the monitor's name, or ``usb``;
+    with several robots the robot's name stands before it.
 
     Args:
         clock: time.
-        config: the truck.
+        configs: the robots; of several ``as_fleet`` has made sure that they can share a world.
         truth: file of what really happened.
-        daemon_of: configuration of a daemon that is run meanwhile: stopped before the devices go, and when it ends by
-            itself they go, too.
+        daemons_of: configurations of daemons that are run meanwhile: stopped before the devices go, and when all have
+            ended by themselves the devices go, too.
 
     Returns:
-        The daemon's exit code if it ended by itself, else 0.
+        The exit code of the first daemon that failed by itself, else 0.
 
     Raises:
         NotPermittedError: this user may not make a port there.
         InputError: ``machine`` names an existing file or folder instead of a link to the emulated computer, or so does
-            a port.
+            a port; or two robots overlap.
         BusyError: another program serves one of the ports.
         OSError: a port cannot be made.
     """
-    links = [it.port.path for it in config.devices.present().values() if isinstance(it.port, PortConfig)]
+    ports = (it.port for config in configs for it in config.devices.present().values())
+    links = [port.path for port in ports if isinstance(port, PortConfig)]
     with ExitStack() as stack:
         stack.enter_context(claimed(*links))
-        folder = Path(stack.enter_context(TemporaryDirectory(prefix="monstertruck-")))
-        stack.enter_context(_linked(config, folder))
-        return await _serve(clock, config, folder, truth, daemon_of)
+        scene = shared_scene(configs)
+        scene.on_contact = lambda contact: _say(str(contact))
+        robots = []
+        for config in configs:
+            folder = Path(stack.enter_context(TemporaryDirectory(prefix="monstertruck-")))
+            stack.enter_context(_linked(config, folder))
+            robots.append(ServedRobot(config, clock, folder, scene))
+        return await _serve(clock, robots, truth, daemons_of)
 
 
 @contextmanager
 def _linked(config: SimulatedTruckConfig, folder: Path) -> Iterator[None]:
     """Link ``machine`` to the folder of the emulated computer, where the daemon needs one."""
-    if not hangs_by_hub(config.devices) and config.monitors == Monitors():
+    if not needs_computer(config):
         yield
         return
     link = config.machine
@@ -111,56 +120,111 @@ def _linked(config: SimulatedTruckConfig, folder: Path) -> Iterator[None]:
             link.unlink(missing_ok=True)
 
 
-async def _serve(
-    clock: Clock, config: SimulatedTruckConfig, folder: Path, truth: Path | None, daemon_of: Path | None
-) -> int:
-    devices = config.devices.present()
-    cables: dict[str, EmulatedPort] = {}
-    for role, device in devices.items():
-        path = device.port.path if isinstance(device.port, PortConfig) else folder / "cables" / role
-        path.parent.mkdir(parents=True, exist_ok=True)
-        cables[role] = PtyPort(path)
-    computer = EmulatedComputer(folder, config.devices, cables, clock)
-    robot = SimulatedRobot(config.sim, config.devices, config.monitors, clock, computer.ports, folder)
-    robot.world.scene.on_contact = lambda contact: _say(str(contact))
-    log = TruthLog(robot.world, clock)
-    emulated: dict[str, Commanded] = {role: Emulated(robot.emulators[role], robot.ports[role]) for role in devices}
-    emulated |= {name: EmulatedFiles(files) for name, files in robot.monitored.items()}
-    emulated["usb"] = computer
+class ServedRobot:
+    """One robot with its devices behind ptys.
+
+    Args:
+        config: the robot.
+        clock: time.
+        folder: of its emulated computer.
+        scene: world.
+    """
+
+    def __init__(self, config: SimulatedTruckConfig, clock: Clock, folder: Path, scene: Surroundings) -> None:
+        self.config, self._clock = config, clock
+        devices = config.devices.present()
+        cables: dict[str, EmulatedPort] = {}
+        for role, device in devices.items():
+            path = device.port.path if isinstance(device.port, PortConfig) else folder / "cables" / role
+            path.parent.mkdir(parents=True, exist_ok=True)
+            cables[role] = PtyPort(path)
+        self._computer = EmulatedComputer(folder, config.devices, cables, clock)
+        self._robot = SimulatedRobot(
+            config.sim,
+            config.devices,
+            config.monitors,
+            clock,
+            self._computer.ports,
+            folder,
+            scene=scene,
+            name=config.robot,
+        )
+        self.truth = TruthLog(self._robot.world, clock)
+        emulated: dict[str, Commanded] = {
+            role: Emulated(self._robot.emulators[role], self._robot.ports[role]) for role in devices
+        }
+        emulated |= {name: EmulatedFiles(files) for name, files in self._robot.monitored.items()}
+        emulated["usb"] = self._computer
+        self.console = CommandedGroup("device", emulated)
+
+    def tasks(self, say: Callable[[str], None]) -> Iterator[asyncio.Task[Any]]:
+        """Everything that runs as long as it is served; ``say`` gets a line for the terminal."""
+        config, world, clock = self.config, self._robot.world, self._clock
+        yield asyncio.create_task(self._robot.run(), name=config.robot)
+        yield asyncio.create_task(self.truth.run(), name="truth")
+        if config.stand == "simulator":
+            yield asyncio.create_task(_see(clock, config, world), name="stand")
+        if config.sim.drill is not None:
+            context = SimContext(config.sim, config.devices, self._robot, self._computer, clock)
+            yield asyncio.create_task(FaultInjector(context, config.sim.drill, say).run(), name="faults")
+        if self._robot.recorded is not None:
+            yield asyncio.create_task(_report_end(self._robot.recorded), name="recording")
+
+
+async def _serve(clock: Clock, robots: Sequence[ServedRobot], truth: Path | None, daemons_of: Sequence[Path]) -> int:
+    alone = len(robots) == 1
     stop = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
-    tasks: list[asyncio.Task[Any]] = [
-        asyncio.create_task(robot.run(), name="robot"),
-        asyncio.create_task(log.run(), name="truth"),
-        asyncio.create_task(FaultConsole(emulated, sys.stdin, _say).run(), name="console"),
-    ]
-    if config.stand == "simulator":
-        tasks.append(asyncio.create_task(_see(clock, config, robot.world), name="stand"))
-    if config.sim.drill is not None:
-        context = SimContext(config.sim, config.devices, robot, computer, clock)
-        tasks.append(asyncio.create_task(FaultInjector(context, config.sim.drill, _say).run(), name="faults"))
-    if robot.recorded is not None:
-        tasks.append(asyncio.create_task(_report_end(robot.recorded), name="recording"))
+    tasks: list[asyncio.Task[Any]] = []
+    for robot in robots:
+        prefix = "" if alone else f"{robot.config.robot}: "
+        tasks += robot.tasks(lambda line, prefix=prefix: _say(prefix + line))  # type: ignore[misc]
+    known = CommandedGroup("robot", {robot.config.robot: robot.console for robot in robots})
+    console = FaultConsole(robots[0].console if alone else known, sys.stdin, _say)
+    tasks.append(asyncio.create_task(console.run(), name="console"))
     waiting = asyncio.create_task(stop.wait())
     settle()
     _say("ready")
+    ended_by = 0
     async with AsyncExitStack() as stack:
-        code = None
-        if daemon_of is not None:
-            daemon = await stack.enter_async_context(program(None, "run", "--config", str(daemon_of)))
-            tasks.append(code := asyncio.create_task(daemon.wait(), name="daemon"))
+        if daemons_of:
+            programs = [
+                await stack.enter_async_context(program(None, "run", "--config", str(file))) for file in daemons_of
+            ]
+            names = [robot.config.robot for robot in robots]
+            tasks.append(daemons := asyncio.create_task(_last_end(programs, names), name="daemons"))
         await asyncio.wait([waiting, *tasks], return_when=asyncio.FIRST_COMPLETED)
-        ended_by = code.result() if code is not None and code.done() else 0
+        if daemons_of and daemons.done():
+            ended_by = daemons.result()
     for task in (waiting, *tasks):
         task.cancel()
     results = await asyncio.gather(*tasks, return_exceptions=True)
     if truth is not None:
-        np.savez(truth, truth=log.array())
+        save_truth(truth, {"truth" if alone else robot.config.robot: robot.truth for robot in robots})
     for result in results:
         if isinstance(result, Exception):
             raise result
     return ended_by
+
+
+def save_truth(file: Path, logs: Mapping[str, TruthLog]) -> None:
+    """Write what really happened, an array of each log by name."""
+    arrays: dict[str, Any] = {name: log.array() for name, log in logs.items()}
+    np.savez(file, **arrays)
+
+
+async def _last_end(programs: Sequence[asyncio.subprocess.Process], names: Sequence[str]) -> int:
+    """Wait until all daemons have ended; the first code that is none of success."""
+    codes: list[int] = []
+
+    async def end(process: asyncio.subprocess.Process, name: str) -> None:
+        codes.append(code := await process.wait())
+        if len(programs) > 1:
+            _say(f"{name}: its daemon ended with code {code}")
+
+    await asyncio.gather(*map(end, programs, names))
+    return next((code for code in codes if code), 0)
 
 
 async def _see(clock: Clock, config: SimulatedTruckConfig, world: World) -> None:

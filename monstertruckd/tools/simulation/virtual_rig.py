@@ -3,8 +3,8 @@
 import asyncio
 import os
 import signal
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from collections.abc import AsyncIterator, Sequence
+from contextlib import AsyncExitStack, ExitStack, asynccontextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Final
@@ -19,10 +19,12 @@ from monstertruck_sim.computer import EmulatedComputer
 from monstertruck_sim.faults import FaultInjector, SimContext
 from monstertruck_sim.robot import SimulatedRobot
 from monstertruck_sim.stand import SimulatedStand
+from monstertruck_sim.world.scene import Surroundings
 from monstertruckd.bus.local import Bus
 from monstertruckd.config.load import Tree
 from monstertruckd.daemon import Daemon
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
+from monstertruckd.tools.simulation.fleet import as_fleet, shared_scene
 from monstertruckd.tools.simulation.simulate import TruthLog
 
 IN_MEMORY: Final = "/dev/shm"  # noqa: S108 - a folder of its own is made in it
@@ -36,9 +38,16 @@ class VirtualRig:
         config: the simulated truck's.
         clock: of the running virtual loop.
         tree: origins of the configuration's values.
+        scene: world that it shares with other rigs of the same clock; None = its own.
     """
 
-    def __init__(self, config: SimulatedTruckConfig, clock: VirtualClock, tree: Tree | None = None) -> None:
+    def __init__(
+        self,
+        config: SimulatedTruckConfig,
+        clock: VirtualClock,
+        tree: Tree | None = None,
+        scene: Surroundings | None = None,
+    ) -> None:
         self.config = config
         self.clock = clock
         self.began = clock.now()
@@ -47,16 +56,21 @@ class VirtualRig:
             prefix="monstertruck-", dir=IN_MEMORY if os.access(IN_MEMORY, os.W_OK | os.X_OK) else None
         )
         self.ports = {role: MemoryPort(role) for role in config.devices.present()}
-        self.computer = EmulatedComputer(Path(self._folder.name), config.devices, self.ports, clock)
-        self.robot = SimulatedRobot(
-            config.sim,
-            config.devices,
-            config.monitors,
-            clock,
-            self.computer.ports,
-            self.computer.folder,
-            offload=inline,
-        )
+        with ExitStack() as unless:
+            unless.callback(self._folder.cleanup)
+            self.computer = EmulatedComputer(Path(self._folder.name), config.devices, self.ports, clock)
+            self.robot = SimulatedRobot(
+                config.sim,
+                config.devices,
+                config.monitors,
+                clock,
+                self.computer.ports,
+                self.computer.folder,
+                offload=inline,
+                scene=scene,
+                name=config.robot,
+            )
+            unless.pop_all()
         self.world = self.robot.world
         self.truth = TruthLog(self.world, clock)
         self._tree = tree
@@ -156,3 +170,19 @@ class VirtualRig:
         assert self._daemon_task is not None
         if not self._daemon_task.cancelled():
             await self._daemon_task
+
+
+@asynccontextmanager
+async def virtual_fleet(
+    configs: Sequence[SimulatedTruckConfig], clock: VirtualClock
+) -> AsyncIterator[tuple[list[VirtualRig], Surroundings]]:
+    """Several robots in one world, their daemons on one virtual clock; the world of the first one.
+
+    Raises:
+        InputError: two robots claim the same thing, or overlap.
+    """
+    configs = as_fleet(configs)
+    scene = shared_scene(configs)
+    async with AsyncExitStack() as stack:
+        rigs = [await stack.enter_async_context(VirtualRig(config, clock, scene=scene).running()) for config in configs]
+        yield rigs, scene

@@ -1,0 +1,64 @@
+"""Several robots in one simulated world: what their configurations have to share, and what each needs for itself."""
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from monstertruck_drivers.config import PortConfig
+from monstertruck_runtime.errors import InputError
+from monstertruck_sim.world.scene import Surroundings
+from monstertruck_sim.world.world import make_scene
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig, needs_computer
+
+
+def as_fleet(configs: Sequence[SimulatedTruckConfig]) -> list[SimulatedTruckConfig]:
+    """The configurations of robots of one world, each with noise of its own.
+
+    Map, people and seed of the world are those of the first one.
+
+    Raises:
+        InputError: two of them claim the same thing, or describe different worlds; the text names both.
+    """
+    first = configs[0]
+    for config in configs[1:]:
+        if config.sim.world.map != first.sim.world.map:
+            raise InputError(
+                f"{config.robot}: sim.world.map is {config.sim.world.map}: expected that of {first.robot}, "
+                f"{first.sim.world.map}"
+            )
+        if config.sim.world.people not in ((), first.sim.world.people):
+            raise InputError(f"{config.robot}: sim.world.people: expected none, or those of {first.robot}")
+    _require_apart(configs, "robot", lambda config: [config.robot])
+    _require_apart(configs, "devices: port", _ports)
+    _require_apart(configs, "zenoh.listen", lambda config: config.zenoh.listen)
+    _require_apart(configs, "state_directory", lambda config: [config.state_directory])
+    _require_apart(configs, "machine", _machines)
+    return [
+        config.model_copy(update={"sim": config.sim.model_copy(update={"seed": config.sim.seed + 1000 * i})})
+        for i, config in enumerate(configs)
+    ]
+
+
+def shared_scene(configs: Sequence[SimulatedTruckConfig]) -> Surroundings:
+    """The world of a fleet, without its robots."""
+    return make_scene(configs[0].sim.world, configs[0].sim.seed)
+
+
+def _ports(config: SimulatedTruckConfig) -> Iterator[Path]:
+    return (it.port.path for it in config.devices.present().values() if isinstance(it.port, PortConfig))
+
+
+def _machines(config: SimulatedTruckConfig) -> Iterator[Path]:
+    """The link to the emulated computer, where the daemon needs one."""
+    if needs_computer(config):
+        yield config.machine
+
+
+def _require_apart(
+    configs: Sequence[SimulatedTruckConfig], what: str, claims: Callable[[SimulatedTruckConfig], Iterable[Any]]
+) -> None:
+    owners: dict[Any, int] = {}
+    for i, config in enumerate(configs):
+        for claim in claims(config):
+            if (owner := owners.setdefault(claim, i)) != i:
+                raise InputError(f"{what} {claim}: of {configs[owner].robot} and of {config.robot}: expected one each")

@@ -1,0 +1,108 @@
+"""Two daemons in one world on one virtual clock: they see each other, bump into each other, and people walk."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
+from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.mailbox import fifo
+from monstertruck_schemas import topics
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import BehaviourOrder
+from monstertruck_sim.world.scene import Contact
+from monstertruckd.config.load import load_config
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
+from monstertruckd.tools.simulation.operator import LocalOperator
+from monstertruckd.tools.simulation.virtual_rig import VirtualRig, virtual_fleet
+
+pytestmark = [pytest.mark.virtual, pytest.mark.timeout(120)]
+
+FOLDER = Path(__file__).resolve().parents[2] / "configs" / "fleet"
+BLIND = {"devices": {"lidar": None}, "gate": {"speed": 0.2, "scan": {"critical": False}}}
+
+
+def fleet(**overlays: dict[str, Any]) -> list[SimulatedTruckConfig]:
+    """``leader`` and ``second``, each with an overlay."""
+    loaded = [load_config(FOLDER / f"{name}.yaml", SimulatedTruckConfig)[0] for name in ("leader", "second")]
+    return [with_overlay(config, {"recorder": None, **overlays.get(config.robot, {})}) for config in loaded]
+
+
+async def move(rig: VirtualRig, clock: VirtualClock, **settings: Any) -> None:
+    operator = LocalOperator(rig.daemon, clock)
+    await operator.arm()
+    order = {"order": BehaviourOrder.START, "behaviour": "move", "settings": settings}
+    await operator.call("behave", {**await operator.header(), **order})
+
+
+def drive(*configs: SimulatedTruckConfig, seconds: float = 12.0) -> tuple[list[VirtualRig], list[Contact], Reason]:
+    """The second robot drives 2 m ahead, to where the first one stands."""
+
+    async def main(clock: VirtualClock) -> tuple[list[VirtualRig], list[Contact], Reason]:
+        async with virtual_fleet(configs, clock) as (rigs, scene):
+            with rigs[1].bus.subscribe(topics.BEHAVIOUR, fifo(4096)) as states:
+                await clock.sleep(2.0)
+                await move(rigs[1], clock, length=2.0)
+                await clock.sleep(seconds)
+                return rigs, scene.contacts, [*states.drain()][-1].outcome
+
+    return run_virtual(main, start=SECOND)
+
+
+def test_a_robot_stops_before_another_that_its_lidar_sees():
+    rigs, contacts, outcome = drive(*fleet())
+    assert outcome is Reason.OBSTACLE_STOP
+    assert contacts == []
+    gap = rigs[0].truth.array()[-1, 1] - rigs[1].truth.array()[-1, 1] - 0.47
+    assert 0.02 < gap < 0.3
+
+
+def test_a_robot_without_eyes_runs_into_it_and_the_world_says_so():
+    rigs, contacts, outcome = drive(*fleet(second=BLIND))
+    assert outcome is not Reason.BEHAVIOUR_DONE
+    assert [(contact.mover, contact.other) for contact in contacts] == [("second", "leader")]
+    assert contacts[0].speed == pytest.approx(0.15, abs=0.03)
+    assert rigs[1].truth.array()[:, 5].any()
+
+
+def test_a_robot_stops_for_somebody_who_walks_across():
+    crossing = {
+        "sim": {"world": {"people": ({"waypoints": ({"x": -1.5, "y": 1.5}, {"x": -1.5, "y": -1.5}), "speed": 0.5},)}}
+    }
+    away = {"odometry": {"start": {"x": 2.5, "y": 2.0, "yaw": 0.0}}}
+    away["sim"] = {"world": {**crossing["sim"]["world"], "start": away["odometry"]["start"]}}
+    _, contacts, _ = drive(*fleet(leader=away, second=crossing), seconds=25.0)
+    assert [contact for contact in contacts if contact.mover == "second"] == []
+
+
+def test_two_runs_of_a_fleet_are_the_same():
+    def ends() -> list[float]:
+        rigs, *_ = drive(*fleet(), seconds=4.0)
+        return [float(value) for rig in rigs for value in rig.truth.array()[-1]]
+
+    assert ends() == ends()
+
+
+def test_the_stand_sees_each_robot_where_it_is():
+    async def main(clock: VirtualClock) -> list[tuple[float, float]]:
+        seen: list[float] = []
+        async with virtual_fleet(fleet(), clock) as (rigs, _):
+            for rig in rigs:
+                rig.bus.tap(lambda _t, message, _d, _a: seen.append(message.pose.x), [topics.STAND_POSE])
+            await clock.sleep(2.0)
+        return seen
+
+    seen = run_virtual(main, start=SECOND)
+    assert {round(x, 1) for x in seen} == {-1.0, -2.2}
+
+
+def test_robots_that_overlap_are_refused():
+    start = {"x": -1.1, "y": 0.0, "yaw": 0.0}
+
+    async def main(clock: VirtualClock) -> None:
+        async with virtual_fleet(fleet(second={"sim": {"world": {"start": start}}}), clock):
+            pass
+
+    with pytest.raises(InputError, match="start: the robots leader and second overlap"):
+        run_virtual(main, start=SECOND)
