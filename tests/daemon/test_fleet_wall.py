@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from monstertruck_runtime.yaml_files import yaml_text
-from monstertruck_schemas.reasons import Reason
 from monstertruckd.tools.demo.runs import free_endpoint
 from tests.daemon.wall_kit import ROOT, Robot, command, end
 
@@ -47,11 +46,11 @@ async def test_two_daemons_in_one_world(tmp_path: Path):
                 wait = ("echo", "health/loop", "-n", "3", "--robot", name, "-e", endpoints[name])
                 while (await command(*wait)).returncode:
                     await asyncio.sleep(0.5)
-        ahead = ("move", "--length", "2", "--arm", "--json", "--robot", "second", "-e", endpoints["second"])
+        ahead = ("move", "--length", "0.2", "--arm", "--json", "--robot", "second", "-e", endpoints["second"])
         async with asyncio.timeout(90):  # a busy computer makes feedback late, and the robot is armed again
-            while (moved := await command(*ahead)).returncode != Reason.OBSTACLE_STOP.exit_code:
+            while (moved := await command(*ahead)).returncode:
                 await asyncio.sleep(0.5)
-        assert "obstacle" in json.loads(moved.stdout)["text"]
+        assert json.loads(moved.stdout)["values"]["covered"] == pytest.approx(0.2, abs=0.01)
         seen = await command("echo", "stand/pose", "-n", "1", "--robot", "leader", "-e", endpoints["leader"])
         assert seen.returncode == 0, seen.stderr
         assert json.loads(seen.stdout)["pose"]["x"] == pytest.approx(-1.0, abs=0.02)
@@ -60,5 +59,5 @@ async def test_two_daemons_in_one_world(tmp_path: Path):
     with np.load(truth) as archive:
         assert set(archive) == {"leader", "second"}
         assert not archive["second"][:, 5].any()
-        assert archive["second"][-1, 1] > archive["second"][0, 1] + 0.4
+        assert archive["second"][-1, 1] > archive["second"][0, 1] + 0.15
     assert list((tmp_path / "second" / "logs").glob("*.mcap"))
