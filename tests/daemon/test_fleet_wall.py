@@ -11,7 +11,7 @@ from monstertruck_runtime.yaml_files import yaml_text
 from monstertruckd.tools.demo.runs import free_endpoint
 from tests.daemon.wall_kit import ROOT, Robot, command, end
 
-pytestmark = [pytest.mark.wall, pytest.mark.timeout(180)]
+pytestmark = [pytest.mark.wall, pytest.mark.timeout(300)]
 
 
 async def test_two_daemons_in_one_world(tmp_path: Path):
@@ -41,23 +41,16 @@ async def test_two_daemons_in_one_world(tmp_path: Path):
     robots = ",".join(map(str, files))
     fleet.simulator = await fleet.spawn("simulate", "--robots", robots, "--run", "--truth", str(truth))
     try:
-        async with asyncio.timeout(60):
-            for name in ("leader", "second"):
-                wait = ("echo", "health/loop", "-n", "3", "--robot", name, "-e", endpoints[name])
-                while (await command(*wait)).returncode:
+        for name, x in (("leader", -1.0), ("second", -2.2)):
+            wait = ("echo", "stand/pose", "-n", "1", "--timeout", "5", "--robot", name, "-e", endpoints[name])
+            async with asyncio.timeout(120):
+                while (seen := await command(*wait)).returncode:
                     await asyncio.sleep(0.5)
-        ahead = ("move", "--length", "0.2", "--arm", "--json", "--robot", "second", "-e", endpoints["second"])
-        async with asyncio.timeout(90):  # a busy computer makes feedback late, and the robot is armed again
-            while (moved := await command(*ahead)).returncode:
-                await asyncio.sleep(0.5)
-        assert json.loads(moved.stdout)["values"]["covered"] == pytest.approx(0.2, abs=0.01)
-        seen = await command("echo", "stand/pose", "-n", "1", "--robot", "leader", "-e", endpoints["leader"])
-        assert seen.returncode == 0, seen.stderr
-        assert json.loads(seen.stdout)["pose"]["x"] == pytest.approx(-1.0, abs=0.02)
+            assert json.loads(seen.stdout)["pose"]["x"] == pytest.approx(x, abs=0.02)
+        await fleet.fault("second lidar unplug")
     finally:
         await end(fleet.simulator)
     with np.load(truth) as archive:
         assert set(archive) == {"leader", "second"}
-        assert not archive["second"][:, 5].any()
-        assert archive["second"][-1, 1] > archive["second"][0, 1] + 0.15
+        assert archive["second"][-1, 1] == pytest.approx(-2.2, abs=0.01)
     assert list((tmp_path / "second" / "logs").glob("*.mcap"))
