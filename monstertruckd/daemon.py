@@ -393,6 +393,7 @@ class Daemon:
             attachments=self._attachments,
             metadata={"robot": self.config.robot},
             offload=in_daemon_thread if self._seed is None else inline,
+            log=lambda: None if self.recorder is None else self.recorder.path,
         )
 
 

@@ -11,9 +11,9 @@ from monstertruck_drivers.cable import EmulatedPort, LineFaults
 from monstertruck_drivers.emulation import Emulator, FileEmulator
 from monstertruck_runtime.errors import InputError
 
-HELP = (
-    "known: plug, unplug, power-cycle, line stalled|deaf on|off, line delay SECONDS, line chunk BYTES|off, "
-    "line flip_rate|drop_rate PROBABILITY, line garbage HEX, line short_writes COUNT, or a fault of the device"
+CABLE = (
+    "of its cable: plug, unplug, power-cycle, line stalled|deaf on|off, line delay SECONDS, line chunk BYTES|off, "
+    "line flip_rate|drop_rate PROBABILITY, line garbage HEX, line short_writes COUNT"
 )
 
 
@@ -51,10 +51,14 @@ class Emulated:
                 self.emulator.power_cycle()
             case ["line", name, value]:
                 set_line_fault(self.port.device.faults, name, value)
-            case [fault, *values] if fault != "line":
-                self.emulator.inject(fault, *values)
+            case ["line", *_]:
+                raise InputError(CABLE)
             case _:
-                raise InputError(HELP)
+                fault, *values = words or ["help"]
+                try:
+                    self.emulator.inject(fault, *values)
+                except InputError as error:
+                    raise InputError(f"{error}; {CABLE}") from None
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +73,7 @@ class EmulatedFiles:
         Raises:
             InputError: it is unknown; the text lists the known ones.
         """
-        fault, *values = words or [""]
+        fault, *values = words or ["help"]
         self.emulator.inject(fault, *values)
 
 
@@ -92,9 +96,9 @@ def set_line_fault(faults: LineFaults, name: str, value: str) -> None:
             case "garbage":
                 faults.garbage = bytes.fromhex(value)
             case _:
-                raise InputError(HELP)
+                raise InputError(CABLE)
     except (KeyError, ValueError) as error:
-        raise InputError(f"line {name}: cannot read {value!r}; {HELP}") from error
+        raise InputError(f"line {name}: cannot read {value!r}; {CABLE}") from error
 
 
 @dataclass(frozen=True, slots=True)

@@ -270,6 +270,7 @@ class EventLog:
         *,
         source: str = "",
         always: bool = False,
+        lasting: bool = False,
     ) -> None:
         """Add an event; repetitions within the interval only raise the next one's ``repeated``.
 
@@ -281,6 +282,7 @@ class EventLog:
             values: measurements behind it.
             source: program or person it is about.
             always: never suppressed, as for transitions.
+            lasting: suppressed for as long as it repeats without a pause of the interval.
         """
         key = (reason, source)
         if key not in self._emitted and len(self._emitted) >= MAX_KEYS:
@@ -289,7 +291,7 @@ class EventLog:
                 return
         last, repeated = self._emitted.get(key, (now - self._interval, 0))
         if not always and now - last < self._interval:
-            self._emitted[key] = (last, repeated + 1)
+            self._emitted[key] = (now if lasting else last, repeated + 1)
             return
         self._emitted[key] = (now, 0)
         fields: dict[str, Value] = {**(values or {})}

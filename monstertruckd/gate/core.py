@@ -283,7 +283,8 @@ class Gate:
     def _refuse(self, now: int, reason: Reason, request: DriveRequest | ControlRequest, text: str = "") -> Reason:
         what = request.order.value if isinstance(request, ControlRequest) else "drive"
         values = {"role": request.role.value, "request": what}
-        self._events.emit(now, reason, Severity.WARNING, text, values, source=request.source)
+        lasting = reason is Reason.LOWER_PRIORITY  # a tracker goes on asking while somebody drives by hand
+        self._events.emit(now, reason, Severity.WARNING, text, values, source=request.source, lasting=lasting)
         return reason
 
     def _refuse_order(self, now: int, reason: Reason, request: ControlRequest, text: str = "") -> Decision:

@@ -7,7 +7,7 @@ import os
 import re
 import stat
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
@@ -25,7 +25,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.topics import TOPICS, Topic
 from monstertruckd.gate.stops import Trip
 from monstertruckd.recorder.config import BlackBoxConfig, Compression
-from monstertruckd.recorder.log_file import LogEntry, LogFile, disk_reason, log_offset
+from monstertruckd.recorder.log_file import RUN_LOG, LogEntry, LogFile, disk_reason, log_offset
 from monstertruckd.recorder.repair import in_use
 from monstertruckd.recorder.ring import Retention, Ring, RingSnapshot
 
@@ -192,6 +192,7 @@ class BlackBox:
         attachments: JSON-able values in every box, as ``<name>.json``.
         metadata: text about the run, in every box.
         offload: where boxes are written.
+        log: file of the run that is being written, named in every box.
     """
 
     name = "blackbox"
@@ -206,7 +207,9 @@ class BlackBox:
         attachments: Mapping[str, Any],
         metadata: Mapping[str, str],
         offload: Offload = in_daemon_thread,
+        log: Callable[[], Path | None] = lambda: None,
     ) -> None:
+        self._log = log
         self._config = config
         self._clock = clock
         self._events = events
@@ -349,6 +352,8 @@ class BlackBox:
             "text": "; ".join(causes_text(trip.causes, trip.at) for trip in pending.trips),
             "lost": str(self.ring.lost),
         }
+        if (run_log := self._log()) is not None:
+            metadata[RUN_LOG] = str(run_log.absolute())
         try:
             dated = log_offset(first.at, offset)
             name = await self._offload(partial(self._write, pending.name, entries, metadata, dated))

@@ -64,6 +64,10 @@ LOG_OFFSET: Final = "log_offset_ns"
 """Its entry with what was added to daemon times for the file's log times, ns."""
 
 
+RUN_LOG: Final = "log"
+"""Entry of a black box's metadata `run`: a log file of its run."""
+
+
 def log_offset(now: int, real_offset: int) -> int:
     """What a file that begins now adds to daemon times for its log times.
 

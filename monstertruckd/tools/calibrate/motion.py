@@ -38,6 +38,11 @@ AT_REST: Final = 0.5
 SETTLE: Final = 5.0
 """Seconds in which it must come to rest."""
 DEPTH: Final = 4096
+LATE: Final = (
+    "requests came too late: end what else keeps this computer or the link to the truck busy, or run the wizard on the "
+    "truck's own computer, and repeat it; nothing was saved"
+)
+"""What to do about a lease that expired."""
 
 
 class Truck(Operator, Protocol):
@@ -68,8 +73,8 @@ class Mover:
         However it ends, the truck is stopped and disarmed.
 
         Raises:
-            RequestRefusedError: the gate refused, or stopped the truck; with its reason.
-            NoAnswerError: the truck does not move, or sends no feedback.
+            RequestRefusedError: the gate refused, stopped the truck, or holds it; with its reason.
+            NoAnswerError: the truck does not move though nothing holds it, or sends no feedback.
         """
         with (
             ExitStack() as besides,
@@ -107,8 +112,10 @@ class Mover:
             if new - way > PROGRESS:
                 way, since = new, self._clock.now()
             elif self._clock.now() - since > STUCK * SECOND:
-                why = ", ".join(reason.text for reason in run.state.reasons) if run.state else ""
-                raise NoAnswerError(f"{move.name}: no progress for {STUCK:g} s ({why or 'no reason given'})")
+                held = run.state.reasons if run.state else ()
+                why = ", ".join(reason.text for reason in held) or "no reason given"
+                text = f"{move.name}: no progress for {STUCK:g} s ({why})"
+                raise RequestRefusedError(held[0], text) if held else NoAnswerError(text)
 
     @asynccontextmanager
     async def _armed(self, run: "_Run") -> AsyncIterator[None]:
@@ -259,4 +266,5 @@ class _Run:
         if not reasons and state.mode is GateMode.DRIVING:
             raise RequestRefusedError(Reason.BUSY, f"{state.holder} drives the truck")
         text = ", ".join(reason.text for reason in reasons) or f"the truck is {state.mode}"
-        raise RequestRefusedError(reasons[0] if reasons else Reason.DISARMED, f"stopped by the gate: {text}")
+        advice = f"; {LATE}" if Reason.LEASE_EXPIRED in reasons else ""
+        raise RequestRefusedError(reasons[0] if reasons else Reason.DISARMED, f"stopped by the gate: {text}{advice}")

@@ -1,5 +1,8 @@
 """``monstertruckd calibrate``: the wizards, what they found so far, and the way back."""
 
+import shutil
+import sys
+import textwrap
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -8,7 +11,7 @@ import typer
 
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruckd.tools.cli.options import EndpointOption, RobotOption, complete_config, with_parameters
-from monstertruckd.tools.cli.output import JsonOption, command_group, print_json, print_table, remark
+from monstertruckd.tools.cli.output import JsonOption, command_group, on_terminal, print_json, print_table, remark
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -298,6 +301,22 @@ def _json(value: Any) -> str:
 
 
 def _print(result: "Result") -> None:
+    """A table in a pipe; on a terminal two lines for each value, however long what it means is."""
+    if on_terminal(sys.stdout):
+        width = shutil.get_terminal_size().columns
+        for e in result.estimates:
+            grade = f", {e.grade}" if e.grade else ""
+            until = "" if e.valid_until is None else f", valid until {e.valid_until.date[:10]}"
+            print(f"{result.wizard}.{e.name}: {_number(e)} {e.unit}{grade}".rstrip())
+            text = f"{e.meaning}; {e.samples} samples, {e.date.replace('T', ' ')[:16]}{until}"
+            print("  " + textwrap.shorten(text, width - 2, placeholder=" ..."))
+    else:
+        _print_table(result)
+    for missing in result.unobserved:
+        remark(f"not seen: {missing}")
+
+
+def _print_table(result: "Result") -> None:
     rows = [
         (
             f"{result.wizard}.{e.name}",
@@ -313,8 +332,6 @@ def _print(result: "Result") -> None:
     ]
     headings = ("what", "value", "unit", "grade", "samples", "measured", "until", "meaning")
     print_table(headings, rows, right=("value", "samples"))
-    for missing in result.unobserved:
-        remark(f"not seen: {missing}")
 
 
 def _number(estimate: "Estimate") -> str:

@@ -68,15 +68,15 @@ def list_command(
         remark(f"{folder}: no logs")
         return
     print_table(
-        ("log", "begins (UTC)", "seconds", "messages", "MB", "state"),
+        ("begins (UTC)", "seconds", "messages", "MB", "state", "log"),
         [
             (
-                str(log.path),
                 log.started or "-",
                 "-" if log.duration is None else f"{log.duration:.1f}",
                 "-" if log.messages is None else str(log.messages),
                 f"{log.size / 1e6:.2f}",
                 log.state.value,
+                str(log.path),
             )
             for log in logs
         ],

@@ -167,7 +167,10 @@ def save(
                     async with clock.deadline(timeout):
                         return await maps.next()
                 except TimeoutError:
-                    raise NoAnswerError(f"{robot} published no map within {timeout:g} s") from None
+                    text = f"{robot} published no map within {timeout:g} s"
+                    if (await client.call("config")).get("slam") is None:
+                        text += ": its configuration has no section `slam`, as configs/slam.yaml has"
+                    raise NoAnswerError(text) from None
 
     grid = run_wall(newest)
     cells = grid.cells.reshape(grid.height, grid.width)
@@ -306,8 +309,18 @@ def _print(facts: dict[str, Any], json_output: bool) -> None:
         print_json(facts)
         return
     for name, value in facts.items():
-        text = f"{value:.2f}" if isinstance(value, float) else str(value)
-        print(f"{name.replace('_', ' '):18} {text}")
+        print(f"{name.replace('_', ' '):18} {_text(value)}")
+
+
+def _text(value: Any) -> str:
+    """A fact as people write it."""
+    if isinstance(value, float):
+        return f"{value:.2f}"
+    if isinstance(value, dict):
+        return ", ".join(f"{count} {name}" for name, count in value.items()) or "-"
+    if isinstance(value, tuple | list):
+        return " ".join(_text(part) for part in value)
+    return "-" if value is None else str(value)
 
 
 def _draw(path: Path, saved: Any, places: Any = ()) -> None:

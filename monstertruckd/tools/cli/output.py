@@ -10,8 +10,10 @@ import errno
 import json
 import math
 import os
+import shutil
 import signal
 import sys
+import textwrap
 from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from enum import Enum
@@ -140,9 +142,18 @@ def _aligned(headings: Sequence[str], rows: Sequence[Sequence[str]], right: Sequ
 
 
 def remark(text: str) -> None:
-    """Print a remark on standard error, so that standard output holds the result alone."""
+    """Print a remark on standard error, so that standard output holds the result alone; a terminal breaks no word."""
     if sys.stderr is not None:  # print() would take standard output in its place
+        if on_terminal(sys.stderr):
+            text = wrapped(text)
         print(text, file=sys.stderr, flush=True)
+
+
+def wrapped(text: str) -> str:
+    """Text broken between words where the terminal ends; what has no blanks, such as a path, stays whole."""
+    width = shutil.get_terminal_size().columns
+    lines = (textwrap.wrap(line, width, break_long_words=False, break_on_hyphens=False) for line in text.split("\n"))
+    return "\n".join("\n".join(line) for line in lines)
 
 
 @contextmanager

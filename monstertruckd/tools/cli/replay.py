@@ -54,9 +54,12 @@ def replay(
 
 
 def _check(log: Path, config: Path | None, tolerance: float | None, *, json_output: bool) -> None:
-    from monstertruckd.tools.replay_check import check_log, parts_of
+    from monstertruckd.tools.replay_check import check_log, parts_of, run_of
 
-    with progress("check", sum(part.stat().st_size for part in parts_of(log)) if log.is_file() else None) as done:
+    run, until = run_of(log)
+    if until is not None:
+        remark(f"{log}: is a black box; its run {run} is computed up to the end of the box")
+    with progress("check", sum(part.stat().st_size for part in parts_of(run))) as done:
         result = check_log(log, config, tolerance, done)
     if json_output:
         print_json(result.figures())

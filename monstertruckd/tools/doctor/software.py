@@ -14,6 +14,8 @@ from monstertruckd.tools.install.apply import Change, install
 from monstertruckd.tools.install.plan import RULES, SERVICE, UNIT, USER, plan
 
 MACHINES = ("x86_64", "aarch64")
+OURS = ("bench", "dev", "docs")
+"""Extras for work on the project itself: dozens of packages that no robot and no station lacks."""
 NEEDED = "robot"
 """Extra without which no device can be used."""
 
@@ -40,9 +42,11 @@ def packages(context: HostContext, requirements: list[str] | None = None) -> Ite
     else:
         yield fine("packages", f"all for a {NEEDED}")
     whole = sorted(extra for extra, names in missing.items() if not names)
-    rest = [f"{extra} ({', '.join(names)})" for extra, names in sorted(missing.items()) if names]
-    seen = f"installed: {', '.join(whole) or 'none'}"
-    yield fine("extras", f"{seen}; incomplete: {'; '.join(rest)}" if rest else seen)
+    rest = [f"{extra} ({', '.join(names)})" for extra, names in sorted(missing.items()) if names and extra not in OURS]
+    ours = sorted(extra for extra in OURS if missing.get(extra))
+    seen = f"installed: {', '.join(extra for extra in whole if extra not in OURS) or 'none'}"
+    seen += f"; incomplete: {'; '.join(rest)}" if rest else ""
+    yield fine("extras", f"{seen}; for work on the project, not all there: {', '.join(ours)}" if ours else seen)
 
 
 def configuration(context: HostContext) -> Iterator[Finding]:

@@ -1,7 +1,7 @@
 """What a robot would have made of a recorded run: its sensors once more through estimation, the outputs compared."""
 
 from monstertruckd.tools.replay_check.check import check_log
-from monstertruckd.tools.replay_check.recorded import parts_of
+from monstertruckd.tools.replay_check.recorded import parts_of, run_of
 from monstertruckd.tools.replay_check.result import Check
 
-__all__ = ["Check", "check_log", "parts_of"]
+__all__ = ["Check", "check_log", "parts_of", "run_of"]

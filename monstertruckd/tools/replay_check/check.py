@@ -25,7 +25,7 @@ from monstertruckd.tools.logs.messages import first_offset
 from monstertruckd.tools.replay_check.chain import WORKER, Chain, outputs_of, unseen_ticks, why_no_goals, without_goals
 from monstertruckd.tools.replay_check.comparison import TopicComparison
 from monstertruckd.tools.replay_check.pace import PacedClock
-from monstertruckd.tools.replay_check.recorded import RunLog, Survey, preamble, recorded_config, survey
+from monstertruckd.tools.replay_check.recorded import RunLog, Survey, preamble, recorded_config, run_of, survey
 from monstertruckd.tools.replay_check.result import Check, Unreadable
 
 RESTS_ON_WORKER: Final = frozenset(
@@ -48,7 +48,7 @@ def check_log(
     """Compute the outputs of ``log`` again and compare them.
 
     Args:
-        log: file to read; of a run in several parts any one stands for all.
+        log: file to read; of a run in several parts any one stands for all, a black box for its run up to its end.
         config: another configuration to compute with; None = the log's own.
         tolerance: greatest difference that agrees, in SI units, instead of the ones above.
         progress: called with the bytes of the run read so far.
@@ -59,7 +59,8 @@ def check_log(
         ConfigError: a configuration is refused.
         WorkerError: the estimation worker failed.
     """
-    reader = RunLog(log)
+    log, until = run_of(log)
+    reader = RunLog(log, until)
     found = survey(reader)
     attachments, metadata = preamble(reader)
     own = recorded_config(log, attachments)

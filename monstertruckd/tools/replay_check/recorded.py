@@ -17,7 +17,7 @@ from monstertruck_schemas.topics import EVENT
 from monstertruckd.config.edit import YamlText
 from monstertruckd.config.migrate import bring_up_to_date
 from monstertruckd.config.truck import TruckConfig
-from monstertruckd.recorder.log_file import NAME
+from monstertruckd.recorder.log_file import NAME, RUN_LOG
 from monstertruckd.recorder.reader import CONFIG, LogMessage, LogReader, attached_config, open_log
 from monstertruckd.tools.replay_check.goals import GoalRecord
 
@@ -45,18 +45,41 @@ def parts_of(log: Path) -> list[Path]:
     return [parts[number] for number in sorted(parts)]
 
 
+def run_of(log: Path) -> tuple[Path, int | None]:
+    """What is computed again for ``log``, whose filters begin with its run, and up to which daemon time, ns.
+
+    Returns:
+        The log itself, to its end; for a black box a log of its run, up to the end of the box.
+
+    Raises:
+        NotFoundError: no such log.
+        InputError: not a log, or the run's log of a black box is gone.
+    """
+    reader = open_log(log)
+    named = reader.metadata().get("run", {}).get(RUN_LOG)
+    if named is None:
+        return log, None
+    places = (Path(named), *(folder / Path(named).name for folder in log.absolute().parents[:2]))
+    found = next((place for place in places if place.is_file()), None)
+    if found is None:
+        raise InputError(f"{log}: begins in the middle of its run, and the run's log {named} is not there")
+    return found, max((message.log_time for message in reader), default=0)
+
+
 class RunLog:
     """The messages of a run, once or again; ends at the first error, or before a part that is not there.
 
     Args:
         log: any part of it, or a log under another name.
+        until: daemon time, ns, up to which it counts; None = to its end.
 
     Raises:
         NotFoundError: no such file.
         InputError: not an MCAP file, no first part, or a part of another run.
     """
 
-    def __init__(self, log: Path) -> None:
+    def __init__(self, log: Path, until: int | None = None) -> None:
+        self._until = until
         self._readers = [open_log(part) for part in parts_of(log)]
         self.path = log
         self.damage: str | None = None
@@ -92,6 +115,8 @@ class RunLog:
                 self.damage = f"{missing} is not there: the run is known up to it alone"
                 return
             for entry in reader:
+                if self._until is not None and entry.log_time > self._until:
+                    return
                 if entry.sequence > newest.get(entry.topic, -1) or number == 0:
                     newest[entry.topic] = entry.sequence
                     yield entry

@@ -154,7 +154,8 @@ def draw(state: ScreenState, width: int, events: int = 6) -> RenderableType:
     layout = Layout()
     gone = state.silence > SILENCE
     paint: Callable[[RenderableType], RenderableType] = _Gone if gone else _as_it_is
-    rows = [Layout(name="top", ratio=1), Layout(paint(_events(state, events)), name="events", size=events + 2)]
+    shown = max(1, min(events, len(state.events)))
+    rows = [Layout(name="top", ratio=1), Layout(paint(_events(state, shown)), name="events", size=shown + 2)]
     if lines := state.why_stopped:
         stop = Panel(Text("\n".join(lines), style="yellow", no_wrap=True), title="stopped", border_style="yellow")
         rows.insert(1, Layout(paint(stop), name="stop", size=len(lines) + 2))

@@ -190,3 +190,12 @@ def test_a_latched_stop_says_so_whatever_stopped_the_truck_before():
     states.stop(NOW, [Reason.TILT_STOP])
     states.latch(NOW + 1)
     assert (states.mode, states.since, states.reasons) == (GateMode.ESTOPPED, NOW + 1, (Reason.ESTOPPED,))
+
+
+def test_what_lasts_is_one_event_until_it_pauses():
+    log = EventLog(1.0)
+    for tick in range(200):
+        log.emit(NOW + tick * SECOND // 50, Reason.LOWER_PRIORITY, WARNING, source="tracker", lasting=True)
+    assert [event.values for event in log.drain()] == [{"by": "tracker"}]
+    log.emit(NOW + 6 * SECOND, Reason.LOWER_PRIORITY, WARNING, source="tracker", lasting=True)
+    assert [event.values for event in log.drain()] == [{"by": "tracker", "repeated": 199}]

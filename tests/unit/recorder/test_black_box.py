@@ -70,6 +70,7 @@ class Bench:
             attachments={"config": {"robot": "truck"}, "versions": {"python": "3"}},
             metadata={"robot": "truck"},
             offload=offload,
+            log=lambda: folder.parent / "run-000001-000.mcap",
         )
         self._seq = 0
 
@@ -133,6 +134,7 @@ def test_a_trip_saves_the_minute_before_and_five_seconds_after(tmp_path: Path):
     messages = list(reader)
     assert reader.damage is None
     assert len(messages) == values["messages"]
+    assert reader.metadata()["run"]["log"] == str(tmp_path.parent / "run-000001-000.mcap")
     first, last = seconds(messages)
     assert (first, last) == (pytest.approx(41.0, abs=0.1), pytest.approx(106.0, abs=0.1))
     assert [m.log_time for m in messages] == sorted(m.log_time for m in messages)

@@ -27,6 +27,7 @@ from monstertruckd.tools.cli.output import (
     print_json,
     print_table,
     progress,
+    remark,
     until_stopped,
 )
 from monstertruckd.tools.logs.summary import LogState, list_logs
@@ -140,7 +141,7 @@ def test_help_and_usage_errors_are_bare_lines_in_pipes():
     assert f"  report   {report}\n" in reported
     refused = called("probe", capture_output=True)
     assert refused.returncode == 2
-    assert refused.stderr.endswith("\nError: Missing argument 'device'.\n")
+    assert refused.stderr == "Error: Missing argument 'device'. Try 'python -m monstertruckd probe -h'.\n"
 
 
 def test_help_is_framed_on_a_terminal():
@@ -234,3 +235,18 @@ def test_progress_is_silent_where_nobody_looks(capsys: pytest.CaptureFixture[str
     with progress("reading", total=10) as done:
         done(5)
     assert capsys.readouterr() == ("", "")
+
+
+def test_a_terminal_breaks_no_word_of_a_remark(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    monkeypatch.setenv("COLUMNS", "30")
+    text = "/a/path/that/is/longer/than/the/terminal: cannot be read, and that is why\n  indented"
+    remark(text)
+    assert capsys.readouterr().err == text + "\n", "a pipe gets the line whole"
+    monkeypatch.setattr("monstertruckd.tools.cli.output.on_terminal", lambda _: True)
+    remark(text)
+    assert capsys.readouterr().err.splitlines() == [
+        "/a/path/that/is/longer/than/the/terminal:",
+        "cannot be read, and that is",
+        "why",
+        "  indented",
+    ]

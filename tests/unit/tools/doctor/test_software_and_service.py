@@ -39,6 +39,9 @@ def test_packages_of_a_robot_must_be_there_others_may(tmp_path: Path):
     found = see(tmp_path / "a", check, without("rerun-sdk"))
     assert bad(found) == {}
     assert found["extras"].seen == "installed: none; incomplete: view (rerun-sdk)"
+    ours = [*REQUIRES, "pytest>=8; extra == 'dev'", "mkdocs-material>=9; extra == 'docs'"]
+    found = see(tmp_path / "d", lambda context: packages(context, ours), without("pytest"))
+    assert found["extras"].seen == "installed: view; for work on the project, not all there: dev"
     lacking = see(tmp_path / "b", check, without("mcap", "numpy"))["packages"]
     assert lacking.reason is Reason.NOT_INSTALLED
     assert lacking.seen == "missing: numpy, mcap"

@@ -89,7 +89,7 @@ def test_the_commands(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pyt
     assert run(monkeypatch, "list", str(folder)) == 0
     out, err = capsys.readouterr()
     assert out.splitlines()[2].split() == [
-        str(folder / "run-1.mcap"), "2026-05-01", "01:46:41", "3.0", "5", "0.01", "finished"
+        "2026-05-01", "01:46:41", "3.0", "5", "0.01", "finished", str(folder / "run-1.mcap")
     ]  # fmt: skip
     assert "log recover FILE" in err
     assert run(monkeypatch, "recover", str(folder / "run-3.mcap"), "--json") == 0

@@ -15,7 +15,7 @@ from monstertruck_schemas.req import Role
 from monstertruck_schemas.sensor import Attitude, Battery, BatteryLevel, LaserScan
 from monstertruck_schemas.state import GateMode, GateState, Odometry
 from monstertruckd.tools.status.screen import ScreenState, draw
-from monstertruckd.tools.status.watch import plain
+from monstertruckd.tools.status.watch import place, plain
 
 HEADER = {"stamp": 10**9, "received": 10**9, "seq": 0}
 
@@ -206,3 +206,15 @@ def test_ages_are_of_the_robots_clock():
     text = shown(state).export_text()
     assert "11 s" in text
     assert " 1.00 s  gate" in text
+
+
+def test_the_title_has_room_for_the_robots_name():
+    assert place("unixsock-stream//tmp/monstertruckd-1000/7447.sock") == "on this computer"
+    assert place("tcp/192.168.1.20:7447") == "at tcp/192.168.1.20:7447"
+
+
+def test_without_events_the_scan_has_their_room():
+    console = Console(width=80, height=24, record=True)
+    console.print(draw(ScreenState("truck", 0), 80), height=24)
+    lines = console.export_text().splitlines()
+    assert len(lines) - next(number for number, line in enumerate(lines) if "events" in line) == 3
