@@ -18,6 +18,7 @@ from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.mailbox import fifo, latest
 from monstertruck_runtime.service import Service
 from monstertruck_schemas import topics
+from monstertruck_schemas.body import Mount
 from monstertruck_schemas.roles import DeviceRole
 from monstertruck_schemas.topics import Writer
 from monstertruckd.assembly.devices import scan_angles
@@ -53,18 +54,20 @@ class Body:
         return cls(config.chassis(), Footprint(config.geometry.length, config.geometry.width), points, mounts)
 
 
-def build_estimation(config: TruckConfig, bus: Bus, clock: Clock, body: Body) -> Iterator[Service]:
-    """Transforms always; odometry where the robot can drive and steer."""
-    mounts = {
-        role: mount(role, (m.x, m.y, m.z), (m.roll, m.pitch, m.yaw))
-        for role, m in ((role, device.mount) for role, device in config.devices.present().items())
-        if DEVICES.roles[role].frame
-    }
-    for role, device in config.devices.present().items():
+def sensor_mounts(config: TruckConfig) -> dict[str, Mount]:
+    """Where every sensor is fixed to the base, by its frame; of the stabiliser the point that its joints turn about."""
+    devices = config.devices.present()
+    mounts = {role: device.mount for role, device in devices.items() if DEVICES.roles[role].frame}
+    for role, device in devices.items():
         if (elements := DEVICES.roles[role].elements) is not None:
             for name, element in getattr(device.driver, elements).items():
-                m = element.mount
-                mounts[f"{role}_{name}"] = mount(f"{role}_{name}", (m.x, m.y, m.z), (m.roll, m.pitch, m.yaw))
+                mounts[f"{role}_{name}"] = element.mount
+    return mounts
+
+
+def build_estimation(config: TruckConfig, bus: Bus, clock: Clock, body: Body) -> Iterator[Service]:
+    """Transforms always; odometry where the robot can drive and steer."""
+    mounts = {name: mount(name, (m.x, m.y, m.z), (m.roll, m.pitch, m.yaw)) for name, m in sensor_mounts(config).items()}
     joints = mounts.pop(DeviceRole.STABILISER, None)
     if joints is not None and DeviceRole.LIDAR in mounts:
         lidar = mounts[DeviceRole.LIDAR]

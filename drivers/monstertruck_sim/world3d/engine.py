@@ -5,7 +5,7 @@ heights by the project's own kernels: MuJoCo's rays cost 0.9 ms a scan against 4
 400 x 400 heights. Only what those kernels do not know, blocks on the ground, is seen by MuJoCo's rays.
 """
 
-from math import hypot, radians
+from math import hypot
 from typing import Final
 
 import mujoco
@@ -17,7 +17,8 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.truck import LinkedAxles
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.map_files import OCCUPIED
-from monstertruck_sim.world.config import LidarConfig, MechanicsConfig, SimTruckConfig, TiltConfig, WorldConfig
+from monstertruck_sim.world.config import LidarConfig, SimTruckConfig, TiltConfig, WorldConfig
+from monstertruck_sim.world.mechanics import mechanics
 from monstertruck_sim.world.obstacles import Box, Disc, Obstacle
 from monstertruck_sim.world.plane import Engine, PlanOutline, without
 from monstertruck_sim.world.plant import Caster, Pose
@@ -188,23 +189,6 @@ class RigidSweep:
             own = met[part] + ((middle - places[part]) * ways[part]).sum(axis=1)
             ranges[part] = np.where(geoms[part] >= 0, own, np.inf)
         return ranges
-
-
-def mechanics(truck: SimTruckConfig, config: MechanicsConfig) -> Mechanics:
-    """What the description is made from."""
-    return Mechanics(
-        mass=truck.mass,
-        wheel_mass=config.wheel_mass,
-        axle_mass=config.axle_mass,
-        mass_height=config.mass_height,
-        wheel_width=config.wheel_width,
-        droop=config.droop,
-        bump=config.bump,
-        damping=config.damping,
-        axle_roll=radians(config.axle_roll_deg),
-        friction=config.friction,
-        rolling_resistance=truck.rolling_resistance,
-    )
 
 
 def drive_line(truck: SimTruckConfig, parts: Mechanics) -> DriveLine:

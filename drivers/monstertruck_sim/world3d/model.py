@@ -97,6 +97,10 @@ class Site:
     scenery: tuple[Sequence[Element], Sequence[Element]] = ((), ())
 
 
+EMPTY: Final = Site(np.zeros((0, 4)), TALL, None)
+"""Level ground without anything."""
+
+
 def rectangles(solid: NDArray[np.bool_], resolution: float, origin: tuple[float, float], longest: int = 80) -> Array:
     """Few rectangles that cover exactly the solid cells, (n, 4): x0, y0, x1, y1, m.
 

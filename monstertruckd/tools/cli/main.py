@@ -8,6 +8,7 @@ from monstertruckd.tools.cli import (
     calibrate,
     config,
     demo,
+    description,
     devices,
     doctor,
     drill,
@@ -61,6 +62,7 @@ app.command("simulate")(demo.simulate)
 app.command("drill")(drill.drill)
 app.command("run")(robot.run)
 app.command("check-config", hidden=True)(config.show)  # its name before there were others
+app.command("description")(description.description)
 app.command("topics")(robot.topics)
 app.command("reasons")(robot.reasons)
 app.command("plugins")(robot.plugins)

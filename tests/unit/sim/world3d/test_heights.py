@@ -6,7 +6,8 @@ import pytest
 
 from monstertruck_kinematics.description import truck_description
 from monstertruck_sim.world.config import MechanicsConfig, SimTruckConfig
-from monstertruck_sim.world3d.engine import drive_line, mechanics
+from monstertruck_sim.world.mechanics import mechanics
+from monstertruck_sim.world3d.engine import drive_line
 from monstertruck_sim.world3d.heights import HeightGrid
 from monstertruck_sim.world3d.model import Group, Site, load
 

@@ -5,7 +5,8 @@ import pytest
 
 from monstertruck_kinematics.description import truck_description
 from monstertruck_sim.world.config import MechanicsConfig, SimTruckConfig
-from monstertruck_sim.world3d.engine import drive_line, mechanics
+from monstertruck_sim.world.mechanics import mechanics
+from monstertruck_sim.world3d.engine import drive_line
 from monstertruck_sim.world3d.model import Block, Site, load, rectangles
 
 
