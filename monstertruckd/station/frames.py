@@ -87,14 +87,12 @@ def transforms(of: Transforms) -> str:
 def facts(config: dict[str, Any], versions: dict[str, str]) -> str:
     """What a robot is and can do, of its configuration; and what software it runs."""
     devices = {role: row for role, row in config.get("devices", {}).items() if row is not None}
-    lidar = devices.get("lidar", {}).get("mount")
     return text(
         "facts",
         robot=config.get("robot"),
         body=config.get("body", {}).get("kind"),
         geometry=config.get("geometry"),
         gate={name: config["gate"][name] for name in ("speed", "reverse_speed", "angle", "tilt", "leases")},
-        lidar=lidar,
         devices=sorted(devices),
         goals=config.get("planner") is not None,
         mapping=config.get("slam") is not None,

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from monstertruck_planners.track.paths import load_path
+from monstertruck_runtime.drives import drive_to, follow
 from monstertruck_runtime.errors import RequestRefusedError
 from monstertruck_schemas import topics
 from monstertruck_schemas.plan import Path as DrivePath
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import GoalOrder, GoalRequest, PathRequest, Role
-from monstertruckd.tools.cli.goto_session import drive_to, follow
 from monstertruckd.tools.simulation.operator import LocalOperator
 from tests.daemon.goal_kit import Trip, assert_at, travel
 

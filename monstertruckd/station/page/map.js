@@ -115,12 +115,20 @@ export class MapView {
     return [a[0] + k * (b[0] - a[0]), a[1] + k * (b[1] - a[1]), a[2] + k * wrapped(b[2] - a[2])];
   }
 
+  /** Pose of a sensor's frame in base, seen from above. */
+  mount(frame) {
+    const row = this.link.newest.transforms?.tree[frame];
+    if (!row || frame === "base") return [0, 0, 0];
+    const [parent, x, y, , qx, qy, qz, qw] = row;
+    const yaw = Math.atan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz));
+    return compose(this.mount(parent), [x, y, yaw]);
+  }
+
   takeScan(message) {
     const ranges = new Uint16Array(message.payload);
     const base = this.poseAt(message.stamp + (ranges.length / 2) * message.time_step * 1e9);
     if (!base) return;
-    const mount = this.link.newest.facts?.lidar ?? { x: 0, y: 0, yaw: 0 };
-    const [x, y, yaw] = compose(base, [mount.x, mount.y, mount.yaw]);
+    const [x, y, yaw] = compose(base, this.mount(message.frame));
     const points = new Float32Array(2 * ranges.length);
     let count = 0;
     for (let i = 0; i < ranges.length; i++) {
@@ -169,7 +177,7 @@ export class MapView {
     const [free, wall] = [rgb(this.colour["map-free"]), rgb(this.colour["map-wall"])];
     const colours = new Uint32Array(101);
     for (let value = 0; value <= 100; value++) {
-      const k = value / 100;
+      const k = (value / 100) ** 1.8; // what is rather free looks free
       const [r, g, b] = free.map((from, i) => Math.round(from + k * (wall[i] - from)));
       colours[value] = (255 << 24) | (b << 16) | (g << 8) | r;
     }

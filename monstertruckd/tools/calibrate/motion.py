@@ -45,7 +45,7 @@ LATE: Final = (
 """What to do about a lease that expired."""
 
 
-class Truck(Operator, Protocol):
+class MovedTruck(Operator, Protocol):
     """Client of a truck that a wizard moves."""
 
     async def drive(self, speed: float, front: float, rear: float = 0.0, lease: float = 0.3) -> None:
@@ -62,7 +62,7 @@ class Mover:
         chassis: for the way.
     """
 
-    def __init__(self, truck: Truck, clock: Clock, chassis: Chassis) -> None:
+    def __init__(self, truck: MovedTruck, clock: Clock, chassis: Chassis) -> None:
         self._truck = truck
         self._clock = clock
         self._drivetrain = chassis.drivetrain
@@ -135,7 +135,7 @@ class _Run:
 
     def __init__(
         self,
-        truck: Truck,
+        truck: MovedTruck,
         clock: Clock,
         feeds: tuple[
             Mailbox[DriveFeedback],

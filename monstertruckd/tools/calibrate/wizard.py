@@ -20,7 +20,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruckd.config.calibration import Result, Value, WizardName, value_at
 from monstertruckd.config.calibration_rpc import SAVE
 from monstertruckd.config.truck import TruckConfig
-from monstertruckd.tools.calibrate.motion import Mover, Truck
+from monstertruckd.tools.calibrate.motion import MovedTruck, Mover
 from monstertruckd.tools.calibrate.steps import Collect, Confirm, MoveRecord, MoveStep, Number, Panel
 
 M = TypeVar("M", bound=Message)
@@ -54,7 +54,7 @@ class WizardContext:
 
     def __init__(
         self,
-        truck: Truck,
+        truck: MovedTruck,
         panel: Panel,
         clock: Clock,
         config: TruckConfig,
@@ -137,7 +137,12 @@ class WizardContext:
 
 
 async def calibrate(
-    wizard: Wizard, truck: Truck, panel: Panel, clock: Clock, config: TruckConfig, known: Mapping[WizardName, Result]
+    wizard: Wizard,
+    truck: MovedTruck,
+    panel: Panel,
+    clock: Clock,
+    config: TruckConfig,
+    known: Mapping[WizardName, Result],
 ) -> tuple[Result, str]:
     """Run a wizard and have the daemon save its result; returns the saved result and the path of the new file.
 

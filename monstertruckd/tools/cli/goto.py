@@ -14,7 +14,7 @@ from monstertruckd.tools.cli.output import JsonOption, finish, print_json
 
 if TYPE_CHECKING:
     from monstertruck_runtime.client import TruckClient
-    from monstertruckd.tools.cli.goto_session import Arrival
+    from monstertruck_runtime.drives import Arrival
 
 ROUTE_TIMEOUT: Final = 6.0
 """Seconds to wait for a first route."""
@@ -36,14 +36,16 @@ def goto(
 
     Ends when the goal is reached or given up, with the reason's exit code. Ctrl-C cancels the goal.
     """
-    from monstertruckd.tools.cli.goto_session import drive_to
+    from monstertruck_runtime.drives import drive_to
+    from monstertruckd.tools.cli.goto_session import on_the_terminal
 
     places = [parse_pose(text, yaw_needed=False) for text in via or ()]
 
     async def main(client: "TruckClient", clock: Clock) -> "Arrival":
         if (await client.call("config")).get("planner") is None:
             raise NotFoundError(f"robot {robot!r} has no planner: expected a section `planner` in its configuration")
-        return await drive_to(client, clock, (x, y, yaw), places, arm=arm)
+        with on_the_terminal() as report:
+            return await drive_to(client, clock, (x, y, yaw), places, arm=arm, report=report)
 
     _run(main, robot, endpoint, json_output=json_output)
 
@@ -61,14 +63,16 @@ def track(
     Ends at its end or when it is lost, with the reason's exit code. Ctrl-C stops the truck.
     """
     from monstertruck_planners.track.paths import load_path
-    from monstertruckd.tools.cli.goto_session import follow
+    from monstertruck_runtime.drives import follow
+    from monstertruckd.tools.cli.goto_session import on_the_terminal
 
     path = load_path(file, closed=closed)
 
     async def main(client: "TruckClient", clock: Clock) -> "Arrival":
         localised = (await client.call("config")).get("slam") is not None
         there = path.model_copy(update={"frame": "map" if localised else "odom"})
-        return await follow(client, clock, there, arm=arm)
+        with on_the_terminal() as report:
+            return await follow(client, clock, there, arm=arm, report=report)
 
     _run(main, robot, endpoint, json_output=json_output)
 

@@ -8,11 +8,12 @@ import pytest
 from typer.testing import CliRunner
 
 from monstertruck_runtime.clock import SECOND, run_virtual
+from monstertruck_runtime.drives import drive_to, follow
 from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError
 from monstertruck_runtime.mailbox import Mailbox
 from monstertruck_schemas.plan import Path
 from monstertruck_schemas.reasons import Reason
-from monstertruckd.tools.cli.goto_session import drive_to, follow
+from monstertruckd.tools.cli.goto_session import on_the_terminal
 from monstertruckd.tools.cli.main import app
 
 
@@ -97,8 +98,9 @@ def interrupted(robot, drive):
     return robot.asked
 
 
-def to_goal(robot, clock):
-    return drive_to(robot, clock, (1.0, 0.0, 0.0), arm=True)
+async def to_goal(robot, clock):
+    with on_the_terminal() as report:
+        return await drive_to(robot, clock, (1.0, 0.0, 0.0), arm=True, report=report)
 
 
 def along_path(robot, clock):

@@ -1,0 +1,243 @@
+"""One drive to a goal or along a path, as a client of the robot: from the request to how it ended."""
+
+import asyncio
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from contextlib import asynccontextmanager, suppress
+from dataclasses import asdict, dataclass
+from typing import Any, Final, Protocol
+
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError, TruckError
+from monstertruck_runtime.mailbox import Mailbox, fifo, latest
+from monstertruck_runtime.requests import Operator
+from monstertruck_schemas.event import Event, Severity
+from monstertruck_schemas.plan import GoalPhase, GoalState, Path, TrackerState
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import GoalOrder
+from monstertruck_schemas.state import GateState
+from monstertruck_schemas.topics import EVENT, GATE, GOAL, PATH, TRACKER
+
+LOOK: Final = 0.5
+"""Half the period of reports why the truck stands, s."""
+PLANNER_START: Final = 240.0
+"""Seconds that a planner may take to start."""
+ACCEPT_TIMEOUT: Final = 3.0
+"""Seconds in which a path is accepted or refused."""
+
+
+class Driver(Operator, Protocol):
+    """Client of a robot that drives to goals and along paths."""
+
+    async def goal(
+        self, goal: tuple[float, float, float], frame: str = "map", via: Sequence[tuple[float, ...]] = ()
+    ) -> dict[str, Any]:
+        """Request to drive to a pose by way of waypoints."""
+        ...
+
+    async def goal_control(self, order: GoalOrder) -> None:
+        """Pause, resume, cancel."""
+        ...
+
+    async def path(self, path: Path, lease: float = 1.0) -> None:
+        """Request to follow a path."""
+        ...
+
+
+class DriveReport:
+    """What is said of a drive while it lasts; this one says nothing."""
+
+    def waiting(self, text: str, share: float) -> None:
+        """The planner is starting; ``share`` of the time allowed has passed."""
+
+    def under_way(self, what: str, share: float) -> None:
+        """Driven so far, 0..1."""
+
+    def stands(self, why: str) -> None:
+        """The truck stands, for another reason than before."""
+
+
+SILENT: Final = DriveReport()
+
+
+@dataclass(frozen=True, slots=True)
+class Arrival:
+    """How a drive ended."""
+
+    reason: Reason
+    text: str
+    length: float
+    """Metres of the first route, or of the path."""
+    elapsed: float
+    """Seconds."""
+    routes: int = 1
+    recoveries: int = 0
+
+    def as_json(self) -> dict[str, Any]:
+        """Everything as plain data."""
+        return asdict(self)
+
+
+async def drive_to(
+    driver: Driver,
+    clock: Clock,
+    goal: tuple[float, float, float],
+    via: Sequence[tuple[float, ...]] = (),
+    *,
+    arm: bool,
+    report: DriveReport = SILENT,
+) -> Arrival:
+    """Send a goal and wait for its end; cancelled or without an answer, it cancels the goal.
+
+    Raises:
+        RequestRefusedError: the goal or the arming was refused.
+        NoAnswerError: the robot does not answer.
+    """
+    with driver.subscribe(GOAL, fifo(256)) as states, driver.subscribe(GATE, latest()) as gate:
+
+        async def cancel() -> None:
+            await driver.goal_control(GoalOrder.CANCEL)
+
+        async with _taken_back(cancel):
+            number = await _taken_on(driver, clock, goal, via, report)
+        end = _goal_end(states, number, report)
+        return await _watched(driver, clock, gate, arm=arm, end=end, undo=cancel, report=report)
+
+
+async def _taken_on(
+    driver: Driver,
+    clock: Clock,
+    goal: tuple[float, float, float],
+    via: Sequence[tuple[float, ...]],
+    report: DriveReport,
+) -> int:
+    """Number of the goal; while the planner is starting it is sent again and again.
+
+    Raises:
+        RequestRefusedError: for another reason, or the planner takes longer than ``PLANNER_START``.
+        NoAnswerError: the robot does not answer.
+    """
+    began = clock.now()
+    while True:
+        try:
+            return int((await driver.goal(goal, via=via))["number"])
+        except RequestRefusedError as refused:
+            waited = (clock.now() - began) / SECOND
+            if refused.refusal is not Reason.PLANNER_STARTING or waited > PLANNER_START:
+                raise
+            report.waiting(str(refused), waited / PLANNER_START)
+        await clock.sleep(LOOK)
+
+
+@asynccontextmanager
+async def _taken_back(undo: Callable[[], Awaitable[object]]) -> AsyncIterator[None]:
+    """``undo`` a request inside that is cancelled or not answered: the robot may carry it out all the same."""
+    try:
+        yield
+    except (asyncio.CancelledError, NoAnswerError):
+        with suppress(TruckError):
+            await undo()
+        raise
+
+
+async def _goal_end(states: Mailbox[GoalState], number: int, report: DriveReport) -> Arrival:
+    length = 0.0
+    async for state in states:
+        if state.number > number:
+            return Arrival(Reason.CANCELLED, f"{state.source} sent another goal", length, 0.0)
+        if state.number < number:
+            continue
+        if state.phase is GoalPhase.IDLE:
+            return Arrival(state.outcome, state.text, length, state.elapsed, state.routes, state.recoveries)
+        length = length or state.remaining
+        if length:
+            report.under_way("to the goal", max(1.0 - state.remaining / length, 0.0))
+    raise NoAnswerError("the link to the robot was closed")
+
+
+async def follow(driver: Driver, clock: Clock, path: Path, *, arm: bool, report: DriveReport = SILENT) -> Arrival:
+    """Send a path and wait for its end; cancelled or without an answer, it stops the truck.
+
+    Raises:
+        RequestRefusedError: the path or the arming was refused.
+        NoAnswerError: the robot does not answer.
+    """
+    path = path.model_copy(update={"name": f"{path.name[:96]}-{clock.now():x}"})
+    with (
+        driver.subscribe(TRACKER, fifo(256)) as states,
+        driver.subscribe(GATE, latest()) as gate,
+        driver.subscribe(EVENT, fifo(256)) as events,
+        driver.subscribe(PATH, latest()) as present,
+    ):
+        async with _taken_back(driver.stop):
+            await driver.path(path)
+            await _accepted(driver, clock, events, present, path.name)
+        end = _path_end(clock, states, path.name, report)
+        return await _watched(driver, clock, gate, arm=arm, end=end, undo=driver.stop, report=report)
+
+
+async def _accepted(driver: Driver, clock: Clock, events: Mailbox[Event], present: Mailbox[Path], name: str) -> None:
+    try:
+        async with clock.deadline(ACCEPT_TIMEOUT):
+            while present.latest is None or present.latest.name != name:
+                for event in events.drain():
+                    if event.source == driver.source and event.severity is Severity.WARNING:
+                        raise RequestRefusedError(event.reason, event.text)
+                await clock.sleep(0.05)
+    except TimeoutError:
+        raise NoAnswerError(f"the robot did not accept the path within {ACCEPT_TIMEOUT:g} s") from None
+
+
+async def _path_end(clock: Clock, states: Mailbox[TrackerState], name: str, report: DriveReport) -> Arrival:
+    begin = clock.now()
+    async for state in states:
+        if state.path != name:
+            continue
+        report.under_way("along the path", state.along / state.length if state.length else 1.0)
+        if state.outcome is not Reason.DRIVING:
+            text = f"{state.along:.2f} of {state.length:.2f} m, {state.cross_track:+.3f} m off the path"
+            return Arrival(state.outcome, text, state.length, (clock.now() - begin) / SECOND)
+    raise NoAnswerError("the link to the robot was closed")
+
+
+async def _watched(
+    driver: Driver,
+    clock: Clock,
+    gate: Mailbox[GateState],
+    *,
+    arm: bool,
+    end: Awaitable[Arrival],
+    undo: Callable[[], Awaitable[object]],
+    report: DriveReport,
+) -> Arrival:
+    """Wait for the end and report why the truck stands meanwhile; ``undo`` if cancelled or refused."""
+    watching = asyncio.create_task(_say_why_it_stands(gate, clock, report))
+    ending = asyncio.ensure_future(end)
+    try:
+        if arm and not ((state := gate.latest) is not None and state.mode.active):
+            # A truck that is armed already may have set off.
+            try:
+                async with _taken_back(driver.disarm):
+                    await driver.arm()
+            except RequestRefusedError as error:
+                raise RequestRefusedError(error.refusal, f"arm refused: {error}") from None
+        return await ending
+    except BaseException:
+        await undo()
+        raise
+    finally:
+        watching.cancel()
+        ending.cancel()
+
+
+async def _say_why_it_stands(gate: Mailbox[GateState], clock: Clock, report: DriveReport) -> None:
+    said = ""
+    while True:
+        await clock.sleep(2 * LOOK)
+        state = gate.latest
+        if state is None or state.mode.active:
+            said = ""
+            continue
+        why = ", ".join(reason.text for reason in state.reasons) or state.mode.value
+        if why != said:
+            said = why
+            report.stands(why)

@@ -1,0 +1,298 @@
+"""The robot for notebooks and scripts without asyncio: every call waits for its outcome.
+
+with Truck("truck", "tcp/192.168.1.7:7447") as truck:
+    truck.goto(1, 2, 0, arm=True)
+"""
+
+import asyncio
+import threading
+import weakref
+from collections.abc import Callable, Coroutine, Iterator, Sequence
+from contextlib import suppress
+from functools import partial
+from types import TracebackType
+from typing import Any, Final, Self, TypeVar
+
+import uvloop
+
+from monstertruck_runtime.client import TruckClient
+from monstertruck_runtime.clock import Clock, WallClock
+from monstertruck_runtime.drives import Arrival, drive_to, follow
+from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
+from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError
+from monstertruck_runtime.mailbox import fifo, latest
+from monstertruck_schemas.base import Message
+from monstertruck_schemas.plan import Path
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import GoalOrder
+from monstertruck_schemas.state import GateState
+from monstertruck_schemas.topics import Topic
+
+M = TypeVar("M", bound=Message)
+T = TypeVar("T")
+
+WAIT: Final = 5.0
+"""Seconds to wait for a message by default."""
+
+
+class Truck:
+    """Session with one robot, over a ``TruckClient`` on an event loop in a thread of its own.
+
+    A context manager; without ``with`` it opens at the first call, and closes with ``close()``, when nothing refers to
+    it any longer, or at the program's end. Calls may come from any thread. Ctrl-C during ``goto`` cancels the goal.
+
+    Args:
+        robot: name in the keys ``mt/<robot>/...``.
+        endpoint: where the robot listens.
+        source: this program's name in requests; see ``TruckClient``.
+        timeout: seconds to wait for the link and for answers.
+    """
+
+    def __init__(
+        self,
+        robot: str = "truck",
+        endpoint: str = DEFAULT_ENDPOINT,
+        *,
+        source: str | None = None,
+        timeout: float = 6.0,
+    ) -> None:
+        self._clock: Clock = WallClock()
+        self._make = partial(TruckClient, robot, endpoint, source=source, clock=self._clock, timeout=timeout)
+        self._loop: _LoopThread | None = None
+        self._lock = threading.Lock()
+        self._finalizer: weakref.finalize[..., Truck] | None = None
+
+    def __enter__(self) -> Self:
+        """Connect. Raises as ``TruckClient`` does."""
+        self._opened()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close."""
+        self.close()
+
+    def close(self) -> None:
+        """End the session; the next call opens another one."""
+        with self._lock:
+            finalizer, self._finalizer, self._loop = self._finalizer, None, None
+        if finalizer is not None:
+            finalizer()
+
+    # What the robot says
+
+    def get(self, topic: Topic[M], timeout: float = WAIT) -> M:
+        """The newest message of ``topic``: of a retained one what there is, of others the next.
+
+        Raises:
+            NoAnswerError: none within ``timeout`` s.
+        """
+        with self.stream(topic, timeout) as messages:
+            return next(messages)
+
+    def stream(self, topic: Topic[M], timeout: float = WAIT, depth: int = 256) -> "MessageStream[M]":
+        """Messages of ``topic`` one after the other, to iterate; up to ``depth`` wait, then the oldest is lost.
+
+        Iterating raises ``NoAnswerError`` if none comes within ``timeout`` s.
+        """
+        return MessageStream(self, topic, timeout, depth)
+
+    def call(self, rpc: str, payload: dict[str, Any] | None = None, timeout: float | None = None) -> dict[str, Any]:
+        """Call ``rpc`` on the robot with a JSON object. Raises as ``TruckClient.call`` does."""
+        return self._do(lambda client: client.call(rpc, payload, timeout))
+
+    def alive(self) -> bool:
+        """Whether the robot's daemon serves at this moment."""
+        return self._do(lambda client: client.alive())
+
+    # Orders
+
+    def arm(self, *, hold: bool = False) -> GateState:
+        """Allow driving, unless ``hold`` by planners too. Raises as ``TruckClient.order`` does, as all orders do."""
+        return self._do(lambda client: client.arm(hold=hold))
+
+    def disarm(self) -> GateState:
+        """Stop and forbid driving."""
+        return self._do(lambda client: client.disarm())
+
+    def stop(self) -> GateState:
+        """Stop driving by the ordinary ramp."""
+        return self._do(lambda client: client.stop())
+
+    def estop(self) -> GateState:
+        """Emergency stop, latched."""
+        return self._do(lambda client: client.estop())
+
+    def reset(self) -> GateState:
+        """Clear the emergency stop."""
+        return self._do(lambda client: client.reset())
+
+    # Driving
+
+    def goto(
+        self, x: float, y: float, yaw: float = 0.0, *, via: Sequence[tuple[float, ...]] = (), arm: bool = False
+    ) -> Arrival:
+        """Drive to a pose in the map and wait for the end.
+
+        Args:
+            x: m.
+            y: m.
+            yaw: rad.
+            via: places to pass, x, y and optionally yaw.
+            arm: arm the truck as well; it drives off at once. Otherwise somebody else has to.
+
+        Raises:
+            RequestRefusedError: the goal or the arming was refused, or the goal was given up; carries the reason.
+            NoAnswerError: the robot does not answer.
+        """
+        return _reached(self._do(lambda client: drive_to(client, self._clock, (x, y, yaw), via, arm=arm)))
+
+    def cancel(self) -> None:
+        """Cancel the goal."""
+        self._do(lambda client: client.goal_control(GoalOrder.CANCEL))
+
+    def follow(self, path: Path, *, arm: bool = False) -> Arrival:
+        """Drive along a path and wait for the end. Raises as ``goto`` does."""
+        return _reached(self._do(lambda client: follow(client, self._clock, path, arm=arm)))
+
+    def drive(self, speed: float, front: float, rear: float = 0.0, lease: float = 0.25) -> None:
+        """Request a speed (m/s) and axle angles (rad) for ``lease`` s; nothing repeats it."""
+        self._do(lambda client: client.drive(speed, front, rear, lease))
+
+    def drive_twist(self, vx: float, vy: float = 0.0, wz: float = 0.0, lease: float = 0.25) -> None:
+        """Request a velocity of the base, m/s and rad/s, for ``lease`` s; nothing repeats it."""
+        self._do(lambda client: client.drive_twist(vx, vy, wz, lease))
+
+    def _do(self, work: Callable[[TruckClient], Coroutine[Any, Any, T]]) -> T:
+        return self._opened().do(work)
+
+    def _opened(self) -> "_LoopThread":
+        with self._lock:
+            if self._loop is None:
+                self._loop = _LoopThread(self._make)
+                # It must not refer to this object, which would never be forgotten then.
+                self._finalizer = weakref.finalize(self, self._loop.close)
+            return self._loop
+
+
+class MessageStream(Iterator[M]):
+    """Messages of one topic; ends with its ``with`` block, or when it is forgotten."""
+
+    def __init__(self, truck: Truck, topic: Topic[M], timeout: float, depth: int) -> None:
+        self._loop = truck._opened()  # noqa: SLF001 - one module
+        self._topic = topic
+        self._timeout = timeout
+
+        async def subscribe(client: TruckClient) -> Any:
+            return client.subscribe(topic, latest() if depth == 1 else fifo(depth))
+
+        self._box = self._loop.do(subscribe)
+        self._finalizer = weakref.finalize(self, self._loop.later, self._box.close)
+
+    def __next__(self) -> M:
+        """The next message.
+
+        Raises:
+            NoAnswerError: none in time.
+        """
+
+        async def following(_: TruckClient) -> M | None:
+            message: M | None = await self._box.next_within(self._timeout)
+            return message
+
+        message = self._loop.do(following)
+        if message is None:
+            raise NoAnswerError(f"no message of {self._topic.name} within {self._timeout:g} s")
+        return message
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """End the subscription."""
+        self._finalizer()
+
+
+class _LoopThread:
+    """An event loop in a thread, with a client that is open as long as it runs.
+
+    Raises:
+        TruckError: the client could not be opened.
+    """
+
+    def __init__(self, make: Callable[[], TruckClient]) -> None:
+        self._loop = uvloop.new_event_loop()
+        self._ending = asyncio.Event()
+        self._thread = threading.Thread(target=self._run, name="truck", daemon=True)
+        self._thread.start()
+        self._client = make()
+        try:
+            self._submit(self._client.__aenter__())
+        except BaseException:
+            self._end()
+            raise
+
+    def do(self, work: Callable[[TruckClient], Coroutine[Any, Any, T]]) -> T:
+        """Run a coroutine there and wait for its result; an interrupt here cancels it there."""
+        return self._submit(work(self._client))
+
+    def later(self, function: Callable[[], object]) -> None:
+        """Call ``function`` there, without waiting; nothing happens when the loop has ended."""
+        with suppress(RuntimeError):
+            self._loop.call_soon_threadsafe(function)
+
+    def close(self) -> None:
+        """Close the client and end the thread."""
+        if threading.current_thread() is self._thread:  # the collector of garbage runs anywhere
+            self._last = self._loop.create_task(self._close_here())
+        elif self._thread.is_alive():
+            self._submit(self._client.__aexit__(None, None, None))
+            self._end()
+
+    async def _close_here(self) -> None:
+        await self._client.__aexit__(None, None, None)
+        self._ending.set()
+
+    def _submit(self, work: Coroutine[Any, Any, T]) -> T:
+        future = asyncio.run_coroutine_threadsafe(work, self._loop)
+        try:
+            return future.result()
+        except BaseException:
+            if not future.done():
+                # The coroutine takes its request back, and ends, before the interrupt is passed on.
+                future.cancel()
+                self._settle()
+            raise
+
+    def _settle(self) -> None:
+        async def others() -> None:
+            tasks = asyncio.all_tasks() - {asyncio.current_task()}
+            await asyncio.wait(tasks, timeout=WAIT) if tasks else None
+
+        asyncio.run_coroutine_threadsafe(others(), self._loop).result()
+
+    def _end(self) -> None:
+        self._loop.call_soon_threadsafe(self._ending.set)
+        self._thread.join(WAIT)
+
+    def _run(self) -> None:
+        asyncio.set_event_loop(self._loop)
+        try:
+            self._loop.run_until_complete(self._ending.wait())
+            self._loop.run_until_complete(self._loop.shutdown_default_executor())
+        finally:
+            self._loop.close()
+
+
+def _reached(arrival: Arrival) -> Arrival:
+    """The arrival, if it is one.
+
+    Raises:
+        RequestRefusedError: the drive ended otherwise.
+    """
+    if arrival.reason is not Reason.GOAL_REACHED:
+        raise RequestRefusedError(arrival.reason, f"{arrival.reason.text}: {arrival.text}")
+    return arrival

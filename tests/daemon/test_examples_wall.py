@@ -1,0 +1,40 @@
+"""The examples, each as its user runs it, before an emulated truck."""
+
+import asyncio
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.daemon.test_station_wall import planner_ready
+from tests.daemon.wall_kit import ROOT, robot
+
+pytestmark = [pytest.mark.wall, pytest.mark.timeout(240)]
+
+
+async def example(folder: Path, name: str, *arguments: str) -> str:
+    """Run one in ``folder``; what it printed."""
+    process = await asyncio.create_subprocess_exec(
+        sys.executable, str(ROOT / "examples" / f"{name}.py"), *arguments, cwd=folder,
+        stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.STDOUT,
+    )  # fmt: skip
+    output, _ = await process.communicate()
+    assert process.returncode == 0, output.decode()
+    return output.decode()
+
+
+async def test_examples_plot_save_drive_to_a_goal_and_along_a_path_of_their_own(tmp_path: Path):
+    async with robot(tmp_path, base=ROOT / "configs/goals.yaml") as made:
+        await made.start_simulator()
+        await made.start_daemon()
+        async with made.client() as client:
+            await example(tmp_path, "battery", made.endpoint, "1")
+            assert (tmp_path / "battery.png").stat().st_size > 5000
+            assert "5 scans of" in await example(tmp_path, "scans", made.endpoint, "5")
+            assert np.load(tmp_path / "scans.npy").shape[0] == 5
+            await planner_ready(client)
+            assert " m in " in await example(tmp_path, "route", made.endpoint, "2.6,3.95,0", "1.8,3.95")
+            assert "off the path" in await example(tmp_path, "planner", made.endpoint, "1.0", "0.05")
+        truth = await made.truth()
+        assert np.hypot(*(truth[-1, 1:3] - (3.6, 4.0))) < 0.35
