@@ -1,6 +1,7 @@
 """What one robot publishes, encoded once for all browsers that look at it."""
 
 import asyncio
+import logging
 import zlib
 from collections import deque
 from collections.abc import Callable
@@ -11,7 +12,7 @@ from typing import Any, Final, Generic, TypeVar
 
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import SECOND, Clock
-from monstertruck_runtime.errors import InputError, NoAnswerError, NotFoundError, NotPermittedError, TruckError
+from monstertruck_runtime.errors import InputError, NotFoundError, NotPermittedError, TruckError
 from monstertruck_runtime.mailbox import Mailbox, fifo, latest
 from monstertruck_schemas import topics
 from monstertruck_schemas.base import Message
@@ -22,6 +23,8 @@ from monstertruckd.station import frames
 from monstertruckd.station.address import RobotAddress
 from monstertruckd.station.frames import Frame
 from monstertruckd.station.viewer import Viewer
+
+log = logging.getLogger(__name__)
 
 M = TypeVar("M", bound=Message)
 
@@ -186,15 +189,23 @@ class RobotFeed:
             sent = self._clock.now()
             try:
                 await client.get_retained(topics.GATE)
-                self._set_link((self._clock.now() - sent) / SECOND, "")
-                if not known:
-                    self._facts = frames.facts(await client.call("config"), await client.call("versions"))
-                    known = True
-                    self._tell(self._facts)
             except TruckError as error:
-                known = known and not isinstance(error, NotFoundError | NoAnswerError)
+                known = False
                 self._set_link(None, str(error))
+            else:
+                self._set_link((self._clock.now() - sent) / SECOND, "")
+                known = known or await self._learn(client)
             await self._clock.sleep(PING)
+
+    async def _learn(self, client: TruckClient) -> bool:
+        """Ask what the robot is; whether it answered."""
+        try:
+            self._facts = frames.facts(await client.call("config"), await client.call("versions"))
+        except TruckError as error:
+            log.warning("robot %s does not say what it is: %s", self.address.name, error)
+            return False
+        self._tell(self._facts)
+        return True
 
     async def _sample(self, client: TruckClient) -> None:
         """Subscribe while anybody looks."""

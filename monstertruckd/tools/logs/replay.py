@@ -1,12 +1,16 @@
 """Plays a log back on Zenoh, on the log's own clock."""
 
 import asyncio
+import json
 from collections.abc import Callable, Collection
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 from monstertruck_runtime.clock import ReplayClock, run_replay
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.ports import Ready
+from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.topics import BY_NAME
 from monstertruckd.bus.local import Bus
 from monstertruckd.bus.rpc import Rpc
@@ -49,7 +53,7 @@ def replay_log(
 
     async def main(clock: ReplayClock) -> int:
         bus = Bus(clock)
-        bridge = ZenohBridge(robot, bus, ZenohConfig(listen=(endpoint,)), clock, Rpc(clock))
+        bridge = ZenohBridge(robot, bus, ZenohConfig(listen=(endpoint,)), clock, _rpc(clock, reader))
         await bridge.open()
         serving = asyncio.Event()
         task = asyncio.create_task(bridge.run(_set(serving)))
@@ -75,6 +79,20 @@ def replay_log(
 
     offset = first_offset(reader.path, reader.metadata().get("run", {}))
     return run_replay(main, start=start, real_offset=offset, rate=speed)
+
+
+def _rpc(clock: ReplayClock, reader: LogReader) -> Rpc:
+    """Answers to what a station asks a robot: its configuration and versions, as attached to the log."""
+    rpc = Rpc(clock)
+    attached = {"config": reader.config(), "versions": json.loads(reader.attachments().get("versions.json", b"{}"))}
+    for name, value in attached.items():
+        if value:
+            rpc.register(name, partial(_answer, value), AccessRole.OBSERVER)
+    return rpc
+
+
+async def _answer(value: dict[str, Any], _: dict[str, Any]) -> dict[str, Any]:
+    return value
 
 
 def _set(event: asyncio.Event) -> Ready:
