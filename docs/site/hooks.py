@@ -8,7 +8,7 @@ from typing import Any
 
 from markdown.extensions.toc import slugify
 from mkdocs.structure.files import File, Files, InclusionLevel
-from pages import commands, configuration, devices, never_tried, source, topics
+from pages import commands, configuration, devices, never_tried, topics
 from pages.markdown import Page, join
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -58,12 +58,12 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Put code in, and turn links to files of the repository into links of the site."""
+    """Turn links to files of the repository into links of the site."""
     if page.is_homepage:
         page.meta["hide"] = ["navigation"]
     if page.file.src_uri.startswith(UNSEARCHED):
         page.meta["search"] = {"exclude": True}
-    return _to_site(source.shown(markdown), page.file.src_uri)
+    return _to_site(markdown, page.file.src_uri)
 
 
 def _to_site(markdown: str, uri: str) -> str:

@@ -38,7 +38,8 @@ def _section(models: Definitions, key: str, field: Json) -> Page:
 
     kinds = list(models.models_in(field))
     common = models.common(kinds)
-    parts = [f"# {key}", plain(field.get("description", ""))]
+    here = f"The section `{key}:` of a configuration: every key with its type, default and meaning."
+    parts = [f"# {key}", here, plain(field.get("description", ""))]
     if common:
         alike = frozenset(models[kinds[0]]["properties"]) - common
         parts += ["## Every kind", models.fields(models[kinds[0]], link, alike)]

@@ -36,6 +36,7 @@ def _page(kind: DeviceKind, habits: str | None) -> Page:
     models = Definitions(kind.settings_class())
     text = join(
         f"# {kind.doc}",
+        f"How the daemon drives `{kind.name}`, what its settings are, and which faults its emulator knows.",
         _facts(kind),
         f"What its emulator does as the device does, test by test: [table](../devices.md#{habits})." if habits else "",
         "## Driver",

@@ -16,7 +16,10 @@ def page(texts: Mapping[str, tuple[str, str]]) -> Page:
     Args:
         texts: title and Markdown of the pages written by hand, by place; links in them are relative to the root.
     """
-    parts = ["# Hardware never tried"]
+    parts = [
+        "# Hardware never tried",
+        "What the author's truck has not confirmed yet, from all pages: read it before you trust a figure or a device.",
+    ]
     for uri, (title, text) in texts.items():
         for heading, section in SECTION.findall(text):
             own = "## All of it" if uri == "index.md" else f"## {title}"

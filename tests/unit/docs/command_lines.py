@@ -96,7 +96,7 @@ INSTEAD |= {
 FOREIGN = {
     "python3 -m monstertruckd.bootstrap demo": "sets up .venv, then `monstertruckd demo`, which has its own tests",
     "python3 -m monstertruckd.bootstrap check": "runs this very test",
-    "mkdocs build -f docs/site/mkdocs.yml": "test_site.py builds it into another folder",
+    "python docs/site/build.py": "test_site.py builds it into another folder",
     "pip install 'monstertruckd[view]'": "needs a package index; the extra is looked up",
     "systemctl status monstertruckd": "needs an installed service; the unit's name is looked up",
     "journalctl -u monstertruckd -f": "needs an installed service; the unit's name is looked up",
