@@ -21,7 +21,7 @@ from monstertruck_sim.world.built_in import BUILT_IN, BuiltIn
 from monstertruck_sim.world.config import TiltConfig, WorldConfig
 from monstertruck_sim.world.obstacles import Box, Obstacle
 from monstertruck_sim.world.plane import Engine, PlanOutline, plane
-from monstertruck_sim.world.plant import Pose, TruthState
+from monstertruck_sim.world.plant import Plant, Pose, TruthState
 from monstertruck_sim.world.scene import Surroundings
 from monstertruck_sim.world.sensors import (
     SimulatedCompass,
@@ -81,6 +81,11 @@ class World:
     def battery_volts(self, time_ns: int) -> float:
         """Voltage behind the battery's divider."""
         return self.servos.analog_volts(self._battery_input, time_ns)
+
+    @property
+    def plant(self) -> Plant:
+        """What moves the robot."""
+        return self._plant
 
     @property
     def motor(self) -> MotorPlant:

@@ -33,20 +33,26 @@ def demo(
     output: Annotated[Path, typer.Option("--output", "-o", help="New folder for log, map and outputs.")] = Path(
         "runs/demo"
     ),
+    film: Annotated[
+        Path | None, typer.Option(help="With --fast and engine mujoco: moving picture of the lap, FILE.gif.")
+    ] = None,
     json_output: JsonOption = False,
 ) -> None:
     """The emulated truck drives a lap: real drivers, real bytes, real log."""
     from monstertruck_runtime.clock import run_wall
+    from monstertruck_runtime.errors import InputError
     from monstertruck_schemas.reasons import Reason
     from monstertruckd.tools.demo.runs import run_fast_demo, run_wall_demo
     from monstertruckd.tools.simulation.config import load_simulated
 
-    load_simulated(config)
+    simulated = load_simulated(config)
+    if film is not None and (not fast or simulated.sim.world.engine != "mujoco" or film.suffix.lower() != ".gif"):
+        raise InputError(f"--film {film}: expected --fast, engine mujoco, and a name.gif")
     folder = _fresh(output)
     screen = on_terminal(sys.stdout) and not json_output
     try:
         if fast:
-            summary = run_fast_demo(config, folder, seed)
+            summary = run_fast_demo(config, folder, seed, film)
         else:
             summary = run_wall(lambda clock: run_wall_demo(clock, config, folder, seed, screen=screen))
     except KeyboardInterrupt:

@@ -35,11 +35,19 @@ TIMEOUT = 60.0
 """Seconds for the two processes to come up (the first run compiles the ray caster)."""
 
 
-def run_fast_demo(config_file: Path, folder: Path, seed: int | None) -> Summary:
+def run_fast_demo(config_file: Path, folder: Path, seed: int | None, film: Path | None = None) -> Summary:
     """Drive a lap on the virtual clock.
+
+    Args:
+        config_file: simulated truck's configuration.
+        folder: for log, map and outputs.
+        seed: of the world; None = the configuration's.
+        film: GIF of the lap; engine mujoco only.
 
     Raises:
         NoAnswerError: the lap was not finished.
+        InputError: there is nothing to film.
+        NotInstalledError: this computer cannot draw.
     """
     overlay = write_overlay(config_file, folder, "tcp/127.0.0.1:0", seed)
     config, tree = load_config(overlay, SimulatedTruckConfig)
@@ -49,7 +57,7 @@ def run_fast_demo(config_file: Path, folder: Path, seed: int | None) -> Summary:
         rig = VirtualRig(config, clock, tree)
         begin_wall, begin = wall.now(), clock.now()
         gc.freeze()  # as the daemon does at its start
-        async with rig.running():
+        async with rig.running(), _filmed(rig, clock, film):
             lap = await drive_lap(LocalOperator(rig.daemon, clock), clock)
             await clock.sleep(1.0)
             speed = (clock.now() - begin) / (wall.now() - begin_wall)
@@ -70,6 +78,24 @@ def run_fast_demo(config_file: Path, folder: Path, seed: int | None) -> Summary:
         speedup=speed,
         closed=config.path is not None and config.path.closed,
     )
+
+
+@asynccontextmanager
+async def _filmed(rig: VirtualRig, clock: VirtualClock, file: Path | None) -> AsyncIterator[None]:
+    """Film the robot meanwhile."""
+    if file is None:
+        yield
+        return
+    from monstertruck_sim.world3d.film import Film  # noqa: PLC0415  # the library of an extra
+
+    film = Film(rig.world, clock, file)
+    task = asyncio.create_task(film.run(), name="film")
+    try:
+        yield
+    finally:
+        task.cancel()
+        await asyncio.wait([task])
+        film.save()
 
 
 async def run_wall_demo(clock: Clock, config: Path, folder: Path, seed: int | None, *, screen: bool) -> Summary:

@@ -1,0 +1,73 @@
+"""A run as a moving picture: an eye follows the robot; frames are taken by the world's clock."""
+
+from math import cos, sin
+from pathlib import Path
+from typing import Final
+
+from PIL import Image
+
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.errors import InputError
+from monstertruck_sim.world.world import World
+from monstertruck_sim.world3d.picture import WorldRenderer, looking
+from monstertruck_sim.world3d.plant import RigidPlant
+
+RATE: Final = 8
+"""Frames a second."""
+SIZE: Final = (480, 320)
+"""Pixels."""
+_BEHIND, _ASIDE, _ABOVE = 1.25, 0.7, 0.95
+"""Place of the eye from the robot, m; it swings round behind a robot that turns."""
+_SWING: Final = 0.12
+"""Share of the way round that it makes from frame to frame."""
+_COLOURS: Final = 128
+
+
+class Film:
+    """Frames of one robot; to be used on the loop of a virtual clock, for a frame takes tens of milliseconds.
+
+    Args:
+        world: with the robot.
+        clock: its time.
+        file: GIF, written by ``save``.
+
+    Raises:
+        InputError: the engine has nothing to draw, or the file is no GIF.
+        NotInstalledError: this computer has no EGL.
+    """
+
+    def __init__(self, world: World, clock: Clock, file: Path) -> None:
+        if file.suffix.lower() != ".gif":
+            raise InputError(f"{file}: expected a name that ends with .gif")
+        if not isinstance(world.plant, RigidPlant):
+            raise InputError(f"{file}: only sim.world.engine mujoco can be filmed")
+        self._world, self._clock, self._file, self._plant = world, clock, file, world.plant
+        self._renderer = WorldRenderer(world.plant.model, *SIZE)
+        self._heading = world.plant.pose[2]
+        self.frames: list[Image.Image] = []
+
+    async def run(self) -> None:
+        """Take frames until cancelled."""
+        due = self._clock.now()
+        while True:
+            self.take()
+            due += SECOND // RATE
+            await self._clock.sleep_until(due)
+
+    def take(self) -> None:
+        """One frame, of this moment."""
+        self._world.truth(self._clock.now())
+        x, y, yaw = self._plant.pose
+        z = self._plant.height
+        self._heading += _SWING * (yaw - self._heading)
+        c, s = cos(self._heading), sin(self._heading)
+        eye = x - _BEHIND * c + _ASIDE * s, y - _BEHIND * s - _ASIDE * c, z + _ABOVE
+        picture = self._renderer.draw(self._plant.data, looking(eye, (x + 0.3 * c, y + 0.3 * s, z + 0.1)))
+        self.frames.append(Image.fromarray(picture).quantize(_COLOURS))
+
+    def save(self) -> None:
+        """Write the file."""
+        self._renderer.close()
+        if self.frames:
+            first, *others = self.frames
+            first.save(self._file, save_all=True, append_images=others, duration=1000 // RATE, loop=0, optimize=False)
