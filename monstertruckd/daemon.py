@@ -7,7 +7,7 @@ order, so the gate commands neutral while actuators and recorder still listen.
 import asyncio
 import dataclasses
 import secrets
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from contextlib import AsyncExitStack, asynccontextmanager
 from types import MappingProxyType
 from typing import Any
@@ -45,6 +45,7 @@ from monstertruckd.assembly.devices import Cabling, build_drivers, measures_batt
 from monstertruckd.assembly.estimation import Body, build_estimation
 from monstertruckd.assembly.planning import build_planners
 from monstertruckd.bus.local import Bus
+from monstertruckd.bus.peers import PeerEar, PeerService
 from monstertruckd.bus.rpc import Rpc
 from monstertruckd.bus.zenoh_session import ZenohBridge
 from monstertruckd.config import calibration_rpc
@@ -120,6 +121,8 @@ class Daemon:
         self.bus.listen(topics.EVENT, self._board.observe_event)
         if config.planner is None:
             self.bus.listen(topics.REQ_GOAL, self._refuse_goal)
+        self.peers = PeerService(clock, self.bus.publisher(topics.PEERS, Writer.ESTIMATION)) if config.peers else None
+        """Where poses of other robots come in."""
         self._remote_steps = RemoteWorkQueue(CODEC)
         self._actors = ActorFactory(clock, self._remote_steps)
         self._calibration = self._build_calibration()
@@ -164,6 +167,8 @@ class Daemon:
             save_map: Callable[[], bool] | None = None
             for service in build_estimation(self.config, self.bus, self.clock, self._body):
                 self._start(estimation, service)
+            for service in self._hearing():
+                self._start(estimation, service)
                 if isinstance(service, SlamService):
                     save_map = service.save_soon
             for service in build_planners(self.config, self.bus, self.clock, self._body, self._actors, save_map):
@@ -184,6 +189,15 @@ class Daemon:
             self.gate.shut_down()
 
     # The scopes' contents
+
+    def _hearing(self) -> Iterator[Service]:
+        """What hears other robots; on the virtual clock nothing comes over Zenoh."""
+        if self.peers is None:
+            return
+        yield self.peers
+        if self._seed is None:
+            for robot, where in self.config.peers.items():
+                yield PeerEar(robot, where, self.clock, self.peers)
 
     @asynccontextmanager
     async def _outside(self) -> AsyncIterator[None]:

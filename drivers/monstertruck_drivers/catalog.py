@@ -247,6 +247,7 @@ RESERVED: Final = frozenset(
         "missions",
         "notify",
         "odometry",
+        "peers",
         "path",
         "present",
         "recorder",

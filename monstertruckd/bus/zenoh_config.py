@@ -126,6 +126,13 @@ class ZenohConfig(Schema):
         return self
 
 
+class PeerConfig(Schema):
+    """Another robot that this one hears."""
+
+    endpoint: str
+    """Where it listens, e.g. tcp/192.168.1.8:7447"""
+
+
 @dataclass(frozen=True, slots=True)
 class Door:
     """One Zenoh session of the robot: its own endpoints and places; what a source may do that comes in by it."""

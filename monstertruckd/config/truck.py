@@ -19,6 +19,7 @@ from monstertruck_kinematics.chassis import AXLES, WHEEL_REACH, Chassis, Dimensi
 from monstertruck_kinematics.truck import DriveTrain
 from monstertruck_planners.behave.api import BehaviourConfig
 from monstertruck_planners.behave.catalog import AnyBehaviour, AnyLevelling
+from monstertruck_planners.behave.follow import FollowConfig
 from monstertruck_planners.behave.move import MoveConfig
 from monstertruck_planners.behave.stabiliser import StabiliserConfig
 from monstertruck_planners.explore.catalog import AnyExplorer
@@ -29,7 +30,7 @@ from monstertruck_runtime.bodies import AnyBody, build_chassis
 from monstertruck_schemas.base import Schema
 from monstertruck_schemas.body import TruckBody
 from monstertruck_schemas.roles import SHAFTS
-from monstertruckd.bus.zenoh_config import ZenohConfig
+from monstertruckd.bus.zenoh_config import PeerConfig, ZenohConfig
 from monstertruckd.config.device_safety import beyond_devices, unattended_times, weakened_devices
 from monstertruckd.gate.config import SIGHT, BodyLimits, GateConfig, beyond, weakened
 from monstertruckd.recorder.config import BlackBoxConfig, MapRender, RecorderConfig
@@ -131,6 +132,8 @@ class TruckConfig(Schema):
         default_factory=dict, validate_default=True
     )
     """What reacts to sensors without a path, by name; started by `behave start`. `move` is always there"""
+    peers: dict[Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,31}$")], PeerConfig] = Field(default_factory=dict)
+    """Other robots whose poses are heard, by name, for behaviours such as `follow`"""
     placement: PlacementConfig = PlacementConfig()
     path: PathConfig | None = None
     map: MapRender | None = None
@@ -233,6 +236,11 @@ class TruckConfig(Schema):
             raise ValueError(f"behaviours need {lack}")
         if self.explorer is not None and (self.planner is None or self.slam is None or self.slam.mode != "mapping"):
             raise ValueError("an explorer needs a planner, which drives to its goals, and slam in mode mapping")
+        for name, behaviour in self.behaviours.items():
+            if isinstance(behaviour, FollowConfig) and behaviour.leader not in self.peers:
+                raise ValueError(f"behaviours.{name}.leader {behaviour.leader}: expected one of peers")
+        if self.robot in self.peers:
+            raise ValueError(f"peers.{self.robot}: expected other robots than this one")
         if self.slam is not None and self.devices.lidar is None:
             raise ValueError("slam needs the device lidar")
         if self.slam is not None and self.slam.mode == "localisation" and self.slam.map is None:

@@ -38,6 +38,25 @@ class Odometry(Message):
     """It rests on a calibration that has expired."""
 
 
+class Peer(Schema):
+    """What another robot says of itself."""
+
+    robot: str
+    """Its name."""
+    pose: Pose2D
+    """In its map: robots that follow each other need one map, or starts measured in one frame."""
+    twist: Twist2D
+    """In its base."""
+    heard: Nanoseconds
+    """When it came in, by this robot's clock: the other one's stamps mean nothing here."""
+
+
+class Peers(Message):
+    """The newest pose of every other robot that was heard since the start."""
+
+    peers: tuple[Peer, ...] = ()
+
+
 class ScanMotion(Message):
     """How base moved between two scans, by the scans alone; ``stamp`` is that of the later one."""
 

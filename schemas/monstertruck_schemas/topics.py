@@ -50,7 +50,7 @@ from monstertruck_schemas.sensor import (
     StandPose,
     SteeringFeedback,
 )
-from monstertruck_schemas.state import ClockOffset, GateState, Grid, Ground, Odometry, ScanMotion, Transforms
+from monstertruck_schemas.state import ClockOffset, GateState, Grid, Ground, Odometry, Peers, ScanMotion, Transforms
 from monstertruck_schemas.usb import UsbTree
 
 M = TypeVar("M", bound=Message)
@@ -196,6 +196,10 @@ GROUND: Final = Topic(
     retained=True,
     foxglove="foxglove.Grid",
 )
+PEERS: Final = Topic(
+    "state/peers", Peers, W.ESTIMATION, "Poses that other robots say of themselves, with when each came in", 10,
+    stale_after=0.5,
+)  # fmt: skip
 GATE: Final = Topic(
     "state/gate", GateState, W.GATE, "Safety gate: mode, holder, limits, reasons", 10, stale_after=0.5, retained=True
 )

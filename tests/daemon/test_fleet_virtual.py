@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
@@ -29,10 +30,10 @@ def fleet(**overlays: dict[str, Any]) -> list[SimulatedTruckConfig]:
     return [with_overlay(config, {"recorder": None, **overlays.get(config.robot, {})}) for config in loaded]
 
 
-async def move(rig: VirtualRig, clock: VirtualClock, **settings: Any) -> None:
-    operator = LocalOperator(rig.daemon, clock)
+async def start(rig: VirtualRig, clock: VirtualClock, behaviour: str = "move", **settings: Any) -> None:
+    operator = LocalOperator(rig.daemon, clock, source=f"operator_{behaviour}")
     await operator.arm()
-    order = {"order": BehaviourOrder.START, "behaviour": "move", "settings": settings}
+    order = {"order": BehaviourOrder.START, "behaviour": behaviour, "settings": settings}
     await operator.call("behave", {**await operator.header(), **order})
 
 
@@ -43,7 +44,7 @@ def drive(*configs: SimulatedTruckConfig, seconds: float = 12.0) -> tuple[list[V
         async with virtual_fleet(configs, clock) as (rigs, scene):
             with rigs[1].bus.subscribe(topics.BEHAVIOUR, fifo(4096)) as states:
                 await clock.sleep(2.0)
-                await move(rigs[1], clock, length=2.0)
+                await start(rigs[1], clock, length=2.0)
                 await clock.sleep(seconds)
                 return rigs, scene.contacts, [*states.drain()][-1].outcome
 
@@ -98,11 +99,55 @@ def test_the_stand_sees_each_robot_where_it_is():
 
 
 def test_robots_that_overlap_are_refused():
-    start = {"x": -1.1, "y": 0.0, "yaw": 0.0}
+    overlapping = {"x": -1.1, "y": 0.0, "yaw": 0.0}
 
     async def main(clock: VirtualClock) -> None:
-        async with virtual_fleet(fleet(second={"sim": {"world": {"start": start}}}), clock):
+        async with virtual_fleet(fleet(second={"sim": {"world": {"start": overlapping}}}), clock):
             pass
 
     with pytest.raises(InputError, match="start: the robots leader and second overlap"):
         run_virtual(main, start=SECOND)
+
+
+def follow(*, silent_after: float | None = None) -> tuple[list[VirtualRig], list[Contact], list[Any]]:
+    """The truck drives ahead and round a bend, the second robot follows it."""
+
+    async def main(clock: VirtualClock) -> tuple[list[VirtualRig], list[Contact], list[Any]]:
+        async with virtual_fleet(fleet(), clock) as (rigs, scene):
+            with rigs[1].bus.subscribe(topics.BEHAVIOUR, fifo(4096)) as states:
+                await clock.sleep(2.0)
+                await start(rigs[1], clock, "follow")
+                await start(rigs[0], clock, length=1.5)
+                if silent_after is not None:
+                    await clock.sleep(silent_after)
+                    await rigs[0].end_daemon()
+                    await clock.sleep(3.0)
+                else:
+                    await clock.sleep(14.0)
+                    await start(rigs[0], clock, radius=0.9, angle=1.7)
+                    await clock.sleep(17.0)
+                return rigs, scene.contacts, [*states.drain()]
+
+    return run_virtual(main, start=SECOND)
+
+
+def test_a_robot_follows_another_round_a_bend_at_its_distance():
+    rigs, contacts, states = follow()
+    assert contacts == []
+    assert states[-1].outcome is Reason.DRIVING
+    leader, second = (rig.truth.array() for rig in rigs)
+    count = min(len(leader), len(second))
+    apart = np.hypot(*(leader[:count, 1:3] - second[:count, 1:3]).T)
+    assert apart.min() > 0.7
+    assert apart[-1] == pytest.approx(1.0, abs=0.12)
+    off = [np.hypot(*(leader[:, 1:3] - place).T).min() for place in second[:, 1:3] if place[0] > -1.0]
+    assert max(off) < 0.12  # on the leader's way, not across the bend
+    assert second[-1, 3] > 0.3
+
+
+def test_a_leader_that_falls_silent_stops_its_follower_with_the_reason():
+    rigs, contacts, states = follow(silent_after=5.0)
+    assert contacts == []
+    assert states[-1].outcome is Reason.INPUT_STALE
+    assert states[-1].text.startswith("leader has been silent for 0.")
+    assert abs(rigs[1].truth.array()[-1, 4]) < 1e-3

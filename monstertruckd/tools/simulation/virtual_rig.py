@@ -5,6 +5,7 @@ import os
 import signal
 from collections.abc import AsyncIterator, Sequence
 from contextlib import AsyncExitStack, ExitStack, asynccontextmanager
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Final
@@ -14,7 +15,7 @@ from monstertruck_drivers.usb.config import UsbPortConfig
 from monstertruck_runtime.clock import VirtualClock
 from monstertruck_runtime.threads import inline
 from monstertruck_schemas.sensor import StandPose
-from monstertruck_schemas.topics import STAND_POSE
+from monstertruck_schemas.topics import POSE, STAND_POSE
 from monstertruck_sim.computer import EmulatedComputer
 from monstertruck_sim.faults import FaultInjector, SimContext
 from monstertruck_sim.robot import SimulatedRobot
@@ -185,4 +186,8 @@ async def virtual_fleet(
     scene = shared_scene(configs)
     async with AsyncExitStack() as stack:
         rigs = [await stack.enter_async_context(VirtualRig(config, clock, scene=scene).running()) for config in configs]
+        for rig in rigs:
+            for other in rigs:
+                if rig.daemon.peers is not None and other.config.robot in rig.config.peers:
+                    other.bus.listen(POSE, partial(rig.daemon.peers.hear, other.config.robot))
         yield rigs, scene

@@ -32,6 +32,12 @@ BEHAVIOURS: Final = Catalog(
         implementation="monstertruck_planners.behave.wall.line:WallLine",
         doc="Follows a wall along a line fitted to the echoes (method 3, our own)",
     ),
+    Plugin(
+        name="follow",
+        settings="monstertruck_planners.behave.follow:FollowConfig",
+        implementation="monstertruck_planners.behave.follow:LeaderFollower",
+        doc="Follows the way of another robot at a distance",
+    ),
     base=BehaviourConfig,
 )
 """A behaviour is a ``Behaviour`` made from its settings; it asks for motion through the gate."""

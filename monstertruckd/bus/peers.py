@@ -1,0 +1,68 @@
+"""Other robots: each is heard over its own Zenoh endpoint; what it says of itself is on ``state/peers``."""
+
+from monstertruck_runtime.client import TruckClient
+from monstertruck_runtime.clock import Clock, Schedule
+from monstertruck_runtime.mailbox import latest
+from monstertruck_runtime.ports import Publisher, Ready
+from monstertruck_schemas.state import Odometry, Peer, Peers
+from monstertruck_schemas.topics import PEERS, POSE
+from monstertruckd.bus.zenoh_config import PeerConfig
+
+
+class PeerService:
+    """Publishes what was heard of others at a steady rate, with the time of receipt.
+
+    Args:
+        clock: time.
+        out: ``state/peers``.
+    """
+
+    name = "peers"
+
+    def __init__(self, clock: Clock, out: Publisher[Peers]) -> None:
+        self._clock, self._out = clock, out
+        self._heard: dict[str, Peer] = {}
+
+    def hear(self, robot: str, pose: Odometry) -> None:
+        """Take the newest pose of another robot."""
+        self._heard[robot] = Peer(robot=robot, pose=pose.pose, twist=pose.twist, heard=self._clock.now())
+
+    async def run(self, ready: Ready) -> None:
+        """Publish until cancelled."""
+        ready()
+        assert PEERS.rate is not None
+        schedule = Schedule(self._clock, PEERS.rate)
+        while True:
+            await schedule.next()
+            now = self._clock.now()
+            message = Peers(
+                stamp=now, received=now, seq=self._out.next_seq(), frame="map", peers=tuple(self._heard.values())
+            )
+            self._out.put(message)
+
+
+class PeerEar:
+    """Hears one other robot; its session reconnects by itself once there was one.
+
+    Args:
+        robot: its name.
+        config: where it is.
+        clock: time.
+        peers: gets its poses.
+    """
+
+    def __init__(self, robot: str, config: PeerConfig, clock: Clock, peers: PeerService) -> None:
+        self.name = f"peer_{robot}"
+        self._robot, self._config, self._clock, self._peers = robot, config, clock, peers
+
+    async def run(self, ready: Ready) -> None:
+        """Listen until cancelled.
+
+        Raises:
+            NotFoundError: nobody is there.
+        """
+        async with TruckClient(self._robot, self._config.endpoint, clock=self._clock) as client:
+            with client.subscribe(POSE, latest()) as poses:
+                ready()
+                async for pose in poses:
+                    self._peers.hear(self._robot, pose)
