@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from monstertruck_runtime.client import TruckClient
     from monstertruck_runtime.clock import Clock
     from monstertruckd.config.calibration import Estimate, Result, WizardName
+    from monstertruckd.tools.calibrate.sequence import SequenceStep
     from monstertruckd.tools.calibrate.wizard import Wizard
 
 app = command_group(
@@ -187,6 +188,80 @@ def slip(
     if by not in OBSERVERS:
         raise InputError(f"--by {by}: expected one of {', '.join(OBSERVERS)}")
     return slip_wizard(SlipWizard("pose" if by == "pose" else "stand", rounds))
+
+
+@app.command("all")
+def all_(
+    *,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print what is still to be done, and end.")] = False,
+    yes: YesOption = False,
+    answer: AnswerOption = None,
+    robot: RobotOption = "truck",
+    endpoint: EndpointOption = DEFAULT_ENDPOINT,
+) -> None:
+    """Every wizard that this robot still needs, in order; what is fresh is skipped.
+
+    After each, restart the daemon: this command waits for it and goes on. Ended half-way, it begins with what is left.
+    """
+    from monstertruck_runtime.clock import run_wall
+
+    call = _Call(robot, endpoint, None, answer or [], yes=yes, undo=False, json_output=False)
+    while True:
+        steps, waiting = run_wall(lambda clock: _steps_left(call, clock))
+        if dry_run or not steps:
+            names = [f"{step.name}{' (first look)' if step.rough else ''}" for step in steps]
+            print(
+                f"still to be calibrated: {', '.join(names)}" if names else "everything is calibrated, nothing expired"
+            )
+            return
+        if waiting:
+            remark("restart the daemon, so that what was measured counts; this command goes on then (Ctrl-C ends it)")
+            run_wall(lambda clock: _until_restarted(call, clock))
+            continue
+        _run(wizard_of(steps[0]), call)
+
+
+def wizard_of(step: "SequenceStep") -> "Wizard":
+    """The wizard of a step of ``calibrate all``, with its own defaults."""
+    if step.name == "drive":
+        return drive(sign_only=step.rough)
+    if step.name == "steering":
+        return steering(rough=step.rough)
+    others = {"battery": battery, "compass": compass, "odometry": odometry, "lidar": lidar, "imu": imu, "slip": slip}
+    return others[step.name]()
+
+
+async def _steps_left(call: _Call, clock: "Clock") -> "tuple[list[SequenceStep], bool]":
+    """Steps that are still to be done, and whether the daemon runs on an older calibration than there is."""
+    from monstertruck_schemas.topics import CALIBRATION
+    from monstertruckd.config.calibration import CalibrationFile
+    from monstertruckd.config.calibration_rpc import SHOW
+    from monstertruckd.config.truck import TruckConfig
+    from monstertruckd.tools.calibrate.sequence import missing
+
+    async with _client(call.robot, call.endpoint, clock) as client:
+        running = await client.call("config")
+        running.pop("sim", None)
+        state = await client.call(SHOW)
+        health = await client.get_retained(CALIBRATION)
+    content = state["content"]
+    results = {} if content is None else CalibrationFile.model_validate_json(_json(content)).results
+    dates = {row.wizard: row.date for row in health.wizards if row.expired} if health is not None else {}
+    expired = {name for name, date in dates.items() if name in results and results[name].date == date}
+    steps = missing(TruckConfig.model_validate_json(_json(running)), results, expired)
+    return steps, state["loaded"] != state["newest"]
+
+
+async def _until_restarted(call: _Call, clock: "Clock") -> None:
+    from monstertruck_runtime.errors import NoAnswerError, NotFoundError
+
+    while True:
+        try:
+            if not (await _steps_left(call, clock))[1]:
+                return
+        except (NoAnswerError, NotFoundError):
+            pass  # it is being restarted
+        await clock.sleep(1.0)
 
 
 @app.command()

@@ -75,6 +75,7 @@ INSTEAD = {
     "monstertruckd calibrate steering": Instead(None, MOVES),
     "monstertruckd calibrate steering --rough": Instead(None, MOVES),
     "monstertruckd calibrate compass": Instead(None, MOVES),
+    "monstertruckd calibrate all": Instead("monstertruckd calibrate all --dry-run", "asks somebody, and drives"),
     "monstertruckd calibrate odometry": Instead(None, MOVES),
     "monstertruckd calibrate lidar --heights": Instead(None, MOVES),
     "monstertruckd calibrate imu": Instead(None, MOVES),

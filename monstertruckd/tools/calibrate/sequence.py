@@ -1,0 +1,69 @@
+"""Which calibrations a robot still needs, in the order in which each can use the results before it."""
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from typing import Final
+
+from monstertruckd.config.calibration import Result, WizardName
+from monstertruckd.config.truck import TruckConfig
+
+
+@dataclass(frozen=True, slots=True)
+class SequenceStep:
+    """One run of a wizard."""
+
+    name: WizardName
+    complete: str
+    """Estimate that its result has once this step is done"""
+    rough: bool = False
+    """A first measurement, on which the others rest: skipped once there is any result of this wizard"""
+
+
+ORDER: Final = (
+    SequenceStep("battery", "gain"),
+    SequenceStep("drive", "inverted", rough=True),
+    SequenceStep("steering", "front_centre", rough=True),
+    SequenceStep("compass", "hard_x"),
+    SequenceStep("drive", "drive_ratio"),
+    SequenceStep("steering", "front_scale"),
+    SequenceStep("odometry", "wheelbase"),
+    SequenceStep("lidar", "x"),
+    SequenceStep("imu", "rate_scale"),
+    SequenceStep("slip", "icr_left"),
+)
+"""The steering's direction needs the drive's sign, a compass circle the steering's direction, a taped straight wheels
+that are about straight, gains of the steering true metres and headings, squares and the lidar's mount all of them."""
+
+
+def fits(step: SequenceStep, config: TruckConfig) -> bool:
+    """Whether a robot has what the step measures."""
+    devices, truck = config.devices, config.body.kind == "truck"
+    match step.name:
+        case "battery":
+            steering = devices.steering
+            return config.monitors.battery is not None or (steering is not None and steering.driver.battery is not None)
+        case "steering" | "odometry":
+            return truck and devices.steering is not None and devices.compass is not None and devices.drive is not None
+        case "slip":
+            return config.body.kind == "skid_steer" and config.stand != "none"
+        case "drive" | "compass" | "lidar" | "imu":
+            return truck and step.name in devices.present()
+
+
+def missing(
+    config: TruckConfig, results: Mapping[WizardName, Result], expired: Collection[str] = ()
+) -> list[SequenceStep]:
+    """Steps that are still to be done.
+
+    Args:
+        config: of the robot.
+        results: of the wizards so far.
+        expired: wizards whose results no longer count.
+    """
+    found = []
+    for step in ORDER:
+        result = results.get(step.name)
+        done = result is not None and result.estimate(step.complete) is not None
+        if fits(step, config) and not (done and (step.rough or step.name not in expired)):
+            found.append(step)
+    return found
