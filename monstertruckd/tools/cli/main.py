@@ -27,6 +27,7 @@ from monstertruckd.tools.cli import (
     robot,
     security,
     service,
+    stand,
     station,
     study,
     usb,
@@ -95,6 +96,7 @@ app.add_typer(calibrate.app, name="calibrate")
 app.add_typer(logs.app, name="log")
 app.add_typer(kinematics.app, name="kinematics")
 app.add_typer(study.app, name="study")
+app.add_typer(stand.app, name="stand")
 app.add_typer(maps.app, name="map")
 app.add_typer(security.app, name="security")
 

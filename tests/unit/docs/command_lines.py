@@ -67,6 +67,20 @@ INSTEAD = {
         None, "serves until it is stopped; tests/daemon/test_station_wall.py opens its page"
     ),
     "monstertruckd map save hall.yaml": Instead(None, "needs a robot that maps"),
+    "monstertruckd stand print runs/stand/print --tags 0-3,100-125": Instead(
+        "monstertruckd stand print print --tags 0-3", "fewer prints"
+    ),
+    **{
+        f"monstertruckd stand {rest}": Instead(None, "needs cameras; tests/unit/tools/stand renders their pictures")
+        for rest in (
+            "snap -c configs/stands/overhead.yaml c1 runs/stand/c1/boards",
+            "snap -c configs/stands/overhead.yaml c1 runs/stand/c1/floor --count 3",
+            "calibrate -c configs/stands/overhead.yaml",
+            "run -c configs/stands/overhead.yaml",
+            "track -c configs/stands/overhead.yaml --out runs/stand/poses.csv",
+        )
+    },
+    "monstertruckd stand analyse logs/run.mcap": Instead(None, "needs a log of a stand"),
     "monstertruckd calibrate battery": Instead(
         "monstertruckd calibrate battery --yes --answer meter=24.2 --answer another=no", "asks somebody"
     ),

@@ -1,0 +1,183 @@
+"""Sessions of ``monstertruckd stand``: live tracking, recorded tracking, pictures, prints."""
+
+import asyncio
+import csv
+from collections.abc import Iterator
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.errors import InputError, NotFoundError
+from monstertruckd.tools.cli.output import remark
+
+if TYPE_CHECKING:
+    from monstertruck_schemas.sensor import StandPose
+    from monstertruckd.tools.stand.config import OverheadConfig
+    from monstertruckd.tools.stand.track import Stream
+    from monstertruckd.tools.stand.tracking import RobotPose
+
+RETRY = 2.0
+"""Seconds after which a robot that is not there is looked for again."""
+
+
+async def run(clock: Clock, config: "OverheadConfig", endpoint: str) -> None:
+    """Track live, and publish to every robot that is there."""
+    from monstertruckd.tools.stand.track import StandRun
+
+    robots = {name: RobotLink(name, endpoint, clock) for name in config.robots}
+    tasks = [asyncio.create_task(link.run(), name=f"robot {name}") for name, link in robots.items()]
+    tracker = _tracker(config, clock.now())
+    try:
+        live = any(camera.source.kind == "v4l2" for camera in config.cameras.values())
+        put = partial(_publish, robots)
+        remark(f"tracks {', '.join(robots)} with {len(config.cameras)} cameras")
+        await StandRun(tracker, _streams(config), config.rate, clock, put, remark, live=live).run()
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.wait(tasks)
+
+
+async def track(clock: Clock, config: "OverheadConfig", out: Path) -> int:
+    """Poses from recorded pictures into a CSV; returns their number."""
+    from monstertruckd.tools.stand.track import StandRun
+
+    poses: list[RobotPose] = []
+    await StandRun(_tracker(config, 0), _streams(config), config.rate, clock, poses.append, remark, live=False).run()
+    with out.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(("stamp_ns", "robot", "x_m", "y_m", "yaw_rad", "sigma_m", "cameras"))
+        for p in poses:
+            numbers = (f"{v:.5f}" for v in (p.x, p.y, p.yaw, p.sigma))
+            writer.writerow((p.stamp, p.robot, *numbers, " ".join(p.cameras)))
+    return len(poses)
+
+
+def snap(config: "OverheadConfig", name: str, folder: Path, count: int, every: float) -> None:
+    """Take pictures with one camera.
+
+    Raises:
+        InputError: there is no such camera, or it sends too few.
+    """
+    import cv2
+
+    from monstertruck_runtime.clock import SECOND, WallClock
+
+    streams = _streams(config)
+    if name not in streams:
+        raise InputError(f"camera {name}: expected one of {', '.join(streams)}")
+    folder.mkdir(parents=True, exist_ok=True)
+    clock = WallClock()
+    taken, due = 0, clock.now()
+    for picture in streams[name]():
+        if clock.now() < due:
+            continue
+        due = clock.now() + round(every * SECOND)
+        cv2.imwrite(str(folder / f"{taken:04d}.png"), picture)
+        taken += 1
+        if taken == count:
+            return
+    raise InputError(f"camera {name} sent {taken} pictures: expected {count}")
+
+
+def print_tags(out: Path, numbers: str, columns: int, rows: int) -> Iterator[Path]:
+    """Write tags and board as PNGs.
+
+    Raises:
+        InputError: numbers that are none.
+    """
+    import cv2
+
+    from monstertruck_estimation.vision.tags import dictionary, drawn
+
+    out.mkdir(parents=True, exist_ok=True)
+    for tag in _numbers(numbers):
+        path = out / f"tag-{tag:03d}.png"
+        cv2.imwrite(str(path), cv2.copyMakeBorder(drawn(tag, 800), 160, 160, 160, 160, cv2.BORDER_CONSTANT, value=255))
+        yield path
+    board = cv2.aruco.CharucoBoard((columns, rows), 0.04, 0.03, dictionary())
+    path = out / f"board-{columns}x{rows}.png"
+    cv2.imwrite(str(path), board.generateImage((columns * 200, rows * 200), marginSize=40))
+    yield path
+
+
+class RobotLink:
+    """Link to one robot's daemon, whenever there is one."""
+
+    def __init__(self, robot: str, endpoint: str, clock: Clock) -> None:
+        self._robot, self._endpoint, self._clock = robot, endpoint, clock
+        self._client: Any = None
+        self._count = 0
+
+    async def run(self) -> None:
+        """Keep the link until cancelled."""
+        from monstertruck_runtime.client import TruckClient
+
+        while True:
+            with suppress(NotFoundError):
+                async with TruckClient(self._robot, self._endpoint, clock=self._clock) as client:
+                    self._client = client
+                    try:
+                        while await client.alive():
+                            await self._clock.sleep(RETRY)
+                    finally:
+                        self._client = None
+            await self._clock.sleep(RETRY)
+
+    def put(self, pose: "RobotPose") -> None:
+        """Publish a pose, if the robot is there."""
+        if self._client is not None:
+            self._count += 1
+            self._client.publish_stand_pose(stand_pose(pose, self._clock.now(), self._count))
+
+
+def stand_pose(pose: "RobotPose", now: int, count: int) -> "StandPose":
+    """The message of a pose."""
+    from monstertruck_schemas.base import Pose2D
+    from monstertruck_schemas.sensor import StandPose
+
+    return StandPose(
+        stamp=pose.stamp,
+        received=now,
+        seq=count,
+        frame="map",
+        pose=Pose2D(x=pose.x, y=pose.y, yaw=pose.yaw),
+        observer="overhead",
+        position_sigma=pose.sigma,
+        heading_sigma=pose.heading_sigma,
+    )
+
+
+def _publish(robots: dict[str, RobotLink], pose: "RobotPose") -> None:
+    robots[pose.robot].put(pose)
+
+
+def _tracker(config: "OverheadConfig", now: int) -> Any:
+    from monstertruckd.tools.stand.calibration import load
+    from monstertruckd.tools.stand.tracking import StandTracker
+
+    placed = load(config.calibration).placed()
+    if missing := config.cameras.keys() - placed.keys():
+        raise InputError(f"{config.calibration}: {', '.join(sorted(missing))} not in it: run `stand calibrate` again")
+    return StandTracker({name: placed[name] for name in config.cameras}, config.robots, config.marks, now)
+
+
+def _streams(config: "OverheadConfig") -> dict[str, "Stream"]:
+    from monstertruckd.tools.stand.sources import stream
+
+    return {name: partial(stream, camera.source, config.size, config.rate) for name, camera in config.cameras.items()}
+
+
+def _numbers(text: str) -> list[int]:
+    found: list[int] = []
+    try:
+        for part in text.split(","):
+            first, _, last = part.partition("-")
+            found += range(int(first), int(last or first) + 1)
+    except ValueError:
+        raise InputError(f"tags {text!r}: expected numbers such as 0-3,100") from None
+    if not all(0 <= tag <= 586 for tag in found):
+        raise InputError(f"tags {text!r}: expected 0 to 586")
+    return found

@@ -1,0 +1,150 @@
+"""What a log says of estimates against the stand: odometry, pose in map, tracker; and the stand's latency.
+
+An estimate's frame is laid over the stand's by least squares of the poses (rotation and shift, no scale). The latency
+is the shift of time at which the turns of odometry and stand agree best.
+"""
+
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from monstertruck_estimation.se2 import interpolate, wrap
+from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.fitting import least_squares
+from monstertruck_runtime.clock import SECOND
+from monstertruck_runtime.errors import InputError
+from monstertruck_schemas.plan import TrackerState
+from monstertruck_schemas.topics import ODOMETRY, POSE, STAND_POSE, TRACKER
+from monstertruckd.recorder.reader import open_log
+
+LEAST: Final = 40
+"""Poses in common."""
+LEAST_TURN: Final = 0.5
+"""Rad: less tells no latency."""
+REACH: Final = 0.5
+"""Greatest latency, s."""
+
+
+@dataclass(frozen=True)
+class EstimateError:
+    """An estimate against what the stand saw."""
+
+    what: str
+    poses: int
+    position_rms: float
+    """m"""
+    position_end: float
+    """At the last pose, the frames laid over each other at the first ones, m"""
+    heading_rms: float
+    """rad"""
+    latency: float | None
+    """Seconds by which the stand's stamps are late against the estimate's; None: too little turn to tell"""
+
+
+def errors_of(path: Path) -> list[EstimateError]:
+    """Odometry's and the map pose's error.
+
+    Raises:
+        NotFoundError: no such file.
+        InputError: it is no log, has no poses of a stand, or none of an estimate.
+    """
+    series: dict[str, list[tuple[float, float, float, float]]] = {n.name: [] for n in (STAND_POSE, ODOMETRY, POSE)}
+    for entry in open_log(path):
+        if entry.topic in series:
+            message: Any = entry.decode()
+            series[entry.topic].append((message.stamp, message.pose.x, message.pose.y, message.pose.yaw))
+    seen = _array(series[STAND_POSE.name])
+    if len(seen) < LEAST:
+        raise InputError(f"{path}: {len(seen)} poses of a stand in it: expected {LEAST}, as with `stand: overhead`")
+    found = [
+        error_of(topic.name, seen, rows)
+        for topic in (ODOMETRY, POSE)
+        if len(rows := _array(series[topic.name])) >= LEAST
+    ]
+    if not found:
+        raise InputError(f"{path}: no odometry in it")
+    return found
+
+
+def tracker_errors(path: Path) -> dict[str, float] | None:
+    """What the tracker itself reported as its distance from the path, m; None where none drove."""
+    off = [abs(message.cross_track) for message in _trackers(path)]
+    if not off:
+        return None
+    return {"reports": float(len(off)), "rms": float(np.sqrt(np.mean(np.square(off)))), "worst": float(max(off))}
+
+
+def error_of(what: str, seen: Array, estimate: Array) -> EstimateError:
+    """Errors of one estimate; both (n, 4): stamp (s), x, y (m), yaw (rad)."""
+    latency = latency_of(seen, estimate)
+    at = seen[:, 0] - (latency or 0.0)
+    inside = (at >= estimate[0, 0]) & (at <= estimate[-1, 0])
+    if inside.sum() < LEAST:
+        raise InputError(f"{what}: {int(inside.sum())} poses at times that the stand saw: expected {LEAST}")
+    truth, there = seen[inside, 1:], interpolate(estimate[:, 0], estimate[:, 1:], at[inside])
+    aligned = _laid_over(truth, there, slice(None))
+    off = np.hypot(*(aligned[:, :2] - truth[:, :2]).T)
+    first = _laid_over(truth, there, slice(0, max(LEAST // 2, len(truth) // 20)))
+    turn = wrap(aligned[:, 2] - truth[:, 2])
+    return EstimateError(
+        what,
+        int(inside.sum()),
+        float(np.sqrt(np.mean(off**2))),
+        float(np.hypot(*(first[-1, :2] - truth[-1, :2]))),
+        float(np.sqrt(np.mean(turn**2))),
+        latency,
+    )
+
+
+def latency_of(seen: Array, estimate: Array) -> float | None:
+    """Seconds by which the stand's stamps are late; None: hardly any turn."""
+    yaw, other = np.unwrap(seen[:, 3]), np.unwrap(estimate[:, 3])
+    if np.ptp(yaw) < LEAST_TURN:
+        return None
+    times = seen[:, 0]
+    inside = (times > estimate[0, 0] + REACH) & (times < estimate[-1, 0] - REACH)
+    if inside.sum() < LEAST:
+        return None
+
+    def residual(parameters: Array) -> Array:
+        predicted = np.interp(times[inside] - parameters[0], estimate[:, 0], other)
+        basis = np.column_stack((np.ones(predicted.size), predicted, times[inside] - times[0]))
+        return np.asarray(yaw[inside] - basis @ np.linalg.lstsq(basis, yaw[inside], rcond=None)[0])
+
+    fit = least_squares(residual, np.zeros(1), np.array((-REACH,)), np.array((REACH,)), huber=0.05)
+    return float(fit.parameters[0])
+
+
+def as_values(found: list[EstimateError]) -> list[dict[str, Any]]:
+    """Plain data."""
+    return [asdict(row) for row in found]
+
+
+def _laid_over(truth: Array, estimate: Array, part: slice) -> Array:
+    """The estimate in the stand's frame: mean turn, and shift, over ``part``."""
+    turns = truth[part, 2] - estimate[part, 2]
+    yaw = float(np.arctan2(np.sin(turns).mean(), np.cos(turns).mean()))
+    c, s = np.cos(yaw), np.sin(yaw)
+    turned = estimate[:, :2] @ np.array(((c, s), (-s, c)))
+    shift = (truth[part, :2] - turned[part]).mean(axis=0)
+    return np.column_stack((turned + shift, estimate[:, 2] + yaw))
+
+
+def _array(rows: list[tuple[float, float, float, float]]) -> Array:
+    found = np.array(rows, dtype=np.float64).reshape(-1, 4)
+    found = found[np.argsort(found[:, 0], kind="stable")]
+    if len(found):
+        found[:, 0] = found[:, 0] / SECOND
+        found = found[np.concatenate(([True], np.diff(found[:, 0]) > 0))]
+    return found
+
+
+def _trackers(path: Path) -> Iterator[TrackerState]:
+    for entry in open_log(path):
+        if entry.topic == TRACKER.name:
+            message = entry.decode()
+            assert isinstance(message, TrackerState)
+            yield message

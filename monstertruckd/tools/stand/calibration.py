@@ -1,0 +1,253 @@
+"""Calibration of the stand: lenses by a board, places by marks on the table, all joined by what several cameras see.
+
+The marks are tags whose middles were measured by ruler. A mark that two cameras see must be at one place for both: the
+places of all cameras are fitted together, by least squares of points on the table.
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Final, Literal
+
+import cv2
+import numpy as np
+from pydantic import Field, ValidationError
+
+from monstertruck_estimation.vision.tags import Picture, Sighting, TagReader, dictionary
+from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.fitting import least_squares
+from monstertruck_runtime.errors import ConfigError, InputError
+from monstertruck_schemas.base import Schema
+from monstertruckd.tools.stand.camera import Lens, PlacedCamera, meet, rotation_matrix
+from monstertruckd.tools.stand.config import BoardConfig, MarkConfig, OverheadConfig
+
+Numbers = Annotated[tuple[float, ...], Field(strict=False)]
+
+LEAST_BOARDS: Final = 6
+"""Pictures of the board."""
+LEAST_CORNERS: Final = 8
+"""Of a board in a picture."""
+LEAST_MARKS: Final = 5
+"""In sight of a camera."""
+SEEN: Final = 0.0005
+"""Standard deviation of a point on the table by a camera's noise, m: a fifth of a pixel."""
+
+
+class CameraCalibration(Schema):
+    """One camera."""
+
+    matrix: Numbers
+    """3 x 3, row-major, pixels"""
+    distortion: Numbers
+    """k1, k2, p1, p2, k3"""
+    size: Annotated[tuple[int, int], Field(strict=False)]
+    rotation: Numbers
+    translation: Numbers
+    lens_rms: float
+    """Of the board's corners, pixels"""
+    place_rms: float
+    """Of the marks, m"""
+    boards: int
+    marks: int
+
+
+class StandCalibration(Schema):
+    """All cameras of a stand."""
+
+    version: Literal[1] = 1
+    cameras: dict[str, CameraCalibration]
+    overlap_rms: float | None
+    """By how much cameras disagree on a mark that several see, m; None: no mark is seen by two"""
+
+    def placed(self) -> dict[str, PlacedCamera]:
+        """For use."""
+        return {name: _placed(found) for name, found in self.cameras.items()}
+
+
+def fit_lens(pictures: Sequence[Picture], board: BoardConfig) -> tuple[Lens, float, int]:
+    """A lens from pictures of the board, the rms of its corners (pixels) and the pictures that showed it.
+
+    Raises:
+        InputError: too few of them show it.
+    """
+    printed = cv2.aruco.CharucoBoard((board.columns, board.rows), board.square, board.marker, dictionary())
+    detector = cv2.aruco.CharucoDetector(printed)
+    objects, images = [], []
+    for picture in pictures:
+        corners, ids, _, _ = detector.detectBoard(picture)
+        if ids is None or len(ids) < LEAST_CORNERS:
+            continue
+        points, shown = printed.matchImagePoints(corners, ids)
+        objects.append(np.asarray(points, dtype=np.float32))
+        images.append(np.asarray(shown, dtype=np.float32))
+    if len(objects) < LEAST_BOARDS:
+        raise InputError(f"the board is seen in {len(objects)} of {len(pictures)} pictures: expected {LEAST_BOARDS}")
+    height, width = pictures[0].shape
+    rms, matrix, distortion, _, _ = cv2.calibrateCamera(
+        objects, images, (width, height), None, None, flags=cv2.CALIB_FIX_K3
+    )
+    return Lens(np.asarray(matrix), np.ravel(distortion)[:5], (width, height)), float(rms), len(objects)
+
+
+def middles(sightings: Sequence[Sighting]) -> dict[int, Array]:
+    """Middle of each tag, pixels: where the diagonals cross, which perspective keeps."""
+    return {sighting.tag: _crossing(sighting.corners) for sighting in sightings}
+
+
+def seen_marks(pictures: Sequence[Picture]) -> dict[int, Array]:
+    """Middles of tags, averaged over pictures in which nothing moves, pixels."""
+    found: dict[int, list[Array]] = {}
+    for picture in pictures:
+        for tag, middle in middles(TagReader(everywhere=1).read(picture)).items():
+            found.setdefault(tag, []).append(middle)
+    return {tag: np.mean(points, axis=0) for tag, points in found.items()}
+
+
+def place(lens: Lens, seen: Mapping[int, Array], marks: Mapping[int, MarkConfig]) -> PlacedCamera:
+    """Place of one camera from marks at known places.
+
+    Raises:
+        InputError: too few of them are in sight.
+    """
+    known = sorted(seen.keys() & marks.keys())
+    if len(known) < LEAST_MARKS:
+        raise InputError(f"marks {known or 'none'} are in sight: expected {LEAST_MARKS} of {sorted(marks)}")
+    points = np.array([(marks[tag].x, marks[tag].y, 0.0) for tag in known])
+    pixels = np.array([seen[tag] for tag in known])
+    _, rotation, translation = cv2.solvePnP(points, pixels, lens.matrix, lens.distortion, flags=cv2.SOLVEPNP_IPPE)
+    rotation, translation = cv2.solvePnPRefineLM(points, pixels, lens.matrix, lens.distortion, rotation, translation)
+    return PlacedCamera(lens, np.ravel(rotation), np.ravel(translation))
+
+
+def join(
+    cameras: Mapping[str, PlacedCamera],
+    seen: Mapping[str, Mapping[int, Array]],
+    marks: Mapping[int, MarkConfig],
+    ruler: float,
+) -> dict[str, PlacedCamera]:
+    """All places fitted together: marks lie where the ruler says, and where the other cameras see them.
+
+    Args:
+        cameras: placed one by one.
+        seen: middles of tags by camera, pixels.
+        marks: by tag.
+        ruler: standard deviation of a mark's place, m.
+    """
+    names = list(cameras)
+    rays = {n: {tag: cameras[n].lens.directions(px[None])[0] for tag, px in seen[n].items()} for n in names}
+    tags = sorted({tag for found in seen.values() for tag in found})
+    start = np.concatenate([np.concatenate((cameras[n].rotation, cameras[n].translation)) for n in names])
+    lists = {n: (list(rays[n]), np.array(list(rays[n].values()))) for n in names if rays[n]}
+
+    def residual(parameters: Array) -> Array:
+        by_tag: dict[int, list[Array]] = {tag: [] for tag in tags}
+        for k, name in enumerate(names):
+            if name not in lists:
+                continue
+            own = parameters[6 * k : 6 * k + 6]
+            numbers, directions = lists[name]
+            for tag, point in zip(numbers, meet(directions, rotation_matrix(own[:3]), own[3:]), strict=True):
+                by_tag[tag].append(point)
+        off: list[Array] = []
+        for tag, points in by_tag.items():
+            middle = np.mean(points, axis=0)
+            off += [(point - middle) / SEEN for point in points] if len(points) > 1 else []
+            if tag in marks:
+                off.append((middle - (marks[tag].x, marks[tag].y)) / ruler)
+        return np.concatenate(off)
+
+    fit = least_squares(residual, start, start - 1.0, start + 1.0, iterations=30)
+    return {
+        name: PlacedCamera(cameras[name].lens, fit.parameters[6 * k : 6 * k + 3], fit.parameters[6 * k + 3 : 6 * k + 6])
+        for k, name in enumerate(names)
+    }
+
+
+def calibrate(
+    config: OverheadConfig, boards: Mapping[str, Sequence[Picture]], floors: Mapping[str, Sequence[Picture]]
+) -> StandCalibration:
+    """Lenses, places, and the join.
+
+    Args:
+        config: of the stand.
+        boards: pictures of the board by camera.
+        floors: pictures of the table by camera.
+
+    Raises:
+        InputError: a camera lacks pictures or marks; it is named.
+    """
+    lenses, seen, placed = {}, {}, {}
+    for name in config.cameras:
+        try:
+            lenses[name] = fit_lens(boards[name], config.board)
+            seen[name] = seen_marks(floors[name])
+            placed[name] = place(lenses[name][0], seen[name], config.marks)
+        except InputError as error:
+            raise InputError(f"camera {name}: {error}") from error
+    joined = join(placed, seen, config.marks, config.ruler_error)
+    points = {name: {tag: joined[name].on_plane(px[None])[0] for tag, px in seen[name].items()} for name in joined}
+    apart = [
+        points[a][tag] - points[b][tag]
+        for k, a in enumerate(joined)
+        for b in list(joined)[k + 1 :]
+        for tag in points[a].keys() & points[b].keys()
+    ]
+    found = {}
+    for name, camera in joined.items():
+        own = [points[name][tag] - (m.x, m.y) for tag, m in config.marks.items() if tag in points[name]]
+        lens, rms, count = lenses[name]
+        found[name] = CameraCalibration(
+            matrix=tuple(lens.matrix.ravel().tolist()),
+            distortion=tuple(lens.distortion.tolist()),
+            size=lens.size,
+            rotation=tuple(camera.rotation.tolist()),
+            translation=tuple(camera.translation.tolist()),
+            lens_rms=rms,
+            place_rms=_rms(own),
+            boards=count,
+            marks=len(own),
+        )
+    return StandCalibration(cameras=found, overlap_rms=_rms(apart) if apart else None)
+
+
+def load(path: Path) -> StandCalibration:
+    """Read it.
+
+    Raises:
+        ConfigError: there is none, or it is damaged.
+    """
+    try:
+        return StandCalibration.model_validate_json(path.read_bytes())
+    except (OSError, ValidationError) as error:
+        raise ConfigError(f"{path}: no usable calibration of the stand: run `stand calibrate` ({error})") from error
+
+
+def save(calibration: StandCalibration, path: Path) -> None:
+    """Write it, whole or not at all.
+
+    Raises:
+        ConfigError: it cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        draft = path.with_suffix(".new")
+        draft.write_text(calibration.model_dump_json(indent=1) + "\n", encoding="utf-8")
+        draft.replace(path)
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be written: {error.strerror}") from error
+
+
+def _placed(found: CameraCalibration) -> PlacedCamera:
+    lens = Lens(np.array(found.matrix).reshape(3, 3), np.array(found.distortion), found.size)
+    return PlacedCamera(lens, np.array(found.rotation), np.array(found.translation))
+
+
+def _crossing(corners: Array) -> Array:
+    a, b, c, d = corners
+    (x1, y1), (x2, y2) = c - a, d - b
+    dx, dy = b - a
+    way = (dx * y2 - dy * x2) / (x1 * y2 - y1 * x2)
+    return np.asarray(a + way * (c - a))
+
+
+def _rms(points: Sequence[Array]) -> float:
+    return float(np.sqrt(np.mean(np.sum(np.square(points), axis=1)))) if len(points) else 0.0

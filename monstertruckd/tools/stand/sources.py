@@ -1,0 +1,77 @@
+"""Where pictures come from: cameras of the computer, films, folders of pictures."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+import cv2
+import numpy as np
+
+from monstertruck_estimation.vision.tags import Picture
+from monstertruck_runtime.errors import DeviceLostError, InputError
+from monstertruckd.tools.stand.config import FileSource, V4l2Source
+
+ENDINGS: Final = (".png", ".jpg", ".jpeg", ".pgm")
+
+
+def pictures_in(folder: Path) -> list[Picture]:
+    """All pictures of a folder in the order of their names, grey.
+
+    Raises:
+        InputError: there is none, or one cannot be read.
+    """
+    files = sorted(path for path in folder.glob("*") if path.suffix.lower() in ENDINGS) if folder.is_dir() else []
+    if not files:
+        raise InputError(f"{folder}: no pictures in it ({', '.join(ENDINGS)}): take some with `stand snap`")
+    return [_read(path) for path in files]
+
+
+def stream(source: V4l2Source | FileSource, size: tuple[int, int], rate: float) -> Iterator[Picture]:
+    """Pictures one after the other, grey; blocks for each.
+
+    Raises:
+        DeviceLostError: the camera is not there, or sends no more.
+        InputError: a film, or a picture, that cannot be read.
+    """
+    if isinstance(source, FileSource):
+        if source.path.is_dir():
+            yield from pictures_in(source.path)
+            return
+        yield from _frames(source.path, cv2.VideoCapture(str(source.path)), InputError("cannot be read as a film"))
+        return
+    capture = cv2.VideoCapture(str(source.device), cv2.CAP_V4L2)
+    for what, value in (
+        (cv2.CAP_PROP_FRAME_WIDTH, size[0]),
+        (cv2.CAP_PROP_FRAME_HEIGHT, size[1]),
+        (cv2.CAP_PROP_FPS, rate),
+        (cv2.CAP_PROP_BUFFERSIZE, 1),
+    ):
+        capture.set(what, value)
+    yield from _frames(source.device, capture, DeviceLostError("cannot be opened"))
+    raise DeviceLostError(f"{source.device}: sends no more pictures")
+
+
+def _frames(name: Path, capture: cv2.VideoCapture, closed: Exception) -> Iterator[Picture]:
+    try:
+        if not capture.isOpened():
+            raise type(closed)(f"{name}: {closed}")
+        while True:
+            there, picture = capture.read()
+            if not there:
+                return
+            yield _grey(np.asarray(picture))
+    finally:
+        capture.release()
+
+
+def _read(path: Path) -> Picture:
+    picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    if picture is None:
+        raise InputError(f"{path}: cannot be read as a picture")
+    return np.asarray(picture, dtype=np.uint8)
+
+
+def _grey(picture: np.ndarray) -> Picture:
+    if picture.ndim == 2:
+        return picture.astype(np.uint8)
+    return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), dtype=np.uint8)

@@ -1,0 +1,122 @@
+"""Cameras to poses: a thread for each camera reads tags, the loop joins what they saw at one instant."""
+
+import asyncio
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from typing import Final
+
+from monstertruck_estimation.vision.tags import Picture, Sighting, TagReader
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.errors import TruckError
+from monstertruckd.tools.stand.tracking import RobotPose, StandTracker
+
+RETRY: Final = 1.0
+"""Seconds after which a lost camera is tried again."""
+
+Stream = Callable[[], Iterator[Picture]]
+
+
+class StandRun:
+    """Tracks until its sources end, or it is cancelled.
+
+    Args:
+        tracker: of robots and cameras.
+        streams: pictures by camera; each call begins anew.
+        rate: pictures a second.
+        clock: stamps a picture when it was read.
+        put: gets every pose.
+        say: gets what is wrong with a camera.
+        live: a source that ends is a fault, and tried again.
+    """
+
+    def __init__(
+        self,
+        tracker: StandTracker,
+        streams: Mapping[str, Stream],
+        rate: float,
+        clock: Clock,
+        put: Callable[[RobotPose], object],
+        say: Callable[[str], object],
+        *,
+        live: bool,
+    ) -> None:
+        self._tracker = tracker
+        self._streams = streams
+        self._rate = rate
+        self._clock = clock
+        self._put = put
+        self._say = say
+        self._live = live
+        self._newest: dict[str, tuple[int, list[Sighting]]] = {}
+        self._ended = threading.Event()
+
+    async def run(self) -> None:
+        """Track; returns when all recorded sources have ended."""
+        if self._live:
+            await self._follow()
+        else:
+            await self._play()
+
+    async def _play(self) -> None:
+        """Recorded pictures: the first ones of all cameras are of one instant, and so on."""
+        iterators = {name: stream() for name, stream in self._streams.items()}
+        readers = {name: TagReader() for name in iterators}
+        began, count = self._clock.now(), 0
+        while iterators:
+            seen = {}
+            for name, pictures in list(iterators.items()):
+                picture = await asyncio.to_thread(next, pictures, None)
+                if picture is None:
+                    del iterators[name]
+                    continue
+                seen[name] = await asyncio.to_thread(readers[name].read, picture)
+            if seen:
+                stamp = began + round(count * SECOND / self._rate)
+                for pose in self._tracker.take(stamp, seen):
+                    self._put(pose)
+                for text in self._tracker.complaints(stamp):
+                    self._say(text)
+            count += 1
+
+    async def _follow(self) -> None:
+        loop = asyncio.get_running_loop()
+        threads = [
+            threading.Thread(target=self._watch, args=(loop, name, stream), name=f"camera {name}", daemon=True)
+            for name, stream in self._streams.items()
+        ]
+        for thread in threads:
+            thread.start()
+        taken: dict[str, int] = {}
+        try:
+            while True:
+                await self._clock.sleep(1 / self._rate)
+                fresh = {n: (at, tags) for n, (at, tags) in self._newest.items() if at > taken.get(n, -1)}
+                if fresh:
+                    taken |= {name: at for name, (at, _) in fresh.items()}
+                    stamp = max(at for at, _ in fresh.values())
+                    for pose in self._tracker.take(stamp, {name: tags for name, (_, tags) in fresh.items()}):
+                        self._put(pose)
+                for text in self._tracker.complaints(self._clock.now()):
+                    self._say(text)
+        finally:
+            self._ended.set()
+
+    def _watch(self, loop: asyncio.AbstractEventLoop, name: str, stream: Stream) -> None:
+        """One camera, in a thread of its own: OpenCV gives the interpreter free while it works."""
+        said = ""
+        while not self._ended.is_set():
+            reader = TagReader()
+            try:
+                for picture in stream():
+                    at = self._clock.now()
+                    self._newest[name] = at, reader.read(picture)
+                    if self._ended.is_set():
+                        return
+                    said = ""
+            except TruckError as error:
+                if str(error) != said:
+                    said = str(error)
+                    with suppress(RuntimeError):  # the loop has ended
+                        loop.call_soon_threadsafe(self._say, f"camera {name}: {error}")
+            self._ended.wait(RETRY)

@@ -1,0 +1,114 @@
+"""AprilTags in a picture: the one place where tags are read (family 36h11; Olson, "AprilTag", ICRA 2011).
+
+OpenCV's ArUco module finds them; corners are crossings of lines along the edges, to a part of a pixel. A tag that stays
+in view is looked for around its last place only, and everywhere once in a while, which lets one core read several
+cameras.
+"""
+
+from collections.abc import Sequence
+from typing import Final, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_kinematics.elementary import Array
+
+Picture = NDArray[np.uint8]
+"""Grey, (height, width)."""
+
+MARGIN: Final = 1.0
+"""Of a window around a tag, in its sizes to each side: how far it may move between two pictures."""
+LEAST_MARGIN: Final = 16
+"""Pixels."""
+EVERYWHERE: Final = 8
+"""Pictures from one look at the whole of it to the next."""
+
+
+class Sighting(NamedTuple):
+    """A tag in a picture."""
+
+    tag: int
+    corners: Array
+    """(4, 2), pixels: of the black square, clockwise as printed, from its upper left one."""
+
+    @property
+    def size(self) -> float:
+        """Mean side, pixels."""
+        return float(np.hypot(*(self.corners - np.roll(self.corners, 1, axis=0)).T).mean())
+
+
+class TagReader:
+    """Reads the tags of one camera's pictures.
+
+    Args:
+        everywhere: pictures from one look at the whole picture to the next; 1 = always.
+    """
+
+    def __init__(self, everywhere: int = EVERYWHERE) -> None:
+        parameters = cv2.aruco.DetectorParameters()
+        # By lines along the edges: a window around a corner takes in cells of a small tag.
+        parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_CONTOUR
+        parameters.adaptiveThreshWinSizeMin = 5
+        parameters.adaptiveThreshWinSizeMax = 21
+        parameters.adaptiveThreshWinSizeStep = 8
+        self._detector = cv2.aruco.ArucoDetector(dictionary(), parameters)
+        self._everywhere = everywhere
+        self._count = 0
+        self._last: list[Sighting] = []
+
+    def read(self, picture: Picture) -> list[Sighting]:
+        """Tags of the next picture."""
+        whole = self._count % self._everywhere == 0 or not self._last
+        self._count += 1
+        if whole:
+            found = self._detect(picture, 0, 0)
+        else:
+            found = []
+            for x0, y0, x1, y1 in _windows(self._last, picture.shape[1], picture.shape[0]):
+                found += self._detect(np.ascontiguousarray(picture[y0:y1, x0:x1]), x0, y0)
+        by_tag = {sighting.tag: sighting for sighting in found}
+        self._last = list(by_tag.values())
+        return self._last
+
+    def _detect(self, picture: Picture, x0: int, y0: int) -> list[Sighting]:
+        corners, ids, _ = self._detector.detectMarkers(picture)
+        if ids is None:
+            return []
+        return [
+            Sighting(int(tag), np.asarray(points, dtype=np.float64).reshape(4, 2) + (x0, y0))  # noqa: RUF005
+            for tag, points in zip(np.ravel(ids), corners, strict=True)
+        ]
+
+
+def dictionary() -> "cv2.aruco.Dictionary":
+    """The family of tags."""
+    return cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+
+
+def drawn(tag: int, pixels: int) -> Picture:
+    """A tag to be printed, its white rim left aside; (pixels, pixels)."""
+    return np.asarray(cv2.aruco.generateImageMarker(dictionary(), tag, pixels), dtype=np.uint8)
+
+
+def _windows(sightings: Sequence[Sighting], width: int, height: int) -> list[tuple[int, int, int, int]]:
+    """Around each tag, those that overlap joined: x0, y0, x1, y1, pixels."""
+    boxes: list[tuple[int, int, int, int]] = []
+    for sighting in sightings:
+        margin = max(LEAST_MARGIN, round(MARGIN * sighting.size))
+        low, high = sighting.corners.min(axis=0), sighting.corners.max(axis=0)
+        box = (
+            max(int(low[0]) - margin, 0),
+            max(int(low[1]) - margin, 0),
+            min(int(high[0]) + margin, width),
+            min(int(high[1]) + margin, height),
+        )
+        while (other := next((b for b in boxes if _overlap(b, box)), None)) is not None:
+            boxes.remove(other)
+            box = (min(box[0], other[0]), min(box[1], other[1]), max(box[2], other[2]), max(box[3], other[3]))
+        boxes.append(box)
+    return boxes
+
+
+def _overlap(a: tuple[int, int, int, int], b: tuple[int, int, int, int]) -> bool:
+    return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]

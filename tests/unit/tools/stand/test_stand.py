@@ -1,0 +1,155 @@
+"""The test stand on rendered pictures: calibration by its own procedure, poses, hand-over, cameras that go or move."""
+
+import csv
+import math
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+pytest.importorskip("cv2")
+
+import cv2
+
+from monstertruck_estimation.vision.tags import Sighting, TagReader
+from monstertruck_runtime.clock import SECOND
+from monstertruck_runtime.errors import InputError
+from monstertruckd.tools.cli.main import app
+from monstertruckd.tools.stand.calibration import place, save
+from monstertruckd.tools.stand.config import MarkConfig, OverheadConfig, TaggedRobot
+from monstertruckd.tools.stand.render import level_tag
+from monstertruckd.tools.stand.tracking import StandTracker, TagPose, merged, tag_pose
+from tests.stand_kit import simulated
+
+pytestmark = pytest.mark.timeout(300)
+
+
+@pytest.fixture(scope="module")
+def stand():
+    return simulated(3, cameras=2, boards=8)
+
+
+def sightings(stand, x, y, yaw, height=0.08):
+    _, config, _, renderers, floor = stand
+    placards = [*floor, level_tag(0, config.mark_size, x, y, yaw, height)]
+    return {name: TagReader(1).read(renderer.picture(placards)) for name, renderer in renderers.items()}
+
+
+def test_poses_are_right_to_millimetres(stand):
+    _, config, found, _, _ = stand
+    rng = np.random.default_rng(1)
+    for _ in range(6):
+        x, y, yaw = rng.uniform(-1.3, 0.4), rng.uniform(0.2, 1.2), rng.uniform(-3, 3)
+        tracker = StandTracker(found.placed(), config.robots, config.marks)
+        (pose,) = tracker.take(0, sightings(stand, x, y, yaw))
+        assert math.hypot(pose.x - x, pose.y - y) < 0.006
+        assert abs(math.remainder(pose.yaw - yaw, math.tau)) < math.radians(1.5)
+        assert pose.sigma < 0.002
+
+
+def test_cameras_agree_where_both_see_a_robot(stand):
+    _, _, found, _, _ = stand
+    seen = sightings(stand, -0.5, 0.75, 0.3)
+    robot = {name: next(s for s in tags if s.tag == 0) for name, tags in seen.items()}
+    poses = [tag_pose(found.placed()[name], sighting, 0.08) for name, sighting in robot.items()]
+    assert len(poses) == 2
+    assert math.hypot(poses[0].x - poses[1].x, poses[0].y - poses[1].y) < 0.005
+
+
+def test_a_robot_near_a_border_counts_less():
+    sure, faint = TagPose(0.0, 0.0, 3.1, 1.0, 0.001, 0.01), TagPose(0.1, 0.0, -3.1, 0.001, 0.001, 0.01)
+    assert merged([sure, faint]).x < 0.001
+    assert abs(merged([sure, sure._replace(yaw=-3.1)]).yaw) > 3.1, "headings are averaged across the turn"
+
+
+def test_a_tag_is_followed_in_a_window(stand):
+    _, _, _, renderers, floor = stand
+    reader = TagReader(everywhere=1000)
+    whole = TagReader(everywhere=1)
+    for k in range(5):
+        picture = renderers["c1"].picture([*floor, level_tag(0, 0.08, -1.0 + 0.01 * k, 0.7, 0.1, 0.08)])
+        found = {s.tag: s for s in reader.read(picture)}
+        for sighting in whole.read(picture):
+            assert np.abs(found[sighting.tag].corners - sighting.corners).max() < 1.0
+
+
+def test_a_lost_camera_and_a_bumped_one_are_named(stand):
+    _, config, found, renderers, floor = stand
+    tracker = StandTracker(found.placed(), config.robots, config.marks)
+    good = {name: TagReader(1).read(renderer.picture(floor)) for name, renderer in renderers.items()}
+    for k in range(30):
+        tracker.take(k * SECOND // 10, good)
+    assert tracker.complaints(3 * SECOND) == []
+    bumped = [s._replace(corners=s.corners + np.array((0.0, 21.0))) for s in good["c1"]]  # 2 degrees of its lens
+    said = []
+    for k in range(30, 130):
+        tracker.take(k * SECOND // 10, {"c1": bumped})
+        said += tracker.complaints(k * SECOND // 10)
+    assert [text for text in said if "c2 sends no picture" in text]
+    assert [text for text in said if "c1 has moved" in text]
+    tracker.take(13 * SECOND, good)
+    assert "camera c2 sends pictures again" in tracker.complaints(13 * SECOND)
+
+
+def test_what_no_robot_can_reach_is_left_out_until_it_stays(stand):
+    _, _, found, _, _ = stand
+    camera = found.placed()["c1"]
+    tracker = StandTracker({"c1": camera}, {"r1": TaggedRobot(tag=0, height=0.0)}, {})
+
+    def at(x, y):
+        corners = np.array(
+            [(x + 0.04, y + 0.04, 0), (x + 0.04, y - 0.04, 0), (x - 0.04, y - 0.04, 0), (x - 0.04, y + 0.04, 0)]
+        )
+        return {"c1": [Sighting(0, camera.project(corners))]}
+
+    assert len(tracker.take(0, at(-1.0, 0.7))) == 1
+    taken = [len(tracker.take((k + 1) * SECOND // 25, at(-0.5, 0.9))) for k in range(8)]
+    assert taken[0] == 0
+    assert taken[-1] == 1
+    assert tracker.left_out == taken.index(1)
+
+
+def test_too_few_marks_or_boards_are_named(stand):
+    _, _, found, _, _ = stand
+    lens = found.placed()["c1"].lens
+    with pytest.raises(InputError, match="marks"):
+        place(lens, {1: np.zeros(2)}, {1: MarkConfig(x=0.0, y=0.0)})
+
+
+def test_the_commands_calibrate_and_track_recorded_pictures(stand, tmp_path):
+    _, config, found, renderers, floor = stand
+    save(found, tmp_path / "calibration.json")
+    for name, renderer in renderers.items():
+        folder = tmp_path / name
+        folder.mkdir()
+        for k in range(4):
+            placards = [*floor, level_tag(0, 0.08, -0.5 + 0.02 * k, 0.7, 0.0, 0.08)]
+            cv2.imwrite(str(folder / f"{k}.png"), renderer.picture(placards))
+    file = tmp_path / "stand.yaml"
+    lines = ["version: 2", f"calibration: {tmp_path}/calibration.json", "robots: { r1: { tag: 0 } }", "cameras:"]
+    for name in renderers:
+        source = f"{{ kind: file, path: {tmp_path}/{name} }}"
+        lines.append(f"  {name}: {{ source: {source}, boards: {tmp_path}/none, floor: {tmp_path}/{name} }}")
+    lines += ["marks:", *(f"  {tag}: {{ x: {m.x}, y: {m.y} }}" for tag, m in config.marks.items())]
+    file.write_text("\n".join(lines))
+    out = tmp_path / "poses.csv"
+    result = CliRunner().invoke(app, ["stand", "track", "-c", str(file), "--out", str(out)])
+    assert result.exit_code == 0, result.output
+    rows = list(csv.DictReader(out.read_text().splitlines()))
+    assert [row["robot"] for row in rows] == ["r1"] * 4
+    assert [float(row["x_m"]) for row in rows] == pytest.approx([-0.5, -0.48, -0.46, -0.44], abs=0.006)
+    assert rows[0]["cameras"] == "c1 c2"
+    again = CliRunner().invoke(app, ["stand", "calibrate", "-c", str(file)])
+    assert again.exit_code != 0
+    assert "no pictures" in again.output
+
+
+def test_the_shipped_configuration_is_one():
+    from pathlib import Path
+
+    from monstertruckd.config.load import load_config
+
+    config, _ = load_config(
+        Path(__file__).resolve().parents[4] / "configs" / "stands" / "overhead.yaml", OverheadConfig
+    )
+    assert len(config.cameras) == 6
