@@ -13,12 +13,13 @@ import math
 import sys
 from pathlib import Path
 from time import process_time
+from typing import Any
 
 import numpy as np
 
 from monstertruck_estimation.vision.tags import TagReader
 from monstertruck_runtime.clock import SECOND
-from monstertruckd.tools.stand.render import Look, level_tag
+from monstertruckd.tools.stand.render import PictureQuality, level_tag
 from monstertruckd.tools.stand.tracking import StandTracker
 from tests.stand_kit import simulated
 
@@ -35,10 +36,12 @@ GOALS = {
 }
 CROSSING = 250
 """Pictures of five robots that cross, 25 a second."""
-HALF = Look(light=0.5)
+HALF = PictureQuality(light=0.5)
 
 
-def accuracy(stand, poses: int, rng: np.random.Generator, look: Look | None) -> tuple[list[float], list[float]]:
+def accuracy(
+    stand: Any, poses: int, rng: np.random.Generator, look: PictureQuality | None
+) -> tuple[list[float], list[float]]:
     """Errors of position, m, and heading, rad, of a tag of 80 mm at random places."""
     _, config, found, renderers, floor = stand
     placed = found.placed()
@@ -53,7 +56,7 @@ def accuracy(stand, poses: int, rng: np.random.Generator, look: Look | None) -> 
     return off, turned
 
 
-def hand_over(stand) -> float:
+def hand_over(stand: Any) -> float:
     """Greatest jump, m, beyond the way driven, of a robot that crosses all views in steps of 8 mm."""
     _, config, found, renderers, floor = stand
     tracker = StandTracker(found.placed(), config.robots, config.marks)
@@ -70,7 +73,7 @@ def hand_over(stand) -> float:
     return worst
 
 
-def crossing(stand) -> tuple[int, float]:
+def crossing(stand: Any) -> tuple[int, float]:
     """Robots lost or mistaken among five that cross, and processor seconds of a picture read and tracked."""
     _, config, found, renderers, floor = stand
     tracker = StandTracker(found.placed(), config.robots, config.marks)
@@ -96,7 +99,7 @@ def crossing(stand) -> tuple[int, float]:
     return lost, spent / pictures
 
 
-def faults(stand) -> tuple[float, float]:
+def faults(stand: Any) -> tuple[float, float]:
     """Seconds until a camera that was turned by 2 degrees, and one that was unplugged, are named."""
     _, config, found, renderers, floor = stand
     tracker = StandTracker(found.placed(), config.robots, config.marks)

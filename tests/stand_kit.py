@@ -6,12 +6,12 @@ import numpy as np
 from monstertruckd.tools.stand.calibration import StandCalibration, calibrate
 from monstertruckd.tools.stand.camera import Lens, PlacedCamera
 from monstertruckd.tools.stand.config import MarkConfig, OverheadConfig
-from monstertruckd.tools.stand.render import Look, StandRenderer, board_in_view, level_tag
+from monstertruckd.tools.stand.render import PictureQuality, StandRenderer, board_in_view, level_tag
 
 GRID = ((-1.0, 0.75), (0.0, 0.75), (1.0, 0.75), (-1.0, -0.75), (0.0, -0.75), (1.0, -0.75))
 """Middles of six cameras' views over a table of 3 m x 3 m."""
 HEIGHT = 2.2
-LOOK = Look()
+LOOK = PictureQuality()
 
 
 def hidden_camera(
@@ -34,7 +34,7 @@ def marks() -> dict[int, tuple[float, float]]:
     return {100 + k: place for k, place in enumerate(lattice)}
 
 
-def simulated(seed: int, cameras: int = 6, boards: int = 20, look: Look = LOOK, robots: int = 1):
+def simulated(seed: int, cameras: int = 6, boards: int = 20, look: PictureQuality = LOOK, robots: int = 1):
     """Hidden cameras, the configuration that a person writes, and the calibration by the stand's procedure.
 
     Returns:

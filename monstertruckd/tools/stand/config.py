@@ -10,7 +10,7 @@ from monstertruck_schemas.base import Schema
 Metres = Annotated[float, Field(gt=0, le=10)]
 
 
-class V4l2Source(Schema):
+class VideoDevice(Schema):
     """A camera of the computer."""
 
     kind: Literal["v4l2"] = "v4l2"
@@ -28,7 +28,7 @@ class FileSource(Schema):
 class StandCamera(Schema):
     """One camera over the table."""
 
-    source: Annotated[V4l2Source | FileSource, Field(discriminator="kind")]
+    source: Annotated[VideoDevice | FileSource, Field(discriminator="kind")]
     boards: Path
     """Folder with pictures of the board, held anyhow: for the lens"""
     floor: Path

@@ -39,7 +39,7 @@ class Placard:
 
 
 @dataclass(frozen=True)
-class Look:
+class PictureQuality:
     """What spoils a picture."""
 
     blur: float = 0.7
@@ -85,7 +85,7 @@ class StandRenderer:
         seed: of the noise.
     """
 
-    def __init__(self, camera: PlacedCamera, look: Look, seed: int) -> None:
+    def __init__(self, camera: PlacedCamera, look: PictureQuality, seed: int) -> None:
         self._camera = camera
         self._look = look
         self._rng = np.random.default_rng(seed)
@@ -97,7 +97,7 @@ class StandRenderer:
         self._rays = rays.reshape(height * FINER, width * FINER, 3).astype(np.float32)
         self._floor = self._table()
 
-    def picture(self, placards: Sequence[Placard], look: Look | None = None) -> Picture:
+    def picture(self, placards: Sequence[Placard], look: PictureQuality | None = None) -> Picture:
         """With what is given, the last one on top."""
         image = self._floor.copy()
         for placard in placards:
@@ -143,7 +143,7 @@ class StandRenderer:
         grain = 6 * np.sin(40 * x + 3 * np.sin(3 * y)) + 4 * np.sin(23 * y + 5 * np.sin(2 * x))
         return np.asarray(FLOOR + grain, dtype=np.float32)
 
-    def _spoiled(self, image: Array, look: Look) -> Picture:
+    def _spoiled(self, image: Array, look: PictureQuality) -> Picture:
         small = cv2.resize(image, self._camera.lens.size, interpolation=cv2.INTER_AREA)
         if look.blur > 0:
             small = cv2.GaussianBlur(small, (0, 0), look.blur)

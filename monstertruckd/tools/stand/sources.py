@@ -9,7 +9,7 @@ import numpy as np
 
 from monstertruck_estimation.vision.tags import Picture
 from monstertruck_runtime.errors import DeviceLostError, InputError
-from monstertruckd.tools.stand.config import FileSource, V4l2Source
+from monstertruckd.tools.stand.config import FileSource, VideoDevice
 
 ENDINGS: Final = (".png", ".jpg", ".jpeg", ".pgm")
 
@@ -26,7 +26,7 @@ def pictures_in(folder: Path) -> list[Picture]:
     return [_read(path) for path in files]
 
 
-def stream(source: V4l2Source | FileSource, size: tuple[int, int], rate: float) -> Iterator[Picture]:
+def stream(source: VideoDevice | FileSource, size: tuple[int, int], rate: float) -> Iterator[Picture]:
     """Pictures one after the other, grey; blocks for each.
 
     Raises:
