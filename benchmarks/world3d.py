@@ -256,13 +256,13 @@ def step() -> dict[str, float]:
 
 
 def best(run: Callable[[], object], count: int, rounds: int = 7) -> float:
-    """Seconds a call, of the best of some rounds: other programs share the processor."""
+    """Seconds of processor time a call, of the best of some rounds: other programs share the computer."""
     found = []
     for _ in range(rounds):
-        begin = time.perf_counter()
+        begin = time.thread_time()
         for _ in range(count):
             run()
-        found.append((time.perf_counter() - begin) / count)
+        found.append((time.thread_time() - begin) / count)
     return min(found)
 
 
@@ -288,7 +288,12 @@ def speed() -> dict[str, float]:
         return figures
     eye = looking((-1.5, -2.4, 1.0), (0.0, -1.7, 0.1))
     renderer.draw(data, eye)
-    figures["picture_ms"] = best(lambda: renderer.draw(data, eye), 3, 3) * 1e3
+    waits = []
+    for _ in range(9):  # by the clock, for the software that draws has threads of its own
+        begin = time.perf_counter()
+        renderer.draw(data, eye)
+        waits.append(time.perf_counter() - begin)
+    figures["picture_ms"] = min(waits) * 1e3
     renderer.close()
     return figures
 
