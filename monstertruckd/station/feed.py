@@ -40,6 +40,10 @@ MOST_TILES: Final = 400
 """Changed parts of the map that are kept until the whole map comes again."""
 
 
+CAMERA_BUDGET: Final = 300_000.0
+"""Bytes a second that pictures of the camera may take."""
+
+
 @dataclass(frozen=True, slots=True)
 class Shown(Generic[M]):
     """A topic on the page: how it is encoded, and how often at most, s."""
@@ -48,6 +52,8 @@ class Shown(Generic[M]):
     kind: str
     encode: Callable[[M], Frame]
     period: float = 0.0
+    budget: float | None = None
+    """Bytes a second; a large message makes the next one wait."""
 
 
 def _whole(topic: Topic[M], kind: str, period: float = 0.0) -> Shown[M]:
@@ -75,7 +81,7 @@ SHOWN: Final[tuple[Shown[Any], ...]] = (
     _whole(topics.HOST, "host"),
     _whole(topics.SLAM, "slam", 0.5),
     _whole(topics.USB, "usb"),
-    Shown(topics.CAMERA, "camera", frames.picture, 0.1),
+    Shown(topics.CAMERA, "camera", frames.picture, 0.1, CAMERA_BUDGET),
 )
 
 
@@ -231,12 +237,14 @@ class RobotFeed:
 
     def _take(self, shown: Shown[M], box: Mailbox[M], taken: dict[str, tuple[Message, int]], now: int) -> None:
         newest = box.latest
-        before, at = taken.get(shown.kind, (None, -SECOND))
+        before, due = taken.get(shown.kind, (None, now))
         # Half a tick of tolerance: the looks themselves come a little early or late.
-        if newest is None or newest is before or now - at < (shown.period - TICK / 2) * SECOND:
+        if newest is None or newest is before or now < due - TICK / 2 * SECOND:
             return
-        taken[shown.kind] = newest, now
-        self._show(shown.kind, shown.encode(newest))
+        frame = shown.encode(newest)
+        pause = max(shown.period, 0.0 if shown.budget is None else len(frame) / shown.budget)
+        taken[shown.kind] = newest, now + round(pause * SECOND)
+        self._show(shown.kind, frame)
 
     def _take_map(self, maps: Mailbox[Grid], tiles: Mailbox[Grid]) -> None:
         for grid in maps.drain():

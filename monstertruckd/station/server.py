@@ -21,6 +21,7 @@ from monstertruckd import __version__
 from monstertruckd.station import commands, frames
 from monstertruckd.station.address import RobotAddress
 from monstertruckd.station.commands import EchoRequest, Heartbeat, Watch
+from monstertruckd.station.discovery import Discovery
 from monstertruckd.station.feed import RobotFeed
 from monstertruckd.station.pilot import Pilot
 from monstertruckd.station.viewer import Viewer
@@ -32,6 +33,8 @@ FILES: Final = re.compile(r"[a-z_]+\.(?:js|css|svg)")
 TYPES: Final = {".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml", ".html": "text/html"}
 BEAT: Final = 10.0
 """Seconds between two pings of the WebSocket itself; a browser that does not answer for half of it is let go."""
+LOOK: Final = 1.0
+"""Seconds between two looks at robots that appeared."""
 LANGUAGE: Final = "en"
 
 HEADERS: Final = {
@@ -70,14 +73,20 @@ class Station:
         robots: what is shown; the first one at the start.
         clock: the station's time.
         place: where to listen.
+        routers: endpoints whose robots are shown as they appear.
     """
 
-    def __init__(self, robots: Sequence[RobotAddress], clock: Clock, place: Place = Place()) -> None:
+    def __init__(
+        self, robots: Sequence[RobotAddress], clock: Clock, place: Place = Place(), routers: Sequence[str] = ()
+    ) -> None:
         self._clock = clock
         self.place = place
         self.feeds = {address.name: RobotFeed(address, clock) for address in robots}
         if len(self.feeds) != len(robots):
             raise InputError("two robots of one name: expected a name of its own for each")
+        self._discoveries = [Discovery(endpoint, clock, self._found) for endpoint in routers]
+        self._following: set[asyncio.Task[None]] = set()
+        self._viewers: set[Viewer] = set()
         self._browsers = itertools.count(1)
         self._run = secrets.token_hex(2)
         """Tells this run's browsers from those of another, whose sequence numbers the robot remembers."""
@@ -91,19 +100,40 @@ class Station:
         """
         runner = web.AppRunner(self.application(), access_log=None, shutdown_timeout=1.0)
         await runner.setup()
-        following = [asyncio.create_task(feed.run()) for feed in self.feeds.values()]
+        for feed in self.feeds.values():
+            self._follow(feed)
+        discovering = [asyncio.create_task(each.run()) for each in self._discoveries]
         try:
             try:
                 await web.TCPSite(runner, self.place.host, self.place.port).start()
             except OSError as error:
                 raise BusyError(f"{self.place.url} cannot be served: {error.strerror or error}") from None
             ready()
-            await asyncio.gather(*following)
+            while True:  # robots may come while others are followed
+                done, _ = await asyncio.wait(
+                    [*self._following, *discovering], return_when=asyncio.FIRST_COMPLETED, timeout=LOOK
+                )
+                for task in done:
+                    task.result()
         finally:
-            for task in following:
+            tasks = [*self._following, *discovering]
+            for task in tasks:
                 task.cancel()
-            await asyncio.gather(*following, return_exceptions=True)
+            await asyncio.gather(*tasks, return_exceptions=True)
             await runner.cleanup()
+
+    def _follow(self, feed: RobotFeed) -> None:
+        self._following.add(asyncio.create_task(feed.run()))
+
+    def _found(self, address: RobotAddress) -> None:
+        """A robot appeared: follow it, and offer it in every browser."""
+        if address.name in self.feeds:
+            return
+        log.info("robot %s appeared at %s", address.name, address.endpoint)
+        self.feeds[address.name] = RobotFeed(address, self._clock)
+        self._follow(self.feeds[address.name])
+        for viewer in self._viewers:
+            viewer.tell(frames.text("robots", names=list(self.feeds)))
 
     def application(self) -> web.Application:
         """All routes."""
@@ -168,6 +198,7 @@ class Station:
         name = f"{self._run}.{next(self._browsers)}"
         log.info("browser %s connected from %s", name, request.remote)
         browser = _Browser(name, self.feeds, self._clock)
+        self._viewers.add(browser.viewer)
         sending = asyncio.create_task(_send(socket, browser.viewer))
         try:
             async for received in socket:
@@ -180,6 +211,7 @@ class Station:
                     log.warning("browser %s: message refused: %s", name, error)
                     browser.viewer.tell(frames.text("trouble", text=str(error)))
         finally:
+            self._viewers.discard(browser.viewer)
             sending.cancel()
             await asyncio.gather(sending, return_exceptions=True)
             await browser.close()
@@ -199,7 +231,8 @@ class _Browser:
         self._pilot: Pilot | None = None
         self._session: asyncio.Task[None] | None = None
         self._ending: set[asyncio.Task[None]] = set()
-        self.viewer.tell(frames.text("hello", version=__version__, robots=list(feeds)))
+        self.viewer.tell(frames.text("hello", version=__version__))
+        self.viewer.tell(frames.text("robots", names=list(feeds)))
 
     def take(self, data: str) -> None:
         """Obey one message.

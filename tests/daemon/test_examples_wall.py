@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.daemon.test_station_wall import planner_ready
-from tests.daemon.wall_kit import ROOT, robot
+from tests.daemon.wall_kit import ROOT, kept_armed, planner_ready, robot
 
 pytestmark = [pytest.mark.wall, pytest.mark.timeout(240)]
 
@@ -24,6 +23,17 @@ async def example(folder: Path, name: str, *arguments: str) -> str:
     return output.decode()
 
 
+async def armed(name: str, folder: Path, *arguments: str) -> str:
+    """Run one that arms the truck, again where a busy computer itself is why that is refused."""
+    for _ in range(20):
+        try:
+            return await example(folder, name, *arguments)
+        except AssertionError as error:
+            if "arm refused: no fresh" not in str(error):
+                raise
+    raise AssertionError("the truck could not be armed")
+
+
 async def test_examples_plot_save_drive_to_a_goal_and_along_a_path_of_their_own(tmp_path: Path):
     async with robot(tmp_path, base=ROOT / "configs/goals.yaml") as made:
         await made.start_simulator()
@@ -34,7 +44,8 @@ async def test_examples_plot_save_drive_to_a_goal_and_along_a_path_of_their_own(
             assert "5 scans of" in await example(tmp_path, "scans", made.endpoint, "5")
             assert np.load(tmp_path / "scans.npy").shape[0] == 5
             await planner_ready(client)
-            assert " m in " in await example(tmp_path, "route", made.endpoint, "2.6,3.95,0", "1.8,3.95")
-            assert "off the path" in await example(tmp_path, "planner", made.endpoint, "1.0", "0.05")
+            async with kept_armed(client):
+                assert " m in " in await armed("route", tmp_path, made.endpoint, "2.6,3.95,0", "1.8,3.95")
+                assert "off the path" in await armed("planner", tmp_path, made.endpoint, "1.0", "0.05")
         truth = await made.truth()
         assert np.hypot(*(truth[-1, 1:3] - (3.6, 4.0))) < 0.35

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from playwright.async_api import Page, expect
 
-from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.mailbox import Mailbox, fifo, latest
 from monstertruck_schemas import topics
 from monstertruck_schemas.cmd import DriveAction, DriveCommand
@@ -19,7 +18,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Role
 from monstertruck_schemas.state import GateMode, GateState
 from tests.daemon.browser_kit import NEEDS_CHROMIUM, PATIENCE, chromium, opened, shows, station
-from tests.daemon.wall_kit import ROOT, Robot, robot
+from tests.daemon.wall_kit import ROOT, Robot, kept_armed, planner_ready, robot
 
 pytestmark = [pytest.mark.wall, pytest.mark.timeout(240), NEEDS_CHROMIUM]
 
@@ -147,7 +146,6 @@ async def test_a_goal_set_with_the_mouse_is_reached_in_the_world(tmp_path: Path)
     async with robot(tmp_path, base=ROOT / "configs/goals.yaml") as made:
         await started(made)
         async with made.client() as client, station(made) as url, chromium(tmp_path) as browser:
-            gate = client.subscribe(topics.GATE, latest())
             goals = client.subscribe(topics.GOAL, latest())
             page = await opened(browser, url)
             await planner_ready(client)
@@ -161,18 +159,10 @@ async def test_a_goal_set_with_the_mouse_is_reached_in_the_world(tmp_path: Path)
             await page.mouse.move(x + 60, y, steps=3)
             await page.mouse.up()
             await page.click("#goal-go")
-            await becomes(lambda: mode(gate) is GateMode.DRIVING)
-            async with asyncio.timeout(90):
+            async with kept_armed(client), asyncio.timeout(120):
                 while goals.latest is None or goals.latest.outcome is Reason.DRIVING:
                     await asyncio.sleep(0.1)
             assert goals.latest.outcome is Reason.GOAL_REACHED, goals.latest.text
             await expect(page.locator("#goal-text")).to_contain_text("Goal 1:", timeout=PATIENCE)
         truth = await made.truth()
         assert np.hypot(*(truth[-1, 1:3] - (2.5, 3.95))) < 0.3
-
-
-async def planner_ready(client: TruckClient) -> None:
-    with client.subscribe(topics.HEALTH, latest()) as health:
-        async with asyncio.timeout(200):
-            while health.latest is None or {s.name: s.state.value for s in health.latest.services}["goals"] != "ready":
-                await asyncio.sleep(0.2)

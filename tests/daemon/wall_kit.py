@@ -15,11 +15,11 @@ import numpy as np
 
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import WallClock
-from monstertruck_runtime.errors import NotFoundError, RequestRefusedError
-from monstertruck_runtime.mailbox import latest
+from monstertruck_runtime.errors import NotFoundError, RequestRefusedError, TruckError
+from monstertruck_runtime.mailbox import Mailbox, latest
 from monstertruck_runtime.yaml_files import read_yaml, yaml_text
 from monstertruck_schemas import topics
-from monstertruck_schemas.state import GateMode
+from monstertruck_schemas.state import GateMode, GateState
 from monstertruckd.tools.demo.runs import free_endpoint, write_overlay
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -106,6 +106,34 @@ class Robot:
 
     def logs(self) -> list[Path]:
         return sorted((self.folder / "logs").glob("*.mcap"))
+
+
+async def planner_ready(client: TruckClient) -> None:
+    """Wait until goals are taken on: the first time a computer's planner compiles."""
+    with client.subscribe(topics.HEALTH, latest()) as health:
+        async with asyncio.timeout(200):
+            while health.latest is None or {s.name: s.state.value for s in health.latest.services}["goals"] != "ready":
+                await asyncio.sleep(0.2)
+
+
+@asynccontextmanager
+async def kept_armed(client: TruckClient) -> AsyncIterator[None]:
+    """Arm again a truck that a busy computer's late samples disarmed while it had somewhere to go."""
+
+    async def arm(gate: Mailbox[GateState]) -> None:
+        while True:
+            if gate.latest is not None and gate.latest.mode is GateMode.DISARMED and gate.latest.waiting:
+                with contextlib.suppress(TruckError):
+                    await client.arm()
+            await asyncio.sleep(0.5)
+
+    with client.subscribe(topics.GATE, latest()) as gate:
+        arming = asyncio.create_task(arm(gate))
+        try:
+            yield
+        finally:
+            arming.cancel()
+            await asyncio.gather(arming, return_exceptions=True)
 
 
 async def end(process: asyncio.subprocess.Process | None, number: int = signal.SIGTERM) -> int | None:

@@ -39,12 +39,16 @@ const drive = new Drive(link);
 const map = new MapView(byId("map"), link, aimed);
 const panels = new Panels(link);
 
-link.on("hello", ({ robots }) => {
+link.on("robots", ({ names }) => {
   const select = byId("robots");
-  select.replaceChildren(...robots.map((name) => new Option(name, name)));
-  const wanted = decodeURIComponent(location.hash.slice(1));
-  select.value = robots.includes(wanted) ? wanted : robots[0];
-  link.watch(select.value);
+  select.replaceChildren(...names.map((name) => new Option(name, name)));
+  const wanted = [link.robot, decodeURIComponent(location.hash.slice(1)), names[0]].find((name) => names.includes(name));
+  if (wanted === undefined) return;
+  select.value = wanted;
+  if (wanted !== link.robot) link.watch(wanted);
+});
+link.on("open", (open) => {
+  if (!open) link.robot = null; // what was watched is asked for again
 });
 byId("robots").addEventListener("change", (event) => {
   location.hash = encodeURIComponent(event.target.value);

@@ -13,6 +13,10 @@ def station(
         list[str] | None,
         typer.Option("--robot", "-r", metavar="NAME@ENDPOINT", help="Robot to show; may be repeated. Default: truck."),
     ] = None,
+    routers: Annotated[
+        list[str] | None,
+        typer.Option("--router", metavar="ENDPOINT", help="Zenoh router whose robots are shown as they appear."),
+    ] = None,
     port: Annotated[int, typer.Option("--port", "-p", min=1, max=65535, help="Port of the page.")] = 8470,
 ) -> None:
     """Serve the operator's page on this machine: map, state, goals, driving, emergency stop.
@@ -23,6 +27,8 @@ def station(
     from monstertruckd.station.address import RobotAddress
     from monstertruckd.station.server import Place, Station
 
-    addresses = [RobotAddress.parse(text) for text in robots or ["truck"]]
+    addresses = [RobotAddress.parse(text) for text in robots or ([] if routers else ["truck"])]
     place = Place(port=port)
-    until_stopped(lambda clock: Station(addresses, clock, place).run(lambda: remark(f"station: {place.url}")))
+    until_stopped(
+        lambda clock: Station(addresses, clock, place, routers or ()).run(lambda: remark(f"station: {place.url}"))
+    )

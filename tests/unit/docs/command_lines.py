@@ -66,6 +66,12 @@ INSTEAD = {
     "monstertruckd station --robot truck@tcp/127.0.0.1:7447": Instead(
         None, "serves until it is stopped; tests/daemon/test_station_wall.py opens its page"
     ),
+    "monstertruckd station --robot ann@tcp/192.168.1.7:7447 --robot bob@tcp/192.168.1.8:7447": Instead(
+        None, "serves until it is stopped"
+    ),
+    "monstertruckd station --router tcp/192.168.1.2:7447": Instead(
+        None, "serves until it is stopped; tests/unit/station/test_server.py has a router"
+    ),
     "monstertruckd map save hall.yaml": Instead(None, "needs a robot that maps"),
     "monstertruckd stand print runs/stand/print --tags 0-3,100-125": Instead(
         "monstertruckd stand print print --tags 0-3", "fewer prints"

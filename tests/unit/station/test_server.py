@@ -2,12 +2,13 @@
 
 import asyncio
 import json
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from typing import Any
 
 import aiohttp
 import pytest
+import zenoh
 from yarl import URL
 
 from monstertruck_runtime.clock import WallClock
@@ -25,8 +26,10 @@ def free_port() -> int:
 
 
 @asynccontextmanager
-async def serving() -> AsyncIterator[tuple[Station, aiohttp.ClientSession]]:
-    station = Station([NOBODY], WallClock(), Place(port=free_port()))
+async def serving(
+    robots: Sequence[RobotAddress] = (NOBODY,), routers: Sequence[str] = ()
+) -> AsyncIterator[tuple[Station, aiohttp.ClientSession]]:
+    station = Station(robots, WallClock(), Place(port=free_port()), routers)
     ready = asyncio.Event()
     running = asyncio.create_task(station.run(ready.set))
     try:
@@ -84,13 +87,15 @@ async def test_other_sites_and_other_names_are_refused_and_logged(caplog: pytest
         assert caplog.text.count("refused") == 4
         assert "127.0.0.1" in caplog.text
         async with session.ws_connect("/socket", origin=f"http://{ours}") as socket:
-            assert (await socket.receive_json())["robots"] == ["truck"]
+            assert (await socket.receive_json())["kind"] == "hello"
+            assert (await socket.receive_json())["names"] == ["truck"]
 
 
 async def test_a_browser_is_answered_although_the_robot_is_absent_and_wrong_messages_are_refused():
     async with serving() as (station, session), connected(station, session) as socket:
         hello = await socket.receive_json()
         assert hello["kind"] == "hello"
+        await socket.receive_json()
         await socket.send_json({"do": "order", "id": 1, "order": "estop"})
         assert (await socket.receive_json())["kind"] == "trouble"
         await socket.send_json({"do": "watch", "robot": "truck"})
@@ -113,6 +118,7 @@ async def test_an_oversized_message_ends_the_connection(caplog: pytest.LogCaptur
     async with serving() as (station, session):
         async with connected(station, session) as socket:
             await socket.receive_json()
+            await socket.receive_json()
             await socket.send_str(json.dumps({"do": "x" * commands.MOST_BYTES}))
             ended = await socket.receive()
             assert ended.type is aiohttp.WSMsgType.CLOSE
@@ -128,3 +134,21 @@ async def test_a_taken_port_and_two_robots_of_one_name_are_refused():
             await Station([NOBODY], WallClock(), station.place).run()
     with pytest.raises(InputError, match="one name"):
         Station([NOBODY, NOBODY], WallClock())
+
+
+async def test_robots_of_a_router_appear_in_every_browser():
+    endpoint = free_endpoint()
+    scouting = {"multicast": {"enabled": False}, "gossip": {"enabled": False}}
+    config = {"mode": "router", "listen": {"endpoints": [endpoint]}, "scouting": scouting}
+    with zenoh.open(zenoh.Config.from_json5(json.dumps(config))) as router:
+        first = router.liveliness().declare_token("mt/ann/alive")
+        async with serving([], [endpoint]) as (station, session), connected(station, session) as socket:
+            names: list[str] = []
+            async with asyncio.timeout(20):
+                while names != ["ann"]:
+                    names = (await socket.receive_json()).get("names", names)
+                second = await asyncio.to_thread(router.liveliness().declare_token, "mt/bob/alive")
+                while names != ["ann", "bob"]:
+                    names = (await socket.receive_json()).get("names", names)
+        second.undeclare()
+        first.undeclare()
