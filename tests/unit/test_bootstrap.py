@@ -191,3 +191,11 @@ def test_every_test_belongs_to_one_step(steps):
                 marks = {"wall": wall, "virtual": virtual, "traced": traced}
                 count = sum(eval(expression, {}, marks) for expression in chosen)
                 assert count == 1 or (wall and virtual)
+
+
+def test_kernels_are_compiled_before_any_test_runs(steps, monkeypatch: pytest.MonkeyPatch):
+    ran: list[str] = []
+    monkeypatch.setattr(bootstrap, "run", lambda *words: ran.append(" ".join(map(str, words))) or 0)
+    bootstrap.check([])
+    compiled = next(number for number, step in enumerate(ran) if "install.kernels" in step)
+    assert compiled < next(number for number, step in enumerate(ran) if "pytest" in step)

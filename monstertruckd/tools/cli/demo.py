@@ -49,6 +49,7 @@ def demo(
     if film is not None and (not fast or simulated.sim.world.engine != "mujoco" or film.suffix.lower() != ".gif"):
         raise InputError(f"--film {film}: expected --fast, engine mujoco, and a name.gif")
     folder = _fresh(output)
+    remark(f"starting the emulated truck and its daemon; log, map and outputs go to {folder}")
     screen = on_terminal(sys.stdout) and not json_output
     try:
         if fast:
@@ -74,10 +75,10 @@ def _fresh(folder: Path) -> Path:
 
 
 def _print(rows: list[tuple[str, str]], messages: dict[str, int]) -> None:
+    print_table(("topic", "messages"), [(name, str(n)) for name, n in sorted(messages.items())], right=("messages",))
+    print()
     for name, value in rows:
         console().print(f"[bold]{name:20}[/bold] {value}", soft_wrap=True)
-    print()
-    print_table(("topic", "messages"), [(name, str(n)) for name, n in sorted(messages.items())], right=("messages",))
 
 
 @needs_extra("sim")

@@ -13,7 +13,7 @@ import typer
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruckd.tools.cli.logs import finish_log
 from monstertruckd.tools.cli.options import ConfigOption, EndpointOption, RobotOption, with_parameters
-from monstertruckd.tools.cli.output import JsonOption, command_group, print_json, progress, remark
+from monstertruckd.tools.cli.output import JsonOption, command_group, needs_extra, print_json, progress, remark
 
 if TYPE_CHECKING:
     from monstertruck_estimation.slam.worker_io import SlamEstimate, WorkerOutput
@@ -72,6 +72,7 @@ def _with_geometry(command: Callable[..., None]) -> Callable[..., None]:
 
 @app.command("build")
 @_with_geometry
+@needs_extra("slam")
 def build(
     log: Log,
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder of the map.")] = Path("runs/map"),
@@ -119,6 +120,7 @@ def build(
 
 
 @app.command("show")
+@needs_extra("slam")
 def show(place: MapPlace, png: Png = None, json_output: JsonOption = False) -> None:
     """Show the facts of a saved map."""
     from monstertruck_estimation.slam.storage import load
@@ -143,6 +145,7 @@ def show(place: MapPlace, png: Png = None, json_output: JsonOption = False) -> N
 
 
 @app.command("save")
+@needs_extra("slam")
 def save(
     output: Annotated[Path, typer.Argument(help="YAML file; its PNG is written next to it.", show_default=False)],
     robot: RobotOption = "truck",
@@ -179,6 +182,7 @@ def save(
 
 
 @app.command("load")
+@needs_extra("slam")
 def load_command(
     place: MapPlace,
     config: ConfigOption,
@@ -215,6 +219,7 @@ def _made_by_load(found: Any) -> bool:
 
 @app.command("localise")
 @_with_geometry
+@needs_extra("slam")
 def localise(
     log: Log,
     place: MapPlace,

@@ -72,6 +72,9 @@ INSTEAD = {
     "monstertruckd station --router tcp/192.168.1.2:7447": Instead(
         None, "serves until it is stopped; tests/unit/station/test_server.py has a router"
     ),
+    "monstertruckd goto 8.5 6 0 --arm": Instead(
+        None, "needs a robot that plans; tests/daemon/test_goals_virtual.py has one"
+    ),
     "monstertruckd map save hall.yaml": Instead(None, "needs a robot that maps"),
     "monstertruckd stand print runs/stand/print --tags 0-3,100-125": Instead(
         "monstertruckd stand print print --tags 0-3", "fewer prints"
@@ -117,6 +120,7 @@ INSTEAD |= {
 FOREIGN = {
     "python3 -m monstertruckd.bootstrap demo": "sets up .venv, then `monstertruckd demo`, which has its own tests",
     "python3 -m monstertruckd.bootstrap check": "runs this very test",
+    "python3 -m monstertruckd.bootstrap sync": "sets up .venv; tests/unit/test_bootstrap.py checks what it runs",
     "python docs/site/build.py": "test_site.py builds it into another folder",
     "pip install 'monstertruckd[view]'": "needs a package index; the extra is looked up",
     "systemctl status monstertruckd": "needs an installed service; the unit's name is looked up",
