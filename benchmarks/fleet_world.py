@@ -1,0 +1,336 @@
+"""Five robots and three people in one world: every robot drives from place to place by moves, for ten minutes.
+
+    python benchmarks/fleet_world.py              one simulator process, a daemon process for each robot, real time
+    python benchmarks/fleet_world.py --virtual    the same daemons on one virtual clock, as fast as it computes
+
+Robots do not know each other's plans: each stops before what it sees, waits a time drawn by its seed, backs off where
+no other robot says that it is near (a lidar of 240 degrees sees nobody who comes from behind), and tries again.
+Contacts in which a robot moves count against the goal; people who walk into a standing one are counted apart.
+"""
+
+import argparse
+import asyncio
+import contextlib
+import json
+import math
+import re
+import sys
+from collections import Counter
+from collections.abc import AsyncIterator, Iterable
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from time import perf_counter, process_time
+from typing import Any
+
+import numpy as np
+
+from monstertruck_runtime.client import TruckClient
+from monstertruck_runtime.clock import SECOND, Clock, VirtualClock, run_virtual, run_wall
+from monstertruck_runtime.errors import NoAnswerError, NotFoundError, RequestRefusedError
+from monstertruck_runtime.mailbox import Mailbox, latest
+from monstertruck_runtime.yaml_files import yaml_text
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.state import GateState, Odometry
+from monstertruck_schemas.topics import GATE, POSE
+from monstertruck_sim.world.scene import MOVING, Contact
+from monstertruckd.tools.cli.behave_session import BehaviourClient, BehaviourEnd, run_behaviour
+from monstertruckd.tools.demo.runs import free_endpoint
+from monstertruckd.tools.simulation.config import load_simulated
+from monstertruckd.tools.simulation.operator import LocalOperator
+from monstertruckd.tools.simulation.virtual_rig import virtual_fleet
+
+ROOT = Path(__file__).resolve().parents[1]
+ROBOTS = {
+    "differential": (-2.0, -1.8, 0.0),
+    "skid_steer": (2.0, -1.8, 1.57),
+    "mecanum": (-2.0, 2.0, 0.0),
+    "omni": (2.0, 2.2, -1.57),
+    "independent": (0.9, -0.6, 3.14),
+}
+"""Configuration of configs/robots, and where it starts in the yard; all of them turn on the spot."""
+PEOPLE = (
+    {"waypoints": [{"x": 0.0, "y": -2.4}, {"x": 0.0, "y": 2.6}], "speed": 0.6, "before": "stop"},
+    {"waypoints": [{"x": -2.6, "y": 0.9}, {"x": 2.6, "y": 0.9}], "speed": 0.5, "before": "turn"},
+    {"waypoints": [{"x": -1.0, "y": -2.6}, {"x": -1.0, "y": 1.9}], "speed": 0.8, "before": "stop"},
+)
+HALF = 2.2
+"""Places are drawn within this of the yard's middle, m."""
+REACHED = 0.15
+"""A place nearer than this is reached, m."""
+APART = 0.75
+"""Between the middles of two robots of which one may turn or go backwards, m."""
+TASKS = 8
+GOALS = {"contacts_by_moving_robots": 0, "tasks_of_each": TASKS}
+CONTACT = re.compile(r"contact: (.+) at ([\d.]+) m/s with (.+) at ([\d.]+) m/s")
+
+
+@dataclass
+class Score:
+    """What one robot did."""
+
+    tasks: int = 0
+    moves: int = 0
+    held: Counter[str] = field(default_factory=Counter)
+    """Why moves were refused or ended early."""
+
+
+def configurations(folder: Path) -> list[Path]:
+    """A file for every robot, with its name, place and folders."""
+    files = []
+    for i, (kind, (x, y, yaw)) in enumerate(ROBOTS.items()):
+        start = {"x": x, "y": y, "yaw": yaw}
+        world: dict[str, Any] = {"map": "yard", "start": start}
+        robot = {
+            "include": str(ROOT / "configs" / "robots" / f"{kind}.yaml"),
+            "version": 2,
+            "robot": kind,
+            "path": None,
+            "tracker": None,
+            "blackbox": None,
+            "recorder": None,
+            "odometry": {"start": start},
+            "state_directory": str(folder / "{robot}" / "state"),
+            "zenoh": {"listen": [free_endpoint()]},
+            "sim": {"world": world | ({"people": list(PEOPLE)} if i == 0 else {})},
+        }
+        file = folder / f"{kind}.yaml"
+        file.write_text(yaml_text(robot))
+        files.append(file)
+    return files
+
+
+@dataclass
+class Pilot:
+    """Drives one robot from drawn place to drawn place.
+
+    Args:
+        driver: its client.
+        clock: time.
+        seed: of places and pauses.
+        score: what it does.
+        everybody: newest pose that each robot says of itself, by name.
+        name: of the robot.
+    """
+
+    driver: BehaviourClient
+    clock: Clock
+    seed: int
+    score: Score
+    everybody: dict[str, Mailbox[Odometry]]
+    name: str
+    rng: np.random.Generator = field(init=False)
+    gate: Mailbox[GateState] = field(init=False)
+
+    async def patrol(self, until: int) -> None:
+        """Until then, ns."""
+        self.rng = np.random.default_rng(self.seed)
+        with self.driver.subscribe(GATE, latest()) as self.gate:
+            while self.clock.now() < until:
+                x, y = (float(v) for v in self.rng.uniform(-HALF, HALF, 2))
+                with contextlib.suppress(TimeoutError):
+                    async with self.clock.deadline(60.0):  # somebody may stand there: another place
+                        await self.go_to(x, y, until)
+
+    async def go_to(self, x: float, y: float, until: int) -> None:
+        """Turn to a place and drive there; after a stop back off and try again."""
+        while self.clock.now() < until:
+            if (newest := self.everybody[self.name].latest) is None:
+                await self.clock.sleep(0.2)
+                continue
+            pose = newest.pose
+            way = math.dist((x, y), (pose.x, pose.y))
+            if way < REACHED:
+                self.score.tasks += 1
+                return
+            turn = math.remainder(math.atan2(y - pose.y, x - pose.x) - pose.yaw, math.tau)
+            turned = abs(turn) < 0.05 or await self.turn(turn)
+            if turned and await self.move(length=way, speed=0.18):
+                continue
+            await self.clock.sleep(float(self.rng.uniform(0.3, 3.0)))
+            if self.rng.random() < 0.7 and self.alone():
+                await self.move(length=-float(self.rng.uniform(0.1, 0.2)), speed=0.1)
+            if self.rng.random() < 0.5 and await self.turn(float(self.rng.uniform(-1.5, 1.5))):
+                await self.move(length=float(self.rng.uniform(0.2, 0.8)), speed=0.15)
+
+    def alone(self) -> bool:
+        """Whether no other robot says that it is near."""
+        poses = {name: box.latest.pose for name, box in self.everybody.items() if box.latest is not None}
+        me = poses.pop(self.name)
+        return all(math.dist((me.x, me.y), (other.x, other.y)) > APART for other in poses.values())
+
+    async def turn(self, angle: float) -> bool:
+        """Whether it turned on the spot."""
+        return self.alone() and await self.move(radius=0.0, angle=angle)
+
+    async def move(self, **settings: float) -> bool:
+        """Whether a move came to its end."""
+        self.score.moves += 1
+        gate = self.gate.latest
+        try:
+            armed = gate is not None and gate.mode.accepts_motion
+            end: BehaviourEnd = await run_behaviour(self.driver, "move", arm=not armed, settings=settings)
+        except (RequestRefusedError, NoAnswerError) as error:
+            self.score.held[getattr(error, "refusal", error.reason).value] += 1
+            await self.clock.sleep(0.5)
+            return False
+        if end.reason is not Reason.BEHAVIOUR_DONE:
+            self.score.held[end.reason.value] += 1
+        return end.reason is Reason.BEHAVIOUR_DONE
+
+
+@dataclass
+class Run:
+    """What came of it."""
+
+    scores: dict[str, Score]
+    contacts: list[tuple[str, float, str, float]]
+    """Mover and other, each with its speed, m/s."""
+    simulated: float
+    """s."""
+    taken: float
+    """Real seconds of that."""
+    processor: float | None = None
+    """Seconds of processor time, where all is one process."""
+
+
+def on_virtual_clock(seconds: float, seed: int) -> Run:
+    """All daemons in this process."""
+    with TemporaryDirectory() as folder:
+        configs = [load_simulated(file) for file in configurations(Path(folder))]
+    scores = {config.robot: Score() for config in configs}
+
+    async def main(clock: VirtualClock) -> tuple[list[Contact], float, float]:
+        async with virtual_fleet(configs, clock) as (rigs, scene):
+            await clock.sleep(2.0)
+            began, used, until = perf_counter(), process_time(), clock.now() + round(seconds * SECOND)
+            everybody = {rig.config.robot: rig.bus.subscribe(POSE, latest()) for rig in rigs}
+            async with asyncio.TaskGroup() as group:
+                for i, rig in enumerate(rigs):
+                    name, driver = rig.config.robot, LocalOperator(rig.daemon, clock)
+                    pilot = Pilot(driver, clock, seed + i, scores[name], everybody, name)
+                    group.create_task(pilot.patrol(until))
+            return scene.contacts, perf_counter() - began, process_time() - used
+
+    contacts, taken, processor = run_virtual(main, start=SECOND)
+    found = [(it.mover, it.speed, it.other, it.other_speed) for it in contacts]
+    return Run(scores, found, seconds, taken, processor)
+
+
+def in_processes(seconds: float, seed: int) -> Run:
+    """One simulator, and a daemon process for each robot."""
+    scores = {name: Score() for name in ROBOTS}
+    lines: list[str] = []
+
+    async def main(clock: Clock) -> tuple[float, float]:
+        with TemporaryDirectory() as name:
+            folder = Path(name)
+            files = configurations(folder)
+            endpoints = {c.robot: c.zenoh.listen[0] for c in map(load_simulated, files)}
+            async with simulator(files, folder / "truth.npz", lines) as process:
+                clients = [await connected(clock, robot, end) for robot, end in endpoints.items()]
+                everybody = {client.robot: client.subscribe(POSE, latest()) for client in clients}
+                until = clock.now() + round(seconds * SECOND)
+                began = perf_counter()
+                try:
+                    async with asyncio.TaskGroup() as group:
+                        for i, client in enumerate(clients):
+                            pilot = Pilot(client, clock, seed + i, scores[client.robot], everybody, client.robot)
+                            group.create_task(pilot.patrol(until))
+                finally:
+                    taken = perf_counter() - began
+                    for client in clients:
+                        await client.__aexit__(None, None, None)
+                assert process.returncode is None, "the simulator ended early"
+            with np.load(folder / "truth.npz") as archive:
+                times = archive[next(iter(ROBOTS))][:, 0]
+            return float(np.sum(times > times[-1] - seconds)) / 20.0, taken
+
+    simulated, taken = run_wall(main)
+    found = [(m[1], float(m[2]), m[3], float(m[4])) for line in lines if (m := CONTACT.match(line))]
+    return Run(scores, found, simulated, taken)
+
+
+@asynccontextmanager
+async def simulator(files: Iterable[Path], truth: Path, lines: list[str]) -> AsyncIterator[asyncio.subprocess.Process]:
+    """The processes while the context lasts; ``lines`` gets what the simulator prints."""
+    command = ("simulate", "--robots", ",".join(map(str, files)), "--run", "--truth", str(truth))
+    with (truth.parent / "daemons.txt").open("wb") as errors:
+        process = await asyncio.create_subprocess_exec(
+            sys.executable,
+            "-m",
+            "monstertruckd",
+            *command,
+            cwd=truth.parent,
+            stdin=asyncio.subprocess.DEVNULL,
+            stdout=asyncio.subprocess.PIPE,
+            stderr=errors,
+        )
+
+    async def read() -> None:
+        assert process.stdout is not None
+        while line := await process.stdout.readline():
+            lines.append(line.decode().strip())
+
+    reading = asyncio.create_task(read())
+    try:
+        yield process
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            process.terminate()
+        await process.wait()
+        await reading
+
+
+async def connected(clock: Clock, robot: str, endpoint: str) -> TruckClient:
+    """A client of a robot, once it answers."""
+    async with clock.deadline(180.0):
+        while True:
+            client = TruckClient(robot, endpoint, clock=clock, timeout=5.0)
+            try:
+                await client.__aenter__()
+                if await client.alive():
+                    return client
+                await client.__aexit__(None, None, None)
+            except NotFoundError:
+                await clock.sleep(0.5)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--virtual", action="store_true", help="all daemons on one virtual clock")
+    parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--seed", type=int, default=1)
+    options = parser.parse_args()
+    run = (on_virtual_clock if options.virtual else in_processes)(60.0 * options.minutes, options.seed)
+    for name, score in run.scores.items():
+        held = ", ".join(f"{reason} {count}" for reason, count in score.held.most_common())
+        print(f"{name:13} {score.tasks:3} tasks  {score.moves:4} moves  held: {held or 'never'}")
+    moving: list[str] = []
+    people: list[str] = []
+    for mover, speed, other, other_speed in run.contacts:
+        print(f"contact: {mover} at {speed:.2f} m/s with {other} at {other_speed:.2f} m/s")
+        by_robot = (mover in ROBOTS and speed >= MOVING) or (other in ROBOTS and other_speed >= MOVING)
+        (moving if by_robot else people).append(mover)
+    rate = run.simulated / run.taken
+    print(f"{run.simulated:.0f} s simulated in {run.taken:.0f} s: rate {rate:.2f}")
+    if run.processor is not None:
+        idle = run.simulated / run.processor
+        print(f"{run.processor:.0f} s of processor time: {idle:.2f} times as fast as real time on an idle core")
+    found = {
+        "daemons": "one process" if options.virtual else "a process each",
+        "minutes": options.minutes,
+        "contacts_by_moving_robots": len(moving),
+        "people_into_standing_robots": len(people),
+        "least_tasks": min(score.tasks for score in run.scores.values()),
+        "tasks": {name: score.tasks for name, score in run.scores.items()},
+        "rate": round(rate, 2),
+        "rate_on_idle_core": None if run.processor is None else round(run.simulated / run.processor, 2),
+    }
+    met = not moving and found["least_tasks"] >= TASKS * options.minutes / 10.0
+    print(json.dumps({"bench": "fleet_world", "figures": found, "goals": GOALS, "met": met}))
+
+
+if __name__ == "__main__":
+    main()
