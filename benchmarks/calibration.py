@@ -1,15 +1,18 @@
 """Wizards against hidden truth: 20 trucks, all values of each off, calibrated in the order of docs/calibration.md.
 
-    python benchmarks/calibration.py [--seeds 20] [--jobs 1]
+    python benchmarks/calibration.py [--seeds 20] [--jobs 1] [--light 200]
 
 Every session runs the whole daemon on a virtual clock: real drivers, emulated devices, the safety gate; the operator
 has a tape, a string and a meter with errors of their own. Judged is whether the true value lies in the stated interval,
 and, against the truck's own linkage, the curvature that the calibrated truck believes, to its full lock.
+Before that the fits of odometry, lidar, inertial unit and slip are judged alone on drawn measurements, ``--light``
+each: how often the truth lies inside, how wide the intervals are. ``--seeds 0`` leaves it at these.
 """
 
 import argparse
 import json
 import logging
+import math
 import sys
 from collections import defaultdict
 from collections.abc import Iterable
@@ -18,6 +21,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import process_time
+from typing import Any
 
 import numpy as np
 
@@ -30,12 +34,27 @@ from monstertruckd.tools.calibrate.drive import DriveWizard, drive_wizard
 from monstertruckd.tools.calibrate.steering import SteeringWizard, steering_wizard
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 from tests.calibration_kit import Verdict, curvature_errors, hidden, run_session, verdicts
+from tests.calibration_light import LIGHT, coverage
 
 ROOT = Path(__file__).resolve().parents[1]
 OUTPUT = ROOT / "runs" / "benchmarks" / "calibration.json"
 GOAL = 0.9
 CURVATURE = 0.02
 """Greatest error of the curvature, as a share."""
+COVERAGE = (0.90, 0.99)
+"""Of all intervals of a wizard."""
+HALF_WIDTHS = {
+    "odometry.way": 0.01,
+    "odometry.wheelbase": 0.01,
+    "odometry.offset": math.radians(0.5),
+    "lidar.x": 0.010,
+    "lidar.y": 0.010,
+    "lidar.yaw": math.radians(0.5),
+    "imu.rate_scale": 0.01,
+    "slip.gain_left": 0.01,
+    "slip.gain_right": 0.01,
+}
+"""Median half-widths at most: 1 % of ways and wheels, 0.5 degrees, 10 mm."""
 EMPTIER = (0.15,)
 """Charge of the second pack that the battery wizard sees."""
 
@@ -107,12 +126,32 @@ def figures(trucks: Iterable[Truck]) -> dict[str, dict[str, float]]:
     return out
 
 
+def light(fits: int) -> tuple[dict[str, Any], bool]:
+    """Fits on drawn measurements: coverage by wizard, half-widths by estimate, and whether both are as meant."""
+    inside, halves, fine = {}, {}, True
+    for wizard in LIGHT:
+        found = coverage(wizard, fits)
+        inside[wizard] = round(float(np.mean([share for share, _ in found.values()])), 4)
+        fine &= COVERAGE[0] <= inside[wizard] <= COVERAGE[1]
+        for name, (share, half) in found.items():
+            print(f"| {name} | {share:.3f} | {half:.4g} |", flush=True)
+            halves[name] = round(half, 5)
+            fine &= half <= HALF_WIDTHS.get(name, math.inf)
+    return {"fits": fits, "coverage": inside, "half_widths": halves}, fine
+
+
 def main() -> int:
-    """Calibrate; 0 = every estimate holds in 90 % of the trucks, and every truck's curvature to 2 %."""
+    """Calibrate; 0 = every estimate holds in 90 % of the trucks, and every truck's curvature to 2 %, and light fits."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--light", type=int, default=200)
     arguments = parser.parse_args()
+    by_light, fine = light(arguments.light)
+    light_goals = {"coverage": COVERAGE, "half_widths": HALF_WIDTHS}
+    if not arguments.seeds:
+        print(json.dumps({"bench": "calibration", "figures": by_light, "goals": light_goals, "met": fine}))
+        return 0 if fine else 1
     trucks = []
     with ProcessPoolExecutor(arguments.jobs) as pool:
         for truck in pool.map(calibrate, range(arguments.seeds)):
@@ -128,7 +167,8 @@ def main() -> int:
     OUTPUT.write_text(json.dumps([asdict(truck) for truck in trucks], indent=1), encoding="utf-8")
     worst = min(table.values(), key=lambda row: row["inside"])["inside"]
     modes = {mode: max(truck.curvature_errors[mode] for truck in trucks) for mode in trucks[0].curvature_errors}
-    sums = {
+    sums: dict[str, Any] = {
+        "light": by_light,
         "trucks": len(trucks),
         "estimates": sum(len(truck.verdicts) for truck in trucks),
         "inside": sum(v.holds for truck in trucks for v in truck.verdicts) / sum(len(t.verdicts) for t in trucks),
@@ -141,8 +181,8 @@ def main() -> int:
         },
         "cpu_s_per_truck": round(float(np.mean([truck.cpu_s for truck in trucks])), 1),
     }
-    goals = {"worst_estimate_inside": GOAL, "worst_curvature_error": CURVATURE}
-    met = worst >= GOAL and max(modes.values()) <= CURVATURE
+    goals = {"worst_estimate_inside": GOAL, "worst_curvature_error": CURVATURE, "light": light_goals}
+    met = fine and worst >= GOAL and max(modes.values()) <= CURVATURE
     print(json.dumps({"bench": "calibration", "figures": sums, "goals": goals, "met": met}))
     return 0 if met else 1
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from markdown.extensions.toc import slugify
 from mkdocs.structure.files import File, Files, InclusionLevel
-from pages import commands, configuration, devices, never_tried, topics
+from pages import commands, configuration, devices, never_tried, symptoms, topics
 from pages.markdown import Page, join
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -36,6 +36,7 @@ def on_config(config: Any) -> Any:
         *topics.pages(),
         *configuration.pages(),
         never_tried.page(texts),
+        symptoms.page(),
     ]
     config.nav = _expanded(config.nav, set(_names(config.nav)))
     return config

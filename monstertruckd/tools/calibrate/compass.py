@@ -148,6 +148,7 @@ def result_of(circle: FieldCircle) -> Result:
         )
         for name, value, error, bound in zip(_NAMES, _iron(fit.parameters), errors, bounds, strict=True)
     ]
+    estimates += _motor(circle, fit)
     estimates.append(
         Estimate(
             name="taken_out",
@@ -167,6 +168,40 @@ def result_of(circle: FieldCircle) -> Result:
             "a rotation of the unit on the truck: a constant error of the heading",
         ),
     )
+
+
+def _motor(circle: FieldCircle, fit: FitResult) -> list[Estimate]:
+    """What an ampere of the motor's current adds to the field, and how far it turns the heading at most."""
+    if not np.isfinite(fit.standard_errors[5:]).all():
+        return []
+    halves = NORMAL * correlation_factor(fit.residuals) * fit.standard_errors[5:]
+    radius = float(fit.parameters[4])
+    found = list(zip(("motor_x", "motor_y"), fit.parameters[5:].tolist(), halves.tolist(), strict=True))
+    amount = math.hypot(*(value for _, value, _ in found))
+    turn = Estimate(
+        name="motor_turn",
+        value=math.degrees(amount / radius),
+        low=math.degrees(max(amount - math.hypot(*halves), 0.0) / radius),
+        high=math.degrees((amount + math.hypot(*halves)) / radius),
+        unit="deg/A",
+        samples=circle.x.size,
+        meaning="greatest turn of the heading by an ampere of motor current, across the disturbance; for information",
+    )
+    return [
+        *(
+            Estimate(
+                name=name,
+                value=value,
+                low=value - half,
+                high=value + half,
+                unit="uT/A",
+                samples=circle.x.size,
+                meaning="field of an ampere of motor current, forward positive; 95 % of the readings' noise",
+            )
+            for name, value, half in found
+        ),
+        turn,
+    ]
 
 
 def fit_ellipse(circle: FieldCircle) -> FitResult:

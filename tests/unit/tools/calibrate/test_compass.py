@@ -100,3 +100,22 @@ def test_a_unit_with_other_axes_is_refused():
     turned = circle()
     with pytest.raises(InputError, match="axes are not x forward, y left"):
         result_of(replace(turned, heading=-turned.heading))
+
+
+def test_the_map_of_the_motors_disturbance():
+    result = result_of(circle())
+    for name, value in zip(("motor_x", "motor_y"), MOTOR, strict=True):
+        estimate = result.estimate(name)
+        assert estimate is not None
+        assert estimate.low is not None
+        assert estimate.high is not None
+        assert estimate.low < value < estimate.high
+        assert estimate.key is None, "the driver does not know the current"
+    turn = result.estimate("motor_turn")
+    assert turn is not None
+    assert turn.value == pytest.approx(math.degrees(float(np.hypot(*MOTOR)) / 25.0), rel=0.3)
+
+
+def test_without_current_there_is_no_map():
+    still = circle()
+    assert result_of(replace(still, current=0.0 * still.current)).estimate("motor_x") is None
