@@ -21,7 +21,7 @@ SYMPTOMS: Final = (
         "`monstertruckd status` names every reason that holds it; `monstertruckd doctor` looks at the computer.",
         {
             "disarmed": "`monstertruckd arm`.",
-            "estopped": "Find out who stopped it and why (`status`, the black box); then `monstertruckd reset`, and arm.",
+            "estopped": "Who stopped it, and why (`status`, black box)? Then `monstertruckd reset`, and arm.",
             "estop_requested": "As above.",
             "not_armed_speed": "Let go of the stick, wait until it stands, and arm again.",
             "lower_priority": "Somebody with precedence drives: wait, or ask for it.",
@@ -55,7 +55,7 @@ SYMPTOMS: Final = (
             "tilt_stop": "Drive it down by hand, or carry it; `gate.tilt` says from where.",
             "clipped": "It was asked for more than allowed, and does less.",
             "shaft_blocked": "A wheel is held: switch off, free it, look at the clutch.",
-            "steering_dead": "It turns otherwise than steered: loose horn, reversed servo, or iron near the compass; `calibrate steering --rough`.",
+            "steering_dead": "Loose horn, reversed servo, iron near the compass; `monstertruckd calibrate steering --rough`.",
             "faults_repeat": "A plug is loose: the events before name the device.",
         },
     ),
