@@ -55,7 +55,7 @@ SYMPTOMS: Final = (
             "tilt_stop": "Drive it down by hand, or carry it; `gate.tilt` says from where.",
             "clipped": "It was asked for more than allowed, and does less.",
             "shaft_blocked": "A wheel is held: switch off, free it, look at the clutch.",
-            "steering_dead": "Loose horn, reversed servo, iron near the compass; `monstertruckd calibrate steering --rough`.",
+            "steering_dead": "Loose horn, reversed servo, or iron: `calibrate steering`.",
             "faults_repeat": "A plug is loose: the events before name the device.",
         },
     ),
