@@ -285,6 +285,10 @@ class Physics(Protocol):
         """Put the lidar onto a mount with joints."""
         ...
 
+    def mount_torque(self, joint: int) -> float:
+        """With which the lidar pushes its pitch (0) or roll (1) joint, Nm, at the newest instant of the world."""
+        ...
+
 
 @dataclass(frozen=True, slots=True)
 class EmulatorSetup:

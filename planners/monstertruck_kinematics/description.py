@@ -163,6 +163,31 @@ class Size:
 
 
 @dataclass(frozen=True, slots=True)
+class LidarHead:
+    """What the stabiliser turns, and its servos: a pitch joint on the base, a roll joint on it, the lidar on that.
+
+    Args:
+        place: of the point that both joints turn about, in the base frame, m.
+        lidar_mass: kg (the maker's data sheet: 160 g).
+        servo_mass: of one servo, kg (the maker's: 55 g).
+        offset: of the lidar's centre of mass above the joints, m.
+    """
+
+    place: Triple = (0.14, 0.0, 0.25)
+    lidar_mass: float = 0.16
+    servo_mass: float = 0.055
+    offset: float = 0.02
+
+    @property
+    def mass(self) -> float:
+        """Kg."""
+        return self.lidar_mass + 2.0 * self.servo_mass
+
+
+HEAD_JOINTS: Final = ("lidar_pitch", "lidar_roll")
+
+
+@dataclass(frozen=True, slots=True)
 class SensorFrame:
     """Where a sensor is fixed to the base: its name, place and roll, pitch, yaw."""
 
@@ -251,7 +276,10 @@ def wheel_inertia(mass: float, radius: float, width: float) -> Triple:
 
 
 def truck_description(
-    size: Size | None = None, mechanics: Mechanics | None = None, sensors: tuple[SensorFrame, ...] = ()
+    size: Size | None = None,
+    mechanics: Mechanics | None = None,
+    sensors: tuple[SensorFrame, ...] = (),
+    head: LidarHead | None = None,
 ) -> Description:
     """The truck: a chassis on two solid axles, each with a vertical slide and a roll joint, and four steered wheels.
 
@@ -259,6 +287,7 @@ def truck_description(
         size: its dimensions; None = the truck's.
         mechanics: masses and springs; None = the truck's.
         sensors: frames on the chassis.
+        head: the lidar on its joints, a part of the mass on the springs; None = it is fixed.
     """
     size, parts = size or Size(), mechanics or Mechanics()
     radius = size.wheel_radius
@@ -269,15 +298,19 @@ def truck_description(
         Shape("box", bodywork[0], (0.0, 0.0, plate + 0.057), "0.75 0.28 0.2 1"),
         Shape("box", bodywork[1], (0.0, 0.0, plate + 0.136), "0.2 0.35 0.6 1"),
     )
+    carried, lift, lever = 0.0, 0.0, 0.0
+    if head is not None:
+        carried, lift, lever = head.mass, head.mass * head.place[2], head.mass * head.place[0] / size.wheelbase
+    body = parts.sprung - carried
     chassis = Part(
         "base",
-        parts.sprung,
-        (0.0, 0.0, parts.mass_height),
-        box_inertia(parts.sprung, (size.wheelbase, 0.2, 0.14)),
+        body,
+        (0.0, 0.0, (parts.sprung * parts.mass_height - lift) / body),
+        box_inertia(body, (size.wheelbase, 0.2, 0.14)),
         shapes,
     )
     links, joints = [chassis], []
-    load, spring = parts.axle_load, parts.axle_spring
+    spring = parts.axle_spring
     damping = parts.damping * 2.0 * math.sqrt(spring * parts.sprung / 2.0)
     arm = size.track / 3.0
     roll = parts.roll_spring if parts.roll_spring is not None else spring * arm * arm
@@ -286,7 +319,7 @@ def truck_description(
         raise KinematicsError(
             f"roll_spring is {roll:g} Nm/rad: expected more than {lean / 2:g}, or the body falls over"
         )
-    for axle, x in (("front", size.wheelbase / 2.0), ("rear", -size.wheelbase / 2.0)):
+    for axle, x, share in (("front", size.wheelbase / 2.0, lever), ("rear", -size.wheelbase / 2.0, -lever)):
         tube = (0.03, size.track - parts.wheel_width - 0.02, 0.03)
         slide = Part(
             f"{axle}_slide", parts.axle_mass / 2.0, ZERO, box_inertia(parts.axle_mass / 2.0, (0.04, 0.04, 0.04))
@@ -311,7 +344,7 @@ def truck_description(
                 limits=(-parts.droop, parts.bump),
                 stiffness=spring,
                 damping=damping,
-                load=-load,
+                load=-(parts.axle_load + share * GRAVITY),
             ),
             PartJoint(
                 f"{axle}_roll",
@@ -354,10 +387,32 @@ def truck_description(
                     friction=parts.rolling_resistance * parts.mass * GRAVITY / 4.0 * radius,
                 ),
             ]
+    if head is not None:
+        _add_head(head, links, joints)
     for sensor in sensors:
         links.append(Part(sensor.name))
         joints.append(PartJoint(f"{sensor.name}_mount", "fixed", "base", sensor.name, sensor.origin, sensor.turn))
     return Description("monstertruck", tuple(links), tuple(joints))
+
+
+def _add_head(head: LidarHead, links: list[Part], joints: list[PartJoint]) -> None:
+    servo = (0.032, 0.05, 0.04)
+    lidar = (0.05, 0.05, 0.07)
+    links += [
+        Part("lidar_pitch", 2.0 * head.servo_mass, ZERO, box_inertia(2.0 * head.servo_mass, servo)),
+        Part(
+            "lidar_head",
+            head.lidar_mass,
+            (0.0, 0.0, head.offset),
+            box_inertia(head.lidar_mass, lidar),
+            (Shape("box", lidar, (0.0, 0.0, head.offset - 0.02), "0.1 0.1 0.1 1"),),
+        ),
+    ]
+    limits = (-math.radians(60.0), math.radians(60.0))
+    joints += [
+        PartJoint("lidar_pitch", "revolute", "base", "lidar_pitch", head.place, axis=(0.0, 1.0, 0.0), limits=limits),
+        PartJoint("lidar_roll", "revolute", "lidar_pitch", "lidar_head", axis=(1.0, 0.0, 0.0), limits=limits),
+    ]
 
 
 _KNUCKLE: Final = 0.04

@@ -308,7 +308,13 @@ def emulated(setup: EmulatorSetup) -> Ax12Bus:
     config: Ax12Config = setup.settings or Ax12Config()
     joints = (config.pitch, config.roll)
     places = {joint.id: float(joint.zero) for joint in joints}
-    bus = Ax12Bus(setup.clock, [joint.id for joint in joints], seed=setup.seed, positions=places)
+    numbers = {joint.id: (i, joint.direction) for i, joint in enumerate(joints)}
+
+    def load(ident: int, _time_ns: int) -> float:
+        number, direction = numbers[ident]
+        return direction * setup.physics.mount_torque(number)
+
+    bus = Ax12Bus(setup.clock, [joint.id for joint in joints], load=load, seed=setup.seed, positions=places)
     setup.port.device.baud = p.BAUD
     setup.physics.carry_lidar(TrueJoints(bus, config))
     return bus

@@ -9,7 +9,7 @@ from typing import ClassVar, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from monstertruck_drivers.emulation import PulseSource
+from monstertruck_drivers.emulation import JointSource, PulseSource
 from monstertruck_kinematics.elementary import Array, integrate
 from monstertruck_sim.world.actuators import RPM, Servo, Shaft
 from monstertruck_sim.world.battery import BatteryModel
@@ -111,6 +111,13 @@ class Plant(Protocol):
 
     def slot(self, time_ns: int, period_ns: int) -> int:
         """Number of the period since the start that an instant falls into: the index of its noise."""
+        ...
+
+    joints: JointSource | None
+    """Of the lidar's mount; None: it is fixed."""
+
+    def mount_torque(self, joint: int, /) -> float:
+        """With which the lidar pushes its pitch (0) or roll (1) joint at the newest instant, Nm; 0 in the plane."""
         ...
 
     def carry(self, pose: Pose) -> None:
@@ -221,6 +228,7 @@ class GriddedPlant(ABC):
         self._stuck_at: Pose | None = None
         self._slipping = [False] * count
         self._trail: deque[tuple[float, ...]] = deque(maxlen=_KEPT_NS // self.STEP_NS)
+        self.joints: JointSource | None = None
         self.together: Callable[[int], None] = lambda _: None
         self.on_blocked: Callable[[Pose, Twist], None] = lambda _pose, _twist: None
 
@@ -263,6 +271,10 @@ class GriddedPlant(ABC):
             self._elapsed = end
             if end % self.STEP_NS == 0:
                 self._remember()
+
+    def mount_torque(self, _joint: int, /) -> float:
+        """As ``Plant``."""
+        return 0.0
 
     def slot(self, time_ns: int, period_ns: int) -> int:
         """Number of the period since the start that an instant falls into: the index of its noise."""

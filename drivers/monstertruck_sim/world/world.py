@@ -124,7 +124,11 @@ class World:
 
     def carry_lidar(self, joints: JointSource) -> None:
         """Put the lidar onto a mount with joints."""
-        self._lidar.joints = joints
+        self._lidar.joints = self._plant.joints = joints
+
+    def mount_torque(self, joint: int) -> float:
+        """With which the lidar pushes its pitch (0) or roll (1) joint, Nm, at the newest instant."""
+        return self._plant.mount_torque(joint)
 
     def carry(self, time_ns: int, pose: Pose) -> None:
         """Put the truck down at another ``pose``: x, y (m) and yaw (rad) in the map frame.

@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from monstertruck_kinematics.description import Mechanics, Size, truck_description, wheel_inertia
+from monstertruck_kinematics.description import LidarHead, Mechanics, Size, truck_description, wheel_inertia
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.truck import LinkedAxles
 from monstertruck_runtime.errors import InputError
@@ -220,7 +220,11 @@ def rigid(config: WorldConfig, footprint: PlanOutline, start: Pose) -> Engine:
     heights = ground_heights(config, place.profile, bounds, start)
     ground: Uneven = heights if heights is not None else LevelGround()
     parts = mechanics(truck, config.mechanics)
-    description = truck_description(Size(truck.wheelbase, truck.track, truck.wheel_radius), parts)
+    description = truck_description(
+        Size(truck.wheelbase, truck.track, truck.wheel_radius),
+        parts,
+        head=LidarHead((config.lidar.x, 0.0, config.lidar.height)),
+    )
     drive = drive_line(truck, parts)
     longest = 80 if heights is None else round(0.25 / resolution)
     walls = rectangles(place.map.cells == OCCUPIED, resolution, place.map.origin, longest)

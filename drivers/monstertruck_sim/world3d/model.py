@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from monstertruck_kinematics.description import Description, Part, PartJoint, Shape
+from monstertruck_kinematics.description import HEAD_JOINTS, Description, Part, PartJoint, Shape
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.errors import InputError
 from monstertruck_sim.world3d.heights import HeightGrid
@@ -309,6 +309,8 @@ def _joint(body: Element, joint: PartJoint) -> None:
     if joint.stiffness:
         element.set("stiffness", f"{joint.stiffness:.9g}")
         element.set("springref", f"{joint.load / joint.stiffness:.9g}")
+    if joint.name in HEAD_JOINTS:
+        element.set("armature", "0.001")
     if joint.name.endswith("_steer"):
         element.set("armature", f"{_STEERING_ARMATURE}")
 
@@ -343,6 +345,10 @@ def _shape(body: Element, shape: Shape, name: str) -> None:
 
 _STEERING_ARMATURE: Final = 0.002
 """Of a steering servo behind its linkage, as each wheel feels it, kg m^2."""
+_HEAD_STIFFNESS: Final = 15.0
+"""Between a stabiliser's shaft and what it turns, Nm/rad."""
+_HEAD_DAMPING: Final = 0.15
+"""Nm s/rad."""
 _STEERING_STIFFNESS: Final = 60.0
 """Nm/rad: the linkage gives a little."""
 _STEERING_DAMPING: Final = 0.8
@@ -364,6 +370,10 @@ def _drive(root: Element, description: Description, drive: DriveLine) -> None:
     for joint in description.joints:
         if joint.name.endswith("_steer"):
             gains = {"kp": f"{_STEERING_STIFFNESS}", "kv": f"{_STEERING_DAMPING}"}
+            SubElement(actuators, "position", gains, name=joint.name, joint=joint.name)
+    for joint in description.joints:
+        if joint.name in HEAD_JOINTS:
+            gains = {"kp": f"{_HEAD_STIFFNESS}", "kv": f"{_HEAD_DAMPING}"}
             SubElement(actuators, "position", gains, name=joint.name, joint=joint.name)
     for i, joints in enumerate(drive.shafts):
         mean(f"shaft_{i}", joints)

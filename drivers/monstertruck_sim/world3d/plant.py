@@ -11,10 +11,11 @@ from typing import ClassVar, Final
 import mujoco
 import numpy as np
 
+from monstertruck_kinematics.description import HEAD_JOINTS
 from monstertruck_kinematics.elementary import Array
 from monstertruck_sim.world.actuators import RPM
 from monstertruck_sim.world.config import BatteryModelConfig, SimTruckConfig
-from monstertruck_sim.world.plant import GriddedPlant, Pose, Vector
+from monstertruck_sim.world.plant import SERVO_FRAME_NS, GriddedPlant, Pose, Vector
 from monstertruck_sim.world3d.model import TIMESTEP, DriveLine, Group
 
 _FREED: Final = 0.005
@@ -65,6 +66,7 @@ class RigidPlant(GriddedPlant):
         self._first_shaft = model.nu - count
         self._wound = [0.0] * count
         """Angle to which each shaft has wound its wheels up, rad, mean of its wheels."""
+        self._head = [mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, name) for name in HEAD_JOINTS]
         self._steered: list[float] = []
         """Servo angles that the steered wheels follow."""
         self._felt = self._turning = (0.0, 0.0, 0.0)
@@ -85,6 +87,10 @@ class RigidPlant(GriddedPlant):
     def height(self) -> float:
         """Of the base over the map's plane, m."""
         return self._height
+
+    def mount_torque(self, joint: int, /) -> float:
+        """With which the lidar pushes its pitch (0) or roll (1) joint at the newest instant, Nm."""
+        return -float(self.data.actuator_force[self._head[joint]])
 
     def integrate(self, time_ns: int) -> None:
         """``advance`` of this robot alone."""
@@ -138,6 +144,9 @@ class RigidPlant(GriddedPlant):
             angles = self._steers(servos)
             controls[: len(angles)] = angles
             self._steered = servos
+        if self.joints is not None and self._elapsed % SERVO_FRAME_NS == 0:
+            pitch, roll = self.joints.angles(np.array([(self._start_ns or 0) + self._elapsed]))
+            controls[self._head] = float(pitch[0]), float(roll[0])
         for i, shaft in enumerate(self.shafts):
             speed = shaft.rpm * RPM / self.config.motor.ratio
             self._wound[i] += speed * dt

@@ -8,6 +8,7 @@ import pytest
 from monstertruck_kinematics.description import (
     WHEELS,
     Description,
+    LidarHead,
     Mechanics,
     Part,
     PartJoint,
@@ -45,6 +46,17 @@ def test_its_springs_carry_it_at_zero():
     suspension = next(joint for joint in truck.joints if joint.name == "front_suspension")
     assert suspension.load == pytest.approx(-parts.sprung * 9.81 / 2)
     assert suspension.load / suspension.stiffness == pytest.approx(-0.010)
+
+
+def test_a_lidar_on_joints_is_a_part_of_the_mass_and_loads_the_front_springs_more():
+    head = LidarHead()
+    truck = truck_description(head=head)
+    assert truck.mass == pytest.approx(7.25)
+    loads = {joint.name: joint.load for joint in truck.joints}
+    assert loads["front_suspension"] + loads["rear_suspension"] == pytest.approx(-Mechanics().sprung * 9.81)
+    moment = (loads["front_suspension"] - loads["rear_suspension"]) * 0.16
+    assert moment == pytest.approx(-head.mass * 9.81 * 0.14)
+    assert truck.frame("lidar_head") == (0.14, 0.0, 0.25)
 
 
 def test_sensors_are_fixed_frames():

@@ -193,6 +193,34 @@ def test_gravity_and_motion_are_what_imu_and_compass_feel(solid):
     )
 
 
+class Shafts:
+    """Of a stabiliser, at fixed angles."""
+
+    def __init__(self, pitch, roll):
+        self.pitch, self.roll = pitch, roll
+
+    def angles(self, times_ns):
+        return np.full(len(times_ns), self.pitch), np.full(len(times_ns), self.roll)
+
+
+def test_the_lidar_follows_the_shafts_of_its_mount_and_its_weight_pushes_them(solid):
+    driver = solid()
+    driver.world.carry_lidar(Shafts(0.3, -0.2))
+    driver.wait(1.0)
+    data = plant(driver).data
+    assert data.joint("lidar_pitch").qpos[0] == pytest.approx(0.3, abs=0.002)
+    assert data.joint("lidar_roll").qpos[0] == pytest.approx(-0.2, abs=0.002)
+    weight = 0.16 * 9.81 * 0.02  # of the lidar, above the joints: it wants to fall further
+    assert driver.world.mount_torque(0) == pytest.approx(weight * np.sin(0.3) * np.cos(0.2), rel=0.05)
+    assert driver.world.mount_torque(1) == pytest.approx(-weight * np.cos(0.3) * np.sin(0.2), rel=0.05)
+
+
+def test_the_mount_of_the_plane_feels_nothing(field):
+    driver = field()
+    driver.world.carry_lidar(Shafts(0.3, -0.2))
+    assert driver.world.mount_torque(0) == 0.0
+
+
 @pytest.mark.parametrize(
     ("config", "text"),
     [
