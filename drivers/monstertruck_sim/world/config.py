@@ -621,8 +621,10 @@ class WorldConfig(Schema):
     @model_validator(mode="after")
     def _check_engine(self) -> Self:
         if self.engine == "mujoco":
-            if self.truck.body.kind != "truck":
-                raise ValueError(f"engine mujoco: has no body {self.truck.body.kind}; expected truck")
+            if self.truck.body.kind not in ("truck", "ackermann", "skid_steer"):
+                raise ValueError(
+                    f"engine mujoco: has no body {self.truck.body.kind}; expected truck, ackermann or skid_steer"
+                )
             if self.tilt.kind != "ground":
                 raise ValueError(f"engine mujoco: tilt {self.tilt.kind}: the ground tilts the robot; expected ground")
         elif self.ground or self.height_image is not None or self.mjcf is not None:

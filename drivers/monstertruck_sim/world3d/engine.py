@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from monstertruck_kinematics.description import LidarHead, Mechanics, Size, truck_description, wheel_inertia
 from monstertruck_kinematics.elementary import Array
-from monstertruck_kinematics.truck import LinkedAxles
+from monstertruck_kinematics.truck import FourWheelSteering, LinkedAxles
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.map_files import OCCUPIED
 from monstertruck_sim.world.config import LidarConfig, SimTruckConfig, TiltConfig, WorldConfig
@@ -34,7 +34,7 @@ from monstertruck_sim.world3d.model import (
     load,
     rectangles,
 )
-from monstertruck_sim.world3d.plant import RigidPlant
+from monstertruck_sim.world3d.plant import RigidPlant, Steering
 
 _RAYS: Final = 64
 """Beams that are cast at blocks from one origin; each is corrected for its own."""
@@ -192,18 +192,39 @@ class RigidSweep:
 
 
 def drive_line(truck: SimTruckConfig, parts: Mechanics) -> DriveLine:
-    """One motor for four wheels: open differentials in both axles, a rigid transfer case between them.
+    """What the motors turn, by the body.
+
+    Of the truck one motor for four wheels: open differentials in both axles, a rigid transfer case between them. Of a
+    car the rear wheels, with a differential. Of a skid-steer robot the wheels of a side, coupled, or every wheel alone.
 
     The wind-up is as stiff as lets the wheels follow critically damped with the mean delay ``motor.drivetrain_lag``.
     """
+    front, rear = (tuple(f"{axle}_{side}_spin" for side in ("left", "right")) for axle in ("front", "rear"))
+    shafts: tuple[tuple[str, ...], ...] = ((*front, *rear),)
+    locked: tuple[tuple[tuple[str, ...], tuple[str, ...]], ...] = ((front, rear),)
+    if truck.body.kind == "ackermann":
+        shafts, locked = (rear,), ()
+    elif truck.body.kind == "skid_steer":
+        left, right = zip(front, rear, strict=True)
+        sides = (left, right) if getattr(truck.body, "motors", "sides") == "sides" else ()
+        shafts = sides or tuple((joint,) for joint in (*front, *rear))
+        locked = tuple(((a,), (b,)) for a, b in sides)
     radius = truck.wheel_radius
     inertia = parts.mass * radius**2 + 4 * wheel_inertia(parts.wheel_mass, radius, parts.wheel_width)[1]
-    natural = 2.0 / truck.motor.drivetrain_lag
-    front, rear = (tuple(f"{axle}_{side}_spin" for side in ("left", "right")) for axle in ("front", "rear"))
-    return DriveLine(
-        ((*front, *rear),), ((front, rear),), inertia * natural**2, 2.0 * inertia * natural,
-        truck.motor.clutch_force * radius,
-    )  # fmt: skip
+    natural, share = 2.0 / truck.motor.drivetrain_lag, inertia / len(shafts)
+    return DriveLine(shafts, locked, share * natural**2, 2.0 * share * natural, truck.motor.clutch_force * radius)
+
+
+def wheel_steering(truck: SimTruckConfig) -> Steering:
+    """From servos to wheels: by the fitted linkage of the truck, by an ideal one of a car; or none is steered."""
+    chassis = truck.chassis()
+    linkage = chassis.linkage
+    if truck.body.kind == "truck" and isinstance(linkage, LinkedAxles):
+        return lambda servos: linkage.wheel_angles(*servos)
+    if truck.body.kind == "ackermann":
+        size = FourWheelSteering(truck.wheelbase, truck.track)
+        return lambda servos: size.wheel_angles(chassis.steering(*servos)[0], 0.0)
+    return lambda servos: (0.0, 0.0, 0.0, 0.0)
 
 
 def rigid(config: WorldConfig, footprint: PlanOutline, start: Pose) -> Engine:
@@ -231,12 +252,9 @@ def rigid(config: WorldConfig, footprint: PlanOutline, start: Pose) -> Engine:
     scene_files = scenery(config.mjcf) if config.mjcf is not None else ((), ())
     site = Site(walls, config.lidar.wall_height, heights, blocks(config.ground, heights), scene_files)
     model = load(description, drive, parts.friction, site)
-    linkage = truck.chassis().linkage
-    assert isinstance(linkage, LinkedAxles)
-    axles = linkage
     plant = RigidPlant(
         truck, config.battery, start, model, drive,
-        lambda servos: axles.wheel_angles(*servos),
+        wheel_steering(truck),
         lambda x, y: float(ground.height(np.array(x), np.array(y))),
     )  # fmt: skip
     space = RigidSpace(footprint, plant, ground, footprint.name)

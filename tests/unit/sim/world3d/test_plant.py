@@ -8,7 +8,7 @@ import pytest
 from monstertruck_kinematics.description import WHEELS
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.base import Pose2D
-from monstertruck_sim.world.config import MechanicsConfig, RoughPatch, SinusoidTilt, WorldConfig
+from monstertruck_sim.world.config import MechanicsConfig, RoughPatch, SimTruckConfig, SinusoidTilt, WorldConfig
 from monstertruck_sim.world.obstacles import Box, Disc
 from monstertruck_sim.world.world import World
 
@@ -193,6 +193,36 @@ def test_gravity_and_motion_are_what_imu_and_compass_feel(solid):
     )
 
 
+def test_a_car_turns_by_its_front_wheels_and_is_driven_by_the_rear_ones(solid):
+    car = SimTruckConfig.model_validate({"body": {"kind": "ackermann"}})
+    driver = solid(truck=car, mechanics=MechanicsConfig(wheel_width=0.01))  # wide tyres scrub
+    driver.steer(0.3, 0.3)
+    driver.drive(0.2)
+    driver.wait(3.0)
+    truth = driver.wait(2.0)
+    expected = np.tan(truth.front) / 0.32  # of the rear axle's middle
+    assert truth.wz / truth.v == pytest.approx(expected / np.hypot(1.0, 0.16 * expected), rel=0.02)
+    data = plant(driver).data
+    assert data.joint("rear_left_steer").qpos[0] == pytest.approx(0.0, abs=0.01)
+    assert data.joint("front_left_steer").qpos[0] > data.joint("front_right_steer").qpos[0] + 0.02
+
+
+@pytest.mark.parametrize("motors", ["sides", "wheels"])
+def test_a_skid_steer_robot_turns_on_the_spot_by_skidding(solid, motors):
+    driver = solid(truck=SimTruckConfig.model_validate({"body": {"kind": "skid_steer", "motors": motors}}))
+    left = (0,) if motors == "sides" else (0, 2)
+    for i, motor in enumerate(driver.world.motors):
+        speed = -0.15 if i in left else 0.15
+        motor.command(driver.now, -speed * 644 / (2 * pi * 0.075) * 60, 20_000.0)
+    driver.wait(2.0)
+    truth = driver.wait(2.0)
+    assert 0.2 < truth.wz < 2 * 0.15 / 0.26  # less than without skidding
+    assert (truth.x, truth.y) == pytest.approx((0.0, 0.0), abs=0.05)
+    rate = [plant(driver).data.joint(f"{wheel}_spin").qvel[0] for wheel in WHEELS]
+    assert rate[1] == pytest.approx(0.15 / 0.075, rel=0.1)
+    assert rate[0] == pytest.approx(-rate[1], rel=0.1)
+
+
 class Shafts:
     """Of a stabiliser, at fixed angles."""
 
@@ -224,7 +254,10 @@ def test_the_mount_of_the_plane_feels_nothing(field):
 @pytest.mark.parametrize(
     ("config", "text"),
     [
-        ({"truck": {"body": {"kind": "differential"}}}, "has no body differential"),
+        (
+            {"truck": {"body": {"kind": "differential"}}},
+            "differential; expected truck, ackermann or skid_steer",
+        ),
         ({"tilt": {"kind": "sinusoid"}}, "the ground tilts the robot"),
     ],
 )
