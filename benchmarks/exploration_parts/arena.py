@@ -36,9 +36,10 @@ class Arena:
     def load(cls, name: str, file: Path) -> "Arena":
         """Of a map_server file."""
         world = load_map(file)
-        blocked = world.cells != FREE
-        field = DistanceField(blocked, world.resolution, (*world.origin, 0.0))
-        return cls(name, world.resolution, world.origin, blocked, clearance(blocked), field)
+        blocked = np.pad(world.cells != FREE, 1, constant_values=True)  # nothing is seen beyond the edge
+        origin = world.origin[0] - world.resolution, world.origin[1] - world.resolution
+        field = DistanceField(blocked, world.resolution, (*origin, 0.0))
+        return cls(name, world.resolution, origin, blocked, clearance(blocked), field)
 
     def start(self, seed: int) -> Pose:
         """A random pose with room around in the largest part that the robot can drive in."""

@@ -5,12 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.ndimage import distance_transform_edt
 
 from monstertruck_estimation.slam.storage import load
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.errors import RequestRefusedError
 from monstertruck_runtime.mailbox import fifo
-from monstertruck_runtime.map_files import FREE, OCCUPIED, WorldMap, save_map
+from monstertruck_runtime.map_files import FREE, OCCUPIED, WorldMap, load_map, save_map
 from monstertruck_schemas import topics
 from monstertruck_schemas.plan import ExplorationPhase
 from monstertruck_schemas.reasons import Reason
@@ -136,3 +137,70 @@ def test_it_stops_when_told_to_and_gives_way_to_other_goals(tmp_path: Path):
     assert "back at the start" in ends[2].text
     assert not truth[:, 5].any()
     assert ends[0].phase is ExplorationPhase.IDLE
+
+
+def doubled(folder: Path) -> float:
+    """Share of the saved map's walls that are more than 0.12 m from true ones."""
+    saved = load(folder / "map").grid
+    true = load_map(folder / "corner.yaml")
+    far = distance_transform_edt(true.cells != OCCUPIED) * true.resolution
+    rows, columns = np.nonzero(saved.cells == OCCUPIED)
+    x = saved.origin[0] + (columns + 0.5) * saved.resolution
+    y = saved.origin[1] + (rows + 0.5) * saved.resolution
+    at = np.clip((np.column_stack((y, x)) / true.resolution).astype(int), 0, 119)
+    return float((far[at[:, 0], at[:, 1]] > 0.12).mean())
+
+
+def test_a_lidar_that_is_gone_for_a_while_stops_it_and_armed_again_it_goes_on(tmp_path: Path):
+    ends = []
+
+    async def story(told: Story) -> None:
+        await told.operator.arm()
+        await told.order(ExploreOrder.START, home=False)
+        await told.clock.sleep(8.0)
+        told.rig.ports["lidar"].unplug()
+        await told.clock.sleep(5.0)
+        told.rig.ports["lidar"].plug()
+        await told.clock.sleep(6.0)
+        await told.operator.arm()
+        ends.append(await told.end(200.0))
+
+    _, truth = tell(story, tmp_path)
+    assert ends[0].outcome is Reason.EXPLORED, ends[0].text
+    assert not truth[:, 5].any()
+    assert doubled(tmp_path) < 0.05
+
+
+def test_far_from_home_it_turns_back_while_the_charge_suffices(tmp_path: Path):
+    ends = []
+
+    async def story(told: Story) -> None:
+        await told.operator.arm()
+        await told.order(ExploreOrder.START)
+        ends.append(await told.end(200.0))
+
+    _, truth = tell(story, tmp_path, explorer={"full_range": 3.0})
+    assert ends[0].outcome is Reason.CHARGE_SPENT
+    assert "are kept for" in ends[0].text
+    assert "back at the start" in ends[0].text
+    assert not truth[:, 5].any()
+    assert math.dist(truth[-1, 1:3], truth[0, 1:3]) < 0.2
+
+
+def test_carried_away_it_stands_says_so_and_leaves_a_map_that_is_not_doubled(tmp_path: Path):
+    ends = []
+
+    async def story(told: Story) -> None:
+        await told.operator.arm()
+        await told.order(ExploreOrder.START)
+        await told.clock.sleep(14.0)
+        told.rig.world.carry(told.clock.now(), (1.2, 1.6, math.pi))
+        ends.append(await told.end(280.0))
+
+    told, truth = tell(story, tmp_path, explorer={"lost": 15.0})
+    assert ends[0].outcome in (Reason.EXPLORED, Reason.POSE_LOST, Reason.GOAL_BLOCKED), ends[0].text
+    assert "map in" in ends[0].text
+    assert not truth[:, 5].any()
+    reasons = [event.reason for event in told.events.drain() if event.source == "explorer"]
+    assert Reason.POSE_LOST in reasons
+    assert doubled(tmp_path) < 0.05

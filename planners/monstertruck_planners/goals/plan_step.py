@@ -50,6 +50,10 @@ NEARBY: Final = 1.5
 """Obstacles this near count when backing out, and are not forgotten, m."""
 
 
+HELD: Final = frozenset({Reason.START_BLOCKED, Reason.GOAL_UNREACHABLE})
+"""Why there is no route if the truck is held by what it stands on."""
+BESIDE: Final = 0.15
+"""Unknown ground this near to where it stands does not hold it, m."""
 RIM: Final = 1.5
 """Cells by which the truck may overlap an obstacle of the map where it stands."""
 CLEARANCE: Final = 0.2
@@ -186,7 +190,9 @@ class StaticMap:
         return np.asarray(there[np.hypot(there[:, 0], there[:, 1]) < reach])
 
 
-def standing_free(cells: Cells, resolution: float, origin: Pose, footprint: Footprint, pose: Pose) -> Cells:
+def standing_free(
+    cells: Cells, resolution: float, origin: Pose, footprint: Footprint, pose: Pose, beside: float = 0.0
+) -> Cells:
     """Cells with those free on which the truck stands: unknown ones, and obstacles that only its rim touches.
 
     A map is as exact as its cells: a truck beside a wall overlaps one by up to a cell. What it overlaps by more stays,
@@ -198,9 +204,10 @@ def standing_free(cells: Cells, resolution: float, origin: Pose, footprint: Foot
         origin: pose of the outer corner of cell (0, 0).
         footprint: the truck.
         pose: of it, in the map's frame.
+        beside: unknown cells this near to it are free too, m.
     """
     at = points_relative(np.array([pose[:2]]), origin)[0] / resolution
-    reach = math.ceil(footprint.circumscribed_radius / resolution) + 1
+    reach = math.ceil((footprint.circumscribed_radius + beside) / resolution) + 1
     rows, columns = cells.shape
     row, column = np.mgrid[
         max(int(at[1]) - reach, 0) : min(int(at[1]) + reach + 1, rows),
@@ -208,7 +215,8 @@ def standing_free(cells: Cells, resolution: float, origin: Pose, footprint: Foot
     ].reshape(2, -1)
     centres = np.column_stack((column + 0.5, row + 0.5, np.zeros(len(row)))) * resolution
     gap = rectangle_distance(footprint, np.array([pose]), placed(centres, origin)[:, :2])[0]
-    freed = (gap < resolution * math.sqrt(0.5)) & ((gap > -RIM * resolution) | (cells[row, column] < 0))
+    unknown, touched = cells[row, column] < 0, resolution * math.sqrt(0.5)
+    freed = np.where(unknown, gap < touched + beside, (gap < touched) & (gap > -RIM * resolution))
     kept = cells.copy()
     kept[row[freed], column[freed]] = 0
     return kept
@@ -367,8 +375,10 @@ class PlanningStep:
         result = plan(self._planner)
         if result.reason is Reason.START_BLOCKED:
             result = plan(self._tight)
+        if result.reason in HELD:
+            self._route_map = route_map = self._standing(static_map, cells, task.pose)
+            result = plan(self._planner)
             if result.reason is Reason.START_BLOCKED:
-                self._route_map = route_map = self._standing(static_map, cells, task.pose)
                 result = plan(self._tight)
         elif (room := self._cusp_clearance(route_map, result)) < self._setup.cusp_clearance:
             wider = plan(self._wide)
@@ -411,7 +421,7 @@ class PlanningStep:
         origin = (float(corner[0]), float(corner[1]), static_map.origin[2])
         outside = np.pad(np.zeros(cells.shape, np.bool_), margin, constant_values=True)
         around = np.pad(cells, margin, constant_values=-1)
-        freed = standing_free(around, static_map.resolution, origin, footprint, pose)
+        freed = standing_free(around, static_map.resolution, origin, footprint, pose, BESIDE)
         freed[outside & (freed < 0)] = 100
         tilt, roughness = self._layers or (None, None)
         return RouteMap.from_cells(
