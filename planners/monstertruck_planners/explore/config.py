@@ -86,7 +86,7 @@ class TourConfig(ExplorerConfig):
     kind: Literal["tour"] = "tour"
     turning: NotNegative = 1.0
     """Metres that half a turn at the start of the tour costs"""
-    keep: NotNegative = 1.0
+    keep: NotNegative = 4.0
     """Metres by which another tour has to be shorter than one that begins with the present goal"""
     most: Annotated[int, Field(ge=3, le=60)] = 24
     """Frontiers of a tour at most, the nearest ones"""
