@@ -1,195 +1,268 @@
-"""Wall following as published in an arena of the study's kind: methods 1 (with and without FL's 0.05 m) and 2.
+"""Wall following in an arena of the study's kind, in random ones, and with faults: published methods 1 and 2, and ours.
 
-The pure steps of the behaviours at 10 Hz, the world's sonars (5 mm + 1 %, 5 % drop-outs), and a robot that follows
-the twist asked for within the acceleration of its gate and a lag of 50 ms; no daemon. Both senses, random headings,
-odometry with errors of its own. Prints for every method: runs that came to their end, contacts, steady error (RMS
-of the side sonar's true distance error on straights from 1 m after a corner), its maximum there (the gap included),
-duration, and the jumps of the speeds asked for. The last line is JSON.
+The pure steps of the behaviours, the world's sonars (5 mm + 1 %, 5 % drop-outs), and a robot that follows the twist
+asked for within the acceleration of its gate and a lag of 50 ms; no daemon, no gate. Both senses, random headings, the
+same seeds for all; odometry and gyroscope with errors of their own.
 
-    python benchmarks/wall_following.py [--seeds 50] [--model beam] [--method NAME ...] [--figure FILE.png]
+- ``study``: 48 m, two corners of 70 and two of 110 degrees, a gap of 0.4 m. Steady is the RMS of the side sonar's true
+  distance error on straights from 1 m after a corner, and after the approach; worst is its maximum there, the gap
+  included; of runs that came to their end.
+- ``start``: the same from the middle with the heading and sense of the study's own run (digits 7 and 5).
+- ``arenas``: one drawn per seed (4 or 5 corners of 50 to 130 degrees, a door, a pillar), method 3.
+- ``faults``: one sonar dead, stuck, cross-talking; IMU unplugged; a motor stalled; method 3, in the study's arena.
+
+A jump is a change of the speed or yaw rate asked for, from one step to the next, of more than 0.8 m/s^2 or rad/s^2.
+Ramps of method 3 are evaluated at 100 Hz. The last line is JSON.
+
+    python benchmarks/wall_following.py [--seeds 50] [--jobs 2] [--only study start arenas faults] [--figure FILE.png]
 """
 
 import argparse
 import json
 import math
 import sys
-from dataclasses import dataclass
-from functools import partial
-from typing import Any, Final
+from collections import Counter
+from concurrent.futures import ProcessPoolExecutor
+from itertools import product
+from multiprocessing import get_context
+from typing import Any, Final, NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
-from wall_parts.arena import Arena, blocked, rays, study
+from wall_parts.arena import Arena, drawn, start_rule, study
+from wall_parts.simulation import Fault, FaultKind, WallRun, drive_along
 
 from monstertruck_kinematics.elementary import Array
-from monstertruck_planners.behave.api import Behaviour, Inputs, RequestedMotion
-from monstertruck_planners.behave.wall.config import WallPdConfig, WallSwitchingConfig
+from monstertruck_planners.behave.api import Behaviour
+from monstertruck_planners.behave.wall.config import WallLineConfig, WallPdConfig, WallSwitchingConfig
+from monstertruck_planners.behave.wall.line import WallLine
 from monstertruck_planners.behave.wall.published import WallPd, WallSwitching
-from monstertruck_schemas.base import Pose2D, Twist2D
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.sensor import SonarEcho, SonarRanges
-from monstertruck_schemas.state import Odometry
-from monstertruck_schemas.topics import ODOMETRY, SONAR
-from monstertruck_sim.world.config import FIVE_SONARS, SonarModelConfig, SonarPlace
-from monstertruck_sim.world.sonar import survey
+from monstertruck_sim.world.config import FIVE_SONARS
 
-PERIOD, FINE = 0.1, 0.01
-LAG: Final = 0.05
-ACCELERATION, YAW_ACCELERATION, YAW_RATE = 0.8, 1.0, 1.5
-"""Of the robot's gate: m/s^2, rad/s^2, rad/s."""
-LIMIT: Final = 600.0
-"""Seconds a run may take."""
 AFTER: Final = 1.0
-"""Metres after a corner from which on a straight counts."""
+"""Metres after a corner, and after the approach, from which on a straight counts."""
 LAP: Final = {"lap_length": 20.0, "lap_radius": 1.0}
-METHODS: Final = ("method-1", "method-1-exact", "method-2")
+METHODS: Final = (
+    ("1", "beam"),
+    ("1, offset 0.05", "beam"),
+    ("1, offset 0.05, gap 0.6", "beam"),
+    ("1, offset 0.05, gap 0.6", "cone"),
+    ("2", "beam"),
+    ("2", "cone"),
+    ("3", "cone"),
+    ("3", "beam"),
+)
+PARTS: Final = ("study", "start", "arenas", "faults")
+FAULTS: Final[tuple[FaultKind, ...]] = ("dead", "stuck", "cross-talk", "imu", "motor")
+FAULT_SEEDS: Final = 20
+GOALS: Final = {
+    "1, offset 0.05, gap 0.6, beam: steady_mm": 4.0,
+    "1, offset 0.05, gap 0.6, beam: worst_mm": 25.0,
+    "3, cone: steady_mm": 2.0,
+    "3, cone: worst_mm": 15.0,
+    "3, cone: seconds_max": 240.0,
+    "3, cone: contacts": 0,
+    "3, cone: unfinished": 0,
+    "3, cone: jumps_v": 0,
+    "3, cone: jumps_w": 0,
+    "3, cone: acceleration": 0.6,
+    "3, cone: jerk": 4.8,
+    "arenas: contacts": 0,
+    "arenas: unfinished": 0,
+    "faults: contacts": 0,
+}
 
 
-@dataclass
-class Outcome:
+class Job(NamedTuple):
     """One run."""
 
-    reason: Reason
-    contact: bool
-    seconds: float
+    part: str
+    method: str
+    model: str
+    side: str
+    seed: int
+    fault: FaultKind | None = None
+    start: tuple[float, float, float] | None = None
+
+
+class Result(NamedTuple):
+    """What is kept of it."""
+
+    job: Job
+    run: WallRun
     errors: Array
-    """Of the side sonar's distance on straights, m."""
-    jumps: tuple[float, float]
-    """Greatest change of v, m/s, and of the yaw rate, rad/s, from one step to the next."""
-    track: Array
-    """(n, 3): x, y, distance error."""
+    """Of the side sonar's distance at every point of ``run.track``, m; NaN where it does not count."""
+    ramp: tuple[float, float]
+    """Greatest acceleration and jerk of the planned ramps."""
 
 
-def behaviour(method: str, side: str) -> Behaviour:
-    if method == "method-2":
-        return WallSwitching(WallSwitchingConfig.model_validate({"side": side, **LAP}))
-    offset = 0.05 if method == "method-1-exact" else 0.0
-    return WallPd(WallPdConfig.model_validate({"side": side, "offset": offset, **LAP}))
+def pilot(method: str, model: str, side: str, lap: dict[str, float]) -> tuple[Behaviour, float]:
+    """The behaviour of a method and its steps a second."""
+    if method == "3":
+        config = WallLineConfig.model_validate({"side": side, "beam": model == "beam", **lap})
+        return WallLine(config), config.rate
+    if method == "2":
+        switching = WallSwitchingConfig.model_validate({"side": side, **lap})
+        return WallSwitching(switching), switching.rate
+    own = {"offset": 0.05 if "offset" in method else 0.0, "gap": 0.6 if "gap" in method else 0.0}
+    pd = WallPdConfig.model_validate({"side": side, **own, **lap})
+    return WallPd(pd), pd.rate
 
 
-def mirrored(walls: Array) -> Array:
-    return walls * np.array([1.0, -1.0, 1.0, -1.0])
+def do(job: Job) -> Result:
+    """Drive."""
+    arena = drawn(job.seed) if job.part == "arenas" else study()
+    behaviour, rate = pilot(job.method, job.model, job.side, {"lap_length": 8.0} if job.part == "arenas" else LAP)
+    fault = None
+    if job.fault is not None:
+        rng = np.random.default_rng([job.seed, FAULTS.index(job.fault)])
+        own = ("l", "fl", "f") if job.side == "left" else ("r", "fr", "f")
+        part = str(rng.choice(("left", "right") if job.fault == "motor" else own))
+        fault = Fault(job.fault, float(rng.uniform(30.0, 150.0)), part)
+    run = drive_along(behaviour, rate, arena, job.side, job.seed, model=job.model, fault=fault, start=job.start)
+    return Result(job, run._replace(ramps=[]), errors_along(arena, run.track), steepest(run))
 
 
-def run(method: str, model: str, side: str, seed: int, arena: Arena) -> Outcome:
-    rng = np.random.default_rng(seed)
-    walls = arena.walls if side == "left" else mirrored(arena.walls)
-    sonar = SonarModelConfig(model=model, dropout=0.05, sonars=FIVE_SONARS)  # type: ignore[arg-type]
-    cast, place = partial(rays, walls), FIVE_SONARS["l" if side == "left" else "r"]
-    x, y, yaw = float(rng.uniform(-0.5, 0.5)), float(rng.uniform(-0.5, 0.5)), float(rng.uniform(-math.pi, math.pi))
-    scale, drift = 1 + float(rng.normal(0, 0.003)), float(rng.normal(0, 0.0003))
-    dead = [x, y, yaw]
-    pilot, v, w = behaviour(method, side), 0.0, 0.0
-    state, errors, track, asked = pilot.begin(), [], [], []
-    contact, reason, t = False, Reason.TIMEOUT, 0.0
-    while t < LIMIT:
-        heard = survey(cast, (x, y, yaw), sonar, rng)
-        step = pilot.step(_inputs(heard, tuple(dead), v, w, sonar), state, t)
-        state = step.state
-        if step.outcome is not Reason.DRIVING:
-            reason = step.outcome
-            break
-        motion = step.motion or RequestedMotion()
-        asked.append(motion[:2])
-        for _ in range(round(PERIOD / FINE)):
-            v += float(np.clip((motion.vx - v) * FINE / LAG, -ACCELERATION * FINE, ACCELERATION * FINE))
-            turn = float(np.clip(motion.wz, -YAW_RATE, YAW_RATE))
-            w += float(np.clip((turn - w) * FINE / LAG, -YAW_ACCELERATION * FINE, YAW_ACCELERATION * FINE))
-            x, y, yaw = x + v * math.cos(yaw) * FINE, y + v * math.sin(yaw) * FINE, yaw + w * FINE
-            dead[2] += w * FINE + drift * v * FINE
-            dead[0] += scale * v * math.cos(dead[2]) * FINE
-            dead[1] += scale * v * math.sin(dead[2]) * FINE
-        contact |= bool(blocked(walls, x, y, yaw))
-        error = _error(arena, (x, y if side == "left" else -y, yaw if side == "left" else -yaw), place)
-        if step.phase not in ("approach", "stop"):
-            track.append((x, y, math.nan if error is None else error))
-            if error is not None:
-                errors.append(error)
-        t += PERIOD
-        if contact:
-            reason = Reason.OBSTACLE_STOP
-            break
-    changes = np.abs(np.diff(np.array(asked), axis=0)).max(axis=0) if len(asked) > 1 else np.zeros(2)
-    jumps = float(changes[0]), float(changes[1])
-    return Outcome(reason, contact, t, np.array(errors), jumps, np.array(track).reshape(-1, 3))
+def steepest(run: WallRun) -> tuple[float, float]:
+    """Greatest acceleration and jerk of the planned ramps at 100 Hz."""
+    acceleration = jerk = 0.0
+    for ramp in run.ramps:
+        a1, a2 = ramp.shape.coefficients
+        t = np.arange(0.0, ramp.shape.duration, 0.01)
+        acceleration = max(acceleration, float(np.abs(ramp.shape.a0 + 2 * a1 * t + 3 * a2 * t**2).max()))
+        jerk = max(jerk, float(np.abs(2 * a1 + 6 * a2 * t).max()))
+    return acceleration, jerk
 
 
-def _inputs(heard: Any, pose: Any, v: float, w: float, sonar: SonarModelConfig) -> Inputs:
-    head = {"stamp": 0, "received": 0, "seq": 0}
-    echoes = tuple(SonarEcho(name=n, range=r if math.isfinite(r) else None, stamp=0) for n, r in heard.items())
-    ranges = SonarRanges(
-        **head, sonars=echoes, field_of_view=sonar.field_of_view, range_min=sonar.range_min, range_max=sonar.range_max
-    )
-    odometry = Odometry(
-        **head, frame="odom", pose=Pose2D(x=pose[0], y=pose[1], yaw=pose[2]), twist=Twist2D(vx=v, vy=0.0, wz=w),
-        pose_covariance=np.zeros(9), twist_covariance=np.zeros(9), age=0.0,
-    )  # fmt: skip
-    return Inputs({SONAR.name: ranges, ODOMETRY.name: odometry})
-
-
-def _error(arena: Arena, pose: tuple[float, float, float], place: SonarPlace) -> float | None:
-    """Error of the side sonar's distance from the line of its wall, of a clockwise lap; None in and near corners."""
-    x, y, yaw = pose
-    left = abs(place.y)
-    at = np.array([
-        x + math.cos(yaw) * place.x - math.sin(yaw) * left, y + math.sin(yaw) * place.x + math.cos(yaw) * left
-    ])  # fmt: skip
-    for a, b in zip(arena.corners, np.roll(arena.corners, -1, axis=0), strict=True):
-        length = float(np.linalg.norm(b - a))
-        along = (b - a) / length
-        if math.cos(yaw - math.atan2(along[1], along[0])) < math.cos(0.5):
+def errors_along(arena: Arena, track: Array) -> Array:
+    """Errors of the side sonar's distance from the line of its wall; NaN in and near corners and in the approach."""
+    errors, place, left = np.full(len(track), np.nan), FIVE_SONARS["l"], AFTER
+    before = track[0, :2]
+    for i, (x, y, yaw, _, found) in enumerate(track):
+        left = left - math.dist((x, y), before) if found else AFTER
+        before = np.array([x, y])
+        if left > 0.0:
             continue
-        way, off = float((at - a) @ along), float(along[0] * (a - at)[1] - along[1] * (a - at)[0])
-        if AFTER <= way <= length - AFTER and 0.0 < off < 1.0:
-            return off - 0.30
-    return None
+        c, s = math.cos(yaw), math.sin(yaw)
+        at = np.array([x + c * place.x - s * place.y, y + s * place.x + c * place.y])
+        for a, b in zip(arena.corners, np.roll(arena.corners, -1, axis=0), strict=True):
+            length = float(np.linalg.norm(b - a))
+            along = (b - a) / length
+            if math.cos(yaw - math.atan2(along[1], along[0])) < math.cos(0.5):
+                continue
+            way, off = float((at - a) @ along), float(along[0] * (a - at)[1] - along[1] * (a - at)[0])
+            if AFTER <= way <= length - AFTER and 0.0 < off < 1.0:
+                errors[i] = off - 0.30
+    return errors
+
+
+def summary(results: list[Result]) -> dict[str, Any]:
+    """Figures of the runs of one row."""
+    done = [r for r in results if r.run.reason is Reason.BEHAVIOUR_DONE]
+    errors = [r.errors[~np.isnan(r.errors)] * 1000 for r in done]
+    counted = np.concatenate(errors) if errors else np.zeros(0)
+    worst = [float(np.abs(e).max()) for e in errors if len(e)]
+    jumps = [r.run.jumps() for r in results]
+    seconds = [r.run.seconds for r in done]
+    return {
+        "runs": len(results),
+        "unfinished": len(results) - len(done),
+        "contacts": sum(r.run.contact for r in results),
+        "steady_mm": round(float(np.sqrt(np.mean(counted**2))), 2) if len(counted) else None,
+        "median_mm": round(float(np.median(np.abs(counted))), 2) if len(counted) else None,
+        "worst_mm": round(max(worst), 1) if worst else None,
+        "worst_median_mm": round(float(np.median(worst)), 1) if worst else None,
+        "seconds": round(float(np.median(seconds)), 1) if seconds else None,
+        "seconds_max": round(max(seconds), 1) if seconds else None,
+        "jumps_v": sum(j[0] for j in jumps),
+        "jumps_w": sum(j[1] for j in jumps),
+        "jump_v": round(max(j[2] for j in jumps), 3),
+        "jump_w": round(max(j[3] for j in jumps), 3),
+        "wheel": round(max(r.run.wheels for r in results), 3),
+        "acceleration": round(max(r.ramp[0] for r in results), 4),
+        "jerk": round(max(r.ramp[1] for r in results), 3),
+        "reasons": dict(Counter(str(r.run.reason) for r in results)),
+    }
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=50)
-    parser.add_argument("--model", choices=("beam", "cone"), default="beam")
-    parser.add_argument("--method", choices=METHODS, nargs="+", default=METHODS)
-    parser.add_argument("--figure", help="PNG of the first run of every method")
+    parser.add_argument("--seeds", type=int, default=50, help="of study and arenas; faults have 20 at most")
+    parser.add_argument("--jobs", type=int, default=2, help="processes")
+    parser.add_argument(
+        "--only", choices=("study", "arenas", "faults"), nargs="+", default=("study", "arenas", "faults")
+    )
+    parser.add_argument("--method", choices=("1", "2", "3"), nargs="+", default=("1", "2", "3"))
+    parser.add_argument("--figure", help="PNG of the runs of `start`")
     args = parser.parse_args()
-    arena, table, first = study(), {}, {}
-    for method in args.method:
-        runs = [run(method, args.model, side, s, arena) for s in range(args.seeds) for side in ("left", "right")]
-        first[method] = runs[0]
-        done = [r for r in runs if r.reason is Reason.BEHAVIOUR_DONE]
-        errors = np.concatenate([r.errors for r in done]) * 1000 if done else np.zeros(0)
-        table[method] = {
-            "runs": len(runs),
-            "finished": len(done),
-            "contacts": sum(r.contact for r in runs),
-            "steady_mm": round(float(np.sqrt(np.mean(errors**2))), 2) if len(errors) else None,
-            "worst_mm": round(float(np.abs(errors).max()), 1) if len(errors) else None,
-            "worst_median_mm": round(float(np.median([np.abs(r.errors).max() for r in done])) * 1000, 1)
-            if done
-            else None,
-            "seconds": round(float(np.median([r.seconds for r in done])), 1) if done else None,
-            "jump_v": round(max(r.jumps[0] for r in runs), 3),
-            "jump_w": round(max(r.jumps[1] for r in runs), 3),
-            "reasons": {str(reason): sum(r.reason is reason for r in runs) for reason in {r.reason for r in runs}},
-        }
-        print(method, table[method], flush=True)
+    sides, jobs = ("left", "right"), []
+    rows = [row for row in METHODS if row[0][0] in args.method]
+    if "study" in args.only:
+        jobs += [Job("study", *row, side, s) for row, s, side in product(rows, range(args.seeds), sides)]
+    if "start" in args.only:
+        heading, side = start_rule(7, 5)
+        mirror = 1.0 if side == "left" else -1.0
+        jobs += [Job("start", *row, side, 0, start=(0.0, 0.0, heading * mirror)) for row in rows]
+    if "arenas" in args.only:
+        jobs += [Job("arenas", "3", "cone", sides[s % 2], s) for s in range(args.seeds)]
+    if "faults" in args.only:
+        seeds = range(min(args.seeds, FAULT_SEEDS))
+        jobs += [Job("faults", "3", "cone", sides[s % 2], s, fault) for fault, s in product(FAULTS, seeds)]
+    groups: dict[str, list[Result]] = {}
+    with ProcessPoolExecutor(args.jobs, mp_context=get_context("spawn")) as pool:
+        for result in pool.map(do, jobs):
+            job = result.job
+            name = {
+                "study": f"{job.method}, {job.model}",
+                "start": f"start: {job.method}, {job.model}",
+                "arenas": "arenas",
+                "faults": f"fault {job.fault}",
+            }[job.part]
+            groups.setdefault(name, []).append(result)
+    figures = {name: summary(results) for name, results in groups.items()}
+    for name, row in figures.items():
+        print(name, row)
+        for text, count in Counter(
+            r.run.text for r in groups[name] if r.run.reason is not Reason.BEHAVIOUR_DONE
+        ).items():
+            print(f"    {count} x {text}")
+    broken = [row["contacts"] for name, row in figures.items() if name.startswith("fault ")]
+    if broken:
+        figures["faults"] = {"contacts": sum(broken)}
     if args.figure:
-        _draw(arena, first, args.figure)
-    print(json.dumps({"model": args.model, "seeds": args.seeds, "methods": table}))
+        _draw({name: results[0] for name, results in groups.items() if results[0].job.part == "start"}, args.figure)
+    goals = {key: goal for key, goal in GOALS.items() if key.split(": ")[0] in figures}
+    met = all(_figure(figures, key) is not None and _figure(figures, key) <= goal + 1e-3 for key, goal in goals.items())
+    print(json.dumps({"bench": "wall_following", "seeds": args.seeds, "figures": figures, "goals": goals, "met": met}))
     return 0
 
 
-def _draw(arena: Arena, runs: dict[str, Outcome], file: str) -> None:
-    figure, axes = plt.subplots(2, len(runs), figsize=(5 * len(runs), 8), squeeze=False)
-    for column, (name, outcome) in enumerate(runs.items()):
+def _figure(figures: dict[str, dict[str, Any]], key: str) -> Any:
+    row, name = key.split(": ")
+    return figures[row][name]
+
+
+def _draw(first: dict[str, Result], file: str) -> None:
+    figure, axes = plt.subplots(3, len(first), figsize=(5 * len(first), 11), squeeze=False)
+    arena = study()
+    for column, (name, result) in enumerate(first.items()):
+        track, asked = result.run.track, result.run.asked
         for wall in arena.walls:
             axes[0, column].plot(wall[::2], wall[1::2], "k")
-        axes[0, column].plot(outcome.track[:, 0], outcome.track[:, 1])
-        axes[0, column].set(title=name, aspect="equal", xlabel="x, m", ylabel="y, m")
-        axes[1, column].plot(np.arange(len(outcome.track)) * PERIOD, outcome.track[:, 2] * 1000)
-        axes[1, column].set(xlabel="s", ylabel="distance error, mm", ylim=(-60, 60))
+        axes[0, column].plot(track[:, 0], track[:, 1])
+        axes[0, column].set(
+            title=f"method {name.removeprefix('start: ')}", aspect="equal", xlabel="x, m", ylabel="y, m"
+        )
+        axes[1, column].plot(track[:, 3], result.errors * 1000)
+        axes[1, column].set(xlabel="time, s", ylabel="distance error on straights, mm", ylim=(-60, 60))
+        times = np.arange(len(asked)) * result.run.period
+        axes[2, column].plot(times, asked[:, 0], label="speed, m/s")
+        axes[2, column].plot(times, asked[:, 1], label="yaw rate, rad/s", linewidth=0.7)
+        axes[2, column].set(xlabel="time, s", ylim=(-1.2, 1.2))
+        axes[2, column].legend()
     figure.tight_layout()
-    figure.savefig(file, dpi=80)
+    figure.savefig(file, dpi=60)
 
 
 if __name__ == "__main__":

@@ -33,11 +33,77 @@ class Arena(NamedTuple):
     """(2, 2): ends of the gap."""
 
 
+def start_rule(first: int, second: int) -> tuple[float, str]:
+    """The study's start from the last digits of two numbers: heading, rad, and the side where the wall is.
+
+    Heading is the sum modulo pi; an even sum is a clockwise lap, with the wall on the left.
+    """
+    total = first + second
+    return total % math.pi, "right" if total % 2 else "left"
+
+
 def study(acute: float = math.radians(70.0)) -> Arena:
     """A parallelogram: two corners of ``acute``, two of its supplement (110 degrees)."""
     shape = _parallelogram(1.0, acute)
     size = (PATH + _shrink(shape)) / _perimeter(shape)
     return _walled(shape * size)
+
+
+def drawn(seed: int) -> Arena:
+    """An arena of four or five walls with corners of 50 to 130 degrees, a door of 0.8 to 1 m, and a pillar."""
+    rng = np.random.default_rng([seed, 22])
+    while True:
+        count = int(rng.integers(4, 6))
+        angles = np.radians(rng.uniform(50.0, 130.0, count))
+        angles += (math.pi * (count - 2) - angles.sum()) / count
+        if angles.min() < math.radians(50) or angles.max() > math.radians(130):
+            continue
+        # Clockwise: every corner turns right by pi less its inner angle.
+        headings = math.pi / 2 - np.concatenate([[0.0], np.cumsum(math.pi - angles[:-1])])
+        ways = np.column_stack([np.cos(headings), np.sin(headings)])
+        lengths = rng.uniform(4.0, 8.0, count - 2)
+        rest = -(ways[:-2] * lengths[:, None]).sum(axis=0)
+        last = np.linalg.solve(ways[-2:].T, rest)
+        sides = np.concatenate([lengths, last])
+        if sides.min() < 3.0 or sides.max() > 12.0:
+            continue
+        corners = np.concatenate([[(0.0, 0.0)], np.cumsum(ways[:-1] * sides[:-1, None], axis=0)])
+        corners -= corners.mean(axis=0)
+        if _least(corners, np.zeros(2)) < 1.5:
+            continue
+        return _furnished(corners, rng)
+
+
+def _furnished(corners: Array, rng: np.random.Generator) -> Arena:
+    """Walls with a door in one of them and a square pillar that leaves room along all walls and round the start."""
+    ends, door = np.roll(corners, -1, axis=0), int(rng.integers(len(corners)))
+    walls = [(*a, *b) for i, (a, b) in enumerate(zip(corners, ends, strict=True)) if i != door]
+    a, b = corners[door], ends[door]
+    length = float(np.linalg.norm(b - a))
+    along = (b - a) / length
+    out, width = np.array([-along[1], along[0]]), float(rng.uniform(0.8, 1.0))
+    first = a + along * float(rng.uniform(1.0, length - 1.0 - width))
+    second = first + along * width
+    back = first + DEPTH * out, second + DEPTH * out
+    walls += [(*a, *first), (*second, *b), (*first, *back[0]), (*back[0], *back[1]), (*back[1], *second)]
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    for _ in range(200):
+        middle, half = rng.uniform(low, high), float(rng.uniform(0.1, 0.2))
+        if _least(corners, middle) > 0.85 + half * math.sqrt(2) and float(np.linalg.norm(middle)) > 1.2:
+            turned = float(rng.uniform(0.0, math.pi / 2))
+            square = middle + half * math.sqrt(2) * np.array([
+                (math.cos(turned + k * math.pi / 2), math.sin(turned + k * math.pi / 2)) for k in range(4)
+            ])  # fmt: skip
+            walls += [(*p, *q) for p, q in zip(square, np.roll(square, -1, axis=0), strict=True)]
+            break
+    return Arena(np.array(walls), corners, _angles(corners), np.array([first, second]))
+
+
+def _least(corners: Array, point: Array) -> float:
+    """Least distance of a point inside from the lines of the walls, m; negative outside."""
+    along = np.roll(corners, -1, axis=0) - corners
+    along /= np.linalg.norm(along, axis=1)[:, None]
+    return float((along[:, 1] * (point - corners)[:, 0] - along[:, 0] * (point - corners)[:, 1]).min())
 
 
 def _parallelogram(ratio: float, acute: float) -> Array:
@@ -94,15 +160,6 @@ def rays(walls: Array, xs: Array, ys: Array, angles: Array, reach: float) -> Arr
         if ranges[i] > reach:
             ranges[i] = np.inf
     return ranges
-
-
-def distance(walls: Array, x: float, y: float) -> Array:
-    """(n,) distances of a point from each wall, m."""
-    a, e = walls[:, :2], walls[:, 2:] - walls[:, :2]
-    part = np.clip(((np.array([x, y]) - a) * e).sum(axis=1) / (e * e).sum(axis=1), 0.0, 1.0)
-    nearest = a + part[:, None] * e
-    found: Array = np.hypot(nearest[:, 0] - x, nearest[:, 1] - y)
-    return found
 
 
 @njit(cache=True)

@@ -50,10 +50,14 @@ class WallPdConfig(WallConfig):
     """Front range at which it turns away, m"""
     offset: Annotated[float, Field(ge=0, le=1)] = 0.0
     """Distance of the diagonal sonar ahead of the side one in the angle to the wall, m: 0 as published, 0.05 exact"""
-    safety: Metres = 0.12
-    """Range of the far diagonal sonar at which it turns away as well, m: for looking into a gap; our figure"""
+    safety: Metres = 0.2
+    """Range of the far diagonal sonar at which it turns away as well, m: for looking into a gap; our figure, above the
+    least range of the sonars"""
     seen: Metres = 0.45
-    """Side ranges below which the new wall is seen, m; our figure"""
+    """Side ranges below which the wall is seen, m; our figure"""
+    gap: Annotated[float, Field(ge=0, le=5)] = 0.0
+    """Way over which a side sonar whose range jumped up looks into a gap and does not count, m; 0 as published: the
+    robot turns into gaps"""
     free: Metres = 0.8
     """Front range from which the way is free again, m; our figure"""
 

@@ -288,7 +288,7 @@ class WallLine:
     # Walls
 
     def _estimate(self, state: LineState, cone: Cone) -> LineState:
-        """EstimateFit the wall beside and the one ahead anew."""
+        """Fit the wall beside and the one ahead anew."""
         echoes, at = state.echoes, state.pose[:2]
         if state.phase == "turn":
             fit = self._turned_to(state, cone)

@@ -26,6 +26,10 @@ SAME_WAY: Final = 1.2
 """Greatest difference of the heading from that at the lap's beginning, rad: the robot weaves."""
 FOLLOWING: Final = ("follow", "free")
 """Phases in which a lap may begin: the robot drives along the wall."""
+JUMP: Final = 0.15
+"""Growth of a range from one step to the next by which a sonar begins to look into a gap, m."""
+BACK: Final = 0.05
+"""Diagonal range times cos 45 degrees less side range below which it ends, m."""
 AT_REST: Final = 0.01
 """m/s."""
 
@@ -84,6 +88,10 @@ class WallState:
     laps: int = 0
     turned_before: float = 0.0
     """``turned`` when the present phase began, rad."""
+    before: Ranges | None = None
+    """Of the step before."""
+    gaps: tuple[float | None, float | None] = (None, None)
+    """``travelled`` when side and diagonal sonar began to look into a gap."""
     asked: float = 0.0
     """Speed asked for at the step before, m/s."""
     moving_since: float | None = None
@@ -148,6 +156,8 @@ class _Wall(ABC):
             v=ramp(t, *v, duration),
             w=ramp(t, *w, duration),
             error=None,
+            before=None,
+            gaps=(None, None),
             turned_before=state.turned,
             begun=begun,
             since=0.0 if state.begun is None else state.since,
@@ -195,23 +205,46 @@ class WallPd(_Wall):
         if state.phase == "approach":
             if blocked:
                 state = self._to(state, "turn_away", t, (config.speed, 0.0), (0.0, -config.turn_rate))
-            elif ranges.side < config.seen and ranges.diagonal < config.seen / math.cos(DIAGONAL):
+            elif self._sees(ranges):
                 state = self._to(state, "follow", t, (config.speed, config.speed), (0.0, 0.0))
             else:
                 return _approach(state, config, t)
         elif state.phase == "follow" and blocked:
             state = self._to(state, "turn_away", t, (config.speed, 0.0), (0.0, -config.turn_rate))
-        elif state.phase == "turn_away":
-            seen = ranges.side < config.seen and ranges.diagonal < config.seen / math.cos(DIAGONAL)
-            if seen and ranges.front > config.free:
-                state = self._to(state, "follow", t, (0.0, config.speed), (0.0, 0.0))
+        elif state.phase == "turn_away" and self._sees(ranges) and ranges.front > config.free:
+            state = self._to(state, "follow", t, (0.0, config.speed), (0.0, 0.0))
         assert state.v is not None
         assert state.w is not None
         if state.phase == "turn_away":
             return state, state.v.at(t), state.w.at(t)
-        error = self._distance(ranges) - config.distance
+        state = self._gaps(state, ranges)
+        side, diagonal = state.gaps
+        if side is not None:
+            return replace(state, error=None), state.v.at(t), 0.0
+        distance = ranges.side if diagonal is not None else self._distance(ranges)
+        error = distance - config.distance
         change = 0.0 if state.error is None else error - state.error
         return replace(state, error=error), state.v.at(t), config.k_p * error + config.k_d * change
+
+    def _gaps(self, state: WallState, ranges: Ranges) -> WallState:
+        """Which sonars look into a gap: from a jump up on, until they measure the wall again or it is too long."""
+        before, (side, diagonal), now = state.before or ranges, state.gaps, state.travelled
+        if ranges.side - before.side > JUMP:
+            side = now
+        elif ranges.side < self._config.seen:
+            side = None
+        if ranges.diagonal - before.diagonal > JUMP:
+            diagonal = now
+        elif ranges.diagonal * math.cos(DIAGONAL) - ranges.side < BACK:
+            diagonal = None
+        gaps = tuple(
+            since if since is not None and now - since < self._config.gap else None for since in (side, diagonal)
+        )
+        return replace(state, before=ranges, gaps=(gaps[0], gaps[1]))
+
+    def _sees(self, ranges: Ranges) -> bool:
+        """Whether side and diagonal sonar measure the wall."""
+        return ranges.side < self._config.seen and ranges.diagonal < self._config.seen / math.cos(DIAGONAL)
 
 
 class WallSwitching(_Wall):

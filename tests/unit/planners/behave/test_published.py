@@ -147,3 +147,12 @@ def test_a_range_at_the_sonars_limit_may_repeat():
 def test_settings_that_make_no_sense_are_refused(field, value):
     with pytest.raises(ValidationError, match=field):
         WallPdConfig(**{field: value})
+
+
+@pytest.mark.parametrize(("gap", "astray"), [(0.0, True), (0.6, False)])
+def test_a_gap_is_passed_straight_on_if_that_is_asked_for(gap, astray):
+    recess = [(0.0, 0.35, 0.0, 1.85), (0.0, 1.85, 0.4, 1.85), (0.4, 1.85, 0.4, 0.35)]
+    walls = [(-10.0, 0.35, 0.0, 0.35), (0.4, 0.35, 9.0, 0.35), *recess]
+    robot = Robot(walls, (-1.0, 0.0, 0.0), ahead=0.05)
+    done = drive(WallPd(WallPdConfig(offset=0.05, gap=gap)), robot, 12.0)
+    assert (np.abs(done.poses[:, 1]).max() > 0.04) == astray
