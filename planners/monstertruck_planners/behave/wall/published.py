@@ -217,14 +217,15 @@ class WallPd(_Wall):
         assert state.w is not None
         if state.phase == "turn_away":
             return state, state.v.at(t), state.w.at(t)
+        v = state.v.at(t)
         state = self._gaps(state, ranges)
         side, diagonal = state.gaps
         if side is not None:
-            return replace(state, error=None), state.v.at(t), 0.0
+            return replace(state, error=None), v, 0.0
         distance = ranges.side if diagonal is not None else self._distance(ranges)
         error = distance - config.distance
         change = 0.0 if state.error is None else error - state.error
-        return replace(state, error=error), state.v.at(t), config.k_p * error + config.k_d * change
+        return replace(state, error=error), v, config.k_p * error + config.k_d * change
 
     def _gaps(self, state: WallState, ranges: Ranges) -> WallState:
         """Which sonars look into a gap: from a jump up on, until they measure the wall again or it is too long."""
