@@ -157,6 +157,16 @@ def errors_along(arena: Arena, track: Array) -> Array:
     return errors
 
 
+def row_of(job: Job) -> str:
+    """Name of the row to which a run belongs."""
+    return {
+        "study": f"{job.method}, {job.model}",
+        "start": f"start: {job.method}, {job.model}",
+        "arenas": "arenas",
+        "faults": f"fault {job.fault}",
+    }[job.part]
+
+
 def summary(results: list[Result]) -> dict[str, Any]:
     """Figures of the runs of one row."""
     done = [r for r in results if r.run.reason is Reason.BEHAVIOUR_DONE]
@@ -194,10 +204,11 @@ def main() -> int:
         "--only", choices=("study", "arenas", "faults"), nargs="+", default=("study", "arenas", "faults")
     )
     parser.add_argument("--method", choices=("1", "2", "3"), nargs="+", default=("1", "2", "3"))
+    parser.add_argument("--model", choices=("beam", "cone"), nargs="+", default=("beam", "cone"))
     parser.add_argument("--figure", help="PNG of the runs of `start`")
     args = parser.parse_args()
     sides, jobs = ("left", "right"), []
-    rows = [row for row in METHODS if row[0][0] in args.method]
+    rows = [row for row in METHODS if row[0][0] in args.method and row[1] in args.model]
     if "study" in args.only:
         jobs += [Job("study", *row, side, s) for row, s, side in product(rows, range(args.seeds), sides)]
     if "start" in args.only:
@@ -210,23 +221,19 @@ def main() -> int:
         seeds = range(min(args.seeds, FAULT_SEEDS))
         jobs += [Job("faults", "3", "cone", sides[s % 2], s, fault) for fault, s in product(FAULTS, seeds)]
     groups: dict[str, list[Result]] = {}
+    figures: dict[str, dict[str, Any]] = {}
+    expected = Counter(row_of(job) for job in jobs)
     with ProcessPoolExecutor(args.jobs, mp_context=get_context("spawn")) as pool:
         for result in pool.map(do, jobs):
-            job = result.job
-            name = {
-                "study": f"{job.method}, {job.model}",
-                "start": f"start: {job.method}, {job.model}",
-                "arenas": "arenas",
-                "faults": f"fault {job.fault}",
-            }[job.part]
-            groups.setdefault(name, []).append(result)
-    figures = {name: summary(results) for name, results in groups.items()}
-    for name, row in figures.items():
-        print(name, row)
-        for text, count in Counter(
-            r.run.text for r in groups[name] if r.run.reason is not Reason.BEHAVIOUR_DONE
-        ).items():
-            print(f"    {count} x {text}")
+            name = row_of(result.job)
+            results = groups.setdefault(name, [])
+            results.append(result)
+            if len(results) == expected[name]:
+                figures[name] = summary(results)
+                print(name, figures[name], flush=True)
+                ends = Counter(r.run.text for r in results if r.run.reason is not Reason.BEHAVIOUR_DONE)
+                for text, count in ends.items():
+                    print(f"    {count} x {text or 'no end, or a contact'}", flush=True)
     broken = [row["contacts"] for name, row in figures.items() if name.startswith("fault ")]
     if broken:
         figures["faults"] = {"contacts": sum(broken)}

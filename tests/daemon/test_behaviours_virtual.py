@@ -20,7 +20,7 @@ from monstertruckd.tools.simulation.operator import LocalOperator
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 from tests.unit.planners.behave.wall_kit import sonars
 
-pytestmark = [pytest.mark.virtual, pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.virtual, pytest.mark.timeout(300)]
 
 FILE = Path(__file__).resolve().parents[2] / "configs" / "robots" / "differential.yaml"
 PLACES = {"l": (0.1, 0.05, 90), "fl": (0.15, 0.05, 45), "f": (0.2, 0.0, 0), "fr": (0.15, -0.05, -45)}
@@ -125,9 +125,11 @@ def test_the_robot_with_five_sonars_follows_a_wall_of_the_yard_by_its_own_device
     assert 3.5 - 0.05 - truth[-40:, 2].mean() == pytest.approx(0.30, abs=0.03)  # of the sonar from the wall
 
 
-def test_method_3_finds_a_wall_of_the_yard_passes_a_niche_and_turns_in_a_corner_by_its_own_devices():
+def along_the_yard(start, seconds, *, fault=None, at=14.0):
+    """Method 3 by the robot's own devices; after so many seconds a fault acts on the rig."""
     config, _ = load_config(FILE.with_name("sonar.yaml"), SimulatedTruckConfig)
-    config = with_overlay(config, {"recorder": None, "sim": {"world": {"start": {"x": 1.6, "y": 0.7, "yaw": 0.4}}}})
+    x, y, yaw = start
+    config = with_overlay(config, {"recorder": None, "sim": {"world": {"start": {"x": x, "y": y, "yaw": yaw}}}})
 
     async def main(clock: VirtualClock):
         rig = VirtualRig(config, clock)
@@ -138,11 +140,18 @@ def test_method_3_finds_a_wall_of_the_yard_passes_a_niche_and_turns_in_a_corner_
                 await operator.arm()
                 order = {**await operator.header(), "order": BehaviourOrder.START, "behaviour": "line_left"}
                 await operator.call("behave", order)
-                await clock.sleep(38.0)
+                await clock.sleep(min(at, seconds))
+                if fault is not None:
+                    fault(rig)
+                await clock.sleep(max(seconds - at, 0.0))
                 truth = rig.truth.array()
             return list(states.drain()), truth
 
-    states, truth = run_virtual(main, start=SECOND)
+    return run_virtual(main, start=SECOND)
+
+
+def test_method_3_finds_a_wall_of_the_yard_passes_a_niche_and_turns_in_a_corner_by_its_own_devices():
+    states, truth = along_the_yard((1.6, 0.7, 0.4), 38.0)
     assert states[-1].running or states[-1].outcome is Reason.SHUTDOWN
     assert not truth[:, 5].any()
     phases = [state.phase for state in states]
@@ -152,3 +161,21 @@ def test_method_3_finds_a_wall_of_the_yard_passes_a_niche_and_turns_in_a_corner_
     south = (truth[:, 2] < 0.0) & (truth[:, 2] > -2.6) & (np.abs(truth[:, 3] + np.pi / 2) < 0.1)
     assert south.sum() > 100
     assert np.abs(3.5 - sides[south] - 0.30).max() < 0.015
+
+
+@pytest.mark.parametrize(
+    ("fault", "outcome"),
+    [
+        (lambda rig: rig.ports["imu"].unplug(), Reason.INPUT_STALE),
+        (lambda rig: rig.robot.emulators["sonar"].inject("dead", "l", "on"), Reason.INPUT_STALE),
+        (lambda rig: rig.robot.emulators["sonar"].inject("stuck", "fl", "on"), Reason.INPUT_CONTRADICTORY),
+    ],
+    ids=["imu unplugged", "sonar dead", "sonar stuck"],
+)
+def test_a_fault_along_a_wall_stops_method_3_with_its_reason(fault, outcome):
+    states, truth = along_the_yard((2.6, 1.0, 0.3), 20.0, fault=fault)
+    assert any(state.phase == "follow" for state in states)
+    assert not states[-1].running
+    assert states[-1].outcome is outcome
+    assert not truth[:, 5].any()
+    assert np.abs(np.diff(truth[-20:, 1:3], axis=0)).max() < 1e-3
