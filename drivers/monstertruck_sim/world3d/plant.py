@@ -19,6 +19,8 @@ from monstertruck_sim.world.plant import SERVO_FRAME_NS, GriddedPlant, Pose, Vec
 from monstertruck_sim.world3d.model import TIMESTEP, DriveLine, Group
 
 _FREED: Final = 0.005
+_STANDING: Final = 0.01
+"""Slower than this, m/s, it has not run into what it touches."""
 _FELT: Final = 0.05
 """Time constant with which an accelerometer feels the body's acceleration, s: its mount and filter."""
 _SETTLE: Final = 400
@@ -197,7 +199,7 @@ class RigidPlant(GriddedPlant):
         if self.data.ncon:
             touching = bool(self._solid[self.data.contact.geom].any())
         if touching:
-            if self._stuck_at is None:
+            if self._stuck_at is None and hypot(*self._twist[:2]) > _STANDING:
                 self.on_blocked(self._pose, self._twist)
             self._stuck_at = self._pose
         elif self._stuck_at is not None:

@@ -1,0 +1,64 @@
+"""Beams leave from where the moving robot is, and robots that share a world see and stop each other."""
+
+from math import cos, pi
+
+import numpy as np
+import pytest
+
+from monstertruck_schemas.base import Pose2D
+from monstertruck_sim.world.config import WorldConfig
+from monstertruck_sim.world.world import World, make_scene
+
+SECOND = 1_000_000_000
+RPM = 644 / (2 * pi * 0.075) * 60
+
+
+def test_every_beam_of_a_sweep_leaves_from_where_the_robot_is_then(solid):
+    """Towards a wall at 0.2 m/s the last beams begin 13 mm nearer than the first ones."""
+    driver = solid(walls=[(3.0, -5.0, 3.2, 5.0)])
+    driver.drive(0.2)
+    driver.wait(2.0)
+    begin = driver.now
+    places = []
+    for _ in range(51):
+        truth = driver.world.truth(driver.now)
+        places.append((truth.x, truth.yaw))
+        driver.wait(0.002)
+    driver.wait(0.05)
+    scan = driver.world.lidar.scan(begin) / 1000
+    for step in range(300, 470, 10):
+        at, yaw = (np.interp(step * 0.1 / 1024, np.arange(51) * 0.002, row) for row in np.transpose(places))
+        assert scan[step] == pytest.approx((3.0 - at - 0.14) / cos(yaw + (step - 384) * 2 * pi / 1024), abs=0.001)
+    assert places[-1][0] - places[0][0] == pytest.approx(0.02, abs=0.001)
+
+
+def pair(gap):
+    configs = [
+        WorldConfig(engine="mujoco", map="yard", noise=False, start=Pose2D(x=x, y=0.0, yaw=0.0)) for x in (0.0, gap)
+    ]
+    scene = make_scene(configs[0], 1)
+    return [World(config, 1, scene, f"robot_{i}") for i, config in enumerate(configs)]
+
+
+def test_robots_see_each_other_and_the_one_behind_is_stopped():
+    behind, ahead = pair(1.0)
+    assert behind.lidar.scan(0)[384] == pytest.approx(1000 - 140 - 235, abs=2)
+    behind.motor.command(0, -0.2 * RPM, 20_000.0)
+    for tenth in range(1, 60):
+        behind.truth(tenth * SECOND // 10)
+        ahead.truth(tenth * SECOND // 10)
+    truth = behind.truth(6 * SECOND)
+    assert truth.stuck
+    assert truth.x == pytest.approx(1.0 - 0.47, abs=0.02)
+    assert [contact.other for contact in behind.scene.contacts] == ["robot_1"]
+
+
+def test_a_robot_that_drives_away_is_followed_to_where_it_is():
+    behind, ahead = pair(0.8)
+    ahead.motor.command(0, -0.2 * RPM, 20_000.0)
+    behind.motor.command(0, -0.2 * RPM, 20_000.0)
+    for tenth in range(1, 60):
+        behind.truth(tenth * SECOND // 10)
+        ahead.truth(tenth * SECOND // 10)
+    assert behind.truth(6 * SECOND).x == pytest.approx(ahead.truth(6 * SECOND).x - 0.8, abs=0.01)
+    assert not behind.truth(6 * SECOND).stuck
