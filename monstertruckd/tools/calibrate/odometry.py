@@ -16,7 +16,7 @@ import numpy as np
 from monstertruck_kinematics.chassis import TruckChassis
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.fitting import FitResult, least_squares
-from monstertruck_runtime.errors import RequestRefusedError
+from monstertruck_runtime.errors import InputError, RequestRefusedError
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.config.calibration import STEERING, Estimate, Result
 from monstertruckd.tools.calibrate.statistics import Interval, known_errors
@@ -267,8 +267,14 @@ class SquareModel:
 
 
 def intervals(fit: FitResult, measured: int) -> tuple[Interval, Interval, Interval]:
-    """Of way and wheelbase (shares) and offset (rad), from so many measurements."""
+    """Of way and wheelbase (shares) and offset (rad), from so many measurements.
+
+    Raises:
+        InputError: they are off by more than a fit may find.
+    """
     halves = known_errors(fit, measured - fit.parameters.size)
+    if not np.isfinite(halves).all():
+        raise InputError("the squares are off by more than 30 %: calibrate drive and steering first")
     way, base, offset = (Interval(float(x), float(h)) for x, h in zip(fit.parameters, halves, strict=True))
     return way, base, offset
 

@@ -135,7 +135,7 @@ def result_of(arcs: Sequence[SkidArc], radius: float, half_track: float) -> Resu
     turns = np.array([arc.motion[2] for arc in arcs])
     if len(arcs) < 4 or not ((turns > 0.3).any() and (turns < -0.3).any()):
         raise InputError(f"{len(arcs)} arcs: expected at least 4, to both sides")
-    model = skid_model("icr and slip", radius, half_track, with_icr_x=True)
+    model = skid_model("icr and slip", radius, half_track, bounded=False, with_icr_x=True)
     seen = np.array([arc.motion for arc in arcs]).T
     ways = np.array([radius * max(abs(arc.left), abs(arc.right)) for arc in arcs])
     place = np.hypot([max(arc.sigma[0], FLOOR) for arc in arcs], SLIDING * ways)
@@ -151,6 +151,8 @@ def result_of(arcs: Sequence[SkidArc], radius: float, half_track: float) -> Resu
 
     fit = least_squares(residual, model.start, model.lower, model.upper)
     halves = known_errors(fit, fit.residuals.size - fit.parameters.size)
+    if not np.isfinite(halves).all():
+        raise InputError("the arcs do not tell all turning centres: drive more of them, of several radii")
     values = dict(zip(model.parameters, fit.parameters.tolist(), strict=True))
     errors = dict(zip(model.parameters, halves.tolist(), strict=True))
     tilt = math.sqrt(values["slip_ratio"])

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from monstertruckd.tools.cli.options import complete_config
-from monstertruckd.tools.cli.output import JsonOption, console, finish, print_json
+from monstertruckd.tools.cli.output import JsonOption, console, finish, print_json, remark
 
 if TYPE_CHECKING:
     from monstertruckd.tools.doctor.context import Finding, HostContext
@@ -27,6 +27,10 @@ def doctor(
         ),
     ] = None,
     root: Annotated[Path, typer.Option("--root", help="Look at the system in this folder instead.")] = Path("/"),
+    fix: Annotated[
+        bool, typer.Option("--fix", help="Run the safe ones of the commands that fix something, each after asking.")
+    ] = False,
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="With --fix: without asking.")] = False,
     json_output: JsonOption = False,
 ) -> None:
     """Check the computer: software, service, rights, cables, devices, clock, disk, network.
@@ -43,6 +47,8 @@ def doctor(
         print_json({"reason": reason, "findings": findings})
     else:
         _print(findings)
+    if fix:
+        _mend(findings, yes=yes)
     finish(reason, f"not ready to drive: {reason.text}")
 
 
@@ -51,7 +57,7 @@ async def _run_checks(context: "HostContext") -> "list[Finding]":
 
     Nothing moves; nothing is changed but the latency of adapters through which devices are asked.
     """
-    from monstertruckd.tools.doctor import computer, devices, software
+    from monstertruckd.tools.doctor import computer, devices, history, software
 
     return [
         *software.python(context),
@@ -65,8 +71,27 @@ async def _run_checks(context: "HostContext") -> "list[Finding]":
         *computer.calendar(context),
         *computer.condition(context),
         *computer.link(context),
+        *computer.wireless(context),
         *computer.access(context),
+        *computer.card(context),
+        *history.calibration(context),
+        *history.newest_log(context),
     ]
+
+
+def _mend(findings: "Sequence[Finding]", *, yes: bool) -> None:
+    """Run what mends something and can break nothing, one after the other."""
+    import subprocess
+
+    from monstertruckd.tools.doctor.context import Level, safe_fix
+
+    for finding in findings:
+        if finding.level is Level.OK or (arguments := safe_fix(finding.fix)) is None:
+            continue
+        if not (yes or typer.confirm(f"{finding.check}: run {finding.fix}?", err=True)):
+            continue
+        code = subprocess.run(arguments, check=False).returncode  # noqa: S603  # from a list of our own commands
+        remark(f"{finding.check}: {'done' if code == 0 else f'ended with {code}'}; run `monstertruckd doctor` again")
 
 
 def _print(findings: "Sequence[Finding]") -> None:

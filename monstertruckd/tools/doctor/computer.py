@@ -1,6 +1,7 @@
 """Checks of the computer: clock, disk, temperature, memory, network, and who may reach the daemon."""
 
 import os
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
@@ -27,6 +28,10 @@ YEAR_2024: Final = 1_704_067_200 * SECOND
 GIGABYTE: Final = 1e9
 MONTH: Final = 30
 """Days."""
+NETWORKS: Final = Path("/etc/NetworkManager/system-connections")
+SUPPLICANT: Final = Path("/etc/wpa_supplicant/wpa_supplicant.conf")
+WORN: Final = 8
+"""Tenths of its life from which on a card is to be replaced."""
 LISTEN: Final = "0A"
 """State of a listening socket in /proc/net/tcp."""
 
@@ -98,6 +103,51 @@ def link(context: HostContext) -> Iterator[Finding]:
         yield warn("link", Reason.LINK_WEAK, seen, "iw dev | grep -A9 Interface")
     else:
         yield fine("link", seen)
+
+
+def wireless(context: HostContext) -> Iterator[Finding]:
+    """Networks that the computer joins by itself without a key, or with one of WEP; only of files that can be read."""
+    found: dict[str, str] = {}
+    for file in sorted(context.at(NETWORKS).glob("*.nmconnection")):
+        text = text_of(file) or ""
+        if "[wifi]" in text:
+            found[file.stem] = _security(text, "key-mgmt=none", "[wifi-security]")
+    text = text_of(context.at(SUPPLICANT)) or ""
+    for block in re.findall(r"network=\{(.*?)\}", text, re.DOTALL):
+        named = re.search(r'ssid="([^"]*)"', block)
+        found[named[1] if named is not None else "network"] = _security(block, "wep_key0", "psk=")
+    for name, kind in found.items():
+        if kind:
+            yield warn("wireless", Reason.LINK_OPEN, f"{name} is {kind}: anybody near can listen and speak; use WPA2")
+    if found and not any(found.values()):
+        yield fine("wireless", f"{', '.join(found)}: with a key")
+
+
+def _security(text: str, weak: str, keyed: str) -> str:
+    """What is wrong with a network's protection; empty: nothing."""
+    plain = text.replace(" ", "")
+    if weak in plain:
+        return "WEP"
+    return "" if keyed in plain or "key_mgmt=WPA" in plain or "key_mgmt=SAE" in plain else "open"
+
+
+def card(context: HostContext) -> Iterator[Finding]:
+    """Wear of eMMC storage, as far as it says so itself (JEDEC: tenths of its life; 2 and 3: end of life near)."""
+    for folder in sorted((context.computer.root / "sys/block").glob("mmcblk*")):
+        life = (text_of(folder / "device/life_time") or "").split()
+        end = text_of(folder / "device/pre_eol_info") or ""
+        try:
+            tenths = max((int(word, 16) for word in life), default=0)
+            worn = int(end.strip() or "0", 16)
+        except ValueError:
+            continue
+        if not tenths:
+            continue
+        seen = f"{folder.name}: {10 * (tenths - 1)} to {10 * tenths} % of its life is used"
+        if tenths >= WORN or worn > 1:
+            yield warn("card", Reason.RECORDING_FAILED, f"{seen}: copy it to a new one")
+        else:
+            yield fine("card", seen)
 
 
 def access(context: HostContext) -> Iterator[Finding]:

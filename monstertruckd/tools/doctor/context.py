@@ -10,6 +10,7 @@ from enum import StrEnum
 from importlib import metadata
 from itertools import pairwise
 from pathlib import Path
+from typing import Final
 
 from monstertruck_drivers.computer import ROOT, Computer
 from monstertruck_drivers.config import AnyPort
@@ -111,6 +112,20 @@ def warn(check: str, reason: Reason, seen: str, fix: str | None = None) -> Findi
 def fail(check: str, reason: Reason, seen: str, fix: str | None = None) -> Finding:
     """A check that failed."""
     return Finding(check=check, level=Level.FAIL, reason=reason, seen=seen, fix=fix)
+
+
+SAFE_PROGRAMS: Final = ("timedatectl", "chmod", "chown", "usermod", "modprobe")
+"""Programs whose calls in findings change what a finding names, and nothing else."""
+
+
+def safe_fix(fix: str | None) -> list[str] | None:
+    """Arguments of a finding's command where it may be run unseen: no shell, no file to be named; None otherwise."""
+    if fix is None or any(sign in fix for sign in "|&;<>$`") or "FILE" in fix:
+        return None
+    words = shlex.split(fix)
+    called = words[1:] if words[:1] == ["sudo"] else words
+    ours = called[1:4] == ["-m", "monstertruckd", "install-service"]
+    return words if ours or (called and called[0] in SAFE_PROGRAMS) else None
 
 
 def first_failure(findings: list[Finding]) -> Reason:

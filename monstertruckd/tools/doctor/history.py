@@ -1,0 +1,153 @@
+"""Checks of what the robot has written: its calibration, and its newest log."""
+
+import math
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from monstertruck_runtime.errors import ConfigError, TruckError
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.topics import CMD_STEERING, COMPASS, EVENT, IMU, ODOMETRY
+from monstertruckd.config.calibration import CalibrationStore
+from monstertruckd.config.expiry import WayCounter, state_of
+from monstertruckd.recorder.reader import open_log
+from monstertruckd.tools.doctor.context import Finding, HostContext, fail, fine, warn
+
+MOST_BYTES: Final = 200_000_000
+"""Longer logs are left to `log report`."""
+LEAST_TURN: Final = 1.0
+"""Rad in all that tell a sign."""
+SATURATED: Final = 0.2
+"""Share of the commands at a limit of an axle."""
+AT_LIMIT: Final = math.radians(0.5)
+COUNTED: Final = {
+    Reason.DEVICE_RESTARTED: ("brown-out", "a device lost its supply and came back: measure it while the motor starts"),
+    Reason.CLOCK_STEPPED: ("clock steps", "the real time jumped: set it before the drive, or log dates are wrong"),
+    Reason.HOST_THROTTLED: ("throttled", "the processor was throttled: heat, or a weak supply"),
+    Reason.OVER_CURRENT: ("over-current", "a hub's port was overloaded: use a supplied hub"),
+}
+"""Events of a log that are findings, with their check and what they mean."""
+
+
+def calibration(context: HostContext) -> Iterator[Finding]:
+    """How well and how long ago each wizard's values were measured."""
+    config = context.config
+    if config is None:
+        return
+    folder = config.calibration_folder
+    place = context.at(folder) if folder.is_absolute() else context.logs().parent / folder
+    try:
+        file = CalibrationStore(place, config.robot).current()
+    except ConfigError as error:
+        yield fail("calibration", Reason.BAD_CONFIG, str(error))
+        return
+    everything = context.command("calibrate", "all")
+    if file is None:
+        yield warn("calibration", Reason.CALIBRATION_EXPIRED, f"none in {place}", everything)
+        return
+    counter = WayCounter(place.parent / "odometer.json")
+    counter.load()
+    clock = context.computer.machine.clock
+    now = clock.now() + clock.real_offset()
+    for name, result in file.results.items():
+        state = state_of(result, config, now, counter.metres)
+        again = context.command("calibrate", name)
+        if state.expired:
+            yield warn(f"calibration {name}", Reason.CALIBRATION_EXPIRED, state.expired, again)
+        elif state.grade == "C":
+            seen = "grade C: its intervals are more than twice as wide as meant"
+            yield warn(f"calibration {name}", Reason.CALIBRATION_EXPIRED, seen, again)
+        else:
+            yield fine(f"calibration {name}", f"grade {state.grade}, counts until {state.until[:10]}")
+
+
+def newest_log(context: HostContext) -> Iterator[Finding]:
+    """What the newest log says of supply, clocks, steering and signs of sensors."""
+    newest = max(context.logs().glob("*.mcap"), key=_modified, default=None)
+    if newest is None or newest.stat().st_size > MOST_BYTES:
+        return
+    try:
+        yield from log_findings(newest)
+    except TruckError as error:
+        yield warn("log", error.reason, str(error), context.command("log", "recover", str(newest)))
+
+
+def log_findings(path: Path) -> Iterator[Finding]:
+    """Findings of one log.
+
+    Raises:
+        InputError: it is none.
+    """
+    events: Counter[Reason] = Counter()
+    series: dict[str, list[tuple[float, float]]] = {topic.name: [] for topic in (COMPASS, ODOMETRY, IMU)}
+    angles: list[tuple[float, float]] = []
+    for entry in open_log(path):
+        if entry.topic == EVENT.name:
+            events[_message(entry).reason] += 1
+        elif entry.topic == COMPASS.name:
+            message = _message(entry)
+            series[COMPASS.name].append((message.stamp, -message.heading))
+        elif entry.topic == ODOMETRY.name:
+            message = _message(entry)
+            series[ODOMETRY.name].append((message.stamp, message.pose.yaw))
+        elif entry.topic == IMU.name:
+            message = _message(entry)
+            series[IMU.name].append((message.stamp, message.angular_velocity.z))
+        elif entry.topic == CMD_STEERING.name:
+            message = _message(entry)
+            angles.append((message.front, message.rear))
+    for reason, (check, text) in COUNTED.items():
+        if count := events[reason]:
+            yield warn(check, reason, f"{count} in {path.name}: {text}")
+    yield from _saturated(angles, path.name)
+    yield from _signs({name: np.array(rows) for name, rows in series.items() if len(rows) > 2}, path.name)
+
+
+def _saturated(angles: list[tuple[float, float]], log: str) -> Iterator[Finding]:
+    """Steering that stood at its greatest angle for much of the drive: a small limit, or wheels off centre."""
+    if len(angles) < 100:
+        return
+    for axle, column in zip(("front", "rear"), np.abs(np.array(angles)).T, strict=True):
+        most = float(column.max())
+        share = float((column > most - AT_LIMIT).mean())
+        if most > math.radians(5.0) and share > SATURATED:
+            seen = f"{axle} at its limit of {math.degrees(most):.0f} degrees for {share:.0%} of {log}"
+            yield warn("steering", Reason.SERVO_LIMIT, seen)
+
+
+def _signs(series: dict[str, Any], log: str) -> Iterator[Finding]:
+    """Turns by compass, IMU and wheels that go opposite ways."""
+    if ODOMETRY.name not in series:
+        return
+    wheels = series[ODOMETRY.name]
+    own = np.unwrap(wheels[:, 1])
+    for name, what in ((COMPASS.name, "compass"), (IMU.name, "IMU")):
+        if name not in series:
+            continue
+        rows = series[name]
+        if name == IMU.name:
+            yaw = np.concatenate(([0.0], np.cumsum(np.diff(rows[:, 0]) * 1e-9 * (rows[1:, 1] + rows[:-1, 1]) / 2)))
+        else:
+            yaw = np.unwrap(rows[:, 1])
+        steps = np.diff(np.interp(wheels[::20, 0], rows[:, 0], yaw)), np.diff(own[::20])
+        turned = float(np.abs(steps[1]).sum())
+        if turned < LEAST_TURN:
+            continue
+        agreement = float(steps[0] @ steps[1]) / max(float(np.linalg.norm(steps[0]) * np.linalg.norm(steps[1])), 1e-12)
+        if agreement < -0.5:
+            yield fail(
+                f"sign {what}", Reason.STEERING_DEAD, f"in {log} it turns against the wheels: mounted upside down?"
+            )
+        elif agreement > 0.5:
+            yield fine(f"sign {what}", "turns as the wheels do")
+
+
+def _message(entry: Any) -> Any:
+    return entry.decode()
+
+
+def _modified(path: Path) -> float:
+    return path.stat().st_mtime
