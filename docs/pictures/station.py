@@ -10,10 +10,10 @@ import contextlib
 import tempfile
 from pathlib import Path
 
-from playwright.async_api import Page
+from playwright.async_api import Browser, Page
 
 from monstertruckd.tools.demo.runs import free_endpoint
-from tests.daemon.browser_kit import chromium, opened, station
+from tests.daemon.browser_kit import chromium, station
 from tests.daemon.wall_kit import ROOT, Robot, end
 
 HERE = Path(__file__).parent
@@ -32,21 +32,21 @@ async def main() -> None:
                     await pictures(made, browser, url, theme, view, size)
 
 
-async def pictures(made: Robot, browser: object, url: str, theme: str, view: str, size: dict[str, int]) -> None:
+async def pictures(made: Robot, browser: Browser, url: str, theme: str, view: str, size: dict[str, int]) -> None:
     """All tabs of one theme and size, during one replay."""
+    page = await (await browser.new_context(viewport=size, color_scheme=theme, has_touch=bool(view))).new_page()
+    await page.goto(url)
+    await page.wait_for_selector("html[data-ready=true]")
+    for _ in range(4):
+        await page.click("#tool-in")
     replaying = await made.spawn("replay", str(LOG), "--endpoint", made.endpoint, "--speed", "0.25")
     try:
-        page = await opened(browser, url, "driving", viewport=size, color_scheme=theme, has_touch=bool(view))
-        await page.click("#tool-goal")
-        await page.locator("#map").hover()
-        for _ in range(4):
-            await page.click("#tool-in")
-        await page.click("#tool-goal")
-        await asyncio.sleep(4.0)
+        await page.wait_for_selector("#authority[data-mode=driving]", timeout=60_000)
+        await asyncio.sleep(2.0)
         for tab in ("drive", "truck", "system", "events"):
             await picture(page, f"station{view}-{theme}-{tab}", tab)
-        await page.context.close()
     finally:
+        await page.context.close()
         with contextlib.suppress(ProcessLookupError):
             await end(replaying)
 

@@ -5,7 +5,8 @@ from typing import Annotated, Final, Literal
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from monstertruck_runtime.errors import InputError
-from monstertruck_schemas.req import BehaviourOrder, GoalOrder, Order, Role
+from monstertruck_schemas.req import UNCONDITIONAL, BehaviourOrder, GoalOrder, Order, Role
+from monstertruck_schemas.roles import AccessRole
 
 MOST_BYTES: Final = 16_384
 """Size of a message; a longer one ends the connection."""
@@ -95,6 +96,13 @@ Asked = GiveOrder | SetGoal | ChangeGoal | Behave
 Command = Annotated[Watch | EchoRequest | Heartbeat | Asked, Field(discriminator="do")]
 
 _COMMANDS: Final[TypeAdapter[Watch | EchoRequest | Heartbeat | Asked]] = TypeAdapter(Command)
+
+
+def needed(command: Watch | EchoRequest | Heartbeat | Asked) -> AccessRole:
+    """What a user must be to ask for it: everybody may look, and stop."""
+    if isinstance(command, GiveOrder) and command.order in UNCONDITIONAL:
+        return AccessRole.OBSERVER
+    return AccessRole.OBSERVER if isinstance(command, Watch | EchoRequest) else AccessRole.PILOT
 
 
 def parse(data: str) -> Watch | EchoRequest | Heartbeat | Asked:

@@ -10,6 +10,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from monstertruck_runtime.errors import RequestRefusedError, TruckError
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.plan import Path
 from monstertruck_schemas.sensor import CompressedImage, LaserScan
@@ -35,6 +36,12 @@ def binary(kind: str, payload: bytes, **fields: Any) -> bytes:
     """A binary frame."""
     head = json.dumps({"kind": kind, **fields}, separators=(",", ":"), allow_nan=False).encode()
     return struct.pack("<I", len(head)) + head + payload
+
+
+def refusal(number: int, error: TruckError) -> str:
+    """Answer to a command that was refused."""
+    reason = error.refusal if isinstance(error, RequestRefusedError) else error.reason
+    return text("answer", id=number, ok=False, reason=reason.value, text=str(error))
 
 
 def scan(of: LaserScan) -> bytes:

@@ -13,7 +13,7 @@ from typing import Any, Final
 
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import SECOND, Clock
-from monstertruck_runtime.errors import NotFoundError, RequestRefusedError, TruckError
+from monstertruck_runtime.errors import NotFoundError, TruckError
 from monstertruck_runtime.stations import own_source, tls_for
 from monstertruckd.station import frames
 from monstertruckd.station.address import RobotAddress
@@ -129,11 +129,8 @@ class Pilot:
             self._answer(number, None)
 
     def _answer(self, number: int, error: TruckError | None) -> None:
-        if error is None:
-            self._viewer.tell(frames.text("answer", id=number, ok=True))
-            return
-        reason = error.refusal if isinstance(error, RequestRefusedError) else error.reason
-        self._viewer.tell(frames.text("answer", id=number, ok=False, reason=reason.value, text=str(error)))
+        answer = frames.text("answer", id=number, ok=True) if error is None else frames.refusal(number, error)
+        self._viewer.tell(answer)
 
 
 def _call(client: TruckClient, command: Asked) -> Coroutine[Any, Any, Any]:

@@ -6,6 +6,7 @@ import json
 import logging
 import re
 import secrets
+import ssl
 from collections.abc import Awaitable, Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -15,7 +16,8 @@ from typing import Final
 from aiohttp import WSMessage, WSMsgType, web
 
 from monstertruck_runtime.clock import Clock
-from monstertruck_runtime.errors import BusyError, InputError
+from monstertruck_runtime.endpoints import LOCAL_HOSTS
+from monstertruck_runtime.errors import BusyError, InputError, NotPermittedError
 from monstertruck_schemas.reasons import Reason
 from monstertruckd import __version__
 from monstertruckd.station import commands, frames
@@ -24,6 +26,7 @@ from monstertruckd.station.commands import EchoRequest, Heartbeat, Watch
 from monstertruckd.station.discovery import Discovery
 from monstertruckd.station.feed import RobotFeed
 from monstertruckd.station.pilot import Pilot
+from monstertruckd.station.users import LOCAL, StationUser, StationUsers
 from monstertruckd.station.viewer import Viewer
 
 log = logging.getLogger(__name__)
@@ -35,6 +38,8 @@ BEAT: Final = 10.0
 """Seconds between two pings of the WebSocket itself; a browser that does not answer for half of it is let go."""
 LOOK: Final = 1.0
 """Seconds between two looks at robots that appeared."""
+END: Final = 5.0
+"""Seconds that sessions with robots may take to close at the end."""
 LANGUAGE: Final = "en"
 
 HEADERS: Final = {
@@ -45,25 +50,43 @@ HEADERS: Final = {
     "Cache-Control": "no-cache",
 }
 
+USER: Final = web.RequestKey("user", StationUser)
+
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where the page is served."""
+    """Where the page is served; beyond this machine only by TLS and to users who log in.
+
+    Raises:
+        NotPermittedError: another address than the loopback one, without certificate and users.
+    """
 
     host: str = "127.0.0.1"
     port: int = 8470
+    tls: ssl.SSLContext | None = None
+    users: StationUsers | None = None
+    aliases: tuple[str, ...] = ()
+    """Further names of this machine by which browsers may ask for the page."""
+
+    def __post_init__(self) -> None:
+        if self.host not in LOCAL_HOSTS and (self.tls is None or self.users is None):
+            raise NotPermittedError(
+                f"host {self.host}: a page that other machines can reach needs a certificate with its key, and users"
+            )
 
     @property
     def url(self) -> str:
         """What to open in a browser."""
-        return f"http://{self.host}:{self.port}/"
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        return f"{'http' if self.tls is None else 'https'}://{host}:{self.port}/"
 
     @property
     def names(self) -> frozenset[str]:
         """Values of the Host header that mean this server: a page of another name that resolves here is refused."""
-        return frozenset(f"{name}:{self.port}" for name in (self.host, "localhost", "127.0.0.1", "[::1]"))
+        names = (self.host, *self.aliases, "localhost", "127.0.0.1", "[::1]")
+        return frozenset(f"{name}:{self.port}" for name in names)
 
 
 class Station:
@@ -87,6 +110,7 @@ class Station:
         self._discoveries = [Discovery(endpoint, clock, self._found) for endpoint in routers]
         self._following: set[asyncio.Task[None]] = set()
         self._viewers: set[Viewer] = set()
+        self._sockets: set[web.WebSocketResponse] = set()
         self._browsers = itertools.count(1)
         self._run = secrets.token_hex(2)
         """Tells this run's browsers from those of another, whose sequence numbers the robot remembers."""
@@ -98,14 +122,14 @@ class Station:
         Raises:
             BusyError: the port is taken.
         """
-        runner = web.AppRunner(self.application(), access_log=None, shutdown_timeout=1.0)
+        runner = web.AppRunner(self.application(), access_log=None, shutdown_timeout=END)
         await runner.setup()
         for feed in self.feeds.values():
             self._follow(feed)
         discovering = [asyncio.create_task(each.run()) for each in self._discoveries]
         try:
             try:
-                await web.TCPSite(runner, self.place.host, self.place.port).start()
+                await web.TCPSite(runner, self.place.host, self.place.port, ssl_context=self.place.tls).start()
             except OSError as error:
                 raise BusyError(f"{self.place.url} cannot be served: {error.strerror or error}") from None
             ready()
@@ -147,7 +171,11 @@ class Station:
                 web.get("/socket", self._socket),
             ]
         )
+        application.on_shutdown.append(self._hang_up)
         return application
+
+    async def _hang_up(self, _: web.Application) -> None:
+        await asyncio.gather(*(socket.close(code=1001) for socket in list(self._sockets)), return_exceptions=True)
 
     @web.middleware
     async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
@@ -158,6 +186,15 @@ class Station:
         foreign = origin is not None and origin.partition("://")[2] not in self.place.names
         if foreign or (request.path == "/socket" and origin is None):
             raise self._refused(request, f"origin {origin!r} is not this station's page")
+        if self.place.users is None:
+            request[USER] = LOCAL
+        else:
+            user = await self.place.users.who(request.headers.get("Authorization"))
+            if user is None:
+                log.warning("%s %s from %s refused: no valid login", request.method, request.path, request.remote)
+                challenge = {"WWW-Authenticate": 'Basic realm="monstertruckd", charset="UTF-8"'}
+                raise web.HTTPUnauthorized(headers=HEADERS | challenge)
+            request[USER] = user
         response = await handler(request)
         if not response.prepared:
             response.headers.update(HEADERS)
@@ -195,10 +232,12 @@ class Station:
     async def _socket(self, request: web.Request) -> web.StreamResponse:
         socket = web.WebSocketResponse(max_msg_size=commands.MOST_BYTES, heartbeat=BEAT, compress=False)
         await socket.prepare(request)
-        name = f"{self._run}.{next(self._browsers)}"
+        user = request[USER]
+        name = f"{user.name}{'-' * bool(user.name)}{self._run}.{next(self._browsers)}"
         log.info("browser %s connected from %s", name, request.remote)
-        browser = _Browser(name, self.feeds, self._clock)
+        browser = _Browser(name, user, self.feeds, self._clock)
         self._viewers.add(browser.viewer)
+        self._sockets.add(socket)
         sending = asyncio.create_task(_send(socket, browser.viewer))
         try:
             async for received in socket:
@@ -207,11 +246,12 @@ class Station:
                     break
                 try:
                     browser.take(received.data)
-                except InputError as error:
+                except (InputError, NotPermittedError) as error:
                     log.warning("browser %s: message refused: %s", name, error)
                     browser.viewer.tell(frames.text("trouble", text=str(error)))
         finally:
             self._viewers.discard(browser.viewer)
+            self._sockets.discard(socket)
             sending.cancel()
             await asyncio.gather(sending, return_exceptions=True)
             await browser.close()
@@ -222,16 +262,17 @@ class Station:
 class _Browser:
     """One connection: what it looks at, and what it asks."""
 
-    def __init__(self, name: str, feeds: dict[str, RobotFeed], clock: Clock) -> None:
+    def __init__(self, name: str, user: StationUser, feeds: dict[str, RobotFeed], clock: Clock) -> None:
         self.viewer = Viewer()
         self._name = name
+        self._user = user
         self._feeds = feeds
         self._clock = clock
         self._feed: RobotFeed | None = None
         self._pilot: Pilot | None = None
         self._session: asyncio.Task[None] | None = None
         self._ending: set[asyncio.Task[None]] = set()
-        self.viewer.tell(frames.text("hello", version=__version__))
+        self.viewer.tell(frames.text("hello", version=__version__, user=user.name, role=user.role.value))
         self.viewer.tell(frames.text("robots", names=list(feeds)))
 
     def take(self, data: str) -> None:
@@ -239,8 +280,14 @@ class _Browser:
 
         Raises:
             InputError: it is none, or names a robot that is not here.
+            NotPermittedError: the user may not ask for that.
         """
         command = commands.parse(data)
+        if not self._user.may(needed := commands.needed(command)):
+            refused = NotPermittedError(f"user {self._user.name!r} is {self._user.role.value}: expected {needed.value}")
+            if isinstance(command, commands.Asked):
+                self.viewer.tell(frames.refusal(command.id, refused))
+            raise refused
         match command:
             case Heartbeat():
                 if self._pilot is not None:

@@ -56,8 +56,8 @@ async def chromium(folder: Path, *flags: str) -> AsyncIterator[Browser]:
             await browser.close()
 
 
-async def opened(browser: Browser, url: str, *modes: str, **context: Any) -> Page:
-    """A tab with the page, as soon as it shows one of these modes of the gate; errors of its scripts fail the test."""
+async def opened(browser: Browser, url: str, **context: Any) -> Page:
+    """A tab with the page, as soon as it shows the gate's state; errors of its scripts fail the test."""
     page = await (await browser.new_context(**context)).new_page()
     page.set_default_timeout(PATIENCE)
     errors: list[str] = []
@@ -66,8 +66,7 @@ async def opened(browser: Browser, url: str, *modes: str, **context: Any) -> Pag
         "request", lambda request: errors.append(request.url) if not request.url.startswith((url, "blob:")) else None
     )
     await page.goto(url)
-    wanted = ", ".join(f"#authority[data-mode={mode}]" for mode in modes or ("disarmed", "estopped"))
-    await page.wait_for_selector(wanted)
+    await page.wait_for_selector("#authority:is([data-mode=disarmed], [data-mode=estopped])")
     assert errors == []
     return page
 

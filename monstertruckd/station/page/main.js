@@ -47,6 +47,7 @@ link.on("robots", ({ names }) => {
   select.value = wanted;
   if (wanted !== link.robot) link.watch(wanted);
 });
+link.on("hello", ({ role }) => (document.body.dataset.role = role));
 link.on("open", (open) => {
   if (!open) link.robot = null; // what was watched is asked for again
 });

@@ -75,6 +75,9 @@ INSTEAD = {
     "monstertruckd goto 8.5 6 0 --arm": Instead(
         None, "needs a robot that plans; tests/daemon/test_goals_virtual.py has one"
     ),
+    "monstertruckd station --users users.yaml --add-user ann --role pilot": Instead(None, "asks for a password"),
+    "monstertruckd station --host 0.0.0.0 --certificate station.pem --key station.key --users users.yaml "
+    "--name station.local": Instead(None, "serves until it is stopped; tests/unit/station/test_login.py logs in"),
     "monstertruckd map save hall.yaml": Instead(None, "needs a robot that maps"),
     "monstertruckd stand print runs/stand/print --tags 0-3,100-125": Instead(
         "monstertruckd stand print print --tags 0-3", "fewer prints"

@@ -1,0 +1,145 @@
+"""Who may use a page that is served beyond this machine: names, roles, and passwords as scrypt hashes (RFC 7914)."""
+
+import asyncio
+import base64
+import binascii
+import hashlib
+import hmac
+import secrets
+import stat
+from collections import OrderedDict
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, Self
+
+from monstertruck_runtime.errors import InputError, NotFoundError, NotPermittedError
+from monstertruck_runtime.threads import in_thread
+from monstertruck_runtime.yaml_files import read_yaml, yaml_text
+from monstertruck_schemas.roles import AccessRole
+from monstertruck_schemas.topics import SOURCE_NAME
+
+COST: Final = {"n": 2**14, "r": 8, "p": 1}
+"""Of scrypt: 16 MB and some 50 ms for each attempt."""
+LENGTH: Final = 32
+SHORTEST: Final = 8
+"""Characters of a password."""
+PAUSE: Final = 1.0
+"""Seconds that a wrong password costs, one attempt after the other."""
+REMEMBERED: Final = 256
+NO_HASH: Final = ":".join(("00" * LENGTH,) * 2)
+"""Compared with for unknown names, so that they take as long as known ones."""
+
+
+@dataclass(frozen=True, slots=True)
+class StationUser:
+    """Somebody before a page."""
+
+    name: str
+    role: AccessRole
+
+    def may(self, needed: AccessRole) -> bool:
+        """Whether the user may do what takes ``needed``."""
+        return self.role.covers(needed)
+
+
+LOCAL: Final = StationUser("", AccessRole.ENGINEER)
+"""Whoever sits at this machine: the page has no login there, as the other commands have none."""
+
+
+class StationUsers:
+    """Users of a file.
+
+    Args:
+        rows: role and hash of the password by name.
+    """
+
+    def __init__(self, rows: dict[str, tuple[AccessRole, str]]) -> None:
+        self._rows = rows
+        self._known: OrderedDict[bytes, StationUser] = OrderedDict()
+        """Headers that were right, by their hash: a page asks for a dozen files."""
+        self._secret = secrets.token_bytes(LENGTH)
+        self._turn = asyncio.Lock()
+
+    @classmethod
+    def load(cls, file: Path) -> Self:
+        """Read a file of users.
+
+        Raises:
+            NotFoundError: there is none.
+            NotPermittedError: others may read it.
+            InputError: it is no such file.
+        """
+        if not file.is_file():
+            raise NotFoundError(
+                f"{file}: not there; expected users (monstertruckd station --add-user NAME --users {file})"
+            )
+        if file.stat().st_mode & (stat.S_IRWXG | stat.S_IRWXO):
+            raise NotPermittedError(f"{file}: others may read it; expected mode 600 (chmod 600 {file})")
+        return cls({name: _row(file, name, value) for name, value in (read_yaml(file) or {}).items()})
+
+    async def who(self, header: str | None) -> StationUser | None:
+        """The user of an ``Authorization`` header of the scheme Basic (RFC 7617); None = nobody."""
+        credentials = _credentials(header)
+        if credentials is None:
+            return None
+        mark = hmac.digest(self._secret, "\0".join(credentials).encode(), "sha256")
+        if mark not in self._known:
+            name, password = credentials
+            role, kept = self._rows.get(name, (AccessRole.OBSERVER, NO_HASH))
+            async with self._turn:
+                right = await in_thread(lambda: _matches(password, kept))
+                if not right or name not in self._rows:
+                    await asyncio.sleep(PAUSE)
+                    return None
+            self._known[mark] = StationUser(name, role)
+            while len(self._known) > REMEMBERED:
+                self._known.popitem(last=False)
+        return self._known[mark]
+
+
+def add_user(file: Path, name: str, role: AccessRole, password: str) -> None:
+    """Add a user to a file, or change one.
+
+    Raises:
+        InputError: the name cannot be part of a key, or the password is too short.
+    """
+    if not SOURCE_NAME.fullmatch(name) or ":" in name or len(name) > 24:
+        raise InputError(f"user {name!r}: expected up to 24 letters, digits and . _ - @")
+    if len(password) < SHORTEST:
+        raise InputError(f"password of {name}: expected at least {SHORTEST} characters")
+    rows: dict[str, Any] = (read_yaml(file) or {}) if file.exists() else {}
+    rows[name] = {"role": role.value, "password": hash_of(password, secrets.token_bytes(LENGTH))}
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.touch(mode=0o600)
+    file.chmod(0o600)
+    file.write_text(yaml_text(rows), encoding="utf-8")
+
+
+def hash_of(password: str, salt: bytes) -> str:
+    """Salt and scrypt hash, hexadecimal, with a colon between."""
+    return f"{salt.hex()}:{hashlib.scrypt(password.encode(), salt=salt, dklen=LENGTH, **COST).hex()}"
+
+
+def _matches(password: str, kept: str) -> bool:
+    return hmac.compare_digest(hash_of(password, bytes.fromhex(kept.partition(":")[0])), kept)
+
+
+def _row(file: Path, name: str, value: Any) -> tuple[AccessRole, str]:
+    try:
+        role, kept = AccessRole(value["role"]), str(value["password"])
+        bytes.fromhex(kept.partition(":")[0])
+    except (ValueError, KeyError, TypeError):
+        roles = ", ".join(AccessRole)
+        raise InputError(f"{file}: {name}: expected a role ({roles}) and a password hash") from None
+    return role, kept
+
+
+def _credentials(header: str | None) -> tuple[str, str] | None:
+    scheme, _, rest = (header or "").partition(" ")
+    if scheme.lower() != "basic" or len(rest) > 1024:
+        return None
+    try:
+        name, colon, password = base64.b64decode(rest, validate=True).decode().partition(":")
+    except (binascii.Error, UnicodeDecodeError):
+        return None
+    return (name, password) if colon else None

@@ -1,0 +1,111 @@
+"""The page beyond this machine: TLS, logins, roles."""
+
+import asyncio
+import base64
+import json
+import ssl
+from pathlib import Path
+
+import aiohttp
+import pytest
+
+from monstertruck_runtime.clock import WallClock
+from monstertruck_runtime.errors import InputError, NotFoundError, NotPermittedError
+from monstertruck_schemas.roles import AccessRole
+from monstertruckd.station import users
+from monstertruckd.station.address import RobotAddress
+from monstertruckd.station.server import Place, Station
+from monstertruckd.station.users import StationUsers, add_user
+from tests.unit.station.certificate import self_signed
+from tests.unit.station.test_server import free_port
+
+
+def basic(name: str, password: str) -> str:
+    return "Basic " + base64.b64encode(f"{name}:{password}".encode()).decode()
+
+
+@pytest.fixture
+def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setattr(users, "PAUSE", 0.01)
+    made = tmp_path / "users.yaml"
+    add_user(made, "ann", AccessRole.PILOT, "correct horse")
+    add_user(made, "olga", AccessRole.OBSERVER, "battery staple")
+    return made
+
+
+def test_a_page_for_other_machines_needs_tls_and_users(file: Path):
+    known = StationUsers.load(file)
+    for tls, who in ((None, None), (None, known), (ssl.create_default_context(ssl.Purpose.CLIENT_AUTH), None)):
+        with pytest.raises(NotPermittedError, match=r"0\.0\.0\.0"):
+            Place("0.0.0.0", tls=tls, users=who)
+
+
+async def test_who_logs_in_and_who_does_not(file: Path):
+    known = StationUsers.load(file)
+
+    async def who(name: str, password: str) -> AccessRole | None:
+        user = await known.who(basic(name, password))
+        return None if user is None else user.role
+
+    assert await who("ann", "correct horse") is AccessRole.PILOT
+    assert await who("ann", "correct horse") is AccessRole.PILOT
+    assert await who("olga", "battery staple") is AccessRole.OBSERVER
+    assert await who("ann", "battery staple") is None
+    assert await who("bob", "") is None
+    for header in (None, "", "Basic", "Basic ???", "Bearer x", "Basic " + "A" * 2000):
+        assert await known.who(header) is None
+
+
+def test_a_file_of_users_is_private_and_wrong_ones_are_refused(file: Path, tmp_path: Path):
+    assert file.stat().st_mode & 0o777 == 0o600
+    assert "correct horse" not in file.read_text()
+    file.chmod(0o640)
+    with pytest.raises(NotPermittedError, match="chmod 600"):
+        StationUsers.load(file)
+    with pytest.raises(NotFoundError, match="--add-user"):
+        StationUsers.load(tmp_path / "none.yaml")
+    wrong = tmp_path / "wrong.yaml"
+    wrong.write_text("ann: {role: queen, password: x}\n")
+    wrong.chmod(0o600)
+    with pytest.raises(InputError, match="ann: expected a role"):
+        StationUsers.load(wrong)
+    for name, password, fault in (("a/b", "long enough", "letters"), ("ann", "short", "8 characters")):
+        with pytest.raises(InputError, match=fault):
+            add_user(file, name, AccessRole.PILOT, password)
+
+
+async def test_an_observer_sees_and_may_stop_and_nothing_else_over_tls(file: Path, tmp_path: Path, caplog):
+    server, client = self_signed(tmp_path)
+    robot = RobotAddress("truck", "tcp/127.0.0.1:1")
+    station = Station([robot], WallClock(), Place(port=free_port(), tls=server, users=StationUsers.load(file)))
+    ready = asyncio.Event()
+    running = asyncio.create_task(station.run(ready.set))
+    try:
+        await ready.wait()
+        url = station.place.url
+        assert url.startswith("https://")
+        async with aiohttp.ClientSession(url, connector=aiohttp.TCPConnector(ssl=client)) as session:
+            for login in ({}, {"Authorization": basic("olga", "wrong")}):
+                for path in ("/", "/page/main.js", "/socket", "/robots/truck/map/1"):
+                    async with session.get(path, headers={"Origin": url[:-1], **login}) as reply:
+                        assert reply.status == 401
+                        assert "Basic" in reply.headers["WWW-Authenticate"]
+            assert "no valid login" in caplog.text
+            login = {"Authorization": basic("olga", "battery staple")}
+            async with session.ws_connect("/socket", origin=url[:-1], headers=login) as socket:
+                hello = await socket.receive_json()
+                assert (hello["user"], hello["role"]) == ("olga", "observer")
+                await socket.send_json({"do": "watch", "robot": "truck"})
+                wanted = {1: "not_permitted", 2: "not_permitted", 3: "not_found"}
+                await socket.send_json({"do": "order", "id": 1, "order": "arm"})
+                await socket.send_json({"do": "goal", "id": 2, "goal": [1, 0, 0]})
+                await socket.send_json({"do": "order", "id": 3, "order": "estop"})
+                answers = {}
+                while answers != wanted:
+                    message = json.loads((await socket.receive()).data)
+                    if message["kind"] == "answer":
+                        answers[message["id"]] = message["reason"]
+            assert "user 'olga' is observer" in caplog.text
+    finally:
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
