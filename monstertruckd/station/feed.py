@@ -234,6 +234,8 @@ class RobotFeed:
                     for event in events.drain():
                         self._take_event(event)
                     await self._clock.sleep(TICK)
+            # Whoever looks next begins with what is published then, not with what was true long ago.
+            self._newest.clear()
 
     def _take(self, shown: Shown[M], box: Mailbox[M], taken: dict[str, tuple[Message, int]], now: int) -> None:
         newest = box.latest
@@ -259,6 +261,8 @@ class RobotFeed:
 
     def _set_link(self, round_trip: float | None, text: str) -> None:
         self.alive = round_trip is not None
+        if not self.alive:
+            self._newest = {kind: frame for kind, frame in self._newest.items() if kind == "map"}
         self._link = frames.text("link", alive=self.alive, round_trip=round_trip, text=text)
         for viewer in self._viewers:
             viewer.show("link", self._link)

@@ -8,16 +8,18 @@ import struct
 import numpy as np
 import pytest
 
+from monstertruck_runtime.clock import WallClock
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.mailbox import Mailbox
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.req import Role
 from monstertruck_schemas.sensor import LaserScan
-from monstertruck_schemas.state import Grid
+from monstertruck_schemas.state import GateMode, GateState, Grid
 from monstertruckd.station import commands, frames
 from monstertruckd.station.address import RobotAddress
 from monstertruckd.station.commands import GiveOrder, Heartbeat
-from monstertruckd.station.feed import MapStore
+from monstertruckd.station.feed import MapStore, RobotFeed
 from monstertruckd.station.pilot import LATEST, DelayWatch
 from monstertruckd.station.server import PAGE
 from monstertruckd.station.viewer import MOST_WAITING, Viewer
@@ -137,3 +139,41 @@ def test_every_text_of_the_page_is_in_the_table_and_none_is_left_over():
     assert unused == []
     texts = re.findall(r">\s*([A-Za-z][^<{]*[a-z])\s*<", page)
     assert texts == ["monstertruckd"], "the title; every other text comes from the table"
+
+
+class PublishedRobot:
+    """Client of a robot whose gate has said something once."""
+
+    def __init__(self):
+        self.boxes: dict[str, Mailbox] = {}
+
+    def subscribe(self, topic, delivery):
+        self.boxes[topic.name] = Mailbox(delivery, lambda _: self.boxes.pop(topic.name))
+        return self.boxes[topic.name]
+
+
+async def test_a_browser_never_begins_with_what_was_true_when_another_one_left():
+    robot, feed = PublishedRobot(), RobotFeed(RobotAddress("truck", "tcp/127.0.0.1:1"), WallClock())
+    sampling = asyncio.create_task(feed._sample(robot))
+    try:
+        first = Viewer()
+        feed.attach(first)
+        while "state/gate" not in robot.boxes:
+            await asyncio.sleep(0.01)
+        gate = GateState(stamp=1, received=1, seq=0, mode=GateMode.DRIVING, nonce="n", speed_limit=0.2)
+        robot.boxes["state/gate"].put(gate)
+        kinds: list[str] = []
+        while "gate" not in kinds:
+            kinds.append(json.loads(await first.next())["kind"])
+        feed.detach(first)
+        while robot.boxes:
+            await asyncio.sleep(0.01)
+        second = Viewer()
+        feed.attach(second)
+        assert json.loads(await second.next())["kind"] == "link"
+        with pytest.raises(TimeoutError):
+            async with asyncio.timeout(0.2):
+                await second.next()
+    finally:
+        sampling.cancel()
+        await asyncio.gather(sampling, return_exceptions=True)
