@@ -1,6 +1,7 @@
 """Random faults on the whole daemon, on the virtual clock, and an observer that is not to be fooled."""
 
 import asyncio
+import contextlib
 import json
 import math
 from collections.abc import Callable
@@ -205,6 +206,8 @@ def watched(
             await clock.sleep(seconds)
         finally:
             watching.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await watching
         return {violation.rule for violation in observer.violations()}
 
     return run_virtual(main)
@@ -293,6 +296,31 @@ def test_driving_on_though_a_device_is_silent_is_seen(role: str, silent: float, 
 
     assert watched(scene, seconds=silent) == ({"silence"} if seen else set())
     assert watched(lambda bare: said(bare, role), seconds=silent) == set(), "it stands"
+
+
+@pytest.mark.parametrize(
+    ("rpm", "unknown", "rules"),
+    [(10_000, 2.5, set[str]()), (10_000, 2.8, {"battery"}), (8_000, 2.8, set()), (0, 2.8, set())],
+)
+def test_driving_fast_though_the_battery_is_no_longer_measured_is_seen(rpm: int, unknown: float, rules: set[str]):
+    def scene(bare: Bare) -> None:
+        motor(rpm)(bare)
+        bare.ports["steering"].device.take(bytes((0xA1, 0x90, 1, 0x90, 5)))  # errors, a servo, the battery
+        asyncio.get_running_loop().call_later(0.001, said, bare, "steering")
+
+    assert watched(scene, seconds=unknown) - {"silence"} == rules, "of the wire itself"
+
+
+def test_a_battery_that_is_asked_for_and_not_answered_counts_as_not_measured():
+    def scene(bare: Bare) -> None:
+        motor(10_000)(bare)
+        device, loop = bare.ports["steering"].device, asyncio.get_running_loop()
+        device.take(bytes((0x90, 5)))
+        loop.call_later(0.001, said, bare, "steering")
+        for at in range(1, 30):
+            loop.call_later(at / 10, device.take, bytes((0x90, 5)))
+
+    assert watched(scene) - {"silence"} == {"battery"}
 
 
 def test_without_the_deadman_line_nothing_stops_a_drive_that_is_silent():

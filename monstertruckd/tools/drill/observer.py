@@ -337,6 +337,36 @@ class _Silence:
                 yield "silence", f"{seen.truth.v:.3f} m/s though {role} is silent for {silent:.2f} s"
 
 
+class _Battery:
+    """A truck whose battery was measured, and is no longer, drives slowly, or not at all.
+
+    Args:
+        tap: wire of the servo controller, whose analog input measures it.
+        channel: of that input.
+        limits: how long it may be unmeasured, s, and the speed limit then, m/s.
+    """
+
+    def __init__(self, tap: WireTap, channel: int, limits: tuple[float, float]) -> None:
+        self._tap, self._channel = tap, channel
+        self._longest, self._speed = limits
+        self._asked: int | None = None
+        self._measured: int | None = None
+
+    def ask(self, channel: int, instant: int) -> None:
+        """The host asks for the position or voltage of a channel at ``instant``, ns."""
+        if channel == self._channel:
+            self._asked = instant
+
+    def __call__(self, seen: Observation) -> Broken:
+        if self._asked is not None and self._tap.heard is not None and self._tap.heard >= self._asked:
+            self._measured, self._asked = self._asked, None
+        if self._measured is None:
+            return
+        unknown = (seen.now - self._measured) / SECOND
+        if unknown > self._longest + STOPS_WITHIN and abs(seen.truth.v) > self._speed * SPEED_MARGIN + AT_REST:
+            yield "battery", f"{seen.truth.v:.3f} m/s though the battery was not measured for {unknown:.1f} s"
+
+
 class _Ahead:
     """Driving forwards: what is before the width of the truck, and what is in its way on its arc.
 
@@ -417,6 +447,10 @@ class Observer:
         gate = config.gate
         self._standstill = _Standstill()
         self._pulses = _Pulses(config)
+        self._battery: _Battery | None = None
+        if (pack := config.devices.steering.driver.battery) is not None:
+            limits = gate.battery.stale_after, 0.0 if gate.battery.critical else gate.battery_low_speed
+            self._battery = _Battery(self._servos, pack.channel, limits)
         self._rules: tuple[Rule, ...] = (
             self._standstill,
             _Speeds(gate.reverse_speed, gate.speed),
@@ -426,6 +460,7 @@ class Observer:
             _Silence(_indispensable(config, taps)),
             _Ahead(config, world),
             _contact,
+            *(() if self._battery is None else (self._battery,)),
         )
         self._violations: dict[str, Violation] = {}
         self.speed = 0.0
@@ -525,10 +560,14 @@ class Observer:
     def _new_pulses(self) -> Iterator[tuple[int, float]]:
         received, self._servos.to_device[:] = list(self._servos.to_device), []
         self._servos.to_host.clear()
-        for _, data in received:
+        for instant, data in received:
             for command in self._maestro.feed(data):
-                if isinstance(command, ServoCommand) and command.code is Code.SET_TARGET and command.value:
+                if not isinstance(command, ServoCommand):
+                    continue
+                if command.code is Code.SET_TARGET and command.value:
                     yield command.data[0], command.value / 4
+                elif command.code is Code.GET_POSITION and self._battery is not None:
+                    self._battery.ask(command.data[0], instant)
 
 
 def _indispensable(config: SimulatedTruckConfig, taps: Mapping[str, WireTap]) -> Iterator[tuple[str, WireTap, float]]:

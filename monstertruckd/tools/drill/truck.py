@@ -70,7 +70,8 @@ class DrillTruck:
                 yield truck
             finally:
                 observing.cancel()
-                await asyncio.wait([observing])
+                with suppress(asyncio.CancelledError):
+                    await observing  # an observer that broke has seen nothing
 
     @property
     def gate(self) -> GateState | None:
