@@ -108,7 +108,9 @@ class RigidPlant(GriddedPlant):
     def _put(self, pose: Pose) -> None:
         """Let it settle on its springs at a pose, held in its place."""
         data = self.data
+        around = data.mocap_pos.copy(), data.mocap_quat.copy()
         mujoco.mj_resetData(self.model, data)
+        data.mocap_pos[:], data.mocap_quat[:] = around
         x, y, yaw = pose
         self._wound = [0.0] * len(self.shafts)
         data.qpos[:3] = x, y, self._ground(x, y) + 0.002

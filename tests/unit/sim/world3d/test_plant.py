@@ -157,6 +157,15 @@ def test_a_carried_robot_stands_elsewhere_at_rest(solid):
     assert (truth.x, truth.y, truth.yaw) == pytest.approx((-2.0, 1.0, pi / 2), abs=0.02)
 
 
+def test_things_stay_where_they_are_while_the_robot_is_carried(solid):
+    driver = solid()
+    driver.world.add(driver.now, Box(1.0, 0.0, 0.2, 1.0))
+    driver.wait(0.1)
+    driver.world.carry(driver.now, (0.3, 0.0, 0.0))
+    driver.drive(0.2)
+    assert driver.wait(5.0).x == pytest.approx(0.9 - 0.235, abs=0.01)
+
+
 def test_the_robot_of_the_built_in_ramp_tilts_by_its_slope():
     world = World(WorldConfig(engine="mujoco", map="ramp", noise=False, start=Pose2D(x=1.75, y=0.0, yaw=0.0)), 1)
     truth = world.truth(0)
