@@ -265,6 +265,8 @@ class _Run:
         reasons = [reason for reason in state.reasons if reason is not Reason.DISARMED]
         if not reasons and state.mode is GateMode.DRIVING:
             raise RequestRefusedError(Reason.BUSY, f"{state.holder} drives the truck")
+        if not reasons and state.mode.active:  # armed still, but this wizard's requests hold it no longer
+            reasons = [Reason.LEASE_EXPIRED]
         text = ", ".join(reason.text for reason in reasons) or f"the truck is {state.mode}"
         advice = f"; {LATE}" if Reason.LEASE_EXPIRED in reasons else ""
         raise RequestRefusedError(reasons[0] if reasons else Reason.DISARMED, f"stopped by the gate: {text}{advice}")

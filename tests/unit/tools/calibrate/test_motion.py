@@ -14,9 +14,9 @@ from monstertruckd.tools.calibrate.steps import MoveStep
 STEP = MoveStep("run", speed=0.2, front=0.0, rear=0.0, metres=1.0)
 
 
-def stopped(*reasons: Reason) -> RequestRefusedError:
+def stopped(*reasons: Reason, mode: GateMode = GateMode.DISARMED) -> RequestRefusedError:
     run = motion._Run(None, None, (), {})
-    run.state = SimpleNamespace(reasons=reasons, mode=GateMode.DISARMED, holder=None)
+    run.state = SimpleNamespace(reasons=reasons, mode=mode, holder=None)
     run._truck = SimpleNamespace(source="wizard")
     with pytest.raises(RequestRefusedError) as refused:
         run._check()
@@ -30,6 +30,7 @@ def test_a_stop_has_the_reason_of_the_gate():
 
 def test_an_expired_lease_says_what_to_do():
     error = stopped(Reason.LEASE_EXPIRED)
+    assert str(stopped(mode=GateMode.ARMED)) == str(error), "armed, and nobody drives: the lease is gone already"
     assert error.refusal is Reason.LEASE_EXPIRED
     assert str(error).startswith(
         "stopped by the gate: no fresh drive request within its lease; requests came too late:"
