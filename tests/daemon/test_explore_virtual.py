@@ -185,22 +185,3 @@ def test_far_from_home_it_turns_back_while_the_charge_suffices(tmp_path: Path):
     assert "back at the start" in ends[0].text
     assert not truth[:, 5].any()
     assert math.dist(truth[-1, 1:3], truth[0, 1:3]) < 0.2
-
-
-def test_carried_away_it_stands_says_so_and_leaves_a_map_that_is_not_doubled(tmp_path: Path):
-    ends = []
-
-    async def story(told: Story) -> None:
-        await told.operator.arm()
-        await told.order(ExploreOrder.START)
-        await told.clock.sleep(14.0)
-        told.rig.world.carry(told.clock.now(), (1.2, 1.6, math.pi))
-        ends.append(await told.end(280.0))
-
-    told, truth = tell(story, tmp_path, explorer={"lost": 15.0})
-    assert ends[0].outcome in (Reason.EXPLORED, Reason.POSE_LOST, Reason.GOAL_BLOCKED), ends[0].text
-    assert "map in" in ends[0].text
-    assert not truth[:, 5].any()
-    reasons = [event.reason for event in told.events.drain() if event.source == "explorer"]
-    assert Reason.POSE_LOST in reasons
-    assert doubled(tmp_path) < 0.05
