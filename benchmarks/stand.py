@@ -77,7 +77,7 @@ def crossing(stand: Any) -> tuple[int, float]:
     """Robots lost or mistaken among five that cross, and processor seconds of a picture read and tracked."""
     _, config, found, renderers, floor = stand
     tracker = StandTracker(found.placed(), config.robots, config.marks)
-    readers = {name: TagReader() for name in renderers}
+    readers = {name: TagReader(still=config.marks) for name in renderers}
     lost, spent, pictures = 0, 0.0, 0
     for k in range(CROSSING):
         t = k / 25

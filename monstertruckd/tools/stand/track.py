@@ -61,7 +61,7 @@ class StandRun:
     async def _play(self) -> None:
         """Recorded pictures: the first ones of all cameras are of one instant, and so on."""
         iterators = {name: stream() for name, stream in self._streams.items()}
-        readers = {name: TagReader() for name in iterators}
+        readers = {name: TagReader(still=self._tracker.marks) for name in iterators}
         began, count = self._clock.now(), 0
         while iterators:
             seen = {}
@@ -106,7 +106,7 @@ class StandRun:
         """One camera, in a thread of its own: OpenCV gives the interpreter free while it works."""
         said = ""
         while not self._ended.is_set():
-            reader = TagReader()
+            reader = TagReader(still=self._tracker.marks)
             try:
                 for picture in stream():
                     at = self._clock.now()

@@ -138,7 +138,7 @@ class StandTracker:
     ) -> None:
         self._cameras = cameras
         self._robots = {robot.tag: (name, robot) for name, robot in robots.items()}
-        self._marks = marks
+        self.marks = marks
         self._known: dict[str, _Known] = {}
         self.cameras = {name: CameraState(now) for name in cameras}
         self.left_out = 0
@@ -201,8 +201,8 @@ class StandTracker:
         state.heard, state.pictures = stamp, state.pictures + 1
         off = []
         for sighting in sightings:
-            if sighting.tag in self._marks:
-                mark = self._marks[sighting.tag]
+            if sighting.tag in self.marks:
+                mark = self.marks[sighting.tag]
                 middle = camera.on_plane(sighting.corners).mean(axis=0)
                 off.append(middle - (mark.x, mark.y))
         if off:

@@ -5,7 +5,7 @@ in view is looked for around its last place only, and everywhere once in a while
 cameras.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Final, NamedTuple
 
 import cv2
@@ -43,9 +43,12 @@ class TagReader:
 
     Args:
         everywhere: pictures from one look at the whole picture to the next; 1 = always.
+        still: tags that do not move: they are read in whole pictures only.
     """
 
-    def __init__(self, everywhere: int = EVERYWHERE) -> None:
+    def __init__(self, everywhere: int = EVERYWHERE, still: Collection[int] = ()) -> None:
+        cv2.setNumThreads(1)  # cameras are read side by side; OpenCV's own threads wait for each other
+        self._still = frozenset(still)
         parameters = cv2.aruco.DetectorParameters()
         # By lines along the edges: a window around a corner takes in cells of a small tag.
         parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_CONTOUR
@@ -68,8 +71,8 @@ class TagReader:
             for x0, y0, x1, y1 in _windows(self._last, picture.shape[1], picture.shape[0]):
                 found += self._detect(np.ascontiguousarray(picture[y0:y1, x0:x1]), x0, y0)
         by_tag = {sighting.tag: sighting for sighting in found}
-        self._last = list(by_tag.values())
-        return self._last
+        self._last = [sighting for tag, sighting in by_tag.items() if tag not in self._still]
+        return list(by_tag.values())
 
     def _detect(self, picture: Picture, x0: int, y0: int) -> list[Sighting]:
         corners, ids, _ = self._detector.detectMarkers(picture)

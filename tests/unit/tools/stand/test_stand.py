@@ -73,6 +73,15 @@ def test_a_tag_is_followed_in_a_window(stand):
             assert np.abs(found[sighting.tag].corners - sighting.corners).max() < 1.0
 
 
+def test_tags_that_lie_still_are_read_in_whole_pictures_only(stand):
+    _, config, _, renderers, floor = stand
+    reader = TagReader(everywhere=3, still=config.marks)
+    picture = renderers["c1"].picture([*floor, level_tag(0, 0.08, -1.0, 0.7, 0.1, 0.08)])
+    seen = [{s.tag for s in reader.read(picture)} for _ in range(4)]
+    assert seen[0] == seen[3] > {0}
+    assert seen[1] == seen[2] == {0}
+
+
 def test_a_lost_camera_and_a_bumped_one_are_named(stand):
     _, config, found, renderers, floor = stand
     tracker = StandTracker(found.placed(), config.robots, config.marks)
