@@ -7,7 +7,9 @@ import pytest
 
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import ConfigError, NotFoundError
-from monstertruckd.config.calibration import CalibrationStore, Estimate, Result
+from monstertruckd.config.calibration import CalibrationStore, Estimate, Result, with_values
+from monstertruckd.config.load import load_config
+from monstertruckd.config.truck import TruckConfig
 
 NOON = 1_795_262_400 * SECOND
 
@@ -135,3 +137,20 @@ def test_another_trucks_file_is_refused(store: CalibrationStore):
     store.save(ratio(640.0), NOON)
     with pytest.raises(ConfigError, match="calibration of 'truck', this is 'lorry'"):
         CalibrationStore(store.folder, "lorry").current()
+
+
+def test_of_two_wizards_that_set_one_value_the_newer_counts(store: CalibrationStore):
+    squares = ratio(620.0).model_copy(update={"wizard": "odometry"})
+    truck = load_config(Path(__file__).resolve().parents[3] / "configs" / "truck.yaml", TruckConfig)[0]
+
+    def counted() -> float:
+        current = store.current()
+        assert current is not None
+        return with_values(truck, current.results.values(), "test").geometry.drive_ratio
+
+    for result, expected in ((ratio(640.0), 640.0), (squares, 620.0), (ratio(641.0), 641.0)):
+        store.save(result, NOON)
+        assert counted() == expected
+    store.undo("drive", NOON)
+    store.undo("odometry", NOON)
+    assert counted() == 640.0
