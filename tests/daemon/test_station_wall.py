@@ -41,25 +41,93 @@ async def started(made: Robot) -> None:
     await made.start_daemon()
 
 
-async def arm_and_hold(page: Page, gate: Mailbox[GateState]) -> None:
-    """Arm, and hold the joystick forward until the truck drives; again where the busy computer itself stops it."""
+class Stick:
+    """The joystick of a page, moved with the mouse."""
+
+    def __init__(self, page: Page):
+        self._page = page
+
+    async def release(self) -> None:
+        await self._page.mouse.up()
+
+    async def push(self) -> None:
+        box = await self._page.locator("#stick").bounding_box()
+        assert box is not None
+        x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+        await self._page.mouse.move(x, y)
+        await self._page.mouse.down()
+        await self._page.mouse.move(x, y - 0.45 * box["height"], steps=3)
+
+
+class Key:
+    """The key that drives ahead."""
+
+    def __init__(self, page: Page):
+        self._page = page
+
+    async def release(self) -> None:
+        await self._page.keyboard.up("w")
+
+    async def push(self) -> None:
+        await self._page.keyboard.down("w")
+
+
+class Pad:
+    """A gamepad that the browser believes in, with its right shoulder button as the deadman."""
+
+    def __init__(self, page: Page):
+        self._page = page
+
+    async def release(self) -> None:
+        await self._say(pressed=False)
+
+    async def push(self) -> None:
+        await self._say(pressed=True)
+
+    async def _say(self, *, pressed: bool) -> None:
+        await self._page.evaluate(
+            """(pressed) => {
+                const buttons = Array.from({ length: 17 }, (_, i) => ({ pressed: pressed && i === 5 }));
+                const pad = { connected: true, mapping: "standard", id: "synthetic", axes: [0, -0.9, 0, 0], buttons };
+                navigator.getGamepads = () => [pad];
+            }""",
+            pressed,
+        )
+
+
+def moves(gate: Mailbox[GateState]) -> bool:
+    return gate.latest is not None and gate.latest.twist is not None and gate.latest.twist.vx > 0.01
+
+
+async def arm_and_hold(page: Page, gate: Mailbox[GateState], hand: Stick | Key | Pad | None = None) -> None:
+    """Arm, and push an input forward until the truck moves; again where the busy computer itself stops it."""
     await page.click("#tab-drive")
-    box = await page.locator("#stick").bounding_box()
-    assert box is not None
-    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
-    await page.mouse.move(x, y)
-    async with asyncio.timeout(60):
-        while mode(gate) is not GateMode.DRIVING:
-            await page.mouse.up()
+    hand = hand or Stick(page)
+    async with asyncio.timeout(90):
+        while not moves(gate):
+            await hand.release()
             await page.evaluate("document.querySelector('#arm').click()")
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(3):
-                    while mode(gate) is not GateMode.ARMED:
+                    while mode(gate) not in (GateMode.ARMED, GateMode.DRIVING):
                         await asyncio.sleep(0.02)
-                    await page.mouse.down()
-                    await page.mouse.move(x, y - 0.45 * box["height"], steps=3)
-                    while mode(gate) is not GateMode.DRIVING:
+                    await hand.push()
+                    while not moves(gate):
                         await asyncio.sleep(0.02)
+
+
+async def test_keys_and_a_gamepad_drive_by_their_own_priority_until_they_are_released(tmp_path: Path):
+    async with robot(tmp_path, FREE) as made:
+        await started(made)
+        async with made.client() as client, station(made) as url, chromium(tmp_path) as browser:
+            gate = client.subscribe(topics.GATE, latest())
+            page = await opened(browser, url)
+            for hand, role in ((Key(page), Role.KEYBOARD), (Pad(page), Role.GAMEPAD)):
+                await arm_and_hold(page, gate, hand)
+                assert gate.latest is not None
+                assert gate.latest.role is role
+                await hand.release()
+                await becomes(lambda: mode(gate) is GateMode.DISARMED)
 
 
 async def test_emergency_stop_by_button_and_space_bar_and_two_tabs_are_two_sources(tmp_path: Path):
