@@ -444,7 +444,7 @@ class WallLine:
     def _stopping(self, ramp: TimedRamp, left: float, t: float) -> TimedRamp:
         """A ramp to standstill, computed anew so that it covers what is left, if that is within the limits."""
         config, speed, change = self._config, ramp.at(t), ramp.acceleration(t)
-        if speed * left <= 0.0:
+        if not 0.0 < speed * left < math.inf:  # nothing is heard ahead any more: the ramp that runs stands
             return ramp
         shape = CubicRamp.to_rest(speed, left, change)
         acceleration, jerk = shape.peaks

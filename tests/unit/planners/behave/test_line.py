@@ -119,3 +119,18 @@ def test_the_gyroscopes_bias_is_measured_at_rest():
 def test_settings_beyond_the_ramps_limits_are_refused(wrong):
     with pytest.raises(ValidationError):
         WallLineConfig(**wrong)
+
+
+def test_it_stops_by_its_ramp_where_the_wall_ahead_is_heard_no_longer_while_it_brakes():
+    behaviour, robot = follower(), Robot(HALL, (0.1, -0.1, 0.3))
+    state = behaviour.begin()
+    for i in range(120):
+        if state.phase == "brake":
+            robot.stuck = {"f": None, "fl": None, "fr": None}
+        step = behaviour.step(robot.inputs(), state, i * PERIOD)
+        state, robot.motion = step.state, step.motion or RequestedMotion()
+        if state.phase == "turn":
+            break
+        robot.move()
+    assert state.phase == "turn"
+    assert abs(step.motion.vx) < 0.02
