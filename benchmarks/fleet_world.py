@@ -59,7 +59,7 @@ HALF = 2.2
 """Places are drawn within this of the yard's middle, m."""
 REACHED = 0.15
 """A place nearer than this is reached, m."""
-APART = 0.75
+APART = 0.65
 """Between the middles of two robots of which one may turn or go backwards, m."""
 TASKS = 8
 GOALS = {"contacts_by_moving_robots": 0, "tasks_of_each": TASKS}
@@ -149,16 +149,17 @@ class Pilot:
             if turned and await self.move(length=way, speed=0.18):
                 continue
             await self.clock.sleep(float(self.rng.uniform(0.3, 3.0)))
-            if self.rng.random() < 0.7 and self.alone():
+            if self.rng.random() < 0.8 and self.alone(back=0.25):
                 await self.move(length=-float(self.rng.uniform(0.1, 0.2)), speed=0.1)
             if self.rng.random() < 0.5 and await self.turn(float(self.rng.uniform(-1.5, 1.5))):
                 await self.move(length=float(self.rng.uniform(0.2, 0.8)), speed=0.15)
 
-    def alone(self) -> bool:
-        """Whether no other robot says that it is near."""
+    def alone(self, back: float = 0.0) -> bool:
+        """Whether no other robot says that it is near, here or so many metres behind."""
         poses = {name: box.latest.pose for name, box in self.everybody.items() if box.latest is not None}
         me = poses.pop(self.name)
-        return all(math.dist((me.x, me.y), (other.x, other.y)) > APART for other in poses.values())
+        place = me.x - back * math.cos(me.yaw), me.y - back * math.sin(me.yaw)
+        return all(math.dist(place, (other.x, other.y)) > APART for other in poses.values())
 
     async def turn(self, angle: float) -> bool:
         """Whether it turned on the spot."""
