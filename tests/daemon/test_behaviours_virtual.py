@@ -35,7 +35,9 @@ async def hear(rig: VirtualRig, out, clock: VirtualClock) -> None:
         ranges = {}
         for name, (px, py, angle) in PLACES.items():
             place = np.array([truth.x + c * px - s * py]), np.array([truth.y + s * px + c * py])
-            reach = float(rig.world._cast(*place, np.array([truth.yaw + np.radians(angle)]), 3.0)[0])
+            reach = float(
+                rig.world.scene.cast(*place, np.array([truth.yaw + np.radians(angle)]), 3.0, without=rig.world.name)[0]
+            )
             ranges[name] = reach if 0.0 < reach < np.inf else None
         out.put(sonars(ranges, now=now))
         await clock.sleep(0.1)

@@ -32,10 +32,15 @@ def test_robots_of_one_world_have_noise_of_their_own():
     assert one.sim.seed != two.sim.seed
 
 
+def test_two_robots_of_one_name_are_refused():
+    with pytest.raises(InputError) as caught:
+        as_fleet([LEADER, LEADER])
+    assert "robot leader: of leader and of leader" in str(caught.value)
+
+
 @pytest.mark.parametrize(
     ("overlay", "said"),
     [
-        ({"robot": "leader"}, "robot leader: of leader and of leader"),
         (
             {"devices": {"lidar": {"port": {"path": LEADER.devices.lidar.port.path}}}},
             "leader/lidar: of leader and of second",

@@ -35,7 +35,7 @@ def test_json_output_has_values_and_origins(monkeypatch: pytest.MonkeyPatch, cap
     assert run(monkeypatch, "config", "show", "--json", str(ROOT / "configs" / "demo.yaml")) == 0
     shown = json.loads(capsys.readouterr().out)
     assert shown["config"]["geometry"]["wheelbase"] == 0.32
-    assert shown["origins"]["geometry.wheelbase"].endswith("chassis.yaml:6")
+    assert shown["origins"]["geometry.wheelbase"].endswith("chassis.yaml:7")
 
 
 def test_a_key_chooses_what_is_shown(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
@@ -46,7 +46,7 @@ def test_a_key_chooses_what_is_shown(monkeypatch: pytest.MonkeyPatch, capsys: py
         "geometry.track",
         *(f"gate.leases.{role}" for role in ("gamepad", "keyboard", "station", "tracker")),
     ]
-    assert lines[0].endswith(f"{ROOT}/configs/parts/chassis.yaml:7"), "included files are named the short way"
+    assert lines[0].endswith(f"{ROOT}/configs/parts/chassis.yaml:8"), "included files are named the short way"
     assert run(monkeypatch, "config", "show", robot, "--key", "geometry.track", "--json") == 0
     shown = json.loads(capsys.readouterr().out)
     assert shown["config"] == {"geometry": {"track": 0.26}}

@@ -24,10 +24,11 @@ def test_every_worker_whose_packages_are_installed_is_built(monkeypatch: pytest.
     assert built == ["present"]
 
 
-def test_mapping_planning_deformation_and_tracking_are_among_them():
+def test_mapping_planning_deformation_tracking_and_exploration_are_among_them():
     assert [target.partition(":")[2] for target in kernels.WORKERS] == [
         "SlamWorker",
         "PlanningWorker",
         "DeformingWorker",
         "TrackingWorker",
+        "ExploringWorker",
     ]
