@@ -83,7 +83,7 @@ class TappedPort(PtyPort):
 def serve(config: Path) -> None:
     """``monstertruckd simulate`` with a tap on the drive's wire."""
     simulate.PtyPort = TappedPort  # type: ignore[misc]
-    run_wall(lambda clock: simulate.serve(clock, load_simulated(config), None))
+    run_wall(lambda clock: simulate.serve(clock, (load_simulated(config),), None))
 
 
 # Flooder
