@@ -23,6 +23,8 @@ PLANNER_START: Final = 240.0
 """Seconds that a planner may take to start."""
 ACCEPT_TIMEOUT: Final = 3.0
 """Seconds in which a path is accepted or refused."""
+STAND_TIMEOUT: Final = 2.0
+"""Seconds that a path waits for a truck that is still moving: one that has just reached its goal comes to rest."""
 
 
 class Driver(Operator, Protocol):
@@ -168,6 +170,10 @@ async def follow(driver: Driver, clock: Clock, path: Path, *, arm: bool, report:
         driver.subscribe(EVENT, fifo(256)) as events,
         driver.subscribe(PATH, latest()) as present,
     ):
+        with suppress(TimeoutError):
+            async with clock.deadline(STAND_TIMEOUT):
+                while (await gate.next()).mode.moving:
+                    pass
         async with _taken_back(driver.stop):
             await driver.path(path)
             await _accepted(driver, clock, events, present, path.name)

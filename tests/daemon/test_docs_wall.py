@@ -3,6 +3,7 @@
 import asyncio
 import os
 import pty
+import re
 import sys
 from pathlib import Path
 
@@ -24,7 +25,8 @@ pytestmark = [pytest.mark.wall, pytest.mark.timeout(300)]
 async def test_every_line_on_a_running_truck(tmp_path: Path):
     others = {line.text for line in ours() if starts_truck(line)} - {"monstertruckd simulate --run"}
     for line in others:
-        load_simulated(ROOT / line.split("--config ")[1])
+        for file in re.split(r"--(?:config|robots) ", line)[1].split()[0].split(","):
+            load_simulated(ROOT / file)
     async with robot(tmp_path, base=ROOT / "configs/demo.yaml") as made:
         await made.start_simulator()
         await made.start_daemon()

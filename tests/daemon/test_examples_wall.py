@@ -15,7 +15,7 @@ pytestmark = [pytest.mark.wall, pytest.mark.timeout(400)]
 async def example(folder: Path, name: str, *arguments: str) -> str:
     """Run one in ``folder``; what it printed."""
     process = await asyncio.create_subprocess_exec(
-        sys.executable, str(ROOT / "examples" / f"{name}.py"), *arguments, cwd=folder,
+        sys.executable, str(ROOT / "docs" / "examples" / f"{name}.py"), *arguments, cwd=folder,
         stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.STDOUT,
     )  # fmt: skip
     output, _ = await process.communicate()

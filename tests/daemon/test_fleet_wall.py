@@ -42,12 +42,16 @@ async def test_two_daemons_in_one_world(tmp_path: Path):
     fleet.simulator = await fleet.spawn("simulate", "--robots", robots, "--run", "--truth", str(truth))
     try:
         for name, x in (("leader", -1.0), ("second", -2.2)):
-            wait = ("echo", "stand/pose", "-n", "1", "--timeout", "5", "--robot", name, "-e", endpoints[name])
+            wait = ("echo", "state/odometry", "-n", "1", "--timeout", "5", "--robot", name, "-e", endpoints[name])
             async with asyncio.timeout(120):
                 while (seen := await command(*wait)).returncode:
                     await asyncio.sleep(0.5)
             assert json.loads(seen.stdout)["pose"]["x"] == pytest.approx(x, abs=0.02)
-        await fleet.fault("second lidar unplug")
+        assert fleet.simulator.stdin is not None
+        fleet.simulator.stdin.write(b"second lidar unplug\n")
+        async with asyncio.timeout(20):
+            while (await fleet.said()).strip() != "ok":  # behind what the simulator said of its start
+                pass
     finally:
         await end(fleet.simulator)
     with np.load(truth) as archive:

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 
 from monstertruck_planners.goals.exchange import DeformAnswer, PlanAnswer
-from monstertruck_planners.steps import CODEC, DEFORMING, PLANNING, STEPS, TRACKING
+from monstertruck_planners.steps import CODEC, DEFORMING, EXPLORING, PLANNING, STEPS, TRACKING
 from monstertruck_runtime.actors.actor import ActorFactory, Placement
 from monstertruck_runtime.actors.remote import RPC, RemoteWorkQueue
 from monstertruck_runtime.clock import Clock, run_wall
 from tests.bus_kit import running_robot
-from tests.unit.runtime.actors.step_kit import deform_tasks, numbers, plan_task, track_inputs
+from tests.unit.runtime.actors.step_kit import deform_tasks, explore_task, numbers, plan_task, track_inputs
 
 pytestmark = [pytest.mark.wall, pytest.mark.timeout(180)]
 
-INPUTS = {PLANNING: [plan_task()], DEFORMING: deform_tasks(), TRACKING: track_inputs()}
+INPUTS = {PLANNING: [plan_task()], DEFORMING: deform_tasks(), TRACKING: track_inputs(), EXPLORING: [explore_task()]}
 
 
 async def outputs(actors: ActorFactory, placement: Placement, name: str) -> list[Any]:
@@ -27,7 +27,7 @@ async def outputs(actors: ActorFactory, placement: Placement, name: str) -> list
         return [await actor.step(one) for one in inputs]
 
 
-def test_planner_deformer_and_tracker_give_the_same_in_the_loop_in_a_worker_and_in_a_plan_server():
+def test_all_steps_give_the_same_in_the_loop_in_a_worker_and_in_a_plan_server():
     async def main(clock: Clock) -> tuple[int, dict[str, list[list[Any]]]]:
         queue = RemoteWorkQueue(CODEC)
         actors = ActorFactory(clock, queue)

@@ -6,6 +6,8 @@ import numpy as np
 
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.collision import Footprint
+from monstertruck_planners.explore.config import TourConfig
+from monstertruck_planners.explore.exchange import ExploreSetup, ExploreTask
 from monstertruck_planners.goals.config import PlannerConfig
 from monstertruck_planners.goals.exchange import DeformTask, LocalRoute, PlanTask, Setup
 from monstertruck_planners.local.config import RsbandConfig
@@ -49,6 +51,15 @@ def plan_task() -> PlanTask:
     setup = Setup(PlannerConfig(route=HybridConfig(effort=1000, margin=0.04)), TRUCK, BODY)
     points = np.array([[2.75, 1.5], [2.75, 1.45]])
     return PlanTask("route", (1.0, 1.5, 0.1), (4.5, 1.4, 0.3), points, setup=setup, grid=room())
+
+
+def explore_task() -> ExploreTask:
+    """The far half of the room is unknown."""
+    cells = room().cells.reshape(60, 120).copy()
+    cells[:, 60:] = -1
+    setup = ExploreSetup(TourConfig(), BODY, 0.5)
+    whole = room().model_copy(update={"cells": cells.ravel()})
+    return ExploreTask((1.0, 1.5, 0.1), whole=whole, setup=setup, choose=True, home=(0.8, 1.5, 0.0))
 
 
 def track_inputs() -> list[TrackInput]:

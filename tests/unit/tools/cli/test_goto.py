@@ -10,9 +10,11 @@ from typer.testing import CliRunner
 from monstertruck_runtime.clock import SECOND, run_virtual
 from monstertruck_runtime.drives import drive_to, follow
 from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError
-from monstertruck_runtime.mailbox import Mailbox
+from monstertruck_runtime.mailbox import Mailbox, latest
 from monstertruck_schemas.plan import Path
 from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.state import GateMode, GateState
+from monstertruck_schemas.topics import GATE
 from monstertruckd.tools.cli.goto_session import on_the_terminal
 from monstertruckd.tools.cli.main import app
 
@@ -85,11 +87,11 @@ PATH = Path(stamp=0, received=0, seq=0, frame="odom", name="p", poses=np.zeros(6
 
 
 def interrupted(robot, drive):
-    """What the robot was asked for until the command, interrupted after a second, had ended."""
+    """What the robot was asked for until the command, interrupted after three seconds, had ended."""
 
     async def main(clock):
         driving = asyncio.create_task(drive(robot, clock))
-        await clock.sleep(1.0)
+        await clock.sleep(3.0)
         driving.cancel()
         with suppress(asyncio.CancelledError, NoAnswerError, RequestRefusedError):
             await driving
@@ -155,3 +157,39 @@ def test_arming_that_is_interrupted_is_taken_back_with_the_goal():
 
 def test_a_path_that_is_interrupted_before_it_is_accepted_stops_the_truck():
     assert interrupted(SilentRobot("none"), along_path) == ["path", "stop"]
+
+
+class MovingRobot(SilentRobot):
+    """Comes to rest after a second."""
+
+    def __init__(self, clock):
+        super().__init__("none")
+        self._clock = clock
+        self.gate = Mailbox(latest())
+
+    def subscribe(self, topic, delivery):
+        return self.gate if topic is GATE else super().subscribe(topic, delivery)
+
+    async def come_to_rest(self):
+        for _ in range(10):
+            self.gate.put(gate_state(GateMode.DRIVING))
+            await self._clock.sleep(0.1)
+        assert self.asked == []
+        self.gate.put(gate_state(GateMode.ARMED))
+
+
+def gate_state(mode):
+    return GateState(stamp=0, received=0, seq=0, mode=mode, nonce="n", speed_limit=0.2)
+
+
+def test_a_path_waits_for_a_truck_that_comes_to_rest():
+    async def main(clock):
+        robot = MovingRobot(clock)
+        following = asyncio.create_task(along_path(robot, clock))
+        await robot.come_to_rest()
+        await clock.sleep(0.01)
+        assert robot.asked == ["path"]
+        following.cancel()
+        await asyncio.gather(following, return_exceptions=True)
+
+    run_virtual(main)

@@ -1,4 +1,4 @@
-"""Plots the battery's voltage for some seconds: python examples/battery.py [ENDPOINT [SECONDS]]; needs matplotlib."""
+"""Plots the battery's voltage for some seconds: docs/examples/battery.py [ENDPOINT [SECONDS]]; needs matplotlib."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""Drives to a pose, at once, by way of others: python examples/route.py ENDPOINT X,Y,YAW [X,Y ...]."""
+"""Drives to a pose, at once, by way of others: docs/examples/route.py ENDPOINT X,Y,YAW [X,Y ...]."""
 
 import sys
 

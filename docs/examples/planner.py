@@ -1,4 +1,4 @@
-"""A planner of one's own: a curve to a point ahead, sent as a path: python examples/planner.py ENDPOINT AHEAD LEFT."""
+"""A planner of one's own: a curve to a point ahead, sent as a path: docs/examples/planner.py ENDPOINT AHEAD LEFT."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""Saves scans as a numpy array of ranges, one row each: python examples/scans.py [ENDPOINT [COUNT]]."""
+"""Saves scans as a numpy array of ranges, one row each: docs/examples/scans.py [ENDPOINT [COUNT]]."""
 
 import sys
 from itertools import islice
