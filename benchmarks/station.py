@@ -176,7 +176,7 @@ async def _read(socket: aiohttp.ClientWebSocketResponse) -> None:
 
 
 async def first_pictures(url: str, count: int) -> list[float]:
-    """Seconds from opening the page to the first scan on it, each in a fresh profile."""
+    """Seconds from opening the page to the gate's state on it, each in a fresh profile."""
     times = []
     with TemporaryDirectory() as folder:
         async with chromium(Path(folder)) as browser:

@@ -15,8 +15,8 @@ from monstertruck_runtime.errors import InputError, RequestRefusedError
 from monstertruck_schemas import topics
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import Battery
-from monstertruckd.config.calibration import STEERING, Estimate, Result
-from monstertruckd.tools.calibrate.statistics import NORMAL, Interval
+from monstertruckd.config.calibration import STEERING, Result
+from monstertruckd.tools.calibrate.statistics import NORMAL, Interval, estimated
 from monstertruckd.tools.calibrate.steps import Collect, Confirm, Number
 from monstertruckd.tools.calibrate.wizard import Wizard, WizardContext
 
@@ -100,16 +100,7 @@ class BatteryWizard:
             f"rounding, and at most {GROUND:g} V along the ground wire"
         )
         estimates = tuple(
-            Estimate(
-                name=name,
-                value=found.value,
-                low=found.low,
-                high=found.high,
-                unit=unit,
-                samples=len(readings),
-                meaning=f"{what} {bounds}",
-                key=key,
-            )
+            estimated(name, found, unit, len(readings), f"{what} {bounds}", key)
             for name, found, unit, what, key in (
                 ("gain", gain, "", "factor from the input's reading to", keys[0]),
                 ("offset", offset, "V", "added to get", keys[1]),

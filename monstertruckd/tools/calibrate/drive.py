@@ -19,7 +19,7 @@ from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError
 from monstertruckd.config.calibration import Estimate, Result
 from monstertruckd.tools.calibrate.response import ResponseFit, Steps, unexplained
-from monstertruckd.tools.calibrate.statistics import Interval, mean_interval
+from monstertruckd.tools.calibrate.statistics import estimated, mean_interval
 from monstertruckd.tools.calibrate.steps import Confirm, MoveRecord, MoveStep, Number
 from monstertruckd.tools.calibrate.wizard import CLEAR, Wizard, WizardContext
 
@@ -117,14 +117,14 @@ class DriveWizard:
         count = len(runs)
         estimates = [
             _sign(inverted),
-            _estimate("drive_ratio", ratio.widened(ratio.value * SLIP), count, wheels, key=RATIO),
-            _estimate("turns_per_metre", turns, count, f"turns of the motor per metre {floor}", "1/m"),
+            estimated("drive_ratio", ratio.widened(ratio.value * SLIP), "", count, wheels, RATIO),
+            estimated("turns_per_metre", turns, "1/m", count, f"turns of the motor per metre {floor}"),
         ]
         drive = context.config.devices.drive
         pulses = None if drive is None else drive.driver.encoder_pulses_per_turn
         if pulses is not None:
             ticks = turns.times(4 * pulses)
-            estimates.append(_estimate("ticks_per_metre", ticks, count, f"encoder counts per metre {floor}", "1/m"))
+            estimates.append(estimated("ticks_per_metre", ticks, "1/m", count, f"encoder counts per metre {floor}"))
         return Result(
             wizard="drive",
             measured=f"{count} runs of about {self.metres:g} m, forward and back in turn, measured with a tape",
@@ -183,21 +183,6 @@ def _sign(inverted: bool) -> Estimate:
         samples=1,
         meaning="driving forward needs negative rpm of the controller; seen by the operator",
         key=INVERTED,
-    )
-
-
-def _estimate(
-    name: str, interval: Interval, samples: int, meaning: str, unit: str = "", key: str | None = None
-) -> Estimate:
-    return Estimate(
-        name=name,
-        value=interval.value,
-        low=interval.low,
-        high=interval.high,
-        unit=unit,
-        samples=samples,
-        meaning=meaning,
-        key=key,
     )
 
 

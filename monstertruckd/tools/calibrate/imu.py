@@ -13,8 +13,8 @@ from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas import topics
 from monstertruck_schemas.sensor import Attitude, Imu
-from monstertruckd.config.calibration import IMU, Estimate, Result
-from monstertruckd.tools.calibrate.statistics import NORMAL, Interval, correlation_factor, known_errors
+from monstertruckd.config.calibration import IMU, Result
+from monstertruckd.tools.calibrate.statistics import NORMAL, Interval, correlation_factor, estimated, known_errors
 from monstertruckd.tools.calibrate.steering_model import HEADING
 from monstertruckd.tools.calibrate.steps import Collect, MoveRecord, MoveStep
 from monstertruckd.tools.calibrate.wizard import CLEAR, Wizard, WizardContext
@@ -137,33 +137,22 @@ def result_of(
     shifted = (_mean(forces[:, i] - down).joined(NORMAL * GRAVITY * TILT) for i, down in enumerate(gravity))
     biases |= dict(zip(("force_x", "force_y"), shifted, strict=True))
     estimates = [
-        Estimate(
-            name=name,
-            value=found.value,
-            low=found.low,
-            high=found.high,
-            unit="rad/s" if name.startswith("rate") else "m/s^2",
-            samples=len(resting),
-            meaning="bias of the angular velocity at rest; 95 % of the readings' noise"
+        estimated(
+            name,
+            found,
+            "rad/s" if name.startswith("rate") else "m/s^2",
+            len(resting),
+            "bias of the angular velocity at rest; 95 % of the readings' noise"
             if name.startswith("rate")
             else "bias of the specific force; 95 % of the noise and of the compass's tilt",
-            key=f"{IMU}.{name}",
+            f"{IMU}.{name}",
         )
         for name, found in biases.items()
     ]
     if turns:
         scale = rate_scale(turns, biases["rate_z"])
-        estimates.append(
-            Estimate(
-                name="rate_scale",
-                value=scale.value,
-                low=scale.low,
-                high=scale.high,
-                samples=len(turns),
-                meaning="factor on the yaw rate, from full turns by the compass; 95 % of the turns' noise",
-                key=f"{IMU}.rate_scale",
-            )
-        )
+        meaning = "factor on the yaw rate, from full turns by the compass; 95 % of the turns' noise"
+        estimates.append(estimated("rate_scale", scale, "", len(turns), meaning, f"{IMU}.rate_scale"))
     return Result(
         wizard="imu",
         measured=f"{len(resting)} readings at rest and {len(turns)} full turns",

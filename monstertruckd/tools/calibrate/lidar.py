@@ -29,7 +29,7 @@ from monstertruck_runtime.errors import InputError
 from monstertruck_schemas import topics
 from monstertruck_schemas.sensor import VALID_BEAM, LaserScan
 from monstertruckd.config.calibration import LIDAR, Estimate, Result
-from monstertruckd.tools.calibrate.statistics import NORMAL, Interval, correlation_factor, known_errors
+from monstertruckd.tools.calibrate.statistics import NORMAL, Interval, correlation_factor, estimated, known_errors
 from monstertruckd.tools.calibrate.steering_model import AXLES, EYE
 from monstertruckd.tools.calibrate.steps import Collect, MoveRecord, MoveStep, Number
 from monstertruckd.tools.calibrate.weave import weaves
@@ -182,7 +182,7 @@ class LidarWizard:
             ("roll", math.asin((side - centre) / left) - body[1], left, "right side down positive"),
         )
         return tuple(
-            _estimate(
+            estimated(
                 name,
                 Interval(angle, NORMAL * math.hypot(error / distance, TILT)),
                 "rad",
@@ -243,9 +243,9 @@ def result_of(
     x, y, yaw = (Interval(float(v), float(h)) for v, h in zip(fit.parameters[:3], halves[:3], strict=True))
     noise = "95 % of scans and slip"
     estimates = [
-        _estimate("x", x.joined(NORMAL * CENTRE), "m", len(legs), f"before the body's middle; {noise}", f"{LIDAR}.x"),
-        _estimate("y", y, "m", len(legs), f"left of it; {noise}", f"{LIDAR}.y"),
-        _estimate(
+        estimated("x", x.joined(NORMAL * CENTRE), "m", len(legs), f"before the body's middle; {noise}", f"{LIDAR}.x"),
+        estimated("y", y, "m", len(legs), f"left of it; {noise}", f"{LIDAR}.y"),
+        estimated(
             "yaw", yaw, "rad", len(legs),
             f"against the direction of travel, left positive; {noise}, and of what the truck may crab", f"{LIDAR}.yaw",
         ),
@@ -253,7 +253,7 @@ def result_of(
     ]  # fmt: skip
     if offset is not None:
         text = "by which odometry runs ahead of the scans, for information"
-        estimates.append(_estimate("time_offset", offset.value, "s", offset.samples, f"{text}; 95 % of the turns"))
+        estimates.append(estimated("time_offset", offset.value, "s", offset.samples, f"{text}; 95 % of the turns"))
     return Result(
         wizard="lidar",
         measured=f"{len(legs)} legs between rests; unexplained {1000 * _unexplained(fit, legs):.1f} mm",
@@ -406,16 +406,3 @@ def _yaws(record: MoveRecord) -> tuple[Array, Array, Array, Array, Array] | None
     wheel = np.unwrap([o.pose.yaw for o in odometry])
     at = np.array(stamps, dtype=np.float64)
     return at, np.unwrap(yaws), np.interp(at, times, wheel), times, wheel
-
-
-def _estimate(name: str, found: Interval, unit: str, samples: int, meaning: str, key: str | None = None) -> Estimate:
-    return Estimate(
-        name=name,
-        value=found.value,
-        low=found.low,
-        high=found.high,
-        unit=unit,
-        samples=samples,
-        meaning=meaning,
-        key=key,
-    )

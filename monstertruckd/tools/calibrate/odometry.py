@@ -19,7 +19,7 @@ from monstertruck_kinematics.fitting import FitResult, least_squares
 from monstertruck_runtime.errors import InputError, RequestRefusedError
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.config.calibration import STEERING, Estimate, Result
-from monstertruckd.tools.calibrate.statistics import Interval, known_errors
+from monstertruckd.tools.calibrate.statistics import Interval, estimated, known_errors
 from monstertruckd.tools.calibrate.steering_model import AXLES, EYE, SLIP, Maps, SteeringModel, SteeringRun
 from monstertruckd.tools.calibrate.steps import Confirm, MoveRecord, MoveStep, Number
 from monstertruckd.tools.calibrate.wizard import CLEAR, Wizard, WizardContext
@@ -128,10 +128,10 @@ class OdometryWizard:
                 f"{FLOOR:.1%} of other floors",
                 key="geometry.drive_ratio",
             ),
-            _estimate(
+            estimated(
                 "wheel_radius", way.times(geometry.wheel_radius), "m", len(squares), "wheels, by the configured ratio"
             ),
-            _estimate(
+            estimated(
                 "wheelbase",
                 base.times(geometry.wheelbase),
                 "m",
@@ -139,7 +139,7 @@ class OdometryWizard:
                 f"that the turns show; 95 % of the legs' noise, and {LINKAGE:.1%} of the linkage",
                 "geometry.wheelbase",
             ),
-            _estimate(
+            estimated(
                 "offset", offset.times(math.degrees(1.0)), "deg", legs,
                 "of the servos, in front to the left and at the rear to the right; 95 % of the legs' noise",
             ),
@@ -154,7 +154,7 @@ class OdometryWizard:
             half = math.hypot(math.degrees(offset.half) * abs(scale), known)
             centre = Interval(maps.centres[axle] - moved, half)
             text = "pulse that steers straight ahead; 95 % of the legs' noise, and what both axles may be off together"
-            estimates.append(_estimate(f"{name}_centre", centre, "us", legs, text, f"{STEERING}.{name}.centre_us"))
+            estimates.append(estimated(f"{name}_centre", centre, "us", legs, text, f"{STEERING}.{name}.centre_us"))
         errors = [math.hypot(*square.off) for square in squares]
         left = [math.dist(model.end(square, fit.parameters), square.off) for square in squares]
         return Result(
@@ -277,19 +277,6 @@ def intervals(fit: FitResult, measured: int) -> tuple[Interval, Interval, Interv
         raise InputError("the squares are off by more than 30 %: calibrate drive and steering first")
     way, base, offset = (Interval(float(x), float(h)) for x, h in zip(fit.parameters, halves, strict=True))
     return way, base, offset
-
-
-def _estimate(name: str, found: Interval, unit: str, samples: int, meaning: str, key: str | None = None) -> Estimate:
-    return Estimate(
-        name=name,
-        value=found.value,
-        low=found.low,
-        high=found.high,
-        unit=unit,
-        samples=samples,
-        meaning=meaning,
-        key=key,
-    )
 
 
 def _chord(turn: float) -> float:

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.fitting import FitResult
+from monstertruckd.config.calibration import Estimate
 
 _T: Final = (
     12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228,
@@ -59,6 +60,20 @@ class Interval:
     def times(self, factor: float) -> "Interval":
         """Of the value times an exact factor."""
         return Interval(self.value * factor, self.half * abs(factor))
+
+
+def estimated(name: str, found: Interval, unit: str, samples: int, meaning: str, key: str | None = None) -> Estimate:
+    """An estimate by its interval; the rest as in ``Estimate``."""
+    return Estimate(
+        name=name,
+        value=found.value,
+        low=found.low,
+        high=found.high,
+        unit=unit,
+        samples=samples,
+        meaning=meaning,
+        key=key,
+    )
 
 
 def mean_interval(values: ArrayLike, least_error: float = 0.0) -> Interval:
