@@ -51,6 +51,7 @@ from monstertruckd.bus.zenoh_session import ZenohBridge
 from monstertruckd.config import calibration_rpc
 from monstertruckd.config.calibration import CalibrationStore
 from monstertruckd.config.expiry import CalibrationWatch, WayCounter
+from monstertruckd.config.live_rpc import LiveConfig
 from monstertruckd.config.load import Tree, resolved
 from monstertruckd.config.truck import TruckConfig
 from monstertruckd.gate import rpc as gate_rpc
@@ -295,14 +296,17 @@ class Daemon:
     def _build_rpc(self) -> Rpc:
         rpc = Rpc(self.clock)
 
+        live = LiveConfig(self.config, self._reconfigure, self._events, self._offload)
+
         async def config(_: dict[str, Any]) -> dict[str, Any]:
-            return resolved(self.config)
+            return resolved(live.config)
 
         async def versions(_: dict[str, Any]) -> dict[str, Any]:
             return dict(running_versions())
 
         rpc.register("config", config, AccessRole.OBSERVER)
         rpc.register("versions", versions, AccessRole.OBSERVER)
+        live.register(rpc)
         rpc.register(REMOTE_STEP, self._remote_steps.serve)
         gate_rpc.register(rpc, self.bus, self.clock)
         loaded = self._tree.calibration if self._tree is not None else None
@@ -317,6 +321,9 @@ class Daemon:
             self._calibration.stamped,
         )
         return rpc
+
+    def _reconfigure(self, config: TruckConfig) -> None:
+        self.gate.configure(config.gate, config.weakened())
 
     def _refuse_goal(self, request: GoalRequest) -> None:
         text = f"goal of {request.source} refused: this robot follows paths, it has no planner that finds one"

@@ -18,11 +18,12 @@ from ruamel.yaml.error import YAMLError
 from ruamel.yaml.nodes import Node, ScalarNode, SequenceNode
 
 from monstertruck_runtime.endpoints import emulated_ports
-from monstertruck_runtime.errors import ConfigError
+from monstertruck_runtime.errors import ConfigError, InputError
 from monstertruck_runtime.plugins import kind_of, models_in
 from monstertruck_schemas.base import Schema
 from monstertruckd.config.calibration import CalibrationStore, with_values
 from monstertruckd.config.edit import YamlText, node_kind, reader
+from monstertruckd.config.live import SavedSettings, with_settings
 from monstertruckd.config.migrate import OLDEST, VERSION, bring_up_to_date
 from monstertruckd.config.truck import ROBOT, TruckConfig
 
@@ -71,12 +72,12 @@ class Tree:
 
 
 def load_truck(path: Path) -> tuple[TruckConfig, Tree]:
-    """The configuration at ``path``, calibrated.
+    """The configuration at ``path`` with the saved settings and the calibration of its robot.
 
     Raises:
-        ConfigError: one line per mistake, in the file or in its calibration.
+        ConfigError: one line per mistake, in the file, in the saved settings or in the calibration.
     """
-    return calibrated(*load_config(path, TruckConfig))
+    return calibrated(*adjusted(*load_config(path, TruckConfig)))
 
 
 def load_config(path: Path, model: type[S]) -> tuple[S, Tree]:
@@ -95,6 +96,24 @@ def resolved(config: Schema) -> dict[str, Any]:
     """The whole configuration as plain data, defaults included."""
     dumped: dict[str, Any] = TypeAdapter(type(config)).dump_python(config, mode="json")
     return dumped
+
+
+def adjusted(config: T, tree: Tree) -> tuple[T, Tree]:
+    """The configuration with the live settings that were saved while the robot ran, and each value's origin.
+
+    Raises:
+        ConfigError: their file is damaged, or the configuration refuses a value.
+    """
+    saved = SavedSettings.of(config)
+    rows = saved.values(config)
+    if not rows:
+        return config, tree
+    origins = tree.origins | {tuple(key.split(".")): Origin(saved.path, line) for key, (_, line) in rows.items()}
+    try:
+        changed = with_settings(config, {key: value for key, (value, _) in rows.items()})
+    except InputError as error:
+        raise ConfigError(f"{saved.path}: {error}") from error
+    return changed, Tree(tree.data, origins, tree.files, tree.calibration)
 
 
 def calibrated(config: T, tree: Tree) -> tuple[T, Tree]:

@@ -13,12 +13,15 @@ from typing import Annotated, Any, Final, Self
 from pydantic import Field, model_validator
 
 from monstertruck_schemas import topics
-from monstertruck_schemas.base import Schema
+from monstertruck_schemas.base import LIVE, Schema
 from monstertruck_schemas.req import Role
 from monstertruck_schemas.topics import Topic
 
 Positive = Annotated[float, Field(gt=0)]
 Share = Annotated[float, Field(ge=0)]
+LivePositive = Annotated[Positive, LIVE]
+LiveShare = Annotated[Share, LIVE]
+LiveTilt = Annotated[float, Field(gt=0, lt=math.pi / 2), LIVE]
 
 
 class SensorLimit(Schema):
@@ -52,13 +55,14 @@ class Leases(Schema):
 class TiltLimits(Schema):
     """Limits of the angle between the truck's z axis and the vertical."""
 
-    slow: Annotated[float, Field(gt=0, lt=math.pi / 2)] = 0.21
+    slow: LiveTilt = 0.21
     """From this tilt on the speed is limited to ``slow_speed``, rad."""
-    stop: Annotated[float, Field(gt=0, lt=math.pi / 2)] = 0.35
+    stop: LiveTilt = 0.35
     """From this tilt on the truck stops, rad."""
     hysteresis: Annotated[float, Field(ge=0)] = 0.035
     """A limit ends when the tilt is this much below where it began, rad."""
-    slow_speed: Positive = 0.08
+    slow_speed: LivePositive = 0.08
+    """M/s."""
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
@@ -84,18 +88,18 @@ class SteeringCheckConfig(Schema):
 class ObstacleLimits(Schema):
     """Clearance kept along the swept path."""
 
-    ahead: Share = 0.05
+    ahead: LiveShare = 0.05
     """Distance between footprint and obstacle after the stop, m."""
-    side_clearance: Share = 0.02
+    side_clearance: LiveShare = 0.02
     """Clearance to all sides while passing, m, added to the footprint's padding."""
-    deceleration: Positive = 0.15
+    deceleration: LivePositive = 0.15
     """Comfortable deceleration towards an obstacle, m/s^2: decides how early the truck slows down."""
     crawl: Positive = 0.02
     """An allowed speed below this is a stop; driving on needs twice as much, m/s."""
     seen: Annotated[float, Field(gt=0, le=1)] = 0.5
     """Share of the beams in each sector of travel (10 degrees) that must see: measure a range, or meet nothing within
     the lidar's range. A recorded URG-04LX has 0.95 to 1.0 of them, and less than half in one of 800 sectors."""
-    unseen_speed: Positive = 0.1
+    unseen_speed: LivePositive = 0.1
     """Speed limit while a sector of travel is not seen, m/s; one not seen for ``scan.stale_after`` stops the truck.
     Where the lidar does not look it is the limit onto ground that no scan of the last 30 s has seen."""
     memory_distance: Share = 1.0
@@ -132,21 +136,21 @@ class GateConfig(Schema):
     rate: Annotated[float, Field(ge=10, le=200)] = 50.0
     """Control ticks per second."""
 
-    speed: Positive = 0.21
+    speed: LivePositive = 0.21
     """Greatest wheel speed over ground, forward, m/s."""
-    reverse_speed: Positive = 0.15
+    reverse_speed: LivePositive = 0.15
     """Greatest wheel speed in other motions (reverse, sideways, on the spot): the lidar does not see it all, m/s."""
-    angle: Annotated[float, Field(gt=0, lt=1.0)] = 0.436
+    angle: Annotated[float, Field(gt=0, lt=1.0), LIVE] = 0.436
     """Greatest axle angle, rad; less where the servos' pulses reach less."""
-    acceleration: Positive = 0.5
+    acceleration: LivePositive = 0.5
     """Growth of the commanded speed of base and wheels, m/s^2."""
-    yaw_acceleration: Annotated[float, Field(gt=0, le=20)] = 6.0
+    yaw_acceleration: Annotated[float, Field(gt=0, le=20), LIVE] = 6.0
     """Growth of the commanded yaw rate, rad/s^2."""
     deceleration: Positive = 1.0
     """Least deceleration of the drive controller's profile after a command of speed 0, m/s^2."""
     quick_deceleration: Positive = 1.2
     """Least deceleration of its quick stop, m/s^2."""
-    steering_rate: Annotated[float, Field(gt=0, le=12)] = 1.0
+    steering_rate: Annotated[float, Field(gt=0, le=12), LIVE] = 1.0
     """Greatest change of a steering angle, rad/s; the quickest servos turn by 60 degrees in 0.09 s."""
     reaction: Share = 0.08
     """Seconds from a command leaving the gate to the truck's response."""
@@ -196,7 +200,7 @@ class GateConfig(Schema):
     """So many stops for stale sensors within ``short_faults_within`` disarm: the fault is no short one."""
     short_faults_within: Positive = 10.0
     """Seconds; at least a second for each of them, as the truck stands in between."""
-    battery_low_speed: Positive = 0.1
+    battery_low_speed: LivePositive = 0.1
     """Speed limit with a low battery, or a stale battery voltage, m/s."""
     obstacle: ObstacleLimits = ObstacleLimits()
     sonar: SonarLimits = SonarLimits()

@@ -153,6 +153,15 @@ class Gate:
         self._stalled_until = 0
         self._shut_down = False
 
+    def configure(self, config: GateConfig) -> None:
+        """Take other limits between two ticks; of those that differ only settings marked live take effect at once.
+
+        A truck that drives slows down to lesser ones by its ramp.
+        """
+        self._config = config
+        self._limiter.configure(config)
+        self._causes.configure(config)
+
     @property
     def mode(self) -> GateMode:
         """Present mode."""

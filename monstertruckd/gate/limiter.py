@@ -365,7 +365,6 @@ class ObstacleGuard:
         self._scan_points = points
         self._visibility = Visibility(footprint, points.mount, config.obstacle.seen)
         self._memory = ScanMemory(footprint, points.mount, config.obstacle.memory_distance)
-        self._keep = round(config.scan.stale_after * SECOND)
         self._points = np.empty((0, 2))
         self._stamp = 0
         self.unseen: float | None = 0.0
@@ -374,11 +373,24 @@ class ObstacleGuard:
         """Distance along the newest ways to ground that no scan has seen, m; +inf if none is within reach."""
         self._checked: frozenset[tuple[int, int, int]] | None = None
         self._free = math.inf
+        self._outline = outline(footprint)
+        self._near = 0.0
+        self.configure(config)
+
+    def configure(self, config: GateConfig) -> None:
+        """Take other limits, between two ticks; what earlier scans left out as too far away counts as not seen."""
+        self._config = config
+        self._keep = round(config.scan.stale_after * SECOND)
         delay = config.scan.stale_after + config.max_latency + config.reaction
         self._reach = config.obstacle.ahead + self._stopping(config.speed, delay, config.obstacle.deceleration)
-        self._near = self._reach + footprint.circumscribed_radius + config.obstacle.side_clearance
-        self._outline = outline(footprint)
+        before, self._near = (
+            self._near,
+            (self._reach + self._footprint.circumscribed_radius + config.obstacle.side_clearance),
+        )
+        if self._near > before:
+            self._memory.forget()
         self._sweep = lru_cache(SWEEPS)(self._swept)
+        self._checked = None
 
     def move(self, now: int, twist: Twist[float] | None, dt: float) -> None:
         """The body moved with ``twist`` for the ``dt`` s until ``now``, ns; None = it is not known how."""
@@ -506,6 +518,10 @@ class Motion:
         """Shaft speeds that are commanded open loop, m/s; None = they follow from the twist."""
         self._servos = self.angles, chassis.servos(*self.angles)
         self._shafts = (STILL, self.angles), chassis.shafts_along(STILL, *self.angles)
+
+    def configure(self, config: GateConfig) -> None:
+        """Take other limits, between two ticks."""
+        self._config = config
 
     @property
     def standing(self) -> bool:
@@ -716,6 +732,15 @@ class CommandLimiter:
         """The obstacle is so near that only the quick stop avoids contact."""
         self.free: float | None = None
         """Distance the footprint can travel, m; None = no obstacle within the checked distance."""
+
+    def configure(self, config: GateConfig) -> None:
+        """Take other limits, between two ticks."""
+        self._config = config
+        self._motion.configure(config)
+        self._obstacles.configure(config)
+        self._sensors.configure(config)
+        if self._sonars is not None:
+            self._sonars.configure(config)
 
     @property
     def unseen(self) -> float | None:

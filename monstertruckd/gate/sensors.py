@@ -128,6 +128,11 @@ class SensorMonitor:
         self.angles = chassis.straight
         """Steering angles by the newest steering feedback, rad."""
 
+    def configure(self, config: GateConfig) -> None:
+        """Take other limits, between two ticks."""
+        self._config = config
+        self._tilt.limits = config.tilt
+
     def observe_scan(self, scan: LaserScan) -> bool:
         """Take a scan; False if it is not valid: by its age, the tilt of its plane, or without a single range."""
         valid = self._valid(scan, Reason.SCAN_STALE)
@@ -346,7 +351,7 @@ class _Tilt:
     """Tilt limits with hysteresis."""
 
     def __init__(self, limits: TiltLimits) -> None:
-        self._limits = limits
+        self.limits = limits
         self.angle = 0.0
         self.slow = False
         self.stop = False
@@ -354,7 +359,7 @@ class _Tilt:
     def update(self, angle: float) -> None:
         """Take a tilt angle, rad."""
         self.angle = angle
-        limits = self._limits
+        limits = self.limits
         self.slow = angle >= limits.slow - (limits.hysteresis if self.slow else 0.0)
         self.stop = angle >= limits.stop - (limits.hysteresis if self.stop else 0.0)
 

@@ -21,6 +21,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import STARTING, ControlRequest, DriveRequest
 from monstertruck_schemas.sensor import Attitude, Battery, DriveFeedback, LaserScan, SonarRanges, SteeringFeedback
 from monstertruck_schemas.state import GateMode, GateState
+from monstertruckd.gate.config import GateConfig
 from monstertruckd.gate.core import Decision, Gate, GateOutput
 from monstertruckd.gate.latch import Latch
 from monstertruckd.gate.stops import Trip
@@ -160,6 +161,14 @@ class GateService:
             _Feed(inputs.battery, gate.observe_battery),
             *(() if inputs.sonar is None else (_Feed(inputs.sonar, gate.observe_sonar),)),
         ]
+
+    def configure(self, config: GateConfig, weakened: tuple[str, ...]) -> None:
+        """Take other limits, which count from the next tick on; see ``Gate.configure``."""
+        self._guarded(None, self._gate.configure, config)
+        added, self._weakened = set(weakened) - set(self._weakened), weakened
+        for setting in sorted(added):
+            self._events(Reason.WEAKENED, Severity.WARNING, self.name, setting)
+        self._published = ()
 
     @property
     def mode(self) -> GateMode:

@@ -68,6 +68,10 @@ class SonarGuard:
         self.view = SonarView(math.inf, (), False)
         """Of the newest motion that was looked at."""
 
+    def configure(self, config: GateConfig) -> None:
+        """Take other limits, between two ticks."""
+        self._config = config
+
     def observe(self, ranges: SonarRanges) -> None:
         """Take a round of pings; one that is too late is left out."""
         if abs(ranges.received - ranges.stamp) > self._config.max_latency * SECOND:

@@ -70,6 +70,10 @@ class CauseBuilder:
             Reason.SHAFT_BLOCKED: self._blocked_shaft,
         }
 
+    def configure(self, config: GateConfig) -> None:
+        """Take other limits, between two ticks."""
+        self._config = config
+
     def causes(self, reasons: Iterable[Reason], now: int, since: Mapping[Reason, int]) -> list[Cause]:
         """One cause per reason, and one per failed service.
 

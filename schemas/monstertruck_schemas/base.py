@@ -5,11 +5,18 @@ Units are SI and radians everywhere; frames follow REP 103 (x forward, y left, z
 """
 
 from collections.abc import Sequence
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, PlainSerializer, PlainValidator, ValidationInfo, WithJsonSchema
+
+
+class Live:
+    """Marks a setting, in its ``Annotated`` type, that may be changed while the robot runs."""
+
+
+LIVE: Final = Live()
 
 
 class Schema(BaseModel):

@@ -39,6 +39,7 @@ class Reason(StrEnum):
     NOT_INSTALLED = "not_installed", 13, "something is not installed, or not as it should be"
     COMMAND_FAILED = "command_failed", 14, "a program of the computer failed"
     REPLAY_DIFFERS = "replay_differs", 15, "the log computed again gives other outputs than it holds"
+    SETTING_CHANGED = "setting_changed", 0, "a setting was changed while the robot runs"
     BLACK_BOX_SAVED = "black_box_saved", 0, "the minute before a stop was saved"
 
     # Devices

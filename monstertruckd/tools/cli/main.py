@@ -27,6 +27,7 @@ from monstertruckd.tools.cli import (
     robot,
     security,
     service,
+    settings,
     stand,
     station,
     study,
@@ -78,6 +79,8 @@ app.command("plan", context_settings={"ignore_unknown_options": True})(plan.plan
 app.command("goto", context_settings={"ignore_unknown_options": True})(goto.goto)
 app.command("track")(goto.track)
 app.command("move")(move.move)
+app.command("get")(settings.get)
+app.command("set", context_settings={"ignore_unknown_options": True})(settings.set_value)
 app.command("explore")(explore.explore)
 app.command("plan-server")(robot.plan_server)
 app.command("replay")(replay.replay)

@@ -1,0 +1,94 @@
+"""Remote calls for the settings that may be changed while the robot runs: ``settings`` and ``set``."""
+
+import asyncio
+from collections.abc import Callable
+from dataclasses import asdict
+from typing import Any, Final
+
+from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.ports import EventSink
+from monstertruck_runtime.threads import Offload
+from monstertruck_schemas.event import Severity
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.roles import AccessRole
+from monstertruckd.bus.rpc import Rpc
+from monstertruckd.config.live import SavedSettings, Value, live_settings, with_settings
+from monstertruckd.config.truck import TruckConfig
+
+LIST: Final = "settings"
+SET: Final = "set"
+MOST: Final = 32
+"""Settings changed by one call."""
+
+
+class LiveConfig:
+    """The running configuration, of which live settings may be replaced.
+
+    Args:
+        config: as the daemon began with.
+        apply: gives every part its settings, between two ticks of the gate.
+        events: gets an event for every change, with who made it.
+        offload: where configurations are validated and files written.
+    """
+
+    def __init__(
+        self, config: TruckConfig, apply: Callable[[TruckConfig], None], events: EventSink, offload: Offload
+    ) -> None:
+        self.config = config
+        self._began = {setting.key: setting.value for setting in live_settings(config)}
+        self._apply = apply
+        self._events = events
+        self._offload = offload
+        self._saved = SavedSettings.of(config)
+        self._start = config
+        self._kept: dict[str, Value] = {}
+        """Saved in this run."""
+        self._turn = asyncio.Lock()
+
+    def register(self, rpc: Rpc) -> None:
+        """Serve ``settings`` and ``set``."""
+        rpc.register(LIST, self._list, AccessRole.OBSERVER)
+        rpc.register(SET, self._set, AccessRole.ENGINEER)
+
+    async def _list(self, _: dict[str, Any]) -> dict[str, Any]:
+        rows = [asdict(setting) | {"began": self._began[setting.key]} for setting in live_settings(self.config)]
+        return {"settings": rows, "file": str(self._saved.path)}
+
+    async def _set(self, payload: dict[str, Any]) -> dict[str, Any]:
+        values, save, by = _values(payload.get("values")), payload.get("save", False), str(payload.get("source", ""))
+        if not isinstance(save, bool):
+            raise InputError(f"save: expected true or false, got {save!r}")
+        async with self._turn:
+            changed = await self._offload(lambda: with_settings(self.config, values))
+            if save:
+                await self._offload(lambda: self._keep(values))
+            before = {setting.key: setting.value for setting in live_settings(self.config)}
+            self.config = changed
+            self._apply(changed)
+        for key, value in values.items():
+            text = f"{key}: {before[key]} to {value} by {by}{', saved' if save else ''}"
+            self._events(
+                Reason.SETTING_CHANGED, Severity.INFO, "settings", text, key=key, value=value, by=by, saved=save
+            )
+        return {"values": values, "file": str(self._saved.path) if save else None}
+
+    def _keep(self, values: dict[str, Value]) -> None:
+        """Save settings, unless the next start would refuse them without those that are not saved."""
+        kept = self._kept | values
+        with_settings(self._start, kept)
+        self._saved.save(values)
+        self._kept = kept
+
+
+def _values(given: Any) -> dict[str, Value]:
+    """Settings from outside.
+
+    Raises:
+        InputError: there are none, or too many; what the values may be is said by their models.
+    """
+    if not isinstance(given, dict) or not 0 < len(given) <= MOST:
+        raise InputError(f"values: expected 1 to {MOST} settings by their dotted names")
+    for key, value in given.items():
+        if not isinstance(value, float | int | bool | str):
+            raise InputError(f"{key}: expected a plain value, got {type(value).__name__}")
+    return given
