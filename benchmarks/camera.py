@@ -19,9 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_drivers.webcam.driver import complete
-from monstertruck_drivers.webcam.emulator import Renderer
+from monstertruck_drivers.webcam.emulator import jpeg
 from monstertruck_drivers.webcam.packets import CameraPacket, PacketKind, PacketParser
-from monstertruck_drivers.webcam.source import Mode
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime import wire
 from monstertruck_runtime.clock import Clock, run_wall
@@ -29,6 +28,8 @@ from monstertruck_runtime.mailbox import fifo
 from monstertruck_runtime.yaml_files import read_yaml, yaml_text
 from monstertruck_schemas import topics
 from monstertruck_schemas.sensor import CompressedImage
+from monstertruck_sim.world.camera import Painter, mounted
+from monstertruck_sim.world.config import CameraConfig
 from monstertruckd.tools.demo.runs import connect, free_endpoint, write_overlay
 from monstertruckd.tools.simulation.program import program
 
@@ -97,9 +98,9 @@ async def compare(clock: Clock, rounds: int, seconds: float) -> dict[str, Any]:
 
 def loop_cost(pictures: int = 300) -> tuple[float, float]:
     """Median and greatest processor time, ms, from a picture's bytes to the bytes of its message."""
-    mode = Mode(640, 480, 15.0)
-    jpeg = Renderer(mode).jpeg(np.linspace(1.0, 4.0, mode.width), 0)
-    data = CameraPacket(PacketKind.PICTURE, 0, 0, jpeg).encode()
+    painter = Painter(CameraConfig(), (640, 480), 0.6)
+    ranges, place = np.linspace(1.0, 4.0, len(painter.azimuths)), mounted((0.0, 0.0, 0.0), CameraConfig())
+    data = CameraPacket(PacketKind.PICTURE, 0, 0, jpeg(painter.picture(ranges, [], place), 0)).encode()
     costs = []
     for number in range(pictures):
         parser, begin = PacketParser(), process_time()

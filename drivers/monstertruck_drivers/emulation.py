@@ -226,15 +226,15 @@ class JointSource(Protocol):
 class ViewSource(Protocol):
     """What a camera sees."""
 
-    def ranges(self, time_ns: int, angles: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Horizontal distances, m, at ``time_ns``; inf = nothing.
+    def exposure(self, time_ns: int, size: tuple[int, int], /) -> Callable[[], NDArray[np.uint8]]:
+        """The picture of an instant: what is returned draws it, in any thread, one at a time.
 
         Args:
             time_ns: instant of the exposure.
-            angles: (n,) directions from the camera's axis, rad, left positive.
+            size: width and height, pixels.
 
         Returns:
-            (n,), float64.
+            Makes (height, width, 3): red, green, blue; the top row first.
         """
         ...
 

@@ -3,7 +3,7 @@
 import asyncio
 import errno
 import io
-import math
+from collections.abc import Callable
 from functools import cache
 from typing import Final
 
@@ -20,76 +20,20 @@ from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.threads import Offload, in_thread
 
 FONT_SIZE: Final = 20
-WALLS, FLOOR, SKY = 0, 128, 192
-"""First palette entries: 128 shades of wall, 64 of floor, 64 of sky."""
-HALF_SHADE: Final = 4.0
-"""Metres at which a wall is half as bright."""
+QUALITY: Final = 75
+"""Of the JPEG, 1..95."""
 
 
-class Renderer:
-    """Pictures of one size; stateless, so that threads may share it.
-
-    Args:
-        mode: size in pixels.
-        field_of_view: horizontal, rad.
-        camera_height: of the camera over the floor, m.
-        wall_height: m.
-        quality: of the JPEG, 1..95.
-    """
-
-    def __init__(
-        self,
-        mode: Mode,
-        *,
-        field_of_view: float = math.radians(63.0),
-        camera_height: float = 0.25,
-        wall_height: float = 0.6,
-        quality: int = 75,
-    ) -> None:
-        self._focal = mode.width / 2 / math.tan(field_of_view / 2)
-        across = mode.width / 2 - 0.5 - np.arange(mode.width)
-        self.angles: NDArray[np.float64] = np.arctan2(across, self._focal)
-        """Direction of every column, rad, left positive; shape (width,)."""
-        self._below = np.arange(mode.height) + 0.5 - mode.height / 2
-        """Of every row, pixels below the horizon; ascending."""
-        self._rows = np.arange(mode.height, dtype=np.uint16)[:, None]
-        self._above_camera, self._camera_height = wall_height - camera_height, camera_height
-        depth = np.abs(self._below) / (mode.height / 2) * 63
-        self._ground = (np.where(self._below > 0, FLOOR, SKY) + depth).astype(np.uint8)[:, None]
-        self._quality = quality
-
-    def jpeg(self, ranges: NDArray[np.float64], counter: int) -> bytes:
-        """Draw one picture.
-
-        Args:
-            ranges: (width,) horizontal distance along each of ``angles``, m; inf = nothing.
-            counter: drawn into the upper left corner.
-        """
-        depth = np.maximum(ranges * np.cos(self.angles), 0.05)
-        shade = (WALLS + 127 / (1 + depth / HALF_SHADE)).astype(np.uint8)
-        top = np.searchsorted(self._below, -self._focal * self._above_camera / depth, side="right")
-        foot = np.searchsorted(self._below, self._focal * self._camera_height / depth)
-        is_wall = (self._rows >= top.astype(np.uint16)) & (self._rows < foot.astype(np.uint16))
-        image = Image.fromarray(np.where(is_wall, shade, self._ground))
-        image.putpalette(_palette())
-        picture = image.convert("RGB")
-        draw = ImageDraw.Draw(picture)
-        text = f"{counter:06d}"
-        draw.rectangle(draw.textbbox((8, 8), text, font=_font()), fill="black")
-        draw.text((8, 8), text, fill="white", font=_font())
-        out = io.BytesIO()
-        picture.save(out, "JPEG", quality=self._quality)
-        return out.getvalue()
-
-
-@cache
-def _palette() -> bytes:
-    rows = np.zeros((256, 3))
-    ramp = np.linspace(0.0, 1.0, 64)[:, None]
-    rows[WALLS:FLOOR] = np.linspace(0.1, 1.0, 128)[:, None] * (225, 215, 200)
-    rows[FLOOR:SKY] = (60, 55, 50) + ramp * (60, 55, 45)
-    rows[SKY:] = (215, 220, 225) - ramp * (95, 65, 25)
-    return rows.astype(np.uint8).tobytes()
+def jpeg(picture: NDArray[np.uint8], counter: int) -> bytes:
+    """A picture, (height, width, 3), with ``counter`` in its upper left corner, as a JPEG."""
+    image = Image.fromarray(picture)
+    draw = ImageDraw.Draw(image)
+    text = f"{counter:06d}"
+    draw.rectangle(draw.textbbox((8, 8), text, font=_font()), fill="black")
+    draw.text((8, 8), text, fill="white", font=_font())
+    out = io.BytesIO()
+    image.save(out, "JPEG", quality=QUALITY)
+    return out.getvalue()
 
 
 @cache
@@ -111,7 +55,7 @@ REFUSALS: Final = {"EINVAL": errno.EINVAL, "EBUSY": errno.EBUSY, "ENOSPC": errno
 class WebcamEmulator:
     """A camera that streams rendered JPEGs while a host wants them.
 
-    Distances are asked of the world on the loop; drawing and compressing happens in ``offload``.
+    The world is asked on the loop; drawing and compressing happens in ``offload``.
 
     Faults (``inject``): ``drop N`` (pictures counted, but not sent), ``corrupt N`` (start marker overwritten),
     ``truncate N`` (the second half is missing), ``bare on|off`` (no Huffman tables), ``jump SECONDS`` (added to all
@@ -120,7 +64,7 @@ class WebcamEmulator:
 
     Args:
         clock: time.
-        view: what is to be seen; None = an empty plain.
+        view: what is to be seen; None = grey.
         offload: where pictures are drawn: a thread, or ``inline`` on the virtual clock.
         usb: the port it hangs on, for ``vanish``.
     """
@@ -151,7 +95,7 @@ class WebcamEmulator:
         """Supply off and on again: it streams no more, and counts from 0."""
         self._sequence = 0
         self._session = 0
-        self._renderer: Renderer | None = None
+        self._size = SIZES[0]
         self._rate = RATE_MAX
         self._wanted.clear()
 
@@ -220,7 +164,7 @@ class WebcamEmulator:
             return
         size = min(SIZES, key=lambda offered: abs(offered[0] - width) + abs(offered[1] - height))
         granted = Mode(*size, min(max(rate, 1.0), RATE_MAX))
-        self._renderer, self._rate = Renderer(granted), granted.rate
+        self._size, self._rate = size, granted.rate
         self._session += 1
         self._wanted.set()
         end.write(CameraPacket(PacketKind.GRANTED, payload=encode_mode(granted)).encode())
@@ -232,27 +176,28 @@ class WebcamEmulator:
             schedule = Schedule(self._clock, self._rate, ahead=-self._clock.now())  # a clock of its own
             while self._wanted.is_set() and session == self._session:
                 stamp = await schedule.next()
-                if self._wanted.is_set() and session == self._session and self._renderer is not None:
-                    await self._expose(end, stamp, self._renderer)
+                if self._wanted.is_set() and session == self._session:
+                    await self._expose(end, stamp)
 
-    async def _expose(self, end: DeviceEnd, stamp: int, renderer: Renderer) -> None:
+    async def _expose(self, end: DeviceEnd, stamp: int) -> None:
         if self._stuck:
             return
         number = self._sequence
         self._sequence += 1
         if self._uses_up("drop"):
             return
-        ranges = self._ranges(stamp, renderer.angles)
-        data = self._damaged(await self._offload(lambda: renderer.jpeg(ranges, number)))
+        draw = self._drawing(stamp)
+        data = self._damaged(await self._offload(lambda: jpeg(draw(), number)))
         packet = CameraPacket(PacketKind.PICTURE, number, stamp + self._jump, data).encode()
         for at in range(0, len(packet), CHUNK):
             await self._clock.sleep(CHUNK_PAUSE)
             end.write(packet[at : at + CHUNK])
 
-    def _ranges(self, stamp: int, angles: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _drawing(self, stamp: int) -> Callable[[], NDArray[np.uint8]]:
         if self._view is None:
-            return np.full(len(angles), np.inf)
-        return self._view.ranges(stamp, angles)
+            width, height = self._size
+            return lambda: np.full((height, width, 3), 128, np.uint8)
+        return self._view.exposure(stamp, self._size)
 
     def _damaged(self, data: bytes) -> bytes:
         if self._bare:

@@ -4,6 +4,7 @@ These are the *true* values of the plant. What the daemon believes stands in its
 is made by changing a value here and not there. ``noise: false`` leaves the physics and drops every random part.
 """
 
+from math import radians
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
@@ -298,12 +299,47 @@ class LidarConfig(Schema):
 
 
 class CameraConfig(Schema):
-    """Webcam that looks forward."""
+    """The webcam: its true mount, lens and noise."""
 
     x: float = 0.18
     """Mount before the geometric centre, m."""
+    y: float = 0.0
+    """And left of it, m."""
+    height: Positive = 0.25
+    """Over the ground, m."""
+    yaw: float = 0.0
+    """Direction in which it looks, left positive, rad."""
+    pitch: float = 0.0
+    """Downwards positive, rad."""
+    roll: float = 0.0
+    """Right side down positive, rad."""
+    field_of_view: Annotated[float, Field(gt=0.1, lt=2.5)] = radians(63.0)
+    """Horizontal, of the lens without its distortion, rad."""
+    k1: Annotated[float, Field(ge=-0.5, le=0.5)] = 0.0
+    """Radial distortion, second order."""
+    k2: Annotated[float, Field(ge=-0.5, le=0.5)] = 0.0
+    """Fourth order."""
+    noise: Annotated[float, Field(ge=0, le=50)] = 0.0
+    """Standard deviation of a pixel's grey, of 255."""
     reach: Positive = 30.0
     """Nothing farther away is drawn, m."""
+
+
+class TagConfig(Schema):
+    """An AprilTag of family 36h11 in the world, upright, as on a wall."""
+
+    tag: Annotated[int, Field(ge=0, le=586)]
+    """Its number."""
+    x: float
+    """Of its middle in the map, m."""
+    y: float
+    """m."""
+    z: float = 0.25
+    """Over the ground, m."""
+    yaw: float = 0.0
+    """Direction that it faces, rad."""
+    size: Annotated[float, Field(gt=0.01, le=1)] = 0.1
+    """Side of its black square, m."""
 
 
 class Iron(Schema):
@@ -617,6 +653,8 @@ class WorldConfig(Schema):
     """MJCF file whose geometries stand in the world and do not move; engine mujoco only"""
     people: Annotated[tuple[PersonConfig, ...], Field(strict=False, max_length=50)] = ()
     """Who walks through it"""
+    tags: Annotated[tuple[TagConfig, ...], Field(strict=False, max_length=500)] = ()
+    """AprilTags on its walls, seen by the camera; extra vision"""
 
     @model_validator(mode="after")
     def _check_engine(self) -> Self:

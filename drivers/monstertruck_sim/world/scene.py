@@ -241,6 +241,12 @@ class Surroundings:
 
     # Sight
 
+    def people_at(self, time_ns: int) -> list[tuple[float, float, float]]:
+        """Where everybody is at an instant of the last half second, and how wide: x, y, radius, m."""
+        elapsed = np.array([float(time_ns - (self._start_ns or 0))])
+        found = [(person.places(elapsed)[:, 0].tolist(), person.radius) for person in self.people]
+        return [(x, y, radius) for (x, y), radius in found]
+
     def cast(
         self,
         xs: Array,

@@ -10,7 +10,6 @@ from monstertruck_drivers.emulation import CompassReading, ImuReading, JointSour
 from monstertruck_kinematics.elementary import Array
 from monstertruck_sim.world.config import (
     BatteryModelConfig,
-    CameraConfig,
     CompassModelConfig,
     ImuModelConfig,
     LidarConfig,
@@ -203,21 +202,6 @@ class SimulatedLidar:
         millimetres[~seen] = NO_RETURN
         millimetres[lost] = FAILED
         return millimetres
-
-
-class SimulatedView:
-    """``ViewSource``: the scene around the camera, which looks forward and stays level."""
-
-    def __init__(self, plant: Plant, cast: Caster, config: CameraConfig) -> None:
-        self._plant, self._cast, self._config = plant, cast, config
-
-    def ranges(self, time_ns: int, angles: Array) -> Array:
-        """Horizontal distances, m, at ``time_ns`` along ``angles`` from the truck's axis; inf = nothing; (n,)."""
-        self._plant.advance(time_ns)
-        x, y, yaw = self._plant.poses(np.array([time_ns]))[:3, 0]
-        ahead = self._config.x
-        xs, ys = np.full(len(angles), x + ahead * cos(yaw)), np.full(len(angles), y + ahead * sin(yaw))
-        return self._cast(xs, ys, yaw + angles, self._config.reach)
 
 
 class SimulatedMotor:

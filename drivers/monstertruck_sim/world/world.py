@@ -13,11 +13,11 @@ from monstertruck_drivers.emulation import (
     RangeSource,
     ServoPlant,
     SonarSource,
-    ViewSource,
 )
 from monstertruck_runtime.errors import InputError, NotInstalledError
 from monstertruck_runtime.map_files import load_map
 from monstertruck_sim.world.built_in import BUILT_IN, BuiltIn
+from monstertruck_sim.world.camera import SimulatedView
 from monstertruck_sim.world.config import TiltConfig, WorldConfig
 from monstertruck_sim.world.obstacles import Box, Obstacle
 from monstertruck_sim.world.plane import Engine, PlanOutline, plane
@@ -29,7 +29,6 @@ from monstertruck_sim.world.sensors import (
     SimulatedLidar,
     SimulatedMotor,
     SimulatedServos,
-    SimulatedView,
 )
 from monstertruck_sim.world.sonar import SimulatedSonars
 from monstertruck_sim.world.terrain import load_profile, profile_path
@@ -68,7 +67,10 @@ class World:
         cast = self._space.cast
         self._lidar = SimulatedLidar(self._plant, sweep, config.lidar, noise_seed)
         self.lidar: RangeSource = self._lidar
-        self.view: ViewSource = SimulatedView(self._plant, cast, config.camera)
+        self.view = SimulatedView(
+            self._plant, cast, config.camera,
+            tags=config.tags, crowd=self.scene, wall_height=config.lidar.wall_height, seed=noise_seed,
+        )  # fmt: skip
         self.motors: tuple[MotorPlant, ...] = tuple(
             SimulatedMotor(self._plant, config.truck.motor, noise_seed, i) for i in range(len(self._plant.shafts))
         )

@@ -40,10 +40,10 @@ SMALL = {"width": 160, "height": 120}
 
 
 class Plain:
-    """A wall that comes nearer by 1 m/s."""
+    """A wall that becomes brighter."""
 
-    def ranges(self, time_ns: int, angles: np.ndarray) -> np.ndarray:
-        return np.full(len(angles), 10.0 - time_ns / SECOND)
+    def exposure(self, time_ns: int, size: tuple[int, int]) -> Any:
+        return lambda: np.full((size[1], size[0], 3), min(10 + 20 * time_ns // SECOND, 255), np.uint8)
 
 
 class Rig:

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from PIL import Image, ImageDraw, ImageFont
 
 from monstertruck_drivers.webcam.driver import TABLES_SEGMENT, complete
+from monstertruck_drivers.webcam.emulator import FONT_SIZE, jpeg
 from tests.unit.drivers.webcam.pictures import bare, picture, pixels
 
 
@@ -59,3 +61,15 @@ def test_any_damage_is_refused_or_passed_but_never_crashes(data: st.DataObject):
         assert result.startswith(b"\xff\xd8")
         assert result.endswith(b"\xff\xd9")
         assert len(result) <= len(candidate) + len(TABLES_SEGMENT)
+
+
+def test_the_counter_can_be_read():
+    image = pixels(jpeg(np.full((480, 640, 3), 128, np.uint8), 4711)).astype(int)[..., 0]
+
+    def likeness(number: int) -> float:
+        template = Image.new("L", (640, 480))
+        ImageDraw.Draw(template).text((8, 8), f"{number:06d}", fill="white", font=ImageFont.load_default(FONT_SIZE))
+        crop = np.s_[8:32, 8:90]
+        return float(np.abs(np.asarray(template).astype(int)[crop] - image[crop]).mean())
+
+    assert min(range(4700, 4720), key=likeness) == 4711

@@ -1,0 +1,385 @@
+"""What the truck's camera sees in the plane: walls as columns, tags and people as flat panels, through a lens.
+
+A pixel's ray is that of the camera's true lens (radial distortion as of Brown) and mount; the ground is level. A panel
+is sampled by several rays in each pixel, so that a far tag blurs as it does on a real sensor.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import cache, lru_cache
+from math import ceil, cos, hypot, sin, tan
+from typing import Final, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from monstertruck_kinematics.elementary import Array
+from monstertruck_runtime.errors import NotInstalledError
+from monstertruck_sim.world.config import CameraConfig, TagConfig
+from monstertruck_sim.world.noise import CAMERA, generator
+from monstertruck_sim.world.plant import Caster, Plant, Pose
+
+Picture = NDArray[np.uint8]
+"""(height, width, 3): red, green, blue; the top row first."""
+Drawing = Callable[[], Picture]
+"""Makes a picture, in any thread, one at a time."""
+
+WALLS, FLOOR, SKY = 0, 128, 192
+"""First palette entries: 128 shades of wall, 64 of floor, 64 of sky."""
+HALF_SHADE: Final = 4.0
+"""Metres at which a wall is half as bright."""
+RIM: Final = 1
+"""Cells of white paper round a tag's black square of eight cells."""
+CELLS: Final = 8
+PAPER, INK = 235, 20
+TALL: Final = 1.7
+"""Height of a person, m."""
+FARTHEST: Final = 12.0
+"""Panels farther away are not drawn, m: a tag of 10 cm is 4 pixels there."""
+BEHIND: Final = 0.08
+"""A panel this far behind what the rays meet is still before it: it hangs on it, m."""
+FINEST: Final = 4
+"""Rays of a pixel along and across, at most."""
+RAYS: Final = 80_000
+"""Of a panel at most: fewer rays a pixel where it fills the picture."""
+_ROUNDS: Final = 6
+"""Of the fixed-point iteration that undoes the lens's distortion."""
+_GRAIN: Final = 64
+"""The grain of the sensor is moved by up to so many pixels from picture to picture."""
+
+
+class CameraPlace(NamedTuple):
+    """Where the camera is at an instant."""
+
+    centre: Array
+    """(3,): of the lens, in the map and over the ground, m."""
+    axes: Array
+    """(3, 3), rows: its right, its down and its axis, in the map."""
+
+
+class Panel(NamedTuple):
+    """A flat picture in the world, seen from its front."""
+
+    texture: NDArray[np.uint8]
+    """(rows, columns, 3)."""
+    opaque: NDArray[np.bool_]
+    """(rows, columns)."""
+    corner: Array
+    """(3,): its upper left corner, m."""
+    right: Array
+    """(3,): its upper edge, m."""
+    down: Array
+    """(3,): its left edge, m."""
+
+
+class Crowd(Protocol):
+    """Who walks around, as the camera sees it."""
+
+    def people_at(self, time_ns: int, /) -> Sequence[tuple[float, float, float]]:
+        """Place and radius of everybody, m."""
+        ...
+
+
+def mounted(pose: Pose, config: CameraConfig, attitude: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> CameraPlace:
+    """The camera of a robot at ``pose``.
+
+    Args:
+        pose: of the robot's geometric centre.
+        config: its mount.
+        attitude: pitch, roll (rad) and height (m) of the body.
+    """
+    body = rotation(pose[2], *attitude[:2])
+    centre = np.array((pose[0], pose[1], attitude[2])) + body @ np.array((config.x, config.y, config.height))
+    forward, left, up = (body @ rotation(config.yaw, config.pitch, config.roll)).T
+    return CameraPlace(centre, np.stack((-left, -up, forward)))
+
+
+def rotation(yaw: float, pitch: float, roll: float) -> Array:
+    """From a body's axes to those it is turned against, (3, 3): yaw, then pitch, then roll (REP 103)."""
+    cy, sy, cp, sp, cr, sr = cos(yaw), sin(yaw), cos(pitch), sin(pitch), cos(roll), sin(roll)
+    return np.array(
+        (
+            (cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
+            (sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),
+            (-sp, cp * sr, cp * cr),
+        )
+    )
+
+
+class SimulatedView:
+    """``ViewSource``: the scene around a camera that is fixed to the robot.
+
+    Args:
+        plant: what carries it.
+        cast: ranges to walls, things, people and robots.
+        config: lens, mount and noise.
+        tags: on the walls.
+        crowd: who walks around.
+        wall_height: m.
+        seed: of the noise; None = none.
+
+    Raises:
+        NotInstalledError: tags need the extra ``vision``.
+    """
+
+    def __init__(
+        self,
+        plant: Plant,
+        cast: Caster,
+        config: CameraConfig,
+        *,
+        tags: Sequence[TagConfig] = (),
+        crowd: Crowd | None = None,
+        wall_height: float = 0.6,
+        seed: int | None = None,
+    ) -> None:
+        self._plant, self._cast, self.config, self._crowd, self._seed = plant, cast, config, crowd, seed
+        self._wall_height = wall_height
+        self._painters: dict[tuple[int, int], Painter] = {}
+        self._panels = [tag_panel(tag) for tag in tags]
+
+    def ranges(self, time_ns: int, angles: Array) -> Array:
+        """Horizontal distances, m, at ``time_ns`` along ``angles`` from the truck's axis; inf = nothing; (n,)."""
+        self._plant.advance(time_ns)
+        x, y, yaw = self._plant.poses(np.array([time_ns]))[:3, 0]
+        c, s = cos(yaw), sin(yaw)
+        ahead, aside = self.config.x, self.config.y
+        count = len(angles)
+        xs, ys = np.full(count, x + ahead * c - aside * s), np.full(count, y + ahead * s + aside * c)
+        return self._cast(xs, ys, yaw + angles, self.config.reach)
+
+    def exposure(self, time_ns: int, size: tuple[int, int]) -> Drawing:
+        """``ViewSource``: asks the world at once, draws when called."""
+        painter = self._painter(size)
+        ranges = self.ranges(time_ns, painter.azimuths)
+        x, y, yaw = self._plant.poses(np.array([time_ns]))[:3, 0].tolist()
+        place = mounted((x, y, yaw), self.config)
+        panels = self._in_view(place)
+        if self._crowd is not None:
+            panels += [person_panel(*person, place) for person in self._crowd.people_at(time_ns)]
+        grain = self.grain(time_ns)
+        return lambda: grain(painter.picture(ranges, panels, place))
+
+    def _painter(self, size: tuple[int, int]) -> "Painter":
+        if size not in self._painters:
+            self._painters[size] = Painter(self.config, size, self._wall_height)
+        return self._painters[size]
+
+    def grain(self, time_ns: int) -> Callable[[Picture], Picture]:
+        """Adds the sensor's noise at an instant."""
+        if self._seed is None or not self.config.noise:
+            return lambda picture: picture
+        seed, noise = self._seed, self.config.noise
+        row, column = generator(seed, CAMERA, self._plant.slot(time_ns, 1_000_000)).integers(0, _GRAIN, 2).tolist()
+        return lambda picture: _grainy(picture, seed, noise, row, column)
+
+    def _in_view(self, place: CameraPlace) -> list[Panel]:
+        """Tags before the camera that show it their front, the farthest one first."""
+        found = []
+        for panel in self._panels:
+            away = panel.corner + (panel.right + panel.down) / 2 - place.centre
+            front = np.cross(panel.down, panel.right)
+            if away @ place.axes[2] > 0.05 and away @ front < 0 and (far := float(np.linalg.norm(away))) < FARTHEST:
+                found.append((far, panel))
+        return [panel for _, panel in sorted(found, key=lambda row: -row[0])]
+
+
+class Painter:
+    """Draws pictures of one size; stateless, so that threads may share it.
+
+    Args:
+        config: lens and mount.
+        size: width and height, pixels.
+        wall_height: m.
+    """
+
+    def __init__(self, config: CameraConfig, size: tuple[int, int], wall_height: float) -> None:
+        width, height = size
+        self._config, self._size = config, size
+        self._focal = width / 2 / tan(config.field_of_view / 2)
+        self._above, self._below = wall_height - config.height, config.height
+        bent = bool(config.k1 or config.k2 or config.pitch or config.roll)
+        if bent:
+            x, y = np.meshgrid(np.arange(width) - (width - 1) / 2, np.arange(height) - (height - 1) / 2)
+            right, down = self._straight(x / self._focal, y / self._focal)
+            turned = rotation(0.0, config.pitch, config.roll)
+            forward, left, up = np.einsum("ij,jhw->ihw", turned, np.stack((np.ones_like(right), -right, -down)))
+            level = np.hypot(forward, left)
+            angles = np.arctan2(left, forward)
+            edge = float(np.abs(angles).max())
+            count = ceil(width * edge / (config.field_of_view / 2))
+            fan = np.linspace(edge, -edge, count)
+            self._column: NDArray[np.intp] | slice = np.clip(
+                np.rint((edge - angles) / (2 * edge) * (count - 1)), 0, count - 1
+            ).astype(np.intp)
+            self._slope = (-up / level).astype(np.float32)
+            self._along = np.ones(count, np.float32)
+        else:
+            fan = np.arctan2((width - 1) / 2 - np.arange(width), self._focal)
+            self._column = slice(None)
+            self._slope = ((np.arange(height) - (height - 1) / 2) / self._focal).astype(np.float32)[:, None]
+            self._along = np.cos(fan).astype(np.float32)
+        self._fan = fan
+        self.azimuths: Array = fan + config.yaw
+        """Of the directions in which it wants to know ranges, from the robot's axis, rad; falling."""
+        depth = np.minimum(np.abs(self._slope) * self._focal / (height / 2), 1.0) * 63
+        self._ground = (np.where(self._slope > 0, FLOOR, SKY) + depth).astype(np.uint8)
+
+    def picture(self, ranges: Array, panels: Sequence[Panel], place: CameraPlace) -> Picture:
+        """Draw.
+
+        Args:
+            ranges: (n,) horizontal distance along each of ``azimuths``, m; inf = nothing.
+            panels: the last one on top.
+            place: of the camera.
+        """
+        depth = np.maximum(ranges * self._along, 0.05).astype(np.float32)
+        shade = (WALLS + 127 / (1 + depth / HALF_SHADE)).astype(np.uint8)
+        column, slope = self._column, self._slope
+        is_wall = (slope > (-self._above / depth)[column]) & (slope < (self._below / depth)[column])
+        image = Image.fromarray(np.where(is_wall, shade[column], self._ground))
+        image.putpalette(_palette())
+        picture: Picture = np.array(image.convert("RGB"))
+        for panel in panels:
+            self._draw(picture, panel, place, ranges)
+        return picture
+
+    def _draw(self, picture: Picture, panel: Panel, place: CameraPlace, ranges: Array) -> None:
+        corners = panel.corner + np.array((panel.right * 0, panel.right, panel.right + panel.down, panel.down))
+        seen = (corners - place.centre) @ place.axes.T
+        if (seen[:, 2] < 0.05).any():
+            return
+        width, height = self._size
+        flat, edge = seen[:, :2] / seen[:, 2:], 1.3 * width / 2 / self._focal
+        at = self._bent(*np.clip(flat, -edge, edge).T) * self._focal + np.array(((width - 1) / 2, (height - 1) / 2))
+        at = np.where(np.abs(flat) > edge, np.sign(flat) * 2 * width, at)  # far outside a lens's terms mean nothing
+        (x0, y0), (x1, y1) = np.floor(at.min(axis=0)).astype(int) - 1, np.ceil(at.max(axis=0)).astype(int) + 2
+        x0, y0, x1, y1 = max(int(x0), 0), max(int(y0), 0), min(int(x1), width), min(int(y1), height)
+        if x0 >= x1 or y0 >= y1:
+            return
+        finer = max(1, min(FINEST, int((RAYS / ((x1 - x0) * (y1 - y0))) ** 0.5)))
+        part = (np.arange(finer) + 0.5) / finer - 0.5
+        us = (np.arange(x0, x1)[:, None] + part).ravel() - (width - 1) / 2
+        vs = (np.arange(y0, y1)[:, None] + part).ravel() - (height - 1) / 2
+        right, down = self._straight(*np.meshgrid(us / self._focal, vs / self._focal))
+        rays = np.stack((right, down, np.ones_like(right)), axis=-1) @ place.axes
+        normal = np.cross(panel.right, panel.down)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            way = (normal @ (panel.corner - place.centre)) / (rays @ normal)
+            points = way[..., None] * rays
+            on = points + (place.centre - panel.corner)
+            rows, columns = panel.opaque.shape
+            u = np.floor(on @ panel.right / (panel.right @ panel.right) * columns)
+            v = np.floor(on @ panel.down / (panel.down @ panel.down) * rows)
+            inside = (u >= 0) & (u < columns) & (v >= 0) & (v < rows) & (way > 0)
+        u, v = np.where(inside, u, 0).astype(np.intp), np.where(inside, v, 0).astype(np.intp)
+        inside &= panel.opaque[v, u] & self._unhidden(points, place, ranges)
+        shape = (y1 - y0, finer, x1 - x0, finer)
+        share = inside.reshape(shape).mean(axis=(1, 3))[..., None]
+        colours = np.where(inside[..., None], panel.texture[v, u], 0).reshape(*shape, 3).mean(axis=(1, 3))
+        window = picture[y0:y1, x0:x1]
+        window[:] = np.rint(colours + (1 - share) * window).astype(np.uint8)
+
+    def _unhidden(self, points: Array, place: CameraPlace, ranges: Array) -> NDArray[np.bool_]:
+        """Which points, from the camera in the map's axes, nothing stands before."""
+        axis = place.axes[2]
+        ahead = np.arctan2(axis[1], axis[0])
+        azimuths = np.angle(np.exp(1j * (np.arctan2(points[..., 1], points[..., 0]) - ahead)))
+        fan = self._fan
+        at = np.clip(np.searchsorted(-fan, -azimuths), 0, len(fan) - 1)
+        found: NDArray[np.bool_] = np.hypot(points[..., 0], points[..., 1]) < ranges[at] + BEHIND
+        return found
+
+    def _bent(self, right: Array, down: Array) -> Array:
+        """Where the lens puts directions, in focal lengths, (n, 2)."""
+        square = right**2 + down**2
+        factor = 1 + self._config.k1 * square + self._config.k2 * square**2
+        return np.stack((right * factor, down * factor), axis=-1)
+
+    def _straight(self, right: Array, down: Array) -> tuple[Array, Array]:
+        """Directions of places in the picture, in focal lengths: the inverse of ``_bent``."""
+        if not (self._config.k1 or self._config.k2):
+            return right, down
+        x, y = right, down
+        for _ in range(_ROUNDS):
+            square = x**2 + y**2
+            factor = 1 + self._config.k1 * square + self._config.k2 * square**2
+            x, y = right / factor, down / factor
+        return x, y
+
+
+# Panels
+
+
+@cache
+def tag_pattern(tag: int) -> NDArray[np.uint8]:
+    """A tag of family 36h11 on its white paper, a pixel a cell, (10, 10).
+
+    Raises:
+        NotInstalledError: the extra ``vision`` is not there.
+    """
+    try:
+        import cv2  # noqa: PLC0415  # the library of an extra
+    except ModuleNotFoundError as error:
+        raise NotInstalledError(
+            "sim.world.tags: opencv is not installed: it comes with the extra vision "
+            "(pip install 'monstertruckd[vision]'; in a checkout: python3 -m monstertruckd.bootstrap sync)"
+        ) from error
+    family = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+    inner = cv2.aruco.generateImageMarker(family, tag, CELLS)
+    return np.pad(np.where(np.asarray(inner) > 127, PAPER, INK).astype(np.uint8), RIM, constant_values=PAPER)
+
+
+def tag_panel(tag: TagConfig) -> Panel:
+    """A tag on its paper, upright, facing ``yaw``."""
+    pattern = tag_pattern(tag.tag)
+    side = tag.size * len(pattern) / CELLS
+    right, down = np.array((-sin(tag.yaw), cos(tag.yaw), 0.0)) * side, np.array((0.0, 0.0, -side))
+    corner = np.array((tag.x, tag.y, tag.z)) - (right + down) / 2
+    return Panel(np.repeat(pattern[..., None], 3, axis=2), np.ones(pattern.shape, np.bool_), corner, right, down)
+
+
+def person_panel(x: float, y: float, radius: float, place: CameraPlace) -> Panel:
+    """Somebody, turned to the camera."""
+    texture, opaque = _person()
+    toward = place.centre[:2] - (x, y)
+    toward = toward / max(hypot(*toward), 1e-6)
+    right = np.array((-toward[1], toward[0], 0.0)) * 2 * radius
+    down = np.array((0.0, 0.0, -TALL))
+    nearest = np.array((*((x, y) + toward * radius), 0.0))
+    return Panel(texture, opaque, nearest - right / 2 - down, right, down)
+
+
+@cache
+def _person() -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """Texture and outline of somebody: 2 cm a pixel at a radius of 0.2 m."""
+    rows, columns = np.mgrid[0:85, 0:20]
+    head = ((rows - 7) / 7.5) ** 2 + ((columns - 9.5) / 5.5) ** 2 < 1
+    trunk = (rows >= 15) & (rows < 46) & (np.abs(columns - 9.5) < 9.6 - np.maximum(0, 18 - rows))
+    legs = (rows >= 46) & (np.abs(columns - 9.5) < 7.6) & (np.abs(columns - 9.5) > 0.6)
+    texture = np.zeros((85, 20, 3), np.uint8)
+    texture[head], texture[trunk], texture[legs] = (205, 160, 130), (150, 60, 50), (50, 60, 90)
+    return texture, head | trunk | legs
+
+
+@cache
+def _palette() -> bytes:
+    rows = np.zeros((256, 3))
+    ramp = np.linspace(0.0, 1.0, 64)[:, None]
+    rows[WALLS:FLOOR] = np.linspace(0.1, 1.0, 128)[:, None] * (225, 215, 200)
+    rows[FLOOR:SKY] = (60, 55, 50) + ramp * (60, 55, 45)
+    rows[SKY:] = (215, 220, 225) - ramp * (95, 65, 25)
+    return rows.astype(np.uint8).tobytes()
+
+
+def _grainy(picture: Picture, seed: int, noise: float, row: int, column: int) -> Picture:
+    height, width = picture.shape[:2]
+    grain = _grain(seed, noise, height, width)[row : row + height, column : column + width, None]
+    noisy: Picture = np.clip(picture + grain, 0, 255).astype(np.uint8)
+    return noisy
+
+
+@lru_cache(maxsize=4)
+def _grain(seed: int, noise: float, height: int, width: int) -> NDArray[np.int16]:
+    drawn = generator(seed, CAMERA).standard_normal((height + _GRAIN, width + _GRAIN))
+    return np.rint(noise * drawn).astype(np.int16)
