@@ -19,6 +19,7 @@ from monstertruck_drivers.computer import Computer
 from monstertruck_drivers.epos.config import EposConfig
 from monstertruck_drivers.link import Port
 from monstertruck_drivers.maestro.config import MaestroConfig
+from monstertruck_estimation.points.service import PointService, register_point_calls
 from monstertruck_estimation.slam.service import SlamService
 from monstertruck_kinematics.chassis import Chassis
 from monstertruck_planners.behave.service import BehaviourService, register_behaviour_calls
@@ -165,13 +166,9 @@ class Daemon:
             if self._seed is None:
                 self._start(gate, StallWatch(self.clock, self.gate.ticks, self.config.state_directory / "stalls"))
             self._start_drivers(sensors, OnBug.FAIL, Duty.SENSOR, Duty.MONITOR)
-            save_map: Callable[[], bool] | None = None
-            for service in build_estimation(self.config, self.bus, self.clock, self._body):
-                self._start(estimation, service)
+            save_map = self._start_estimation(estimation)
             for service in self._hearing():
                 self._start(estimation, service)
-                if isinstance(service, SlamService):
-                    save_map = service.save_soon
             for service in build_planners(self.config, self.bus, self.clock, self._body, self._actors, save_map):
                 self._start(planners, service)
                 if isinstance(service, GoalService):
@@ -190,6 +187,17 @@ class Daemon:
             self.gate.shut_down()
 
     # The scopes' contents
+
+    def _start_estimation(self, estimation: Scope) -> Callable[[], bool] | None:
+        """Returns what has the map saved; None = there is none."""
+        save_map: Callable[[], bool] | None = None
+        for service in build_estimation(self.config, self.bus, self.clock, self._body):
+            self._start(estimation, service)
+            if isinstance(service, SlamService):
+                save_map = service.save_soon
+            if isinstance(service, PointService):
+                register_point_calls(self.rpc, service)
+        return save_map
 
     def _hearing(self) -> Iterator[Service]:
         """What hears other robots; on the virtual clock nothing comes over Zenoh."""

@@ -250,6 +250,7 @@ RESERVED: Final = frozenset(
         "odometry",
         "path",
         "peers",
+        "points",
         "present",
         "recorder",
         "shafts",

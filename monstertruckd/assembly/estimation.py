@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import Final, Self
 
 from monstertruck_drivers.catalog import DEVICES
@@ -10,15 +11,23 @@ from monstertruck_estimation.catalog import ODOMETRY
 from monstertruck_estimation.ground.grid import GroundGrid
 from monstertruck_estimation.ground.service import GroundService
 from monstertruck_estimation.odometry import OdometryContext
+from monstertruck_estimation.points.config import PointsConfig
+from monstertruck_estimation.points.service import START_TIMEOUT as READER_START
+from monstertruck_estimation.points.service import TARGET as READER
+from monstertruck_estimation.points.service import PointFolders, PointInputs, PointService
+from monstertruck_estimation.points.tracking import PoseAsker
 from monstertruck_estimation.slam.service import SlamService
 from monstertruck_estimation.transforms import TransformService, compose, invert, mount
 from monstertruck_kinematics.chassis import Chassis
 from monstertruck_planners.collision import Footprint, ScanPoints
-from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.actors.actor import WorkerActor
+from monstertruck_runtime.clock import Clock, VirtualClock
+from monstertruck_runtime.errors import NotInstalledError
 from monstertruck_runtime.mailbox import fifo, latest
 from monstertruck_runtime.service import Service
+from monstertruck_runtime.threads import in_thread, inline
 from monstertruck_schemas import topics
-from monstertruck_schemas.body import Mount
+from monstertruck_schemas.body import LensConfig, Mount
 from monstertruck_schemas.roles import DeviceRole
 from monstertruck_schemas.topics import Writer
 from monstertruckd.assembly.devices import scan_angles
@@ -91,6 +100,8 @@ def build_estimation(config: TruckConfig, bus: Bus, clock: Clock, body: Body) ->
     ground = _build_ground(config, bus, clock)
     if ground is not None:
         yield ground
+    if config.points is not None:
+        yield _build_points(config, config.points, bus, clock, None if slam is None else slam.bases_at)
 
 
 def _upright(config: TruckConfig) -> float | None:
@@ -126,6 +137,43 @@ def _build_ground(config: TruckConfig, bus: Bus, clock: Clock) -> GroundService 
         events=bus.event_sink(),
         grid=GroundGrid() if folder is None else GroundGrid.load(folder),
         save=slam.save if slam is not None and slam.mode == "mapping" else None,
+    )
+
+
+def _build_points(
+    config: TruckConfig, points: PointsConfig, bus: Bus, clock: Clock, ask: PoseAsker | None
+) -> PointService:
+    camera, slam = config.devices.camera, config.slam
+    if camera is not None and find_spec("cv2") is None:
+        raise NotInstalledError(
+            "points: opencv is not installed: it comes with the extra vision (pip install 'monstertruckd[vision]'; "
+            "in a checkout: python3 -m monstertruckd.bootstrap sync)"
+        )
+    known = slam.map if slam is not None else None if config.planner is None else config.planner.map
+    folder = known if known is None or not known.suffix else known.parent
+    mapping = slam is not None and slam.mode == "mapping"
+    return PointService(
+        points,
+        None if camera is None else (camera.mount, getattr(camera.driver, "lens", LensConfig())),
+        clock,
+        WorkerActor(
+            "points", READER, clock, latency=points.latency, deadline=points.deadline, start_timeout=READER_START
+        ),
+        inputs=PointInputs(
+            camera=None if camera is None else bus.subscribe(topics.CAMERA, latest()),
+            pose=bus.subscribe(topics.ODOMETRY if slam is None else topics.POSE, fifo(ODOMETRIES)),
+            slam=None if slam is None else bus.subscribe(topics.SLAM, latest()),
+            attitude=None if config.devices.compass is None else bus.subscribe(topics.COMPASS, latest()),
+            gate=bus.subscribe(topics.GATE, latest()),
+        ),
+        ask=ask,
+        out=bus.publisher(topics.POINTS, Writer.ESTIMATION),
+        events=bus.event_sink(),
+        folders=PointFolders(
+            load=None if mapping else folder, save=slam.save if slam is not None and mapping else folder
+        ),
+        offload=inline if isinstance(clock, VirtualClock) else in_thread,
+        max_age=config.gate.max_request_age,
     )
 
 

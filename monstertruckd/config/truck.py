@@ -14,6 +14,7 @@ from monstertruck_drivers.usb.config import UsbConfig
 from monstertruck_estimation.catalog import AnyOdometry
 from monstertruck_estimation.ground.config import GroundConfig
 from monstertruck_estimation.odometry import OdometryConfig
+from monstertruck_estimation.points.config import PointsConfig
 from monstertruck_estimation.slam.config import SlamConfig
 from monstertruck_kinematics.chassis import AXLES, WHEEL_REACH, Chassis, Dimensions
 from monstertruck_kinematics.truck import DriveTrain
@@ -141,6 +142,8 @@ class TruckConfig(Schema):
     """Mapping, or localisation in a saved map, by the lidar; null = the pose in map is odometry"""
     ground: GroundConfig | None = GroundConfig()
     """Tilt and roughness of the ground, for the routes of a robot with a compass; null = not estimated"""
+    points: PointsConfig | None = None
+    """Points of interest in the map: tags that the camera sees (extra vision), and marked places; null = none"""
     recorder: RecorderConfig | None = None
     blackbox: BlackBoxConfig | None = BlackBoxConfig()
     """The minute before every trip of the gate; null = not kept"""

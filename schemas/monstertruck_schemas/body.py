@@ -39,6 +39,33 @@ class Mount(Schema):
         return self.x, self.y, self.yaw
 
 
+class LensConfig(Schema):
+    """What a camera makes of directions: a pinhole with the distortion of Brown; as nominal, or as calibrated."""
+
+    width: Annotated[int, Field(ge=16, le=8192)] = 640
+    """Of the pictures it holds for, pixels; of others it is scaled"""
+    height: Annotated[int, Field(ge=16, le=8192)] = 480
+    """Pixels"""
+    focal_x: Annotated[float, Field(gt=10, le=20_000)] = 522.2
+    """Pixels; nominal: 63 degrees across 640 pixels"""
+    focal_y: Annotated[float, Field(gt=10, le=20_000)] = 522.2
+    """Pixels"""
+    centre_x: Annotated[float, Field(ge=0, le=8192)] = 319.5
+    """Where the axis meets the picture; the middle of the first pixel is 0"""
+    centre_y: Annotated[float, Field(ge=0, le=8192)] = 239.5
+    """Pixels"""
+    k1: Coefficient = 0.0
+    """Radial distortion, second order"""
+    k2: Coefficient = 0.0
+    """Fourth order"""
+    k3: Coefficient = 0.0
+    """Sixth order"""
+    p1: Coefficient = 0.0
+    """Tangential distortion"""
+    p2: Coefficient = 0.0
+    """The other axis"""
+
+
 class BodyConfig(Schema):
     """What only one kind of body has; each kind is a subclass."""
 

@@ -37,6 +37,7 @@ from monstertruck_schemas.plan import (
     StabiliserCommand,
     TrackerState,
 )
+from monstertruck_schemas.points import PointsOfInterest
 from monstertruck_schemas.req import ControlRequest, DriveRequest, GoalControl, GoalRequest, PathRequest
 from monstertruck_schemas.sensor import (
     Attitude,
@@ -195,6 +196,13 @@ GROUND: Final = Topic(
     "Tilt and roughness of the ground that was driven over or seen",
     retained=True,
     foxglove="foxglove.Grid",
+)
+POINTS: Final = Topic(
+    "state/points",
+    PointsOfInterest,
+    W.ESTIMATION,
+    "Points of interest in map: tags that the camera found, places that were marked",
+    retained=True,
 )
 PEERS: Final = Topic(
     "state/peers", Peers, W.ESTIMATION, "Poses that other robots say of themselves, with when each came in", 10,

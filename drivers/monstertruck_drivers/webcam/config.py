@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from monstertruck_schemas.base import FrameId, Schema
+from monstertruck_schemas.body import LensConfig
 
 
 class WebcamConfig(Schema):
@@ -23,3 +24,5 @@ class WebcamConfig(Schema):
     """Pictures the kernel may keep for us"""
     frame: FrameId = "camera"
     """Frame of the pictures"""
+    lens: LensConfig = LensConfig()
+    """For what measures by its pictures"""

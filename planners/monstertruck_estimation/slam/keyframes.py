@@ -182,6 +182,26 @@ class Trajectory:
             poses[begin:end] += share[:, None] * off
         return np.delete(stamps, joints), np.delete(poses, joints, axis=0)
 
+    def at(self, stamps: NDArray[np.int64], keys: Array, joined: NDArray[np.bool_]) -> Array:
+        """Poses (n, 3) at any instants, between scans by a straight line; NaN outside, and off the map.
+
+        Args:
+            stamps: (n,), ns.
+            keys: poses of the keyframes.
+            joined: which of them belong to the map.
+        """
+        mine = self._stamps.view
+        found = np.full((len(stamps), 3), np.nan)
+        if len(mine) < 2:
+            return found
+        before = np.clip(np.searchsorted(mine, stamps, side="right") - 1, 0, len(mine) - 2)
+        inside = (stamps >= mine[0]) & (stamps <= mine[-1]) & joined[self._keys.view[before]]
+        before = before[inside]
+        ends = [compose(keys[self._keys.view[rows]], self._relative.view[rows]) for rows in (before, before + 1)]
+        share = (stamps[inside] - mine[before]) / np.maximum(mine[before + 1] - mine[before], 1)
+        found[inside] = compose(ends[0], between(ends[0], ends[1]) * share[:, None])
+        return found
+
     def marked(self, keys: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Marks of all scans, shape (n,), given those of the keyframes."""
         return np.asarray(np.delete(keys[self._keys.view], self._joints()))

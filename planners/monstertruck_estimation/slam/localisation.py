@@ -10,6 +10,7 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from monstertruck_estimation.se2 import Vector, between, compose, compose_jacobians, inverse
 from monstertruck_estimation.slam.config import MapperConfig
@@ -180,6 +181,9 @@ class LocalisationEstimator:
 
     def trajectory(self) -> None:
         """See ``Estimator``: the poses were estimated one by one."""
+
+    def poses_at(self, _stamps: NDArray[np.int64]) -> None:
+        """See ``Estimator``."""
 
     def finish(self) -> bool:
         """See ``Estimator``: there is nothing to optimise."""

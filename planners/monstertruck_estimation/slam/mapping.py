@@ -205,6 +205,10 @@ class Mapper:
         """Stamps (n,), ns, and poses (n, 3) of base in map at all scans, as the graph has them now."""
         return self._trajectory.poses(self.map.poses)
 
+    def poses_at(self, stamps: NDArray[np.int64]) -> Array:
+        """Base in map at instants (n,), ns, as the graph has it now, (n, 3); NaN where it is not known."""
+        return self._trajectory.at(stamps, self.map.poses, self.map.joined())
+
     def on_map(self) -> NDArray[np.bool_]:
         """Which scans of ``trajectory``, shape (n,), belong to the map, not to a submap that is not joined to it."""
         return self._trajectory.marked(self.map.joined())
@@ -338,6 +342,10 @@ class Estimator(Protocol):
         """Stamps (n,), ns, and poses (n, 3) of base in map at all scans; None in a saved map."""
         ...
 
+    def poses_at(self, stamps: NDArray[np.int64]) -> Array | None:
+        """Base in map at instants (n,), ns: (n, 3), NaN where it is not known; None in a saved map."""
+        ...
+
     def finish(self) -> bool:
         """Optimise everything jointly; False if the result was not kept."""
         ...
@@ -443,6 +451,10 @@ class MappingEstimator:
     def trajectory(self) -> tuple[NDArray[np.int64], Array]:
         """See ``Estimator``."""
         return self.mapper.trajectory()
+
+    def poses_at(self, stamps: NDArray[np.int64]) -> Array:
+        """See ``Estimator``."""
+        return self.mapper.poses_at(stamps)
 
     def finish(self) -> bool:
         """See ``Estimator``."""

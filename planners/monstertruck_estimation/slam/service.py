@@ -102,6 +102,9 @@ class SlamService:
         self._due = {"tiles": 0, "whole": 0, "save": clock.now() + round(config.save_period * SECOND)}
         self._changed = False
         self._under_way: asyncio.Task[Any] | None = None
+        self._instants: tuple[int, ...] = ()
+        self._sent_instants: tuple[int, ...] = ()
+        self._bases: dict[int, Vector] = {}
 
     def frames(self) -> Iterable[Transform]:
         """Odom in map as published; without odometry, base in map."""
@@ -112,6 +115,14 @@ class SlamService:
             return ()
         stamp = self._newest.stamp
         return planar("map", "odom", stamp, self._newest.pose), planar("odom", "base", stamp, (0.0, 0.0, 0.0))
+
+    def bases_at(self, instants: tuple[int, ...]) -> Mapping[int, Vector]:
+        """Where the base was at instants, ns, by the graph as it is now; brought up to date every ``tiles_period``.
+
+        Those asked for now are answered later, those the map does not know never.
+        """
+        self._instants = instants
+        return self._bases
 
     def save_soon(self) -> bool:
         """Have the map saved with the next scan; returns whether there is a map to save, and a place for it."""
@@ -277,12 +288,18 @@ class SlamService:
         save = config.save if "save" in due and config.mode == "mapping" else None
         if "save" in due:
             self._due["save"] = now + round(config.save_period * SECOND)
-        return WorkerInput(start=start, scan=scan, tiles="tiles" in due, whole=whole, save=save)
+        self._sent_instants = self._instants if "tiles" in due else ()
+        return WorkerInput(
+            start=start, scan=scan, tiles="tiles" in due, whole=whole, save=save, instants=self._sent_instants
+        )
 
     def _take(self, outputs: WorkerOutput, scan: LaserScan) -> None:
         if outputs.refused is not None:
             self._skip(outputs.refused)
         self._report_saved(outputs)
+        if outputs.bases is not None:
+            rows = zip(self._sent_instants, outputs.bases.tolist(), strict=True)
+            self._bases = {at: (x, y, yaw) for at, (x, y, yaw) in rows if x == x}  # NaN: not known
         now = self._clock.now()
         self._changed |= bool(outputs.tiles)
         if outputs.whole is not None and outputs.whole.cells.size:

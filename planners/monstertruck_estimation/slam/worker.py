@@ -72,7 +72,8 @@ class SlamWorker:
         saved, error = self._save(inputs, estimator)
         trajectory = estimator.trajectory() if inputs.trajectory else None
         counts = dict(estimator.counts)
-        return WorkerOutput(made, refused, tuple(tiles), whole, redrawn, counts, saved, error, trajectory, joint)
+        bases = estimator.poses_at(np.array(inputs.instants, np.int64)) if inputs.instants else None
+        return WorkerOutput(made, refused, tuple(tiles), whole, redrawn, counts, saved, error, trajectory, bases, joint)
 
     def _begin(self, start: Start) -> None:
         config = start.config

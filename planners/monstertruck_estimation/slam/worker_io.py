@@ -98,6 +98,8 @@ class WorkerInput:
     """First optimise all keyframes jointly (seconds of work)."""
     trajectory: bool = False
     """Return the poses of all scans."""
+    instants: tuple[int, ...] = ()
+    """Return where the base was at these, ns."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,5 +159,7 @@ class WorkerOutput:
     """Why the map could not be saved."""
     trajectory: tuple[NDArray[np.int64], Array] | None = None
     """Stamps (n,), ns, and poses (n, 3) of base in map at the first beam of every scan; None in a saved map."""
+    bases: Array | None = None
+    """Shape (n, 3): base in map at the instants asked for; NaN where it is not known; None in a saved map."""
     joint: bool | None = None
     """After ``finish``: whether the joint registration was kept, for it agreed better than the graph."""

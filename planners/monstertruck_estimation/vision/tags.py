@@ -6,7 +6,7 @@ cameras.
 """
 
 from collections.abc import Collection, Sequence
-from typing import Final, NamedTuple
+from typing import Final, Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -44,14 +44,24 @@ class TagReader:
     Args:
         everywhere: pictures from one look at the whole picture to the next; 1 = always.
         still: tags that do not move: they are read in whole pictures only.
+        corners: how they are found: as crossings of lines along the edges, which bears tags of few pixels a cell and
+            dirt, or by the gradients around each, to a quarter of a pixel, for tags that are measured.
     """
 
-    def __init__(self, everywhere: int = EVERYWHERE, still: Collection[int] = ()) -> None:
+    def __init__(
+        self,
+        everywhere: int = EVERYWHERE,
+        still: Collection[int] = (),
+        corners: Literal["lines", "subpixel"] = "lines",
+    ) -> None:
         cv2.setNumThreads(1)  # cameras are read side by side; OpenCV's own threads wait for each other
         self._still = frozenset(still)
         parameters = cv2.aruco.DetectorParameters()
-        # By lines along the edges: a window around a corner takes in cells of a small tag.
-        parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_CONTOUR
+        if corners == "lines":
+            # A window around a corner takes in cells of a small tag.
+            parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_CONTOUR
+        else:
+            parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
         parameters.adaptiveThreshWinSizeMin = 5
         parameters.adaptiveThreshWinSizeMax = 21
         parameters.adaptiveThreshWinSizeStep = 8

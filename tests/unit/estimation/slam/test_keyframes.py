@@ -78,3 +78,18 @@ def test_views_that_judge_are_far_apart_in_time_and_no_partners(twice_round):
     assert np.diff(stamps[pairs], axis=1).min() >= 0.25 * (stamps[-1] - stamps[0])
     partners = set(map(tuple, keyframes.partners(twice_round.poses).tolist()))
     assert not partners & set(map(tuple, pairs.tolist()))
+
+
+def test_poses_at_any_instant_move_with_the_keyframes_and_are_unknown_off_the_map():
+    poses = np.column_stack((np.arange(3.0), np.zeros(3), np.zeros(3)))
+    trail, keys = Trajectory(1000), poses[:2].copy()
+    for k, pose in enumerate(poses):
+        trail.append(100 * k, min(k, 1), between(keys[min(k, 1)], pose))
+    asked, joined = np.array([-1, 0, 50, 200, 201]), np.ones(2, np.bool_)
+    found = trail.at(asked, keys, joined)
+    assert np.isnan(found[[0, -1]]).all()
+    assert found[1:4, 0] == pytest.approx([0.0, 0.5, 2.0])
+    keys[:, 1] += 2.0
+    assert trail.at(asked, keys, joined)[2] == pytest.approx(found[2] + np.array((0.0, 2.0, 0.0)))
+    joined[0] = False
+    assert np.isnan(trail.at(asked, keys, joined)[1]).all()

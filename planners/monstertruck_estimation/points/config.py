@@ -1,0 +1,40 @@
+"""Settings of the points of interest; light, for the daemon's start."""
+
+from math import radians
+from typing import Annotated
+
+from pydantic import Field
+
+from monstertruck_schemas.base import Schema
+
+Positive = Annotated[float, Field(gt=0)]
+Size = Annotated[float, Field(gt=0.005, le=2)]
+
+
+class PointsConfig(Schema):
+    """What is taken for a tag in the camera's pictures; the camera's lens and mount are its device's."""
+
+    size: Size = 0.1
+    """Side of the tags' black square, m"""
+    sizes: dict[Annotated[int, Field(ge=0, le=586)], Size] = Field(default_factory=dict)
+    """Of tags that have another one, by number, m"""
+    rate: Annotated[float, Field(gt=0, le=30)] = 5.0
+    """Pictures read a second, at most; of a robot that stands two at a place"""
+    reach: Positive = 2.0
+    """Tags farther away are not used, m: at 3 m a tag of 10 cm has 2 pixels a cell"""
+    angle: Annotated[float, Field(gt=0, lt=1.57)] = radians(60.0)
+    """Nor are those seen more obliquely, from their normal, rad"""
+    margin: Annotated[float, Field(ge=0, lt=1)] = 0.15
+    """Of every cell from grey to what it should be, as a share; less is no tag"""
+    sightings: Annotated[int, Field(ge=1, le=20)] = 2
+    """Pictures that have to agree before a tag is an object of the map"""
+    agree: Positive = 0.15
+    """How near to each other they have to put it, m; more where they are less certain"""
+    tilt: Annotated[float, Field(gt=0, le=0.5)] = 0.1
+    """Pictures taken while the robot was tilted more than this are not used, rad"""
+    most: Annotated[int, Field(ge=1, le=2000)] = 500
+    """Points of interest"""
+    latency: Annotated[float, Field(gt=0, le=1)] = 0.06
+    """Seconds after which a picture that was read counts on the virtual clock"""
+    deadline: Annotated[float, Field(gt=0, le=60)] = 10.0
+    """Seconds after which a silent worker is killed"""

@@ -1,0 +1,64 @@
+"""What the reader of pictures is given, and what it answers; light, as the daemon's loop imports it."""
+
+from dataclasses import dataclass, field
+from typing import Any, Self
+
+from monstertruck_schemas.body import LensConfig
+
+Triple = tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class ReadTask:
+    """A picture to be read."""
+
+    jpeg: bytes
+    lens: LensConfig
+    size: float
+    """Side of tags, m."""
+    sizes: dict[int, float] = field(default_factory=dict)
+    """Of others, by number."""
+    reach: float = 2.0
+    """m."""
+    angle: float = 1.0
+    """rad."""
+    margin: float = 0.15
+
+    @classmethod
+    def of(cls, jpeg: bytes, lens: LensConfig, config: Any) -> Self:
+        """By a ``PointsConfig``."""
+        return cls(jpeg, lens, config.size, dict(config.sizes), config.reach, config.angle, config.margin)
+
+
+@dataclass(frozen=True, slots=True)
+class TagReading:
+    """A tag as a picture shows it, in the camera's axes: right, down, ahead."""
+
+    tag: int
+    middle: Triple
+    """m."""
+    normal: Triple
+    """Unit vector, out of its front."""
+    other_normal: Triple
+    """That of the second pose that fits its outline."""
+    doubt: float
+    """How well the second one fits, 0 (not at all) to 1 (as well): the heading means nothing then."""
+    pixels: float
+    """Mean side of its black square."""
+    margin: float
+    """Of the worst cell."""
+    angle: float
+    """From its normal, rad."""
+    picture: bytes = b""
+    """It and what is around it, JPEG."""
+
+
+@dataclass(frozen=True, slots=True)
+class ReadAnswer:
+    """What a picture shows."""
+
+    readings: tuple[TagReading, ...] = ()
+    refused: int = 0
+    """Tags too far away, too oblique or not clear enough."""
+    unreadable: bool = False
+    """The picture is none."""

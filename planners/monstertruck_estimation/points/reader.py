@@ -1,0 +1,133 @@
+"""The reading step: a picture in, tags with their places before the camera out. For workers; loads OpenCV.
+
+The pose of a tag is that of its square (Collins and Bartoli, "Infinitesimal plane-based pose estimation", IJCV 2014;
+in OpenCV ``SOLVEPNP_IPPE_SQUARE``). It has two solutions: a small square seen from afar looks alike turned to either
+side.
+"""
+
+from typing import Final
+
+import cv2
+import numpy as np
+
+from monstertruck_estimation.points.exchange import ReadAnswer, ReadTask, TagReading, Triple
+from monstertruck_estimation.vision.tags import Picture, Sighting, TagReader, drawn
+from monstertruck_kinematics.elementary import Array
+from monstertruck_schemas.body import LensConfig
+
+CELLS: Final = 8
+"""Of a tag's black square, along a side."""
+SAMPLES: Final = 6
+"""Pixels of a cell that is looked at."""
+CONTRAST: Final = 25.0
+"""Least difference of white and black, of 255."""
+AROUND: Final = 0.6
+"""Of a tag's picture, in its sides to each side."""
+WIDEST: Final = 160
+"""Pixels of a tag's picture at most."""
+PIXEL: Final = 0.25
+"""Standard deviation of a corner, pixels."""
+
+
+class ReadingStep:
+    """Reads pictures one by one; keeps nothing from one to the next."""
+
+    def __init__(self) -> None:
+        self._reader = TagReader(everywhere=1, corners="subpixel")
+
+    def step(self, task: ReadTask) -> ReadAnswer:
+        """Read one picture."""
+        data = np.frombuffer(task.jpeg, np.uint8)
+        colour = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
+        if colour is None:
+            return ReadAnswer(unreadable=True)
+        grey: Picture = np.asarray(cv2.cvtColor(colour, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
+        found, refused = [], 0
+        matrix, distortion = camera_matrix(task.lens, grey.shape[1], grey.shape[0])
+        for sighting in self._reader.read(grey):
+            margin = decode_margin(grey, sighting)
+            reading = placed(sighting, task.sizes.get(sighting.tag, task.size), matrix, distortion, margin)
+            near = reading is not None and float(np.linalg.norm(reading.middle)) <= task.reach
+            if reading is None or margin < task.margin or not near or reading.angle > task.angle:
+                refused += 1
+                continue
+            found.append(_with_picture(reading, colour, sighting))
+        return ReadAnswer(tuple(found), refused)
+
+
+def camera_matrix(lens: LensConfig, width: int, height: int) -> tuple[Array, Array]:
+    """OpenCV's matrix (3, 3) and distortion (5,) of a lens for pictures of another size than it was measured with."""
+    across, up = width / lens.width, height / lens.height
+    matrix = np.array(
+        (
+            (lens.focal_x * across, 0.0, (lens.centre_x + 0.5) * across - 0.5),
+            (0.0, lens.focal_y * up, (lens.centre_y + 0.5) * up - 0.5),
+            (0.0, 0.0, 1.0),
+        )
+    )
+    return matrix, np.array((lens.k1, lens.k2, lens.p1, lens.p2, lens.k3))
+
+
+def decode_margin(grey: Picture, sighting: Sighting) -> float:
+    """How clear the least clear cell is: 1 = black or white, 0 = grey, below 0 = the other one."""
+    side = CELLS * SAMPLES
+    square = np.array(((0, 0), (side, 0), (side, side), (0, side)), np.float32) - 0.5
+    turned = cv2.getPerspectiveTransform(sighting.corners.astype(np.float32), square.astype(np.float32))
+    flat = cv2.warpPerspective(grey, turned, (side, side), flags=cv2.INTER_LINEAR)
+    core = slice(SAMPLES // 3, SAMPLES - SAMPLES // 3)
+    means = np.asarray(flat, dtype=np.float64).reshape(CELLS, SAMPLES, CELLS, SAMPLES)[:, core, :, core].mean((1, 3))
+    white = drawn(sighting.tag, CELLS) > 127
+    bright, dark = float(means[white].mean()), float(means[~white].mean())
+    if bright - dark < CONTRAST:
+        return -1.0
+    share = (means - (bright + dark) / 2) / ((bright - dark) / 2)
+    return float(np.where(white, share, -share).min())
+
+
+def placed(sighting: Sighting, size: float, matrix: Array, distortion: Array, margin: float) -> TagReading | None:
+    """A tag before the camera; None if no pose fits."""
+    half = size / 2
+    square = np.array(((-half, half, 0), (half, half, 0), (half, -half, 0), (-half, -half, 0)))
+    count, rotations, places, errors = cv2.solvePnPGeneric(
+        square, sighting.corners.reshape(4, 1, 2), matrix, distortion, flags=cv2.SOLVEPNP_IPPE_SQUARE
+    )
+    if not count:
+        return None
+    middle = np.asarray(places[0], dtype=np.float64).ravel()
+    if not np.isfinite(middle).all() or middle[2] <= 0:
+        return None
+    normals = [np.asarray(cv2.Rodrigues(turn)[0])[:, 2] for turn in rotations[:count]]
+    fits = [float(np.ravel(error)[0]) for error in errors[:count]]
+    doubt = 0.0 if count < 2 else min(1.0, (fits[0] + PIXEL) / (fits[1] + PIXEL))
+    away = middle / np.linalg.norm(middle)
+    return TagReading(
+        sighting.tag,
+        _triple(middle),
+        _triple(normals[0]),
+        _triple(normals[-1]),
+        doubt,
+        sighting.size,
+        margin,
+        float(np.arccos(np.clip(-away @ normals[0], -1.0, 1.0))),
+    )
+
+
+def _with_picture(reading: TagReading, colour: Array, sighting: Sighting) -> TagReading:
+    margin = AROUND * sighting.size
+    low, high = sighting.corners.min(axis=0) - margin, sighting.corners.max(axis=0) + margin
+    x0, y0 = np.maximum(low, 0).astype(int)
+    x1, y1 = np.minimum(np.ceil(high), (colour.shape[1], colour.shape[0])).astype(int)
+    part = colour[y0:y1, x0:x1]
+    scale = WIDEST / max(part.shape[:2])
+    if scale < 1.0:
+        part = np.asarray(cv2.resize(part, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA))
+    _, data = cv2.imencode(".jpg", part, (cv2.IMWRITE_JPEG_QUALITY, 80))
+    return TagReading(
+        reading.tag, reading.middle, reading.normal, reading.other_normal, reading.doubt, reading.pixels,
+        reading.margin, reading.angle, data.tobytes(),
+    )  # fmt: skip
+
+
+def _triple(values: Array) -> Triple:
+    x, y, z = (float(value) for value in values)
+    return x, y, z

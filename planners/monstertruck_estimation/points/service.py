@@ -1,0 +1,387 @@
+"""Points of interest as a service: pictures to the worker that reads them, readings to objects of the map."""
+
+import asyncio
+import base64
+import math
+from collections import deque
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from monstertruck_estimation.points import files
+from monstertruck_estimation.points.config import PointsConfig
+from monstertruck_estimation.points.exchange import ReadAnswer, ReadTask
+from monstertruck_estimation.points.tracking import Bases, PointMap, PoseAsker, nearest
+from monstertruck_estimation.se2 import Vector, between, compose
+from monstertruck_kinematics.elementary import Array
+from monstertruck_runtime.actors.actor import Actor
+from monstertruck_runtime.clock import SECOND, Clock, Schedule
+from monstertruck_runtime.errors import InputError, NotFoundError, RequestRefusedError, WorkerError
+from monstertruck_runtime.mailbox import Mailbox
+from monstertruck_runtime.ports import EventSink, Publisher, Ready, RpcRegistry, Subscription
+from monstertruck_runtime.requests import Sequences, parse_request, refusal
+from monstertruck_runtime.threads import Offload
+from monstertruck_schemas.body import LensConfig, Mount
+from monstertruck_schemas.event import Severity
+from monstertruck_schemas.health import LocalisationStatus, SlamHealth
+from monstertruck_schemas.points import PointOrder, PointRequest, PointsOfInterest
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.roles import AccessRole
+from monstertruck_schemas.sensor import Attitude, CompressedImage
+from monstertruck_schemas.state import GateState, Odometry
+from monstertruck_schemas.topics import POSE
+
+TARGET: Final = "monstertruck_estimation.points.reader:ReadingStep"
+START_TIMEOUT: Final = 60.0
+"""Real seconds the worker may take to start."""
+NO_PLACE: Final = frozenset({LocalisationStatus.LOST, LocalisationStatus.SEARCHING, LocalisationStatus.OUTSIDE})
+HISTORY: Final = 128
+"""Poses kept: 2.5 s at 50 Hz."""
+WAITED: Final = SECOND // 10
+"""A picture waits for a pose that is as new for so long, ns."""
+OLDEST: Final = SECOND
+"""Older pictures are not read, ns."""
+STANDING: Final = (0.02, 0.02)
+"""A robot that has moved and turned less, m and rad, is still at the place of the last picture."""
+LOOKS: Final = 2
+"""Pictures read at one place."""
+KEEP_RATE: Final = 2.0
+"""Looks a second at what has changed."""
+PERIOD: Final = SECOND
+"""Between two messages, ns."""
+SAVE_PERIOD: Final = 10 * SECOND
+"""Between two writes of the file, ns."""
+AT_ONCE: Final = 4
+"""Points that are computed without letting others run."""
+PAUSE: Final = 0.02
+"""Seconds that others run then."""
+RETRY: Final = 2.0
+"""Seconds after which a worker that failed is tried again."""
+CRUMB: Final = 0.5
+"""Metres between two places remembered for marks."""
+CRUMBS: Final = 4000
+MOVED: Final = 0.001
+"""A correction that moves less, m or rad, moves no point."""
+
+
+@dataclass(frozen=True, slots=True)
+class PointInputs:
+    """Topics read."""
+
+    camera: Mailbox[CompressedImage] | None
+    """None = places are marked only."""
+    pose: Mailbox[Odometry]
+    """In map; all of them."""
+    slam: Subscription[SlamHealth] | None
+    attitude: Subscription[Attitude] | None
+    gate: Subscription[GateState]
+
+
+@dataclass(frozen=True, slots=True)
+class PointFolders:
+    """Where points are kept."""
+
+    load: Path | None = None
+    """Of the map that is known at the start."""
+    save: Path | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class _Placed:
+    stamp: int
+    pose: Vector
+    covariance: Array
+    rate: float
+
+
+class PointService:
+    """Finds tags in the camera's pictures, and keeps them and what operators mark in the map.
+
+    Args:
+        config: gates and rates.
+        camera: mount and lens; None = there is none.
+        clock: time.
+        actor: where pictures are read.
+        inputs: topics read.
+        ask: where the robot was; None = the map does not move.
+        out: ``state/points``.
+        events: what was found, and what fails.
+        folders: of the map.
+        offload: where files are read and written.
+        max_age: see ``GateConfig.max_request_age``.
+    """
+
+    name = "points"
+
+    def __init__(
+        self,
+        config: PointsConfig,
+        camera: tuple[Mount, LensConfig] | None,
+        clock: Clock,
+        actor: Actor,
+        *,
+        inputs: PointInputs,
+        ask: PoseAsker | None,
+        out: Publisher[PointsOfInterest],
+        events: EventSink,
+        folders: PointFolders,
+        offload: Offload,
+        max_age: float,
+    ) -> None:
+        self._config, self._clock, self._actor, self._in = config, clock, actor, inputs
+        mount, self._lens = (Mount(), LensConfig()) if camera is None else camera
+        self._ask, self._out, self._events, self._folders = ask, out, events, folders
+        self._offload, self._max_age = offload, max_age
+        self._map = PointMap(config, mount)
+        self._sequences = Sequences(max_age)
+        self._history: deque[_Placed] = deque(maxlen=HISTORY)
+        self._trail: deque[tuple[int, Vector]] = deque(maxlen=CRUMBS)
+        self._stamps: tuple[int, ...] = ()
+        self._bases: Bases = {}
+        self._dirty: dict[str, None] = {}
+        self._published = self._unsaved = False
+        self._looked: tuple[Vector, int] | None = None
+        """Where pictures were read last, and how many."""
+        self._unreadable = False
+
+    async def run(self, ready: Ready) -> None:
+        """Serve until cancelled, then save."""
+        await self._load()
+        try:
+            async with self._actor as actor, asyncio.TaskGroup() as tasks:
+                if self._in.camera is not None:
+                    tasks.create_task(self._look(actor, self._in.camera))
+                tasks.create_task(self._keep())
+                ready()
+        finally:
+            self._write(self._map.pictured())
+
+    # Pictures
+
+    async def _look(self, actor: Actor, camera: Mailbox[CompressedImage]) -> None:
+        schedule, newest = Schedule(self._clock, self._config.rate), 0
+        while True:
+            await schedule.next()
+            picture = camera.latest
+            if picture is None or picture.stamp <= newest or self._clock.now() - picture.received > OLDEST:
+                continue
+            newest = picture.stamp
+            placed = await self._placed(picture.stamp)
+            if placed is None or not self._is_level() or not self._worth(placed.pose):
+                continue
+            try:
+                answer: ReadAnswer = await actor.step(ReadTask.of(picture.data, self._lens, self._config))
+            except WorkerError as error:
+                self._events(error.reason, Severity.ERROR, self.name, str(error))
+                await self._clock.sleep(RETRY)
+                continue
+            self._take(answer, placed)
+
+    def _take(self, answer: ReadAnswer, placed: _Placed) -> None:
+        if answer.unreadable and not self._unreadable:
+            self._events(Reason.BAD_INPUT, Severity.WARNING, self.name, "a picture of the camera cannot be decoded")
+        self._unreadable = answer.unreadable
+        for reading in answer.readings:
+            found = self._map.see(reading, placed.stamp, placed.pose, placed.covariance, placed.rate)
+            name = f"tag-{reading.tag}"
+            self._dirty[name] = None
+            if found:
+                self._map.refresh(name, self._bases)
+                point = self._map.shown[name]
+                text = f"{name} at ({point.x:.2f}, {point.y:.2f})"
+                self._events(Reason.POINT_FOUND, Severity.INFO, self.name, text, tag=reading.tag)
+        if answer.readings:
+            self._stamps = self._map.stamps()
+
+    async def _placed(self, stamp: int) -> _Placed | None:
+        """Where the robot was at an instant; None if that is not known."""
+        limit = self._clock.now() + WAITED
+        self._gather()
+        while (not self._history or self._history[-1].stamp < stamp) and self._clock.now() < limit:
+            await self._clock.sleep(PAUSE)
+            self._gather()
+        slam = None if self._in.slam is None else self._in.slam.latest
+        if slam is not None and slam.standing in NO_PLACE:
+            return None
+        rows = list(self._history)
+        after = next((i for i, row in enumerate(rows) if row.stamp >= stamp), None)
+        if after is None or after == 0:
+            return None
+        a, b = rows[after - 1], rows[after]
+        share = (stamp - a.stamp) / max(b.stamp - a.stamp, 1)
+        way = between(np.array(a.pose), np.array(b.pose)) * share
+        x, y, yaw = compose(np.array(a.pose), way).tolist()
+        return _Placed(stamp, (x, y, yaw), b.covariance, b.rate)
+
+    def _gather(self) -> None:
+        for message in self._in.pose.drain():
+            pose = (message.pose.x, message.pose.y, message.pose.yaw)
+            if self._history and message.stamp <= self._history[-1].stamp:
+                self._history.clear()
+            covariance = message.pose_covariance.reshape(3, 3)
+            self._history.append(_Placed(message.stamp, pose, covariance, message.twist.wz))
+            if not self._trail or math.dist(self._trail[-1][1][:2], pose[:2]) >= CRUMB:
+                self._trail.append((message.stamp, pose))
+
+    def _is_level(self) -> bool:
+        attitude = None if self._in.attitude is None else self._in.attitude.latest
+        return attitude is None or not attitude.tilt_valid or math.hypot(
+            attitude.pitch, attitude.roll
+        ) <= self._config.tilt  # fmt: skip
+
+    def _worth(self, pose: Vector) -> bool:
+        """Whether the robot has moved since the last pictures, or has looked here once only."""
+        if self._looked is not None:
+            before, looks = self._looked
+            turned = abs(math.remainder(pose[2] - before[2], math.tau))
+            if math.dist(before[:2], pose[:2]) < STANDING[0] and turned < STANDING[1]:
+                self._looked = before, looks + 1
+                return looks < LOOKS
+        self._looked = pose, 1
+        return True
+
+    # What is kept
+
+    async def _keep(self) -> None:
+        schedule = Schedule(self._clock, KEEP_RATE)
+        now = self._clock.now()
+        published, saved = now - PERIOD, now
+        while True:
+            await schedule.next()
+            self._gather()
+            self._correct()
+            await self._refresh()
+            now = self._clock.now()
+            if not self._published and now - published >= PERIOD:
+                published, self._published = now, True
+                self._publish(now)
+            if self._unsaved and now - saved >= SAVE_PERIOD:
+                saved, self._unsaved = now, False
+                rows = self._map.pictured()
+                await self._offload(lambda rows=rows: self._write(rows))  # type: ignore[misc]
+
+    def _correct(self) -> None:
+        """What the mapper has moved since moves its points."""
+        if self._ask is None or not self._stamps:
+            return
+        bases = self._ask(self._stamps)
+        if bases is self._bases:
+            return
+        before, self._bases = self._bases, bases
+        if any(_apart(before[at], base) for at, base in bases.items() if at in before):
+            self._dirty |= dict.fromkeys(self._map.points)
+
+    async def _refresh(self) -> None:
+        dirty, self._dirty = list(self._dirty), {}
+        for i, name in enumerate(dirty):
+            if i and i % AT_ONCE == 0:
+                await self._clock.sleep(PAUSE)
+            self._map.refresh(name, self._bases)
+        if dirty:
+            self._published, self._unsaved = False, True
+
+    def _publish(self, now: int) -> None:
+        points = tuple(self._map.shown.values())
+        self._out.put(PointsOfInterest(stamp=now, received=now, seq=self._out.next_seq(), frame="map", points=points))
+
+    async def _load(self) -> None:
+        if (folder := self._folders.load) is None:
+            return
+        try:
+            self._map.load(await self._offload(lambda: files.load(folder)))
+        except InputError as error:
+            self._events(Reason.BAD_INPUT, Severity.WARNING, self.name, str(error))
+        self._dirty = dict.fromkeys(self._map.points)
+
+    def _write(self, rows: list[Any]) -> None:
+        if self._folders.save is None or not (rows or (self._folders.save / files.FILE).exists()):
+            return
+        try:
+            files.save(self._folders.save, rows)
+        except OSError as error:
+            self._events(Reason.BAD_INPUT, Severity.WARNING, self.name, f"points not saved: {error}")
+
+    # Requests
+
+    def take(self, request: PointRequest) -> None:
+        """Mark a place, or forget a point.
+
+        Raises:
+            RequestRefusedError: the sender may not, or the robot does not know where it is.
+            NotFoundError: no point has this name.
+            InputError: half of a place.
+        """
+        reason = refusal(request, self._in.gate.latest, self._sequences, self._clock.now(), None)
+        if reason is not Reason.OK:
+            raise RequestRefusedError(reason)
+        if request.order is PointOrder.REMOVE:
+            if self._map.points.pop(request.name, None) is None:
+                raise NotFoundError(f"no point of interest {request.name!r}")
+            text = f"{request.name} removed by {request.source}"
+        else:
+            place = self._mark(request)
+            text = f"{request.name} at ({place[0]:.2f}, {place[1]:.2f}), marked by {request.source}"
+        self._dirty[request.name] = None
+        self._stamps = self._map.stamps()
+        self._events(Reason.POINT_CHANGED, Severity.INFO, self.name, text)
+
+    def _mark(self, request: PointRequest) -> Vector:
+        if (request.x is None) != (request.y is None):
+            raise InputError("point: x and y: expected both, or neither")
+        if request.name.startswith("tag-"):
+            raise InputError(f"point {request.name!r}: names that begin with tag- are those of tags")
+        if request.name not in self._map.points and len(self._map.points) >= self._config.most:
+            raise InputError(f"point: {self._config.most} are known: no room for more")
+        self._gather()
+        fresh = self._history and self._clock.now() - self._history[-1].stamp <= POSE.fresh_for() * SECOND
+        if not fresh:
+            raise RequestRefusedError(Reason.NO_MAP, "no fresh pose in map")
+        here = self._history[-1]
+        x, y, yaw = here.pose
+        place = (
+            x if request.x is None else request.x,
+            y if request.y is None else request.y,
+            yaw if request.yaw is None else math.remainder(request.yaw, math.tau),
+        )
+        # A place far from here moves with what of the map is near it.
+        stamp, base = (here.stamp, here.pose) if request.x is None else nearest(self._trail, place)
+        base = self._bases.get(stamp, base)
+        self._map.mark(request.name, stamp, base, place, here.covariance)
+        return place
+
+    def picture(self, name: str) -> bytes:
+        """The picture of a point, JPEG.
+
+        Raises:
+            NotFoundError: no such point, or it has none.
+        """
+        tracked = self._map.points.get(name)
+        if tracked is None or not tracked.picture:
+            raise NotFoundError(f"no picture of a point of interest {name!r}")
+        return tracked.picture
+
+
+def _apart(one: Vector, other: Vector) -> bool:
+    return max(abs(one[0] - other[0]), abs(one[1] - other[1]), abs(math.remainder(one[2] - other[2], math.tau))) > MOVED
+
+
+def register_point_calls(rpc: RpcRegistry, service: PointService) -> None:
+    """Serve ``points``, whose payload is a ``PointRequest``, and ``point_picture`` with the ``name`` of a point.
+
+    Args:
+        rpc: where.
+        service: what keeps them.
+    """
+
+    async def points(payload: dict[str, Any]) -> dict[str, Any]:
+        service.take(parse_request(PointRequest, payload))
+        return {}
+
+    async def point_picture(payload: dict[str, Any]) -> dict[str, Any]:
+        data = service.picture(str(payload.get("name", "")))
+        return {"jpeg": base64.b64encode(data).decode("ascii")}
+
+    rpc.register("points", points)
+    rpc.register("point_picture", point_picture, AccessRole.OBSERVER)

@@ -1,0 +1,74 @@
+"""Points of interest: what the camera found in the map, and what an operator marked there."""
+
+from enum import StrEnum
+from typing import Annotated
+
+from pydantic import Field
+
+from monstertruck_schemas.base import Covariance, Message, Nanoseconds, Schema
+from monstertruck_schemas.req import Request
+
+PointName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,31}$")]
+Coordinate = Annotated[float, Field(ge=-10_000, le=10_000)]
+
+
+class PointKind(StrEnum):
+    """Where a point of interest comes from."""
+
+    TAG = "tag"
+    """An AprilTag that the camera saw."""
+    MARK = "mark"
+    """An operator."""
+
+
+class Point(Schema):
+    """One point of interest, in map."""
+
+    name: PointName
+    kind: PointKind
+    tag: Annotated[int, Field(ge=0)] | None = None
+    """Number of the tag."""
+    x: float
+    """m; of a tag its middle."""
+    y: float
+    z: float = 0.0
+    """Over the ground, m."""
+    yaw: float
+    """Rad; of a tag the direction that it faces, of a mark as it was given."""
+    covariance: Covariance
+    """Shape (9,), row-major, of (x, y, yaw): m^2, m rad, rad^2; against the map around it."""
+    sightings: Annotated[int, Field(ge=0)] = 0
+    """Pictures that it was read from."""
+    size: float | None = None
+    """Side of the tag's black square, m."""
+    first: Nanoseconds
+    """When it was seen, or marked, first."""
+    last: Nanoseconds
+    """And last."""
+    picture: bool = False
+    """There is one: remote call ``point_picture``."""
+
+
+class PointsOfInterest(Message):
+    """All that are known; in the order in which they were found."""
+
+    points: tuple[Point, ...] = ()
+
+
+class PointOrder(StrEnum):
+    """What an operator can do to a point of interest."""
+
+    MARK = "mark"
+    REMOVE = "remove"
+
+
+class PointRequest(Request):
+    """Mark a place, or have a point of interest forgotten."""
+
+    order: PointOrder
+    name: PointName
+    x: Coordinate | None = None
+    """Of a mark, in map, m; None = where the robot is."""
+    y: Coordinate | None = None
+    yaw: Coordinate | None = None
+    """Rad; None = the robot's."""

@@ -1,0 +1,167 @@
+"""The service: pictures in, points of interest out; marks, removal, what is saved, what is refused."""
+
+import asyncio
+import base64
+import math
+from contextlib import suppress
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from monstertruck_estimation.points import files
+from monstertruck_estimation.points.config import PointsConfig
+from monstertruck_estimation.points.service import (
+    TARGET,
+    PointFolders,
+    PointInputs,
+    PointService,
+    register_point_calls,
+)
+from monstertruck_runtime.actors.actor import LoopActor
+from monstertruck_runtime.clock import run_virtual
+from monstertruck_runtime.errors import InputError, NotFoundError, RequestRefusedError
+from monstertruck_runtime.mailbox import Mailbox, fifo, latest
+from monstertruck_runtime.threads import inline
+from monstertruck_schemas.base import Pose2D, Twist2D
+from monstertruck_schemas.body import LensConfig, Mount
+from monstertruck_schemas.points import PointKind, PointOrder
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import Role
+from monstertruck_schemas.sensor import Attitude, CompressedImage
+from monstertruck_schemas.state import Odometry
+from monstertruck_sim.world.config import TagConfig
+from tests.unit.estimation.points.test_reader import picture
+
+SEEN = picture(TagConfig(tag=3, x=1.0, y=0.1, z=0.3, yaw=math.pi))
+"""From the camera, which is at (0.18, 0, 0.25) in base."""
+
+
+class Kept(list):
+    def next_seq(self) -> int:
+        return len(self)
+
+    put = list.append
+
+
+class Calls(dict):
+    def register(self, name, handler, role=None) -> None:
+        self[name] = handler
+
+
+class Rig:
+    """A robot that creeps along x."""
+
+    def __init__(self, clock, folder, ask=None, load=None) -> None:
+        self.clock, self.out, self.events, self.seq, self.speed = clock, Kept(), [], 0, 0.05
+        self.camera, self.pose, self.felt = Mailbox(latest()), Mailbox(fifo(256)), Mailbox(latest())
+        self.gate = SimpleNamespace(latest=SimpleNamespace(nonce="n", stamp=0))
+        self.calls = Calls()
+        self.service = PointService(
+            PointsConfig(), (Mount(x=0.18, z=0.25), LensConfig(k1=-0.15, k2=0.03)), clock,
+            LoopActor(TARGET, clock, 0.05),
+            inputs=PointInputs(self.camera, self.pose, None, self.felt, self.gate), ask=ask, out=self.out,
+            events=lambda reason, *args, **_: self.events.append((reason, args[-1])),
+            folders=PointFolders(load=load, save=folder), offload=inline, max_age=5.0,
+        )  # fmt: skip
+        register_point_calls(self.calls, self.service)
+
+    async def drive(self, seconds: float, *, tilt: float = 0.0, show: bytes = SEEN) -> None:
+        for i in range(round(seconds / 0.05)):
+            now = self.clock.now()
+            header = {"stamp": now, "received": now, "seq": i}
+            self.pose.put(Odometry(
+                **header, frame="map", pose=Pose2D(x=self.speed * now * 1e-9, y=0.0, yaw=0.0),
+                twist=Twist2D(vx=self.speed, vy=0.0, wz=0.0), pose_covariance=np.full(9, 1e-6),
+                twist_covariance=np.zeros(9), age=0.0, sources=(),
+            ))  # fmt: skip
+            self.felt.put(Attitude(**header, heading=0.0, roll=0.0, pitch=tilt))
+            if i % 4 == 0:
+                self.camera.put(CompressedImage(**header, frame="camera", data=show, sequence=i))
+            await self.clock.sleep(0.05)
+
+    async def ask(self, order: PointOrder, name: str, **more) -> None:
+        self.seq += 1
+        await self.calls["points"]({
+            "stamp": 0, "received": 0, "seq": self.seq, "source": "ann", "role": Role.STATION, "lease": 1.0,
+            "nonce": "n", "order": order, "name": name, **more,
+        })  # fmt: skip
+
+
+def told(story, folder, **more) -> Rig:
+    async def main(clock) -> Rig:
+        rig = Rig(clock, folder, **more)
+        serving = asyncio.create_task(rig.service.run(lambda: None))
+        telling = asyncio.create_task(story(rig))
+        await asyncio.wait([serving, telling], return_when=asyncio.FIRST_COMPLETED)
+        serving.cancel()
+        with suppress(asyncio.CancelledError):
+            await serving
+        await telling
+        return rig
+
+    return run_virtual(main)
+
+
+def test_a_tag_in_pictures_becomes_a_point_with_a_picture_and_is_saved(tmp_path):
+    async def story(rig: Rig) -> None:
+        await rig.drive(2.5)
+        data = base64.b64decode((await rig.calls["point_picture"]({"name": "tag-3"}))["jpeg"])
+        assert data.startswith(b"\xff\xd8")
+        with pytest.raises(NotFoundError):
+            await rig.calls["point_picture"]({"name": "tag-4"})
+
+    rig = told(story, tmp_path)
+    assert not rig.out[0].points, "late joiners know that there is none"
+    (point,) = rig.out[-1].points
+    # The picture is always the same, so the tag goes along with the robot: sightings agree within what is allowed.
+    assert (point.x, point.y, point.z) == pytest.approx((1.18 + 0.05, 0.1, 0.3), abs=0.08)
+    assert [reason for reason, _ in rig.events] == [Reason.POINT_FOUND]
+    ((saved, picture_),) = files.load(tmp_path)
+    assert saved.name == "tag-3"
+    assert picture_
+
+
+def test_nothing_is_read_of_a_tilted_robot_and_a_standing_one_is_left_alone(tmp_path):
+    async def tilted(rig: Rig) -> None:
+        await rig.drive(1.5, tilt=0.3)
+
+    assert not any(message.points for message in told(tilted, tmp_path).out)
+
+    async def standing(rig: Rig) -> None:
+        rig.speed = 0.0
+        await rig.drive(3.0)
+
+    assert told(standing, tmp_path).out[-1].points[0].sightings == 2
+
+
+def test_places_are_marked_moved_with_the_map_and_removed(tmp_path):
+    moved = {}
+
+    async def story(rig: Rig) -> None:
+        with pytest.raises(RequestRefusedError, match="no fresh pose"):
+            await rig.ask(PointOrder.MARK, "dock")
+        rig.speed = 1.0
+        await rig.drive(2.0, show=b"")
+        await rig.ask(PointOrder.MARK, "here")
+        await rig.ask(PointOrder.MARK, "there", x=1.0, y=3.0, yaw=1.0)
+        for wrong in ({"x": 1.0}, {"name": "tag-9"}):
+            with pytest.raises(InputError):
+                await rig.ask(PointOrder.MARK, **({"name": "odd"} | wrong))
+        with pytest.raises(NotFoundError, match="no point of interest 'nowhere'"):
+            await rig.ask(PointOrder.REMOVE, "nowhere")
+        await rig.drive(1.5, show=b"")
+        before = {point.name: point for point in rig.out[-1].points}
+        assert before["there"].kind is PointKind.MARK
+        moved["asked"] = dict.fromkeys(rig.service._map.stamps(), (10.0, 0.0, 0.0))
+        await rig.drive(1.5, show=b"")
+        after = {point.name: point for point in rig.out[-1].points}
+        assert after["here"].x == pytest.approx(10.0)
+        assert after["there"].y == pytest.approx(3.0)
+        await rig.ask(PointOrder.REMOVE, "here")
+        await rig.drive(1.5, show=b"")
+
+    rig = told(story, tmp_path, ask=lambda stamps: moved.get("asked", {}))
+    assert [point.name for point in rig.out[-1].points] == ["there"]
+    again = told(lambda rig: rig.drive(1.2, show=b""), None, load=tmp_path)
+    assert [point.name for point in again.out[-1].points] == ["there"]

@@ -1,0 +1,134 @@
+"""Readings become points of interest; they move with the map, and outliers do not count."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from monstertruck_estimation.points.config import PointsConfig
+from monstertruck_estimation.points.exchange import TagReading
+from monstertruck_estimation.points.files import load, save
+from monstertruck_estimation.points.tracking import KEPT, PointMap, axes
+from monstertruck_runtime.errors import InputError
+from monstertruck_schemas.body import Mount
+from monstertruck_schemas.points import PointKind
+
+MOUNT = Mount(x=0.2, z=0.25, yaw=0.1, pitch=-0.05)
+STILL = np.diag((1e-4, 1e-4, 1e-5))
+SECOND = 1_000_000_000
+TAG = (3.0, 1.0, 0.3, math.pi)
+"""x, y, z and yaw in map."""
+
+
+def reading(base, tag=TAG, number=7, **more) -> TagReading:
+    """What an ideal camera on the robot at ``base`` reads."""
+    c, s = math.cos(base[2]), math.sin(base[2])
+    dx, dy = tag[0] - base[0], tag[1] - base[1]
+    place = np.array((c * dx + s * dy, -s * dx + c * dy, tag[2])) - (MOUNT.x, MOUNT.y, MOUNT.z)
+    facing = tag[3] - base[2]
+    turned = axes(MOUNT).T
+    normal = tuple(turned @ np.array((math.cos(facing), math.sin(facing), 0.0)))
+    values = {
+        "other_normal": normal,
+        "doubt": 0.1,
+        "pixels": 40.0,
+        "margin": 0.8,
+        "angle": 0.2,
+        "picture": b"\xff\xd8x",
+    }
+    return TagReading(number, tuple(turned @ place), normal, **(values | more))
+
+
+def seen_from(points: PointMap, bases, **more) -> list[bool]:
+    return [
+        points.see(reading(base, **more), (i + 1) * SECOND, base, STILL, 0.0) for i, base in enumerate(bases)
+    ]  # fmt: skip
+
+
+BASES = [(2.0, 1.0, 0.0), (2.1, 0.8, 0.1), (1.9, 1.2, -0.2), (2.2, 1.1, 0.0)]
+
+
+def shown(points: PointMap, bases=None, name: str = "tag-7"):
+    points.refresh(name, bases or {})
+    return points.shown.get(name)
+
+
+def test_a_tag_is_known_after_two_pictures_at_its_place():
+    points = PointMap(PointsConfig(), MOUNT)
+    assert seen_from(points, BASES[:1]) == [False]
+    assert shown(points) is None
+    assert points.see(reading(BASES[1]), SECOND + 1, BASES[1], STILL, 0.0) is False, "the same instant"
+    assert points.see(reading(BASES[1]), 2 * SECOND, BASES[1], STILL, 0.0) is True
+    point = shown(points)
+    assert (point.x, point.y, point.z, abs(point.yaw)) == pytest.approx(TAG, abs=1e-6)
+    assert (point.sightings, point.tag, point.picture) == (2, 7, True)
+    assert math.sqrt(point.covariance[0]) < 0.03
+
+
+def test_two_pictures_that_disagree_are_none():
+    points = PointMap(PointsConfig(), MOUNT)
+    seen_from(points, BASES[:1])
+    assert not points.see(reading(BASES[1], (3.0, 2.0, 0.3, math.pi)), 9 * SECOND, BASES[1], STILL, 0.0)
+    assert shown(points) is None
+
+
+def test_an_outlier_does_not_move_it():
+    points = PointMap(PointsConfig(), MOUNT)
+    seen_from(points, BASES)
+    points.see(reading((2.4, 1.0, 0.0), (4.0, 1.0, 0.3, 0.0)), 9 * SECOND, (2.4, 1.0, 0.0), STILL, 0.0)
+    assert (shown(points).x, shown(points).y) == pytest.approx(TAG[:2], abs=1e-6)
+
+
+def test_it_moves_with_what_the_mapper_corrects():
+    points = PointMap(PointsConfig(), MOUNT)
+    seen_from(points, BASES)
+    moved = {(i + 1) * SECOND: (x + 0.5, y - 0.2, yaw) for i, (x, y, yaw) in enumerate(BASES)}
+    point = shown(points, moved)
+    assert (point.x, point.y) == pytest.approx((TAG[0] + 0.5, TAG[1] - 0.2), abs=1e-6)
+    assert points.stamps() == tuple(moved)
+
+
+def test_of_two_poses_of_a_square_the_upright_one_is_taken_and_a_doubt_is_told():
+    points = PointMap(PointsConfig(), MOUNT)
+    right = reading(BASES[0])
+    tilted = tuple(axes(MOUNT).T @ np.array((-0.8, 0.0, 0.6)))
+    for i, base in enumerate(BASES[:2]):
+        one = replace(reading(base), normal=tilted, other_normal=right.normal, doubt=0.9)
+        points.see(one, (i + 1) * SECOND, base, STILL, 0.0)
+    assert abs(shown(points).yaw) == pytest.approx(math.pi, abs=0.1)
+    doubted = PointMap(PointsConfig(), MOUNT)
+    seen_from(doubted, BASES[:2], doubt=0.9)
+    assert shown(doubted).covariance[8] > 1.0
+
+
+def test_a_robot_that_stands_keeps_one_sighting_and_a_long_drive_not_too_many():
+    points = PointMap(PointsConfig(), MOUNT)
+    seen_from(points, [BASES[0]] * 30)
+    assert len(points.points["tag-7"].sightings) == 1
+    assert shown(points).sightings == 30
+    seen_from(
+        points := PointMap(PointsConfig(), MOUNT), [(1.0 + 0.1 * (i % 9), 0.1 * (i // 9), 0.0) for i in range(60)]
+    )
+    assert len(points.points["tag-7"].sightings) == KEPT
+
+
+def test_a_mark_moves_with_the_map_near_it_and_what_is_saved_comes_back(tmp_path):
+    points = PointMap(PointsConfig(), MOUNT)
+    seen_from(points, BASES)
+    points.mark("dock", 5 * SECOND, (1.0, 0.0, 0.0), (1.5, 0.5, 1.0), STILL)
+    mark = shown(points, {5 * SECOND: (1.0, 1.0, 0.0)}, "dock")
+    assert (mark.x, mark.y, mark.yaw) == pytest.approx((1.5, 1.5, 1.0))
+    assert mark.kind is PointKind.MARK
+    shown(points)
+    save(tmp_path, points.pictured())
+    again = PointMap(PointsConfig(), MOUNT)
+    again.load(load(tmp_path))
+    for name in points.shown:
+        old, new = points.shown[name], shown(again, name=name)
+        assert (new.x, new.y, new.yaw) == pytest.approx((old.x, old.y, old.yaw))
+        assert new.kind is old.kind
+    assert again.points["tag-7"].picture == b"\xff\xd8x"
+    (tmp_path / "points.json").write_text("[{}]")
+    with pytest.raises(InputError, match=r"points\.json: not readable"):
+        load(tmp_path)
