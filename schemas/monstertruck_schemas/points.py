@@ -21,7 +21,7 @@ class PointKind(StrEnum):
     """An operator."""
 
 
-class Point(Schema):
+class PointOfInterest(Schema):
     """One point of interest, in map."""
 
     name: PointName
@@ -52,7 +52,7 @@ class Point(Schema):
 class PointsOfInterest(Message):
     """All that are known; in the order in which they were found."""
 
-    points: tuple[Point, ...] = ()
+    points: tuple[PointOfInterest, ...] = ()
 
 
 class PointOrder(StrEnum):

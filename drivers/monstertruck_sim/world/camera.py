@@ -57,7 +57,7 @@ class CameraPlace(NamedTuple):
     """(3, 3), rows: its right, its down and its axis, in the map."""
 
 
-class Panel(NamedTuple):
+class FlatPanel(NamedTuple):
     """A flat picture in the world, seen from its front."""
 
     texture: NDArray[np.uint8]
@@ -173,7 +173,7 @@ class SimulatedView:
         row, column = generator(seed, CAMERA, self._plant.slot(time_ns, 1_000_000)).integers(0, _GRAIN, 2).tolist()
         return lambda picture: _grainy(picture, seed, noise, row, column)
 
-    def _in_view(self, place: CameraPlace) -> list[Panel]:
+    def _in_view(self, place: CameraPlace) -> list[FlatPanel]:
         """Tags before the camera that show it their front, the farthest one first."""
         found = []
         for panel in self._panels:
@@ -225,7 +225,7 @@ class Painter:
         depth = np.minimum(np.abs(self._slope) * self._focal / (height / 2), 1.0) * 63
         self._ground = (np.where(self._slope > 0, FLOOR, SKY) + depth).astype(np.uint8)
 
-    def picture(self, ranges: Array, panels: Sequence[Panel], place: CameraPlace) -> Picture:
+    def picture(self, ranges: Array, panels: Sequence[FlatPanel], place: CameraPlace) -> Picture:
         """Draw.
 
         Args:
@@ -244,7 +244,7 @@ class Painter:
             self._draw(picture, panel, place, ranges)
         return picture
 
-    def _draw(self, picture: Picture, panel: Panel, place: CameraPlace, ranges: Array) -> None:
+    def _draw(self, picture: Picture, panel: FlatPanel, place: CameraPlace, ranges: Array) -> None:
         corners = panel.corner + np.array((panel.right * 0, panel.right, panel.right + panel.down, panel.down))
         seen = (corners - place.centre) @ place.axes.T
         if (seen[:, 2] < 0.05).any():
@@ -330,16 +330,16 @@ def tag_pattern(tag: int) -> NDArray[np.uint8]:
     return np.pad(np.where(np.asarray(inner) > 127, PAPER, INK).astype(np.uint8), RIM, constant_values=PAPER)
 
 
-def tag_panel(tag: TagConfig) -> Panel:
+def tag_panel(tag: TagConfig) -> FlatPanel:
     """A tag on its paper, upright, facing ``yaw``."""
     pattern = tag_pattern(tag.tag)
     side = tag.size * len(pattern) / CELLS
     right, down = np.array((-sin(tag.yaw), cos(tag.yaw), 0.0)) * side, np.array((0.0, 0.0, -side))
     corner = np.array((tag.x, tag.y, tag.z)) - (right + down) / 2
-    return Panel(np.repeat(pattern[..., None], 3, axis=2), np.ones(pattern.shape, np.bool_), corner, right, down)
+    return FlatPanel(np.repeat(pattern[..., None], 3, axis=2), np.ones(pattern.shape, np.bool_), corner, right, down)
 
 
-def person_panel(x: float, y: float, radius: float, place: CameraPlace) -> Panel:
+def person_panel(x: float, y: float, radius: float, place: CameraPlace) -> FlatPanel:
     """Somebody, turned to the camera."""
     texture, opaque = _person()
     toward = place.centre[:2] - (x, y)
@@ -347,7 +347,7 @@ def person_panel(x: float, y: float, radius: float, place: CameraPlace) -> Panel
     right = np.array((-toward[1], toward[0], 0.0)) * 2 * radius
     down = np.array((0.0, 0.0, -TALL))
     nearest = np.array((*((x, y) + toward * radius), 0.0))
-    return Panel(texture, opaque, nearest - right / 2 - down, right, down)
+    return FlatPanel(texture, opaque, nearest - right / 2 - down, right, down)
 
 
 @cache

@@ -7,11 +7,11 @@ from pydantic import TypeAdapter, ValidationError
 
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.small_files import replace_file, require_file
-from monstertruck_schemas.points import Point
+from monstertruck_schemas.points import PointOfInterest
 
 FILE: Final = "points.json"
 MOST_BYTES: Final = 5_000_000
-_POINTS: Final = TypeAdapter(list[Point])
+_POINTS: Final = TypeAdapter(list[PointOfInterest])
 
 
 def picture_name(point: str) -> str:
@@ -19,7 +19,7 @@ def picture_name(point: str) -> str:
     return f"point-{point}.jpg"
 
 
-def save(folder: Path, points: list[tuple[Point, bytes]]) -> None:
+def save(folder: Path, points: list[tuple[PointOfInterest, bytes]]) -> None:
     """Write points and pictures; the list last.
 
     Raises:
@@ -33,7 +33,7 @@ def save(folder: Path, points: list[tuple[Point, bytes]]) -> None:
     replace_file(folder / FILE, _POINTS.dump_json([point for point, _ in points], indent=1))
 
 
-def load(folder: Path) -> list[tuple[Point, bytes]]:
+def load(folder: Path) -> list[tuple[PointOfInterest, bytes]]:
     """Points of a map's folder, with their pictures; none if it has none.
 
     Raises:

@@ -270,8 +270,10 @@ class PointService:
         if bases is self._bases:
             return
         before, self._bases = self._bases, bases
-        if any(_apart(before[at], base) for at, base in bases.items() if at in before):
-            self._dirty |= dict.fromkeys(self._map.points)
+        new = {at for at, base in bases.items() if at not in before or _apart(before[at], base)}
+        if new:
+            points = self._map.points.values()
+            self._dirty |= {p.name: None for p in points if any(one.stamp in new for one in p.sightings)}
 
     async def _refresh(self) -> None:
         dirty, self._dirty = list(self._dirty), {}

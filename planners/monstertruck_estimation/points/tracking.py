@@ -17,7 +17,7 @@ from monstertruck_estimation.points.exchange import TagReading, Triple
 from monstertruck_estimation.se2 import Vector, compose
 from monstertruck_kinematics.elementary import Array
 from monstertruck_schemas.body import Mount
-from monstertruck_schemas.points import Point, PointKind
+from monstertruck_schemas.points import PointKind, PointOfInterest
 
 KEPT: Final = 24
 """Sightings of a point at most."""
@@ -48,7 +48,7 @@ FAR: Final = 3.5
 
 
 @dataclass(frozen=True, slots=True)
-class Sighting:
+class PointSighting:
     """A point as seen from the robot at one instant."""
 
     stamp: int
@@ -73,7 +73,7 @@ class Tracked:
     kind: PointKind
     tag: int | None
     size: float | None
-    sightings: tuple[Sighting, ...]
+    sightings: tuple[PointSighting, ...]
     count: int
     """All pictures so far."""
     first: int
@@ -101,7 +101,7 @@ class PointMap:
     config: PointsConfig
     mount: Mount
     points: dict[str, Tracked] = field(default_factory=dict)
-    shown: dict[str, Point] = field(default_factory=dict)
+    shown: dict[str, PointOfInterest] = field(default_factory=dict)
     """As they were when ``refresh`` was last called for each."""
 
     def see(self, reading: TagReading, stamp: int, base: Vector, covariance: Array, rate: float) -> bool:
@@ -150,7 +150,7 @@ class PointMap:
         """
         x, y, yaw = (float(v) for v in _between(base, place))
         spread = tuple(float(v) for v in (covariance + np.eye(3) * MARK_ERROR**2).ravel())
-        one = Sighting(stamp, base, (x, y, 0.0), yaw, spread)
+        one = PointSighting(stamp, base, (x, y, 0.0), yaw, spread)
         self.points[name] = Tracked(name, PointKind.MARK, None, None, (one,), 0, stamp, stamp)
 
     def stamps(self) -> tuple[int, ...]:
@@ -165,25 +165,25 @@ class PointMap:
         else:
             self.shown[name] = self._point(tracked, bases)
 
-    def pictured(self) -> list[tuple[Point, bytes]]:
+    def pictured(self) -> list[tuple[PointOfInterest, bytes]]:
         """Points as shown, with their pictures."""
         return [(point, self.points[name].picture) for name, point in self.shown.items() if name in self.points]
 
-    def load(self, points: Iterable[tuple[Point, bytes]]) -> None:
+    def load(self, points: Iterable[tuple[PointOfInterest, bytes]]) -> None:
         """Take over points of a saved map, with their pictures."""
         for point, picture in points:
             spread = tuple(float(v) for v in point.covariance)
-            one = Sighting(0, (0.0, 0.0, 0.0), (point.x, point.y, point.z), point.yaw, spread)
+            one = PointSighting(0, (0.0, 0.0, 0.0), (point.x, point.y, point.z), point.yaw, spread)
             self.points[point.name] = Tracked(
                 point.name, point.kind, point.tag, point.size, (one,), max(point.sightings, self.config.sightings),
                 point.first, point.last, picture, 40.0 if picture else 0.0,
             )  # fmt: skip
 
-    def _point(self, tracked: Tracked, bases: Bases) -> Point:
+    def _point(self, tracked: Tracked, bases: Bases) -> PointOfInterest:
         mean, z, covariance = fused(tracked.sightings, bases, self.config)
         flat = covariance.ravel()
         flat.flags.writeable = False
-        return Point(
+        return PointOfInterest(
             name=tracked.name,
             kind=tracked.kind,
             tag=tracked.tag,
@@ -200,7 +200,9 @@ class PointMap:
         )
 
 
-def sighting(reading: TagReading, mount: Mount, stamp: int, base: Vector, covariance: Array, rate: float) -> Sighting:
+def sighting(
+    reading: TagReading, mount: Mount, stamp: int, base: Vector, covariance: Array, rate: float
+) -> PointSighting:
     """A reading in the robot's base, with what may be wrong with it.
 
     Of the two poses of a square the one is taken whose normal is level, as of a tag that hangs upright; where both are,
@@ -230,7 +232,7 @@ def sighting(reading: TagReading, mount: Mount, stamp: int, base: Vector, covari
     spread += by_turn @ into @ covariance @ into.T @ by_turn.T
     yaw = math.atan2(normal[1], normal[0])
     x, y, z = (float(v) for v in place)
-    return Sighting(stamp, base, (x, y, z), yaw, tuple(spread.ravel().tolist()), reading.pixels)
+    return PointSighting(stamp, base, (x, y, z), yaw, tuple(spread.ravel().tolist()), reading.pixels)
 
 
 def axes(mount: Mount) -> Array:
@@ -248,7 +250,7 @@ def axes(mount: Mount) -> Array:
     return np.stack((-turned[:, 1], -turned[:, 2], turned[:, 0]), axis=1)
 
 
-def fused(sightings: Sequence[Sighting], bases: Bases, config: PointsConfig) -> tuple[Array, float, Array]:
+def fused(sightings: Sequence[PointSighting], bases: Bases, config: PointsConfig) -> tuple[Array, float, Array]:
     """Pose (x, y, yaw) of those that agree, height, and the pose's covariance, (3, 3).
 
     Errors of one place are alike in its sightings: the covariance is not less than that of the best one over the root
@@ -268,7 +270,7 @@ def fused(sightings: Sequence[Sighting], bases: Bases, config: PointsConfig) -> 
     return np.array((*mean, yaw)), float(np.median(heights)), covariance
 
 
-def in_map(sightings: Sequence[Sighting], bases: Bases) -> tuple[Array, Array]:
+def in_map(sightings: Sequence[PointSighting], bases: Bases) -> tuple[Array, Array]:
     """Poses (n, 3) and covariances (n, 3, 3) of sightings, by where the robot was."""
     base = np.array([bases.get(one.stamp, one.base) for one in sightings])
     local = np.array([(*one.place[:2], one.yaw) for one in sightings])
@@ -289,11 +291,11 @@ def _agreeing(places: Array, spreads: Array, config: PointsConfig) -> NDArray[np
     return np.flatnonzero(near[best])
 
 
-def _consensus(sightings: Sequence[Sighting], bases: Bases, config: PointsConfig) -> int:
+def _consensus(sightings: Sequence[PointSighting], bases: Bases, config: PointsConfig) -> int:
     return len(_agreeing(*in_map(sightings, bases), config))
 
 
-def _added(sightings: tuple[Sighting, ...], new: Sighting) -> tuple[Sighting, ...]:
+def _added(sightings: tuple[PointSighting, ...], new: PointSighting) -> tuple[PointSighting, ...]:
     """With the new one; of one place the better one stays, and of too many the oldest but the first goes."""
     for i, old in enumerate(sightings):
         moved = math.dist(old.base[:2], new.base[:2])
