@@ -25,14 +25,21 @@ ZERO: Final[Triple] = (0.0, 0.0, 0.0)
 class Shape:
     """What a link looks like, and collides with.
 
-    ``box``: lengths along x, y, z. ``wheel``: radius and width of a cylinder about y.
+    ``box``: lengths along x, y, z. ``wheel``: radius and width of a cylinder about y. ``ball``: radius.
     """
 
-    kind: Literal["box", "wheel"]
+    kind: Literal["box", "wheel", "ball"]
     size: tuple[float, ...]
     centre: Triple = ZERO
     colour: str = "0.35 0.36 0.4 1"
     """Red, green, blue and opacity, 0..1."""
+    yaw: float = 0.0
+    """About z, rad; of a cylinder."""
+    touches: Literal["all", "ground", "walls"] = "all"
+    slick: bool = False
+    """Without friction."""
+    seen: bool = True
+    """In pictures."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,11 +162,15 @@ class Size:
         wheelbase: m.
         track: m.
         wheel_radius: m.
+        length: of the footprint, m.
+        width: m.
     """
 
     wheelbase: float = 0.32
     track: float = 0.26
     wheel_radius: float = 0.075
+    length: float = 0.47
+    width: float = 0.34
 
 
 @dataclass(frozen=True, slots=True)
@@ -388,14 +399,20 @@ def truck_description(
                 ),
             ]
     if head is not None:
-        _add_head(head, links, joints)
-    for sensor in sensors:
-        links.append(Part(sensor.name))
-        joints.append(PartJoint(f"{sensor.name}_mount", "fixed", "base", sensor.name, sensor.origin, sensor.turn))
+        add_head(head, links, joints)
+    add_sensors(sensors, links, joints)
     return Description("monstertruck", tuple(links), tuple(joints))
 
 
-def _add_head(head: LidarHead, links: list[Part], joints: list[PartJoint]) -> None:
+def add_sensors(sensors: tuple[SensorFrame, ...], links: list[Part], joints: list[PartJoint]) -> None:
+    """Frames on the base."""
+    for sensor in sensors:
+        links.append(Part(sensor.name))
+        joints.append(PartJoint(f"{sensor.name}_mount", "fixed", "base", sensor.name, sensor.origin, sensor.turn))
+
+
+def add_head(head: LidarHead, links: list[Part], joints: list[PartJoint]) -> None:
+    """The lidar and its joints on the base."""
     servo = (0.032, 0.05, 0.04)
     lidar = (0.05, 0.05, 0.07)
     links += [
@@ -432,6 +449,8 @@ def urdf(description: Description) -> str:
             ET.SubElement(inertial, "inertia", ixx=ixx, iyy=iyy, izz=izz, ixy="0", ixz="0", iyz="0")
         for kind in ("visual", "collision"):
             for shape in link.shapes:
+                if kind == "visual" and not shape.seen:
+                    continue
                 _urdf_shape(ET.SubElement(element, kind), shape, coloured=kind == "visual")
     for joint in description.joints:
         element = ET.SubElement(robot, "joint", name=joint.name, type=joint.kind)
@@ -451,11 +470,13 @@ def urdf(description: Description) -> str:
 
 
 def _urdf_shape(element: ET.Element, shape: Shape, *, coloured: bool) -> None:
-    turn = (math.pi / 2.0, 0.0, 0.0) if shape.kind == "wheel" else ZERO
+    turn = (math.pi / 2.0, 0.0, shape.yaw) if shape.kind == "wheel" else ZERO
     ET.SubElement(element, "origin", xyz=_numbers(shape.centre), rpy=_numbers(turn))
     geometry = ET.SubElement(element, "geometry")
     if shape.kind == "box":
         ET.SubElement(geometry, "box", size=_numbers(shape.size))
+    elif shape.kind == "ball":
+        ET.SubElement(geometry, "sphere", radius=f"{shape.size[0]:.6g}")
     else:
         radius, width = shape.size
         ET.SubElement(geometry, "cylinder", radius=f"{radius:.6g}", length=f"{width:.6g}")

@@ -6,7 +6,7 @@ is made by changing a value here and not there. ``noise: false`` leaves the phys
 
 from math import radians
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Final, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -624,6 +624,10 @@ class HeightImage(Schema):
 GroundFeature = Annotated[Hills | Slope | UprightStep | Ditch | Rubble, Field(discriminator="kind")]
 
 
+SOLID_BODIES: Final = ("truck", "ackermann", "skid_steer", "differential", "omni", "mecanum")
+"""That have rigid parts: the first three on the truck's axles, the others on wheels with springs of their own."""
+
+
 class WorldConfig(Schema):
     """One simulated world, and one robot in it."""
 
@@ -659,9 +663,9 @@ class WorldConfig(Schema):
     @model_validator(mode="after")
     def _check_engine(self) -> Self:
         if self.engine == "mujoco":
-            if self.truck.body.kind not in ("truck", "ackermann", "skid_steer"):
+            if self.truck.body.kind not in SOLID_BODIES:
                 raise ValueError(
-                    f"engine mujoco: has no body {self.truck.body.kind}; expected truck, ackermann or skid_steer"
+                    f"engine mujoco: has no body {self.truck.body.kind}; expected one of {', '.join(SOLID_BODIES)}"
                 )
             if self.tilt.kind != "ground":
                 raise ValueError(f"engine mujoco: tilt {self.tilt.kind}: the ground tilts the robot; expected ground")

@@ -1,8 +1,19 @@
-"""From the configured masses and springs to those of the description."""
+"""From the configured body, masses and springs to the description of the robot."""
 
 from math import radians
 
-from monstertruck_kinematics.description import Mechanics
+from monstertruck_kinematics.description import (
+    Description,
+    LidarHead,
+    Mechanics,
+    SensorFrame,
+    Size,
+    truck_description,
+)
+from monstertruck_kinematics.platform import BallCaster, platform_description
+from monstertruck_kinematics.unsteered import mecanum, omni
+from monstertruck_kinematics.wheels import FixedWheel, Wheel
+from monstertruck_schemas.body import OmniBody
 from monstertruck_sim.world.config import MechanicsConfig, SimTruckConfig
 
 
@@ -21,3 +32,43 @@ def mechanics(truck: SimTruckConfig, config: MechanicsConfig) -> Mechanics:
         friction=config.friction,
         rolling_resistance=truck.rolling_resistance,
     )
+
+
+def platform_wheels(truck: SimTruckConfig) -> tuple[Wheel, ...]:
+    """Driven wheels of a body on a platform, in the order of its shafts; of other bodies none."""
+    body, radius = truck.body, truck.wheel_radius
+    if isinstance(body, OmniBody):
+        return omni(body.circle, radius, body.count).swedish
+    if body.kind == "mecanum":
+        return mecanum(truck.wheelbase, truck.track, radius).swedish
+    if body.kind == "differential":
+        half = truck.track / 2.0
+        return FixedWheel("left", 0.0, half, radius), FixedWheel("right", 0.0, -half, radius)
+    return ()
+
+
+def description(
+    truck: SimTruckConfig,
+    parts: Mechanics,
+    sensors: tuple[SensorFrame, ...] = (),
+    head: LidarHead | None = None,
+) -> Description:
+    """Of the robot of a body, one of ``SOLID_BODIES``.
+
+    Args:
+        truck: body and dimensions.
+        parts: masses and springs.
+        sensors: frames on the chassis.
+        head: the lidar on its joints; None = it is fixed.
+
+    Raises:
+        KinematicsError: masses or springs no robot can have.
+    """
+    size = Size(truck.wheelbase, truck.track, truck.wheel_radius, truck.length, truck.width)
+    wheels = platform_wheels(truck)
+    if not wheels:
+        return truck_description(size, parts, sensors, head)
+    radius = truck.wheel_radius / 2.0
+    ends = (("front_caster", truck.length / 2.0 - radius), ("rear_caster", radius - truck.length / 2.0))
+    casters = tuple(BallCaster(name, x, 0.0, radius) for name, x in ends) if truck.body.kind == "differential" else ()
+    return platform_description(size, parts, wheels, casters, sensors, head)

@@ -12,13 +12,14 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from monstertruck_kinematics.description import LidarHead, Mechanics, Size, truck_description, wheel_inertia
+from monstertruck_kinematics.description import WHEELS, LidarHead, Mechanics, wheel_inertia
 from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.platform import frame_name, rolled
 from monstertruck_kinematics.truck import FourWheelSteering, LinkedAxles
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.map_files import OCCUPIED
 from monstertruck_sim.world.config import LidarConfig, SimTruckConfig, TiltConfig, WorldConfig
-from monstertruck_sim.world.mechanics import mechanics
+from monstertruck_sim.world.mechanics import description, mechanics, platform_wheels
 from monstertruck_sim.world.obstacles import Box, Disc, Obstacle
 from monstertruck_sim.world.plane import Engine, PlanOutline, without
 from monstertruck_sim.world.plant import Caster, Pose
@@ -164,7 +165,7 @@ class RigidSweep:
         config = self._config
         beams = turned(LEVEL_BEAMS if beams is None else beams, pitch, roll)
         still = np.zeros(len(x))
-        ahead, aside, up = turned((still + config.x, still, still + config.height), pitch, roll)
+        ahead, aside, up = turned((still + config.x, still + config.y, still + config.height), pitch, roll)
         c, s = np.cos(yaw), np.sin(yaw)
         origins = x + c * ahead - s * aside, y + s * ahead + c * aside, z + up
         ranges = over(self._cast, self._ground, config, origins, yaw, beams, times_ns)
@@ -196,13 +197,17 @@ def drive_line(truck: SimTruckConfig, parts: Mechanics) -> DriveLine:
 
     Of the truck one motor for four wheels: open differentials in both axles, a rigid transfer case between them. Of a
     car the rear wheels, with a differential. Of a skid-steer robot the wheels of a side, coupled, or every wheel alone.
+    Of a platform every wheel alone.
 
     The wind-up is as stiff as lets the wheels follow critically damped with the mean delay ``motor.drivetrain_lag``.
     """
     front, rear = (tuple(f"{axle}_{side}_spin" for side in ("left", "right")) for axle in ("front", "rear"))
     shafts: tuple[tuple[str, ...], ...] = ((*front, *rear),)
     locked: tuple[tuple[tuple[str, ...], tuple[str, ...]], ...] = ((front, rear),)
-    if truck.body.kind == "ackermann":
+    wheels = platform_wheels(truck)
+    if wheels:
+        shafts, locked = tuple((f"{frame_name(wheel)}_spin",) for wheel in wheels), ()
+    elif truck.body.kind == "ackermann":
         shafts, locked = (rear,), ()
     elif truck.body.kind == "skid_steer":
         left, right = zip(front, rear, strict=True)
@@ -210,9 +215,13 @@ def drive_line(truck: SimTruckConfig, parts: Mechanics) -> DriveLine:
         shafts = sides or tuple((joint,) for joint in (*front, *rear))
         locked = tuple(((a,), (b,)) for a, b in sides)
     radius = truck.wheel_radius
-    inertia = parts.mass * radius**2 + 4 * wheel_inertia(parts.wheel_mass, radius, parts.wheel_width)[1]
+    inertia = (
+        parts.mass * radius**2 + len(wheels or WHEELS) * wheel_inertia(parts.wheel_mass, radius, parts.wheel_width)[1]
+    )
     natural, share = 2.0 / truck.motor.drivetrain_lag, inertia / len(shafts)
-    return DriveLine(shafts, locked, share * natural**2, 2.0 * share * natural, truck.motor.clutch_force * radius)
+    turns = {f"{frame_name(wheel)}_spin": rolled(wheel) for wheel in wheels}
+    clutch = truck.motor.clutch_force * radius
+    return DriveLine(shafts, locked, share * natural**2, 2.0 * share * natural, clutch, turns)
 
 
 def wheel_steering(truck: SimTruckConfig) -> Steering:
@@ -224,7 +233,7 @@ def wheel_steering(truck: SimTruckConfig) -> Steering:
     if truck.body.kind == "ackermann":
         size = FourWheelSteering(truck.wheelbase, truck.track)
         return lambda servos: size.wheel_angles(chassis.steering(*servos)[0], 0.0)
-    return lambda servos: (0.0, 0.0, 0.0, 0.0)
+    return lambda _: ()
 
 
 def rigid(config: WorldConfig, footprint: PlanOutline, start: Pose) -> Engine:
@@ -241,17 +250,13 @@ def rigid(config: WorldConfig, footprint: PlanOutline, start: Pose) -> Engine:
     heights = ground_heights(config, place.profile, bounds, start)
     ground: Uneven = heights if heights is not None else LevelGround()
     parts = mechanics(truck, config.mechanics)
-    description = truck_description(
-        Size(truck.wheelbase, truck.track, truck.wheel_radius),
-        parts,
-        head=LidarHead((config.lidar.x, 0.0, config.lidar.height)),
-    )
+    robot = description(truck, parts, head=LidarHead((config.lidar.x, config.lidar.y, config.lidar.height)))
     drive = drive_line(truck, parts)
     longest = 80 if heights is None else round(0.25 / resolution)
     walls = rectangles(place.map.cells == OCCUPIED, resolution, place.map.origin, longest)
     scene_files = scenery(config.mjcf) if config.mjcf is not None else ((), ())
     site = Site(walls, config.lidar.wall_height, heights, blocks(config.ground, heights), scene_files)
-    model = load(description, drive, parts.friction, site)
+    model = load(robot, drive, parts.friction, site)
     plant = RigidPlant(
         truck, config.battery, start, model, drive,
         wheel_steering(truck),

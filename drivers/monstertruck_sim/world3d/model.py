@@ -4,8 +4,8 @@ Geometries are in groups: ground, walls, blocks on the ground, the robot, and wh
 """
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Final
 from xml.etree import ElementTree as ET
@@ -30,6 +30,14 @@ TALL: Final = 0.6
 """Height of what is put into a world, m."""
 
 
+# Two geometries touch where a bit of the type of one is in the affinity of the other.
+_GROUND: Final = {"contype": "5", "conaffinity": "2"}
+_UPRIGHT: Final = {"contype": "9", "conaffinity": "2"}
+_TOUCHES: Final = {
+    "all": {"contype": "2", "conaffinity": "1"},
+    "ground": {"contype": "0", "conaffinity": "4"},
+    "walls": {"contype": "0", "conaffinity": "8"},
+}
 _FLAT: Final = 1e-3
 """Least height of a height field, m."""
 
@@ -55,6 +63,7 @@ class DriveLine:
         stiffness: of the wind-up between a shaft and the mean of its wheels, Nm/rad.
         damping: Nm s/rad.
         clutch: greatest torque of all wheels of a shaft together, Nm.
+        turns: of a spin joint a turn of its wheel, where it is not 1.
     """
 
     shafts: tuple[tuple[str, ...], ...]
@@ -62,6 +71,7 @@ class DriveLine:
     stiffness: float
     damping: float
     clutch: float
+    turns: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,7 +170,7 @@ def mjcf(description: Description, drive: DriveLine, friction: float, site: Site
     SubElement(visual, "quality", shadowsize="1024", offsamples="0")
     SubElement(visual, "headlight", ambient="0.35 0.35 0.35", diffuse="0.25 0.25 0.25", specular="0 0 0")
     default = SubElement(root, "default")
-    SubElement(default, "geom", contype="1", conaffinity="2", friction=f"{friction} 0.005 0.0001")
+    SubElement(default, "geom", _GROUND, friction=f"{friction} 0.005 0.0001")
     asset = SubElement(root, "asset")
     _materials(asset)
     world = SubElement(root, "worldbody")
@@ -249,6 +259,7 @@ def _walls(world: Element, site: Site) -> None:
         SubElement(
             world,
             "geom",
+            _UPRIGHT,
             name=f"wall_{i}",
             type="box",
             group=f"{Group.WALLS.value}",
@@ -263,8 +274,8 @@ def _scenery(asset: Element, world: Element, scenery: tuple[Sequence[Element], S
     for element in scenery[1]:
         for geom in element.iter("geom"):
             geom.set("group", f"{Group.BLOCKS.value}")
-            geom.set("contype", "1")
-            geom.set("conaffinity", "2")
+            for key, value in _GROUND.items():
+                geom.set(key, value)
         world.append(element)
 
 
@@ -274,7 +285,8 @@ def _spare(world: Element) -> None:
             body = SubElement(world, "body", name=f"{kind}_{i}", mocap="true", pos=_text(0.0, 0.0, PARKED))
             shape = "cylinder" if kind == "disc" else "box"
             group = f"{Group.MOVING.value}"
-            SubElement(body, "geom", name=f"{kind}_{i}", type=shape, size=size, group=group, rgba="0.8 0.45 0.15 1")
+            look = {**_UPRIGHT, "type": shape, "size": size, "group": group, "rgba": "0.8 0.45 0.15 1"}
+            SubElement(body, "geom", look, name=f"{kind}_{i}")
 
 
 def _robot(world: Element, description: Description) -> None:
@@ -326,13 +338,19 @@ def _shape(body: Element, shape: Shape, name: str) -> None:
     geom = SubElement(
         body,
         "geom",
+        _TOUCHES[shape.touches],
         name=name,
         group=f"{Group.ROBOT.value}",
-        contype="2",
-        conaffinity="1",
         pos=_text(*shape.centre),
-        rgba=shape.colour,
+        rgba=shape.colour if shape.seen else "0 0 0 0",
     )
+    if shape.slick:
+        geom.set("condim", "1")
+        geom.set("priority", "1")
+    if shape.kind == "ball":
+        geom.set("type", "sphere")
+        geom.set("size", _text(*shape.size))
+        return
     if shape.kind == "box":
         geom.set("type", "box")
         geom.set("size", _text(*(side / 2 for side in shape.size)))
@@ -340,7 +358,7 @@ def _shape(body: Element, shape: Shape, name: str) -> None:
     radius, width = shape.size
     geom.set("type", "cylinder")
     geom.set("size", _text(radius, width / 2))
-    geom.set("euler", _text(math.pi / 2, 0.0, 0.0))
+    geom.set("euler", _text(math.pi / 2, shape.yaw, 0.0))
 
 
 _STEERING_ARMATURE: Final = 0.002
@@ -361,7 +379,8 @@ def _drive(root: Element, description: Description, drive: DriveLine) -> None:
     def mean(name: str, joints: Sequence[str]) -> None:
         fixed = SubElement(tendons, "fixed", name=name)
         for joint in joints:
-            SubElement(fixed, "joint", joint=joint, coef=f"{1 / len(joints):.9g}")
+            turns = drive.turns.get(joint, 1.0)
+            SubElement(fixed, "joint", joint=joint, coef=f"{1 / (turns * len(joints)):.9g}")
 
     for i, pair in enumerate(drive.locked):
         for name, joints in zip((f"case_{i}_a", f"case_{i}_b"), pair, strict=True):

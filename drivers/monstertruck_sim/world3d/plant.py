@@ -69,6 +69,8 @@ class RigidPlant(GriddedPlant):
         self._wound = [0.0] * count
         """Angle to which each shaft has wound its wheels up, rad, mean of its wheels."""
         self._head = [mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, name) for name in HEAD_JOINTS]
+        self._rolling = [model.jnt_qposadr[i] for i in range(model.njnt) if model.joint(i).name.endswith("_rollers")]
+        """Of balls that stand for wheels with rollers: whose axis across the rollers' stays level."""
         self._steered: list[float] = []
         """Servo angles that the steered wheels follow."""
         self._felt = self._turning = (0.0, 0.0, 0.0)
@@ -138,6 +140,8 @@ class RigidPlant(GriddedPlant):
         self._command(dt, servos)
         before = self.data.qvel[:3].copy()
         mujoco.mj_step(self.model, self.data)
+        if self._rolling:
+            self.data.qpos[self._rolling] = 0.0
         self._read(before)
         self._draw(dt, self._slip())
         self._touch()

@@ -1,9 +1,9 @@
 """The description of the robot that a configuration means."""
 
-from monstertruck_kinematics.description import Description, Mechanics, SensorFrame, Size, truck_description
+from monstertruck_kinematics.description import Description, Mechanics, SensorFrame
 from monstertruck_runtime.errors import InputError
-from monstertruck_sim.world.config import SimTruckConfig, WorldConfig
-from monstertruck_sim.world.mechanics import mechanics
+from monstertruck_sim.world.config import SOLID_BODIES, SimTruckConfig, WorldConfig
+from monstertruck_sim.world.mechanics import description, mechanics
 from monstertruckd.assembly.estimation import sensor_mounts
 from monstertruckd.config.truck import TruckConfig
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
@@ -15,11 +15,11 @@ def described(config: TruckConfig) -> Description:
     Raises:
         InputError: its body has no description.
     """
-    size, parts = _parts(config)
+    truck, parts = _parts(config)
     sensors = tuple(
         SensorFrame(name, (m.x, m.y, m.z), (m.roll, m.pitch, m.yaw)) for name, m in sensor_mounts(config).items()
     )
-    return truck_description(size, parts, sensors)
+    return description(truck, parts, sensors)
 
 
 def model_text(config: TruckConfig) -> str:
@@ -27,17 +27,26 @@ def model_text(config: TruckConfig) -> str:
     from monstertruck_sim.world3d.engine import drive_line  # noqa: PLC0415  # the library of an extra
     from monstertruck_sim.world3d.model import EMPTY, mjcf  # noqa: PLC0415  # the library of an extra
 
-    truck = config.sim.world.truck if isinstance(config, SimulatedTruckConfig) else SimTruckConfig()
-    parts = _parts(config)[1]
+    truck, parts = _parts(config)
     return mjcf(described(config), drive_line(truck, parts), parts.friction, EMPTY) + "\n"
 
 
-def _parts(config: TruckConfig) -> tuple[Size, Mechanics]:
-    if config.body.kind != "truck":
-        raise InputError(f"body {config.body.kind}: has no description; truck has one")
-    geometry = config.geometry
-    size = Size(geometry.wheelbase, geometry.track, geometry.wheel_radius)
+def _parts(config: TruckConfig) -> tuple[SimTruckConfig, Mechanics]:
+    """Body and dimensions as the daemon believes them; masses and springs as simulated."""
+    if config.body.kind not in SOLID_BODIES:
+        raise InputError(f"body {config.body.kind}: has no description; expected one of {', '.join(SOLID_BODIES)}")
     world = config.sim.world if isinstance(config, SimulatedTruckConfig) else WorldConfig()
-    if not isinstance(config, SimulatedTruckConfig):
-        return size, mechanics(SimTruckConfig(mass=geometry.mass), world.mechanics)
-    return size, mechanics(world.truck, world.mechanics)
+    geometry = config.geometry
+    mass = world.truck.mass if isinstance(config, SimulatedTruckConfig) else geometry.mass
+    truck = world.truck.model_copy(
+        update={
+            "body": config.body,
+            "wheelbase": geometry.wheelbase,
+            "track": geometry.track,
+            "wheel_radius": geometry.wheel_radius,
+            "length": geometry.length,
+            "width": geometry.width,
+            "mass": mass,
+        }
+    )
+    return truck, mechanics(truck, world.mechanics)

@@ -1,5 +1,6 @@
 """The description of a robot: a tree of links, their masses, and the files made from it."""
 
+import math
 from math import radians
 from xml.etree import ElementTree as ET
 
@@ -20,6 +21,8 @@ from monstertruck_kinematics.description import (
     wheel_inertia,
 )
 from monstertruck_kinematics.elementary import KinematicsError
+from monstertruck_kinematics.platform import platform_description, rolled
+from monstertruck_kinematics.unsteered import mecanum, omni
 
 
 def test_the_truck_weighs_what_its_author_found():
@@ -112,3 +115,35 @@ def test_masses_that_do_not_add_up_and_springs_that_do_not_hold_are_refused():
         Mechanics(mass=2.0)
     with pytest.raises(KinematicsError, match="roll_spring"):
         truck_description(mechanics=Mechanics(roll_spring=0.5))
+
+
+def platform(count=4, **parts):
+    wheels = mecanum(0.32, 0.26, 0.075).swedish if count == 4 else omni(0.15, 0.075).swedish
+    return platform_description(Size(), Mechanics(**parts), wheels, (), (), LidarHead())
+
+
+@pytest.mark.parametrize("count", [3, 4])
+def test_a_platform_has_all_the_mass_over_its_middle(count):
+    robot = platform(count)
+    assert robot.mass == pytest.approx(7.25, abs=0.01)
+    assert robot.mass_centre[:2] == pytest.approx((0.0, 0.0), abs=1e-3)
+    assert sum(-joint.load for joint in robot.joints) == pytest.approx((7.25 - count * 0.281) * 9.81)
+
+
+def test_a_mecanum_wheel_turns_about_the_axis_of_its_rollers():
+    robot = platform()
+    by_name = {joint.name: joint for joint in robot.joints}
+    assert by_name["front_left_suspension"].turn == pytest.approx((0.0, 0.0, -math.pi / 4))
+    assert by_name["front_right_suspension"].turn == pytest.approx((0.0, 0.0, math.pi / 4))
+    assert (by_name["front_left_rollers"].axis, by_name["front_left_spin"].axis) == ((1, 0, 0), (0, 1, 0))
+    assert rolled(mecanum().swedish[0]) == pytest.approx(math.sqrt(0.5))
+    urdf_text = urdf(robot)
+    assert urdf_text.count("<sphere") == 4  # collisions only
+    assert urdf_text.count("<cylinder") == 8
+
+
+def test_a_platform_that_would_fall_over_is_refused():
+    with pytest.raises(KinematicsError, match="the body falls over"):
+        platform(spring=50.0)
+    with pytest.raises(KinematicsError, match="expected more than wheels and lidar together"):
+        platform(mass=2.2, wheel_mass=0.5, axle_mass=0.05)

@@ -232,6 +232,50 @@ def test_a_skid_steer_robot_turns_on_the_spot_by_skidding(solid, motors):
     assert rate[0] == pytest.approx(-rate[1], rel=0.1)
 
 
+@pytest.mark.parametrize(
+    ("body", "speeds"),
+    [
+        ({"kind": "differential"}, (0.1, 0.2)),
+        ({"kind": "mecanum"}, (-0.2, 0.2, 0.2, -0.2)),
+        ({"kind": "mecanum"}, (0.0, 0.2, 0.0, 0.2)),
+        ({"kind": "omni", "circle": 0.15}, (0.1, -0.1, 0.2)),
+        ({"kind": "omni", "circle": 0.15, "count": 4}, (0.2, 0.2, -0.1, -0.1)),
+    ],
+)
+def test_a_platform_moves_as_its_wheels_say(solid, body, speeds):
+    truck = SimTruckConfig.model_validate({"body": body})
+    driver = solid(truck=truck, mechanics=MechanicsConfig(wheel_width=0.005))  # wide tyres scrub
+    for motor, speed in zip(driver.world.motors, speeds, strict=True):
+        motor.command(driver.now, -speed * 644 / (2 * pi * 0.075) * 60, 20_000.0)
+    driver.wait(1.0)
+    expected = truck.chassis().predicted(speeds)
+    assert plant(driver).twist == pytest.approx(expected, rel=0.03, abs=0.003)
+    truth = driver.wait(0.5)
+    assert (truth.pitch, truth.roll) == pytest.approx((0.0, 0.0), abs=0.002)
+
+
+def test_a_wheel_with_rollers_holds_along_their_axis_by_friction_only(solid):
+    """On a side slope wheels that stand hold a mecanum robot; pushed harder than friction holds, it slides."""
+    driver = solid(truck=SimTruckConfig.model_validate({"body": {"kind": "mecanum"}}))
+    rigid = plant(driver)
+    base = rigid.model.body("base").id
+    rigid.data.xfrc_applied[base, 1] = 0.6 * 0.5 * 7.25 * 9.81 / 2**0.5
+    driver.wait(1.0)
+    assert abs(rigid.pose[1]) < 0.01
+    rigid.data.xfrc_applied[base, 1] = 0.5 * 7.25 * 9.81 * 1.2
+    driver.wait(1.0)
+    assert rigid.pose[1] > 0.1
+
+
+def test_a_platform_is_stopped_by_a_wall(solid):
+    driver = solid(walls=[(1.0, -2.0, 1.2, 2.0)], truck=SimTruckConfig.model_validate({"body": {"kind": "mecanum"}}))
+    for motor in driver.world.motors:
+        motor.command(driver.now, -0.3 * 644 / (2 * pi * 0.075) * 60, 20_000.0)
+    truth = driver.wait(4.0)
+    assert truth.stuck
+    assert truth.x == pytest.approx(1.0 - 0.235, abs=0.01)
+
+
 class Shafts:
     """Of a stabiliser, at fixed angles."""
 
@@ -264,8 +308,8 @@ def test_the_mount_of_the_plane_feels_nothing(field):
     ("config", "text"),
     [
         (
-            {"truck": {"body": {"kind": "differential"}}},
-            "differential; expected truck, ackermann or skid_steer",
+            {"truck": {"body": {"kind": "synchro"}}},
+            "has no body synchro; expected one of truck, ackermann, skid_steer, differential, omni, mecanum",
         ),
         ({"tilt": {"kind": "sinusoid"}}, "the ground tilts the robot"),
     ],

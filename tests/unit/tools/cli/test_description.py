@@ -29,6 +29,16 @@ def test_the_mjcf_is_a_model_of_the_same_mass():
 
 
 def test_a_body_without_description_is_refused():
-    result = CliRunner().invoke(app, ["description", str(CONFIGS / "robots" / "omni.yaml")])
+    result = CliRunner().invoke(app, ["description", str(CONFIGS / "robots" / "synchro.yaml")])
     assert result.exit_code == 3
-    assert "body omni: has no description" in result.stderr
+    assert "body synchro: has no description" in result.stderr
+
+
+@pytest.mark.parametrize("robot", ["sonar", "omni"])
+def test_a_platform_has_its_wheels_and_sensors(robot):
+    result = CliRunner().invoke(app, ["description", str(CONFIGS / "robots" / f"{robot}.yaml")])
+    assert result.exit_code == 0
+    joints = {joint.get("name") for joint in ET.fromstring(result.stdout).findall("joint")}
+    assert joints > (
+        {"left_spin", "sonar_fl_mount", "rear_caster_suspension"} if robot == "sonar" else {"wheel_3_spin"}
+    )

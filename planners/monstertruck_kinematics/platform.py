@@ -1,0 +1,158 @@
+"""Descriptions of robots whose wheels are not steered: a platform on driven wheels, each on a spring of its own.
+
+A wheel with rollers (Swedish, mecanum) is made from its ideal: a ball that rolls freely about the axis of its rollers
+and is driven about the level axis across it. Along the rollers' axis it has the tyre's friction, across it rolls. The
+ball touches the ground only; a wheel's outline around it touches walls.
+"""
+
+import math
+from dataclasses import dataclass, replace
+from typing import Final
+
+from monstertruck_kinematics.description import (
+    GRAVITY,
+    ZERO,
+    Description,
+    LidarHead,
+    Mechanics,
+    Part,
+    PartJoint,
+    SensorFrame,
+    Shape,
+    Size,
+    add_head,
+    add_sensors,
+    box_inertia,
+    wheel_inertia,
+)
+from monstertruck_kinematics.elementary import KinematicsError
+from monstertruck_kinematics.wheels import SwedishWheel, Wheel
+
+_HUB: Final = 0.04
+"""Mass of a hub, kg; counted to its wheel."""
+_CASTER: Final = 0.05
+"""Mass of a caster, kg."""
+_CASTER_SHARE: Final = 0.1
+"""Of the weight, on every caster."""
+
+
+@dataclass(frozen=True, slots=True)
+class BallCaster:
+    """A ball that carries its share of the weight, and slides without friction: name, place and radius, m."""
+
+    name: str
+    x: float
+    y: float
+    radius: float
+
+
+def frame_name(wheel: Wheel) -> str:
+    """What a wheel's links and joints are named by."""
+    return wheel.name.replace(" ", "_")
+
+
+def rolled(wheel: Wheel) -> float:
+    """Turns of a wheel's joint ``NAME_spin`` a turn of the wheel: a mecanum wheel is driven across its rollers only."""
+    return math.cos(wheel.roller) if isinstance(wheel, SwedishWheel) else 1.0
+
+
+def platform_description(
+    size: Size,
+    parts: Mechanics,
+    wheels: tuple[Wheel, ...],
+    casters: tuple[BallCaster, ...] = (),
+    sensors: tuple[SensorFrame, ...] = (),
+    head: LidarHead | None = None,
+) -> Description:
+    """A platform on driven wheels and casters, its centre of mass over the geometric centre.
+
+    Args:
+        size: its dimensions.
+        parts: masses and springs; an axle's mass is the platform's.
+        wheels: driven ones; each wheel carries as much as any other.
+        casters: what else carries it.
+        sensors: frames on the platform.
+        head: the lidar on its joints; None = it is fixed.
+
+    Raises:
+        KinematicsError: springs that do not hold it upright, or more wheels than mass.
+    """
+    sprung = parts.mass - len(wheels) * parts.wheel_mass - len(casters) * _CASTER
+    carried, lift, lever = (0.0, 0.0, 0.0) if head is None else (head.mass, *_moments(head))
+    body = sprung - carried
+    if body <= 0.0:
+        raise KinematicsError(
+            f"mass is {parts.mass}: expected more than wheels and lidar together, {parts.mass - body:g} kg"
+        )
+    centre = -lever / body, 0.0, (sprung * parts.mass_height - lift) / body
+    deck = Shape("box", (size.length, size.width, 0.06), (0.0, 0.0, size.wheel_radius + 0.035), "0.75 0.28 0.2 1")
+    links = [Part("base", body, centre, box_inertia(body, (size.length, size.width, 0.1)), (deck,))]
+    joints: list[PartJoint] = []
+    weight = sprung * GRAVITY
+    share = (1.0 - _CASTER_SHARE * len(casters)) / len(wheels)
+    roll = pitch = 0.0
+    for name, x, y, radius, load in (
+        *((frame_name(w), w.x, w.y, w.radius, share * weight) for w in wheels),
+        *((c.name, c.x, c.y, c.radius, _CASTER_SHARE * weight) for c in casters),
+    ):
+        spring = load / parts.droop if parts.spring is None else parts.spring
+        roll, pitch = roll + spring * y * y, pitch + spring * x * x
+        joints.append(
+            PartJoint(
+                f"{name}_suspension",
+                "prismatic",
+                "base",
+                f"{name}_hub",
+                (x, y, radius),
+                limits=(-parts.droop, parts.bump),
+                stiffness=spring,
+                damping=parts.damping * 2.0 * math.sqrt(spring * load / GRAVITY),
+                load=-load,
+            )
+        )
+    if min(roll, pitch) <= weight * parts.mass_height:
+        raise KinematicsError(
+            f"springs hold {min(roll, pitch):g} Nm/rad: expected more than {weight * parts.mass_height:g}, "
+            "or the body falls over"
+        )
+    for joint, wheel in zip(joints[: len(wheels)], wheels, strict=True):
+        _add_wheel(wheel, joint, parts, links, joints)
+    for caster in casters:
+        ball = Shape("ball", (caster.radius,), ZERO, "0.5 0.5 0.5 1", slick=True)
+        inertia = box_inertia(_CASTER, (caster.radius, caster.radius, caster.radius))
+        links.append(Part(f"{caster.name}_hub", _CASTER, ZERO, inertia, (ball,)))
+    if head is not None:
+        add_head(head, links, joints)
+    add_sensors(sensors, links, joints)
+    return Description("monstertruck", tuple(links), tuple(joints))
+
+
+def _moments(head: LidarHead) -> tuple[float, float]:
+    """Mass times height and times distance ahead, kg m."""
+    return head.mass * head.place[2], head.mass * head.place[0]
+
+
+def _add_wheel(wheel: Wheel, leg: PartJoint, parts: Mechanics, links: list[Part], joints: list[PartJoint]) -> None:
+    name, radius, width = frame_name(wheel), wheel.radius, parts.wheel_width
+    mass = parts.wheel_mass - _HUB
+    across, spin, _ = wheel_inertia(mass, radius, width)
+    resistance = parts.rolling_resistance * -leg.load * radius
+    outline = Shape("wheel", (radius, width), ZERO, "0.12 0.12 0.13 1")
+    hub, tread = Part(f"{name}_hub", _HUB, ZERO, box_inertia(_HUB, (0.03, 0.03, 0.03))), f"{name}_hub"
+    if isinstance(wheel, SwedishWheel):
+        # The hub's x axis is the rollers' own: along it the wheel drives.
+        turn = wheel.heading + wheel.roller
+        around = Shape("wheel", (radius, width), ZERO, outline.colour, yaw=wheel.heading - turn, touches="walls")
+        hub = Part(hub.name, hub.mass, ZERO, hub.inertia, (around,))
+        outline = Shape("ball", (radius,), touches="ground", seen=False)
+        across, tread = spin / 2.0, f"{name}_rollers"
+        links += [hub, Part(tread, 1e-3, ZERO, (1e-7, 1e-7, 1e-7))]
+        joints.append(PartJoint(tread, "continuous", hub.name, tread, axis=(1.0, 0.0, 0.0), friction=resistance))
+    else:
+        turn = wheel.heading
+        links.append(hub)
+    joints[joints.index(leg)] = replace(leg, turn=(0.0, 0.0, turn))
+    links.append(Part(f"{name}_wheel", mass, ZERO, (across, spin, across), (outline,)))
+    joints.append(
+        PartJoint(f"{name}_spin", "continuous", tread, f"{name}_wheel", axis=(0.0, 1.0, 0.0), friction=resistance)
+    )
