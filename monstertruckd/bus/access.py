@@ -8,7 +8,7 @@ Groups out of the robot may only leave it and requests may only enter it, so tha
 state to the others. A rule covers a declaration only if it contains the whole declared key expression.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import chain
 from typing import Any, Final
@@ -16,6 +16,9 @@ from typing import Any, Final
 from monstertruck_schemas.req import ControlRequest, DriveForm, DriveRequest, Order, Request, Role
 from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.topics import KEY_ROOT, STAND_POSE, TOPICS, Writer, alive_key, rpc_key
+
+FLEET_RULE: Final = "fleet-in"
+_OTHER_FLOW: Final = {"ingress": "egress", "egress": "ingress"}
 
 ANONYMOUS: Final = "anonymous"
 """Source of requests whose key names none."""
@@ -79,7 +82,7 @@ def in_groups() -> tuple[str, ...]:
     return tuple(dict.fromkeys(topic.group for topic in TOPICS if topic.writer is Writer.OUTSIDE))
 
 
-def access_rules(robot: str, owners: Iterable[str] | None = None) -> dict[str, Any]:
+def access_rules(robot: str, owners: Iterable[str] | None = None, routers: Iterable[str] = ()) -> dict[str, Any]:
     """Zenoh ``access_control`` section for ``robot``.
 
     The rules know no variables: each certificate has rules, a subject and a policy of its own.
@@ -88,13 +91,76 @@ def access_rules(robot: str, owners: Iterable[str] | None = None) -> dict[str, A
         robot: name of the robot.
         owners: common names of the certificates that may see, and ask under their own name; None = everybody who can
             connect may, under any name.
+        routers: common names of a fleet's routers. What comes from one may have the name of any owner: the router
+            has compared it with the certificate (``router_rules``).
     """
+    common = _common(robot)
+    if owners is None:
+        own = {"everybody": _own("everybody", *_all_keys(robot))}
+        subjects: list[dict[str, Any]] = [{"id": "everybody"}]
+    else:
+        own = {owner: _own(owner, *_keys_of(robot, owner)) for owner in owners}
+        subjects = [_subject(owner) for owner in own]
+    passing = [rule["id"] for rule in chain(common, *own.values())]
+    policies = [
+        {"rules": [rule["id"] for rule in (*common, *rules)], "subjects": [owner]} for owner, rules in own.items()
+    ]
+    fleet = [] if owners is None else list(routers)
+    return {
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": [*common, *chain.from_iterable(own.values()), *([_fleet_rule()] if fleet else [])],
+        "subjects": [*subjects, *map(_subject, fleet)],
+        "policies": [*policies, *({"rules": [*passing, FLEET_RULE], "subjects": [router]} for router in fleet)],
+    }
+
+
+def router_rules(fleet: Mapping[str, Iterable[str]]) -> dict[str, Any]:
+    """Zenoh ``access_control`` section of a router between robots and stations.
+
+    A robot says its own state and nobody else's, and hears requests to itself only. A station sees and asks the robots
+    that know it, under its own name; it may watch for all robots, and is told of those.
+
+    Args:
+        fleet: common names of the stations that each robot knows, by the robot's name, which is the common name of its
+            certificate.
+    """
+    rules: list[dict[str, Any]] = [_fleet_rule()]
+    policies: list[dict[str, Any]] = []
+    seen_by: dict[str, list[str]] = {}
+    for robot, owners in fleet.items():
+        # The robot's end of its link, seen from the other end: what leaves there enters here.
+        behind = [
+            _renamed(rule, f"{robot}-{rule['id']}", _OTHER_FLOW[rule["flows"][0]])
+            for rule in (*_common(robot), *_own("fleet", *_all_keys(robot)))
+        ]
+        policies.append({"rules": [rule["id"] for rule in behind], "subjects": [robot]})
+        common = [_renamed(rule, f"{rule['id']}-of-{robot}", rule["flows"][0]) for rule in _common(robot)]
+        rules += [*behind, *common]
+        for owner in owners:
+            own = [
+                _renamed(rule, f"{rule['id']}-of-{robot}", rule["flows"][0])
+                for rule in _own(owner, *_keys_of(robot, owner))
+            ]
+            rules += own
+            seen_by.setdefault(owner, []).extend(rule["id"] for rule in (*common, *own))
+    policies += [{"rules": [*names, FLEET_RULE], "subjects": [owner]} for owner, names in seen_by.items()]
+    return {
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": rules,
+        "subjects": [_subject(name) for name in (*fleet, *seen_by)],
+        "policies": policies,
+    }
+
+
+def _common(robot: str) -> list[dict[str, Any]]:
+    """What everybody may who may see the robot."""
     seen = [f"{KEY_ROOT}/{robot}/{group}/**" for group in out_groups()]
     history = [f"{KEY_ROOT}/{robot}/{group}/*/{_SIDE_CHANNEL}" for group in out_groups()]
     descriptions = [rpc_key(robot, name) for name in _DESCRIPTIONS]
-    requests = [f"{KEY_ROOT}/{robot}/{group}/**" for group in in_groups()]
-    calls = [rpc_key(robot, "**")]
-    common = [
+    requests, calls = _all_keys(robot)
+    return [
         _rule(
             "see-in",
             "ingress",
@@ -112,21 +178,24 @@ def access_rules(robot: str, owners: Iterable[str] | None = None) -> dict[str, A
         _rule("stand-in", "ingress", ["put"], [STAND_POSE.key(robot)]),
         _rule("calls-out", "egress", ["declare_queryable", "reply"], calls),
     ]
-    if owners is None:
-        own = {"everybody": _own("everybody", requests, calls)}
-        subjects: list[dict[str, Any]] = [{"id": "everybody"}]
-    else:
-        own = {owner: _own(owner, *_keys_of(robot, owner)) for owner in owners}
-        subjects = [{"id": owner, "link_protocols": ["tls"], "cert_common_names": [owner]} for owner in own]
-    return {
-        "enabled": True,
-        "default_permission": "deny",
-        "rules": [*common, *chain.from_iterable(own.values())],
-        "subjects": subjects,
-        "policies": [
-            {"rules": [rule["id"] for rule in (*common, *rules)], "subjects": [owner]} for owner, rules in own.items()
-        ],
-    }
+
+
+def _all_keys(robot: str) -> tuple[list[str], list[str]]:
+    """Keys of all requests and of all calls."""
+    return [f"{KEY_ROOT}/{robot}/{group}/**" for group in in_groups()], [rpc_key(robot, "**")]
+
+
+def _fleet_rule() -> dict[str, Any]:
+    """Robots are looked for by one expression for all, which no rule of a single robot contains."""
+    return _rule(FLEET_RULE, "ingress", ["declare_liveliness_subscriber", "liveliness_query"], [alive_key("*")])
+
+
+def _renamed(rule: dict[str, Any], name: str, flow: str) -> dict[str, Any]:
+    return {**rule, "id": name, "flows": [flow]}
+
+
+def _subject(name: str) -> dict[str, Any]:
+    return {"id": name, "link_protocols": ["tls"], "cert_common_names": [name]}
 
 
 def _keys_of(robot: str, owner: str) -> tuple[list[str], list[str]]:

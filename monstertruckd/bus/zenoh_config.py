@@ -43,6 +43,8 @@ class TlsConfig(Schema):
     """Common names that may see, and order an emergency stop."""
     engineers: Owners = ()
     """Common names that may save and undo calibrations, besides all a pilot may."""
+    routers: Owners = ()
+    """Common names of a fleet's routers: they bind names to certificates, and pass on what others ask."""
     ranks: dict[OwnerName, Literal[Role.GAMEPAD, Role.KEYBOARD, Role.STATION]] = {}
     """Highest priority a name may claim; station where it is not given."""
     pilots_ca: Path | None = None
@@ -51,9 +53,10 @@ class TlsConfig(Schema):
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         names = (*self.pilots, *self.observers, *self.engineers)
+        everybody = (*names, *self.routers)
         if not self.pilots and not self.engineers:
             raise ValueError("tls: expected a name in pilots or engineers: nobody could drive")
-        if twice := sorted({name for name in names if names.count(name) > 1}):
+        if twice := sorted({name for name in everybody if everybody.count(name) > 1}):
             raise ValueError(f"tls: {', '.join(twice)}: expected one role each")
         if unknown := sorted(set(self.ranks) - set(names)):
             raise ValueError(f"tls.ranks: {', '.join(unknown)}: expected names of pilots, observers or engineers")
@@ -145,6 +148,8 @@ class Door:
     """Who is let in; None = everybody who reaches it."""
     grants: dict[str, Grant] | None = None
     """By name on the certificate; None = everything to everybody."""
+    routers: tuple[str, ...] = ()
+    """Names on the certificates of a fleet's routers."""
     guarded: bool = False
     """Whether forged state is refused."""
 
@@ -158,10 +163,11 @@ def doors(config: ZenohConfig) -> list[Door]:
     tls = config.tls
     guarded = config.access_control or tls is not None
     grants = None if tls is None else tls.grants()
-    found = [Door(config.listen, config.max_sessions, config.connect, None if tls is None else tls.ca, grants, guarded)]
+    ca, routers = (None, ()) if tls is None else (tls.ca, tls.routers)
+    found = [Door(config.listen, config.max_sessions, config.connect, ca, grants, routers, guarded)]
     if config.listen_pilots and tls is not None and grants is not None:
         driving = {name: grant for name, grant in grants.items() if grant.role.covers(AccessRole.PILOT)}
-        found.append(Door(config.listen_pilots, config.max_sessions, (), tls.pilots_ca, driving, guarded))
+        found.append(Door(config.listen_pilots, config.max_sessions, (), tls.pilots_ca, driving, guarded=guarded))
     if config.local_socket and (local := local_endpoint(config.listen)) is not None:
         found.append(Door((local,), LOCAL_SESSIONS, guarded=guarded))
     return found
@@ -210,7 +216,7 @@ def session_config(robot: str, config: ZenohConfig, door: Door, *, probe: bool =
         }
     if door.guarded:
         owners: Iterable[str] | None = door.grants
-        session["access_control"] = access_rules(robot, owners)
+        session["access_control"] = access_rules(robot, owners, door.routers)
     return json.dumps(session)
 
 

@@ -28,6 +28,13 @@ class Watch(_Command):
     robot: Annotated[str, Field(max_length=64)]
 
 
+class LookAtFleet(_Command):
+    """Show where all robots are, or no longer."""
+
+    do: Literal["fleet"]
+    on: bool
+
+
 class EchoRequest(_Command):
     """Answer at once: the browser measures the way to the station."""
 
@@ -93,19 +100,19 @@ class Behave(_Command):
 
 Asked = GiveOrder | SetGoal | ChangeGoal | Behave
 """Commands whose outcome is answered."""
-Command = Annotated[Watch | EchoRequest | Heartbeat | Asked, Field(discriminator="do")]
+Command = Annotated[Watch | LookAtFleet | EchoRequest | Heartbeat | Asked, Field(discriminator="do")]
 
-_COMMANDS: Final[TypeAdapter[Watch | EchoRequest | Heartbeat | Asked]] = TypeAdapter(Command)
+_COMMANDS: Final[TypeAdapter[Watch | LookAtFleet | EchoRequest | Heartbeat | Asked]] = TypeAdapter(Command)
 
 
-def needed(command: Watch | EchoRequest | Heartbeat | Asked) -> AccessRole:
+def needed(command: Watch | LookAtFleet | EchoRequest | Heartbeat | Asked) -> AccessRole:
     """What a user must be to ask for it: everybody may look, and stop."""
     if isinstance(command, GiveOrder) and command.order in UNCONDITIONAL:
         return AccessRole.OBSERVER
-    return AccessRole.OBSERVER if isinstance(command, Watch | EchoRequest) else AccessRole.PILOT
+    return AccessRole.OBSERVER if isinstance(command, Watch | LookAtFleet | EchoRequest) else AccessRole.PILOT
 
 
-def parse(data: str) -> Watch | EchoRequest | Heartbeat | Asked:
+def parse(data: str) -> Watch | LookAtFleet | EchoRequest | Heartbeat | Asked:
     """The command of one message.
 
     Raises:

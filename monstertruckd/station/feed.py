@@ -17,7 +17,7 @@ from monstertruck_runtime.mailbox import Mailbox, fifo, latest
 from monstertruck_schemas import topics
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.event import Event
-from monstertruck_schemas.state import Grid
+from monstertruck_schemas.state import GateState, Grid
 from monstertruck_schemas.topics import Topic
 from monstertruckd.station import frames
 from monstertruckd.station.address import RobotAddress
@@ -134,6 +134,12 @@ class RobotFeed:
         self.map = MapStore()
         self.alive = False
         """Whether the robot answered the last time it was asked."""
+        self.round_trip: float | None = None
+        """Seconds there and back, of the last time; None without an answer."""
+        self.gate: GateState | None = None
+        """As the robot answered the last time."""
+        self.client: TruckClient | None = None
+        """While there is a session."""
         self._clock = clock
         self._viewers: set[Viewer] = set()
         self._watched = asyncio.Event()
@@ -172,10 +178,13 @@ class RobotFeed:
             try:
                 name, endpoint = self.address.name, self.address.endpoint
                 async with TruckClient(name, endpoint, clock=self._clock, timeout=RETRY) as client:
+                    self.client = client
                     await self._follow(client)
             except (InputError, NotFoundError, NotPermittedError) as error:
                 self._set_link(None, str(error))
                 await self._clock.sleep(RETRY)
+            finally:
+                self.client = None
 
     async def _follow(self, client: TruckClient) -> None:
         jobs = [asyncio.create_task(job) for job in (self._ask(client), self._sample(client))]
@@ -194,7 +203,7 @@ class RobotFeed:
         while True:
             sent = self._clock.now()
             try:
-                await client.get_retained(topics.GATE)
+                self.gate = await client.get_retained(topics.GATE)
             except TruckError as error:
                 known = False
                 self._set_link(None, str(error))
@@ -260,7 +269,7 @@ class RobotFeed:
         self._tell(frame)
 
     def _set_link(self, round_trip: float | None, text: str) -> None:
-        self.alive = round_trip is not None
+        self.alive, self.round_trip = round_trip is not None, round_trip
         if not self.alive:
             self._newest = {kind: frame for kind, frame in self._newest.items() if kind == "map"}
         self._link = frames.text("link", alive=self.alive, round_trip=round_trip, text=text)

@@ -22,9 +22,10 @@ from monstertruck_schemas.reasons import Reason
 from monstertruckd import __version__
 from monstertruckd.station import commands, frames
 from monstertruckd.station.address import RobotAddress
-from monstertruckd.station.commands import EchoRequest, Heartbeat, Watch
+from monstertruckd.station.commands import EchoRequest, Heartbeat, LookAtFleet, Watch
 from monstertruckd.station.discovery import Discovery
 from monstertruckd.station.feed import RobotFeed
+from monstertruckd.station.fleet import FleetBoard
 from monstertruckd.station.pilot import Pilot
 from monstertruckd.station.users import LOCAL, StationUser, StationUsers
 from monstertruckd.station.viewer import Viewer
@@ -107,6 +108,7 @@ class Station:
         self.feeds = {address.name: RobotFeed(address, clock) for address in robots}
         if len(self.feeds) != len(robots):
             raise InputError("two robots of one name: expected a name of its own for each")
+        self._board = FleetBoard(self.feeds, clock)
         self._discoveries = [Discovery(endpoint, clock, self._found) for endpoint in routers]
         self._following: set[asyncio.Task[None]] = set()
         self._viewers: set[Viewer] = set()
@@ -126,7 +128,8 @@ class Station:
         await runner.setup()
         for feed in self.feeds.values():
             self._follow(feed)
-        discovering = [asyncio.create_task(each.run()) for each in self._discoveries]
+        runs = (self._board.run(), *(each.run() for each in self._discoveries))
+        discovering = [asyncio.create_task(run) for run in runs]
         try:
             try:
                 await web.TCPSite(runner, self.place.host, self.place.port, ssl_context=self.place.tls).start()
@@ -235,7 +238,7 @@ class Station:
         user = request[USER]
         name = f"{user.name}{'-' * bool(user.name)}{self._run}.{next(self._browsers)}"
         log.info("browser %s connected from %s", name, request.remote)
-        browser = _Browser(name, user, self.feeds, self._clock)
+        browser = _Browser(name, user, self.feeds, self._board, self._clock)
         self._viewers.add(browser.viewer)
         self._sockets.add(socket)
         sending = asyncio.create_task(_send(socket, browser.viewer))
@@ -262,8 +265,11 @@ class Station:
 class _Browser:
     """One connection: what it looks at, and what it asks."""
 
-    def __init__(self, name: str, user: StationUser, feeds: dict[str, RobotFeed], clock: Clock) -> None:
+    def __init__(
+        self, name: str, user: StationUser, feeds: dict[str, RobotFeed], board: FleetBoard, clock: Clock
+    ) -> None:
         self.viewer = Viewer()
+        self._board = board
         self._name = name
         self._user = user
         self._feeds = feeds
@@ -294,6 +300,8 @@ class _Browser:
                     self._pilot.drive(command)
             case EchoRequest():
                 self.viewer.tell(frames.text("pong", at=command.at))
+            case LookAtFleet():
+                self._board.show(self.viewer, command.on)
             case Watch():
                 self._watch(command.robot)
             case _:
@@ -324,6 +332,7 @@ class _Browser:
 
     async def close(self) -> None:
         """End its sessions."""
+        self._board.show(self.viewer, False)
         self._leave()
         await asyncio.gather(*self._ending, return_exceptions=True)
 

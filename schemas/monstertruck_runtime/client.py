@@ -9,7 +9,7 @@ import threading
 from collections.abc import Callable, Coroutine, Mapping, Sequence
 from functools import partial
 from types import TracebackType
-from typing import Any, Final, Self, TypeVar
+from typing import Any, Final, Generic, Self, TypeVar
 
 import zenoh
 from zenoh import ext, handlers
@@ -85,6 +85,42 @@ def in_network_thread(take: Callable[[zenoh.Sample], None]) -> "handlers.Callbac
         take(sample)
 
     return handlers.Callback(receive, indirect=False)
+
+
+class Watched(Generic[M]):
+    """The newest message of a topic; a context manager that ends the subscription.
+
+    Args:
+        topic: row of the topic table.
+        declare: subscribes with a handler of samples.
+    """
+
+    def __init__(self, topic: Topic[M], declare: Callable[..., Any]) -> None:
+        self._topic = topic
+        self._bytes: bytes | None = None
+        self._decoded: tuple[bytes | None, M | None] = None, None
+        self._subscriber = declare(in_network_thread(self._take))
+
+    def _take(self, sample: zenoh.Sample) -> None:
+        self._bytes = sample.payload.to_bytes()
+
+    @property
+    def latest(self) -> M | None:
+        """The newest message; None before the first, and for one that cannot be decoded."""
+        data = self._bytes
+        if data is not self._decoded[0] and data is not None:
+            try:
+                self._decoded = data, wire.decode(self._topic, data)
+            except InputError as error:
+                log.warning("message skipped: %s", error)
+                self._decoded = data, None
+        return self._decoded[1]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._subscriber.undeclare()
 
 
 class TruckClient(Operator):
@@ -195,6 +231,13 @@ class TruckClient(Operator):
 
         self._subscriptions[mailbox] = end
         return mailbox
+
+    def watch(self, topic: Topic[M]) -> "Watched[M]":
+        """Follow the newest message of ``topic``, which is decoded only when it is asked for.
+
+        For looking at a topic less often than it is published: messages in between cost next to nothing.
+        """
+        return Watched(topic, partial(self._open_session().declare_subscriber, topic.key(self.robot)))
 
     async def get_retained(self, topic: Topic[M]) -> M | None:
         """Newest message of a retained topic; None if the robot has published none yet.

@@ -1,4 +1,5 @@
 import { Drive } from "./drive.js";
+import { FleetView } from "./fleet.js";
 import { MapView } from "./map.js";
 import { Panels } from "./panels.js";
 import { Link } from "./socket.js";
@@ -38,6 +39,7 @@ await loadWords();
 const drive = new Drive(link);
 const map = new MapView(byId("map"), link, aimed);
 const panels = new Panels(link);
+const fleet = new FleetView(link, map, chosen);
 
 link.on("robots", ({ names }) => {
   const select = byId("robots");
@@ -51,10 +53,17 @@ link.on("hello", ({ role }) => (document.body.dataset.role = role));
 link.on("open", (open) => {
   if (!open) link.robot = null; // what was watched is asked for again
 });
-byId("robots").addEventListener("change", (event) => {
-  location.hash = encodeURIComponent(event.target.value);
-  link.watch(event.target.value);
-});
+function look(name) {
+  location.hash = encodeURIComponent(name);
+  link.watch(name);
+}
+byId("robots").addEventListener("change", (event) => look(event.target.value));
+
+function chosen(name) {
+  byId("robots").value = name;
+  if (name !== link.robot) look(name);
+  fleet.show(false);
+}
 
 byId("arm").onclick = async () => {
   const waiting = link.newest.gate?.waiting.length > 0;
@@ -67,6 +76,7 @@ byId("theme").onclick = () => {
   document.documentElement.dataset.theme = next;
   localStorage.setItem("theme", next);
   map.readColours();
+  if (fleet.open) fleet.draw();
 };
 
 // Map and goals

@@ -90,7 +90,7 @@ export class Link {
   }
 
   watch(robot) {
-    const kept = ["open", "hello", "robots"];
+    const kept = ["open", "hello", "robots", "fleet"];
     for (const kind of Object.keys(this.newest)) if (!kept.includes(kind)) delete this.newest[kind], delete this.arrived[kind];
     this.robot = robot;
     this.send({ do: "watch", robot });

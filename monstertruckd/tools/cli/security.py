@@ -107,6 +107,31 @@ def rules(folder: FolderOption = HERE) -> None:
     )
 
 
+@app.command("router")
+def router(
+    robots: Annotated[list[Path], typer.Argument(help="Folders of the authorities of the fleet's robots.")],
+    address: Annotated[
+        list[str], typer.Option("--address", "-a", help="Address or host name of the router; robots dial the first.")
+    ],
+    place: Annotated[Path | None, typer.Option(help="Where the router keeps its files.")] = None,
+    port: Annotated[int, typer.Option(min=1, max=65535, help="Where it listens.")] = 7447,
+    folder: Annotated[
+        Path, typer.Option("--folder", "-f", help="Folder of the router's authority.", show_default=False)
+    ] = Path("router-security"),
+) -> None:
+    """Certificate, access rules and configuration of a fleet's router; its robots and their stations trust it then.
+
+    Again after a robot or a station is added: the router reads its rules at its start.
+    """
+    from monstertruckd.tools.security.router import PLACE, make_router
+
+    kept = [_folder(path) for path in robots]
+    make_router(folder, kept, address, _now(), place or PLACE, port)
+    print(f"router of {', '.join(each.register().robot for each in kept)}: its files: {folder / 'router'}")
+    remark(f"To the router, into {place or PLACE}: {shlex.quote(str(folder / 'router'))}/*; it starts with zenoh.json5")
+    remark("To every robot and station their folders again: they trust the router from now on.")
+
+
 @app.command("check")
 def check(
     endpoint: Annotated[str, typer.Option("--endpoint", "-e", help="Of the running robot: tls/HOST:PORT.")],

@@ -7,6 +7,7 @@
     issuers/NAME.pem .key           one per station; the keys stay here
     robot/                          to the robot: zenoh.yaml, its certificate and key, whom it lets in
     stations/NAME/                  to the station: its certificate and key, the authority's certificate
+    router.pem                      authority of the fleet's router, where there is one
 """
 
 import shutil
@@ -40,6 +41,8 @@ ROBOT_DAYS: Final = 825
 STATION_DAYS: Final = 365
 PORT: Final = 7447
 PILOTS_PORT: Final = 7448
+ROUTER_FILE: Final = "router.pem"
+"""Certificate of the authority of the fleet's router, if there is one."""
 PLACE: Final = Path("/etc/monstertruckd/security")
 """Where the robot keeps its files."""
 
@@ -54,6 +57,14 @@ class CertifiedStation(Schema):
     rank: Rank = Role.STATION
 
 
+class TrustedRouter(Schema):
+    """A router of the fleet that the robot dials."""
+
+    name: OwnerName
+    """Common name of its certificate."""
+    endpoint: str
+
+
 class CertificateRegister(Schema):
     """What an authority has certified."""
 
@@ -63,6 +74,7 @@ class CertificateRegister(Schema):
     place: Path = PLACE
     """Where the robot keeps its files."""
     stations: dict[OwnerName, CertifiedStation] = {}
+    router: TrustedRouter | None = None
 
     def of_role(self, *roles: AccessRole) -> tuple[str, ...]:
         """Names with one of these roles."""
@@ -117,8 +129,8 @@ class Folder:
             InputError: the names make no sense, or the folder cannot be written.
         """
         new = not (self.path / "register.yaml").exists()
-        stations = {} if new else self.register().stations
-        made = {"robot": robot, "addresses": addresses, "place": place, "stations": stations}
+        kept = {} if new else self.register().model_dump(include={"stations", "router"})
+        made = {"robot": robot, "addresses": addresses, "place": place, **kept}
         register = _validated(CertificateRegister, made, self.path)
         self.path.mkdir(mode=0o700, parents=True, exist_ok=True)
         if new:
@@ -156,7 +168,7 @@ class Folder:
         target = self.path / "stations" / name
         target.mkdir(mode=0o700, parents=True, exist_ok=True)
         issue(issuer, name, now, days * DAY).save(target / "station.pem", target / "station.key", issuer.pem)
-        replace_file(target / "ca.pem", (self.path / "authority.pem").read_bytes())
+        replace_file(target / "ca.pem", self._trusted())
         self._write(register)
         return register != before
 
@@ -174,6 +186,25 @@ class Folder:
         for file in self._files(f"issuers/{name}"):
             file.unlink(missing_ok=True)
         shutil.rmtree(self.path / "stations" / name, ignore_errors=True)
+
+    def join(self, name: str, endpoint: str, authority: bytes) -> None:
+        """Let the robot dial a router and its stations trust it.
+
+        Args:
+            name: common name of the router's certificate.
+            endpoint: where it listens.
+            authority: who certified it, PEM.
+
+        Raises:
+            InputError: the name is taken by a station.
+        """
+        before = self.register()
+        made = before.model_dump() | {"router": {"name": name, "endpoint": endpoint}}
+        register = _validated(CertificateRegister, made, name)
+        replace_file(self.path / ROUTER_FILE, authority)
+        for station in register.stations:
+            replace_file(self.path / "stations" / station / "ca.pem", self._trusted())
+        self._write(register)
 
     def authority(self) -> Certificate:
         """The authority.
@@ -220,12 +251,22 @@ class Folder:
         replace_file(self.path / "register.yaml", yaml_text(register.model_dump(mode="json")))
         driving = register.of_role(AccessRole.PILOT, AccessRole.ENGINEER)
         for file, names in (("stations.pem", tuple(register.stations)), ("pilots.pem", driving)):
-            replace_file(self.robot / file, b"".join(self._files(f"issuers/{name}")[0].read_bytes() for name in names))
+            issuers = [self._files(f"issuers/{name}")[0].read_bytes() for name in names]
+            replace_file(self.robot / file, b"".join([*issuers, *([self._router()] if file == "stations.pem" else [])]))
         replace_file(
             self.robot / "zenoh.yaml",
             "# Written by `monstertruckd security`; include it in the robot's configuration.\n"
             + yaml_text({"version": VERSION, "zenoh": _zenoh(register)}),
         )
+
+    def _router(self) -> bytes:
+        """Who certified the fleet's router; nothing without one."""
+        file = self.path / ROUTER_FILE
+        return file.read_bytes() if file.exists() else b""
+
+    def _trusted(self) -> bytes:
+        """Whom a station believes: the robot's authority, and the router's."""
+        return (self.path / "authority.pem").read_bytes() + self._router()
 
     def _files(self, name: str) -> tuple[Path, Path]:
         return self.path / f"{name}.pem", self.path / f"{name}.key"
@@ -246,8 +287,15 @@ def _zenoh(register: CertificateRegister) -> dict[str, Any]:
             name: station.rank.value for name, station in register.stations.items() if station.rank is not Role.STATION
         },
     }
+    router = register.router
+    tls["routers"] = [] if router is None else [router.name]
     assert set(tls) == set(TlsConfig.model_fields)
-    return {"listen": [f"tls/0.0.0.0:{PORT}"], "listen_pilots": [f"tls/0.0.0.0:{PILOTS_PORT}"], "tls": tls}
+    return {
+        "listen": [f"tls/0.0.0.0:{PORT}"],
+        "listen_pilots": [f"tls/0.0.0.0:{PILOTS_PORT}"],
+        "connect": [] if router is None else [router.endpoint],
+        "tls": tls,
+    }
 
 
 def _validated(model: type[S], data: Any, where: Path | str) -> S:

@@ -38,6 +38,9 @@ SYSTEM = "needs root"
 OWN_DEVICE = "needs the page's own package; tests/daemon/test_own_device.py installs and runs it"
 
 INSTEAD = {
+    "monstertruckd security router ann/security bob/security --address 192.168.1.2": Instead(
+        None, "needs the folders of two authorities; tests/unit/bus/test_router.py makes them"
+    ),
     "monstertruckd log view logs/run-000001-000.mcap": Instead(
         "monstertruckd log view logs/run-000001-000.mcap --save shown.rrd", "opens a window and stays"
     ),

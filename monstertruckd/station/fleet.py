@@ -1,0 +1,124 @@
+"""All robots at a glance: where each is, its gate, battery and link, for browsers that look at the fleet."""
+
+import asyncio
+from collections.abc import Mapping
+from contextlib import ExitStack
+from typing import Any, Final
+
+from monstertruck_runtime.client import TruckClient, Watched
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_schemas import topics
+from monstertruck_schemas.sensor import Battery
+from monstertruck_schemas.state import Odometry
+from monstertruckd.station import frames
+from monstertruckd.station.feed import RobotFeed
+from monstertruckd.station.viewer import Viewer
+
+PERIOD: Final = 0.5
+"""Seconds between two looks at all robots."""
+OLD: Final = 2.0
+"""Seconds after which a pose that did not change in time is shown as old."""
+
+
+class RobotGlimpse:
+    """Newest pose and battery of one robot, decoded at every look and not at every message.
+
+    Args:
+        client: session with the robot.
+        clock: the station's time.
+    """
+
+    def __init__(self, client: TruckClient, clock: Clock) -> None:
+        self.client = client
+        self._clock = clock
+        self._stack = ExitStack()
+        self._pose: Watched[Odometry] = self._stack.enter_context(client.watch(topics.POSE))
+        self._battery: Watched[Battery] = self._stack.enter_context(client.watch(topics.BATTERY))
+        self._stamp = 0
+        self._changed = clock.now()
+
+    def row(self) -> dict[str, Any]:
+        """What the page shows of it; keys are there whatever the robot says."""
+        now, pose, battery = self._clock.now(), self._pose.latest, self._battery.latest
+        if pose is not None and pose.stamp != self._stamp:
+            self._stamp, self._changed = pose.stamp, now
+        return {
+            "pose": None if pose is None else [round(v, 3) for v in (pose.pose.x, pose.pose.y, pose.pose.yaw)],
+            "speed": None if pose is None else round(pose.twist.vx, 3),
+            "old": (now - self._changed) / SECOND > OLD,
+            "voltage": None if battery is None else battery.voltage,
+            "level": None if battery is None else battery.level.value,
+        }
+
+    def close(self) -> None:
+        """End the subscriptions; the session may be gone already."""
+        self._stack.close()
+
+
+class FleetBoard:
+    """Makes one frame of all robots for all browsers that look at the fleet; nothing is subscribed while none does.
+
+    Args:
+        feeds: of all robots, by name; more may be added.
+        clock: the station's time.
+    """
+
+    def __init__(self, feeds: Mapping[str, RobotFeed], clock: Clock) -> None:
+        self._feeds = feeds
+        self._clock = clock
+        self._viewers: set[Viewer] = set()
+        self._watched = asyncio.Event()
+        self._glimpses: dict[str, RobotGlimpse] = {}
+        self._rows: dict[str, dict[str, Any]] = {}
+        """The last of each robot, which are shown as old when it is gone."""
+
+    def show(self, viewer: Viewer, on: bool) -> None:
+        """Show the fleet in a browser, or no longer."""
+        (self._viewers.add if on else self._viewers.discard)(viewer)
+        if self._viewers:
+            self._watched.set()
+        else:
+            self._watched.clear()
+
+    async def run(self) -> None:
+        """Look until cancelled."""
+        try:
+            while True:
+                await self._watched.wait()
+                frame = self._look()
+                for viewer in self._viewers:
+                    viewer.show("fleet", frame)
+                await self._clock.sleep(PERIOD)
+                if not self._viewers:
+                    self._leave()
+        finally:
+            self._leave()
+
+    def _look(self) -> str:
+        for name, feed in self._feeds.items():
+            glimpse = self._glimpses.get(name)
+            if glimpse is not None and glimpse.client is not feed.client:
+                self._glimpses.pop(name).close()
+                glimpse = None
+            if glimpse is None and feed.client is not None:
+                glimpse = self._glimpses[name] = RobotGlimpse(feed.client, self._clock)
+            if glimpse is not None:
+                self._rows[name] = glimpse.row()
+        return frames.text("fleet", robots=[self._row(name, feed) for name, feed in self._feeds.items()])
+
+    def _row(self, name: str, feed: RobotFeed) -> dict[str, Any]:
+        gate = feed.gate if feed.alive else None
+        seen = self._rows.get(name, {"pose": None, "speed": None, "old": True, "voltage": None, "level": None})
+        return seen | {
+            "name": name,
+            "alive": feed.alive,
+            "old": seen["old"] or not feed.alive,
+            "round_trip": None if feed.round_trip is None else round(feed.round_trip, 4),
+            "mode": None if gate is None else gate.mode.value,
+            "holder": None if gate is None else gate.holder,
+            "reasons": [] if gate is None else [reason.value for reason in gate.reasons],
+        }
+
+    def _leave(self) -> None:
+        while self._glimpses:
+            self._glimpses.popitem()[1].close()

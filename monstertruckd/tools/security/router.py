@@ -1,0 +1,92 @@
+"""A router of a fleet: its certificate, whom it lets in and its access rules, from its robots' folders.
+
+::
+
+    authority.pem authority.key     certifies the router and nothing else; the key stays here
+    router/                         to the router: zenoh.json5, its certificate and key, whom it lets in
+
+Robots and stations trust the router's authority from then on: their folders are written anew.
+"""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.small_files import replace_file
+from monstertruckd.bus.access import router_rules
+from monstertruckd.tools.security.certificates import DAY, issue, load, new_authority
+from monstertruckd.tools.security.folder import AUTHORITY_DAYS, PORT, ROBOT_DAYS, Folder
+
+ROUTER: Final = "router"
+"""Common name of its certificate."""
+PLACE: Final = Path("/etc/zenohd")
+"""Where the router keeps its files."""
+PLACES: Final = 512
+"""Robots and stations that may be connected at once."""
+
+
+def make_router(
+    path: Path, robots: Sequence[Folder], addresses: Sequence[str], now: int, place: Path = PLACE, port: int = PORT
+) -> None:
+    """Make or renew a router's files, and make its robots and their stations trust it.
+
+    Args:
+        path: folder of the router's authority.
+        robots: folders of the robots' authorities.
+        addresses: what robots and stations dial; robots dial the first one.
+        now: real time, s.
+        place: where the router keeps its files.
+        port: where it listens.
+
+    Raises:
+        InputError: two of them have one name.
+        NotFoundError: a folder is none of an authority.
+    """
+    registers = [folder.register() for folder in robots]
+    names = [ROUTER, *(register.robot for register in registers), *{n for each in registers for n in each.stations}]
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise InputError(f"{', '.join(twice)}: expected another name for each robot and station behind one router")
+    target = path / "router"
+    target.mkdir(mode=0o700, parents=True, exist_ok=True)
+    files = path / "authority.pem", path / "authority.key"
+    if not files[1].exists():
+        new_authority(f"Authority of {ROUTER}", now, AUTHORITY_DAYS).save(*files)
+    authority = load(*files)
+    issue(authority, ROUTER, now, ROBOT_DAYS * DAY, server=addresses).save(target / "router.pem", target / "router.key")
+    # One certificate that is behind the others is enough: stations send that of their issuer along.
+    replace_file(target / "ca.pem", b"".join(folder.authority().pem for folder in robots))
+    fleet = {register.robot: tuple(register.stations) for register in registers}
+    replace_file(target / "zenoh.json5", json.dumps(router_session(place, port, fleet), indent=2).encode() + b"\n")
+    for folder in robots:
+        folder.join(ROUTER, f"tls/{addresses[0]}:{port}", authority.pem)
+
+
+def router_session(place: Path, port: int, fleet: dict[str, tuple[str, ...]]) -> dict[str, Any]:
+    """Zenoh's configuration of the router.
+
+    Args:
+        place: of its files.
+        port: where it listens.
+        fleet: common names of the stations that each robot knows, by its name.
+    """
+    return {
+        "mode": "router",
+        "listen": {"endpoints": [f"tls/0.0.0.0:{port}"], "exit_on_failure": True},
+        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
+        "adminspace": {"enabled": False},
+        "transport": {
+            "unicast": {"max_sessions": PLACES},
+            "link": {
+                "tls": {
+                    "root_ca_certificate": str(place / "ca.pem"),
+                    "listen_certificate": str(place / "router.pem"),
+                    "listen_private_key": str(place / "router.key"),
+                    "enable_mtls": True,
+                    "close_link_on_expiration": True,
+                }
+            },
+        },
+        "access_control": router_rules(fleet),
+    }
