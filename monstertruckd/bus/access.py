@@ -119,7 +119,7 @@ def router_rules(fleet: Mapping[str, Iterable[str]]) -> dict[str, Any]:
     """Zenoh ``access_control`` section of a router between robots and stations.
 
     A robot says its own state and nobody else's, and hears requests to itself only. A station sees and asks the robots
-    that know it, under its own name; it may watch for all robots, and is told of those.
+    that know it, under its own name; it may watch for all robots, and finds those.
 
     Args:
         fleet: common names of the stations that each robot knows, by the robot's name, which is the common name of its
