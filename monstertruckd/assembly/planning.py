@@ -10,7 +10,7 @@ from monstertruck_planners.behave.catalog import LEVELLING
 from monstertruck_planners.behave.service import BehaviourService
 from monstertruck_planners.collision import Footprint
 from monstertruck_planners.explore.config import ExplorerConfig
-from monstertruck_planners.explore.exchange import ExploreSetup
+from monstertruck_planners.explore.exchange import CameraView, ExploreSetup
 from monstertruck_planners.explore.service import TILES, ExplorerInputs, ExplorerService
 from monstertruck_planners.goals.config import PlannerConfig
 from monstertruck_planners.goals.deformation import RouteDeformation
@@ -208,7 +208,7 @@ def _build_explorer(
     config: TruckConfig, explorer: ExplorerConfig, bus: Bus, clock: Clock, body: Body, goals: GoalService,
     actors: ActorFactory, save_map: Callable[[], bool] | None,
 ) -> ExplorerService:  # fmt: skip
-    planner, lidar = config.planner, config.devices.lidar
+    planner, lidar, camera = config.planner, config.devices.lidar, config.devices.camera
     assert planner is not None
     assert lidar is not None
     planner = _within_reach(planner, body.chassis.reached_angle)
@@ -218,6 +218,7 @@ def _build_explorer(
         body.chassis.bicycle.minimum_radius("front" if planner.steering == "2ws" else "counter", planner.angle),
         planner.route.margin,
         lidar.mount.planar,
+        CameraView() if camera is None else CameraView(mount=camera.mount.planar),
     )
     actor = actors.actor(
         config.placement.explorer,
@@ -236,6 +237,7 @@ def _build_explorer(
         slam=bus.subscribe(topics.SLAM, latest()),
         battery=bus.subscribe(topics.BATTERY, latest()),
         events=bus.subscribe(topics.EVENT, fifo(256)),
+        points=None if config.points is None or camera is None else bus.subscribe(topics.POINTS, latest()),
     )
     return ExplorerService(
         setup,
@@ -264,6 +266,7 @@ def _build_missions(config: TruckConfig, bus: Bus, clock: Clock, parts: MissionP
             goal=bus.subscribe(topics.GOAL, latest()),
             behaviour=bus.subscribe(topics.BEHAVIOUR, latest()),
             explore=bus.subscribe(topics.EXPLORE, latest()),
+            points=None if config.points is None else bus.subscribe(topics.POINTS, latest()),
         ),
         state=bus.publisher(topics.MISSION, Writer.PLANNER),
         events=bus.event_sink(),

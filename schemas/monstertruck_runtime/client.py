@@ -32,6 +32,7 @@ from monstertruck_runtime.threads import ThreadHop, in_thread
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.mission import Mission
 from monstertruck_schemas.plan import Path as DrivePath
+from monstertruck_schemas.points import PointOrder
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import (
     UNCONDITIONAL,
@@ -395,7 +396,7 @@ class TruckClient(Operator):
         return await self.call("behave", {**await self._answered(1.0), **request})
 
     async def explore(
-        self, order: ExploreOrder, *, home: bool | None = None, budget: float | None = None
+        self, order: ExploreOrder, *, home: bool | None = None, budget: float | None = None, find: int | None = None
     ) -> dict[str, Any]:
         """Start an exploration, or end it; answers with its ``number``. Progress is on ``plan/explore``.
 
@@ -403,13 +404,40 @@ class TruckClient(Operator):
             order: which of both.
             home: drive back to the start at the end; None = as configured.
             budget: seconds after which it ends; None = as configured.
+            find: look for tags on walls, too, and end when so many are known.
 
         Raises:
             RequestRefusedError: why it does not start, or none runs.
             NotFoundError: the robot is not there, or does not explore.
             NoAnswerError: no answer in time.
         """
-        return await self.call("explore", {**await self._answered(1.0), "order": order, "home": home, "budget": budget})
+        request = {"order": order, "home": home, "budget": budget} | ({} if find is None else {"find": find})
+        return await self.call("explore", {**await self._answered(1.0), **request})
+
+    async def point(
+        self,
+        order: PointOrder,
+        name: str,
+        place: tuple[float, float] | None = None,
+        yaw: float | None = None,
+    ) -> dict[str, Any]:
+        """Mark a place by name, or have a point of interest forgotten; all are on ``state/points``.
+
+        Args:
+            order: which of both.
+            name: of the point.
+            place: of a mark, in map, m; None = where the robot is.
+            yaw: rad; None = the robot's.
+
+        Raises:
+            RequestRefusedError: why not.
+            NotFoundError: the robot, or the point, is not there, or the robot keeps none.
+            NoAnswerError: no answer in time.
+        """
+        x, y = (None, None) if place is None else place
+        return await self.call(
+            "points", {**await self._answered(1.0), "order": order, "name": name, "x": x, "y": y, "yaw": yaw}
+        )
 
     async def mission(self, order: MissionOrder, mission: Mission | None = None) -> dict[str, Any]:
         """Start a mission, go on with one, or end it; answers with its ``number``. Progress is on ``plan/mission``.

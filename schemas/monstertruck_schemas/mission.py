@@ -40,6 +40,16 @@ class GoToStep(MissionStep):
     """Places x, y to pass before"""
 
 
+class PointStep(MissionStep):
+    """Drive before a tag that the camera found, or to a place that was marked."""
+
+    do: Literal["goto_point"]
+    point: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,31}$")]
+    """Its name"""
+    distance: Annotated[float, Field(ge=0, le=5)] = 0.7
+    """M before a tag"""
+
+
 class LookStep(MissionStep):
     """Turn towards a place, where the robot stands."""
 
@@ -65,6 +75,8 @@ class ExploreStep(MissionStep):
     """Seconds after which it ends; null = as the robot is configured"""
     home: bool = False
     """Drive back to where the exploration began"""
+    find: Annotated[int, Field(ge=1, le=10_000)] | None = None
+    """Look for tags on walls, too, and end when the map has so many"""
 
 
 class BehaviourStepOfMission(MissionStep):
@@ -101,7 +113,15 @@ class ReturnStep(MissionStep):
 
 
 AnyStep = Annotated[
-    GoToStep | LookStep | WaitStep | ExploreStep | BehaviourStepOfMission | FollowWallStep | RecordStep | ReturnStep,
+    GoToStep
+    | PointStep
+    | LookStep
+    | WaitStep
+    | ExploreStep
+    | BehaviourStepOfMission
+    | FollowWallStep
+    | RecordStep
+    | ReturnStep,
     Field(discriminator="do"),
 ]
 

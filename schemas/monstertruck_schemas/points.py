@@ -1,11 +1,12 @@
 """Points of interest: what the camera found in the map, and what an operator marked there."""
 
+import math
 from enum import StrEnum
 from typing import Annotated
 
 from pydantic import Field
 
-from monstertruck_schemas.base import Covariance, Message, Nanoseconds, Schema
+from monstertruck_schemas.base import Covariance, Message, Nanoseconds, Pose2D, Schema
 from monstertruck_schemas.req import Request
 
 PointName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,31}$")]
@@ -47,6 +48,13 @@ class PointOfInterest(Schema):
     """And last."""
     picture: bool = False
     """There is one: remote call ``point_picture``."""
+
+    def before(self, distance: float) -> Pose2D:
+        """Where a robot stands to look at it: a tag from so far before it, m; a mark is a place of its own."""
+        if self.kind is PointKind.MARK:
+            return Pose2D(x=self.x, y=self.y, yaw=self.yaw)
+        x, y = self.x + distance * math.cos(self.yaw), self.y + distance * math.sin(self.yaw)
+        return Pose2D(x=x, y=y, yaw=math.remainder(self.yaw + math.pi, math.tau))
 
 
 class PointsOfInterest(Message):

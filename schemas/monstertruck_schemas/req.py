@@ -226,6 +226,8 @@ class ExploreRequest(Request):
     """Drive back to the start at the end; None = as configured."""
     budget: Annotated[float, Field(gt=0)] | None = None
     """Seconds after which it ends; None = as configured."""
+    find: Annotated[int, Field(ge=1, le=10_000)] | None = None
+    """Look for tags on walls, and end when the map has so many of them; None = explore only."""
 
 
 class MissionOrder(StrEnum):

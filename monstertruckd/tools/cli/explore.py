@@ -41,6 +41,10 @@ def explore(
     budget: Annotated[
         str | None, typer.Option(help="Time after which it ends, such as 20min; else as configured.", metavar="TIME")
     ] = None,
+    find: Annotated[
+        int | None,
+        typer.Option(min=1, help="Look for tags on walls, too; ends when the map has so many.", show_default=False),
+    ] = None,
     stop: Annotated[bool, typer.Option("--stop", help="End the exploration that runs.")] = False,
     arm: Annotated[bool, typer.Option("--arm", help="Arm the robot first; it drives off at once.")] = False,
     robot: RobotOption = "truck",
@@ -64,7 +68,7 @@ def explore(
                 await client.explore(ExploreOrder.STOP)
                 return None
             tell = None if json_output else print
-            return await run_exploration(client, home=home, budget=seconds, arm=arm, tell=tell)
+            return await run_exploration(client, home=home, budget=seconds, find=find, arm=arm, tell=tell)
 
     end = run_wall(main)
     if end is None:

@@ -21,7 +21,7 @@ class ExploringClient(Operator, Protocol):
     """Client of a robot that explores."""
 
     async def explore(
-        self, order: ExploreOrder, *, home: bool | None = None, budget: float | None = None
+        self, order: ExploreOrder, *, home: bool | None = None, budget: float | None = None, find: int | None = None
     ) -> dict[str, Any]:
         """Start an exploration, or end it."""
         ...
@@ -51,6 +51,7 @@ async def run_exploration(
     *,
     home: bool | None,
     budget: float | None,
+    find: int | None = None,
     arm: bool,
     tell: Callable[[str], object] | None = None,
 ) -> ExplorationEnd:
@@ -60,6 +61,7 @@ async def run_exploration(
         client: of the robot.
         home: see ``TruckClient.explore``.
         budget: likewise, s.
+        find: likewise.
         arm: arm the robot first.
         tell: gets a line of progress now and then.
 
@@ -71,7 +73,7 @@ async def run_exploration(
         if arm:
             await client.arm()
         try:
-            number = int((await client.explore(ExploreOrder.START, home=home, budget=budget))["number"])
+            number = int((await client.explore(ExploreOrder.START, home=home, budget=budget, find=find))["number"])
             return await _followed(states, number, tell)
         except BaseException as error:
             if not isinstance(error, TruckError) or isinstance(error, NoAnswerError):

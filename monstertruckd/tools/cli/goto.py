@@ -47,7 +47,7 @@ def goto(
         with on_the_terminal() as report:
             return await drive_to(client, clock, (x, y, yaw), places, arm=arm, report=report)
 
-    _run(main, robot, endpoint, json_output=json_output)
+    drive_and_tell(main, robot, endpoint, json_output=json_output)
 
 
 def track(
@@ -74,16 +74,17 @@ def track(
         with on_the_terminal() as report:
             return await follow(client, clock, there, arm=arm, report=report)
 
-    _run(main, robot, endpoint, json_output=json_output)
+    drive_and_tell(main, robot, endpoint, json_output=json_output)
 
 
-def _run(
+def drive_and_tell(
     drive: Callable[["TruckClient", Clock], Coroutine[Any, Any, "Arrival"]],
     robot: str,
     endpoint: str,
     *,
     json_output: bool,
 ) -> None:
+    """Connect, drive, and print how it ended; its reason is the exit code."""
     from monstertruck_runtime.client import TruckClient
 
     async def main(clock: Clock) -> "Arrival":

@@ -23,6 +23,7 @@ from monstertruckd.tools.cli import (
     move,
     orders,
     plan,
+    points,
     replay,
     robot,
     security,
@@ -101,6 +102,7 @@ app.add_typer(kinematics.app, name="kinematics")
 app.add_typer(study.app, name="study")
 app.add_typer(stand.app, name="stand")
 app.add_typer(maps.app, name="map")
+app.add_typer(points.app, name="points")
 app.add_typer(security.app, name="security")
 
 

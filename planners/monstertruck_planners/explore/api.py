@@ -167,6 +167,10 @@ class ExplorationView:
         cost = UNREACHED if at is None else int(self._ways.cost[at])
         return None if cost >= UNREACHED else cost * self._cell / UNIT
 
+    def free(self, poses: Array) -> NDArray[np.bool_]:
+        """Whether the robot can stand at poses, shape (n, 3): (n,)."""
+        return np.asarray(self._route_map.field.free(self.setup.footprint, poses, self.setup.margin), np.bool_)
+
     def ways_between(self, options: list[Option]) -> Array:
         """Metres from each option's place to each other's, shape (n, n); inf where no way is known."""
         if self._rough is None:

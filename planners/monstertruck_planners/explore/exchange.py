@@ -12,6 +12,22 @@ Point = tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True)
+class CameraView:
+    """What the camera is good for where tags are looked for."""
+
+    mount: Pose = (0.18, 0.0, 0.0)
+    """In base."""
+    view: float = 0.95
+    """Angle of view that is counted on, rad."""
+    reach: float = 1.4
+    """Farthest, m..."""
+    nearest: float = 0.25
+    """...and nearest wall, m."""
+    oblique: float = 0.75
+    """Greatest angle from a wall's normal, rad."""
+
+
+@dataclass(frozen=True, slots=True)
 class ExploreSetup:
     """What exploring is made for; comes first, and again after every restart."""
 
@@ -23,6 +39,7 @@ class ExploreSetup:
     """Kept to obstacles by the routes, m."""
     lidar: Pose = (0.0, 0.0, 0.0)
     """In base."""
+    camera: CameraView = CameraView()
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +65,8 @@ class ExploreTask:
     """Nothing is looked at from here: these places could not be reached."""
     home: Pose | None = None
     """Way there is wanted."""
+    find: bool = False
+    """Walls are looked at, too, once no frontier is left."""
 
 
 @dataclass(frozen=True, slots=True)

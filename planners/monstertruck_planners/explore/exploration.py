@@ -91,6 +91,8 @@ class Observed:
     """The battery's voltage is low."""
     saved: str | None = None
     """Where the map was saved after that was asked for; empty = nowhere."""
+    found: int = 0
+    """Points of interest that are known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,6 +112,8 @@ class Exploration:
     """At frontiers."""
     unreached: Attempts
     """At places to look from."""
+    find: int | None = None
+    """It ends when so many points of interest are known; None = they do not matter."""
     phase: ExplorationPhase = ExplorationPhase.LOOKING
     since: float = 0.0
     """Begin of the phase, s."""
@@ -148,11 +152,12 @@ Step = tuple[Exploration, tuple[Action, ...]]
 
 
 def begin(
-    number: int, source: str, pose: Pose, now: float, config: ExplorerConfig, *, home: bool, budget: float
-) -> Step:
+    number: int, source: str, pose: Pose, now: float, config: ExplorerConfig, *, home: bool, budget: float,
+    find: int | None = None,
+) -> Step:  # fmt: skip
     """Take on an exploration."""
     none = Attempts(config.blacklist, config.attempts)
-    run = Exploration(number, source, pose, home, budget, now, now, none, none, since=now)
+    run = Exploration(number, source, pose, home, budget, now, now, none, none, find, since=now)
     text = f"{config.kind}, for {budget:g} s at most{', then home' if home else ''}, asked for by {source}"
     return run, (Notice(Reason.EXPLORATION_STARTED, Severity.INFO, text),)
 
@@ -199,6 +204,8 @@ def _merged(before: ExploreAnswer, answer: ExploreAnswer) -> ExploreAnswer:
 
 def _enough(run: Exploration, seen: Observed, config: ExplorerConfig) -> tuple[Reason, str] | None:
     """Why the exploring ends now."""
+    if run.find is not None and seen.found >= run.find:
+        return Reason.POINTS_FOUND, f"{seen.found} points of interest"
     if run.now - run.begun > run.budget:
         return Reason.BUDGET_SPENT, f"after {run.budget:g} s"
     if seen.low:
@@ -239,7 +246,8 @@ def _looking(run: Exploration, seen: Observed) -> Step:
         again = replace(run, attempts=attempts or run.attempts, unreached=unreached or run.unreached)
         again = replace(again, nothing=0, not_before=run.now)
         return again, (Notice(Reason.RECOVERING, Severity.INFO, text),)
-    return _finish(run, Reason.EXPLORED, f"{run.newest.known:.1f} m^2 of free ground")
+    found = "" if run.find is None else f"; {seen.found} of {run.find} points of interest were found"
+    return _finish(run, Reason.EXPLORED, f"{run.newest.known:.1f} m^2 of free ground{found}")
 
 
 def _driving(run: Exploration, seen: Observed, config: ExplorerConfig) -> Step:

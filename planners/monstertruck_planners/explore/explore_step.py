@@ -9,8 +9,9 @@ from monstertruck_planners.collision import Footprint
 from monstertruck_planners.explore.api import LEAST, ExplorationView, Explorer, Option, Remembered
 from monstertruck_planners.explore.catalog import make_explorer
 from monstertruck_planners.explore.config import TourConfig
-from monstertruck_planners.explore.exchange import ExploreAnswer, ExploreSetup, ExploreTask, Viewpoint
+from monstertruck_planners.explore.exchange import CameraView, ExploreAnswer, ExploreSetup, ExploreTask, Viewpoint
 from monstertruck_planners.explore.frontier import FrontierMap
+from monstertruck_planners.explore.look import WallLooks
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.state import Grid
@@ -27,6 +28,7 @@ class ExploringStep:
         self._explorer: Explorer | None = None
         self._map: FrontierMap | None = None
         self._memory = Remembered()
+        self._looks = WallLooks(CameraView())
 
     def step(self, task: ExploreTask) -> ExploreAnswer:
         """Do one task.
@@ -36,6 +38,7 @@ class ExploringStep:
         """
         if task.setup is not None:
             self._setup, self._explorer = task.setup, make_explorer(task.setup.config)
+            self._looks = WallLooks(task.setup.camera)
         if self._setup is None or self._explorer is None:
             raise InputError("exploring: expected a setup before anything else")
         changed = self._take(task)
@@ -47,6 +50,9 @@ class ExploringStep:
             return ExploreAnswer(known=area, changed=changed)
         view = ExplorationView(known, self._setup, task.pose, task.banned, task.avoided, self._memory)
         target = self._explorer.choose(view, task.current, self._still(view, task.current), task.pursued)
+        if task.find:
+            self._looks.take(known, task.pose)
+            target = target or self._looks.choose(view, task.current)
         return ExploreAnswer(
             target,
             kept=target is not None and target is task.current,

@@ -21,6 +21,7 @@ from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.event import Event, Severity
 from monstertruck_schemas.health import LocalisationStatus, SlamHealth
 from monstertruck_schemas.plan import ExplorationPhase, ExplorationState, GoalPhase, GoalState
+from monstertruck_schemas.points import PointKind, PointsOfInterest
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import ExploreOrder, ExploreRequest, GoalControl, GoalOrder, GoalRequest
 from monstertruck_schemas.sensor import Battery, BatteryLevel
@@ -71,6 +72,7 @@ class ExplorerInputs:
     slam: Subscription[SlamHealth]
     battery: Subscription[Battery]
     events: Mailbox[Event]
+    points: Subscription[PointsOfInterest] | None = None
 
 
 class ExplorerService:
@@ -172,10 +174,16 @@ class ExplorerService:
             raise RequestRefusedError(Reason.NO_MAP, "no pose in a map yet")
         self._fresh, self._goal, self._refused, self._saves = True, None, None, None
         self._others = 0 if goal is None else goal.number
+        if request.find is not None and self._in.points is None:
+            raise RequestRefusedError(Reason.NOT_SUPPORTED, "this robot keeps no points of interest: section `points`")
         home = self._config.home if request.home is None else request.home
         number = 1 if run is None else run.number + 1
         budget = request.budget or self._config.budget
-        self._do(exploration.begin(number, request.source, pose, now / SECOND, self._config, home=home, budget=budget))
+        self._do(
+            exploration.begin(
+                number, request.source, pose, now / SECOND, self._config, home=home, budget=budget, find=request.find
+            )
+        )
         return number
 
     # Observations
@@ -229,7 +237,13 @@ class ExplorerService:
             charge=battery.charge if battery is not None and fresh else None,
             low=battery is not None and fresh and battery.level in LOW,
             saved=saved,
+            found=self._found(),
         )
+
+    def _found(self) -> int:
+        """Tags that are known."""
+        message = None if self._in.points is None else self._in.points.latest
+        return 0 if message is None else sum(point.kind is PointKind.TAG for point in message.points)
 
     def _goal_end(self) -> tuple[Reason | None, str, str]:
         """How the goal that was sent ended, in words, and whose goal took its place."""
@@ -292,6 +306,7 @@ class ExplorerService:
             banned=run.attempts.banned(now),
             avoided=run.unreached.banned(now),
             home=run.home,
+            find=run.find is not None,
         )
         self._fresh, self._sent_whole, self._sent_tiles = False, self._whole, len(self._tiles)
         self._deciding = self._tasks.create_task(self._ask(task))

@@ -5,7 +5,7 @@ from typing import Literal
 
 from monstertruck_planners.goals.exchange import Pose
 from monstertruck_schemas.base import Pose2D, Schema
-from monstertruck_schemas.mission import AnyStep, GoToStep, LookStep, Mission, WaitStep
+from monstertruck_schemas.mission import AnyStep, GoToStep, LookStep, Mission, PointStep, WaitStep
 from monstertruck_schemas.reasons import Reason
 
 FINAL = frozenset({Reason.CANCELLED, Reason.DISARMED, Reason.ESTOPPED, Reason.SHUTDOWN})
@@ -100,6 +100,8 @@ def in_words(step: AnyStep) -> str:
             return f"goto {x:g} {y:g} {yaw:g}"
         case LookStep(x=x, y=y):
             return f"look at {x:g} {y:g}"
+        case PointStep(point=point):
+            return f"goto_point {point}"
         case WaitStep(seconds=seconds):
             return f"wait {seconds:g} s"
         case _:

@@ -37,11 +37,13 @@ from monstertruck_schemas.mission import (
     GoToStep,
     LookStep,
     Mission,
+    PointStep,
     RecordStep,
     ReturnStep,
     WaitStep,
 )
 from monstertruck_schemas.plan import BehaviourState, ExplorationState, GoalPhase, GoalState, MissionState
+from monstertruck_schemas.points import PointsOfInterest
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import (
     BehaviourOrder,
@@ -114,6 +116,7 @@ class MissionInputs:
     goal: Subscription[GoalState]
     behaviour: Subscription[BehaviourState]
     explore: Subscription[ExplorationState]
+    points: Subscription[PointsOfInterest] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -244,6 +247,8 @@ class MissionService:
         for number, step in enumerate(mission.steps, 1):
             if isinstance(step, ExploreStep) and self._parts.explorer is None:
                 raise NotFoundError(f"step {number}: explore: the robot's configuration has no section `explorer`")
+            if isinstance(step, PointStep) and self._in.points is None:
+                raise NotFoundError(f"step {number}: goto_point: the robot's configuration has no section `points`")
             if isinstance(step, BehaviourStepOfMission | FollowWallStep) and step.name not in self._parts.names:
                 known = ", ".join(sorted(self._parts.names)) or "none"
                 raise NotFoundError(f"step {number}: no behaviour {step.name!r}: expected one of {known}")
@@ -295,6 +300,8 @@ class MissionService:
             match step:
                 case GoToStep(x=x, y=y, yaw=yaw, via=via):
                     return await self._go((x, y, yaw), via)
+                case PointStep():
+                    return await self._go_before(step)
                 case LookStep(x=x, y=y):
                     return await self._look(x, y)
                 case WaitStep(seconds=seconds):
@@ -317,6 +324,14 @@ class MissionService:
             return StepEnd(error.refusal, str(error))
         except TruckError as error:
             return StepEnd(error.reason, str(error))
+
+    async def _go_before(self, step: PointStep) -> StepEnd:
+        message = None if self._in.points is None else self._in.points.latest
+        for point in () if message is None else message.points:
+            if point.name == step.point:
+                pose = point.before(step.distance)
+                return await self._go((pose.x, pose.y, pose.yaw), ())
+        return StepEnd(Reason.NOT_FOUND, f"no point of interest {step.point!r} is known")
 
     async def _look(self, x: float, y: float) -> StepEnd:
         pose = self._pose()
@@ -345,7 +360,9 @@ class MissionService:
         explorer = self._parts.explorer
         assert explorer is not None
         header = self._header()
-        number = explorer.take(ExploreRequest(**header, order=ExploreOrder.START, home=step.home, budget=step.budget))
+        number = explorer.take(
+            ExploreRequest(**header, order=ExploreOrder.START, home=step.home, budget=step.budget, find=step.find)
+        )
 
         def end() -> StepEnd | None:
             state = self._in.explore.latest

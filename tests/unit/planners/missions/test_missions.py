@@ -91,9 +91,11 @@ class Pretended:
 
     def __init__(self, clock: VirtualClock, file: Path | None = None) -> None:
         self.clock, self.number, self.reached = clock, 0, [Reason.GOAL_REACHED] * 99
-        self.latest = {"gate": None, "pose": None, "goal": None, "behaviour": None, "explore": None}
+        self.latest = {"gate": None, "pose": None, "goal": None, "behaviour": None, "explore": None, "points": None}
         self.reports, self.events, self.goals, self.held = [], [], [], set()
         box = {name: self._box(name) for name in self.latest}
+        dock = SimpleNamespace(name="dock", before=lambda away: Pose2D(x=7.0 - away, y=8.0, yaw=0.0))
+        self.latest["points"] = SimpleNamespace(points=(dock,))
         self.latest["gate"] = SimpleNamespace(nonce="n", stamp=0, reasons=(), mode=SimpleNamespace(active=True))
         self.seq = 0
         self.service = MissionService(
@@ -149,6 +151,18 @@ def played(story, file: Path | None = None) -> Pretended:
         return robot
 
     return run_virtual(main, start=SECOND)
+
+
+def test_a_step_goes_before_a_point_of_interest_and_says_when_none_has_its_name():
+    async def story(robot: Pretended) -> None:
+        point = {"do": "goto_point", "point": "dock", "distance": 1.0}
+        robot.order(MissionOrder.START, point, point | {"point": "tag-9"})
+        await robot.clock.sleep(6.0)
+
+    robot = played(story)
+    assert robot.goals == [(6.0, 8.0)]
+    assert robot.reports[-1].outcome is Reason.NOT_FOUND
+    assert "'tag-9'" in robot.reports[-1].text
 
 
 def test_a_mission_is_done_step_by_step_and_keeps_the_robot_armed(tmp_path: Path):

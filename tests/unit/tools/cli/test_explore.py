@@ -37,7 +37,7 @@ class Robot:
     async def arm(self):
         self.orders.append(("arm",))
 
-    async def explore(self, order: ExploreOrder, *, home=None, budget=None):
+    async def explore(self, order: ExploreOrder, *, home=None, budget=None, find=None):
         self.orders.append((order, home, budget))
         if self.refuse:
             raise RequestRefusedError(Reason.BUSY)

@@ -1,0 +1,164 @@
+"""``monstertruckd points``: points of interest in the map: list, export, go to, mark, remove."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from monstertruck_runtime.clock import Clock, run_wall
+from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
+from monstertruck_runtime.errors import InputError, NoAnswerError, NotFoundError
+from monstertruckd.tools.cli.goto import ArmOption, drive_and_tell
+from monstertruckd.tools.cli.options import EndpointOption, RobotOption
+from monstertruckd.tools.cli.output import JsonOption, command_group, print_json, print_table, remark
+
+if TYPE_CHECKING:
+    from monstertruck_runtime.client import TruckClient
+    from monstertruck_runtime.drives import Arrival
+    from monstertruck_schemas.points import PointOfInterest
+
+app = command_group("Points of interest in the map: tags that the camera found, places that were marked.")
+
+NameArgument = Annotated[str, typer.Argument(help="Of the point, such as tag-7 or dock.", show_default=False)]
+MapOption = Annotated[
+    Path | None, typer.Option("--map", help="Folder of a saved map, instead of a robot.", show_default=False)
+]
+WAIT = 3.0
+"""Seconds to wait for the robot's list."""
+
+
+@app.command("list")
+def list_command(
+    map_folder: MapOption = None,
+    robot: RobotOption = "truck",
+    endpoint: EndpointOption = DEFAULT_ENDPOINT,
+    json_output: JsonOption = False,
+) -> None:
+    """Print all points of interest."""
+    from monstertruckd.tools.cli.points_files import row_of
+
+    points = _points(map_folder, robot, endpoint)
+    if json_output:
+        print_json([point.model_dump(mode="json") for point in points])
+    elif points:
+        numbers = ("x m", "y m", "yaw rad", "sigma cm", "seen")
+        print_table(("name", *numbers), [row_of(point) for point in points], right=numbers)
+    else:
+        print("none")
+
+
+@app.command("export")
+def export_command(
+    file: Annotated[Path, typer.Argument(help="Name.csv, .geojson or .yaml.", show_default=False)],
+    map_folder: MapOption = None,
+    robot: RobotOption = "truck",
+    endpoint: EndpointOption = DEFAULT_ENDPOINT,
+) -> None:
+    """Write all points of interest to a file, whose ending says how."""
+    from monstertruckd.tools.cli.points_files import FORMATS, text_of
+
+    if file.suffix not in FORMATS:
+        raise InputError(f"{file}: expected a name that ends with one of {', '.join(FORMATS)}")
+    points = _points(map_folder, robot, endpoint)
+    file.write_text(text_of(points, file.suffix), encoding="utf-8")
+    remark(f"wrote {len(points)} points to {file}")
+
+
+@app.command("goto")
+def goto_command(
+    name: NameArgument,
+    distance: Annotated[float, typer.Option(min=0.0, max=5.0, help="Metres before a tag, facing it.")] = 0.7,
+    arm: ArmOption = False,
+    robot: RobotOption = "truck",
+    endpoint: EndpointOption = DEFAULT_ENDPOINT,
+    json_output: JsonOption = False,
+) -> None:
+    """Drive to a marked place, or before a tag. Ctrl-C cancels the goal."""
+    from monstertruck_runtime.drives import drive_to
+    from monstertruckd.tools.cli.goto_session import on_the_terminal
+
+    async def main(client: "TruckClient", clock: Clock) -> "Arrival":
+        named = {point.name: point for point in await _newest(client, clock)}
+        if name not in named:
+            raise NotFoundError(f"no point of interest {name!r}: expected one of {', '.join(named) or 'none'}")
+        pose = named[name].before(distance)
+        with on_the_terminal() as report:
+            return await drive_to(client, clock, (pose.x, pose.y, pose.yaw), [], arm=arm, report=report)
+
+    drive_and_tell(main, robot, endpoint, json_output=json_output)
+
+
+@app.command("mark", context_settings={"ignore_unknown_options": True})
+def mark_command(
+    name: NameArgument,
+    x: Annotated[float | None, typer.Argument(help="Metres; without, where the robot is.", show_default=False)] = None,
+    y: Annotated[float | None, typer.Argument(help="Metres.", show_default=False)] = None,
+    yaw: Annotated[float | None, typer.Argument(help="Radians; else the robot's.", show_default=False)] = None,
+    robot: RobotOption = "truck",
+    endpoint: EndpointOption = DEFAULT_ENDPOINT,
+) -> None:
+    """Mark a place by name: where the robot is, or x y in the map; one that is there is moved."""
+    from monstertruck_schemas.points import PointOrder
+
+    if (x is None) is not (y is None):
+        raise InputError("expected x and y, or neither")
+    place = None if x is None or y is None else (x, y)
+    _ask(lambda client: client.point(PointOrder.MARK, name, place, yaw), robot, endpoint)
+    remark(f"marked {name}")
+
+
+@app.command("remove")
+def remove_command(
+    name: NameArgument, robot: RobotOption = "truck", endpoint: EndpointOption = DEFAULT_ENDPOINT
+) -> None:
+    """Have a point of interest forgotten."""
+    from monstertruck_schemas.points import PointOrder
+
+    _ask(lambda client: client.point(PointOrder.REMOVE, name), robot, endpoint)
+    remark(f"removed {name}")
+
+
+def _points(folder: Path | None, robot: str, endpoint: str) -> "list[PointOfInterest]":
+    if folder is not None:
+        from monstertruck_estimation.points.files import FILE, load
+
+        if not (folder / FILE).is_file():
+            raise NotFoundError(f"{folder}: no {FILE} in it")
+        return [point for point, _ in load(folder)]
+
+    async def main(client: "TruckClient", clock: Clock) -> "list[PointOfInterest]":
+        return await _newest(client, clock)
+
+    found: list[PointOfInterest] = _with(main, robot, endpoint)
+    return found
+
+
+def _ask(order: Any, robot: str, endpoint: str) -> None:
+    async def main(client: "TruckClient", _: Clock) -> None:
+        await order(client)
+
+    _with(main, robot, endpoint)
+
+
+def _with(main: Any, robot: str, endpoint: str) -> Any:
+    from monstertruck_runtime.client import TruckClient
+
+    async def session(clock: Clock) -> Any:
+        async with TruckClient(robot, endpoint, clock=clock) as client:
+            if (await client.call("config")).get("points") is None:
+                raise NotFoundError(f"robot {robot!r} keeps no points of interest: expected a section `points`")
+            return await main(client, clock)
+
+    return run_wall(session)
+
+
+async def _newest(client: "TruckClient", clock: Clock) -> "list[PointOfInterest]":
+    from monstertruck_runtime.mailbox import latest
+    from monstertruck_schemas.topics import POINTS
+
+    with client.subscribe(POINTS, latest()) as box:
+        try:
+            async with clock.deadline(WAIT):
+                return list((await box.next()).points)
+        except TimeoutError:
+            raise NoAnswerError(f"no list of points of interest within {WAIT:g} s") from None
