@@ -17,11 +17,19 @@ from monstertruck_runtime.mailbox import latest
 from monstertruck_schemas import topics
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.state import GateMode
+from monstertruckd.config.calibration import CalibrationStore, Estimate, Result
 from tests.daemon.wall_kit import ROOT, Robot, end, robot
 
 pytestmark = [pytest.mark.wall, pytest.mark.timeout(180)]
 
 YARD = ROOT / "configs" / "yard.yaml"
+BATTERY = Result(
+    wizard="battery",
+    measured="long ago",
+    estimates=(
+        Estimate(name="gain", value=1.01, samples=2, meaning="test", key="devices.steering.driver.battery.gain"),
+    ),
+)
 LONG_WAITS = {
     "gate": {sensor: {"stale_after": 1.5} for sensor in ("scan", "drive", "steering", "attitude")}
     | {"max_latency": 1.0, "tick_stall": 1.0, "leases": {"station": 1.0}}
@@ -32,13 +40,10 @@ LONG_WAITS = {
 @asynccontextmanager
 async def truck_with_a_calibration(folder: Path) -> AsyncIterator[tuple[Robot, TruckClient, dict[Path, bytes]]]:
     async with robot(folder, LONG_WAITS, YARD) as truck:
+        CalibrationStore(folder / "state" / "calibration", "truck").save(BATTERY, 0)
         await truck.start_simulator()
         await truck.start_daemon()
         async with truck.client() as client:
-            done = await command(truck, "battery", "--json", "--answer", "meter=24.6", "--answer", "another=no")
-            assert done.returncode == 0, done.stderr
-            saved = json.loads(done.stdout)
-            assert saved["result"]["estimates"][0]["key"] == "devices.steering.driver.battery.gain"
             yield truck, client, files(folder)
 
 
@@ -67,36 +72,21 @@ async def drive_away(truck: Robot, client: TruckClient) -> asyncio.subprocess.Pr
     return wizard
 
 
-async def ends_by(number: int, folder: Path) -> int | None:
-    """End the wizard by a signal in mid-run; its exit code, once truck and file are as they should be."""
-    async with truck_with_a_calibration(folder) as (truck, client, before):
-        wizard = await drive_away(truck, client)
-        ended = truck.clock.now() / 1e9
-        code = await end(wizard, number)
-        with client.subscribe(topics.GATE, latest()) as gate:
-            async with asyncio.timeout(10):
-                while gate.latest is None or gate.latest.mode is not GateMode.DISARMED:
-                    await asyncio.sleep(0.05)
-        assert files(folder) == before, "the old file is intact, and no other one is there"
-        await asyncio.sleep(2.0)
-        assert await end(truck.daemon) == 0
-        truth = await truck.truth()
-    after = truth[truth[:, 0] > ended + 1.5]
-    assert abs(after[:, 4]).max() < 0.01
-    return code
-
-
-async def test_kill_9_of_the_wizard_leaves_truck_neutral_and_file_intact(tmp_path: Path):
-    assert await ends_by(signal.SIGKILL, tmp_path) == -signal.SIGKILL
-
-
-async def test_ctrl_c_does_the_same_and_says_so(tmp_path: Path):
-    assert await ends_by(signal.SIGINT, tmp_path) == Reason.CANCELLED.exit_code
-    assert Reason.CANCELLED.text in (tmp_path / "calibrate.txt").read_text()
-
-
-async def test_kill_9_of_the_daemon_ends_the_wizard_and_leaves_file_intact_and_truck_standing(tmp_path: Path):
+async def test_a_wizard_that_is_killed_leaves_truck_neutral_and_file_intact(tmp_path: Path):
+    """By Ctrl-C, which it says, by kill -9, and at last because the daemon is killed."""
     async with truck_with_a_calibration(tmp_path) as (truck, client, before):
+        ended = []
+        for number, expected in ((signal.SIGINT, Reason.CANCELLED.exit_code), (signal.SIGKILL, -signal.SIGKILL)):
+            wizard = await drive_away(truck, client)
+            ended.append(truck.clock.now() / 1e9)
+            assert await end(wizard, number) == expected
+            with client.subscribe(topics.GATE, latest()) as gate:
+                async with asyncio.timeout(10):
+                    while gate.latest is None or gate.latest.mode is not GateMode.DISARMED:
+                        await asyncio.sleep(0.05)
+            assert files(tmp_path) == before, "the old file is intact, and no other one is there"
+            await asyncio.sleep(2.0)
+        assert Reason.CANCELLED.text in (tmp_path / "calibrate.txt").read_text()
         wizard = await drive_away(truck, client)
         await end(truck.daemon, signal.SIGKILL)
         script = [sys.executable, "-I", str(ROOT / "systemd" / "neutral.py"), str(tmp_path / "dev" / "drive")]
@@ -111,11 +101,31 @@ async def test_kill_9_of_the_daemon_ends_the_wizard_and_leaves_file_intact_and_t
         assert "Traceback" not in said
         assert files(tmp_path) == before
         truth = await truck.truth()
+    for instant in ended:
+        after = truth[(truth[:, 0] > instant + 1.5) & (truth[:, 0] < instant + 2.0)]
+        assert abs(after[:, 4]).max() < 0.01
     assert abs(truth[-5:, 4]).max() < 0.01
 
 
 async def test_scripted_shown_undone_and_applied_by_the_next_start(tmp_path: Path):
-    async with truck_with_a_calibration(tmp_path) as (truck, _, before):
+    async with robot(tmp_path, LONG_WAITS, YARD) as truck:
+        await truck.start_simulator()
+        await truck.start_daemon()
+        async with truck.client():
+            pass
+        unanswered = await command(truck, "drive", "--yes", "--sign-only")
+        assert unanswered.returncode == Reason.BAD_INPUT.exit_code
+        assert "forward: no answer on standard input; give it by --answer forward=VALUE" in unanswered.stderr
+        assert unanswered.stdout == ""
+        refused = await command(truck, "battery", "--answer", "meter=240")
+        assert refused.returncode == Reason.BAD_INPUT.exit_code
+        assert "meter: 240 is not within 5 to 70" in refused.stderr
+        assert not (tmp_path / "state" / "calibration").exists()
+        done = await command(truck, "battery", "--json", "--answer", "meter=24.6", "--answer", "another=no")
+        assert done.returncode == 0, done.stderr
+        saved = json.loads(done.stdout)
+        assert saved["result"]["estimates"][0]["key"] == "devices.steering.driver.battery.gain"
+        before = files(tmp_path)
         shown = await command(truck, "show")
         assert shown.returncode == 0
         assert "battery.gain" in shown.stdout
@@ -135,15 +145,3 @@ async def test_scripted_shown_undone_and_applied_by_the_next_start(tmp_path: Pat
         again = await command(truck, "battery", "--undo", "--config", str(truck.config))
         assert again.returncode == 0, "without the daemon too"
         assert len(files(tmp_path)) == 3
-
-
-async def test_a_script_that_cannot_answer_gets_the_question(tmp_path: Path):
-    async with truck_with_a_calibration(tmp_path) as (truck, _, before):
-        unanswered = await command(truck, "drive", "--yes", "--sign-only")
-        assert unanswered.returncode == Reason.BAD_INPUT.exit_code
-        assert "forward: no answer on standard input; give it by --answer forward=VALUE" in unanswered.stderr
-        assert unanswered.stdout == ""
-        refused = await command(truck, "battery", "--answer", "meter=240")
-        assert refused.returncode == Reason.BAD_INPUT.exit_code
-        assert "meter: 240 is not within 5 to 70" in refused.stderr
-        assert files(tmp_path) == before

@@ -34,7 +34,6 @@ def corridor(width: float, folder: Path) -> Path:
         (0.8, "lqr", 1, {"obstacle": {"ahead": 0.01, "side_clearance": 0.01}}),
         (0.8, "mpc", 2, {"obstacle": {"ahead": 0.01, "side_clearance": 0.01}}),
         (0.9, "lqr", 3, {}),
-        (1.0, "lqr", 4, {}),
     ],
 )
 def test_turning_round_in_a_corridor_touches_nothing(

@@ -25,7 +25,7 @@ pytestmark = [
 ]
 
 
-def drill(count: int = 4) -> Drill:
+def drill(count: int = 3) -> Drill:
     """Legs of one fault each."""
     config = load_config(ROOT / "configs" / "demo.yaml", SimulatedTruckConfig)[0]
     return Drill(7, count, with_overlay(config, {"recorder": None}), leg=1)

@@ -155,14 +155,31 @@ def steps(monkeypatch: pytest.MonkeyPatch):
 
     monkeypatch.setattr(bootstrap, "find_uv", lambda: "uv")
     monkeypatch.setattr(bootstrap, "run", run)
+    monkeypatch.setattr(bootstrap.subprocess, "Popen", Compiling)
     return ran, codes
+
+
+class Compiling:
+    """The process that compiles the kernels."""
+
+    code, waited, killed = 0, False, False
+
+    def __init__(self, command: tuple[str, ...], **_: object) -> None:
+        assert command == bootstrap.KERNELS
+
+    def wait(self) -> int:
+        type(self).waited = True
+        return self.code
+
+    def kill(self) -> None:
+        type(self).killed = True
 
 
 def test_tests_that_failed_beside_others_are_run_once_more_alone(steps):
     ran, codes = steps
     codes += [0, 1, 0]
     assert bootstrap.check([]) == 0
-    assert len(ran) == 5
+    assert len(ran) == 4
     assert ran[2] == (*ran[1], *bootstrap.FAILED_ALONE)
 
 
@@ -186,16 +203,32 @@ def test_every_test_belongs_to_one_step(steps):
     bootstrap.check([])
     chosen = [arguments[arguments.index("-m") + 1] for arguments in ran]
     for wall in (True, False):
-        for virtual in (True, False):
-            for traced in (True, False):
-                marks = {"wall": wall, "virtual": virtual, "traced": traced}
-                count = sum(eval(expression, {}, marks) for expression in chosen)
-                assert count == 1 or (wall and virtual)
+        for traced in (True, False):
+            marks = {"wall": wall, "traced": traced}
+            assert sum(eval(expression, {}, marks) for expression in chosen) == 1
 
 
 def test_kernels_are_compiled_before_any_test_runs(steps, monkeypatch: pytest.MonkeyPatch):
-    ran: list[str] = []
-    monkeypatch.setattr(bootstrap, "run", lambda *words: ran.append(" ".join(map(str, words))) or 0)
-    bootstrap.check([])
-    compiled = next(number for number, step in enumerate(ran) if "install.kernels" in step)
-    assert compiled < next(number for number, step in enumerate(ran) if "pytest" in step)
+    monkeypatch.setattr(Compiling, "waited", False)
+
+    def run(program: Path, *_: str) -> int:
+        assert Compiling.waited or program.name != "pytest"
+        return 0
+
+    monkeypatch.setattr(bootstrap, "run", run)
+    assert bootstrap.check([]) == 0
+    assert Compiling.waited
+
+
+def test_kernels_that_do_not_compile_fail_the_check_before_any_test(steps, monkeypatch: pytest.MonkeyPatch):
+    ran, _ = steps
+    monkeypatch.setattr(Compiling, "code", 1)
+    assert bootstrap.check([]) == 1
+    assert ran == []
+
+
+def test_the_compilation_ends_with_the_check(steps, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(Compiling, "killed", False)
+    monkeypatch.setattr(bootstrap, "run", lambda program, *_: 4 if program.name == "mypy" else 0)
+    assert bootstrap.check([]) == 4
+    assert Compiling.killed

@@ -14,6 +14,7 @@ from tests.unit.docs.command_lines import (
     FOREIGN,
     INSTEAD,
     ROOT,
+    SHORTENED,
     Line,
     commands_of,
     inline,
@@ -45,6 +46,12 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     # For lines that add stations, whichever line is first.
     authority = CliRunner().invoke(app, ["security", "init", "--folder", str(folder / "security")])
     assert authority.exit_code == 0, authority.output
+    way = (ROOT / "configs" / "paths" / "loop.csv").read_text().splitlines(keepends=True)[:32]
+    (folder / "short.csv").write_text("".join(way))
+    for name in SHORTENED:
+        (folder / f"short_{name}.yaml").write_text(
+            f"include: configs/{name}.yaml\nversion: 2\npath: {{ file: short.csv, closed: false }}\n"
+        )
     return folder
 
 

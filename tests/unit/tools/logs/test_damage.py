@@ -57,11 +57,10 @@ def test_no_damage_of_an_index_makes_messages(tmp_path):
     write(log, 1)
     whole, messages = log.read_bytes(), list(open_log(log))
     for place in range(int.from_bytes(whole[-28:-20], "little"), len(whole)):
-        for bit in (0x01, 0x80):
-            with flipped(log, place, bit):
-                reader = open_log(log)
-                assert list(reader) == messages
-                assert reader.fault == "has a damaged index"
+        with flipped(log, place, (0x01, 0x80)[place % 2]):
+            reader = open_log(log)
+            assert list(reader) == messages
+            assert reader.fault == "has a damaged index"
 
 
 def test_what_turned_into_an_end_is_none(tmp_path):
