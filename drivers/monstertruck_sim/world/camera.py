@@ -133,15 +133,15 @@ class SimulatedView:
         wall_height: float = 0.6,
         seed: int | None = None,
     ) -> None:
-        self._plant, self._cast, self.config, self._crowd, self._seed = plant, cast, config, crowd, seed
+        self.plant, self._cast, self.config, self.crowd, self._seed = plant, cast, config, crowd, seed
         self._wall_height = wall_height
         self._painters: dict[tuple[int, int], Painter] = {}
         self._panels = [tag_panel(tag) for tag in tags]
 
     def ranges(self, time_ns: int, angles: Array) -> Array:
         """Horizontal distances, m, at ``time_ns`` along ``angles`` from the truck's axis; inf = nothing; (n,)."""
-        self._plant.advance(time_ns)
-        x, y, yaw = self._plant.poses(np.array([time_ns]))[:3, 0]
+        self.plant.advance(time_ns)
+        x, y, yaw = self.plant.poses(np.array([time_ns]))[:3, 0]
         c, s = cos(yaw), sin(yaw)
         ahead, aside = self.config.x, self.config.y
         count = len(angles)
@@ -152,11 +152,11 @@ class SimulatedView:
         """``ViewSource``: asks the world at once, draws when called."""
         painter = self._painter(size)
         ranges = self.ranges(time_ns, painter.azimuths)
-        x, y, yaw = self._plant.poses(np.array([time_ns]))[:3, 0].tolist()
+        x, y, yaw = self.plant.poses(np.array([time_ns]))[:3, 0].tolist()
         place = mounted((x, y, yaw), self.config)
         panels = self._in_view(place)
-        if self._crowd is not None:
-            panels += [person_panel(*person, place) for person in self._crowd.people_at(time_ns)]
+        if self.crowd is not None:
+            panels += [person_panel(*person, place) for person in self.crowd.people_at(time_ns)]
         grain = self.grain(time_ns)
         return lambda: grain(painter.picture(ranges, panels, place))
 
@@ -170,7 +170,7 @@ class SimulatedView:
         if self._seed is None or not self.config.noise:
             return lambda picture: picture
         seed, noise = self._seed, self.config.noise
-        row, column = generator(seed, CAMERA, self._plant.slot(time_ns, 1_000_000)).integers(0, _GRAIN, 2).tolist()
+        row, column = generator(seed, CAMERA, self.plant.slot(time_ns, 1_000_000)).integers(0, _GRAIN, 2).tolist()
         return lambda picture: _grainy(picture, seed, noise, row, column)
 
     def _in_view(self, place: CameraPlace) -> list[FlatPanel]:
@@ -289,6 +289,18 @@ class Painter:
         at = np.clip(np.searchsorted(-fan, -azimuths), 0, len(fan) - 1)
         found: NDArray[np.bool_] = np.hypot(points[..., 0], points[..., 1]) < ranges[at] + BEHIND
         return found
+
+    def straight_pixels(self) -> tuple[float, Array]:
+        """How much wider a picture without distortion has to be, and where in it every pixel lies, (h, w, 2).
+
+        The wider one has as many pixels.
+        """
+        width, height = self._size
+        x, y = np.meshgrid(np.arange(width) - (width - 1) / 2, np.arange(height) - (height - 1) / 2)
+        right, down = self._straight(x / self._focal, y / self._focal)
+        right, down = right * self._focal, down * self._focal
+        wider = max(1.0, 2 * float(np.abs(right).max()) / (width - 1), 2 * float(np.abs(down).max()) / (height - 1))
+        return wider, np.stack((right / wider + (width - 1) / 2, down / wider + (height - 1) / 2), axis=-1)
 
     def _bent(self, right: Array, down: Array) -> Array:
         """Where the lens puts directions, in focal lengths, (n, 2)."""

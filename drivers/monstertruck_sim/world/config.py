@@ -323,6 +323,8 @@ class CameraConfig(Schema):
     """Standard deviation of a pixel's grey, of 255."""
     reach: Positive = 30.0
     """Nothing farther away is drawn, m."""
+    rendered: bool = False
+    """Pictures are rendered in three dimensions, with shadows (40 ms each by software); engine mujoco only."""
 
 
 class TagConfig(Schema):
@@ -669,6 +671,8 @@ class WorldConfig(Schema):
                 )
             if self.tilt.kind != "ground":
                 raise ValueError(f"engine mujoco: tilt {self.tilt.kind}: the ground tilts the robot; expected ground")
+        elif self.camera.rendered:
+            raise ValueError("engine plane: draws the camera's pictures itself; camera.rendered needs engine mujoco")
         elif self.ground or self.height_image is not None or self.mjcf is not None:
             raise ValueError("engine plane: has no ground, height_image or mjcf; expected engine mujoco")
         return self

@@ -21,7 +21,7 @@ from monstertruck_sim.world.camera import SimulatedView
 from monstertruck_sim.world.config import TiltConfig, WorldConfig
 from monstertruck_sim.world.obstacles import Box, Obstacle
 from monstertruck_sim.world.plane import Engine, PlanOutline, plane
-from monstertruck_sim.world.plant import Plant, Pose, TruthState
+from monstertruck_sim.world.plant import Caster, Plant, Pose, TruthState
 from monstertruck_sim.world.scene import Surroundings
 from monstertruck_sim.world.sensors import (
     SimulatedCompass,
@@ -67,10 +67,7 @@ class World:
         cast = self._space.cast
         self._lidar = SimulatedLidar(self._plant, sweep, config.lidar, noise_seed)
         self.lidar: RangeSource = self._lidar
-        self.view = SimulatedView(
-            self._plant, cast, config.camera,
-            tags=config.tags, crowd=self.scene, wall_height=config.lidar.wall_height, seed=noise_seed,
-        )  # fmt: skip
+        self.view = make_view(config, self._plant, cast, self.scene, noise_seed)
         self.motors: tuple[MotorPlant, ...] = tuple(
             SimulatedMotor(self._plant, config.truck.motor, noise_seed, i) for i in range(len(self._plant.shafts))
         )
@@ -204,6 +201,22 @@ def make_engine(config: WorldConfig, footprint: PlanOutline, start: Pose, seed: 
             ) from error
         return rigid(config, footprint, start)
     return plane(config, footprint, start, seed)
+
+
+def make_view(config: WorldConfig, plant: Plant, cast: Caster, scene: Surroundings, seed: int | None) -> SimulatedView:
+    """What the camera sees, drawn in the plane or rendered.
+
+    Raises:
+        NotInstalledError: this computer cannot render, or tags need a library that is not there.
+    """
+    drawn = SimulatedView(
+        plant, cast, config.camera, tags=config.tags, crowd=scene, wall_height=config.lidar.wall_height, seed=seed
+    )
+    if not config.camera.rendered:
+        return drawn
+    from monstertruck_sim.world3d.camera import RenderedView  # noqa: PLC0415  # the library of an extra
+
+    return RenderedView(drawn)
 
 
 def make_scene(config: WorldConfig, seed: int) -> Surroundings:

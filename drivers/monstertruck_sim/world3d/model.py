@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 from monstertruck_kinematics.description import HEAD_JOINTS, Description, Part, PartJoint, Shape
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.errors import InputError
+from monstertruck_sim.world.camera import CELLS, tag_pattern
+from monstertruck_sim.world.config import TagConfig
 from monstertruck_sim.world3d.heights import HeightGrid
 
 TIMESTEP: Final = 0.002
@@ -38,6 +40,8 @@ _TOUCHES: Final = {
     "ground": {"contype": "0", "conaffinity": "4"},
     "walls": {"contype": "0", "conaffinity": "8"},
 }
+_TAG_PIXELS: Final = 16
+"""Of a tag's cell in its texture."""
 _FLAT: Final = 1e-3
 """Least height of a height field, m."""
 
@@ -50,6 +54,8 @@ class Group(IntEnum):
     BLOCKS = 2
     ROBOT = 3
     MOVING = 4
+    SIGNS = 5
+    """Tags: nothing touches them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,6 +104,7 @@ class Site:
         heights: of the ground; None = level at 0.
         blocks: on it.
         scenery: assets, and bodies and geometries, of another MJCF file.
+        tags: on the walls.
     """
 
     walls: Array
@@ -105,6 +112,7 @@ class Site:
     heights: HeightGrid | None
     blocks: tuple[Block, ...] = ()
     scenery: tuple[Sequence[Element], Sequence[Element]] = ((), ())
+    tags: tuple[TagConfig, ...] = ()
 
 
 EMPTY: Final = Site(np.zeros((0, 4)), TALL, None)
@@ -190,6 +198,7 @@ def mjcf(description: Description, drive: DriveLine, friction: float, site: Site
             rgba="0.55 0.5 0.42 1",
         )
     _scenery(asset, world, site.scenery)
+    _tags(asset, world, site.tags)
     _spare(world)
     _robot(world, description)
     _drive(root, description, drive)
@@ -209,6 +218,11 @@ def load(description: Description, drive: DriveLine, friction: float, site: Site
     if (heights := site.heights) is not None:
         low, high = float(heights.z.min()), float(heights.z.max())
         model.hfield_data[:] = ((heights.z - low) / max(high - low, _FLAT)).astype(np.float32).ravel()
+    for i, tag in enumerate(site.tags):
+        texture = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_TEXTURE, f"tag_{i}")
+        shades = np.kron(tag_pattern(tag.tag), np.ones((_TAG_PIXELS, _TAG_PIXELS), np.uint8))
+        data = np.repeat(shades[:, :, None], model.tex_nchannel[texture], axis=2).ravel()
+        model.tex_data[model.tex_adr[texture] : model.tex_adr[texture] + len(data)] = data
     return model
 
 
@@ -266,6 +280,40 @@ def _walls(world: Element, site: Site) -> None:
             size=_text((x1 - x0) / 2, (y1 - y0) / 2, (top - bottom) / 2),
             pos=_text((x0 + x1) / 2, (y0 + y1) / 2, (top + bottom) / 2),
             rgba="0.86 0.84 0.78 1",
+        )
+
+
+def _tags(asset: Element, world: Element, tags: Sequence[TagConfig]) -> None:
+    """Sheets of paper on the walls; ``load`` paints them."""
+    for i, tag in enumerate(tags):
+        cells = len(tag_pattern(tag.tag))
+        pixels = f"{cells * _TAG_PIXELS}"
+        name = f"tag_{i}"
+        SubElement(
+            asset,
+            "texture",
+            name=name,
+            type="2d",
+            builtin="flat",
+            width=pixels,
+            height=pixels,
+            rgb1="1 1 1",
+            nchannel="3",
+        )
+        SubElement(asset, "material", name=name, texture=name, texrepeat="1 1", texuniform="false", specular="0")
+        side = tag.size * cells / CELLS / 2
+        SubElement(
+            world,
+            "geom",
+            name=name,
+            type="box",
+            group=f"{Group.SIGNS.value}",
+            contype="0",
+            conaffinity="0",
+            size=_text(side, side, 0.0005),
+            pos=_text(tag.x, tag.y, tag.z),
+            xyaxes=_text(-math.sin(tag.yaw), math.cos(tag.yaw), 0.0, 0.0, 0.0, 1.0),
+            material=name,
         )
 
 

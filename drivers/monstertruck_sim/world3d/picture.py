@@ -1,5 +1,6 @@
 """Pictures of the world, rendered by software without a screen (EGL)."""
 
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import mujoco
@@ -9,6 +10,8 @@ from numpy.typing import NDArray
 from monstertruck_runtime.errors import NotInstalledError
 from monstertruck_sim.world3d.model import Group
 
+Somebody = tuple[float, float, float, float]
+"""Place, height of the ground, and radius, m."""
 Picture = NDArray[np.uint8]
 """(height, width, 3), red, green and blue, the top row first."""
 
@@ -72,15 +75,38 @@ class WorldRenderer:
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
         self._view = mujoco.MjrRect(0, 0, width, height)
         self._option = mujoco.MjvOption()
-        self._option.geomgroup[:] = [group in list(Group) for group in range(mujoco.mjNGROUP)]
         self._pixels = np.empty((height, width, 3), np.uint8)
 
     def draw(self, data: mujoco.MjData, eye: Eye, *, shadows: bool = True) -> Picture:
         """The world at the state of ``data``."""
+        self.arrange(data, eye, shadows=shadows)
+        return self.render()
+
+    def arrange(
+        self,
+        data: mujoco.MjData,
+        eye: Eye,
+        *,
+        shadows: bool = True,
+        people: Sequence[Somebody] = (),
+        hidden: Collection[Group] = (),
+    ) -> None:
+        """Take over what is to be seen; needs no thread of its own.
+
+        Args:
+            data: state of the world.
+            eye: from where.
+            shadows: are drawn.
+            people: who is there.
+            hidden: groups that are left out.
+        """
+        self._option.geomgroup[:] = [group in list(Group) and group not in hidden for group in range(mujoco.mjNGROUP)]
         camera = mujoco.MjvCamera()
         mujoco.mjv_updateScene(
             self._model, data, self._option, None, camera, mujoco.mjtCatBit.mjCAT_ALL.value, self._scene
         )
+        for somebody in people:
+            self._add(*somebody)
         near = 0.01
         half = near * np.tan(eye.field_of_view / 2)
         for part in self._scene.camera:
@@ -89,10 +115,29 @@ class WorldRenderer:
             part.frustum_bottom, part.frustum_top = -half, half
             part.frustum_center, part.frustum_width = 0.0, half * self._view.width / self._view.height
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows
+
+    def render(self) -> Picture:
+        """What was arranged; in the thread that made the renderer."""
         self._gl.make_current()
         mujoco.mjr_render(self._view, self._scene, self._context)
         mujoco.mjr_readPixels(self._pixels, None, self._view, self._context)
         return self._pixels[::-1].copy()
+
+    def _add(self, x: float, y: float, z: float, radius: float) -> None:
+        """Legs, trunk and head of somebody who stands at a place."""
+        parts = (
+            (mujoco.mjtGeom.mjGEOM_CYLINDER, (0.8 * radius, 0.4, 0.0), 0.4, (0.2, 0.24, 0.36, 1.0)),
+            (mujoco.mjtGeom.mjGEOM_CYLINDER, (radius, 0.32, 0.0), 1.12, (0.6, 0.24, 0.2, 1.0)),
+            (mujoco.mjtGeom.mjGEOM_SPHERE, (0.12, 0.0, 0.0), 1.57, (0.8, 0.63, 0.5, 1.0)),
+        )
+        for kind, size, middle, colour in parts:
+            if self._scene.ngeom >= self._scene.maxgeom:
+                return
+            mujoco.mjv_initGeom(
+                self._scene.geoms[self._scene.ngeom], kind, np.array(size), np.array((x, y, z + middle)),
+                np.eye(3).ravel(), np.array(colour, np.float32),
+            )  # fmt: skip
+            self._scene.ngeom += 1
 
     def close(self) -> None:
         """Give the context back."""

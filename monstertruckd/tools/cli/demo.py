@@ -94,12 +94,22 @@ def simulate(
     ] = None,
     truth: Annotated[Path | None, typer.Option("--truth", help="Write what really happened (npz) at the end.")] = None,
     run: Annotated[bool, typer.Option("--run", help="Run the daemons of the same configurations, too.")] = False,
+    film: Annotated[
+        Path | None,
+        typer.Option(help="Film a run on the virtual clock instead, FILE.gif; engine mujoco.", show_default=False),
+    ] = None,
+    seconds: Annotated[float, typer.Option(min=1.0, max=3600.0, help="Of the film, of the run's time.")] = 30.0,
 ) -> None:
     """Serve simulated robots' devices behind ptys: at the ports their configurations name, else in a folder of yours.
 
     Faults are read from standard input as with `emulate`, each line beginning with the device's role, the monitor's
     name, or `usb` (an unknown word lists what it knows); with several robots the robot's name stands before it.
+    With `--film` nothing is served: robot and daemon run for some seconds on the virtual clock, the robot drives its
+    path or explores, and a moving picture of it is written.
     """
+    if film is not None:
+        _film(config, film, seconds, alone=robots is None and truth is None and not run)
+        return
     from monstertruckd.tools.simulation.config import load_simulated
     from monstertruckd.tools.simulation.fleet import as_fleet
     from monstertruckd.tools.simulation.simulate import serve
@@ -115,3 +125,19 @@ def simulate(
     until_stopped(main)
     if code:
         raise typer.Exit(code)
+
+
+def _film(config: Path, film: Path, seconds: float, *, alone: bool) -> None:
+    """Film one robot.
+
+    Raises:
+        InputError: of an option that does not go with it.
+    """
+    from monstertruck_runtime.errors import InputError
+    from monstertruckd.tools.demo.runs import run_film
+    from monstertruckd.tools.simulation.config import load_simulated
+
+    if not alone or load_simulated(config).sim.world.engine != "mujoco" or film.suffix.lower() != ".gif":
+        raise InputError(f"--film {film}: expected engine mujoco, a name.gif, and no --robots, --truth or --run")
+    run_film(config, film, seconds)
+    remark(f"wrote {seconds:g} s to {film}")

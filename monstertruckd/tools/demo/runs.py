@@ -9,8 +9,9 @@ import gc
 import os
 import socket
 from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -31,6 +32,8 @@ from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 from monstertruckd.tools.status.screen import draw
 from monstertruckd.tools.status.watch import PERIOD, Follower
 
+SETTLE = 3.0
+"""Seconds for the sensors, and a first map."""
 TIMEOUT = 60.0
 """Seconds for the two processes to come up (the first run compiles the ray caster)."""
 
@@ -78,6 +81,37 @@ def run_fast_demo(config_file: Path, folder: Path, seed: int | None, film: Path 
         speedup=speed,
         closed=config.path is not None and config.path.closed,
     )
+
+
+def run_film(config_file: Path, film: Path, seconds: float) -> None:
+    """Film a run on the virtual clock: the truck drives the path it has, or explores; people walk.
+
+    Args:
+        config_file: simulated truck's configuration.
+        film: GIF.
+        seconds: of the run.
+
+    Raises:
+        InputError: there is nothing to film, or no place for the file.
+        NotInstalledError: this computer cannot draw.
+    """
+    with TemporaryDirectory(prefix="monstertruck-") as folder:
+        config, tree = load_config(write_overlay(config_file, Path(folder), "tcp/127.0.0.1:0"), SimulatedTruckConfig)
+
+        async def main(clock: VirtualClock) -> None:
+            rig = VirtualRig(config, clock, tree)
+            async with rig.running(), _filmed(rig, clock, film):
+                operator = LocalOperator(rig.daemon, clock)
+                begin = clock.now()
+                with suppress(TimeoutError):
+                    async with clock.deadline(SETTLE):
+                        await operator.arm()
+                if config.explorer is not None:
+                    await clock.sleep(SETTLE)
+                    await operator.call("explore", {**await operator.header(), "order": "start"})
+                await clock.sleep_until(begin + round(seconds * SECOND))
+
+        run_virtual(main, start=SECOND)
 
 
 @asynccontextmanager

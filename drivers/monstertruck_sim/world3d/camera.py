@@ -1,0 +1,81 @@
+"""The truck's camera in three dimensions: rendered by software (EGL) in a thread of its own, then bent by the lens."""
+
+import weakref
+from concurrent.futures import ThreadPoolExecutor
+from math import atan, tan
+from typing import Final
+
+import numpy as np
+
+from monstertruck_runtime.errors import InputError
+from monstertruck_sim.world.camera import Drawing, Painter, Picture, SimulatedView, mounted
+from monstertruck_sim.world3d.model import Group
+from monstertruck_sim.world3d.picture import Eye, WorldRenderer
+from monstertruck_sim.world3d.plant import RigidPlant
+
+FULL_SIZE: Final = (640, 480)
+"""Pixels: with what it is tried whether this computer can draw."""
+
+
+class RenderedView(SimulatedView):
+    """``ViewSource`` of a robot of rigid bodies; what it asks of the plane is answered as by ``SimulatedView``.
+
+    Args:
+        drawn: the same camera in the plane.
+
+    Raises:
+        NotInstalledError: this computer has no EGL.
+        InputError: the robot is none of rigid bodies.
+    """
+
+    def __init__(self, drawn: SimulatedView) -> None:
+        self.__dict__.update(drawn.__dict__)
+        if not isinstance(drawn.plant, RigidPlant):
+            raise InputError("sim.world.camera.rendered: expected engine mujoco")
+        self._rigid = drawn.plant
+        self._thread = ThreadPoolExecutor(1, "camera")
+        """A context of EGL belongs to one thread."""
+        self._renderers: dict[tuple[int, int], tuple[WorldRenderer, float, Painter]] = {}
+        self._renderer(FULL_SIZE)
+        # At the program's end the thread is gone before, and the context with it.
+        weakref.finalize(self, _close, self._thread, self._renderers).atexit = False
+
+    def exposure(self, time_ns: int, size: tuple[int, int]) -> Drawing:
+        """``ViewSource``: takes the world over at once, renders when called."""
+        self._rigid.advance(time_ns)
+        renderer, wider, painter = self._renderer(size)
+        x, y, yaw, pitch, roll, z = self._rigid.poses(np.array([time_ns]))[:, 0].tolist()
+        place = mounted((x, y, yaw), self.config, (pitch, roll, z))
+        _, down, ahead = place.axes.tolist()
+        width, height = size
+        upright = 2 * atan(height / width * tan(self.config.field_of_view / 2) * wider)
+        eye = Eye(tuple(place.centre.tolist()), tuple(ahead), (-down[0], -down[1], -down[2]), upright)
+        people = [] if self.crowd is None else self.crowd.people_at(time_ns)
+        standing = [(px, py, z, radius) for px, py, radius in people]
+        renderer.arrange(self._rigid.data, eye, people=standing, hidden=(Group.ROBOT,))
+        grain = self.grain(time_ns)
+        return lambda: grain(_bent(self._thread.submit(renderer.render).result(), wider, painter))
+
+    def _renderer(self, size: tuple[int, int]) -> tuple[WorldRenderer, float, Painter]:
+        if size not in self._renderers:
+            renderer = self._thread.submit(WorldRenderer, self._rigid.model, *size).result()
+            painter = self._painter(size)
+            self._renderers[size] = renderer, painter.straight_pixels()[0], painter
+        return self._renderers[size]
+
+
+def _bent(picture: Picture, wider: float, painter: Painter) -> Picture:
+    """Through the lens: each pixel from where the picture without distortion has it."""
+    if wider == 1.0:
+        return picture
+    import cv2  # noqa: PLC0415  # the library of an extra
+
+    at = painter.straight_pixels()[1].astype(np.float32)
+    bent: Picture = np.asarray(cv2.remap(picture, at, None, cv2.INTER_LINEAR), dtype=np.uint8)
+    return bent
+
+
+def _close(thread: ThreadPoolExecutor, renderers: dict[tuple[int, int], tuple[WorldRenderer, float, Painter]]) -> None:
+    for renderer, *_ in renderers.values():
+        thread.submit(renderer.close).result()
+    thread.shutdown()
