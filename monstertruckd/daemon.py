@@ -9,6 +9,7 @@ import dataclasses
 import secrets
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from contextlib import AsyncExitStack, asynccontextmanager
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
@@ -59,6 +60,7 @@ from monstertruckd.gate import rpc as gate_rpc
 from monstertruckd.gate.core import Gate
 from monstertruckd.gate.latch import EstopLatch, Latch, MemoryLatch, marks_folder
 from monstertruckd.gate.service import GateInputs, GateOutputs, GateService
+from monstertruckd.host import acknowledge
 from monstertruckd.host.health import ClockService, HealthBoard, MeterService
 from monstertruckd.host.journal import published
 from monstertruckd.host.notify import notify_from, status_line
@@ -66,6 +68,7 @@ from monstertruckd.host.stall import StallWatch
 from monstertruckd.host.versions import running_versions
 from monstertruckd.recorder.black_box import BlackBox
 from monstertruckd.recorder.recorder import LogDigest, Recorder
+from monstertruckd.recorder.recordings import Recordings
 
 
 class Daemon:
@@ -315,6 +318,8 @@ class Daemon:
         rpc.register("config", config, AccessRole.OBSERVER)
         rpc.register("versions", versions, AccessRole.OBSERVER)
         live.register(rpc)
+        acknowledge.register(rpc, self._events)
+        self._recordings().register(rpc)
         rpc.register(REMOTE_STEP, self._remote_steps.serve)
         gate_rpc.register(rpc, self.bus, self.clock)
         loaded = self._tree.calibration if self._tree is not None else None
@@ -329,6 +334,14 @@ class Daemon:
             self._calibration.stamped,
         )
         return rpc
+
+    def _recordings(self) -> Recordings:
+        recorder, boxes = self.config.recorder, self.config.black_box_folder
+        folders = {} if recorder is None else {"run": Path(recorder.directory)}
+        if boxes is not None:
+            folders["blackbox"] = boxes
+        written = lambda: None if self.recorder is None else self.recorder.path  # noqa: E731  # it comes later
+        return Recordings(folders, written, self.clock, self._events, self._offload)
 
     def _reconfigure(self, config: TruckConfig) -> None:
         self.gate.configure(config.gate, config.weakened())

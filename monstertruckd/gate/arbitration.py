@@ -15,6 +15,8 @@ Rules:
 - After a STOP order every source must send a neutral request before it may drive again, until the truck is armed again;
   for one that was driving, none for its lease is as good. A source that is first heard after the stop is no exception.
 - An ARM order with ``hold`` keeps planners out until one without.
+- An operator who drives may hand over to one who has asked. For a moment nobody else of their priority may drive, and
+  the former driver not before a neutral request.
 """
 
 from collections.abc import Iterable, Mapping
@@ -39,6 +41,13 @@ Key = tuple[bool, str]
 
 MAX_KEYS: Final = 64
 """Different events (reason and source) within one interval: sources may invent any number of names."""
+
+ASKING: Final = 20 * SECOND
+"""An operator who asks for the drive is forgotten after this, ns."""
+MAX_ASKING: Final = 4
+"""Operators who ask at once; one more replaces the oldest."""
+HANDED: Final = 3 * SECOND
+"""Others wait so long for the operator to whom the drive was handed over, ns."""
 
 MODE_REASONS: Final = {GateMode.ESTOPPED: (Reason.ESTOPPED,), GateMode.DISARMED: (Reason.DISARMED,)}
 """Why the truck does not drive in these modes."""
@@ -102,6 +111,10 @@ class Sources:
         """Source and time (ns) of the newest order that stops."""
         self._stop_of_others = "", 0
         """The same of the newest one of another source than that."""
+        self._asking: dict[str, int] = {}
+        """Operators who ask for the drive, and until when that counts, ns."""
+        self._handed: tuple[str, int, int] | None = None
+        """Operator to whom the drive was handed over, until when (ns) and below which rank others wait for it."""
 
     def accept_request(self, request: DriveRequest, now: int) -> Reason:
         """OK, or why a drive request from outside is refused."""
@@ -174,8 +187,45 @@ class Sources:
             now: ns.
             holder: key of the driving source.
         """
-        able = [source for source in self.live(now) if not source.held and source.rank >= self._min_rank]
+        able = [
+            source
+            for source in self.live(now)
+            if not source.held and source.rank >= self._min_rank and not self._waits(source, now)
+        ]
         return max(able, key=lambda source: (source.rank, source.requests_motion, source.key == holder), default=None)
+
+    def ask(self, name: str, now: int) -> None:
+        """An operator asks for the drive."""
+        self._asking = {other: until for other, until in self._asking.items() if now <= until and other != name}
+        while len(self._asking) >= MAX_ASKING:
+            del self._asking[next(iter(self._asking))]
+        self._asking[name] = now + ASKING
+
+    def asking(self, now: int) -> tuple[str, ...]:
+        """Operators who ask for the drive, the newest last."""
+        return tuple(name for name, until in self._asking.items() if now <= until)
+
+    def hand_over(self, holder: Source, to: str, now: int) -> None:
+        """``holder`` lets ``to`` drive; it must send a neutral request before it may drive itself."""
+        holder.held = True
+        self._asking.pop(to, None)
+        self._handed = to, now + HANDED, holder.rank
+        self._min_rank = min(self._min_rank, PRIORITY[Role.STATION])
+
+    def handed_to(self, now: int) -> str | None:
+        """Operator to whom the drive was handed over just now."""
+        return self._handed[0] if self._handed is not None and now <= self._handed[1] else None
+
+    def live_name(self, name: str, now: int) -> bool:
+        """Whether an operator of this name sends requests."""
+        return any(not source.inside and source.request.source == name for source in self.live(now))
+
+    def _waits(self, source: Source, now: int) -> bool:
+        """Whether the drive was just handed over to another than this one."""
+        to = self.handed_to(now)
+        if to is None or (source.request.source == to and not source.inside):
+            return False
+        return self._handed is not None and source.rank <= self._handed[2]
 
     def priority(self, source: Source, now: int, holder: Key | None) -> Reason:
         """OK if this source drives or would drive, or why not."""

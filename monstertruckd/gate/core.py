@@ -98,6 +98,10 @@ class GateOutput(NamedTuple):
     """M."""
     waiting: tuple[str, ...]
     """Planners that request motion while nobody drives."""
+    asking: tuple[str, ...]
+    """Operators who ask for the drive."""
+    handed_to: str | None
+    """Operator to whom it was handed over just now."""
     events: tuple[GateEvent, ...]
     trips: tuple[Trip, ...]
 
@@ -287,7 +291,15 @@ class Gate:
             return self._disarm_by(request, now)
         if request.role not in OPERATORS:
             return self._refuse_order(now, Reason.BAD_ROLE, request)
-        return self._arm(request, now) if request.order is Order.ARM else self._reset(request, now)
+        match request.order:
+            case Order.ASK:
+                return self._ask(request, now)
+            case Order.HAND_OVER:
+                return self._hand_over(request, now)
+            case Order.ARM:
+                return self._arm(request, now)
+            case _:
+                return self._reset(request, now)
 
     def _refuse(self, now: int, reason: Reason, request: DriveRequest | ControlRequest, text: str = "") -> Reason:
         what = request.order.value if isinstance(request, ControlRequest) else "drive"
@@ -344,6 +356,32 @@ class Gate:
             return self._refuse_order(now, Reason.NOT_ARMED_SPEED, request)
         self._sources.release(planners=not request.hold)
         self._states.arm(now, request.source)
+        return ACCEPTED
+
+    def _ask(self, request: ControlRequest, now: int) -> Decision:
+        holder = self._states.holder
+        if holder is None or holder.inside:
+            return self._refuse_order(now, Reason.NOT_FOUND, request, "no operator drives who could hand over")
+        if holder.request.source == request.source:
+            return self._refuse_order(now, Reason.BUSY, request, f"{request.source} drives already")
+        self._sources.ask(request.source, now)
+        text = f"{request.source} asks {holder.request.source} to hand over"
+        self._events.emit(now, Reason.DRIVE_ASKED, Severity.INFO, text, source=request.source)
+        return ACCEPTED
+
+    def _hand_over(self, request: ControlRequest, now: int) -> Decision:
+        holder = self._states.holder
+        if holder is None or holder.inside or holder.request.source != request.source:
+            return self._refuse_order(now, Reason.BAD_ROLE, request, "only the operator who drives can hand over")
+        asking = self._sources.asking(now)
+        if request.to not in asking or request.to is None:
+            text = f"to {request.to}: expected one who asks: {', '.join(asking) or 'nobody does'}"
+            return self._refuse_order(now, Reason.BAD_INPUT, request, text)
+        text = f"{request.source} hands over to {request.to}"
+        self._sources.hand_over(holder, request.to, now)
+        self._events.emit(now, Reason.DRIVE_HANDED, Severity.INFO, text, source=request.source, always=True)
+        if not self._sources.live_name(request.to, now):
+            self._stop(now, [_order_cause(Reason.DRIVE_HANDED, text, request, now)], ordered=True)
         return ACCEPTED
 
     def _reset(self, request: ControlRequest, now: int) -> Decision:
@@ -518,6 +556,8 @@ class Gate:
             reasons=reasons,
             stopping_distance=self._limiter.stopping_distance(now),
             waiting=self._sources.waiting(now) if holder is None else (),
+            asking=self._sources.asking(now),
+            handed_to=self._sources.handed_to(now),
             events=self._events.drain(),
             trips=self._stops.drain(now),
         )

@@ -26,6 +26,8 @@ CARRIED_OUT: Final[Mapping[Order, Callable[[GateMode], bool]]] = {
     Order.ESTOP: lambda mode: mode is GateMode.ESTOPPED,
     Order.RESET: lambda mode: mode is not GateMode.ESTOPPED,
     Order.STOP: lambda mode: not mode.moving,
+    Order.ASK: lambda _: True,
+    Order.HAND_OVER: lambda _: True,
 }
 """Modes that show an order as carried out."""
 

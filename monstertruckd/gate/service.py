@@ -302,7 +302,8 @@ class GateService:
             stop = self._stop(trip, now)
             self._outputs.stops.put(stop)
             log.log(logging.INFO if stop.ordered else logging.WARNING, "%s", stop.text)
-        visible = (output.mode, output.holder, output.reasons, output.waiting, self._latched)
+        asked = output.asking, output.handed_to
+        visible = (output.mode, output.holder, output.reasons, output.waiting, asked, self._latched)
         if visible != self._published or now - self._published_at >= STATE_PERIOD:
             self._published, self._published_at = visible, now
             self._outputs.state.put(self._state(output, now))
@@ -349,6 +350,8 @@ class GateService:
             latched=self._latched is True,
             weakened=self._weakened,
             waiting=output.waiting,
+            asking=output.asking,
+            handed_to=output.handed_to,
         )
 
     def _mark_latch(self) -> None:

@@ -342,6 +342,14 @@ class TruckClient(Operator):
             self._put(REQ_CONTROL, ControlRequest(**self._header(1.0), order=order))
         return self._outcome(order, self._overtaking, {"hold": True} if hold else {})
 
+    async def ask_to_drive(self) -> GateState:
+        """Ask the operator who drives to hand over: it shows in ``asking`` of the gate's state. Raises as ``order``."""
+        return await self._outcome(Order.ASK, self._overtaking, {})
+
+    async def hand_over(self, to: str) -> GateState:
+        """Let another operator drive, who has asked for it; only who drives can. Raises as ``order`` does."""
+        return await self._outcome(Order.HAND_OVER, self._overtaking, {"to": to})
+
     async def _outcome(self, order: Order, overtaking: int, more: dict[str, Any]) -> GateState:
         header = self._header(1.0) if order in UNCONDITIONAL else await self._answered(1.0)
         if overtaking != self._overtaking and order not in UNCONDITIONAL:

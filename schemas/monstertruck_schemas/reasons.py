@@ -39,6 +39,8 @@ class Reason(StrEnum):
     NOT_INSTALLED = "not_installed", 13, "something is not installed, or not as it should be"
     COMMAND_FAILED = "command_failed", 14, "a program of the computer failed"
     REPLAY_DIFFERS = "replay_differs", 15, "the log computed again gives other outputs than it holds"
+    ACKNOWLEDGED = "acknowledged", 0, "an operator has seen a warning"
+    RECORDING_DELETED = "recording_deleted", 0, "a recording was deleted"
     SETTING_CHANGED = "setting_changed", 0, "a setting was changed while the robot runs"
     BLACK_BOX_SAVED = "black_box_saved", 0, "the minute before a stop was saved"
 
@@ -94,6 +96,8 @@ class Reason(StrEnum):
     FAULTS_REPEAT = "faults_repeat", 73, "short faults come again and again"
     WEAKENED = "weakened", 77, "configured less safe than by default"
     ARMED = "armed", 0, "armed"
+    DRIVE_ASKED = "drive_asked", 0, "an operator asks the one who drives to hand over"
+    DRIVE_HANDED = "drive_handed", 0, "an operator handed the drive over to another one"
     DRIVING = "driving", 0, "driving"
     STOPPED = "stopped", 0, "at standstill"
 

@@ -144,6 +144,10 @@ class Order(StrEnum):
     ESTOP = "estop"
     RESET = "reset"
     STOP = "stop"
+    ASK = "ask"
+    """Ask the operator who drives to hand over; changes nothing by itself."""
+    HAND_OVER = "hand_over"
+    """Of the operator who drives: let another one drive, who has asked for it."""
 
 
 STARTING: Final = frozenset({Order.ARM, Order.RESET})
@@ -154,11 +158,13 @@ UNCONDITIONAL: Final = frozenset({Order.ESTOP, Order.STOP})
 
 
 class ControlRequest(Request):
-    """Arm, disarm, emergency stop, its reset, or give up driving."""
+    """Arm, disarm, emergency stop, its reset, give up driving, ask for it, or hand it over."""
 
     order: Order
     hold: bool = False
     """Of an order to arm: planners do not drive until the truck is armed without it."""
+    to: Annotated[str, Field(max_length=64)] | None = None
+    """Of a hand-over: source that may drive then."""
 
 
 class Waypoint(Schema):

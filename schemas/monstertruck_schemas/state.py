@@ -185,3 +185,7 @@ class GateState(Message):
     """Settings by which this robot is less safe than by the defaults, each with its value and the default."""
     waiting: tuple[str, ...] = ()
     """Planners that ask for motion while nobody drives: they set off as soon as the truck is armed without ``hold``."""
+    asking: tuple[str, ...] = ()
+    """Operators who have asked the one who drives to hand over, the newest last."""
+    handed_to: str | None = None
+    """Operator to whom the drive was handed over just now: others of that priority wait a moment."""
