@@ -5,7 +5,7 @@ from typing import Annotated, Final, Literal
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from monstertruck_runtime.errors import InputError
-from monstertruck_schemas.req import UNCONDITIONAL, BehaviourOrder, GoalOrder, Order, Role
+from monstertruck_schemas.req import UNCONDITIONAL, BehaviourOrder, ExploreOrder, GoalOrder, MissionOrder, Order, Role
 from monstertruck_schemas.roles import AccessRole
 
 MOST_BYTES: Final = 16_384
@@ -98,7 +98,103 @@ class Behave(_Command):
     behaviour: Annotated[str, Field(max_length=64)] = ""
 
 
-Asked = GiveOrder | SetGoal | ChangeGoal | Behave
+class Explore(_Command):
+    """Start an exploration, or end it."""
+
+    do: Literal["explore"]
+    id: Id
+    order: ExploreOrder
+
+
+class DoMission(_Command):
+    """Start a mission, go on with one, or end it."""
+
+    do: Literal["mission"]
+    id: Id
+    order: MissionOrder
+    text: Annotated[str, Field(max_length=MOST_BYTES)] = ""
+    """Of a start: the mission's file, YAML."""
+
+
+class Track(_Command):
+    """Follow a path that was drawn on the map, in its frame."""
+
+    do: Literal["track"]
+    id: Id
+    points: Annotated[tuple[tuple[Number, Number], ...], Field(min_length=2, max_length=400)]
+
+
+class AskToDrive(_Command):
+    """Ask whoever drives to hand over."""
+
+    do: Literal["ask"]
+    id: Id
+
+
+class HandOver(_Command):
+    """Let somebody drive who has asked for it."""
+
+    do: Literal["hand_over"]
+    id: Id
+    to: Annotated[str, Field(max_length=64)]
+
+
+class Acknowledge(_Command):
+    """A warning was seen."""
+
+    do: Literal["acknowledge"]
+    id: Id
+    text: Annotated[str, Field(max_length=200)]
+
+
+class ListSettings(_Command):
+    """What may be changed while the robot runs."""
+
+    do: Literal["settings"]
+    id: Id
+
+
+class ChangeSetting(_Command):
+    """Change a setting while the robot runs."""
+
+    do: Literal["set"]
+    id: Id
+    key: Annotated[str, Field(max_length=100)]
+    value: Number | bool | Annotated[str, Field(max_length=100)]
+    save: bool = False
+
+
+class ListRecordings(_Command):
+    """The recordings on the robot."""
+
+    do: Literal["recordings"]
+    id: Id
+
+
+class DeleteRecording(_Command):
+    """Delete one of them."""
+
+    do: Literal["delete_recording"]
+    id: Id
+    name: Annotated[str, Field(max_length=128)]
+
+
+Asked = (
+    GiveOrder
+    | SetGoal
+    | ChangeGoal
+    | Behave
+    | Explore
+    | DoMission
+    | Track
+    | AskToDrive
+    | HandOver
+    | Acknowledge
+    | ListSettings
+    | ChangeSetting
+    | ListRecordings
+    | DeleteRecording
+)
 """Commands whose outcome is answered."""
 Command = Annotated[Watch | LookAtFleet | EchoRequest | Heartbeat | Asked, Field(discriminator="do")]
 
@@ -109,7 +205,9 @@ def needed(command: Watch | LookAtFleet | EchoRequest | Heartbeat | Asked) -> Ac
     """What a user must be to ask for it: everybody may look, and stop."""
     if isinstance(command, GiveOrder) and command.order in UNCONDITIONAL:
         return AccessRole.OBSERVER
-    return AccessRole.OBSERVER if isinstance(command, Watch | LookAtFleet | EchoRequest) else AccessRole.PILOT
+    if isinstance(command, Watch | LookAtFleet | EchoRequest | ListSettings | ListRecordings):
+        return AccessRole.OBSERVER
+    return AccessRole.ENGINEER if isinstance(command, ChangeSetting | DeleteRecording) else AccessRole.PILOT
 
 
 def parse(data: str) -> Watch | LookAtFleet | EchoRequest | Heartbeat | Asked:

@@ -17,6 +17,7 @@ from monstertruck_runtime.mailbox import Mailbox, fifo, latest
 from monstertruck_schemas import topics
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.event import Event
+from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.state import GateState, Grid
 from monstertruck_schemas.topics import Topic
 from monstertruckd.station import frames
@@ -40,6 +41,8 @@ MOST_TILES: Final = 400
 """Changed parts of the map that are kept until the whole map comes again."""
 
 
+GROUND_BUDGET: Final = 20_000.0
+"""Bytes a second that pictures of the ground may take."""
 CAMERA_BUDGET: Final = 300_000.0
 """Bytes a second that pictures of the camera may take."""
 
@@ -63,6 +66,10 @@ def _whole(topic: Topic[M], kind: str, period: float = 0.0) -> Shown[M]:
 SHOWN: Final[tuple[Shown[Any], ...]] = (
     _whole(topics.GATE, "gate"),
     _whole(topics.STOP, "stop"),
+    _whole(topics.EXPLORE, "explore", 0.5),
+    _whole(topics.MISSION, "mission", 0.5),
+    _whole(topics.CALIBRATION, "calibration"),
+    Shown(topics.GROUND, "ground", frames.ground, 2.0, GROUND_BUDGET),
     Shown(topics.SCAN, "scan", frames.scan, 0.1),
     Shown(topics.TRANSFORMS, "transforms", frames.transforms, 0.2),
     Shown(topics.PATH, "path", frames.path),
@@ -146,6 +153,8 @@ class RobotFeed:
         self._newest: dict[str, Frame] = {}
         self._events: deque[str] = deque(maxlen=KEPT_EVENTS)
         self._facts: str | None = None
+        self._known = False
+        """Whether ``_facts`` are those of the robot as it runs."""
         self._link = frames.text("link", alive=False, round_trip=None, text="")
 
     # Browsers
@@ -199,17 +208,17 @@ class RobotFeed:
 
     async def _ask(self, client: TruckClient) -> None:
         """Measure the round trip; ask a robot that appears what it is."""
-        known = False
+        self._known = False
         while True:
             sent = self._clock.now()
             try:
                 self.gate = await client.get_retained(topics.GATE)
             except TruckError as error:
-                known = False
+                self._known = False
                 self._set_link(None, str(error))
             else:
                 self._set_link((self._clock.now() - sent) / SECOND, "")
-                known = known or await self._learn(client)
+                self._known = self._known or await self._learn(client)
             await self._clock.sleep(PING)
 
     async def _learn(self, client: TruckClient) -> bool:
@@ -264,6 +273,8 @@ class RobotFeed:
             self._tell(self.map.change(part))
 
     def _take_event(self, event: Event) -> None:
+        if event.reason is Reason.SETTING_CHANGED:
+            self._known = False
         frame = frames.message("event", event)
         self._events.append(frame)
         self._tell(frame)

@@ -6,6 +6,7 @@ its head (uint32, little-endian), the head (JSON, with the ``kind``), then the p
 
 import json
 import struct
+import zlib
 from typing import Any, Final
 
 import numpy as np
@@ -14,7 +15,7 @@ from monstertruck_runtime.errors import RequestRefusedError, TruckError
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.plan import Path
 from monstertruck_schemas.sensor import CompressedImage, LaserScan
-from monstertruck_schemas.state import Grid, Odometry, Transforms
+from monstertruck_schemas.state import Grid, Ground, Odometry, Transforms
 
 Frame = str | bytes
 
@@ -103,6 +104,8 @@ def facts(config: dict[str, Any], versions: dict[str, str]) -> str:
         devices=sorted(devices),
         goals=config.get("planner") is not None,
         mapping=config.get("slam") is not None,
+        explores=config.get("explorer") is not None,
+        tracks=config.get("tracker") is not None,
         behaviours=sorted(config.get("behaviours") or {}),
         versions=versions,
     )
@@ -122,6 +125,13 @@ def grid_head(of: Grid) -> dict[str, Any]:
 def tile(of: Grid) -> bytes:
     """A part of the map; payload: int8 cells, row 0 at the lowest y."""
     return binary("tile", of.cells.tobytes(), **grid_head(of))
+
+
+def ground(of: Ground) -> bytes:
+    """The ground; payload: zlib of the uint8 roughness, mm of standard deviation, 255 = unknown."""
+    head = {"width": of.width, "height": of.height, "resolution": of.resolution, "frame": of.frame}
+    origin = [of.origin.x, of.origin.y, of.origin.yaw]
+    return binary("ground", zlib.compress(of.roughness.tobytes(), 1), origin=origin, **head)
 
 
 def _rounded(*values: float) -> list[float]:

@@ -5,19 +5,46 @@ held up on its way: what the hand did then says nothing of what it does now.
 """
 
 import asyncio
+import json
 import math
 from collections import deque
-from collections.abc import Coroutine
+from collections.abc import Coroutine, Sequence
 from contextlib import suppress
 from typing import Any, Final
 
+import numpy as np
+from pydantic import ValidationError
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
+
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import SECOND, Clock
-from monstertruck_runtime.errors import NotFoundError, TruckError
+from monstertruck_runtime.errors import InputError, NotFoundError, TruckError
 from monstertruck_runtime.stations import own_source, tls_for
+from monstertruck_runtime.threads import in_thread
+from monstertruck_schemas.mission import Mission
+from monstertruck_schemas.plan import Path
+from monstertruck_schemas.req import MissionOrder
 from monstertruckd.station import frames
 from monstertruckd.station.address import RobotAddress
-from monstertruckd.station.commands import Asked, Behave, ChangeGoal, GiveOrder, Heartbeat, SetGoal
+from monstertruckd.station.commands import (
+    Acknowledge,
+    Asked,
+    AskToDrive,
+    Behave,
+    ChangeGoal,
+    ChangeSetting,
+    DeleteRecording,
+    DoMission,
+    Explore,
+    GiveOrder,
+    HandOver,
+    Heartbeat,
+    ListRecordings,
+    ListSettings,
+    SetGoal,
+    Track,
+)
 from monstertruckd.station.viewer import Viewer
 
 LEASE: Final = 0.25
@@ -30,6 +57,12 @@ RETRY: Final = 1.0
 """Seconds between two attempts to reach the robot, and in which it answers."""
 TELL_LATE: Final = 1.0
 """Seconds between two remarks on late heartbeats."""
+SPACING: Final = 0.05
+"""Between two poses of a drawn path, m."""
+SMOOTHING: Final = 0.12
+"""Standard deviation of the weights with which a drawn line is smoothed, m: hands tremble."""
+SHORTEST: Final = 0.3
+"""Of a drawn path, m."""
 
 
 class DelayWatch:
@@ -114,7 +147,7 @@ class Pilot:
     def ask(self, command: Asked) -> None:
         """Carry out a command, and send its outcome to the browser. An emergency stop has left when this returns."""
         if self._client is None:
-            self._answer(command.id, NotFoundError("no link to the robot"))
+            self._viewer.tell(frames.refusal(command.id, NotFoundError("no link to the robot")))
             return
         task = asyncio.create_task(self._outcome(command.id, _call(self._client, command)))
         self._answers.add(task)
@@ -122,15 +155,12 @@ class Pilot:
 
     async def _outcome(self, number: int, call: Coroutine[Any, Any, Any]) -> None:
         try:
-            await call
+            value = await call
         except TruckError as error:
-            self._answer(number, error)
+            self._viewer.tell(frames.refusal(number, error))
         else:
-            self._answer(number, None)
-
-    def _answer(self, number: int, error: TruckError | None) -> None:
-        answer = frames.text("answer", id=number, ok=True) if error is None else frames.refusal(number, error)
-        self._viewer.tell(answer)
+            more = {"value": value} if isinstance(value, dict) else {}
+            self._viewer.tell(frames.text("answer", id=number, ok=True, **more))
 
 
 def _call(client: TruckClient, command: Asked) -> Coroutine[Any, Any, Any]:
@@ -143,3 +173,77 @@ def _call(client: TruckClient, command: Asked) -> Coroutine[Any, Any, Any]:
             return client.goal_control(command.order)
         case Behave():
             return client.behave(command.order, command.behaviour)
+        case Explore():
+            return client.explore(command.order)
+        case DoMission():
+            return _mission(client, command)
+        case Track():
+            return client.path(drawn_path(command.points))
+        case _:
+            return _other_call(client, command)
+
+
+def _other_call(client: TruckClient, command: Asked) -> Coroutine[Any, Any, Any]:
+    """What moves nothing."""
+    match command:
+        case AskToDrive():
+            return client.ask_to_drive()
+        case HandOver():
+            return client.hand_over(command.to)
+        case Acknowledge():
+            return client.call("acknowledge", {"text": command.text})
+        case ListSettings():
+            return client.call("settings")
+        case ChangeSetting():
+            return client.call("set", {"values": {command.key: command.value}, "save": command.save})
+        case ListRecordings():
+            return client.call("recordings")
+        case DeleteRecording():
+            return client.call("recording_delete", {"name": command.name})
+        case _:
+            raise AssertionError(command)
+
+
+async def _mission(client: TruckClient, command: DoMission) -> dict[str, Any]:
+    mission = None
+    if command.order is MissionOrder.START:
+        mission = await in_thread(lambda: read_mission(command.text))
+    return await client.mission(command.order, mission)
+
+
+def read_mission(text: str) -> Mission:
+    """The mission of a file's text.
+
+    Raises:
+        InputError: it is none; names the first mistake.
+    """
+    try:
+        return Mission.model_validate_json(json.dumps(YAML(typ="safe", pure=True).load(text)))
+    except ValidationError as error:
+        detail = error.errors(include_url=False)[0]
+        raise InputError(f"mission: {'.'.join(map(str, detail['loc']))}: {detail['msg']}") from error
+    except (YAMLError, TypeError, ValueError, RecursionError) as error:
+        raise InputError(f"mission: not valid YAML: {' '.join(str(error).split())[:160]}") from error
+
+
+def drawn_path(points: Sequence[tuple[float, float]]) -> Path:
+    """A drawn line as a path, resampled to ``SPACING`` and smoothed, driven forward; m, in map.
+
+    Raises:
+        InputError: it is too short to be driven.
+    """
+    line = np.array(points)
+    steps = np.hypot(*np.diff(line, axis=0).T)
+    line = line[np.concatenate(([True], steps > 1e-6))]
+    along = np.concatenate(([0.0], np.cumsum(steps[steps > 1e-6])))
+    if along[-1] < SHORTEST:
+        raise InputError(f"path: {along[-1]:.2f} m are drawn, expected at least {SHORTEST} m")
+    places = np.linspace(0.0, along[-1], max(math.ceil(along[-1] / SPACING), 2) + 1)
+    spread = np.exp(-0.5 * ((places[:, None] - places) / SMOOTHING) ** 2)
+    even = np.column_stack([np.interp(places, along, line[:, i]) for i in (0, 1)])
+    smooth = spread @ even / spread.sum(axis=1, keepdims=True)
+    smooth[[0, -1]] = even[[0, -1]]
+    turns = np.gradient(smooth, axis=0)
+    poses = np.column_stack((smooth, np.arctan2(turns[:, 1], turns[:, 0])))
+    header: dict[str, Any] = {"stamp": 0, "received": 0, "seq": 0, "frame": "map"}
+    return Path(**header, poses=poses.ravel(), directions=np.ones(len(poses)), name="drawn")

@@ -19,11 +19,13 @@ from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.endpoints import LOCAL_HOSTS
 from monstertruck_runtime.errors import BusyError, InputError, NotPermittedError
 from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.roles import AccessRole
 from monstertruckd import __version__
 from monstertruckd.station import commands, frames
 from monstertruckd.station.address import RobotAddress
 from monstertruckd.station.commands import EchoRequest, Heartbeat, LookAtFleet, Watch
 from monstertruckd.station.discovery import Discovery
+from monstertruckd.station.downloads import download
 from monstertruckd.station.feed import RobotFeed
 from monstertruckd.station.fleet import FleetBoard
 from monstertruckd.station.pilot import Pilot
@@ -34,6 +36,7 @@ log = logging.getLogger(__name__)
 
 PAGE: Final = Path(__file__).parent / "page"
 FILES: Final = re.compile(r"[a-z_]+\.(?:js|css|svg)")
+RECORDING: Final = re.compile(r"[A-Za-z0-9_.-]{1,120}\.mcap")
 TYPES: Final = {".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml", ".html": "text/html"}
 BEAT: Final = 10.0
 """Seconds between two pings of the WebSocket itself; a browser that does not answer for half of it is let go."""
@@ -171,6 +174,7 @@ class Station:
                 web.get("/page/{file}", self._file),
                 web.get("/strings.json", self._table),
                 web.get("/robots/{robot}/map/{version}", self._map),
+                web.get("/robots/{robot}/recordings/{name}", self._recording),
                 web.get("/socket", self._socket),
             ]
         )
@@ -229,6 +233,15 @@ class Station:
         return web.Response(
             body=cells, content_type="application/octet-stream", headers={"Content-Encoding": "deflate"}
         )
+
+    async def _recording(self, request: web.Request) -> web.StreamResponse:
+        feed, name, user = self.feeds.get(request.match_info["robot"]), request.match_info["name"], request[USER]
+        if not user.may(AccessRole.PILOT):
+            raise self._refused(request, f"user {user.name!r} is {user.role.value}: expected pilot")
+        if feed is None or not RECORDING.fullmatch(name):
+            raise web.HTTPNotFound
+        log.info("recording %s of %s goes to %s", name, feed.address.name, request.remote)
+        return await download(request, feed.address, name, user.name, self._clock, HEADERS)
 
     # One browser
 

@@ -36,7 +36,7 @@ def asked(folder: Path, scenario):
             events.append(text)
 
         Recordings(folders, lambda: folder / "run-000002-000.mcap", clock, note, inline).register(rpc)
-        return await scenario(lambda name, **payload: rpc.call(name, {"source": "ann", **payload}), clock)
+        return await scenario(lambda what, **payload: rpc.call(what, {"source": "ann", **payload}), clock)
 
     return run_virtual(main), events
 

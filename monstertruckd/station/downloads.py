@@ -1,0 +1,90 @@
+"""Recordings of a robot as files for a browser, which goes on with a download that was broken off by itself."""
+
+import base64
+import logging
+import re
+from collections.abc import Mapping
+from typing import Any, Final
+
+from aiohttp import web
+
+from monstertruck_runtime.client import TruckClient
+from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.errors import NotFoundError, RequestRefusedError, TruckError
+from monstertruck_runtime.stations import own_source, tls_for
+from monstertruck_schemas.reasons import Reason
+from monstertruckd.station.address import RobotAddress
+
+log = logging.getLogger(__name__)
+
+WAIT: Final = 5.0
+"""Seconds in which the robot answers."""
+RANGE: Final = re.compile(r"bytes=(\d{1,15})-")
+
+
+async def download(
+    request: web.Request, address: RobotAddress, name: str, user: str, clock: Clock, headers: Mapping[str, str]
+) -> web.StreamResponse:
+    """Answer a request for a recording; the robot says how fast.
+
+    A ``Range`` of the kind ``bytes=N-`` gives what comes behind (RFC 9110, 14.2), others are ignored.
+
+    Raises:
+        web.HTTPException: the robot refuses, is not there, or the range lies behind the end.
+    """
+    tls = tls_for(address.endpoint)
+    source = f"{own_source(None if tls is None else tls.owner())}-{user}{'.' * bool(user)}files"
+    async with TruckClient(
+        address.name, address.endpoint, source=source[-64:], clock=clock, timeout=WAIT, tls=tls
+    ) as truck:
+        offset = _begin(request.headers.get("Range"))
+        try:
+            first = await truck.call("recording_read", {"name": name, "offset": offset})
+        except TruckError as error:
+            raise _failure(error) from error
+        size = int(first["bytes"])
+        if 0 < size <= offset:
+            raise web.HTTPRequestRangeNotSatisfiable(headers={"Content-Range": f"bytes */{size}"})
+        response = web.StreamResponse(status=206 if offset else 200)
+        response.content_type = "application/octet-stream"
+        response.content_length = size - offset
+        response.headers.update(headers)
+        response.headers["Accept-Ranges"] = "bytes"
+        response.headers["ETag"] = f'"{name}"'
+        response.headers["Content-Disposition"] = f'attachment; filename="{name}"'
+        if offset:
+            response.headers["Content-Range"] = f"bytes {offset}-{size - 1}/{size}"
+        await response.prepare(request)
+        await _stream(response, truck, name, first, offset, size)
+        return response
+
+
+async def _stream(
+    response: web.StreamResponse, truck: TruckClient, name: str, answer: dict[str, Any], at: int, size: int
+) -> None:
+    """Pass chunks on until the size that was promised; one that fails breaks the connection, for the browser to see."""
+    while True:
+        data = base64.b64decode(answer["data"])[: size - at]
+        await response.write(data)
+        at += len(data)
+        if at >= size:
+            return
+        try:
+            answer = await truck.call("recording_read", {"name": name, "offset": at})
+        except TruckError as error:
+            log.warning("download of %s broken off at %d of %d bytes: %s", name, at, size, error)
+            raise ConnectionResetError(str(error)) from error
+
+
+def _begin(header: str | None) -> int:
+    found = RANGE.fullmatch(header or "")
+    return 0 if found is None else int(found[1])
+
+
+def _failure(error: TruckError) -> web.HTTPException:
+    if isinstance(error, NotFoundError):
+        return web.HTTPNotFound(text=str(error))
+    if isinstance(error, RequestRefusedError):
+        busy = error.refusal is Reason.BUSY
+        return web.HTTPTooManyRequests(text=str(error)) if busy else web.HTTPForbidden(text=str(error))
+    return web.HTTPGatewayTimeout(text=str(error))
