@@ -52,7 +52,7 @@ def live_settings(config: Schema, prefix: str = "") -> Iterator[LiveSetting]:
         if isinstance(value, Schema):
             yield from live_settings(value, f"{prefix}{name}.")
         elif LIVE in field.metadata:
-            meaning = " ".join((field.description or "").split())
+            meaning = " ".join((field.description or "").replace("``", "").split())
             yield LiveSetting(f"{prefix}{name}", value, meaning, *_bounds(field))
 
 

@@ -62,7 +62,7 @@ class TiltLimits(Schema):
     hysteresis: Annotated[float, Field(ge=0)] = 0.035
     """A limit ends when the tilt is this much below where it began, rad."""
     slow_speed: LivePositive = 0.08
-    """M/s."""
+    """Speed limit from there on, m/s."""
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:

@@ -239,10 +239,12 @@ def drawn_path(points: Sequence[tuple[float, float]]) -> Path:
     if along[-1] < SHORTEST:
         raise InputError(f"path: {along[-1]:.2f} m are drawn, expected at least {SHORTEST} m")
     places = np.linspace(0.0, along[-1], max(math.ceil(along[-1] / SPACING), 2) + 1)
-    spread = np.exp(-0.5 * ((places[:, None] - places) / SMOOTHING) ** 2)
     even = np.column_stack([np.interp(places, along, line[:, i]) for i in (0, 1)])
-    smooth = spread @ even / spread.sum(axis=1, keepdims=True)
-    smooth[[0, -1]] = even[[0, -1]]
+    # Mirrored at its ends, which stay where they are.
+    more = min(math.ceil(3 * SMOOTHING / SPACING), len(even) - 1)
+    mirrored = np.concatenate((2 * even[0] - even[more:0:-1], even, 2 * even[-1] - even[-2 : -2 - more : -1]))
+    weights = np.exp(-0.5 * (np.arange(-more, more + 1) * SPACING / SMOOTHING) ** 2)
+    smooth = np.column_stack([np.convolve(mirrored[:, i], weights / weights.sum(), "valid") for i in (0, 1)])
     turns = np.gradient(smooth, axis=0)
     poses = np.column_stack((smooth, np.arctan2(turns[:, 1], turns[:, 0])))
     header: dict[str, Any] = {"stamp": 0, "received": 0, "seq": 0, "frame": "map"}

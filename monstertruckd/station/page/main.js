@@ -1,8 +1,9 @@
 import { Drive } from "./drive.js";
 import { FleetView } from "./fleet.js";
 import { MapView } from "./map.js";
-import { Panels } from "./panels.js";
+import { element, Panels } from "./panels.js";
 import { Link } from "./socket.js";
+import { Work } from "./work.js";
 import { degrees, loadWords, number, reason, words } from "./words.js";
 
 const byId = (id) => document.getElementById(id);
@@ -40,6 +41,7 @@ const drive = new Drive(link);
 const map = new MapView(byId("map"), link, aimed);
 const panels = new Panels(link);
 const fleet = new FleetView(link, map, chosen);
+new Work(link, outcome);
 
 link.on("robots", ({ names }) => {
   const select = byId("robots");
@@ -69,6 +71,35 @@ byId("arm").onclick = async () => {
   const waiting = link.newest.gate?.waiting.length > 0;
   if ((await order("arm", { hold: !waiting })) && !waiting) drive.keepArmed();
 };
+// Who drives: asking for it, and handing it over.
+
+let handed = null;
+byId("ask").onclick = async () => {
+  const holder = link.newest.gate?.holder;
+  if (outcome("ask", await link.ask({ do: "ask" }))) byId("refusal").textContent = words("asked", { name: holder });
+};
+link.on("gate", (gate) => {
+  const operator = gate.holder && gate.role !== "tracker";
+  const mine = gate.holder === panels.source;
+  byId("ask").hidden = !operator || mine;
+  const asking = mine && link.newest.hello?.role !== "observer" ? gate.asking : [];
+  if (byId("asking").dataset.shown !== asking.join()) {
+    byId("asking").dataset.shown = asking.join();
+    byId("asking").replaceChildren(...asking.map((name) => {
+      const give = element("button", { className: "go", textContent: words("hand_over") });
+      give.onclick = async () => outcome("hand_over", await link.ask({ do: "hand_over", to: name }));
+      return element("p", {}, element("span", { textContent: words("asking", { name }) }), give);
+    }));
+  }
+  if (gate.handed_to !== handed) {
+    handed = gate.handed_to;
+    if (handed && handed === panels.source) {
+      drive.keepArmed();
+      panels.drop("handed");
+      panels.banner("handed", words("banner.handed"), "good");
+    }
+  }
+});
 for (const name of ["disarm", "stop", "reset"]) byId(name).onclick = () => order(name);
 
 byId("theme").onclick = () => {
@@ -95,31 +126,78 @@ byId("tool-out").onclick = () => map.zoom(1 / 1.3);
 byId("tool-fit").onclick = () => map.fit();
 byId("tool-goal").onclick = () => aim(!map.aiming);
 
+byId("tool-draw").onclick = () => draw(!map.drawing);
+
 function aim(on) {
+  if (on) draw(false);
   map.setAiming(on);
   press("tool-goal", on);
-  byId("hint").hidden = !on;
-  byId("hint").textContent = words("goal.hint");
+  hint(on ? "goal.hint" : null);
 }
 
-function aimed(pose) {
+function draw(on) {
+  if (on) aim(false);
+  map.setDrawing(on);
+  press("tool-draw", on);
+  hint(on ? "map.draw.hint" : null);
+}
+
+function hint(key) {
+  byId("hint").hidden = key === null;
+  if (key !== null) byId("hint").textContent = words(key);
+}
+
+function aimed(pose, line = null) {
   aim(false);
+  draw(false);
   map.pending = pose;
+  map.drawn = line;
+  if (line) map.via = [];
   showGoal();
 }
 
+function showWaypoints() {
+  const key = JSON.stringify(map.via);
+  byId("waypoints").hidden = !map.via.length;
+  if (byId("waypoints").dataset.shown === key) return;
+  byId("waypoints").dataset.shown = key;
+  byId("waypoints").replaceChildren(...map.via.map(([x, y], i) => {
+    const drop = element("button", { className: "quiet", textContent: "×", ariaLabel: words("goal.via.drop", { number: i + 1 }) });
+    drop.onclick = () => {
+      map.take("via", map.via.filter((_, j) => j !== i));
+      showGoal();
+    };
+    return element("li", {}, element("span", { textContent: words("goal.via.row", { x: number(x), y: number(y) }) }), drop);
+  }));
+}
+
+const LAYERS = ["scan", "trail", "frontiers", "points", "ground"];
+for (const name of LAYERS) {
+  const input = element("input", { type: "checkbox", checked: map.layers[name] });
+  input.onchange = () => map.setLayer(name, input.checked);
+  byId("layers").append(element("label", {}, input, ` ${words(`layer.${name}`)}`));
+}
+byId("tool-layers").onclick = () => {
+  byId("layers").hidden = !byId("layers").hidden;
+  byId("tool-layers").setAttribute("aria-expanded", !byId("layers").hidden);
+};
+
 function showGoal() {
   const state = link.newest.goal;
-  const pending = map.pending;
+  const pending = map.pending ?? map.drawn;
   const running = state && state.phase !== "idle";
   byId("goal").hidden = !pending && !(state?.number > 0);
-  byId("goal-go").hidden = byId("goal-drop").hidden = !pending;
+  byId("goal-drop").hidden = !pending;
+  byId("goal-go").hidden = byId("goal-via").hidden = !map.pending;
+  byId("path-go").hidden = !map.drawn;
+  showWaypoints();
   byId("goal-pause").hidden = Boolean(pending) || !running || state.phase === "paused";
   byId("goal-resume").hidden = Boolean(pending) || state?.phase !== "paused";
   byId("goal-cancel").hidden = Boolean(pending) || !running;
   byId("goal-go").textContent = words(link.newest.gate?.mode === "disarmed" ? "goal.arm" : "goal.go");
   let text = "";
-  if (pending) text = words("goal.at", { x: number(pending[0]), y: number(pending[1]), yaw: degrees(pending[2]) });
+  if (map.drawn) text = words("path.drawn", { metres: number(lengthOf(map.drawn), 1) });
+  else if (pending) text = words("goal.at", { x: number(pending[0]), y: number(pending[1]), yaw: degrees(pending[2]) });
   else if (running) text = words("goal.state", { number: state.number, phase: words(`phase.${state.phase}`), remaining: number(state.remaining, 1) });
   else if (state) text = words("goal.ended", { number: state.number, text: state.text || reason(state.outcome) });
   if (byId("goal-text").textContent !== text) byId("goal-text").textContent = text;
@@ -131,17 +209,36 @@ link.on("robot", showGoal);
 byId("goal-go").onclick = async () => {
   const goal = map.pending;
   const armed = link.newest.gate?.mode !== "disarmed";
-  if (!outcome("map.goal", await link.ask({ do: "goal", goal }))) return;
+  if (!outcome("map.goal", await link.ask({ do: "goal", goal, via: map.via }))) return;
   map.pending = null;
+  map.via = [];
   showGoal();
   if (!armed) await order("arm");
 };
+byId("goal-via").onclick = () => {
+  map.via = [...map.via, map.pending.slice(0, 2)];
+  map.take("pending", null);
+  showGoal();
+  aim(true);
+};
+byId("path-go").onclick = async () => {
+  if (!outcome("map.draw", await link.ask({ do: "track", points: map.drawn }))) return;
+  map.take("drawn", null);
+  showGoal();
+  if (link.newest.gate?.mode === "disarmed") await order("arm");
+};
 byId("goal-drop").onclick = () => {
+  map.drawn = null;
+  map.via = [];
   map.take("pending", null);
   showGoal();
 };
 for (const name of ["pause", "resume", "cancel"]) {
   byId(`goal-${name}`).onclick = async () => outcome(`goal.${name}`, await link.ask({ do: "goal_control", order: name }));
+}
+
+function lengthOf(line) {
+  return line.slice(1).reduce((sum, [x, y], i) => sum + Math.hypot(x - line[i][0], y - line[i][1]), 0);
 }
 
 document.documentElement.dataset.ready = "true";

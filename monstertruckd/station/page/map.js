@@ -1,10 +1,13 @@
 // The map: grid, tiles, scan, trail, route, footprint, stopping distance and goal on one canvas.
 import { compose, moved, outline, wheelAngles, wrapped } from "./geometry.js";
 
-const COLOURS = ["map", "map-free", "map-wall", "map-grid", "scan", "trail", "route", "deformed", "goal", "ghost", "truck", "ink", "card", "accent"];
+const COLOURS = ["map", "map-free", "map-wall", "map-grid", "scan", "trail", "route", "deformed", "goal", "ghost", "truck", "ink", "card", "accent", "frontier", "point"];
 const TRAIL_STEP = 0.03;
 const TRAIL_LENGTH = 6000;
 const POSES = 60;
+const DRAWN_STEP = 0.08; // metres between two points of a path that is drawn
+const DRAWN_MOST = 400;
+const ROUGH = 30; // millimetres of standard deviation that are drawn full
 const AIM = 0.15; // metres of dragging from which on it is a heading
 
 export class MapView {
@@ -18,6 +21,8 @@ export class MapView {
     this.follow = true;
     this.headingUp = false;
     this.aiming = false;
+    this.drawing = false;
+    this.layers = { scan: true, trail: true, frontiers: false, points: true, ground: false, ...JSON.parse(localStorage.getItem("layers") ?? "{}") };
     this.pointers = new Map();
     this.clear();
     this.readColours();
@@ -42,8 +47,10 @@ export class MapView {
     this.grid = null;
     this.tiles = new Map();
     this.path = this.route = null;
-    this.pending = null;
+    this.pending = this.drawn = null;
+    this.via = [];
     this.goal = null;
+    this.ground = null;
     this.wanted = 0;
     this.dirty = true;
   }
@@ -74,7 +81,8 @@ export class MapView {
     link.on("map", (message) => this.takeMap(message));
     link.on("tile", (message) => this.takeTile(message));
     link.on("goal", (state) => this.take("goal", state.goal));
-    link.on("gate", () => (this.dirty = true));
+    for (const kind of ["gate", "explore", "points"]) link.on(kind, () => (this.dirty = true));
+    link.on("ground", (message) => this.takeGround(message));
     const { canvas } = this;
     canvas.addEventListener("pointerdown", (event) => this.press(event));
     canvas.addEventListener("pointermove", (event) => this.drag(event));
@@ -167,6 +175,26 @@ export class MapView {
     this.dirty = true;
   }
 
+  async takeGround(message) {
+    const cells = new Uint8Array(await new Response(new Blob([message.payload]).stream().pipeThrough(new DecompressionStream("deflate"))).arrayBuffer());
+    if (this.link.newest.ground !== message || cells.length !== message.width * message.height) return;
+    const canvas = Object.assign(document.createElement("canvas"), { width: message.width, height: message.height });
+    const data = canvas.getContext("2d").createImageData(message.width, message.height);
+    cells.forEach((rough, i) => {
+      if (rough === 255) return;
+      data.data.set([208, 96, 16, Math.min(rough / ROUGH, 1) * 200 + 20], 4 * i);
+    });
+    canvas.getContext("2d").putImageData(data, 0, 0);
+    this.take("ground", { ...message, canvas });
+  }
+
+  setLayer(name, shown) {
+    this.layers[name] = shown;
+    localStorage.setItem("layers", JSON.stringify(this.layers));
+    if (name === "frontiers") for (const image of [this.grid, ...this.tiles.values()]) if (image) this.paint(image);
+    this.dirty = true;
+  }
+
   /** Draw the cells of a grid into a canvas of their own, in the theme's colours. */
   paint(image) {
     const { width, height, cells } = image;
@@ -182,6 +210,15 @@ export class MapView {
       colours[value] = (255 << 24) | (b << 16) | (g << 8) | r;
     }
     for (let i = 0; i < cells.length; i++) pixels[i] = cells[i] < 0 ? 0 : colours[cells[i]];
+    if (this.layers.frontiers) {
+      const [r, g, b] = rgb(this.colour.frontier);
+      const edge = (255 << 24) | (b << 16) | (g << 8) | r;
+      for (let y = 1; y < height - 1; y++) {
+        for (let i = y * width + 1; i < (y + 1) * width - 1; i++) {
+          if (cells[i] >= 0 && cells[i] < 40 && (cells[i - 1] < 0 || cells[i + 1] < 0 || cells[i - width] < 0 || cells[i + width] < 0)) pixels[i] = edge;
+        }
+      }
+    }
     context.putImageData(data, 0, 0);
     return image;
   }
@@ -203,6 +240,7 @@ export class MapView {
   press(event) {
     this.canvas.setPointerCapture(event.pointerId);
     this.pointers.set(event.pointerId, [event.offsetX, event.offsetY]);
+    if (this.drawing && this.pointers.size === 1) this.take("drawn", [this.toWorld(event.offsetX, event.offsetY)]);
     if (this.aiming && this.pointers.size === 1) {
       const [x, y] = this.toWorld(event.offsetX, event.offsetY);
       this.pending = [x, y, this.pose ? Math.atan2(y - this.pose[1], x - this.pose[0]) : 0];
@@ -215,7 +253,11 @@ export class MapView {
     if (!before) return;
     const now = [event.offsetX, event.offsetY];
     this.pointers.set(event.pointerId, now);
-    if (this.aiming && this.pointers.size === 1) {
+    if (this.drawing && this.drawn && this.pointers.size === 1) {
+      const [x, y] = this.toWorld(...now);
+      const [lx, ly] = this.drawn.at(-1);
+      if (Math.hypot(x - lx, y - ly) > DRAWN_STEP && this.drawn.length < DRAWN_MOST) this.drawn.push([x, y]);
+    } else if (this.aiming && this.pointers.size === 1) {
       const [x, y] = this.toWorld(...now);
       const [gx, gy] = this.pending;
       if (Math.hypot(x - gx, y - gy) > AIM) this.pending[2] = Math.atan2(y - gy, x - gx);
@@ -238,7 +280,13 @@ export class MapView {
   }
 
   release(event) {
-    if (!this.pointers.delete(event.pointerId) || !this.aiming || this.pointers.size) return;
+    if (!this.pointers.delete(event.pointerId) || this.pointers.size) return;
+    if (this.drawing) {
+      const line = event.type === "pointercancel" || !this.drawn || this.drawn.length < 2 ? null : this.drawn;
+      this.take("drawn", line);
+      if (line) this.onAim(null, line);
+    }
+    if (!this.aiming) return;
     if (event.type === "pointercancel") this.pending = null;
     this.onAim(this.pending);
     this.dirty = true;
@@ -276,6 +324,13 @@ export class MapView {
     this.aiming = aiming;
     if (aiming) this.pending = null;
     this.canvas.classList.toggle("aiming", aiming);
+    this.dirty = true;
+  }
+
+  setDrawing(drawing) {
+    this.drawing = drawing;
+    if (drawing) this.pending = this.drawn = null;
+    this.canvas.classList.toggle("aiming", drawing || this.aiming);
     this.dirty = true;
   }
 
@@ -322,14 +377,16 @@ export class MapView {
     const px = 1 / this.scale;
     if (this.grid) this.drawImage(c, this.grid);
     for (const tile of this.tiles.values()) this.drawImage(c, tile);
+    if (this.ground && this.layers.ground) this.drawImage(c, this.ground);
     this.drawLines(c, px);
-    this.stroke(c, this.trail, this.colour.trail, 2 * px);
+    if (this.layers.trail) this.stroke(c, this.trail, this.colour.trail, 2 * px);
     if (this.path?.deformed && this.route) this.stroke(c, this.route, this.colour.route, 1.5 * px, [6 * px, 5 * px]);
     if (this.path) this.stroke(c, this.path.points, this.colour[this.path.deformed ? "deformed" : "route"], 3 * px);
-    this.drawScan(c, px);
+    if (this.layers.scan) this.drawScan(c, px);
     this.drawGhost(c, px);
     if (this.pose) this.drawTruck(c, px);
     if (this.goal) this.drawGoal(c, [this.goal.x, this.goal.y, this.goal.yaw], px, this.colour.goal);
+    this.drawPlaces(c, px);
     if (this.pending) this.drawGoal(c, this.pending, px, this.colour.accent);
     c.setTransform(this.ratio, 0, 0, this.ratio, 0, 0);
     this.drawScale(c);
@@ -451,6 +508,33 @@ export class MapView {
     c.beginPath();
     c.arc(pose[0], pose[1], 4 * px, 0, 2 * Math.PI);
     c.fill();
+  }
+
+  /** Drawn path, waypoints, where an exploration goes, and points of interest. */
+  drawPlaces(c, px) {
+    if (this.drawn) this.stroke(c, this.drawn, this.colour.accent, 3 * px);
+    if (this.via.length) this.stroke(c, [...(this.pose ? [this.pose] : []), ...this.via, ...(this.pending ? [this.pending] : [])], this.colour.accent, 1.5 * px, [4 * px, 4 * px]);
+    this.via.forEach(([x, y], i) => this.mark(c, px, x, y, this.colour.accent, String(i + 1)));
+    const { explore, points } = this.link.newest;
+    if (this.layers.frontiers && explore?.target && explore.phase !== "idle") this.mark(c, px, explore.target.x, explore.target.y, this.colour.frontier, "");
+    if (this.layers.points) for (const { x, y, name } of points?.points ?? []) this.mark(c, px, x, y, this.colour.point, name ?? "");
+  }
+
+  mark(c, px, x, y, colour, label) {
+    c.beginPath();
+    c.arc(x, y, 7 * px, 0, 2 * Math.PI);
+    c.fillStyle = colour;
+    c.fill();
+    if (!label) return;
+    c.save();
+    c.translate(x, y);
+    c.rotate(-this.rotation);
+    c.scale(px, -px);
+    c.font = "bold 12px system-ui, sans-serif";
+    c.textAlign = "left";
+    c.fillStyle = this.colour.ink;
+    c.fillText(label, 10, 4);
+    c.restore();
   }
 
   drawScale(c) {

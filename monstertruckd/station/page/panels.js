@@ -5,6 +5,8 @@ import { degrees, number, reason, words } from "./words.js";
 const byId = (id) => document.getElementById(id);
 const KEPT = 300;
 const SILENT = 1.0;
+const HOT = 80; // degrees of the computer
+const LATE = 0.02; // seconds: one control tick
 
 export function element(name, fields = {}, ...children) {
   const made = Object.assign(document.createElement(name), fields);
@@ -92,6 +94,7 @@ export class Panels {
       if (look && !this.seen.has(key)) this.banner(key, words("banner.battery", { voltage: number(battery.voltage, 1), level: words(`level.${battery.level}`) }), look);
       if (!look) this.drop("battery-");
     }
+    this.warn();
     const silent = this.link.open && !this.alive && this.link.age("robot") > 2;
     if (silent && newest.gate) this.banner("silent", words("banner.silent"), "bad");
     else this.drop("silent");
@@ -99,6 +102,19 @@ export class Panels {
     if (facts && newest.hello && facts.versions.monstertruckd !== newest.hello.version) {
       this.banner("versions", words("versions.differ", { robot: facts.versions.monstertruckd, station: newest.hello.version }), "warn");
     }
+  }
+
+  /** Banners of tilt, temperature, loop and link. */
+  warn() {
+    const { gate, compass, host, loop, network } = this.link.newest;
+    const tilt = Math.acos(Math.cos(compass?.roll ?? 0) * Math.cos(compass?.pitch ?? 0));
+    const rows = [
+      ["tilt", gate?.reasons.some((why) => why.startsWith("tilt_")), () => words("banner.tilt", { tilt: degrees(tilt) }), gate?.reasons.includes("tilt_stop") ? "bad" : "warn"],
+      ["temperature", host && (host.throttled || host.temperature > HOT), () => words("banner.temperature", { temperature: number(host.temperature, 0) }), "warn"],
+      ["loop", loop && loop.lateness_p99 > LATE, () => words("banner.loop", { late: number(loop.lateness_p99 * 1000, 0) }), "warn"],
+      ["link", network && ["poor", "unusable", "down"].includes(network.level), () => words("banner.link", { level: words(`level.${network.level}`) }), "warn"],
+    ];
+    for (const [key, holds, text, look] of rows) holds ? this.banner(key, text(), look) : this.drop(key);
   }
 
   showLink() {
@@ -185,6 +201,8 @@ export class Panels {
     close.onclick = () => {
       this.seen.add(key);
       made.remove();
+      const said = made.firstChild.textContent.slice(0, 200);
+      if (look !== "good" && this.link.newest.hello?.role !== "observer") this.link.ask({ do: "acknowledge", text: said });
     };
     byId("banners").append(made);
   }
@@ -246,7 +264,39 @@ export class Panels {
     ]);
   }
 
+  showUsb() {
+    const nodes = this.link.newest.usb?.nodes ?? [];
+    const key = JSON.stringify(nodes);
+    if (byId("usb").dataset.shown === key) return;
+    byId("usb").dataset.shown = key;
+    const look = { present: "good", absent: "bad", waiting: "warn", held: "bad" };
+    const below = (parent) => nodes.filter((node) => node.parent === parent).map((node) => {
+      const facts = [node.name, node.tty, node.usb_id, node.replugs ? words("usb.replugs", { count: node.replugs }) : null].filter(Boolean).join(" · ");
+      const inner = below(node.name);
+      const state = node.hub && node.state === "present" ? [] : [element("span", { className: `state ${look[node.state]}`, textContent: words(`usb.${node.state}`) })];
+      return element("li", {}, element("span", { textContent: node.role ?? (node.title || node.name) }), ...state, element("small", { textContent: facts }),
+        ...(inner.length ? [element("ul", {}, ...inner)] : []));
+    });
+    const roots = below(null);
+    byId("usb").replaceChildren(...(roots.length ? roots : [element("li", { textContent: words("usb.none") })]));
+  }
+
+  showCalibration() {
+    const wizards = this.link.newest.calibration?.wizards ?? [];
+    const key = JSON.stringify(wizards);
+    if (byId("calibration").dataset.shown === key) return;
+    byId("calibration").dataset.shown = key;
+    byId("calibration").replaceChildren(...(wizards.length ? wizards : [null]).map((row) => row === null
+      ? element("tr", {}, element("td", { colSpan: 3, textContent: words("calibration.none") }))
+      : element("tr", {},
+        element("td", { textContent: row.wizard }, element("small", { textContent: words("calibration.age", { days: Math.max(Math.floor((Date.now() - Date.parse(row.date)) / 864e5), 0) }) })),
+        element("td", { textContent: row.grade, className: { A: "good", B: "", C: "warn" }[row.grade] }),
+        element("td", { textContent: row.expired ? words("calibration.expired", { why: row.expired }) : row.until.slice(0, 10), className: row.expired ? "bad" : "" }))));
+  }
+
   showSystem() {
+    this.showUsb();
+    this.showCalibration();
     const { host, loop, recorder, network, facts, hello } = this.link.newest;
     const delay = this.link.roundTrip();
     const gigabytes = (bytes) => `${number(bytes / 1e9, 1)} GB`;

@@ -1,0 +1,154 @@
+// The panes of tasks, settings and recordings.
+import { element } from "./panels.js";
+import { number, reason, words } from "./words.js";
+
+const byId = (id) => document.getElementById(id);
+
+function button(text, press, look = "") {
+  const made = element("button", { textContent: text, className: look });
+  made.onclick = press;
+  return made;
+}
+
+export class Work {
+  constructor(link, outcome) {
+    this.link = link;
+    this.outcome = outcome;
+    for (const kind of ["facts", "robot", "explore", "mission", "behaviour", "hello"]) link.on(kind, () => this.showTasks());
+    link.on("robot", () => this.clear());
+    link.on("event", ({ reason: why }) => {
+      if (why === "setting_changed" && !byId("pane-settings").hidden) this.loadSettings();
+      if (why === "recording_deleted" && !byId("pane-recordings").hidden) this.loadRecordings();
+    });
+    byId("tab-settings").addEventListener("click", () => this.loadSettings());
+    byId("tab-recordings").addEventListener("click", () => this.loadRecordings());
+    byId("recordings-again").onclick = () => this.loadRecordings();
+    byId("explore-start").onclick = () => this.ask("task.explore", { do: "explore", order: "start" });
+    byId("explore-stop").onclick = () => this.ask("task.explore", { do: "explore", order: "stop" });
+    byId("mission-start").onclick = () => byId("mission-file").click();
+    byId("mission-file").onchange = () => this.startMission();
+    byId("mission-resume").onclick = () => this.ask("task.mission", { do: "mission", order: "resume" });
+    byId("mission-stop").onclick = () => this.ask("task.mission", { do: "mission", order: "stop" });
+  }
+
+  get engineer() {
+    return this.link.newest.hello?.role === "engineer";
+  }
+
+  clear() {
+    byId("settings").replaceChildren();
+    byId("recordings").replaceChildren();
+    if (!byId("pane-settings").hidden) this.loadSettings();
+    if (!byId("pane-recordings").hidden) this.loadRecordings();
+  }
+
+  async ask(what, command) {
+    const answer = await this.link.ask(command);
+    this.outcome(what, answer);
+    return answer;
+  }
+
+  // Tasks
+
+  showTasks() {
+    const { facts, explore, mission, behaviour } = this.link.newest;
+    const observer = this.link.newest.hello?.role === "observer";
+    const text = (id, value) => byId(id).textContent !== value && (byId(id).textContent = value);
+    byId("task-explore").hidden = !facts?.explores;
+    const exploring = explore && explore.phase !== "idle";
+    byId("explore-start").hidden = exploring || observer;
+    byId("explore-stop").hidden = !exploring || observer;
+    text("explore-state", exploring ? words("task.explore.state", { frontiers: explore.frontiers, known: number(explore.known, 0), metres: number(explore.travelled, 0) })
+      : explore?.number ? explore.text || reason(explore.outcome) : words("task.none"));
+    byId("task-mission").hidden = !facts?.goals;
+    byId("mission-start").hidden = mission?.running || observer;
+    byId("mission-stop").hidden = !mission?.running || observer;
+    byId("mission-resume").hidden = !mission?.resumable || mission?.running || observer;
+    text("mission-state", mission?.running ? words("task.mission.state", { name: mission.name, step: mission.step, steps: mission.steps, doing: mission.doing })
+      : mission?.number ? mission.text || reason(mission.outcome) : words("task.none"));
+    const names = facts?.behaviours ?? [];
+    byId("task-behaviours").hidden = !names.length;
+    const key = `${names.join()}|${behaviour?.running ? behaviour.behaviour : ""}|${observer}`;
+    if (byId("behaviours").dataset.shown !== key) {
+      byId("behaviours").dataset.shown = key;
+      byId("behaviours").replaceChildren(...(observer ? [] : names.map((name) => {
+        const runs = behaviour?.running && behaviour.behaviour === name;
+        return button(words(runs ? "task.behaviour.stop" : "task.behaviour.start", { name: title(name) }),
+          () => this.ask("task.behaviour", { do: "behave", order: runs ? "stop" : "start", behaviour: name }), runs ? "go" : "");
+      })));
+    }
+    text("behaviour-state", behaviour?.running ? words("task.behaviour.state", { name: title(behaviour.behaviour), phase: behaviour.phase, seconds: number(behaviour.elapsed, 0) })
+      : behaviour?.number ? behaviour.text || reason(behaviour.outcome) : words("task.none"));
+    byId("tasks-none").hidden = Boolean(facts?.explores || facts?.goals || names.length);
+  }
+
+  async startMission() {
+    const [file] = byId("mission-file").files;
+    byId("mission-file").value = "";
+    if (file) this.ask("task.mission", { do: "mission", order: "start", text: await file.text() });
+  }
+
+  // Settings
+
+  async loadSettings() {
+    const answer = await this.link.ask({ do: "settings" });
+    if (!this.outcome("tab.settings", answer)) return;
+    byId("settings").replaceChildren(...answer.value.settings.map((row) => this.setting(row)));
+    byId("settings-save-row").hidden = !this.engineer;
+  }
+
+  setting({ key, value, began, meaning, above, at_least, below, at_most }) {
+    const id = `setting-${key.replaceAll(".", "-")}`;
+    const input = element("input", { id, value: String(value), disabled: !this.engineer, inputMode: "decimal", autocomplete: "off" });
+    input.setAttribute("aria-describedby", `${id}-note`);
+    const change = async () => {
+      if (input.value === String(value)) return;
+      const wanted = Number.isFinite(Number(input.value)) && input.value.trim() ? Number(input.value) : input.value;
+      const answer = await this.link.ask({ do: "set", key, value: wanted, save: byId("settings-save").checked });
+      if (!this.outcome(key, answer)) input.value = String(value);
+    };
+    input.onchange = change;
+    const bounds = [[">", above], ["≥", at_least], ["<", below], ["≤", at_most]]
+      .filter(([, bound]) => bound !== null).map(([sign, bound]) => `${sign} ${Number(bound.toPrecision(4))}`).join(", ");
+    const changed = value === began ? "" : words("settings.began", { value: began });
+    return element("div", { className: `setting${changed ? " changed" : ""}` }, element("label", { htmlFor: id, textContent: key }), input,
+      element("p", { id: `${id}-note`, className: "note", textContent: [meaning, bounds, changed].filter(Boolean).join(" · ") }));
+  }
+
+  // Recordings
+
+  async loadRecordings() {
+    const answer = await this.link.ask({ do: "recordings" });
+    if (!this.outcome("tab.recordings", answer)) return;
+    const rows = answer.value.recordings;
+    byId("recordings-none").hidden = rows.length > 0;
+    byId("recordings").replaceChildren(...rows.map((row) => this.recording(row)));
+  }
+
+  recording({ name, bytes, modified, kind, open }) {
+    const date = new Date(modified * 1000).toLocaleString([], { dateStyle: "short", timeStyle: "short" });
+    const facts = [date, `${number(bytes / 1e6, 1)} MB`, words(`recordings.${open ? "open" : kind}`)].join(" · ");
+    const actions = element("div", { className: "row" });
+    const item = element("li", {}, element("strong", { textContent: name }), element("small", { textContent: facts }), actions);
+    const offer = () => {
+      actions.replaceChildren();
+      if (this.link.newest.hello?.role !== "observer") {
+        const href = `/robots/${encodeURIComponent(this.link.robot)}/recordings/${encodeURIComponent(name)}`;
+        actions.append(element("a", { href, download: name, className: "button", textContent: words("recordings.download"), ariaLabel: `${words("recordings.download")}: ${name}` }));
+      }
+      if (this.engineer && !open) actions.append(button(words("recordings.delete"), confirm));
+    };
+    const confirm = () => {
+      const sure = button(words("recordings.sure", { size: `${number(bytes / 1e6, 1)} MB` }), async () => {
+        if (this.outcome("recordings.delete", await this.link.ask({ do: "delete_recording", name }))) this.loadRecordings();
+      }, "danger");
+      actions.replaceChildren(sure, button(words("recordings.keep"), offer));
+      sure.focus();
+    };
+    offer();
+    return item;
+  }
+}
+
+/** A configured name as people write it. */
+const title = (name) => name.replaceAll("_", " ");
