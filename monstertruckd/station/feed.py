@@ -89,7 +89,7 @@ SHOWN: Final[tuple[Shown[Any], ...]] = (
     _whole(topics.SLAM, "slam", 0.5),
     _whole(topics.USB, "usb"),
     Shown(topics.CAMERA, "camera", frames.picture, 0.1, CAMERA_BUDGET),
-    *(_whole(points, "points", 0.5) for points in topics.TOPICS if points.name == "state/points"),
+    _whole(topics.POINTS, "points", 0.5),
 )
 
 
