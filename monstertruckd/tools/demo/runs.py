@@ -9,7 +9,7 @@ import gc
 import os
 import socket
 from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager, suppress
+from contextlib import asynccontextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -94,6 +94,7 @@ def run_film(config_file: Path, film: Path, seconds: float) -> None:
     Raises:
         InputError: there is nothing to film, or no place for the file.
         NotInstalledError: this computer cannot draw.
+        RequestRefusedError: the truck cannot be armed.
     """
     with TemporaryDirectory(prefix="monstertruck-") as folder:
         config, tree = load_config(write_overlay(config_file, Path(folder), "tcp/127.0.0.1:0"), SimulatedTruckConfig)
@@ -103,11 +104,9 @@ def run_film(config_file: Path, film: Path, seconds: float) -> None:
             async with rig.running(), _filmed(rig, clock, film):
                 operator = LocalOperator(rig.daemon, clock)
                 begin = clock.now()
-                with suppress(TimeoutError):
-                    async with clock.deadline(SETTLE):
-                        await operator.arm()
+                await clock.sleep(SETTLE)
+                await operator.arm()
                 if config.explorer is not None:
-                    await clock.sleep(SETTLE)
                     await operator.call("explore", {**await operator.header(), "order": "start"})
                 await clock.sleep_until(begin + round(seconds * SECOND))
 

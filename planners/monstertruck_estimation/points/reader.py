@@ -33,7 +33,7 @@ class ReadingStep:
     """Reads pictures one by one; keeps nothing from one to the next."""
 
     def __init__(self) -> None:
-        self._reader = TagReader(everywhere=1, corners="subpixel")
+        self._reader = TagReader(everywhere=1, corners="edges")
 
     def step(self, task: ReadTask) -> ReadAnswer:
         """Read one picture."""

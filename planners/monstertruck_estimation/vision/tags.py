@@ -45,14 +45,14 @@ class TagReader:
         everywhere: pictures from one look at the whole picture to the next; 1 = always.
         still: tags that do not move: they are read in whole pictures only.
         corners: how they are found: as crossings of lines along the edges, which bears tags of few pixels a cell and
-            dirt, or by the gradients around each, to a quarter of a pixel, for tags that are measured.
+            dirt, or to a tenth of a pixel as crossings of the edges of the picture itself, for tags that are measured.
     """
 
     def __init__(
         self,
         everywhere: int = EVERYWHERE,
         still: Collection[int] = (),
-        corners: Literal["lines", "subpixel"] = "lines",
+        corners: Literal["lines", "edges"] = "lines",
     ) -> None:
         cv2.setNumThreads(1)  # cameras are read side by side; OpenCV's own threads wait for each other
         self._still = frozenset(still)
@@ -65,6 +65,7 @@ class TagReader:
         parameters.adaptiveThreshWinSizeMin = 5
         parameters.adaptiveThreshWinSizeMax = 21
         parameters.adaptiveThreshWinSizeStep = 8
+        self._exact = corners == "edges"
         self._detector = cv2.aruco.ArucoDetector(dictionary(), parameters)
         self._everywhere = everywhere
         self._count = 0
@@ -80,6 +81,8 @@ class TagReader:
             found = []
             for x0, y0, x1, y1 in _windows(self._last, picture.shape[1], picture.shape[0]):
                 found += self._detect(np.ascontiguousarray(picture[y0:y1, x0:x1]), x0, y0)
+        if self._exact:
+            found = [sighting._replace(corners=along_edges(picture, sighting.corners)) for sighting in found]
         by_tag = {sighting.tag: sighting for sighting in found}
         self._last = [sighting for tag, sighting in by_tag.items() if tag not in self._still]
         return list(by_tag.values())
@@ -92,6 +95,48 @@ class TagReader:
             Sighting(int(tag), np.asarray(points, dtype=np.float64).reshape(4, 2) + (x0, y0))  # noqa: RUF005
             for tag, points in zip(np.ravel(ids), corners, strict=True)
         ]
+
+
+EDGE: Final = (0.12, 0.88)
+"""Part of an edge that is looked at: its ends are rounded by blur."""
+ACROSS: Final = np.linspace(-2.5, 2.5, 21)
+"""Pixels from an edge, over which its step is looked for."""
+STEP: Final = 3.0
+"""Least step of an edge from sample to sample, of 255."""
+ASTRAY: Final = 0.7
+"""Pixels from the others at which a sample of an edge is none of it."""
+
+
+def along_edges(picture: Picture, corners: Array) -> Array:
+    """Corners as crossings of the lines through the steps of the picture along each edge, (4, 2).
+
+    OpenCV's own ones lie inwards of the true ones: at 35 pixels a side a tag seems 1.4 % smaller, so farther away.
+    """
+    lines = []
+    for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        length = float(np.hypot(*(end - start)))
+        along = (end - start) / length
+        across = np.array((along[1], -along[0]))
+        points = start + np.linspace(*EDGE, max(8, int(length)))[:, None] * length * along
+        samples = (points[:, None] + ACROSS[:, None] * across).astype(np.float32)
+        values = np.asarray(cv2.remap(picture, samples, None, cv2.INTER_LINEAR), dtype=np.float64)
+        steps = np.abs(np.diff(values, axis=1))
+        middles = (ACROSS[1:] + ACROSS[:-1]) / 2
+        off = (steps**2 @ middles) / np.maximum((steps**2).sum(axis=1), 1e-9)
+        clear = steps.max(axis=1) > STEP
+        if clear.sum() < 4:
+            return corners
+        clear &= np.abs(off - np.median(off[clear])) < ASTRAY
+        on = points[clear] + off[clear, None] * across
+        middle = on.mean(axis=0)
+        lines.append((middle, np.linalg.svd(on - middle)[2][0]))
+    found = []
+    for (one, direction), (other, towards) in zip([lines[-1], *lines[:-1]], lines, strict=True):
+        crossing = np.array((direction, -towards)).T
+        if abs(float(np.linalg.det(crossing))) < 0.1:
+            return corners
+        found.append(one + np.linalg.solve(crossing, other - one)[0] * direction)
+    return np.array(found)
 
 
 def dictionary() -> "cv2.aruco.Dictionary":
