@@ -5,7 +5,7 @@
 Every session runs the whole daemon on a virtual clock: real drivers, emulated devices, the safety gate; the operator
 has a tape, a string and a meter with errors of their own. Judged is whether the true value lies in the stated interval,
 and, against the truck's own linkage, the curvature that the calibrated truck believes, to its full lock.
-Before that the fits of odometry, lidar, inertial unit and slip are judged alone on drawn measurements, ``--light``
+Before that the fits of every wizard are judged alone on drawn measurements, ``--light``
 each: how often the truth lies inside, how wide the intervals are. ``--seeds 0`` leaves it at these.
 """
 
@@ -34,7 +34,7 @@ from monstertruckd.tools.calibrate.drive import DriveWizard, drive_wizard
 from monstertruckd.tools.calibrate.steering import SteeringWizard, steering_wizard
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 from tests.calibration_kit import Verdict, curvature_errors, hidden, run_session, verdicts
-from tests.calibration_light import LIGHT, coverage
+from tests.calibration_light import HALF_WIDTHS, LIGHT, coverage
 
 ROOT = Path(__file__).resolve().parents[1]
 OUTPUT = ROOT / "runs" / "benchmarks" / "calibration.json"
@@ -43,18 +43,6 @@ CURVATURE = 0.02
 """Greatest error of the curvature, as a share."""
 COVERAGE = (0.90, 0.99)
 """Of all intervals of a wizard."""
-HALF_WIDTHS = {
-    "odometry.way": 0.01,
-    "odometry.wheelbase": 0.01,
-    "odometry.offset": math.radians(0.5),
-    "lidar.x": 0.010,
-    "lidar.y": 0.010,
-    "lidar.yaw": math.radians(0.5),
-    "imu.rate_scale": 0.01,
-    "slip.gain_left": 0.01,
-    "slip.gain_right": 0.01,
-}
-"""Median half-widths at most: 1 % of ways and wheels, 0.5 degrees, 10 mm."""
 EMPTIER = (0.15,)
 """Charge of the second pack that the battery wizard sees."""
 

@@ -13,10 +13,21 @@ from monstertruck_kinematics.unsteered import SkidSteer
 from monstertruck_runtime.bodies import build_chassis
 from monstertruck_schemas.body import TruckBody
 from monstertruck_schemas.sensor import Attitude, Imu, Vector3
-from monstertruckd.config.calibration import Result
-from monstertruckd.tools.calibrate import imu, lidar, odometry, slip
+from monstertruckd.config.calibration import Estimate, Result
+from monstertruckd.tools.calibrate import battery, compass, drive, imu, lidar, odometry, slip, weave
+from monstertruckd.tools.calibrate.response import ResponseFit, Steps
 from monstertruckd.tools.calibrate.statistics import NORMAL, Interval
-from monstertruckd.tools.calibrate.steering_model import SLIP, Maps, SteeringModel, SteeringRun
+from monstertruckd.tools.calibrate.steering import BAND, SPAN
+from monstertruckd.tools.calibrate.steering_model import (
+    CURVE,
+    HEADING,
+    LINKAGE,
+    SLIP,
+    Maps,
+    SteeringModel,
+    SteeringRun,
+    half_widths,
+)
 from tests.calibration_kit import Verdict
 
 CHASSIS: Final = build_chassis(TruckBody(), Dimensions(DriveTrain(644.0, 0.075), 0.32, 0.26))
@@ -31,6 +42,144 @@ def judged(result: Result, truth: dict[str, float]) -> list[Verdict]:
         for e in result.estimates
         if e.name in truth
     ]
+
+
+def battery_fit(rng: np.random.Generator) -> list[Verdict]:
+    """A multimeter at a full and at an emptier pack."""
+    wizard = battery.BatteryWizard()
+    gain, offset = rng.uniform(0.94, 1.06), rng.uniform(-battery.GROUND, battery.GROUND)
+    share, readings = wizard.meter_share * rng.uniform(-1, 1), []
+    for volts in (16.4, 13.4):
+        raw, noise = (volts - offset) / gain, 0.003
+        shown = volts * (1 + share) + wizard.meter_digits * rng.uniform(-1, 1)
+        readings.append(battery.MeterReading(raw + noise * rng.normal(), shown, noise))
+    found = wizard.scale(readings)
+    return [
+        Verdict(f"battery.{name}", i.value, i.low, i.high, t)
+        for name, i, t in zip(("gain", "offset"), found, (gain, offset), strict=True)
+    ]
+
+
+def drive_fit(rng: np.random.Generator) -> list[Verdict]:
+    """Taped runs."""
+    wizard = drive.DriveWizard()
+    turns = rng.uniform(1000.0, 1600.0)
+    tape = 1 + drive.TAPE_SCALE * rng.normal() / NORMAL
+    values = []
+    for _ in range(wizard.runs):
+        shown = wizard.metres * tape + math.sqrt(2) * wizard.tape_error * rng.normal()
+        values.append(turns * wizard.metres / shown)
+    found = drive.turns_per_metre(values, wizard.tape_error, wizard.metres, 0.0)
+    # On another floor.
+    ratio, true = drive.on_any_floor(found), turns * (1 + drive.SLIP * rng.normal() / NORMAL)
+    return [
+        Verdict("drive.turns_per_metre", found.value, found.low, found.high, turns),
+        Verdict("drive.drive_ratio", ratio.value / turns, ratio.low / turns, ratio.high / turns, true / turns),
+    ]
+
+
+def compass_fit(rng: np.random.Generator) -> list[Verdict]:
+    """A flat circle there and back."""
+    count, up = 240, -39.0
+    there = np.linspace(0, 1.05 * math.tau, count // 2)
+    heading = np.concatenate((there, there[::-1]))
+    current = np.repeat((0.25, -0.25), count // 2) + 0.02 * rng.standard_normal(count)
+    hard, motor = rng.uniform(-7, 7, 2), rng.uniform(-0.5, 0.5, 2)
+    xy = rng.uniform(-0.06, 0.06)
+    iron = np.array(((rng.uniform(0.88, 1.12), xy), (xy, rng.uniform(0.88, 1.12))))
+    soft = np.linalg.inv(iron)
+    soft /= math.sqrt(np.linalg.det(soft))
+    # The unit's own tilt errs, and its sensors bend.
+    tilt = compass.TILT * rng.normal(size=2) / NORMAL
+    bend = 1 + compass.LINEARITY * rng.normal(size=2) / NORMAL
+    level = 25.0 * np.array((np.cos(heading), np.sin(heading)))
+    level += up * np.sin(tilt)[:, None]
+    field = (iron @ level) * bend[:, None] + hard[:, None] + motor[:, None] * current
+    field += 0.03 * rng.standard_normal(field.shape)
+    believed = np.unwrap(np.arctan2(field[1], field[0]))
+    flat = np.zeros(count)
+    circle = compass.FieldCircle(field[0], field[1], np.full(count, up), flat, flat, current, believed)
+    return judged(
+        compass.result_of(circle),
+        {
+            **dict(zip(("hard_x", "hard_y", "motor_x", "motor_y"), (*hard, *motor), strict=True)),
+            "soft_xx": soft[0, 0],
+            "soft_xy": soft[0, 1],
+            "soft_yy": soft[1, 1],
+        },
+    )
+
+
+def steering_fit(rng: np.random.Generator) -> list[Verdict]:
+    """Straights along a string, arcs and full circles; then weaves."""
+    assert isinstance(CHASSIS, TruckChassis)
+    model = SteeringModel(CHASSIS)
+    true = Maps(
+        (1439.2 + rng.uniform(-40, 40), 1439.2 + rng.uniform(-40, 40)),
+        (-10.48 * rng.uniform(0.9, 1.1), 10.48 * rng.uniform(0.9, 1.1)),
+    )
+    arcs = [(sign * 0.18 * (1 - i), sign * 0.18 * i, way) for i in (0, 1) for sign in (1, -1) for way in (1.0, -1.0)]
+    circles = [(s * 0.35, 0.0, 5.6) for s in (1, -1)] + [(0.0, s * 0.35, 5.6) for s in (1, -1)]
+    both = [(s * 0.35, -s * 0.35, 2.8) for s in (1, -1)]
+    straights = [(0.0, 0.0, sign * 2.0) for _ in range(3) for sign in (1, -1)]
+    legs = [_steered_leg(model, true, *leg, rng) for leg in (*arcs, *circles, *both, *straights)]
+    fit = model.fit(legs, MAPS)
+    halves = half_widths(fit)
+    names = ("front_centre", "front_scale", "rear_centre", "rear_scale")
+    bands = (BAND, BAND / SPAN) * 2
+    # A servo stops anywhere in its dead band: the interval covers it, the mean of many moves has little of it.
+    found = [Interval(float(fit.parameters[i]), math.hypot(float(halves[i]), bands[i])) for i in range(len(names))]
+    actual = true.parameters[:4] + np.array(bands) * rng.normal(size=4) / NORMAL
+    pulse_maps = [
+        Verdict(f"steering.{name}", i.value, i.low, i.high, float(t))
+        for name, i, t in zip(names, found, actual, strict=True)
+    ]
+    return [*pulse_maps, *_weaves(rng)]
+
+
+def _steered_leg(
+    model: SteeringModel, true: Maps, front: float, rear: float, way: float, rng: np.random.Generator
+) -> SteeringRun:
+    motor = np.full(16, CHASSIS.drivetrain.motor_angle(way) / 16)
+    linkage = CHASSIS.linkage
+    assert linkage is not None
+    servos = CHASSIS.servos(front, rear)
+    pulses = tuple(np.full(16, float(MAPS.pulses(axle, np.array(servos[axle])))) for axle in (0, 1))
+    (ideal,), (aside,) = model.predict([SteeringRun(motor, (pulses[0], pulses[1]), 0.0, 0.0)], true)
+    part = min(abs(math.remainder(float(ideal), math.tau)), 1.0)
+    sigma = math.hypot(HEADING, CURVE * part, LINKAGE * float(ideal))
+    turn = float(ideal) + math.hypot(sigma, SLIP * math.sqrt(abs(way))) * rng.normal()
+    string = front == rear == 0.0 and way > 0.0
+    offset = float(aside) + 0.0076 * rng.normal() if string else None
+    return SteeringRun(motor, (pulses[0], pulses[1]), turn, sigma, offset, 0.0076)
+
+
+def _weaves(rng: np.random.Generator) -> list[Verdict]:
+    """Delay of the steering from three weaves ahead and back."""
+    delay, lag = rng.uniform(0.02, 0.15), rng.uniform(0.0, 0.06)
+    dead = max(delay - lag, 0.0)
+    late = weave.HALF_FRAME * rng.uniform(-1, 1)  # how long commands wait for a pulse since this start
+    at = np.arange(0.0, 12.0, 0.04)
+    changes = np.cumsum(weave.WEAVE * 4)
+    sides = np.array([1.0 if k % 2 else -1.0 for k in range(len(changes))])
+    seen = []
+    for sign in (1, -1):
+        for _ in range(3):
+            commanded = Steps(0.6, changes, 1.2 * sides)
+            turned = 0.15 * sign * commanded.integral(at, dead + lag + late, lag**2)
+            turned = turned + 0.01 * rng.normal() * at + 0.003 * rng.standard_normal(at.size)
+            stride = round(weave.BASE / 0.04)
+            ways = 0.15 * sign * at
+            seen.append(weave.Weave(commanded, at, ways, stride, turned[stride:] - turned[:-stride]))
+
+    def residuals(delay: float, squared: float) -> np.ndarray:
+        return np.concatenate([one.residuals(delay, squared) for one in seen])
+
+    found: dict[str, Estimate] = {
+        e.name: e for e in weave.estimates(ResponseFit.of(residuals, weave.HALF_FRAME, weave.ROUNDED))
+    }
+    e = found["delay"]
+    return [Verdict("steering.delay", e.value, e.low, e.high, dead + lag)]
 
 
 def odometry_fit(rng: np.random.Generator) -> list[Verdict]:
@@ -155,12 +304,39 @@ def slip_fit(rng: np.random.Generator) -> list[Verdict]:
 
 
 LIGHT: Final[dict[str, Callable[[np.random.Generator], list[Verdict]]]] = {
+    "battery": battery_fit,
+    "drive": drive_fit,
+    "compass": compass_fit,
+    "steering": steering_fit,
     "odometry": odometry_fit,
     "lidar": lidar_fit,
     "imu": imu_fit,
     "slip": slip_fit,
 }
 """By wizard."""
+HALF_WIDTHS: Final = {
+    "battery.offset": 0.1,
+    "drive.drive_ratio": 0.01,
+    "compass.hard_x": 0.87,
+    "compass.hard_y": 0.87,
+    "compass.soft_xx": 0.035,
+    "compass.soft_yy": 0.035,
+    "steering.front_centre": 8.5,
+    "steering.rear_centre": 8.5,
+    "steering.delay": 0.010,
+    "odometry.way": 0.01,
+    "odometry.wheelbase": 0.01,
+    "odometry.offset": math.radians(0.5),
+    "lidar.x": 0.010,
+    "lidar.y": 0.010,
+    "lidar.yaw": math.radians(0.5),
+    "imu.rate_scale": 0.01,
+    "slip.icr_left": 0.002,
+    "slip.gain_left": 0.01,
+    "slip.gain_right": 0.01,
+}
+"""Median half-widths at most: 0.1 V, 1 % of ways and wheels, 2 degrees by iron in 25 uT, 0.5 degrees of an axle (8.5
+us), 10 ms, 10 mm and 0.5 degrees of the lidar, 2 mm of turning centres."""
 
 
 def coverage(wizard: str, fits: int) -> dict[str, tuple[float, float]]:

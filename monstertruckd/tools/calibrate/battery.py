@@ -6,11 +6,11 @@ between full and empty, so a second reading usually comes days later: readings a
 
 import math
 from dataclasses import dataclass
-from itertools import combinations
 from typing import Final
 
 import numpy as np
 
+from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.errors import InputError, RequestRefusedError
 from monstertruck_schemas import topics
 from monstertruck_schemas.reasons import Reason
@@ -24,6 +24,8 @@ METER: Final = Number("meter", "Voltage of the pack at its plug by the multimete
 ANOTHER: Final = Confirm("another", "Take another reading now, with the pack at another voltage?", fact=True)
 GROUND: Final = 0.1
 """Greatest offset, V: 10 mV along the ground wire, times the divider."""
+EVEN: Final = math.sqrt(3)
+"""Greatest error over standard deviation where all errors up to the greatest are as likely."""
 ROUNDING: Final = 0.5
 """Part of the rounding of one reading that is left in their mean: noise averages it out, but is never relied on."""
 
@@ -93,10 +95,10 @@ class BatteryWizard:
 
     def _result(self, readings: list[MeterReading], keys: tuple[str, str]) -> Result:
         volts = [reading.volts for reading in readings]
-        gain, offset = self.bounds(readings)
+        gain, offset = self.scale(readings)
         observed = offset.half < 0.9 * GROUND
         bounds = (
-            f"pack volts; bounds from the meter's {self.meter_share:.1%} and {self.meter_digits:g} V, the input's "
+            f"pack volts; 95 % of the meter's {self.meter_share:.1%} and {self.meter_digits:g} V, the input's "
             f"rounding, and at most {GROUND:g} V along the ground wire"
         )
         estimates = tuple(
@@ -114,33 +116,43 @@ class BatteryWizard:
             readings=tuple((reading.raw, reading.volts, reading.error) for reading in readings),
         )
 
-    def bounds(self, readings: list[MeterReading]) -> tuple[Interval, Interval]:
-        """Gain and offset: the middle and half the extent of all lines that pass every reading within its bounds.
+    def scale(self, readings: list[MeterReading]) -> tuple[Interval, Interval]:
+        """Gain and offset, by least squares.
+
+        The meter's share errs the same way at every reading, its digits anew. Errors of which only the greatest is
+        known are taken as even up to it.
 
         Raises:
-            InputError: there is no such line.
+            InputError: no line passes every reading within its bounds.
         """
-        rows, limits = [(0.0, 1.0), (0.0, -1.0)], [GROUND, GROUND]
-        for reading in readings:
-            noise = NORMAL * reading.error * reading.volts / reading.raw
-            bound = self.meter_share * reading.volts + self.meter_digits + noise
-            rows += [(reading.raw, 1.0), (-reading.raw, -1.0)]
-            limits += [reading.volts + bound, bound - reading.volts]
-        sides, ends = np.array(rows), np.array(limits)
-        corners = [
-            np.linalg.solve(sides[[i, j]], ends[[i, j]])
-            for i, j in combinations(range(len(rows)), 2)
-            if abs(np.linalg.det(sides[[i, j]])) > 1e-9
-        ]
-        inside = np.array([corner for corner in corners if (sides @ corner <= ends + 1e-9).all()])
-        if not inside.size:
+        raw = np.array([reading.raw for reading in readings])
+        volts = np.array([reading.volts for reading in readings])
+        noise = np.array([reading.error for reading in readings]) * volts / raw
+        self._check(raw, volts, NORMAL * noise)
+        sigma = np.hypot(self.meter_digits / EVEN, noise)
+        share = max(self.meter_share, 1e-9)
+        rows = np.vstack(
+            (
+                np.column_stack((raw, np.ones_like(raw), volts)) / np.maximum(sigma, 1e-9)[:, None],
+                (0.0, EVEN / GROUND, 0.0),
+                (0.0, 0.0, EVEN / share),
+            )
+        )
+        errors = np.linalg.inv(rows.T @ rows)
+        gain, offset, _ = errors @ rows.T @ np.concatenate((volts / np.maximum(sigma, 1e-9), (0.0, 0.0)))
+        halves = NORMAL * np.sqrt(np.diag(errors))
+        return Interval(float(gain), float(halves[0])), Interval(float(offset), min(float(halves[1]), GROUND))
+
+    def _check(self, raw: Array, volts: Array, noise: Array) -> None:
+        """Raise where no gain and offset explain all readings: each leaves a range of gains for an offset."""
+        bounds = self.meter_share * volts + self.meter_digits + noise
+        offsets = np.linspace(-GROUND, GROUND, 201)[:, None]
+        low, high = (volts - bounds - offsets) / raw, (volts + bounds - offsets) / raw
+        if not (low.max(axis=1) <= high.min(axis=1)).any():
             raise InputError(
-                f"no scale fits all {len(readings)} readings: a slip, or the divider has changed; forget the earlier "
+                f"no scale fits all {len(raw)} readings: a slip, or the divider has changed; forget the earlier "
                 "readings with --fresh"
             )
-        low, high = inside.min(axis=0), inside.max(axis=0)
-        middle, half = (low + high) / 2, (high - low) / 2
-        return Interval(float(middle[0]), float(half[0])), Interval(float(middle[1]), float(half[1]))
 
 
 def battery_wizard(settings: BatteryWizard | None = None) -> Wizard:

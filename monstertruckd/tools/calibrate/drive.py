@@ -8,7 +8,7 @@ apart: drivers pass on a slower speed at once, a faster one with their next cycl
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal, Self
 
@@ -19,7 +19,7 @@ from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError
 from monstertruckd.config.calibration import Estimate, Result
 from monstertruckd.tools.calibrate.response import ResponseFit, Steps, unexplained
-from monstertruckd.tools.calibrate.statistics import estimated, mean_interval
+from monstertruckd.tools.calibrate.statistics import Interval, estimated, mean_interval
 from monstertruckd.tools.calibrate.steps import Confirm, MoveRecord, MoveStep, Number
 from monstertruckd.tools.calibrate.wizard import CLEAR, Wizard, WizardContext
 
@@ -103,10 +103,9 @@ class DriveWizard:
             if abs(value / middle - 1) > APART:
                 off = 100 * (value / middle - 1)
                 raise InputError(f"run {number} differs by {off:.1f} % from the others: measure again")
-        tape = math.sqrt(2) * self.tape_error / self.metres
         # A compass disturbed by iron shows that there is a bend, not how much.
         bend = 0.0 if "compass" in context.known else max(run.bend for run in runs)
-        turns = mean_interval(values, middle * tape).widened(middle * (TAPE_SCALE + bend))
+        turns = turns_per_metre(values, self.tape_error, self.metres, bend)
         radius = float(context.value("geometry.wheel_radius"))
         ratio = turns.times(2 * math.pi * radius)
         floor = (
@@ -117,7 +116,7 @@ class DriveWizard:
         count = len(runs)
         estimates = [
             _sign(inverted),
-            estimated("drive_ratio", ratio.widened(ratio.value * SLIP), "", count, wheels, RATIO),
+            estimated("drive_ratio", on_any_floor(ratio), "", count, wheels, RATIO),
             estimated("turns_per_metre", turns, "1/m", count, f"turns of the motor per metre {floor}"),
         ]
         drive = context.config.devices.drive
@@ -135,6 +134,25 @@ class DriveWizard:
                 "how much later than the motor the wheels turn",
             ),
         )
+
+
+def turns_per_metre(values: Sequence[float], tape_error: float, metres: float, bend: float) -> Interval:
+    """Turns of the motor per metre on this floor.
+
+    Args:
+        values: of every run, 1/m.
+        tape_error: standard deviation of one reading of the tape, m.
+        metres: length of a run.
+        bend: greatest share by which a run may have been crooked unseen.
+    """
+    middle = float(np.median(values))
+    found = mean_interval(values, middle * math.sqrt(2) * tape_error / metres)
+    return found.joined(middle * TAPE_SCALE).widened(middle * bend)
+
+
+def on_any_floor(found: Interval) -> Interval:
+    """What was found on one floor, as it counts on others."""
+    return found.joined(found.value * SLIP)
 
 
 def drive_wizard(settings: DriveWizard | None = None) -> Wizard:

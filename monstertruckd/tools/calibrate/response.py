@@ -16,7 +16,7 @@ import numpy as np
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.fitting import least_squares
 from monstertruck_runtime.errors import InputError
-from monstertruckd.config.calibration import Estimate
+from monstertruckd.config.calibration import CONFIDENCE, Estimate
 from monstertruckd.tools.calibrate.statistics import NORMAL, Interval, correlation_factor
 
 START: Final = (0.08, 0.03**2)
@@ -84,7 +84,8 @@ class ResponseFit:
 
         Args:
             residuals: from the delay (s) and the square of the lag (s^2), in the order of time; (n,).
-            wait: half the range of a time, s, for which commands may have to wait, another one after each start.
+            wait: half the range of a time, s, for which commands may have to wait, another one after each start; as
+                likely anywhere in it.
             rounded: greatest square of a lag, s^2, that anything else may look like.
 
         Raises:
@@ -96,7 +97,7 @@ class ResponseFit:
             raise InputError("dead time and lag do not show: does the truck follow its commands?")
         halves = NORMAL * correlation_factor(fit.residuals) * fit.standard_errors
         delay, squared = (Interval(float(x), float(half)) for x, half in zip(fit.parameters, halves, strict=True))
-        return cls(delay.widened(wait), squared.widened(rounded), fit.residuals.size)
+        return cls(delay.joined(CONFIDENCE * wait), squared.widened(rounded), fit.residuals.size)
 
     def estimates(self, meanings: tuple[str, str, str], covers: str, prefix: str = "", key: str = "") -> list[Estimate]:
         """Dead time, lag and delay, as they are saved.
