@@ -2,6 +2,7 @@
 
 import math
 import sys
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -22,6 +23,13 @@ def drive(
         float,
         typer.Option(min=0.1, max=1.0, help="Seconds a first press stands: just above the keyboard's repeat delay."),
     ] = 0.6,
+    gamepad: Annotated[
+        bool, typer.Option("--gamepad", help="Drive by a gamepad as well, plugged in at any time.")
+    ] = False,
+    mapping: Annotated[
+        Path | None,
+        typer.Option("--mapping", help="YAML file with what its sticks and buttons do (docs/command-line.md)."),
+    ] = None,
 ) -> None:
     """Drive with the keyboard: the truck moves only while a key is held, in this terminal.
 
@@ -29,13 +37,18 @@ def drive(
     `r` resets it, `1` to `5` choose front, rear, counter, crab or hybrid steering, `z` and `c`
     the drift of the last, `x` straightens the wheels, `+` and `-` change the speed, `q` ends.
     `6` drives by twist: `A` and `D` turn, also on the spot, `z` and `c` move left and right.
+
+    With `--gamepad`: the truck moves only while the right shoulder button or trigger is held; left stick,
+    start arms, A stops, B is the emergency stop, X resets it, Y or the cross change steering and speed.
     """
     from monstertruck_runtime.errors import InputError
     from monstertruckd.tools.cli.drive_session import DriveSession
+    from monstertruckd.tools.cli.gamepad import PadMapping, read_mapping
     from monstertruckd.tools.cli.teleop import Teleop
 
     if not (on_terminal(sys.stdin) and on_terminal(sys.stdout)):
         raise InputError("drive reads keys as they are held: it needs a terminal")
     level = min(range(len(SPEEDS)), key=lambda index: abs(SPEEDS[index] - speed))
     teleop = Teleop(math.radians(angle), first_hold=hold, level=level, mode=mode)
-    until_stopped(lambda clock: DriveSession(teleop, clock, sys.stdin, sys.stdout).run(robot, endpoint))
+    pad = None if not gamepad and mapping is None else PadMapping() if mapping is None else read_mapping(mapping)
+    until_stopped(lambda clock: DriveSession(teleop, clock, sys.stdin, sys.stdout, pad).run(robot, endpoint))

@@ -19,10 +19,13 @@ from rich.text import Text
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import TruckError
+from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order, Role
 from monstertruck_schemas.state import GateMode, GateState
 from monstertruck_schemas.topics import GATE
 from monstertruckd.tools.cli.driving_modes import SteeringMode
+from monstertruckd.tools.cli.gamepad import Action, PadMapping, key_for
+from monstertruckd.tools.cli.gamepad_device import PadLink
 from monstertruckd.tools.cli.teleop import MODE_KEYS, STEPS, Command, KeyReader, Teleop, TeleopRequest
 from monstertruckd.tools.cli.terminal import every_key, forget_input, when_readable
 from monstertruckd.tools.status import screen
@@ -37,6 +40,10 @@ TAKE_HOLD: Final = 0.15
 """Seconds of neutral requests before an order to arm: they keep a tracker from driving off."""
 STALLED: Final = 0.3
 """After a longer pause of this program, s, keys that are read late may have been released meanwhile."""
+REST: Final = 6
+"""Neutral requests after the gamepad was let go, so that the truck stops by its ramp."""
+QUIET: Final = frozenset({Reason.CLIPPED, Reason.SERVO_LIMIT})
+"""Limits of the driver's own request: the hand knows."""
 END: Final = 1.0
 """Seconds to wait at the end for the truck to stop."""
 PING: Final = 1.0
@@ -62,6 +69,8 @@ class Stream:
     """Why nothing can be sent."""
     refusal: str = ""
     """Why the newest order was refused."""
+    pad: str = ""
+    """Name of the gamepad, or why there is none; empty = none is wanted."""
 
 
 class DriveSession:
@@ -72,9 +81,12 @@ class DriveSession:
         clock: time.
         keyboard: terminal that is read.
         screen: terminal that is drawn on.
+        gamepad: what its parts do; None = keys only.
     """
 
-    def __init__(self, teleop: Teleop, clock: Clock, keyboard: IO[Any], screen: IO[Any]) -> None:
+    def __init__(
+        self, teleop: Teleop, clock: Clock, keyboard: IO[Any], screen: IO[Any], gamepad: PadMapping | None = None
+    ) -> None:
         self._teleop = teleop
         self._clock = clock
         self._keyboard = keyboard
@@ -83,6 +95,9 @@ class DriveSession:
         self._commands: asyncio.Queue[Command] = asyncio.Queue()
         self._stream = Stream()
         self._arming: asyncio.TimerHandle | None = None
+        self._gamepad = None if gamepad is None else PadLink(gamepad, clock, self._act)
+        self._resting = 0
+        """Neutral requests that are still sent after the gamepad was let go."""
 
     async def run(self, robot: str, endpoint: str) -> None:
         """Drive until the user ends it or the terminal is gone; the terminal is restored, the truck stopped.
@@ -105,6 +120,8 @@ class DriveSession:
 
     async def _until_the_end(self, client: TruckClient, follower: Follower) -> None:
         jobs = [self._ask(client), self._ping(client), self._draw(follower), follower.run()]
+        if self._gamepad is not None:
+            jobs += [self._gamepad.run(), self._feel(self._gamepad, follower)]
         tasks = [asyncio.create_task(job) for job in (self._obey(client), *jobs)]
         try:
             done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
@@ -176,12 +193,47 @@ class DriveSession:
                 self._forget()
             before = now
             self._press(self._reader.flush())
-            await self._request(client, self._teleop.request(now))
+            await self._request(client, *self._input(now))
 
-    async def _request(self, client: TruckClient, request: TeleopRequest | None) -> None:
+    def _input(self, now: int) -> tuple[TeleopRequest | None, Role]:
+        """What the hands say at this moment: a gamepad that is held goes before the keys."""
+        link = self._gamepad
+        pad = None if link is None else link.pad
+        self._stream.pad = "" if link is None else link.hint or ("" if pad is None else pad.name)
+        if pad is not None and pad.held:
+            self._resting = REST
+        elif self._resting > 0:
+            self._resting -= 1
+        else:
+            return self._teleop.request(now), Role.KEYBOARD
+        if pad is None:
+            return TeleopRequest(0.0, 0.0, 0.0), Role.GAMEPAD
+        return pad.motion(self._teleop.mode, self._teleop.speed, self._teleop.angle), Role.GAMEPAD
+
+    def _act(self, action: Action) -> None:
+        self._press([key_for(action, self._teleop.mode)])
+
+    async def _feel(self, link: PadLink, follower: Follower) -> None:
+        """Shake the hand when a limit begins, harder when the truck stops."""
+        before: frozenset[Reason] = frozenset()
+        mode: GateMode | None = None
+        while True:
+            await self._clock.sleep(1.0 / RATE)
+            gate = follower.state.gate
+            if gate is None:
+                continue
+            limits = frozenset(gate.reasons) - QUIET
+            if gate.mode is not mode and gate.mode in (GateMode.STOPPING, GateMode.ESTOPPED):
+                link.rumble(1.0, 0.5)
+            elif limits - before and gate.mode is GateMode.DRIVING:
+                link.rumble(0.5, 0.2)
+            before, mode = limits, gate.mode
+
+    async def _request(self, client: TruckClient, request: TeleopRequest | None, role: Role = Role.KEYBOARD) -> None:
         self._stream.request = request
         if request is None:
             return
+        client.role = role
         try:
             if request.twist is None:
                 await client.drive(request.speed, request.front, request.rear, lease=LEASE)
@@ -197,6 +249,8 @@ class DriveSession:
         self._reader.clear()
         self._hold_arming()
         self._teleop.release()
+        if self._gamepad is not None:
+            self._gamepad.flush()
 
     async def _ping(self, client: TruckClient) -> None:
         while True:
@@ -240,7 +294,8 @@ def _controls(state: ScreenState, teleop: Teleop, stream: Stream) -> Panel:
     body.add_row(_modes(teleop))
     body.add_row(Text(HELP, style="dim", no_wrap=True, overflow="ellipsis"))
     body.add_row(_message(state, stream))
-    return Panel(body, title="drive: moves only while a key is held", border_style="dim")
+    title = "drive: moves only while a key is held" + (f" · {stream.pad}" if stream.pad else "")
+    return Panel(body, title=title, border_style="dim")
 
 
 def _message(state: ScreenState, stream: Stream) -> Text:

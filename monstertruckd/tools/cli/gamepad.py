@@ -1,0 +1,233 @@
+"""Gamepads: bytes of a Linux input device to stick positions and orders, by a mapping. Pure.
+
+Records are those of ``struct input_event`` (linux/input.h) on a 64-bit kernel, codes those of
+linux/input-event-codes.h, places of buttons and sticks those of the kernel's gamepad specification
+(Documentation/input/gamepad.rst).
+"""
+
+import math
+import struct
+from dataclasses import dataclass, field
+from fnmatch import fnmatch
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal
+
+from pydantic import Field, ValidationError
+
+from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.yaml_files import read_yaml
+from monstertruck_schemas.base import Schema
+from monstertruckd.tools.cli.driving_modes import SteeringMode
+from monstertruckd.tools.cli.teleop import MODE_KEYS, TURN_RADIUS, TeleopRequest, axles
+
+EVENT: Final = struct.Struct("llHHi")
+"""Seconds, microseconds, type, code, value."""
+EV_SYN, EV_KEY, EV_ABS = 0, 1, 3
+SYN_DROPPED: Final = 3
+"""The kernel's queue overflowed: what was held is not known."""
+
+BUTTONS: Final = {
+    "south": 0x130,
+    "east": 0x131,
+    "north": 0x133,
+    "west": 0x134,
+    "left_shoulder": 0x136,
+    "right_shoulder": 0x137,
+    "left_trigger": 0x138,
+    "right_trigger": 0x139,
+    "select": 0x13A,
+    "start": 0x13B,
+    "mode": 0x13C,
+    "left_stick": 0x13D,
+    "right_stick": 0x13E,
+    "up": 0x220,
+    "down": 0x221,
+    "left": 0x222,
+    "right": 0x223,
+}
+AXES: Final = {
+    "left_x": 0,
+    "left_y": 1,
+    "left_trigger": 2,
+    "right_x": 3,
+    "right_y": 4,
+    "right_trigger": 5,
+    "hat_x": 16,
+    "hat_y": 17,
+}
+DEAD: Final = 0.08
+"""Share of a stick's way around its middle that counts as the middle."""
+HALF: Final = 0.5
+"""Share of a hat's, or a trigger's, way from which on it is pressed."""
+
+Action = Literal["arm", "stop", "estop", "reset", "next_mode", "previous_mode", "faster", "slower"]
+Button = Literal[
+    "south", "east", "north", "west", "left_shoulder", "right_shoulder", "left_trigger", "right_trigger", "select",
+    "start", "mode", "left_stick", "right_stick", "up", "down", "left", "right",
+]  # fmt: skip
+Axis = Literal["left_x", "left_y", "left_trigger", "right_x", "right_y", "right_trigger", "hat_x", "hat_y"]
+KEYS: Final[dict[str, str]] = {
+    "arm": "enter",
+    "stop": "space",
+    "estop": "e",
+    "reset": "r",
+    "faster": "+",
+    "slower": "-",
+}
+"""Keys of the keyboard that do the same."""
+HATS: Final[dict[tuple[int, int], str]] = {(16, -1): "left", (16, 1): "right", (17, -1): "up", (17, 1): "down"}
+"""Buttons that a hat stands for."""
+
+
+USUAL: Final[dict[Button, Action]] = {
+    "start": "arm",
+    "south": "stop",
+    "east": "estop",
+    "west": "reset",
+    "north": "next_mode",
+    "right": "next_mode",
+    "left": "previous_mode",
+    "up": "faster",
+    "down": "slower",
+}
+"""What the buttons do without a mapping."""
+
+
+class PadMapping(Schema):
+    """What the sticks and buttons of a gamepad do."""
+
+    name: str = "*"
+    """Devices it is for: their name, with * and ?"""
+    speed: Axis = "left_y"
+    steer: Axis = "left_x"
+    side: Axis = "right_x"
+    """Sideways by twist, drift in hybrid steering"""
+    inverted: Annotated[tuple[Literal["speed", "steer", "side"], ...], Field(strict=False)] = ()
+    """Axes that count the other way; without this, up is ahead and left is left"""
+    deadman: Annotated[tuple[Button, ...], Field(strict=False, min_length=1)] = ("right_shoulder", "right_trigger")
+    """Of these one has to be held for the truck to move"""
+    buttons: dict[Button, Action] = Field(default_factory=lambda: dict(USUAL))
+
+    def fits(self, name: str) -> bool:
+        """Whether it is for a device of this name."""
+        return fnmatch(name, self.name)
+
+
+def read_mapping(file: Path) -> PadMapping:
+    """A mapping from YAML.
+
+    Raises:
+        InputError: it cannot be read, or is none; names the first wrong field.
+    """
+    content: Any = read_yaml(file) or {}
+    try:
+        return PadMapping.model_validate(content)
+    except ValidationError as error:
+        detail = error.errors(include_url=False)[0]
+        raise InputError(f"{file}: {'.'.join(map(str, detail['loc']))}: {detail['msg']}") from error
+
+
+@dataclass(slots=True)
+class Pad:
+    """What one gamepad says at this moment; it counts as released until its deadman button was seen released.
+
+    Args:
+        name: of the device.
+        mapping: what its parts do.
+        ranges: least and greatest value of every axis, by code.
+    """
+
+    name: str
+    mapping: PadMapping
+    ranges: dict[int, tuple[int, int]]
+    _axes: dict[int, float] = field(default_factory=dict)
+    _pressed: set[int] = field(default_factory=set)
+    _rest: bytes = b""
+    _trusted: bool = True
+    """The deadman button counts."""
+
+    def feed(self, data: bytes) -> list[Action]:
+        """Take bytes of the device; returns the actions that its buttons give."""
+        data = self._rest + data
+        whole = len(data) - len(data) % EVENT.size
+        self._rest = data[whole:]
+        actions: list[Action] = []
+        for _, _, kind, code, value in EVENT.iter_unpack(data[:whole]):
+            if kind == EV_KEY:
+                actions += self._key(code, pressed=value != 0)
+            elif kind == EV_ABS:
+                actions += self._move(code, value)
+            elif kind == EV_SYN and code == SYN_DROPPED:
+                self.release()
+        self._trusted |= not self._deadman
+        return actions
+
+    def release(self) -> None:
+        """Let go: the deadman button counts again once it was released, sticks once they move."""
+        self._trusted = False
+        triggers = {AXES[name] for name in self.mapping.deadman if name in AXES}
+        self._axes = {code: value for code, value in self._axes.items() if code in triggers}
+
+    @property
+    def _deadman(self) -> bool:
+        names = self.mapping.deadman
+        held = any(BUTTONS[name] in self._pressed for name in names)
+        return held or any(self._axes.get(AXES[name], -1.0) > HALF for name in names if name in AXES)
+
+    @property
+    def held(self) -> bool:
+        """Whether a hand holds the deadman button."""
+        return self._trusted and self._deadman
+
+    def motion(self, mode: SteeringMode, speed: float, angle: float) -> TeleopRequest:
+        """What the sticks ask for; standstill unless the deadman button is held.
+
+        Args:
+            mode: which axles steer.
+            speed: with the stick at its end, m/s.
+            angle: full lock of an axle, rad.
+        """
+        if not self.held:
+            return TeleopRequest(0.0, 0.0, 0.0, (0.0, 0.0, 0.0) if mode is SteeringMode.TWIST else None)
+        ahead, steer, side = (-self._stick(name) for name in ("speed", "steer", "side"))
+        if mode is SteeringMode.TWIST:
+            return TeleopRequest(0.0, 0.0, 0.0, (ahead * speed, side * speed, steer * speed / TURN_RADIUS))
+        front, rear = axles(mode, steer * angle, side * angle)
+        return TeleopRequest(ahead * speed, front, math.copysign(min(abs(rear), angle), rear))
+
+    def _stick(self, what: Literal["speed", "steer", "side"]) -> float:
+        axis: Axis = getattr(self.mapping, what)
+        value = self._axes.get(AXES[axis], 0.0)
+        if abs(value) < DEAD:
+            return 0.0
+        return -value if what in self.mapping.inverted else value
+
+    def _key(self, code: int, *, pressed: bool) -> list[Action]:
+        if not pressed:
+            self._pressed.discard(code)
+            return []
+        before = code in self._pressed
+        self._pressed.add(code)
+        name = next((name for name, number in BUTTONS.items() if number == code), None)
+        action = next((action for button, action in self.mapping.buttons.items() if button == name), None)
+        return [] if before or action is None else [action]
+
+    def _move(self, code: int, value: int) -> list[Action]:
+        low, high = self.ranges.get(code, (-1, 1))
+        position = 2.0 * (value - low) / max(high - low, 1) - 1.0
+        before = self._axes.get(code, 0.0)
+        self._axes[code] = max(-1.0, min(1.0, position))
+        side = (position > HALF) - (position < -HALF)
+        if (code, side) not in HATS or side == (before > HALF) - (before < -HALF):
+            return []
+        action = next((a for button, a in self.mapping.buttons.items() if button == HATS[code, side]), None)
+        return [] if action is None else [action]
+
+
+def key_for(action: Action, mode: SteeringMode) -> str:
+    """The key of the keyboard that does the same, with the steering ``mode`` of now."""
+    if action in KEYS:
+        return KEYS[action]
+    modes = list(MODE_KEYS.values())
+    step = 1 if action == "next_mode" else -1
+    return list(MODE_KEYS)[(modes.index(mode) + step) % len(modes)]

@@ -1,0 +1,142 @@
+"""The gamepad of this computer: found, read, shaken, and found again when it was unplugged.
+
+Numbers of the requests to the kernel are those of linux/input.h; ``struct ff_effect`` has 48 bytes on 64-bit kernels.
+"""
+
+import asyncio
+import errno
+import fcntl
+import os
+import struct
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Final
+
+from monstertruck_runtime.clock import Clock
+from monstertruckd.tools.cli.gamepad import AXES, BUTTONS, EV_KEY, EVENT, Action, Pad, PadMapping
+from monstertruckd.tools.cli.terminal import when_readable
+
+FOLDER: Final = Path("/dev/input")
+LOOK: Final = 1.0
+"""Seconds between two looks for a gamepad."""
+EV_FF: Final = 0x15
+FF_RUMBLE: Final = 0x50
+EVIOCSFF: Final = 0x4030_4580
+EFFECT: Final = struct.Struct("HhHHHHHxxHH28x")
+"""Type, number, direction, trigger (2), replay (length and delay, ms), strong and weak motor."""
+
+
+class PadLink:
+    """Keeps the link to a gamepad that fits a mapping.
+
+    Args:
+        mapping: which gamepads, and what their parts do.
+        clock: time.
+        act: called with every action of a button.
+        folder: where the kernel has its input devices.
+    """
+
+    def __init__(
+        self, mapping: PadMapping, clock: Clock, act: Callable[[Action], object], folder: Path = FOLDER
+    ) -> None:
+        self.pad: Pad | None = None
+        """The gamepad; None while there is none."""
+        self.hint = ""
+        """Why there is none."""
+        self._mapping = mapping
+        self._clock = clock
+        self._act = act
+        self._folder = folder
+        self._file: int | None = None
+        self._effect = -1
+        """Number of the effect in the kernel; -1 = none yet."""
+
+    async def run(self) -> None:
+        """Look for a gamepad, read it until it is gone, look again; until cancelled."""
+        try:
+            while True:
+                if self._file is None:
+                    self._open()
+                await self._clock.sleep(LOOK)
+        finally:
+            self._close()
+
+    def rumble(self, strength: float, seconds: float) -> None:
+        """Shake the hand, 0..1; a gamepad that cannot stays quiet."""
+        if self._file is None:
+            return
+        size = round(0xFFFF * strength)
+        effect = bytearray(EFFECT.pack(FF_RUMBLE, self._effect, 0, 0, 0, round(seconds * 1000), 0, size, size))
+        with suppress(OSError):
+            fcntl.ioctl(self._file, EVIOCSFF, effect)
+            self._effect = EFFECT.unpack(effect)[1]
+            os.write(self._file, EVENT.pack(0, 0, EV_FF, self._effect, 1))
+
+    def flush(self) -> None:
+        """Throw away what was not read in time, and let go."""
+        if self.pad is not None:
+            self._read(act=False)
+        if self.pad is not None:
+            self.pad.release()
+
+    def _open(self) -> None:
+        self.hint = f"no gamepad in {self._folder}"
+        for path in sorted(self._folder.glob("event*")):
+            try:
+                file = os.open(path, os.O_RDWR | os.O_NONBLOCK)
+            except OSError as error:
+                if error.errno == errno.EACCES:
+                    self.hint = f"{path}: not permitted (group input)"
+                continue
+            pad = described(file, self._mapping)
+            if pad is not None:
+                self._file, self.pad, self._effect, self.hint = file, pad, -1, ""
+                when_readable(file, self._read)
+                return
+            os.close(file)
+
+    def _read(self, *, act: bool = True) -> None:
+        assert self._file is not None
+        assert self.pad is not None
+        try:
+            data = os.read(self._file, 64 * EVENT.size)
+        except BlockingIOError:
+            return
+        except OSError:  # it was unplugged
+            data = b""
+        if not data:
+            self._close()
+            return
+        for action in self.pad.feed(data):
+            if act:
+                self._act(action)
+
+    def _close(self) -> None:
+        file, self._file, self.pad = self._file, None, None
+        if file is not None:
+            asyncio.get_running_loop().remove_reader(file)
+            os.close(file)
+
+
+def described(file: int, mapping: PadMapping) -> Pad | None:
+    """The gamepad behind an open input device; None if it is another device, or not one that the mapping is for."""
+    try:
+        name = fcntl.ioctl(file, _read_request(0x06, 256), bytes(256)).split(b"\0")[0].decode(errors="replace")
+        keys = fcntl.ioctl(file, _read_request(0x20 + EV_KEY, 96), bytes(96))
+        if not keys[BUTTONS["south"] // 8] >> BUTTONS["south"] % 8 & 1 or not mapping.fits(name):
+            return None
+    except OSError:
+        return None
+    ranges = {}
+    for code in AXES.values():
+        with suppress(OSError):  # it has no such axis
+            _, low, high, *_ = struct.unpack("6i", fcntl.ioctl(file, _read_request(0x40 + code, 24), bytes(24)))
+            if low < high:
+                ranges[code] = (low, high)
+    return Pad(name, mapping, ranges)
+
+
+def _read_request(number: int, size: int) -> int:
+    """Number of a reading request of the input subsystem (``_IOC(_IOC_READ, 'E', number, size)``)."""
+    return 2 << 30 | size << 16 | ord("E") << 8 | number
