@@ -1,12 +1,12 @@
 """The simulated side of a configuration: the section ``sim``."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from monstertruck_schemas.base import Schema
-from monstertruck_sim.world.config import WorldConfig
+from monstertruck_sim.world.config import CameraConfig, WorldConfig
 
 
 class DrillConfig(Schema):
@@ -18,6 +18,33 @@ class DrillConfig(Schema):
     """Seconds from one fault to the next, on average"""
 
 
+class CeilingCamera(CameraConfig):
+    """A camera of the stand, rendered: it hangs in the map and looks down; engine mujoco only."""
+
+    port: Path
+    """Link that is made to it; the stand's camera of kind `rendered` names the same"""
+    x: float = 0.0
+    """In the map, m"""
+    y: float = 0.0
+    """m"""
+    height: Annotated[float, Field(gt=0)] = 2.2
+    """Over the ground, m"""
+    pitch: float = 1.5707963268
+    """Downwards positive, rad: 90 degrees look down, the picture's upper edge is towards `yaw`"""
+    rendered: Literal[True] = True
+
+
+class BoardInView(Schema):
+    """A ChArUco board that somebody holds before the ceiling's cameras, another way in each picture."""
+
+    columns: Annotated[int, Field(ge=4, le=30)] = 8
+    rows: Annotated[int, Field(ge=4, le=30)] = 6
+    square: Annotated[float, Field(gt=0, le=1)] = 0.04
+    """m"""
+    marker: Annotated[float, Field(gt=0, le=1)] = 0.03
+    """m"""
+
+
 class StandConfig(Schema):
     """The test stand that sees the simulated robot from outside."""
 
@@ -27,6 +54,10 @@ class StandConfig(Schema):
     """Standard deviation of x and of y, m: a camera over the table"""
     heading_noise: Annotated[float, Field(ge=0)] = 0.01
     """Rad"""
+    cameras: dict[Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,31}$")], CeilingCamera] = Field(default_factory=dict)
+    """That `stand run` looks through, by name"""
+    board: BoardInView | None = None
+    """For the pictures by which `stand calibrate` finds their lenses"""
 
 
 class SimConfig(Schema):
@@ -45,3 +76,9 @@ class SimConfig(Schema):
     """Faults that happen by themselves; null = none"""
     recording: Path | None = None
     """Lidar recording (text columns, gzip) that the emulated lidar serves instead of the world"""
+
+    @model_validator(mode="after")
+    def _check_cameras(self) -> Self:
+        if self.stand.cameras and self.world.engine != "mujoco":
+            raise ValueError("stand.cameras: rendered in three dimensions: expected world.engine mujoco")
+        return self

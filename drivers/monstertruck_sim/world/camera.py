@@ -31,6 +31,7 @@ HALF_SHADE: Final = 4.0
 RIM: Final = 1
 """Cells of white paper round a tag's black square of eight cells."""
 CELLS: Final = 8
+PAPER_CELLS: Final = CELLS + 2 * RIM
 PAPER, INK = 235, 20
 TALL: Final = 1.7
 """Height of a person, m."""
@@ -241,10 +242,11 @@ class Painter:
         image.putpalette(_palette())
         picture: Picture = np.array(image.convert("RGB"))
         for panel in panels:
-            self._draw(picture, panel, place, ranges)
+            self.draw(picture, panel, place, ranges)
         return picture
 
-    def _draw(self, picture: Picture, panel: FlatPanel, place: CameraPlace, ranges: Array) -> None:
+    def draw(self, picture: Picture, panel: FlatPanel, place: CameraPlace, ranges: Array) -> None:
+        """Draw a panel over a picture; arguments as of ``picture``."""
         corners = panel.corner + np.array((panel.right * 0, panel.right, panel.right + panel.down, panel.down))
         seen = (corners - place.centre) @ place.axes.T
         if (seen[:, 2] < 0.05).any():
@@ -343,12 +345,21 @@ def tag_pattern(tag: int) -> NDArray[np.uint8]:
 
 
 def tag_panel(tag: TagConfig) -> FlatPanel:
-    """A tag on its paper, upright, facing ``yaw``."""
+    """A tag on its paper, upright and facing ``yaw``, or lying with its upper edge towards it."""
     pattern = tag_pattern(tag.tag)
     side = tag.size * len(pattern) / CELLS
-    right, down = np.array((-sin(tag.yaw), cos(tag.yaw), 0.0)) * side, np.array((0.0, 0.0, -side))
+    right, up = tag_axes(tag.yaw, lies=tag.lies)
+    right, down = right * side, -up * side
     corner = np.array((tag.x, tag.y, tag.z)) - (right + down) / 2
     return FlatPanel(np.repeat(pattern[..., None], 3, axis=2), np.ones(pattern.shape, np.bool_), corner, right, down)
+
+
+def tag_axes(yaw: float, *, lies: bool) -> tuple[Array, Array]:
+    """Unit vectors along a tag's upper edge, from left to right, and upwards on it."""
+    c, s = cos(yaw), sin(yaw)
+    if lies:
+        return np.array((s, -c, 0.0)), np.array((c, s, 0.0))
+    return np.array((-s, c, 0.0)), np.array((0.0, 0.0, 1.0))
 
 
 def person_panel(x: float, y: float, radius: float, place: CameraPlace) -> FlatPanel:

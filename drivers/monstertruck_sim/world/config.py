@@ -328,7 +328,7 @@ class CameraConfig(Schema):
 
 
 class TagConfig(Schema):
-    """An AprilTag of family 36h11 in the world, upright, as on a wall."""
+    """An AprilTag of family 36h11 in the world: upright, as on a wall, or lying."""
 
     tag: Annotated[int, Field(ge=0, le=586)]
     """Its number."""
@@ -339,8 +339,24 @@ class TagConfig(Schema):
     z: float = 0.25
     """Over the ground, m."""
     yaw: float = 0.0
-    """Direction that it faces, rad."""
+    """Direction that it faces, rad; of a lying one that of its upper edge."""
     size: Annotated[float, Field(gt=0.01, le=1)] = 0.1
+    """Side of its black square, m."""
+    lies: bool = False
+    """It faces upwards."""
+
+
+class RoofTag(Schema):
+    """An AprilTag that lies on the robot, its upper edge towards the front; seen in three dimensions only."""
+
+    tag: Annotated[int, Field(ge=0, le=586)]
+    x: float = 0.0
+    """Of its middle before the geometric centre, m."""
+    y: float = 0.0
+    """And left of it, m."""
+    z: float = 0.3
+    """Over the ground, m."""
+    size: Annotated[float, Field(gt=0.01, le=1)] = 0.08
     """Side of its black square, m."""
 
 
@@ -661,6 +677,8 @@ class WorldConfig(Schema):
     """Who walks through it"""
     tags: Annotated[tuple[TagConfig, ...], Field(strict=False, max_length=500)] = ()
     """AprilTags on its walls, seen by the camera; extra vision"""
+    roof: RoofTag | None = None
+    """A tag on the robot; engine mujoco only"""
 
     @model_validator(mode="after")
     def _check_engine(self) -> Self:
@@ -671,6 +689,8 @@ class WorldConfig(Schema):
                 )
             if self.tilt.kind != "ground":
                 raise ValueError(f"engine mujoco: tilt {self.tilt.kind}: the ground tilts the robot; expected ground")
+        elif self.roof is not None:
+            raise ValueError("engine plane: nothing sees a tag on the robot; roof needs engine mujoco")
         elif self.camera.rendered:
             raise ValueError("engine plane: draws the camera's pictures itself; camera.rendered needs engine mujoco")
         elif self.ground or self.height_image is not None or self.mjcf is not None:

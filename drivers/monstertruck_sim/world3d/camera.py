@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from monstertruck_runtime.errors import InputError
-from monstertruck_sim.world.camera import Drawing, Painter, Picture, SimulatedView, mounted
+from monstertruck_sim.world.camera import CameraPlace, Drawing, Painter, Picture, SimulatedView, mounted
 from monstertruck_sim.world3d.model import Group
 from monstertruck_sim.world3d.picture import Eye, WorldRenderer
 from monstertruck_sim.world3d.plant import RigidPlant
@@ -28,6 +28,9 @@ class RenderedView(SimulatedView):
         InputError: the robot is none of rigid bodies.
     """
 
+    HIDDEN: tuple[Group, ...] = (Group.ROBOT,)
+    """Left out of its pictures: what carries it."""
+
     def __init__(self, drawn: SimulatedView) -> None:
         self.__dict__.update(drawn.__dict__)
         if not isinstance(drawn.plant, RigidPlant):
@@ -44,17 +47,21 @@ class RenderedView(SimulatedView):
         """``ViewSource``: takes the world over at once, renders when called."""
         self._rigid.advance(time_ns)
         renderer, wider, painter = self._renderer(size)
-        x, y, yaw, pitch, roll, z = self._rigid.poses(np.array([time_ns]))[:, 0].tolist()
-        place = mounted((x, y, yaw), self.config, (pitch, roll, z))
+        place = self._place(time_ns)
         _, down, ahead = place.axes.tolist()
         width, height = size
         upright = 2 * atan(height / width * tan(self.config.field_of_view / 2) * wider)
         eye = Eye(tuple(place.centre.tolist()), tuple(ahead), (-down[0], -down[1], -down[2]), upright)
         people = [] if self.crowd is None else self.crowd.people_at(time_ns)
-        standing = [(px, py, z, radius) for px, py, radius in people]
-        renderer.arrange(self._rigid.data, eye, people=standing, hidden=(Group.ROBOT,))
+        floor = self._rigid.height
+        standing = [(x, y, floor, radius) for x, y, radius in people]
+        renderer.arrange(self._rigid.data, eye, people=standing, hidden=self.HIDDEN)
         grain = self.grain(time_ns)
         return lambda: grain(_bent(self._thread.submit(renderer.render).result(), wider, painter))
+
+    def _place(self, time_ns: int) -> CameraPlace:
+        x, y, yaw, pitch, roll, z = self._rigid.poses(np.array([time_ns]))[:, 0].tolist()
+        return mounted((x, y, yaw), self.config, (pitch, roll, z))
 
     def _renderer(self, size: tuple[int, int]) -> tuple[WorldRenderer, float, Painter]:
         if size not in self._renderers:

@@ -255,7 +255,9 @@ def rigid(config: WorldConfig, footprint: PlanOutline, start: Pose) -> Engine:
     longest = 80 if heights is None else round(0.25 / resolution)
     walls = rectangles(place.map.cells == OCCUPIED, resolution, place.map.origin, longest)
     scene_files = scenery(config.mjcf) if config.mjcf is not None else ((), ())
-    site = Site(walls, config.lidar.wall_height, heights, blocks(config.ground, heights), scene_files, config.tags)
+    site = Site(
+        walls, config.lidar.wall_height, heights, blocks(config.ground, heights), scene_files, config.tags, config.roof
+    )
     model = load(robot, drive, parts.friction, site)
     plant = RigidPlant(
         truck, config.battery, start, model, drive,

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from monstertruck_kinematics.description import HEAD_JOINTS, Description, Part, PartJoint, Shape
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.errors import InputError
-from monstertruck_sim.world.camera import CELLS, tag_pattern
-from monstertruck_sim.world.config import TagConfig
+from monstertruck_sim.world.camera import CELLS, PAPER_CELLS, tag_axes, tag_pattern
+from monstertruck_sim.world.config import RoofTag, TagConfig
 from monstertruck_sim.world3d.heights import HeightGrid
 
 TIMESTEP: Final = 0.002
@@ -105,6 +105,7 @@ class Site:
         blocks: on it.
         scenery: assets, and bodies and geometries, of another MJCF file.
         tags: on the walls.
+        roof: on the robot.
     """
 
     walls: Array
@@ -113,6 +114,7 @@ class Site:
     blocks: tuple[Block, ...] = ()
     scenery: tuple[Sequence[Element], Sequence[Element]] = ((), ())
     tags: tuple[TagConfig, ...] = ()
+    roof: RoofTag | None = None
 
 
 EMPTY: Final = Site(np.zeros((0, 4)), TALL, None)
@@ -200,7 +202,9 @@ def mjcf(description: Description, drive: DriveLine, friction: float, site: Site
     _scenery(asset, world, site.scenery)
     _tags(asset, world, site.tags)
     _spare(world)
-    _robot(world, description)
+    body = _robot(world, description)
+    if (roof := site.roof) is not None:
+        _paper(asset, body, "roof", roof.size, (roof.x, roof.y, roof.z), (0.0, -1.0, 0.0, 1.0, 0.0, 0.0))
     _drive(root, description, drive)
     return ET.tostring(root, encoding="unicode")
 
@@ -218,9 +222,12 @@ def load(description: Description, drive: DriveLine, friction: float, site: Site
     if (heights := site.heights) is not None:
         low, high = float(heights.z.min()), float(heights.z.max())
         model.hfield_data[:] = ((heights.z - low) / max(high - low, _FLAT)).astype(np.float32).ravel()
-    for i, tag in enumerate(site.tags):
-        texture = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_TEXTURE, f"tag_{i}")
-        shades = np.kron(tag_pattern(tag.tag), np.ones((_TAG_PIXELS, _TAG_PIXELS), np.uint8))
+    named = {f"tag_{i}": tag.tag for i, tag in enumerate(site.tags)}
+    if site.roof is not None:
+        named["roof"] = site.roof.tag
+    for name, tag in named.items():
+        texture = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_TEXTURE, name)
+        shades = np.kron(tag_pattern(tag), np.ones((_TAG_PIXELS, _TAG_PIXELS), np.uint8))
         data = np.repeat(shades[:, :, None], model.tex_nchannel[texture], axis=2).ravel()
         model.tex_data[model.tex_adr[texture] : model.tex_adr[texture] + len(data)] = data
     return model
@@ -286,35 +293,33 @@ def _walls(world: Element, site: Site) -> None:
 def _tags(asset: Element, world: Element, tags: Sequence[TagConfig]) -> None:
     """Sheets of paper on the walls; ``load`` paints them."""
     for i, tag in enumerate(tags):
-        cells = len(tag_pattern(tag.tag))
-        pixels = f"{cells * _TAG_PIXELS}"
-        name = f"tag_{i}"
-        SubElement(
-            asset,
-            "texture",
-            name=name,
-            type="2d",
-            builtin="flat",
-            width=pixels,
-            height=pixels,
-            rgb1="1 1 1",
-            nchannel="3",
-        )
-        SubElement(asset, "material", name=name, texture=name, texrepeat="1 1", texuniform="false", specular="0")
-        side = tag.size * cells / CELLS / 2
-        SubElement(
-            world,
-            "geom",
-            name=name,
-            type="box",
-            group=f"{Group.SIGNS.value}",
-            contype="0",
-            conaffinity="0",
-            size=_text(side, side, 0.0005),
-            pos=_text(tag.x, tag.y, tag.z),
-            xyaxes=_text(-math.sin(tag.yaw), math.cos(tag.yaw), 0.0, 0.0, 0.0, 1.0),
-            material=name,
-        )
+        right, up = tag_axes(tag.yaw, lies=tag.lies)
+        _paper(asset, world, f"tag_{i}", tag.size, (tag.x, tag.y, tag.z + 0.001 * tag.lies), (*right, *up))
+
+
+def _paper(
+    asset: Element, parent: Element, name: str, size: float, place: tuple[float, float, float], axes: Sequence[float]
+) -> None:
+    pixels = f"{PAPER_CELLS * _TAG_PIXELS}"
+    SubElement(asset, "texture", name=name, type="2d", builtin="flat", width=pixels, height=pixels, nchannel="3")
+    SubElement(
+        asset, "material", name=name, texture=name, texrepeat="1 1", texuniform="false", specular="0", emission="0.3"
+    )
+    side = size * PAPER_CELLS / CELLS / 2
+    SubElement(
+        parent,
+        "geom",
+        name=name,
+        type="box",
+        group=f"{Group.SIGNS.value}",
+        contype="0",
+        conaffinity="0",
+        mass="0",
+        size=_text(side, side, 0.0005),
+        pos=_text(*place),
+        xyaxes=_text(*axes),
+        material=name,
+    )
 
 
 def _scenery(asset: Element, world: Element, scenery: tuple[Sequence[Element], Sequence[Element]]) -> None:
@@ -337,12 +342,13 @@ def _spare(world: Element) -> None:
             SubElement(body, "geom", look, name=f"{kind}_{i}")
 
 
-def _robot(world: Element, description: Description) -> None:
+def _robot(world: Element, description: Description) -> Element:
     base = description.links[0]
     body = SubElement(world, "body", name=base.name)
     SubElement(body, "freejoint", name="free")
     _link(body, base)
     _children(body, description, base.name)
+    return body
 
 
 def _children(parent: Element, description: Description, name: str) -> None:

@@ -30,7 +30,7 @@ async def run(clock: Clock, config: "OverheadConfig", endpoint: str) -> None:
     tasks = [asyncio.create_task(link.run(), name=f"robot {name}") for name, link in robots.items()]
     tracker = _tracker(config, clock.now())
     try:
-        live = any(camera.source.kind == "v4l2" for camera in config.cameras.values())
+        live = any(camera.source.kind != "file" for camera in config.cameras.values())
         put = partial(_publish, robots)
         remark(f"tracks {', '.join(robots)} with {len(config.cameras)} cameras")
         await StandRun(tracker, _streams(config), config.rate, clock, put, remark, live=live).run()

@@ -15,6 +15,7 @@ import numpy as np
 from monstertruck_drivers.cable import EmulatedPort, PtyPort
 from monstertruck_drivers.config import PortConfig
 from monstertruck_drivers.hokuyo_urg.recording import RecordedHokuyoEmulator
+from monstertruck_drivers.webcam.emulator import WebcamEmulator
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import SECOND, Clock
@@ -22,6 +23,7 @@ from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruck_runtime.errors import InputError, NotFoundError
 from monstertruck_runtime.memory import settle
 from monstertruck_sim.computer import EmulatedComputer
+from monstertruck_sim.config import BoardInView, CeilingCamera
 from monstertruck_sim.console import Commanded, CommandedGroup, Emulated, EmulatedFiles, FaultConsole
 from monstertruck_sim.faults import FaultInjector, SimContext
 from monstertruck_sim.robot import SimulatedRobot
@@ -90,6 +92,7 @@ async def serve(
     """
     ports = (it.port for config in configs for it in config.devices.present().values())
     links = [port.path for port in ports if isinstance(port, PortConfig)]
+    links += [camera.port for config in configs for camera in config.sim.stand.cameras.values()]
     with ExitStack() as stack:
         stack.enter_context(claimed(*links))
         scene = shared_scene(configs)
@@ -164,6 +167,9 @@ class ServedRobot:
         yield asyncio.create_task(self.truth.run(), name="truth")
         if config.stand == "simulator":
             yield asyncio.create_task(_see(clock, config, world), name="stand")
+        for i, (name, camera) in enumerate(config.sim.stand.cameras.items()):
+            watching = _watch(clock, world, camera, config.sim.stand.board, config.sim.seed + i)
+            yield asyncio.create_task(watching, name=f"camera {name}")
         if config.sim.drill is not None:
             context = SimContext(config.sim, config.devices, self._robot, self._computer, clock)
             yield asyncio.create_task(FaultInjector(context, config.sim.drill, say).run(), name="faults")
@@ -237,6 +243,20 @@ async def _see(clock: Clock, config: SimulatedTruckConfig, world: World) -> None
                 await SimulatedStand(config.sim.stand, world, clock, client.publish_stand_pose, seed).run()
         except NotFoundError:
             await clock.sleep(STAND_RETRY)
+
+
+async def _watch(clock: Clock, world: World, camera: CeilingCamera, board: BoardInView | None, seed: int) -> None:
+    """Serve a camera of the stand."""
+    from monstertruck_sim.world3d.ceiling import CeilingView  # noqa: PLC0415  # the library of an extra
+
+    camera.port.parent.mkdir(parents=True, exist_ok=True)
+    port = PtyPort(camera.port)
+    emulator = WebcamEmulator(clock, CeilingView(world, camera, board, seed))
+    try:
+        port.plug()
+        await emulator.run(port.device)
+    finally:
+        port.unplug()
 
 
 async def _report_end(recorded: RecordedHokuyoEmulator) -> None:

@@ -25,10 +25,18 @@ class FileSource(Schema):
     path: Path
 
 
+class RenderedCamera(Schema):
+    """A camera under the ceiling of a simulated world, which `simulate` renders."""
+
+    kind: Literal["rendered"] = "rendered"
+    port: Path
+    """That of `sim.stand.cameras`"""
+
+
 class StandCamera(Schema):
     """One camera over the table."""
 
-    source: Annotated[VideoDevice | FileSource, Field(discriminator="kind")]
+    source: Annotated[VideoDevice | FileSource | RenderedCamera, Field(discriminator="kind")]
     boards: Path
     """Folder with pictures of the board, held anyhow: for the lens"""
     floor: Path

@@ -1,5 +1,6 @@
 """Where pictures come from: cameras of the computer, films, folders of pictures."""
 
+import asyncio
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
@@ -7,9 +8,13 @@ from typing import Final
 import cv2
 import numpy as np
 
+from monstertruck_drivers.link import SerialPort
+from monstertruck_drivers.webcam.rendered_source import RenderedSource
+from monstertruck_drivers.webcam.source import Mode
 from monstertruck_estimation.vision.tags import Picture
+from monstertruck_runtime.clock import WallClock
 from monstertruck_runtime.errors import DeviceLostError, InputError
-from monstertruckd.tools.stand.config import FileSource, VideoDevice
+from monstertruckd.tools.stand.config import FileSource, RenderedCamera, VideoDevice
 
 ENDINGS: Final = (".png", ".jpg", ".jpeg", ".pgm")
 
@@ -26,7 +31,7 @@ def pictures_in(folder: Path) -> list[Picture]:
     return [_read(path) for path in files]
 
 
-def stream(source: VideoDevice | FileSource, size: tuple[int, int], rate: float) -> Iterator[Picture]:
+def stream(source: VideoDevice | FileSource | RenderedCamera, size: tuple[int, int], rate: float) -> Iterator[Picture]:
     """Pictures one after the other, grey; blocks for each.
 
     Raises:
@@ -39,6 +44,9 @@ def stream(source: VideoDevice | FileSource, size: tuple[int, int], rate: float)
             return
         yield from _frames(source.path, cv2.VideoCapture(str(source.path)), InputError("cannot be read as a film"))
         return
+    if isinstance(source, RenderedCamera):
+        yield from _rendered(source.port, Mode(*size, rate))
+        return
     capture = cv2.VideoCapture(str(source.device), cv2.CAP_V4L2)
     for what, value in (
         (cv2.CAP_PROP_FRAME_WIDTH, size[0]),
@@ -49,6 +57,20 @@ def stream(source: VideoDevice | FileSource, size: tuple[int, int], rate: float)
         capture.set(what, value)
     yield from _frames(source.device, capture, DeviceLostError("cannot be opened"))
     raise DeviceLostError(f"{source.device}: sends no more pictures")
+
+
+def _rendered(port: Path, mode: Mode) -> Iterator[Picture]:
+    """Pictures of an emulated camera; the loop runs while one is waited for only."""
+    with asyncio.Runner() as runner:
+        stream = runner.run(RenderedSource(SerialPort(port), WallClock()).open(mode, buffers=2))
+        try:
+            while True:
+                data = np.frombuffer(runner.run(stream.next()).data, np.uint8)
+                picture = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if len(data) else None
+                if picture is not None:
+                    yield np.asarray(picture, dtype=np.uint8)
+        finally:
+            runner.run(stream.__aexit__(None, None, None))
 
 
 def _frames(name: Path, capture: cv2.VideoCapture, closed: Exception) -> Iterator[Picture]:

@@ -2,6 +2,7 @@
 
 import math
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,8 +13,10 @@ from monstertruck_estimation.vision.tags import TagReader
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import NotInstalledError
 from monstertruck_schemas.base import Pose2D
-from monstertruck_sim.world.config import CameraConfig, PersonConfig, Spot, TagConfig, WorldConfig
+from monstertruck_sim.config import BoardInView, CeilingCamera
+from monstertruck_sim.world.config import CameraConfig, PersonConfig, RoofTag, Spot, TagConfig, WorldConfig
 from monstertruck_sim.world.world import World
+from monstertruck_sim.world3d.ceiling import CeilingView
 
 SIZE = (320, 240)
 FOCAL = 160 / math.tan(math.radians(31.5))
@@ -58,3 +61,28 @@ def test_without_egl_the_world_says_so(world: World, monkeypatch: pytest.MonkeyP
 def test_the_plane_renders_nothing():
     with pytest.raises(ValidationError, match=r"camera\.rendered needs engine mujoco"):
         WorldConfig(camera=CameraConfig(rendered=True))
+
+
+def test_a_ceiling_camera_sees_the_tag_on_the_robot_and_a_board_that_is_held():
+    config = WorldConfig(
+        map="table", engine="mujoco", noise=False, start=Pose2D(x=0.3, y=0.2, yaw=0.5), roof=RoofTag(tag=3, size=0.12)
+    )
+    world = World(config, 1)
+    above = CeilingCamera(port=Path("unused"), height=2.0, yaw=math.pi / 2)
+    try:
+        view = CeilingView(world, above, None, 1)
+    except NotInstalledError as error:
+        pytest.skip(str(error))
+    world.truth(SECOND)
+
+    def grey(view: CeilingView) -> np.ndarray:
+        return np.asarray(Image.fromarray(view.exposure(SECOND, (640, 480))()).convert("L"))
+
+    (seen,) = TagReader(1).read(grey(view))
+    scale = 2 * FOCAL / (2.0 - 0.3)
+    assert seen.tag == 3
+    assert seen.corners.mean(axis=0) == pytest.approx((319.5 + scale * 0.3, 239.5 - scale * 0.2), abs=1.0)
+    front = seen.corners[:2].mean(axis=0) - seen.corners[2:].mean(axis=0)
+    assert math.atan2(-front[1], front[0]) == pytest.approx(0.5, abs=0.05)
+    board = grey(CeilingView(world, above, BoardInView(), 1))
+    assert len(TagReader(1).read(board)) > 15
