@@ -179,6 +179,23 @@ class DeleteRecording(_Command):
     name: Annotated[str, Field(max_length=128)]
 
 
+class ReplayRecording(_Command):
+    """Fetch a recording from the robot, and show it."""
+
+    do: Literal["replay"]
+    id: Id
+    name: Annotated[str, Field(max_length=128)]
+
+
+class ControlReplay(_Command):
+    """Go to a time of the recording that is shown, s since its beginning; play or pause; play at another rate."""
+
+    do: Literal["seek"]
+    at: Number | None = None
+    playing: bool | None = None
+    rate: Number | None = None
+
+
 Asked = (
     GiveOrder
     | SetGoal
@@ -194,23 +211,25 @@ Asked = (
     | ChangeSetting
     | ListRecordings
     | DeleteRecording
+    | ReplayRecording
 )
 """Commands whose outcome is answered."""
-Command = Annotated[Watch | LookAtFleet | EchoRequest | Heartbeat | Asked, Field(discriminator="do")]
+AnyCommand = Watch | LookAtFleet | EchoRequest | Heartbeat | ControlReplay | Asked
+Command = Annotated[AnyCommand, Field(discriminator="do")]
 
-_COMMANDS: Final[TypeAdapter[Watch | LookAtFleet | EchoRequest | Heartbeat | Asked]] = TypeAdapter(Command)
+_COMMANDS: Final[TypeAdapter[AnyCommand]] = TypeAdapter(Command)
 
 
-def needed(command: Watch | LookAtFleet | EchoRequest | Heartbeat | Asked) -> AccessRole:
+def needed(command: AnyCommand) -> AccessRole:
     """What a user must be to ask for it: everybody may look, and stop."""
     if isinstance(command, GiveOrder) and command.order in UNCONDITIONAL:
         return AccessRole.OBSERVER
-    if isinstance(command, Watch | LookAtFleet | EchoRequest | ListSettings | ListRecordings):
+    if isinstance(command, Watch | LookAtFleet | EchoRequest | ControlReplay | ListSettings | ListRecordings):
         return AccessRole.OBSERVER
     return AccessRole.ENGINEER if isinstance(command, ChangeSetting | DeleteRecording) else AccessRole.PILOT
 
 
-def parse(data: str) -> Watch | LookAtFleet | EchoRequest | Heartbeat | Asked:
+def parse(data: str) -> AnyCommand:
     """The command of one message.
 
     Raises:

@@ -3,7 +3,9 @@
 import base64
 import logging
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
 from typing import Any, Final
 
 from aiohttp import web
@@ -12,6 +14,7 @@ from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import NotFoundError, RequestRefusedError, TruckError
 from monstertruck_runtime.stations import own_source, tls_for
+from monstertruck_runtime.threads import in_thread
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.station.address import RobotAddress
 
@@ -32,11 +35,7 @@ async def download(
     Raises:
         web.HTTPException: the robot refuses, is not there, or the range lies behind the end.
     """
-    tls = tls_for(address.endpoint)
-    source = f"{own_source(None if tls is None else tls.owner())}-{user}{'.' * bool(user)}files"
-    async with TruckClient(
-        address.name, address.endpoint, source=source[-64:], clock=clock, timeout=WAIT, tls=tls
-    ) as truck:
+    async with _session(address, user, clock) as truck:
         offset = _begin(request.headers.get("Range"))
         try:
             first = await truck.call("recording_read", {"name": name, "offset": offset})
@@ -57,6 +56,37 @@ async def download(
         await response.prepare(request)
         await _stream(response, truck, name, first, offset, size)
         return response
+
+
+async def fetch(
+    address: RobotAddress, name: str, user: str, clock: Clock, to: Path, progress: Callable[[float], object]
+) -> None:
+    """Fetch a recording into a file, going on with what is there of it already; ``progress`` gets the share.
+
+    Raises:
+        TruckError: the robot refuses, or is not there.
+    """
+    async with _session(address, user, clock) as truck:
+        at = await in_thread(lambda: to.stat().st_size if to.exists() else 0)
+        while True:
+            answer = await truck.call("recording_read", {"name": name, "offset": at})
+            data = base64.b64decode(answer["data"])
+            await in_thread(partial(_append, to, data))
+            size, at = int(answer["bytes"]), at + len(data)
+            progress(at / max(size, 1))
+            if not data or at >= size:
+                return
+
+
+def _append(file: Path, data: bytes) -> None:
+    with file.open("ab") as end:
+        end.write(data)
+
+
+def _session(address: RobotAddress, user: str, clock: Clock) -> TruckClient:
+    tls = tls_for(address.endpoint)
+    source = f"{own_source(None if tls is None else tls.owner())}-{user}{'.' * bool(user)}files"
+    return TruckClient(address.name, address.endpoint, source=source[-64:], clock=clock, timeout=WAIT, tls=tls)
 
 
 async def _stream(

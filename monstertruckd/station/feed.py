@@ -248,7 +248,7 @@ class RobotFeed:
                     for shown, box in boxes:
                         self._take(shown, box, taken, now)
                     pose = next((box for box in poses if box.latest is not None), poses[0])
-                    self._take(_POSE, pose, taken, now)
+                    self._take(POSE, pose, taken, now)
                     self._take_map(maps, tiles)
                     for event in events.drain():
                         self._take_event(event)
@@ -298,4 +298,4 @@ class RobotFeed:
             viewer.tell(frame)
 
 
-_POSE: Final = Shown(topics.ODOMETRY, "pose", frames.pose)
+POSE: Final = Shown(topics.ODOMETRY, "pose", frames.pose)

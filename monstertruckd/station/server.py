@@ -6,29 +6,34 @@ import json
 import logging
 import re
 import secrets
+import shutil
 import ssl
-from collections.abc import Awaitable, Callable, Sequence
+import tempfile
+from collections.abc import Awaitable, Callable, Coroutine, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from aiohttp import WSMessage, WSMsgType, web
 
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.endpoints import LOCAL_HOSTS
-from monstertruck_runtime.errors import BusyError, InputError, NotPermittedError
+from monstertruck_runtime.errors import BusyError, InputError, NotPermittedError, TruckError
+from monstertruck_runtime.threads import in_thread
 from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import UNCONDITIONAL
 from monstertruck_schemas.roles import AccessRole
 from monstertruckd import __version__
 from monstertruckd.station import commands, frames
 from monstertruckd.station.address import RobotAddress
-from monstertruckd.station.commands import EchoRequest, Heartbeat, LookAtFleet, Watch
+from monstertruckd.station.commands import ControlReplay, EchoRequest, Heartbeat, LookAtFleet, ReplayRecording, Watch
 from monstertruckd.station.discovery import Discovery
-from monstertruckd.station.downloads import download
+from monstertruckd.station.downloads import download, fetch
 from monstertruckd.station.feed import RobotFeed
 from monstertruckd.station.fleet import FleetBoard
 from monstertruckd.station.pilot import Pilot
+from monstertruckd.station.replay import LogOpener, ReplayFeed
 from monstertruckd.station.users import LOCAL, StationUser, StationUsers
 from monstertruckd.station.viewer import Viewer
 
@@ -36,6 +41,8 @@ log = logging.getLogger(__name__)
 
 PAGE: Final = Path(__file__).parent / "page"
 FILES: Final = re.compile(r"[a-z_]+\.(?:js|css|svg)")
+MOST_REPLAYS: Final = 4
+"""Recordings that are shown, and kept in memory, at once."""
 RECORDING: Final = re.compile(r"[A-Za-z0-9_.-]{1,120}\.mcap")
 TYPES: Final = {".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml", ".html": "text/html"}
 BEAT: Final = 10.0
@@ -101,10 +108,16 @@ class Station:
         clock: the station's time.
         place: where to listen.
         routers: endpoints whose robots are shown as they appear.
+        open_log: opens recordings that are to be replayed; None = none are.
     """
 
     def __init__(
-        self, robots: Sequence[RobotAddress], clock: Clock, place: Place = Place(), routers: Sequence[str] = ()
+        self,
+        robots: Sequence[RobotAddress],
+        clock: Clock,
+        place: Place = Place(),
+        routers: Sequence[str] = (),
+        open_log: LogOpener | None = None,
     ) -> None:
         self._clock = clock
         self.place = place
@@ -120,6 +133,12 @@ class Station:
         self._run = secrets.token_hex(2)
         """Tells this run's browsers from those of another, whose sequence numbers the robot remembers."""
         self._strings = _strings()
+        self._open_log = open_log
+        self.replays: dict[str, ReplayFeed] = {}
+        """Recordings that are shown, by their name in the list of robots."""
+        self._folder: Path | None = None
+        """Where recordings are fetched to, while it runs."""
+        self._fetching = asyncio.Lock()
 
     async def run(self, ready: Callable[[], object] = lambda: None) -> None:
         """Serve until cancelled; ``ready`` is called once browsers are answered.
@@ -151,9 +170,45 @@ class Station:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
             await runner.cleanup()
+            if self._folder is not None:
+                shutil.rmtree(self._folder, ignore_errors=True)
 
-    def _follow(self, feed: RobotFeed) -> None:
+    def _follow(self, feed: RobotFeed | ReplayFeed) -> None:
         self._following.add(asyncio.create_task(feed.run()))
+
+    @property
+    def names(self) -> list[str]:
+        """What browsers can look at: robots, then recordings."""
+        return [*self.feeds, *self.replays]
+
+    async def replay(self, address: RobotAddress, name: str, user: str, viewer: Viewer) -> str:
+        """Fetch a recording and offer it in every browser; returns its name there.
+
+        Raises:
+            InputError: there is no such name, it cannot be shown, or too many are shown already.
+            TruckError: the robot refuses it, or is not there.
+        """
+        title = f"{address.name} {name.removesuffix('.mcap')}"
+        if self._open_log is None or not RECORDING.fullmatch(name):
+            raise InputError(f"{name}: cannot be replayed here")
+        async with self._fetching:
+            if title in self.replays:
+                return title
+            if len(self.replays) >= MOST_REPLAYS:
+                raise InputError(f"{MOST_REPLAYS} recordings are shown already: start the station anew")
+            if self._folder is None:
+                self._folder = Path(tempfile.mkdtemp(prefix="monstertruckd-station-"))
+            file, open_log = self._folder / f"{address.name}-{name}", self._open_log
+
+            def progress(share: float) -> None:
+                viewer.show("fetching", frames.text("fetching", name=name, share=round(share, 3)))
+
+            await fetch(address, name, user, self._clock, file, progress)
+            self.replays[title] = feed = await in_thread(lambda: ReplayFeed(title, file, open_log, self._clock))
+        self._follow(feed)
+        for each in self._viewers:
+            each.tell(frames.text("robots", names=self.names))
+        return title
 
     def _found(self, address: RobotAddress) -> None:
         """A robot appeared: follow it, and offer it in every browser."""
@@ -163,7 +218,7 @@ class Station:
         self.feeds[address.name] = RobotFeed(address, self._clock)
         self._follow(self.feeds[address.name])
         for viewer in self._viewers:
-            viewer.tell(frames.text("robots", names=list(self.feeds)))
+            viewer.tell(frames.text("robots", names=self.names))
 
     def application(self) -> web.Application:
         """All routes."""
@@ -226,7 +281,8 @@ class Station:
         return web.Response(body=self._strings, content_type="application/json")
 
     async def _map(self, request: web.Request) -> web.StreamResponse:
-        feed = self.feeds.get(request.match_info["robot"])
+        name = request.match_info["robot"]
+        feed = self.feeds.get(name) or self.replays.get(name)
         cells = None if feed is None else await feed.map.packed()
         if cells is None:
             raise web.HTTPNotFound
@@ -251,7 +307,7 @@ class Station:
         user = request[USER]
         name = f"{user.name}{'-' * bool(user.name)}{self._run}.{next(self._browsers)}"
         log.info("browser %s connected from %s", name, request.remote)
-        browser = _Browser(name, user, self.feeds, self._board, self._clock)
+        browser = _Browser(name, user, self, self._board, self._clock)
         self._viewers.add(browser.viewer)
         self._sockets.add(socket)
         sending = asyncio.create_task(_send(socket, browser.viewer))
@@ -278,21 +334,19 @@ class Station:
 class _Browser:
     """One connection: what it looks at, and what it asks."""
 
-    def __init__(
-        self, name: str, user: StationUser, feeds: dict[str, RobotFeed], board: FleetBoard, clock: Clock
-    ) -> None:
+    def __init__(self, name: str, user: StationUser, station: Station, board: FleetBoard, clock: Clock) -> None:
         self.viewer = Viewer()
         self._board = board
         self._name = name
         self._user = user
-        self._feeds = feeds
+        self._station = station
         self._clock = clock
-        self._feed: RobotFeed | None = None
+        self._feed: RobotFeed | ReplayFeed | None = None
         self._pilot: Pilot | None = None
         self._session: asyncio.Task[None] | None = None
         self._ending: set[asyncio.Task[None]] = set()
         self.viewer.tell(frames.text("hello", version=__version__, user=user.name, role=user.role.value))
-        self.viewer.tell(frames.text("robots", names=list(feeds)))
+        self.viewer.tell(frames.text("robots", names=station.names))
 
     def take(self, data: str) -> None:
         """Obey one message.
@@ -302,8 +356,8 @@ class _Browser:
             NotPermittedError: the user may not ask for that.
         """
         command = commands.parse(data)
-        if not self._user.may(needed := commands.needed(command)):
-            refused = NotPermittedError(f"user {self._user.name!r} is {self._user.role.value}: expected {needed.value}")
+        refused = self._refusal(command)
+        if refused is not None:
             if isinstance(command, commands.Asked):
                 self.viewer.tell(frames.refusal(command.id, refused))
             raise refused
@@ -311,6 +365,11 @@ class _Browser:
             case Heartbeat():
                 if self._pilot is not None:
                     self._pilot.drive(command)
+            case ControlReplay():
+                if isinstance(self._feed, ReplayFeed):
+                    self._feed.control(command.at, command.playing, command.rate)
+            case ReplayRecording():
+                self._begin(self._replay(command))
             case EchoRequest():
                 self.viewer.tell(frames.text("pong", at=command.at))
             case LookAtFleet():
@@ -322,16 +381,52 @@ class _Browser:
                     raise InputError("no robot is looked at")
                 self._pilot.ask(command)
 
+    def _refusal(self, command: commands.AnyCommand) -> NotPermittedError | None:
+        """Why the user may not ask for that now."""
+        if not self._user.may(needed := commands.needed(command)):
+            return NotPermittedError(f"user {self._user.name!r} is {self._user.role.value}: expected {needed.value}")
+        if isinstance(self._feed, ReplayFeed) and not _while_replaying(command):
+            return NotPermittedError("a recording is shown: nothing but a stop goes to the robot")
+        return None
+
+    def _begin(self, job: Coroutine[Any, Any, None]) -> None:
+        task = asyncio.create_task(job)
+        self._ending.add(task)
+        task.add_done_callback(self._ending.discard)
+
+    async def _replay(self, command: ReplayRecording) -> None:
+        feed = self._feed
+        try:
+            if not isinstance(feed, RobotFeed):
+                raise InputError("no robot is looked at")
+            name = await self._station.replay(feed.address, command.name, self._user.name, self.viewer)
+        except TruckError as error:
+            self.viewer.tell(frames.refusal(command.id, error))
+        else:
+            self.viewer.tell(frames.text("answer", id=command.id, ok=True, value={"robot": name}))
+
     def _watch(self, robot: str) -> None:
-        feed = self._feeds.get(robot)
+        if (replay := self._station.replays.get(robot)) is not None:
+            self._show_replay(replay)
+            return
+        feed = self._station.feeds.get(robot)
         if feed is None:
-            raise InputError(f"robot {robot!r}: expected one of {', '.join(self._feeds)}")
+            raise InputError(f"robot {robot!r}: expected one of {', '.join(self._station.names)}")
         self._leave()
         self.viewer.tell(frames.text("robot", name=robot))
         self._feed = feed
         feed.attach(self.viewer)
         self._pilot = Pilot(feed.address, self._name, self.viewer, self._clock)
         self._session = asyncio.create_task(self._pilot.run())
+
+    def _show_replay(self, replay: ReplayFeed) -> None:
+        """Show a recording; the session with the robot stays, so that its emergency stop is at hand."""
+        if self._feed is not None:
+            self._feed.detach(self.viewer)
+        self.viewer.forget()
+        self.viewer.tell(frames.text("robot", name=replay.name))
+        self._feed = replay
+        replay.attach(self.viewer)
 
     def _leave(self) -> None:
         if self._feed is not None:
@@ -347,7 +442,16 @@ class _Browser:
         """End its sessions."""
         self._board.show(self.viewer, False)
         self._leave()
+        for task in self._ending:
+            task.cancel()
         await asyncio.gather(*self._ending, return_exceptions=True)
+
+
+def _while_replaying(command: commands.AnyCommand) -> bool:
+    """Whether it is obeyed while a recording is shown."""
+    if isinstance(command, commands.GiveOrder):
+        return command.order in UNCONDITIONAL
+    return isinstance(command, Watch | LookAtFleet | EchoRequest | ControlReplay)
 
 
 async def _send(socket: web.WebSocketResponse, viewer: Viewer) -> None:

@@ -133,7 +133,7 @@ export class Drive {
   }
 
   send([input, x, y]) {
-    if (this.link.newest.hello?.role === "observer") return;
+    if (this.link.newest.hello?.role === "observer" || document.body.dataset.replay === "true") return;
     const limit = this.limit();
     const speed = Math.abs(y) < DEAD ? 0 : y * limit;
     const steer = -x * (this.facts?.gate.angle ?? 0.36);

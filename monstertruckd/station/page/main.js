@@ -2,6 +2,7 @@ import { Drive } from "./drive.js";
 import { FleetView } from "./fleet.js";
 import { MapView } from "./map.js";
 import { element, Panels } from "./panels.js";
+import { ReplayBar } from "./replay.js";
 import { Link } from "./socket.js";
 import { Work } from "./work.js";
 import { degrees, loadWords, number, reason, words } from "./words.js";
@@ -41,7 +42,8 @@ const drive = new Drive(link);
 const map = new MapView(byId("map"), link, aimed);
 const panels = new Panels(link);
 const fleet = new FleetView(link, map, chosen);
-new Work(link, outcome);
+new ReplayBar(link, chosen); // first: the others look at what it says of the page
+new Work(link, outcome, chosen);
 
 link.on("robots", ({ names }) => {
   const select = byId("robots");

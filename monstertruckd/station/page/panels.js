@@ -99,7 +99,7 @@ export class Panels {
     if (silent && newest.gate) this.banner("silent", words("banner.silent"), "bad");
     else this.drop("silent");
     const facts = newest.facts;
-    if (facts && newest.hello && facts.versions.monstertruckd !== newest.hello.version) {
+    if (facts?.versions.monstertruckd && newest.hello && facts.versions.monstertruckd !== newest.hello.version) {
       this.banner("versions", words("versions.differ", { robot: facts.versions.monstertruckd, station: newest.hello.version }), "warn");
     }
   }

@@ -11,8 +11,14 @@ function button(text, press, look = "") {
 }
 
 export class Work {
-  constructor(link, outcome) {
+  /** outcome: shows an answer; watch: called with the name of a recording that is to be shown. */
+  constructor(link, outcome, watch) {
     this.link = link;
+    this.watch = watch;
+    link.on("fetching", ({ name, share }) => {
+      const bar = byId("recordings").querySelector(`[data-name="${name}"] progress`);
+      if (bar) bar.value = share;
+    });
     this.outcome = outcome;
     for (const kind of ["facts", "robot", "explore", "mission", "behaviour", "hello"]) link.on(kind, () => this.showTasks());
     link.on("robot", () => this.clear());
@@ -91,6 +97,7 @@ export class Work {
   // Settings
 
   async loadSettings() {
+    if (document.body.dataset.replay === "true") return;
     const answer = await this.link.ask({ do: "settings" });
     if (!this.outcome("tab.settings", answer)) return;
     byId("settings").replaceChildren(...answer.value.settings.map((row) => this.setting(row)));
@@ -118,6 +125,7 @@ export class Work {
   // Recordings
 
   async loadRecordings() {
+    if (document.body.dataset.replay === "true") return;
     const answer = await this.link.ask({ do: "recordings" });
     if (!this.outcome("tab.recordings", answer)) return;
     const rows = answer.value.recordings;
@@ -136,7 +144,14 @@ export class Work {
         const href = `/robots/${encodeURIComponent(this.link.robot)}/recordings/${encodeURIComponent(name)}`;
         actions.append(element("a", { href, download: name, className: "button", textContent: words("recordings.download"), ariaLabel: `${words("recordings.download")}: ${name}` }));
       }
+      if (this.link.newest.hello?.role !== "observer") actions.append(button(words("recordings.replay"), replay));
       if (this.engineer && !open) actions.append(button(words("recordings.delete"), confirm));
+    };
+    const replay = async () => {
+      actions.replaceChildren(element("progress", { max: 1, value: 0, ariaLabel: words("recordings.fetching", { name }) }));
+      const answer = await this.link.ask({ do: "replay", name });
+      offer();
+      if (this.outcome("recordings.replay", answer)) this.watch(answer.value.robot);
     };
     const confirm = () => {
       const sure = button(words("recordings.sure", { size: `${number(bytes / 1e6, 1)} MB` }), async () => {
@@ -145,6 +160,7 @@ export class Work {
       actions.replaceChildren(sure, button(words("recordings.keep"), offer));
       sure.focus();
     };
+    item.dataset.name = name;
     offer();
     return item;
   }

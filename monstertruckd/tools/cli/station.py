@@ -44,6 +44,7 @@ def station(
     It is a client of the robots like any other, and asks nothing of the internet. Beyond the loopback
     interface the page is served by TLS only, and to users who log in.
     """
+    from monstertruckd.recorder.reader import open_log
     from monstertruckd.station import users as station_users
     from monstertruckd.station.address import RobotAddress
     from monstertruckd.station.server import Place, Station
@@ -58,7 +59,9 @@ def station(
     known = None if users is None else station_users.StationUsers.load(users)
     place = Place(host, port, _tls(certificate, key), known, tuple(name or ()))
     until_stopped(
-        lambda clock: Station(addresses, clock, place, routers or ()).run(lambda: remark(f"station: {place.url}"))
+        lambda clock: Station(addresses, clock, place, routers or (), open_log).run(
+            lambda: remark(f"station: {place.url}")
+        )
     )
 
 

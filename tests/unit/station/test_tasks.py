@@ -1,21 +1,30 @@
 """What the page asks beyond driving: paths that are drawn, missions, settings, recordings."""
 
+import asyncio
 import base64
+import contextlib
 import json
+from pathlib import Path
 from types import SimpleNamespace
 
 import aiohttp
 import numpy as np
 import pytest
 
-from monstertruck_runtime.clock import WallClock
+from monstertruck_runtime.clock import SECOND, WallClock
 from monstertruck_runtime.errors import InputError, NotFoundError, RequestRefusedError
+from monstertruck_schemas import topics
+from monstertruck_schemas.base import Pose2D, Twist2D
+from monstertruck_schemas.event import Event, Severity
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.roles import AccessRole
-from monstertruckd.station import commands, downloads
+from monstertruck_schemas.state import Grid, Odometry
+from monstertruckd.station import commands, downloads, server
 from monstertruckd.station.address import RobotAddress
 from monstertruckd.station.pilot import SHORTEST, drawn_path, read_mission
+from monstertruckd.station.replay import ReplayFeed
 from monstertruckd.station.server import Place, Station
+from monstertruckd.station.viewer import Viewer
 from monstertruckd.tools.demo.runs import free_endpoint
 
 
@@ -119,3 +128,114 @@ async def test_a_recording_is_downloaded_gone_on_with_and_refused_as_the_robot_s
             assert foreign.status == 403
     finally:
         await runner.cleanup()
+
+
+class Recorded:
+    """One message of a log."""
+
+    def __init__(self, topic, message, at):
+        self.topic, self.log_time, self.payload = topic.name, at, b"x"
+        self.decode = lambda: message
+
+
+class RecordedDrive:
+    """A log of 10 s: a pose each 0.1 s, a map at 0 and 5 s, a tile at 7 s, an event each second."""
+
+    def __init__(self, _=None):
+        pass
+
+    def config(self):
+        return {}
+
+    def __iter__(self):
+        for i in range(101):
+            at = i * SECOND // 10
+            header = {"stamp": at, "received": at, "seq": i}
+            pose = Pose2D(x=i / 10, y=0.0, yaw=0.0)
+            still = {"pose_covariance": np.zeros(9), "twist_covariance": np.zeros(9), "age": 0.0}
+            twist = Twist2D(vx=1.0, vy=0.0, wz=0.0)
+            odometry = Odometry(**header, frame="map", pose=pose, twist=twist, **still)
+            yield Recorded(topics.POSE, odometry, at)
+            if i in (0, 50, 70):
+                width = 4 if i < 70 else 1
+                grid = Grid(
+                    **header,
+                    frame="map",
+                    resolution=0.1,
+                    width=width,
+                    height=1,
+                    origin=Pose2D(x=float(i), y=0.0, yaw=0.0),
+                    cells=np.zeros(width, np.int8),
+                )
+                yield Recorded(topics.MAP if i < 70 else topics.MAP_TILES, grid, at)
+            if i % 10 == 0:
+                event = Event(**header, reason=Reason.OK, severity=Severity.INFO, source="test", text=f"at {i // 10}")
+                yield Recorded(topics.EVENT, event, at)
+
+
+async def shown(viewer) -> list:
+    """Everything that waits to be sent."""
+    frames = []
+    with contextlib.suppress(TimeoutError):
+        while True:
+            frames.append(await asyncio.wait_for(viewer.next(), 0.01))
+    return [json.loads(frame) if isinstance(frame, str) else {"kind": "binary"} for frame in frames]
+
+
+def of(frames: list, kind: str) -> list:
+    return [frame for frame in frames if frame["kind"] == kind]
+
+
+async def test_a_recording_is_played_paused_and_gone_through_by_its_time_bar():
+    feed, viewer = ReplayFeed("truck run-1", Path("run-1.mcap"), RecordedDrive, WallClock()), Viewer()
+    feed.attach(viewer)
+    begun = await shown(viewer)
+    assert of(begun, "pose")[0]["pose"][0] == 0.0
+    assert of(begun, "replay")[0]["length"] == 10.0
+    feed._play(2 * SECOND + SECOND // 20)
+    played = await shown(viewer)
+    assert of(played, "pose")[0]["pose"][0] == 2.0
+    assert [frame["m"]["text"] for frame in of(played, "event")] == ["at 1", "at 2"]
+    feed.control(8.0, None, None)
+    jumped = await shown(viewer)
+    assert jumped[0]["kind"] == "robot", "the page forgets what was"
+    assert of(jumped, "pose")[0]["pose"][0] == 8.0
+    assert (of(jumped, "map")[0]["origin"][0], len(of(jumped, "binary"))) == (50.0, 1), "the newest map and its change"
+    assert of(jumped, "event")[-1]["m"]["text"] == "at 8"
+    feed.control(1.0, False, 5.0)
+    back = await shown(viewer)
+    assert of(back, "map")[0]["origin"][0] == 0.0
+    assert of(back, "binary") == []
+    state = of(back, "replay")[-1]
+    assert (state["at"], state["playing"], state["rate"]) == (1.0, False, 5.0)
+    feed.detach(viewer)
+
+
+async def test_a_recording_plays_by_itself_at_its_rate_to_its_end():
+    feed, viewer = ReplayFeed("truck run-1", Path("run-1.mcap"), RecordedDrive, WallClock()), Viewer()
+    feed.control(None, True, 20.0)
+    feed.attach(viewer)
+    playing = asyncio.create_task(feed.run())
+    try:
+        async with asyncio.timeout(10):
+            while not (states := of(await shown(viewer), "replay")) or states[-1]["playing"]:
+                await asyncio.sleep(0.05)
+        assert states[-1]["at"] == 10.0
+    finally:
+        playing.cancel()
+
+
+@pytest.mark.parametrize(
+    ("asked", "obeyed"),
+    [
+        ({"do": "order", "id": 1, "order": "estop"}, True),
+        ({"do": "seek", "at": 1.0}, True),
+        ({"do": "watch", "robot": "truck"}, True),
+        ({"do": "order", "id": 1, "order": "arm"}, False),
+        ({"do": "drive", "at": 0.0, "input": "keys", "speed": 0.1}, False),
+        ({"do": "goal", "id": 1, "goal": [0, 0, 0]}, False),
+        ({"do": "set", "id": 1, "key": "gate.speed", "value": 0.1}, False),
+    ],
+)
+def test_while_a_recording_is_shown_nothing_but_a_stop_goes_to_the_robot(asked: dict, obeyed: bool):
+    assert server._while_replaying(commands.parse(json.dumps(asked))) is obeyed

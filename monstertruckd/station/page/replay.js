@@ -1,0 +1,49 @@
+// The time bar of a recording that is shown in place of a robot.
+import { number, words } from "./words.js";
+
+const byId = (id) => document.getElementById(id);
+
+export class ReplayBar {
+  /** watch: called with the robot's name when the recording is closed. */
+  constructor(link, watch) {
+    this.link = link;
+    this.robot = null; // looked at before
+    this.held = false;
+    link.on("robot", ({ name }) => this.opened(name));
+    link.on("replay", (state) => this.show(state));
+    byId("replay-play").onclick = () => this.send({ playing: !this.state?.playing });
+    byId("replay-rate").onchange = () => this.send({ rate: Number(byId("replay-rate").value) });
+    byId("replay-end").onclick = () => watch(this.robot);
+    const bar = byId("replay-at");
+    bar.onpointerdown = () => (this.held = true);
+    bar.onchange = () => {
+      this.held = false;
+      this.send({ at: Number(bar.value) });
+    };
+  }
+
+  send(more) {
+    this.link.send({ do: "seek", ...more });
+  }
+
+  opened(name) {
+    const robots = this.link.newest.robots?.names ?? [];
+    this.recording = name.includes(" ");
+    if (!this.recording) this.robot = name;
+    this.robot ??= robots[0];
+    byId("replay").hidden = !this.recording;
+    document.body.dataset.replay = this.recording;
+    byId("replay-stop").textContent = words("replay.stop", { robot: this.robot });
+  }
+
+  show(state) {
+    if (!this.recording) return;
+    this.state = state;
+    const bar = byId("replay-at");
+    bar.max = state.length;
+    if (!this.held) bar.value = state.at;
+    bar.setAttribute("aria-valuetext", words("replay.time", { at: number(state.at, 0), length: number(state.length, 0) }));
+    byId("replay-time").textContent = words("replay.time", { at: number(state.at, 1), length: number(state.length, 0) });
+    byId("replay-play").textContent = words(state.playing ? "replay.pause" : "replay.play");
+  }
+}

@@ -1,0 +1,251 @@
+"""A recording on the page, with a time bar: the same frames as of a robot, out of a log."""
+
+import bisect
+import logging
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any, Final, Protocol
+
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.errors import InputError, TruckError
+from monstertruck_schemas import topics
+from monstertruck_schemas.base import Message
+from monstertruckd.station import frames
+from monstertruckd.station.feed import POSE, SHOWN, TICK, MapStore
+from monstertruckd.station.frames import Frame
+from monstertruckd.station.viewer import Viewer
+
+log = logging.getLogger(__name__)
+
+MOST_BYTES: Final = 400_000_000
+"""Payload of a recording that is kept in memory."""
+AGAIN: Final = 0.4
+"""Seconds after which what stands still is shown once more: pages tell a silent robot by it."""
+AGAIN_KINDS: Final = ("gate", "pose", "scan")
+EVENTS: Final = 50
+"""Events shown of the time before the place that was chosen."""
+FASTEST: Final = 20.0
+
+
+class Recorded(Protocol):
+    """One message of a log."""
+
+    topic: str
+    log_time: int
+
+    def decode(self) -> Message:
+        """The typed message."""
+        ...
+
+
+class RecordedLog(Iterable[Any], Protocol):
+    """A log file: iterates over its messages."""
+
+    def config(self) -> dict[str, Any]:
+        """The configuration it was recorded with."""
+        ...
+
+
+LogOpener = Callable[[Path], RecordedLog]
+
+
+class RecordedTopic:
+    """The messages of one topic in the order of their times."""
+
+    def __init__(self) -> None:
+        self.times: list[int] = []
+        self.messages: list[Recorded] = []
+        self.index = 0
+        """Messages before the present time."""
+
+    def up_to(self, at: int) -> Iterator[Message]:
+        """What came since the last time, up to ``at``; what cannot be decoded is left out."""
+        end = bisect.bisect_right(self.times, at)
+        begin, self.index = self.index, end
+        for row in self.messages[begin:end]:
+            try:
+                yield row.decode()
+            except TruckError as error:
+                log.debug("message left out: %s", error)
+
+    def newest(self, at: int) -> Message | None:
+        """The newest of these, or None if none came."""
+        end = bisect.bisect_right(self.times, at)
+        if end == self.index:
+            return None
+        self.index = end - 1
+        return next(self.up_to(at), None)
+
+
+class ReplayFeed:
+    """A recording that all browsers which look at it see at the same time.
+
+    Args:
+        name: in the page's list of robots.
+        file: the log.
+        open_log: opens logs.
+        clock: the station's time.
+
+    Raises:
+        InputError: it is no log, holds nothing to be shown, or too much.
+    """
+
+    def __init__(self, name: str, file: Path, open_log: LogOpener, clock: Clock) -> None:
+        self.name = name
+        self.map = MapStore()
+        self._clock = clock
+        self._viewers: set[Viewer] = set()
+        self._newest: dict[str, Frame] = {}
+        shown = (*SHOWN, POSE)
+        ways = (topics.POSE, topics.MAP, topics.MAP_TILES, topics.EVENT)
+        self._tracks = {topic.name: RecordedTopic() for topic in (*(row.topic for row in shown), *ways)}
+        reader = open_log(file)
+        self._begin, self._end = self._fill(reader, file)
+        pose = topics.POSE if self._tracks[topics.POSE.name].times else topics.ODOMETRY
+        self._shown = [*((row.topic.name, row) for row in SHOWN), (pose.name, POSE)]
+        self._facts = _facts(reader)
+        self._at = self._begin
+        self._playing = True
+        self._rate = 1.0
+        self._seek(self._begin)
+
+    def _fill(self, reader: RecordedLog, file: Path) -> tuple[int, int]:
+        size = 0
+        for row in reader:
+            track = self._tracks.get(row.topic)
+            if track is None:
+                continue
+            size += len(row.payload)
+            if size > MOST_BYTES:
+                raise InputError(
+                    f"{file.name}: more than {MOST_BYTES / 1e6:.0f} MB to be shown; see `monstertruckd replay`"
+                )
+            track.times.append(max(row.log_time, track.times[-1] if track.times else row.log_time))
+            track.messages.append(row)
+        filled = [track.times for track in self._tracks.values() if track.times]
+        if not filled:
+            raise InputError(f"{file.name}: holds nothing that the page shows")
+        return min(times[0] for times in filled), max(times[-1] for times in filled)
+
+    # Browsers
+
+    def attach(self, viewer: Viewer) -> None:
+        """Show it in a browser."""
+        self._viewers.add(viewer)
+        self._greet(viewer)
+
+    def detach(self, viewer: Viewer) -> None:
+        """Show it there no longer."""
+        self._viewers.discard(viewer)
+
+    def control(self, at: float | None, playing: bool | None, rate: float | None) -> None:
+        """Go to a time (s since the beginning), play or pause, or play at another rate."""
+        if rate is not None:
+            self._rate = min(max(rate, 0.1), FASTEST)
+        if playing is not None:
+            self._playing = playing
+            if playing and self._at >= self._end and at is None:
+                at = 0.0
+        if at is not None:
+            self._seek(min(max(self._begin + round(at * SECOND), self._begin), self._end))
+            for viewer in self._viewers:
+                viewer.forget()
+                viewer.tell(frames.text("robot", name=self.name))
+                self._greet(viewer)
+        self._say()
+
+    def _greet(self, viewer: Viewer) -> None:
+        viewer.tell(self._facts)
+        viewer.show("link", frames.text("link", alive=True, round_trip=0.0, text=""))
+        for kind, frame in self._newest.items():
+            viewer.show(kind, frame)
+        for part in self.map.tiles.values():
+            viewer.tell(part)
+        for event in self._events():
+            viewer.tell(event)
+        viewer.show("replay", self._state())
+
+    def _events(self) -> Iterator[Frame]:
+        track = self._tracks[topics.EVENT.name]
+        for row in track.messages[max(track.index - EVENTS, 0) : track.index]:
+            yield frames.message("event", row.decode())
+
+    # Time
+
+    async def run(self) -> None:
+        """Play until cancelled."""
+        before = self._clock.now()
+        due = 0
+        while True:
+            await self._clock.sleep(TICK)
+            now = self._clock.now()
+            if self._viewers and self._playing:
+                self._play(min(self._at + round((now - before) * self._rate), self._end))
+            before = now
+            if self._viewers and now >= due:
+                due = now + round(AGAIN * SECOND)
+                for kind in AGAIN_KINDS:
+                    if kind in self._newest:
+                        self._show(kind, self._newest[kind])
+                self._say()
+
+    def _play(self, at: int) -> None:
+        self._at = at
+        self._playing = at < self._end
+        self._look(at)
+        for event in self._tracks[topics.EVENT.name].up_to(at):
+            self._tell(frames.message("event", event))
+
+    def _seek(self, at: int) -> None:
+        self._at = at
+        self._newest.clear()
+        version, self.map = self.map.version, MapStore()
+        self.map.version = version
+        for track in self._tracks.values():
+            track.index = 0
+        maps, tiles, events = (self._tracks[t.name] for t in (topics.MAP, topics.MAP_TILES, topics.EVENT))
+        events.index = bisect.bisect_right(events.times, at)
+        newest = bisect.bisect_right(maps.times, at) - 1
+        tiles.index = bisect.bisect_left(tiles.times, maps.times[newest]) if newest >= 0 else 0
+        self._look(at)
+
+    def _look(self, at: int) -> None:
+        """Show what came up to ``at``."""
+        for name, row in self._shown:
+            if (message := self._tracks[name].newest(at)) is not None:
+                self._show(row.kind, row.encode(message))
+        if (grid := self._tracks[topics.MAP.name].newest(at)) is not None:
+            self._show("map", self.map.take(grid))  # type: ignore[arg-type]  # the topic's model
+        for part in self._tracks[topics.MAP_TILES.name].up_to(at):
+            self._tell(self.map.change(part))  # type: ignore[arg-type]
+
+    def _state(self) -> str:
+        return frames.text(
+            "replay",
+            at=round((self._at - self._begin) / SECOND, 2),
+            length=round((self._end - self._begin) / SECOND, 2),
+            playing=self._playing,
+            rate=self._rate,
+        )
+
+    def _say(self) -> None:
+        for viewer in self._viewers:
+            viewer.show("replay", self._state())
+
+    def _show(self, kind: str, frame: Frame) -> None:
+        self._newest[kind] = frame
+        for viewer in self._viewers:
+            viewer.show(kind, frame)
+
+    def _tell(self, frame: Frame) -> None:
+        for viewer in self._viewers:
+            viewer.tell(frame)
+
+
+def _facts(reader: RecordedLog) -> str:
+    """What the robot was; of a log that does not say it, nothing."""
+    try:
+        return frames.facts(reader.config(), {})
+    except (TruckError, KeyError, TypeError, AttributeError):
+        nothing = {"robot": None, "gate": dict.fromkeys(("speed", "reverse_speed", "angle", "tilt", "leases"), 0.0)}
+        return frames.facts(nothing, {})
