@@ -101,6 +101,8 @@ class ValidUntil(Schema):
     """Way of the robot in all, m; None: the way does not count"""
     part: str = ""
     """Device that was measured, and its port; another device, or one that was plugged elsewhere, is another part"""
+    serial: str = ""
+    """Its serial number by USB; empty: it was not known"""
 
 
 class Result(Schema):

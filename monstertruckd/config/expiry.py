@@ -1,7 +1,8 @@
 """How well a calibration was measured, and until when it counts: grades, validity, and the service that watches both.
 
 What rests on an expired calibration says so (``degraded``): the truck drives on, as nothing has failed. A calibration
-expires by time, by the way driven since, or when the device that was measured is another one or hangs on another port.
+expires by time, by the way driven since, or when the device that was measured is another one (by its serial number,
+where USB states one) or hangs on another port.
 """
 
 import itertools
@@ -9,6 +10,7 @@ import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -22,7 +24,8 @@ from monstertruck_runtime.threads import Offload
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.health import CalibrationHealth, CalibrationState
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.topics import BATTERY, CALIBRATION, COMPASS, DRIVE, ODOMETRY, POSE, Topic, Writer
+from monstertruck_schemas.topics import BATTERY, CALIBRATION, COMPASS, DRIVE, ODOMETRY, POSE, USB, Topic, Writer
+from monstertruck_schemas.usb import UsbTree
 from monstertruckd.bus.local import Bus
 from monstertruckd.config.calibration import Estimate, Grade, Result, ValidUntil, WizardName, utc
 from monstertruckd.config.truck import TruckConfig
@@ -35,6 +38,9 @@ PUBLISH: Final = 60
 """Periods between two messages, and between two writings of the odometer."""
 WORTH_WRITING: Final = 1.0
 """Metres: less is not written, to spare the memory card."""
+
+
+_UNKNOWN: Final[Mapping[str, str]] = MappingProxyType({})
 
 
 class Lifetime(NamedTuple):
@@ -123,13 +129,21 @@ def part_of(config: TruckConfig, role: str) -> str:
     return " ".join((device.kind.name, *map(str, port.values()), *((serial,) if serial else ())))
 
 
-def stamped(result: Result, config: TruckConfig, real_ns: int, odometer: float) -> Result:
-    """A result with grades and validity of its estimates, as it is saved now."""
+def serials_of(tree: UsbTree) -> dict[str, str]:
+    """Serial numbers of the devices that hang by hub and port, by role."""
+    return {node.role: node.serial for node in tree.nodes if node.role is not None and node.serial is not None}
+
+
+def stamped(
+    result: Result, config: TruckConfig, real_ns: int, odometer: float, serials: Mapping[str, str] = _UNKNOWN
+) -> Result:
+    """A result with grades and validity of its estimates, as it is saved now; ``serials`` as far as they are known."""
     life = LIFETIMES[result.wizard]
     until = ValidUntil(
         date=utc(real_ns + life.days * DAY),
         odometer=None if life.metres is None else odometer + life.metres,
         part=part_of(config, life.role),
+        serial=serials.get(life.role, ""),
     )
     estimates = tuple(
         e.model_copy(update={"grade": grade(result.wizard, e), "valid_until": until}) for e in result.estimates
@@ -143,8 +157,10 @@ def worst(result: Result) -> Grade:
     return max(grades, default="C")
 
 
-def state_of(result: Result, config: TruckConfig, real_ns: int, odometer: float) -> CalibrationState:
-    """Grade and validity of a result now."""
+def state_of(
+    result: Result, config: TruckConfig, real_ns: int, odometer: float, serials: Mapping[str, str] = _UNKNOWN
+) -> CalibrationState:
+    """Grade and validity of a result now; ``serials`` as far as they are known."""
     ends = [e.valid_until for e in result.estimates if e.valid_until is not None]
     life = LIFETIMES[result.wizard]
     until = min((end.date for end in ends), default=_later(result.date, life.days))
@@ -152,9 +168,13 @@ def state_of(result: Result, config: TruckConfig, real_ns: int, odometer: float)
     left = min(ways) - odometer if ways else None
     now, part = utc(real_ns), part_of(config, life.role)
     before = next((end.part for end in ends if end.part and end.part != part), None)
+    serial = serials.get(life.role, "")
+    other = next((end.serial for end in ends if end.serial and serial and end.serial != serial), None)
     expired = ""
     if before is not None:
         expired = f"{life.role} was {before}, it is {part or 'gone'}"
+    elif other is not None:
+        expired = f"{life.role} was the device with serial number {other}, it is {serial}"
     elif now > until:
         expired = f"measured {result.date[:10]}, counted until {until[:10]}"
     elif left is not None and left < 0.0:
@@ -238,14 +258,16 @@ class CalibrationWatch:
         self._train = DriveTrain(config.geometry.drive_ratio, config.geometry.wheel_radius)
         self._out = bus.publisher(CALIBRATION, Writer.DAEMON)
         self._expired: frozenset[str] = frozenset()
+        self._serials: dict[str, str] = {}
 
     def stamped(self, result: Result) -> Result:
         """As it is saved now."""
-        return stamped(result, self._config, self._real(), self.odometer.metres)
+        return stamped(result, self._config, self._real(), self.odometer.metres, self._serials)
 
     def states(self) -> list[CalibrationState]:
         """Of every wizard whose result counts."""
-        return [state_of(r, self._config, self._real(), self.odometer.metres) for r in self._results.values()]
+        now, way = self._real(), self.odometer.metres
+        return [state_of(r, self._config, now, way, self._serials) for r in self._results.values()]
 
     async def run(self, ready: Ready) -> None:
         """Watch until cancelled; the way is written at the end."""
@@ -253,7 +275,7 @@ class CalibrationWatch:
         self._expired = frozenset()
         self._look()
         ready()
-        with self._bus.subscribe(DRIVE, latest()) as drive:
+        with self._bus.subscribe(DRIVE, latest()) as drive, self._bus.subscribe(USB, latest()) as usb:
             before: float | None = None
             try:
                 for count in itertools.count(1):
@@ -263,8 +285,11 @@ class CalibrationWatch:
                         if before is not None:
                             self.odometer.metres += abs(float(self._train.distance(here - before)))
                         before = here
-                    if count % PUBLISH == 0:
+                    serials = self._serials if usb.latest is None else self._serials | serials_of(usb.latest)
+                    replaced, self._serials = serials != self._serials, serials
+                    if replaced or count % PUBLISH == 0:
                         self._look()
+                    if count % PUBLISH == 0:
                         await self._keep()
             finally:
                 await self._keep()

@@ -31,6 +31,8 @@ class UsbNode(Schema):
     """Product as the device calls itself."""
     usb_id: str | None = None
     """``vendor:product``, four hex digits each; None if it was never there."""
+    serial: str | None = None
+    """Serial number that it states; None if it states none, or was never there."""
     hub: bool = False
     tty: str | None = None
     """Serial node at this moment, e.g. ``ttyUSB0``."""

@@ -336,6 +336,7 @@ class HubCoordinator:
             parent=parent_of(name),
             title=device.title if device is not None else "",
             usb_id=device.usb_id if device is not None else None,
+            serial=device.serial if device is not None else None,
             hub=device is not None and device.hub,
             tty=tty.name if tty is not None else None,
             role=role,

@@ -8,6 +8,8 @@ from typing import Any, Final
 
 import numpy as np
 
+from monstertruck_drivers.usb.config import UsbPortConfig
+from monstertruck_drivers.usb.tree import read_tree
 from monstertruck_runtime.errors import ConfigError, TruckError
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.topics import CMD_STEERING, COMPASS, EVENT, IMU, ODOMETRY
@@ -52,8 +54,15 @@ def calibration(context: HostContext) -> Iterator[Finding]:
     counter.load()
     clock = context.computer.machine.clock
     now = clock.now() + clock.real_offset()
+    tree, ports = read_tree(context.computer.machine.sysfs), config.devices.present()
+    plugged = {
+        role: device.serial
+        for role, entry in ports.items()
+        if isinstance(entry.port, UsbPortConfig) and (device := tree.devices.get(entry.port.device)) is not None
+    }
+    serials = {role: serial for role, serial in plugged.items() if serial is not None}
     for name, result in file.results.items():
-        state = state_of(result, config, now, counter.metres)
+        state = state_of(result, config, now, counter.metres, serials)
         again = context.command("calibrate", name)
         if state.expired:
             yield warn(f"calibration {name}", Reason.CALIBRATION_EXPIRED, state.expired, again)

@@ -14,6 +14,7 @@ from monstertruck_schemas import topics
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import Battery, BatteryLevel, DriveFeedback, DriveMode
 from monstertruck_schemas.topics import Writer
+from monstertruck_schemas.usb import UsbNode, UsbState, UsbTree
 from monstertruckd.bus.local import Bus
 from monstertruckd.config.calibration import KEYS, Estimate, Result, utc
 from monstertruckd.config.expiry import (
@@ -139,3 +140,37 @@ def test_the_watch_marks_messages_tells_once_and_counts_the_way(tmp_path):
     kept = WayCounter(tmp_path / "odometer.json")
     kept.load()
     assert kept.metres == pytest.approx(128 * way, abs=2 * way)
+
+
+def test_another_device_on_the_same_port_is_told_and_the_old_one_counts_again(tmp_path):
+    node = UsbNode(name="1-1.2", role="drive", serial="A1", state=UsbState.PRESENT)
+
+    async def main(clock: VirtualClock):
+        bus = Bus(clock)
+        told = []
+        watch = CalibrationWatch(
+            TRUCK, {}, bus, clock, lambda *args, **_: told.append(args), inline, WayCounter(tmp_path / "odometer.json")
+        )
+        tree = bus.publisher(topics.USB, Writer.DAEMON)
+        task = asyncio.create_task(watch.run(lambda: None))
+
+        async def plugged(serial: str | None) -> str:
+            found = node.model_copy(update={"serial": serial})
+            tree.put(UsbTree(stamp=clock.now(), received=clock.now(), seq=tree.next_seq(), nodes=(found,)))
+            await clock.sleep(1.5)
+            return watch.states()[0].expired if watch.states() else ""
+
+        await plugged("A1")
+        saved = watch.stamped(result())
+        watch._results["drive"] = saved
+        seen = [await plugged(serial) for serial in ("A1", "B2", None, "A1")]
+        task.cancel()
+        await asyncio.wait([task])
+        return saved, seen, told
+
+    saved, seen, told = run_virtual(main)
+    assert saved.estimates[0].valid_until is not None
+    assert saved.estimates[0].valid_until.serial == "A1"
+    other = "drive was the device with serial number A1, it is B2"
+    assert seen == ["", other, other, ""]  # an unplugged device is still the one that was seen last
+    assert [args[3] for args in told] == [f"drive: {other}"]
