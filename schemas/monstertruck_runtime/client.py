@@ -72,7 +72,7 @@ ORDER_TIMEOUT: Final = 6.0
 """Seconds to wait for the outcome of an order: the robot itself gives up after 5 s."""
 
 
-def in_network_thread(take: Callable[[zenoh.Sample], None]) -> "handlers.Callback[zenoh.Sample]":
+def in_network_thread(take: Callable[[zenoh.Sample], object]) -> "handlers.Callback[zenoh.Sample]":
     """Handler that calls ``take`` in the thread that reads the network; zenoh-python's own way is one thread further.
 
     While it runs nothing else is read from that link: it must be quick, and must not use the session. The interpreter's
@@ -214,24 +214,28 @@ class TruckClient(Operator):
         def receive(sample: zenoh.Sample) -> None:
             hop.put(sample.payload.to_bytes())
 
-        key = topic.key(self.robot)
-        subscriber = (
-            ext.declare_advanced_subscriber(
-                self._open_session(),
-                key,
-                receive,
-                history=ext.HistoryConfig(detect_late_publishers=True, max_samples=1),
-            )
-            if topic.retained
-            else self._open_session().declare_subscriber(key, in_network_thread(receive))
-        )
+        subscriber = self._declare(topic, receive)
 
         def end() -> None:
             hop.close()
-            subscriber.undeclare()  # type: ignore[no-untyped-call]
+            subscriber.undeclare()
 
         self._subscriptions[mailbox] = end
         return mailbox
+
+    def tap(self, topic: Topic[Any], take: Callable[[bytes], object]) -> Any:
+        """Hand the bytes of every message of ``topic`` to ``take``, in a thread that reads the network.
+
+        Of a retained topic the newest message comes at once. It ends by ``undeclare()`` of what is returned.
+        """
+        return self._declare(topic, lambda sample: take(sample.payload.to_bytes()))
+
+    def _declare(self, topic: Topic[Any], receive: Callable[[zenoh.Sample], object]) -> Any:
+        key = topic.key(self.robot)
+        if not topic.retained:
+            return self._open_session().declare_subscriber(key, in_network_thread(receive))
+        history = ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
+        return ext.declare_advanced_subscriber(self._open_session(), key, receive, history=history)
 
     def watch(self, topic: Topic[M]) -> "Watched[M]":
         """Follow the newest message of ``topic``, which is decoded only when it is asked for.

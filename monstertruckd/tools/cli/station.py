@@ -1,14 +1,19 @@
 """``monstertruckd station``: the operator's web page."""
 
+import asyncio
 import ssl
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from monstertruck_runtime.clock import WallClock
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.roles import AccessRole
 from monstertruckd.tools.cli.output import needs_extra, remark, until_stopped
+
+if TYPE_CHECKING:
+    from monstertruckd.station.address import RobotAddress
 
 
 @needs_extra("station")
@@ -38,6 +43,17 @@ def station(
         typer.Option("--add-user", metavar="USER", help="Add a user to --users, asking for a password; end."),
     ] = None,
     role: Annotated[AccessRole, typer.Option("--role", help="Of the added user.")] = AccessRole.PILOT,
+    foxglove: Annotated[
+        bool, typer.Option("--foxglove", help="Also serve the first robot to Foxglove's app on this machine.")
+    ] = False,
+    foxglove_port: Annotated[int, typer.Option("--foxglove-port", min=1, max=65535, help="Port of that.")] = 8765,
+    foxglove_drive: Annotated[
+        bool,
+        typer.Option("--foxglove-drive", help="Let Foxglove drive and arm: any page in a browser here could, too."),
+    ] = False,
+    rerun: Annotated[
+        bool, typer.Option("--rerun", help="Also show the first robot in a running rerun viewer on this machine.")
+    ] = False,
 ) -> None:
     """Serve the operator's page on this machine: map, state, goals, driving, emergency stop.
 
@@ -58,11 +74,34 @@ def station(
     addresses = [RobotAddress.parse(text) for text in robots or ([] if routers else ["truck"])]
     known = None if users is None else station_users.StationUsers.load(users)
     place = Place(host, port, _tls(certificate, key), known, tuple(name or ()))
-    until_stopped(
-        lambda clock: Station(addresses, clock, place, routers or (), open_log).run(
-            lambda: remark(f"station: {place.url}")
-        )
-    )
+    if (foxglove or foxglove_drive or rerun) and not addresses:
+        raise typer.BadParameter("a viewer shows one robot: expected --robot NAME@ENDPOINT")
+
+    async def serve(clock: WallClock) -> None:
+        page = Station(addresses, clock, place, routers or (), open_log)
+        jobs = [page.run(lambda: remark(f"station: {place.url}"))]
+        if foxglove or foxglove_drive:
+            jobs.append(_foxglove(addresses[0], clock, foxglove_port, drives=foxglove_drive))
+        if rerun:
+            jobs.append(_rerun(addresses[0], clock))
+        await asyncio.gather(*jobs)
+
+    until_stopped(serve)
+
+
+async def _foxglove(address: "RobotAddress", clock: WallClock, port: int, *, drives: bool) -> None:
+    with needs_extra("viewers"):
+        from monstertruckd.station.foxglove import LAYOUT, FoxgloveServer
+
+        server = FoxgloveServer(address, clock, port, drives=drives)
+    await server.run(lambda: remark(f"Foxglove: ws://127.0.0.1:{server.port}, layout {LAYOUT}"))
+
+
+async def _rerun(address: "RobotAddress", clock: WallClock) -> None:
+    with needs_extra("viewers"):
+        from monstertruckd.tools.logs.live import VIEWER, show_live
+    remark(f"rerun: {VIEWER}")
+    await show_live(address.name, address.endpoint, clock)
 
 
 def _tls(certificate: Path | None, key: Path | None) -> ssl.SSLContext | None:

@@ -133,9 +133,11 @@ class Scene:
 
     def truck(self, reader: LogReader) -> None:
         """A box of the size in the log's configuration; logs without one show none."""
-        geometry: dict[str, Any] = {}
         with suppress(InputError, ConfigError):
-            geometry = reader.config().get("geometry", {})
+            self.box(reader.config().get("geometry", {}))
+
+    def box(self, geometry: Mapping[str, Any]) -> None:
+        """A box of the size in this section of a configuration, with an arrow ahead; none if it does not say."""
         length, width = geometry.get("length"), geometry.get("width")
         if length is None or width is None:
             return
@@ -158,13 +160,18 @@ class Scene:
             self._set_time(log_time)
             handler(message)
 
-    def finish(self) -> None:
-        """Send the collected curves and the driven path."""
+    def flush(self) -> None:
+        """Send the curves collected since the last time."""
         names = {entity(figure, curve): curve.label for figure in FIGURES for curve in figure.curves}
         self.entities |= self._samples.keys()
         for path, (times, values) in self._samples.items():
             self._stream.log(path, rr.SeriesLines(names=names[path]), static=True)
             self._stream.send_columns(path, [self._column(times)], rr.Scalars.columns(scalars=values))
+        self._samples.clear()
+
+    def finish(self) -> None:
+        """Send the collected curves and the driven path."""
+        self.flush()
         if len(self._way.points) > 1:
             strip = [(x, y, 0.01) for _, x, y in self._way.points]
             lines = rr.LineStrips3D([strip], colors=_WAY, radii=0.008)

@@ -81,6 +81,8 @@ INSTEAD = {
     "monstertruckd station --robot ann@tcp/192.168.1.7:7447 --robot bob@tcp/192.168.1.8:7447": Instead(
         None, "serves until it is stopped"
     ),
+    "monstertruckd station --foxglove": Instead(None, "serves until it is stopped; test_foxglove.py connects to it"),
+    "monstertruckd station --rerun": Instead(None, "serves until it is stopped; test_live.py draws without a viewer"),
     "monstertruckd station --router tcp/192.168.1.2:7447": Instead(
         None, "serves until it is stopped; tests/unit/station/test_server.py has a router"
     ),

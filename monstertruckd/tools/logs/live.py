@@ -1,0 +1,84 @@
+"""A running robot in the rerun viewer: what a log of it would show, as it comes."""
+
+from contextlib import ExitStack, suppress
+from typing import Any, Final
+
+import rerun as rr
+
+from monstertruck_runtime.client import TruckClient
+from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.errors import TruckError
+from monstertruck_runtime.mailbox import Mailbox, fifo
+from monstertruck_schemas import topics as t
+from monstertruck_schemas.base import Message
+from monstertruck_schemas.topics import Topic
+from monstertruckd.tools.logs.report.signals import FIGURES
+from monstertruckd.tools.logs.rerun_view import APPLICATION, Scene, blueprint
+
+VIEWER: Final = "rerun+http://127.0.0.1:9876/proxy"
+"""Where a viewer on this machine listens: ``rerun --bind 127.0.0.1``."""
+PERIOD: Final = 0.1
+"""Seconds between two looks at what came."""
+RETRY: Final = 1.0
+"""Seconds between two attempts to reach the robot, and in which it answers."""
+WAITING: Final = 200
+"""Messages of a topic that may wait for a look."""
+DRAWN: Final[tuple[Topic[Any], ...]] = (
+    t.SCAN, t.TRANSFORMS, t.MAP, t.PATH, t.POSE, t.CAMERA, t.GATE, t.HEALTH, t.EVENT, t.STOP, t.LOG,
+)  # fmt: skip
+
+
+async def show_live(robot: str, endpoint: str, clock: Clock, viewer: str = VIEWER) -> None:
+    """Show a robot until cancelled; one that is not there is waited for, as is the viewer.
+
+    Args:
+        robot: its name.
+        endpoint: where it listens.
+        clock: time.
+        viewer: of rerun, as an address of its own.
+    """
+    stream = rr.RecordingStream(APPLICATION)
+    stream.connect_grpc(viewer)
+    try:
+        await follow(robot, endpoint, clock, stream)
+    finally:
+        stream.disconnect()
+
+
+async def follow(robot: str, endpoint: str, clock: Clock, stream: rr.RecordingStream) -> None:
+    """Draw what a robot publishes into a recording until cancelled."""
+    stream.set_log_time_enabled(False)
+    stream.set_log_tick_enabled(False)
+    drawn: list[Topic[Any]] = [*DRAWN, *(curve.topic for figure in FIGURES for curve in figure.curves)]
+    topics = {topic.name: topic for topic in drawn}
+    scene = Scene(stream, clock.real_offset())
+    laid_out: set[str] = set()
+    while True:
+        with suppress(TruckError):
+            async with TruckClient(robot, endpoint, clock=clock, timeout=RETRY) as client:
+                with ExitStack() as stack:
+                    boxes = [
+                        (topic, stack.enter_context(client.subscribe(topic, fifo(WAITING))))
+                        for topic in topics.values()
+                    ]
+                    await _box(scene, client)
+                    while True:
+                        take(scene, boxes)
+                        if scene.entities != laid_out:
+                            laid_out = set(scene.entities)
+                            stream.send_blueprint(blueprint(laid_out))
+                        await clock.sleep(PERIOD)
+        await clock.sleep(RETRY)
+
+
+def take(scene: Scene, boxes: list[tuple[Topic[Any], Mailbox[Any]]]) -> None:
+    """Draw all messages that wait, in the order of their stamps."""
+    waiting: list[tuple[Message, str]] = [(message, topic.name) for topic, box in boxes for message in box.drain()]
+    for message, topic in sorted(waiting, key=lambda row: row[0].received):
+        scene.take(topic, message.received, message)
+    scene.flush()
+
+
+async def _box(scene: Scene, client: TruckClient) -> None:
+    with suppress(TruckError):
+        scene.box((await client.call("config")).get("geometry", {}))
