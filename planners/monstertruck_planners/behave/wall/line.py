@@ -54,10 +54,16 @@ FRESH: Final = 0.35
 """Seconds for which an echo shows what is before the robot."""
 FACING: Final = 1.1
 """Greatest angle between the direction of travel and the normal of a wall that is ahead, rad."""
+LATE: Final = 0.6
+"""Share of the way of gentle braking that is left, below which it brakes as hard as a ramp may."""
+NEARER: Final = 5.0
+"""Standard deviations by which an echo of the diagonal sonar is nearer than the wall beside: of something ahead."""
 LEAST: Final = 6
 """Echoes that make a wall."""
 TOUCHING: Final = 0.16
 """A range from which on the robot stops at once, m."""
+STARTED: Final = 0.05
+"""Angle up to which a turn begins, rad."""
 BEAM_CRITICAL: Final = 1.3
 """Greatest angle from the normal at which a beam comes back, rad."""
 CATCH_UP: Final = 1.5
@@ -335,14 +341,17 @@ class WallLine:
         fit = search(rows, at, cone)
         return fit if fit.explained >= max(LEAST, 0.3 * len(rows)) else None
 
-    def _way_left(self, state: LineState) -> float:
+    def _way_left(self, state: LineState, cone: Cone) -> float:
         """Way until the robot stands before the wall ahead at the distance at which it follows walls, m."""
         left, fresh = math.inf, _fresh(state.echoes, state)
         if state.ahead is not None:
             left = self._way_to(state, state.ahead)
         else:  # what is ahead makes no line: as if it were right before the sonar
-            for number in (FRONT,) if state.wall is not None else (DIAGONAL, FRONT, FAR):
-                ranges = fresh[fresh[:, 4] == number][-3:, 3]
+            for number in (DIAGONAL, FRONT) if state.wall is not None else (DIAGONAL, FRONT, FAR):
+                rows = fresh[fresh[:, 4] == number][-3:]
+                if number == DIAGONAL and state.wall is not None:
+                    rows = rows[residuals(rows, state.wall, cone) < -NEARER]
+                ranges = rows[:, 3]
                 if len(ranges) >= 2:
                     left = min(left, float(np.median(ranges)) + state.ears[number].reach - self._keep(state))
         near = fresh[np.isin(fresh[:, 4], (DIAGONAL, FRONT, FAR))][-6:, 3]
@@ -374,6 +383,10 @@ class WallLine:
             return Reason.STUCK, text
         if stands is not None and t - stands > STALL:
             return Reason.STUCK, f"{state.v.at(t):.2f} m/s asked for, {odometry.twist.vx:.2f} m/s driven"
+        if state.phase == "turn" and state.turned - state.marks[1] < STARTED:
+            for number in (DIAGONAL, FRONT, FAR):
+                if 0.0 < (near := state.equal[number][0]) < TOUCHING:
+                    return Reason.STUCK, f"sonar {self._names[number]} measures {near:.2f} m: too near to turn away"
         if state.phase == "turn" and state.turned - state.marks[1] > 1.2 * math.tau:
             return Reason.STUCK, "turned once around and found no wall to follow"
         if state.phase == "search" and state.travelled - state.marks[0] > self._config.search:
@@ -409,7 +422,7 @@ class WallLine:
             case "brake":
                 state = self._steer(state, t) if state.wall is not None else state
                 if not state.v.over(t):
-                    return replace(state, v=self._stopping(state.v, self._left(state, t), t))
+                    return replace(state, v=self._stopping(state.v, self._left(state, cone, t), t))
                 state = self._to(state, "turn")
                 sense = self._sense(state)
                 return replace(state, sense=sense, w=self._ramp(state.w, sense * config.turn_rate, t))
@@ -431,15 +444,17 @@ class WallLine:
                 if state.laps >= config.laps:
                     return self._steer(self._to(replace(state, v=self._ramp(state.v, 0.0, t)), "stop"), t)
         state = self._steer(state, t)
-        left, speed = self._left(state, t), state.v.at(t)
+        left, speed = self._left(state, cone, t), state.v.at(t)
         brake = shortest_ramp(speed, state.v.acceleration(t), 0.0, config.braking, config.jerk)
         if left - speed / config.rate > brake.distance:
             return state
+        if left < LATE * brake.distance:
+            brake = shortest_ramp(speed, state.v.acceleration(t), 0.0, config.acceleration, config.jerk)
         return self._to(replace(state, v=self._stopping(TimedRamp(t, brake), left, t)), "brake")
 
-    def _left(self, state: LineState, t: float) -> float:
+    def _left(self, state: LineState, cone: Cone, t: float) -> float:
         """``_way_left`` of where the robot is at ``t`` by its ramp, m."""
-        return self._way_left(state) - state.lag[0] - state.v.at(t) * self._config.lead
+        return self._way_left(state, cone) - state.lag[0] - state.v.at(t) * self._config.lead
 
     def _stopping(self, ramp: TimedRamp, left: float, t: float) -> TimedRamp:
         """A ramp to standstill, computed anew so that it covers what is left, if that is within the limits."""
