@@ -58,6 +58,9 @@ class WallPdConfig(WallConfig):
     gap: Annotated[float, Field(ge=0, le=5)] = 0.0
     """Way over which a side sonar whose range jumped up looks into a gap and does not count, m; 0 as published: the
     robot turns into gaps"""
+    aligned: Annotated[float, Field(ge=-1.5, le=0.5)] | None = None
+    """Heading away from the wall by side and diagonal sonar from which on turning away ends, rad; as published none:
+    the robot drives on while it still faces the wall"""
     free: Metres = 0.8
     """Front range from which the way is free again, m; our figure"""
 

@@ -26,10 +26,17 @@ SAME_WAY: Final = 1.2
 """Greatest difference of the heading from that at the lap's beginning, rad: the robot weaves."""
 FOLLOWING: Final = ("follow", "free")
 """Phases in which a lap may begin: the robot drives along the wall."""
-JUMP: Final = 0.15
-"""Growth of a range from one step to the next by which a sonar begins to look into a gap, m."""
+JUMP: Final = 0.06, 0.15
+"""Growth of the range of the side sonar over two steps, and of the diagonal one over one, by which it begins to look
+into a gap, m."""
+EDGE: Final = 0.1
+"""Way behind the edge of a gap over which the side sonar may measure the gap's own side wall, m."""
 BACK: Final = 0.05
 """Diagonal range times cos 45 degrees less side range below which it ends, m."""
+STRAIGHT: Final = 2.0
+"""Yaw rate per heading error past a gap, 1/s."""
+SMOOTH: Final = 10
+"""Measurements over which the heading along the wall is averaged."""
 AT_REST: Final = 0.01
 """m/s."""
 
@@ -88,10 +95,12 @@ class WallState:
     laps: int = 0
     turned_before: float = 0.0
     """``turned`` when the present phase began, rad."""
-    before: Ranges | None = None
-    """Of the step before."""
+    before: tuple[Ranges, ...] = ()
+    """Of the two steps before."""
     gaps: tuple[float | None, float | None] = (None, None)
     """``travelled`` when side and diagonal sonar began to look into a gap."""
+    along: tuple[float, int] = (0.0, 0)
+    """Heading along the wall by odometry, with the wall on the left, rad, and the samples it is the mean of."""
     asked: float = 0.0
     """Speed asked for at the step before, m/s."""
     moving_since: float | None = None
@@ -156,8 +165,9 @@ class _Wall(ABC):
             v=ramp(t, *v, duration),
             w=ramp(t, *w, duration),
             error=None,
-            before=None,
+            before=(),
             gaps=(None, None),
+            along=(0.0, 0),
             turned_before=state.turned,
             begun=begun,
             since=0.0 if state.begun is None else state.since,
@@ -211,7 +221,7 @@ class WallPd(_Wall):
                 return _approach(state, config, t)
         elif state.phase == "follow" and blocked:
             state = self._to(state, "turn_away", t, (config.speed, 0.0), (0.0, -config.turn_rate))
-        elif state.phase == "turn_away" and self._sees(ranges) and ranges.front > config.free:
+        elif state.phase == "turn_away" and self._sees(ranges) and self._aligned(ranges) and ranges.front > config.free:
             state = self._to(state, "follow", t, (0.0, config.speed), (0.0, 0.0))
         assert state.v is not None
         assert state.w is not None
@@ -220,8 +230,16 @@ class WallPd(_Wall):
         v = state.v.at(t)
         state = self._gaps(state, ranges)
         side, diagonal = state.gaps
+        yaw = 0.0 if state.pose is None else state.pose[2] * self._mirror
         if side is not None:
-            return replace(state, error=None), v, 0.0
+            along, samples = state.along
+            away = math.remainder(along - yaw, math.tau) if samples else 0.0
+            return replace(state, error=None), v, STRAIGHT * away
+        if diagonal is None:
+            seen = yaw + wall_angle(ranges.diagonal, ranges.side, config.offset)
+            along, samples = state.along
+            along += math.remainder(seen - along, math.tau) / min(samples + 1, SMOOTH)
+            state = replace(state, along=(along, samples + 1))
         distance = ranges.side if diagonal is not None else self._distance(ranges)
         error = distance - config.distance
         change = 0.0 if state.error is None else error - state.error
@@ -229,19 +247,24 @@ class WallPd(_Wall):
 
     def _gaps(self, state: WallState, ranges: Ranges) -> WallState:
         """Which sonars look into a gap: from a jump up on, until they measure the wall again or it is too long."""
-        before, (side, diagonal), now = state.before or ranges, state.gaps, state.travelled
-        if ranges.side - before.side > JUMP:
-            side = now
-        elif ranges.side < self._config.seen:
+        before, (side, diagonal), now = state.before, state.gaps, state.travelled
+        if before and ranges.side - min(sample.side for sample in before) > JUMP[0]:
+            side = now if side is None else side
+        elif side is not None and ranges.side < self._config.seen and now - side > EDGE:
             side = None
-        if ranges.diagonal - before.diagonal > JUMP:
+        if before and ranges.diagonal - before[-1].diagonal > JUMP[1]:
             diagonal = now
         elif ranges.diagonal * math.cos(DIAGONAL) - ranges.side < BACK:
             diagonal = None
         gaps = tuple(
             since if since is not None and now - since < self._config.gap else None for since in (side, diagonal)
         )
-        return replace(state, before=ranges, gaps=(gaps[0], gaps[1]))
+        return replace(state, before=(*before[-1:], ranges), gaps=(gaps[0], gaps[1]))
+
+    def _aligned(self, ranges: Ranges) -> bool:
+        """Whether the robot has turned far enough from the wall ahead."""
+        config = self._config
+        return config.aligned is None or wall_angle(ranges.diagonal, ranges.side, config.offset) >= config.aligned
 
     def _sees(self, ranges: Ranges) -> bool:
         """Whether side and diagonal sonar measure the wall."""

@@ -1,6 +1,7 @@
 """Method 3: laps of a hall, gaps, ramps, and bad inputs."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,7 +9,8 @@ from pydantic import ValidationError
 
 from monstertruck_planners.behave.api import Inputs, RequestedMotion
 from monstertruck_planners.behave.wall.config import WallLineConfig
-from monstertruck_planners.behave.wall.line import WallLine
+from monstertruck_planners.behave.wall.echoes import WallEstimate
+from monstertruck_planners.behave.wall.line import STANDSTILL, WallLine
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.topics import IMU, ODOMETRY, SONAR, TRANSFORMS
 from tests.unit.planners.behave.wall_kit import PERIOD, Robot, drive, frames, rectangle
@@ -21,8 +23,7 @@ def follower(**settings):
     return WallLine(WallLineConfig(rate=10.0, beam=True, lead=0.0, **settings))
 
 
-@pytest.mark.parametrize("side", ["left", "right"])
-@pytest.mark.parametrize("heading", [0.3, 2.0, -2.5])
+@pytest.mark.parametrize(("side", "heading"), [("left", 0.3), ("right", 2.0), ("left", -2.5)])
 def test_a_lap_of_a_hall_ends_with_its_reason_and_keeps_the_distance(side, heading):
     done = drive(follower(side=side, lap_length=6.0), Robot(HALL, (0.1, -0.1, heading), bias=0.01), 300.0)
     assert done.outcome is Reason.BEHAVIOUR_DONE
@@ -134,3 +135,30 @@ def test_it_stops_by_its_ramp_where_the_wall_ahead_is_heard_no_longer_while_it_b
         robot.move()
     assert state.phase == "turn"
     assert abs(step.motion.vx) < 0.02
+
+
+def test_a_front_sonar_that_hears_nothing_is_made_up_for_by_the_diagonal_one():
+    corner = [(-9.0, 0.35, 2.0, 0.35), (2.0, 0.35, 3.5, -3.0)]
+    robot = Robot(corner, (0.5, 0.0, 0.1))
+    robot.stuck = {"f": None, "fr": None}
+    behaviour, state, clearance = follower(), None, math.inf
+    state = replace(behaviour.begin(), phase="follow", wall=WallEstimate(math.pi / 2, 0.35))
+    for i in range(200):
+        step = behaviour.step(robot.inputs(), state, i * PERIOD)
+        state, robot.motion = step.state, step.motion or RequestedMotion()
+        clearance = min(clearance, robot.clearance)
+        if state.phase == "turn" or step.outcome is not Reason.DRIVING:
+            break
+        robot.move()
+    assert state.phase == "turn"
+    assert clearance > 0.16
+
+
+def test_it_does_not_turn_away_from_what_is_too_near():
+    robot = Robot(HALL, (0.0, 0.0, 0.0))
+    robot.stuck = {"fl": 0.15}
+    behaviour = follower()
+    state = behaviour.step(robot.inputs(), behaviour.begin(), 0.0).state
+    step = behaviour.step(robot.inputs(), replace(state, phase="turn", w=STANDSTILL), PERIOD)
+    assert step.outcome is Reason.STUCK
+    assert step.text == "sonar fl measures 0.15 m: too near to turn away"

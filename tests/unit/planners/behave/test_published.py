@@ -149,10 +149,23 @@ def test_settings_that_make_no_sense_are_refused(field, value):
         WallPdConfig(**{field: value})
 
 
-@pytest.mark.parametrize(("gap", "astray"), [(0.0, True), (0.6, False)])
-def test_a_gap_is_passed_straight_on_if_that_is_asked_for(gap, astray):
+@pytest.mark.parametrize(("gap", "heading", "astray"), [(0.0, 0.0, True), (0.6, 0.0, False), (0.6, -0.15, False)])
+def test_a_gap_is_passed_straight_on_if_that_is_asked_for(gap, heading, astray):
     recess = [(0.0, 0.35, 0.0, 1.85), (0.0, 1.85, 0.4, 1.85), (0.4, 1.85, 0.4, 0.35)]
     walls = [(-10.0, 0.35, 0.0, 0.35), (0.4, 0.35, 9.0, 0.35), *recess]
-    robot = Robot(walls, (-1.0, 0.0, 0.0), ahead=0.05)
+    robot = Robot(walls, (-1.0, 0.0, heading), ahead=0.05)
     done = drive(WallPd(WallPdConfig(offset=0.05, gap=gap)), robot, 12.0)
     assert (np.abs(done.poses[:, 1]).max() > 0.04) == astray
+
+
+def test_turning_away_goes_on_until_the_robot_is_along_the_wall_if_that_is_asked_for():
+    corner = [(-9.0, 0.35, 2.0, 0.35), (2.0, 0.35, 1.0, -3.0)]
+    angles = {}
+    for aligned in (None, 0.0):
+        behaviour = WallPd(WallPdConfig(offset=0.05, seen=0.6, free=0.5, aligned=aligned))
+        done = drive(behaviour, Robot(corner, (1.0, 0.0, 0.0), ahead=0.05), 30.0)
+        phases = [step.phase for step in done.steps]
+        begun = phases.index("follow", phases.index("turn_away"))
+        angles[aligned] = math.atan2(-3.35, -1.0) - done.poses[begun, 2]
+    assert abs(math.remainder(angles[0.0], math.tau)) < 0.05
+    assert abs(math.remainder(angles[None], math.tau)) > 0.1
