@@ -122,7 +122,7 @@ def scans() -> dict[str, float]:
 
 def overturn(parts: Mechanics, track: float, radius: float) -> float:
     """Side slope at which the outer wheels carry everything, rad, of a body that leans on its springs."""
-    arm, height = track / 2 + parts.wheel_width / 2, parts.mass_height - radius
+    arm, height = track / 2, parts.mass_height - radius  # a round tread carries in its middle
     roll_spring = 2 * parts.axle_spring * (track / 3) ** 2
     sprung, unsprung = parts.sprung, parts.mass - parts.sprung
 

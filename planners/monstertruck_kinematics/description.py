@@ -39,7 +39,7 @@ class Shape:
     slick: bool = False
     """Without friction."""
     seen: bool = True
-    """In pictures."""
+    """In pictures and in files for viewers."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,6 +113,9 @@ class Mechanics:
         friction: between tyre and ground.
         rolling_resistance: of the weight.
         steering_limit: greatest angle of a wheel, rad.
+        tyre_stiffness: force of one rolling tyre by a small slip angle, N/rad, and by a small slip ratio, N (isotropic
+            brush); 0: rigid wheels.
+        relaxation: distance rolled in which a tyre's deflection gives way, m.
     """
 
     mass: float = 7.25
@@ -129,10 +132,13 @@ class Mechanics:
     friction: float = 0.5
     rolling_resistance: float = 0.05
     steering_limit: float = math.radians(45.0)
+    tyre_stiffness: float = 0.0
+    relaxation: float = 0.04
 
     def __post_init__(self) -> None:
         for name in ("mass", "wheel_mass", "axle_mass", "mass_height", "wheel_width", "friction", "bump", "droop"):
             require_positive(name, getattr(self, name))
+        require_positive("relaxation", self.relaxation)
         if self.sprung <= 0.0:
             raise KinematicsError(
                 f"mass is {self.mass}: expected more than wheels and axles together, {self.mass - self.sprung:g} kg"
@@ -147,6 +153,11 @@ class Mechanics:
     def axle_load(self) -> float:
         """Force on the springs of one axle at rest, N."""
         return self.sprung * GRAVITY / 2.0
+
+    @property
+    def tyre_spring(self) -> float:
+        """Of one tyre that does not roll, N/m."""
+        return self.tyre_stiffness / self.relaxation
 
     @property
     def axle_spring(self) -> float:
@@ -286,6 +297,14 @@ def wheel_inertia(mass: float, radius: float, width: float) -> Triple:
     return across, spin, across
 
 
+def wheel_shapes(radius: float, width: float) -> tuple[Shape, Shape]:
+    """A wheel's outline, which touches walls, of its hub; and a round tread, which touches the ground, of its tyre."""
+    return (
+        Shape("wheel", (radius, width), ZERO, "0.12 0.12 0.13 1", touches="walls"),
+        Shape("ball", (radius,), touches="ground", seen=False),
+    )
+
+
 def truck_description(
     size: Size | None = None,
     mechanics: Mechanics | None = None,
@@ -370,17 +389,18 @@ def truck_description(
         ]
         for side, y in (("left", size.track / 2.0), ("right", -size.track / 2.0)):
             wheel = f"{axle}_{side}"
+            outline, ball = wheel_shapes(radius, parts.wheel_width)
             links += [
-                Part(f"{wheel}_knuckle", _KNUCKLE, ZERO, box_inertia(_KNUCKLE, (0.03, 0.03, 0.03))),
+                Part(f"{wheel}_knuckle", HUB, ZERO, box_inertia(HUB, (0.03, 0.03, 0.03)), (outline,)),
                 Part(
                     f"{wheel}_wheel",
-                    parts.wheel_mass - _KNUCKLE,
+                    turning_mass(parts),
                     ZERO,
-                    wheel_inertia(parts.wheel_mass - _KNUCKLE, radius, parts.wheel_width),
-                    (Shape("wheel", (radius, parts.wheel_width), ZERO, "0.12 0.12 0.13 1"),),
+                    wheel_inertia(turning_mass(parts), radius, parts.wheel_width),
+                    (ball,),
                 ),
             ]
-            joints += [
+            joints.append(
                 PartJoint(
                     f"{wheel}_steer",
                     "revolute",
@@ -388,11 +408,14 @@ def truck_description(
                     f"{wheel}_knuckle",
                     (0.0, y, 0.0),
                     limits=(-parts.steering_limit, parts.steering_limit),
-                ),
+                )
+            )
+            rim = add_tyre(wheel, f"{wheel}_knuckle", parts, links, joints)
+            joints += [
                 PartJoint(
                     f"{wheel}_spin",
                     "continuous",
-                    f"{wheel}_knuckle",
+                    rim,
                     f"{wheel}_wheel",
                     axis=(0.0, 1.0, 0.0),
                     friction=parts.rolling_resistance * parts.mass * GRAVITY / 4.0 * radius,
@@ -402,6 +425,33 @@ def truck_description(
         add_head(head, links, joints)
     add_sensors(sensors, links, joints)
     return Description("monstertruck", tuple(links), tuple(joints))
+
+
+def add_tyre(wheel: str, hub: str, parts: Mechanics, links: list[Part], joints: list[PartJoint]) -> str:
+    """The give of a tyre along and across between hub and rim, where tyres have one; the link that carries the wheel.
+
+    The springs are the simulator's: they act on the deflection of what touches the ground, which rolling renews.
+    """
+    if parts.tyre_stiffness == 0.0:
+        return hub
+    damping = _TYRE_DAMPING * 2.0 * math.sqrt(parts.tyre_spring * parts.mass / 4.0)
+    for name, axis in (("along", (1.0, 0.0, 0.0)), ("across", (0.0, 1.0, 0.0))):
+        rim = f"{wheel}_{name}"
+        links.append(Part(rim, _RIM, ZERO, (1e-6, 1e-6, 1e-6)))
+        joints.append(PartJoint(rim, "prismatic", hub, rim, axis=axis, damping=damping))
+        hub = rim
+    return hub
+
+
+def turning_mass(parts: Mechanics) -> float:
+    """Of a wheel without its hub and what carries the tyre's give, kg."""
+    return parts.wheel_mass - HUB - (2.0 * _RIM if parts.tyre_stiffness else 0.0)
+
+
+_RIM: Final = 1e-3
+"""Mass of a link that only carries the give of a tyre, kg."""
+_TYRE_DAMPING: Final = 0.2
+"""Share of the critical one of the robot on its tyres."""
 
 
 def add_sensors(sensors: tuple[SensorFrame, ...], links: list[Part], joints: list[PartJoint]) -> None:
@@ -432,8 +482,8 @@ def add_head(head: LidarHead, links: list[Part], joints: list[PartJoint]) -> Non
     ]
 
 
-_KNUCKLE: Final = 0.04
-"""Mass of a knuckle, kg; counted to its wheel."""
+HUB: Final = 0.04
+"""Mass of a knuckle or hub, kg; counted to its wheel."""
 
 
 def urdf(description: Description) -> str:
@@ -448,9 +498,7 @@ def urdf(description: Description) -> str:
             ixx, iyy, izz = (f"{value:.6g}" for value in link.inertia)
             ET.SubElement(inertial, "inertia", ixx=ixx, iyy=iyy, izz=izz, ixy="0", ixz="0", iyz="0")
         for kind in ("visual", "collision"):
-            for shape in link.shapes:
-                if kind == "visual" and not shape.seen:
-                    continue
+            for shape in (shape for shape in link.shapes if shape.seen):
                 _urdf_shape(ET.SubElement(element, kind), shape, coloured=kind == "visual")
     for joint in description.joints:
         element = ET.SubElement(robot, "joint", name=joint.name, type=joint.kind)

@@ -11,6 +11,7 @@ from typing import Final
 
 from monstertruck_kinematics.description import (
     GRAVITY,
+    HUB,
     ZERO,
     Description,
     LidarHead,
@@ -22,14 +23,15 @@ from monstertruck_kinematics.description import (
     Size,
     add_head,
     add_sensors,
+    add_tyre,
     box_inertia,
+    turning_mass,
     wheel_inertia,
+    wheel_shapes,
 )
 from monstertruck_kinematics.elementary import KinematicsError
 from monstertruck_kinematics.wheels import SwedishWheel, Wheel
 
-_HUB: Final = 0.04
-"""Mass of a hub, kg; counted to its wheel."""
 _CASTER: Final = 0.05
 """Mass of a caster, kg."""
 _CASTER_SHARE: Final = 0.1
@@ -134,25 +136,23 @@ def _moments(head: LidarHead) -> tuple[float, float]:
 
 def _add_wheel(wheel: Wheel, leg: PartJoint, parts: Mechanics, links: list[Part], joints: list[PartJoint]) -> None:
     name, radius, width = frame_name(wheel), wheel.radius, parts.wheel_width
-    mass = parts.wheel_mass - _HUB
+    mass = parts.wheel_mass - HUB if isinstance(wheel, SwedishWheel) else turning_mass(parts)
     across, spin, _ = wheel_inertia(mass, radius, width)
     resistance = parts.rolling_resistance * -leg.load * radius
-    outline = Shape("wheel", (radius, width), ZERO, "0.12 0.12 0.13 1")
-    hub, tread = Part(f"{name}_hub", _HUB, ZERO, box_inertia(_HUB, (0.03, 0.03, 0.03))), f"{name}_hub"
+    outline, ball = wheel_shapes(radius, width)
+    hub = f"{name}_hub"
+    turn = wheel.heading + (wheel.roller if isinstance(wheel, SwedishWheel) else 0.0)
+    around = replace(outline, yaw=wheel.heading - turn)
+    links.append(Part(hub, HUB, ZERO, box_inertia(HUB, (0.03, 0.03, 0.03)), (around,)))
     if isinstance(wheel, SwedishWheel):
         # The hub's x axis is the rollers' own: along it the wheel drives.
-        turn = wheel.heading + wheel.roller
-        around = Shape("wheel", (radius, width), ZERO, outline.colour, yaw=wheel.heading - turn, touches="walls")
-        hub = Part(hub.name, hub.mass, ZERO, hub.inertia, (around,))
-        outline = Shape("ball", (radius,), touches="ground", seen=False)
         across, tread = spin / 2.0, f"{name}_rollers"
-        links += [hub, Part(tread, 1e-3, ZERO, (1e-7, 1e-7, 1e-7))]
-        joints.append(PartJoint(tread, "continuous", hub.name, tread, axis=(1.0, 0.0, 0.0), friction=resistance))
+        links.append(Part(tread, 1e-3, ZERO, (1e-7, 1e-7, 1e-7)))
+        joints.append(PartJoint(tread, "continuous", hub, tread, axis=(1.0, 0.0, 0.0), friction=resistance))
     else:
-        turn = wheel.heading
-        links.append(hub)
+        tread = add_tyre(name, hub, parts, links, joints)
     joints[joints.index(leg)] = replace(leg, turn=(0.0, 0.0, turn))
-    links.append(Part(f"{name}_wheel", mass, ZERO, (across, spin, across), (outline,)))
+    links.append(Part(f"{name}_wheel", mass, ZERO, (across, spin, across), (ball,)))
     joints.append(
         PartJoint(f"{name}_spin", "continuous", tread, f"{name}_wheel", axis=(0.0, 1.0, 0.0), friction=resistance)
     )

@@ -233,6 +233,11 @@ class MechanicsConfig(Schema):
     """Greatest roll of an axle against the chassis."""
     friction: Positive = 0.5
     """Between tyres and ground."""
+    tyre_stiffness: NotNegative = 60.0
+    """Force of one rolling tyre by a small slip angle, N/rad (half an axle's of the single-track model), and by a small
+    slip ratio, N; 0: rigid wheels"""
+    relaxation: Annotated[float, Field(ge=0.01)] = 0.04
+    """Distance rolled in which a tyre's deflection gives way, m"""
 
 
 class BatteryModelConfig(Schema):

@@ -31,6 +31,8 @@ def mechanics(truck: SimTruckConfig, config: MechanicsConfig) -> Mechanics:
         axle_roll=radians(config.axle_roll_deg),
         friction=config.friction,
         rolling_resistance=truck.rolling_resistance,
+        tyre_stiffness=config.tyre_stiffness,
+        relaxation=config.relaxation,
     )
 
 

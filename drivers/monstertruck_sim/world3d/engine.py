@@ -263,6 +263,7 @@ def rigid(config: WorldConfig, footprint: PlanOutline, start: Pose) -> Engine:
         truck, config.battery, start, model, drive,
         wheel_steering(truck),
         lambda x, y: float(ground.height(np.array(x), np.array(y))),
+        parts,
     )  # fmt: skip
     space = RigidSpace(footprint, plant, ground, footprint.name)
     plant.before_steps = space.follow

@@ -6,12 +6,13 @@ for, so what is commanded up to then is in it.
 
 from collections.abc import Callable, Sequence
 from math import asin, atan2, cos, exp, hypot, sin, tau
-from typing import ClassVar, Final
+from typing import ClassVar, Final, NamedTuple
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
-from monstertruck_kinematics.description import HEAD_JOINTS
+from monstertruck_kinematics.description import HEAD_JOINTS, Mechanics
 from monstertruck_kinematics.elementary import Array
 from monstertruck_sim.world.actuators import RPM
 from monstertruck_sim.world.config import BatteryModelConfig, SimTruckConfig
@@ -32,6 +33,31 @@ Steering = Callable[[Sequence[float]], Sequence[float]]
 """Servo angles to the angles of the steered wheels, in the order of their joints; rad."""
 
 
+class _Tyres(NamedTuple):
+    """The give of all tyres: places and speeds of their joints, and speeds of their wheels."""
+
+    places: NDArray[np.intp]
+    slips: NDArray[np.intp]
+    spins: NDArray[np.intp]
+    spring: float
+    """N/m."""
+    share: float
+    """Of the relaxation that a wheel rolls in one step, for each rad/s."""
+
+
+def _tyres(model: mujoco.MjModel, parts: Mechanics, radius: float) -> _Tyres | None:
+    found: list[tuple[int, int, int]] = []
+    for index in range(model.njnt):
+        joint = model.joint(index)
+        wheel, _, kind = joint.name.rpartition("_")
+        if kind in ("along", "across"):
+            found.append((joint.qposadr[0], joint.dofadr[0], model.joint(f"{wheel}_spin").dofadr[0]))
+    if not found:
+        return None
+    places, slips, spins = np.array(found).T
+    return _Tyres(places, slips, spins, parts.tyre_spring, radius * TIMESTEP / parts.relaxation)
+
+
 class RigidPlant(GriddedPlant):
     """One robot among rigid bodies.
 
@@ -43,6 +69,7 @@ class RigidPlant(GriddedPlant):
         drive: its drive line.
         steering: servo angles to those of the steered wheels.
         ground: height under a point of the map, m.
+        parts: its mechanics.
     """
 
     STEP_NS: ClassVar[int] = round(TIMESTEP * 1e9)
@@ -57,6 +84,7 @@ class RigidPlant(GriddedPlant):
         drive: DriveLine,
         steering: Steering,
         ground: Ground,
+        parts: Mechanics,
     ) -> None:
         super().__init__(config, battery, start, (0.0, 0.0))
         self.model = model
@@ -71,6 +99,9 @@ class RigidPlant(GriddedPlant):
         self._head = [mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, name) for name in HEAD_JOINTS]
         self._rolling = [model.jnt_qposadr[i] for i in range(model.njnt) if model.joint(i).name.endswith("_rollers")]
         """Of balls that stand for wheels with rollers: whose axis across the rollers' stays level."""
+        self._tyres = _tyres(model, parts, config.wheel_radius)
+        self._deflection = np.zeros(0 if self._tyres is None else len(self._tyres.places))
+        """Of the tyres along and across, m."""
         self._steered: list[float] = []
         """Servo angles that the steered wheels follow."""
         self._felt = self._turning = (0.0, 0.0, 0.0)
@@ -118,6 +149,7 @@ class RigidPlant(GriddedPlant):
         data.qpos[:3] = x, y, self._ground(x, y) + 0.002
         data.qpos[3:7] = cos(yaw / 2), 0.0, 0.0, sin(yaw / 2)
         self._steered = []
+        self._deflection[:] = 0.0
         self._command(0.0, [servo.angle for servo in self._servos])
         for _ in range(_SETTLE):
             mujoco.mj_step(self.model, data)
@@ -140,11 +172,27 @@ class RigidPlant(GriddedPlant):
         self._command(dt, servos)
         before = self.data.qvel[:3].copy()
         mujoco.mj_step(self.model, self.data)
-        if self._rolling:
-            self.data.qpos[self._rolling] = 0.0
+        self._roll()
         self._read(before)
         self._draw(dt, self._slip())
         self._touch()
+
+    def _roll(self) -> None:
+        """Tyres give way where they touch the ground; rolling on brings a fresh piece of them there.
+
+        Their deflection d follows d' = u' - |v| d / relaxation, u' being the slip of the rolling wheel: the force
+        settles at ``tyre_stiffness`` times the slip ratio, or the tangent of the slip angle, and dry friction bounds
+        it (a relaxation length; e.g. Pacejka, Tyre and Vehicle Dynamics, chapter 7).
+        """
+        data, tyres = self.data, self._tyres
+        if self._rolling:
+            data.qpos[self._rolling] = 0.0
+        if tyres is None:
+            return
+        rolled = abs(data.qvel[tyres.spins]) * tyres.share
+        self._deflection = (self._deflection + data.qpos[tyres.places]) * np.exp(-rolled)
+        data.qpos[tyres.places] = 0.0
+        data.qfrc_applied[tyres.slips] = -tyres.spring * self._deflection
 
     def _command(self, dt: float, servos: list[float]) -> None:
         controls, drive = self.data.ctrl, self._drive

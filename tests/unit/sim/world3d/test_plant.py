@@ -6,6 +6,9 @@ import numpy as np
 import pytest
 
 from monstertruck_kinematics.description import WHEELS
+from monstertruck_kinematics.linkage import common_motion
+from monstertruck_kinematics.polynomials import SteeringPolynomials
+from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.base import Pose2D
 from monstertruck_sim.world.config import MechanicsConfig, RoughPatch, SimTruckConfig, SinusoidTilt, WorldConfig
@@ -51,7 +54,7 @@ def test_it_drives_as_the_plane_does(solid, field):
         each.steer(0.3, -0.3)
     rigid, plane = driver.wait(8.0), flat.wait(8.0)
     assert rigid.v == pytest.approx(plane.v, rel=0.03)
-    assert 0.85 * plane.wz < rigid.wz < plane.wz  # dry friction: least sum of slips, not of their squares
+    assert 0.93 * plane.wz < rigid.wz < plane.wz
     assert (rigid.front, rigid.rear) == (plane.front, plane.rear)
     for each in (driver, flat):
         each.drive(0.0)
@@ -102,6 +105,32 @@ def test_a_lifted_wheel_spins_and_the_others_stand(solid):
     driver.wait(2.0)
     spins = [rigid.data.joint(f"{wheel}_spin").qvel[0] for wheel in ("front_left", "front_right")]
     assert np.mean(spins) == pytest.approx(0.2 / 0.075, rel=0.05)
+
+
+def test_tyres_give_way_sideways_and_rigid_wheels_turn_less(solid):
+    """Least squares of side slips for tyres of one stiffness; dry friction alone takes the least sum of slips."""
+    linkage = SimTruckConfig().chassis().linkage
+    angles = linkage.wheel_angles(*SteeringPolynomials().servo_from_axles(0.35, 0.0))
+    slide, turn, _ = common_motion(FourWheelSteering(), angles)
+    curvature = {}
+    for stiffness in (60.0, 0.0):
+        driver = solid(mechanics=MechanicsConfig(tyre_stiffness=stiffness))
+        driver.steer(0.35, 0.0)
+        driver.drive(0.2)
+        truth = driver.wait(3.0)
+        curvature[stiffness] = truth.wz / truth.v / (turn / np.hypot(1.0, slide))
+    assert 0.95 < curvature[60.0] < 1.0
+    assert curvature[0.0] < 0.94
+
+
+def test_a_standing_robot_holds_on_a_slope(solid):
+    """A tyre that stands does not give way; the engine's friction creeps by less than 1 mm/s."""
+    driver = solid()
+    plant(driver).model.opt.gravity[:] = 0.0, 9.81 * np.sin(0.3), -9.81 * np.cos(0.3)
+    driver.wait(1.0)
+    y = driver.wait(0.5).y
+    assert 0.001 < y < 0.02
+    assert driver.wait(1.0).y == pytest.approx(y, abs=1e-3)
 
 
 def test_both_axles_turn_alike(solid):
@@ -204,7 +233,7 @@ def test_gravity_and_motion_are_what_imu_and_compass_feel(solid):
 
 def test_a_car_turns_by_its_front_wheels_and_is_driven_by_the_rear_ones(solid):
     car = SimTruckConfig.model_validate({"body": {"kind": "ackermann"}})
-    driver = solid(truck=car, mechanics=MechanicsConfig(wheel_width=0.01))  # wide tyres scrub
+    driver = solid(truck=car)
     driver.steer(0.3, 0.3)
     driver.drive(0.2)
     driver.wait(3.0)
@@ -244,10 +273,10 @@ def test_a_skid_steer_robot_turns_on_the_spot_by_skidding(solid, motors):
 )
 def test_a_platform_moves_as_its_wheels_say(solid, body, speeds):
     truck = SimTruckConfig.model_validate({"body": body})
-    driver = solid(truck=truck, mechanics=MechanicsConfig(wheel_width=0.005))  # wide tyres scrub
+    driver = solid(truck=truck)
     for motor, speed in zip(driver.world.motors, speeds, strict=True):
         motor.command(driver.now, -speed * 644 / (2 * pi * 0.075) * 60, 20_000.0)
-    driver.wait(1.0)
+    driver.wait(1.6)
     expected = truck.chassis().predicted(speeds)
     assert plant(driver).twist == pytest.approx(expected, rel=0.03, abs=0.003)
     truth = driver.wait(0.5)
