@@ -187,7 +187,7 @@ class ZenohBridge:
         except zenoh.ZError as error:
             text = _SOURCE_PLACE.sub("", str(error))
             if "in use" in text or "EAGAIN" in text:
-                msg = f"{where} is in use: another daemon is running here"
+                msg = f"{where} is in use: another daemon is running here; a second robot needs zenoh.listen of its own"
                 raise BusyError(msg) from error
             msg = f"zenoh cannot open {where}: {text}"
             raise ConfigError(msg) from error

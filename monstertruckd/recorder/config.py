@@ -53,8 +53,8 @@ class BlackBoxConfig(Schema):
     """Seconds before the trip."""
     after: Seconds = 5.0
     """Seconds after it; trips meanwhile share the box."""
-    journal: Seconds = 300.0
-    """Seconds of events and log records."""
+    journal: Seconds = 60.0
+    """Seconds of events and log records, where those are to reach further back than the rest."""
     pictures: Seconds = 5.0
     """Seconds before the trip of which all pictures are kept."""
     picture_period: Seconds = 0.5

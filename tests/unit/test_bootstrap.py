@@ -227,6 +227,14 @@ def test_kernels_that_do_not_compile_fail_the_check_before_any_test(steps, monke
     assert ran == []
 
 
+def test_our_bytecode_is_compiled_before_any_process_needs_it(steps, monkeypatch: pytest.MonkeyPatch):
+    ran: list[tuple[str, ...]] = []
+    monkeypatch.setattr(bootstrap, "run", lambda _, *words: ran.append(words) or 0)
+    bootstrap.check([])
+    assert ran[0] == bootstrap.BYTECODE
+    assert all((bootstrap.ROOT / folder).is_dir() for folder in ran[0][5:])
+
+
 def test_the_compilation_ends_with_the_check(steps, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(Compiling, "killed", False)
     monkeypatch.setattr(bootstrap, "run", lambda program, *_: 4 if program.name == "mypy" else 0)

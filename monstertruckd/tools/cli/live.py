@@ -15,6 +15,7 @@ from monstertruckd.tools.cli.output import JsonOption, on_terminal, print_json, 
 
 if TYPE_CHECKING:
     from monstertruck_runtime.client import TruckClient
+    from monstertruck_schemas.topics import Topic
 
 SILENCE: Final = 2.0
 """Seconds without a message after which `echo` says what it is waiting for."""
@@ -62,7 +63,7 @@ def echo(
     async def main(clock: Clock) -> None:
         async with TruckClient(robot, endpoint, clock=clock) as client:
             with client.subscribe(row, fifo(256)) as messages:
-                waiting = asyncio.create_task(_explain_silence(client, clock, topic))
+                waiting = asyncio.create_task(_explain_silence(client, clock, row))
                 seen = 0
                 try:
                     while seen != count:
@@ -79,12 +80,18 @@ def echo(
     until_stopped(main)
 
 
-async def _explain_silence(client: "TruckClient", clock: Clock, topic: str) -> None:
+async def _explain_silence(client: "TruckClient", clock: Clock, topic: "Topic[Any]") -> None:
+    from monstertruck_schemas.topics import Writer
+
     await clock.sleep(SILENCE)
-    if await client.alive():
-        remark(f"robot {client.robot!r} is there but publishes no {topic} yet; waiting")
+    if not await client.alive():
+        remark(f"no robot {client.robot!r} seen at {client.endpoint}; waiting for {topic.name}")
+    elif topic.writer is Writer.STAND:
+        remark(
+            f"robot {client.robot!r} records {topic.name} where `stand:` is set, and passes it on to nobody; waiting"
+        )
     else:
-        remark(f"no robot {client.robot!r} seen at {client.endpoint}; waiting for {topic}")
+        remark(f"robot {client.robot!r} is there but publishes no {topic.name} yet; waiting")
 
 
 def shortened(value: Any) -> Any:

@@ -148,24 +148,24 @@ def _turn(h: int, turn: int, radius: float, cell: float) -> tuple[list[_Segment]
     lines = np.array([[math.cos(a), math.cos(b)], [math.sin(a), math.sin(b)]])
     arc = turn * np.array([math.sin(b) - math.sin(a), math.cos(a) - math.cos(b)])
     reach = math.ceil(2.0 * radius * abs(b - a) / cell) + 6
-    best: tuple[float, Array, float, tuple[int, int]] | None = None
-    for dx in range(-reach, reach + 1):
-        for dy in range(-reach, reach + 1):
-            fixed, slope = np.linalg.solve(lines, np.column_stack((np.array([dx, dy]) * cell, arc))).T
-            least = fixed - radius * slope
-            if (least < -1e-12).any():
-                continue
-            # Both lines shrink as the radius grows: to where the first is gone.
-            widest = min((f / s for f, s in zip(fixed, slope, strict=True) if s > 1e-12), default=radius)
-            widest = max(widest, radius)
-            ends = np.maximum(fixed - widest * slope, 0.0)
-            length = float(ends.sum() + widest * abs(b - a))
-            if best is None or length < best[0] - 1e-9:
-                best = (length, ends, widest, (dx, dy))
-    assert best is not None
-    _, ends, widest, where = best
-    pieces = [(float(ends[0]), 0.0, 0.0), (widest * abs(b - a), turn / widest, 0.0), (float(ends[1]), 0.0, 0.0)]
-    return [piece for piece in pieces if piece[0] > 1e-9], where
+    side = np.arange(-reach, reach + 1)
+    cells = np.stack(np.meshgrid(side, side, indexing="ij")).reshape(2, -1)
+    slope = np.linalg.solve(lines, arc)
+    fixed = np.linalg.solve(lines, cells * cell)
+    possible = (fixed - radius * slope[:, None] >= -1e-12).all(axis=0)
+    cells, fixed = cells[:, possible], fixed[:, possible]
+    # Both lines shrink as the radius grows: to where the first is gone.
+    shrinking = slope > 1e-12
+    gone = fixed[shrinking] / slope[shrinking, None]
+    widest = (
+        np.maximum(gone.min(axis=0, initial=math.inf), radius) if shrinking.any() else np.full(len(fixed.T), radius)
+    )
+    ends = np.maximum(fixed - widest * slope[:, None], 0.0)
+    lengths = np.round(ends.sum(axis=0) + widest * abs(b - a), 9)
+    best = int(np.argmin(lengths))
+    arc_length, curvature = float(widest[best]) * abs(b - a), turn / float(widest[best])
+    pieces = [(float(ends[0, best]), 0.0, 0.0), (arc_length, curvature, 0.0), (float(ends[1, best]), 0.0, 0.0)]
+    return [piece for piece in pieces if piece[0] > 1e-9], (int(cells[0, best]), int(cells[1, best]))
 
 
 def _translations(h: int, side: int, crab: float) -> list[tuple[int, int, float]]:

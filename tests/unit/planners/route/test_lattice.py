@@ -17,7 +17,7 @@ WALL = (2.9, 0.0, 3.1, 2.8)
 START, GOAL = np.array([1.0, 1.0, 0.0]), np.array([5.0, 1.0, 0.0])
 
 
-@pytest.mark.parametrize("cell", [0.03, 0.05, 0.1])
+@pytest.mark.parametrize("cell", [0.02, 0.03, 0.04, 0.05, 0.1])
 @pytest.mark.parametrize(("radius", "crab"), [(0.757, 0.0), (0.378, 0.4)])
 def test_primitives_end_on_cells_and_keep_the_radius(cell, radius, crab):
     primitives = make_primitives(radius, crab, cell)

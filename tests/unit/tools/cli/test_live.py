@@ -1,12 +1,15 @@
 """What a terminal shows of a message, and the screen of `drive`."""
 
+from types import SimpleNamespace
+
 import pytest
 from rich.console import Console
 
-from monstertruck_runtime.clock import SECOND
+from monstertruck_runtime.clock import SECOND, run_virtual
+from monstertruck_schemas import topics
 from monstertruck_schemas.state import GateMode, GateState
 from monstertruckd.tools.cli.drive_session import Stream, draw
-from monstertruckd.tools.cli.live import shortened
+from monstertruckd.tools.cli.live import _explain_silence, shortened
 from monstertruckd.tools.cli.teleop import Teleop, TeleopRequest
 from monstertruckd.tools.status.screen import ScreenState
 
@@ -18,6 +21,29 @@ def test_long_lists_and_texts_are_cut_and_say_so():
     assert short["data"].endswith("A... 5000 characters")
     assert len(short["data"]) < 100
     assert (short["name"], short["pose"]) == ("scan", {"x": 1.0, "of": [1, 2]})
+
+
+@pytest.mark.parametrize(
+    ("topic", "alive", "said"),
+    [
+        (topics.SCAN, True, "robot 'truck' is there but publishes no sensor/scan yet; waiting"),
+        (topics.SCAN, False, "no robot 'truck' seen at tcp/x:1; waiting for sensor/scan"),
+        (
+            topics.STAND_POSE,
+            True,
+            "robot 'truck' records stand/pose where `stand:` is set, and passes it on to nobody; waiting",
+        ),
+    ],
+)
+def test_a_topic_that_stays_silent_is_explained(
+    topic: topics.Topic, alive: bool, said: str, capsys: pytest.CaptureFixture[str]
+):
+    async def is_alive() -> bool:
+        return alive
+
+    client = SimpleNamespace(robot="truck", endpoint="tcp/x:1", alive=is_alive)
+    run_virtual(lambda clock: _explain_silence(client, clock, topic))
+    assert capsys.readouterr().err.splitlines() == [said]
 
 
 def state(mode: GateMode) -> ScreenState:
