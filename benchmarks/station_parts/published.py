@@ -96,16 +96,16 @@ def world() -> np.ndarray:
     return cells.ravel()
 
 
-async def main(endpoint: str, robot: str, clock: Clock) -> None:
+async def main(zenoh: ZenohConfig, robot: str, clock: Clock) -> None:
     """Publish until cancelled."""
     bus, rpc = Bus(clock), Rpc(clock)
 
     async def answer(value: dict[str, Any], _: dict[str, Any]) -> dict[str, Any]:
         return value
 
-    rpc.register("config", partial(answer, CONFIG), AccessRole.OBSERVER)
+    rpc.register("config", partial(answer, CONFIG | {"robot": robot}), AccessRole.OBSERVER)
     rpc.register("versions", partial(answer, {"monstertruckd": "0.1.0"}), AccessRole.OBSERVER)
-    bridge = ZenohBridge(robot, bus, ZenohConfig(listen=(endpoint,)), clock, rpc)
+    bridge = ZenohBridge(robot, bus, zenoh, clock, rpc)
     await bridge.open()
     control = bus.subscribe(topics.REQ_CONTROL, fifo(1024))
     jobs: list[Any] = [publish(bus, clock, topic, *row) for topic, row in messages().items()]
@@ -132,4 +132,4 @@ async def report(control: Any, clock: Clock) -> None:
 
 
 if __name__ == "__main__":
-    run_wall(partial(main, sys.argv[1], sys.argv[2] if sys.argv[2:] else "truck"))
+    run_wall(partial(main, ZenohConfig(listen=(sys.argv[1],)), sys.argv[2] if sys.argv[2:] else "truck"))
