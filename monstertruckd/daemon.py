@@ -31,10 +31,11 @@ from monstertruck_planners.steps import CODEC
 from monstertruck_runtime.actors.actor import ActorFactory
 from monstertruck_runtime.actors.remote import RPC as REMOTE_STEP
 from monstertruck_runtime.actors.remote import RemoteWorkQueue
-from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.clock import Clock, VirtualClock
 from monstertruck_runtime.errors import ConfigError
 from monstertruck_runtime.mailbox import latest
 from monstertruck_runtime.service import OnBug, RestartPolicy, Scope, Service, scope, supervise
+from monstertruck_runtime.slowness import SlowComputer, factor_of
 from monstertruck_runtime.threads import Offload, in_daemon_thread, in_thread, inline
 from monstertruck_schemas import topics
 from monstertruck_schemas.event import Severity
@@ -129,6 +130,12 @@ class Daemon:
         self.peers = PeerService(clock, self.bus.publisher(topics.PEERS, Writer.ESTIMATION)) if config.peers else None
         """Where poses of other robots come in."""
         self._remote_steps = RemoteWorkQueue(CODEC)
+        if config.placement.slowness is not None and not isinstance(clock, VirtualClock):
+            raise ConfigError(
+                "placement.slowness: for studies on the virtual clock only, not for a daemon in real time"
+            )
+        self.slow: SlowComputer | None = None
+        """The computer that a study puts in the place of this one."""
         self._actors = ActorFactory(clock, self._remote_steps)
         self._calibration = self._build_calibration()
         self.rpc = self._build_rpc()
@@ -151,6 +158,8 @@ class Daemon:
             BusyError: another daemon runs this robot or holds the endpoint.
             BaseExceptionGroup: a bug in gate, actuators or bus.
         """
+        if (slowness := self.config.placement.slowness) is not None and isinstance(self.clock, VirtualClock):
+            self.slow = SlowComputer(self.clock, factor_of(slowness))
         async with (
             self._outside(),
             self._black_box(),
@@ -294,10 +303,8 @@ class Daemon:
         self, where: Scope, service: Service, on_bug: OnBug = OnBug.FAIL, policy: RestartPolicy | None = None
     ) -> None:
         rng = np.random.default_rng(self._rng.integers(2**63))
-        where.start(
-            service.name,
-            supervise(service, policy or RestartPolicy(), self.clock, self._board.report, rng, on_bug),
-        )
+        work = supervise(service, policy or RestartPolicy(), self.clock, self._board.report, rng, on_bug)
+        where.start(service.name, work if self.slow is None else self.slow.service(service.name, work))
 
     def _start_drivers(self, where: Scope, on_bug: OnBug, *duties: Duty) -> None:
         devices = self.config.devices.present()

@@ -28,6 +28,7 @@ from monstertruck_planners.goals.config import DRIVEN, PlannerConfig
 from monstertruck_planners.track.catalog import AnyTracker
 from monstertruck_planners.track.config import STEERING_MODES
 from monstertruck_runtime.bodies import AnyBody, build_chassis
+from monstertruck_runtime.slowness import Board
 from monstertruck_schemas.base import Schema
 from monstertruck_schemas.body import TruckBody
 from monstertruck_schemas.roles import SHAFTS
@@ -100,6 +101,9 @@ class PlacementConfig(Schema):
     """Likewise"""
     tracker: Literal["loop", "worker", "remote"] = "loop"
     explorer: Literal["loop", "worker", "remote"] = "worker"
+    slowness: Annotated[float, Field(gt=0, le=1000)] | Board | None = None
+    """Study, virtual clock only: all computations take so many times as long. `xu4` (5) and `pi2` (20) are estimates;
+    null = declared latencies alone, and runs are reproducible"""
 
 
 class TruckConfig(Schema):

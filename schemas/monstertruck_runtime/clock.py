@@ -262,6 +262,10 @@ class VirtualClock(_LoopClock):
         """The offset given at construction, and the steps since."""
         return self._real_offset
 
+    def spend(self, seconds: float) -> None:
+        """Let time pass at once: what is due meanwhile comes late, as behind a computation."""
+        self._loop.instant += round(seconds * SECOND)
+
     def step_real(self, seconds: float) -> None:
         """Set the real time forwards or back, as an operator or a time server does."""
         self._real_offset += round(seconds * SECOND)

@@ -16,6 +16,7 @@ from monstertruck_runtime.actors.process import WorkerProcess
 from monstertruck_runtime.actors.remote import RemoteWorkQueue
 from monstertruck_runtime.clock import SECOND, Clock, VirtualClock
 from monstertruck_runtime.errors import WorkerTimeoutError
+from monstertruck_runtime.slowness import SlowComputer, slow_computer
 from monstertruck_runtime.threads import in_thread
 
 T = TypeVar("T")
@@ -95,6 +96,10 @@ def use_delivery(clock: VirtualClock, delivery: ResultDelivery) -> None:
     _deliveries[clock] = delivery
 
 
+def _factor(computer: SlowComputer | None) -> float:
+    return 1.0 if computer is None else computer.factor
+
+
 class LoopActor:
     """The step in the caller's own loop, which is blocked meanwhile.
 
@@ -128,7 +133,8 @@ class LoopActor:
             self._step = None
             raise
         if isinstance(self._clock, VirtualClock):
-            await delivery_of(self._clock).wait(self._clock, submitted + round(self._latency * SECOND))
+            latency = self._latency * _factor(slow_computer(self._clock))
+            await delivery_of(self._clock).wait(self._clock, submitted + round(latency * SECOND))
         return outputs
 
     async def __aenter__(self) -> Self:
@@ -147,8 +153,9 @@ class WorkerActor:
     cancelled is killed; the next step starts a fresh one, without the state of the old.
 
     On the wall clock a result is delivered as soon as it is there. On the virtual clock it is delivered exactly
-    ``latency * cpu_factor`` after submission: the loop stops the real time at that instant until the process is
-    done, and results due together come in the order of submission, so that runs are reproducible.
+    ``latency`` after submission: the loop stops the real time at that instant until the process is done, and results
+    due together come in the order of submission, so that runs are reproducible. On a ``SlowComputer`` both the latency
+    and the processor time that the step has really used are longer by its factor, and the longer one counts.
 
     Args:
         name: for error texts, and ``ActorFactory.worker_pids``.
@@ -156,7 +163,6 @@ class WorkerActor:
         clock: time.
         latency: declared seconds of a step on the reference computer.
         deadline: seconds after which a step is given up.
-        cpu_factor: how much slower than the reference the studied computer is; virtual clock only.
         start_timeout: real seconds a start may take.
         answer_timeout: real seconds without an answer, or without more of it, after which the worker is given up; on
             the virtual clock from the result's instant on. As long as a start if not said.
@@ -170,14 +176,13 @@ class WorkerActor:
         *,
         latency: float,
         deadline: float,
-        cpu_factor: float = 1.0,
         start_timeout: float = 30.0,
         answer_timeout: float | None = None,
     ) -> None:
         self.name = name
         self._target = target
         self._clock = clock
-        self._latency = latency * cpu_factor
+        self._latency = latency
         self._deadline = deadline
         self._start_timeout = start_timeout
         self._answer_timeout = start_timeout if answer_timeout is None else answer_timeout
@@ -259,13 +264,22 @@ class WorkerActor:
             raise self._late() from None
 
     async def _step_virtually(self, process: WorkerProcess, inputs: Any) -> Any:
-        submitted = self._clock.now()
+        submitted, computer = self._clock.now(), slow_computer(self._clock)
+        latency = self._latency * _factor(computer)
         try:
             process.send(inputs)
-            if self._latency <= self._deadline:
+            if latency <= self._deadline:
                 assert isinstance(self._clock, VirtualClock)
-                await delivery_of(self._clock).wait(self._clock, submitted + round(self._latency * SECOND))
-                return process.receive(self._answer_timeout)
+                await delivery_of(self._clock).wait(self._clock, submitted + round(latency * SECOND))
+                outputs = process.receive(self._answer_timeout)
+                if computer is None:
+                    return outputs
+                computer.note(f"worker {self.name}", process.used)
+                used = process.used * computer.factor
+                if used <= self._deadline:
+                    if used > latency:
+                        await delivery_of(self._clock).wait(self._clock, submitted + round(used * SECOND))
+                    return outputs
         except TimeoutError:
             pass
         await self._clock.sleep_until(submitted + round(self._deadline * SECOND))

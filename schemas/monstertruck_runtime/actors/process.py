@@ -8,6 +8,7 @@ workers end. Imports stay few, for every worker pays for them.
 import importlib
 import os
 import queue
+import resource
 import signal
 import socket
 import struct
@@ -39,6 +40,8 @@ class WorkerProcess:
 
     def __init__(self, name: str, target: str, stall_timeout: float = 30.0) -> None:
         self._name = name
+        self.used = 0.0
+        """Processor time of the newest step, s."""
         ours, theirs = socket.socketpair()
         limit = _TIMEVAL.pack(*divmod(round(stall_timeout * 1e6), 10**6))
         for direction in (socket.SO_SNDTIMEO, socket.SO_RCVTIMEO):
@@ -70,7 +73,7 @@ class WorkerProcess:
             raise WorkerError(self._gone()) from error
 
     def receive(self, timeout: float | None = None) -> Any:
-        """Wait for the outputs of a step, or for the message that the worker is built.
+        """Wait for the outputs of a step, or for the message that the worker is built; sets ``used``.
 
         Raises:
             WorkerError: the process is gone or its code raised; the text holds its traceback.
@@ -79,7 +82,7 @@ class WorkerProcess:
         try:
             if not self._connection.poll(timeout):
                 raise TimeoutError
-            success, value = self._connection.recv()
+            success, value, self.used = self._connection.recv()
         except TimeoutError:
             raise
         except BlockingIOError:  # SO_RCVTIMEO has passed
@@ -119,12 +122,21 @@ def main() -> int:
     try:
         module, _, factory = sys.argv[2].partition(":")
         worker = getattr(importlib.import_module(module), factory)()
-        connection.send((True, None))
+        connection.send((True, None, 0.0))
         while True:
-            connection.send((True, worker.step(steps.get())))
+            inputs = steps.get()
+            begin = _processor_time()
+            outputs = worker.step(inputs)
+            connection.send((True, outputs, _processor_time() - begin))
     except Exception:  # noqa: BLE001  # reported to the parent, which decides
-        connection.send((False, traceback.format_exc()))
+        connection.send((False, traceback.format_exc(), 0.0))
         return 1
+
+
+def _processor_time() -> float:
+    """Of this thread, s; the clock's module would cost every worker the import of asyncio."""
+    usage = resource.getrusage(resource.RUSAGE_THREAD)
+    return usage.ru_utime + usage.ru_stime
 
 
 def _read(connection: Connection, steps: "queue.SimpleQueue[Any]") -> None:

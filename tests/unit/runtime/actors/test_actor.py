@@ -14,6 +14,7 @@ import pytest
 from monstertruck_runtime.actors.actor import WorkerActor, delivery_of
 from monstertruck_runtime.clock import SECOND, VirtualClock, WallClock, run_virtual
 from monstertruck_runtime.errors import WorkerError, WorkerTimeoutError
+from monstertruck_runtime.slowness import SlowComputer
 
 ROOT = Path(__file__).parents[4]
 
@@ -198,7 +199,8 @@ def test_a_stopped_worker_on_the_virtual_clock_is_killed_too():
 def test_on_the_virtual_clock_a_result_comes_exactly_at_its_declared_latency():
     async def main(clock: VirtualClock) -> list[tuple[int, int]]:
         got = []
-        async with counter(clock, latency=0.2, cpu_factor=2.5) as worker:
+        SlowComputer(clock, 2.5)
+        async with counter(clock, latency=0.2) as worker:
             for seconds in (0.05, 0.0):
                 start = clock.now()
                 got.append((await worker.step({"sleep": seconds}), clock.now() - start))
@@ -239,7 +241,8 @@ def test_results_due_together_come_in_the_order_of_submission_whatever_the_proce
 
 def test_too_slow_a_computer_misses_the_deadline_on_the_virtual_clock():
     async def main(clock: VirtualClock) -> float:
-        async with counter(clock, latency=0.2, deadline=0.5, cpu_factor=3) as worker:
+        SlowComputer(clock, 3.0)
+        async with counter(clock, latency=0.2, deadline=0.5) as worker:
             start = clock.now()
             with pytest.raises(WorkerTimeoutError):
                 await worker.step(None)

@@ -1,0 +1,110 @@
+"""How slow may a computer be: on the virtual clock, a run is charged the processor time that a slower one would take.
+
+What the tasks of a service compute is measured turn by turn and moves the virtual time on by its processor time times a
+factor: timers that are due meanwhile fire late, as on that computer. A worker's result is delivered after its declared
+latency times the factor, or after its measured processor time times the factor, whichever is longer; workers have
+processors of their own. Such runs depend on this computer's speed, so no two are alike. Without a factor nothing is
+measured, and runs are reproducible.
+
+Callbacks that belong to no task of a service (the links' bytes, the world) are not charged.
+"""
+
+import asyncio
+from collections.abc import Callable, Coroutine, Generator
+from contextvars import ContextVar
+from typing import Any, Final, Literal, TypeVar
+from weakref import WeakKeyDictionary
+
+from monstertruck_runtime.clock import Clock, VirtualClock, processor_time
+
+T = TypeVar("T")
+
+Board = Literal["xu4", "pi2"]
+
+BOARDS: Final[dict[Board, float]] = {"xu4": 5.0, "pi2": 20.0}
+"""Estimates, measured on no board: Dhrystone figures of one core (Cortex-A15 3.5 DMIPS/MHz at 2.0 GHz, Cortex-A7 1.9 at
+0.9 GHz) against some 35 000 DMIPS of the reference computer's core."""
+
+_module: ContextVar[str | None] = ContextVar("module", default=None)
+"""The service that the present task works for; tasks inherit it from those that create them."""
+
+
+def factor_of(slowness: float | Board) -> float:
+    """The factor of a number, or of a named board."""
+    return slowness if isinstance(slowness, float) else BOARDS[slowness]
+
+
+class SlowComputer:
+    """A computer whose every core is ``factor`` times slower than this one's.
+
+    Args:
+        clock: that is charged; at most one slow computer per clock.
+        factor: how much slower it is.
+    """
+
+    def __init__(self, clock: VirtualClock, factor: float) -> None:
+        self.factor = factor
+        self.turns: dict[str, list[float]] = {}
+        """Processor time of this computer, s, of every turn of every service, and of every step of every worker."""
+        self._clock = clock
+        _computers[clock] = self
+        asyncio.get_running_loop().set_task_factory(self._task)
+
+    def service(self, name: str, work: Coroutine[Any, Any, T]) -> Coroutine[Any, Any, T]:
+        """``work`` as the service ``name``, to be run by a task; the tasks that it creates belong to it."""
+        return _Measured(work, name, self)
+
+    def note(self, name: str, used: float) -> None:
+        """Remember processor time, s, that needs not be waited for by others."""
+        self.turns.setdefault(name, []).append(used)
+
+    def charge(self, name: str, used: float) -> None:
+        """Remember processor time, s, of the loop, and let as much time pass as the slow computer takes for it."""
+        self.note(name, used)
+        self._clock.spend(used * self.factor)
+
+    def _task(self, loop: asyncio.AbstractEventLoop, work: Any, **options: Any) -> asyncio.Task[Any]:
+        name = _module.get()
+        return asyncio.Task(work if name is None else _Measured(work, name, self), loop=loop, **options)
+
+
+_computers: WeakKeyDictionary[Clock, SlowComputer] = WeakKeyDictionary()
+
+
+def slow_computer(clock: Clock) -> SlowComputer | None:
+    """The computer that a clock simulates; None = this one, at its own speed."""
+    return _computers.get(clock)
+
+
+class _Measured(Coroutine[Any, Any, T]):
+    """A coroutine whose every turn is charged."""
+
+    def __init__(self, work: Coroutine[Any, Any, T], name: str, computer: SlowComputer) -> None:
+        self._work = work
+        self._name = name
+        self._computer = computer
+
+    def send(self, value: Any) -> Any:
+        """One turn."""
+        _module.set(self._name)
+        return self._turn(self._work.send, value)
+
+    def throw(self, *error: Any) -> Any:
+        """One turn that begins with an exception."""
+        _module.set(self._name)
+        return self._turn(self._work.throw, *error)
+
+    def close(self) -> None:
+        """End it where it waits."""
+        self._work.close()
+
+    def __await__(self) -> Generator[Any, Any, T]:
+        """Tasks alone take it, by ``send`` and ``throw``."""
+        raise NotImplementedError
+
+    def _turn(self, go_on: Callable[..., Any], *arguments: Any) -> Any:
+        begin = processor_time()
+        try:
+            return go_on(*arguments)
+        finally:
+            self._computer.charge(self._name, processor_time() - begin)
