@@ -134,14 +134,20 @@ def unseen_ticks(config: TruckConfig, log: Survey) -> list[tuple[int, str]]:
 
 
 def _early_ticks(config: TruckConfig, log: Survey) -> Iterable[int]:
-    """Of odometry, which reads already but has nothing to tell yet: its grid, continued back from its first output."""
+    """Of odometry, which reads already but has nothing to tell yet: its grid, continued back from its first output.
+
+    It tells something from its first tick after the first reading of every shaft, however late a busy computer came to
+    that tick: there was none in between.
+    """
     first = log.first.get(topics.ODOMETRY.name)
     if first is None:
         return ()
     started = log.first.get(topics.TRANSFORMS.name)
     begin = log.start if started is None else started.stamp
     period = round(SECOND / config.odometry.rate)
-    return range(first.stamp - period, begin - period // 4, -period)
+    shafts = [log.first.get(topic.name) for topic in topics.DRIVES[: len(config.devices.shafts())]]
+    read = max((reading.log_time for reading in shafts if reading is not None), default=first.stamp)
+    return (tick for tick in range(first.stamp - period, begin - period // 4, -period) if tick <= read)
 
 
 class Chain:
