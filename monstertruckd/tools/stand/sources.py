@@ -1,7 +1,10 @@
 """Where pictures come from: cameras of the computer, films, folders of pictures."""
 
 import asyncio
+import queue
+import threading
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
@@ -9,11 +12,12 @@ import cv2
 import numpy as np
 
 from monstertruck_drivers.link import SerialPort
+from monstertruck_drivers.webcam.driver import complete
 from monstertruck_drivers.webcam.rendered_source import RenderedSource
 from monstertruck_drivers.webcam.source import Mode
 from monstertruck_estimation.vision.tags import Picture
 from monstertruck_runtime.clock import WallClock
-from monstertruck_runtime.errors import DeviceLostError, InputError
+from monstertruck_runtime.errors import DeviceLostError, InputError, TruckError
 from monstertruckd.tools.stand.config import FileSource, RenderedCamera, VideoDevice
 
 ENDINGS: Final = (".png", ".jpg", ".jpeg", ".pgm")
@@ -60,17 +64,40 @@ def stream(source: VideoDevice | FileSource | RenderedCamera, size: tuple[int, i
 
 
 def _rendered(port: Path, mode: Mode) -> Iterator[Picture]:
-    """Pictures of an emulated camera; the loop runs while one is waited for only."""
-    with asyncio.Runner() as runner:
-        stream = runner.run(RenderedSource(SerialPort(port), WallClock()).open(mode, buffers=2))
-        try:
-            while True:
-                data = np.frombuffer(runner.run(stream.next()).data, np.uint8)
-                picture = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if len(data) else None
-                if picture is not None:
-                    yield np.asarray(picture, dtype=np.uint8)
-        finally:
-            runner.run(stream.__aexit__(None, None, None))
+    """Pictures of an emulated camera, the newest one whenever one is asked for."""
+    box: queue.Queue[bytes | BaseException] = queue.Queue(1)
+    ended = threading.Event()
+    # A thread of its own takes what comes: a pty keeps 4 kB.
+    reading = threading.Thread(target=_read_port, args=(port, mode, box, ended), name=f"camera {port}", daemon=True)
+    reading.start()
+    try:
+        while True:
+            found = box.get()
+            if isinstance(found, BaseException):
+                raise found
+            picture = cv2.imdecode(np.frombuffer(found, np.uint8), cv2.IMREAD_GRAYSCALE)
+            if picture is not None:
+                yield np.asarray(picture, dtype=np.uint8)
+    finally:
+        ended.set()
+
+
+def _read_port(port: Path, mode: Mode, box: "queue.Queue[bytes | BaseException]", ended: threading.Event) -> None:
+    def put(found: bytes | BaseException) -> None:
+        with suppress(queue.Empty):
+            box.get_nowait()
+        box.put(found)
+
+    async def read() -> None:
+        async with await RenderedSource(SerialPort(port), WallClock()).open(mode, buffers=2) as stream:
+            while not ended.is_set():
+                with suppress(ValueError):  # cut off
+                    put(complete((await stream.next()).data))
+
+    try:
+        asyncio.run(read())
+    except TruckError as error:
+        put(error)
 
 
 def _frames(name: Path, capture: cv2.VideoCapture, closed: Exception) -> Iterator[Picture]:
