@@ -11,7 +11,7 @@ from monstertruckd.tools.cli.options import complete_config
 from monstertruckd.tools.cli.output import JsonOption, console, finish, print_json, remark
 
 if TYPE_CHECKING:
-    from monstertruckd.tools.doctor.context import Finding, HostContext
+    from monstertruckd.tools.doctor.context import Finding
 
 STYLES = {"ok": "green", "warn": "yellow", "fail": "bold red"}
 
@@ -38,10 +38,11 @@ def doctor(
     Every finding comes with the command that fixes it. Ends with the code of the first failure; warnings end with 0.
     """
     from monstertruck_runtime.clock import run_wall
+    from monstertruckd.tools.doctor.checks import examine
     from monstertruckd.tools.doctor.context import first_failure, inspect
     from monstertruckd.tools.install.files import Program
 
-    findings = run_wall(lambda clock: _run_checks(inspect(root, Program.present(), config, os.getuid(), clock)))
+    findings = run_wall(lambda clock: examine(inspect(root, Program.present(), config, os.getuid(), clock)))
     reason = first_failure(findings)
     if json_output:
         print_json({"reason": reason, "findings": findings})
@@ -50,33 +51,6 @@ def doctor(
     if fix:
         _mend(findings, yes=yes)
     finish(reason, f"not ready to drive: {reason.text}")
-
-
-async def _run_checks(context: "HostContext") -> "list[Finding]":
-    """All findings, in the order in which problems are fixed.
-
-    Nothing moves; nothing is changed but the latency of adapters through which devices are asked.
-    """
-    from monstertruckd.tools.doctor import computer, devices, history, software
-
-    return [
-        *software.python(context),
-        *software.packages(context),
-        *software.configuration(context),
-        *[finding async for finding in software.service(context)],
-        *software.rules(context),
-        *software.rights(context),
-        *devices.wiring(context),
-        *[finding async for finding in devices.handshakes(context)],
-        *computer.calendar(context),
-        *computer.condition(context),
-        *computer.link(context),
-        *computer.wireless(context),
-        *computer.access(context),
-        *computer.card(context),
-        *history.calibration(context),
-        *history.newest_log(context),
-    ]
 
 
 def _mend(findings: "Sequence[Finding]", *, yes: bool) -> None:

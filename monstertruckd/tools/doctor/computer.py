@@ -80,7 +80,7 @@ def condition(context: HostContext) -> Iterator[Finding]:
     heat = "not measured" if host.temperature is None else f"{host.temperature:.0f} degrees"
     slow = host.frequency_share is not None and host.frequency_share < limits.slow
     if host.temperature is not None and host.temperature > limits.hot:
-        yield warn("heat", Reason.HOST_HOT, heat)
+        yield warn("heat", Reason.HOST_HOT, f"{heat}: let it cool, give it air or a fan")
     elif host.firmware_throttled or slow:
         seen = f"{heat}, but the processor is throttled: temperature or supply voltage"
         yield warn("heat", Reason.HOST_THROTTLED, seen, "grep . /sys/devices/system/cpu/cpu*/cpufreq/scaling_max_freq")
@@ -182,7 +182,7 @@ def _file(context: HostContext, file: Path, *, private: bool) -> Iterator[Findin
     try:
         status = place.stat()
     except FileNotFoundError:
-        yield fail("tls", Reason.NOT_FOUND, f"{file}: no such file")
+        yield fail("tls", Reason.NOT_FOUND, f"{file}: no such file", context.command("security", "show"))
         return
     except PermissionError:
         yield _not_checked(context, file)
@@ -200,11 +200,11 @@ def _expiry(context: HostContext, file: Path, place: Path) -> Finding:
     """The certificate of a file, or of the station let in by it, that expires first."""
     clock = context.computer.machine.clock
     now = (clock.now() + clock.real_offset()) // SECOND
+    show = context.command("security", "show")
     try:
         days, name = min((seconds_left(one, now) // DAY, common_name(one)) for one in read_certificates(place))
     except InputError:
-        return fail("certificate", Reason.BAD_INPUT, f"{file}: expected certificates")
-    show = context.command("security", "show")
+        return fail("certificate", Reason.BAD_INPUT, f"{file}: expected certificates", show)
     if days < 0:
         return fail("certificate", Reason.NOT_PERMITTED, f"{file}: that of {name} expired {-days} days ago", show)
     if days < MONTH:

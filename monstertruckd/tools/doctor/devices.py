@@ -18,6 +18,7 @@ from monstertruckd.tools.doctor.context import Finding, HostContext, fail, fine,
 
 MODULES = {"0403": "ftdi_sio", "10c4": "cp210x", "067b": "pl2303"}
 """Kernel modules by vendor; all others are USB-CDC."""
+SUPPLY: Final = "what hangs there draws too much, or its cable is damaged: use a hub with a supply of its own"
 TIMEOUT: Final = 15.0
 """Seconds for one device's whole answer; a scanner that measures has to be stopped first."""
 
@@ -36,7 +37,9 @@ def wiring(context: HostContext) -> Iterator[Finding]:
             yield _by_path(context, role, device.port)
     for name, count in tree.over_current.items():
         if count and name in taken:
-            yield warn("over-current", Reason.OVER_CURRENT, f"{place(name)}: {count} times since its hub came")
+            yield warn(
+                "over-current", Reason.OVER_CURRENT, f"{place(name)}: {count} times since its hub came: {SUPPLY}"
+            )
 
 
 def _by_path(context: HostContext, role: str, port: AnyPort) -> Finding:

@@ -28,7 +28,7 @@ AT_LIMIT: Final = math.radians(0.5)
 COUNTED: Final = {
     Reason.DEVICE_RESTARTED: ("brown-out", "a device lost its supply and came back: measure it while the motor starts"),
     Reason.CLOCK_STEPPED: ("clock steps", "the real time jumped: set it before the drive, or log dates are wrong"),
-    Reason.HOST_THROTTLED: ("throttled", "the processor was throttled: heat, or a weak supply"),
+    Reason.HOST_THROTTLED: ("throttled", "the processor was throttled: cool it, and measure its supply"),
     Reason.OVER_CURRENT: ("over-current", "a hub's port was overloaded: use a supplied hub"),
 }
 """Events of a log that are findings, with their check and what they mean."""
@@ -123,7 +123,8 @@ def _saturated(angles: list[tuple[float, float]], log: str) -> Iterator[Finding]
         most = float(column.max())
         share = float((column > most - AT_LIMIT).mean())
         if most > math.radians(5.0) and share > SATURATED:
-            seen = f"{axle} at its limit of {math.degrees(most):.0f} degrees for {share:.0%} of {log}"
+            where = f"{axle} at its limit of {math.degrees(most):.0f} degrees for {share:.0%} of {log}"
+            seen = f"{where}: calibrate the steering, or drive wider turns"
             yield warn("steering", Reason.SERVO_LIMIT, seen)
 
 
@@ -148,7 +149,10 @@ def _signs(series: dict[str, Any], log: str) -> Iterator[Finding]:
         agreement = float(steps[0] @ steps[1]) / max(float(np.linalg.norm(steps[0]) * np.linalg.norm(steps[1])), 1e-12)
         if agreement < -0.5:
             yield fail(
-                f"sign {what}", Reason.STEERING_DEAD, f"in {log} it turns against the wheels: mounted upside down?"
+                f"sign {what}",
+                Reason.STEERING_DEAD,
+                f"in {log} it turns against the wheels: mounted upside down, or the wheels' directions are wrong "
+                "(calibrate drive --sign-only, calibrate steering --rough)",
             )
         elif agreement > 0.5:
             yield fine(f"sign {what}", "turns as the wheels do")

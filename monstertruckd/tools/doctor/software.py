@@ -60,7 +60,8 @@ def configuration(context: HostContext) -> Iterator[Finding]:
     else:
         yield fine("config", str(file))
     if context.config is not None and (weaker := context.config.weakened()):
-        yield warn("safety", Reason.WEAKENED, "; ".join(weaker))
+        show = context.command("config", "show", str(file))
+        yield warn("safety", Reason.WEAKENED, "; ".join(weaker), show)
 
 
 def _missing(context: HostContext, requirements: list[str]) -> dict[str, list[str]]:
