@@ -2,7 +2,8 @@
 
     python -m docs.pictures.station
 
-A recorded drive to a goal is published slowly, a station shows it, and Debian's chromium takes the pictures.
+A recorded drive to a goal is published slowly, a station shows it, and Debian's chromium takes the pictures; views that
+ask the robot for something are those of an emulated truck that explores.
 """
 
 import asyncio
@@ -14,12 +15,28 @@ from playwright.async_api import Browser, Page
 
 from monstertruckd.tools.demo.runs import free_endpoint
 from tests.daemon.browser_kit import chromium, station
-from tests.daemon.wall_kit import ROOT, Robot, end
+from tests.daemon.wall_kit import ROOT, Robot, end, robot
 
 HERE = Path(__file__).parent
 LOG = ROOT / "tests" / "data" / "replay" / "goals.mcap"
 DESK = {"width": 1280, "height": 800}
 PHONE = {"width": 360, "height": 740}
+EXPLORING = {
+    "path": None,
+    "map": None,
+    "planner": {"map": None},
+    "tracker": {"kind": "lqr"},
+    "slam": {
+        "mode": "mapping",
+        "tiles_period": 0.5,
+        "map_period": 2.0,
+        "grid": {"passed": 5.6, "free_footprint": True},
+    },
+    "explorer": {"kind": "tour"},
+    "odometry": {"start": {"x": 1.0, "y": 3.95, "yaw": 0.0}},
+    "sim": {"world": {"map": "rooms"}},
+}
+"""The whole emulated truck in rooms that it does not know."""
 
 
 async def main() -> None:
@@ -30,6 +47,48 @@ async def main() -> None:
             for theme in ("light", "dark"):
                 for view, size in (("", DESK), ("-phone", PHONE)):
                     await pictures(made, browser, url, theme, view, size)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        overlay = EXPLORING | {"machine": str(folder / "machine"), "recorder": {"directory": str(folder / "logs")}}
+        async with robot(folder, overlay, ROOT / "configs" / "full.yaml") as made:
+            await made.start_simulator()
+            await made.start_daemon()
+            async with station(made) as url, chromium(made.folder) as browser:
+                for theme, view, size in (("light", "", DESK), ("dark", "-phone", PHONE)):
+                    await asking(browser, url, theme, view, size)
+
+
+async def asking(browser: Browser, url: str, theme: str, view: str, size: dict[str, int]) -> None:
+    """Views of a robot that is there: tasks, settings, recordings, a replay, a path that is drawn."""
+    page = await (await browser.new_context(viewport=size, color_scheme=theme, has_touch=bool(view))).new_page()
+    page.set_default_timeout(60_000)
+    await page.goto(url)
+    await page.wait_for_selector("html[data-ready=true]")
+    await page.wait_for_selector("#authority:not([data-mode=unknown])")
+    await asyncio.sleep(5.0)
+    for tab in ("tasks", "settings", "recordings"):
+        await page.evaluate(f"document.querySelector('#tab-{tab}').click()")
+        await asyncio.sleep(1.5)
+        await picture(page, f"station{view}-{theme}-{tab}", tab)
+    await page.evaluate("window.scrollTo(0, 0)")
+    await page.click("#tool-draw")
+    box = await page.locator("#map").bounding_box()
+    assert box is not None
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    await page.mouse.move(x, y)
+    await page.mouse.down()
+    for dx, dy in ((60, 0), (90, -10), (120, -30)):
+        await page.mouse.move(x + dx, y + dy, steps=5)
+    await page.mouse.up()
+    await page.screenshot(path=HERE / f"station{view}-{theme}-path.png")
+    await page.click("#goal-drop")
+    await page.locator("#recordings button").first.click()
+    await page.wait_for_selector("#replay:not([hidden])")
+    await asyncio.sleep(1.0)
+    await page.evaluate("document.querySelector('#tab-truck').click(); window.scrollTo(0, 0)")
+    await asyncio.sleep(1.0)
+    await page.screenshot(path=HERE / f"station{view}-{theme}-replay.png")
+    await page.context.close()
 
 
 async def pictures(made: Robot, browser: Browser, url: str, theme: str, view: str, size: dict[str, int]) -> None:
