@@ -85,8 +85,12 @@ async def asking(browser: Browser, url: str, theme: str, view: str, size: dict[s
     await page.locator("#recordings button").first.click()
     await page.wait_for_selector("#replay:not([hidden])")
     await asyncio.sleep(1.0)
-    await page.evaluate("document.querySelector('#tab-truck').click(); window.scrollTo(0, 0)")
-    await asyncio.sleep(1.0)
+    await page.evaluate(
+        "const bar = document.querySelector('#replay-at'); bar.value = 0.9 * bar.max;"
+        "bar.dispatchEvent(new Event('change'));"
+        "document.querySelector('#tab-truck').click(); window.scrollTo(0, 0)"
+    )
+    await asyncio.sleep(1.5)
     await page.screenshot(path=HERE / f"station{view}-{theme}-replay.png")
     await page.context.close()
 
