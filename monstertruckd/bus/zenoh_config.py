@@ -137,7 +137,7 @@ class PeerConfig(Schema):
 
 
 @dataclass(frozen=True, slots=True)
-class Door:
+class Listener:
     """One Zenoh session of the robot: its own endpoints and places; what a source may do that comes in by it."""
 
     listen: tuple[str, ...]
@@ -158,22 +158,22 @@ class Door:
         return EVERYTHING if self.grants is None else self.grants.get(owner_of(source), OBSERVING)
 
 
-def doors(config: ZenohConfig) -> list[Door]:
+def listeners(config: ZenohConfig) -> list[Listener]:
     """The sessions of a robot; the first one is that of all stations and of the fleet."""
     tls = config.tls
     guarded = config.access_control or tls is not None
     grants = None if tls is None else tls.grants()
     ca, routers = (None, ()) if tls is None else (tls.ca, tls.routers)
-    found = [Door(config.listen, config.max_sessions, config.connect, ca, grants, routers, guarded)]
+    found = [Listener(config.listen, config.max_sessions, config.connect, ca, grants, routers, guarded)]
     if config.listen_pilots and tls is not None and grants is not None:
         driving = {name: grant for name, grant in grants.items() if grant.role.covers(AccessRole.PILOT)}
-        found.append(Door(config.listen_pilots, config.max_sessions, (), tls.pilots_ca, driving, guarded=guarded))
+        found.append(Listener(config.listen_pilots, config.max_sessions, (), tls.pilots_ca, driving, guarded=guarded))
     if config.local_socket and (local := local_endpoint(config.listen)) is not None:
-        found.append(Door((local,), LOCAL_SESSIONS, guarded=guarded))
+        found.append(Listener((local,), LOCAL_SESSIONS, guarded=guarded))
     return found
 
 
-def session_config(robot: str, config: ZenohConfig, door: Door, *, probe: bool = False) -> str:
+def session_config(robot: str, config: ZenohConfig, listener: Listener, *, probe: bool = False) -> str:
     """Zenoh's own JSON configuration of one of the robot's sessions, or of a client that looks whom it would meet.
 
     No discovery at all, for fixed endpoints connect in milliseconds. A full transmit queue drops at once
@@ -181,7 +181,7 @@ def session_config(robot: str, config: ZenohConfig, door: Door, *, probe: bool =
     No shared memory: it takes 20 MB and a thread of its own, and for scans it is the slower way.
     """
     transport: dict[str, Any] = {
-        "unicast": {"max_sessions": door.places},
+        "unicast": {"max_sessions": listener.places},
         "shared_memory": {"enabled": False},
         "link": {
             "tx": {
@@ -197,16 +197,16 @@ def session_config(robot: str, config: ZenohConfig, door: Door, *, probe: bool =
     }
     session: dict[str, Any] = {
         "mode": "client" if probe else config.mode,
-        "listen": {"endpoints": () if probe else door.listen, "exit_on_failure": True},
-        "connect": {"endpoints": door.connect, "timeout_ms": 500, "exit_on_failure": probe},
+        "listen": {"endpoints": () if probe else listener.listen, "exit_on_failure": True},
+        "connect": {"endpoints": listener.connect, "timeout_ms": 500, "exit_on_failure": probe},
         "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "timestamping": {"enabled": True},
         "adminspace": {"enabled": False},
         "transport": transport,
     }
-    if config.tls is not None and door.ca is not None:
+    if config.tls is not None and listener.ca is not None:
         transport["link"]["tls"] = {
-            "root_ca_certificate": str(door.ca),
+            "root_ca_certificate": str(listener.ca),
             "listen_certificate": str(config.tls.certificate),
             "listen_private_key": str(config.tls.key),
             "connect_certificate": str(config.tls.certificate),
@@ -214,9 +214,9 @@ def session_config(robot: str, config: ZenohConfig, door: Door, *, probe: bool =
             "enable_mtls": True,
             "close_link_on_expiration": True,
         }
-    if door.guarded:
-        owners: Iterable[str] | None = door.grants
-        session["access_control"] = access_rules(robot, owners, door.routers)
+    if listener.guarded:
+        owners: Iterable[str] | None = listener.grants
+        session["access_control"] = access_rules(robot, owners, listener.routers)
     return json.dumps(session)
 
 

@@ -44,7 +44,7 @@ from monstertruckd.bus.intake import Intake, Refusals, StandIntake
 from monstertruckd.bus.local import Bus
 from monstertruckd.bus.replies import Replies, Reply
 from monstertruckd.bus.rpc import Rpc, failure, topic_rows
-from monstertruckd.bus.zenoh_config import Door, ZenohConfig, doors, session_config
+from monstertruckd.bus.zenoh_config import Listener, ZenohConfig, listeners, session_config
 
 log = logging.getLogger(__name__)
 
@@ -53,7 +53,7 @@ BULKY = frozenset({CAMERA.name, MAP.name, MAP_TILES.name})
 MAX_CALL = 16_384
 """Bytes of the largest payload of a call."""
 Put = Callable[[bytes], None]
-Call = tuple[zenoh.Query, Door]
+Call = tuple[zenoh.Query, Listener]
 """A question, and where it came in."""
 
 _SCHEMA_PREFIX = "schema/"
@@ -87,7 +87,7 @@ class ZenohBridge:
         self._config = config
         self._clock = clock
         self._rpc = rpc
-        self._sessions: list[tuple[Door, zenoh.Session]] = []
+        self._sessions: list[tuple[Listener, zenoh.Session]] = []
         rpc.register("topics", self._topics, AccessRole.OBSERVER)
 
     async def open(self) -> None:
@@ -161,10 +161,10 @@ class ZenohBridge:
 
     def _open(self) -> None:
         try:
-            for door in doors(self._config):
-                self._sessions.append((door, self._open_door(door)))
-                if door.connect and self._runs_elsewhere(door):
-                    msg = f"another daemon already runs robot {self._robot!r} behind {', '.join(door.connect)}"
+            for listener in listeners(self._config):
+                self._sessions.append((listener, self._open_listener(listener)))
+                if listener.connect and self._runs_elsewhere(listener):
+                    msg = f"another daemon already runs robot {self._robot!r} behind {', '.join(listener.connect)}"
                     raise BusyError(msg)
         except BaseException:
             self._close()
@@ -175,13 +175,13 @@ class ZenohBridge:
             _, session = self._sessions.pop()
             session.close()  # type: ignore[no-untyped-call]
 
-    def _open_door(self, door: Door) -> zenoh.Session:
-        where = ", ".join(door.listen)
-        sockets = [Path(endpoint.removeprefix(UNIX)) for endpoint in door.listen if endpoint.startswith(UNIX)]
+    def _open_listener(self, listener: Listener) -> zenoh.Session:
+        where = ", ".join(listener.listen)
+        sockets = [Path(endpoint.removeprefix(UNIX)) for endpoint in listener.listen if endpoint.startswith(UNIX)]
         try:
             for path in sockets:
                 make_private(path.parent)
-            session = zenoh.open(zenoh.Config.from_json5(session_config(self._robot, self._config, door)))
+            session = zenoh.open(zenoh.Config.from_json5(session_config(self._robot, self._config, listener)))
             for path in sockets:
                 path.chmod(0o660)
         except zenoh.ZError as error:
@@ -196,9 +196,9 @@ class ZenohBridge:
             raise ConfigError(msg) from error
         return session
 
-    def _runs_elsewhere(self, door: Door) -> bool:
+    def _runs_elsewhere(self, listener: Listener) -> bool:
         """Ask the fleet's routers as a client: its link is complete when it is open, a router's is not."""
-        config = session_config(self._robot, self._config, door, probe=True)
+        config = session_config(self._robot, self._config, listener, probe=True)
         try:
             with zenoh.open(zenoh.Config.from_json5(config)) as probe:
                 return any(reply.ok for reply in probe.liveliness().get(alive_key(self._robot), timeout=1.0))
@@ -225,12 +225,12 @@ class ZenohBridge:
         """Subscribers and queryables; last the tokens that say so, which live as long as their objects."""
         remote = zenoh.Locality.REMOTE
         tokens = []
-        for door, session in self._sessions:
+        for listener, session in self._sessions:
             for group in in_groups():
                 # One for all requests, so that a put to many keys comes once.
                 session.declare_subscriber(
                     f"{KEY_ROOT}/{self._robot}/{group}/**",
-                    partial(self._on_request, door, intakes, refusals),
+                    partial(self._on_request, listener, intakes, refusals),
                     allowed_origin=remote,
                 )
             if self._stand:
@@ -243,18 +243,20 @@ class ZenohBridge:
                     session.declare_queryable(key, partial(self._on_get, topic, key, replies), allowed_origin=remote)
             session.declare_queryable(
                 rpc_key(self._robot, "**"),
-                partial(self._on_call, door, queries, replies, limits),
+                partial(self._on_call, listener, queries, replies, limits),
                 allowed_origin=remote,
             )
             tokens.append(session.liveliness().declare_token(alive_key(self._robot)))
         return tokens
 
-    def _on_request(self, door: Door, intakes: Mapping[str, Intake], refusals: Refusals, sample: zenoh.Sample) -> None:
+    def _on_request(
+        self, listener: Listener, intakes: Mapping[str, Intake], refusals: Refusals, sample: zenoh.Sample
+    ) -> None:
         key, payload = str(sample.key_expr), sample.payload
         found = sender_in(self._robot, key)
         name, source = found if found is not None else ("", None)
         if name in intakes:
-            intakes[name].take(_sender(door, source), len(payload), payload.to_bytes)
+            intakes[name].take(_sender(listener, source), len(payload), payload.to_bytes)
             return
         source = (*key.split("/")[3:4], "")[0]
         for intake in intakes.values():
@@ -292,7 +294,7 @@ class ZenohBridge:
         return sender_in(self._robot, key) or (key.removeprefix(rpc_key(self._robot, "")), None)
 
     def _on_call(
-        self, door: Door, queries: ThreadHop[Call], replies: Replies, limits: CallLimits, query: zenoh.Query
+        self, listener: Listener, queries: ThreadHop[Call], replies: Replies, limits: CallLimits, query: zenoh.Query
     ) -> None:
         replies.wait_for_room()
         size = 0 if query.payload is None else len(query.payload)
@@ -305,16 +307,16 @@ class ZenohBridge:
         elif not self._rpc.serves(name) and (described := self._described(query)):
             replies.end(query, partial(_reply_schemas, described))
         else:
-            queries.put((query, door))
+            queries.put((query, listener))
 
-    def _discard(self, query: zenoh.Query, _: Door, replies: Replies, limits: CallLimits) -> None:
+    def _discard(self, query: zenoh.Query, _: Listener, replies: Replies, limits: CallLimits) -> None:
         limits.ended(*self._called(query))
         replies.end(query)
 
     def _serve(
         self,
         query: zenoh.Query,
-        door: Door,
+        listener: Listener,
         replies: Replies,
         limits: CallLimits,
         calls: asyncio.TaskGroup,
@@ -324,7 +326,7 @@ class ZenohBridge:
         if not may_be_served(name, len(active)):
             replies.end(query, _error(failure(Reason.BUSY, TOO_MANY)))
             return
-        task = calls.create_task(self._answer(query, name, _sender(door, source)))
+        task = calls.create_task(self._answer(query, name, _sender(listener, source)))
         if name != ESTOP:
             active.add(task)
 
@@ -349,8 +351,8 @@ class ZenohBridge:
         return {"topics": topic_rows(self._robot)}
 
 
-def _sender(door: Door, source: str | None) -> Sender:
-    return Sender(ANONYMOUS, OBSERVING) if source is None else Sender(source, door.grant(source))
+def _sender(listener: Listener, source: str | None) -> Sender:
+    return Sender(ANONYMOUS, OBSERVING) if source is None else Sender(source, listener.grant(source))
 
 
 def _last(name: str) -> str:

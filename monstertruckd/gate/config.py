@@ -320,10 +320,15 @@ def stopping_distance(config: GateConfig) -> float:
     return config.obstacle.ahead + config.speed * delay + config.speed**2 / (2 * config.deceleration)
 
 
+def required_sensors(config: GateConfig) -> dict[str, SensorLimit]:
+    """Limits of the sensors that stop the truck by default when they are stale, by their key."""
+    limits = ((name, limit) for name, limit in config if isinstance(limit, SensorLimit))
+    return {name: limit for name, limit in limits if GateConfig.model_fields[name].default.critical}
+
+
 def _times(config: GateConfig) -> Iterator[tuple[str, float]]:
     """Times in which the truck drives on whatever happens, s."""
-    for name in ("scan", "drive", "steering", "attitude"):
-        limit: SensorLimit = getattr(config, name)
+    for name, limit in required_sensors(config).items():
         yield f"gate.{name}.stale_after", limit.stale_after
     for name in ("max_latency", "reaction", "tick_stall", "max_request_age"):
         yield f"gate.{name}", getattr(config, name)
@@ -398,8 +403,8 @@ def weakened(config: GateConfig) -> tuple[str, ...]:
     texts = [*weaker("gate", config, default, WEAKER_ABOVE, WEAKER_BELOW)]
     texts += [
         f"gate.{name}.critical false: a silent sensor does not stop the truck"
-        for name in ("scan", "drive", "steering", "attitude")
-        if not getattr(config, name).critical
+        for name, limit in required_sensors(config).items()
+        if not limit.critical
     ]
     if config.turning is None:
         texts.append("gate.turning null: servos without supply are not noticed")

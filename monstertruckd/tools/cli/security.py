@@ -98,12 +98,15 @@ def revoke(name: NameArgument, folder: FolderOption = HERE) -> None:
 def rules(folder: FolderOption = HERE) -> None:
     """Print the access rules that follow for each of the robot's Zenoh sessions, as Zenoh reads them."""
     from monstertruckd.bus.access import access_rules
-    from monstertruckd.bus.zenoh_config import doors
+    from monstertruckd.bus.zenoh_config import listeners
 
     kept = _folder(folder)
     robot = kept.register().robot
     print_json(
-        [{"listen": door.listen, "access_control": access_rules(robot, door.grants)} for door in doors(kept.zenoh())]
+        [
+            {"listen": listener.listen, "access_control": access_rules(robot, listener.grants)}
+            for listener in listeners(kept.zenoh())
+        ]
     )
 
 

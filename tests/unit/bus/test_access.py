@@ -10,7 +10,7 @@ from monstertruck_schemas.req import DriveRequest, Role
 from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.topics import TOPICS, Writer
 from monstertruckd.bus.access import EVERYTHING, OBSERVING, Grant, access_rules, in_groups, out_groups, role_needed
-from monstertruckd.bus.zenoh_config import TlsConfig, ZenohConfig, doors, session_config
+from monstertruckd.bus.zenoh_config import TlsConfig, ZenohConfig, listeners, session_config
 
 FILES = {"ca": Path("ca.pem"), "certificate": Path("t.pem"), "key": Path("t.key")}
 
@@ -80,7 +80,7 @@ def test_names_that_make_no_sense_are_refused(names, text):
 def test_tls_means_access_control():
     tls = TlsConfig(**FILES, pilots=("ann",), observers=("bob",))
     config = ZenohConfig(tls=tls)
-    (stations, local) = doors(config)
+    (stations, local) = listeners(config)
     written = json.loads(session_config("rover", config, stations))
     assert written["access_control"] == access_rules("rover", ["ann", "bob"])
     assert written["transport"]["link"]["tls"]["enable_mtls"] is True
@@ -95,13 +95,13 @@ def test_what_each_name_may_do():
         engineers=("cy",),
         ranks={"ann": Role.GAMEPAD, "cy": Role.KEYBOARD},
     )
-    stations, local = doors(ZenohConfig(tls=tls))
+    stations, local = listeners(ZenohConfig(tls=tls))
     assert stations.grant("ann") == stations.grant("ann:laptop-7") == Grant(AccessRole.PILOT, Role.GAMEPAD)
     assert stations.grant("bob") == Grant(AccessRole.OBSERVER, Role.STATION)
     assert stations.grant("cy") == Grant(AccessRole.ENGINEER, Role.KEYBOARD)
     assert stations.grant("eve") == stations.grant("anna") == OBSERVING
     assert local.grant("whoever") == EVERYTHING
-    assert doors(ZenohConfig())[0].grant("whoever") == EVERYTHING
+    assert listeners(ZenohConfig())[0].grant("whoever") == EVERYTHING
 
 
 @pytest.mark.parametrize(

@@ -37,7 +37,7 @@ async def test_an_emergency_stop_gets_through_when_strangers_hold_all_places():
             await asyncio.to_thread(stranger.close)
 
 
-async def test_state_and_liveliness_are_the_same_at_every_door():
+async def test_state_and_liveliness_are_the_same_at_every_listener():
     async with running_robot() as robot:
         socket = nearest(robot.endpoint)
         assert socket.startswith("unixsock-stream/")

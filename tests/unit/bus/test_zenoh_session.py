@@ -29,7 +29,7 @@ from monstertruck_schemas.topics import GATE, MAP, POSE, REQ_DRIVE, REQ_GOAL, ST
 from monstertruckd.bus.call_limits import CALL_RATE, MAX_WAITING
 from monstertruckd.bus.local import Bus
 from monstertruckd.bus.rpc import Rpc
-from monstertruckd.bus.zenoh_config import ZenohConfig, doors, session_config
+from monstertruckd.bus.zenoh_config import ZenohConfig, listeners, session_config
 from monstertruckd.bus.zenoh_session import MAX_CALL, ZenohBridge
 from tests.bus_kit import free_endpoint, gate_state, odometry, running_robot
 
@@ -454,7 +454,7 @@ async def test_access_control_stops_forgers_but_no_one_else():
 
 
 def test_discovery_is_off_and_the_default_is_this_machine_only():
-    config = json.loads(session_config("truck", ZenohConfig(), doors(ZenohConfig())[0]))
+    config = json.loads(session_config("truck", ZenohConfig(), listeners(ZenohConfig())[0]))
     assert config["listen"]["endpoints"] == ["tcp/127.0.0.1:7447"]
     assert config["scouting"]["multicast"]["enabled"] is False
     assert config["scouting"]["gossip"]["enabled"] is False
