@@ -1,7 +1,8 @@
 """What explorers choose from: the frontiers of a map, a place to look at each, and the ways there. Loads numba."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from dataclasses import field as attribute
 from typing import Final, Protocol
 
 import numpy as np
@@ -9,10 +10,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import label
 
 from monstertruck_kinematics.elementary import Array
-from monstertruck_planners.collision import OCCUPIED, DistanceField
 from monstertruck_planners.explore.exchange import ExploreSetup, Point, Viewpoint
 from monstertruck_planners.explore.frontier import FrontierMap
-from monstertruck_planners.explore.kernels import joined_cells, new_areas, shares_seen
+from monstertruck_planners.explore.kernels import far_from_obstacles, joined_cells, new_areas, shares_seen
 from monstertruck_planners.goals.exchange import Pose
 from monstertruck_planners.goals.plan_step import BESIDE, standing_free
 from monstertruck_planners.route.api import RouteCosts, RouteMap, Vehicle
@@ -23,6 +23,7 @@ from monstertruck_planners.route.heuristic import (
     CostToGo,
     cell_ahead,
     cell_at,
+    cells_to_goal,
     complete,
     cost_to_go,
 )
@@ -31,8 +32,12 @@ LONGEST: Final = 2.5
 """Frontiers longer than this are divided, m."""
 AROUND: Final = 3.0
 """A frontier is looked at from this near, m."""
-PLACES: Final = 40
-"""Places to look from that are compared for each frontier."""
+COMPARED: Final = 160
+"""Places that are compared for each frontier by how much of it is in sight..."""
+PLACES: Final = 32
+"""...and of the good ones so many by how much new area is seen."""
+MARGIN: Final = 1.0
+"""What is found is of use until something changes within this of such places, m."""
 SAMPLES: Final = 12
 """Cells of a frontier that are to be seen from there."""
 SEEN: Final = 0.6
@@ -68,6 +73,22 @@ class Frontier:
     """The one nearest to their mean, m."""
     length: float
     """About, m."""
+
+
+@dataclass(frozen=True)
+class Look:
+    """Places from where a frontier is looked at; they hold as long as nothing changes around it."""
+
+    change: int
+    """The newest one of the map."""
+    reached: int
+    """Coarse cells round it that could be reached."""
+    places: Array = attribute(default_factory=lambda: np.empty((0, 2)))
+    """Shape (n, 2), m."""
+    bearings: Array = attribute(default_factory=lambda: np.empty(0))
+    """Directions of the frontier from there, shape (n,), rad."""
+    gains: Array = attribute(default_factory=lambda: np.empty(0))
+    """New area that is seen with that heading, shape (n,), m^2."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +132,8 @@ class Remembered:
     """What is computed again only where the map differs."""
 
     route_map: RouteMap | None = None
-    obstacles: DistanceField | None = None
+    looks: dict[bytes, Look] = attribute(default_factory=dict)
+    """By a frontier's cells."""
 
 
 @dataclass
@@ -133,8 +155,8 @@ class ExplorationView:
     banned: tuple[Point, ...]
     avoided: tuple[Point, ...]
     memory: Remembered
-    options: list[Option] = field(init=False, default_factory=list)
-    left_alone: int = field(init=False, default=0)
+    options: list[Option] = attribute(init=False, default_factory=list)
+    left_alone: int = attribute(init=False, default=0)
     """Banned frontiers."""
 
     def __post_init__(self) -> None:
@@ -146,8 +168,6 @@ class ExplorationView:
             cells, known.resolution, known.origin, "blocked", previous=self.memory.route_map
         )
         self.memory.route_map = self._route_map = route_map
-        self._obstacles = DistanceField(known.cells >= OCCUPIED, known.resolution, known.origin, self.memory.obstacles)
-        self.memory.obstacles = self._obstacles
         self._field = route_map.field.data()
         self._costs = RouteCosts.of(vehicle, DriveCosts(margin=setup.margin))
         self._cell = route_map.coarse_cell
@@ -210,24 +230,26 @@ class ExplorationView:
 
     def _find_options(self, ways: CostToGo) -> list[Option]:
         options = []
-        reached = np.argwhere(ways.cost < UNREACHED)
-        if not len(reached):
-            return []
-        way = ways.cost[reached[:, 0], reached[:, 1]] * (self._cell / UNIT)
-        places = self._centres(reached)
-        for avoided in self.avoided:
-            away = np.hypot(*(places - avoided).T) > AVOIDED
-            reached, way, places = reached[away], way[away], places[away]
+        seen: dict[bytes, Look] = {}
+        reached = ways.cost < UNREACHED
         for frontier in self._frontiers():
-            near = np.hypot(*(places - frontier.middle).T) < AROUND
-            if not near.any():
-                continue
             if any(math.dist(frontier.middle, place) < BANNED for place in self.banned):
                 self.left_alone += 1
                 continue
-            option = self._option(frontier, ways, reached[near], places[near], way[near])
+            key = (frontier.points + self.known.resolution / 4).round(2).tobytes()
+            near = self._reached_near(reached, frontier)
+            look = self.memory.looks.get(key)
+            if (
+                look is None
+                or look.reached != len(near)
+                or self.known.changed_within(frontier.middle, AROUND + MARGIN) > look.change
+            ):
+                look = self._look(frontier, near)
+            seen[key] = look
+            option = self._option(frontier, look, ways)
             if option is not None:
                 options.append(option)
+        self.memory.looks = seen
         return options
 
     def _centres(self, coarse: NDArray[np.int64]) -> Array:
@@ -241,15 +263,20 @@ class ExplorationView:
             return []
         rows, columns = np.nonzero(known.frontier)
         of = labels[rows, columns]
+        least = self.setup.config.smallest / resolution
+        kept = np.bincount(of)[of] >= least
+        rows, columns, of = rows[kept], columns[kept], of[kept]
+        if not len(of):
+            return []
         centres = (np.column_stack((columns, rows)) + 0.5) * resolution + known.origin[:2]
-        room = self._obstacles.lookup(centres)
+        # Between obstacles too close for the robot nothing is to be reached.
+        roomy = far_from_obstacles(known.cells, rows, columns, self._passable / resolution)
         result = []
         order = np.argsort(of, kind="stable")
         for group in np.split(order, np.flatnonzero(np.diff(of[order])) + 1):
             for part in _divided(centres[group], LONGEST):
                 members = group[part]
-                # Between obstacles too close for the robot nothing is to be reached.
-                if len(members) * resolution < self.setup.config.smallest or room[members].max() < self._passable:
+                if len(members) < least or not roomy[members].any():
                     continue
                 points = centres[members]
                 middle = points[np.argmin(np.hypot(*(points - points.mean(axis=0)).T))]
@@ -260,34 +287,57 @@ class ExplorationView:
     def _passable(self) -> float:
         return self.setup.footprint.half_width - self.known.resolution / 2
 
-    def _option(
-        self, frontier: Frontier, ways: CostToGo, coarse: NDArray[np.int64], places: Array, way: Array
-    ) -> Option | None:
-        """The nearest place from which nearly as much is seen of a frontier as from the best one."""
+    def _reached_near(self, reached: NDArray[np.bool_], frontier: Frontier) -> NDArray[np.int64]:
+        """Coarse cells (row, column) that can be reached, in a square round a frontier, shape (n, 2)."""
+        row, column = cell_at(self._field, self._cell, *frontier.middle)
+        reach = math.ceil(AROUND / self._cell)
+        top, left = max(row - reach, 0), max(column - reach, 0)
+        near = np.argwhere(reached[top : row + reach + 1, left : column + reach + 1])
+        near += (top, left)
+        return near
+
+    def _look(self, frontier: Frontier, near: NDArray[np.int64]) -> Look:
+        """Places from which enough of a frontier is in sight, and nearly as much new area as from the best one."""
         config, resolution, corner = self.setup.config, self.known.resolution, self.known.origin[:2]
-        order = np.argsort(way, kind="stable")
-        chosen = order[np.unique(np.linspace(0, len(order) - 1, 4 * PLACES).astype(np.intp))]
-        sample = frontier.points[np.linspace(0, len(frontier.points) - 1, SAMPLES).astype(np.intp)]
-        here, there = ((v - corner) / resolution for v in (places[chosen], sample))
+        change, reached = self.known.changes, len(near)
+        places = self._centres(near)
+        places = places[np.hypot(*(places - frontier.middle).T) < AROUND]
+        if not len(places):
+            return Look(change, reached)
+        places = places[_spread(len(places), COMPARED)]
+        sample = frontier.points[_spread(len(frontier.points), SAMPLES)]
+        here, there = ((v - corner) / resolution for v in (places, sample))
         share = shares_seen(self.known.cells, here, there, (config.reach - SHORT) / resolution)
-        chosen = chosen[share >= min(SEEN, float(share.max(initial=0.0)))]
         if share.max(initial=0.0) == 0.0:
-            return None
-        chosen = chosen[np.unique(np.linspace(0, len(chosen) - 1, PLACES).astype(np.intp))]
-        headings = [self._heading(ways, coarse[i], places[i], frontier.middle) for i in chosen]
-        poses = np.column_stack((places[chosen], headings))
-        free = self._route_map.field.free(self.setup.footprint, poses, self.setup.margin)
-        chosen, poses = chosen[free], poses[free]
-        if not len(chosen):
-            return None
-        gains = self.gains(poses)
+            return Look(change, reached)
+        places = places[share >= min(SEEN, float(share.max()))]
+        places = places[_spread(len(places), PLACES)]
+        bearings = np.arctan2(*(frontier.middle - places).T[::-1])
+        gains = self.gains(np.column_stack((places, bearings)))
         worth = gains >= max(WORTH * float(gains.max()), LEAST)
-        if not worth.any():
+        return Look(change, reached, places[worth], bearings[worth], gains[worth])
+
+    def _option(self, frontier: Frontier, look: Look, ways: CostToGo) -> Option | None:
+        """The nearest place to look at a frontier from."""
+        if not len(look.places):
             return None
-        first = int(np.argmax(worth))  # they are ordered by their way
-        x, y, yaw = poses[first].tolist()
-        at = chosen[first]
-        return Option(frontier, (x, y, yaw), float(way[at]), float(gains[first]), self._turn(ways, coarse[at]))
+        rows, columns = np.floor((look.places - (self._field.x, self._field.y)) / self._cell).astype(int).T[::-1]
+        cost = ways.cost[rows, columns]
+        for i in np.argsort(cost, kind="stable"):
+            if cost[i] >= UNREACHED:
+                break
+            x, y = look.places[i].tolist()
+            if any(math.dist((x, y), place) <= AVOIDED for place in self.avoided):
+                continue
+            at, bearing = (int(rows[i]), int(columns[i])), float(look.bearings[i])
+            headings = np.array((self._heading(ways, at, bearing), bearing))
+            poses = np.column_stack((np.full((2, 2), (x, y)), headings))
+            free = self._route_map.field.free(self.setup.footprint, poses, self.setup.margin)
+            if free.any():
+                yaw = float(headings[int(np.argmax(free))])
+                way = float(cost[i]) * self._cell / UNIT
+                return Option(frontier, (x, y, yaw), way, float(look.gains[i]), self._turn(ways, at))
+        return None
 
     def gains(self, poses: Array) -> Array:
         """New area seen from poses of the base, shape (n, 3): m^2, shape (n,)."""
@@ -301,31 +351,28 @@ class ExplorationView:
         area: Array = cells * resolution**2
         return area
 
-    def _heading(self, ways: CostToGo, at: NDArray[np.int64], place: Array, towards: Point) -> float:
-        """That of the way there, if the frontier is in view then; else towards it."""
-        bearing = math.atan2(towards[1] - place[1], towards[0] - place[0])
-        before = cell_ahead(ways.step, int(at[0]), int(at[1]), float(BEHIND))
-        if before == (int(at[0]), int(at[1])):
+    def _heading(self, ways: CostToGo, at: tuple[int, int], bearing: float) -> float:
+        """That of the way to a coarse cell, if a frontier in that direction is in view then; else towards it."""
+        before = cell_ahead(ways.step, *at, float(BEHIND))
+        if before == at:
             return bearing
         arriving = math.atan2(at[0] - before[0], at[1] - before[1])
         in_view = abs(math.remainder(bearing - arriving, math.tau)) < self.setup.config.view / 2 - SIDEWARD
         return arriving if in_view else bearing
 
-    def _turn(self, ways: CostToGo, at: NDArray[np.int64]) -> float:
+    def _turn(self, ways: CostToGo, at: tuple[int, int]) -> float:
         """Angle between the robot's heading and the beginning of the way to a coarse cell, rad."""
-        row, column = int(at[0]), int(at[1])
-        length = 0.0
-        trail = [(row, column)]
-        while ways.step[row, column] >= 0 and length < ways.step.size:
-            row, column = cell_ahead(ways.step, row, column, 1.0)
-            trail.append((row, column))
-            length += 1.0
-        ahead = trail[max(len(trail) - 1 - 2 * BEHIND, 0)]
-        if ahead == (row, column):
+        trail = cells_to_goal(ways.step, *at)
+        if len(trail) < 2:
             return 0.0
-        there = self._centres(np.array([ahead]))[0]
+        there = self._centres(trail[max(len(trail) - 1 - 2 * BEHIND, 0)][None])[0]
         bearing = math.atan2(there[1] - self.pose[1], there[0] - self.pose[0])
         return abs(math.remainder(bearing - self.pose[2], math.tau))
+
+
+def _spread(count: int, most: int) -> NDArray[np.intp]:
+    """At most so many numbers below ``count``, evenly."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.intp))
 
 
 def _divided(points: Array, longest: float) -> list[NDArray[np.intp]]:

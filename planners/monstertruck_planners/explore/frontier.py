@@ -39,6 +39,10 @@ class FrontierMap:
         self.frontier: NDArray[np.bool_] = np.zeros((0, 0), np.bool_)
         self.free = 0
         """Free cells."""
+        self.changes = 0
+        """How often something was put in."""
+        self.changed: NDArray[np.int64] = np.zeros((0, 0), np.int64)
+        """The change in which a cell of each block became known, free or occupied last."""
         self.put(grid, whole=True)
 
     @property
@@ -61,6 +65,7 @@ class FrontierMap:
         if np.abs(at - low).max() > 0.01:
             raise InputError(f"map at {grid.origin.x}, {grid.origin.y}: expected whole cells of {self.resolution} m")
         new = grid.cells.reshape(grid.height, grid.width)
+        self.changes += 1
         self._cover(low, low + np.array((grid.width, grid.height)))
         if whole:
             there = np.full_like(self.cells, UNKNOWN)
@@ -81,8 +86,13 @@ class FrontierMap:
                 if np.array_equal(self.cells[place], part):
                     continue
                 self.free += _free(part) - _free(self.cells[place])
+                same = np.array_equal(_standing(self.cells[place]), _standing(part))
                 self.cells[place] = part
-                looked += self._look((row, column, row + part.shape[0], column + part.shape[1]))
+                if not same:
+                    bottom, right = row + part.shape[0], column + part.shape[1]
+                    blocks = np.s_[row // BLOCK : -(-bottom // BLOCK), column // BLOCK : -(-right // BLOCK)]
+                    self.changed[blocks] = self.changes
+                    looked += self._look((row, column, bottom, right))
         return looked
 
     def _look(self, box: Box) -> int:
@@ -113,11 +123,26 @@ class FrontierMap:
         corner = (low // BLOCK - wider[0]) * BLOCK
         shape = ((-(-high // BLOCK) + wider[1]) * BLOCK - corner)[::-1]
         cells, frontier = np.full(shape, UNKNOWN, np.int8), np.zeros(shape, np.bool_)
+        changed = np.zeros(np.array(shape) // BLOCK, np.int64)
         if size.all():
             column, row = self.corner - corner
             inside = np.s_[row : row + size[1], column : column + size[0]]
             cells[inside], frontier[inside] = self.cells, self.frontier
-        self.corner, self.cells, self.frontier = corner, cells, frontier
+            row, column = row // BLOCK, column // BLOCK
+            changed[row : row + self.changed.shape[0], column : column + self.changed.shape[1]] = self.changed
+        self.corner, self.cells, self.frontier, self.changed = corner, cells, frontier, changed
+
+    def changed_within(self, middle: tuple[float, float], reach: float) -> int:
+        """The newest change of any block within a square round a place, m: ``reach`` to each side."""
+        cells = BLOCK * self.resolution
+        low, high = (np.floor((np.array(middle) + d - self.origin[:2]) / cells).astype(int) for d in (-reach, reach))
+        part = self.changed[max(low[1], 0) : max(high[1] + 1, 0), max(low[0], 0) : max(high[0] + 1, 0)]
+        return int(part.max(initial=0))
+
+
+def _standing(cells: Cells) -> Cells:
+    """Unknown, free or occupied: -1, 0, 1."""
+    return (cells >= OCCUPIED).astype(np.int8) - (cells < 0)
 
 
 def _free(cells: Cells) -> int:

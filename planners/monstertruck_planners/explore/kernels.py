@@ -26,6 +26,22 @@ def sees(cells: NDArray[np.int8], x: float, y: float, to_x: float, to_y: float) 
 
 
 @njit(cache=True)
+def far_from_obstacles(
+    cells: NDArray[np.int8], rows: NDArray[np.int64], columns: NDArray[np.int64], least: float
+) -> NDArray[np.bool_]:
+    """Whether the middle of each of some cells, shape (n,), is so far from those of all obstacles, in cells."""
+    result = np.ones(len(rows), np.bool_)
+    around = int(least)
+    for k in range(len(rows)):
+        for row in range(max(rows[k] - around, 0), min(rows[k] + around + 1, cells.shape[0])):
+            for column in range(max(columns[k] - around, 0), min(columns[k] + around + 1, cells.shape[1])):
+                away = (row - rows[k]) ** 2 + (column - columns[k]) ** 2
+                if cells[row, column] >= OCCUPIED and away < least * least:
+                    result[k] = False
+    return result
+
+
+@njit(cache=True)
 def new_area(
     cells: NDArray[np.int8], x: float, y: float, heading: float, view: float, reach: float, depth: float, beams: int
 ) -> float:
