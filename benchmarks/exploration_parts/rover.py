@@ -19,6 +19,7 @@ from monstertruck_planners.collision import placed, points_relative
 from monstertruck_planners.explore.attempts import Attempts
 from monstertruck_planners.explore.config import AuthorConfig, ExplorerConfig
 from monstertruck_planners.explore.exchange import ExploreSetup, ExploreTask, Viewpoint
+from monstertruck_planners.explore.exploration import LEFT, REMEMBERED, STUCK, TRAIL
 from monstertruck_planners.explore.explore_step import ExploringStep
 from monstertruck_planners.goals.config import PlannerConfig
 from monstertruck_planners.goals.exchange import PlanTask, Pose, Setup
@@ -92,6 +93,9 @@ class Rover:
         self.truth = np.column_stack((x, y))
         self.unseen = np.ones(len(x), np.bool_)
         self.attempts = self.unreached = Attempts(config.blacklist, config.attempts)
+        self.trail: list[Pose] = []
+        self.stuck, self.stuck_at = 0, self.pose
+        self.blameless = self.attempts, self.unreached
         self.points = np.empty((0, 2))
         self.scanned: Pose | None = None
         self.sent: list[Grid | None] = [None, None]
@@ -224,6 +228,7 @@ class Rover:
                     target = None
                     continue
                 self.left = poses
+            self.remember()
             free = self.drive(self.left, DECIDE)
             self.take_stock()
             if not free:
@@ -240,14 +245,39 @@ class Rover:
         self.run.seconds = time.process_time() - begin
         return self.run
 
+    def remember(self) -> None:
+        """Where it came from."""
+        if not self.trail or math.dist(self.trail[-1][:2], self.pose[:2]) >= TRAIL:
+            self.trail = [*self.trail, self.pose][-REMEMBERED:]
+
+    def back(self) -> bool:
+        """Drive back to where it came from, as ``exploration`` does; whether there is such a place."""
+        self.trail = [pose for pose in self.trail if math.dist(pose[:2], self.pose[:2]) > TRAIL]
+        if not self.trail:
+            return False
+        self.stuck = 0
+        self.attempts, self.unreached = self.blameless
+        poses = self.route(self.trail.pop())
+        if poses is not None:
+            self.drive(poses, math.inf)
+            self.take_stock()
+        return True
+
     def fail(self, target: Viewpoint) -> None:
         """Leave a place alone."""
         self.run.failures += 1
+        if self.stuck > 0 and math.dist(self.stuck_at[:2], self.pose[:2]) < LEFT:
+            self.stuck += 1
+        else:
+            self.stuck, self.stuck_at, self.blameless = 1, self.pose, (self.attempts, self.unreached)
+        if self.stuck >= STUCK and self.back():
+            return
         self.attempts = self.attempts.failed(target.frontier, self.now, patient=True)
         self.unreached = self.unreached.failed(target.pose[:2], self.now)
 
     def arrived(self, target: Viewpoint) -> None:
         """What is still to be seen from here was not seen: do not come again soon."""
+        self.stuck = 0
         if not isinstance(self.config, AuthorConfig):
             self.attempts = self.attempts.failed(target.frontier, self.now)
 

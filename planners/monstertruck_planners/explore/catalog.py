@@ -14,7 +14,7 @@ EXPLORERS: Final = Catalog(
         name="tour",
         settings="monstertruck_planners.explore.config:TourConfig",
         implementation="monstertruck_planners.explore.tour:Tour",
-        doc="A short tour over all frontiers, planned anew as the map grows",
+        doc="Large areas near by first, with a short tour over all frontiers, planned anew as the map grows",
         extra="planning",
     ),
     Plugin(

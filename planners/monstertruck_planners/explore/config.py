@@ -81,12 +81,16 @@ class InformationConfig(ExplorerConfig):
 
 
 class TourConfig(ExplorerConfig):
-    """A short tour over all frontiers, planned anew as the map grows."""
+    """The way to a frontier against what it shows, and the short tour over the others after it."""
 
     kind: Literal["tour"] = "tour"
+    worth: NotNegative = 1.0
+    """Metres of way that are driven for a metre of what is seen: the square root of the new area"""
     turning: NotNegative = 1.0
     """Metres that half a turn at the start of the tour costs"""
-    keep: NotNegative = 4.0
-    """Metres by which another tour has to be shorter than one that begins with the present goal"""
-    most: Annotated[int, Field(ge=3, le=60)] = 24
-    """Frontiers of a tour at most, the nearest ones"""
+    keep: NotNegative = 1.0
+    """Metres by which another tour has to be better than one that begins with the present goal"""
+    rest: NotNegative = 0.1
+    """Weight of the way over the other frontiers, against that to the first one"""
+    most: Annotated[int, Field(ge=3, le=60)] = 16
+    """Frontiers of a tour at most, the best ones"""

@@ -28,6 +28,14 @@ SAVE: Final = 30.0
 """Seconds to wait for the map to be saved."""
 AGAIN: Final = 2.0
 """Seconds between two goals for the way home, or after a goal that was not taken."""
+STUCK: Final = 3
+"""Goals in a row that fail without the robot leaving its place, after which the place is to blame..."""
+LEFT: Final = 0.3
+"""...which it has left this far from there, m."""
+TRAIL: Final = 0.5
+"""Metres between the poses that are remembered for driving back..."""
+REMEMBERED: Final = 8
+"""...and how many."""
 LEAST_USED: Final = 0.05
 """Share of the charge after which its use per metre counts as measured."""
 PASSING: Final = frozenset({Reason.PLANNER_STARTING, Reason.NO_MAP, Reason.LEASE_EXPIRED})
@@ -136,6 +144,16 @@ class Exploration:
     newest: ExploreAnswer = field(default_factory=ExploreAnswer)
     travelled: float = 0.0
     before: Pose | None = None
+    trail: tuple[Pose, ...] = ()
+    """Where it came from, the newest last."""
+    stuck: int = 0
+    """Goals in a row that failed where it stands..."""
+    stuck_at: Pose | None = None
+    """...and where that is."""
+    blameless: tuple[Attempts, Attempts] | None = None
+    """At frontiers and at places to look from, before these goals."""
+    backing: bool = False
+    """The goal is one it came from."""
     charge: float | None = None
     """At the start."""
     goals: int = 0
@@ -182,7 +200,7 @@ def tick(run: Exploration, seen: Observed, config: ExplorerConfig) -> Step:
     if run.phase is ExplorationPhase.LOST:
         return _lost(run, seen, config)
     if seen.pose is None:
-        lost = replace(_enter(run, ExplorationPhase.LOST), target=None)
+        lost = replace(_enter(run, ExplorationPhase.LOST), target=None, backing=False)
         return lost, (Cancel(), Notice(Reason.POSE_LOST, Severity.WARNING, "waits where it stands"))
     if run.phase is ExplorationPhase.RETURNING:
         return _returning(run, seen)
@@ -194,7 +212,10 @@ def tick(run: Exploration, seen: Observed, config: ExplorerConfig) -> Step:
 def _moved(run: Exploration, seen: Observed) -> Exploration:
     way = 0.0 if run.before is None or seen.pose is None else math.dist(run.before[:2], seen.pose[:2])
     charge = seen.charge if run.charge is None else run.charge
-    return replace(run, before=seen.pose, travelled=run.travelled + way, charge=charge)
+    trail = run.trail
+    if seen.pose is not None and (not trail or math.dist(trail[-1][:2], seen.pose[:2]) >= TRAIL) and not run.backing:
+        trail = (*trail, seen.pose)[-REMEMBERED:]
+    return replace(run, before=seen.pose, travelled=run.travelled + way, charge=charge, trail=trail)
 
 
 def _merged(before: ExploreAnswer, answer: ExploreAnswer) -> ExploreAnswer:
@@ -258,11 +279,18 @@ def _driving(run: Exploration, seen: Observed, config: ExplorerConfig) -> Step:
         if seen.ended is Reason.CANCELLED:
             return _end(run, Reason.CANCELLED, f"its goal was cancelled: {seen.ended_text}", Save())
         if seen.ended in PASSING:
-            return replace(_enter(run, ExplorationPhase.LOOKING), target=None, not_before=run.now + AGAIN), ()
+            looking = _enter(run, ExplorationPhase.LOOKING)
+            return replace(looking, target=None, backing=False, not_before=run.now + AGAIN), ()
         reached = seen.ended is Reason.GOAL_REACHED
-        attempts, unreached = run.attempts.failed(run.target.frontier, run.now, patient=not reached), run.unreached
+        if run.backing:
+            looking = _enter(run, ExplorationPhase.LOOKING)
+            return replace(looking, target=None, backing=False, not_before=run.now + SETTLE), ()
+        target, run = run.target, _counted(run, seen, reached=reached)
+        if run.stuck >= STUCK and (back := _back(run)) is not None:
+            return back
+        attempts, unreached = run.attempts.failed(target.frontier, run.now, patient=not reached), run.unreached
         if not reached:
-            unreached = unreached.failed(run.target.pose[:2], run.now)
+            unreached = unreached.failed(target.pose[:2], run.now)
         run = replace(run, target=None, attempts=attempts, unreached=unreached, failures=run.failures + (not reached))
         run = replace(_enter(run, ExplorationPhase.LOOKING), not_before=run.now + SETTLE, nothing=0)
         if reached:
@@ -270,16 +298,46 @@ def _driving(run: Exploration, seen: Observed, config: ExplorerConfig) -> Step:
         text = f"not reached ({seen.ended.text}): left alone for {config.blacklist:g} s"
         return run, (Notice(seen.ended, Severity.INFO, text),)
     answer = seen.answer
-    if answer is not None and not answer.kept:
+    if answer is not None and not answer.kept and not run.backing:
         if answer.target is None:
             looking = replace(
                 _enter(run, ExplorationPhase.LOOKING), target=None, nothing=0, not_before=run.now + SETTLE
             )
             return looking, (Cancel(),)
         return _go(run, answer.target)
-    if not run.waiting and run.now - run.asked >= 1.0 / config.rate:
+    if not run.backing and not run.waiting and run.now - run.asked >= 1.0 / config.rate:
         return _ask(run)
     return run, ()
+
+
+def _counted(run: Exploration, seen: Observed, *, reached: bool) -> Exploration:
+    """With the goal that ended counted, if it failed where others did before."""
+    if reached:
+        return replace(run, stuck=0)
+    assert seen.pose is not None
+    here = run.stuck_at is not None and math.dist(run.stuck_at[:2], seen.pose[:2]) < LEFT
+    if here and run.stuck > 0:
+        return replace(run, stuck=run.stuck + 1)
+    return replace(run, stuck=1, stuck_at=seen.pose, blameless=(run.attempts, run.unreached))
+
+
+def _back(run: Exploration) -> Step | None:
+    """Drive back to where it came from, as no place can be reached from here; None = nowhere is left to drive back to.
+
+    The places are not to blame: they are as before.
+    """
+    assert run.before is not None
+    assert run.blameless is not None
+    here = run.before
+    earlier = tuple(pose for pose in run.trail if math.dist(pose[:2], here[:2]) > TRAIL)
+    if not earlier:
+        return None
+    attempts, unreached = run.blameless
+    target = Viewpoint(earlier[-1], earlier[-1][:2])
+    run = replace(run, attempts=attempts, unreached=unreached, trail=earlier[:-1], stuck=0, failures=run.failures + 1)
+    run = replace(_enter(run, ExplorationPhase.DRIVING), target=target, backing=True, pursued=run.now, nothing=0)
+    text = f"{STUCK} places in a row were not reached from here: drives back to where it came from"
+    return run, (Go(target.pose), Notice(Reason.RECOVERING, Severity.INFO, text))
 
 
 def _go(run: Exploration, target: Viewpoint) -> Step:

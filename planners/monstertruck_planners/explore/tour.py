@@ -1,20 +1,28 @@
-"""The explorer that goes where a short tour over all frontiers begins."""
+"""The explorer that weighs the way to a frontier against what it shows, and the short tour over the others after it."""
 
 import math
 
 import numpy as np
 
+from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.explore.api import ExplorationView, Option
 from monstertruck_planners.explore.config import TourConfig
 from monstertruck_planners.explore.exchange import Viewpoint
-from monstertruck_planners.explore.kernels import short_tour
+from monstertruck_planners.explore.kernels import short_tour, tour_length
 
 FAR = 1e4
 """Stands for a way that is not known, m."""
+BEGINNINGS = 6
+"""Frontiers that are compared as the first one."""
 
 
 class Tour:
-    """The first place of a short tour.
+    """The first place of the best tour.
+
+    Of a tour that begins with a frontier the cost is the way there, less ``worth`` times the square root of the new
+    area that is seen from there (about its size in metres), plus ``rest`` times the length of the short tour over the
+    others after it. A tour that only is short begins with whatever shadow of a corner is near, and comes late to the
+    large areas: most of those shadows vanish by themselves, or are too small to matter.
 
     Args:
         config: settings.
@@ -28,16 +36,33 @@ class Tour:
     ) -> Viewpoint | None:
         """See ``Explorer``."""
         del seconds
-        options = sorted(view.options, key=lambda option: option.way)[: self._config.most]
+        options = sorted(view.options, key=lambda option: self._first(option, option is still))[: self._config.most]
         if not options:
             return None
-        first = np.array([self._first(option, option is still) for option in options])
-        distance = np.minimum(view.ways_between(options), FAR) if len(options) > 2 else np.zeros((len(options),) * 2)
-        if len(options) == 2:
-            distance[0, 1] = distance[1, 0] = 1.0
-        chosen = options[int(short_tour(distance, first)[0])]
+        chosen = options[0]
+        if self._config.rest > 0.0 and len(options) > 2:
+            first = np.array([self._first(option, option is still) for option in options])
+            distance = np.minimum(view.ways_between(options), FAR)
+            chosen = options[best_beginning(first, distance, self._config.rest)]
         return pursued if chosen is still else chosen.target
 
     def _first(self, option: Option, present: bool) -> float:
-        begin = option.way + self._config.turning * option.turn / math.pi
-        return max(begin - self._config.keep, 0.0) if present else begin
+        config = self._config
+        cost = option.way + config.turning * option.turn / math.pi - config.worth * math.sqrt(option.gain)
+        return cost - config.keep if present else cost
+
+
+def best_beginning(first: Array, distance: Array, rest: float) -> int:
+    """The place with which the best tour begins.
+
+    Args:
+        first: cost of each of the n > 2 places as the first one, ascending, shape (n,).
+        distance: between them, shape (n, n).
+        rest: weight of the tour over the others.
+    """
+    costs = []
+    for k in range(min(len(first), BEGINNINGS)):
+        others = np.delete(np.arange(len(first)), k)
+        between, begin = distance[np.ix_(others, others)], distance[k, others]
+        costs.append(first[k] + rest * tour_length(between, begin, short_tour(between, begin)))
+    return int(np.argmin(costs))

@@ -373,7 +373,9 @@ class PlanningStep:
             return replan(planner, route_map, self._route, start, goal, self._now, via=via)
 
         result = plan(self._planner)
-        if result.reason is Reason.START_BLOCKED:
+        if result.reason is Reason.START_BLOCKED or (
+            result.reason is Reason.ROUTE_TIMEOUT and self._confined(route_map, task.pose)
+        ):
             result = plan(self._tight)
         if result.reason in HELD:
             self._route_map = route_map = self._standing(static_map, cells, task.pose)
@@ -396,6 +398,12 @@ class PlanningStep:
         poses = moved(result.poses, -self._vehicle.reference)
         length = float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum())
         return PlanAnswer(Reason.OK, "", poses, np.ones(len(poses)), (), length, result.cost, drivable=False)
+
+    def _confined(self, route_map: RouteMap, pose: Pose) -> bool:
+        """Whether the truck stands nearer to an obstacle than routes pass: then any first motion may be too near."""
+        assert self._setup is not None
+        margin = self._setup.config.route.margin
+        return not route_map.field.free(self._setup.footprint, np.array([pose]), margin)[0]
 
     def _map_of(self, cells: Cells, static_map: StaticMap) -> RouteMap:
         assert self._setup is not None

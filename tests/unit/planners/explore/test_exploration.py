@@ -114,6 +114,30 @@ def test_a_place_it_cannot_come_to_is_left_alone_for_a_while_and_then_for_good()
     assert tale.said() == [Reason.EXPLORED]
 
 
+def test_where_no_place_can_be_reached_it_drives_back_and_blames_none_of_them():
+    tale = Tale()
+    for x in (1.0, 1.6, 2.2):
+        tale.pose = (x, 2.0, 0.0)
+        tale.tell()
+    tale.run = replace(tale.run, waiting=False, asked=-math.inf)
+    for k in range(exploration.STUCK):
+        tale.look(ExploreAnswer(Viewpoint((5.0 + k, 2.0, 0.0), (6.0 + k, 2.0)), known=5.0))
+        tale.tell(ended=Reason.ROUTE_TIMEOUT)
+    assert tale.said() == [Reason.RECOVERING]
+    assert tale.actions[0] == Go((1.6, 2.0, 0.0))
+    assert (tale.run.attempts.places, tale.run.unreached.places) == ((), ())
+    tale.tell(2.0)
+    assert Choose() not in tale.actions, "it drives back first"
+    tale.tell(ended=Reason.ROUTE_TIMEOUT)
+    assert tale.run.phase is Phase.LOOKING
+    for k in range(exploration.STUCK):
+        tale.look(ExploreAnswer(Viewpoint((5.0 + k, 2.0, 0.0), (6.0 + k, 2.0)), known=5.0))
+        tale.tell(ended=Reason.ROUTE_TIMEOUT)
+    assert tale.actions[0] == Go((1.0, 2.0, 0.0)), "farther back the next time"
+    tale.tell(ended=Reason.GOAL_REACHED)
+    assert tale.run.phase is Phase.LOOKING
+
+
 @pytest.mark.parametrize(
     ("seen", "outcome"),
     [

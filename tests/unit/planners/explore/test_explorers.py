@@ -11,6 +11,7 @@ from monstertruck_planners.explore.config import AuthorConfig, InformationConfig
 from monstertruck_planners.explore.exchange import ExploreSetup, ExploreTask, Viewpoint
 from monstertruck_planners.explore.explore_step import ExploringStep
 from monstertruck_planners.explore.kernels import new_area, sees, short_tour, tour_length
+from monstertruck_planners.explore.tour import best_beginning
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.state import Grid
@@ -115,6 +116,38 @@ def test_information_prefers_the_wide_opening_to_the_narrow_one_a_little_nearer(
     chosen = step_of(InformationConfig(turning=0.0), grid).step(ExploreTask((4.6, 5.0, 1.57), choose=True)).target
     assert chosen is not None
     assert chosen.frontier[0] > 8.0
+
+
+def test_the_default_goes_to_a_wide_opening_before_a_shadow_that_is_nearer():
+    wide, shadow = (8.95, 3.0, 8.95, 7.0), (1.0, 4.8, 1.0, 5.2)
+    pose = (4.8, 5.0, 1.57)
+    chosen = step_of(TourConfig(), hall(wide, shadow)).step(ExploreTask(pose, choose=True)).target
+    assert chosen is not None
+    assert chosen.frontier[0] > 8.0
+    nearest = step_of(NearestConfig(), hall(wide, shadow)).step(ExploreTask(pose, choose=True)).target
+    assert nearest is not None
+    assert nearest.frontier[0] < 2.0
+
+
+def test_a_tour_begins_where_the_way_over_the_others_is_short():
+    places = np.array([1.0, -1.2, -4.0])
+    distance = np.abs(places[:, None] - places)
+    assert best_beginning(np.array([1.2, 1.0, 4.0]), distance, 1.0) == 0
+    assert best_beginning(np.array([1.2, 0.6, 4.0]), distance, 0.01) == 1
+
+
+def test_a_frontier_is_looked_at_from_where_the_robot_can_go_also_once_a_door_is_open():
+    """What was found for it holds only while the same ground can be reached."""
+    grid = hall(EAST)
+    shut = grid.cells.reshape(200, 200).copy()
+    shut[20:180, 150:154] = 100
+    closed = grid.model_copy(update={"cells": shut.reshape(-1)})
+    step = step_of(TourConfig(), closed)
+    assert step.step(ExploreTask(MIDDLE, choose=True)).target is None
+    shut[80:120, 150:154] = 0
+    opened = step.step(ExploreTask(MIDDLE, grid.model_copy(update={"cells": shut.reshape(-1)}), choose=True)).target
+    assert opened is not None
+    assert math.dist(opened.frontier, (8.95, 5.0)) < 0.1
 
 
 def test_a_tour_begins_with_the_near_end_of_the_row():

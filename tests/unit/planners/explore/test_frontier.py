@@ -76,6 +76,21 @@ def test_only_the_surroundings_of_what_differs_are_looked_at_again():
     assert known.frontier[-known.corner[1] + 64 :, -known.corner[0] + 64 :][4:7, 4:7].sum() == 4
 
 
+def test_a_place_has_changed_where_a_cell_became_known_or_occupied_nearby():
+    cells = np.zeros((640, 640), np.int8)
+    known = FrontierMap(grid_of(cells))
+    before = known.changes
+    tile = np.full((64, 64), 30, np.int8)  # as free as before
+    known.put(grid_of(tile, 6.4, 6.4), whole=False)
+    assert known.changed_within((8.0, 8.0), 1.0) == before
+    tile[5, 5] = 100
+    known.put(grid_of(tile, 6.4, 6.4), whole=False)
+    assert known.changed_within((8.0, 8.0), 1.0) == known.changes
+    assert known.changed_within((20.0, 8.0), 1.0) == before
+    known.put(grid_of(np.zeros((8, 8)), -30.0, -30.0), whole=False)  # it grows
+    assert known.changed_within((20.0, 8.0), 1.0) == before
+
+
 @pytest.mark.parametrize(
     ("grid", "text"),
     [

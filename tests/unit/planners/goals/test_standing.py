@@ -34,6 +34,14 @@ def test_it_leaves_a_wall_that_its_rim_overlaps_but_not_one_it_stands_in():
     assert planned(cells, (1.0, 0.45, 0.0), goal).reason is Reason.START_BLOCKED
 
 
+def test_it_leaves_a_wall_that_is_as_near_as_the_narrowest_margin():
+    """Its place is free at that margin, and every motion from there is a hair too near."""
+    cells = np.zeros((60, 100), np.int8)
+    cells[:10] = 100
+    side = 0.5 + Footprint().width / 2 + Footprint().padding + 0.0305
+    assert planned(cells, (1.0, side, 0.0), (4.0, 1.5, 0.0)).reason is Reason.OK
+
+
 def test_unknown_ground_under_it_and_the_edge_of_the_map_do_not_hold_it():
     cells = np.zeros((60, 100), np.int8)
     cells[20:40, :17] = -1
