@@ -76,7 +76,7 @@ class Frontier:
 
 
 @dataclass(frozen=True)
-class Look:
+class Outlook:
     """Places from where a frontier is looked at; they hold as long as nothing changes around it."""
 
     change: int
@@ -132,7 +132,7 @@ class Remembered:
     """What is computed again only where the map differs."""
 
     route_map: RouteMap | None = None
-    looks: dict[bytes, Look] = attribute(default_factory=dict)
+    looks: dict[bytes, Outlook] = attribute(default_factory=dict)
     """By a frontier's cells."""
 
 
@@ -230,7 +230,7 @@ class ExplorationView:
 
     def _find_options(self, ways: CostToGo) -> list[Option]:
         options = []
-        seen: dict[bytes, Look] = {}
+        seen: dict[bytes, Outlook] = {}
         reached = ways.cost < UNREACHED
         for frontier in self._frontiers():
             if any(math.dist(frontier.middle, place) < BANNED for place in self.banned):
@@ -296,28 +296,28 @@ class ExplorationView:
         near += (top, left)
         return near
 
-    def _look(self, frontier: Frontier, near: NDArray[np.int64]) -> Look:
+    def _look(self, frontier: Frontier, near: NDArray[np.int64]) -> Outlook:
         """Places from which enough of a frontier is in sight, and nearly as much new area as from the best one."""
         config, resolution, corner = self.setup.config, self.known.resolution, self.known.origin[:2]
         change, reached = self.known.changes, len(near)
         places = self._centres(near)
         places = places[np.hypot(*(places - frontier.middle).T) < AROUND]
         if not len(places):
-            return Look(change, reached)
+            return Outlook(change, reached)
         places = places[_spread(len(places), COMPARED)]
         sample = frontier.points[_spread(len(frontier.points), SAMPLES)]
         here, there = ((v - corner) / resolution for v in (places, sample))
         share = shares_seen(self.known.cells, here, there, (config.reach - SHORT) / resolution)
         if share.max(initial=0.0) == 0.0:
-            return Look(change, reached)
+            return Outlook(change, reached)
         places = places[share >= min(SEEN, float(share.max()))]
         places = places[_spread(len(places), PLACES)]
         bearings = np.arctan2(*(frontier.middle - places).T[::-1])
         gains = self.gains(np.column_stack((places, bearings)))
         worth = gains >= max(WORTH * float(gains.max()), LEAST)
-        return Look(change, reached, places[worth], bearings[worth], gains[worth])
+        return Outlook(change, reached, places[worth], bearings[worth], gains[worth])
 
-    def _option(self, frontier: Frontier, look: Look, ways: CostToGo) -> Option | None:
+    def _option(self, frontier: Frontier, look: Outlook, ways: CostToGo) -> Option | None:
         """The nearest place to look at a frontier from."""
         if not len(look.places):
             return None
