@@ -166,7 +166,10 @@ def access(context: HostContext) -> Iterator[Finding]:
         yield fine("access", "from this computer only")
     if zenoh.tls is not None:
         names = ", ".join(f"{name} ({grant.role})" for name, grant in zenoh.tls.grants().items())
-        seen = f"{names}; Zenoh drops requests under another name than the certificate's, and answers nothing"
+        seen = (
+            f"{names}; Zenoh drops requests under another name than the certificate's, and answers nothing; "
+            "`monstertruckd security check` tries what each role may do"
+        )
         yield fine("names", seen)
         for file in dict.fromkeys((zenoh.tls.ca, zenoh.tls.pilots_ca, zenoh.tls.certificate, zenoh.tls.key)):
             if file is not None:
