@@ -1,12 +1,14 @@
 """The world in three dimensions: against closed forms, against the plane, and how fast it is.
 
-    python benchmarks/world3d.py [--parts scans mechanics turning step speed lap] [--keep FOLDER]
+    python benchmarks/world3d.py [--parts scans mechanics turning step speed lap slopes rough drill] [--keep FOLDER]
+        [--seeds 20] [--metres 60] [--count 200]
 
 ``scans``: standing scans without noise from free poses against the plane's. ``mechanics``: sag under a load, overturn
 angle, pull of the clutch, a lifted wheel. ``turning``: radius in every steering mode against ``common_motion`` (least
 squares of the wheels' side slips) and against the least sum of slips, which is what dry friction makes. ``step``: how
 far half the step moves the end of a drive. ``speed``: one step, one swept scan, one picture. ``lap``: the demo's lap by
-the whole daemon, its error, its speed, twice the same. The last line is JSON.
+the whole daemon, its error, its speed, twice the same. ``slopes``: trucks that drive onto a hillside, by the daemon and
+without one. ``rough``: lidar, map and pose on hills of 5 degrees RMS. ``drill``: seeded faults. The last line is JSON.
 """
 
 import argparse
@@ -20,6 +22,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from world3d_parts.terrain import drilled, rough, slopes
 
 import monstertruck_sim.world3d.model as rigid_model
 import monstertruck_sim.world3d.plant as rigid_plant
@@ -54,6 +57,14 @@ GOALS: dict[str, tuple[str, float]] = {
     "lap_cross_track_cm": ("<=", 1.5),
     "lap_speed": (">=", 6.0),
     "same_log": (">=", 1.0),
+    "slope_overturned": ("<=", 0.0),
+    "slope_overturned_without": (">=", 1.0),
+    "rough_lidar_deg_rms": ("<=", 1.0),
+    "rough_lidar_deg_max": ("<=", 3.0),
+    "rough_over_flat_walls": ("<=", 1.5),
+    "rough_ghost_share": ("<=", 0.01),
+    "rough_ate_cm": ("<=", 5.0),
+    "drill_unsafe": ("<=", 0.0),
 }
 
 
@@ -322,12 +333,22 @@ PARTS: dict[str, Callable[[], dict[str, float]]] = {
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--parts", nargs="+", default=[*PARTS, "lap"], choices=[*PARTS, "lap"])
+    names = [*PARTS, "lap", "slopes", "rough", "drill"]
+    parser.add_argument("--parts", nargs="+", default=names, choices=names)
+    parser.add_argument("--seeds", type=int, default=20, help="of the slopes")
+    parser.add_argument("--metres", type=float, default=60.0, help="on rough ground")
+    parser.add_argument("--count", type=int, default=200, help="of faults")
     parser.add_argument("--keep", type=Path, help="folder for the laps' logs")
     arguments = parser.parse_args()
     figures: dict[str, float] = {}
+    calls = PARTS | {
+        "lap": lambda: lap(arguments.keep),
+        "slopes": lambda: slopes(arguments.seeds),
+        "rough": lambda: rough(arguments.metres),
+        "drill": lambda: drilled(arguments.count),
+    }
     for part in arguments.parts:
-        figures |= PARTS[part]() if part != "lap" else lap(arguments.keep)
+        figures |= calls[part]()
     for name, value in figures.items():
         print(f"{name:32} {value:12.5g}")
     goals = {name: f"{sign} {value:g}" for name, (sign, value) in GOALS.items() if name in figures}

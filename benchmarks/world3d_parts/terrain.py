@@ -1,0 +1,218 @@
+"""The whole daemon on uneven ground: level lidar, map and pose on hills; side slopes with the gate and without it."""
+
+from collections.abc import Awaitable, Callable
+from math import acos, degrees, hypot, pi, radians, tan
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.ndimage import distance_transform_edt
+
+from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
+from monstertruck_runtime.mailbox import latest
+from monstertruck_runtime.map_files import OCCUPIED
+from monstertruck_schemas import topics
+from monstertruck_schemas.req import Order
+from monstertruck_schemas.state import Grid
+from monstertruck_sim.world.config import WorldConfig
+from monstertruck_sim.world.world import World
+from monstertruck_sim.world3d.ground import ground_heights
+from monstertruck_sim.world3d.plant import RigidPlant
+from monstertruckd.config.load import load_config
+from monstertruckd.tools.drill.random_drill import Drill, default_jobs
+from monstertruckd.tools.drill.truck import DrillTruck
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
+
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+ROUGH_DEG = 5.0
+"""RMS of the ground's slope."""
+WAVE = 1.5
+GHOST = 0.15
+"""An occupied cell of the map this far from every wall is none, m."""
+OCCUPIED_FROM = 65
+SETTLED = 500
+"""Samples, ten seconds from where the truck has begun to drive on a slope."""
+FALLEN = radians(60.0)
+TOP_HEAVY = {"friction": 1.5, "mass_height": 0.25}
+"""A load on the roof, on ground that does not let it slide: computed, it falls at 29 to 33 degrees."""
+RPM = 644 / (2 * pi * 0.075) * 60
+
+
+class Driven(NamedTuple):
+    """What one drive over ground came to; degrees and metres."""
+
+    lidar: np.ndarray
+    """Tilt of the scan plane at every 20 ms."""
+    body: np.ndarray
+    errors: np.ndarray
+    """Of the pose in the map."""
+    way: float
+    grid: Grid | None
+    walls: np.ndarray
+    """Distance of every occupied cell from the nearest wall."""
+
+
+def run(config: SimulatedTruckConfig, drive: Callable[[DrillTruck], Awaitable[Any]]) -> Any:
+    """What ``drive`` returns, on the virtual clock."""
+    found: list[Any] = []
+
+    async def main(clock: VirtualClock) -> None:
+        async with DrillTruck.running(config, clock) as truck:
+            found.append(await drive(truck))
+
+    run_virtual(main, start=SECOND)
+    return found[0]
+
+
+def hills() -> list[dict[str, Any]]:
+    """Hills with the RMS slope over the demo's world, and a ramp."""
+    feature = {"kind": "hills", "height": 0.05, "wavelength": WAVE, "seed": 5}
+    config = WorldConfig.model_validate({"engine": "mujoco", "map": "loop", "ground": [feature]})
+    heights = ground_heights(config, None, (-3.0, 3.0, -3.0, 3.0), (9.0, 9.0, 0.0))
+    assert heights is not None
+    rows, columns = np.gradient(heights.z, heights.resolution)
+    slope = degrees(float(np.sqrt((np.arctan(np.hypot(rows, columns)) ** 2).mean())))
+    ramp = {"kind": "slope", "x": -1.0, "y": 0.0, "angle_deg": 5.0, "length": 1.5}
+    return [feature | {"height": 0.05 * tan(radians(ROUGH_DEG)) / tan(radians(slope))}, ramp]
+
+
+def over(ground: list[dict[str, Any]], metres: float, *, stabilised: bool) -> Driven:
+    """Laps of the demo with a map that grows."""
+    base = load_config(CONFIGS / "full3d.yaml", SimulatedTruckConfig)[0]
+    overlay: dict[str, Any] = {
+        "recorder": None,
+        "map": None,
+        "slam": {"mode": "mapping"},
+        "gate": {"tilt": {"slow": 0.3}},
+        "sim": {"world": {"ground": ground}},
+    }
+    if not stabilised:
+        overlay["devices"] = {"stabiliser": None}
+
+    async def drive(truck: DrillTruck) -> Driven:
+        pose, grids = truck.rig.bus.subscribe(topics.POSE, latest()), truck.rig.bus.subscribe(topics.MAP, latest())
+        world, clock = truck.rig.world, truck.clock
+        plant = world.plant
+        assert isinstance(plant, RigidPlant)
+        assert await truck.until(truck.drives, 30.0, Order.ARM)
+        lidar, body, errors, way = [], [], [], 0.0
+        then = world.truth(clock.now())
+        limit = clock.now() + round(metres / 0.1 * SECOND)
+        while way < metres and clock.now() < limit:
+            await clock.sleep(0.02)
+            now = world.truth(clock.now())
+            up = plant.data.body("lidar_head").xmat[8]
+            lidar.append(degrees(acos(min(1.0, float(up)))))
+            body.append(degrees(hypot(now.pitch, now.roll)))
+            way += hypot(now.x - then.x, now.y - then.y)
+            then = now
+            if (heard := pose.latest) is not None:
+                errors.append(hypot(heard.pose.x - now.x, heard.pose.y - now.y))
+        await clock.sleep(2.0)
+        grid = grids.latest
+        walls = np.zeros(0) if grid is None else to_walls(grid, world)
+        return Driven(np.array(lidar), np.array(body), np.array(errors), way, grid, walls)
+
+    return run(with_overlay(base, overlay), drive)
+
+
+def to_walls(grid: Grid, world: World) -> np.ndarray:
+    """Distance of every occupied cell of a map from the nearest solid cell of the world, m."""
+    base = world.map
+    far = distance_transform_edt(base.cells != OCCUPIED) * base.resolution
+    cells = np.asarray(grid.cells).reshape(grid.height, grid.width)
+    rows, columns = np.nonzero(cells >= OCCUPIED_FROM)
+    x = grid.origin.x + (columns + 0.5) * grid.resolution - base.origin[0]
+    y = grid.origin.y + (rows + 0.5) * grid.resolution - base.origin[1]
+    row = np.clip((y / base.resolution).astype(int), 0, base.cells.shape[0] - 1)
+    column = np.clip((x / base.resolution).astype(int), 0, base.cells.shape[1] - 1)
+    return np.asarray(far[row, column])
+
+
+def rough(metres: float) -> dict[str, float]:
+    """Lidar, map and pose on hills; on the flat for comparison, and without stabiliser."""
+    figures: dict[str, float] = {}
+    runs = {
+        "flat": over([], metres, stabilised=True),
+        "rough": over(hills(), metres, stabilised=True),
+        "unstabilised": over(hills(), metres, stabilised=False),
+    }
+    for name, it in runs.items():
+        rms = {key: float(np.sqrt((values**2).mean())) for key, values in (("lidar", it.lidar), ("body", it.body))}
+        settled = it.lidar[min(SETTLED, len(it.lidar) - 1) :]
+        figures |= {
+            f"{name}_way": it.way,
+            f"{name}_body_deg_rms": rms["body"],
+            f"{name}_lidar_deg_rms": rms["lidar"],
+            f"{name}_lidar_deg_max": float(it.lidar.max()),
+            f"{name}_lidar_settled_deg_rms": float(np.sqrt((settled**2).mean())),
+            f"{name}_lidar_settled_deg_max": float(settled.max()),
+            f"{name}_ate_cm": float(np.sqrt((it.errors**2).mean())) * 100 if len(it.errors) else float("inf"),
+        }
+        if len(it.walls):
+            real = it.walls[it.walls < GHOST]
+            figures[f"{name}_wall_error_cm"] = float(np.sqrt((real**2).mean())) * 100
+            figures[f"{name}_ghost_share"] = float((it.walls >= GHOST).mean())
+    if "rough_wall_error_cm" in figures:
+        figures["rough_over_flat_walls"] = figures["rough_wall_error_cm"] / figures["flat_wall_error_cm"]
+    return figures
+
+
+def hillside(seed: int) -> dict[str, Any]:
+    """The hall with a hillside that the truck drives onto aslant; angles by the seed."""
+    rng = np.random.default_rng(seed)
+    angle, aslant = float(rng.uniform(37.0, 40.0)), float(rng.uniform(0.3, 0.5))
+    side = float(rng.choice([-1.0, 1.0]))
+    slope = {
+        "kind": "slope",
+        "x": 1.5,
+        "y": 0.0,
+        "direction": side * (pi / 2 - aslant),
+        "angle_deg": angle,
+        "length": 2.5,
+    }
+    start = {"x": 0.0, "y": 0.0, "yaw": 0.0}
+    return {"engine": "mujoco", "map": "hall", "start": start, "ground": [slope], "mechanics": TOP_HEAVY}
+
+
+def slopes(seeds: int) -> dict[str, float]:
+    """How many of some trucks that drive onto a hillside fall over, by the daemon and without one."""
+    fallen, bare, steepest = 0, 0, 0.0
+    base = load_config(CONFIGS / "world3d" / "side_slope.yaml", SimulatedTruckConfig)[0]
+    for seed in range(1, seeds + 1):
+        world = hillside(seed)
+        tilt = run(with_overlay(base, {"recorder": None, "sim": {"seed": seed, "world": world}}), _onto)
+        fallen, steepest = fallen + (tilt > FALLEN), max(steepest, tilt)
+        alone = World(WorldConfig.model_validate(world), seed)
+        alone.truth(0)
+        alone.motor.command(0, -0.2 * RPM, 20_000.0)
+        tilt = max(_tilted(alone, step * SECOND // 20) for step in range(1, 500))
+        bare += tilt > FALLEN
+    return {
+        "slope_seeds": seeds,
+        "slope_overturned": fallen,
+        "slope_greatest_tilt_deg": degrees(steepest),
+        "slope_overturned_without": bare,
+    }
+
+
+def drilled(count: int) -> dict[str, float]:
+    """Seeded faults on the whole truck in three dimensions, with its deadman line."""
+    truck = load_config(CONFIGS / "full3d.yaml", SimulatedTruckConfig)[0]
+    figures = Drill(1, count, truck).run(jobs=default_jobs()).figures()
+    return {f"drill_{name}": float(value) for name, value in figures.items() if isinstance(value, int | float)}
+
+
+async def _onto(truck: DrillTruck) -> float:
+    assert await truck.until(truck.drives, 15.0, Order.ARM)
+    world, clock = truck.rig.world, truck.clock
+    greatest = 0.0
+    for _ in range(500):
+        await clock.sleep(0.05)
+        greatest = max(greatest, _tilted(world, clock.now()))
+    return greatest
+
+
+def _tilted(world: World, time_ns: int) -> float:
+    truth = world.truth(time_ns)
+    return hypot(truth.pitch, truth.roll)
