@@ -141,7 +141,11 @@ class BatteryWizard:
         errors = np.linalg.inv(rows.T @ rows)
         gain, offset, _ = errors @ rows.T @ np.concatenate((volts / np.maximum(sigma, 1e-9), (0.0, 0.0)))
         halves = NORMAL * np.sqrt(np.diag(errors))
-        return Interval(float(gain), float(halves[0])), Interval(float(offset), min(float(halves[1]), GROUND))
+        # No offset is beyond the ground wire's; the gain follows it, so that both fit the readings.
+        low, high = np.clip((offset - halves[1], offset + halves[1]), -GROUND, GROUND).tolist()
+        within = Interval((low + high) / 2, (high - low) / 2)
+        gain += errors[0, 1] / errors[1, 1] * (within.value - offset)
+        return Interval(float(gain), float(halves[0])), within
 
     def _check(self, raw: Array, volts: Array, noise: Array) -> None:
         """Raise where no gain and offset explain all readings: each leaves a range of gains for an offset."""
