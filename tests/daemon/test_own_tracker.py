@@ -7,7 +7,7 @@ import pytest
 
 from tests.plugin_kit import ROOT, files_of, installed, run_with, written
 
-pytestmark = [pytest.mark.virtual, pytest.mark.timeout(180)]
+pytestmark = [pytest.mark.virtual, pytest.mark.timeout(300)]
 
 
 @pytest.fixture(scope="module")
