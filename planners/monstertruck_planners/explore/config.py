@@ -90,7 +90,7 @@ class TourConfig(ExplorerConfig):
     """Metres that half a turn at the start of the tour costs"""
     keep: NotNegative = 1.0
     """Metres by which another tour has to be better than one that begins with the present goal"""
-    rest: NotNegative = 0.1
-    """Weight of the way over the other frontiers, against that to the first one"""
+    rest: NotNegative = 0.0
+    """Weight of the short tour over the other frontiers, against the way to the first one; 0 drove least so far"""
     most: Annotated[int, Field(ge=3, le=60)] = 16
     """Frontiers of a tour at most, the best ones"""

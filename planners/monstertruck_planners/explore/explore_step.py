@@ -105,6 +105,7 @@ def warm_up() -> None:
     )  # fmt: skip
     step = ExploringStep()
     pose = (3.5, 3.5, 0.0)
-    first = step.step(ExploreTask(pose, grid, (), ExploreSetup(TourConfig(), Footprint(), 0.5), choose=True, home=pose))
+    setup = ExploreSetup(TourConfig(rest=1.0), Footprint(), 0.5)
+    first = step.step(ExploreTask(pose, grid, (), setup, choose=True, home=pose))
     assert first.target is not None
     step.step(ExploreTask(pose, choose=True, current=first.target))
