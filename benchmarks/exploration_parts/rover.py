@@ -71,21 +71,27 @@ class Rover:
         arena: the world.
         config: of the explorer.
         seed: of start and noise.
+        start: instead of the seed's.
+        steering: of the routes, 2ws or 4ws.
     """
 
-    def __init__(self, arena: Arena, config: ExplorerConfig, seed: int, start: Pose | None = None) -> None:
+    def __init__(
+        self, arena: Arena, config: ExplorerConfig, seed: int, start: Pose | None = None, steering: str = "4ws"
+    ) -> None:
         self.arena, self.config = arena, config
         self.pose: Pose = arena.start(seed) if start is None else start
         self.home = self.pose
         self.rng = np.random.default_rng([11, seed])
         self.grid = OccupancyGrid(GridConfig())
         self.body = outline(BODY.length, BODY.width, 0.025)
-        planner = PlannerConfig(route=HybridConfig(margin=0.04, unknown="blocked", reverse_cost=2.0, effort=EFFORTS[0]))
+        planner = PlannerConfig(
+            steering=steering, route=HybridConfig(margin=0.04, unknown="blocked", reverse_cost=2.0, effort=EFFORTS[0])
+        )
         thorough = planner.model_copy(update={"route": planner.route.model_copy(update={"effort": EFFORTS[1]})})
         self.planning = [PlanningStep(), PlanningStep()]
         self.setups = [Setup(c, TRUCK, BODY, MOUNT) for c in (planner, thorough)]
         self.fresh = [True, True]
-        radius = Vehicle.truck("4ws", angle=planner.angle).radius
+        radius = Vehicle.truck(steering, angle=planner.angle).radius
         self.exploring = ExploringStep()
         self.setup: ExploreSetup | None = ExploreSetup(config, BODY, radius, 0.04, MOUNT)
         self.run = Run(arena.name, config.kind, seed, config.reach)

@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 from pydantic import TypeAdapter
+from scoring import distance
 
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.track.catalog import AnyTracker, build_tracker
@@ -256,18 +257,6 @@ def drive(
         track=poses,
         width=swept(poses[len(poses) // 20 :], points),
     )
-
-
-def distance(places: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Distances (m,) of places (m, 2) from a polyline (n, 2), m."""
-    begin, step = points[:-1], np.diff(points, axis=0)
-    square = (step**2).sum(axis=1)
-    result = np.empty(len(places))
-    for i in range(0, len(places), 500):
-        to = places[i : i + 500, None] - begin
-        share = np.clip((to * step).sum(axis=2) / square, 0.0, 1.0)
-        result[i : i + 500] = np.hypot(*np.moveaxis(to - share[..., None] * step, 2, 0)).min(axis=1)
-    return result
 
 
 def swept(poses: np.ndarray, points: np.ndarray) -> float:

@@ -1,0 +1,101 @@
+"""Estimates and paths against the world's truth: the one home of these measures, for all benchmarks.
+
+Poses are (x, y, yaw) in metres and radians; truth is what only the simulated world knows.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
+
+from monstertruck_kinematics.elementary import Array
+from monstertruck_planners.collision import DistanceField, Footprint
+
+
+def rms(values: Array) -> float:
+    """Root of the mean square; 0 of none."""
+    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else 0.0
+
+
+def at(stamps: Array, poses: Array, instants: Array) -> Array:
+    """Poses (m, 3) at instants, s, between those of a trajectory (n, 3): linear, the yaw unwrapped."""
+    yaw = np.unwrap(poses[:, 2])
+    return np.column_stack([np.interp(instants, stamps, column) for column in (poses[:, 0], poses[:, 1], yaw)])
+
+
+def trajectory(estimate: Array, truth: Array) -> dict[str, float]:
+    """Absolute errors of poses (n, 3) against the true ones of the same instants; nothing is aligned."""
+    off = np.hypot(*(estimate - truth)[:, :2].T)
+    turned = np.abs(np.remainder(estimate[:, 2] - truth[:, 2] + math.pi, math.tau) - math.pi)
+    return {
+        "ate_m": rms(off),
+        "max_m": float(off.max()),
+        "end_m": float(off[-1]),
+        "end_rad": float(turned[-1]),
+        "driven_m": length(truth),
+    }
+
+
+def length(poses: Array) -> float:
+    """Metres along poses (n, >= 2)."""
+    return float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum())
+
+
+def distance(places: Array, points: Array) -> Array:
+    """Distances (m,) of places (m, 2) from a polyline (n, 2), m."""
+    begin, step = points[:-1], np.diff(points, axis=0)
+    square = (step**2).sum(axis=1)
+    result = np.empty(len(places))
+    for i in range(0, len(places), 500):
+        to = places[i : i + 500, None] - begin
+        share = np.clip((to * step).sum(axis=2) / square, 0.0, 1.0)
+        result[i : i + 500] = np.hypot(*np.moveaxis(to - share[..., None] * step, 2, 0)).min(axis=1)
+    return result
+
+
+def clearance(truth: DistanceField, footprint: Footprint, poses: Array, most: float = 1.0) -> float:
+    """Least distance of the footprint at poses (n, 3) from what is occupied, m, at most ``most``."""
+    return float(truth.clearance(footprint, poses, most).min())
+
+
+def map_error(
+    cells: NDArray[np.int8], origin: tuple[float, float], resolution: float, truth: DistanceField
+) -> dict[str, float]:
+    """A grid (rows, columns; 100 occupied, 0 free, -1 unknown) against the world.
+
+    Walls: distance of occupied cells from the nearest true wall, m. ``occupied_free``: share of the cells known as free
+    that lie within a wall by more than a cell.
+    """
+    rows, columns = np.nonzero(cells >= 65)
+    middle = (np.column_stack((columns, rows)) + 0.5) * resolution + origin
+    off = truth.lookup(middle)
+    rows, columns = np.nonzero((cells >= 0) & (cells < 50))
+    middle = (np.column_stack((columns, rows)) + 0.5) * resolution + origin
+    through = truth.lookup(middle) < 0.25 * resolution
+    return {
+        "wall_mean_m": float(off.mean()) if len(off) else math.inf,
+        "wall_p95_m": float(np.percentile(off, 95)) if len(off) else math.inf,
+        "false_free_share": float(through.mean()) if len(through) else 0.0,
+        "known_m2": float((cells >= 0).sum()) * resolution**2,
+    }
+
+
+def wall_iou(
+    cells: NDArray[np.int8], origin: tuple[float, float], resolution: float, truth: DistanceField, within: float
+) -> float:
+    """Share in common of the walls of grid and world, both widened by ``within`` m, where the grid knows."""
+    rows, columns = np.indices(cells.shape)
+    middle = (np.column_stack((columns.ravel(), rows.ravel())) + 0.5) * resolution + origin
+    true = truth.lookup(middle).reshape(cells.shape) <= within
+    mine = distance_transform_edt(cells < 65) * resolution <= within
+    known = cells >= 0
+    return float((true & mine & known).sum() / max(((true | mine) & known).sum(), 1))
+
+
+def percentiles(values: Array, unit: str = "ms") -> dict[str, float]:
+    """Median, 99th percentile and greatest value."""
+    if not len(values):
+        return {f"p50_{unit}": 0.0, f"p99_{unit}": 0.0, f"max_{unit}": 0.0}
+    p50, p99 = np.percentile(values, (50, 99))
+    return {f"p50_{unit}": float(p50), f"p99_{unit}": float(p99), f"max_{unit}": float(np.max(values))}

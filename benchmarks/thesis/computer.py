@@ -1,0 +1,131 @@
+"""5.7 Computer: processor time of every module, and how slow a board may be, by ``placement.slowness``.
+
+The whole daemon maps and drives on the virtual clock: ours follows the lap with its tracker; ``published`` with the
+fuzzy rules at 5 Hz. A deadline of control is missed by every fifth of a second in which the tracker says nothing, one
+of mapping by every scan (10 Hz) whose result takes longer than a tenth of a second or that is passed over. Processor
+time is this computer's; factors of boards are estimates.
+"""
+
+import contextlib
+import resource
+from typing import Any
+
+import numpy as np
+import scoring
+from navigation_parts import Options, Part
+from navigation_parts.daemon import CONFIGS
+
+from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
+from monstertruck_runtime.errors import RequestRefusedError
+from monstertruck_runtime.slowness import BOARDS
+from monstertruck_schemas import topics
+from monstertruckd.config.load import load_config
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
+from monstertruckd.tools.simulation.operator import LocalOperator
+from monstertruckd.tools.simulation.virtual_rig import VirtualRig
+
+FACTORS = (1.0, 3.0, BOARDS["xu4"], 8.0, 12.0, BOARDS["pi2"], 40.0)
+QUICK_FACTORS = (1.0, 40.0)
+SECONDS, QUICK_SECONDS = 20.0, 3.0
+CONTROL, LIDAR = 0.2, 0.1
+"""Periods, s."""
+ALLOWED = 0.01
+"""Share of deadlines that may be missed."""
+TRACKERS: dict[str, dict[str, Any]] = {
+    "ours": {"tracker": {"kind": "lqr"}},
+    "published": {"tracker": {"kind": "fuzzy", "rules": "published", "rate": 5.0, "speed": 0.2, "steering": "counter"}},
+}
+
+
+def run(options: Options) -> Part:
+    part = Part()
+    rows: dict[str, list[dict[str, Any]]] = {}
+    for name, overlay in TRACKERS.items():
+        for factor in QUICK_FACTORS if options.quick else FACTORS:
+            row = drive(overlay, factor, QUICK_SECONDS if options.quick else SECONDS)
+            rows.setdefault(name, []).append(row)
+            print(f"  {name} x{factor:g}: control {row['control']:.3f}, mapping {row['mapping']:.3f}", flush=True)
+            for what in ("control", "mapping"):
+                part.add(f"{name}.x{factor:g}.{what}_missed_share", row[what])
+        for what in ("control", "mapping"):
+            first = [row["factor"] for row in rows[name] if row[what] > ALLOWED]
+            if first:
+                part.add(f"{name}.{what}_first_misses_at", first[0])
+            else:
+                part.add(f"{name}.{what}_keeps_up_to", rows[name][-1]["factor"])
+        modules(part, name, rows[name][0])
+    part.goals["ours.x1.control_missed_share"] = part.goals["ours.x1.mapping_missed_share"] = ALLOWED
+    part.add("ram_daemon_and_world_mb", resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
+    part.add("ram_greatest_worker_mb", resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024)
+    draw(options, rows)
+    return part
+
+
+def modules(part: Part, name: str, row: dict[str, Any]) -> None:
+    """Share of a core, and percentiles of a turn, of every module, without slowness."""
+    for module, turns in sorted(row["turns"].items()):
+        prefix = f"{name}.{module.replace(' ', '_')}"
+        part.add(f"{prefix}.cpu_percent", 100 * sum(turns) / row["seconds"])
+        for key, value in scoring.percentiles(1e3 * np.array(turns)).items():
+            part.add(f"{prefix}.turn_{key}", value)
+
+
+def drive(overlay: dict[str, Any], factor: float, seconds: float) -> dict[str, Any]:
+    """Shares of missed deadlines and the turns of every module while the truck drives."""
+    config = load_config(CONFIGS / "slam.yaml", SimulatedTruckConfig)[0]
+    common = {"recorder": None, "blackbox": None, "map": None, "placement": {"slowness": factor}}
+    config = with_overlay(config, {**common, "tracker": None})
+    config = with_overlay(config, overlay)
+    said: list[float] = []
+    scans: list[float] = []
+
+    async def main(clock: VirtualClock) -> dict[str, Any]:
+        rig = VirtualRig(config, clock)
+        rig.bus.tap(lambda *_: said.append(clock.now() / SECOND), [topics.TRACKER])
+        rig.bus.tap(lambda *_: scans.append(clock.now() / SECOND), [topics.SCAN])
+        async with rig.running():
+            await clock.sleep(3.0)
+            with contextlib.suppress(RequestRefusedError):  # too slow to be armed: no deadline is kept
+                await LocalOperator(rig.daemon, clock).arm()
+            await clock.sleep(1.0)
+            slow = rig.daemon.slow
+            assert slow is not None
+            slow.turns.clear()
+            begin = clock.now() / SECOND
+            await clock.sleep(seconds)
+            end = clock.now() / SECOND
+            return {"turns": {name: list(turns) for name, turns in slow.turns.items()}, "begin": begin, "end": end}
+
+    row = run_virtual(main)
+    begin, end = row["begin"], row["end"]
+    heard = np.histogram(said, np.arange(begin, end, CONTROL))[0]
+    steps = factor * np.array(row["turns"].get("worker slam", []))
+    due = max(round((end - begin) / LIDAR), 1)
+    return row | {
+        "factor": factor, "seconds": end - begin, "control": float((heard == 0).mean()),
+        "mapping": min(max(1.0 - (steps <= LIDAR).sum() / due, 0.0), 1.0), "scans": len(scans),
+    }  # fmt: skip
+
+
+def draw(options: Options, rows: dict[str, list[dict[str, Any]]]) -> None:
+    from matplotlib.figure import Figure  # noqa: PLC0415
+
+    figure = Figure(figsize=(12, 5), layout="constrained")
+    misses, cpu = figure.subplots(1, 2)
+    for name, found in rows.items():
+        for what, style in (("control", "-o"), ("mapping", "--s")):
+            factors = [row["factor"] for row in found]
+            misses.plot(factors, [100 * row[what] for row in found], style, label=f"{name}, {what}")
+    misses.axhline(100 * ALLOWED, color="0.6")
+    for board, factor in BOARDS.items():
+        misses.axvline(factor, color="0.8")
+        misses.text(factor, 50, f"{board} (estimate)", rotation=90, fontsize=8)
+    misses.set_xscale("log")
+    misses.set_xlabel("slowness")
+    misses.set_ylabel("deadlines missed, %")
+    misses.legend()
+    row = rows["ours"][0]
+    shares = sorted((100 * sum(turns) / row["seconds"], module) for module, turns in row["turns"].items())
+    cpu.barh([module for _, module in shares], [share for share, _ in shares])
+    cpu.set_xlabel("% of a core, ours, this computer")
+    figure.savefig(options.out / "computer.png", dpi=80)

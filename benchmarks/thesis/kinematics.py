@@ -1,0 +1,120 @@
+"""5.1 Kinematics: odometry's error and the turning radius for each manoeuvre, whole daemon, open-loop requests.
+
+The truck drives in the empty hall, on the virtual clock and through all emulated devices, with servos in whole degrees.
+Truth is the world's. The radius is that of the true poses while the angles hold, against the formula.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+import scoring
+from navigation_parts import Options, Part
+from navigation_parts.daemon import CONFIGS
+
+from monstertruck_kinematics.truck import FourWheelSteering
+from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
+from monstertruck_schemas import topics
+from monstertruck_schemas.req import DriveRequest
+from monstertruckd.config.load import load_config
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
+from monstertruckd.tools.simulation.operator import LocalOperator
+from monstertruckd.tools.simulation.virtual_rig import VirtualRig
+
+TRUCK = FourWheelSteering()
+SPEED, ANGLE = 0.2, 0.3
+START = {"x": 4.0, "y": 0.0, "yaw": 0.0}
+QUARTER = math.pi / 2 * TRUCK.wheelbase / (2 * math.tan(ANGLE) * SPEED)
+"""Seconds of a right angle in counter steering."""
+MANOEUVRES: dict[str, list[tuple[float, float, float]]] = {
+    "straight": [(12.0, 0.0, 0.0)],
+    "circle_2ws": [(33.0, ANGLE, 0.0)],
+    "circle_counter": [(16.0, ANGLE, -ANGLE)],
+    "crab": [(12.0, 0.25, 0.25)],
+    "figure_eight": [(16.3, ANGLE, -ANGLE), (16.3, -ANGLE, ANGLE)],
+    "square": 4 * [(4.0, 0.0, 0.0), (QUARTER, ANGLE, -ANGLE)],
+}
+"""Seconds, front and rear axle angle, rad, of each leg."""
+
+
+def run(options: Options) -> Part:
+    part = Part()
+    rows = {}
+    for name, whole in MANOEUVRES.items():
+        if options.quick and name not in ("straight", "circle_counter"):
+            continue
+        legs = [(3.0, *whole[0][1:])] if options.quick else whole
+        rows[name] = row = drive(legs)
+        score = scoring.trajectory(row["odometry"], row["truth"])
+        part.add(f"{name}.end_share", score["end_m"] / score["driven_m"], 0.02)
+        for key in ("ate_m", "end_m", "end_rad", "driven_m"):
+            part.add(f"{name}.{key}", score[key])
+        _, front, rear = legs[0]
+        bend = (math.tan(front) - math.tan(rear)) / TRUCK.wheelbase
+        if name.startswith("circle"):
+            part.add(f"{name}.radius_m", row["radius"])
+            part.add(f"{name}.radius_formula_m", math.hypot(1 / bend, 0.16 if rear == 0.0 else 0.0))
+            off = row["radius"] / part.figures[f"{name}.radius_formula_m"] - 1.0
+            part.add(f"{name}.radius_off_share", abs(off), 0.05)
+    draw(options, rows)
+    return part
+
+
+def drive(legs: list[tuple[float, float, float]]) -> dict[str, Any]:
+    """True and estimated poses (n, 3) of the same instants, and the true radius of the first leg."""
+    config = load_config(CONFIGS / "demo.yaml", SimulatedTruckConfig)[0]
+    overlay = {
+        "path": None,
+        "map": None,
+        "recorder": None,
+        "blackbox": None,
+        "sim": {"world": {"map": "hall", "start": START}},
+    }
+    config = with_overlay(config, overlay | {"odometry": {"start": START}})
+    seen: list[tuple[float, ...]] = []
+
+    async def main(clock: VirtualClock) -> np.ndarray:
+        rig = VirtualRig(config, clock)
+        rig.bus.tap(
+            lambda topic, message, data, at: seen.append(
+                (message.stamp / SECOND, message.pose.x, message.pose.y, message.pose.yaw)
+            ),
+            [topics.ODOMETRY],
+        )
+        async with rig.running():
+            await clock.sleep(2.0)
+            operator = LocalOperator(rig.daemon, clock)
+            await operator.arm()
+            for seconds, front, rear in legs:
+                for _ in range(round(seconds * 10)):
+                    request = DriveRequest(**await operator.header(0.3), speed=SPEED, front=front, rear=rear)
+                    rig.bus.inject(topics.REQ_DRIVE, request)
+                    await clock.sleep(0.1)
+            await clock.sleep(1.5)
+            began = rig.began
+        true = rig.truth.array()[:, :4]
+        true[:, 0] += 0.0 if true[0, 0] >= began / SECOND else began / SECOND
+        return true
+
+    true = run_virtual(main)
+    estimate = np.array(seen)
+    estimate = estimate[(estimate[:, 0] >= true[0, 0]) & (estimate[:, 0] <= true[-1, 0])]
+    truth = scoring.at(true[:, 0], true[:, 1:], estimate[:, 0])
+    first = truth[(estimate[:, 0] > estimate[0, 0] + 4.0) & (estimate[:, 0] < estimate[0, 0] + 2.0 + legs[0][0])]
+    turned = abs(float(np.unwrap(first[:, 2])[-1] - first[0, 2])) if len(first) > 1 else 0.0
+    return {
+        "truth": truth, "odometry": estimate[:, 1:], "radius": scoring.length(first) / turned if turned > 0.1 else 0.0
+    }  # fmt: skip
+
+
+def draw(options: Options, rows: dict[str, dict[str, Any]]) -> None:
+    from matplotlib.figure import Figure  # noqa: PLC0415
+
+    figure = Figure(figsize=(11, 7), layout="constrained")
+    for axes, (name, row) in zip(figure.subplots(2, 3).flat, rows.items(), strict=False):
+        axes.plot(*row["truth"][:, :2].T, color="0.6", lw=3, label="truth")
+        axes.plot(*row["odometry"][:, :2].T, color="tab:red", lw=1, label="odometry")
+        axes.set_title(name)
+        axes.set_aspect("equal", "datalim")
+    axes.legend()
+    figure.savefig(options.out / "kinematics.png", dpi=80)

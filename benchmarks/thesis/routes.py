@@ -1,0 +1,78 @@
+"""5.3 Path construction: random queries in the built-in rooms by all route planners, two and four wheels.
+
+``grid_astar`` is the author's (its paths bind no wheels); times are processor time. Clearance is that of the true
+footprint in the world, curvature is given as share of the tightest that the truck can drive.
+"""
+
+import time
+
+import numpy as np
+import scoring
+from exploration_parts.arena import BARE, Arena
+from navigation_parts import Options, Part
+from navigation_parts.harness import WORLDS
+
+from monstertruck_planners.route.api import RouteMap, Vehicle
+from monstertruck_planners.route.catalog import make_planner
+from monstertruck_planners.route.config import GridAstarConfig, HybridConfig, LatticeConfig
+
+PLANNERS = {"hybrid": HybridConfig(), "lattice": LatticeConfig(), "grid_astar": GridAstarConfig()}
+QUERIES = 20
+
+
+def run(options: Options) -> Part:
+    part = Part()
+    arena = Arena.load("rooms", WORLDS / "rooms.yaml")
+    ground = RouteMap.from_cells(
+        np.where(arena.blocked, 100, 0).astype(np.int8), arena.resolution, (*arena.origin, 0.0)
+    )
+    queries = [(arena.start(2 * k), arena.start(2 * k + 1)) for k in range(2 if options.quick else QUERIES)]
+    shown = []
+    for name, config in PLANNERS.items():
+        for car in ("2ws", "4ws"):
+            vehicle = Vehicle.truck(car)
+            planner = make_planner(vehicle, config)
+            planner.plan(ground, vehicle.reference_pose(queries[0][0]), vehicle.reference_pose(queries[0][1]))
+            rows = [one(planner, vehicle, arena, ground, *query) for query in queries]
+            done = [row for row in rows if row is not None]
+            part.add(f"{name}.{car}.found_share", len(done) / len(rows))
+            for key in ("length_m", "time_ms", "cusps"):
+                part.add(f"{name}.{car}.{key}", float(np.mean([row[key] for row in done])) if done else 0.0)
+            if done:
+                bend, room = (max(row["bend"] for row in done), min(row["clearance_m"] for row in done))
+                part.add(f"{name}.{car}.curvature_max_share", bend, None if name == "grid_astar" else 1.001)
+                part.add(f"{name}.{car}.clearance_min_m", room)
+                shown.append((f"{name} {car}", done[0]["poses"]))
+    draw(options, arena, shown)
+    return part
+
+
+def one(planner, vehicle, arena: Arena, ground: RouteMap, start, goal) -> dict | None:  # noqa: ANN001
+    begin = time.thread_time()
+    path = planner.plan(ground, vehicle.reference_pose(start), vehicle.reference_pose(goal)).path
+    used = time.thread_time() - begin
+    if path is None:
+        return None
+    poses = path.sample(0.05).poses
+    base = poses.copy()
+    base[:, :2] -= vehicle.reference * np.column_stack((np.cos(poses[:, 2]), np.sin(poses[:, 2])))
+    return {
+        "length_m": path.length, "time_ms": 1e3 * used, "cusps": path.cusps, "poses": base,
+        "bend": float(np.abs(path.segments[:, 1]).max() * vehicle.radius),
+        "clearance_m": scoring.clearance(arena.truth, BARE, base),
+    }  # fmt: skip
+
+
+def draw(options: Options, arena: Arena, shown: list) -> None:
+    from matplotlib.figure import Figure  # noqa: PLC0415
+
+    figure = Figure(figsize=(9, 7), layout="constrained")
+    axes = figure.subplots()
+    rows, columns = arena.blocked.shape
+    x, y = arena.origin
+    box = (x, x + columns * arena.resolution, y, y + rows * arena.resolution)
+    axes.imshow(arena.blocked, origin="lower", extent=box, cmap="Greys", alpha=0.7)
+    for name, poses in shown:
+        axes.plot(*poses[:, :2].T, lw=1.2, label=name)
+    axes.legend()
+    figure.savefig(options.out / "routes.png", dpi=80)

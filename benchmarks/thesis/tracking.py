@@ -1,0 +1,52 @@
+"""5.5 Tracking: RMS and greatest distance from the path for each steering mode, our trackers and the published rules.
+
+The truck with dead time, lag and turning rate of its axles at the author's 0.2 m/s, from 5 cm beside the path.
+"""
+
+import numpy as np
+from navigation_parts import Options, Part
+from navigation_parts.tracking import TRUCK, Result, built_in, drive
+
+MODES = ("front", "counter", "crab", "hybrid")
+TRACKERS = {"lqr": "ours", "fuzzy": "fuzzy, our rules", "fuzzy_published": "published"}
+
+
+def run(options: Options) -> Part:
+    part = Part()
+    courses = {name: 1.4 * points for name, points in built_in().items()}
+    found: dict[tuple[str, str, str], Result] = {}
+    for course, points in list(courses.items())[: 1 if options.quick else None]:
+        for tracker in TRACKERS:
+            for mode in MODES[:2] if options.quick else MODES:
+                way = points[:120] if options.quick else points
+                row = drive(way, tracker, 0.2, "lag", "forward", TRUCK, steering=mode, angle=0.4)
+                found[course, tracker, mode] = row
+                prefix = f"{course}.{tracker}.{mode}"
+                part.add(f"{prefix}.rms_mm", row.rms)
+                part.add(f"{prefix}.max_mm", row.worst)
+                part.add(f"{prefix}.arrived", int(row.arrived))
+    if not options.quick:
+        for course in courses:
+            for mode in ("front", "counter", "hybrid"):
+                ours, theirs = (found[course, tracker, mode] for tracker in ("lqr", "fuzzy_published"))
+                part.add(f"{course}.{mode}.ours_over_published_rms", ours.rms / theirs.rms, 1.0)
+    draw(options, found, courses)
+    return part
+
+
+def draw(options: Options, found: dict, courses: dict[str, np.ndarray]) -> None:
+    from matplotlib.figure import Figure  # noqa: PLC0415
+
+    names = list(dict.fromkeys(key[0] for key in found))
+    figure = Figure(figsize=(14, 4 * len(names)), layout="constrained")
+    for line, course in zip(figure.subplots(len(names), 4, squeeze=False), names, strict=True):
+        for axes, mode in zip(line, MODES, strict=True):
+            axes.plot(*courses[course].T, color="0.7", lw=4)
+            for tracker in TRACKERS:
+                if (row := found.get((course, tracker, mode))) is not None:
+                    axes.plot(*row.track[:, :2].T, lw=1, label=f"{tracker} {row.rms:.0f}/{row.worst:.0f} mm")
+            axes.set_title(f"{course}, {mode}", fontsize=9)
+            axes.set_aspect("equal", "datalim")
+            if mode == MODES[0]:
+                axes.legend(fontsize=7)
+    figure.savefig(options.out / "tracking.png", dpi=70)
