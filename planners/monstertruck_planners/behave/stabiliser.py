@@ -15,21 +15,33 @@ For tilt about one axis the joint is the opposite angle. For both, a heading of 
 rocks by 15 degrees at 0.5 Hz, each 10 ms of that cost up to half a degree. So the tilt is followed by a filter of
 constant acceleration (the fading-memory polynomial filter of second degree, also called critically damped g-h-k; see
 Brookner, "Tracking and Kalman Filtering Made Easy") and predicted to the instant when the joints will be there.
+
+**Driving.** The compass finds the vertical by an accelerometer, which feels the body's own acceleration too: 0.9 m/s^2
+look like 5 degrees, and the prediction would make 10 of them. The odometry's acceleration, by its speed and its speed
+times its yaw rate, is taken out of each reading, averaged over ``felt`` seconds as the accelerometer's filter does.
 """
 
 import math
+from collections import deque
 from dataclasses import dataclass
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Final, Literal, NamedTuple
 
 from pydantic import Field
 
 from monstertruck_runtime.clock import SECOND, Clock, Schedule
-from monstertruck_runtime.mailbox import latest
+from monstertruck_runtime.mailbox import Mailbox, fifo, latest
 from monstertruck_runtime.ports import BusPort, Publisher, Ready, Subscription
 from monstertruck_schemas.base import Schema
 from monstertruck_schemas.plan import StabiliserCommand
 from monstertruck_schemas.sensor import Attitude
-from monstertruck_schemas.topics import COMPASS, PLAN_STABILISER, Writer
+from monstertruck_schemas.state import Odometry
+from monstertruck_schemas.topics import COMPASS, ODOMETRY, PLAN_STABILISER, Writer
+
+GRAVITY: Final = 9.81
+KEPT: Final = 64
+"""Readings of the odometry."""
+GREATEST: Final = 2.0
+"""Acceleration of the body that is taken out at most, m/s^2: wheels that spin know no better."""
 
 Positive = Annotated[float, Field(gt=0)]
 Limit = Annotated[float, Field(gt=0, lt=math.pi / 2)]
@@ -52,6 +64,8 @@ class StabiliserConfig(Schema):
     """Share of the past that one reading leaves in the filter; more is calmer and later."""
     coast: Positive = 0.2
     """Seconds over which tilt may be predicted beyond its newest reading."""
+    felt: Annotated[float, Field(gt=0, le=0.5)] = 0.06
+    """Seconds over which the odometry's acceleration is averaged, as the compass's accelerometer feels it."""
     stale_after: Positive = COMPASS.fresh_for()
     """Seconds without valid tilt after which the joints return to 0."""
 
@@ -124,6 +138,45 @@ class _Axis:
         self.acceleration += forget**3 * off / dt**2
 
 
+class BodyAcceleration:
+    """The body's acceleration by its odometry.
+
+    Args:
+        felt: seconds over which it is averaged.
+    """
+
+    def __init__(self, felt: float) -> None:
+        self._felt = round(felt * SECOND)
+        self._speeds: deque[tuple[int, float, float]] = deque(maxlen=KEPT)
+
+    def observe(self, odometry: Odometry) -> None:
+        """Take a reading; older ones than the newest are passed over."""
+        if not self._speeds or odometry.stamp > self._speeds[-1][0]:
+            self._speeds.append((odometry.stamp, odometry.twist.vx, odometry.twist.wz))
+
+    def at(self, stamp: int) -> tuple[float, float]:
+        """Forward and left, m/s^2, over the time before ``stamp``, ns; 0 where the odometry does not tell."""
+        spell = [speed for speed in self._speeds if stamp - 2 * self._felt <= speed[0] <= stamp]
+        old = next((speed for speed in reversed(spell) if speed[0] <= stamp - self._felt), None)
+        if old is None or stamp - spell[-1][0] > self._felt:
+            return 0.0, 0.0
+        new = spell[-1]
+        forward = (new[1] - old[1]) * SECOND / (new[0] - old[0])
+        left = (new[1] * new[2] + old[1] * old[2]) / 2
+        return _clip(forward, GREATEST), _clip(left, GREATEST)
+
+
+def without(acceleration: tuple[float, float], tilt: Tilt) -> Tilt:
+    """Tilt of a body whose accelerometer took the reaction to gravity and to its acceleration for the vertical.
+
+    Args:
+        acceleration: forward and left, m/s^2.
+        tilt: measured.
+    """
+    forward, left = acceleration
+    return Tilt(tilt.roll - math.atan2(left, GRAVITY), tilt.pitch + math.atan2(forward, GRAVITY))
+
+
 class TiltFilter:
     """Follows valid tilt and predicts it.
 
@@ -136,17 +189,23 @@ class TiltFilter:
         self._stamp: int | None = None
         self._roll = self._pitch = _Axis(0.0)
 
-    def observe(self, attitude: Attitude) -> None:
-        """Take a reading; invalid and older ones are passed over, after a gap it starts anew."""
+    def observe(self, attitude: Attitude, acceleration: tuple[float, float] = (0.0, 0.0)) -> None:
+        """Take a reading; invalid and older ones are passed over, after a gap it starts anew.
+
+        Args:
+            attitude: reading.
+            acceleration: of the body then, forward and left, m/s^2.
+        """
         if not attitude.tilt_valid or (self._stamp is not None and attitude.stamp <= self._stamp):
             return
         dt = math.inf if self._stamp is None else (attitude.stamp - self._stamp) / SECOND
         self._stamp = attitude.stamp
+        roll, pitch = without(acceleration, Tilt(attitude.roll, attitude.pitch))
         if dt > self._config.stale_after:
-            self._roll, self._pitch = _Axis(attitude.roll), _Axis(attitude.pitch)
+            self._roll, self._pitch = _Axis(roll), _Axis(pitch)
             return
-        self._roll.correct(attitude.roll, dt, self._config.memory)
-        self._pitch.correct(attitude.pitch, dt, self._config.memory)
+        self._roll.correct(roll, dt, self._config.memory)
+        self._pitch.correct(pitch, dt, self._config.memory)
 
     def tilt(self, now: int) -> Tilt | None:
         """Tilt ``lead`` seconds after ``now`` (ns); None when the newest valid reading is stale."""
@@ -166,6 +225,7 @@ class StabiliserService:
         config: limits, times.
         clock: time; the compass's stamps are of the same clock.
         compass: the body's tilt.
+        odometry: its speeds.
         out: joint goals.
         name: service name.
     """
@@ -175,6 +235,7 @@ class StabiliserService:
         config: StabiliserConfig,
         clock: Clock,
         compass: Subscription[Attitude],
+        odometry: Mailbox[Odometry],
         out: Publisher[StabiliserCommand],
         name: str = "levelling",
     ) -> None:
@@ -182,18 +243,21 @@ class StabiliserService:
         self._config = config
         self._clock = clock
         self._compass = compass
+        self._odometry = odometry
         self._out = out
 
     async def run(self, ready: Ready) -> None:
         """Publish until cancelled."""
         ready()
         schedule = Schedule(self._clock, self._config.rate)
-        tilt, joints, seen = TiltFilter(self._config), SQUARE, None
+        tilt, body, joints, seen = TiltFilter(self._config), BodyAcceleration(self._config.felt), SQUARE, None
         while True:
             await schedule.next()
+            for moved in self._odometry.drain():
+                body.observe(moved)
             reading = self._compass.latest
             if reading is not None and reading is not seen:
-                tilt.observe(reading)
+                tilt.observe(reading, body.at(reading.stamp))
                 seen = reading
             now = self._clock.now()
             joints = goals(tilt.tilt(now), joints, 1 / self._config.rate, self._config)
@@ -204,4 +268,5 @@ class StabiliserService:
 def build_stabiliser(config: StabiliserConfig, clock: Clock, bus: BusPort) -> StabiliserService:
     """The service with its topics, for the catalog."""
     out = bus.publisher(PLAN_STABILISER, Writer.PLANNER)
-    return StabiliserService(config, clock, bus.subscribe(COMPASS, latest()), out)
+    compass, odometry = bus.subscribe(COMPASS, latest()), bus.subscribe(ODOMETRY, fifo(KEPT))
+    return StabiliserService(config, clock, compass, odometry, out)

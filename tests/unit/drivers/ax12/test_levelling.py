@@ -11,6 +11,7 @@ from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.mailbox import Mailbox, latest
 from monstertruck_schemas.plan import StabiliserCommand
 from monstertruck_schemas.sensor import Attitude
+from monstertruck_schemas.state import Odometry
 from tests.unit.drivers.ax12.rig import FAST, Rig, bench
 from tests.unit.drivers.kit import background
 
@@ -69,7 +70,8 @@ def off_level(config: Ax12Config, amplitude: float, frequency: float, **bus) -> 
         tilts: list[float] = []
         async with bench(clock, config, **bus) as rig:
             readings: Mailbox[Attitude] = Mailbox(latest())
-            service = StabiliserService(StabiliserConfig(), clock, readings, Goals(rig.commands))
+            moved: Mailbox[Odometry] = Mailbox(latest())
+            service = StabiliserService(StabiliserConfig(), clock, readings, moved, Goals(rig.commands))
             async with (
                 rig.driving(),
                 background(compass(rig, readings, amplitude, frequency)),

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from monstertruck_planners.behave.stabiliser import (
     SQUARE,
+    BodyAcceleration,
     Joints,
     StabiliserConfig,
     StabiliserService,
@@ -17,12 +18,15 @@ from monstertruck_planners.behave.stabiliser import (
     TiltFilter,
     goals,
     level,
+    without,
 )
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
-from monstertruck_runtime.mailbox import Mailbox, latest
+from monstertruck_runtime.mailbox import Mailbox, fifo, latest
 from monstertruck_schemas.plan import StabiliserCommand
 from monstertruck_schemas.sensor import Attitude
+from monstertruck_schemas.state import Odometry
 from tests.unit.drivers.kit import background
+from tests.unit.planners.behave.wall_kit import odometry
 
 CONFIG = StabiliserConfig()
 angles = st.floats(-1.2, 1.2)
@@ -136,16 +140,17 @@ class Kept:
         self.kept.append(message)
 
 
-def serving(test: Any) -> None:
-    """Run ``test(clock, compass, out)`` with the service running."""
+def serving(test: Any, with_odometry: bool = False) -> None:
+    """Run ``test(clock, compass, out)``, or with the odometry as well, with the service running."""
 
     async def main(clock: VirtualClock) -> None:
         compass: Mailbox[Attitude] = Mailbox(latest())
+        moved: Mailbox[Odometry] = Mailbox(fifo(64))
         out = Kept()
         ready: list[int] = []
-        service = StabiliserService(CONFIG, clock, compass, out)
+        service = StabiliserService(CONFIG, clock, compass, moved, out)
         async with background(service.run(lambda: ready.append(clock.now()))):
-            await test(clock, compass, out)
+            await (test(clock, compass, out, moved) if with_odometry else test(clock, compass, out))
         assert len(ready) == 1
 
     run_virtual(main)
@@ -181,3 +186,58 @@ def test_the_service_returns_to_zero_when_tilt_stops_counting():
         assert out.kept[-1].roll == 0.0, "the compass fell silent"
 
     serving(test)
+
+
+def felt_tilt(forward, left, roll, pitch):
+    """Roll and pitch that an accelerometer shows on a body with a tilt and an acceleration in its level frame."""
+    turn_pitch = np.array([[math.cos(pitch), 0, math.sin(pitch)], [0, 1, 0], [-math.sin(pitch), 0, math.cos(pitch)]])
+    turn_roll = np.array([[1, 0, 0], [0, math.cos(roll), -math.sin(roll)], [0, math.sin(roll), math.cos(roll)]])
+    x, y, z = (turn_pitch @ turn_roll).T @ (forward, left, 9.81)
+    return Tilt(math.atan2(y, z), math.atan2(-x, math.hypot(y, z)))
+
+
+@pytest.mark.parametrize(("forward", "left"), [(0.9, 0.0), (-1.2, 0.0), (0.0, 0.8), (0.5, -0.6)])
+@pytest.mark.parametrize(("roll", "pitch"), [(0.0, 0.0), (0.1, -0.15)])
+def test_the_bodys_acceleration_is_taken_out_of_its_tilt(forward, left, roll, pitch):
+    measured = felt_tilt(forward, left, roll, pitch)
+    assert math.dist(measured, (roll, pitch)) > 0.05
+    assert without((forward, left), measured) == pytest.approx((roll, pitch), abs=0.004)
+
+
+def test_acceleration_is_that_of_the_speeds_before_the_reading():
+    body = BodyAcceleration(0.06)
+    assert body.at(SECOND) == (0.0, 0.0)
+    for i in range(20):
+        t = 0.02 * i
+        body.observe(odometry(vx=0.5 * t, wz=0.4, now=round(t * SECOND)))
+    assert body.at(round(0.38 * SECOND)) == pytest.approx((0.5, 0.4 * 0.5 * 0.35))
+    assert body.at(round(0.05 * SECOND)) == (0.0, 0.0)  # too little is known
+    assert body.at(SECOND) == (0.0, 0.0)  # the odometry is silent
+    body.observe(odometry(vx=9.0, now=round(0.40 * SECOND)))  # spinning wheels
+    assert body.at(round(0.40 * SECOND))[0] == 2.0
+
+
+def swing(*, with_odometry: bool) -> float:
+    """Greatest joint angle, degrees, of a level truck that sets off and whose accelerometer has a filter of 50 ms."""
+    found = []
+
+    async def test(clock, compass, out, moved) -> None:
+        speed = felt = 0.0
+        for i in range(150):
+            before, speed = speed, min(max(i - 50, 0) * 0.02 * 0.9, 0.2)
+            felt += ((speed - before) / 0.02 - felt) * 0.02 / 0.05
+            now = clock.now()
+            if with_odometry:
+                moved.put(odometry(vx=speed, now=now))
+            if i % 2 == 0:
+                measured = felt_tilt(felt, 0.0, 0.0, 0.0)
+                compass.put(attitude(now / SECOND, roll=measured.roll, pitch=measured.pitch))
+            await clock.sleep(0.02)
+        found.extend(math.degrees(abs(message.pitch)) for message in out.kept)
+
+    serving(test, with_odometry=True)
+    return max(found)
+
+
+def test_a_level_truck_that_sets_off_keeps_its_lidar_level():
+    assert swing(with_odometry=True) < swing(with_odometry=False) / 2
