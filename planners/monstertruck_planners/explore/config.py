@@ -88,7 +88,7 @@ class TourConfig(ExplorerConfig):
     """Metres of way that are driven for a metre of what is seen: the square root of the new area"""
     turning: NotNegative = 1.0
     """Metres that half a turn at the start of the tour costs"""
-    keep: NotNegative = 1.0
+    keep: NotNegative = 3.0
     """Metres by which another tour has to be better than one that begins with the present goal"""
     rest: NotNegative = 0.0
     """Weight of the short tour over the other frontiers, against the way to the first one; 0 drove least so far"""
