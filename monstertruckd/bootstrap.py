@@ -160,7 +160,9 @@ def run(program: Path, *arguments: str) -> int:
 
 
 def check(arguments: list[str]) -> int:
-    """All checks, those that take least first; stops at the first that fails. ``arguments`` go to pytest.
+    """All checks but the long tests, those that take least first; stops at the first that fails.
+
+    ``arguments`` go to pytest.
 
     Tests that fail are run once more, one after the other: on a busy computer some miss a time-out beside the others.
     Both results are printed; one that fails again fails the check.
@@ -190,7 +192,7 @@ def check(arguments: list[str]) -> int:
     steps: list[tuple[Path, list[str]]] = [
         (pytest, [*TESTS, "-m", "traced and not wall", "--cov", "--cov-report=", *TRACED]),
         (tools / "coverage", ["report"]),
-        (pytest, [*TESTS, "-m", "not wall and not traced", *arguments]),
+        (pytest, [*TESTS, "-m", "not wall and not traced and not long", *arguments]),
         (pytest, [*TESTS, "-m", "wall", *arguments]),
     ]
     for program, rest in steps:

@@ -169,8 +169,16 @@ def test_method_3_finds_a_wall_of_the_yard_passes_a_niche_and_turns_in_a_corner_
     ("fault", "outcome"),
     [
         (lambda rig: rig.ports["imu"].unplug(), Reason.INPUT_STALE),
-        (lambda rig: rig.robot.emulators["sonar"].inject("dead", "l", "on"), Reason.INPUT_STALE),
-        (lambda rig: rig.robot.emulators["sonar"].inject("stuck", "fl", "on"), Reason.INPUT_CONTRADICTORY),
+        pytest.param(
+            lambda rig: rig.robot.emulators["sonar"].inject("dead", "l", "on"),
+            Reason.INPUT_STALE,
+            marks=pytest.mark.long,
+        ),
+        pytest.param(
+            lambda rig: rig.robot.emulators["sonar"].inject("stuck", "fl", "on"),
+            Reason.INPUT_CONTRADICTORY,
+            marks=pytest.mark.long,
+        ),
     ],
     ids=["imu unplugged", "sonar dead", "sonar stuck"],
 )

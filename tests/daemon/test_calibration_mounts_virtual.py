@@ -38,6 +38,7 @@ def judged(wizard: Wizard, config: SimulatedTruckConfig, seed: int) -> set[str]:
     return {verdict.name.partition(".")[2] for verdict in found}
 
 
+@pytest.mark.long
 def test_odometry(tmp_path: Path):
     config = truck(tmp_path, 1, "odometry")
     assert judged(odometry_wizard(), config, 1) >= {"drive_ratio", "wheelbase", "front_centre", "rear_centre"}
@@ -47,6 +48,7 @@ def test_odometry(tmp_path: Path):
     assert calibrated.geometry.wheelbase != config.geometry.wheelbase
 
 
+@pytest.mark.long
 def test_lidar(tmp_path: Path):
     wizard = lidar_wizard(LidarWizard(heights=True))
     assert judged(wizard, truck(tmp_path, 2, "lidar"), 2) == {"x", "y", "yaw", "pitch", "roll"}

@@ -106,6 +106,7 @@ def test_drive_whose_sign_is_wrong_and_whose_next_start_is_right(tmp_path: Path)
     assert second.value == pytest.approx(first.value, rel=0.005), "measured anew with the calibrated drive"
 
 
+@pytest.mark.long
 def test_steering(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """A truck one of whose axles turns the wrong way."""
     monkeypatch.setattr(steering, "FULL", 0.24)  # circles take half the time
@@ -121,6 +122,7 @@ def test_steering(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     assert session.result.again is None
 
 
+@pytest.mark.long
 def test_everything_hidden_at_once_begins_with_what_needs_nothing_else(tmp_path: Path):
     config, rng = yard(tmp_path, 8, "compass", "drive", "steering")
     for wizard in (drive_wizard(DriveWizard(sign_only=True)), steering_wizard(SteeringWizard(rough=True))):

@@ -151,6 +151,7 @@ def doubled(folder: Path) -> float:
     return float((far[at[:, 0], at[:, 1]] > 0.12).mean())
 
 
+@pytest.mark.long
 def test_a_lidar_that_is_gone_for_a_while_stops_it_and_armed_again_it_goes_on(tmp_path: Path):
     ends = []
 

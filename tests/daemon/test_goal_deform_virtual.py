@@ -53,6 +53,7 @@ def test_without_a_deformer_the_route_is_planned_anew():
     assert_at(travel(story, planner={"local_planner": None}), 6.0, 3.9, 0.0)
 
 
+@pytest.mark.long
 def test_where_the_hall_is_blocked_the_truck_takes_the_way_through_the_rooms():
     async def story(trip: Trip) -> None:
         await trip.goal(7.0, 3.9, 0.0)

@@ -198,14 +198,16 @@ def test_a_step_that_ran_no_tests_is_not_tried_again(steps):
     assert len(ran) == 1
 
 
-def test_every_test_belongs_to_one_step(steps):
+def test_every_test_but_the_long_ones_belongs_to_one_step(steps):
     ran, _ = steps
     bootstrap.check([])
     chosen = [arguments[arguments.index("-m") + 1] for arguments in ran]
     for wall in (True, False):
         for traced in (True, False):
-            marks = {"wall": wall, "traced": traced}
+            marks = {"wall": wall, "traced": traced, "long": False}
             assert sum(eval(expression, {}, marks) for expression in chosen) == 1
+    long = {"wall": False, "traced": False, "long": True}
+    assert not any(eval(expression, {}, long) for expression in chosen)
 
 
 def test_kernels_are_compiled_before_any_test_runs(steps, monkeypatch: pytest.MonkeyPatch):
