@@ -152,6 +152,7 @@ def along_the_yard(start, seconds, *, fault=None, at=14.0):
     return run_virtual(main, start=SECOND)
 
 
+@pytest.mark.long
 def test_method_3_finds_a_wall_of_the_yard_passes_a_niche_and_turns_in_a_corner_by_its_own_devices():
     states, truth = along_the_yard((1.6, 0.7, 0.4), 38.0)
     assert states[-1].running or states[-1].outcome is Reason.SHUTDOWN

@@ -59,6 +59,7 @@ def test_imu(tmp_path: Path):
     assert judged(wizard, truck(tmp_path, 3, "imu"), 3) >= {"rate_z", "rate_scale", "force_x"}
 
 
+@pytest.mark.long
 def test_slip(tmp_path: Path):
     body = {"kind": "skid_steer", "motors": "wheels", "icr_left": 0.08, "icr_right": -0.07, "gain_left": 1.05}
     base = load_config(CONFIGS / "robots" / "skid_stand.yaml", SimulatedTruckConfig)[0]

@@ -172,6 +172,7 @@ def test_a_lidar_that_is_gone_for_a_while_stops_it_and_armed_again_it_goes_on(tm
     assert doubled(tmp_path) < 0.05
 
 
+@pytest.mark.long
 def test_far_from_home_it_turns_back_while_the_charge_suffices(tmp_path: Path):
     ends = []
 

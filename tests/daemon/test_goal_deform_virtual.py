@@ -68,6 +68,7 @@ def test_where_the_hall_is_blocked_the_truck_takes_the_way_through_the_rooms():
     assert rig.truth.array()[:, 2].max() > 5.5
 
 
+@pytest.mark.long
 def test_where_all_ways_are_blocked_the_recovery_behaviours_are_tried_to_the_last():
     async def story(trip: Trip) -> None:
         world, now = trip.rig.world, trip.clock.now
@@ -90,6 +91,7 @@ def test_where_all_ways_are_blocked_the_recovery_behaviours_are_tried_to_the_las
     assert not travel(story).truth.array()[:, 5].any(), "collided"
 
 
+@pytest.mark.long
 def test_the_way_to_the_next_goal_does_not_back_into_what_was_seen_on_the_way_to_the_last():
     async def story(trip: Trip) -> None:
         await trip.goal(3.0, 6.0, 1.5)

@@ -36,6 +36,7 @@ def test_a_goal_in_another_room_is_reached():
     assert_at(travel(story), 2.4, 1.5, -1.57)
 
 
+@pytest.mark.long
 def test_waypoints_are_passed_in_their_order_asked_for_by_call_or_by_topic():
     async def story(trip: Trip) -> None:
         answer = await trip.goal(3.5, 3.9, 0.0, via=[(2.4, 1.6), (2.4, 3.8, 1.57)])

@@ -25,6 +25,7 @@ def roughness_at(ground: Ground, x: float, y: float) -> float:
     return float(value * ROUGHNESS_STEP)
 
 
+@pytest.mark.long
 def test_a_rough_patch_is_driven_over_once():
     turns = []
 

@@ -34,6 +34,7 @@ def centimetres(figures: dict[str, str]) -> float:
     return float(figures["cross-track RMS"].split()[0])
 
 
+@pytest.mark.long
 def test_it_drives_the_lap_in_the_loop_and_in_a_worker_and_its_settings_count(
     project: Path, target: Path, tmp_path: Path
 ):
