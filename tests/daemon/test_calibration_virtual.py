@@ -85,11 +85,13 @@ def test_battery_by_a_converter_of_the_kernel(tmp_path: Path):
     assert gain.low < converter.sim.world.battery.divider < gain.high
 
 
+@pytest.mark.long
 def test_compass(tmp_path: Path):
     config, rng = yard(tmp_path, 1, "compass")
     judged(run_session(config, compass_wizard(), rng), config)
 
 
+@pytest.mark.long
 def test_drive_whose_sign_is_wrong_and_whose_next_start_is_right(tmp_path: Path):
     config, rng = yard(tmp_path, 3, "drive")
     assert config.sim.world.truck.motor.inverted is False

@@ -83,6 +83,7 @@ def tell(story, folder: Path, **overlay) -> tuple[Story, np.ndarray]:
     return run_virtual(main, start=SECOND)
 
 
+@pytest.mark.long
 def test_it_explores_a_room_drives_home_and_saves_the_map(tmp_path: Path):
     ends = []
 

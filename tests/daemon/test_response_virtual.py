@@ -60,6 +60,7 @@ def lap(kind: str, **tracker: float) -> tuple[np.ndarray, AxleResponse, list[Rea
     return run_virtual(main, start=SECOND)
 
 
+@pytest.mark.long
 def test_a_delay_that_nobody_configured_is_found_and_costs_little():
     away, axles, reasons = lap("lqr")
     assert np.sqrt(np.mean(away**2)) < 0.025
@@ -68,6 +69,7 @@ def test_a_delay_that_nobody_configured_is_found_and_costs_little():
     assert Reason.RESPONSE_DIFFERS not in reasons
 
 
+@pytest.mark.long
 def test_a_delay_that_is_configured_wrongly_is_reported():
     _, axles, reasons = lap("lqr", dead_time=0.0)
     assert reasons.count(Reason.RESPONSE_DIFFERS) >= 1
