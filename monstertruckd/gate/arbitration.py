@@ -207,7 +207,8 @@ class Sources:
 
     def hand_over(self, holder: Source, to: str, now: int) -> None:
         """``holder`` lets ``to`` drive; it must send a neutral request before it may drive itself."""
-        holder.held = True
+        # Since the tick that made it the holder it may have sent a newer request.
+        self._drive.get(holder.key, holder).held = True
         self._asking.pop(to, None)
         self._handed = to, now + HANDED, holder.rank
         self._min_rank = min(self._min_rank, PRIORITY[Role.STATION])

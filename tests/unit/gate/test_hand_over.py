@@ -64,6 +64,24 @@ def test_a_higher_priority_overrules_a_hand_over_and_a_lower_one_may_be_handed_t
     assert rig.out.mode is GateMode.ESTOPPED
 
 
+def test_a_former_driver_who_never_lets_go_does_not_take_it_back_even_where_a_request_came_before_the_next_tick():
+    pad = {"source": "pad", "role": Role.GAMEPAD}
+    rig = Rig().driving(**pad)
+    rig.order(Order.ASK, **BOB)
+    rig.drive(**BOB, speed=0.1)
+    rig.tick()
+    rig.drive(**pad, speed=0.1)
+    assert rig.order(Order.HAND_OVER, **pad, to="bob") is Reason.OK
+    rig.driver = {**pad, "speed": 0.1}
+    for _ in range(50 * 4):  # longer than others wait for bob
+        rig.drive(**BOB, speed=0.1)
+        rig.tick()
+        assert rig.out.holder == "bob"
+    rig.drive(**pad, speed=0.0)
+    rig.tick()
+    assert rig.out.holder == "pad", "who has let go has its priority again"
+
+
 @pytest.mark.parametrize(
     ("order", "who", "to", "refused"),
     [
