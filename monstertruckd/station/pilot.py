@@ -16,6 +16,7 @@ import numpy as np
 from pydantic import ValidationError
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
+from ruamel.yaml.events import AliasEvent
 
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import SECOND, Clock
@@ -62,7 +63,9 @@ SPACING: Final = 0.05
 SMOOTHING: Final = 0.12
 """Standard deviation of the weights with which a drawn line is smoothed, m: hands tremble."""
 SHORTEST: Final = 0.3
-"""Of a drawn path, m."""
+"""Of a drawn path, m..."""
+LONGEST: Final = 200.0
+"""...and the longest: it is computed at once, in about 2 ms."""
 
 
 class DelayWatch:
@@ -178,7 +181,7 @@ def _call(client: TruckClient, command: Asked) -> Coroutine[Any, Any, Any]:
         case DoMission():
             return _mission(client, command)
         case Track():
-            return client.path(drawn_path(command.points))
+            return _track(client, command)
         case _:
             return _other_call(client, command)
 
@@ -204,6 +207,11 @@ def _other_call(client: TruckClient, command: Asked) -> Coroutine[Any, Any, Any]
             raise AssertionError(command)
 
 
+async def _track(client: TruckClient, command: Track) -> Any:
+    path = drawn_path(command.points)
+    return await client.path(path)
+
+
 async def _mission(client: TruckClient, command: DoMission) -> dict[str, Any]:
     mission = None
     if command.order is MissionOrder.START:
@@ -215,9 +223,11 @@ def read_mission(text: str) -> Mission:
     """The mission of a file's text.
 
     Raises:
-        InputError: it is none; names the first mistake.
+        InputError: it is none, or has aliases, of which a few lines can mean gigabytes; names the first mistake.
     """
     try:
+        if any(isinstance(event, AliasEvent) for event in YAML(typ="safe", pure=True).parse(text)):
+            raise InputError("mission: has an alias (*name): expected every value written out")
         return Mission.model_validate_json(json.dumps(YAML(typ="safe", pure=True).load(text)))
     except ValidationError as error:
         detail = error.errors(include_url=False)[0]
@@ -230,7 +240,7 @@ def drawn_path(points: Sequence[tuple[float, float]]) -> Path:
     """A drawn line as a path, resampled to ``SPACING`` and smoothed, driven forward; m, in map.
 
     Raises:
-        InputError: it is too short to be driven.
+        InputError: it is too short to be driven, or too long.
     """
     line = np.array(points)
     steps = np.hypot(*np.diff(line, axis=0).T)
@@ -238,6 +248,8 @@ def drawn_path(points: Sequence[tuple[float, float]]) -> Path:
     along = np.concatenate(([0.0], np.cumsum(steps[steps > 1e-6])))
     if along[-1] < SHORTEST:
         raise InputError(f"path: {along[-1]:.2f} m are drawn, expected at least {SHORTEST} m")
+    if along[-1] > LONGEST:
+        raise InputError(f"path: {along[-1]:.4g} m are drawn, expected at most {LONGEST:g} m")
     places = np.linspace(0.0, along[-1], max(math.ceil(along[-1] / SPACING), 2) + 1)
     even = np.column_stack([np.interp(places, along, line[:, i]) for i in (0, 1)])
     # Mirrored at its ends, which stay where they are.

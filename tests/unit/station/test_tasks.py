@@ -21,7 +21,7 @@ from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.state import Grid, Odometry
 from monstertruckd.station import commands, downloads, server
 from monstertruckd.station.address import RobotAddress
-from monstertruckd.station.pilot import SHORTEST, drawn_path, read_mission
+from monstertruckd.station.pilot import LONGEST, SHORTEST, Pilot, drawn_path, read_mission
 from monstertruckd.station.replay import ReplayFeed
 from monstertruckd.station.server import Place, Station
 from monstertruckd.station.viewer import Viewer
@@ -58,6 +58,17 @@ def test_a_drawn_line_becomes_an_even_smooth_path_with_its_own_ends():
     assert poses[5, 2] == pytest.approx(0.0, abs=0.1)
     with pytest.raises(InputError, match=f"at least {SHORTEST}"):
         drawn_path([(0.0, 0.0), (0.1, 0.0)])
+    with pytest.raises(InputError, match=f"at most {LONGEST:g}"):
+        drawn_path([(0.0, 0.0), (1e12, 0.0)])
+
+
+async def test_a_path_that_is_refused_by_the_station_is_answered():
+    viewer = Viewer()
+    pilot = Pilot(RobotAddress("truck", "tcp/127.0.0.1:1"), "page", viewer, WallClock())
+    pilot._client = object()
+    pilot.ask(commands.parse(json.dumps({"do": "track", "id": 7, "points": [[0, 0], [0.1, 0]]})))
+    (answer,) = await shown(viewer)
+    assert (answer["kind"], answer["id"], answer["ok"]) == ("answer", 7, False)
 
 
 def test_a_mission_is_read_and_a_wrong_one_refused_by_field():
@@ -67,6 +78,7 @@ def test_a_mission_is_read_and_a_wrong_one_refused_by_field():
         ("version: 2\nname: round\nsteps: [{do: fly}]", "steps"),
         ("steps: [", "not valid YAML"),
         ("", "mission"),
+        ("a: &a [1, 1]\nsteps: [*a, *a]", "alias"),
     ):
         with pytest.raises(InputError, match=said):
             read_mission(text)
