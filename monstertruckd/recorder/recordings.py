@@ -94,7 +94,10 @@ class Recordings:
             for path in folder.glob("*.mcap") if folder.is_dir() else ():
                 if path.is_symlink() or not path.is_file() or not NAME.fullmatch(path.name):
                     continue
-                status = path.stat()
+                try:
+                    status = path.stat()
+                except FileNotFoundError:  # the quota of the logs, or another caller, took it
+                    continue
                 yield path, Recording(path.name, status.st_size, status.st_mtime, kind, path == current)
 
     def _find(self, payload: dict[str, Any]) -> tuple[Path, Recording]:
@@ -122,9 +125,12 @@ class Recordings:
 
             def read() -> tuple[str, int, int]:
                 path, row = self._find(payload)
-                with path.open("rb") as file:
-                    file.seek(offset)
-                    data = file.read(CHUNK)
+                try:
+                    with path.open("rb") as file:
+                        file.seek(min(offset, row.bytes))  # behind the end there is nothing
+                        data = file.read(CHUNK)
+                except OSError as error:
+                    raise InputError(f"recording {row.name}: cannot be read: {error.strerror}") from error
                 return base64.b64encode(data).decode(), len(data), row.bytes
 
             text, size, whole = await self._offload(read)
@@ -140,7 +146,10 @@ class Recordings:
             path, row = self._find(payload)
             if row.open:
                 raise BusyError(f"recording {row.name}: it is being written")
-            path.unlink()
+            try:
+                path.unlink()
+            except OSError as error:
+                raise InputError(f"recording {row.name}: cannot be deleted: {error.strerror}") from error
             return row
 
         row = await self._offload(delete)

@@ -12,7 +12,7 @@ from aiohttp import web
 
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import Clock
-from monstertruck_runtime.errors import NotFoundError, RequestRefusedError, TruckError
+from monstertruck_runtime.errors import InputError, NotFoundError, RequestRefusedError, TruckError
 from monstertruck_runtime.stations import own_source, tls_for
 from monstertruck_runtime.threads import in_thread
 from monstertruck_schemas.reasons import Reason
@@ -22,6 +22,8 @@ log = logging.getLogger(__name__)
 
 WAIT: Final = 5.0
 """Seconds in which the robot answers."""
+MOST_BYTES: Final = 2_000_000_000
+"""Of a recording that is fetched to be shown, which fills the station's temporary folder."""
 RANGE: Final = re.compile(r"bytes=(\d{1,15})-")
 
 
@@ -42,7 +44,7 @@ async def download(
         except TruckError as error:
             raise _failure(error) from error
         size = int(first["bytes"])
-        if 0 < size <= offset:
+        if 0 < offset >= size:
             raise web.HTTPRequestRangeNotSatisfiable(headers={"Content-Range": f"bytes */{size}"})
         response = web.StreamResponse(status=206 if offset else 200)
         response.content_type = "application/octet-stream"
@@ -54,7 +56,8 @@ async def download(
         if offset:
             response.headers["Content-Range"] = f"bytes {offset}-{size - 1}/{size}"
         await response.prepare(request)
-        await _stream(response, truck, name, first, offset, size)
+        if request.method != "HEAD":
+            await _stream(response, truck, name, first, offset, size)
         return response
 
 
@@ -64,23 +67,29 @@ async def fetch(
     """Fetch a recording into a file, going on with what is there of it already; ``progress`` gets the share.
 
     Raises:
+        InputError: it is larger than ``MOST_BYTES``.
         TruckError: the robot refuses, or is not there.
     """
     async with _session(address, user, clock) as truck:
         at = await in_thread(lambda: to.stat().st_size if to.exists() else 0)
         while True:
             answer = await truck.call("recording_read", {"name": name, "offset": at})
-            data = base64.b64decode(answer["data"])
-            await in_thread(partial(_append, to, data))
-            size, at = int(answer["bytes"]), at + len(data)
+            data, size = base64.b64decode(answer["data"]), int(answer["bytes"])
+            if size > MOST_BYTES:
+                raise InputError(f"{name}: {size / 1e6:.0f} MB: more than {MOST_BYTES / 1e6:.0f} MB to be shown")
+            await in_thread(partial(_put, to, at, data))
+            at += len(data)
             progress(at / max(size, 1))
             if not data or at >= size:
                 return
 
 
-def _append(file: Path, data: bytes) -> None:
-    with file.open("ab") as end:
-        end.write(data)
+def _put(file: Path, at: int, data: bytes) -> None:
+    """At its place: a write that was given up may still be under way."""
+    file.touch()
+    with file.open("r+b") as part:
+        part.seek(at)
+        part.write(data)
 
 
 def _session(address: RobotAddress, user: str, clock: Clock) -> TruckClient:
@@ -92,7 +101,10 @@ def _session(address: RobotAddress, user: str, clock: Clock) -> TruckClient:
 async def _stream(
     response: web.StreamResponse, truck: TruckClient, name: str, answer: dict[str, Any], at: int, size: int
 ) -> None:
-    """Pass chunks on until the size that was promised; one that fails breaks the connection, for the browser to see."""
+    """Pass chunks on until the size that was promised; one that fails breaks the connection, for the browser to see.
+
+    So does an empty one: the file became shorter, and asking on would never end.
+    """
     while True:
         data = base64.b64decode(answer["data"])[: size - at]
         await response.write(data)
@@ -100,6 +112,8 @@ async def _stream(
         if at >= size:
             return
         try:
+            if not data:
+                raise NotFoundError("the recording became shorter")
             answer = await truck.call("recording_read", {"name": name, "offset": at})
         except TruckError as error:
             log.warning("download of %s broken off at %d of %d bytes: %s", name, at, size, error)

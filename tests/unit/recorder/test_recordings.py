@@ -107,3 +107,25 @@ def test_a_recording_is_deleted_with_an_event_and_the_one_being_written_is_not(f
     _, events = asked(folder, scenario)
     assert events == ["run-000001-000.mcap (0.3 MB) deleted by ann"]
     assert not (folder / "run-000001-000.mcap").exists()
+
+
+def test_what_goes_wrong_with_a_file_is_said_and_no_bug(folder: Path, monkeypatch: pytest.MonkeyPatch):
+    def gone(path, *_, **__):
+        raise FileNotFoundError(2, "No such file or directory")
+
+    async def scenario(call, _):
+        beyond = await call("recording_read", name="run-000001-000.mcap", offset=10**24)
+        assert beyond == {"data": "", "bytes": 300_000}
+        with monkeypatch.context() as patch:
+            patch.setattr(Path, "open", gone)
+            patch.setattr(Path, "unlink", gone)
+            for what in ("recording_read", "recording_delete"):
+                with pytest.raises(InputError, match=r"run-000001-000\.mcap: cannot be .*: No such file"):
+                    await call(what, name="run-000001-000.mcap")
+        real, removed = Path.stat, folder / "run-000001-000.mcap"  # between the listing and the look at it
+        monkeypatch.setattr(Path, "is_file", lambda _: True)
+        monkeypatch.setattr(Path, "stat", lambda path, **more: gone(path) if path == removed else real(path, **more))
+        return {row["name"] for row in (await call("recordings"))["recordings"]}
+
+    left, _ = asked(folder, scenario)
+    assert left == {"run-000002-000.mcap", "blackbox-000001-estopped.mcap"}

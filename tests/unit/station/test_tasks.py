@@ -88,7 +88,10 @@ class Robot:
     """Client of a robot with one recording."""
 
     DATA = bytes(range(256)) * 4
+    LONGER = 0
+    """Bytes that the robot promises beyond those it has."""
     refuses: Exception | None = None
+    calls = 0
 
     def __init__(self, *args, **more):
         pass
@@ -104,8 +107,9 @@ class Robot:
             raise NotFoundError("none of this name")
         if self.refuses is not None:
             raise self.refuses
+        Robot.calls += 1
         data = self.DATA[payload["offset"] : payload["offset"] + 300]
-        return {"data": base64.b64encode(data).decode(), "bytes": len(self.DATA)}
+        return {"data": base64.b64encode(data).decode(), "bytes": len(self.DATA) + self.LONGER}
 
 
 async def test_a_recording_is_downloaded_gone_on_with_and_refused_as_the_robot_says(monkeypatch: pytest.MonkeyPatch):
@@ -131,6 +135,19 @@ async def test_a_recording_is_downloaded_gone_on_with_and_refused_as_the_robot_s
             assert (rest.status, rest.data) == (206, Robot.DATA[1000:])
             assert rest.headers["Content-Range"] == "bytes 1000-1023/1024"
             assert (await get(url, Range="bytes=5000-")).status == 416
+            with monkeypatch.context() as patch:
+                patch.setattr(Robot, "DATA", b"")
+                assert (await get(url, Range="bytes=5-")).status == 416
+            calls = Robot.calls
+            async with session.head(url) as reply:
+                assert (reply.status, reply.headers["Content-Length"]) == (200, "1024")
+            assert Robot.calls == calls + 1, "who asks for the head gets no chunk"
+            with monkeypatch.context() as patch:
+                patch.setattr(Robot, "LONGER", 10)
+                calls = Robot.calls
+                with pytest.raises(aiohttp.ClientPayloadError):
+                    await get(url)
+                assert Robot.calls == calls + 5, "a file that became shorter is not asked for without end"
             Robot.refuses = RequestRefusedError(Reason.BUSY, "bob downloads")
             assert (await get(url)).status == 429
             Robot.refuses = None
@@ -140,6 +157,33 @@ async def test_a_recording_is_downloaded_gone_on_with_and_refused_as_the_robot_s
             assert foreign.status == 403
     finally:
         await runner.cleanup()
+
+
+async def test_a_recording_is_fetched_at_its_places_and_a_huge_one_is_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(downloads, "TruckClient", Robot)
+    file, shares = tmp_path / "run.mcap", []
+
+    async def fetch():
+        address = RobotAddress("truck", "tcp/127.0.0.1:1")
+        await downloads.fetch(address, "run-000001-000.mcap", "", WallClock(), file, shares.append)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(downloads, "MOST_BYTES", 1000)
+        with pytest.raises(InputError, match="more than"):
+            await fetch()
+    assert not file.exists()
+    file.write_bytes(Robot.DATA[:300])
+    put = downloads._put
+
+    def late(*args):  # a write that was given up by another browser ends now
+        put(file, 300, Robot.DATA[300:600])
+        put(*args)
+
+    monkeypatch.setattr(downloads, "_put", late)
+    await fetch()
+    assert (file.read_bytes(), shares[-1]) == (Robot.DATA, 1.0)
 
 
 class Recorded:
