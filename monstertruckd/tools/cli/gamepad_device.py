@@ -20,6 +20,8 @@ from monstertruckd.tools.cli.terminal import when_readable
 FOLDER: Final = Path("/dev/input")
 LOOK: Final = 1.0
 """Seconds between two looks for a gamepad."""
+STOPPING: Final = frozenset({"stop", "estop"})
+"""Actions that count however late they are read."""
 EV_FF: Final = 0x15
 FF_RUMBLE: Final = 0x50
 EVIOCSFF: Final = 0x4030_4580
@@ -74,9 +76,9 @@ class PadLink:
             os.write(self._file, EVENT.pack(0, 0, EV_FF, self._effect, 1))
 
     def flush(self) -> None:
-        """Throw away what was not read in time, and let go."""
-        if self.pad is not None:
-            self._read(act=False)
+        """Throw away what was not read in time, but for orders to stop, and let go."""
+        while self.pad is not None and self._read(act=False):
+            pass
         if self.pad is not None:
             self.pad.release()
 
@@ -96,21 +98,23 @@ class PadLink:
                 return
             os.close(file)
 
-    def _read(self, *, act: bool = True) -> None:
+    def _read(self, *, act: bool = True) -> bool:
+        """Take what waits, up to a few records; False if nothing did."""
         assert self._file is not None
         assert self.pad is not None
         try:
             data = os.read(self._file, 64 * EVENT.size)
         except BlockingIOError:
-            return
+            return False
         except OSError:  # it was unplugged
             data = b""
         if not data:
             self._close()
-            return
+            return False
         for action in self.pad.feed(data):
-            if act:
+            if act or action in STOPPING:
                 self._act(action)
+        return True
 
     def _close(self) -> None:
         file, self._file, self.pad = self._file, None, None

@@ -153,6 +153,13 @@ async def test_a_gamepad_is_found_read_and_found_again(tmp_path: Path, monkeypat
         assert link.pad.held
         link.rumble(1.0, 0.5)  # a pipe cannot, and nothing comes of it
         assert actions == ["arm"]
+        # A pause of the program: far more waits than one read takes, orders to arm and to stop last.
+        orders = key("start", 0) + key("start") + key("east") + key("right_shoulder", 2)
+        os.write(far, axis("left_y", -900) * 200 + orders)
+        link.flush()
+        await asyncio.sleep(0.03)
+        assert actions == ["arm", "estop"], "an emergency stop counts, however late"
+        assert not link.pad.held
 
         def gone(*_):
             raise OSError(errno.ENODEV, "No such device")
