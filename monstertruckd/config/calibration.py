@@ -305,10 +305,7 @@ def with_values(config: C, results: Iterable[Result], source: Path | str) -> C:
         ConfigError: a value that no wizard may set, or one that the configuration refuses.
     """
     data = config.model_dump()
-    for result in results:
-        for estimate in result.estimates:
-            if estimate.key is not None:
-                _set(data, estimate, result, source)
+    put_values(data, results, source)
     try:
         return type(config).model_validate(data)
     except ValidationError as error:
@@ -316,6 +313,18 @@ def with_values(config: C, results: Iterable[Result], source: Path | str) -> C:
         where = ".".join(str(part) for part in detail["loc"])
         msg = f"{source}: {where}: {detail['msg'].removeprefix('Value error, ')}"
         raise ConfigError(msg) from error
+
+
+def put_values(data: dict[str, Any], results: Iterable[Result], source: Path | str) -> None:
+    """Put the values of ``results`` into a configuration's plain data, which is not validated.
+
+    Raises:
+        ConfigError: a value that no wizard may set.
+    """
+    for result in results:
+        for estimate in result.estimates:
+            if estimate.key is not None:
+                _set(data, estimate, result, source)
 
 
 def _set(data: dict[str, Any], estimate: Estimate, result: Result, source: Path | str) -> None:

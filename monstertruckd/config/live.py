@@ -69,14 +69,10 @@ def with_settings(config: T, values: Mapping[str, Any]) -> T:
     """
     known = {setting.key for setting in live_settings(config)}
     data = config.model_dump()
-    for key, value in values.items():
+    for key in values:
         if key not in known:
             raise InputError(f"{key}: cannot be changed while the robot runs; there are {', '.join(sorted(known))}")
-        section = data
-        *way, last = key.split(".")
-        for part in way:
-            section = section[part]
-        section[last] = value
+    put_settings(data, values)
     try:
         return type(config).model_validate(data)
     except ValidationError as error:
@@ -84,6 +80,16 @@ def with_settings(config: T, values: Mapping[str, Any]) -> T:
         where = ".".join(map(str, detail["loc"]))
         text = detail["msg"].removeprefix("Value error, ")
         raise InputError(f"{where}: {text}" if where else text) from error
+
+
+def put_settings(data: dict[str, Any], values: Mapping[str, Any]) -> None:
+    """Put live settings, by dotted key, into a configuration's plain data, which is not validated."""
+    for key, value in values.items():
+        section = data
+        *way, last = key.split(".")
+        for part in way:
+            section = section[part]
+        section[last] = value
 
 
 class SavedSettings:

@@ -7,7 +7,7 @@ YAML is read as version 1.2: ``true`` and ``false`` are the only booleans, ``1e-
 import difflib
 import json
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
@@ -18,12 +18,12 @@ from ruamel.yaml.error import YAMLError
 from ruamel.yaml.nodes import Node, ScalarNode, SequenceNode
 
 from monstertruck_runtime.endpoints import emulated_ports
-from monstertruck_runtime.errors import ConfigError, InputError
+from monstertruck_runtime.errors import ConfigError
 from monstertruck_runtime.plugins import kind_of, models_in
 from monstertruck_schemas.base import Schema
-from monstertruckd.config.calibration import CalibrationStore, with_values
+from monstertruckd.config.calibration import CalibrationStore, Result, WizardName, put_values
 from monstertruckd.config.edit import YamlText, node_kind, reader
-from monstertruckd.config.live import SavedSettings, with_settings
+from monstertruckd.config.live import SavedSettings, put_settings
 from monstertruckd.config.migrate import OLDEST, VERSION, bring_up_to_date
 from monstertruckd.config.truck import ROBOT, TruckConfig
 
@@ -77,7 +77,7 @@ def load_truck(path: Path) -> tuple[TruckConfig, Tree]:
     Raises:
         ConfigError: one line per mistake, in the file, in the saved settings or in the calibration.
     """
-    return calibrated(*adjusted(*load_config(path, TruckConfig)))
+    return calibrated(*load_config(path, TruckConfig))
 
 
 def load_config(path: Path, model: type[S]) -> tuple[S, Tree]:
@@ -98,42 +98,48 @@ def resolved(config: Schema) -> dict[str, Any]:
     return dumped
 
 
-def adjusted(config: T, tree: Tree) -> tuple[T, Tree]:
-    """The configuration with the live settings that were saved while the robot ran, and each value's origin.
+def calibrated(config: T, tree: Tree) -> tuple[T, Tree]:
+    """The configuration with the settings that were saved while the robot ran and the newest calibration, and the tree.
+
+    The tree has each value's origin. Both are validated together, as they were when they were saved: what bounds a
+    setting may be a calibrated value.
 
     Raises:
-        ConfigError: their file is damaged, or the configuration refuses a value.
+        ConfigError: one of their files is damaged, or of another truck, or the configuration refuses a value.
     """
     saved = SavedSettings.of(config)
-    rows = saved.values(config)
-    if not rows:
-        return config, tree
-    origins = tree.origins | {tuple(key.split(".")): Origin(saved.path, line) for key, (_, line) in rows.items()}
-    try:
-        changed = with_settings(config, {key: value for key, (value, _) in rows.items()})
-    except InputError as error:
-        raise ConfigError(f"{saved.path}: {error}") from error
-    return changed, Tree(tree.data, origins, tree.files, tree.calibration)
-
-
-def calibrated(config: T, tree: Tree) -> tuple[T, Tree]:
-    """The configuration with the values of the newest calibration, and the tree with each value's origin.
-
-    Raises:
-        ConfigError: the file is damaged, of another truck, or its values do not fit the configuration.
-    """
+    settings = saved.values(config)
     store = CalibrationStore(config.calibration_folder, config.robot)
     path = store.newest()
-    if path is None:
+    if path is None and not settings:
         return config, tree
-    file = store.load(path)
-    lines = load_tree(path).origins
-    origins = dict(tree.origins)
-    for wizard, result in file.results.items():
-        for index, estimate in enumerate(result.estimates):
-            if estimate.key is not None:
-                origins[tuple(estimate.key.split("."))] = lines["results", wizard, "estimates", index, "value"]
-    return with_values(config, file.results.values(), path), Tree(tree.data, origins, tree.files, calibration=path)
+    data, origins, sources = config.model_dump(), dict(tree.origins), []
+    if settings:
+        put_settings(data, {key: value for key, (value, _) in settings.items()})
+        origins |= {tuple(key.split(".")): Origin(saved.path, line) for key, (_, line) in settings.items()}
+        sources.append(str(saved.path))
+    if path is not None:
+        results = store.load(path).results
+        put_values(data, results.values(), path)
+        origins |= _calibrated_origins(results, load_tree(path).origins)
+        sources.append(str(path))
+    try:
+        changed = type(config).model_validate(data)
+    except ValidationError as error:
+        detail = error.errors(include_url=False)[0]
+        where = ".".join(map(str, detail["loc"]))
+        text = detail["msg"].removeprefix("Value error, ")
+        raise ConfigError(f"{' with '.join(sources)}: {where}{': ' if where else ''}{text}") from error
+    return changed, Tree(tree.data, origins, tree.files, calibration=path)
+
+
+def _calibrated_origins(results: Mapping[WizardName, Result], lines: Mapping[Key, Origin]) -> dict[Key, Origin]:
+    return {
+        tuple(estimate.key.split(".")): lines["results", wizard, "estimates", index, "value"]
+        for wizard, result in results.items()
+        for index, estimate in enumerate(result.estimates)
+        if estimate.key is not None
+    }
 
 
 # YAML

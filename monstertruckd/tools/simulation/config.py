@@ -10,7 +10,7 @@ from monstertruck_drivers.config import Monitors
 from monstertruck_runtime.errors import ConfigError
 from monstertruck_sim.computer import hangs_by_hub
 from monstertruck_sim.config import SimConfig
-from monstertruckd.config.load import Tree, adjusted, calibrated, load_tree, validated
+from monstertruckd.config.load import Tree, calibrated, load_tree, validated
 from monstertruckd.config.truck import TruckConfig
 
 DEADMAN_LINE: Final[Mapping[str, Any]] = {
@@ -59,7 +59,7 @@ def load_robot(path: Path) -> tuple[TruckConfig, Tree]:
     """
     tree = load_tree(path)
     model = TruckConfig if tree.data.get("sim") is None else SimulatedTruckConfig
-    return calibrated(*adjusted(*validated(tree, path, model)))
+    return calibrated(*validated(tree, path, model))
 
 
 def needs_computer(config: SimulatedTruckConfig) -> bool:

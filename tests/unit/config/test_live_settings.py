@@ -12,6 +12,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.roles import AccessRole
 from monstertruckd.bus.access import EVERYTHING, Grant, Sender
 from monstertruckd.bus.rpc import Rpc
+from monstertruckd.config.calibration import CalibrationStore, Estimate, Result
 from monstertruckd.config.live import SavedSettings, live_settings, with_settings
 from monstertruckd.config.live_rpc import LiveConfig
 from monstertruckd.config.load import load_truck
@@ -107,6 +108,30 @@ def test_what_is_saved_counts_at_the_next_start_and_names_its_line(tmp_path: Pat
     assert after.gate.speed == before.gate.speed
     assert (after.gate.tilt.stop, after.gate.tilt.slow, after.gate.reverse_speed) == (0.3, 0.2, 0.1)
     assert str(tree.origins["gate", "tilt", "stop"]) == f"{saved.path}:4"
+
+
+def test_what_is_saved_on_a_calibrated_robot_counts_at_the_next_start(tmp_path: Path):
+    """The motor's greatest speed over ground, which bounds gate.speed, follows from a calibrated ratio."""
+    file = tmp_path / "robot.yaml"
+    file.write_text(f"include: {ROOT / 'configs/demo.yaml'}\nversion: 2\nstate_directory: {tmp_path}\n")
+    plain = load_truck(file)[0]
+    assert plain.body_limits.motor_speed < 0.221, "without calibration the setting below is refused"
+    store = CalibrationStore(plain.calibration_folder, plain.robot)
+
+    def calibrate(ratio: float) -> None:
+        estimate = Estimate(name="drive_ratio", value=ratio, samples=4, meaning="test", key="geometry.drive_ratio")
+        store.save(Result(wizard="drive", measured="taped", estimates=(estimate,)), 1_795_262_400_000_000_000)
+
+    calibrate(plain.geometry.drive_ratio * 0.99)
+    Robot(load_truck(file)[0]).set({"gate.speed": 0.221}, save=True)
+    after, tree = load_truck(file)
+    assert after.gate.speed == 0.221
+    assert after.geometry.drive_ratio == plain.geometry.drive_ratio * 0.99
+    assert str(tree.origins["gate", "speed"]) == f"{SavedSettings.of(plain).path}:3"
+    assert tree.calibration == store.newest() == tree.origins["geometry", "drive_ratio"].file
+    calibrate(plain.geometry.drive_ratio)
+    with pytest.raises(ConfigError, match=r"settings-truck\.yaml with .*\.json: gate\.speed 0\.221 m/s: at most"):
+        load_truck(file)
 
 
 def test_what_the_next_start_would_refuse_is_not_saved(config: TruckConfig):
