@@ -63,6 +63,7 @@ class LiveConfig:
             if save:
                 await self._offload(lambda: self._keep(values))
             before = {setting.key: setting.value for setting in live_settings(self.config)}
+            weaker = [text for text in changed.weakened() if text not in self.config.weakened()]
             self.config = changed
             self._apply(changed)
         for key, value in values.items():
@@ -70,7 +71,7 @@ class LiveConfig:
             self._events(
                 Reason.SETTING_CHANGED, Severity.INFO, "settings", text, key=key, value=value, by=by, saved=save
             )
-        return {"values": values, "file": str(self._saved.path) if save else None}
+        return {"values": values, "file": str(self._saved.path) if save else None, "weakened": weaker}
 
     def _keep(self, values: dict[str, Value]) -> None:
         """Save settings, unless the next start would refuse them without those that are not saved."""

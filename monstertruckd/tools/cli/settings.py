@@ -9,7 +9,7 @@ from monstertruck_runtime.clock import Clock, run_wall
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruck_runtime.errors import NotFoundError
 from monstertruckd.tools.cli.options import EndpointOption, RobotOption
-from monstertruckd.tools.cli.output import JsonOption, print_json, print_table
+from monstertruckd.tools.cli.output import JsonOption, print_json, print_table, remark
 
 
 def get(
@@ -55,6 +55,8 @@ def set_value(
         print_json(answer)
     else:
         print(f"{key} is {value}" + (f", saved in {answer['file']}" if save else " until the daemon ends"))
+    for text in answer["weakened"]:
+        remark(f"less safe than by default: {text}")
 
 
 def _call(robot: str, endpoint: str, name: str, payload: dict[str, Any]) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from monstertruckd.config.live import SavedSettings, live_settings, with_setting
 from monstertruckd.config.live_rpc import LiveConfig
 from monstertruckd.config.load import load_truck
 from monstertruckd.config.truck import TruckConfig
+from monstertruckd.tools.cli import settings
 from tests.unit.gate.rig import Rig
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -91,6 +92,19 @@ def test_a_change_is_applied_as_a_whole_and_said_with_who_made_it(config: TruckC
         Reason.SETTING_CHANGED, Severity.INFO, f"gate.speed: {config.gate.speed} to 0.12 by ann@lab",
     )  # fmt: skip
     assert not SavedSettings.of(config).path.exists()
+
+
+def test_who_makes_the_robot_less_safe_than_by_default_is_told(
+    config: TruckConfig, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    robot = Robot(config)
+    assert robot.set({"gate.tilt.stop": 0.3})["weakened"] == []
+    monkeypatch.setattr(settings, "_call", lambda robot_name, endpoint, name, payload: robot.set(**payload))
+    settings.set_value("gate.tilt.stop", "0.4")
+    said = capsys.readouterr()
+    assert said.out == "gate.tilt.stop is 0.4 until the daemon ends\n"
+    assert "less safe than by default: gate.tilt.stop 0.4, default 0.35" in said.err
+    assert robot.set({"gate.speed": 0.1, "gate.reverse_speed": 0.1})["weakened"] == [], "only what is new"
 
 
 def test_what_is_saved_counts_at_the_next_start_and_names_its_line(tmp_path: Path):
