@@ -189,12 +189,13 @@ class RobotFeed:
                 name, endpoint = self.address.name, self.address.endpoint
                 async with TruckClient(name, endpoint, clock=self._clock, timeout=RETRY) as client:
                     self.client = client
-                    await self._follow(client)
+                    try:
+                        await self._follow(client)
+                    finally:
+                        self.client = None  # before the session closes, which takes a while
             except (InputError, NotFoundError, NotPermittedError) as error:
                 self._set_link(None, str(error))
                 await self._clock.sleep(RETRY)
-            finally:
-                self.client = None
 
     async def _follow(self, client: TruckClient) -> None:
         jobs = [asyncio.create_task(job) for job in (self._ask(client), self._sample(client))]

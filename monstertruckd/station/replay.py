@@ -62,11 +62,7 @@ class RecordedTopic:
         """What came since the last time, up to ``at``; what cannot be decoded is left out."""
         end = bisect.bisect_right(self.times, at)
         begin, self.index = self.index, end
-        for row in self.messages[begin:end]:
-            try:
-                yield row.decode()
-            except TruckError as error:
-                log.debug("message left out: %s", error)
+        yield from _decoded(self.messages[begin:end])
 
     def newest(self, at: int) -> Message | None:
         """The newest of these, or None if none came."""
@@ -75,6 +71,15 @@ class RecordedTopic:
             return None
         self.index = end - 1
         return next(self.up_to(at), None)
+
+
+def _decoded(rows: Iterable[Recorded]) -> Iterator[Message]:
+    """Messages; what cannot be decoded is left out."""
+    for row in rows:
+        try:
+            yield row.decode()
+        except TruckError as error:
+            log.debug("message left out: %s", error)
 
 
 class ReplayFeed:
@@ -167,8 +172,8 @@ class ReplayFeed:
 
     def _events(self) -> Iterator[Frame]:
         track = self._tracks[topics.EVENT.name]
-        for row in track.messages[max(track.index - EVENTS, 0) : track.index]:
-            yield frames.message("event", row.decode())
+        for event in _decoded(track.messages[max(track.index - EVENTS, 0) : track.index]):
+            yield frames.message("event", event)
 
     # Time
 

@@ -9,6 +9,7 @@ import pytest
 
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import WallClock
+from monstertruck_runtime.errors import NotPermittedError
 from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.topics import GATE, POSE, Writer
 from monstertruckd.station import fleet
@@ -80,6 +81,42 @@ async def test_every_robot_has_a_row_and_one_that_is_gone_keeps_its_last_place(m
             for job in jobs:
                 job.cancel()
             await asyncio.gather(*jobs, return_exceptions=True)
+
+
+async def test_no_session_that_closes_is_offered(monkeypatch: pytest.MonkeyPatch):
+    """A look at the fleet in that moment would end the looking for good."""
+    offered = []
+
+    class Client:
+        def __init__(self, *_, **__):
+            pass
+
+        async def __aenter__(self):
+            return self
+
+        async def __aexit__(self, *_):
+            offered.append(feed.client)
+
+        async def get_retained(self, _):
+            raise NotPermittedError("not for you")
+
+        call = get_retained
+
+        def subscribe(self, *_):
+            raise NotPermittedError("not for you")
+
+    monkeypatch.setattr("monstertruckd.station.feed.TruckClient", Client)
+    feed = RobotFeed(RobotAddress("ann", "tcp/127.0.0.1:1"), WallClock())
+    feed.attach(Viewer())
+    running = asyncio.create_task(feed.run())
+    try:
+        async with asyncio.timeout(3):
+            while not offered:
+                await asyncio.sleep(0.01)
+    finally:
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
+    assert offered == [None]
 
 
 async def test_a_watched_topic_is_decoded_when_it_is_asked_for(monkeypatch: pytest.MonkeyPatch):

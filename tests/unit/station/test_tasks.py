@@ -267,6 +267,17 @@ async def test_a_recording_is_played_paused_and_gone_through_by_its_time_bar():
     feed.detach(viewer)
 
 
+async def test_a_damaged_event_of_a_recording_is_left_out():
+    def damaged():
+        raise InputError("cut off")
+
+    feed, viewer = ReplayFeed("truck run-1", Path("run-1.mcap"), RecordedDrive, WallClock()), Viewer()
+    feed._tracks[topics.EVENT.name].messages[1].decode = damaged
+    feed.control(2.5, None, None)
+    feed.attach(viewer)
+    assert [frame["m"]["text"] for frame in of(await shown(viewer), "event")] == ["at 0", "at 2"]
+
+
 async def test_a_recording_plays_by_itself_at_its_rate_to_its_end():
     feed, viewer = ReplayFeed("truck run-1", Path("run-1.mcap"), RecordedDrive, WallClock()), Viewer()
     feed.control(None, True, 20.0)
