@@ -13,9 +13,9 @@
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Literal, TypeVar
+from typing import Any, Final, Literal, Self, TypeVar
 
-from pydantic import Field, ValidationError
+from pydantic import Field, ValidationError, model_validator
 
 from monstertruck_runtime.errors import InputError, NotFoundError
 from monstertruck_runtime.small_files import replace_file
@@ -75,6 +75,12 @@ class CertificateRegister(Schema):
     """Where the robot keeps its files."""
     stations: dict[OwnerName, CertifiedStation] = {}
     router: TrustedRouter | None = None
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.router is not None and self.router.name in self.stations:
+            raise ValueError(f"{self.router.name}: is the fleet's router: expected another name for a station")
+        return self
 
     def of_role(self, *roles: AccessRole) -> tuple[str, ...]:
         """Names with one of these roles."""
@@ -303,4 +309,5 @@ def _validated(model: type[S], data: Any, where: Path | str) -> S:
         return model.model_validate(data, strict=False)
     except ValidationError as error:
         detail = error.errors(include_url=False)[0]
-        raise InputError(f"{where}: {'.'.join(map(str, detail['loc']))}: {detail['msg']}") from None
+        place, text = ".".join(map(str, detail["loc"])), detail["msg"].removeprefix("Value error, ")
+        raise InputError(f"{where}: {place}{': ' if place else ''}{text}") from None
