@@ -3,6 +3,7 @@
 import asyncio
 import base64
 import math
+import threading
 from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,7 +27,7 @@ from monstertruck_runtime.threads import Offload
 from monstertruck_schemas.body import LensConfig, Mount
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.health import LocalisationStatus, SlamHealth
-from monstertruck_schemas.points import PointOrder, PointRequest, PointsOfInterest
+from monstertruck_schemas.points import PointOfInterest, PointOrder, PointRequest, PointsOfInterest
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.sensor import Attitude, CompressedImage
@@ -145,6 +146,9 @@ class PointService:
         self._looked: tuple[Vector, int] | None = None
         """Where pictures were read last, and how many."""
         self._unreadable = False
+        self._writing = threading.Lock()
+        self._unanchored: dict[str, int] = {}
+        """Marks whose place in the map is known, but not yet where the robot was then by the map of today: instants."""
 
     async def run(self, ready: Ready) -> None:
         """Serve until cancelled, then save."""
@@ -156,7 +160,9 @@ class PointService:
                 tasks.create_task(self._keep())
                 ready()
         finally:
-            self._write(self._map.pictured())
+            for name in self._dirty:
+                self._map.refresh(name, self._bases)
+            await self._save()
 
     # Pictures
 
@@ -259,8 +265,7 @@ class PointService:
                 self._publish(now)
             if self._unsaved and now - saved >= SAVE_PERIOD:
                 saved, self._unsaved = now, False
-                rows = self._map.pictured()
-                await self._offload(lambda rows=rows: self._write(rows))  # type: ignore[misc]
+                await self._save()
 
     def _correct(self) -> None:
         """What the mapper has moved since moves its points."""
@@ -271,6 +276,9 @@ class PointService:
             return
         before, self._bases = self._bases, bases
         new = {at for at, base in bases.items() if at not in before or _apart(before[at], base)}
+        for name in [name for name, at in self._unanchored.items() if at in bases]:
+            del self._unanchored[name]
+            self._map.anchor(name, bases[self._map.points[name].sightings[0].stamp])
         if new:
             points = self._map.points.values()
             self._dirty |= {p.name: None for p in points if any(one.stamp in new for one in p.sightings)}
@@ -294,16 +302,23 @@ class PointService:
         try:
             self._map.load(await self._offload(lambda: files.load(folder)))
         except InputError as error:
-            self._events(Reason.BAD_INPUT, Severity.WARNING, self.name, str(error))
+            self._events(Reason.BAD_INPUT, Severity.WARNING, self.name, f"{error}; points are not saved over it")
+            if folder == self._folders.save:
+                self._folders = PointFolders(folder)
         self._dirty = dict.fromkeys(self._map.points)
 
-    def _write(self, rows: list[Any]) -> None:
-        if self._folders.save is None or not (rows or (self._folders.save / files.FILE).exists()):
+    async def _save(self) -> None:
+        folder, rows = self._folders.save, self._map.pictured()
+        if folder is None or not (rows or (folder / files.FILE).exists()):
             return
         try:
-            files.save(self._folders.save, rows)
+            await self._offload(lambda: self._write(folder, rows))
         except OSError as error:
             self._events(Reason.BAD_INPUT, Severity.WARNING, self.name, f"points not saved: {error}")
+
+    def _write(self, folder: Path, rows: list[tuple[PointOfInterest, bytes]]) -> None:
+        with self._writing:  # at the end one may be under way
+            files.save(folder, rows)
 
     # Requests
 
@@ -321,6 +336,7 @@ class PointService:
         if request.order is PointOrder.REMOVE:
             if self._map.points.pop(request.name, None) is None:
                 raise NotFoundError(f"no point of interest {request.name!r}")
+            self._unanchored.pop(request.name, None)
             text = f"{request.name} removed by {request.source}"
         else:
             place = self._mark(request)
@@ -349,6 +365,9 @@ class PointService:
         )
         # A place far from here moves with what of the map is near it.
         stamp, base = (here.stamp, here.pose) if request.x is None else nearest(self._trail, place)
+        self._unanchored.pop(request.name, None)
+        if request.x is not None and self._ask is not None and stamp not in self._bases:
+            self._unanchored[request.name] = stamp
         base = self._bases.get(stamp, base)
         self._map.mark(request.name, stamp, base, place, here.covariance)
         return place

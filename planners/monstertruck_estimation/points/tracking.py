@@ -43,6 +43,8 @@ UNKNOWN_HEADING: Final = 2.0
 """Else, rad."""
 MARK_ERROR: Final = 0.01
 """Of where an operator marks, m and rad."""
+LOADED: Final = 2
+"""Sightings that a point of a saved map is worth: one that disagrees changes nothing yet."""
 FAR: Final = 3.5
 """Standard deviations at which two sightings disagree."""
 
@@ -63,6 +65,8 @@ class PointSighting:
     """Row-major (3, 3), covariance of x, y, yaw in base."""
     pixels: float = 0.0
     """Side of the tag."""
+    worth: int = 1
+    """Sightings that it stands for."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +122,8 @@ class PointMap:
         known = self.points.get(name)
         if known is None and len(self.points) >= self.config.most:
             return False
-        if known is not None and stamp - known.last < APART:
+        # What a saved map says was on the clock of another start.
+        if known is not None and abs(stamp - known.last) < APART:
             return False
         new = sighting(reading, self.mount, stamp, base, covariance, rate)
         before = known is not None and self.is_known(known)
@@ -149,9 +154,21 @@ class PointMap:
             covariance: of the robot's pose, (3, 3).
         """
         x, y, yaw = (float(v) for v in _between(base, place))
-        spread = tuple(float(v) for v in (covariance + np.eye(3) * MARK_ERROR**2).ravel())
+        into = _into_base(base)
+        spread = tuple(float(v) for v in (into @ covariance @ into.T + np.eye(3) * MARK_ERROR**2).ravel())
         one = PointSighting(stamp, base, (x, y, 0.0), yaw, spread)
         self.points[name] = Tracked(name, PointKind.MARK, None, None, (one,), 0, stamp, stamp)
+
+    def anchor(self, name: str, base: Vector) -> None:
+        """Leave a mark where it is in the map, for the robot was at ``base`` at its instant by the map of today."""
+        point = self.points[name]
+        (old,) = point.sightings
+        here = compose(np.array(old.base), np.array((*old.place[:2], old.yaw)))
+        x, y, yaw = _between(base, (float(here[0]), float(here[1]), float(here[2])))
+        turn = _into_base(base) @ _into_base(old.base).T
+        spread = turn @ np.array(old.spread).reshape(3, 3) @ turn.T
+        new = replace(old, base=base, place=(x, y, old.place[2]), yaw=yaw, spread=tuple(spread.ravel().tolist()))
+        self.points[name] = replace(point, sightings=(new,))
 
     def stamps(self) -> tuple[int, ...]:
         """Instants at which it matters where the robot was."""
@@ -173,7 +190,8 @@ class PointMap:
         """Take over points of a saved map, with their pictures."""
         for point, picture in points:
             spread = tuple(float(v) for v in point.covariance)
-            one = PointSighting(0, (0.0, 0.0, 0.0), (point.x, point.y, point.z), point.yaw, spread)
+            place = (point.x, point.y, point.z)
+            one = PointSighting(0, (0.0, 0.0, 0.0), place, point.yaw, spread, worth=LOADED)
             self.points[point.name] = Tracked(
                 point.name, point.kind, point.tag, point.size, (one,), max(point.sightings, self.config.sightings),
                 point.first, point.last, picture, 40.0 if picture else 0.0,
@@ -224,9 +242,7 @@ def sighting(
     spread = np.zeros((3, 3))
     spread[:2, :2] = spin @ np.diag((along**2 + SIDE_ERROR**2, across**2)) @ spin.T
     spread[2, 2] = (HEADING_ERROR if sure else UNKNOWN_HEADING) ** 2
-    c, s = math.cos(base[2]), math.sin(base[2])
-    # The pose's own covariance, taken into base.
-    into = np.array(((c, s, 0.0), (-s, c, 0.0), (0.0, 0.0, 1.0)))
+    into = _into_base(base)
     by_turn = np.eye(3)
     by_turn[0, 2], by_turn[1, 2] = -place[1], place[0]
     spread += by_turn @ into @ covariance @ into.T @ by_turn.T
@@ -257,7 +273,7 @@ def fused(sightings: Sequence[PointSighting], bases: Bases, config: PointsConfig
     of how many places agree.
     """
     places, spreads = in_map(sightings, bases)
-    inside = _agreeing(places, spreads, config)
+    inside = _agreeing(places, spreads, _worth(sightings), config)
     weights = np.array([np.linalg.inv(spread[:2, :2]) for spread in spreads[inside]])
     total = np.linalg.inv(weights.sum(axis=0))
     mean = total @ np.einsum("nij,nj->i", weights, places[inside, :2])
@@ -280,30 +296,43 @@ def in_map(sightings: Sequence[PointSighting], bases: Bases) -> tuple[Array, Arr
     return compose(base, local), turned @ spreads @ turned.transpose(0, 2, 1)
 
 
-def _agreeing(places: Array, spreads: Array, config: PointsConfig) -> NDArray[np.intp]:
+def _worth(sightings: Sequence[PointSighting]) -> NDArray[np.int64]:
+    return np.array([one.worth for one in sightings])
+
+
+def _agreeing(places: Array, spreads: Array, worth: NDArray[np.int64], config: PointsConfig) -> NDArray[np.intp]:
     """Indices of the largest group that agrees with one of them, of equal ones the newest."""
     apart = places[:, None, :2] - places[None, :, :2]
     both = spreads[:, None, :2, :2] + spreads[None, :, :2, :2]
     far = np.einsum("ijk,ijkl,ijl->ij", apart, np.linalg.inv(both), apart)
     near = (np.hypot(apart[..., 0], apart[..., 1]) < config.agree) | (far < FAR**2)
-    votes = near.sum(axis=1)
+    votes = near @ worth
     best = len(votes) - 1 - int(np.argmax(votes[::-1]))
     return np.flatnonzero(near[best])
 
 
 def _consensus(sightings: Sequence[PointSighting], bases: Bases, config: PointsConfig) -> int:
-    return len(_agreeing(*in_map(sightings, bases), config))
+    worth = _worth(sightings)
+    return int(worth[_agreeing(*in_map(sightings, bases), worth, config)].sum())
 
 
 def _added(sightings: tuple[PointSighting, ...], new: PointSighting) -> tuple[PointSighting, ...]:
     """With the new one; of one place the better one stays, and of too many the oldest but the first goes."""
     for i, old in enumerate(sightings):
+        if old.worth > 1:  # of a saved map: from where it was seen is not known
+            continue
         moved = math.dist(old.base[:2], new.base[:2])
         if moved < SAME_PLACE and abs(math.remainder(old.base[2] - new.base[2], math.tau)) < SAME_TURN:
             better = new if new.spread[0] + new.spread[4] < old.spread[0] + old.spread[4] else old
             return (*sightings[:i], better, *sightings[i + 1 :])
     kept = (*sightings, new)
     return kept if len(kept) <= KEPT else (kept[0], *kept[2:])
+
+
+def _into_base(base: Vector) -> Array:
+    """Turns (x, y, yaw) of map into base's axes, (3, 3)."""
+    c, s = math.cos(base[2]), math.sin(base[2])
+    return np.array(((c, s, 0.0), (-s, c, 0.0), (0.0, 0.0, 1.0)))
 
 
 def _between(base: Vector, place: Vector) -> tuple[float, float, float]:

@@ -165,3 +165,57 @@ def test_places_are_marked_moved_with_the_map_and_removed(tmp_path):
     assert [point.name for point in rig.out[-1].points] == ["there"]
     again = told(lambda rig: rig.drive(1.2, show=b""), None, load=tmp_path)
     assert [point.name for point in again.out[-1].points] == ["there"]
+
+
+def test_a_place_far_from_here_is_marked_where_it_is_in_the_map_of_today(tmp_path):
+    """The robot passed it before a loop was closed, by which the mapper has moved where it was then."""
+    answers = {}
+
+    async def story(rig: Rig) -> None:
+        rig.speed = 1.0
+        await rig.drive(2.0, show=b"")
+        await rig.ask(PointOrder.MARK, "there", x=1.0, y=3.0, yaw=1.0)
+        answers["now"] = dict.fromkeys(rig.service._map.stamps(), (1.0, 0.5, 0.2))
+        await rig.drive(1.5, show=b"")
+        (point,) = rig.out[-1].points
+        assert (point.x, point.y, point.yaw) == pytest.approx((1.0, 3.0, 1.0))
+        answers["now"] = dict.fromkeys(rig.service._map.stamps(), (1.0, 0.8, 0.2))
+        await rig.drive(1.5, show=b"")
+        assert rig.out[-1].points[0].y == pytest.approx(3.3), "from then on it goes along"
+
+    told(story, tmp_path, ask=lambda stamps: answers.get("now", {}))
+
+
+def test_what_cannot_be_read_is_not_written_over_and_the_last_mark_is_kept(tmp_path):
+    (tmp_path / "points.json").write_text("[{}]")
+
+    async def story(rig: Rig) -> None:
+        await rig.drive(1.0, show=b"")
+        await rig.ask(PointOrder.MARK, "dock")
+
+    rig = told(story, tmp_path, load=tmp_path)
+    assert (tmp_path / "points.json").read_text() == "[{}]"
+    assert any("not saved over it" in text for _, text in rig.events)
+    told(story, tmp_path / "new")
+    assert [point.name for point, _ in files.load(tmp_path / "new")] == ["dock"]
+
+
+def test_files_are_written_by_a_thread_and_failures_are_told_by_the_loop(tmp_path):
+    (tmp_path / "file").touch()
+    inside = []
+
+    async def offload(work):
+        inside.append(1)
+        try:
+            return work()
+        finally:
+            inside.pop()
+
+    async def story(rig: Rig) -> None:
+        rig.service._offload = offload
+        rig.service._events = lambda reason, *args, **_: rig.events.append((len(inside), args[-1]))
+        await rig.drive(1.0, show=b"")
+        await rig.ask(PointOrder.MARK, "dock")
+
+    rig = told(story, tmp_path / "file" / "folder")
+    assert [by for by, text in rig.events if "points not saved" in text] == [0]

@@ -132,3 +132,26 @@ def test_a_mark_moves_with_the_map_near_it_and_what_is_saved_comes_back(tmp_path
     (tmp_path / "points.json").write_text("[{}]")
     with pytest.raises(InputError, match=r"points\.json: not readable"):
         load(tmp_path)
+
+
+def test_a_mark_is_as_uncertain_along_the_maps_axes_as_the_robot_was():
+    points = PointMap(PointsConfig(), MOUNT)
+    points.mark("dock", SECOND, (1.0, 0.0, math.pi / 2), (1.0, 0.0, 0.0), np.diag((1.0, 1e-4, 1e-5)))
+    assert shown(points, name="dock").covariance[[0, 4]] == pytest.approx((1.0, 1e-4), abs=2e-4)
+
+
+def test_a_tag_of_a_saved_map_is_seen_after_a_restart_of_the_computer_and_no_one_picture_undoes_it(tmp_path):
+    points, hours = PointMap(PointsConfig(), MOUNT), 36_000 * SECOND
+    for i, base in enumerate(BASES):
+        points.see(reading(base), hours + i * SECOND, base, STILL, 0.0)
+    shown(points)
+    save(tmp_path, points.pictured())
+    again = PointMap(PointsConfig(), MOUNT)
+    again.load(load(tmp_path))
+    off = (4.0, 1.0, 0.3, math.pi)
+    again.see(reading(BASES[0], off), SECOND, BASES[0], STILL, 0.0)
+    assert shown(again).sightings == len(BASES) + 1, "its clock began anew"
+    assert (shown(again).x, shown(again).y) == pytest.approx(TAG[:2], abs=1e-6)
+    for i, base in enumerate(BASES[1:]):
+        again.see(reading(base, off), (i + 2) * SECOND, base, STILL, 0.0)
+    assert shown(again).x == pytest.approx(4.0, abs=1e-3), "it hangs elsewhere now"
