@@ -72,7 +72,7 @@ def with_settings(config: T, values: Mapping[str, Any]) -> T:
     for key in values:
         if key not in known:
             raise InputError(f"{key}: cannot be changed while the robot runs; there are {', '.join(sorted(known))}")
-    put_settings(data, values)
+    _put(data, values)
     try:
         return type(config).model_validate(data)
     except ValidationError as error:
@@ -82,7 +82,7 @@ def with_settings(config: T, values: Mapping[str, Any]) -> T:
         raise InputError(f"{where}: {text}" if where else text) from error
 
 
-def put_settings(data: dict[str, Any], values: Mapping[str, Any]) -> None:
+def _put(data: dict[str, Any], values: Mapping[str, Any]) -> None:
     """Put live settings, by dotted key, into a configuration's plain data, which is not validated."""
     for key, value in values.items():
         section = data
@@ -96,36 +96,40 @@ class SavedSettings:
     """The file of live settings that outlast the run; its methods may block for a file system's time.
 
     Args:
-        path: the file; made when the first setting is saved.
+        folder: the robot's ``state_directory``; the file in it is made when the first setting is saved.
+        robot: its name.
     """
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    def __init__(self, folder: Path, robot: str) -> None:
+        self.path = folder / f"settings-{robot}.yaml"
 
-    @classmethod
-    def of(cls, config: TruckConfig) -> "SavedSettings":
-        """That of a robot."""
-        return cls(config.state_directory / f"settings-{config.robot}.yaml")
-
-    def values(self, config: TruckConfig) -> dict[str, tuple[Value, int]]:
-        """Saved values by dotted key, each with its line.
+    def values(self) -> dict[str, tuple[Value, int]]:
+        """Saved values by dotted key, each with its line; empty without a file.
 
         Raises:
-            ConfigError: the file is damaged, or holds what is no live setting; names the line.
+            ConfigError: the file is damaged; names the line.
         """
         if not self.path.exists():
             return {}
         text = YamlText.read(self.path)
         content = _load(text.text) or {}
-        known = {setting.key for setting in live_settings(config)}
         found = {}
         for key, value in _leaves(content, ()):
             node = text.node(*key)
-            line = 1 if node is None else node.start_mark.line + 1
-            if (dotted := ".".join(key)) not in known:
-                raise ConfigError(f"{self.path}:{line}: {dotted}: is no setting that can be changed while running")
-            found[dotted] = value, line
+            found[".".join(key)] = value, 1 if node is None else node.start_mark.line + 1
         return found
+
+    def put(self, values: Mapping[str, tuple[Value, int]], config: TruckConfig, data: dict[str, Any]) -> None:
+        """Put saved values into a configuration's plain data, which is not validated.
+
+        Raises:
+            ConfigError: one is no live setting of the configuration; names the line.
+        """
+        known = {setting.key for setting in live_settings(config)}
+        for key, (_, line) in values.items():
+            if key not in known:
+                raise ConfigError(f"{self.path}:{line}: {key}: is no setting that can be changed while running")
+        _put(data, {key: value for key, (value, _) in values.items()})
 
     def save(self, values: Mapping[str, Value]) -> None:
         """Add settings, or replace them; whatever else is in the file stays, comments too.

@@ -39,7 +39,7 @@ class LiveConfig:
         self._apply = apply
         self._events = events
         self._offload = offload
-        self._saved = SavedSettings.of(config)
+        self._saved = SavedSettings(config.state_directory, config.robot)
         self._start = config
         self._kept: dict[str, Value] = {}
         """Saved in this run."""

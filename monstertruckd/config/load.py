@@ -23,7 +23,7 @@ from monstertruck_runtime.plugins import kind_of, models_in
 from monstertruck_schemas.base import Schema
 from monstertruckd.config.calibration import CalibrationStore, Result, WizardName, put_values
 from monstertruckd.config.edit import YamlText, node_kind, reader
-from monstertruckd.config.live import SavedSettings, put_settings
+from monstertruckd.config.live import SavedSettings
 from monstertruckd.config.migrate import OLDEST, VERSION, bring_up_to_date
 from monstertruckd.config.truck import ROBOT, TruckConfig
 
@@ -107,15 +107,15 @@ def calibrated(config: T, tree: Tree) -> tuple[T, Tree]:
     Raises:
         ConfigError: one of their files is damaged, or of another truck, or the configuration refuses a value.
     """
-    saved = SavedSettings.of(config)
-    settings = saved.values(config)
+    saved = SavedSettings(config.state_directory, config.robot)
+    settings = saved.values()
     store = CalibrationStore(config.calibration_folder, config.robot)
     path = store.newest()
     if path is None and not settings:
         return config, tree
     data, origins, sources = config.model_dump(), dict(tree.origins), []
     if settings:
-        put_settings(data, {key: value for key, (value, _) in settings.items()})
+        saved.put(settings, config, data)
         origins |= {tuple(key.split(".")): Origin(saved.path, line) for key, (_, line) in settings.items()}
         sources.append(str(saved.path))
     if path is not None:

@@ -80,7 +80,7 @@ def test_a_change_that_is_refused_changes_nothing(config: TruckConfig, values, s
     with pytest.raises(InputError, match=said):
         robot.set(values, save=True)
     assert (robot.applied, robot.events) == ([], [])
-    assert not SavedSettings.of(config).path.exists()
+    assert not SavedSettings(config.state_directory, config.robot).path.exists()
 
 
 def test_a_change_is_applied_as_a_whole_and_said_with_who_made_it(config: TruckConfig):
@@ -91,7 +91,7 @@ def test_a_change_is_applied_as_a_whole_and_said_with_who_made_it(config: TruckC
     assert robot.events[0] == (
         Reason.SETTING_CHANGED, Severity.INFO, f"gate.speed: {config.gate.speed} to 0.12 by ann@lab",
     )  # fmt: skip
-    assert not SavedSettings.of(config).path.exists()
+    assert not SavedSettings(config.state_directory, config.robot).path.exists()
 
 
 def test_who_makes_the_robot_less_safe_than_by_default_is_told(
@@ -114,7 +114,7 @@ def test_what_is_saved_counts_at_the_next_start_and_names_its_line(tmp_path: Pat
     robot = Robot(before)
     robot.set({"gate.speed": 0.18})
     robot.set({"gate.tilt.stop": 0.3, "gate.reverse_speed": 0.1}, save=True)
-    saved = SavedSettings.of(before)
+    saved = SavedSettings(before.state_directory, before.robot)
     saved.path.write_text(saved.path.read_text().replace("stop: 0.3", "stop: 0.3  # steep yard"))
     robot.set({"gate.tilt.slow": 0.2}, save=True)
     assert "0.3  # steep yard" in saved.path.read_text()
@@ -141,7 +141,7 @@ def test_what_is_saved_on_a_calibrated_robot_counts_at_the_next_start(tmp_path: 
     after, tree = load_truck(file)
     assert after.gate.speed == 0.221
     assert after.geometry.drive_ratio == plain.geometry.drive_ratio * 0.99
-    assert str(tree.origins["gate", "speed"]) == f"{SavedSettings.of(plain).path}:3"
+    assert str(tree.origins["gate", "speed"]) == f"{SavedSettings(plain.state_directory, plain.robot).path}:3"
     assert tree.calibration == store.newest() == tree.origins["geometry", "drive_ratio"].file
     calibrate(plain.geometry.drive_ratio)
     with pytest.raises(ConfigError, match=r"settings-truck\.yaml with .*\.json: gate\.speed 0\.221 m/s: at most"):
