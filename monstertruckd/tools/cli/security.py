@@ -104,7 +104,7 @@ def rules(folder: FolderOption = HERE) -> None:
     robot = kept.register().robot
     print_json(
         [
-            {"listen": listener.listen, "access_control": access_rules(robot, listener.grants)}
+            {"listen": listener.listen, "access_control": access_rules(robot, listener.grants, listener.routers)}
             for listener in listeners(kept.zenoh())
         ]
     )

@@ -158,7 +158,7 @@ class BodyAcceleration:
         """Forward and left, m/s^2, over the time before ``stamp``, ns; 0 where the odometry does not tell."""
         spell = [speed for speed in self._speeds if stamp - 2 * self._felt <= speed[0] <= stamp]
         old = next((speed for speed in reversed(spell) if speed[0] <= stamp - self._felt), None)
-        if old is None or stamp - spell[-1][0] > self._felt:
+        if old is None or old is spell[-1]:
             return 0.0, 0.0
         new = spell[-1]
         forward = (new[1] - old[1]) * SECOND / (new[0] - old[0])

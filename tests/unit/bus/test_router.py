@@ -175,6 +175,8 @@ def test_a_router_is_made_by_a_command_and_every_name_is_there_once(tmp_path: Pa
     made = CliRunner().invoke(app, ["security", "router", *words, "-a", "10.0.0.2", "-f", str(tmp_path / "router")])
     assert made.exit_code == 0, made.output
     assert "router of hare, crab" in made.output
+    printed = json.loads(CliRunner().invoke(app, ["security", "rules", "-f", words[0]]).stdout)
+    assert [s["id"] for s in printed[0]["access_control"]["subjects"]] == ["ann", "bob", "router"]
     for folder in folders.values():
         assert folder.zenoh().connect == ("tls/10.0.0.2:7447",)
         assert folder.zenoh().tls.routers == ("router",)

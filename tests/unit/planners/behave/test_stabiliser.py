@@ -213,6 +213,7 @@ def test_acceleration_is_that_of_the_speeds_before_the_reading():
     assert body.at(round(0.38 * SECOND)) == pytest.approx((0.5, 0.4 * 0.5 * 0.35))
     assert body.at(round(0.05 * SECOND)) == (0.0, 0.0)  # too little is known
     assert body.at(SECOND) == (0.0, 0.0)  # the odometry is silent
+    assert body.at(round(0.44 * SECOND)) == (0.0, 0.0)  # its newest is as old as the oldest that is wanted
     body.observe(odometry(vx=9.0, now=round(0.40 * SECOND)))  # spinning wheels
     assert body.at(round(0.40 * SECOND))[0] == 2.0
 
