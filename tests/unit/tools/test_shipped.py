@@ -1,5 +1,6 @@
 """Files that come with the program beside its modules."""
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -43,3 +44,18 @@ def test_the_wheel_holds_all_configurations_and_the_files_of_the_service(tmp_pat
     ]
     assert len(files) > 20
     assert {f"monstertruckd/{name}" for name in files} <= held
+
+
+def test_shipped_configurations_write_below_the_folder_they_are_used_in_and_say_how_they_are_tried():
+    texts = {file: file.read_text() for file in (ROOT / "configs").rglob("*.yaml")}
+    assert not {
+        file.name for file, text in texts.items() if re.search(r"^ *(save|directory): *\.\.", text, re.MULTILINE)
+    }
+    tried = [
+        (file.name, line)
+        for file, text in texts.items()
+        for line in re.findall(r"^#.* simulate .*, then .*", text, re.MULTILINE)
+    ]
+    orders = [row for row in tried if "then monstertruckd" in row[1]]
+    assert len(orders) >= 5
+    assert [row for row in orders if "--run" not in row[1]] == [], "without it no daemon runs"
