@@ -176,4 +176,5 @@ def scan_angles(config: TruckConfig, bus: Bus, delivery: Delivery) -> ScanAngles
     if devices.compass is None:
         return None
     joints = bus.subscribe(topics.STABILISER, delivery) if devices.stabiliser is not None else None
-    return ScanAngles(bus.subscribe(topics.COMPASS, delivery), joints)
+    odometry = bus.subscribe(topics.ODOMETRY, delivery) if config.missing_actuators() is None else None
+    return ScanAngles(bus.subscribe(topics.COMPASS, delivery), joints, odometry)

@@ -130,7 +130,7 @@ def _build_ground(config: TruckConfig, bus: Bus, clock: Clock) -> GroundService 
         mount=None if lidar is None else lidar.mount,
         compass=bus.subscribe(topics.COMPASS, fifo(ODOMETRIES)),
         angles=None if lidar is None else scan_angles(config, bus, fifo(ODOMETRIES)),
-        pose=bus.subscribe(topics.ODOMETRY if slam is None else topics.POSE, latest()),
+        pose=bus.subscribe(topics.ODOMETRY if slam is None else topics.POSE, fifo(ODOMETRIES)),
         scan=None if lidar is None else bus.subscribe(topics.SCAN, fifo(SCANS)),
         slip=bus.subscribe(topics.FUSION, latest()),
         out=bus.publisher(topics.GROUND, Writer.ESTIMATION),

@@ -10,10 +10,12 @@ from collections import deque
 from collections.abc import Iterable
 from typing import Final
 
+from monstertruck_estimation.body_tilt import BodyAcceleration
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.mailbox import Mailbox
 from monstertruck_runtime.ports import Publisher
 from monstertruck_schemas.sensor import Attitude, LaserScan, StabiliserFeedback
+from monstertruck_schemas.state import Odometry
 
 STALE: Final = SECOND // 4
 """Nanoseconds over which angles are extended beyond the newest reading."""
@@ -77,11 +79,19 @@ class ScanAngles:
     Args:
         compass: the body's tilt.
         joints: of the mount; None = the lidar is fixed to the body.
+        odometry: by which the body's acceleration is taken out of its tilt; None = it is left in.
     """
 
-    def __init__(self, compass: Mailbox[Attitude], joints: Mailbox[StabiliserFeedback] | None) -> None:
+    def __init__(
+        self,
+        compass: Mailbox[Attitude],
+        joints: Mailbox[StabiliserFeedback] | None,
+        odometry: Mailbox[Odometry] | None = None,
+    ) -> None:
         self._compass = compass
         self._feedback = joints
+        self._odometry = odometry
+        self._moved = BodyAcceleration()
         self._body = AngleHistory()
         self._mount = AngleHistory()
 
@@ -92,7 +102,9 @@ class ScanAngles:
 
     def at(self, scan: LaserScan) -> tuple[float, float, float, float] | None:
         """Roll and pitch of the body, pitch and roll of the joints in the middle of ``scan``, rad; None = unknown."""
-        self._body.extend((a.stamp, (a.roll, a.pitch)) for a in self._compass.drain() if a.tilt_valid)
+        for odometry in () if self._odometry is None else self._odometry.drain():
+            self._moved.observe(odometry)
+        self._body.extend((a.stamp, self._moved.tilt(a)) for a in self._compass.drain() if a.tilt_valid)
         middle = scan.stamp + round(scan.time_increment * len(scan.ranges) / 2 * SECOND)
         body = self._body.at(middle)
         if self._feedback is None:

@@ -425,6 +425,8 @@ _HEAD_STIFFNESS: Final = 15.0
 """Between a stabiliser's shaft and what it turns, Nm/rad."""
 _HEAD_DAMPING: Final = 0.15
 """Nm s/rad."""
+HEAD_LAG: Final = _HEAD_DAMPING / _HEAD_STIFFNESS
+"""Seconds by which a joint would trail a shaft that turns, because its damper holds it against the body."""
 _STEERING_STIFFNESS: Final = 60.0
 """Nm/rad: the linkage gives a little."""
 _STEERING_DAMPING: Final = 0.8

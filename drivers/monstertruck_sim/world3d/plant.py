@@ -16,8 +16,8 @@ from monstertruck_kinematics.description import HEAD_JOINTS, Mechanics
 from monstertruck_kinematics.elementary import Array
 from monstertruck_sim.world.actuators import RPM
 from monstertruck_sim.world.config import BatteryModelConfig, SimTruckConfig
-from monstertruck_sim.world.plant import SERVO_FRAME_NS, GriddedPlant, Pose, Vector
-from monstertruck_sim.world3d.model import TIMESTEP, DriveLine, Group
+from monstertruck_sim.world.plant import GriddedPlant, Pose, Vector
+from monstertruck_sim.world3d.model import HEAD_LAG, TIMESTEP, DriveLine, Group
 
 _FREED: Final = 0.005
 _STANDING: Final = 0.01
@@ -97,6 +97,8 @@ class RigidPlant(GriddedPlant):
         self._wound = [0.0] * count
         """Angle to which each shaft has wound its wheels up, rad, mean of its wheels."""
         self._head = [mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, name) for name in HEAD_JOINTS]
+        self._head_shafts = np.zeros(len(self._head))
+        """Angles of the stabiliser's shafts at the newest step, rad."""
         self._rolling = [model.jnt_qposadr[i] for i in range(model.njnt) if model.joint(i).name.endswith("_rollers")]
         """Of balls that stand for wheels with rollers: whose axis across the rollers' stays level."""
         self._tyres = _tyres(model, parts, config.wheel_radius)
@@ -200,9 +202,11 @@ class RigidPlant(GriddedPlant):
             angles = self._steers(servos)
             controls[: len(angles)] = angles
             self._steered = servos
-        if self.joints is not None and self._elapsed % SERVO_FRAME_NS == 0:
-            pitch, roll = self.joints.angles(np.array([(self._start_ns or 0) + self._elapsed]))
-            controls[self._head] = float(pitch[0]), float(roll[0])
+        if self.joints is not None:
+            shafts = np.concatenate(self.joints.angles(np.array([(self._start_ns or 0) + self._elapsed])))
+            rates = (shafts - self._head_shafts) / TIMESTEP if dt else 0.0
+            controls[self._head] = shafts + HEAD_LAG * rates
+            self._head_shafts = shafts
         for i, shaft in enumerate(self.shafts):
             speed = shaft.rpm * RPM / self.config.motor.ratio
             self._wound[i] += speed * dt

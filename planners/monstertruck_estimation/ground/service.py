@@ -7,6 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from monstertruck_estimation.body_tilt import BodyAcceleration, Tilt
 from monstertruck_estimation.ground.config import GroundConfig
 from monstertruck_estimation.ground.grid import RESOLUTION, GroundGrid, planes
 from monstertruck_estimation.ground.terrain import TerrainEstimator
@@ -89,7 +90,8 @@ class GroundService:
         self._out, self._events, self._grid, self._save = out, events, grid, save
         self._cells = _spread(*footprint)
         self._terrain = TerrainEstimator(WINDOW)
-        self._attitude: Attitude | None = None
+        self._moved = BodyAcceleration()
+        self._felt: Tilt | None = None
         self._marked: Array | None = None
         self._travelled: tuple[float, float] | None = None
         """Where the robot's height was integrated to: x and y, m."""
@@ -124,11 +126,13 @@ class GroundService:
             self._write()
 
     def _observe(self, now: int) -> None:
+        for moved in self._pose.drain():
+            self._moved.observe(moved)
         for attitude in self._compass.drain():
             if attitude.tilt_valid:
-                self._attitude = attitude
-                self._terrain.add(attitude.stamp / SECOND, attitude.roll, attitude.pitch)
-        odometry, felt = self._pose.latest, self._attitude
+                self._felt = self._moved.tilt(attitude)
+                self._terrain.add(attitude.stamp / SECOND, *self._felt)
+        odometry, felt = self._pose.latest, self._felt
         scans = [] if self._scan is None else self._scan.drain()
         if odometry is None or felt is None or now - odometry.received > ODOMETRY.fresh_for() * SECOND:
             return

@@ -16,18 +16,23 @@ rocks by 15 degrees at 0.5 Hz, each 10 ms of that cost up to half a degree. So t
 constant acceleration (the fading-memory polynomial filter of second degree, also called critically damped g-h-k; see
 Brookner, "Tracking and Kalman Filtering Made Easy") and predicted to the instant when the joints will be there.
 
-**Driving.** The compass finds the vertical by an accelerometer, which feels the body's own acceleration too: 0.9 m/s^2
-look like 5 degrees, and the prediction would make 10 of them. The odometry's acceleration, by its speed and its speed
-times its yaw rate, is taken out of each reading, averaged over ``felt`` seconds as the accelerometer's filter does.
+A filter that forgets quickly follows a body that rocks; on smooth ground it makes three times as much of the compass's
+noise, and of the odometry's (below). So filters of several memories run side by side, and each counts by how well it
+has lately predicted the readings that came ``JUDGED`` readings later.
+
+**Driving.** The body's own acceleration is taken out of the compass's tilt (``monstertruck_estimation.body_tilt``): the
+prediction would make twice as much of it.
 """
 
 import math
 from collections import deque
-from dataclasses import dataclass
 from typing import Annotated, Final, Literal, NamedTuple
 
+import numpy as np
 from pydantic import Field
 
+from monstertruck_estimation.body_tilt import KEPT, BodyAcceleration, Tilt
+from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND, Clock, Schedule
 from monstertruck_runtime.mailbox import Mailbox, fifo, latest
 from monstertruck_runtime.ports import BusPort, Publisher, Ready, Subscription
@@ -37,11 +42,17 @@ from monstertruck_schemas.sensor import Attitude
 from monstertruck_schemas.state import Odometry
 from monstertruck_schemas.topics import COMPASS, ODOMETRY, PLAN_STABILISER, Writer
 
-GRAVITY: Final = 9.81
-KEPT: Final = 64
-"""Readings of the odometry."""
-GREATEST: Final = 2.0
-"""Acceleration of the body that is taken out at most, m/s^2: wheels that spin know no better."""
+FILTERS: Final = 5
+CALMER: Final = 0.6
+"""Each next filter forgets this much of what the one before it forgets."""
+JUDGED: Final = 2
+"""Readings over which a prediction is judged: about as far ahead as it is used."""
+JUDGEMENT: Final = 0.1
+"""Share that the newest reading has in a filter's errors."""
+DECIDED: Final = 4
+"""Power of the mean square with which filters that are wrong more often lose."""
+LEAST_ERROR: Final = math.radians(0.1)
+"""Filters better than this are equally good, rad: the compass's resolution."""
 
 Positive = Annotated[float, Field(gt=0)]
 Limit = Annotated[float, Field(gt=0, lt=math.pi / 2)]
@@ -61,20 +72,11 @@ class StabiliserConfig(Schema):
     lead: Annotated[float, Field(ge=0, le=0.5)] = 0.036
     """Seconds by which a joint is late on its goal: servo, bus and half a period of the goals."""
     memory: Annotated[float, Field(gt=0, lt=1)] = 0.4
-    """Share of the past that one reading leaves in the filter; more is calmer and later."""
+    """Share of the past that one reading leaves in the quickest filter; more is calmer and later."""
     coast: Positive = 0.2
     """Seconds over which tilt may be predicted beyond its newest reading."""
-    felt: Annotated[float, Field(gt=0, le=0.5)] = 0.06
-    """Seconds over which the odometry's acceleration is averaged, as the compass's accelerometer feels it."""
     stale_after: Positive = COMPASS.fresh_for()
     """Seconds without valid tilt after which the joints return to 0."""
-
-
-class Tilt(NamedTuple):
-    """Of the body, rad, REP 103."""
-
-    roll: float
-    pitch: float
 
 
 class Joints(NamedTuple):
@@ -119,66 +121,8 @@ def _towards(before: float, wanted: float, step: float) -> float:
     return before + _clip(wanted - before, step)
 
 
-@dataclass(slots=True)
-class _Axis:
-    """Angle, rate and acceleration of one axis: rad, rad/s, rad/s^2."""
-
-    angle: float
-    rate: float = 0.0
-    acceleration: float = 0.0
-
-    def ahead(self, dt: float) -> float:
-        return self.angle + dt * (self.rate + dt * self.acceleration / 2)
-
-    def correct(self, measured: float, dt: float, memory: float) -> None:
-        off = measured - self.ahead(dt)
-        forget = 1 - memory
-        self.angle = measured - memory**3 * off
-        self.rate += dt * self.acceleration + 1.5 * forget**2 * (1 + memory) * off / dt
-        self.acceleration += forget**3 * off / dt**2
-
-
-class BodyAcceleration:
-    """The body's acceleration by its odometry.
-
-    Args:
-        felt: seconds over which it is averaged.
-    """
-
-    def __init__(self, felt: float) -> None:
-        self._felt = round(felt * SECOND)
-        self._speeds: deque[tuple[int, float, float]] = deque(maxlen=KEPT)
-
-    def observe(self, odometry: Odometry) -> None:
-        """Take a reading; older ones than the newest are passed over."""
-        if not self._speeds or odometry.stamp > self._speeds[-1][0]:
-            self._speeds.append((odometry.stamp, odometry.twist.vx, odometry.twist.wz))
-
-    def at(self, stamp: int) -> tuple[float, float]:
-        """Forward and left, m/s^2, over the time before ``stamp``, ns; 0 where the odometry does not tell."""
-        spell = [speed for speed in self._speeds if stamp - 2 * self._felt <= speed[0] <= stamp]
-        old = next((speed for speed in reversed(spell) if speed[0] <= stamp - self._felt), None)
-        if old is None or old is spell[-1]:
-            return 0.0, 0.0
-        new = spell[-1]
-        forward = (new[1] - old[1]) * SECOND / (new[0] - old[0])
-        left = (new[1] * new[2] + old[1] * old[2]) / 2
-        return _clip(forward, GREATEST), _clip(left, GREATEST)
-
-
-def without(acceleration: tuple[float, float], tilt: Tilt) -> Tilt:
-    """Tilt of a body whose accelerometer took the reaction to gravity and to its acceleration for the vertical.
-
-    Args:
-        acceleration: forward and left, m/s^2.
-        tilt: measured.
-    """
-    forward, left = acceleration
-    return Tilt(tilt.roll - math.atan2(left, GRAVITY), tilt.pitch + math.atan2(forward, GRAVITY))
-
-
 class TiltFilter:
-    """Follows valid tilt and predicts it.
+    """Follows valid tilt and predicts it, by the filters whose predictions have lately come true; see the module.
 
     Args:
         config: memory and times.
@@ -187,25 +131,36 @@ class TiltFilter:
     def __init__(self, config: StabiliserConfig) -> None:
         self._config = config
         self._stamp: int | None = None
-        self._roll = self._pitch = _Axis(0.0)
+        self._forget: Array = np.asarray((1 - config.memory) * CALMER ** np.arange(FILTERS, dtype=np.float64))[:, None]
+        self._past: deque[tuple[int, Array]] = deque(maxlen=JUDGED)
+        """Stamps and states after the newest readings: angle, rate, acceleration; shape (3, filters, 2 axes)."""
+        self._errors = np.zeros((FILTERS, 2))
+        """Mean squares of what the filters predicted over that many readings, rad^2."""
 
-    def observe(self, attitude: Attitude, acceleration: tuple[float, float] = (0.0, 0.0)) -> None:
+    def observe(self, attitude: Attitude, body: BodyAcceleration | None = None) -> None:
         """Take a reading; invalid and older ones are passed over, after a gap it starts anew.
 
         Args:
             attitude: reading.
-            acceleration: of the body then, forward and left, m/s^2.
+            body: how the body has moved, if that is known.
         """
         if not attitude.tilt_valid or (self._stamp is not None and attitude.stamp <= self._stamp):
             return
         dt = math.inf if self._stamp is None else (attitude.stamp - self._stamp) / SECOND
         self._stamp = attitude.stamp
-        roll, pitch = without(acceleration, Tilt(attitude.roll, attitude.pitch))
+        measured = np.array((BodyAcceleration() if body is None else body).tilt(attitude))
         if dt > self._config.stale_after:
-            self._roll, self._pitch = _Axis(roll), _Axis(pitch)
-            return
-        self._roll.correct(roll, dt, self._config.memory)
-        self._pitch.correct(pitch, dt, self._config.memory)
+            self._past.clear()
+            self._errors[:] = 0.0
+            state = np.zeros((3, FILTERS, 2))
+            state[0] = measured
+        else:
+            if len(self._past) == JUDGED:
+                before, old = self._past[0]
+                missed = measured - _ahead(old, (attitude.stamp - before) / SECOND)
+                self._errors += JUDGEMENT * (missed**2 - self._errors)
+            state = _corrected(self._past[-1][1], measured, dt, self._forget)
+        self._past.append((attitude.stamp, state))
 
     def tilt(self, now: int) -> Tilt | None:
         """Tilt ``lead`` seconds after ``now`` (ns); None when the newest valid reading is stale."""
@@ -214,8 +169,28 @@ class TiltFilter:
         age = (now - self._stamp) / SECOND
         if age > self._config.stale_after:
             return None
-        ahead = min(age + self._config.lead, self._config.coast)
-        return Tilt(self._roll.ahead(ahead), self._pitch.ahead(ahead))
+        weights = (self._errors + LEAST_ERROR**2) ** -DECIDED
+        predicted = _ahead(self._past[-1][1], min(age + self._config.lead, self._config.coast))
+        roll, pitch = ((weights * predicted).sum(axis=0) / weights.sum(axis=0)).tolist()
+        return Tilt(roll, pitch)
+
+
+def _ahead(state: Array, dt: float) -> Array:
+    angle, rate, acceleration = state
+    return np.asarray(angle + dt * (rate + dt * acceleration / 2))
+
+
+def _corrected(state: Array, measured: Array, dt: float, forget: Array) -> Array:
+    """State after a reading ``dt`` seconds later, of filters that forget a share of the past with each."""
+    off = measured - _ahead(state, dt)
+    _, rate, acceleration = state
+    return np.stack(
+        (
+            measured - (1 - forget) ** 3 * off,
+            rate + dt * acceleration + 1.5 * forget**2 * (2 - forget) * off / dt,
+            acceleration + forget**3 * off / dt**2,
+        )
+    )
 
 
 class StabiliserService:
@@ -250,14 +225,14 @@ class StabiliserService:
         """Publish until cancelled."""
         ready()
         schedule = Schedule(self._clock, self._config.rate)
-        tilt, body, joints, seen = TiltFilter(self._config), BodyAcceleration(self._config.felt), SQUARE, None
+        tilt, body, joints, seen = TiltFilter(self._config), BodyAcceleration(), SQUARE, None
         while True:
             await schedule.next()
             for moved in self._odometry.drain():
                 body.observe(moved)
             reading = self._compass.latest
             if reading is not None and reading is not seen:
-                tilt.observe(reading, body.at(reading.stamp))
+                tilt.observe(reading, body)
                 seen = reading
             now = self._clock.now()
             joints = goals(tilt.tilt(now), joints, 1 / self._config.rate, self._config)

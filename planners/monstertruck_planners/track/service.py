@@ -7,6 +7,7 @@ from collections.abc import Awaitable, Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
+from monstertruck_estimation.body_tilt import BodyAcceleration
 from monstertruck_estimation.ground.terrain import TerrainEstimator
 from monstertruck_kinematics.elementary import KinematicsError
 from monstertruck_kinematics.truck import FourWheelSteering
@@ -120,6 +121,7 @@ class TrackingStep:
         self._points = points or ScanPoints(setup.lidar)
         self._near = setup.footprint.circumscribed_radius + setup.config.slow_clearance
         self._terrain = TerrainEstimator(ROUGHNESS_WINDOW)
+        self._acceleration = BodyAcceleration()
         self._seen: tuple[LaserScan, SegmentedPath] | None = None
         self._clearance_ahead = math.inf
         """Clearance ahead on that path, in that scan."""
@@ -164,6 +166,7 @@ class TrackingStep:
     def _control(self, path: SegmentedPath, pose: Odometry, gate: GateState, newest: Newest, now: int) -> TrackOutput:
         at = (pose.pose.x, pose.pose.y, pose.pose.yaw)
         clearance = self._clearance(newest.scan, path, pose, now)
+        self._acceleration.observe(pose)
         tilt, roughness = self._terrain_at(newest.attitude, now)
         obeyed = gate.mode is GateMode.DRIVING and gate.holder == SOURCE
         heading = _heading(newest.attitude, now)
@@ -264,7 +267,7 @@ class TrackingStep:
         if attitude is None or now - attitude.received > COMPASS.fresh_for() * SECOND:
             return 0.0, 0.0
         if attitude.tilt_valid:
-            self._terrain.add(attitude.stamp / SECOND, attitude.roll, attitude.pitch)
+            self._terrain.add(attitude.stamp / SECOND, *self._acceleration.tilt(attitude))
         return self._terrain.tilt, self._terrain.roughness
 
     def _report(self, reason: Reason, severity: Severity, text: str = "", **values: Value) -> None:

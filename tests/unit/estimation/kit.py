@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 
+from monstertruck_estimation.body_tilt import Tilt
 from monstertruck_estimation.odometry import DeadReckoning, OdometryConfig
 from monstertruck_kinematics.chassis import Dimensions, truck_chassis
 from monstertruck_kinematics.truck import DriveTrain, FourWheelSteering
@@ -28,6 +29,14 @@ def heading(now, yaw, disturbed=False):
     return Attitude(
         stamp=now, received=now, seq=0, heading=(-yaw) % math.tau, roll=0.0, pitch=0.0, heading_disturbed=disturbed
     )
+
+
+def felt_tilt(forward, left, roll, pitch):
+    """Roll and pitch that an accelerometer shows on a body with a tilt and an acceleration in its level frame."""
+    turn_pitch = np.array([[math.cos(pitch), 0, math.sin(pitch)], [0, 1, 0], [-math.sin(pitch), 0, math.cos(pitch)]])
+    turn_roll = np.array([[1, 0, 0], [0, math.cos(roll), -math.sin(roll)], [0, math.sin(roll), math.cos(roll)]])
+    x, y, z = (turn_pitch @ turn_roll).T @ (forward, left, 9.81)
+    return Tilt(math.atan2(y, z), math.atan2(-x, math.hypot(y, z)))
 
 
 class Truck:

@@ -9,6 +9,9 @@ from monstertruck_estimation.scan_tilt import UNKNOWN, AngleHistory, ScanAngles,
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.mailbox import Delivery, Mailbox
 from monstertruck_schemas.sensor import Attitude, LaserScan, StabiliserFeedback, StabiliserJoint, TorqueState
+from monstertruck_schemas.state import Odometry
+from tests.unit.estimation.kit import felt_tilt
+from tests.unit.planners.behave.wall_kit import odometry
 
 RECENT = Delivery(16, counted=False)
 HOLDING = StabiliserJoint(torque=TorqueState.HOLDING)
@@ -87,6 +90,17 @@ def test_without_a_stabiliser_the_scan_has_the_bodys_tilt_in_its_middle():
     stamper.put(scan(75 * MS))
     assert out.scans[0].tilt is None
     assert out.scans[1].tilt == pytest.approx(0.15)
+
+
+def test_acceleration_by_the_odometry_is_no_tilt_of_the_scan():
+    out, compass, moved = Kept(), Mailbox[Attitude](RECENT), Mailbox[Odometry](RECENT)
+    stamper = TiltStamper(out, ScanAngles(compass, None, moved))
+    for i in range(12):
+        moved.put(odometry(vx=0.02 * i, now=20 * i * MS))  # 1 m/s^2
+    for at in (150, 200):
+        compass.put(attitude(at * MS, felt_tilt(1.0, 0.0, 0.0, 0.0).pitch))
+    stamper.put(scan(125 * MS))
+    assert out.scans[0].tilt == pytest.approx(0.0, abs=0.002)
 
 
 def test_joints_level_what_the_body_tilts():

@@ -44,12 +44,18 @@ class Rig:
             events=lambda *args, **values: self.events.append(args), **{"grid": GroundGrid()} | options,
         )  # fmt: skip
 
-    async def drive(self, seconds, pitch=lambda _: 0.0, *, slipping=False, speed=SPEED, fresh=True, scanned=None):
+    async def drive(
+        self, seconds, pitch=lambda _: 0.0, *, slipping=False, speed=SPEED, fresh=True, scanned=None, accelerates=0.0
+    ):
         serving = asyncio.create_task(self.service.run(lambda: None))
+        x, still = 0.0, speed
         for i in range(round(seconds / STEP)):
-            now, x = self.clock.now(), i * STEP * speed
+            now = self.clock.now()
+            speed = still + accelerates * math.sin(1.5 * i * STEP) / 1.5
+            x += STEP * speed if i else 0.0
             header = {"stamp": now, "received": now, "seq": i}
-            felt = Attitude(**header, heading=0.0, roll=0.0, pitch=pitch(x))
+            forward = accelerates * math.cos(1.5 * (i - 1) * STEP)
+            felt = Attitude(**header, heading=0.0, roll=0.0, pitch=pitch(x) - math.atan2(forward, 9.81))
             self.compass.put(felt)
             self.beside.put(felt)
             if fresh or i == 0:
@@ -85,6 +91,11 @@ def test_a_slope_is_tilt_and_a_washboard_is_roughness():
     assert layer(ground, "tilt", 2.2) < 0.05
     assert layer(ground, "roughness", 3.3) > 0.008
     assert layer(ground, "tilt", 0.8, 0.3) is None, "beside the robot nothing was felt"
+
+
+def test_a_truck_whose_speed_swings_does_not_tilt_level_ground():
+    ground = driven(10, accelerates=0.7)  # which looks like 4 degrees to either side
+    assert layer(ground, "tilt", 1.0) < 0.03
 
 
 def test_ground_on_which_wheels_slip_is_rough():

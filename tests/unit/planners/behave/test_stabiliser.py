@@ -8,17 +8,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from monstertruck_estimation.body_tilt import Tilt
 from monstertruck_planners.behave.stabiliser import (
     SQUARE,
-    BodyAcceleration,
     Joints,
     StabiliserConfig,
     StabiliserService,
-    Tilt,
     TiltFilter,
     goals,
     level,
-    without,
 )
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.mailbox import Mailbox, fifo, latest
@@ -26,6 +24,7 @@ from monstertruck_schemas.plan import StabiliserCommand
 from monstertruck_schemas.sensor import Attitude
 from monstertruck_schemas.state import Odometry
 from tests.unit.drivers.kit import background
+from tests.unit.estimation.kit import felt_tilt
 from tests.unit.planners.behave.wall_kit import odometry
 
 CONFIG = StabiliserConfig()
@@ -86,13 +85,13 @@ def test_goals_arrive_and_without_tilt_return_to_zero():
 
 def test_the_filter_knows_constant_acceleration():
     tilt = TiltFilter(CONFIG)
-    times = 1 + np.cumsum([0.05, 0.05, 0.04, 0.06] * 10)
+    times = 1 + np.cumsum([0.05, 0.05, 0.04, 0.06] * 20)
     for t in times:
         tilt.observe(attitude(float(t), roll=0.1 * t**2, pitch=0.3 - 0.2 * t))
     now = float(times[-1]) + 0.05
     ahead = now + CONFIG.lead
     expected = Tilt(0.1 * ahead**2, 0.3 - 0.2 * ahead)
-    assert tilt.tilt(round(now * SECOND)) == pytest.approx(expected, abs=1e-6)
+    assert tilt.tilt(round(now * SECOND)) == pytest.approx(expected, abs=1e-4)
 
 
 def test_prediction_ends_and_readings_get_stale():
@@ -126,7 +125,27 @@ def test_after_a_gap_the_filter_starts_anew():
     for i in range(10):
         tilt.observe(attitude(1 + 0.05 * i, pitch=0.05 * i))
     tilt.observe(attitude(5.0, roll=0.1, pitch=-0.1))
-    assert tilt.tilt(5 * SECOND) == Tilt(0.1, -0.1)
+    assert tilt.tilt(5 * SECOND) == pytest.approx(Tilt(0.1, -0.1))
+
+
+def followed(rocking: float, noise: float) -> float:
+    """RMS of what is predicted too much or too little, rad, of a body that rocks at 0.5 Hz; angles in rad."""
+    tilt, rng, off = TiltFilter(CONFIG), np.random.default_rng(1), []
+
+    def body(t):
+        return rocking * math.sin(math.pi * t)
+
+    for i in range(400):
+        t = 1 + 0.05 * i
+        tilt.observe(attitude(t, pitch=body(t) + noise * rng.standard_normal()))
+        if i > 100:
+            off.append(tilt.tilt(round((t + 0.05) * SECOND)).pitch - body(t + 0.05 + CONFIG.lead))
+    return float(np.sqrt(np.mean(np.square(off))))
+
+
+def test_it_is_calm_on_smooth_ground_and_quick_where_the_body_rocks():
+    assert followed(0.0, 0.01) < 0.012, "the quickest filter alone makes 0.03 of it"
+    assert followed(0.26, 0.002) < 0.02, "the calmest filter alone would be off by 0.1"
 
 
 class Kept:
@@ -186,36 +205,6 @@ def test_the_service_returns_to_zero_when_tilt_stops_counting():
         assert out.kept[-1].roll == 0.0, "the compass fell silent"
 
     serving(test)
-
-
-def felt_tilt(forward, left, roll, pitch):
-    """Roll and pitch that an accelerometer shows on a body with a tilt and an acceleration in its level frame."""
-    turn_pitch = np.array([[math.cos(pitch), 0, math.sin(pitch)], [0, 1, 0], [-math.sin(pitch), 0, math.cos(pitch)]])
-    turn_roll = np.array([[1, 0, 0], [0, math.cos(roll), -math.sin(roll)], [0, math.sin(roll), math.cos(roll)]])
-    x, y, z = (turn_pitch @ turn_roll).T @ (forward, left, 9.81)
-    return Tilt(math.atan2(y, z), math.atan2(-x, math.hypot(y, z)))
-
-
-@pytest.mark.parametrize(("forward", "left"), [(0.9, 0.0), (-1.2, 0.0), (0.0, 0.8), (0.5, -0.6)])
-@pytest.mark.parametrize(("roll", "pitch"), [(0.0, 0.0), (0.1, -0.15)])
-def test_the_bodys_acceleration_is_taken_out_of_its_tilt(forward, left, roll, pitch):
-    measured = felt_tilt(forward, left, roll, pitch)
-    assert math.dist(measured, (roll, pitch)) > 0.05
-    assert without((forward, left), measured) == pytest.approx((roll, pitch), abs=0.004)
-
-
-def test_acceleration_is_that_of_the_speeds_before_the_reading():
-    body = BodyAcceleration(0.06)
-    assert body.at(SECOND) == (0.0, 0.0)
-    for i in range(20):
-        t = 0.02 * i
-        body.observe(odometry(vx=0.5 * t, wz=0.4, now=round(t * SECOND)))
-    assert body.at(round(0.38 * SECOND)) == pytest.approx((0.5, 0.4 * 0.5 * 0.35))
-    assert body.at(round(0.05 * SECOND)) == (0.0, 0.0)  # too little is known
-    assert body.at(SECOND) == (0.0, 0.0)  # the odometry is silent
-    assert body.at(round(0.44 * SECOND)) == (0.0, 0.0)  # its newest is as old as the oldest that is wanted
-    body.observe(odometry(vx=9.0, now=round(0.40 * SECOND)))  # spinning wheels
-    assert body.at(round(0.40 * SECOND))[0] == 2.0
 
 
 def swing(*, with_odometry: bool) -> float:

@@ -15,8 +15,10 @@ from monstertruck_runtime.clock import SECOND, run_virtual
 from monstertruck_schemas.base import Pose2D, Twist2D
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Role
-from monstertruck_schemas.sensor import LaserScan
+from monstertruck_schemas.sensor import Attitude, LaserScan
 from monstertruck_schemas.state import GateMode, GateState, Odometry
+from tests.unit.estimation.kit import felt_tilt
+from tests.unit.planners.behave.wall_kit import odometry
 from tests.unit.planners.kit import STEERING, circle, path, straight
 
 
@@ -132,6 +134,24 @@ def test_a_long_path_is_taken_in_within_several_turns_of_the_loop(step, turns):
         assert output.command is not None
 
     on_bench(scenario, path(circle(1.0)))
+
+
+def test_a_truck_that_gains_speed_on_level_ground_does_not_take_that_for_a_slope():
+    async def scenario(bench):
+        tracking = TrackingStep(TrackSetup(PurePursuitConfig(), FourWheelSteering(), Footprint(), (0.14, 0.0, 0.0)))
+        bench.gate(GateMode.DRIVING)
+        asked = []
+        for i in range(10):
+            pose = odometry(vx=0.06 * i, now=bench.clock.now())  # 1.2 m/s^2
+            felt = felt_tilt(1.2, 0.0, 0.0, 0.0)
+            attitude = Attitude(stamp=pose.stamp, received=pose.stamp, seq=i, heading=0.0, roll=0.0, pitch=felt.pitch)
+            output = list(tracking.parts(pose.stamp, bench.newest()._replace(pose=pose, attitude=attitude)))[-1]
+            asked.append(output.command.speed)
+            await bench.clock.sleep(0.05)
+        assert asked[0] < 0.15, "the compass alone shows 7 degrees"
+        assert asked[-1] == PurePursuitConfig().speed
+
+    on_bench(scenario, path(straight(5.0)))
 
 
 class Elsewhere:

@@ -306,13 +306,13 @@ def test_a_platform_is_stopped_by_a_wall(solid):
 
 
 class Shafts:
-    """Of a stabiliser, at fixed angles."""
+    """Of a stabiliser, at fixed angles; that of pitch may turn at a rate from the start on."""
 
-    def __init__(self, pitch, roll):
-        self.pitch, self.roll = pitch, roll
+    def __init__(self, pitch, roll, rate=0.0):
+        self.pitch, self.roll, self.rate = pitch, roll, rate
 
     def angles(self, times_ns):
-        return np.full(len(times_ns), self.pitch), np.full(len(times_ns), self.roll)
+        return self.pitch + self.rate * times_ns / 1e9, np.full(len(times_ns), self.roll)
 
 
 def test_the_lidar_follows_the_shafts_of_its_mount_and_its_weight_pushes_them(solid):
@@ -325,6 +325,16 @@ def test_the_lidar_follows_the_shafts_of_its_mount_and_its_weight_pushes_them(so
     weight = 0.16 * 9.81 * 0.02  # of the lidar, above the joints: it wants to fall further
     assert driver.world.mount_torque(0) == pytest.approx(weight * np.sin(0.3) * np.cos(0.2), rel=0.05)
     assert driver.world.mount_torque(1) == pytest.approx(-weight * np.cos(0.3) * np.sin(0.2), rel=0.05)
+
+
+def test_the_lidar_does_not_trail_a_shaft_that_turns(solid):
+    driver = solid()
+    shafts = Shafts(-0.5 * driver.now / 1e9, 0.0, 0.5)
+    driver.world.carry_lidar(shafts)
+    driver.wait(0.3)
+    joint = plant(driver).data.joint("lidar_pitch")
+    assert joint.qvel[0] == pytest.approx(0.5, abs=0.01)
+    assert joint.qpos[0] == pytest.approx(0.15, abs=0.003)
 
 
 def test_the_mount_of_the_plane_feels_nothing(field):
