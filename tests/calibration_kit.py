@@ -8,6 +8,7 @@ from typing import Any, Final, TypeVar
 
 import numpy as np
 
+from monstertruck_drivers.srf08.emulator import SOUND
 from monstertruck_kinematics.polynomials import F_CORRECTED, G_PRINTED, mirrored
 from monstertruck_runtime.clock import SECOND, Clock, VirtualClock, run_virtual
 from monstertruck_runtime.mailbox import Delivery, Mailbox
@@ -42,6 +43,12 @@ MODES: Final = {
 }
 """Sides to which the front and rear wheels are steered."""
 SLIP_NAMES: Final = ("icr_left", "icr_right", "icr_x", "gain_left", "gain_right")
+PARKED: Final = (0.2, 1.8, 0.0)
+"""Beside a flat wall of the yard, m and rad."""
+YARD_WALL: Final = 3.5
+"""Its y, m."""
+OFF: Final = (0.03, 0.03, 0.1)
+"""By which the sonars' places are off at most, m and rad."""
 START_UP: Final = 3.0
 """Seconds in which every device of the emulated truck is up."""
 
@@ -137,6 +144,9 @@ class SimulatedOperator:
                 c, s = math.cos(self._line), math.sin(self._line)
                 off = c * dx + s * dy if step.name == "ahead" else c * dy - s * dx
                 return 100 * (off + self._error(self._hands.tape))
+            case "wall":
+                side = truth.y + math.cos(truth.yaw) * self._rig.config.sim.world.truck.width / 2
+                return YARD_WALL - side + self._error(self._hands.tape)
             case "meter":
                 error = float(self._rng.uniform(-1, 1)) * self._hands.meter_volts
                 return round(truth.supply_v * (1 + self._meter) + error, 2)
@@ -222,6 +232,15 @@ def hidden(
         world["lidar"] = {"x": x, "y": y, "yaw": yaw, "pitch": pitch, "roll": roll}
     if "imu" in parts:
         world["imu"] = {"rate_scale": float(np.random.default_rng([seed, 13]).uniform(0.96, 1.04))}
+    if "sonar" in parts:
+        own = np.random.default_rng([seed, 19])
+        x, y, yaw = PARKED
+        world["start"] = {"x": x, "y": y, "yaw": yaw + own.uniform(-0.05, 0.05)}
+        places = {
+            name: {k: v + own.uniform(-off, off) for k, v, off in zip(("x", "y", "yaw"), place, OFF, strict=True)}
+            for name, place in ((n, (s.x, s.y, s.yaw)) for n, s in config.sim.world.sonar.sonars.items())
+        }
+        world["sonar"] = {"field_of_view": own.uniform(0.8, 0.94), "sonars": places}
     if "odometry" in parts:
         own = np.random.default_rng([seed, 17])
         truck["wheel_radius"] = 0.075 * own.uniform(0.95, 1.05)
@@ -303,6 +322,8 @@ def truths(config: SimulatedTruckConfig) -> dict[WizardName, dict[str, Value]]:
     soft /= math.sqrt(np.linalg.det(soft))
     if truck.body.kind == "skid_steer":
         return {"slip": {name: getattr(truck.body, name) for name in SLIP_NAMES}}
+    if config.devices.sonar is not None:
+        return {"sonar": _sonar_truth(config)}
     steering: dict[str, Value] = {}
     chassis = truck.chassis()
     for axle, (name, servo) in enumerate((("front", truck.front_servo), ("rear", truck.rear_servo))):
@@ -359,6 +380,12 @@ def _odometry_truth(config: SimulatedTruckConfig) -> dict[str, Value]:
         "front_centre": truck.front_servo.centre_us,
         "rear_centre": truck.rear_servo.centre_us,
     }
+
+
+def _sonar_truth(config: SimulatedTruckConfig) -> dict[str, Value]:
+    sonar = config.sim.world.sonar
+    places = {f"{n}_{what}": getattr(s, what) for n, s in sonar.sonars.items() for what in ("x", "y", "yaw")}
+    return {"cone": sonar.field_of_view, "speed_of_sound": SOUND, **places}
 
 
 def _imu_truth(config: SimulatedTruckConfig) -> dict[str, Value]:

@@ -1,11 +1,12 @@
 """Measurements of hidden trucks by the wizards' own error models, without a daemon: many, for coverage of intervals."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Final
 
 import numpy as np
 
+from monstertruck_drivers.srf08.config import Srf08Config
 from monstertruck_kinematics.chassis import Dimensions, TruckChassis
 from monstertruck_kinematics.elementary import integrate
 from monstertruck_kinematics.truck import DriveTrain
@@ -14,7 +15,7 @@ from monstertruck_runtime.bodies import build_chassis
 from monstertruck_schemas.body import TruckBody
 from monstertruck_schemas.sensor import Attitude, Imu, Vector3
 from monstertruckd.config.calibration import Estimate, Result
-from monstertruckd.tools.calibrate import battery, compass, drive, imu, lidar, odometry, slip, weave
+from monstertruckd.tools.calibrate import battery, compass, drive, imu, lidar, odometry, slip, sonar, weave
 from monstertruckd.tools.calibrate.response import ResponseFit, Steps
 from monstertruckd.tools.calibrate.statistics import NORMAL, Interval
 from monstertruckd.tools.calibrate.steering import BAND, SPAN
@@ -33,6 +34,8 @@ from tests.calibration_kit import Verdict
 CHASSIS: Final = build_chassis(TruckBody(), Dimensions(DriveTrain(644.0, 0.075), 0.32, 0.26))
 MAPS: Final = Maps((1439.2, 1439.2), (-10.48, 10.48))
 AHEAD: Final = 0.235
+ARC: Final = 0.67
+"""Radius in which the robot with sonars drives its arcs, m."""
 
 
 def judged(result: Result, truth: dict[str, float]) -> list[Verdict]:
@@ -303,6 +306,50 @@ def slip_fit(rng: np.random.Generator) -> list[Verdict]:
     return judged(slip.result_of(arcs, 0.021, 0.0525), truth)
 
 
+def sonar_fit(rng: np.random.Generator) -> list[Verdict]:
+    """Four arcs beside a wall."""
+    settings = Srf08Config()
+    cone, factor = rng.uniform(0.75, 0.95), 1 + 0.01 * rng.normal()
+    wall, turned = 1.7 + rng.uniform(-0.05, 0.05), rng.uniform(-0.06, 0.06)
+    true = {
+        name: sonar.SonarPose(*(np.array(s.mount.planar) + rng.uniform(-1, 1, 3) * (0.03, 0.03, 0.1)))
+        for name, s in settings.sonars.items()
+    }
+    legs = sonar_legs(true, (wall, turned), cone / 2, factor, rng)
+    result = sonar.result_of(legs, settings, wall + 0.002 * rng.normal(), 0.002)
+    truth = {"cone": cone, "speed_of_sound": settings.speed_of_sound / factor}
+    truth |= {f"{n}_{what}": float(v) for n, p in true.items() for what, v in zip(("x", "y", "yaw"), p, strict=True)}
+    return judged(result, truth)
+
+
+def sonar_legs(
+    places: Mapping[str, sonar.SonarPose],
+    wall: tuple[float, float],
+    half: float,
+    factor: float,
+    rng: np.random.Generator,
+    turn: float = math.tau,
+) -> list[sonar.SonarLeg]:
+    """Arcs ahead and back to both sides, 5 pings a second: ranges with the sonars' noise, over ``factor``; odometry
+    drifts between."""
+    legs = []
+    step = 0.2 * sonar.SonarWizard().speed / ARC
+    for side in (1, -1):
+        for way in (1, -1):
+            angles = np.arange(0.0, turn, step)[::way] * side
+            radius = side * ARC
+            poses = np.column_stack((radius * np.sin(angles), radius * (1 - np.cos(angles)), angles))
+            nearer, drift = np.array(sonar.DRIFT) * rng.normal(size=2) if legs else (0.0, 0.0)
+            ranges = {}
+            for name, place in places.items():
+                actual = poses + np.array((0.0, 0.0, drift))
+                due, past = sonar.wall_range(actual, place, (wall[0] - nearer, wall[1]), half)
+                heard = due / factor + np.hypot(sonar.NOISE[0], sonar.NOISE[1] * due) * rng.normal(size=due.size)
+                ranges[name] = np.where((past <= 0.45) & (due <= 3.0), heard, np.inf)
+            legs.append(sonar.SonarLeg(dict.fromkeys(places, poses), ranges))
+    return legs
+
+
 LIGHT: Final[dict[str, Callable[[np.random.Generator], list[Verdict]]]] = {
     "battery": battery_fit,
     "drive": drive_fit,
@@ -312,6 +359,7 @@ LIGHT: Final[dict[str, Callable[[np.random.Generator], list[Verdict]]]] = {
     "lidar": lidar_fit,
     "imu": imu_fit,
     "slip": slip_fit,
+    "sonar": sonar_fit,
 }
 """By wizard."""
 HALF_WIDTHS: Final = {
@@ -334,9 +382,17 @@ HALF_WIDTHS: Final = {
     "slip.icr_left": 0.002,
     "slip.gain_left": 0.01,
     "slip.gain_right": 0.01,
+    "sonar.cone": math.radians(2.0),
+    "sonar.speed_of_sound": 3.4,
+    **{
+        f"sonar.{name}_{what}": half
+        for name in ("l", "fl", "f", "fr", "r")
+        for what, half in (("x", 0.015), ("y", 0.015), ("yaw", math.radians(3.0)))
+    },
 }
 """Median half-widths at most: 0.1 V, 1 % of ways and wheels, 2 degrees by iron in 25 uT, 0.5 degrees of an axle (8.5
-us), 10 ms, 10 mm and 0.5 degrees of the lidar, 2 mm of turning centres."""
+us), 10 ms, 10 mm and 0.5 degrees of the lidar, 2 mm of turning centres, 15 mm and 3 degrees of sonars, 1 % of the
+speed of sound."""
 
 
 def coverage(wizard: str, fits: int) -> dict[str, tuple[float, float]]:

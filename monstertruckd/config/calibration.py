@@ -29,12 +29,13 @@ CONFIDENCE: Final = 0.95
 
 Value = bool | int | float
 Grade = Literal["A", "B", "C"]
-WizardName = Literal["battery", "compass", "drive", "steering", "odometry", "lidar", "imu", "slip"]
+WizardName = Literal["battery", "compass", "drive", "steering", "odometry", "lidar", "imu", "slip", "sonar"]
 
 STEERING: Final = "devices.steering.driver"
 COMPASS: Final = "devices.compass.driver.iron"
 LIDAR: Final = "devices.lidar.mount"
 IMU: Final = "devices.imu.driver.correction"
+SONAR: Final = "devices.sonar.driver"
 
 KEYS: Final[dict[WizardName, tuple[str, ...]]] = {
     "battery": (
@@ -64,9 +65,14 @@ KEYS: Final[dict[WizardName, tuple[str, ...]]] = {
     "lidar": tuple(f"{LIDAR}.{name}" for name in ("x", "y", "yaw", "roll", "pitch")),
     "imu": tuple(f"{IMU}.{name}" for name in ("rate_x", "rate_y", "rate_z", "rate_scale", "force_x", "force_y")),
     "slip": tuple(f"body.{name}" for name in ("icr_left", "icr_right", "icr_x", "gain_left", "gain_right")),
+    "sonar": (
+        f"{SONAR}.field_of_view",
+        f"{SONAR}.speed_of_sound",
+        *(f"{SONAR}.sonars.*.mount.{name}" for name in ("x", "y", "yaw")),
+    ),
 }
-"""Values of the configuration that each wizard may set; a calibration never touches any other. Where two wizards
-measure the same value, the newer measurement counts."""
+"""Values of the configuration that each wizard may set, ``*`` for any one name; a calibration never touches any other.
+Where two wizards measure the same value, the newer measurement counts."""
 
 
 class Estimate(Schema):
@@ -329,7 +335,7 @@ def put_values(data: dict[str, Any], results: Iterable[Result], source: Path | s
 
 def _set(data: dict[str, Any], estimate: Estimate, result: Result, source: Path | str) -> None:
     assert estimate.key is not None
-    if estimate.key not in KEYS[result.wizard]:
+    if not may_set(result.wizard, estimate.key):
         raise ConfigError(f"{source}: {estimate.key}: the wizard {result.wizard} has no business there")
     *way, last = estimate.key.split(".")
     section: Any = data
@@ -338,6 +344,16 @@ def _set(data: dict[str, Any], estimate: Estimate, result: Result, source: Path 
         if not isinstance(section, dict):
             return
     section[last] = estimate.value
+
+
+def may_set(wizard: WizardName, key: str) -> bool:
+    """Whether a wizard may set a value of the configuration, by ``KEYS``."""
+    names = key.split(".")
+    patterns = (pattern.split(".") for pattern in KEYS[wizard])
+    return any(
+        len(parts) == len(names) and all(part in ("*", name) for part, name in zip(parts, names, strict=True))
+        for parts in patterns
+    )
 
 
 def value_at(config: Mapping[str, Any], key: str) -> Value | None:

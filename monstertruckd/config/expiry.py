@@ -24,7 +24,7 @@ from monstertruck_runtime.threads import Offload
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.health import CalibrationHealth, CalibrationState
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.topics import BATTERY, CALIBRATION, COMPASS, DRIVE, ODOMETRY, POSE, USB, Topic, Writer
+from monstertruck_schemas.topics import BATTERY, CALIBRATION, COMPASS, DRIVE, ODOMETRY, POSE, SONAR, USB, Topic, Writer
 from monstertruck_schemas.usb import UsbTree
 from monstertruckd.bus.local import Bus
 from monstertruckd.config.calibration import Estimate, Grade, Result, ValidUntil, WizardName, utc
@@ -65,6 +65,7 @@ LIFETIMES: Final[dict[WizardName, Lifetime]] = {
     "lidar": Lifetime(180, 20_000.0, "lidar", (POSE,)),
     "imu": Lifetime(90, None, "imu", _MOTION),
     "slip": Lifetime(90, 5_000.0, "wheels", _MOTION),
+    "sonar": Lifetime(180, 20_000.0, "sonar", (SONAR,)),
 }
 """By experience of such parts, none of it measured: tyres wear, linkages and mounts are knocked, iron changes."""
 
@@ -104,14 +105,20 @@ GOALS: Final[dict[str, Goal]] = {
     "slip.icr_right": Goal(0.03, share=True),
     "slip.gain_left": Goal(0.01, share=True),
     "slip.gain_right": Goal(0.01, share=True),
+    "sonar.cone": Goal(0.035),
+    "sonar.speed_of_sound": Goal(0.01, share=True),
+    "sonar.*_x": Goal(0.015),
+    "sonar.*_y": Goal(0.015),
+    "sonar.*_yaw": Goal(0.052),
 }
 """Of the intervals, in the estimates' units: 1 % of ways, 0.5 degrees of steering (8.5 us), 2 degrees by iron
-in a horizontal field of 25 uT, 10 mm and 0.5 degrees of the lidar, 0.1 V."""
+in a horizontal field of 25 uT, 10 mm and 0.5 degrees of the lidar, 15 mm and 3 degrees of any sonar, 0.1 V."""
 
 
 def grade(wizard: WizardName, estimate: Estimate) -> Grade | None:
     """A: the interval is as narrow as meant; B: at most twice as wide; C: wider. None: it has no goal."""
-    goal = GOALS.get(f"{wizard}.{estimate.name}")
+    of_each = f"{wizard}.*_{estimate.name.rpartition('_')[2]}"
+    goal = GOALS.get(f"{wizard}.{estimate.name}", GOALS.get(of_each))
     if goal is None or estimate.low is None or estimate.high is None:
         return None
     half = (estimate.high - estimate.low) / 2

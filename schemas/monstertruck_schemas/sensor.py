@@ -181,6 +181,8 @@ class SonarRanges(Message):
     """Least range that is measured, m: what is nearer is reported as about this range, or not at all."""
     range_max: Annotated[float, Field(gt=0)]
     """Greatest range, m."""
+    degraded: bool = False
+    """It rests on a calibration that has expired."""
 
     def echo(self, name: str) -> SonarEcho | None:
         """The sonar of that name; None = the array has none."""

@@ -11,6 +11,7 @@ from monstertruckd.tools.calibrate.imu import ImuWizard, imu_wizard
 from monstertruckd.tools.calibrate.lidar import LidarWizard, lidar_wizard
 from monstertruckd.tools.calibrate.odometry import odometry_wizard
 from monstertruckd.tools.calibrate.slip import SlipWizard, slip_wizard
+from monstertruckd.tools.calibrate.sonar import SonarWizard, sonar_wizard
 from monstertruckd.tools.calibrate.wizard import Wizard
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
 from tests.calibration_kit import hidden, run_session, verdicts
@@ -71,3 +72,16 @@ def test_slip(tmp_path: Path):
     }
     config = with_overlay(base, overlay)
     assert judged(slip_wizard(SlipWizard(rounds=1)), config, 4) >= {"icr_left", "icr_right", "gain_left"}
+
+
+@pytest.mark.long
+def test_sonar(tmp_path: Path):
+    base = load_config(CONFIGS / "robots" / "sonar.yaml", SimulatedTruckConfig)[0]
+    overlay = {"recorder": None, "blackbox": None, "state_directory": tmp_path}
+    overlay |= {"devices": {"sonar": {"driver": {"speed_of_sound": 340.0}}}}
+    config = hidden(with_overlay(base, overlay), np.random.default_rng(5), 5, ("sonar",))
+    assert len(judged(sonar_wizard(SonarWizard(turn=3.3, speed=0.25)), config, 5)) == 17
+    current = CalibrationStore(config.calibration_folder, config.robot).current()
+    assert current is not None
+    calibrated = with_values(config, current.results.values(), "calibration")
+    assert calibrated.devices.sonar.driver.sonars["l"].mount != config.devices.sonar.driver.sonars["l"].mount

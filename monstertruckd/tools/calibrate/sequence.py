@@ -6,6 +6,7 @@ from typing import Final
 
 from monstertruckd.config.calibration import Result, WizardName
 from monstertruckd.config.truck import TruckConfig
+from monstertruckd.tools.calibrate.sonar import BODIES
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,6 +31,7 @@ ORDER: Final = (
     SequenceStep("lidar", "x"),
     SequenceStep("imu", "rate_scale"),
     SequenceStep("slip", "icr_left"),
+    SequenceStep("sonar", "cone"),
 )
 """The steering's direction needs the drive's sign, a compass circle the steering's direction, a taped straight wheels
 that are about straight, gains of the steering true metres and headings, squares and the lidar's mount all of them."""
@@ -44,6 +46,8 @@ def fits(step: SequenceStep, config: TruckConfig) -> bool:
             return config.monitors.battery is not None or (steering is not None and steering.driver.battery is not None)
         case "steering" | "odometry":
             return truck and devices.steering is not None and devices.compass is not None and devices.drive is not None
+        case "sonar":
+            return "sonar" in devices.present() and config.body.kind in BODIES
         case "slip":
             return config.body.kind == "skid_steer" and config.stand != "none"
         case "drive" | "compass" | "lidar" | "imu":

@@ -190,6 +190,22 @@ def slip(
     return slip_wizard(SlipWizard("pose" if by == "pose" else "stand", rounds))
 
 
+@_wizard
+def sonar(
+    turn: Annotated[float, typer.Option(min=190, max=720, help="Turn of each arc, degrees.")] = 360.0,
+    tape_error: Annotated[float, typer.Option(min=0.1, max=50, help="Standard error of the distance, mm.")] = 2.0,
+) -> "Wizard":
+    """Where the sonars sit and look, their cones, and the speed of sound: arcs beside a flat wall.
+
+    Asks `park`, `wall` (m) and `clear`.
+    """
+    import math
+
+    from monstertruckd.tools.calibrate.sonar import SonarWizard, sonar_wizard
+
+    return sonar_wizard(SonarWizard(math.radians(turn), tape_error=tape_error / 1000))
+
+
 @app.command("all")
 def all_(
     *,
@@ -227,7 +243,15 @@ def wizard_of(step: "SequenceStep") -> "Wizard":
         return drive(sign_only=step.rough)
     if step.name == "steering":
         return steering(rough=step.rough)
-    others = {"battery": battery, "compass": compass, "odometry": odometry, "lidar": lidar, "imu": imu, "slip": slip}
+    others = {
+        "battery": battery,
+        "compass": compass,
+        "odometry": odometry,
+        "lidar": lidar,
+        "imu": imu,
+        "slip": slip,
+        "sonar": sonar,
+    }
     return others[step.name]()
 
 

@@ -32,6 +32,11 @@ def test_a_skid_steer_robot_on_a_stand_needs_its_slip_alone():
     assert names(missing(stand, {})) == ["slip"]
 
 
+def test_a_robot_with_sonars_needs_their_places():
+    robot = load_config(CONFIGS / "robots" / "sonar.yaml", TruckConfig)[0]
+    assert names(missing(robot, {})) == ["sonar"]
+
+
 def test_what_is_fresh_is_skipped_and_a_first_look_is_taken_once():
     results = {"battery": result("battery", "gain"), "drive": result("drive", "inverted")}
     left = missing(TRUCK, results)

@@ -1,0 +1,409 @@
+"""Place and axis of every sonar, the width of their cones, and the speed of sound, from arcs beside a flat wall.
+
+A wall sends the sound back along its normal, from wherever in the cone that is: a range is the sonar's distance from
+the wall while the normal lies in the cone, and the cone's edge meets the wall a little beyond. Arcs to both sides turn
+every sonar past the wall, and carry it towards the wall and away: that tells where it sits, where its cone ends and
+begins, and by the one taped distance the speed of sound. One circle would not: sonars whose places are turned about its
+centre look like a wall that is turned.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_drivers.srf08.config import Srf08Config
+from monstertruck_kinematics.chassis import Chassis, TruckChassis
+from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.fitting import FitResult, least_squares
+from monstertruck_runtime.errors import InputError, RequestRefusedError
+from monstertruck_schemas import topics
+from monstertruck_schemas.reasons import Reason
+from monstertruckd.config.calibration import SONAR, Result
+from monstertruckd.tools.calibrate.statistics import Interval, estimated, known_errors
+from monstertruckd.tools.calibrate.steps import Confirm, MoveRecord, MoveStep, Number
+from monstertruckd.tools.calibrate.wizard import CLEAR, Wizard, WizardContext
+
+ROOM: Final = (
+    "a flat wall 5 m long and as high as the sonars see, 1.7 m to the robot's left; nothing else within 2 m before, "
+    "behind and to the right of the robot"
+)
+RADIUS: Final = 0.4
+"""Of the arcs at least, m."""
+ANGLE: Final = 0.35
+"""Of both axles of a truck, against each other, rad."""
+SHARE: Final = 0.96
+"""Of the angle that the gate lets a request have."""
+NOISE: Final = (0.005, 0.01)
+"""Standard deviation of a range: m, and share of it, added in quadrature."""
+DRIFT: Final = (0.003, 0.003)
+"""Standard deviation of the robot's distance from the wall (m) and heading (rad) on one arc, by odometry."""
+BELIEVED: Final = 0.01
+"""Standard deviation of the speed of sound before it is measured, as a share: 6 degrees Celsius."""
+NEAR: Final = 0.2
+"""Greatest error of a range that still may be the wall, m, before anything is fitted;"""
+SIGMAS: Final = 4.0
+"""and in standard deviations afterwards."""
+BEYOND: Final = 0.3
+"""Past the cone's edge the wall is still heard, rad: grazing sound is reflected away."""
+LEAST: Final = 12
+"""Echoes of a sonar that its place rests on, at least."""
+SPAN: Final = 1.0
+"""Turn to each side, rad, at least."""
+BODY: Final = 0.3
+"""Greatest difference of a range from the wall's distance of the robot's middle, m."""
+ASTRAY: Final = 0.4
+"""Angle between the middle of the echoes and that of those that are due, rad, that no mount is off by."""
+BODIES: Final = ("differential", "skid_steer", "truck")
+"""That turn within a metre."""
+COMMON: Final = 4
+"""Parameters before those of the arcs: distance and direction of the wall, half the cone, factor of the ranges."""
+
+_PARK: Final = Confirm(
+    "park", "Stand the robot along the wall, the wall 1.7 m to its left, the middle of the wall beside it. Done?"
+)
+_WALL: Final = Number("wall", "Distance from the wall to the middle of the robot's left side, m", 0.3, 3.0)
+
+
+class SonarPose(NamedTuple):
+    """Place and axis of one sonar on the body, or of one for each echo (n,), m and rad."""
+
+    x: float | Array
+    y: float | Array
+    yaw: float | Array
+
+
+@dataclass(frozen=True, slots=True)
+class SonarLeg:
+    """One arc: where the robot was at every ping, and what came back."""
+
+    poses: Mapping[str, Array]
+    """By sonar, (n, 3): x, y (m) and yaw (rad) in the frame of the robot as it was parked"""
+    ranges: Mapping[str, Array]
+    """By sonar, (n,), m; inf without an echo"""
+
+    @classmethod
+    def of(cls, record: MoveRecord, origin: tuple[float, float, float]) -> "SonarLeg":
+        """From a move.
+
+        Args:
+            record: with odometry and sonars.
+            origin: x, y (m) and yaw (rad) of the odometry when the robot was parked.
+
+        Raises:
+            InputError: no odometry.
+        """
+        odometry = record.of(topics.ODOMETRY)
+        if len(odometry) < 2:
+            raise InputError("no odometry came while the robot moved")
+        stamps = np.array([o.stamp for o in odometry], dtype=np.float64)
+        x = np.array([o.pose.x for o in odometry]) - origin[0]
+        y = np.array([o.pose.y for o in odometry]) - origin[1]
+        yaw = np.unwrap([o.pose.yaw for o in odometry]) - origin[2]
+        c, s = math.cos(origin[2]), math.sin(origin[2])
+        track = (c * x + s * y, c * y - s * x, yaw)
+        rows: dict[str, list[tuple[float, float]]] = {}
+        for message in record.of(topics.SONAR):
+            for echo in message.sonars:
+                if echo.answered and stamps[0] <= echo.stamp <= stamps[-1]:
+                    distance = math.inf if echo.range is None else echo.range
+                    rows.setdefault(echo.name, []).append((float(echo.stamp), distance))
+        poses, ranges = {}, {}
+        for name, found in rows.items():
+            times, distances = np.array(found).T
+            poses[name] = np.column_stack([np.interp(times, stamps, values) for values in track])
+            ranges[name] = distances
+        return cls(poses, ranges)
+
+
+@dataclass(frozen=True, slots=True)
+class SonarWizard:
+    """An arc to each side, driven ahead and back, beside a wall."""
+
+    turn: float = 2 * math.pi
+    """Of each arc, rad"""
+    tape_error: float = 0.002
+    """Standard deviation of the taped distance, m"""
+    speed: float = 0.12
+
+    async def __call__(self, context: WizardContext) -> Result:
+        """Measure."""
+        config = context.config
+        device = config.devices.sonar
+        if device is None or not isinstance(device.driver, Srf08Config):
+            raise RequestRefusedError(Reason.NOT_SUPPORTED, "this robot has no array of sonars whose places it states")
+        if config.body.kind not in BODIES:
+            raise RequestRefusedError(Reason.NOT_SUPPORTED, f"body {config.body.kind}: its arcs are too wide")
+        settings = device.driver
+        await context.confirm(_PARK)
+        wall = await context.ask(_WALL) + config.geometry.width / 2
+        await context.confirm(CLEAR)
+        front, rear, radius = arc(context.chassis, context.config.gate.angle)
+        records = []
+        for side, name in ((1, "left"), (-1, "right")):
+            for way in (1, -1):
+                move = MoveStep(
+                    f"an arc to the {name}, {'ahead' if way > 0 else 'back'}",
+                    way * min(self.speed, config.gate.speed if way > 0 else config.gate.reverse_speed),
+                    side * front,
+                    side * rear,
+                    2.0 * self.turn * radius,
+                    done=lambda record: abs(_turned(record)) >= self.turn,
+                    also=(topics.SONAR, topics.ODOMETRY),
+                )
+                records.append(await context.move(move))
+        origin = _start(records[0])
+        legs = [SonarLeg.of(record, origin) for record in records]
+        return context.fit("places and cones", lambda: result_of(legs, settings, wall, self.tape_error))
+
+
+def sonar_wizard(settings: SonarWizard | None = None) -> Wizard:
+    """Places and cones."""
+    doc = "where every sonar sits and looks, how wide its cone is, and the speed of sound, from arcs beside a wall"
+    return Wizard("sonar", doc, ROOM, settings or SonarWizard())
+
+
+def result_of(legs: Sequence[SonarLeg], settings: Srf08Config, wall: float, tape_error: float) -> Result:
+    """Fit and judge.
+
+    Args:
+        legs: driven, the first from where the robot was parked.
+        settings: that the daemon runs with.
+        wall: distance of the wall from the robot's middle, as taped, m.
+        tape_error: its standard deviation, m.
+
+    Raises:
+        InputError: arcs to one side only, too few echoes, or sonars that hear what others should.
+    """
+    headings = np.concatenate([p[:, 2] for leg in legs for p in leg.poses.values()] or [np.zeros(1)])
+    if headings.max() < SPAN or headings.min() > -SPAN:
+        raise InputError(f"expected arcs of {SPAN:g} rad at least to both sides, with sonars that answer")
+    places = {n: SonarPose(*s.mount.planar) for n, s in settings.sonars.items()}
+    _check_places(legs, places, wall, settings.field_of_view / 2)
+    model = SonarModel(legs, settings, wall, tape_error)
+    fit = model.fit()
+    halves = known_errors(fit, model.kept.ranges.size - fit.parameters.size)
+    if not np.isfinite(halves).all():
+        raise InputError("the arcs do not tell the sonars' places: one is off by more than a fit may find")
+    found = [Interval(float(v), float(h)) for v, h in zip(fit.parameters, halves, strict=True)]
+    count, noise = model.kept.ranges.size, "95 % of ranges, odometry and tape"
+    sound = Interval(settings.speed_of_sound / found[3].value, settings.speed_of_sound * found[3].half)
+    estimates = [
+        estimated("cone", found[2].times(2.0), "rad", count, f"full opening angle, hard edges taken; {noise}",
+                  f"{SONAR}.field_of_view"),
+        estimated("speed_of_sound", sound, "m/s", count, f"with which the wall is where the tape says; {noise}",
+                  f"{SONAR}.speed_of_sound"),
+    ]  # fmt: skip
+    meanings = {"x": "ahead of the robot's middle", "y": "left of it", "yaw": "of its axis, left positive"}
+    for i, name in enumerate(model.order):
+        base = model.first + 3 * i
+        for j, (what, meaning) in enumerate(meanings.items()):
+            key = f"{SONAR}.sonars.{name}.mount.{what}"
+            unit = "rad" if what == "yaw" else "m"
+            estimates.append(
+                estimated(f"{name}_{what}", found[base + j], unit, model.samples(name), f"{meaning}; {noise}", key)
+            )
+    return Result(
+        wizard="sonar",
+        measured=f"{len(legs)} arcs beside a wall, {count} echoes; unexplained {fit.rms:.2f} of what is expected",
+        estimates=tuple(estimates),
+        unobserved=(
+            "height and tilt of the cones",
+            "how a cone fades towards its edge: it is taken for a hard one",
+            "the speed of sound at another temperature: 0.6 m/s for each degree Celsius",
+        ),
+    )
+
+
+def arc(chassis: Chassis, limit: float) -> tuple[float, float, float]:
+    """Axle angles of an arc to the left (rad), and its radius (m): by both axles of a truck, else by the front one."""
+    if isinstance(chassis, TruckChassis):
+        angles = ANGLE, -ANGLE
+    else:
+        angles = min(SHARE * limit, math.atan((chassis.bicycle.l_f + chassis.bicycle.l_r) / RADIUS)), 0.0
+    return (*angles, 1.0 / float(chassis.bicycle.curvature(*angles)))
+
+
+def wall_range(poses: Array, place: SonarPose, wall: tuple[float, float], half: float) -> tuple[Array, Array]:
+    """Range of a wall, m, and by how much its normal is past the cone's edge, rad; (n,) each.
+
+    Args:
+        poses: of the robot, (n, 3).
+        place: of the sonar.
+        wall: distance from the origin (m), and by how much it is turned from the x axis to the right (rad).
+        half: of the cone, rad.
+    """
+    x, y, yaw = poses.T
+    turned = yaw + wall[1]
+    distance = (
+        wall[0]
+        - (math.sin(wall[1]) * x + math.cos(wall[1]) * y)
+        - (np.sin(turned) * place.x + np.cos(turned) * place.y)
+    )
+    off = np.abs(_wrapped(turned + place.yaw - math.pi / 2))
+    past = np.maximum(off - half, 0.0)
+    return np.asarray(distance / np.cos(np.minimum(past, 1.2))), past
+
+
+class SonarModel:
+    """Ranges of a wall along arcs.
+
+    Parameters: ``COMMON``; for every arc but the first what the robot is nearer to the wall (m) and turned (rad); x, y,
+    yaw of every sonar.
+
+    Args:
+        legs: driven.
+        settings: that the daemon runs with.
+        wall: as taped, m.
+        tape_error: its standard deviation, m.
+    """
+
+    def __init__(self, legs: Sequence[SonarLeg], settings: Srf08Config, wall: float, tape_error: float) -> None:
+        self.order = tuple(settings.sonars)
+        self.first = COMMON + 2 * (len(legs) - 1)
+        rows = [
+            (i, k, *pose, distance)
+            for i, leg in enumerate(legs)
+            for k, name in enumerate(self.order)
+            if name in leg.poses
+            for pose, distance in zip(leg.poses[name].tolist(), leg.ranges[name].tolist(), strict=True)
+            if distance < math.inf
+        ]
+        arcs, sonars, *poses, ranges = np.array(rows).T
+        self._echoes = _Echoes(arcs.astype(np.int64), sonars.astype(np.int64), np.array(poses), ranges)
+        self._wall, self._tape_error = wall, tape_error
+        mounts = [s.mount.planar for s in settings.sonars.values()]
+        self._start = np.concatenate(
+            ((wall, 0.0, settings.field_of_view / 2, 1.0), np.zeros(self.first - COMMON), np.ravel(mounts))
+        )
+        self._limits = 1.2 * settings.range_min, 0.95 * settings.range_max
+        self.kept = self._chosen(self._start, NEAR, 0.0)
+
+    def samples(self, name: str) -> int:
+        """Echoes of a sonar that are the wall's."""
+        return int((self.kept.sonars == self.order.index(name)).sum())
+
+    def fit(self) -> FitResult:
+        """Least squares: by what the wall meets within the cones, then by their edges too, then without strays.
+
+        Raises:
+            InputError: too few echoes of a sonar.
+        """
+        found = self._solve(self._start, edges=False)
+        sigmas = SIGMAS * _sigma(self._echoes.ranges)
+        for bounds in (NEAR / 2 + sigmas, sigmas):
+            self.kept = self._chosen(found.parameters, bounds, BEYOND)
+            found = self._solve(found.parameters)
+        return found
+
+    def _solve(self, start: Array, *, edges: bool = True) -> FitResult:
+        """Axes and cone stay as they are where no edges tell them."""
+        for name in self.order:
+            if (count := self.samples(name)) < LEAST:
+                raise InputError(f"sonar {name}: {count} echoes of the wall: expected {LEAST}; drive longer arcs")
+        reach = np.concatenate(((0.3, 0.3, 0.25, 0.1), np.full(self.first - COMMON, 0.1)))
+        reach = np.concatenate((reach, np.tile((0.15, 0.15, 0.4 if edges else 0.0), len(self.order))))
+        reach[2] *= edges
+        return least_squares(self._residual, start, self._start - reach, self._start + reach)
+
+    def _predicted(self, parameters: Array, echoes: "_Echoes") -> tuple[Array, Array]:
+        """Ranges as the sonars measure them, m, and what the normal is past the cone's edge, rad."""
+        distance, direction, half, factor = parameters[:COMMON].tolist()
+        drift = np.vstack(((0.0, 0.0), parameters[COMMON : self.first].reshape(-1, 2)))
+        nearer, turned = drift[echoes.arcs].T
+        x, y, yaw = parameters[self.first :].reshape(-1, 3)[echoes.sonars].T
+        poses = np.column_stack((echoes.poses[0], echoes.poses[1], echoes.poses[2] + turned))
+        due, past = wall_range(poses, SonarPose(x, y, yaw), (distance - nearer, direction), half)
+        return due / factor, past
+
+    def _residual(self, parameters: Array) -> Array:
+        kept = self.kept
+        off = (kept.ranges - self._predicted(parameters, kept)[0]) / _sigma(kept.ranges)
+        drift = parameters[COMMON : self.first].reshape(-1, 2) / DRIFT
+        believed = ((parameters[0] - self._wall) / self._tape_error, (parameters[3] - 1.0) / BELIEVED)
+        return np.concatenate((off, drift.ravel(), believed))
+
+    def _chosen(self, parameters: Array, bounds: Array | float, beyond: float) -> "_Echoes":
+        """The wall's echoes: as near to what is due as ``bounds``, m, ``beyond`` the cone's edge at most, rad."""
+        due, past = self._predicted(parameters, self._echoes)
+        near = np.abs(self._echoes.ranges - due) < bounds
+        near &= (past <= beyond) & (due > self._limits[0]) & (due < self._limits[1])
+        e = self._echoes
+        return _Echoes(e.arcs[near], e.sonars[near], e.poses[:, near], e.ranges[near])
+
+
+class _Echoes(NamedTuple):
+    """Echoes of all sonars on all arcs; (n,) each."""
+
+    arcs: NDArray[np.int64]
+    sonars: NDArray[np.int64]
+    poses: Array
+    """(3, n): x, y (m) and yaw (rad) of the robot"""
+    ranges: Array
+    """m."""
+
+
+def _check_places(legs: Sequence[SonarLeg], places: Mapping[str, SonarPose], wall: float, half: float) -> None:
+    """Raise where a sonar looks elsewhere than it should: by the middle of the directions in which it hears the wall.
+
+    Raises:
+        InputError: cables or addresses are swapped, or a sonar hears no wall.
+    """
+    wrong, deaf = [], []
+    for name in places:
+        bearings, near = _bearings(legs, name, wall)
+        if near.sum() < LEAST:
+            deaf.append(name)
+            continue
+        off = {}
+        for at, place in places.items():
+            due = np.abs(_wrapped(bearings - place.yaw)) <= half + BEYOND
+            off[at] = abs(_wrapped(_middle(bearings[near]) - _middle(bearings[due]))) if due.any() else math.pi
+        nearest = min(off, key=lambda at: off[at])
+        if off[name] > ASTRAY and nearest != name:
+            wrong.append(f"{name} hears what is due at {nearest}")
+    if deaf:
+        raise InputError(f"sonar {', '.join(deaf)}: too few echoes of the wall: is it where it was taped?")
+    if wrong:
+        raise InputError(f"{', '.join(wrong)}: their addresses or cables are swapped, or left and right are")
+
+
+def _bearings(legs: Sequence[SonarLeg], name: str, wall: float) -> tuple[Array, NDArray[np.bool_]]:
+    """Direction of the wall on the body at every ping, rad, and whether the sonar heard something as far off; (n,)."""
+    poses = np.concatenate([leg.poses[name] for leg in legs if name in leg.poses] or [np.empty((0, 3))])
+    ranges = np.concatenate([leg.ranges[name] for leg in legs if name in leg.poses] or [np.empty(0)])
+    return math.pi / 2 - poses[:, 2], np.abs(ranges - (wall - poses[:, 1])) < BODY
+
+
+def _middle(angles: Array) -> float:
+    return math.atan2(float(np.sin(angles).sum()), float(np.cos(angles).sum()))
+
+
+def _wrapped(angles: Any) -> Any:
+    return (angles + math.pi) % (2 * math.pi) - math.pi
+
+
+def _sigma(ranges: Array) -> Array:
+    return np.asarray(np.hypot(NOISE[0], NOISE[1] * ranges))
+
+
+def _turned(record: MoveRecord) -> float:
+    """Turn by odometry, rad."""
+    yaws = np.unwrap([o.pose.yaw for o in record.of(topics.ODOMETRY)])
+    return float(yaws[-1] - yaws[0]) if yaws.size else 0.0
+
+
+def _start(record: MoveRecord) -> tuple[float, float, float]:
+    """Pose by odometry at rest before a move.
+
+    Raises:
+        InputError: none came.
+    """
+    resting = record.at_rest(topics.ODOMETRY)[0]
+    if not resting:
+        raise InputError("no odometry came while the robot stood")
+    pose = resting[-1].pose
+    return pose.x, pose.y, pose.yaw

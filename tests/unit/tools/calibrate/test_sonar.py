@@ -1,0 +1,103 @@
+"""Places of sonars from arcs beside a wall: what tells them, and what is refused."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from monstertruck_drivers.srf08.config import Srf08Config
+from monstertruck_runtime.clock import SECOND
+from monstertruck_runtime.errors import InputError
+from monstertruck_schemas import topics
+from monstertruck_schemas.base import Pose2D, Twist2D
+from monstertruck_schemas.sensor import SonarEcho, SonarRanges
+from monstertruck_schemas.state import Odometry
+from monstertruckd.config.calibration import may_set
+from monstertruckd.tools.calibrate.sonar import SonarLeg, SonarPose, result_of
+from monstertruckd.tools.calibrate.steps import MoveRecord
+from tests.calibration_light import sonar_legs
+
+SETTINGS = Srf08Config()
+PLACES = {n: SonarPose(*s.mount.planar) for n, s in SETTINGS.sonars.items()}
+TURN = 3.3
+WALL = 1.7
+
+
+def legs(places=PLACES, seed=1):
+    return sonar_legs(places, (WALL, 0.02), 0.43, 1.0, np.random.default_rng(seed), TURN)
+
+
+def swapped(first, second):
+    return {**PLACES, first: PLACES[second], second: PLACES[first]}
+
+
+def test_all_places_and_no_other_key_are_found():
+    result = result_of(legs(), SETTINGS, WALL, 0.002)
+    assert {e.name for e in result.estimates} == {
+        "cone", "speed_of_sound", *(f"{n}_{what}" for n in PLACES for what in ("x", "y", "yaw")),
+    }  # fmt: skip
+    assert all(e.key is not None and may_set("sonar", e.key) for e in result.estimates)
+    assert not may_set("sonar", "devices.sonar.driver.sonars.l.address")
+    assert not may_set("sonar", "devices.sonar.driver.sonars.l.x.mount.x")
+
+
+@pytest.mark.parametrize(("first", "second"), [("l", "r"), ("fl", "fr"), ("l", "fl"), ("f", "r")])
+def test_swapped_cables_are_named(first, second):
+    with pytest.raises(InputError, match=f"{first} hears what is due at {second}, {second} hears .* at {first}"):
+        result_of(legs(swapped(first, second)), SETTINGS, WALL, 0.002)
+
+
+def test_a_wall_that_is_elsewhere_is_no_swap():
+    with pytest.raises(InputError, match="too few echoes of the wall: is it where it was taped"):
+        result_of(legs(), SETTINGS, 2.6, 0.002)
+
+
+def test_echoes_of_other_things_are_left_out():
+    crowded = []
+    for leg in legs():
+        ranges = {n: np.where(np.arange(r.size) % 7 == 0, 0.5, r) for n, r in leg.ranges.items()}
+        crowded.append(replace(leg, ranges=ranges))
+    result = result_of(crowded, SETTINGS, WALL, 0.002)
+    for name, place in PLACES.items():
+        for what in ("x", "y", "yaw"):
+            estimate = result.estimate(f"{name}_{what}")
+            assert estimate is not None
+            half = (estimate.high - estimate.low) / 2
+            assert estimate.value == pytest.approx(getattr(place, what), abs=2 * half)
+            assert half < 0.15
+
+
+def test_pings_are_placed_where_the_robot_was_by_odometry():
+    record = MoveRecord(left=3 * SECOND, arrived=9 * SECOND)
+    header = {"received": 0, "seq": 1}
+    covariance = tuple(np.eye(3).ravel())
+    record.others[topics.ODOMETRY.name] = [
+        Odometry(
+            **header, stamp=k * SECOND, pose=Pose2D(x=2.0, y=1.0 + 0.1 * k, yaw=math.pi / 2), twist=Twist2D(vx=0.0, vy=0.0, wz=0.0),
+            pose_covariance=covariance, twist_covariance=covariance, age=0.0,
+        )
+        for k in range(11)
+    ]  # fmt: skip
+    echoes = (
+        SonarEcho(name="l", range=1.2, stamp=round(4.5 * SECOND)),
+        SonarEcho(name="f", stamp=5 * SECOND),
+        SonarEcho(name="r", answered=False, stamp=5 * SECOND),
+    )
+    record.others[topics.SONAR.name] = [
+        SonarRanges(**header, stamp=5 * SECOND, sonars=echoes, field_of_view=0.8, range_min=0.1, range_max=3.0)
+    ]
+    leg = SonarLeg.of(record, (2.0, 1.0, math.pi / 2))
+    assert leg.poses["l"][0] == pytest.approx((0.45, 0.0, 0.0))
+    assert leg.ranges["l"] == pytest.approx([1.2])
+    assert leg.ranges["f"][0] == math.inf
+    assert "r" not in leg.poses
+
+
+def test_short_arcs_and_too_few_echoes_are_refused():
+    short = sonar_legs(PLACES, (WALL, 0.0), 0.43, 1.0, np.random.default_rng(1), 0.5)
+    with pytest.raises(InputError, match="arcs of 1 rad at least"):
+        result_of(short, SETTINGS, WALL, 0.002)
+    deaf = [replace(leg, ranges={**leg.ranges, "f": np.full_like(leg.ranges["f"], np.inf)}) for leg in legs()]
+    with pytest.raises(InputError, match="sonar f"):
+        result_of(deaf, SETTINGS, WALL, 0.002)
