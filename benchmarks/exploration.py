@@ -2,14 +2,17 @@
 
 The grid, the exploring step and the route planner are the daemon's; the robot is where its route says. All runs of a
 world and seed start at the same pose. Peers: `nearest` and `author` (kinds of the catalog), and `offline`, a tour by
-somebody who knows the world. Reachable: what the footprint can cover, flood-filled by its inscribed circle. Besides,
-frontiers of a map of 1000 x 1000 cells with one changed tile, and a decision on it. The last line is JSON.
+somebody who knows the world. Reachable: what the footprint can cover, flood-filled by its inscribed circle. The last
+line is JSON.
 
-    python benchmarks/exploration.py [--maps FOLDER] [--seeds 5] [--reach 5.6 4] [--worlds NAME ...] [--kinds NAME ...]
-        [--resume]
+    python benchmarks/exploration.py [--part NAME ...] [--maps FOLDER] [--seeds N] [--reach 5.6 4] [--worlds NAME ...]
+        [--kinds NAME ...] [--faults NAME ...] [--resume]
+
+Parts: `metres`, 5 seeds; `costs`: frontiers of a map of 1000 x 1000 cells with one changed tile, and a decision on it;
+`faults`: the whole daemon, 20 seeds, see `exploration_parts/faults.py`.
 
 FOLDER has map_server files (stdr_simple_rooms, nav2_depot, stdr_hospital_section, movingai_berlin_0_256); without it
-the worlds of this repository are explored. Rows go to runs/exploration/rows.jsonl; with --resume those there count.
+the worlds of this repository are explored. Rows go to runs/exploration/PART.jsonl; with --resume those there count.
 """
 
 import argparse
@@ -23,6 +26,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
 
+from exploration_parts import faults
 from exploration_parts.arena import Arena
 from exploration_parts.offline import offline_tour
 from exploration_parts.rover import SHARES, Rover, Run
@@ -48,46 +52,78 @@ OUT = Path(__file__).resolve().parents[1] / "runs" / "exploration"
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--part", nargs="+", choices=PARTS, default=PARTS)
     parser.add_argument("--maps", type=Path)
-    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--seeds", type=int, help="instead of each part's own number")
     parser.add_argument("--reach", type=float, nargs="+", default=[5.6, 4.0])
     parser.add_argument("--worlds", nargs="+")
     parser.add_argument("--kinds", nargs="+", default=[OURS, *PEERS, "offline"])
+    parser.add_argument("--faults", nargs="+", choices=faults.FAULTS, default=faults.FAULTS)
     parser.add_argument("--resume", action="store_true")
     arguments = parser.parse_args()
     OUT.mkdir(parents=True, exist_ok=True)
-    known = list(WORLDS) if arguments.maps is not None else list(SHIPPED)
-    rows = explored(arguments, arguments.worlds or known)
-    figures, goals = summary(rows)
-    figures |= costs()
-    goals |= {"frontier_update_p99_ms": 5.0, "decision_1000_max_ms": 200.0}
+    figures: dict[str, float] = {}
+    goals: dict[str, float] = {}
+    for part in arguments.part:
+        found, asked = PARTS[part](arguments)
+        figures |= found
+        goals |= asked
     met = all(figures[name] <= goal for name, goal in goals.items() if name in figures)
     print(json.dumps({"bench": "exploration", "figures": figures, "goals": goals, "met": met}))
     return 0 if met else 1
 
 
-def explored(arguments: argparse.Namespace, worlds: list[str]) -> list[dict[str, Any]]:
-    """All runs, one row each."""
-    file = OUT / "rows.jsonl"
-    rows = [json.loads(line) for line in file.read_text().splitlines()] if arguments.resume and file.exists() else []
-    if not arguments.resume:
-        file.write_text("")
-    done = {(row["world"], row["kind"], row["seed"], row["reach"]) for row in rows}
+class Rows:
+    """Those of a part, each written down at once.
+
+    Args:
+        part: name of the file.
+        keep: those of a run before count.
+    """
+
+    def __init__(self, part: str, *, keep: bool) -> None:
+        self._file = OUT / f"{part}.jsonl"
+        self.all: list[dict[str, Any]] = []
+        if keep and self._file.exists():
+            self.all = [json.loads(line) for line in self._file.read_text().splitlines()]
+        else:
+            self._file.write_text("")
+
+    def has(self, **key: Any) -> bool:
+        """Whether there is one like this."""
+        return any(key.items() <= row.items() for row in self.all)
+
+    def add(self, row: dict[str, Any]) -> None:
+        """Print it, and write it down."""
+        self.all.append(row)
+        print(json.dumps(row), flush=True)
+        with self._file.open("a") as out:
+            out.write(json.dumps(row) + "\n")
+
+
+def metres(arguments: argparse.Namespace) -> tuple[dict[str, float], dict[str, float]]:
+    """All runs in the light harness."""
+    worlds = arguments.worlds or list(WORLDS if arguments.maps is not None else SHIPPED)
+    rows = Rows("metres", keep=arguments.resume)
     warm_up()
-    for seed in range(arguments.seeds):
+    for seed in range(arguments.seeds or 5):
         for reach in arguments.reach:
             for world in worlds:
                 arena = Arena.load(world, file_of(world, arguments.maps))
                 for kind in arguments.kinds:
-                    if (world, kind, seed, reach) in done:
-                        continue
-                    row = row_of(run_of(arena, kind, reach, seed))
-                    rows.append(row)
-                    print(json.dumps(row), flush=True)
-                    with file.open("a") as out:
-                        out.write(json.dumps(row) + "\n")
-    wanted = set(worlds)
-    return [row for row in rows if row["world"] in wanted]
+                    if not rows.has(world=world, kind=kind, seed=seed, reach=reach):
+                        rows.add(row_of(run_of(arena, kind, reach, seed)))
+    return summary([row for row in rows.all if row["world"] in worlds])
+
+
+def faulty(arguments: argparse.Namespace) -> tuple[dict[str, float], dict[str, float]]:
+    """The whole daemon, and what goes wrong."""
+    rows = Rows("faults", keep=arguments.resume)
+    for seed in range(arguments.seeds or 20):
+        for fault in arguments.faults:
+            if not rows.has(fault=fault, seed=seed):
+                rows.add(faults.explored(seed, fault))
+    return faults.summary(rows.all)
 
 
 def file_of(world: str, maps: Path | None) -> Path:
@@ -145,7 +181,7 @@ def summary(rows: list[dict[str, Any]]) -> tuple[dict[str, float], dict[str, flo
     return figures, goals
 
 
-def costs() -> dict[str, float]:
+def costs(_: argparse.Namespace) -> tuple[dict[str, float], dict[str, float]]:
     """A map of 1000 x 1000 cells with rooms half of which are known: a changed tile, and a decision; processor time."""
     rng = np.random.default_rng(5)
     cells = np.full((1000, 1000), -1, np.int8)
@@ -174,12 +210,13 @@ def costs() -> dict[str, float]:
             begin = time.process_time()
             answer = step.step(ExploreTask(pose, choose=True, home=pose))
             decisions.append(time.process_time() - begin)
-    return {
+    figures = {
         "frontier_update_p99_ms": round(1e3 * float(np.percentile(updates, 99)), 3),
         "decision_1000_p50_ms": round(1e3 * float(np.median(decisions[1:])), 1),
         "decision_1000_max_ms": round(1e3 * max(decisions[1:]), 1),
         "decision_1000_frontiers": float(answer.frontiers),
     }
+    return figures, {"frontier_update_p99_ms": 5.0, "decision_1000_max_ms": 200.0}
 
 
 def message(cells: np.ndarray, column: int, row: int) -> Grid:
@@ -189,6 +226,9 @@ def message(cells: np.ndarray, column: int, row: int) -> Grid:
         stamp=0, received=0, seq=0, frame="map", resolution=0.05, width=columns, height=rows,
         origin=Pose2D(x=column * 0.05, y=row * 0.05, yaw=0.0), cells=np.ascontiguousarray(cells).reshape(-1),
     )  # fmt: skip
+
+
+PARTS: Final = {"metres": metres, "costs": costs, "faults": faulty}
 
 
 if __name__ == "__main__":

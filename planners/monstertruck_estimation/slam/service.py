@@ -42,6 +42,8 @@ HISTORY: Final = 128
 """Poses of odometry kept: 2.5 s at 50 Hz."""
 STALE: Final = SECOND // 5
 """Odometry older than the scan by more than this is not used, ns."""
+UNSCANNED: Final = 1.0
+"""A map that is asked for is saved without a scan if no usable one comes within so many seconds."""
 CORRECTIONS: Final = {"closed": "closure {}", "joined": "two submaps are joined"}
 """What is reported of a step that has corrected the map; {} is the number of closures."""
 PLACELESS: Final = frozenset({LocalisationStatus.SEARCHING, LocalisationStatus.OUTSIDE})
@@ -102,6 +104,11 @@ class SlamService:
         self._due = {"tiles": 0, "whole": 0, "save": clock.now() + round(config.save_period * SECOND)}
         self._changed = False
         self._under_way: asyncio.Task[Any] | None = None
+        self._one_step = asyncio.Lock()
+        self._asked = asyncio.Event()
+        """The map is to be saved."""
+        self._started = False
+        """The worker has a map."""
         self._instants: tuple[int, ...] = ()
         self._sent_instants: tuple[int, ...] = ()
         self._bases: dict[int, Vector] = {}
@@ -125,8 +132,9 @@ class SlamService:
         return self._bases
 
     def save_soon(self) -> bool:
-        """Have the map saved with the next scan; returns whether there is a map to save, and a place for it."""
+        """Have the map saved, with the next scan if one comes; returns whether there is one, and a place for it."""
         self._due["save"] = 0
+        self._asked.set()
         return self._config.save is not None and self._config.mode == "mapping"
 
     async def run(self, ready: Ready) -> None:
@@ -146,10 +154,12 @@ class SlamService:
         )
         async with worker:
             await worker.start()
+            self._started = False
             ready()
             try:
                 async with asyncio.TaskGroup() as tasks:
                     tasks.create_task(self._map(worker))
+                    tasks.create_task(self._save_unscanned(worker))
                     if self._odometry is not None:
                         tasks.create_task(self._follow(self._odometry))
             except* WorkerError as group:
@@ -199,17 +209,28 @@ class SlamService:
     # Scans
 
     async def _map(self, worker: WorkerActor) -> None:
-        started = False
         async for scan in self._scan:
             reason = self._unusable(scan)
             if reason is not None:
                 self._skip(reason)
                 continue
             inputs = self._inputs(scan)
-            start = None if started else Start(self._config, self._start(inputs.odom), self._body)
-            outputs = await self._step(worker, self._work(inputs, start))
-            started = True
+            start = None if self._started else Start(self._config, self._start(inputs.odom), self._body)
+            async with self._one_step:
+                outputs = await self._step(worker, self._work(inputs, start))
+            self._started = True
             self._take(outputs, scan)
+
+    async def _save_unscanned(self, worker: WorkerActor) -> None:
+        """Save a map that is asked for while the lidar is silent, or the robot lies on its side."""
+        while True:
+            await self._asked.wait()
+            self._asked.clear()
+            await self._clock.sleep(UNSCANNED)
+            async with self._one_step:
+                if self._started and self._due["save"] == 0 and self._config.mode == "mapping":
+                    self._due["save"] = self._clock.now() + round(self._config.save_period * SECOND)
+                    self._report_saved(await self._step(worker, WorkerInput(save=self._config.save)))
 
     async def _step(self, worker: WorkerActor, work: WorkerInput) -> WorkerOutput:
         """Shielded: cancelling a step kills the worker, and the map that is still to be saved with it."""

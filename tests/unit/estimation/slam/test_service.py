@@ -1,0 +1,119 @@
+"""The service around the worker: a map that is asked for is saved, with scans and without."""
+
+import asyncio
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+import pytest
+
+from monstertruck_estimation.slam import service as module
+from monstertruck_estimation.slam.config import SlamConfig
+from monstertruck_estimation.slam.service import SlamService
+from monstertruck_estimation.slam.worker_io import WorkerInput, WorkerOutput
+from monstertruck_runtime.clock import VirtualClock, run_virtual
+from monstertruck_runtime.mailbox import Mailbox, fifo
+from monstertruck_schemas.body import Mount
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.sensor import LaserScan
+
+
+class FakeWorker:
+    """Notes what it is asked; a step takes 50 ms."""
+
+    tasks: list[WorkerInput]
+    at_once: int
+
+    def __init__(self, name: str, target: str, clock: VirtualClock, **settings: float) -> None:
+        FakeWorker.tasks, FakeWorker.at_once = [], 0
+        self.pid, self._clock, self._busy = 1, clock, 0
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *error: object) -> None:
+        return
+
+    async def start(self) -> None:
+        return
+
+    async def step(self, task: WorkerInput) -> WorkerOutput:
+        self.tasks.append(task)
+        self._busy += 1
+        FakeWorker.at_once = max(FakeWorker.at_once, self._busy)
+        await self._clock.sleep(0.05)
+        self._busy -= 1
+        return WorkerOutput(saved=None if task.save is None else str(task.save))
+
+
+class Nowhere:
+    """A publisher that nobody hears."""
+
+    def put(self, message: object) -> None:
+        return
+
+    def next_seq(self) -> int:
+        return 1
+
+
+def scan(clock: VirtualClock) -> LaserScan:
+    return LaserScan(
+        stamp=clock.now(), received=clock.now(), seq=1, frame="lidar", start_angle=-2.0, end_angle=2.0,
+        time_increment=0.0, scan_time=0.1, range_min=0.02, range_max=5.6, ranges=np.full(41, 2.0, np.float32),
+        codes=np.full(41, 255, np.uint8),
+    )  # fmt: skip
+
+
+def told(story, monkeypatch: pytest.MonkeyPatch, folder: Path) -> list[tuple[Reason, str]]:
+    """Let a service run through it; returns the events while it ran."""
+    monkeypatch.setattr(module, "WorkerActor", FakeWorker)
+    events: list[tuple[Reason, str]] = []
+
+    async def main(clock: VirtualClock) -> list[tuple[Reason, str]]:
+        scans: Mailbox[LaserScan] = Mailbox(fifo(4))
+        service = SlamService(
+            SlamConfig(mode="mapping", save=folder), Mount(), clock, scan=scans, odometry=None, angles=None,
+            pose=Nowhere(), whole=Nowhere(), tiles=Nowhere(), motion=Nowhere(), health=Nowhere(),
+            events=lambda reason, severity, source, text="", **values: events.append((reason, text)),
+        )  # fmt: skip
+        task = asyncio.create_task(service.run(lambda: None))
+        await clock.sleep(0.1)
+        await story(clock, scans, service)
+        during = list(events)
+        task.cancel()
+        await asyncio.wait([task])
+        return during
+
+    return run_virtual(main)
+
+
+def test_a_map_that_is_asked_for_is_saved_though_no_scan_comes(monkeypatch, tmp_path: Path):
+    async def story(clock, scans, service):
+        scans.put(scan(clock))
+        await clock.sleep(1.0)
+        assert service.save_soon()
+        await clock.sleep(2.0)
+
+    assert told(story, monkeypatch, tmp_path) == [(Reason.MAP_SAVED, str(tmp_path))]
+    assert [task.scan is None for task in FakeWorker.tasks[:2]] == [False, True]
+
+
+def test_with_scans_it_is_saved_once_with_the_next_one(monkeypatch, tmp_path: Path):
+    async def story(clock, scans, service):
+        for k in range(40):
+            scans.put(scan(clock))
+            await clock.sleep(0.06)
+            if k == 5:
+                service.save_soon()
+
+    assert told(story, monkeypatch, tmp_path) == [(Reason.MAP_SAVED, str(tmp_path))]
+    assert FakeWorker.at_once == 1
+
+
+def test_before_the_first_scan_there_is_nothing_to_save(monkeypatch, tmp_path: Path):
+    async def story(clock, scans, service):
+        service.save_soon()
+        await clock.sleep(3.0)
+
+    assert told(story, monkeypatch, tmp_path) == []
+    assert FakeWorker.tasks == []
