@@ -8,6 +8,8 @@ from typing import Any, Final, TypeVar
 
 import numpy as np
 
+from monstertruck_drivers.ax12.emulator import Ax12Bus, TrueJoints, really
+from monstertruck_drivers.emulation import Horn
 from monstertruck_drivers.srf08.emulator import SOUND
 from monstertruck_kinematics.polynomials import F_CORRECTED, G_PRINTED, mirrored
 from monstertruck_runtime.clock import SECOND, Clock, VirtualClock, run_virtual
@@ -16,7 +18,7 @@ from monstertruck_schemas import topics
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.req import DriveRequest
 from monstertruck_schemas.topics import Topic, Writer
-from monstertruck_sim.world.config import ServoModelConfig
+from monstertruck_sim.world.config import ServoModelConfig, SteadyTilt
 from monstertruck_sim.world.noise import IMU_FIXED, generator
 from monstertruck_sim.world.plant import GRAVITY, TruthState
 from monstertruckd.config.calibration import CalibrationStore, Result, Value, WizardName, with_values
@@ -162,6 +164,10 @@ class SimulatedOperator:
                 self._line = truth.yaw + (self._error(self._hands.string) if "string" in step.question else 0.0)
             case "string":
                 self._string = (truth.x, truth.y, truth.yaw + self._error(self._hands.string))
+            case "level" | "nose" | "side":
+                pitch, roll = {"level": (0.0, 0.0), "nose": (9.0, 0.0), "side": (0.0, 11.0)}[step.name]
+                tilt = SteadyTilt(kind="steady", pitch_deg=pitch, roll_deg=roll)
+                self._rig.world.set_tilt(self._rig.clock.now(), tilt)
             case "forward":
                 before = self._before
                 along = math.cos(before.yaw) * (truth.x - before.x) + math.sin(before.yaw) * (truth.y - before.y)
@@ -192,9 +198,21 @@ class SimulatedOperator:
             return lidar.height
         beam = 384 if step.name == "ahead" else 640
         ranges = self._rig.world.lidar.scan(self._rig.clock.now() - SECOND)
-        pitch, roll = truth.pitch + lidar.pitch, truth.roll + lidar.roll
+        a, b = self._joints()
+        pitch, roll = truth.pitch + lidar.pitch + a, truth.roll + lidar.roll + b
         rise = -math.sin(pitch) if step.name == "ahead" else math.sin(roll)
         return lidar.height + float(np.median(ranges[beam - 3 : beam + 4])) / 1000 * rise
+
+    def _joints(self) -> tuple[float, float]:
+        """Of the lidar's mount, rad."""
+        stabiliser = self._rig.config.devices.stabiliser
+        if stabiliser is None:
+            return 0.0, 0.0
+        bus = self._rig.robot.emulators["stabiliser"]
+        assert isinstance(bus, Ax12Bus)
+        joints = TrueJoints(bus, stabiliser.driver, self._rig.world.horns())
+        pitch, roll = joints.angles(np.array([self._rig.clock.now()]))
+        return float(pitch[0]), float(roll[0])
 
     def _error(self, sigma: float) -> float:
         return sigma * float(self._rng.standard_normal())
@@ -232,6 +250,12 @@ def hidden(
         world["lidar"] = {"x": x, "y": y, "yaw": yaw, "pitch": pitch, "roll": roll}
     if "imu" in parts:
         world["imu"] = {"rate_scale": float(np.random.default_rng([seed, 13]).uniform(0.96, 1.04))}
+    if "stabiliser" in parts:
+        own = np.random.default_rng([seed, 23])
+        world["mount"] = {
+            name: {"zero": zero + own.uniform(-8, 8), "direction": int(own.choice((-1, 1)))}
+            for name, zero in (("pitch", 511), ("roll", 204))
+        }
     if "sonar" in parts:
         own = np.random.default_rng([seed, 19])
         x, y, yaw = PARKED
@@ -368,7 +392,19 @@ def truths(config: SimulatedTruckConfig) -> dict[WizardName, dict[str, Value]]:
         "odometry": _odometry_truth(config),
         "lidar": {name: getattr(world.lidar, name) for name in ("x", "y", "yaw", "pitch", "roll")},
         "imu": _imu_truth(config),
+        "stabiliser": _stabiliser_truth(config),
     }
+
+
+def _stabiliser_truth(config: SimulatedTruckConfig) -> dict[str, Value]:
+    device, mount = config.devices.stabiliser, config.sim.world.mount
+    if device is None:
+        return {}
+    found: dict[str, Value] = {}
+    for name, joint, horn in (("pitch", device.driver.pitch, mount.pitch), ("roll", device.driver.roll, mount.roll)):
+        zero, direction = really(joint, Horn(horn.zero, horn.direction))
+        found |= {f"{name}_zero": zero, f"{name}_direction": direction}
+    return found
 
 
 def _odometry_truth(config: SimulatedTruckConfig) -> dict[str, Value]:

@@ -6,6 +6,8 @@ from typing import Final
 
 import numpy as np
 
+from monstertruck_drivers.ax12.config import Ax12Config
+from monstertruck_drivers.ax12.protocol import STEP
 from monstertruck_drivers.srf08.config import Srf08Config
 from monstertruck_kinematics.chassis import Dimensions, TruckChassis
 from monstertruck_kinematics.elementary import integrate
@@ -15,7 +17,7 @@ from monstertruck_runtime.bodies import build_chassis
 from monstertruck_schemas.body import TruckBody
 from monstertruck_schemas.sensor import Attitude, Imu, Vector3
 from monstertruckd.config.calibration import Estimate, Result
-from monstertruckd.tools.calibrate import battery, compass, drive, imu, lidar, odometry, slip, sonar, weave
+from monstertruckd.tools.calibrate import battery, compass, drive, imu, lidar, odometry, slip, sonar, stabiliser, weave
 from monstertruckd.tools.calibrate.response import ResponseFit, Steps
 from monstertruckd.tools.calibrate.statistics import NORMAL, Interval
 from monstertruckd.tools.calibrate.steering import BAND, SPAN
@@ -350,6 +352,56 @@ def sonar_legs(
     return legs
 
 
+def stabiliser_fit(rng: np.random.Generator) -> list[Verdict]:
+    """Heights of the beam, and the floor on blocks."""
+    settings = Ax12Config()
+    zeros = 511 + rng.uniform(-8, 8), 204 + rng.uniform(-8, 8)
+    directions = int(rng.choice((-1, 1))), int(rng.choice((-1, 1)))
+    stands = mounted(settings, zeros, directions, rng)
+    height, walls = 0.25, (2.0, 2.5)
+    true = true_joints(settings, stands[0][1], zeros, directions)
+    sigma = math.hypot(0.002 * math.sqrt(2), stabiliser.FLAT * 0.002) / math.sqrt(2)
+    centre, ahead, left = (
+        height,
+        height - walls[0] * math.sin(stands[0][0].pitch + true.pitch),
+        height + walls[1] * math.sin(stands[0][0].roll + true.roll),
+    )
+    heights = stabiliser.Heights(*(h + sigma * rng.normal() for h in (centre, ahead, left)))
+    flat, nose, side = (stand for _, _, stand in stands)
+    result = stabiliser.result_of(flat, nose, side, heights, walls, settings, 0.002)
+    truth = {"pitch_zero": zeros[0], "pitch_direction": directions[0]}
+    return judged(result, truth | {"roll_zero": zeros[1], "roll_direction": directions[1]})
+
+
+def true_joints(
+    settings: Ax12Config, said: stabiliser.Lean, zeros: tuple[float, float], directions: tuple[int, int]
+) -> stabiliser.Lean:
+    """What joints really are that the driver says to be at ``said``, rad."""
+    pitch, roll = (
+        direction * (joint.zero + joint.direction * angle / STEP - zero) * STEP
+        for joint, angle, zero, direction in zip((settings.pitch, settings.roll), said, zeros, directions, strict=True)
+    )
+    return stabiliser.Lean(pitch, roll)
+
+
+def mounted(
+    settings: Ax12Config, zeros: tuple[float, float], directions: tuple[int, int], rng: np.random.Generator
+) -> list[tuple[stabiliser.Lean, stabiliser.Lean, stabiliser.Standing]]:
+    """The truck level, nose low, right side low: its true tilt, what the driver says of the joints, what was read."""
+    angles = np.linspace(-2.09, 2.09, 682)
+    found = []
+    for pitch, roll in ((0.01, -0.005), (0.155, 0.0), (0.0, 0.185)):
+        body = stabiliser.Lean(pitch, roll)
+        seen = stabiliser.Lean(pitch + stabiliser.TILT * rng.normal(), roll + stabiliser.TILT * rng.normal())
+        said = stabiliser.Lean(round(-pitch / STEP) * STEP, round(-roll / STEP) * STEP)
+        really = true_joints(settings, said, zeros, directions)
+        up = stabiliser.beams_up(body, really, angles)
+        ranges = np.minimum(np.where(up < 0.0, 0.25 / np.maximum(-up, 1e-9), np.inf), 3.5)
+        ranges = ranges * (1 + 0.01 * rng.normal(size=angles.size))
+        found.append((body, said, stabiliser.Standing(seen, said, angles, ranges)))
+    return found
+
+
 LIGHT: Final[dict[str, Callable[[np.random.Generator], list[Verdict]]]] = {
     "battery": battery_fit,
     "drive": drive_fit,
@@ -360,6 +412,7 @@ LIGHT: Final[dict[str, Callable[[np.random.Generator], list[Verdict]]]] = {
     "imu": imu_fit,
     "slip": slip_fit,
     "sonar": sonar_fit,
+    "stabiliser": stabiliser_fit,
 }
 """By wizard."""
 HALF_WIDTHS: Final = {
@@ -382,6 +435,8 @@ HALF_WIDTHS: Final = {
     "slip.icr_left": 0.002,
     "slip.gain_left": 0.01,
     "slip.gain_right": 0.01,
+    "stabiliser.pitch_zero": 3.4,
+    "stabiliser.roll_zero": 3.4,
     "sonar.cone": math.radians(2.0),
     "sonar.speed_of_sound": 3.4,
     **{
@@ -392,7 +447,7 @@ HALF_WIDTHS: Final = {
 }
 """Median half-widths at most: 0.1 V, 1 % of ways and wheels, 2 degrees by iron in 25 uT, 0.5 degrees of an axle (8.5
 us), 10 ms, 10 mm and 0.5 degrees of the lidar, 2 mm of turning centres, 15 mm and 3 degrees of sonars, 1 % of the
-speed of sound."""
+speed of sound, 1 degree (3.4 steps) of the stabiliser."""
 
 
 def coverage(wizard: str, fits: int) -> dict[str, tuple[float, float]]:
@@ -400,7 +455,8 @@ def coverage(wizard: str, fits: int) -> dict[str, tuple[float, float]]:
     found: dict[str, list[Verdict]] = {}
     for seed in range(fits):
         for verdict in LIGHT[wizard](np.random.default_rng([seed, 26])):
-            found.setdefault(verdict.name, []).append(verdict)
+            if verdict.low is not None:  # what has none is a choice, no number
+                found.setdefault(verdict.name, []).append(verdict)
     return {
         name: (
             sum(v.holds for v in rows) / len(rows),

@@ -4,7 +4,7 @@ import shutil
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, NamedTuple, Protocol, SupportsIndex
+from typing import Any, Final, Literal, NamedTuple, Protocol, SupportsIndex
 
 import numpy as np
 from numpy.typing import NDArray
@@ -239,6 +239,15 @@ class ViewSource(Protocol):
         ...
 
 
+class Horn(NamedTuple):
+    """Of a servo of the lidar's mount."""
+
+    zero: float | None
+    """Position at which the lidar is parallel to the body, steps; None = as the driver's settings say."""
+    direction: Literal[-1, 1] | None
+    """+1 where a rising position turns the joint positively; None = as the driver's settings say."""
+
+
 class Physics(Protocol):
     """The simulated world, as far as devices feel it."""
 
@@ -279,6 +288,10 @@ class Physics(Protocol):
 
     def battery_volts(self, time_ns: int) -> float:
         """Voltage behind the battery's divider."""
+        ...
+
+    def horns(self) -> tuple[Horn, Horn]:
+        """How the mount's pitch and roll servo were put together."""
         ...
 
     def carry_lidar(self, joints: JointSource) -> None:

@@ -29,12 +29,15 @@ CONFIDENCE: Final = 0.95
 
 Value = bool | int | float
 Grade = Literal["A", "B", "C"]
-WizardName = Literal["battery", "compass", "drive", "steering", "odometry", "lidar", "imu", "slip", "sonar"]
+WizardName = Literal[
+    "battery", "compass", "drive", "steering", "odometry", "lidar", "imu", "slip", "sonar", "stabiliser"
+]
 
 STEERING: Final = "devices.steering.driver"
 COMPASS: Final = "devices.compass.driver.iron"
 LIDAR: Final = "devices.lidar.mount"
 IMU: Final = "devices.imu.driver.correction"
+STABILISER: Final = "devices.stabiliser.driver"
 SONAR: Final = "devices.sonar.driver"
 
 KEYS: Final[dict[WizardName, tuple[str, ...]]] = {
@@ -69,6 +72,9 @@ KEYS: Final[dict[WizardName, tuple[str, ...]]] = {
         f"{SONAR}.field_of_view",
         f"{SONAR}.speed_of_sound",
         *(f"{SONAR}.sonars.*.mount.{name}" for name in ("x", "y", "yaw")),
+    ),
+    "stabiliser": tuple(
+        f"{STABILISER}.{joint}.{name}" for joint in ("pitch", "roll") for name in ("zero", "direction")
     ),
 }
 """Values of the configuration that each wizard may set, ``*`` for any one name; a calibration never touches any other.

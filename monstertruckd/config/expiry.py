@@ -65,6 +65,7 @@ LIFETIMES: Final[dict[WizardName, Lifetime]] = {
     "lidar": Lifetime(180, 20_000.0, "lidar", (POSE,)),
     "imu": Lifetime(90, None, "imu", _MOTION),
     "slip": Lifetime(90, 5_000.0, "wheels", _MOTION),
+    "stabiliser": Lifetime(180, 20_000.0, "stabiliser", (POSE,)),
     "sonar": Lifetime(180, 20_000.0, "sonar", (SONAR,)),
 }
 """By experience of such parts, none of it measured: tyres wear, linkages and mounts are knocked, iron changes."""
@@ -105,6 +106,8 @@ GOALS: Final[dict[str, Goal]] = {
     "slip.icr_right": Goal(0.03, share=True),
     "slip.gain_left": Goal(0.01, share=True),
     "slip.gain_right": Goal(0.01, share=True),
+    "stabiliser.pitch_zero": Goal(3.4),
+    "stabiliser.roll_zero": Goal(3.4),
     "sonar.cone": Goal(0.035),
     "sonar.speed_of_sound": Goal(0.01, share=True),
     "sonar.*_x": Goal(0.015),
@@ -112,7 +115,8 @@ GOALS: Final[dict[str, Goal]] = {
     "sonar.*_yaw": Goal(0.052),
 }
 """Of the intervals, in the estimates' units: 1 % of ways, 0.5 degrees of steering (8.5 us), 2 degrees by iron
-in a horizontal field of 25 uT, 10 mm and 0.5 degrees of the lidar, 15 mm and 3 degrees of any sonar, 0.1 V."""
+in a horizontal field of 25 uT, 10 mm and 0.5 degrees of the lidar, 15 mm and 3 degrees of any sonar, 1
+degree (3.4 steps) of the stabiliser, 0.1 V."""
 
 
 def grade(wizard: WizardName, estimate: Estimate) -> Grade | None:

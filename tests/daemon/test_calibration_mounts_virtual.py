@@ -12,6 +12,7 @@ from monstertruckd.tools.calibrate.lidar import LidarWizard, lidar_wizard
 from monstertruckd.tools.calibrate.odometry import odometry_wizard
 from monstertruckd.tools.calibrate.slip import SlipWizard, slip_wizard
 from monstertruckd.tools.calibrate.sonar import SonarWizard, sonar_wizard
+from monstertruckd.tools.calibrate.stabiliser import stabiliser_wizard
 from monstertruckd.tools.calibrate.wizard import Wizard
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
 from tests.calibration_kit import hidden, run_session, verdicts
@@ -72,6 +73,28 @@ def test_slip(tmp_path: Path):
     }
     config = with_overlay(base, overlay)
     assert judged(slip_wizard(SlipWizard(rounds=1)), config, 4) >= {"icr_left", "icr_right", "gain_left"}
+
+
+@pytest.mark.long
+def test_stabiliser(tmp_path: Path):
+    base = load_config(CONFIGS / "full.yaml", SimulatedTruckConfig)[0]
+    lean = {"devices": {"camera": None}, "monitors": {"link": None, "host": None}, "planner": None, "path": None}
+    overlay = {
+        "recorder": None,
+        "blackbox": None,
+        "state_directory": tmp_path,
+        "sim": {"world": {"map": "yard"}},
+        **lean,
+    }
+    config = hidden(with_overlay(base, overlay), np.random.default_rng(6), 6, ("stabiliser",))
+    found = judged(stabiliser_wizard(), config, 6)
+    assert found == {"pitch_zero", "pitch_direction", "roll_zero", "roll_direction"}
+    current = CalibrationStore(config.calibration_folder, config.robot).current()
+    assert current is not None
+    driver = with_values(config, current.results.values(), "calibration").devices.stabiliser.driver
+    assert (driver.pitch.direction, driver.roll.direction) == tuple(
+        getattr(config.sim.world.mount, joint).direction for joint in ("pitch", "roll")
+    )
 
 
 @pytest.mark.long

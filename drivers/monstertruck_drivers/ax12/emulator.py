@@ -8,14 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_drivers.ax12 import protocol as p
-from monstertruck_drivers.ax12.config import Ax12Config
+from monstertruck_drivers.ax12.config import Ax12Config, JointConfig
 from monstertruck_drivers.ax12.protocol import Alarm, Ax12Parser, Instruction, Packet
 from monstertruck_drivers.ax12.unit import Load, Unit, Voltage, no_load, steady_voltage
 from monstertruck_drivers.cable import DeviceEnd
-from monstertruck_drivers.emulation import EmulatorSetup, Trail
+from monstertruck_drivers.emulation import EmulatorSetup, Horn, Trail
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import InputError
 
+AS_SET: Final = Horn(None, None)
 UNITS_MAX: Final = 6
 BYTE_GAP: Final = 100_000_000
 """Nanoseconds of silence inside a packet after which a unit gives it up."""
@@ -283,22 +284,31 @@ class Ax12Bus:
         return bytes(np.frombuffer(wire, dtype=np.uint8) ^ noise)
 
 
+def really(joint: JointConfig, horn: Horn) -> tuple[float, int]:
+    """Zero (steps) and direction of a joint as it was put together."""
+    zero = joint.zero if horn.zero is None else horn.zero
+    return float(zero), joint.direction if horn.direction is None else horn.direction
+
+
 class TrueJoints:
     """``JointSource``: where the shafts of an emulated stabiliser really are.
 
     Args:
         bus: the units.
         config: which unit turns what.
+        horns: how both were put together.
     """
 
-    def __init__(self, bus: Ax12Bus, config: Ax12Config) -> None:
+    def __init__(self, bus: Ax12Bus, config: Ax12Config, horns: tuple[Horn, Horn] = (AS_SET, AS_SET)) -> None:
         self._bus = bus
-        self._joints = (config.pitch, config.roll)
+        self._joints = [
+            (joint.id, *really(joint, horn)) for joint, horn in zip((config.pitch, config.roll), horns, strict=True)
+        ]
 
     def angles(self, times_ns: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Pitch and roll of the mount, rad."""
         pitch, roll = (
-            joint.direction * (self._bus.angles(joint.id, times_ns) - joint.zero * p.STEP) for joint in self._joints
+            direction * (self._bus.angles(ident, times_ns) - zero * p.STEP) for ident, zero, direction in self._joints
         )
         return pitch, roll
 
@@ -306,9 +316,10 @@ class TrueJoints:
 def emulated(setup: EmulatorSetup) -> Ax12Bus:
     """Both units below a simulated truck's lidar, at rest where it is parallel to the body; a line of real speed."""
     config: Ax12Config = setup.settings or Ax12Config()
-    joints = (config.pitch, config.roll)
-    places = {joint.id: float(joint.zero) for joint in joints}
-    numbers = {joint.id: (i, joint.direction) for i, joint in enumerate(joints)}
+    joints, horns = (config.pitch, config.roll), setup.physics.horns()
+    real = {joint.id: really(joint, horn) for joint, horn in zip(joints, horns, strict=True)}
+    places = {ident: zero for ident, (zero, _) in real.items()}
+    numbers = {ident: (i, direction) for i, (ident, (_, direction)) in enumerate(real.items())}
 
     def load(ident: int, _time_ns: int) -> float:
         number, direction = numbers[ident]
@@ -316,5 +327,5 @@ def emulated(setup: EmulatorSetup) -> Ax12Bus:
 
     bus = Ax12Bus(setup.clock, [joint.id for joint in joints], load=load, seed=setup.seed, positions=places)
     setup.port.device.baud = p.BAUD
-    setup.physics.carry_lidar(TrueJoints(bus, config))
+    setup.physics.carry_lidar(TrueJoints(bus, config, horns))
     return bus

@@ -402,6 +402,22 @@ class CompassModelConfig(Schema):
     iron: Iron = Iron()
 
 
+class HornConfig(Schema):
+    """How a servo of the lidar's mount was put together."""
+
+    zero: float | None = None
+    """Position at which the lidar is parallel to the body, steps; None: as the driver's settings say."""
+    direction: Literal[-1, 1] | None = None
+    """+1 where a rising position turns the joint positively (REP 103); None: as the driver's settings say."""
+
+
+class MountConfig(Schema):
+    """The lidar's mount with its two servos."""
+
+    pitch: HornConfig = HornConfig()
+    roll: HornConfig = HornConfig()
+
+
 class SonarPlace(Schema):
     """A sonar on the body: place from the geometric centre, m, and direction of its axis, rad, left positive."""
 
@@ -512,7 +528,17 @@ class SinusoidTilt(Schema):
     """Hz."""
 
 
-TiltConfig = Annotated[GroundTilt | SinusoidTilt, Field(discriminator="kind")]
+class SteadyTilt(Schema):
+    """The body stands on blocks, on any ground."""
+
+    kind: Literal["steady"]
+    pitch_deg: float = 0.0
+    """Nose down positive."""
+    roll_deg: float = 0.0
+    """Right side down positive."""
+
+
+TiltConfig = Annotated[GroundTilt | SinusoidTilt | SteadyTilt, Field(discriminator="kind")]
 
 
 class Spot(Schema):
@@ -665,6 +691,7 @@ class WorldConfig(Schema):
     mechanics: MechanicsConfig = MechanicsConfig()
     battery: BatteryModelConfig = BatteryModelConfig()
     lidar: LidarConfig = LidarConfig()
+    mount: MountConfig = MountConfig()
     camera: CameraConfig = CameraConfig()
     compass: CompassModelConfig = CompassModelConfig()
     sonar: SonarModelConfig = SonarModelConfig()

@@ -1,6 +1,6 @@
 """The engine ``plane``: a footprint that moves over a map, tilted by a profile of the ground or as commanded."""
 
-from math import hypot
+from math import hypot, radians
 from typing import NamedTuple
 
 import numpy as np
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.errors import InputError
-from monstertruck_sim.world.config import SimTruckConfig, SinusoidTilt, TiltConfig, WorldConfig
+from monstertruck_sim.world.config import SimTruckConfig, SinusoidTilt, SteadyTilt, TiltConfig, WorldConfig
 from monstertruck_sim.world.obstacles import Box, Obstacle
 from monstertruck_sim.world.plant import Plant, Pose, Space, Twist
 from monstertruck_sim.world.scene import Surroundings
@@ -129,6 +129,8 @@ class PlaneSpace:
         """Pitch and roll of the robot at a pose, rad."""
         if isinstance(self._tilt, SinusoidTilt):
             return rocking(self._tilt, elapsed_ns)
+        if isinstance(self._tilt, SteadyTilt):
+            return radians(self._tilt.pitch_deg), radians(self._tilt.roll_deg)
         if self.terrain is None:
             return 0.0, 0.0
         return self.terrain.tilt(x, y, yaw, self._truck.wheelbase, self._truck.track)

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from monstertruck_drivers.emulation import (
     AttitudeSource,
+    Horn,
     ImuSource,
     JointSource,
     MotorPlant,
@@ -67,6 +68,8 @@ class World:
         cast = self._space.cast
         self._lidar = SimulatedLidar(self._plant, sweep, config.lidar, noise_seed)
         self.lidar: RangeSource = self._lidar
+        pitch, roll = config.mount.pitch, config.mount.roll
+        self._horns = Horn(pitch.zero, pitch.direction), Horn(roll.zero, roll.direction)
         self.view = make_view(config, self._plant, cast, self.scene, noise_seed)
         self.motors: tuple[MotorPlant, ...] = tuple(
             SimulatedMotor(self._plant, config.truck.motor, noise_seed, i) for i in range(len(self._plant.shafts))
@@ -120,6 +123,10 @@ class World:
         """What is really the case at ``time_ns`` (or at the newest instant asked for, if that is later)."""
         self._plant.advance(time_ns)
         return self._plant.truth()
+
+    def horns(self) -> tuple[Horn, Horn]:
+        """Of the mount's pitch and roll servo."""
+        return self._horns
 
     def carry_lidar(self, joints: JointSource) -> None:
         """Put the lidar onto a mount with joints."""

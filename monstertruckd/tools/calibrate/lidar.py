@@ -173,7 +173,7 @@ class LidarWizard:
     async def _level(self, context: WizardContext) -> tuple[Estimate, ...]:
         scans = await context.collect(Collect("distances of the walls", topics.SCAN, 10))
         tilt = await context.collect(Collect("the truck's tilt", topics.COMPASS, 20))
-        ahead, left = (_distance(scans, angle) for angle in (0.0, QUARTER))
+        ahead, left = (beam_distance(scans, angle) for angle in (0.0, QUARTER))
         centre, front, side = [(await context.ask(step)) / 100 for step in HEIGHTS]
         body = tuple(float(np.mean([getattr(a, name) for a in tilt])) for name in ("pitch", "roll"))
         error = math.hypot(self.tape_error * math.sqrt(2), FLAT * self.tape_error)
@@ -330,7 +330,7 @@ def _at_rest(scans: Sequence[LaserScan]) -> Scan:
     return prepare(np.where(steady, sums / np.maximum(counts, 1), np.inf), _geometry(scans[0]))
 
 
-def _distance(scans: Sequence[LaserScan], angle: float) -> float:
+def beam_distance(scans: Sequence[LaserScan], angle: float) -> float:
     """Median range around an angle, m.
 
     Raises:

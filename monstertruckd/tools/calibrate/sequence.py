@@ -28,6 +28,7 @@ ORDER: Final = (
     SequenceStep("drive", "drive_ratio"),
     SequenceStep("steering", "front_scale"),
     SequenceStep("odometry", "wheelbase"),
+    SequenceStep("stabiliser", "pitch_zero"),
     SequenceStep("lidar", "x"),
     SequenceStep("imu", "rate_scale"),
     SequenceStep("slip", "icr_left"),
@@ -46,6 +47,8 @@ def fits(step: SequenceStep, config: TruckConfig) -> bool:
             return config.monitors.battery is not None or (steering is not None and steering.driver.battery is not None)
         case "steering" | "odometry":
             return truck and devices.steering is not None and devices.compass is not None and devices.drive is not None
+        case "stabiliser":
+            return devices.stabiliser is not None and devices.compass is not None and devices.lidar is not None
         case "sonar":
             return "sonar" in devices.present() and config.body.kind in BODIES
         case "slip":

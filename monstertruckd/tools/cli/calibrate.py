@@ -206,6 +206,19 @@ def sonar(
     return sonar_wizard(SonarWizard(math.radians(turn), tape_error=tape_error / 1000))
 
 
+@_wizard
+def stabiliser(
+    tape_error: Annotated[float, typer.Option(min=0.1, max=50, help="Standard error of a height, mm.")] = 2.0,
+) -> "Wizard":
+    """Zero and direction of both servos below the lidar: heights of its beam, then blocks under the wheels.
+
+    Nothing drives. Asks `level`, `centre`, `ahead`, `left` (cm), `nose` and `side`.
+    """
+    from monstertruckd.tools.calibrate.stabiliser import StabiliserWizard, stabiliser_wizard
+
+    return stabiliser_wizard(StabiliserWizard(tape_error / 1000))
+
+
 @app.command("all")
 def all_(
     *,
@@ -251,6 +264,7 @@ def wizard_of(step: "SequenceStep") -> "Wizard":
         "imu": imu,
         "slip": slip,
         "sonar": sonar,
+        "stabiliser": stabiliser,
     }
     return others[step.name]()
 

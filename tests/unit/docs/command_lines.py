@@ -124,6 +124,7 @@ INSTEAD = {
     "monstertruckd calibrate imu": Instead(None, MOVES),
     "monstertruckd calibrate slip": Instead(None, MOVES),
     "monstertruckd calibrate sonar": Instead(None, MOVES),
+    "monstertruckd calibrate stabiliser": Instead(None, "asks somebody who lifts the truck"),
     "monstertruckd demo --fast -c robot.yaml": Instead(None, OWN_DEVICE),
     "monstertruckd emulate ranger --link /tmp/ranger": Instead(None, OWN_DEVICE),
     "monstertruckd probe ranger --port /tmp/ranger": Instead(None, OWN_DEVICE),

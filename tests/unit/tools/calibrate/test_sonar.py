@@ -74,8 +74,8 @@ def test_pings_are_placed_where_the_robot_was_by_odometry():
     covariance = tuple(np.eye(3).ravel())
     record.others[topics.ODOMETRY.name] = [
         Odometry(
-            **header, stamp=k * SECOND, pose=Pose2D(x=2.0, y=1.0 + 0.1 * k, yaw=math.pi / 2), twist=Twist2D(vx=0.0, vy=0.0, wz=0.0),
-            pose_covariance=covariance, twist_covariance=covariance, age=0.0,
+            **header, stamp=k * SECOND, pose=Pose2D(x=2.0, y=1.0 + 0.1 * k, yaw=math.pi / 2),
+            twist=Twist2D(vx=0.0, vy=0.0, wz=0.0), pose_covariance=covariance, twist_covariance=covariance, age=0.0,
         )
         for k in range(11)
     ]  # fmt: skip

@@ -1,0 +1,307 @@
+"""Zero and direction of the two servos below the lidar, by the height of its beam and by what it sees of the floor.
+
+The levelling runs as always: it turns the joints against the tilt that the compass measures. On a level floor the
+height of the beam at its window, on a wall ahead and on one to the left tells how the lidar lies; less the body's tilt
+that is what the joints really are, so the positions of their servos tell the zeros. On blocks a joint that turns the
+right way keeps the lidar level, and one that turns the wrong way doubles the body's tilt: then the beam meets the floor
+where two tilts meet it. A joint that does not turn leaves one tilt, and so do two that are swapped.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_drivers.ax12.config import Ax12Config, JointConfig
+from monstertruck_drivers.ax12.protocol import STEP
+from monstertruck_kinematics.elementary import Array
+from monstertruck_runtime.errors import InputError, RequestRefusedError
+from monstertruck_schemas import topics
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.sensor import VALID_BEAM, Attitude, LaserScan, StabiliserFeedback
+from monstertruckd.config.calibration import STABILISER, Estimate, Result
+from monstertruckd.tools.calibrate.lidar import HEIGHTS, beam_distance
+from monstertruckd.tools.calibrate.statistics import NORMAL, Interval
+from monstertruckd.tools.calibrate.steps import Collect, Confirm
+from monstertruckd.tools.calibrate.wizard import Wizard, WizardContext
+
+ROOM: Final = (
+    "a level floor, a wall 2.5 to 3.5 m ahead of the truck and one to its left, nothing within 2.5 m ahead and to the "
+    "right; two blocks, 4 to 6 cm high"
+)
+TILT: Final = math.radians(0.2)
+"""Standard deviation of the compass's tilt, rad."""
+FLAT: Final = 0.5
+"""Share of the tape's standard deviation that a floor is uneven by."""
+SETTLED: Final = 0.3
+"""Position, steps, to which a unit reads itself: half a step, evenly."""
+BLOCKS: Final = (math.radians(4.0), math.radians(15.0))
+"""Tilt of a body on blocks, rad."""
+FOLLOWS: Final = math.radians(2.0)
+"""Difference between a joint and the tilt that it takes out, rad, up to which it follows."""
+SECTOR: Final = math.radians(20.0)
+"""To both sides of the direction in which a tilted lidar meets the floor."""
+NEAR: Final = 0.15
+"""Share by which a range may differ from the floor's."""
+NEARER: Final = 0.8
+"""Share of what stands there from which on a floor is told from it;"""
+REACH: Final = 4.0
+"""and how far away the lidar still sees a floor, m."""
+MOST: Final = 0.6
+"""Share of the beams of the sector that must be on the floor, for the lidar to look there;"""
+FEW: Final = 0.2
+"""and at most, for it not to."""
+LEAST: Final = 10
+"""Beams in the sector."""
+JOINTS: Final = ("pitch", "roll")
+
+_LEVEL: Final = Confirm("level", "Stand the truck on the level floor, wheels straight, and let go. Done?")
+_NOSE: Final = Confirm("nose", "Put the rear wheels on blocks, so that the nose is low, and let go. Done?")
+_SIDE: Final = Confirm("side", "Put the left wheels on blocks instead, so that the right side is low. Done?")
+
+
+class Lean(NamedTuple):
+    """Two angles, rad, REP 103: pitch nose down, roll right side down positive."""
+
+    pitch: float
+    roll: float
+
+
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """What was measured while the truck stood."""
+
+    body: Lean
+    """By the compass"""
+    joints: Lean
+    """As the driver says"""
+    angles: Array
+    """Of the beams, rad, left positive; (n,)"""
+    ranges: Array
+    """Medians, m; inf = nothing; (n,)"""
+
+    @classmethod
+    def of(
+        cls, scans: Sequence[LaserScan], tilts: Sequence[Attitude], joints: Sequence[StabiliserFeedback]
+    ) -> "Standing":
+        """From messages.
+
+        Raises:
+            InputError: a servo does not answer.
+        """
+        read = [(j.pitch, j.roll) for j in joints if j.pitch is not None and j.roll is not None]
+        if len(read) < len(joints) / 2:
+            raise InputError("a servo of the stabiliser does not answer")
+        pitch, roll = np.mean(np.array(read), axis=0).tolist()
+        ranges = np.array([np.where(s.codes == VALID_BEAM, s.ranges, np.inf) for s in scans])
+        angles = scans[0].start_angle + scans[0].angle_increment * np.arange(ranges.shape[1], dtype=np.float64)
+        body = Lean(float(np.mean([a.pitch for a in tilts])), float(np.mean([a.roll for a in tilts])))
+        return cls(body, Lean(pitch, roll), angles, np.median(ranges, axis=0))
+
+
+@dataclass(frozen=True, slots=True)
+class Heights:
+    """Of the beam over the floor, m."""
+
+    centre: float
+    ahead: float
+    left: float
+
+
+@dataclass(frozen=True, slots=True)
+class StabiliserWizard:
+    """Heights on the level floor; then blocks below the rear wheels, and below the left ones."""
+
+    tape_error: float = 0.002
+    """Standard deviation of a height, m"""
+
+    async def __call__(self, context: WizardContext) -> Result:
+        """Measure."""
+        device = context.config.devices.stabiliser
+        if device is None or context.config.devices.compass is None or context.config.devices.lidar is None:
+            raise RequestRefusedError(Reason.NOT_SUPPORTED, "a stabiliser is measured with compass and lidar")
+        await context.confirm(_LEVEL)
+        flat, scans = await self._stand(context)
+        ahead, left = (beam_distance(scans, angle) for angle in (0.0, math.pi / 2))
+        heights = Heights(*[(await context.ask(step)) / 100 for step in HEIGHTS])
+        await context.confirm(_NOSE)
+        nose, _ = await self._stand(context)
+        await context.confirm(_SIDE)
+        side, _ = await self._stand(context)
+        walls = ahead, left
+        return context.fit(
+            "zeros and directions", lambda: result_of(flat, nose, side, heights, walls, device.driver, self.tape_error)
+        )
+
+    @staticmethod
+    async def _stand(context: WizardContext) -> tuple[Standing, list[LaserScan]]:
+        await context.collect(Collect("the truck comes to rest", topics.SCAN, 20))
+        scans = await context.collect(Collect("what the lidar sees", topics.SCAN, 10))
+        tilts = await context.collect(Collect("the truck's tilt", topics.COMPASS, 20))
+        joints = await context.collect(Collect("positions of the servos", topics.STABILISER, 20))
+        return Standing.of(scans, tilts, joints), scans
+
+
+def stabiliser_wizard(settings: StabiliserWizard | None = None) -> Wizard:
+    """Zeros and directions."""
+    doc = "zero and direction of both servos below the lidar, from the height of its beam and from blocks under wheels"
+    return Wizard("stabiliser", doc, ROOM, settings or StabiliserWizard())
+
+
+def result_of(
+    flat: Standing,
+    nose: Standing,
+    side: Standing,
+    heights: Heights,
+    walls: tuple[float, float],
+    settings: Ax12Config,
+    tape_error: float,
+) -> Result:
+    """Judge.
+
+    Args:
+        flat: on the level floor.
+        nose: with the nose low.
+        side: with the right side low.
+        heights: of the beam.
+        walls: distances of the wall ahead and of the one to the left, m.
+        settings: that the daemon runs with.
+        tape_error: standard deviation of a height, m.
+
+    Raises:
+        InputError: the blocks are missing, a joint does not follow, or what the lidar sees fits neither direction.
+    """
+    error = math.hypot(tape_error * math.sqrt(2), FLAT * tape_error)
+    lies = Lean(
+        math.asin(max(-1.0, min(1.0, (heights.centre - heights.ahead) / walls[0]))),
+        math.asin(max(-1.0, min(1.0, (heights.left - heights.centre) / walls[1]))),
+    )
+    really = Lean(lies.pitch - flat.body.pitch, lies.roll - flat.body.roll)
+    joints = (settings.pitch, settings.roll)
+    changes = [_turns(stand, flat, heights.centre, axis, really) for axis, stand in enumerate((nose, side))]
+    estimates: list[Estimate] = []
+    for axis, (name, joint, change) in enumerate(zip(JOINTS, joints, changes, strict=True)):
+        direction = joint.direction * change
+        position = joint.zero + joint.direction * flat.joints[axis] / STEP
+        zero = Interval(
+            position - direction * really[axis] / STEP,
+            NORMAL * math.hypot(math.hypot(error / walls[axis], TILT) / STEP, SETTLED),
+        )
+        _check_range(name, joint, zero.value)
+        estimates += [
+            Estimate(
+                name=f"{name}_zero",
+                value=round(zero.value),
+                low=zero.low,
+                high=zero.high,
+                unit="steps",
+                samples=2,
+                meaning=f"position at which the lidar is parallel to the body; 95 % of two heights {walls[axis]:.1f} m "
+                "apart, and of the compass's tilt",
+                key=f"{STABILISER}.{name}.zero",
+            ),
+            Estimate(
+                name=f"{name}_direction",
+                value=direction,
+                samples=1,
+                meaning="+1: a rising position turns the joint positively; by the floor that the lidar sees, or not",
+                key=f"{STABILISER}.{name}.direction",
+            ),
+        ]
+    turned = [name for name, change in zip(JOINTS, changes, strict=True) if change < 0]
+    again = f"{' and '.join(turned)} turned the wrong way: restart the daemon, and look whether the lidar is level then"
+    return Result(
+        wizard="stabiliser",
+        measured=f"heights of the beam; blocks of {math.degrees(nose.body.pitch):.0f} and "
+        f"{math.degrees(side.body.roll):.0f} deg",
+        estimates=tuple(estimates),
+        unobserved=("a lidar that sits askew on its mount: it looks like a zero that is off",),
+        again=again if turned else None,
+    )
+
+
+def _turns(stand: Standing, flat: Standing, height: float, axis: int, really: Lean) -> int:
+    """+1 where a joint turns as its driver says, -1 where it turns the other way.
+
+    Raises:
+        InputError: see ``result_of``.
+    """
+    name, low = JOINTS[axis], ("nose", "right side")[axis]
+    tilt = stand.body[axis]
+    if not BLOCKS[0] <= tilt <= BLOCKS[1]:
+        raise InputError(
+            f"the {low} is {math.degrees(tilt):.1f} deg low: expected {math.degrees(BLOCKS[0]):.0f} to "
+            f"{math.degrees(BLOCKS[1]):.0f}; use other blocks"
+        )
+    moved = [s - f for s, f in zip(stand.joints, flat.joints, strict=True)]
+    if abs(moved[axis] + tilt - flat.body[axis]) > FOLLOWS:
+        raise InputError(
+            f"the {name} joint stands at {math.degrees(stand.joints[axis]):.0f} deg where "
+            f"{math.degrees(-tilt):.0f} would level the lidar: it does not follow; see `status` for the stabiliser"
+        )
+    direction = (0.0, -math.pi / 2)[axis]
+
+    def lidar(turn: Callable[[Lean], Lean]) -> Lean:
+        offset = turn(Lean(moved[0], moved[1]))
+        return Lean(really.pitch + offset.pitch, really.roll + offset.roll)
+
+    wrong = lidar(lambda m: Lean(-m.pitch, m.roll) if axis == 0 else Lean(m.pitch, -m.roll))
+    swapped = (lidar(lambda m: Lean(m.roll, m.pitch)), lidar(lambda m: Lean(-m.roll, -m.pitch)))
+    loose = lidar(lambda _: Lean(0.0, 0.0))
+
+    def seen(joints: Lean) -> float | None:
+        return _on_floor(stand, flat, joints, height, direction)
+
+    turned, leaning = seen(wrong), seen(loose)
+    if turned is None or leaning is None:
+        raise InputError(
+            f"with the {low} low a lidar that leans would see the floor hardly nearer than what stands there: higher "
+            "blocks, or more room"
+        )
+    if turned > MOST:
+        return -1
+    if leaning > MOST:
+        raise InputError(f"with the {low} low the lidar leans with the body: the horn of the {name} joint is loose")
+    if max(seen(joints) or 0.0 for joints in swapped) > MOST:
+        raise InputError(f"with the {low} low the lidar leans aside: pitch and roll servo are swapped (their ids)")
+    if max(turned, leaning) < FEW:
+        return 1
+    raise InputError(
+        f"with the {low} low the lidar sees neither a clear floor nor none: {turned:.0%} of its beams are where the "
+        "floor would be; nothing may stand there"
+    )
+
+
+def _on_floor(stand: Standing, flat: Standing, joints: Lean, height: float, direction: float) -> float | None:
+    """Share of the beams around ``direction`` (rad) that measure the floor of a lidar with such joints (rad).
+
+    None: it would be hardly nearer than what a level lidar sees there.
+    """
+    up = beams_up(stand.body, joints, stand.angles)
+    floor = np.where(up < 0.0, height / np.maximum(-up, 1e-9), np.inf)
+    sector: NDArray[np.bool_] = np.abs(stand.angles - direction) <= SECTOR
+    due = sector & (floor < NEARER * flat.ranges) & (floor < REACH)
+    if due.sum() < max(LEAST, sector.sum() / 4):
+        return None
+    return float((np.abs(stand.ranges[due] / floor[due] - 1) < NEAR).mean())
+
+
+def beams_up(body: Lean, joints: Lean, angles: Array) -> Array:
+    """Rise of beams in the level frame, per metre: third row of Ry(p) Rx(r) Ry(a) Rx(b) on (cos, sin, 0); (n,)."""
+    row = np.array((-math.sin(body.pitch), math.sin(body.roll) * math.cos(body.pitch),
+                    math.cos(body.roll) * math.cos(body.pitch)))  # fmt: skip
+    a, b = joints
+    forward = np.array((math.cos(a), 0.0, -math.sin(a)))
+    left = np.array((math.sin(a) * math.sin(b), math.cos(b), math.cos(a) * math.sin(b)))
+    return np.asarray(np.cos(angles) * (row @ forward) + np.sin(angles) * (row @ left))
+
+
+def _check_range(name: str, joint: JointConfig, zero: float) -> None:
+    if not joint.min_position < round(zero) < joint.max_position:
+        raise InputError(
+            f"the {name} joint is level at position {zero:.0f}, beyond its limits of {joint.min_position} to "
+            f"{joint.max_position}: put its horn on by some teeth"
+        )
