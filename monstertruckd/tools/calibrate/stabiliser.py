@@ -47,7 +47,7 @@ SECTOR: Final = math.radians(20.0)
 NEAR: Final = 0.15
 """Share by which a range may differ from the floor's."""
 NEARER: Final = 0.8
-"""Share of what stands there from which on a floor is told from it;"""
+"""Share of the distance of what stands there, up to which a floor differs clearly from it;"""
 REACH: Final = 4.0
 """and how far away the lidar still sees a floor, m."""
 MOST: Final = 0.6
