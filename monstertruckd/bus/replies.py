@@ -2,10 +2,14 @@
 
 A reply, and the final message of a query that is dropped, waits for room towards its station: 2 s towards one that
 takes nothing. Neither the event loop nor the threads in which queries arrive may stand still so long.
+
+Zenoh serves no station while it hangs up on one, and that takes 2 s more for each further thread that is still waiting
+for room there: with eight of them, 14 s. So one owner has one reply under way.
 """
 
 import logging
 import threading
+from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -13,10 +17,13 @@ from typing import Final
 
 import zenoh
 
+from monstertruck_schemas.topics import owner_of
+from monstertruckd.bus.access import ANONYMOUS
+
 log = logging.getLogger(__name__)
 
 THREADS: Final = 8
-"""Replies under way at once; as many further ones to orders."""
+"""Replies under way at once, each to another owner; as many further ones to orders."""
 DEPTH: Final = 4096
 """Queries that may wait for their reply; beyond that no further query is taken until one has left."""
 
@@ -32,40 +39,59 @@ class Replies:
         self._others = ThreadPoolExecutor(THREADS, "replies")
         self._change = threading.Condition()
         self._waiting = 0
+        self._queues: dict[tuple[str, bool], deque[tuple[zenoh.Query, Reply | None]]] = {}
+        """By owner, orders apart; the first of each is under way."""
 
     def wait_for_room(self) -> None:
         """Wait until fewer than ``DEPTH`` replies wait; not for the event loop."""
         with self._change:
             self._change.wait_for(lambda: self._waiting < DEPTH)
 
-    def end(self, query: zenoh.Query, reply: Reply | None = None, *, order: bool = False) -> None:
+    def end(
+        self, query: zenoh.Query, reply: Reply | None = None, source: str | None = None, *, order: bool = False
+    ) -> None:
         """Reply and end the query, without waiting for it; callable from any thread.
 
         Args:
             query: not to be used any more.
             reply: None = end it without an answer.
+            source: who asks; None = the query names nobody.
             order: whether it answers an order: these do not wait behind the others.
         """
+        key = owner_of(source or ANONYMOUS), order
         with self._change:
             self._waiting += 1
+            queue = self._queues.setdefault(key, deque())
+            queue.append((query, reply))
+            if len(queue) > 1:
+                return
         with suppress(RuntimeError):  # closed meanwhile
-            (self._orders if order else self._others).submit(self._end, query, reply)
+            (self._orders if order else self._others).submit(self._end_all, key)
 
     def close(self) -> None:
         """Wait for all replies: with the sessions closed they fail at once."""
         for pool in (self._orders, self._others):
             pool.shutdown()
 
-    def _end(self, query: zenoh.Query, reply: Reply | None) -> None:
-        try:
-            with query:
-                if reply is not None:
-                    reply(query)
-        except zenoh.ZError as error:  # the station has left
-            log.debug("no reply: %s", error)
-        except Exception:
-            log.exception("reply: bug")
-        finally:
+    def _end_all(self, key: tuple[str, bool]) -> None:
+        queue = self._queues[key]
+        while True:
+            _end(*queue[0])
             with self._change:
+                queue.popleft()
                 self._waiting -= 1
                 self._change.notify_all()
+                if not queue:
+                    del self._queues[key]
+                    return
+
+
+def _end(query: zenoh.Query, reply: Reply | None) -> None:
+    try:
+        with query:
+            if reply is not None:
+                reply(query)
+    except zenoh.ZError as error:  # the station has left
+        log.debug("no reply: %s", error)
+    except Exception:
+        log.exception("reply: bug")

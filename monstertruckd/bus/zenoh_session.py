@@ -301,17 +301,18 @@ class ZenohBridge:
         name, source = self._called(query)
         if size > MAX_CALL:
             text = f"payload of {size} bytes, at most {MAX_CALL} are taken"
-            replies.end(query, _error(failure(Reason.BAD_INPUT, text)))
+            replies.end(query, _error(failure(Reason.BAD_INPUT, text)), source)
         elif text := limits.refusal(name, source, queries.waiting):
-            replies.end(query, _error(failure(Reason.BUSY, text)))
+            replies.end(query, _error(failure(Reason.BUSY, text)), source)
         elif not self._rpc.serves(name) and (described := self._described(query)):
-            replies.end(query, partial(_reply_schemas, described))
+            replies.end(query, partial(_reply_schemas, described), source)
         else:
             queries.put((query, listener))
 
     def _discard(self, query: zenoh.Query, _: Listener, replies: Replies, limits: CallLimits) -> None:
-        limits.ended(*self._called(query))
-        replies.end(query)
+        name, source = self._called(query)
+        limits.ended(name, source)
+        replies.end(query, source=source)
 
     def _serve(
         self,
@@ -324,7 +325,7 @@ class ZenohBridge:
     ) -> None:
         name, source = self._called(query)
         if not may_be_served(name, len(active)):
-            replies.end(query, _error(failure(Reason.BUSY, TOO_MANY)))
+            replies.end(query, _error(failure(Reason.BUSY, TOO_MANY)), source)
             return
         task = calls.create_task(self._answer(query, name, _sender(listener, source)))
         if name != ESTOP:
@@ -333,7 +334,7 @@ class ZenohBridge:
         def end(_: asyncio.Task[Reply]) -> None:
             active.discard(task)
             limits.ended(name, source)
-            replies.end(query, None if task.cancelled() else task.result(), order=name in ORDERS)
+            replies.end(query, None if task.cancelled() else task.result(), source, order=name in ORDERS)
 
         task.add_done_callback(end)
 

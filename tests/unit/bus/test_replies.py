@@ -53,14 +53,28 @@ def test_neither_replies_nor_finals_are_sent_where_the_query_ends():
 def test_answers_to_orders_wait_behind_no_others():
     replies, taken, order = Replies(), threading.Event(), Question()
     stuck = [Question(taken) for _ in range(3 * THREADS)]
-    for query in stuck:
-        replies.end(query, answer)
-    replies.end(order, answer, order=True)
+    for number, query in enumerate(stuck):
+        replies.end(query, answer, f"s{number}")
+    replies.end(order, answer, "s0", order=True)
     assert order.ended.wait(5.0)
     assert not any(query.ended.is_set() for query in stuck)
     taken.set()
     replies.close()
     assert all(query.ended.is_set() for query in stuck)
+
+
+def test_an_owner_has_one_reply_under_way_and_holds_up_no_other():
+    replies, taken, other = Replies(), threading.Event(), Question()
+    begun = []
+    stuck = [Question(taken) for _ in range(2 * THREADS)]
+    for number, query in enumerate(stuck):
+        replies.end(query, begun.append, f"ann:{number}")
+    replies.end(other, answer, "bob")
+    assert other.ended.wait(5.0)
+    assert begun == stuck[:1]
+    taken.set()
+    replies.close()
+    assert begun == stuck
 
 
 def test_where_too_many_wait_no_more_are_taken_until_one_has_left(monkeypatch: pytest.MonkeyPatch):
