@@ -197,12 +197,17 @@ async def order(client: TruckClient, what: Order) -> None:
 
 
 async def press(client: TruckClient, stops: Stops, forward: bool, more: float) -> float | None:
-    """Drive, then one emergency stop; seconds to its quick stop, None if it is missed. Leaves the truck disarmed."""
-    await order(client, Order.ARM)
-    with client.subscribe(topics.ODOMETRY, latest()) as odometry:
+    """Drive, then one emergency stop; seconds to its quick stop, None if it is missed. Leaves the truck disarmed.
+
+    A truck that a computer too busy for its sensors has disarmed meanwhile is armed again.
+    """
+    with client.subscribe(topics.ODOMETRY, latest()) as odometry, client.subscribe(topics.GATE, latest()) as gate:
         async with asyncio.timeout(ORDER_TIMEOUT):
             driven: int | None = None
             while driven is None or time.monotonic_ns() < driven + (DRIVEN + more) * SECOND:
+                if gate.latest is None or gate.latest.mode is GateMode.DISARMED:
+                    await order(client, Order.ARM)
+                    driven = None
                 await client.drive(0.1 if forward else -0.1, 0.0)
                 moves = odometry.latest is not None and abs(odometry.latest.twist.vx) > 0.02
                 if driven is None and moves:

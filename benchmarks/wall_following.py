@@ -46,8 +46,8 @@ LAP: Final = {"lap_length": 20.0, "lap_radius": 1.0}
 METHODS: Final = (
     ("1", "beam"),
     ("1, offset 0.05", "beam"),
-    ("1, offset 0.05, gap 0.6, aligned", "beam"),
-    ("1, offset 0.05, gap 0.6, aligned", "cone"),
+    ("1, amended", "beam"),
+    ("1, amended", "cone"),
     ("2", "beam"),
     ("2", "cone"),
     ("3", "cone"),
@@ -57,8 +57,8 @@ PARTS: Final = ("study", "start", "arenas", "faults")
 FAULTS: Final[tuple[FaultKind, ...]] = ("dead", "stuck", "cross-talk", "imu", "motor")
 FAULT_SEEDS: Final = 20
 GOALS: Final = {
-    "1, offset 0.05, gap 0.6, aligned, beam: steady_mm": 4.0,
-    "1, offset 0.05, gap 0.6, aligned, beam: worst_mm": 25.0,
+    "1, amended, beam: steady_mm": 4.0,
+    "1, amended, beam: worst_mm": 25.0,
     "3, cone: steady_mm": 2.0,
     "3, cone: worst_mm": 15.0,
     "3, cone: seconds_max": 240.0,
@@ -106,9 +106,8 @@ def pilot(method: str, model: str, side: str, lap: dict[str, float]) -> tuple[Be
         switching = WallSwitchingConfig.model_validate({"side": side, **lap})
         return WallSwitching(switching), switching.rate
     own = {
-        "offset": 0.05 if "offset" in method else 0.0,
-        "gap": 0.6 if "gap" in method else 0.0,
-        **({"aligned": 0.0, "seen": 0.6} if "aligned" in method else {}),
+        "offset": 0.0 if method == "1" else 0.05,
+        **({"gap": 0.6, "aligned": 0.0, "seen": 0.6, "trigger": 0.34} if "amended" in method else {}),
     }
     pd = WallPdConfig.model_validate({"side": side, **own, **lap})
     return WallPd(pd), pd.rate

@@ -10,6 +10,8 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Final, Literal, NamedTuple
 
+import numpy as np
+
 from monstertruck_kinematics.profiles import CubicRamp, TimedRamp
 from monstertruck_planners.behave.api import BehaviourStep, Inputs, RequestedMotion
 from monstertruck_planners.behave.wall.config import WallConfig, WallPdConfig, WallSwitchingConfig
@@ -33,10 +35,12 @@ EDGE: Final = 0.1
 """Way behind the edge of a gap over which the side sonar may measure the gap's own side wall, m."""
 BACK: Final = 0.05
 """Diagonal range times cos 45 degrees less side range below which it ends, m."""
-STRAIGHT: Final = 2.0
-"""Yaw rate per heading error past a gap, 1/s."""
-SMOOTH: Final = 10
-"""Measurements over which the heading along the wall is averaged."""
+WALL_WAY: Final = 0.8
+"""Way over which echoes make the line of a wall past whose gap it drives, m."""
+LEAST_ECHOES: Final = 4
+"""Of such a line."""
+LINE_GAINS: Final = 5.0, 2.0
+"""Yaw rate per distance error from it, rad/s/m, and per heading error, 1/s: critically damped at 0.2 m/s."""
 AT_REST: Final = 0.01
 """m/s."""
 
@@ -99,8 +103,8 @@ class WallState:
     """Of the two steps before."""
     gaps: tuple[float | None, float | None] = (None, None)
     """``travelled`` when side and diagonal sonar began to look into a gap."""
-    along: tuple[float, int] = (0.0, 0)
-    """Heading along the wall by odometry, with the wall on the left, rad, and the samples it is the mean of."""
+    echoes: tuple[tuple[float, float, float], ...] = ()
+    """Newest ones on the wall: x and y by odometry, with the wall on the left, and ``travelled`` when they came, m."""
     asked: float = 0.0
     """Speed asked for at the step before, m/s."""
     moving_since: float | None = None
@@ -167,7 +171,7 @@ class _Wall(ABC):
             error=None,
             before=(),
             gaps=(None, None),
-            along=(0.0, 0),
+            echoes=(),
             turned_before=state.turned,
             begun=begun,
             since=0.0 if state.begun is None else state.since,
@@ -228,22 +232,38 @@ class WallPd(_Wall):
         if state.phase == "turn_away":
             return state, state.v.at(t), state.w.at(t)
         v = state.v.at(t)
-        state = self._gaps(state, ranges)
-        side, diagonal = state.gaps
-        yaw = 0.0 if state.pose is None else state.pose[2] * self._mirror
-        if side is not None:
-            along, samples = state.along
-            away = math.remainder(along - yaw, math.tau) if samples else 0.0
-            return replace(state, error=None), v, STRAIGHT * away
-        if diagonal is None:
-            seen = yaw + wall_angle(ranges.diagonal, ranges.side, config.offset)
-            along, samples = state.along
-            along += math.remainder(seen - along, math.tau) / min(samples + 1, SMOOTH)
-            state = replace(state, along=(along, samples + 1))
-        distance = ranges.side if diagonal is not None else self._distance(ranges)
-        error = distance - config.distance
+        state = self._mapped(self._gaps(state, ranges), ranges)
+        if state.gaps != (None, None):
+            return replace(state, error=None), v, self._along_line(state)
+        error = self._distance(ranges) - config.distance
         change = 0.0 if state.error is None else error - state.error
         return replace(state, error=error), v, config.k_p * error + config.k_d * change
+
+    def _mapped(self, state: WallState, ranges: Ranges) -> WallState:
+        """Add the echoes of the sonars that measure the wall, by odometry."""
+        if state.pose is None or not self._config.gap:
+            return state
+        x, y, yaw, now = state.pose[0], state.pose[1] * self._mirror, state.pose[2] * self._mirror, state.travelled
+        echoes = [echo for echo in state.echoes if now - echo[2] < WALL_WAY]
+        reach, offset = ranges.diagonal * math.cos(DIAGONAL), self._config.offset
+        for gap, ahead, aside in zip(state.gaps, (0.0, offset + reach), (ranges.side, reach), strict=True):
+            if gap is None:
+                c, s = math.cos(yaw), math.sin(yaw)
+                echoes.append((x + c * ahead - s * aside, y + s * ahead + c * aside, now))
+        return replace(state, echoes=tuple(echoes))
+
+    def _along_line(self, state: WallState) -> float:
+        """Yaw rate along the line through the newest echoes, rad/s; straight on if there are too few."""
+        if state.pose is None or len(state.echoes) < LEAST_ECHOES:
+            return 0.0
+        x, y, yaw = state.pose[0], state.pose[1] * self._mirror, state.pose[2] * self._mirror
+        points = np.array(state.echoes)[:, :2]
+        middle = points.mean(axis=0)
+        along = np.linalg.eigh(np.cov((points - middle).T))[1][:, 1]
+        along *= math.copysign(1.0, along @ (math.cos(yaw), math.sin(yaw)))
+        error = float(along[0] * (middle[1] - y) - along[1] * (middle[0] - x)) - self._config.distance
+        away = math.remainder(math.atan2(along[1], along[0]) - yaw, math.tau)
+        return LINE_GAINS[0] * error + LINE_GAINS[1] * away
 
     def _gaps(self, state: WallState, ranges: Ranges) -> WallState:
         """Which sonars look into a gap: from a jump up on, until they measure the wall again or it is too long."""

@@ -169,3 +169,11 @@ def test_turning_away_goes_on_until_the_robot_is_along_the_wall_if_that_is_asked
         angles[aligned] = math.atan2(-3.35, -1.0) - done.poses[begun, 2]
     assert abs(math.remainder(angles[0.0], math.tau)) < 0.05
     assert abs(math.remainder(angles[None], math.tau)) > 0.1
+
+
+def test_a_gap_just_after_following_began_is_passed_along_the_line_of_its_wall():
+    recess = [(0.0, 0.35, 0.0, 1.85), (0.0, 1.85, 0.4, 1.85), (0.4, 1.85, 0.4, 0.35)]
+    walls = [(-10.0, 0.35, 0.0, 0.35), (0.4, 0.35, 9.0, 0.35), *recess]
+    done = drive(WallPd(WallPdConfig(offset=0.05, gap=0.6)), Robot(walls, (-0.35, -0.05, 0.15), ahead=0.05), 8.0)
+    behind = done.poses[done.poses[:, 0] > 0.6, 1]
+    assert np.abs(behind).max() < 0.012
