@@ -1,14 +1,16 @@
 """The world in three dimensions: against closed forms, against the plane, and how fast it is.
 
-    python benchmarks/world3d.py [--parts scans mechanics turning step speed lap slopes rough drill] [--keep FOLDER]
-        [--seeds 20] [--metres 60] [--count 200]
+    python benchmarks/world3d.py [--parts scans mechanics turning step speed lap slopes rough patch drill fleet]
+        [--seeds 20] [--metres 60] [--count 200] [--keep FOLDER]
 
 ``scans``: standing scans without noise from free poses against the plane's. ``mechanics``: sag under a load, overturn
 angle, pull of the clutch, a lifted wheel. ``turning``: radius in every steering mode against ``common_motion`` (least
 squares of the wheels' side slips) and against the least sum of slips, which is what dry friction makes. ``step``: how
 far half the step moves the end of a drive. ``speed``: one step, one swept scan, one picture. ``lap``: the demo's lap by
 the whole daemon, its error, its speed, twice the same. ``slopes``: trucks that drive onto a hillside, by the daemon and
-without one. ``rough``: lidar, map and pose on hills of 5 degrees RMS. ``drill``: seeded faults. The last line is JSON.
+without one. ``rough``: lidar, map and pose on hills of 5 degrees RMS. ``patch``: whether
+rough ground is found, and routes go round it. ``drill``: seeded faults, with a deadman line and without. ``fleet``: two
+robots and people, a daemon for each robot. The last line is JSON.
 """
 
 import argparse
@@ -22,6 +24,8 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from world3d_parts.fleet import fleet
+from world3d_parts.patch import patch
 from world3d_parts.terrain import drilled, rough, slopes
 
 import monstertruck_sim.world3d.model as rigid_model
@@ -64,7 +68,14 @@ GOALS: dict[str, tuple[str, float]] = {
     "rough_over_flat_walls": ("<=", 1.5),
     "rough_ghost_share": ("<=", 0.01),
     "rough_ate_cm": ("<=", 5.0),
+    "patch_narrow_reached": (">=", 1.0),
+    "patch_narrow_last_m_on_stones": ("<=", 0.0),
+    "patch_narrow_detour": ("<=", 1.5),
+    "patch_spanning_reached": (">=", 1.0),
     "drill_unsafe": ("<=", 0.0),
+    "fleet_followed": (">=", 1.0),
+    "fleet_contacts_by_robots": ("<=", 0.0),
+    "fleet_same": (">=", 1.0),
 }
 
 
@@ -333,7 +344,7 @@ PARTS: dict[str, Callable[[], dict[str, float]]] = {
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    names = [*PARTS, "lap", "slopes", "rough", "drill"]
+    names = [*PARTS, "lap", "slopes", "rough", "patch", "drill", "fleet"]
     parser.add_argument("--parts", nargs="+", default=names, choices=names)
     parser.add_argument("--seeds", type=int, default=20, help="of the slopes")
     parser.add_argument("--metres", type=float, default=60.0, help="on rough ground")
@@ -345,6 +356,8 @@ def main() -> None:
         "lap": lambda: lap(arguments.keep),
         "slopes": lambda: slopes(arguments.seeds),
         "rough": lambda: rough(arguments.metres),
+        "patch": patch,
+        "fleet": fleet,
         "drill": lambda: drilled(arguments.count),
     }
     for part in arguments.parts:

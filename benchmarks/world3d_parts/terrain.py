@@ -14,6 +14,7 @@ from monstertruck_runtime.map_files import OCCUPIED
 from monstertruck_schemas import topics
 from monstertruck_schemas.req import Order
 from monstertruck_schemas.state import Grid
+from monstertruck_sim.faults import FaultCatalog, FaultKind, apply
 from monstertruck_sim.world.config import WorldConfig
 from monstertruck_sim.world.world import World
 from monstertruck_sim.world3d.ground import ground_heights
@@ -21,7 +22,7 @@ from monstertruck_sim.world3d.plant import RigidPlant
 from monstertruckd.config.load import load_config
 from monstertruckd.tools.drill.random_drill import Drill, default_jobs
 from monstertruckd.tools.drill.truck import DrillTruck
-from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
+from monstertruckd.tools.simulation.config import DEADMAN_LINE, SimulatedTruckConfig, with_overlay
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 ROUGH_DEG = 5.0
@@ -197,10 +198,33 @@ def slopes(seeds: int) -> dict[str, float]:
 
 
 def drilled(count: int) -> dict[str, float]:
-    """Seeded faults on the whole truck in three dimensions, with its deadman line."""
+    """Seeded faults on the whole truck, with its deadman line; metres without computer, with the line and without."""
     truck = load_config(CONFIGS / "full3d.yaml", SimulatedTruckConfig)[0]
-    figures = Drill(1, count, truck).run(jobs=default_jobs()).figures()
-    return {f"drill_{name}": float(value) for name, value in figures.items() if isinstance(value, int | float)}
+    report = Drill(1, count, truck).run(jobs=default_jobs())
+    figures = {f"drill_{k}": float(value) for k, value in report.figures().items() if isinstance(value, int | float)}
+    figures["drill_computer_power_faults"] = sum(o.kind is FaultKind.COMPUTER_POWER for o in report.outcomes)
+    for name, overlay in (("with", DEADMAN_LINE), ("without", {})):
+        config = with_overlay(truck, {"recorder": None, "map": None, **overlay})
+        figures[f"drill_metres_without_computer_{name}_line"] = run(config, _unpowered)
+    return figures
+
+
+async def _unpowered(truck: DrillTruck) -> float:
+    """Metres that a truck drives in ten seconds from when its computer's supply (M4-ATX) fails."""
+    assert await truck.until(truck.drives, 15.0, Order.ARM)
+    rig, clock = truck.rig, truck.clock
+    await clock.sleep(2.0)
+    catalog = FaultCatalog(rig.config.devices, (), records=False, restarts=True, workers=())
+    lost = catalog.draw(
+        np.random.default_rng(1), without=frozenset(kind for kind in FaultKind if kind is not FaultKind.COMPUTER_POWER)
+    )
+    await apply(lost.start, rig.context)
+    then, way = rig.world.truth(clock.now()), 0.0
+    for _ in range(200):
+        await clock.sleep(0.05)
+        now = rig.world.truth(clock.now())
+        way, then = way + hypot(now.x - then.x, now.y - then.y), now
+    return way
 
 
 async def _onto(truck: DrillTruck) -> float:

@@ -59,6 +59,20 @@ def test_a_robot_stops_before_another_that_its_lidar_sees():
     assert 0.02 < gap < 0.3
 
 
+def test_in_three_dimensions_each_has_its_daemon_and_stops_before_the_other():
+    world = {"engine": "mujoco", "ground": [{"kind": "hills", "height": 0.01, "wavelength": 1.5}]}
+    near = {"x": -1.9, "y": 0.0, "yaw": 0.0}
+    leader, second = (
+        {"sim": {"world": world}},
+        {"sim": {"world": {**world, "start": near}}, "odometry": {"start": near}},
+    )
+    rigs, contacts, _ = drive(*fleet(leader=leader, second=second), seconds=3.0)
+    assert contacts == []
+    x, speed = rigs[1].truth.array()[-1, [1, 4]]
+    assert x - near["x"] > 0.1
+    assert abs(speed) < 0.02, "before it stands the first one, 1.7 m before its goal"
+
+
 def test_a_robot_without_eyes_runs_into_it_and_the_world_says_so():
     rigs, contacts, outcome = drive(*fleet(second=BLIND))
     assert outcome is not Reason.BEHAVIOUR_DONE

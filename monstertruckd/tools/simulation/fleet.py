@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from monstertruck_drivers.config import PortConfig
 from monstertruck_runtime.errors import InputError
@@ -10,22 +10,26 @@ from monstertruck_sim.world.scene import Surroundings
 from monstertruck_sim.world.world import make_scene
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, needs_computer
 
+SHARED: Final = ("map", "engine", "ground", "height_image", "mjcf")
+"""What robots of one world have in common."""
+
 
 def as_fleet(configs: Sequence[SimulatedTruckConfig]) -> list[SimulatedTruckConfig]:
     """The configurations of robots of one world, each with noise of its own.
 
-    Map, people and seed of the world are those of the first one.
+    Map, engine, ground, people and seed of the world are those of the first one.
 
     Raises:
         InputError: two of them claim the same thing, or describe different worlds; the text names both.
     """
     first = configs[0]
     for config in configs[1:]:
-        if config.sim.world.map != first.sim.world.map:
-            raise InputError(
-                f"{config.robot}: sim.world.map is {config.sim.world.map}: expected that of {first.robot}, "
-                f"{first.sim.world.map}"
-            )
+        for name in SHARED:
+            value, expected = getattr(config.sim.world, name), getattr(first.sim.world, name)
+            if value != expected:
+                raise InputError(
+                    f"{config.robot}: sim.world.{name} is {value}: expected that of {first.robot}, {expected}"
+                )
         if config.sim.world.people not in ((), first.sim.world.people):
             raise InputError(f"{config.robot}: sim.world.people: expected none, or those of {first.robot}")
     _require_apart(configs, "robot", lambda config: [config.robot])

@@ -48,6 +48,10 @@ def test_two_robots_of_one_name_are_refused():
         ({"zenoh": {"listen": ("tcp/127.0.0.1:7447",)}}, "zenoh.listen tcp/127.0.0.1:7447: of leader and of second"),
         ({"state_directory": Path("runs/leader/state")}, "state_directory runs/leader/state"),
         ({"sim": {"world": {"map": "rooms"}}}, "second: sim.world.map is rooms: expected that of leader, yard"),
+        (
+            {"sim": {"world": {"engine": "mujoco"}}},
+            "second: sim.world.engine is mujoco: expected that of leader, plane",
+        ),
         ({"sim": {"world": {"people": ({},)}}}, "second: sim.world.people: expected none, or those of leader"),
     ],
 )
