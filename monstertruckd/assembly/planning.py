@@ -18,13 +18,14 @@ from monstertruck_planners.goals.exchange import Setup
 from monstertruck_planners.goals.path_publisher import GoalInputs, GoalOutputs
 from monstertruck_planners.goals.service import GoalService
 from monstertruck_planners.missions.service import MissionInputs, MissionParts, MissionService
-from monstertruck_planners.steps import DEFORMING, EXPLORING, PLANNING, STEPS, TRACKING
+from monstertruck_planners.steps import DEFORMING, EXPLORING, PLANNING, PLANNING_BY_KIND, STEPS, TRACKING
 from monstertruck_planners.track.config import TrackerConfig
 from monstertruck_planners.track.paths import PathService, load_path
 from monstertruck_planners.track.service import TrackerService, TrackSetup
 from monstertruck_runtime.actors.actor import ActorFactory
 from monstertruck_runtime.clock import Clock, VirtualClock
 from monstertruck_runtime.mailbox import fifo, latest
+from monstertruck_runtime.plugins import kind_of
 from monstertruck_runtime.ports import Publisher, Subscription
 from monstertruck_runtime.service import Service
 from monstertruck_runtime.threads import in_thread, inline
@@ -180,7 +181,7 @@ def build_goals(
         actors.actor(
             config.placement.planner,
             PLANNING,
-            STEPS[PLANNING],
+            PLANNING_BY_KIND.get(kind_of(type(planner.route)) or "", STEPS[PLANNING]),
             latency=planner.latency,
             deadline=planner.deadline,
             start_timeout=START_TIMEOUT,

@@ -23,6 +23,9 @@ STEPS: Final = {
 }
 """``module:factory`` by name."""
 
+PLANNING_BY_KIND: Final = {"hybrid": "monstertruck_planners.goals.plan_step:hybrid_worker"}
+"""Of workers that compile what one kind of route planner needs."""
+
 CODEC: Final = StepCodec(
     *(PlanTask, PlanAnswer, DeformTask, DeformAnswer, TrackInput, TrackOutput, ExploreTask, ExploreAnswer),
     # What ``TrackInput.news`` holds.

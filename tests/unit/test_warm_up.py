@@ -5,6 +5,11 @@ import sys
 
 import pytest
 
+from monstertruck_planners.goals import plan_step
+from monstertruck_planners.goals.config import PlannerConfig
+from monstertruck_planners.steps import PLANNING_BY_KIND
+from monstertruck_runtime.plugins import kind_of
+
 # In a process of its own: in this one other tests have compiled some.
 SCRIPT = """
 import importlib, pkgutil, sys
@@ -44,3 +49,15 @@ def test_a_worker_has_compiled_all_its_kernels(module: str, worker: str, package
         [sys.executable, "-c", SCRIPT, module, worker, package], check=True, capture_output=True, text=True
     )
     assert done.stdout.strip() == unused
+
+
+def test_the_planning_worker_of_a_robot_waits_for_its_own_planner_only(monkeypatch: pytest.MonkeyPatch):
+    warmed: list[str] = []
+    monkeypatch.setattr(plan_step, "warm_up", lambda planner: warmed.append(planner.config.kind))
+    assert kind_of(type(PlannerConfig().route)) in PLANNING_BY_KIND
+    for kind, target in PLANNING_BY_KIND.items():
+        warmed.clear()
+        getattr(plan_step, target.rpartition(":")[2])()
+        assert warmed == [kind]
+    plan_step.PlanningWorker()
+    assert sorted(warmed[1:]) == ["grid_astar", "hybrid", "lattice"]

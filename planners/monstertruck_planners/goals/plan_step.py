@@ -8,7 +8,7 @@ behind it, so nothing is forgotten by age.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Final
 
@@ -29,7 +29,7 @@ from monstertruck_planners.goals.escape import escape
 from monstertruck_planners.goals.exchange import PlanAnswer, PlanTask, Pose, Setup, explained_within
 from monstertruck_planners.route.api import Clock, RouteMap, RoutePlanner, RouteResult, Vehicle, warm_up
 from monstertruck_planners.route.catalog import make_planner
-from monstertruck_planners.route.config import GridAstarConfig, HybridConfig, LatticeConfig
+from monstertruck_planners.route.config import GoalConfig, GridAstarConfig, HybridConfig, LatticeConfig
 from monstertruck_planners.route.motion import MotionPath, moved
 from monstertruck_planners.route.replan import ViaPoint, replan, with_headings
 from monstertruck_planners.track.segments import stops
@@ -513,10 +513,19 @@ def shortened(answer: PlanAnswer) -> PlanAnswer:
 
 
 class PlanningWorker(PlanningStep):
-    """The step as a worker's: its code is compiled when it is built."""
+    """The step as a worker's: its code is compiled when it is built.
 
-    def __init__(self) -> None:
+    Args:
+        configs: route planners whose code that is; all of ours, if not said.
+    """
+
+    def __init__(self, configs: Sequence[GoalConfig] = (HybridConfig(), LatticeConfig(), GridAstarConfig())) -> None:
         super().__init__()
-        for config in (HybridConfig(), LatticeConfig(), GridAstarConfig()):
+        for config in configs:
             warm_up(make_planner(Vehicle.truck(), config))
         Vehicle.truck("2ws").reeds_shepp().distance(np.zeros(3), np.ones(3))
+
+
+def hybrid_worker() -> PlanningWorker:
+    """A worker of a robot whose routes are planned by hybrid A*: the others' code is not waited for."""
+    return PlanningWorker((HybridConfig(),))
