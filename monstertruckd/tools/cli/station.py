@@ -2,6 +2,7 @@
 
 import asyncio
 import ssl
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -98,8 +99,11 @@ async def _foxglove(address: "RobotAddress", clock: WallClock, port: int, *, dri
 
 
 async def _rerun(address: "RobotAddress", clock: WallClock) -> None:
+    from monstertruckd.tools.logs.live_process import VIEWER, show_live
+
     with needs_extra("viewers"):
-        from monstertruckd.tools.logs.live import VIEWER, show_live
+        if find_spec("rerun") is None:
+            raise ModuleNotFoundError(name="rerun")
     remark(f"rerun: {VIEWER}")
     await show_live(address.name, address.endpoint, clock)
 

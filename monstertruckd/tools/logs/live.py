@@ -1,12 +1,20 @@
-"""A running robot in the rerun viewer: what a log of it would show, as it comes."""
+"""A running robot in the rerun viewer: what a log of it would show, as it comes. A program of ``live_process``.
 
+    python -m monstertruckd.tools.logs.live ROBOT ENDPOINT VIEWER
+
+It ends when its standard input does.
+"""
+
+import os
+import sys
+import threading
 from contextlib import ExitStack, suppress
 from typing import Any, Final
 
 import rerun as rr
 
 from monstertruck_runtime.client import TruckClient
-from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.clock import Clock, run_wall
 from monstertruck_runtime.errors import TruckError
 from monstertruck_runtime.mailbox import Mailbox, fifo
 from monstertruck_schemas import topics as t
@@ -15,8 +23,6 @@ from monstertruck_schemas.topics import Topic
 from monstertruckd.tools.logs.report.signals import FIGURES
 from monstertruckd.tools.logs.rerun_view import APPLICATION, Scene, blueprint
 
-VIEWER: Final = "rerun+http://127.0.0.1:9876/proxy"
-"""Where a viewer on this machine listens: ``rerun --bind 127.0.0.1``."""
 PERIOD: Final = 0.1
 """Seconds between two looks at what came."""
 RETRY: Final = 1.0
@@ -26,23 +32,6 @@ WAITING: Final = 200
 DRAWN: Final[tuple[Topic[Any], ...]] = (
     t.SCAN, t.TRANSFORMS, t.MAP, t.PATH, t.POSE, t.CAMERA, t.GATE, t.HEALTH, t.EVENT, t.STOP, t.LOG,
 )  # fmt: skip
-
-
-async def show_live(robot: str, endpoint: str, clock: Clock, viewer: str = VIEWER) -> None:
-    """Show a robot until cancelled; one that is not there is waited for, as is the viewer.
-
-    Args:
-        robot: its name.
-        endpoint: where it listens.
-        clock: time.
-        viewer: of rerun, as an address of its own.
-    """
-    stream = rr.RecordingStream(APPLICATION)
-    stream.connect_grpc(viewer)
-    try:
-        await follow(robot, endpoint, clock, stream)
-    finally:
-        stream.disconnect()
 
 
 async def follow(robot: str, endpoint: str, clock: Clock, stream: rr.RecordingStream) -> None:
@@ -79,6 +68,25 @@ def take(scene: Scene, boxes: list[tuple[Topic[Any], Mailbox[Any]]]) -> None:
     scene.flush()
 
 
+def main() -> None:
+    """Draw until standard input ends; a robot that is not there is waited for."""
+    robot, endpoint, viewer = sys.argv[1:]
+    # Drawing stands still where the viewer takes nothing, so that a thread has to see the end.
+    threading.Thread(target=_end_with_input, daemon=True).start()
+    stream = rr.RecordingStream(APPLICATION)
+    stream.connect_grpc(viewer)
+    run_wall(lambda clock: follow(robot, endpoint, clock, stream))
+
+
+def _end_with_input() -> None:
+    sys.stdin.buffer.read()
+    os._exit(0)
+
+
 async def _box(scene: Scene, client: TruckClient) -> None:
     with suppress(TruckError):
         scene.box((await client.call("config")).get("geometry", {}))
+
+
+if __name__ == "__main__":
+    main()

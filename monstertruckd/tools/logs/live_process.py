@@ -1,0 +1,62 @@
+"""A running robot in the rerun viewer, drawn by a process of its own.
+
+The SDK keeps what a viewer does not take, and when that is too much it stands still until the viewer does: in the
+station's process its page would stand still, too. The process runs only while a viewer listens.
+"""
+
+import asyncio
+import sys
+from asyncio.subprocess import DEVNULL, PIPE
+from collections.abc import Sequence
+from contextlib import suppress
+from typing import Final
+from urllib.parse import urlsplit
+
+from monstertruck_runtime.clock import Clock
+
+VIEWER: Final = "rerun+http://127.0.0.1:9876/proxy"
+"""Where a viewer on this machine listens: ``rerun --bind 127.0.0.1``."""
+LOOK: Final = 2.0
+"""Seconds between two looks whether it listens."""
+PROGRAM: Final = (sys.executable, "-m", "monstertruckd.tools.logs.live")
+
+
+async def show_live(
+    robot: str, endpoint: str, clock: Clock, viewer: str = VIEWER, program: Sequence[str] = PROGRAM
+) -> None:
+    """Show a robot until cancelled, in a viewer whenever there is one.
+
+    Args:
+        robot: its name.
+        endpoint: where it listens.
+        clock: time.
+        viewer: of rerun, as an address of its own.
+        program: what draws, given robot, endpoint and viewer.
+    """
+    while True:
+        while not await listens(viewer):
+            await clock.sleep(LOOK)
+        # A session of its own: Ctrl-C is for the station, which ends it.
+        drawing = await asyncio.create_subprocess_exec(
+            *program, robot, endpoint, viewer, stdin=PIPE, stdout=DEVNULL, start_new_session=True
+        )
+        try:
+            while drawing.returncode is None and await listens(viewer):
+                await clock.sleep(LOOK)
+        finally:
+            with suppress(ProcessLookupError):
+                drawing.kill()
+            await drawing.wait()
+        await clock.sleep(LOOK)
+
+
+async def listens(viewer: str) -> bool:
+    """Whether anybody answers at a viewer's address."""
+    place = urlsplit(viewer)
+    try:
+        async with asyncio.timeout(LOOK):
+            _, writer = await asyncio.open_connection(place.hostname, place.port)
+    except (OSError, TimeoutError):
+        return False
+    writer.close()
+    return True
