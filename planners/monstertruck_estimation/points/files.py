@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Final
 
+import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
 from monstertruck_runtime.errors import InputError
@@ -45,9 +46,21 @@ def load(folder: Path) -> list[tuple[PointOfInterest, bytes]]:
     try:
         require_file(file, MOST_BYTES)
         points = _POINTS.validate_json(file.read_bytes())
-    except (OSError, ValidationError) as error:
-        first = str(error).partition("\n")[0]
-        raise InputError(f"{file}: not readable as points of interest: {first}") from error
+    except OSError as error:
+        raise InputError(f"{file}: not readable as points of interest: {error.strerror or error}") from error
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        place = ".".join(map(str, first["loc"]))
+        raise InputError(
+            f"{file}: not readable as points of interest: {place}{': ' if place else ''}{first['msg']}"
+        ) from error
+    names = [point.name for point in points]
+    for point in points:
+        covariance = np.reshape(point.covariance, (3, 3))
+        if names.count(point.name) > 1:
+            raise InputError(f"{file}: {point.name}: expected every name once")
+        if not np.allclose(covariance, covariance.T) or np.linalg.eigvalsh(covariance).min() <= 0.0:
+            raise InputError(f"{file}: {point.name}: covariance: expected a symmetric matrix of positive variances")
     return [(point, _picture(folder / picture_name(point.name))) for point in points]
 
 

@@ -1,5 +1,6 @@
 """Readings become points of interest; they move with the map, and outliers do not count."""
 
+import json
 import math
 from dataclasses import replace
 
@@ -155,3 +156,23 @@ def test_a_tag_of_a_saved_map_is_seen_after_a_restart_of_the_computer_and_no_one
     for i, base in enumerate(BASES[1:]):
         again.see(reading(base, off), (i + 2) * SECOND, base, STILL, 0.0)
     assert shown(again).x == pytest.approx(4.0, abs=1e-3), "it hangs elsewhere now"
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"x": "left"}, r"0\.x: Input should be a valid number"),
+        ({"covariance": [0.0] * 9}, "dock: covariance: expected a symmetric matrix of positive variances"),
+        ({"covariance": [-1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]}, "dock: covariance: expected"),
+        ({}, "dock: expected every name once"),
+    ],
+)
+def test_a_file_of_points_that_is_wrong_is_refused_with_the_place(tmp_path, change: dict, said: str):
+    points = PointMap(PointsConfig(), MOUNT)
+    points.mark("dock", SECOND, (1.0, 0.0, 0.0), (1.5, 0.5, 1.0), STILL)
+    shown(points, name="dock")
+    save(tmp_path, points.pictured())
+    (row,) = json.loads((tmp_path / "points.json").read_text())
+    (tmp_path / "points.json").write_text(json.dumps([row | change] if change else [row, row]))
+    with pytest.raises(InputError, match=f"points.json: .*{said}"):
+        load(tmp_path)
