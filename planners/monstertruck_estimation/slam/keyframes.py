@@ -195,7 +195,8 @@ class Trajectory:
         if len(mine) < 2:
             return found
         before = np.clip(np.searchsorted(mine, stamps, side="right") - 1, 0, len(mine) - 2)
-        inside = (stamps >= mine[0]) & (stamps <= mine[-1]) & joined[self._keys.view[before]]
+        known = joined[self._keys.view]
+        inside = (stamps >= mine[0]) & (stamps <= mine[-1]) & known[before] & known[before + 1]
         before = before[inside]
         ends = [compose(keys[self._keys.view[rows]], self._relative.view[rows]) for rows in (before, before + 1)]
         share = (stamps[inside] - mine[before]) / np.maximum(mine[before + 1] - mine[before], 1)

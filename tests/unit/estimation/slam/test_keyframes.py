@@ -91,5 +91,7 @@ def test_poses_at_any_instant_move_with_the_keyframes_and_are_unknown_off_the_ma
     assert found[1:4, 0] == pytest.approx([0.0, 0.5, 2.0])
     keys[:, 1] += 2.0
     assert trail.at(asked, keys, joined)[2] == pytest.approx(found[2] + np.array((0.0, 2.0, 0.0)))
-    joined[0] = False
-    assert np.isnan(trail.at(asked, keys, joined)[1]).all()
+    for lost in (0, 1):
+        joined[:] = True
+        joined[lost] = False
+        assert np.isnan(trail.at(asked, keys, joined)[2]).all(), "one end of the line is nowhere"
