@@ -1,12 +1,15 @@
 """Wizards against hidden truth: 20 trucks, all values of each off, calibrated in the order of docs/calibration.md.
 
     python benchmarks/calibration.py [--seeds 20] [--jobs 1] [--light 200]
+    python benchmarks/calibration.py --part swapped [--count 20]
 
 Every session runs the whole daemon on a virtual clock: real drivers, emulated devices, the safety gate; the operator
 has a tape, a string and a meter with errors of their own. Judged is whether the true value lies in the stated interval,
 and, against the truck's own linkage, the curvature that the calibrated truck believes, to its full lock.
 Before that the fits of every wizard are judged alone on drawn measurements, ``--light``
 each: how often the truth lies inside, how wide the intervals are. ``--seeds 0`` leaves it at these.
+
+``--part swapped``: a swapped cable or a wrong sign, drawn for every wizard, that it has to name in every case.
 """
 
 import argparse
@@ -15,7 +18,7 @@ import logging
 import math
 import sys
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -35,6 +38,7 @@ from monstertruckd.tools.calibrate.steering import SteeringWizard, steering_wiza
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 from tests.calibration_kit import Verdict, curvature_errors, hidden, run_session, verdicts
 from tests.calibration_light import HALF_WIDTHS, LIGHT, coverage
+from tests.calibration_wrong import WRONG, noticed
 
 ROOT = Path(__file__).resolve().parents[1]
 OUTPUT = ROOT / "runs" / "benchmarks" / "calibration.json"
@@ -128,13 +132,31 @@ def light(fits: int) -> tuple[dict[str, Any], bool]:
     return {"fits": fits, "coverage": inside, "half_widths": halves}, fine
 
 
+def swapped(count: int) -> tuple[dict[str, Any], dict[str, Any], bool]:
+    """Wrong parts that every wizard names, of so many; goals; whether they are met."""
+    found = {wizard: noticed(wizard, count) for wizard in WRONG}
+    for wizard, named in found.items():
+        print(f"{wizard}: {named} of {count} named", flush=True)
+    return {"count": count, "named": found}, {"named": count}, all(named == count for named in found.values())
+
+
+PARTS: dict[str, Callable[[int], tuple[dict[str, Any], dict[str, Any], bool]]] = {"swapped": swapped}
+"""Besides the trucks."""
+
+
 def main() -> int:
     """Calibrate; 0 = every estimate holds in 90 % of the trucks, and every truck's curvature to 2 %, and light fits."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--light", type=int, default=200)
+    parser.add_argument("--part", choices=("trucks", *PARTS), default="trucks")
+    parser.add_argument("--count", type=int, default=20, help="of faults or interruptions of each kind")
     arguments = parser.parse_args()
+    if arguments.part in PARTS:
+        found, goals, met = PARTS[arguments.part](arguments.count)
+        print(json.dumps({"bench": f"calibration.{arguments.part}", "figures": found, "goals": goals, "met": met}))
+        return 0 if met else 1
     by_light, fine = light(arguments.light)
     light_goals = {"coverage": COVERAGE, "half_widths": HALF_WIDTHS}
     if not arguments.seeds:

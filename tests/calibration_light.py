@@ -127,7 +127,7 @@ def steering_fit(rng: np.random.Generator) -> list[Verdict]:
     circles = [(s * 0.35, 0.0, 5.6) for s in (1, -1)] + [(0.0, s * 0.35, 5.6) for s in (1, -1)]
     both = [(s * 0.35, -s * 0.35, 2.8) for s in (1, -1)]
     straights = [(0.0, 0.0, sign * 2.0) for _ in range(3) for sign in (1, -1)]
-    legs = [_steered_leg(model, true, *leg, rng) for leg in (*arcs, *circles, *both, *straights)]
+    legs = [steered_leg(model, true, *leg, rng) for leg in (*arcs, *circles, *both, *straights)]
     fit = model.fit(legs, MAPS)
     halves = half_widths(fit)
     names = ("front_centre", "front_scale", "rear_centre", "rear_scale")
@@ -142,7 +142,7 @@ def steering_fit(rng: np.random.Generator) -> list[Verdict]:
     return [*pulse_maps, *_weaves(rng)]
 
 
-def _steered_leg(
+def steered_leg(
     model: SteeringModel, true: Maps, front: float, rear: float, way: float, rng: np.random.Generator
 ) -> SteeringRun:
     motor = np.full(16, CHASSIS.drivetrain.motor_angle(way) / 16)
@@ -194,6 +194,18 @@ def odometry_fit(rng: np.random.Generator) -> list[Verdict]:
     true = np.array((rng.uniform(0.95, 1.05), rng.uniform(0.95, 1.05), rng.uniform(-0.04, 0.04)))
     # What the interval's bounds cover besides: linkage and floor.
     actual = true * (1 + odometry.FLOOR * rng.normal() / NORMAL, 1 + odometry.LINKAGE * rng.normal() / NORMAL, 1.0)
+    squares = square_legs(model, actual, rng)
+    fit = model.fit(squares, 0.002, 0.0035)
+    way, base, offset = odometry.intervals(fit, 16 + 6)
+    found = {"way": way.joined(odometry.FLOOR), "wheelbase": base.joined(odometry.LINKAGE), "offset": offset}
+    return [
+        Verdict(f"odometry.{name}", i.value, i.low, i.high, float(t))
+        for (name, i), t in zip(found.items(), true, strict=True)
+    ]
+
+
+def square_legs(model: odometry.SquareModel, actual: np.ndarray, rng: np.random.Generator) -> list[odometry.Square]:
+    """A square to each side of a truck whose parameters are ``actual``, as it is measured."""
     squares = []
     for sense in (1, -1):
         legs = []
@@ -206,13 +218,7 @@ def odometry_fit(rng: np.random.Generator) -> list[Verdict]:
         side += math.hypot(0.002 * math.sqrt(2), 0.003) * rng.normal()
         place = math.hypot(odometry.PLACE, 0.007)
         squares.append(odometry.Square(runs, side, (end[0] + place * rng.normal(), end[1] + place * rng.normal())))
-    fit = model.fit(squares, 0.002, 0.0035)
-    way, base, offset = odometry.intervals(fit, 16 + 6)
-    found = {"way": way.joined(odometry.FLOOR), "wheelbase": base.joined(odometry.LINKAGE), "offset": offset}
-    return [
-        Verdict(f"odometry.{name}", i.value, i.low, i.high, float(t))
-        for (name, i), t in zip(found.items(), true, strict=True)
-    ]
+    return squares
 
 
 def _leg(

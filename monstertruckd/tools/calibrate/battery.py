@@ -62,7 +62,9 @@ class BatteryWizard:
         while True:
             volts = await context.ask(METER)
             taken = await context.collect(Collect("battery voltage", topics.BATTERY, self.samples, 30.0))
-            readings.append(self._reading(taken, volts, gain, offset, self._step(context)))
+            reading = self._reading(taken, volts, gain, offset, self._step(context))
+            check_input(reading, gain)
+            readings.append(reading)
             if not await context.confirm(ANOTHER):
                 break
         return context.fit("scale", lambda: self._result(readings, keys))
@@ -157,6 +159,25 @@ class BatteryWizard:
                 f"no scale fits all {len(raw)} readings: a slip, or the divider has changed; forget the earlier "
                 "readings with --fresh"
             )
+
+
+def check_input(reading: MeterReading, gain: float) -> None:
+    """Raise where the input cannot be the battery's.
+
+    Raises:
+        InputError: it reads less than half or more than twice what the meter shows.
+    """
+    shown = reading.raw * gain
+    if not volts_near(shown, reading.volts):
+        raise InputError(
+            f"the input reads {shown:.1f} V where the meter shows {reading.volts:.1f} V: a cable on another input, or "
+            "another divider than configured"
+        )
+
+
+def volts_near(shown: float, volts: float) -> bool:
+    """Whether two voltages may be the same pack's by inputs that are wrong by a factor of two at most."""
+    return volts / 2 < shown < 2 * volts
 
 
 def battery_wizard(settings: BatteryWizard | None = None) -> Wizard:

@@ -176,6 +176,8 @@ def rate_scale(turns: Sequence[Turn], bias: Interval) -> Interval:
         raise InputError(f"{len(turns)} turns: expected at least one to each side")
     rows = np.array([(t.integral, t.seconds, t.turned, t.sigma) for t in turns])
     integral, seconds, turned, sigma = rows.T
+    if float((integral - bias.value * seconds) @ turned) < 0.0:
+        raise InputError("the yaw rate has the wrong sign: the unit lies upside down, or is mounted otherwise than set")
     drift = bias.half / NORMAL
 
     def residual(parameters: Array) -> Array:

@@ -44,6 +44,8 @@ STRAIGHT: Final = 1.0
 """m."""
 LEAST_OVERLAP: Final = 0.5
 """Of two scans that are registered."""
+BETTER: Final = 0.2
+"""Overlap by which another way round has to be better, to be named."""
 LEAST_SCANS: Final = 3
 """At each rest."""
 SCAN: Final = 0.002
@@ -105,6 +107,7 @@ class LidarLeg:
         guess = between(believed, compose(body, believed))
         fit = register(after, Cloud.of(scans), guess, reach=0.3)
         fit = register(after, Cloud.of(scans), fit.pose)
+        check_way_round(scans, after, (way, turn), believed, fit.overlap)
         if fit.overlap < LEAST_OVERLAP:
             raise InputError(
                 f"the scans before and after a leg overlap by {fit.overlap:.0%}: expected {LEAST_OVERLAP:.0%}"
@@ -308,6 +311,43 @@ def _unexplained(fit: FitResult, legs: Sequence[LidarLeg]) -> float:
 
 
 # Scans
+
+
+def check_way_round(before: Scan, after: Scan, moved: tuple[float, float], mount: Array, overlap: float) -> None:
+    """Raise where scans fit together much better if the lidar is upside down, or looks backwards.
+
+    Args:
+        before: scan at the first rest.
+        after: and at the second one.
+        moved: way (m) and turn (rad) of the body.
+        mount: as believed.
+        overlap: of the scans as they are.
+
+    Raises:
+        InputError: so it is.
+    """
+    body = _arc(moved[0], 0.0, moved[1])
+    ways = (
+        ("is upside down", _mirrored, mount),
+        ("looks backwards: its mount's yaw is near 3.14", _as_seen, mount + np.array((0.0, 0.0, math.pi))),
+    )
+    for what, seen, turned in ways:
+        guess = between(turned, compose(body, turned))
+        found = register(seen(after), Cloud.of(seen(before)), guess, reach=0.3)
+        found = register(seen(after), Cloud.of(seen(before)), found.pose)
+        if found.overlap > max(LEAST_OVERLAP, overlap + BETTER):
+            raise InputError(
+                f"the lidar {what}: a leg's scans overlap by {found.overlap:.0%} so, by {overlap:.0%} as configured"
+            )
+
+
+def _as_seen(scan: Scan) -> Scan:
+    return scan
+
+
+def _mirrored(scan: Scan) -> Scan:
+    flip = np.array((1.0, -1.0))
+    return replace(scan, points=scan.points * flip, normals=scan.normals * flip)
 
 
 def _geometry(scan: LaserScan) -> ScanGeometry:

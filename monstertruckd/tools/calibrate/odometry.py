@@ -36,6 +36,8 @@ FLOOR: Final = 0.003
 """Share by which the way differs on another floor, half a 95 % interval."""
 LINKAGE: Final = 0.004
 """Share of a turn by which a linkage is off its polynomials, half a 95 % interval."""
+SAME: Final = 0.5
+"""Share of the turn by the steering that the compass must see."""
 PRIORS: Final = 3
 """Beliefs among the residuals."""
 BELIEVED: Final = (0.05, 0.05, math.radians(6.0))
@@ -110,6 +112,7 @@ class OdometryWizard:
         chassis, geometry = context.chassis, context.config.geometry
         assert isinstance(chassis, TruckChassis)
         model = SquareModel(SteeringModel(chassis), maps, geometry.length / 2)
+        check_senses(model, squares)
         fit = model.fit(squares, self.tape_error, self.string_error)
         legs = sum(len(square.legs) for square in squares)
         way, base, offset = intervals(fit, legs + 3 * len(squares))
@@ -264,6 +267,22 @@ class SquareModel:
             )
 
         return least_squares(residual, start, start - 0.3, start + 0.3)
+
+
+def check_senses(model: "SquareModel", squares: Sequence[Square]) -> None:
+    """Raise where the truck turned the other way than its steering says, or an axle did.
+
+    Raises:
+        InputError: so it is.
+    """
+    legs = [leg for square in squares for leg in square.legs]
+    said, turned = model.turns(legs, np.array((1.0, 1.0, 0.0))), np.array([leg.turn for leg in legs])
+    share = float(said @ turned) / float(said @ said)
+    if share < SAME:
+        raise InputError(
+            f"the corners turn by {share:.0%} of what the steering says: an axle steers the other way, or its servo is "
+            "on another channel; calibrate the steering first"
+        )
 
 
 def intervals(fit: FitResult, measured: int) -> tuple[Interval, Interval, Interval]:

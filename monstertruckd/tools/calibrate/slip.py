@@ -141,6 +141,7 @@ def result_of(arcs: Sequence[SkidArc], radius: float, half_track: float) -> Resu
     place = np.hypot([max(arc.sigma[0], FLOOR) for arc in arcs], SLIDING * ways)
     heading = np.hypot([max(arc.sigma[1], AIM) for arc in arcs], SLIDING * np.abs(turns))
     left, right = np.array([(arc.left, arc.right) for arc in arcs]).T
+    _check_sides(left, right, seen)
 
     def residual(values: Array) -> Array:
         vx, vy, wz = model.build(values).forward((left, right))
@@ -185,6 +186,21 @@ def result_of(arcs: Sequence[SkidArc], radius: float, half_track: float) -> Resu
         ),
         unobserved=("another floor, another load", "what a reversal turns the body by, and slow sliding"),
     )
+
+
+def _check_sides(left: Array, right: Array, seen: Array) -> None:
+    """Raise where the sides are swapped, or one turns the other way.
+
+    Raises:
+        InputError: so it is; which.
+    """
+    ahead, turned = np.sign(seen[0]), seen[2]
+    sides = {"left": float(ahead @ left), "right": float(ahead @ right)}
+    wrong = [name for name, sense in sides.items() if sense < 0.0]
+    if wrong:
+        raise InputError(f"the {' and '.join(wrong)} wheels count backwards while the body goes ahead: swap their sign")
+    if float((right - left) @ turned) < 0.0:
+        raise InputError("the body turns left where the left wheels are faster: the sides are swapped")
 
 
 def _turned(record: MoveRecord, shaft: int) -> float:

@@ -85,12 +85,14 @@ class SteeringWizard:
         maps, model = Maps.of(context.config), SteeringModel(chassis)
         await context.confirm(CLEAR)
         arcs = await self._arcs(context, maps, ROUGH)
-        directions = context.fit("directions", lambda: _directions(arcs))
+        directions = context.fit("directions", lambda: steered_senses(arcs))
         start = Maps(maps.centres, (maps.scales[0] * directions[0], maps.scales[1] * directions[1]), maps.deficit)
         wrong = [name for name, sign in zip(AXLES, directions, strict=True) if sign < 0]
         if self.rough or wrong:
             again = f"{' and '.join(wrong)} wheels steer the other way: restart the daemon, and measure the rest"
-            return context.fit("centres", lambda: _rough(arcs, model, start, None if self.rough else again))
+            if len(wrong) == len(AXLES):
+                again += "; swapped cables look the same: do the FRONT wheels turn when the front ones are steered?"
+            return context.fit("centres", lambda: _rough(arcs, model, start, again if wrong else None))
         legs = [leg for axle in await self._arcs(context, maps, ARC) for leg in axle]
         first = Maps.from_parameters(model.fit([*arcs[0], *arcs[1], *legs], start).parameters)
         travel = await self._travel(context, maps, model, first)
@@ -302,7 +304,7 @@ def _steered(axle: int, angle: float) -> tuple[float, float]:
     return (angle, 0.0) if axle == 0 else (0.0, angle)
 
 
-def _directions(arcs: tuple[list[SteeringRun], list[SteeringRun]]) -> tuple[int, int]:
+def steered_senses(arcs: tuple[list[SteeringRun], list[SteeringRun]]) -> tuple[int, int]:
     """+1 where an axle steers as commanded, -1 where it steers the other way.
 
     Raises:

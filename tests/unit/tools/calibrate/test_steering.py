@@ -10,7 +10,7 @@ from monstertruck_kinematics.polynomials import F_CORRECTED, G_PRINTED, AxlePoly
 from monstertruck_kinematics.truck import DriveTrain
 from monstertruck_runtime.errors import InputError
 from monstertruckd.config.calibration import KEYS
-from monstertruckd.tools.calibrate.steering import AxleTravel, _deficits, _directions, _rough
+from monstertruckd.tools.calibrate.steering import AxleTravel, _deficits, _rough, steered_senses
 from monstertruckd.tools.calibrate.steering_model import Maps, SteeringModel, SteeringRun, half_widths
 
 CHASSIS = truck_chassis(Dimensions(DriveTrain()))
@@ -79,7 +79,7 @@ def test_directions_by_the_sense_of_the_turn(signs: tuple[int, int]):
          for s in (1, -1) for d in (1, -1)]
         for axle in (0, 1)
     )  # fmt: skip
-    assert _directions(arcs) == signs  # type: ignore[arg-type]
+    assert steered_senses(arcs) == signs  # type: ignore[arg-type]
     start = Maps(BELIEVED.centres, (BELIEVED.scales[0] * signs[0], BELIEVED.scales[1] * signs[1]))
     result = _rough(arcs, MODEL, start, None)  # type: ignore[arg-type]
     for axle, (name, sign) in enumerate(zip(("front", "rear"), signs, strict=True)):
@@ -95,7 +95,7 @@ def test_directions_by_the_sense_of_the_turn(signs: tuple[int, int]):
 def test_wheels_that_do_not_steer_are_named():
     dead = ([leg(0, 0, d * 0.4, BELIEVED) for d in (1, -1, 1, -1)],) * 2
     with pytest.raises(InputError, match="front wheels: steered, they turn the truck by"):
-        _directions(dead)
+        steered_senses(dead)
 
 
 def test_a_stop_is_found_and_kept_clear_of():
