@@ -167,12 +167,15 @@ class Mapper:
         return self._motion.use
 
     def _best_match(self, scan: Scan, motion: tuple[Array, Array]) -> tuple[tuple[Array, Array], ScanMatch]:
-        """Match after the predicted ``motion``, or after the other prediction if that alone fits."""
-        match, other = self._matched(scan, *motion), self._motion.other
-        if fits(match) or other is None or self._submap is None:
+        """Match after the predicted ``motion``, or after the first of the other predictions of which one fits."""
+        match = self._matched(scan, *motion)
+        if fits(match) or self._submap is None:
             return motion, match
-        instead = self._matched(scan, *other)
-        return (other, instead) if fits(instead) else (motion, match)
+        for other in self._motion.others:
+            instead = self._matched(scan, *other)
+            if fits(instead):
+                return other, instead
+        return motion, match
 
     def _matched(self, scan: Scan, delta: Array, noise: Array) -> ScanMatch:
         """Match ``scan`` after a motion ``delta`` of covariance ``noise``."""

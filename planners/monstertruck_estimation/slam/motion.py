@@ -187,11 +187,17 @@ class MotionPredictor:
         return OdometryUse.CONTRADICTED if self.check.contradicted else OdometryUse.USED
 
     @property
-    def other(self) -> tuple[Array, Array] | None:
-        """The prediction that ``predict`` did not choose, and its covariance; None without odometry."""
+    def others(self) -> tuple[tuple[Array, Array], ...]:
+        """The predictions that ``predict`` did not choose, and their covariances; none without odometry.
+
+        That by the scans' own motion is always among all of them: wheels of which only ways or turns count may still
+        be wrong at one scan, and would then lose a robot that scans alone do not lose.
+        """
         if self._by_odometry is None:
-            return None
-        return self._by_odometry if self.check.contradicted else self._by_motion
+            return ()
+        if not self.check.contradicted:
+            return (self._by_motion,)
+        return (self._by_motion, self._by_odometry) if any(self.check.kept) else (self._by_odometry,)
 
     @property
     def odom(self) -> Array | None:

@@ -249,6 +249,18 @@ def test_wrong_odometry_is_reported_and_costs_nothing_against_scans_alone(kind):
     assert errors(mapper.trajectory()[1], truth).mean() < max(1.2 * best, 0.02)
 
 
+def test_ways_that_come_late_once_do_not_lose_a_robot_whose_turns_are_contradicted():
+    truth = rounds(240, laps=1.5)
+    turns, mapper = wrong(drifting(truth), "mirrored"), Mapper()
+    drive(mapper, ROOM, truth[:81], turns[:81])
+    assert mapper.odometry is OdometryUse.CONTRADICTED
+    # A second without scans, over which odometry says nothing of the way.
+    for k, odom in ((95, turns[81]), (96, turns[96]), (97, turns[97])):
+        step = mapper.step(scan(ROOM, truth[k]), int(k * 1e8), odom)
+        assert step.match.accepted
+        assert step.pose[:2] == pytest.approx(between(truth[0], truth[k])[:2], abs=0.1)
+
+
 def test_a_stale_odometry_does_not_spoil_the_map():
     truth = rounds(60, 0.8)
     odom = drifting(truth)
