@@ -25,7 +25,7 @@ def main(config: Path, lines: Path) -> None:
         async def serve(clock: Clock) -> None:
             simulate.PtyPort = lambda path: tapped(path, clock, out)
             simulate.TruthLog = lambda world, _: Speeds(world, clock, out)
-            await simulate.serve(clock, (load_simulated(config),), None)
+            await simulate.serve(clock, (load_simulated(config),), lines.with_suffix(".npz"))
 
         run_wall(serve)
 

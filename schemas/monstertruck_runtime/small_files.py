@@ -43,6 +43,20 @@ def require_file(path: Path, most: int | None = None) -> None:
         raise OSError(errno.EFBIG, f"{status.st_size} bytes, expected at most {most}", str(path))
 
 
+def require_place(path: Path) -> None:
+    """Refuse a file that cannot be written, before the work whose result it is to hold.
+
+    Raises:
+        OSError: its folder is not there or cannot be written to, or it is a folder itself.
+    """
+    if path.is_dir():
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    try:
+        tempfile.TemporaryFile(dir=path.parent).close()
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from None
+
+
 def replace_file(path: Path, content: str | bytes, mode: int = 0o644, *, follow_links: bool = True) -> None:
     """Give the file its ``content``, as a whole or not at all; one that was there keeps its mode.
 

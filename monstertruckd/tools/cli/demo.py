@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.small_files import require_place
 from monstertruckd.tools.cli.options import SimulatedOption
 from monstertruckd.tools.cli.output import (
     JsonOption,
@@ -48,6 +49,8 @@ def demo(
     simulated = load_simulated(config)
     if film is not None and (not fast or simulated.sim.world.engine != "mujoco" or film.suffix.lower() != ".gif"):
         raise InputError(f"--film {film}: expected --fast, engine mujoco, and a name.gif")
+    if film is not None:
+        require_place(film)
     folder = _fresh(output)
     remark(f"starting the emulated truck and its daemon; log, map and outputs go to {folder}")
     screen = on_terminal(sys.stdout) and not json_output
@@ -114,6 +117,9 @@ def simulate(
     from monstertruckd.tools.simulation.fleet import as_fleet
     from monstertruckd.tools.simulation.simulate import serve
 
+    if truth is not None:
+        require_place(truth)
+
     files = [config] if robots is None else [Path(name) for name in robots.split(",")]
     simulated = as_fleet([load_simulated(file) for file in files])
     code = 0
@@ -139,5 +145,6 @@ def _film(config: Path, film: Path, seconds: float, *, alone: bool) -> None:
 
     if not alone or load_simulated(config).sim.world.engine != "mujoco" or film.suffix.lower() != ".gif":
         raise InputError(f"--film {film}: expected engine mujoco, a name.gif, and no --robots, --truth or --run")
+    require_place(film)
     run_film(config, film, seconds)
     remark(f"wrote {seconds:g} s to {film}")

@@ -101,7 +101,7 @@ async def serve(
         for config in configs:
             folder = Path(stack.enter_context(TemporaryDirectory(prefix="monstertruck-")))
             stack.enter_context(_linked(config, folder))
-            robots.append(ServedRobot(config, clock, folder, scene))
+            robots.append(ServedRobot(config, clock, folder, scene, keeps_truth=truth is not None))
         return await _serve(clock, robots, truth, daemons_of)
 
 
@@ -131,9 +131,12 @@ class ServedRobot:
         clock: time.
         folder: of its emulated computer.
         scene: world.
+        keeps_truth: whether what really happens is asked for at the end; a day of it is 80 MB.
     """
 
-    def __init__(self, config: SimulatedTruckConfig, clock: Clock, folder: Path, scene: Surroundings) -> None:
+    def __init__(
+        self, config: SimulatedTruckConfig, clock: Clock, folder: Path, scene: Surroundings, *, keeps_truth: bool
+    ) -> None:
         self.config, self._clock = config, clock
         devices = config.devices.present()
         cables: dict[str, EmulatedPort] = {}
@@ -153,6 +156,7 @@ class ServedRobot:
             name=config.robot,
         )
         self.truth = TruthLog(self._robot.world, clock)
+        self._keeps_truth = keeps_truth
         emulated: dict[str, Commanded] = {
             role: Emulated(self._robot.emulators[role], self._robot.ports[role]) for role in devices
         }
@@ -164,7 +168,8 @@ class ServedRobot:
         """Everything that runs as long as it is served; ``say`` gets a line for the terminal."""
         config, world, clock = self.config, self._robot.world, self._clock
         yield asyncio.create_task(self._robot.run(), name=config.robot)
-        yield asyncio.create_task(self.truth.run(), name="truth")
+        if self._keeps_truth:
+            yield asyncio.create_task(self.truth.run(), name="truth")
         if config.stand == "simulator":
             yield asyncio.create_task(_see(clock, config, world), name="stand")
         for i, (name, camera) in enumerate(config.sim.stand.cameras.items()):

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from monstertruck_runtime.small_files import number_of, replace_file, text_of
+from monstertruck_runtime.small_files import number_of, replace_file, require_place, text_of
 
 
 @pytest.mark.parametrize(("content", "number"), [("42\n", 42), ("-1", -1), ("", None), ("4.2", None), ("abc", None)])
@@ -56,3 +56,11 @@ def test_only_regular_files_are_replaced(tmp_path: Path, make: Callable[[Path], 
         replace_file(tmp_path / "link", "x")
     assert not special.is_file()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["link", "special"], "nothing is left behind"
+
+
+def test_a_place_for_a_file_is_known_before_the_work(tmp_path: Path):
+    require_place(tmp_path / "new.gif")
+    assert list(tmp_path.iterdir()) == []
+    for wrong in (tmp_path, tmp_path / "nowhere" / "x.gif", Path("/proc/x.gif")):
+        with pytest.raises(OSError, match=str(wrong)):
+            require_place(wrong)
