@@ -162,14 +162,15 @@ class Stops:
 
 
 @asynccontextmanager
-async def process(core: int, output: Path, *arguments: str) -> AsyncIterator[asyncio.subprocess.Process]:
-    """A Python process on one core while the context lasts."""
+async def process(core: int | None, output: Path, *arguments: str) -> AsyncIterator[asyncio.subprocess.Process]:
+    """A Python process while the context lasts; on one core, if one is named."""
     pipe = asyncio.subprocess.PIPE
     with output.open("ab") as errors:
         running = await asyncio.create_subprocess_exec(
             sys.executable, *arguments, cwd=ROOT, stdin=pipe, stdout=pipe, stderr=errors
         )
-    os.sched_setaffinity(running.pid, {core})
+    if core is not None:
+        os.sched_setaffinity(running.pid, {core})
     try:
         yield running
     finally:

@@ -9,7 +9,8 @@
     goto     from the start of `goto`, to a daemon that has just started, to the first route, s; kernels compiled
 
 ``estop``, ``status`` and ``goto`` talk to a daemon and an emulated truck in processes of their own; the goals are for
-two idle cores. The last line is JSON.
+two idle cores. ``estop`` and ``status`` keep daemon and truck on a core each; for ``goto`` the daemon and its workers
+have both, as a user's have. The last line is JSON.
 """
 
 import argparse
@@ -73,11 +74,20 @@ def help_text(trials: int) -> dict[str, float]:
 
 
 @asynccontextmanager
-async def robot(clock: Clock, folder: Path, config: str) -> AsyncIterator[tuple[TruckClient, str, Stops]]:
-    """An emulated truck with its daemon, a client, the endpoint, and the quick stops on the drive's wire."""
+async def robot(
+    clock: Clock, folder: Path, config: str, *, apart: bool = True
+) -> AsyncIterator[tuple[TruckClient, str, Stops]]:
+    """An emulated truck with its daemon, a client, the endpoint, and the quick stops on the drive's wire.
+
+    Args:
+        clock: time.
+        folder: for configuration and outputs.
+        config: in ``configs``.
+        apart: truck and daemon have a core each.
+    """
     endpoint = free_endpoint()
     overlay = write_overlay(ROOT / "configs" / config, folder, endpoint)
-    cores = sorted(os.sched_getaffinity(0))
+    cores = sorted(os.sched_getaffinity(0)) if apart else [None]
     bench = str(ROOT / "benchmarks" / "estop.py")
     async with (
         process(cores[-1], folder / "simulate.txt", bench, "--serve", str(overlay)) as simulator,
@@ -153,7 +163,7 @@ async def goto(clock: Clock, folder: Path) -> dict[str, float]:
     for turn in ("first", "second"):
         (folder / turn).mkdir()
         async with (
-            robot(clock, folder / turn, "goals.yaml") as (client, endpoint, _),
+            robot(clock, folder / turn, "goals.yaml", apart=False) as (client, endpoint, _),
             contextlib.AsyncExitStack() as stack,
         ):
             goals = stack.enter_context(client.subscribe(topics.GOAL, latest()))
