@@ -243,6 +243,7 @@ RESERVED: Final = frozenset(
         "ground",
         "health",
         "levelling",
+        "lidar_sonars",
         "map",
         "meter",
         "missions",

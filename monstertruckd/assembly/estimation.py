@@ -71,6 +71,8 @@ def sensor_mounts(config: TruckConfig) -> dict[str, Mount]:
         if (elements := DEVICES.roles[role].elements) is not None:
             for name, element in getattr(device.driver, elements).items():
                 mounts[f"{role}_{name}"] = element.mount
+    if config.lidar_sonars is not None:
+        mounts |= {f"sonar_{name}": place for name, place in config.lidar_sonars.sonars.items()}
     return mounts
 
 

@@ -7,6 +7,7 @@ from monstertruck_drivers.config import Devices
 from monstertruck_kinematics.chassis import Chassis
 from monstertruck_planners.behave.api import BehaviourBody
 from monstertruck_planners.behave.catalog import LEVELLING
+from monstertruck_planners.behave.lidar_sonars import LidarSonars
 from monstertruck_planners.behave.service import BehaviourService
 from monstertruck_planners.collision import Footprint
 from monstertruck_planners.explore.config import ExplorerConfig
@@ -84,6 +85,15 @@ def build_planners(
             if config.explorer is not None:
                 explorer = _build_explorer(config, config.explorer, bus, clock, body, goals, actors, save_map)
                 yield explorer
+    lidar = config.devices.lidar
+    if config.lidar_sonars is not None and lidar is not None:
+        yield LidarSonars(
+            config.lidar_sonars,
+            lidar.mount.planar,
+            clock,
+            bus.subscribe(topics.SCAN, latest()),
+            bus.publisher(topics.SONAR, Writer.DRIVER),
+        )
     behaviours = None
     if config.behaviours and requests is not None:
         moved = BehaviourBody(body.chassis, config.gate.angle)

@@ -21,6 +21,7 @@ from monstertruck_kinematics.truck import DriveTrain
 from monstertruck_planners.behave.api import BehaviourConfig
 from monstertruck_planners.behave.catalog import AnyBehaviour, AnyLevelling
 from monstertruck_planners.behave.follow import FollowConfig
+from monstertruck_planners.behave.lidar_sonars import LidarSonarsConfig
 from monstertruck_planners.behave.move import MoveConfig
 from monstertruck_planners.behave.stabiliser import StabiliserConfig
 from monstertruck_planners.explore.catalog import AnyExplorer
@@ -137,6 +138,8 @@ class TruckConfig(Schema):
         default_factory=dict, validate_default=True
     )
     """What reacts to sensors without a path, by name; started by `behave start`. `move` is always there"""
+    lidar_sonars: LidarSonarsConfig | None = None
+    """Sonars computed from the lidar, for behaviours of a robot that has none; null = none"""
     peers: dict[Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,31}$")], PeerConfig] = Field(default_factory=dict)
     """Other robots whose poses are heard, by name, for behaviours such as `follow`"""
     placement: PlacementConfig = PlacementConfig()
@@ -248,6 +251,8 @@ class TruckConfig(Schema):
                 raise ValueError(f"behaviours.{name}.leader {behaviour.leader}: expected one of peers")
         if self.robot in self.peers:
             raise ValueError(f"peers.{self.robot}: expected other robots than this one")
+        if self.lidar_sonars is not None and (self.devices.lidar is None or self.devices.sonar is not None):
+            raise ValueError("lidar_sonars needs the device lidar, and no device sonar")
         if self.slam is not None and self.devices.lidar is None:
             raise ValueError("slam needs the device lidar")
         if self.slam is not None and self.slam.mode == "localisation" and self.slam.map is None:

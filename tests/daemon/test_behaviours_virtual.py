@@ -128,10 +128,15 @@ def test_the_robot_with_five_sonars_follows_a_wall_of_the_yard_by_its_own_device
 
 
 def along_the_yard(start, seconds, *, fault=None, at=14.0):
-    """Method 3 by the robot's own devices; after so many seconds a fault acts on the rig."""
+    """Method 3 in the yard."""
     config, _ = load_config(FILE.with_name("sonar.yaml"), SimulatedTruckConfig)
     x, y, yaw = start
     config = with_overlay(config, {"recorder": None, "sim": {"world": {"start": {"x": x, "y": y, "yaw": yaw}}}})
+    return followed(config, "line_left", seconds, fault=fault, at=at)
+
+
+def followed(config, behaviour, seconds, *, fault=None, at=14.0):
+    """A behaviour by the robot's own devices; after so many seconds a fault acts on the rig."""
 
     async def main(clock: VirtualClock):
         rig = VirtualRig(config, clock)
@@ -140,7 +145,7 @@ def along_the_yard(start, seconds, *, fault=None, at=14.0):
                 operator = LocalOperator(rig.daemon, clock)
                 await clock.sleep(2.0)
                 await operator.arm()
-                order = {**await operator.header(), "order": BehaviourOrder.START, "behaviour": "line_left"}
+                order = {**await operator.header(), "order": BehaviourOrder.START, "behaviour": behaviour}
                 await operator.call("behave", order)
                 await clock.sleep(min(at, seconds))
                 if fault is not None:
@@ -190,3 +195,23 @@ def test_a_fault_along_a_wall_stops_method_3_with_its_reason(fault, outcome):
     assert states[-1].outcome is outcome
     assert not truth[:, 5].any()
     assert np.abs(np.diff(truth[-20:, 1:3], axis=0)).max() < 1e-3
+
+
+@pytest.mark.long
+def test_the_truck_follows_walls_by_sonars_computed_from_its_lidar():
+    wall = {
+        "kind": "wall_pd", "distance": 0.45, "offset": 0.05, "speed": 0.15, "k_p": 3.0, "k_d": 6.0, "trigger": 0.85,
+        "seen": 0.8, "free": 1.1, "gap": 0.6, "aligned": 0.0, "safety": 0.4,
+    }  # fmt: skip
+    bare = dict.fromkeys(("recorder", "path", "tracker", "slam", "map", "planner"))
+    config, _ = load_config(FILE.parents[1] / "demo.yaml", SimulatedTruckConfig)
+    config = with_overlay(
+        config, {**bare, "lidar_sonars": {}, "behaviours": {"wall": wall}, "sim": {"world": {"map": "yard"}}}
+    )
+    states, truth = followed(config, "wall", 58.0)
+    assert not truth[:, 5].any()
+    phases = [state.phase for state in states]
+    assert phases.count("turn_away") > 2
+    behind = [state.values["distance"] for state in states if state.phase == "follow" and state.elapsed > 53.0]
+    assert behind
+    assert np.abs(np.array(behind) - 0.45).max() < 0.06

@@ -8,12 +8,13 @@ All is written for a wall on the left; a wall on the right is the mirror image.
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, Final, Literal, NamedTuple
+from typing import Any, ClassVar, Final, Literal, NamedTuple, Self
 
 import numpy as np
 
+from monstertruck_kinematics.elementary import KinematicsError
 from monstertruck_kinematics.profiles import CubicRamp, TimedRamp
-from monstertruck_planners.behave.api import BehaviourStep, Inputs, RequestedMotion
+from monstertruck_planners.behave.api import BehaviourBody, BehaviourStep, Inputs, RequestedMotion
 from monstertruck_planners.behave.wall.config import WallConfig, WallPdConfig, WallSwitchingConfig
 from monstertruck_planners.behave.wall.monitor import NAMES, SonarMonitor
 from monstertruck_schemas.reasons import Reason
@@ -41,6 +42,8 @@ LEAST_ECHOES: Final = 4
 """Of such a line."""
 LINE_GAINS: Final = 5.0, 2.0
 """Yaw rate per distance error from it, rad/s/m, and per heading error, 1/s: critically damped at 0.2 m/s."""
+TIGHT: Final = 4.0
+"""Curvature that no body with steered axles reaches, 1/m."""
 AT_REST: Final = 0.01
 """m/s."""
 
@@ -71,6 +74,24 @@ def wall_angle(diagonal: float, side: float, offset: float = 0.0) -> float:
 def wall_distance(diagonal: float, side: float, offset: float = 0.0) -> float:
     """Perpendicular distance from the side sonar to the wall, m."""
     return side * math.cos(wall_angle(diagonal, side, offset))
+
+
+def tightest_curvature(body: BehaviourBody) -> float:
+    """Greatest curvature of a body's way, 1/m; inf where it turns on the spot.
+
+    Raises:
+        KinematicsError: it cannot turn.
+    """
+    chassis = body.chassis
+    try:
+        chassis.possible((0.0, 0.0, 1.0))
+    except KinematicsError:
+        twist = chassis.possible((1.0, 0.0, TIGHT))
+    else:
+        return math.inf
+    angles, _ = chassis.limited_steering(chassis.steering_for(twist, chassis.straight), body.max_angle)
+    vx, _, wz = chassis.along(twist, *chassis.reached(angles))
+    return abs(wz / vx)
 
 
 def ramp(begin: float, start: float, end: float, duration: float) -> TimedRamp:
@@ -116,10 +137,20 @@ class _Wall(ABC):
 
     reads: ClassVar[tuple[Topic[Any], ...]] = (SONAR, ODOMETRY)
 
-    def __init__(self, config: WallConfig) -> None:
+    def __init__(self, config: WallConfig, tightest: float = math.inf) -> None:
         self._shared = config
+        self._tightest = tightest
         self._names = NAMES[config.side]
         self._mirror = 1.0 if config.side == "left" else -1.0
+
+    @classmethod
+    def fit(cls, config: Any, body: BehaviourBody) -> Self:
+        """The behaviour for a body; one that cannot turn on the spot turns away along its tightest arc.
+
+        Raises:
+            KinematicsError: the body cannot turn.
+        """
+        return cls(config, tightest_curvature(body))
 
     def begin(self) -> WallState:
         """Before the first step."""
@@ -144,6 +175,10 @@ class _Wall(ABC):
         if state.phase == "stop":
             return self._stopping(state, ranges, t)
         state, v, w = self._drive(state, ranges, t)
+        if math.isfinite(self._tightest) and abs(w) > v * self._tightest:
+            if state.phase == "turn_away":
+                v = abs(w) / self._tightest
+            w = math.copysign(v * self._tightest, w)
         return self._answer(replace(state, asked=v), v, w, ranges)
 
     @abstractmethod
@@ -204,10 +239,11 @@ class WallPd(_Wall):
 
     Args:
         config: gains and ranges.
+        tightest: see ``tightest_curvature``.
     """
 
-    def __init__(self, config: WallPdConfig) -> None:
-        super().__init__(config)
+    def __init__(self, config: WallPdConfig, tightest: float = math.inf) -> None:
+        super().__init__(config, tightest)
         self._config = config
 
     def _distance(self, ranges: Ranges) -> float:
@@ -296,10 +332,11 @@ class WallSwitching(_Wall):
 
     Args:
         config: ranges.
+        tightest: see ``tightest_curvature``.
     """
 
-    def __init__(self, config: WallSwitchingConfig) -> None:
-        super().__init__(config)
+    def __init__(self, config: WallSwitchingConfig, tightest: float = math.inf) -> None:
+        super().__init__(config, tightest)
         self._config = config
 
     def _drive(self, state: WallState, ranges: Ranges, t: float) -> tuple[WallState, float, float]:

@@ -114,6 +114,7 @@ devices:
         (TRUCK + "geometry: {wheel_radius: 0.2}\n", "bad.yaml:5: geometry: impossible geometry", "touch"),
         (TRUCK.replace("hokuyo_urg", "sick"), "bad.yaml:3: devices.lidar.driver.kind: ", "hokuyo_urg"),
         (TRUCK + "tracker: {kind: pure_pursuit}\n", "a tracker needs the devices drive and steering", ""),
+        ("version: 2\ndevices: {}\nlidar_sonars: {}\n", "lidar_sonars needs the device lidar, and no device sonar", ""),
         (TRUCK + "sim: {world: {map: loop, gravity: 1}}\n", "bad.yaml:5: sim.world.gravity: unknown key", ""),
     ],
 )

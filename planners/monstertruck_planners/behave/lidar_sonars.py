@@ -1,0 +1,151 @@
+"""Sonars computed from a lidar: ranges along axes fixed to the robot, as ``sensor/sonar``, for a robot without sonars.
+
+The points of a scan, joined where neighbouring beams met one surface, are cut by each axis: a narrow beam that starts
+at the sonar's place. Behaviours that follow walls by sonars then drive a robot that has only a lidar.
+"""
+
+import math
+from typing import Annotated, Final, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from monstertruck_kinematics.elementary import Array
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.mailbox import Mailbox
+from monstertruck_runtime.ports import Publisher, Ready
+from monstertruck_schemas.base import FrameId, Schema
+from monstertruck_schemas.body import Mount
+from monstertruck_schemas.sensor import NO_ECHO, VALID_BEAM, LaserScan, SonarEcho, SonarRanges
+
+OPENING: Final = 0.01
+"""Opening angle that the messages state, rad: that of a beam."""
+JOINED: Final = 0.15
+"""Greatest distance of neighbouring points of one surface, m, and its share of their range, where that is more."""
+JOINED_SHARE: Final = 0.1
+
+
+def places() -> dict[str, Mount]:
+    """Left, front left, front, front right and right, with the diagonal ones 0.05 m ahead of the others."""
+    return {
+        "l": Mount(x=0.05, y=0.05, yaw=math.pi / 2),
+        "fl": Mount(x=0.10, y=0.05, yaw=math.pi / 4),
+        "f": Mount(x=0.12),
+        "fr": Mount(x=0.10, y=-0.05, yaw=-math.pi / 4),
+        "r": Mount(x=0.05, y=-0.05, yaw=-math.pi / 2),
+    }
+
+
+class LidarSonarsConfig(Schema):
+    """Sonars that are computed from the lidar's scans."""
+
+    sonars: dict[FrameId, Mount] = Field(default_factory=places, min_length=1)
+    """Place and axis of each, in the base frame, by name"""
+    range_min: Annotated[float, Field(ge=0, lt=5)] = 0.02
+    """Least range that is stated, m"""
+    range_max: Annotated[float, Field(gt=0, le=30)] = 3.0
+    """Greatest range, m"""
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if self.range_min >= self.range_max:
+            raise ValueError(f"range_min {self.range_min} m: expected less than range_max, {self.range_max} m")
+        return self
+
+
+def sonars_of(scan: LaserScan, mount: tuple[float, float, float], config: LidarSonarsConfig) -> tuple[SonarEcho, ...]:
+    """What the sonars measure; one whose axis runs where the lidar does not see or does not know has not answered.
+
+    Args:
+        scan: of the lidar.
+        mount: its pose in base, m, m, rad.
+        config: the sonars.
+    """
+    bearings = scan.start_angle + scan.angle_increment * np.arange(len(scan.ranges))
+    valid = (scan.codes == VALID_BEAM) & np.isfinite(scan.ranges)
+    ranges = np.where(valid, scan.ranges, 0.0)
+    points = np.column_stack([
+        mount[0] + ranges * np.cos(mount[2] + bearings),
+        mount[1] + ranges * np.sin(mount[2] + bearings),
+    ])  # fmt: skip
+    apart = np.hypot(*np.diff(points, axis=0).T)
+    joined = valid[:-1] & valid[1:] & (apart <= np.maximum(JOINED, JOINED_SHARE * ranges[1:]))
+    known = valid | (scan.codes <= NO_ECHO)
+    echoes = []
+    for name, place in config.sonars.items():
+        found, beam = _cut(points, joined, place)
+        if beam is None:
+            beam = _beam_towards(scan, mount, place, config.range_max)
+        answered = beam is not None and bool(known[beam])
+        near = found is not None and found <= config.range_max
+        late = 0 if beam is None else round(beam * scan.time_increment * SECOND)
+        measured = max(found, config.range_min) if found is not None and near else None
+        echoes.append(SonarEcho(name=name, answered=answered, range=measured, stamp=scan.stamp + late))
+    return tuple(echoes)
+
+
+def _cut(points: Array, joined: NDArray[np.bool_], place: Mount) -> tuple[float, int] | tuple[None, None]:
+    """Range at which the axis first cuts the surfaces, m, and the number of the beam before; None = it does not."""
+    c, s = math.cos(place.yaw), math.sin(place.yaw)
+    dx, dy = points[:, 0] - place.x, points[:, 1] - place.y
+    along, aside = c * dx + s * dy, c * dy - s * dx
+    crossing = joined & (aside[:-1] * aside[1:] <= 0.0) & (aside[:-1] != aside[1:])
+    at = crossing.nonzero()[0]
+    share = aside[at] / (aside[at] - aside[at + 1])
+    cuts = along[at] + share * (along[at + 1] - along[at])
+    ahead = cuts > 0.0
+    if not ahead.any():
+        return None, None
+    best = int(np.argmin(np.where(ahead, cuts, np.inf)))
+    return float(cuts[best]), int(at[best])
+
+
+def _beam_towards(
+    scan: LaserScan, mount: tuple[float, float, float], place: Mount, reach: float
+) -> int | None:  # fmt: skip
+    """Number of the lidar's beam to the far end of a sonar's axis; None = the lidar does not look there."""
+    x, y = place.x + reach * math.cos(place.yaw) - mount[0], place.y + reach * math.sin(place.yaw) - mount[1]
+    bearing = math.remainder(math.atan2(y, x) - mount[2], math.tau)
+    beam = round((bearing - scan.start_angle) / scan.angle_increment) if scan.angle_increment else -1
+    return beam if 0 <= beam < len(scan.ranges) else None
+
+
+class LidarSonars:
+    """Service that publishes ``sensor/sonar`` for every scan.
+
+    Args:
+        config: the sonars.
+        mount: of the lidar in base, m, m, rad.
+        clock: time.
+        scans: ``sensor/scan``.
+        out: ``sensor/sonar``.
+    """
+
+    name = "lidar_sonars"
+
+    def __init__(
+        self,
+        config: LidarSonarsConfig,
+        mount: tuple[float, float, float],
+        clock: Clock,
+        scans: Mailbox[LaserScan],
+        out: Publisher[SonarRanges],
+    ) -> None:
+        self._config, self._mount, self._clock, self._scans, self._out = config, mount, clock, scans, out
+
+    async def run(self, ready: Ready) -> None:
+        """Serve until cancelled."""
+        ready()
+        async for scan in self._scans:
+            self._out.put(
+                SonarRanges(
+                    stamp=scan.stamp,
+                    received=self._clock.now(),
+                    seq=self._out.next_seq(),
+                    sonars=sonars_of(scan, self._mount, self._config),
+                    field_of_view=OPENING,
+                    range_min=self._config.range_min,
+                    range_max=self._config.range_max,
+                )
+            )
