@@ -1,9 +1,10 @@
-"""Estimates and paths against the world's truth: the one home of these measures, for all benchmarks.
+"""Estimates, paths and deadlines against the world's truth: the one home of these measures, for all benchmarks.
 
 Poses are (x, y, yaw) in metres and radians; truth is what only the simulated world knows.
 """
 
 import math
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -99,3 +100,34 @@ def percentiles(values: Array, unit: str = "ms") -> dict[str, float]:
         return {f"p50_{unit}": 0.0, f"p99_{unit}": 0.0, f"max_{unit}": 0.0}
     p50, p99 = np.percentile(values, (50, 99))
     return {f"p50_{unit}": float(p50), f"p99_{unit}": float(p99), f"max_{unit}": float(np.max(values))}
+
+
+def missed(instants: Sequence[float], begin: float, end: float, period: float) -> float:
+    """Share of the whole periods from ``begin`` to ``end``, s, within which none of the instants lies."""
+    edges = begin + period * np.arange(math.floor((end - begin) / period + 1e-9) + 1)
+    return float((np.histogram(instants, edges)[0] == 0).mean())
+
+
+def first_miss(share: Callable[[float], float], factors: Sequence[float], allowed: float, ratio: float) -> float:
+    """The factor from which on more than ``allowed`` is missed: to a ``ratio`` above one that keeps up; inf if none is.
+
+    Args:
+        share: missed at a factor.
+        factors: rising; the first that misses is looked for among them, then between it and the one before.
+        allowed: share that may be missed.
+        ratio: over 1, between the factor that misses and the greatest tried that does not.
+    """
+    keeps = None
+    for factor in factors:
+        if share(factor) > allowed:
+            break
+        keeps = factor
+    else:
+        return math.inf
+    while keeps is not None and factor / keeps > ratio:
+        middle = math.sqrt(keeps * factor)
+        if share(middle) > allowed:
+            factor = middle
+        else:
+            keeps = middle
+    return factor

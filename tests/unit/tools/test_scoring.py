@@ -44,3 +44,21 @@ def test_distance_from_a_line_and_clearance_of_a_footprint():
     wall[:, 60] = True
     room = scoring.clearance(DistanceField(wall, 0.05), Footprint(padding=0.0), np.array([[2.0, 2.0, 0.0]]))
     assert room == pytest.approx(3.0 - 2.235, abs=0.06)
+
+
+def test_a_period_without_an_instant_is_missed():
+    assert scoring.missed([0.05, 0.1, 0.35, 0.9], 0.0, 1.0, 0.2) == pytest.approx(0.4)
+    assert scoring.missed([], 2.0, 3.0, 0.2) == 1.0
+
+
+@pytest.mark.parametrize(("limit", "found"), [(7.0, (7.0, 7.7)), (0.5, (1.0, 1.0)), (99.0, (math.inf, math.inf))])
+def test_the_first_factor_that_misses_is_bisected(limit, found):
+    tried = []
+
+    def share(factor):
+        tried.append(factor)
+        return 0.02 if factor >= limit else 0.01
+
+    least, most = found
+    assert least <= scoring.first_miss(share, (1.0, 3.0, 12.0, 40.0), 0.01, 1.1) <= most
+    assert len(tried) < 10
