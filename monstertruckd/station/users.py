@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, Final, Self
 
 from monstertruck_runtime.errors import InputError, NotFoundError, NotPermittedError
+from monstertruck_runtime.small_files import replace_file
 from monstertruck_runtime.threads import in_thread
 from monstertruck_runtime.yaml_files import read_yaml, yaml_text
 from monstertruck_schemas.roles import AccessRole
@@ -110,9 +111,9 @@ def add_user(file: Path, name: str, role: AccessRole, password: str) -> None:
     rows: dict[str, Any] = (read_yaml(file) or {}) if file.exists() else {}
     rows[name] = {"role": role.value, "password": hash_of(password, secrets.token_bytes(LENGTH))}
     file.parent.mkdir(parents=True, exist_ok=True)
-    file.touch(mode=0o600)
-    file.chmod(0o600)
-    file.write_text(yaml_text(rows), encoding="utf-8")
+    if file.exists():
+        file.chmod(0o600)
+    replace_file(file, yaml_text(rows), 0o600)
 
 
 def hash_of(password: str, salt: bytes) -> str:

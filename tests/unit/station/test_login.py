@@ -74,6 +74,16 @@ def test_a_file_of_users_is_private_and_wrong_ones_are_refused(file: Path, tmp_p
             add_user(file, name, AccessRole.PILOT, password)
 
 
+def test_users_are_replaced_as_a_whole(file: Path, tmp_path: Path):
+    before = file.read_text()
+    (tmp_path / "old").hardlink_to(file)
+    file.chmod(0o644)
+    add_user(file, "bob", AccessRole.PILOT, "long enough")
+    assert (tmp_path / "old").read_text() == before, "what a full disk would have left of them"
+    assert file.stat().st_mode & 0o777 == 0o600
+    assert "bob" in file.read_text()
+
+
 async def test_an_observer_sees_and_may_stop_and_nothing_else_over_tls(file: Path, tmp_path: Path, caplog):
     server, client = self_signed(tmp_path)
     robot = RobotAddress("truck", "tcp/127.0.0.1:1")
