@@ -1,6 +1,7 @@
 """How long from an emergency stop to the quick-stop bytes on the drive controller's wire, whatever else arrives.
 
     python benchmarks/estop.py [--trials 300] [--quick] [--flood NAME ...]
+    python benchmarks/estop.py --page [--trials 500] [--quick]
 
 Emulated truck, its daemon in a process of its own, pinned to one core; world, emulators, the operator and the flooder
 on the other. The truck drives to and fro at 0.1 m/s; each trial sends one emergency stop by topic and counts from then
@@ -14,7 +15,8 @@ flooder can, at most ``RATE`` a second; the rate that it achieved is reported:
     calls    remote calls, each with an answer
     forged   states of the gate and scans that the flooder publishes under the robot's keys
 
-``--quick`` makes 40 trials of none, nonce and rubbish. The last line is JSON.
+``--quick`` makes 40 trials of none, nonce and rubbish. ``--page`` measures from the page in a browser instead
+(``estop_parts/page.py``): clicks, commands to the wires, and a frozen browser. The last line is JSON.
 """
 
 import argparse
@@ -269,10 +271,26 @@ async def trials(clock: Clock, folder: Path, kind: str, count: int) -> dict[str,
     }
 
 
+def from_the_page(count: int) -> int:
+    """Press on the page; 0 = all goals met."""
+    from benchmarks.estop_parts import page  # noqa: PLC0415 - needs a browser
+
+    with TemporaryDirectory(prefix="estop-") as folder:
+        figures = run_wall(lambda clock: page.measure(clock, Path(folder), count))
+    print("| from the page | trials | not counted | p50 ms | p99 ms | greatest ms |")
+    print("|---|---:|---:|---:|---:|---:|")
+    for name, done in figures.items():
+        print(f"| {name} | " + " | ".join(str(value) for value in done.values()) + " |")
+    goals_met = page.met(figures)
+    print(json.dumps({"bench": "estop_page", "figures": figures, "goals": page.GOALS, "met": goals_met}))
+    return 0 if goals_met else 1
+
+
 def main() -> int:
     """Press; 0 = all goals met."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--trials", type=int, default=300)
+    parser.add_argument("--trials", type=int, help="300; 500 from the page")
+    parser.add_argument("--page", action="store_true", help="from a hand on the page, in a browser")
     parser.add_argument("--quick", action="store_true", help="40 trials, fewer floods")
     parser.add_argument("--flood", nargs="*", choices=FLOODS, help="only these")
     parser.add_argument("--serve", type=Path, help=argparse.SUPPRESS)
@@ -284,7 +302,9 @@ def main() -> int:
     if options.flooder is not None:
         flood(*options.flooder)
         return 0
-    count = 40 if options.quick else options.trials
+    count = 40 if options.quick else options.trials or (500 if options.page else 300)
+    if options.page:
+        return from_the_page(count)
     figures: dict[str, dict[str, Any]] = {}
     print("| flood | rate, 1/s | trials | missed | p50 ms | p99 ms | greatest ms |")
     print("|---|---:|---:|---:|---:|---:|---:|")

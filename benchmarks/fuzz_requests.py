@@ -26,7 +26,7 @@ from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import Clock, run_wall
 from monstertruck_runtime.errors import TruckError
 from monstertruck_runtime.mailbox import latest
-from monstertruck_runtime.stations import session_config
+from monstertruck_runtime.stations import session_config, tls_for
 from monstertruck_schemas import topics
 from monstertruck_schemas.health import ServiceState
 from monstertruck_schemas.req import Order
@@ -78,13 +78,15 @@ def payload(rng: np.random.Generator) -> bytes:
 
 
 def fuzz(endpoint: str, names: list[str], count: int, seed: int, rate: float) -> None:
-    """Send; prints how many."""
+    """Send; prints how many. Of a ``tls/`` endpoint with this user's certificate, under its name."""
     rng = np.random.default_rng(seed)
+    tls = tls_for(endpoint)
+    owner = "fuzz{}" if tls is None else tls.owner()
     inward = [topic for topic in TOPICS if topic.writer is Writer.OUTSIDE]
-    with zenoh.open(zenoh.Config.from_json5(json.dumps(session_config(endpoint, 5.0, None)))) as session:
+    with zenoh.open(zenoh.Config.from_json5(json.dumps(session_config(endpoint, 5.0, tls)))) as session:
         began = time.monotonic()
         for number in range(count):
-            source = f"fuzz{rng.integers(1000)}:{rng.integers(10)}"
+            source = f"{owner.format(rng.integers(1000))}:{rng.integers(10)}"
             data = payload(rng)
             if number % 2:
                 session.put(inward[number // 2 % len(inward)].key("truck", source), data)

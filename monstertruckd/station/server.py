@@ -295,6 +295,11 @@ class Station:
         if not user.may(AccessRole.PILOT):
             raise self._refused(request, f"user {user.name!r} is {user.role.value}: expected pilot")
         if feed is None or not RECORDING.fullmatch(name):
+            log.warning(
+                "GET %s from %s refused: expected a robot's name and that of a recording",
+                request.raw_path[:200],
+                request.remote,
+            )
             raise web.HTTPNotFound
         log.info("recording %s of %s goes to %s", name, feed.address.name, request.remote)
         return await download(request, feed.address, name, user.name, self._clock, HEADERS)

@@ -13,11 +13,13 @@ from pathlib import Path
 
 import pytest
 
-from monstertruck_runtime.errors import RequestRefusedError
+from benchmarks.fuzz_requests import call_names
+from monstertruck_runtime.client import TruckClient
+from monstertruck_runtime.errors import RequestRefusedError, TruckError
 from monstertruck_runtime.mailbox import Mailbox, fifo, latest
 from monstertruck_schemas import topics
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import DriveForm, Role
+from monstertruck_schemas.req import DriveForm, Order, Role
 from monstertruck_schemas.state import GateMode, GateState, Odometry
 from tests.daemon.wall_kit import ROOT, Robot, command, end, robot
 
@@ -83,6 +85,36 @@ async def becomes(condition: Callable[[], bool]) -> None:
             await asyncio.sleep(0.02)
 
 
+async def _wrong_requests_move_nothing(
+    made: Robot, client: TruckClient, gate: Mailbox[GateState], odometry: Mailbox[Odometry]
+) -> None:
+    """A thousand on every key, from another process; `benchmarks/fuzz_requests.py` sends more."""
+    before = await odometry.next()
+    names = ",".join(await call_names(client))
+    fuzzer = await asyncio.create_subprocess_exec(
+        sys.executable,
+        "-m",
+        "benchmarks.fuzz_requests",
+        "--fuzzer",
+        made.endpoint,
+        names,
+        "1000",
+        "1",
+        "2000",
+        cwd=ROOT,
+    )
+    while fuzzer.returncode is None:
+        assert _mode(gate) in (None, GateMode.DISARMED, GateMode.ESTOPPED)
+        await asyncio.sleep(0.02)
+    assert fuzzer.returncode == 0
+    after = await odometry.next()
+    assert (after.pose.x, after.pose.y) == pytest.approx((before.pose.x, before.pose.y), abs=0.005)
+    async with asyncio.timeout(20):
+        while _mode(gate) is not GateMode.DISARMED:
+            with contextlib.suppress(TruckError):
+                await client.order(Order.RESET)
+
+
 async def test_the_truck_moves_while_a_key_is_held_and_silence_stops_it(tmp_path: Path):
     async with robot(tmp_path) as made:
         await made.start_simulator()
@@ -90,6 +122,7 @@ async def test_the_truck_moves_while_a_key_is_held_and_silence_stops_it(tmp_path
         async with made.client() as client:
             gate = client.subscribe(topics.GATE, latest())
             odometry = client.subscribe(topics.ODOMETRY, latest())
+            await _wrong_requests_move_nothing(made, client, gate, odometry)
             async with driving(made) as terminal:
                 await _drive_off(terminal, gate, odometry)
                 await _stopped_and_disarmed(gate, odometry)

@@ -56,8 +56,15 @@ async def test_the_page_its_files_and_texts_are_served_with_a_policy_that_lets_n
             assert "reason.scan_stale" in await reply.json()
 
 
-async def test_what_is_not_the_page_is_not_found():
+async def test_what_is_no_file_of_the_page_and_no_recording_is_not_found_and_who_tries_is_logged(
+    caplog: pytest.LogCaptureFixture,
+):
+    recordings = ("..%2f..%2fetc%2fpasswd", "..%5crun.mcap", "%2fetc%2fshadow.mcap", "run.mcap%00", "..%2frun.mcap")
     async with serving() as (_, session):
+        for name in recordings:
+            path = URL(f"/robots/truck/recordings/{name}", encoded=True)
+            async with session.get(path, allow_redirects=False) as reply:
+                assert reply.status == 404, name
         for path in (
             "..%2fserver.py",
             "%2e%2e/server.py",
@@ -71,6 +78,9 @@ async def test_what_is_not_the_page_is_not_found():
         for path in ("/robots/a/map/1", "/robots/truck/map/1", "/etc"):
             async with session.get(path) as reply:
                 assert reply.status == 404, path
+    refused = [text for record in caplog.records if "refused" in (text := record.getMessage())]
+    assert len(refused) == len(recordings)
+    assert "/robots/truck/recordings/..%2f..%2fetc%2fpasswd from 127.0.0.1 refused: expected" in refused[0]
 
 
 async def test_other_sites_and_other_names_are_refused_and_logged(caplog: pytest.LogCaptureFixture):
@@ -81,10 +91,14 @@ async def test_other_sites_and_other_names_are_refused_and_logged(caplog: pytest
             ("/socket", {"Origin": "http://evil.example"}),
             ("/socket", {}),
             ("/socket", {"Origin": f"http://{ours}.evil.example"}),
+            ("/robots/truck/recordings/run.mcap", {"Origin": "http://evil.example"}),
         ):
             async with session.get(path, headers=headers) as reply:
                 assert reply.status == 403, (path, headers)
-        assert caplog.text.count("refused") == 4
+        assert caplog.text.count("refused") == 5
+        for method in ("POST", "PUT", "DELETE"):
+            async with session.request(method, "/robots/truck/recordings/run.mcap", data=b"x=1") as reply:
+                assert reply.status == 405, "what a form of another site can send changes nothing"
         assert "127.0.0.1" in caplog.text
         async with session.ws_connect("/socket", origin=f"http://{ours}") as socket:
             assert (await socket.receive_json())["kind"] == "hello"
