@@ -4,7 +4,6 @@ import base64
 import logging
 import re
 from collections.abc import Callable, Mapping
-from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -12,9 +11,9 @@ from aiohttp import web
 
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import Clock
-from monstertruck_runtime.errors import InputError, NotFoundError, RequestRefusedError, TruckError
+from monstertruck_runtime.errors import NotFoundError, RequestRefusedError, TruckError
+from monstertruck_runtime.recordings import fetch_recording
 from monstertruck_runtime.stations import own_source, tls_for
-from monstertruck_runtime.threads import in_thread
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.station.address import RobotAddress
 
@@ -71,25 +70,7 @@ async def fetch(
         TruckError: the robot refuses, or is not there.
     """
     async with _session(address, user, clock) as truck:
-        at = await in_thread(lambda: to.stat().st_size if to.exists() else 0)
-        while True:
-            answer = await truck.call("recording_read", {"name": name, "offset": at})
-            data, size = base64.b64decode(answer["data"]), int(answer["bytes"])
-            if size > MOST_BYTES:
-                raise InputError(f"{name}: {size / 1e6:.0f} MB: more than {MOST_BYTES / 1e6:.0f} MB to be shown")
-            await in_thread(partial(_put, to, at, data))
-            at += len(data)
-            progress(at / max(size, 1))
-            if not data or at >= size:
-                return
-
-
-def _put(file: Path, at: int, data: bytes) -> None:
-    """At its place: a write that was given up may still be under way."""
-    file.touch()
-    with file.open("r+b") as part:
-        part.seek(at)
-        part.write(data)
+        await fetch_recording(truck, name, to, progress, MOST_BYTES)
 
 
 def _session(address: RobotAddress, user: str, clock: Clock) -> TruckClient:

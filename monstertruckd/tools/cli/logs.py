@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
+from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruck_schemas.reasons import Reason
-from monstertruckd.tools.cli.options import complete_topic
+from monstertruckd.tools.cli.options import EndpointOption, RobotOption, complete_topic
 from monstertruckd.tools.cli.output import (
     JsonOption,
     command_group,
@@ -123,6 +124,68 @@ def _show_info(log: Path, summary: "dict[str, Any]") -> None:
     print_table(("topic", "schema", "messages", "Hz", "kB unpacked"), rows, right=("messages", "Hz", "kB unpacked"))
     for name, bytes_ in summary["attachments"].items():
         print(f"attached: {name} ({bytes_} bytes)")
+
+
+@app.command("fetch")
+def fetch_command(
+    name: Annotated[str | None, typer.Argument(help="Recording on the robot; without it they are listed.")] = None,
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="File; by default as on the robot.")] = None,
+    robot: RobotOption = "truck",
+    endpoint: EndpointOption = DEFAULT_ENDPOINT,
+    json_output: JsonOption = False,
+) -> None:
+    """Fetch a recording from a running robot, going on with what is there of the file already.
+
+    The robot gives 1 MB/s at most, and one recording at a time.
+    """
+    from monstertruck_runtime.client import TruckClient
+    from monstertruck_runtime.clock import Clock, run_wall
+    from monstertruck_runtime.recordings import fetch_recording
+
+    to = output or Path(Path(name or "").name)
+
+    async def rows(clock: Clock) -> list[dict[str, Any]]:
+        async with TruckClient(robot, endpoint, clock=clock) as truck:
+            found: list[dict[str, Any]] = (await truck.call("recordings"))["recordings"]
+            return found
+
+    async def fetched(clock: Clock) -> int:
+        async with TruckClient(robot, endpoint, clock=clock, timeout=5.0) as truck:
+            with progress(f"fetching {name}", 1.0) as shown:
+                return await fetch_recording(truck, name or "", to, shown)
+
+    if name is None:
+        _show_recordings(run_wall(rows), json_output=json_output)
+        return
+    size = run_wall(fetched)
+    if json_output:
+        print_json({"name": name, "file": str(to), "bytes": size})
+    else:
+        print(f"{to}  {size / 1e6:.2f} MB")
+
+
+def _show_recordings(rows: "list[dict[str, Any]]", *, json_output: bool) -> None:
+    if json_output:
+        print_json(rows)
+        return
+    import numpy as np
+
+    if not rows:
+        remark("the robot has no recordings")
+        return
+    print_table(
+        ("changed (UTC)", "MB", "kind", "recording"),
+        [
+            (
+                str(np.datetime64(int(row["modified"]), "s")).replace("T", " "),
+                f"{row['bytes'] / 1e6:.2f}",
+                f"{row['kind']}{', being written' * row['open']}",
+                row["name"],
+            )
+            for row in rows
+        ],
+        right=("MB",),
+    )
 
 
 @app.command("recover")

@@ -11,6 +11,7 @@ import aiohttp
 import numpy as np
 import pytest
 
+from monstertruck_runtime import recordings
 from monstertruck_runtime.clock import SECOND, WallClock
 from monstertruck_runtime.errors import InputError, NotFoundError, RequestRefusedError
 from monstertruck_schemas import topics
@@ -171,17 +172,17 @@ async def test_a_recording_is_fetched_at_its_places_and_a_huge_one_is_not(
 
     with monkeypatch.context() as patch:
         patch.setattr(downloads, "MOST_BYTES", 1000)
-        with pytest.raises(InputError, match="more than"):
+        with pytest.raises(InputError, match="at most"):
             await fetch()
     assert not file.exists()
     file.write_bytes(Robot.DATA[:300])
-    put = downloads._put
+    put = recordings.put
 
     def late(*args):  # a write that was given up by another browser ends now
         put(file, 300, Robot.DATA[300:600])
         put(*args)
 
-    monkeypatch.setattr(downloads, "_put", late)
+    monkeypatch.setattr(recordings, "put", late)
     await fetch()
     assert (file.read_bytes(), shares[-1]) == (Robot.DATA, 1.0)
 

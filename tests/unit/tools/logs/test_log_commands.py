@@ -1,5 +1,6 @@
 """The commands on logs, as a user types them."""
 
+import base64
 import errno
 import fcntl
 import json
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from monstertruck_runtime.errors import NotFoundError
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.tools.cli.main import app
 from monstertruckd.tools.logs.messages import Selection
@@ -19,6 +21,47 @@ GOLDEN = max((Path(__file__).parents[3] / "data" / "golden").glob("*/run.mcap"))
 
 def run(*arguments):
     return CliRunner().invoke(app, ["log", *map(str, arguments)])
+
+
+class RobotWithRecordings:
+    """Client of a robot that has one recording."""
+
+    DATA = bytes(range(256)) * 3
+
+    def __init__(self, *_, **__):
+        pass
+
+    async def __aenter__(self):
+        return self
+
+    async def __aexit__(self, *_):
+        pass
+
+    async def call(self, name, payload=None):
+        if name == "recordings":
+            row = {"name": "run-000001-000.mcap", "bytes": 768, "modified": 1.8e9, "kind": "run", "open": True}
+            return {"recordings": [row], "left_out": 0}
+        if payload["name"] != "run-000001-000.mcap":
+            raise NotFoundError("recording: there is none of this name")
+        data = self.DATA[payload["offset"] : payload["offset"] + 500]
+        return {"data": base64.b64encode(data).decode(), "bytes": len(self.DATA)}
+
+
+def test_recordings_of_a_robot_are_listed_and_fetched_and_a_file_of_something_else_stays(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("monstertruck_runtime.client.TruckClient", RobotWithRecordings)
+    assert "2027-01-15 08:00:00  0.00  run, being written  run-000001-000.mcap" in run("fetch").output
+    file = tmp_path / "run-000001-000.mcap"
+    file.write_bytes(RobotWithRecordings.DATA[:100])
+    assert json.loads(run("fetch", file.name, "--json").stdout)["bytes"] == 768
+    assert file.read_bytes() == RobotWithRecordings.DATA
+    assert run("fetch", "../other.mcap").exit_code == Reason.NOT_FOUND.exit_code
+    assert not (tmp_path / "other.mcap").exists()
+    file.write_bytes(b"x" * 1000)
+    refused = run("fetch", file.name)
+    assert refused.exit_code == 3
+    assert "expected the beginning of run-000001-000.mcap, which has 768" in refused.output
+    assert file.read_bytes() == b"x" * 1000
 
 
 def test_report_names_its_file_or_prints_its_figures(tmp_path):

@@ -1,0 +1,53 @@
+"""Recordings of a robot as files of whoever asks for them."""
+
+import base64
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+from monstertruck_runtime.client import TruckClient
+from monstertruck_runtime.errors import InputError, NotFoundError
+from monstertruck_runtime.threads import in_thread
+
+
+async def fetch_recording(
+    truck: TruckClient, name: str, to: Path, progress: Callable[[float], object], most: int | None = None
+) -> int:
+    """Fetch a recording into a file, going on with what is there of it already; returns its size, bytes.
+
+    The robot says how fast.
+
+    Args:
+        truck: the robot.
+        name: of the recording.
+        to: file, made with the first bytes.
+        progress: gets the share that is there, 0..1.
+        most: bytes of which it may be; None = any number.
+
+    Raises:
+        InputError: it is larger than that, or than what the file holds already.
+        TruckError: the robot refuses, is not there, or has no such recording.
+    """
+    at = await in_thread(lambda: to.stat().st_size if to.exists() else 0)
+    while True:
+        answer = await truck.call("recording_read", {"name": name, "offset": at})
+        data, size = base64.b64decode(answer["data"]), int(answer["bytes"])
+        if most is not None and size > most:
+            raise InputError(f"{name}: {size / 1e6:.0f} MB: expected at most {most / 1e6:.0f} MB")
+        if at > size:
+            raise InputError(f"{to}: {at} bytes: expected the beginning of {name}, which has {size}")
+        await in_thread(partial(put, to, at, data))
+        at += len(data)
+        progress(at / max(size, 1))
+        if at >= size:
+            return size
+        if not data:
+            raise NotFoundError(f"{name}: became shorter while it was fetched")
+
+
+def put(file: Path, at: int, data: bytes) -> None:
+    """Write at a place: a write that was given up may still be under way."""
+    file.touch()
+    with file.open("r+b") as part:
+        part.seek(at)
+        part.write(data)
