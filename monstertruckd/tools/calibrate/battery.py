@@ -26,6 +26,8 @@ GROUND: Final = 0.1
 """Greatest offset, V: 10 mV along the ground wire, times the divider."""
 EVEN: Final = math.sqrt(3)
 """Greatest error over standard deviation where all errors up to the greatest are as likely."""
+FINEST: Final = 1e-4
+"""Error of a reading at least, V: less no multimeter states, and no fit bears."""
 ROUNDING: Final = 0.5
 """Part of the rounding of one reading that is left in their mean: noise averages it out, but is never relied on."""
 
@@ -131,17 +133,17 @@ class BatteryWizard:
         volts = np.array([reading.volts for reading in readings])
         noise = np.array([reading.error for reading in readings]) * volts / raw
         self._check(raw, volts, NORMAL * noise)
-        sigma = np.hypot(self.meter_digits / EVEN, noise)
-        share = max(self.meter_share, 1e-9)
+        sigma = np.maximum(np.hypot(self.meter_digits / EVEN, noise), FINEST)
+        share = max(self.meter_share, 1e-6)
         rows = np.vstack(
             (
-                np.column_stack((raw, np.ones_like(raw), volts)) / np.maximum(sigma, 1e-9)[:, None],
+                np.column_stack((raw, np.ones_like(raw), volts)) / sigma[:, None],
                 (0.0, EVEN / GROUND, 0.0),
                 (0.0, 0.0, EVEN / share),
             )
         )
         errors = np.linalg.inv(rows.T @ rows)
-        gain, offset, _ = errors @ rows.T @ np.concatenate((volts / np.maximum(sigma, 1e-9), (0.0, 0.0)))
+        gain, offset, _ = errors @ rows.T @ np.concatenate((volts / sigma, (0.0, 0.0)))
         halves = NORMAL * np.sqrt(np.diag(errors))
         # No offset is beyond the ground wire's; the gain follows it, so that both fit the readings.
         low, high = np.clip((offset - halves[1], offset + halves[1]), -GROUND, GROUND).tolist()

@@ -42,3 +42,13 @@ def test_the_truth_is_inside_as_often_as_stated_whatever_the_meter_does_within_i
 def test_readings_that_contradict_each_other_are_refused():
     with pytest.raises(InputError, match=r"no scale fits all 2 readings.*--fresh"):
         WIZARD.scale([MeterReading(24.0, 24.6, 0.0), MeterReading(20.0, 22.6, 0.0)])
+
+
+@pytest.mark.parametrize("share", [0.005, 0.0])
+def test_a_meter_that_is_said_to_have_no_digits_to_spare_breaks_no_fit(share: float):
+    """A fine converter gives the same reading every time."""
+    wizard = BatteryWizard(meter_share=share, meter_digits=0.0)
+    gain, offset = wizard.scale([MeterReading(raw, 1.0135 * raw, 0.0) for raw in (7.4, 8.2)])
+    assert gain.value == pytest.approx(1.0135, abs=1e-3)
+    assert gain.half > 1e-4
+    assert offset.value == pytest.approx(0.0, abs=0.01)
