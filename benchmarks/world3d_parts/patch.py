@@ -26,9 +26,9 @@ ENDS = (0.5, 6.0)
 """Places along x between which the truck drives to and fro, m."""
 PATCH = (2.4, 4.0)
 """Where the stones begin and end along x, m."""
-WIDTHS = {"narrow": 0.8, "spanning": 6.0}
-"""Of the patch, m: one with room on both sides, and one from wall to wall."""
-TRIPS = 3
+WIDTHS = {"narrow": 0.5, "spanning": 6.0}
+"""Of the patch, m: one that is felt as a whole on one trip, with room on both sides, and one from wall to wall."""
+TRIPS = 2
 LIMIT = 240.0
 """Seconds a trip may take."""
 STONE = 0.125
@@ -138,7 +138,7 @@ def patch() -> dict[str, float]:
     """Trips over a narrow patch and over one from wall to wall."""
     figures: dict[str, float] = {}
     for name, width in WIDTHS.items():
-        ways, ground = trips(width, TRIPS if name == "narrow" else 2)
+        ways, ground = trips(width, TRIPS)
         on, off = (0.0, 1.0) if ground is None else found(ground, width, ways)
         figures |= {
             f"patch_{name}_reached": sum(trip.reached for trip in ways) / len(ways),

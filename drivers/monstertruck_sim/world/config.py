@@ -466,6 +466,8 @@ class SonarModelConfig(Schema):
     """Farthest wall whose echo is heard, m: what comes back from beyond ``range_max`` may meet the next ping."""
     sonars: dict[FrameId, SonarPlace] = FIVE_SONARS
     """By name."""
+    height: NotNegative = 0.12
+    """Of all of them over the ground, m: on a body that leans some look over the walls."""
 
     @model_validator(mode="after")
     def _check_order(self) -> Self:

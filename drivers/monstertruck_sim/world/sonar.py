@@ -21,6 +21,7 @@ from monstertruck_runtime.errors import InputError
 from monstertruck_sim.world.config import SonarModelConfig, SonarPlace
 from monstertruck_sim.world.noise import SONAR, generator
 from monstertruck_sim.world.plant import Caster, Plant
+from monstertruck_sim.world.sensors import turned
 
 SPEED_OF_SOUND: Final = 343.0
 """m/s, in air of 20 degrees Celsius."""
@@ -85,6 +86,31 @@ def surface(cast: Caster, ping: Ping, model: SonarModelConfig) -> Surface:
     x, y = ping.x + way * np.cos(angles), ping.y + way * np.sin(angles)
     normals, scatters = _normals(x, y, ranges)
     return Surface(ping, x, y, ranges, normals, scatters)
+
+
+def leaning(cast: Caster, yaw: float, pitch: float, roll: float, over: float) -> Caster:
+    """Casts rays that lean with a body, and measures along them.
+
+    The ground gives no echo: it is met at too flat an angle.
+
+    Args:
+        cast: ranges to the walls in the level; its angles are those that the rays of a level body would have.
+        yaw: of the body in the map frame, rad.
+        pitch: its nose down positive, rad.
+        roll: its right side down positive, rad.
+        over: height of the walls over the sonars, m: what passes above them meets nothing.
+    """
+    if pitch == 0.0 and roll == 0.0:
+        return cast
+
+    def along(xs: Array, ys: Array, angles: Array, reach: float, times_ns: NDArray[np.int64] | None = None, /) -> Array:
+        flat = np.cos(angles - yaw), np.sin(angles - yaw), np.zeros(len(angles))
+        ahead, aside, up = turned(flat, np.array(pitch), np.array(roll))
+        level = np.hypot(ahead, aside)
+        ranges = cast(xs, ys, yaw + np.arctan2(aside, ahead), reach, times_ns) / level
+        return np.where((ranges <= reach) & (ranges * up <= over), ranges, inf)
+
+    return along
 
 
 def cone(surfaces: Sequence[Surface], listener: Ping, model: SonarModelConfig) -> float:
@@ -204,15 +230,19 @@ class SimulatedSonars:
     """``SonarSource``: every ping leaves from where the body is then, and is heard by all others until it dies away.
 
     Args:
-        plant: what carries them.
+        plant: what carries them; they lean with it.
         cast: ranges to the walls.
         config: true parameters.
         seed: of the noise; None = none.
+        wall_height: over the ground, m.
     """
 
-    def __init__(self, plant: Plant, cast: Caster, config: SonarModelConfig, seed: int | None) -> None:
+    def __init__(
+        self, plant: Plant, cast: Caster, config: SonarModelConfig, seed: int | None, wall_height: float = inf
+    ) -> None:
         self._plant, self._cast, self._config, self._seed = plant, cast, config, seed
-        self._pings: deque[tuple[str, Ping, Surface | None]] = deque(maxlen=_KEPT)
+        self._over = wall_height - config.height
+        self._pings: deque[tuple[str, Ping, Caster, Surface | None]] = deque(maxlen=_KEPT)
         self._heard = 0
 
     def fire(self, name: str, time_ns: int) -> None:
@@ -225,21 +255,23 @@ class SimulatedSonars:
         if place is None:
             raise InputError(f"no sonar {name} in sim.world.sonar.sonars; known: {', '.join(self._config.sonars)}")
         self._plant.advance(time_ns)
-        x, y, yaw = self._plant.poses(np.array([time_ns]))[:3, 0]
-        ping = placed(place, float(x), float(y), float(yaw), time_ns * 1e-9)
-        found = surface(self._cast, ping, self._config) if self._config.model == "cone" else None
-        self._pings.append((name, ping, found))
+        x, y, yaw, pitch, roll = self._plant.poses(np.array([time_ns]))[:5, 0].tolist()
+        ping = placed(place, x, y, yaw, time_ns * 1e-9)
+        cast = leaning(self._cast, yaw, pitch, roll, self._over)
+        found = surface(cast, ping, self._config) if self._config.model == "cone" else None
+        self._pings.append((name, ping, cast, found))
 
     def range(self, name: str) -> float:
         """Distance that the newest ping of a sonar came to, m, once its sound is back; inf = no echo."""
-        mine = next((ping for fired, ping, _ in reversed(self._pings) if fired == name), None)
-        if mine is None:
+        newest = next(((ping, cast) for fired, ping, cast, _ in reversed(self._pings) if fired == name), None)
+        if newest is None:
             return inf
+        mine, cast = newest
         if self._config.model == "beam":
-            distance = beam(self._cast, mine, self._config)
+            distance = beam(cast, mine, self._config)
         else:
             alive = 2 * self._config.audible / SPEED_OF_SOUND
-            found = [seen for _, ping, seen in self._pings if seen and abs(ping.time - mine.time) < alive]
+            found = [seen for _, ping, _, seen in self._pings if seen and abs(ping.time - mine.time) < alive]
             distance = cone(found, mine, self._config)
         self._heard += 1
         return heard(distance, self._config, None if self._seed is None else generator(self._seed, SONAR, self._heard))

@@ -77,7 +77,9 @@ class World:
         self._battery_input = config.battery.channel
         self.servos: ServoPlant = SimulatedServos(self._plant, config.battery, noise_seed)
         self.compass: AttitudeSource = SimulatedCompass(self._plant, config.compass, noise_seed)
-        self.sonars: SonarSource = SimulatedSonars(self._plant, cast, config.sonar, noise_seed)
+        self.sonars: SonarSource = SimulatedSonars(
+            self._plant, cast, config.sonar, noise_seed, config.lidar.wall_height
+        )
         self.imu: ImuSource = SimulatedImu(self._plant, config.imu, noise_seed)
 
     def battery_volts(self, time_ns: int) -> float:

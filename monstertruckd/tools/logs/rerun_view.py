@@ -24,7 +24,16 @@ from monstertruck_schemas.event import Event, LogLevel, LogRecord, Severity, Sto
 from monstertruck_schemas.health import HealthTable
 from monstertruck_schemas.plan import Path as TruckPath
 from monstertruck_schemas.sensor import CompressedImage, LaserScan
-from monstertruck_schemas.state import GateState, Grid, Odometry, Transforms
+from monstertruck_schemas.state import (
+    GROUND_UNKNOWN,
+    ROUGHNESS_STEP,
+    TILT_STEP,
+    GateState,
+    Grid,
+    Ground,
+    Odometry,
+    Transforms,
+)
 from monstertruckd.recorder.reader import LogReader, open_log, spare_log
 from monstertruckd.tools.logs.export import removed_on_failure
 from monstertruckd.tools.logs.messages import ALL, Progress, Selection, real_offset
@@ -40,6 +49,10 @@ _FIRST: Final = ("Speed", "Steering commanded", "Cross-track error", "Battery", 
 _SCAN, _PATH, _WAY, _TRUCK = (39, 104, 211), (120, 130, 145), (217, 83, 44), (28, 154, 104)
 _HEIGHT: Final = 0.15
 """Of the truck's box, m; not configured."""
+_ROUGH: Final = 0.03
+"""Roughness that is shown in full, m."""
+_STEEP: Final = 0.35
+"""Tilt likewise, rad."""
 _LEVELS: Final = {Severity.INFO: "INFO", Severity.WARNING: "WARN", Severity.ERROR: "ERROR"}
 _JOURNAL: Final = {
     LogLevel.DEBUG: "DEBUG",
@@ -121,6 +134,7 @@ class Scene:
             t.SCAN.name: self._scan,
             t.TRANSFORMS.name: self._transforms,
             t.MAP.name: self._grid,
+            t.GROUND.name: self._ground,
             t.PATH.name: self._path,
             t.POSE.name: self._pose,
             t.CAMERA.name: self._image,
@@ -217,6 +231,25 @@ class Scene:
         )
         self._stream.log("map", rr.CoordinateFrame(grid.frame), picture)
 
+    def _ground(self, ground: Ground) -> None:
+        """Red as it is rough, blue as it is tilted; unknown ground is clear."""
+        layers = np.stack((ground.roughness, ground.tilt)).reshape(2, ground.height, ground.width)
+        known = layers[0] != GROUND_UNKNOWN
+        full = np.array((_ROUGH / ROUGHNESS_STEP, _STEEP / TILT_STEP)).reshape(2, 1, 1)
+        red, blue = np.where(known, np.minimum(layers / full, 1.0) * 255.0, 0.0).astype(np.uint8)
+        pixels = np.stack((red, np.zeros_like(red), blue, np.where(known, np.maximum(red, blue), 0)), axis=-1)
+        layout = rr.components.ImageFormat(
+            width=ground.width, height=ground.height, color_model="RGBA", channel_datatype="U8"
+        )
+        picture = rr.GridMap(
+            data=np.ascontiguousarray(np.flipud(pixels), np.uint8).tobytes(),
+            format=layout,
+            cell_size=ground.resolution,
+            translation=(ground.origin.x, ground.origin.y, -0.005),
+            rotation_axis_angle=rr.RotationAxisAngle((0.0, 0.0, 1.0), radians=ground.origin.yaw),
+        )
+        self._stream.log("ground", rr.CoordinateFrame(ground.frame), picture)
+
     def _path(self, path: TruckPath) -> None:
         strip = [(x, y, 0.0) for x, y, _ in path.poses.reshape(-1, 3).tolist()]
         self._stream.log("path", rr.CoordinateFrame(path.frame), rr.LineStrips3D([strip], colors=_PATH, radii=0.008))
@@ -273,7 +306,7 @@ def blueprint(entities: Collection[str]) -> rrb.Blueprint:
     place = rrb.Spatial3DView(
         name="Place",
         origin="/",
-        contents=["+ /scan", "+ /map", "+ /path", "+ /way", "+ /truck/**", "+ /frames/**"],
+        contents=["+ /scan", "+ /map", "+ /ground", "+ /path", "+ /way", "+ /truck/**", "+ /frames/**"],
         eye_controls=eye,
         spatial_information=rrb.SpatialInformation(target_frame="map"),
     )

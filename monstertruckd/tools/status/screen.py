@@ -231,8 +231,7 @@ def _truck(state: ScreenState) -> Panel:
         _row(table, "calibrated", calibration_badge(state.calibration))
     if odometry is not None:
         _row(table, "pose", f"{odometry.pose.x:+.2f} {odometry.pose.y:+.2f} m {math.degrees(odometry.pose.yaw):+.0f}°")
-    if state.attitude is not None:
-        _row(table, "tilt", f"{math.degrees(state.attitude.roll):+.1f}° {math.degrees(state.attitude.pitch):+.1f}°")
+    _tilt(table, state)
     if state.tracker is not None:
         done = _done(state.tracker)
         bar = "█" * round(done * 16)
@@ -241,6 +240,15 @@ def _truck(state: ScreenState) -> Panel:
     if state.loop is not None:
         _row(table, "tick late", f"p99 {state.loop.lateness_p99 * 1e3:.1f} ms max {state.loop.lateness_max * 1e3:.1f}")
     return Panel(table, title=f"mt/{state.robot}", border_style="dim")
+
+
+def _tilt(table: Table, state: ScreenState) -> None:
+    """Of the body, and of the lidar's plane, as far as they are measured."""
+    if state.attitude is not None:
+        roll, pitch = (math.degrees(angle) for angle in (state.attitude.roll, state.attitude.pitch))
+        _row(table, "tilt", f"roll {roll:+.1f}° pitch {pitch:+.1f}°")
+    if state.scan is not None and state.scan.tilt is not None:
+        _row(table, "lidar", f"{math.degrees(state.scan.tilt):.1f}° off the level")
 
 
 def _done(tracker: TrackerState) -> float:

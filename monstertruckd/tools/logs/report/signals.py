@@ -9,6 +9,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from monstertruck_estimation.scan_tilt import UNKNOWN
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas import topics as t
@@ -200,6 +201,17 @@ FIGURES: Final = (
         (
             Curve("roll", t.COMPASS, lambda m: math.degrees(m.roll) if m.tilt_valid else None),
             Curve("pitch", t.COMPASS, lambda m: math.degrees(m.pitch) if m.tilt_valid else None),
+        ),
+        zero=True,
+    ),
+    Figure(
+        "Tilt of the lidar's plane",
+        "°",
+        4,
+        (
+            Curve(
+                "off the level", t.SCAN, lambda m: None if m.tilt is None or m.tilt >= UNKNOWN else math.degrees(m.tilt)
+            ),
         ),
         zero=True,
     ),

@@ -9,7 +9,7 @@ from monstertruck_runtime.errors import InputError
 from monstertruck_sim.world.config import FIVE_SONARS, ImuModelConfig, SonarModelConfig, SonarPlace
 from monstertruck_sim.world.obstacles import Disc, discs_and_segments
 from monstertruck_sim.world.raycast import cast_rays, clearance
-from monstertruck_sim.world.sonar import SPEED_OF_SOUND, Ping, beam, cone, heard, placed, surface, survey
+from monstertruck_sim.world.sonar import SPEED_OF_SOUND, Ping, beam, cone, heard, leaning, placed, surface, survey
 
 SECOND = 1_000_000_000
 EMPTY = clearance(np.zeros((2, 2), np.bool_))
@@ -121,6 +121,28 @@ def test_fl_reads_at_a_parallel_wall_what_it_would_read_at_the_place_of_l():
     there = Ping(left.x, left.y, fl.yaw)
     assert beam(walls(WALL), fl, BEAM) == pytest.approx(beam(walls(WALL), there, BEAM))
     assert fl.x - left.x == pytest.approx(0.05)
+
+
+def wall_ahead(xs, ys, angles, reach, times_ns=None, /):
+    """Ranges to a wall at x = 2 m."""
+    with np.errstate(divide="ignore"):
+        ranges = np.where(np.cos(angles) > 0, (2.0 - xs) / np.cos(angles), np.inf)
+    return np.where(ranges <= reach, ranges, np.inf)
+
+
+def test_on_a_body_that_leans_the_axis_leans():
+    here, ahead = np.zeros(1), np.zeros(1)
+    assert leaning(wall_ahead, 0.0, 0.0, 0.0, 0.2) is wall_ahead
+    up = leaning(wall_ahead, 0.0, -0.1, 0.0, np.inf)
+    assert up(here, here, ahead, 3.0) == pytest.approx([2.0 / np.cos(0.1)])
+    assert leaning(wall_ahead, 0.0, -0.1, 0.0, 0.21)(here, here, ahead, 3.0) < np.inf  # 0.2 m up at the wall
+    assert leaning(wall_ahead, 0.0, -0.1, 0.0, 0.19)(here, here, ahead, 3.0) == np.inf
+    assert leaning(wall_ahead, 0.0, 0.1, 0.0, 0.19)(here, here, ahead, 3.0) < np.inf  # nose down
+    aside = np.full(1, np.pi / 4)
+    rolled = leaning(wall_ahead, 0.0, 0.0, 0.2, np.inf)(here, here, aside, 6.0)
+    assert rolled == pytest.approx([2.0 / np.cos(np.pi / 4)])  # the wall is along the axis of roll
+    assert leaning(wall_ahead, 0.0, 0.0, 0.2, 0.1)(here, here, aside, 6.0) == np.inf  # the left side is up
+    assert up(here, here, ahead, 2.005) == np.inf
 
 
 def test_pings_leave_from_the_moving_robot_and_are_repeatable(field):

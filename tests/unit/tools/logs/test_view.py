@@ -14,7 +14,9 @@ from typer.testing import CliRunner
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import CommandFailedError, InputError, NotFoundError, NotInstalledError
 from monstertruck_schemas import topics as t
+from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.event import LogLevel, LogRecord
+from monstertruck_schemas.state import Ground
 from monstertruckd.tools.cli.logs import app
 from monstertruckd.tools.cli.output import needs_extra
 from monstertruckd.tools.logs.messages import Selection
@@ -26,6 +28,24 @@ from tests.unit.tools.logs.test_export import grid, image, path, transforms
 
 def record(now, seq):
     return LogRecord(stamp=now, received=now, seq=seq, level=LogLevel.WARNING, name="gate", text="late")
+
+
+def ground(now, seq):
+    tilt, rough = np.full(6, 255, np.uint8), np.full(6, 255, np.uint8)
+    tilt[1], rough[1] = 40, 30
+    corner = Pose2D(x=0.0, y=0.0, yaw=0.0)
+    return Ground(
+        stamp=now,
+        received=now,
+        seq=seq,
+        frame="map",
+        resolution=0.1,
+        width=3,
+        height=2,
+        origin=corner,
+        tilt=tilt,
+        roughness=rough,
+    )
 
 
 MAKERS = {
@@ -47,6 +67,7 @@ def log(tmp_path):
     writer.put(t.CLOCK, clock(SECOND))
     writer.put(t.MAP, grid(SECOND, 0))
     writer.put(t.PATH, path(SECOND, 0))
+    writer.put(t.GROUND, ground(SECOND, 0))
     for seq in range(20):
         for topic, make in MAKERS.items():
             writer.put(topic, make(SECOND + seq * SECOND // 10, seq))
@@ -68,12 +89,34 @@ def rows(chunks):
 
 def test_every_kind_of_message_becomes_an_entity(log, tmp_path):
     found = read(convert(log, tmp_path / "out" / "run.rrd"))
-    assert {"/scan", "/map", "/path", "/way", "/camera", "/frames/base", "/truck", "/states/gate"} <= found.keys()
+    assert {
+        "/scan",
+        "/map",
+        "/ground",
+        "/path",
+        "/way",
+        "/camera",
+        "/frames/base",
+        "/truck",
+        "/states/gate",
+    } <= found.keys()
     assert rows(found["/scan"]) == rows(found["/camera"]) == rows(found["/frames/base"]) == 20
     assert rows(found["/events/journal"]) == 20
     assert rows(found["/states/gate"]) == 1, "only changes of a state"
     assert rows(found["/signals/speed/measured"]) == 20
     assert all(chunk.timeline_names == [TIMELINE] for chunk in found["/scan"])
+
+
+def test_rough_ground_is_red_and_tilted_ground_blue_where_it_is_known(log, tmp_path):
+    (chunk,) = (c for c in read(convert(log, tmp_path / "run.rrd"))["/ground"] if not c.is_static)
+    data = chunk.to_record_batch().column("GridMap:data")[0].as_py()
+    pixels = np.array(data, np.uint8).reshape(2, 3, 4)[::-1]  # row 0 is the lowest y again
+    red, green, blue, alpha = pixels[0, 1].tolist()
+    assert red == 255
+    assert green == 0
+    assert 0 < blue < 255
+    assert alpha == 255
+    assert pixels[1].max() == 0
 
 
 def test_values_and_dates_survive(log, tmp_path):

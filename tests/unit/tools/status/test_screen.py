@@ -53,6 +53,7 @@ def full() -> ScreenState:
             range_max=5.6,
             ranges=ranges,
             codes=np.full(682, 255, np.uint8),
+            tilt=0.05,
         ),
         Attitude(**HEADER, heading=1.0, roll=0.1, pitch=0.2),
         Battery(**HEADER, voltage=None, raw_voltage=0.0, cells=6, level=BatteryLevel.SENSOR_FAULT),
@@ -97,6 +98,8 @@ def test_it_shows_what_matters():
         "NOT RECORDING: no space left",
         "backoff",
         "0.00 s  gate: tilted",
+        "roll +5.7° pitch +11.5°",
+        "2.9° off the level",
         "▲",
     ):
         assert words in text
