@@ -208,8 +208,7 @@ class PointService:
         while (not self._history or self._history[-1].stamp < stamp) and self._clock.now() < limit:
             await self._clock.sleep(PAUSE)
             self._gather()
-        slam = None if self._in.slam is None else self._in.slam.latest
-        if slam is not None and slam.standing in NO_PLACE:
+        if self._is_lost():
             return None
         rows = list(self._history)
         after = next((i for i, row in enumerate(rows) if row.stamp >= stamp), None)
@@ -230,6 +229,10 @@ class PointService:
             self._history.append(_Placed(message.stamp, pose, covariance, message.twist.wz))
             if not self._trail or math.dist(self._trail[-1][1][:2], pose[:2]) >= CRUMB:
                 self._trail.append((message.stamp, pose))
+
+    def _is_lost(self) -> bool:
+        slam = None if self._in.slam is None else self._in.slam.latest
+        return slam is not None and slam.standing in NO_PLACE
 
     def _is_level(self) -> bool:
         attitude = None if self._in.attitude is None else self._in.attitude.latest
@@ -356,6 +359,8 @@ class PointService:
         fresh = self._history and self._clock.now() - self._history[-1].stamp <= POSE.fresh_for() * SECOND
         if not fresh:
             raise RequestRefusedError(Reason.NO_MAP, "no fresh pose in map")
+        if request.x is None and self._is_lost():
+            raise RequestRefusedError(Reason.POSE_LOST, "where the robot is in the map is not known")
         here = self._history[-1]
         x, y, yaw = here.pose
         place = (

@@ -25,6 +25,7 @@ from monstertruck_runtime.mailbox import Mailbox, fifo, latest
 from monstertruck_runtime.threads import inline
 from monstertruck_schemas.base import Pose2D, Twist2D
 from monstertruck_schemas.body import LensConfig, Mount
+from monstertruck_schemas.health import LocalisationStatus
 from monstertruck_schemas.points import PointKind, PointOrder
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Role
@@ -52,15 +53,16 @@ class Calls(dict):
 class Rig:
     """A robot that creeps along x."""
 
-    def __init__(self, clock, folder, ask=None, load=None) -> None:
+    def __init__(self, clock, folder, ask=None, load=None, standing=None) -> None:
         self.clock, self.out, self.events, self.seq, self.speed = clock, Kept(), [], 0, 0.05
         self.camera, self.pose, self.felt = Mailbox(latest()), Mailbox(fifo(256)), Mailbox(latest())
         self.gate = SimpleNamespace(latest=SimpleNamespace(nonce="n", stamp=0))
         self.calls = Calls()
+        slam = None if standing is None else SimpleNamespace(latest=SimpleNamespace(standing=standing))
         self.service = PointService(
             PointsConfig(), (Mount(x=0.18, z=0.25), LensConfig(k1=-0.15, k2=0.03)), clock,
             LoopActor(TARGET, clock, 0.05),
-            inputs=PointInputs(self.camera, self.pose, None, self.felt, self.gate), ask=ask, out=self.out,
+            inputs=PointInputs(self.camera, self.pose, slam, self.felt, self.gate), ask=ask, out=self.out,
             events=lambda reason, *args, **_: self.events.append((reason, args[-1])),
             folders=PointFolders(load=load, save=folder), offload=inline, max_age=5.0,
         )  # fmt: skip
@@ -219,3 +221,15 @@ def test_files_are_written_by_a_thread_and_failures_are_told_by_the_loop(tmp_pat
 
     rig = told(story, tmp_path / "file" / "folder")
     assert [by for by, text in rig.events if "points not saved" in text] == [0]
+
+
+def test_a_robot_that_is_lost_marks_no_place_of_its_own_and_reads_no_tags(tmp_path):
+    async def story(rig: Rig) -> None:
+        await rig.drive(1.5)
+        with pytest.raises(RequestRefusedError, match="not known"):
+            await rig.ask(PointOrder.MARK, "here")
+        await rig.ask(PointOrder.MARK, "there", x=1.0, y=3.0)
+        await rig.drive(1.5)
+
+    rig = told(story, tmp_path, standing=LocalisationStatus.LOST)
+    assert [point.name for point in rig.out[-1].points] == ["there"]
