@@ -21,7 +21,7 @@ def picture_name(point: str) -> str:
 
 
 def save(folder: Path, points: list[tuple[PointOfInterest, bytes]]) -> None:
-    """Write points and pictures; the list last.
+    """Write points and pictures, then the list; pictures of other points go.
 
     Raises:
         OSError: a file could not be written.
@@ -32,6 +32,10 @@ def save(folder: Path, points: list[tuple[PointOfInterest, bytes]]) -> None:
         if picture and not (file.is_file() and file.read_bytes() == picture):
             replace_file(file, picture)
     replace_file(folder / FILE, _POINTS.dump_json([point for point, _ in points], indent=1))
+    pictured = {picture_name(point.name) for point, picture in points if picture}
+    for file in folder.glob(picture_name("*")):
+        if file.name not in pictured:
+            file.unlink(missing_ok=True)
 
 
 def load(folder: Path) -> list[tuple[PointOfInterest, bytes]]:

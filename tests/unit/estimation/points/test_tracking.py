@@ -130,6 +130,8 @@ def test_a_mark_moves_with_the_map_near_it_and_what_is_saved_comes_back(tmp_path
         assert (new.x, new.y, new.yaw) == pytest.approx((old.x, old.y, old.yaw))
         assert new.kind is old.kind
     assert again.points["tag-7"].picture == b"\xff\xd8x"
+    save(tmp_path, [row for row in points.pictured() if row[0].name == "dock"])
+    assert [file.name for file in tmp_path.iterdir()] == ["points.json"], "no picture of what was forgotten is left"
     (tmp_path / "points.json").write_text("[{}]")
     with pytest.raises(InputError, match=r"points\.json: not readable"):
         load(tmp_path)
