@@ -18,7 +18,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Role
 from monstertruck_schemas.state import GateMode, GateState
 from tests.daemon.browser_kit import NEEDS_CHROMIUM, PATIENCE, chromium, opened, shows, station
-from tests.daemon.wall_kit import ROOT, Robot, kept_armed, planner_ready, robot
+from tests.daemon.wall_kit import ROOT, Robot, end, kept_armed, planner_ready, robot
 
 pytestmark = [pytest.mark.wall, pytest.mark.timeout(240), NEEDS_CHROMIUM]
 
@@ -124,20 +124,6 @@ async def reset(page: Page) -> None:
             await asyncio.sleep(0.5)
 
 
-async def test_keys_and_a_gamepad_drive_by_their_own_priority_until_they_are_released(tmp_path: Path):
-    async with robot(tmp_path, FREE) as made:
-        await started(made)
-        async with made.client() as client, station(made) as url, chromium(tmp_path) as browser:
-            gate = client.subscribe(topics.GATE, latest())
-            page = await opened(browser, url)
-            for hand, role in ((Key(page), Role.KEYBOARD), (Pad(page), Role.GAMEPAD)):
-                await arm_and_hold(page, gate, hand)
-                assert gate.latest is not None
-                assert gate.latest.role is role
-                await hand.release()
-                await becomes(lambda: mode(gate) is GateMode.DISARMED)
-
-
 async def test_emergency_stop_by_button_and_space_bar_and_two_tabs_are_two_sources(tmp_path: Path):
     async with robot(tmp_path, FREE) as made:
         await started(made)
@@ -178,23 +164,30 @@ async def test_emergency_stop_by_button_and_space_bar_and_two_tabs_are_two_sourc
             await shows(other, "estopped")
 
 
-async def test_a_browser_that_freezes_stops_the_truck_and_repeats_nothing(tmp_path: Path):
+async def test_a_hand_that_lets_go_and_a_browser_that_freezes_reloads_or_loses_its_network_stop_the_truck(
+    tmp_path: Path,
+):
+    """And nothing repeats a last value; a daemon that is started anew is there on the page, and is stopped from it."""
     async with robot(tmp_path, FREE) as made:
         await started(made)
         async with made.client() as client, station(made) as url, chromium(tmp_path) as browser:
             gate = client.subscribe(topics.GATE, latest())
             commands = client.subscribe(topics.CMD_DRIVE, fifo(4096))
             page = await opened(browser, url)
+            for hand, role in ((Key(page), Role.KEYBOARD), (Pad(page), Role.GAMEPAD)):
+                await arm_and_hold(page, gate, hand)
+                assert gate.latest is not None
+                assert gate.latest.role is role
+                await hand.release()
+                await becomes(lambda: mode(gate) is GateMode.DISARMED)
+
             await arm_and_hold(page, gate)
             frozen = processes_below(os.getpid(), "chromium")
             assert frozen
             try:
                 for process in frozen:
                     os.kill(process, signal.SIGSTOP)
-                await becomes(lambda: mode(gate) is not GateMode.DRIVING)
-                commands.drain()
-                await becomes(lambda: mode(gate) is GateMode.DISARMED)
-                assert all(neutral(command) for command in commands.drain())
+                await _stops(gate, commands)
             finally:
                 for process in frozen:
                     os.kill(process, signal.SIGCONT)
@@ -202,6 +195,34 @@ async def test_a_browser_that_freezes_stops_the_truck_and_repeats_nothing(tmp_pa
             await asyncio.sleep(1.0)
             assert mode(gate) is GateMode.DISARMED
             assert all(neutral(command) for command in commands.drain())
+
+            await arm_and_hold(page, gate, Key(page))
+            await page.context.set_offline(True)  # a lid that is closed
+            await _stops(gate, commands)
+            await page.context.set_offline(False)
+            await Key(page).release()
+            await shows(page, "disarmed")
+
+            await arm_and_hold(page, gate, Key(page))
+            await page.reload()
+            await _stops(gate, commands)
+            await shows(page, "disarmed")
+
+            assert await end(made.daemon) == 0
+            await page.wait_for_selector("#authority[data-mode=unknown]")
+            await made.start_daemon()
+            await shows(page, "disarmed")
+            await page.keyboard.press("Space")
+            await shows(page, "estopped")
+
+
+async def _stops(gate: Mailbox[GateState], commands: Mailbox[DriveCommand]) -> None:
+    """Wait until the truck is stopped and disarmed; the motor is asked for nothing meanwhile."""
+    await becomes(lambda: mode(gate) is not GateMode.DRIVING)
+    await asyncio.sleep(0.1)  # states and commands come by two ways
+    commands.drain()
+    await becomes(lambda: mode(gate) is GateMode.DISARMED)
+    assert all(neutral(command) for command in commands.drain())
 
 
 def neutral(command: DriveCommand) -> bool:
