@@ -1,11 +1,13 @@
 """What the station costs: processor time and bytes for each browser, first picture, and the way of an emergency stop.
 
     python -m benchmarks.station [--seconds S] [--quick]
+    python -m benchmarks.station --memory [--hours 2]
 
 A robot that only publishes (``station_parts/published.py``: 10 Hz scans, 2 Hz map of 400 x 400 cells, 15 Hz pictures)
 and a station, each a process. Browsers are WebSocket clients that fetch every map as the page does; one more never
 reads. The first picture is taken in Debian's chromium, where there is one. The emergency stop is timed from the
-WebSocket message to the request on the robot's bus.
+WebSocket message to the request on the robot's bus. ``--memory``: the messages of so many hours, sent eight times as
+fast, with a browser that reads them; how much the station's memory grows behind the first quarter.
 """
 
 import argparse
@@ -38,6 +40,9 @@ GOALS = {
     "delay_beside_a_frozen_browser_ms": 100.0,
 }
 BROWSERS = 5
+TIMES = 8.0
+"""As fast as at its nominal rates a robot sends, for the memory."""
+GROWTH_MB = 10.0
 TICKS = os.sysconf("SC_CLK_TCK")
 
 
@@ -190,6 +195,46 @@ async def first_pictures(url: str, count: int) -> list[float]:
     return times
 
 
+def resident(pid: int) -> float:
+    """Memory of a process, MB."""
+    pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+async def memory(hours: float) -> int:
+    """How the station's memory grows over the messages of so many hours."""
+    endpoint = free_endpoint()
+    port = free_endpoint().rpartition(":")[2]
+    url = Place(port=int(port)).url
+    words = ("benchmarks.station_parts.published", endpoint, "truck", str(TIMES))
+    robot = await spawned(*words, ready="ready")
+    station = await spawned(
+        "monstertruckd", "station", "--robot", f"truck@{endpoint}", "--port", port, ready="station:"
+    )
+    samples, seconds = [], hours * 3600 / TIMES
+    try:
+        async with browsers(url, 1) as (browser,):
+            for _ in range(40):
+                await asyncio.sleep(seconds / 40)
+                samples.append(round(resident(station.pid), 1))
+        scans = len(browser.gaps)
+    finally:
+        await ended(station)
+        await ended(robot)
+    settled = max(samples[:10])
+    figures = {
+        "hours": hours,
+        "scans_read": scans,
+        "scans_sent_at_most": round(hours * 36_000),
+        "memory_mb": samples[9::10],
+        "growth_mb": round(max(samples[10:]) - settled, 1),
+    }
+    met = bool(figures["growth_mb"] <= GROWTH_MB and scans > 0)
+    goals = {"growth_mb": GROWTH_MB, "hours": 2.0}
+    print(json.dumps({"bench": "station_memory", "figures": figures, "goals": goals, "met": met and hours >= 2.0}))
+    return 0 if met else 1
+
+
 async def main(seconds: float, presses: int) -> int:
     """Everything."""
     endpoint = free_endpoint()
@@ -230,5 +275,9 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=20.0)
     parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--memory", action="store_true", help="growth of the station's memory, nothing else")
+    parser.add_argument("--hours", type=float, default=2.0, help="of messages, with --memory")
     options = parser.parse_args()
+    if options.memory:
+        sys.exit(asyncio.run(memory(options.hours)))
     sys.exit(asyncio.run(main(5.0 if options.quick else options.seconds, 50 if options.quick else 500)))

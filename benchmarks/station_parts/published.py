@@ -1,9 +1,9 @@
 """Publishes every topic a page shows at its nominal rate and size, as a daemon does, and answers a station's questions.
 
-    python -m benchmarks.station_parts.published ENDPOINT [ROBOT]
+    python -m benchmarks.station_parts.published ENDPOINT [ROBOT [TIMES]]
 
 Scans have 682 beams at 10 Hz, the map 400 x 400 cells at 2 Hz, pictures 20 kB at 15 Hz. Prints the delay of every
-control request, ns from the moment its sender wrote into it.
+control request, ns from the moment its sender wrote into it. TIMES as fast, it sends the messages of as much more time.
 """
 
 import asyncio
@@ -96,7 +96,7 @@ def world() -> np.ndarray:
     return cells.ravel()
 
 
-async def main(zenoh: ZenohConfig, robot: str, clock: Clock) -> None:
+async def main(zenoh: ZenohConfig, robot: str, clock: Clock, times: float = 1.0) -> None:
     """Publish until cancelled."""
     bus, rpc = Bus(clock), Rpc(clock)
 
@@ -108,7 +108,7 @@ async def main(zenoh: ZenohConfig, robot: str, clock: Clock) -> None:
     bridge = ZenohBridge(robot, bus, zenoh, clock, rpc)
     await bridge.open()
     control = bus.subscribe(topics.REQ_CONTROL, fifo(1024))
-    jobs: list[Any] = [publish(bus, clock, topic, *row) for topic, row in messages().items()]
+    jobs: list[Any] = [publish(bus, clock, topic, times * rate, fields) for topic, (rate, fields) in messages().items()]
     print("ready", flush=True)
     await asyncio.gather(bridge.run(lambda: None), report(control, clock), *jobs)
 
@@ -132,4 +132,6 @@ async def report(control: Any, clock: Clock) -> None:
 
 
 if __name__ == "__main__":
-    run_wall(partial(main, ZenohConfig(listen=(sys.argv[1],)), sys.argv[2] if sys.argv[2:] else "truck"))
+    _, endpoint, robot, times = [*sys.argv, *("truck", "1")[len(sys.argv) - 2 :]]
+    config = ZenohConfig(listen=(endpoint,))
+    run_wall(lambda clock: main(config, robot, clock, float(times)))

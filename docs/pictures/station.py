@@ -54,7 +54,7 @@ async def main() -> None:
             await made.start_simulator()
             await made.start_daemon()
             async with station(made) as url, chromium(made.folder) as browser:
-                for theme, view, size in (("light", "", DESK), ("dark", "-phone", PHONE)):
+                for theme, view, size in (("light", "", DESK), ("dark", "", DESK), ("dark", "-phone", PHONE)):
                     await asking(browser, url, theme, view, size)
 
 
@@ -80,6 +80,7 @@ async def asking(browser: Browser, url: str, theme: str, view: str, size: dict[s
     for dx, dy in ((60, 0), (90, -10), (120, -30)):
         await page.mouse.move(x + dx, y + dy, steps=5)
     await page.mouse.up()
+    await page.evaluate("document.querySelectorAll('#banners button').forEach((button) => button.click())")
     await page.screenshot(path=HERE / f"station{view}-{theme}-path.png")
     await page.click("#goal-drop")
     await page.locator("#recordings button").first.click()
@@ -115,7 +116,8 @@ async def pictures(made: Robot, browser: Browser, url: str, theme: str, view: st
 
 
 async def picture(page: Page, name: str, tab: str) -> None:
-    """One picture of one tab."""
+    """One picture of one tab, without what a busy computer is warned of."""
+    await page.evaluate("document.querySelectorAll('#banners button').forEach((button) => button.click())")
     await page.evaluate(
         f"document.querySelector('#tab-{tab}').click(); window.scrollTo(0, {'0' if tab == 'drive' else '1e6'})"
     )

@@ -118,7 +118,7 @@ export class Work {
     const bounds = [[">", above], ["≥", at_least], ["<", below], ["≤", at_most]]
       .filter(([, bound]) => bound !== null).map(([sign, bound]) => `${sign} ${Number(bound.toPrecision(4))}`).join(", ");
     const changed = value === began ? "" : words("settings.began", { value: began });
-    return element("div", { className: `setting${changed ? " changed" : ""}` }, element("label", { htmlFor: id, textContent: key }), input,
+    return element("div", { className: `setting${changed ? " changed" : ""}` }, element("label", { htmlFor: id }, ...breakable(key)), input,
       element("p", { id: `${id}-note`, className: "note", textContent: [meaning, bounds, changed].filter(Boolean).join(" · ") }));
   }
 
@@ -168,3 +168,8 @@ export class Work {
 
 /** A configured name as people write it. */
 const title = (name) => name.replaceAll("_", " ");
+
+/** A dotted name that may be broken behind its dots and underscores. */
+function breakable(key) {
+  return key.split(/(?<=[._])/).flatMap((part) => [part, document.createElement("wbr")]);
+}
