@@ -9,7 +9,8 @@ line is JSON.
         [--kinds NAME ...] [--faults NAME ...] [--resume]
 
 Parts: `metres`, 5 seeds; `costs`: frontiers of a map of 1000 x 1000 cells with one changed tile, and a decision on it;
-`faults`: the whole daemon, 20 seeds, see `exploration_parts/faults.py`.
+`daemon`: the whole daemon in the worlds of this repository, 2 seeds; `faults`: what goes wrong meanwhile, 20 seeds, see
+`exploration_parts/faults.py`.
 
 FOLDER has map_server files (stdr_simple_rooms, nav2_depot, stdr_hospital_section, movingai_berlin_0_256); without it
 the worlds of this repository are explored. Rows go to runs/exploration/PART.jsonl; with --resume those there count.
@@ -26,7 +27,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from exploration_parts import faults
+from exploration_parts import daemon, faults
 from exploration_parts.arena import Arena
 from exploration_parts.offline import offline_tour
 from exploration_parts.rover import SHARES, Rover, Run
@@ -124,6 +125,16 @@ def faulty(arguments: argparse.Namespace) -> tuple[dict[str, float], dict[str, f
             if not rows.has(fault=fault, seed=seed):
                 rows.add(faults.explored(seed, fault))
     return faults.summary(rows.all)
+
+
+def whole(arguments: argparse.Namespace) -> tuple[dict[str, float], dict[str, float]]:
+    """The whole daemon."""
+    rows = Rows("daemon", keep=arguments.resume)
+    for seed in range(arguments.seeds or 2):
+        for world in [world for world in arguments.worlds or SHIPPED if world in SHIPPED]:
+            if not rows.has(world=world, seed=seed):
+                rows.add(daemon.explored(world, seed))
+    return daemon.summary(rows.all)
 
 
 def file_of(world: str, maps: Path | None) -> Path:
@@ -228,7 +239,7 @@ def message(cells: np.ndarray, column: int, row: int) -> Grid:
     )  # fmt: skip
 
 
-PARTS: Final = {"metres": metres, "costs": costs, "faults": faulty}
+PARTS: Final = {"metres": metres, "costs": costs, "daemon": whole, "faults": faulty}
 
 
 if __name__ == "__main__":

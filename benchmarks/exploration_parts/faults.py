@@ -7,37 +7,23 @@
 - ``battery``: it is changed for one nearly empty when the truck is ``FAR`` from its start.
 
 A run ends safely if it ends in time, touches nothing, and the truck stands. The map is doubled if more than ``DOUBLED``
-of its walls are more than ``OFF`` from true ones (a door leaf and posts count as such). It says what it did if its end
-has a reason and a text, the map was saved by then, and a reason of the fault was reported.
+of its walls are more than 0.15 m from true ones (the door leaf counts as such). It says what it did if its end has a
+reason and a text, the map was saved by then, and a reason of the fault was reported.
 """
 
-import asyncio
 import math
-from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt
 
-from exploration_parts.arena import Arena
-from monstertruck_estimation.slam.storage import load
-from monstertruck_planners.collision import OCCUPIED, Footprint
-from monstertruck_planners.goals.exchange import Pose
-from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
+from exploration_parts.daemon import Story, Told, told
+from monstertruck_planners.collision import Footprint
+from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError, TruckError
-from monstertruck_runtime.mailbox import fifo, latest
 from monstertruck_schemas import topics
-from monstertruck_schemas.plan import ExplorationState
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import ExploreOrder
 from monstertruck_sim.world.obstacles import Box
-from monstertruckd.config.load import load_config
-from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
-from monstertruckd.tools.simulation.operator import LocalOperator
-from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 
-CONFIGS: Final = Path(__file__).resolve().parents[2] / "configs"
 FAULTS: Final = ("kidnap", "door", "person", "lidar", "battery")
 DOORS: Final = ((2.45, 3.1, 0.9, 0.1), (7.65, 3.1, 0.9, 0.1), (3.85, 4.8, 0.9, 0.1), (6.85, 4.8, 0.9, 0.1))
 """Of the rooms: middle, length, width, m."""
@@ -48,7 +34,7 @@ WHEN: Final = (15.0, 60.0)
 SHUT, UNPLUGGED, FAR = 60.0, 5.0, 4.0
 CARRIED: Final = (1.5, 6.0)
 """Least and greatest way of a robot that is carried off, m."""
-OFF, DOUBLED = 0.15, 0.05
+DOUBLED: Final = 0.05
 HOME: Final = 0.2
 """Metres from the start within which it is back."""
 SAYS: Final = {
@@ -60,205 +46,98 @@ SAYS: Final = {
 
 
 def explored(seed: int, fault: str) -> dict[str, Any]:
-    """One run."""
+    """One run, judged."""
     rng = np.random.default_rng([31, seed, FAULTS.index(fault)])
-    arena = Arena.load("rooms", CONFIGS / "worlds" / "rooms.yaml")
-    start = arena.start(seed)
-    pose = dict(zip(("x", "y", "yaw"), start, strict=True))
-    with TemporaryDirectory() as folder:
-        overlay: dict[str, Any] = {
-            "recorder": None,
-            "blackbox": None,
-            "placement": {"planner": "loop", "explorer": "loop"},
-            "planner": {"local_planner": None, "route": {"effort": 3000}},
-            "odometry": {"start": pose},
-            "slam": {"save": Path(folder) / "map"},
-            "sim": {"seed": seed, "world": {"start": pose}},
-        }
-        if fault == "person":
-            overlay["sim"]["world"]["people"] = [{"speed": 0.5, "before": ("stop", "turn")[seed % 2]}]
-        config = with_overlay(load_config(CONFIGS / "explore.yaml", SimulatedTruckConfig)[0], overlay)
-        told: dict[str, Any] = {}
+    people = [{"speed": 0.5, "before": ("stop", "turn")[seed % 2]}] if fault == "person" else []
 
-        async def main(clock: VirtualClock) -> None:
-            rig = VirtualRig(config, clock)
-            async with rig.running():
-                await clock.sleep(4.0)
-                told.update(await Story(rig, arena, fault, seed, rng, start).tell())
-            told["true"] = rig.truth.array()
-
-        run_virtual(main, start=SECOND)
-        row = {"fault": fault, "seed": seed, **judged(told, fault, start)}
-        row["off_share"] = off_share(Path(folder) / "map", arena, told["added"])
-    row["doubled"] = bool(row["off_share"] > DOUBLED)
-    return row
-
-
-class Story:
-    """A truck that explores, and what happens to it.
-
-    Args:
-        rig: the truck.
-        arena: the world.
-        fault: what happens.
-        seed: every other one's door opens again.
-        rng: of what is drawn.
-        start: of the truck.
-    """
-
-    def __init__(
-        self, rig: VirtualRig, arena: Arena, fault: str, seed: int, rng: np.random.Generator, start: Pose
-    ) -> None:
-        self.rig, self.clock, self.arena, self.fault = rig, rig.clock, arena, fault
-        self.opens, self.rng, self.start = seed % 2 == 1, rng, start
-        self.operator = LocalOperator(rig.daemon, rig.clock)
-        self.states = rig.bus.subscribe(topics.EXPLORE, latest())
-        self.events = rig.bus.subscribe(topics.EVENT, fifo(100_000))
-        self.poses = rig.bus.subscribe(topics.POSE, latest())
-        self.added: list[Box] = []
-        self.at = 0.0
-
-    async def tell(self) -> dict[str, Any]:
-        """From arming to the end of the exploration."""
-        await self.operator.arm()
-        order = {"order": ExploreOrder.START, "home": True, "budget": BUDGET}
-        await self.operator.call("explore", {**await self.operator.header(), **order})
-        began = self.clock.now()
-        happening = asyncio.create_task(self.happen())
-        state, late = None, False
-        try:
-            async with self.clock.deadline(LIMIT):
-                state = await self.end()
-        except TimeoutError:
-            late, state = True, self.states.latest
-        happening.cancel()
-        await asyncio.wait([happening])
-        if not happening.cancelled() and (error := happening.exception()) is not None:
-            raise error
-        await self.clock.sleep(2.0)
-        pose, true = self.poses.latest, self.rig.world.truth(self.clock.now())
-        off = math.inf if pose is None else math.dist((pose.pose.x, pose.pose.y), (true.x, true.y))
-        return {
-            "state": state, "late": late, "events": self.events.drain(), "added": self.added, "at": self.at,
-            "seconds": (self.clock.now() - began) / SECOND, "pose_off": off, "speed": abs(true.v),
-        }  # fmt: skip
-
-    async def end(self) -> ExplorationState:
-        """What the exploration came to."""
-        while True:
-            state = self.states.latest
-            if state is not None and state.number and not state.running:
-                return state
-            await self.clock.sleep(0.5)
-
-    async def happen(self) -> None:
-        """The fault, and what its people do about it."""
-        await self.clock.sleep(float(self.rng.uniform(*WHEN)))
-        match self.fault:
+    async def happen(story: Story) -> None:
+        await story.clock.sleep(float(rng.uniform(*WHEN)))
+        match fault:
             case "kidnap":
-                self.carry_off()
-                await self.arm_again(4.0)
+                carry_off(story, rng)
+                await arm_again(story, 4.0)
             case "door":
-                await self.shut_door()
+                await shut_door(story, opens=seed % 2 == 1)
             case "lidar":
-                self.noted()
-                self.rig.ports["lidar"].unplug()
-                await self.clock.sleep(UNPLUGGED)
-                self.rig.ports["lidar"].plug()
-                await self.arm_again(6.0)
+                noted(story)
+                story.rig.ports["lidar"].unplug()
+                await story.clock.sleep(UNPLUGGED)
+                story.rig.ports["lidar"].plug()
+                await arm_again(story, 6.0)
             case "battery":
-                while math.dist(self.here[:2], self.start[:2]) < FAR:
-                    await self.clock.sleep(0.5)
-                self.noted()
-                self.rig.world.set_charge(self.clock.now(), float(self.rng.uniform(0.05, 0.12)))
+                while math.dist(story.here[:2], story.start[:2]) < FAR:
+                    await story.clock.sleep(0.5)
+                noted(story)
+                story.rig.world.set_charge(story.clock.now(), float(rng.uniform(0.05, 0.12)))
 
-    @property
-    def here(self) -> Pose:
-        """Where the truck really is."""
-        truth = self.rig.world.truth(self.clock.now())
-        return truth.x, truth.y, truth.yaw
+    return judged(told("rooms", seed, happen, budget=BUDGET, limit=LIMIT, people=people), fault, seed)
 
-    def noted(self) -> None:
-        """The fault comes now."""
-        self.at = self.clock.now() / SECOND
 
-    def carry_off(self) -> None:
-        """Somewhere else."""
-        low, size = np.array(self.arena.origin), np.array(self.arena.blocked.shape[::-1]) * self.arena.resolution
-        while True:
-            pose = (*(low + size * self.rng.random(2)), self.rng.uniform(-math.pi, math.pi))
-            far = CARRIED[0] < math.dist(pose[:2], self.here[:2]) < CARRIED[1]
-            if far and self.arena.truth.free(Footprint(), np.array([pose]), 0.15)[0]:
-                break
-        self.noted()
-        self.rig.world.carry(self.clock.now(), tuple(map(float, pose)))  # type: ignore[arg-type]
+def noted(story: Story) -> None:
+    """The fault comes now."""
+    story.at = story.clock.now() / SECOND
 
-    async def shut_door(self) -> None:
-        """The nearest one that the truck is not in."""
-        while True:
-            x, y, _ = self.here
-            doors = sorted(DOORS, key=lambda door: math.dist((x, y), door[:2]))
-            door = next(door for door in doors if math.dist((x, y), door[:2]) > 0.7)
-            leaf = Box(*door)
-            try:
-                self.rig.world.add(self.clock.now(), leaf)
-            except InputError:
-                await self.clock.sleep(1.0)
-                continue
+
+def carry_off(story: Story, rng: np.random.Generator) -> None:
+    """Somewhere else."""
+    arena = story.arena
+    low, size = np.array(arena.origin), np.array(arena.blocked.shape[::-1]) * arena.resolution
+    while True:
+        x, y = (low + size * rng.random(2)).tolist()
+        pose = x, y, float(rng.uniform(-math.pi, math.pi))
+        far = CARRIED[0] < math.dist(pose[:2], story.here[:2]) < CARRIED[1]
+        if far and arena.truth.free(Footprint(), np.array([pose]), 0.15)[0]:
             break
-        self.noted()
-        self.added.append(leaf)
-        if self.opens:
-            await self.clock.sleep(SHUT)
-            self.rig.world.remove(self.clock.now(), leaf)
-
-    async def arm_again(self, after: float) -> None:
-        """As somebody does who put it right; again where it is refused."""
-        for _ in range(10):
-            await self.clock.sleep(after)
-            gate = self.rig.bus.newest(topics.GATE)
-            if gate is not None and gate.mode.active:
-                return
-            try:
-                await self.operator.arm()
-            except TruckError:
-                continue
+    noted(story)
+    story.rig.world.carry(story.clock.now(), pose)
 
 
-def judged(told: dict[str, Any], fault: str, start: Pose) -> dict[str, Any]:
-    """What the run has to be judged by, but for its map."""
-    state, true = told["state"], told["true"]
-    reasons = {event.reason for event in told["events"] if event.stamp / SECOND >= told["at"] - 0.5}
-    wanted = SAYS.get(fault, set())
-    saved = "map in" in state.text
+async def shut_door(story: Story, *, opens: bool) -> None:
+    """The nearest one that the truck is not in."""
+    while True:
+        here = story.here[:2]
+        doors = sorted(DOORS, key=lambda door: math.dist(here, door[:2]))
+        leaf = Box(*next(door for door in doors if math.dist(here, door[:2]) > 0.7))
+        try:
+            story.rig.world.add(story.clock.now(), leaf)
+        except InputError:
+            await story.clock.sleep(1.0)
+            continue
+        break
+    noted(story)
+    story.added.append(leaf)
+    if opens:
+        await story.clock.sleep(SHUT)
+        story.rig.world.remove(story.clock.now(), leaf)
+
+
+async def arm_again(story: Story, after: float) -> None:
+    """As somebody does who put it right; again where it is refused."""
+    for _ in range(10):
+        await story.clock.sleep(after)
+        gate = story.rig.bus.newest(topics.GATE)
+        if gate is not None and gate.mode.active:
+            return
+        try:
+            await story.operator.arm()
+        except TruckError:
+            continue
+
+
+def judged(run: Told, fault: str, seed: int) -> dict[str, Any]:
+    """What is kept of a run."""
+    state, at = run.state, run.story.at
+    reasons = {event.reason for event in run.events if event.stamp / SECOND >= at}
+    wanted, saved = SAYS.get(fault, set()), "map in" in state.text
     return {
-        "outcome": str(state.outcome), "text": state.text, "late": told["late"],
-        "touched": bool(true[:, 5].any()), "stands": told["speed"] < 0.01, "pose_off": round(told["pose_off"], 3),
-        "home": round(math.dist(true[-1, 1:3], start[:2]), 3), "seconds": round(told["seconds"]),
+        "fault": fault, "seed": seed, "outcome": str(state.outcome), "text": state.text, "late": run.late,
+        "touched": bool(run.true[:, 5].any()), "stands": abs(run.true[-1, 4]) < 0.01,
+        "doubled": run.off_share > DOUBLED, "off_share": run.off_share, "pose_off": round(run.pose_off, 3),
+        "home": round(math.dist(run.true[-1, 1:3], run.start[:2]), 3), "seconds": round(run.seconds),
         "travelled": round(state.travelled, 1), "saved": saved,
         "said": bool(state.text) and saved and (not wanted or bool(wanted & reasons)),
-        "reasons": sorted({str(e.reason) for e in told["events"] if e.stamp / SECOND >= told["at"]}),
+        "reasons": sorted(map(str, reasons)),
     }  # fmt: skip
-
-
-def off_share(folder: Path, arena: Arena, added: list[Box]) -> float:
-    """Share of the saved map's walls that are more than ``OFF`` from true ones and from what was put there."""
-    saved = load(folder).grid
-    rows, columns = np.nonzero(saved.cells >= OCCUPIED)
-    places = (np.column_stack((columns, rows)) + 0.5) * saved.resolution + np.array(saved.origin[:2])
-    blocked = arena.blocked.copy()
-    origin = np.array(arena.origin)
-    for box in added:
-        half = np.array((box.length, box.width)) / 2
-        low, high = (
-            np.floor((np.array((box.x, box.y)) + sign * half - origin) / arena.resolution).astype(int)
-            for sign in (-1, 1)
-        )
-        blocked[low[1] : high[1] + 1, low[0] : high[0] + 1] = True
-    away = distance_transform_edt(~blocked) * arena.resolution
-    at = np.floor((places - origin) / arena.resolution).astype(int)[:, ::-1]
-    at = np.clip(at, 0, np.array(blocked.shape) - 1)
-    return round(float((away[at[:, 0], at[:, 1]] > OFF).mean()), 4) if len(at) else 1.0
 
 
 def summary(rows: list[dict[str, Any]]) -> tuple[dict[str, float], dict[str, float]]:

@@ -1,0 +1,249 @@
+"""The whole daemon explores a world on the virtual clock, drives home and saves its map; devices are the emulated ones.
+
+Metres are those really driven, known is what the published map knows of the area that the footprint can cover, at home
+is where the truck really stands. Explorer, planner and tracker run in the loop, the mapper in its worker.
+"""
+
+import asyncio
+import math
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Final
+
+import numpy as np
+from scipy.ndimage import distance_transform_edt
+
+from exploration_parts.arena import Arena
+from exploration_parts.rover import SHARES
+from monstertruck_estimation.slam.storage import load
+from monstertruck_kinematics.elementary import Array
+from monstertruck_planners.collision import OCCUPIED
+from monstertruck_planners.explore.frontier import UNKNOWN, FrontierMap
+from monstertruck_planners.goals.exchange import Pose
+from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
+from monstertruck_runtime.mailbox import fifo, latest
+from monstertruck_schemas import topics
+from monstertruck_schemas.event import Event
+from monstertruck_schemas.plan import ExplorationState
+from monstertruck_schemas.req import ExploreOrder
+from monstertruck_schemas.state import Grid
+from monstertruck_sim.world.obstacles import Box
+from monstertruckd.config.load import load_config
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
+from monstertruckd.tools.simulation.operator import LocalOperator
+from monstertruckd.tools.simulation.virtual_rig import VirtualRig
+
+CONFIGS: Final = Path(__file__).resolve().parents[2] / "configs"
+OFF: Final = 0.15
+"""A wall of a saved map this far from every true one is none, m."""
+HOME: Final = 0.1
+"""Metres from the start within which the loop is closed."""
+BUDGET, LIMIT = 1800.0, 3600.0
+"""Seconds of exploring, and until the end."""
+
+Happen = Callable[["Story"], Awaitable[None]]
+
+
+@dataclass
+class Told:
+    """What became of one exploration."""
+
+    state: ExplorationState
+    late: bool
+    """It had not ended in time."""
+    events: list[Event]
+    grids: list[tuple[Grid, bool]]
+    """Published maps, True, and tiles."""
+    true: Array
+    """See ``TruthLog``."""
+    start: Pose
+    pose_off: float
+    """Metres between where it stands and where it believes to be."""
+    off_share: float
+    """Share of the saved map's walls that are none."""
+    seconds: float
+    story: "Story"
+
+
+class Story:
+    """A truck that explores.
+
+    Args:
+        rig: the truck.
+        arena: the world.
+        start: of the truck.
+    """
+
+    def __init__(self, rig: VirtualRig, arena: Arena, start: Pose) -> None:
+        self.rig, self.clock, self.arena, self.start = rig, rig.clock, arena, start
+        self.operator = LocalOperator(rig.daemon, rig.clock)
+        self.states = rig.bus.subscribe(topics.EXPLORE, latest())
+        self.events = rig.bus.subscribe(topics.EVENT, fifo(100_000))
+        self.poses = rig.bus.subscribe(topics.POSE, latest())
+        self.maps, self.tiles = (rig.bus.subscribe(topic, fifo(100_000)) for topic in (topics.MAP, topics.MAP_TILES))
+        self.added: list[Box] = []
+        """What was put into the world."""
+        self.at = 0.0
+        """When something happened, s."""
+
+    @property
+    def here(self) -> Pose:
+        """Where the truck really is."""
+        truth = self.rig.world.truth(self.clock.now())
+        return truth.x, truth.y, truth.yaw
+
+    async def tell(self, budget: float, limit: float, happen: Happen | None) -> dict[str, Any]:
+        """From arming to the end of the exploration."""
+        await self.operator.arm()
+        order = {"order": ExploreOrder.START, "home": True, "budget": budget}
+        await self.operator.call("explore", {**await self.operator.header(), **order})
+        began, late = self.clock.now(), False
+        happening = None if happen is None else asyncio.ensure_future(happen(self))
+        try:
+            async with self.clock.deadline(limit):
+                while (state := self.states.latest) is None or not state.number or state.running:
+                    await self.clock.sleep(0.5)
+        except TimeoutError:
+            late, state = True, self.states.latest
+        if happening is not None:
+            happening.cancel()
+            await asyncio.wait([happening])
+            if not happening.cancelled():
+                happening.result()
+        await self.clock.sleep(2.0)
+        pose, here = self.poses.latest, self.here
+        return {
+            "state": state, "late": late, "events": self.events.drain(), "start": self.start, "story": self,
+            "grids": sorted(
+                [(grid, True) for grid in self.maps.drain()] + [(tile, False) for tile in self.tiles.drain()],
+                key=lambda pair: pair[0].received,
+            ),
+            "pose_off": math.inf if pose is None else math.dist((pose.pose.x, pose.pose.y), here[:2]),
+            "seconds": (self.clock.now() - began) / SECOND,
+        }  # fmt: skip
+
+
+def told(
+    world: str, seed: int, happen: Happen | None = None, *, budget: float = BUDGET, limit: float = LIMIT, **more: Any
+) -> Told:
+    """One exploration of a world of this repository; it starts where the light harness does.
+
+    Args:
+        world: name.
+        seed: of start and noise.
+        happen: what happens meanwhile.
+        budget: seconds of exploring.
+        limit: seconds until the end.
+        more: of the configuration's `sim.world`.
+    """
+    file = CONFIGS / "worlds" / f"{world}.yaml"
+    arena = Arena.load(world, file)
+    start = arena.start(seed)
+    pose = dict(zip(("x", "y", "yaw"), start, strict=True))
+    with TemporaryDirectory() as folder:
+        overlay: dict[str, Any] = {
+            "recorder": None,
+            "blackbox": None,
+            "placement": {"planner": "loop", "explorer": "loop"},
+            "planner": {"route": {"effort": 3000}},
+            "odometry": {"start": pose},
+            "slam": {"save": Path(folder) / "map"},
+            "sim": {"seed": seed, "world": {"map": str(file), "start": pose, **more}},
+        }
+        config = with_overlay(load_config(CONFIGS / "explore.yaml", SimulatedTruckConfig)[0], overlay)
+        result: dict[str, Any] = {}
+
+        async def main(clock: VirtualClock) -> None:
+            rig = VirtualRig(config, clock)
+            async with rig.running():
+                await clock.sleep(4.0)
+                result.update(await Story(rig, arena, start).tell(budget, limit, happen))
+            result["true"] = rig.truth.array()
+
+        run_virtual(main, start=SECOND)
+        result["off_share"] = off_share(Path(folder) / "map", arena, result["story"].added)
+    return Told(**result)
+
+
+def explored(world: str, seed: int) -> dict[str, Any]:
+    """One run, judged."""
+    run = told(world, seed)
+    metres, covered = known(run)
+    here = run.true[-1, 1:3]
+    return {
+        "world": world, "seed": seed, "outcome": str(run.state.outcome), "text": run.state.text,
+        "metres": {f"{share:.0%}": round(metres[share], 2) for share in SHARES if share in metres},
+        "covered": round(covered, 5), "driven": round(driven(run.true)[-1], 1), "seconds": round(run.seconds),
+        "collided": bool(run.true[:, 5].any()), "late": run.late, "home": round(math.dist(here, run.start[:2]), 3),
+        "pose_off": round(run.pose_off, 3), "off_share": run.off_share, "goals": run.state.goals,
+        "failures": run.state.failures,
+    }  # fmt: skip
+
+
+def driven(true: Array) -> Array:
+    """Metres at each sample."""
+    return np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(true[:, 1:3], axis=0).T))))
+
+
+def known(run: Told) -> tuple[dict[float, float], float]:
+    """Metres at which each share of what can be reached was known, and the share at the end."""
+    x, y = run.story.arena.reachable(run.start)
+    rest = np.column_stack((x, y))
+    count, way, share = len(rest), driven(run.true), 0.0
+    metres: dict[float, float] = {}
+    grid: FrontierMap | None = None
+    for message, whole in run.grids:
+        if grid is None:
+            grid = FrontierMap(message)
+        else:
+            grid.put(message, whole=whole)
+        column, row = np.floor(rest / grid.resolution).astype(int).T - grid.corner[:, None]
+        rows, columns = grid.cells.shape
+        inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
+        value = np.full(len(rest), UNKNOWN)
+        value[inside] = grid.cells[row[inside], column[inside]]
+        rest = rest[value == UNKNOWN]
+        share = 1.0 - len(rest) / count
+        for wanted in SHARES:
+            if share >= wanted:
+                metres.setdefault(wanted, float(np.interp(message.received / SECOND, run.true[:, 0], way)))
+    return metres, share
+
+
+def off_share(folder: Path, arena: Arena, added: list[Box]) -> float:
+    """Share of the saved map's walls that are more than ``OFF`` from true ones and from what was put there."""
+    saved = load(folder).grid
+    rows, columns = np.nonzero(saved.cells >= OCCUPIED)
+    places = (np.column_stack((columns, rows)) + 0.5) * saved.resolution + np.array(saved.origin[:2])
+    blocked = arena.blocked.copy()
+    origin = np.array(arena.origin)
+    for box in added:
+        half = np.array((box.length, box.width)) / 2
+        low, high = (
+            np.floor((np.array((box.x, box.y)) + sign * half - origin) / arena.resolution).astype(int)
+            for sign in (-1, 1)
+        )
+        blocked[low[1] : high[1] + 1, low[0] : high[0] + 1] = True
+    away = distance_transform_edt(~blocked) * arena.resolution
+    at = np.floor((places - origin) / arena.resolution).astype(int)[:, ::-1]
+    at = np.clip(at, 0, np.array(blocked.shape) - 1)
+    return round(float((away[at[:, 0], at[:, 1]] > OFF).mean()), 4) if len(at) else 1.0
+
+
+def summary(rows: list[dict[str, Any]]) -> tuple[dict[str, float], dict[str, float]]:
+    """Means of each world, and what is not to be."""
+    figures: dict[str, float] = {"daemon_runs": float(len(rows))}
+    for world in sorted({row["world"] for row in rows}):
+        of = [row for row in rows if row["world"] == world]
+        for share in (f"{share:.0%}" for share in SHARES):
+            values = [row["metres"].get(share, math.inf) for row in of]
+            figures[f"daemon_{world}_{share}_m"] = round(min(float(np.mean(values)), 1e6), 1)
+    figures["daemon_not_99"] = float(sum("99%" not in row["metres"] for row in rows))
+    figures["daemon_collisions"] = float(sum(row["collided"] for row in rows))
+    figures["daemon_late"] = float(sum(row["late"] for row in rows))
+    figures["daemon_home_max_m"] = max((row["home"] for row in rows), default=0.0)
+    figures["daemon_off_share_max"] = max((row["off_share"] for row in rows), default=0.0)
+    none = dict.fromkeys(("daemon_not_99", "daemon_collisions", "daemon_late"), 0.0)
+    return figures, {**none, "daemon_home_max_m": HOME}
