@@ -34,7 +34,7 @@ from exploration_parts.rover import SHARES, Rover, Run
 
 from monstertruck_planners.collision import Footprint
 from monstertruck_planners.explore.catalog import EXPLORERS
-from monstertruck_planners.explore.config import TourConfig
+from monstertruck_planners.explore.config import InformationConfig
 from monstertruck_planners.explore.exchange import ExploreSetup, ExploreTask
 from monstertruck_planners.explore.explore_step import ExploringStep, warm_up
 from monstertruck_schemas.base import Pose2D
@@ -47,7 +47,7 @@ WORLDS: Final = {
     "berlin": "movingai_berlin_0_256",
 }
 SHIPPED: Final = ("rooms", "corridor_maze", "loop", "yard")
-OURS, PEERS = "tour", ("nearest", "author")
+OURS, PEERS = "information", ("nearest", "author")
 OUT = Path(__file__).resolve().parents[1] / "runs" / "exploration"
 
 
@@ -207,7 +207,7 @@ def costs(_: argparse.Namespace) -> tuple[dict[str, float], dict[str, float]]:
     step, pose = ExploringStep(), (3.0, 3.0, 0.0)
     cells[20:100, 20:100] = 0
     whole = message(cells, 0, 0)
-    step.step(ExploreTask(pose, whole, (), ExploreSetup(TourConfig(), Footprint(), 0.47)))
+    step.step(ExploreTask(pose, whole, (), ExploreSetup(InformationConfig(), Footprint(), 0.47)))
     updates, decisions = [], []
     for k in range(600):
         row, column = (int(v) * 64 for v in rng.integers(0, 15, 2))

@@ -147,7 +147,6 @@ def told(
             "recorder": None,
             "blackbox": None,
             "placement": {"planner": "loop", "explorer": "loop"},
-            "planner": {"route": {"effort": 3000}},
             "odometry": {"start": pose},
             "slam": {"save": Path(folder) / "map"},
             "sim": {"seed": seed, "world": {"map": str(file), "start": pose, **more}},

@@ -131,7 +131,7 @@ def judged(run: Told, fault: str, seed: int) -> dict[str, Any]:
     wanted, saved = SAYS.get(fault, set()), "map in" in state.text
     return {
         "fault": fault, "seed": seed, "outcome": str(state.outcome), "text": state.text, "late": run.late,
-        "touched": bool(run.true[:, 5].any()), "stands": abs(run.true[-1, 4]) < 0.01,
+        "touched": bool(run.true[:, 5].any()), "stands": bool(abs(run.true[-1, 4]) < 0.01),
         "doubled": run.off_share > DOUBLED, "off_share": run.off_share, "pose_off": round(run.pose_off, 3),
         "home": round(math.dist(run.true[-1, 1:3], run.start[:2]), 3), "seconds": round(run.seconds),
         "travelled": round(state.travelled, 1), "saved": saved,

@@ -13,7 +13,7 @@ from navigation_parts.harness import WORLDS
 from monstertruck_planners.explore.catalog import EXPLORERS
 from monstertruck_planners.explore.explore_step import warm_up
 
-KINDS = ("tour", "author")
+KINDS = ("information", "author")
 REACH = 4.0
 """Of the thesis's lidar, m."""
 SEEDS = 2
@@ -31,12 +31,15 @@ def run(options: Options) -> Part:
                 part.add(f"{kind}.{car}.{key}", float(np.mean([row[key] for row, _ in rows])))
             tracks[f"{kind} {car}"] = rows[0][1]
             print(f"  {kind} {car}: {rows[0][0]}", flush=True)
-    part.goals |= {name: 0 for name in part.figures if name.startswith("tour") and name.endswith("collisions")}
+    part.goals |= {name: 0 for name in part.figures if name.startswith(KINDS[0]) and name.endswith("collisions")}
     if not options.quick:
         for car in ("2ws", "4ws"):
             ours, theirs = (part.figures[f"{kind}.{car}.metres_95"] for kind in KINDS)
             part.add(f"{car}.ours_over_author_95", ours / theirs, 1.0)
-        part.add("ours.4ws_over_2ws_95", part.figures["tour.4ws.metres_95"] / part.figures["tour.2ws.metres_95"])
+        part.add(
+            "ours.4ws_over_2ws_95",
+            part.figures[f"{KINDS[0]}.4ws.metres_95"] / part.figures[f"{KINDS[0]}.2ws.metres_95"],
+        )
     draw(options, arena, tracks)
     return part
 

@@ -11,17 +11,17 @@ if TYPE_CHECKING:
 EXPLORERS: Final = Catalog(
     "monstertruck.explorers",
     Plugin(
-        name="tour",
-        settings="monstertruck_planners.explore.config:TourConfig",
-        implementation="monstertruck_planners.explore.tour:Tour",
-        doc="Large areas near by first, with a short tour over all frontiers, planned anew as the map grows",
-        extra="planning",
-    ),
-    Plugin(
         name="information",
         settings="monstertruck_planners.explore.config:InformationConfig",
         implementation="monstertruck_planners.explore.scores:Information",
         doc="The most new area per second of way",
+        extra="planning",
+    ),
+    Plugin(
+        name="tour",
+        settings="monstertruck_planners.explore.config:TourConfig",
+        implementation="monstertruck_planners.explore.tour:Tour",
+        doc="Large areas near by first, with a short tour over all frontiers, planned anew as the map grows",
         extra="planning",
     ),
     Plugin(
@@ -42,7 +42,7 @@ EXPLORERS: Final = Catalog(
 )
 """An explorer is made from its settings; it is an ``Explorer``."""
 
-AnyExplorer = Annotated[ExplorerConfig, EXPLORERS.section("tour")]
+AnyExplorer = Annotated[ExplorerConfig, EXPLORERS.section("information")]
 """The configuration's section `explorer`."""
 
 

@@ -78,6 +78,8 @@ class InformationConfig(ExplorerConfig):
     """Of driving, m/s"""
     turning: NotNegative = 4.0
     """Seconds that half a turn at the start costs"""
+    better: Annotated[float, Field(ge=1)] = 4.0
+    """How many times as much per second another frontier has to show, to be preferred to the one that is pursued"""
 
 
 class TourConfig(ExplorerConfig):
@@ -91,6 +93,6 @@ class TourConfig(ExplorerConfig):
     keep: NotNegative = 3.0
     """Metres by which another tour has to be better than one that begins with the present goal"""
     rest: NotNegative = 0.0
-    """Weight of the short tour over the other frontiers, against the way to the first one; 0 drove least so far"""
+    """Weight of the short tour over the other frontiers, against the way to the first one"""
     most: Annotated[int, Field(ge=3, le=60)] = 16
     """Frontiers of a tour at most, the best ones"""

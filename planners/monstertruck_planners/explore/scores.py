@@ -6,9 +6,6 @@ from monstertruck_planners.explore.api import ExplorationView, Option
 from monstertruck_planners.explore.config import AuthorConfig, InformationConfig, NearestConfig
 from monstertruck_planners.explore.exchange import Viewpoint
 
-BETTER = 1.3
-"""How many times as much per second another frontier has to show, to be preferred to the one that is pursued."""
-
 
 class Nearest:
     """The nearest frontier, until it is gone.
@@ -33,6 +30,9 @@ class Nearest:
 class Information:
     """The most new area per second of way.
 
+    A goal that is pursued is kept unless another one is much better: what is new there becomes less on the way, as it
+    comes into sight, and a robot that turns to whatever is best at each instant leaves a bit of everything behind.
+
     Args:
         config: settings.
     """
@@ -48,7 +48,7 @@ class Information:
         if not view.options:
             return None
         best = max(view.options, key=self._rate)
-        if still is not None and self._rate(best) < BETTER * self._rate(still):
+        if still is not None and self._rate(best) < self._config.better * self._rate(still):
             return pursued
         return best.target
 

@@ -4,9 +4,10 @@ import math
 
 import numpy as np
 import pytest
+from pydantic import TypeAdapter
 
 from monstertruck_planners.collision import Footprint
-from monstertruck_planners.explore.catalog import EXPLORERS, make_explorer
+from monstertruck_planners.explore.catalog import EXPLORERS, AnyExplorer, make_explorer
 from monstertruck_planners.explore.config import AuthorConfig, InformationConfig, NearestConfig, TourConfig
 from monstertruck_planners.explore.exchange import ExploreSetup, ExploreTask, Viewpoint
 from monstertruck_planners.explore.explore_step import ExploringStep
@@ -118,7 +119,17 @@ def test_information_prefers_the_wide_opening_to_the_narrow_one_a_little_nearer(
     assert chosen.frontier[0] > 8.0
 
 
-def test_the_default_goes_to_a_wide_opening_before_a_shadow_that_is_nearer():
+@pytest.mark.parametrize(("better", "kept"), [(20.0, True), (1.0, False)])
+def test_information_keeps_its_goal_unless_another_one_is_that_much_better(better, kept):
+    wide, narrow = (8.95, 3.0, 8.95, 7.0), (1.0, 4.75, 1.0, 5.25)
+    pose = (4.8, 5.0, math.pi / 2)
+    first = step_of(InformationConfig(), hall(narrow)).step(ExploreTask(pose, choose=True)).target
+    assert first is not None
+    step = step_of(InformationConfig(better=better), hall(wide, narrow))
+    assert step.step(ExploreTask(pose, choose=True, current=first)).kept is kept
+
+
+def test_a_tour_goes_to_a_wide_opening_before_a_shadow_that_is_nearer():
     wide, shadow = (8.95, 3.0, 8.95, 7.0), (1.0, 4.8, 1.0, 5.2)
     pose = (4.8, 5.0, 1.57)
     chosen = step_of(TourConfig(), hall(wide, shadow)).step(ExploreTask(pose, choose=True)).target
@@ -203,7 +214,8 @@ def test_a_robot_on_unknown_ground_begins_where_it_stands():
     assert answer.target is not None
 
 
-def test_kinds_are_a_catalog_whose_default_is_tour():
-    assert list(EXPLORERS) == ["tour", "information", "nearest", "author"]
+def test_kinds_are_a_catalog_whose_default_is_information():
+    assert list(EXPLORERS) == ["information", "tour", "nearest", "author"]
+    assert TypeAdapter(AnyExplorer).validate_python({}).kind == "information"
     assert all(hasattr(make_explorer(config), "choose") for config in KINDS)
     assert Viewpoint((0.0, 0.0, 0.0), (1.0, 0.0)).way == 0.0
