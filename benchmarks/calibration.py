@@ -1,7 +1,7 @@
 """Wizards against hidden truth: 20 trucks, all values of each off, calibrated in the order of docs/calibration.md.
 
     python benchmarks/calibration.py [--seeds 20] [--jobs 1] [--light 200]
-    python benchmarks/calibration.py --part swapped [--count 20]
+    python benchmarks/calibration.py --part swapped|interruptions [--count 20]
 
 Every session runs the whole daemon on a virtual clock: real drivers, emulated devices, the safety gate; the operator
 has a tape, a string and a meter with errors of their own. Judged is whether the true value lies in the stated interval,
@@ -10,6 +10,8 @@ Before that the fits of every wizard are judged alone on drawn measurements, ``-
 each: how often the truth lies inside, how wide the intervals are. ``--seeds 0`` leaves it at these.
 
 ``--part swapped``: a swapped cable or a wrong sign, drawn for every wizard, that it has to name in every case.
+``--part interruptions``: Ctrl-C, a cable, the emergency stop, a low battery, a lost lease, and kill -9 of wizard and
+daemon at random instants: the old file is intact, the truck neutral, and the wizard runs again (half an hour).
 """
 
 import argparse
@@ -27,6 +29,7 @@ from time import process_time
 from typing import Any
 
 import numpy as np
+from calibration_parts.interruptions import interruptions
 
 from monstertruck_runtime.errors import TruckError
 from monstertruckd.config.calibration import CalibrationStore, with_values
@@ -140,7 +143,10 @@ def swapped(count: int) -> tuple[dict[str, Any], dict[str, Any], bool]:
     return {"count": count, "named": found}, {"named": count}, all(named == count for named in found.values())
 
 
-PARTS: dict[str, Callable[[int], tuple[dict[str, Any], dict[str, Any], bool]]] = {"swapped": swapped}
+PARTS: dict[str, Callable[[int], tuple[dict[str, Any], dict[str, Any], bool]]] = {
+    "swapped": swapped,
+    "interruptions": interruptions,
+}
 """Besides the trucks."""
 
 

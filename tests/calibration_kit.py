@@ -13,10 +13,12 @@ from monstertruck_drivers.emulation import Horn
 from monstertruck_drivers.srf08.emulator import SOUND
 from monstertruck_kinematics.polynomials import F_CORRECTED, G_PRINTED, mirrored
 from monstertruck_runtime.clock import SECOND, Clock, VirtualClock, run_virtual
+from monstertruck_runtime.errors import NoAnswerError
 from monstertruck_runtime.mailbox import Delivery, Mailbox
 from monstertruck_schemas import topics
 from monstertruck_schemas.base import Message
-from monstertruck_schemas.req import DriveRequest
+from monstertruck_schemas.req import DriveRequest, Order
+from monstertruck_schemas.state import GateState
 from monstertruck_schemas.topics import Topic, Writer
 from monstertruck_sim.world.config import ServoModelConfig, SteadyTilt
 from monstertruck_sim.world.noise import IMU_FIXED, generator
@@ -73,6 +75,21 @@ class LocalTruck(LocalOperator):
         """Inject a drive request as the bridge to Zenoh does."""
         request = {**await self.header(lease), "speed": speed, "front": front, "rear": rear}
         self._daemon.bus.inject(topics.REQ_DRIVE, DriveRequest(**request))
+
+
+class SilentTruck(LocalTruck):
+    """Falls silent when asked to."""
+
+    silent = False
+
+    async def drive(self, speed: float, front: float, rear: float = 0.0, lease: float = 0.3) -> None:
+        if not self.silent:
+            await super().drive(speed, front, rear, lease)
+
+    async def order(self, order: Order, *, hold: bool = False) -> GateState:
+        if self.silent:
+            raise NoAnswerError("silent")
+        return await super().order(order)
 
 
 @dataclass(frozen=True, slots=True)

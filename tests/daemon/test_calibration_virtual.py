@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from monstertruck_runtime.clock import VirtualClock, run_virtual
-from monstertruck_runtime.errors import ConfigError, InputError, NoAnswerError, RequestRefusedError, TruckError
+from monstertruck_runtime.errors import ConfigError, InputError, RequestRefusedError, TruckError
 from monstertruck_runtime.mailbox import fifo, latest
 from monstertruck_schemas import topics
 from monstertruck_schemas.reasons import Reason
@@ -28,7 +28,7 @@ from monstertruckd.tools.calibrate.wizard import calibrate
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
 from monstertruckd.tools.simulation.operator import LocalOperator
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
-from tests.calibration_kit import LocalTruck, Session, SimulatedOperator, hidden, run_session, verdicts
+from tests.calibration_kit import LocalTruck, Session, SilentTruck, SimulatedOperator, hidden, run_session, verdicts
 
 pytestmark = [pytest.mark.virtual, pytest.mark.timeout(600)]
 
@@ -136,28 +136,13 @@ def test_everything_hidden_at_once_begins_with_what_needs_nothing_else(tmp_path:
 # Half-way
 
 
-class Falling(LocalTruck):
-    """Falls silent when asked to."""
-
-    silent = False
-
-    async def drive(self, speed: float, front: float, rear: float = 0.0, lease: float = 0.3) -> None:
-        if not self.silent:
-            await super().drive(speed, front, rear, lease)
-
-    async def order(self, order: Order, *, hold: bool = False) -> GateState:
-        if self.silent:
-            raise NoAnswerError("silent")
-        return await super().order(order)
-
-
 class Bench:
     """One truck with an old calibration, and a wizard that is about to be disturbed."""
 
     def __init__(self, rig: VirtualRig, clock: VirtualClock) -> None:
         self.rig = rig
         self.clock = clock
-        self.truck = Falling(rig.daemon, clock)
+        self.truck = SilentTruck(rig.daemon, clock)
         self.store = CalibrationStore(rig.config.calibration_folder, rig.config.robot)
         self.files = {path: path.read_bytes() for path in self.store.files()}
         self.gate = rig.bus.subscribe(topics.GATE, latest())
