@@ -32,6 +32,7 @@ from monstertruckd.tools.cli import (
     stand,
     station,
     study,
+    tune,
     usb,
 )
 from monstertruckd.tools.cli.output import HELP_SETTINGS, HELP_STYLE, CommandGroup
@@ -100,6 +101,7 @@ app.add_typer(calibrate.app, name="calibrate")
 app.add_typer(logs.app, name="log")
 app.add_typer(kinematics.app, name="kinematics")
 app.add_typer(study.app, name="study")
+app.add_typer(tune.app, name="tune")
 app.add_typer(stand.app, name="stand")
 app.add_typer(maps.app, name="map")
 app.add_typer(points.app, name="points")

@@ -1,0 +1,60 @@
+"""``monstertruckd tune``: gains found by runs of the robot."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from monstertruck_runtime.clock import Clock, run_wall
+from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
+from monstertruck_runtime.errors import InputError, NotFoundError
+from monstertruckd.tools.cli.options import EndpointOption, RobotOption
+from monstertruckd.tools.cli.output import command_group, print_table, remark
+
+if TYPE_CHECKING:
+    from monstertruckd.tools.tune.recipe import WallGains
+    from monstertruckd.tools.tune.runs import TuningRun
+
+app = command_group("WallGains found by runs of the robot.")
+
+
+@app.command("wall")
+def wall_command(
+    name: Annotated[str, typer.Argument(help="A behaviour of kind wall_pd.")] = "wall_left",
+    first: Annotated[float, typer.Option(min=0.1, max=100, help="K_p of the first run.")] = 6.0,
+    seconds: Annotated[float, typer.Option(min=4, max=60, help="Of following that make a run.")] = 8.0,
+    plot: Annotated[Path | None, typer.Option("--plot", help="PNG of all runs.", show_default=False)] = None,
+    robot: RobotOption = "sonar",
+    endpoint: EndpointOption = DEFAULT_ENDPOINT,
+) -> None:
+    """Arm the robot, which stands beside a wall, and raise K_p and K_d by the coursework's recipe, run by run."""
+    from monstertruck_runtime.client import TruckClient
+    from monstertruckd.tools.tune.runs import tune
+
+    runs: list[TuningRun] = []
+
+    def report(run: "TuningRun") -> None:
+        runs.append(run)
+        remark(run.text)
+
+    async def main(clock: Clock) -> "WallGains | None":
+        async with TruckClient(robot, endpoint, clock=clock) as client:
+            config = ((await client.call("config")).get("behaviours") or {}).get(name)
+            if config is None:
+                raise NotFoundError(f"no behaviour {name!r}: see `monstertruckd behave list`")
+            if config["kind"] != "wall_pd":
+                raise InputError(f"{name} is of kind {config['kind']}: expected wall_pd, which has these gains")
+            await client.arm()
+            return await tune(client, name, float(config["distance"]), first, seconds, lambda: clock.sleep(1.5), report)
+
+    try:
+        best = run_wall(main)
+    finally:
+        if plot is not None and runs:
+            from monstertruckd.tools.tune.plots import draw
+
+            draw(runs, plot)
+            remark(f"wrote {plot}")
+    if best is None:
+        raise NotFoundError("no gains were calm: the sonars' noise or a lag swings it; try another --first")
+    print_table(("k_p", "k_d"), [(f"{best.k_p:.3g}", f"{best.k_d:.3g}")], right=("k_p", "k_d"))

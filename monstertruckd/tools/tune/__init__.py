@@ -1,0 +1,1 @@
+"""Tuning of gains by runs of the robot."""

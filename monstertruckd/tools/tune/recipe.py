@@ -1,0 +1,92 @@
+"""The coursework's recipe for the gains of a PD control of the distance from a wall, as a pure procedure.
+
+K_d = 0: raise K_p until it overshoots. Raise K_d until it is calm. Raise K_p again, and repeat until the steady error
+is small.
+"""
+
+from collections.abc import Generator, Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+
+OVERSHOOTS: Final = 0.6
+"""Share of the first error by which the distance goes beyond the one wanted, from which on it overshoots."""
+CALM: Final = 0.5
+"""Share up to which it is calm."""
+SMALL: Final = 0.006
+"""Steady error that is small, m: what the coursework had."""
+RAISE_P: Final = 1.5, 1.2
+"""Factors of K_p, at first and again later."""
+FIRST_D, RAISE_D = 0.5, 1.8
+"""First K_d, of K_p, and the factor by which it grows."""
+GREATEST: Final = 60.0
+"""K_p that is tried."""
+MOST: Final = 16
+"""Runs."""
+LEAST_STEP: Final = 0.03
+"""First error that counts as one, m."""
+SMOOTHED: Final = 4
+"""Samples over which errors are averaged."""
+
+
+class WallGains(NamedTuple):
+    """Of the control."""
+
+    k_p: float
+    """Rad/s/m."""
+    k_d: float
+    """Rad/s/m, of the plain difference between two samples."""
+
+
+class RunVerdict(NamedTuple):
+    """What one run shows."""
+
+    overshoot: float
+    """Share of the first error."""
+    steady: float
+    """RMS of the errors in the last third, m."""
+
+
+def judged(errors: Sequence[float]) -> RunVerdict:
+    """Judge a run from the distance errors of its samples, m; the first is the step.
+
+    Raises:
+        ValueError: fewer than ten samples.
+    """
+    if len(errors) < 3 * SMOOTHED + 1:
+        raise ValueError(f"{len(errors)} samples: expected at least {3 * SMOOTHED + 1}")
+    all_of = np.asarray(errors)
+    smooth = np.convolve(all_of, np.ones(SMOOTHED) / SMOOTHED, "valid")
+    step = max(abs(float(smooth[0])), LEAST_STEP)
+    beyond = -np.sign(smooth[0]) * smooth
+    steady = all_of[-len(all_of) // 3 :]
+    return RunVerdict(max(float(beyond.max()), 0.0) / step, float(np.sqrt(np.mean(steady**2))))
+
+
+def recipe(k_p: float) -> Generator[WallGains, RunVerdict, WallGains | None]:
+    """WallGains to try, one after the other; is sent each run's verdict.
+
+    Returns:
+        Of the calm gains those with the least steady error; None if none was calm.
+    """
+    gains, runs = WallGains(k_p, 0.0), 1
+    verdict = yield gains
+    while verdict.overshoot < OVERSHOOTS and runs < MOST and gains.k_p * RAISE_P[0] <= GREATEST:
+        gains, runs = WallGains(gains.k_p * RAISE_P[0], 0.0), runs + 1
+        verdict = yield gains
+    best: tuple[float, WallGains] | None = None
+    while runs < MOST:
+        if verdict.overshoot <= CALM:
+            if best is None or verdict.steady < best[0]:
+                best = verdict.steady, gains
+            if verdict.steady <= SMALL:
+                break
+            gains = WallGains(gains.k_p * RAISE_P[1], gains.k_d)
+        else:
+            gains = WallGains(gains.k_p, max(FIRST_D * gains.k_p, RAISE_D * gains.k_d))
+        runs += 1
+        verdict = yield gains
+    else:
+        if verdict.overshoot <= CALM and (best is None or verdict.steady < best[0]):
+            best = verdict.steady, gains
+    return None if best is None else best[1]

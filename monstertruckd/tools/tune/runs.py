@@ -1,0 +1,154 @@
+"""Runs of a wall-following behaviour with gains of the recipe, each from a step of the distance wanted."""
+
+import math
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, suppress
+from functools import partial
+from typing import Any, Final, NamedTuple, Protocol
+
+from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError, TruckError
+from monstertruck_runtime.mailbox import Delivery, Mailbox, fifo
+from monstertruck_schemas.plan import BehaviourState
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import BehaviourOrder
+from monstertruck_schemas.topics import BEHAVIOUR, Topic
+from monstertruckd.tools.tune.recipe import RunVerdict, WallGains, judged, recipe
+
+STEP: Final = 0.05
+"""Between the distances wanted of one run and the next, m."""
+FOLLOWING: Final = "follow"
+LIMIT: Final = 120.0
+"""Seconds in which a run must have been complete."""
+LOST: Final = 0.12
+"""Distance error at which a run is broken off before the robot loses the wall, m; it counts as overshooting."""
+CALM_WITHIN: Final = 0.02
+"""Distance error of a robot that is ready for a run, m, ..."""
+CALM_FOR: Final = 2.0
+"""... for so many seconds."""
+
+
+class TunedRobot(Protocol):
+    """Client of a robot that has behaviours."""
+
+    def subscribe(
+        self, topic: Topic[BehaviourState], delivery: Delivery
+    ) -> AbstractContextManager[Mailbox[BehaviourState]]:
+        """Subscribe to a topic."""
+        ...
+
+    async def behave(
+        self, order: BehaviourOrder, behaviour: str = "", settings: Mapping[str, Any] | None = None
+    ) -> dict[str, Any]:
+        """Start or stop a behaviour."""
+        ...
+
+
+Samples = Sequence[tuple[float, float]]
+"""Times since following began, s, and measured distances, m."""
+
+
+class TuningRun(NamedTuple):
+    """One run."""
+
+    gains: WallGains
+    samples: tuple[tuple[float, float], ...]
+    """Times since the step, s, and distance errors, m."""
+    verdict: RunVerdict
+
+    @property
+    def text(self) -> str:
+        """In one line."""
+        gains, (overshoot, steady) = self.gains, self.verdict
+        stayed = math.isfinite(overshoot)
+        found = f"{100 * overshoot:.0f} % beyond, steady {1000 * steady:.1f} mm" if stayed else "left the wall"
+        return f"K_p {gains.k_p:.3g}, K_d {gains.k_d:.3g}: {found}"
+
+
+async def tune(
+    client: TunedRobot,
+    name: str,
+    distance: float,
+    first: float,
+    seconds: float,
+    pause: Callable[[], Awaitable[None]],
+    report: Callable[[TuningRun], None],
+) -> WallGains | None:
+    """Run the recipe; the robot is armed and stands beside a wall.
+
+    Before each run the behaviour as configured, with its own gains, brings the robot along the wall.
+
+    Args:
+        client: of the robot.
+        name: of a behaviour of kind ``wall_pd``.
+        distance: the nearer one, m; every second run wants ``STEP`` more.
+        first: K_p of the first run.
+        seconds: of following that make a run.
+        pause: waits until the robot stands.
+        report: called with every run.
+
+    Raises:
+        RequestRefusedError: a start is refused, or the behaviour ended before the run was complete.
+        NoAnswerError: the robot does not answer.
+    """
+    trials = recipe(first)
+    gains, number = next(trials), 0
+    while True:
+        before, wanted = (distance + STEP * (n % 2) for n in (number, number + 1))
+        await _run(client, name, {"distance": before}, partial(_calm, before))
+        await pause()
+        samples = await _run(client, name, {**gains._asdict(), "distance": wanted}, partial(_over, wanted, seconds))
+        errors = tuple((at, measured - wanted) for at, measured in samples)
+        lost = abs(errors[-1][1]) > LOST
+        found = TuningRun(
+            gains, errors, RunVerdict(math.inf, math.inf) if lost else judged([error for _, error in errors])
+        )
+        report(found)
+        await pause()
+        number += 1
+        try:
+            gains = trials.send(found.verdict)
+        except StopIteration as end:
+            best: WallGains | None = end.value
+            return best
+
+
+def _calm(wanted: float, samples: Samples) -> bool:
+    """Whether the robot keeps its distance."""
+    newest = [measured for at, measured in samples if at >= samples[-1][0] - CALM_FOR]
+    return samples[-1][0] >= CALM_FOR and max(abs(measured - wanted) for measured in newest) < CALM_WITHIN
+
+
+def _over(wanted: float, seconds: float, samples: Samples) -> bool:
+    """Whether a run is complete, or has to be broken off."""
+    return samples[-1][0] >= seconds or abs(samples[-1][1] - wanted) > LOST
+
+
+async def _run(client: TunedRobot, name: str, settings: Mapping[str, Any], over: Callable[[Samples], bool]) -> Samples:
+    """One start of the behaviour: the first stretch of following that is over; a corner begins another one."""
+    with client.subscribe(BEHAVIOUR, fifo(1024)) as states:
+        number = int((await client.behave(BehaviourOrder.START, name, settings))["number"])
+        try:
+            return await _followed(states, number, over)
+        finally:
+            with suppress(TruckError):
+                await client.behave(BehaviourOrder.STOP, name)
+
+
+async def _followed(states: Mailbox[BehaviourState], number: int, over: Callable[[Samples], bool]) -> Samples:
+    begun, samples = 0.0, list[tuple[float, float]]()
+    async for state in states:
+        if state.number != number:
+            continue
+        if not state.running:
+            raise RequestRefusedError(state.outcome, f"the run ended early: {state.text or state.outcome.text}")
+        if state.elapsed > LIMIT:
+            text = f"{state.phase} for {LIMIT:g} s: place the robot beside a straight wall"
+            raise RequestRefusedError(Reason.TIMEOUT, text)
+        if state.phase != FOLLOWING or "distance" not in state.values:
+            samples = []
+            continue
+        begun = begun if samples else state.elapsed
+        samples.append((state.elapsed - begun, state.values["distance"]))
+        if over(samples):
+            return samples
+    raise NoAnswerError("the link to the robot was closed")

@@ -1,0 +1,116 @@
+"""The recipe for the gains of ``wall_pd``, tried on a robot beside a wall."""
+
+import asyncio
+import math
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+
+from monstertruck_planners.behave.wall.config import WallPdConfig
+from monstertruck_planners.behave.wall.published import WallPd
+from monstertruck_runtime.errors import RequestRefusedError
+from monstertruck_runtime.mailbox import Mailbox
+from monstertruck_schemas.plan import BehaviourState
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import BehaviourOrder
+from monstertruckd.tools.tune.plots import draw
+from monstertruckd.tools.tune.recipe import CALM, MOST, OVERSHOOTS, RunVerdict, judged, recipe
+from monstertruckd.tools.tune.runs import tune
+from tests.unit.planners.behave.wall_kit import Robot, drive
+
+WALL = [(-50.0, 0.35, 200.0, 0.35)]
+
+
+class Client:
+    """A robot with ideal wheels whose behaviour is run at once when it is started."""
+
+    wild = None
+
+    def __init__(self, outcome=Reason.DRIVING):
+        self.outcome, self.number, self.running, self.wanted = outcome, 0, "", 0.35
+
+    @contextmanager
+    def subscribe(self, topic, delivery):
+        self.box = Mailbox(delivery)
+        yield self.box
+
+    async def behave(self, order, behaviour="", settings=None):
+        if order is BehaviourOrder.STOP:
+            self.running = ""
+            return {}
+        assert not self.running
+        self.number, self.running = self.number + 1, behaviour
+        robot = Robot(WALL, (0.0, 0.30 - self.wanted, 0.0), ahead=0.05)
+        self.wanted = settings["distance"]
+        head = {"stamp": 0, "received": 0, "seq": 0, "number": self.number, "behaviour": behaviour, "kind": "wall_pd"}
+        config = WallPdConfig(offset=0.05, **settings)
+        for i, step in enumerate(drive(WallPd(config), robot, 9.0).steps):
+            head |= {"running": self.outcome is Reason.DRIVING, "outcome": self.outcome, "elapsed": i * 0.1}
+            values = dict(step.values)
+            if (config.k_p, config.k_d) == self.wild:
+                values["distance"] += 0.01 * i
+            self.box.put(BehaviourState(**head, source="ann", phase=step.phase, travelled=0.0, values=values))
+        return {"number": self.number}
+
+
+async def rest():
+    await asyncio.sleep(0)
+
+
+def tuned(client, runs):
+    return asyncio.run(tune(client, "wall_left", 0.3, 3.0, 8.0, rest, runs.append))
+
+
+def test_it_raises_p_until_it_overshoots_and_d_until_it_is_calm(tmp_path):
+    runs = []
+    best = tuned(Client(), runs)
+    overshot = next(i for i, run in enumerate(runs) if run.verdict.overshoot >= OVERSHOOTS)
+    assert all(run.gains.k_d == 0.0 for run in runs[: overshot + 1])
+    assert best is not None
+    assert best.k_d > 0.0
+    chosen = next(run for run in runs if run.gains == best)
+    assert chosen.verdict.overshoot <= CALM
+    assert chosen.verdict.steady == min(run.verdict.steady for run in runs if run.verdict.overshoot <= CALM)
+    draw(runs, tmp_path / "runs.png")
+    assert (tmp_path / "runs.png").stat().st_size > 5000
+
+
+def test_a_run_in_which_the_robot_leaves_the_wall_is_broken_off_and_counts_as_overshooting():
+    client, runs = Client(), []
+    client.wild = 3.0, 0.0
+    tuned(client, runs)
+    assert runs[0].verdict.overshoot == math.inf
+    assert len(runs[0].samples) < 25
+    assert runs[1].gains.k_d > 0.0
+
+
+def test_a_run_that_ends_early_ends_the_tuning_with_its_reason():
+    client = Client(Reason.STUCK)
+    with pytest.raises(RequestRefusedError) as caught:
+        tuned(client, [])
+    assert caught.value.refusal is Reason.STUCK
+    assert not client.running
+
+
+def test_it_gives_up_after_some_runs_without_calm_gains():
+    trials, tried = recipe(3.0), []
+    tried.append(next(trials))
+    best = trials
+    try:
+        while True:
+            tried.append(trials.send(RunVerdict(1.0, 0.02)))
+    except StopIteration as end:
+        best = end.value
+    assert len(tried) == MOST
+    assert tried[-1].k_d > 0.0
+    assert best is None
+
+
+def test_overshoot_is_a_share_of_the_step_and_steady_the_end():
+    times = np.arange(0.0, 8.0, 0.1)
+    verdict = judged(list(0.05 * np.exp(-0.5 * times) * np.cos(2 * times)))
+    assert verdict.overshoot == pytest.approx(0.5, abs=0.06)
+    assert verdict.steady < 0.005
+    with pytest.raises(ValueError, match="9 samples"):
+        judged([0.0] * 9)
