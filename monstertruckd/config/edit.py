@@ -17,8 +17,9 @@ MOST_BYTES: Final = 1_000_000
 """Of one file."""
 DEEPEST: Final = 50
 """Sections and lists within each other."""
-MOST_NODES: Final = 10_000
-"""Keys and values of one file as they are written: read in half a second; a full configuration has a thousand."""
+MOST_NODES: Final = 5_000
+"""Keys and values of one file as they are written: read in a quarter of a second; a full configuration has some
+hundreds."""
 
 
 class _BoundedComposer(Composer):
