@@ -18,6 +18,7 @@ from monstertruck_schemas import topics
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.state import GateMode
 from monstertruckd.config.calibration import CalibrationStore, Estimate, Result
+from tests.daemon import forked
 from tests.daemon.wall_kit import ROOT, Robot, end, robot
 
 pytestmark = [pytest.mark.wall, pytest.mark.timeout(180)]
@@ -54,9 +55,8 @@ def files(folder: Path) -> dict[Path, bytes]:
 
 
 async def command(truck: Robot, *words: str) -> subprocess.CompletedProcess[str]:
-    arguments = [sys.executable, "-m", "monstertruckd", "calibrate", *words, "--endpoint", truck.endpoint]
     return await asyncio.to_thread(
-        subprocess.run, arguments, cwd=ROOT, capture_output=True, text=True, timeout=90, check=False, input=""
+        forked.run, "calibrate", *words, "--endpoint", truck.endpoint, folder=ROOT, timeout=90
     )
 
 

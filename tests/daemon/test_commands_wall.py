@@ -4,7 +4,6 @@ import asyncio
 import csv
 import itertools
 import json
-import sys
 from pathlib import Path
 
 import pytest
@@ -13,6 +12,7 @@ from monstertruck_runtime.mailbox import fifo
 from monstertruck_runtime.yaml_files import yaml_text
 from monstertruck_schemas import topics
 from monstertruckd.tools.demo.runs import free_endpoint
+from tests.daemon import forked
 from tests.daemon.wall_kit import DEMO, ROOT, Robot, command, end
 
 pytestmark = [pytest.mark.wall, pytest.mark.timeout(120)]
@@ -30,19 +30,15 @@ pytestmark = [pytest.mark.wall, pytest.mark.timeout(120)]
 )
 async def test_every_emulator_answers_its_probe(device: str, expected: str, tmp_path: Path):
     link = tmp_path / device
-    pipe = asyncio.subprocess.PIPE
-    arguments = ("-m", "monstertruckd", "emulate", device, "--link", str(link))
-    emulator = await asyncio.create_subprocess_exec(
-        sys.executable, *arguments, cwd=ROOT, stdin=pipe, stdout=pipe, stderr=pipe
-    )
+    said = tmp_path / "said.txt"
+    emulator = await forked.started("emulate", device, "--link", str(link), folder=ROOT, errors=said)
     try:
-        assert emulator.stderr is not None
-        assert device in (await emulator.stderr.readline()).decode()
+        async with asyncio.timeout(40):
+            while device not in said.read_text():
+                await asyncio.sleep(0.02)
         probed = await command("probe", device, "--port", str(link), "--json")
         assert probed.returncode == 0, probed.stderr
         assert expected in json.dumps(json.loads(probed.stdout))
-        assert emulator.stdin is not None
-        assert emulator.stdout is not None
         emulator.stdin.write(b"no-such-fault\nunplug\n")
         await emulator.stdin.drain()
         assert (await emulator.stdout.readline()).decode().startswith("error: ")

@@ -21,6 +21,7 @@ from monstertruck_runtime.yaml_files import read_yaml, yaml_text
 from monstertruck_schemas import topics
 from monstertruck_schemas.state import GateMode, GateState
 from monstertruckd.tools.demo.runs import free_endpoint, write_overlay
+from tests.daemon import forked
 
 ROOT = Path(__file__).resolve().parents[2]
 DEMO = ROOT / "configs" / "demo.yaml"
@@ -41,13 +42,12 @@ class Robot:
     endpoint: str
     config: Path
     clock: WallClock = field(default_factory=WallClock)
-    simulator: asyncio.subprocess.Process | None = None
+    simulator: "asyncio.subprocess.Process | forked.Forked | None" = None
     daemon: asyncio.subprocess.Process | None = None
 
     async def start_simulator(self) -> None:
-        self.simulator = await self.spawn(
-            "simulate", "--config", str(self.config), "--truth", str(self.folder / "t.npz")
-        )
+        words = ("simulate", "--config", str(self.config), "--truth", str(self.folder / "t.npz"))
+        self.simulator = await forked.started(*words, folder=ROOT, errors=self.folder / "simulate.txt")
         async with asyncio.timeout(40):
             while "ready" not in await self.said():
                 pass
@@ -136,7 +136,7 @@ async def kept_armed(client: TruckClient) -> AsyncIterator[None]:
             await asyncio.gather(arming, return_exceptions=True)
 
 
-async def end(process: asyncio.subprocess.Process | None, number: int = signal.SIGTERM) -> int | None:
+async def end(process: "asyncio.subprocess.Process | forked.Forked | None", number: int = signal.SIGTERM) -> int | None:
     """Signal a process and wait for it; its exit code."""
     if process is None:
         return None
@@ -170,13 +170,4 @@ async def robot(folder: Path, overlay: dict[str, Any] | None = None, base: Path 
 
 async def command(*arguments: str, timeout: float = 60) -> subprocess.CompletedProcess[str]:
     """Run one command to its end."""
-    return await asyncio.to_thread(
-        subprocess.run,
-        [sys.executable, "-m", "monstertruckd", *arguments],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=timeout,
-        check=False,
-        stdin=subprocess.DEVNULL,
-    )
+    return await asyncio.to_thread(forked.run, *arguments, folder=ROOT, timeout=timeout)
