@@ -12,8 +12,7 @@ from exploration_parts.arena import BARE, Arena
 from navigation_parts import Options, Part
 from navigation_parts.harness import WORLDS
 
-from monstertruck_planners.route.api import RouteMap, Vehicle
-from monstertruck_planners.route.catalog import make_planner
+from monstertruck_planners.route.api import RouteMap, Vehicle, make_planner
 from monstertruck_planners.route.config import GridAstarConfig, HybridConfig, LatticeConfig
 
 PLANNERS = {"hybrid": HybridConfig(), "lattice": LatticeConfig(), "grid_astar": GridAstarConfig()}

@@ -17,6 +17,7 @@ from monstertruck_schemas.state import Grid
 
 if TYPE_CHECKING:
     from monstertruck_planners.collision_kernels import FieldData, FootprintData
+    from monstertruck_planners.distance_kernels import Box
 
 
 OCCUPIED = 50
@@ -304,11 +305,8 @@ class ScanPoints:
 TILE = 64
 """Edge of the squares by which changes of a grid are found, cells."""
 
-Box = tuple[int, int, int, int]
-"""First row, first column, and those after the last."""
 
-
-def boxes_of(mask: NDArray[np.bool_]) -> list[Box]:
+def boxes_of(mask: NDArray[np.bool_]) -> "list[Box]":
     """Boxes that hold all marked cells of a grid (rows, columns), one for each square of TILE cells with any."""
     boxes = []
     for row in np.flatnonzero(np.logical_or.reduceat(mask.any(axis=1), np.arange(0, len(mask), TILE))) * TILE:

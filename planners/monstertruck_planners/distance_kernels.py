@@ -12,7 +12,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from monstertruck_kinematics.elementary import Array
-from monstertruck_planners.collision import Box
+
+Box = tuple[int, int, int, int]
+"""First row, first column, and those after the last."""
 
 
 @njit(cache=True)

@@ -60,8 +60,8 @@ def plan(
 
     The truck is the author's; poses are of its base. The exit code follows the reason if there is no route.
     """
-    from monstertruck_planners.route.api import RouteMap, Vehicle, warm_up
-    from monstertruck_planners.route.catalog import ROUTE_PLANNERS, make_planner
+    from monstertruck_planners.route.api import RouteMap, Vehicle, make_planner, warm_up
+    from monstertruck_planners.route.catalog import ROUTE_PLANNERS
     from monstertruck_runtime.clock import processor_time
     from monstertruck_runtime.map_files import load_map
 

@@ -3,13 +3,15 @@
 import math
 from dataclasses import dataclass
 from dataclasses import field as attribute
-from typing import Final, Protocol
+from typing import Final, Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import label
 
 from monstertruck_kinematics.elementary import Array
+from monstertruck_planners.explore.catalog import EXPLORERS
+from monstertruck_planners.explore.config import ExplorerConfig
 from monstertruck_planners.explore.exchange import ExploreSetup, Point, Viewpoint
 from monstertruck_planners.explore.frontier import FrontierMap
 from monstertruck_planners.explore.kernels import far_from_obstacles, joined_cells, new_areas, shares_seen
@@ -390,3 +392,12 @@ def _divided(points: Array, longest: float) -> list[NDArray[np.intp]]:
             halves = part[along <= middle], part[along > middle]
             waiting.extend(half for half in halves if len(half))
     return parts
+
+
+def make_explorer(config: ExplorerConfig) -> Explorer:
+    """Explorer of a configuration.
+
+    Raises:
+        InputError: settings without a kind of explorer, or what it needs is not installed.
+    """
+    return cast("Explorer", EXPLORERS.implementation(config)(config))

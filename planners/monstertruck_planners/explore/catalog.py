@@ -1,12 +1,9 @@
 """Exploration by ``kind``: which frontier is looked at next."""
 
-from typing import TYPE_CHECKING, Annotated, Final, cast
+from typing import Annotated, Final
 
 from monstertruck_planners.explore.config import ExplorerConfig
 from monstertruck_runtime.plugins import Catalog, Plugin
-
-if TYPE_CHECKING:
-    from monstertruck_planners.explore.api import Explorer
 
 EXPLORERS: Final = Catalog(
     "monstertruck.explorers",
@@ -44,12 +41,3 @@ EXPLORERS: Final = Catalog(
 
 AnyExplorer = Annotated[ExplorerConfig, EXPLORERS.section("information")]
 """The configuration's section `explorer`."""
-
-
-def make_explorer(config: ExplorerConfig) -> "Explorer":
-    """Explorer of a configuration; loads numba.
-
-    Raises:
-        InputError: settings without a kind of explorer, or what it needs is not installed.
-    """
-    return cast("Explorer", EXPLORERS.implementation(config)(config))

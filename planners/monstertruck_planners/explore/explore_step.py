@@ -6,8 +6,7 @@ from typing import Final
 import numpy as np
 
 from monstertruck_planners.collision import Footprint
-from monstertruck_planners.explore.api import LEAST, ExplorationView, Explorer, Option, Remembered
-from monstertruck_planners.explore.catalog import make_explorer
+from monstertruck_planners.explore.api import LEAST, ExplorationView, Explorer, Option, Remembered, make_explorer
 from monstertruck_planners.explore.config import TourConfig
 from monstertruck_planners.explore.exchange import CameraView, ExploreAnswer, ExploreSetup, ExploreTask, Viewpoint
 from monstertruck_planners.explore.frontier import FrontierMap

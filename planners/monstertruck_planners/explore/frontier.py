@@ -10,7 +10,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from monstertruck_planners.collision import OCCUPIED, Box
+from monstertruck_planners.collision import OCCUPIED
+from monstertruck_planners.distance_kernels import Box
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.state import Grid
 

@@ -28,8 +28,7 @@ from monstertruck_planners.goals.plan_step import answer_of
 from monstertruck_planners.local.api import LocalPlan, LocalPlannerState, PosePath, nearest_pose, pose_distance
 from monstertruck_planners.local.catalog import make_local_planner
 from monstertruck_planners.local.config import RsbandConfig, TebConfig
-from monstertruck_planners.route.api import Vehicle, warm_up
-from monstertruck_planners.route.catalog import make_planner
+from monstertruck_planners.route.api import Vehicle, make_planner, warm_up
 from monstertruck_planners.route.config import HybridConfig
 from monstertruck_planners.route.motion import moved
 from monstertruck_runtime.errors import InputError

@@ -27,8 +27,7 @@ from monstertruck_planners.collision import (
 )
 from monstertruck_planners.goals.escape import escape
 from monstertruck_planners.goals.exchange import PlanAnswer, PlanTask, Pose, Setup, explained_within
-from monstertruck_planners.route.api import Clock, RouteMap, RoutePlanner, RouteResult, Vehicle, warm_up
-from monstertruck_planners.route.catalog import make_planner
+from monstertruck_planners.route.api import Clock, RouteMap, RoutePlanner, RouteResult, Vehicle, make_planner, warm_up
 from monstertruck_planners.route.config import GoalConfig, GridAstarConfig, HybridConfig, LatticeConfig
 from monstertruck_planners.route.motion import MotionPath, moved
 from monstertruck_planners.route.replan import ViaPoint, replan, with_headings

@@ -4,15 +4,16 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from dataclasses import field as attribute
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple, Protocol, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.truck import FourWheelSteering
-from monstertruck_planners.collision import OCCUPIED, Box, DiscFootprint, DistanceField, Footprint, boxes_of
-from monstertruck_planners.route.catalog import make_planner
+from monstertruck_planners.collision import OCCUPIED, DiscFootprint, DistanceField, Footprint, boxes_of
+from monstertruck_planners.distance_kernels import Box
+from monstertruck_planners.route.catalog import ROUTE_PLANNERS
 from monstertruck_planners.route.config import DriveCosts, GoalConfig, Unknown
 from monstertruck_planners.route.heuristic import COARSE_CELL, CellRule, fill_cell_costs
 from monstertruck_planners.route.motion import MotionPath, moved
@@ -371,3 +372,12 @@ def warm_up(planner: RoutePlanner) -> None:
         path.part(0.1, path.length).base_poses(0.1)
     cells[:60, 40] = cells[63:, 40] = 100
     planner.plan(RouteMap.from_cells(cells, 0.1, previous=route_map), *ends)
+
+
+def make_planner(vehicle: Vehicle, config: GoalConfig) -> RoutePlanner:
+    """Route planner of a configuration.
+
+    Raises:
+        InputError: settings without a kind of route planner, or what it needs is not installed.
+    """
+    return cast("RoutePlanner", ROUTE_PLANNERS.implementation(config)(vehicle, config))

@@ -1,12 +1,9 @@
 """The route planners by ``kind``."""
 
-from typing import TYPE_CHECKING, Annotated, Final, cast
+from typing import Annotated, Final
 
 from monstertruck_planners.route.config import GoalConfig
 from monstertruck_runtime.plugins import Catalog, Plugin
-
-if TYPE_CHECKING:
-    from monstertruck_planners.route.api import RoutePlanner, Vehicle
 
 ROUTE_PLANNERS: Final = Catalog(
     "monstertruck.route_planners",
@@ -37,12 +34,3 @@ ROUTE_PLANNERS: Final = Catalog(
 
 AnyRoutePlanner = Annotated[GoalConfig, ROUTE_PLANNERS.section()]
 """The configuration's section `planner.route`."""
-
-
-def make_planner(vehicle: "Vehicle", config: GoalConfig) -> "RoutePlanner":
-    """Route planner of a configuration; loads numba.
-
-    Raises:
-        InputError: settings without a kind of route planner, or what it needs is not installed.
-    """
-    return cast("RoutePlanner", ROUTE_PLANNERS.implementation(config)(vehicle, config))

@@ -17,8 +17,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from monstertruck_kinematics.elementary import Array
-from monstertruck_planners.collision import Box
 from monstertruck_planners.collision_kernels import FieldData
+from monstertruck_planners.distance_kernels import Box
 from monstertruck_planners.route.reeds_shepp import COST, MAX_SEGMENTS, connect
 from monstertruck_planners.route.search import CostLayer, clearance_cost, extra_cost
 

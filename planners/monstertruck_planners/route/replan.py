@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from monstertruck_kinematics.elementary import Array
-from monstertruck_planners.route.api import Clock, RouteMap, RoutePlanner, RouteResult
-from monstertruck_planners.route.catalog import make_planner
+from monstertruck_planners.route.api import Clock, RouteMap, RoutePlanner, RouteResult, make_planner
 from monstertruck_planners.route.config import HybridConfig
 from monstertruck_planners.route.hybrid import HybridPlanner
 from monstertruck_planners.route.motion import MotionPath, joined

@@ -7,7 +7,8 @@ import pytest
 from pydantic import TypeAdapter
 
 from monstertruck_planners.collision import Footprint
-from monstertruck_planners.explore.catalog import EXPLORERS, AnyExplorer, make_explorer
+from monstertruck_planners.explore.api import make_explorer
+from monstertruck_planners.explore.catalog import EXPLORERS, AnyExplorer
 from monstertruck_planners.explore.config import AuthorConfig, InformationConfig, NearestConfig, TourConfig
 from monstertruck_planners.explore.exchange import ExploreSetup, ExploreTask, Viewpoint
 from monstertruck_planners.explore.explore_step import ExploringStep

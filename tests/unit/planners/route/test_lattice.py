@@ -3,8 +3,8 @@ import math
 import numpy as np
 import pytest
 
-from monstertruck_planners.route.api import RouteMap, Vehicle, warm_up
-from monstertruck_planners.route.catalog import ROUTE_PLANNERS, make_planner
+from monstertruck_planners.route.api import RouteMap, Vehicle, make_planner, warm_up
+from monstertruck_planners.route.catalog import ROUTE_PLANNERS
 from monstertruck_planners.route.config import GridAstarConfig, LatticeConfig
 from monstertruck_planners.route.grid_astar import GridAstarPlanner
 from monstertruck_planners.route.lattice import ANGLES, LatticePlanner, make_primitives
