@@ -278,7 +278,7 @@ class Rover:
             self.stuck, self.stuck_at, self.blameless = 1, self.pose, (self.attempts, self.unreached)
         if self.stuck >= STUCK and self.back():
             return
-        self.attempts = self.attempts.failed(target.frontier, self.now, patient=True)
+        self.attempts = self.attempts.failed(target.frontier, self.now, ignore_first=True)
         self.unreached = self.unreached.failed(target.pose[:2], self.now)
 
     def arrived(self, target: Viewpoint) -> None:

@@ -12,8 +12,11 @@ SOURCES = [
     for path in sorted((ROOT / folder).rglob("*.py"))
 ]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
-PRIVATE = re.compile(r"(?<![a-z])(told|wish(es)?|hunt(s|ed)?|lookout|rungs?|ladder|mishaps?)(?![a-z])", re.IGNORECASE)
-"""reported, request, search, path check, recovery behaviour, fault"""
+PRIVATE = re.compile(
+    r"(?<![a-z])(told|wish(es)?|hunt(s|ed)?|lookout|rungs?|ladder|mishaps?|patients?|thinning|nobody waits)(?![a-z])",
+    re.IGNORECASE,
+)
+"""reported, request, search, path check, recovery behaviour, fault, host context, pruning, without waiting"""
 OLD_KEYS = ROOT / "monstertruckd" / "config" / "migrate.py"
 
 

@@ -54,7 +54,7 @@ class StepperSession:
         self._seq = 0
 
     def tell(self, verb: str, *words: int) -> int:
-        """Send a request whose answer nobody waits for; returns its number.
+        """Send a request without waiting for its answer; returns its number.
 
         Raises:
             DeviceLostError: unplugged.

@@ -33,11 +33,11 @@ class Attempts:
     most: int
     places: tuple[Attempt, ...] = ()
 
-    def failed(self, place: Point, now: float, *, patient: bool = False) -> "Attempts":
-        """With one more attempt in vain at a place; of a ``patient`` one, the first makes no difference yet."""
+    def failed(self, place: Point, now: float, *, ignore_first: bool = False) -> "Attempts":
+        """With one more attempt in vain at a place; ``ignore_first``: the first has no effect yet."""
         before = next((attempt for attempt in self.places if math.dist(attempt.place, place) < SAME), None)
         count = 1 if before is None else before.count + 1
-        until = math.inf if count >= self.most else now if patient and count == 1 else now + self.period
+        until = math.inf if count >= self.most else now if ignore_first and count == 1 else now + self.period
         others = tuple(attempt for attempt in self.places if attempt is not before)
         return replace(self, places=(*others, Attempt(place, count, until)))
 

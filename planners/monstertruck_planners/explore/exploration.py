@@ -288,7 +288,7 @@ def _driving(run: Exploration, seen: Observed, config: ExplorerConfig) -> Step:
         target, run = run.target, _counted(run, seen, reached=reached)
         if run.stuck >= STUCK and (back := _back(run)) is not None:
             return back
-        attempts, unreached = run.attempts.failed(target.frontier, run.now, patient=not reached), run.unreached
+        attempts, unreached = run.attempts.failed(target.frontier, run.now, ignore_first=not reached), run.unreached
         if not reached:
             unreached = unreached.failed(target.pose[:2], run.now)
         run = replace(run, target=None, attempts=attempts, unreached=unreached, failures=run.failures + (not reached))

@@ -240,7 +240,7 @@ def test_stopped_it_cancels_the_goal_and_saves():
 
 
 def test_places_are_left_alone_until_their_time_is_over():
-    assert Attempts(60.0, 3).failed((1.0, 1.0), 10.0, patient=True).banned(10.0) == ()
+    assert Attempts(60.0, 3).failed((1.0, 1.0), 10.0, ignore_first=True).banned(10.0) == ()
     attempts = Attempts(60.0, 2).failed((1.0, 1.0), 10.0)
     assert attempts.banned(69.0) == ((1.0, 1.0),)
     assert attempts.banned(70.0) == ()
