@@ -8,8 +8,10 @@ from zipfile import ZipFile
 
 import pytest
 
+from monstertruckd.config.load import load_config
 from monstertruckd.tools import shipped as places
 from monstertruckd.tools.cli.demo import DEMO_CONFIG
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -59,3 +61,10 @@ def test_shipped_configurations_write_below_the_folder_they_are_used_in_and_say_
     orders = [row for row in tried if "then monstertruckd" in row[1]]
     assert len(orders) >= 5
     assert [row for row in orders if "--run" not in row[1]] == [], "without it no daemon runs"
+
+
+@pytest.mark.parametrize("name", ["goals", "explore", "points", "as-published", "slam", "fusion", "kiss"])
+def test_where_the_robot_really_is_comes_with_every_configuration_that_drives_or_maps_by_itself(name: str):
+    config = load_config(ROOT / "configs" / f"{name}.yaml", SimulatedTruckConfig)[0]
+    assert config.stand == "simulator"
+    assert (config.sim.stand.position_noise, config.sim.stand.heading_noise) == (0.0, 0.0)
