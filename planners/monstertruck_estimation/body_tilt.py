@@ -17,7 +17,7 @@ GRAVITY: Final = 9.81
 KEPT: Final = 64
 """Readings of the odometry."""
 GREATEST: Final = 2.0
-"""Acceleration of the body that is taken out at most, m/s^2: wheels that spin know no better."""
+"""Acceleration of the body that is believed at most, m/s^2: beyond it the wheels spin, and nothing is taken out."""
 FELT: Final = 0.06
 """Seconds over which the odometry's acceleration is averaged, as the compass's accelerometer feels it."""
 
@@ -46,7 +46,7 @@ class BodyAcceleration:
             self._speeds.append((odometry.stamp, odometry.twist.vx, odometry.twist.wz))
 
     def at(self, stamp: int) -> tuple[float, float]:
-        """Forward and left, m/s^2, over the time before ``stamp``, ns; 0 where the odometry does not tell."""
+        """Forward and left, m/s^2, over the time before ``stamp``, ns; 0 where the odometry does not tell it."""
         spell = [speed for speed in self._speeds if stamp - 2 * self._felt <= speed[0] <= stamp]
         old = next((speed for speed in reversed(spell) if speed[0] <= stamp - self._felt), None)
         if old is None or old is spell[-1]:
@@ -54,7 +54,7 @@ class BodyAcceleration:
         new = spell[-1]
         forward = (new[1] - old[1]) * SECOND / (new[0] - old[0])
         left = (new[1] * new[2] + old[1] * old[2]) / 2
-        return _bounded(forward), _bounded(left)
+        return _believed(forward), _believed(left)
 
     def tilt(self, attitude: Attitude) -> Tilt:
         """Of the body by a valid reading of its compass."""
@@ -72,5 +72,5 @@ def without(acceleration: tuple[float, float], tilt: Tilt) -> Tilt:
     return Tilt(tilt.roll - math.atan2(left, GRAVITY), tilt.pitch + math.atan2(forward, GRAVITY))
 
 
-def _bounded(acceleration: float) -> float:
-    return min(max(acceleration, -GREATEST), GREATEST)
+def _believed(acceleration: float) -> float:
+    return acceleration if abs(acceleration) <= GREATEST else 0.0

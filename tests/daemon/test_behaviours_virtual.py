@@ -102,9 +102,6 @@ def test_without_sonars_it_stops_with_its_reason():
     assert np.abs(np.diff(truth[-20:, 1:3], axis=0)).max() < 1e-3
 
 
-@pytest.mark.xfail(
-    reason="too near to the wall after 9 s since the amended method 1 follows the line past gaps", strict=True
-)
 def test_the_robot_with_five_sonars_follows_a_wall_of_the_yard_by_its_own_devices():
     config, _ = load_config(FILE.with_name("sonar.yaml"), SimulatedTruckConfig)
     world = {"start": {"x": -1.0, "y": 3.15, "yaw": 0.0}, "sonar": {"model": "beam"}}

@@ -123,9 +123,6 @@ def test_iron_near_the_compass_is_reported_and_the_compass_no_source(troubled: d
     assert "compass" not in sources(troubled, begin + 1.9)
 
 
-@pytest.mark.xfail(
-    reason="not reported since the tracker takes the acceleration by slipping wheels out of the tilt", strict=True
-)
 def test_slip_and_its_end_are_reported(troubled: dict):
     begin = troubled["slip"] / SECOND
     assert any(begin < second < begin + 1.0 for second in reported(troubled, Reason.WHEEL_SLIP))

@@ -276,11 +276,12 @@ class WallPd(_Wall):
         return replace(state, error=error), v, config.k_p * error + config.k_d * change
 
     def _mapped(self, state: WallState, ranges: Ranges) -> WallState:
-        """Add the echoes of the sonars that measure the wall, by odometry."""
+        """Add the echoes of the sonars that measure the wall, by odometry; none from before a niche ended."""
         if state.pose is None or not self._config.gap:
             return state
         x, y, yaw, now = state.pose[0], state.pose[1] * self._mirror, state.pose[2] * self._mirror, state.travelled
-        echoes = [echo for echo in state.echoes if now - echo[2] < WALL_WAY]
+        nearer = len(state.before) > 1 and state.before[0].side - ranges.side > JUMP[1]
+        echoes = [] if nearer else [echo for echo in state.echoes if now - echo[2] < WALL_WAY]
         reach, offset = ranges.diagonal * math.cos(DIAGONAL), self._config.offset
         for gap, ahead, aside in zip(state.gaps, (0.0, offset + reach), (ranges.side, reach), strict=True):
             if gap is None:
