@@ -14,7 +14,7 @@ same seeds for all; odometry and gyroscope with errors of their own.
 A jump is a change of the speed or yaw rate asked for, from one step to the next, of more than 0.8 m/s^2 or rad/s^2.
 Ramps of method 3 are evaluated at 100 Hz. The last line is JSON.
 
-    python benchmarks/wall_following.py [--seeds 50] [--jobs 2] [--only study start arenas faults] [--figure FILE.png]
+    python benchmarks/wall_following.py [--seeds 50] [--jobs 2] [--only study arenas faults] [--figure FILE.png]
 """
 
 import argparse

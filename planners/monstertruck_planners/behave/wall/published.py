@@ -276,12 +276,11 @@ class WallPd(_Wall):
         return replace(state, error=error), v, config.k_p * error + config.k_d * change
 
     def _mapped(self, state: WallState, ranges: Ranges) -> WallState:
-        """Add the echoes of the sonars that measure the wall, by odometry; none from before a niche ended."""
+        """Add the echoes of the sonars that measure the wall, by odometry."""
         if state.pose is None or not self._config.gap:
             return state
         x, y, yaw, now = state.pose[0], state.pose[1] * self._mirror, state.pose[2] * self._mirror, state.travelled
-        nearer = len(state.before) > 1 and state.before[0].side - ranges.side > JUMP[1]
-        echoes = [] if nearer else [echo for echo in state.echoes if now - echo[2] < WALL_WAY]
+        echoes = [echo for echo in state.echoes if now - echo[2] < WALL_WAY]
         reach, offset = ranges.diagonal * math.cos(DIAGONAL), self._config.offset
         for gap, ahead, aside in zip(state.gaps, (0.0, offset + reach), (ranges.side, reach), strict=True):
             if gap is None:
@@ -303,8 +302,12 @@ class WallPd(_Wall):
         return LINE_GAINS[0] * error + LINE_GAINS[1] * away
 
     def _gaps(self, state: WallState, ranges: Ranges) -> WallState:
-        """Which sonars look into a gap: from a jump up on, until they measure the wall again or it is too long."""
+        """Which sonars look into a gap: from a jump up on, until they measure the wall again or it is too long.
+
+        A jump down out of no known gap ends a niche that it started beside: its echoes were none of the wall.
+        """
         before, (side, diagonal), now = state.before, state.gaps, state.travelled
+        niche = side is None and bool(before) and before[-1].side - ranges.side > JUMP[1]
         if before and ranges.side - min(sample.side for sample in before) > JUMP[0]:
             side = now if side is None else side
         elif side is not None and ranges.side < self._config.seen and now - side > EDGE:
@@ -316,7 +319,8 @@ class WallPd(_Wall):
         gaps = tuple(
             since if since is not None and now - since < self._config.gap else None for since in (side, diagonal)
         )
-        return replace(state, before=(*before[-1:], ranges), gaps=(gaps[0], gaps[1]))
+        echoes = () if niche else state.echoes
+        return replace(state, before=(*before[-1:], ranges), gaps=(gaps[0], gaps[1]), echoes=echoes)
 
     def _aligned(self, ranges: Ranges) -> bool:
         """Whether the robot has turned far enough from the wall ahead."""
