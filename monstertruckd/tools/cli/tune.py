@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from monstertruckd.tools.tune.recipe import WallGains
     from monstertruckd.tools.tune.runs import TuningRun
 
-app = command_group("WallGains found by runs of the robot.")
+app = command_group("Gains found by runs of the robot.")
 
 
 @app.command("wall")

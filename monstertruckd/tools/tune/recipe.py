@@ -64,7 +64,7 @@ def judged(errors: Sequence[float]) -> RunVerdict:
 
 
 def recipe(k_p: float) -> Generator[WallGains, RunVerdict, WallGains | None]:
-    """WallGains to try, one after the other; is sent each run's verdict.
+    """Gains to try, one after the other; is sent each run's verdict.
 
     Returns:
         Of the calm gains those with the least steady error; None if none was calm.

@@ -101,9 +101,7 @@ def _cut(points: Array, joined: NDArray[np.bool_], place: Mount) -> tuple[float,
     return float(cuts[best]), int(at[best])
 
 
-def _beam_towards(
-    scan: LaserScan, mount: tuple[float, float, float], place: Mount, reach: float
-) -> int | None:  # fmt: skip
+def _beam_towards(scan: LaserScan, mount: tuple[float, float, float], place: Mount, reach: float) -> int | None:
     """Number of the lidar's beam to the far end of a sonar's axis; None = the lidar does not look there."""
     x, y = place.x + reach * math.cos(place.yaw) - mount[0], place.y + reach * math.sin(place.yaw) - mount[1]
     bearing = math.remainder(math.atan2(y, x) - mount[2], math.tau)
