@@ -38,6 +38,25 @@ def trajectory(estimate: Array, truth: Array) -> dict[str, float]:
     }
 
 
+def relative(stamps: Array, estimate: Array, truth: Array, seconds: float) -> float:
+    """RMS error of the motion over so many seconds, m (relative pose error): of every pose (n, 3) that has one later.
+
+    Args:
+        stamps: rising, s.
+        estimate: of those instants.
+        truth: likewise.
+        seconds: over which they are compared.
+    """
+    later = np.searchsorted(stamps, stamps + seconds)
+    first = np.flatnonzero(later < len(stamps))
+    moves = []
+    for poses in (estimate, truth):
+        begin, step = poses[first], poses[later[first], :2] - poses[first, :2]
+        cos, sin = np.cos(begin[:, 2]), np.sin(begin[:, 2])
+        moves.append(np.column_stack((cos * step[:, 0] + sin * step[:, 1], cos * step[:, 1] - sin * step[:, 0])))
+    return rms(np.hypot(*(moves[0] - moves[1]).T))
+
+
 def length(poses: Array) -> float:
     """Metres along poses (n, >= 2)."""
     return float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum())
@@ -60,6 +79,14 @@ def clearance(truth: DistanceField, footprint: Footprint, poses: Array, most: fl
     return float(truth.clearance(footprint, poses, most).min())
 
 
+def wall_distances(
+    cells: NDArray[np.int8], origin: tuple[float, float], resolution: float, truth: DistanceField
+) -> Array:
+    """Distance of every occupied cell of a grid (rows, columns) from the nearest true wall, m."""
+    rows, columns = np.nonzero(cells >= 65)
+    return truth.lookup((np.column_stack((columns, rows)) + 0.5) * resolution + origin)
+
+
 def map_error(
     cells: NDArray[np.int8], origin: tuple[float, float], resolution: float, truth: DistanceField
 ) -> dict[str, float]:
@@ -68,9 +95,7 @@ def map_error(
     Walls: distance of occupied cells from the nearest true wall, m. ``occupied_free``: share of the cells known as free
     that lie within a wall by more than a cell.
     """
-    rows, columns = np.nonzero(cells >= 65)
-    middle = (np.column_stack((columns, rows)) + 0.5) * resolution + origin
-    off = truth.lookup(middle)
+    off = wall_distances(cells, origin, resolution, truth)
     rows, columns = np.nonzero((cells >= 0) & (cells < 50))
     middle = (np.column_stack((columns, rows)) + 0.5) * resolution + origin
     through = truth.lookup(middle) < 0.25 * resolution

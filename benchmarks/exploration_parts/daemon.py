@@ -13,13 +13,13 @@ from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt
+import scoring
 
 from exploration_parts.arena import Arena
 from exploration_parts.rover import SHARES
 from monstertruck_estimation.slam.storage import load
 from monstertruck_kinematics.elementary import Array
-from monstertruck_planners.collision import OCCUPIED
+from monstertruck_planners.collision import DistanceField
 from monstertruck_planners.explore.frontier import UNKNOWN, FrontierMap
 from monstertruck_planners.goals.exchange import Pose
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
@@ -214,8 +214,6 @@ def known(run: Told) -> tuple[dict[float, float], float]:
 def off_share(folder: Path, arena: Arena, added: list[Box]) -> float:
     """Share of the saved map's walls that are more than ``OFF`` from true ones and from what was put there."""
     saved = load(folder).grid
-    rows, columns = np.nonzero(saved.cells >= OCCUPIED)
-    places = (np.column_stack((columns, rows)) + 0.5) * saved.resolution + np.array(saved.origin[:2])
     blocked = arena.blocked.copy()
     origin = np.array(arena.origin)
     for box in added:
@@ -225,10 +223,9 @@ def off_share(folder: Path, arena: Arena, added: list[Box]) -> float:
             for sign in (-1, 1)
         )
         blocked[low[1] : high[1] + 1, low[0] : high[0] + 1] = True
-    away = distance_transform_edt(~blocked) * arena.resolution
-    at = np.floor((places - origin) / arena.resolution).astype(int)[:, ::-1]
-    at = np.clip(at, 0, np.array(blocked.shape) - 1)
-    return round(float((away[at[:, 0], at[:, 1]] > OFF).mean()), 4) if len(at) else 1.0
+    truth = DistanceField(blocked, arena.resolution, (*arena.origin, 0.0))
+    off = scoring.wall_distances(saved.cells, saved.origin[:2], saved.resolution, truth)
+    return round(float((off > OFF).mean()), 4) if len(off) else 1.0
 
 
 def summary(rows: list[dict[str, Any]]) -> tuple[dict[str, float], dict[str, float]]:

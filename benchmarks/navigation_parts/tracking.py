@@ -19,7 +19,8 @@ from typing import Any
 
 import numpy as np
 from pydantic import TypeAdapter
-from scoring import distance
+from scipy.spatial import cKDTree
+from scoring import distance, rms
 
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.track.catalog import AnyTracker, build_tracker
@@ -95,6 +96,11 @@ class Result:
     """Processor time of every step."""
     track: np.ndarray
     width: float = 0.0
+    heading: float = 0.0
+    """RMS of the angle between the truck and the course where it is nearest, rad."""
+    effort: float = 0.0
+    """What both axles turned in all, rad."""
+    seconds: float = 0.0
     lost: bool = False
     untrue: bool = False
     """The tracker reported the goal as reached from further off than its tolerance."""
@@ -226,7 +232,7 @@ def drive(
     direction = -1 if version == "backward" else 1
     plant.pose = (float(x), float(y), yaw if direction > 0 else yaw + math.pi)
     path = SegmentedPath(route(points, version), plant.pose, config.beyond)
-    progress, track, work, outcome = path.start, [plant.pose], [], Reason.DRIVING
+    progress, track, work, effort, outcome = path.start, [plant.pose], [], 0.0, Reason.DRIVING
     plant.speed = 0.0 if version == "cusps" else direction * speed
     tracker.prepare(path, progress)
     for k in range(round(5 * path.length / speed / PERIOD) + 200):
@@ -239,7 +245,9 @@ def drive(
         for _ in range(round(PERIOD / STEP)):
             if version == "cusps":
                 plant.speed += min(max(command.speed - plant.speed, -STEP), STEP)
+            front, rear = plant.front, plant.rear
             plant.step(command.front, command.rear)
+            effort += abs(plant.front - front) + abs(plant.rear - rear)
             track.append(plant.pose)
     poses = np.array(track)
     met = poses[-1:, :2] if version == "cusps" else poses[-TAIL:, :2]
@@ -256,7 +264,18 @@ def drive(
         steps_ms=1000 * np.array(work),
         track=poses,
         width=swept(poses[len(poses) // 20 :], points),
+        heading=heading(poses[len(poses) // 20 :], points, backward=direction < 0),
+        effort=effort,
+        seconds=(len(track) - 1) * STEP,
     )
+
+
+def heading(poses: np.ndarray, points: np.ndarray, *, backward: bool) -> float:
+    """RMS angle of the truck to the nearest piece of the course, rad."""
+    middle, step = 0.5 * (points[1:] + points[:-1]), np.diff(points, axis=0)
+    nearest = cKDTree(middle).query(poses[:, :2])[1]
+    along = np.arctan2(step[nearest, 1], step[nearest, 0]) + (math.pi if backward else 0.0)
+    return rms(np.remainder(poses[:, 2] - along + math.pi, math.tau) - math.pi)
 
 
 def swept(poses: np.ndarray, points: np.ndarray) -> float:

@@ -1,7 +1,9 @@
 """5.1 Kinematics: odometry's error and the turning radius for each manoeuvre, whole daemon, open-loop requests.
 
 The truck drives in the empty hall, on the virtual clock and through all emulated devices, with servos in whole degrees.
-Truth is the world's. The radius is that of the true poses while the angles hold, against the formula.
+Truth is the world's. The radius is that of the true poses while the angles hold, against the formula; the speed's ratio
+is the true way over odometry's. The formulas by themselves: how far wheels would slip at 1 m/s if they turned and
+rolled as the formulas say, and an axle angle that goes through the linkage and back.
 """
 
 import math
@@ -12,6 +14,7 @@ import scoring
 from navigation_parts import Options, Part
 from navigation_parts.daemon import CONFIGS
 
+from monstertruck_kinematics.polynomials import SteeringPolynomials
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_schemas import topics
@@ -35,20 +38,29 @@ MANOEUVRES: dict[str, list[tuple[float, float, float]]] = {
     "square": 4 * [(4.0, 0.0, 0.0), (QUARTER, ANGLE, -ANGLE)],
 }
 """Seconds, front and rear axle angle, rad, of each leg."""
+RADII: dict[str, list[tuple[float, float, float]]] = {
+    f"circle_{mode}_{angle}": [(12.0, angle, share * angle)]
+    for mode, share in (("2ws", 0.0), ("counter", -1.0))
+    for angle in (0.15, 0.25, 0.38)
+}
+"""Further angles, of which only the radius is looked at."""
 
 
 def run(options: Options) -> Part:
     part = Part()
     rows = {}
-    for name, whole in MANOEUVRES.items():
+    formulas(part)
+    for name, whole in (MANOEUVRES | RADII).items():
         if options.quick and name not in ("straight", "circle_counter"):
             continue
         legs = [(3.0, *whole[0][1:])] if options.quick else whole
         rows[name] = row = drive(legs)
-        score = scoring.trajectory(row["odometry"], row["truth"])
-        part.add(f"{name}.end_share", score["end_m"] / score["driven_m"], 0.02)
-        for key in ("ate_m", "end_m", "end_rad", "driven_m"):
-            part.add(f"{name}.{key}", score[key])
+        if name in MANOEUVRES:
+            score = scoring.trajectory(row["odometry"], row["truth"])
+            part.add(f"{name}.end_share", score["end_m"] / score["driven_m"], 0.02)
+            for key in ("ate_m", "end_m", "end_rad", "driven_m"):
+                part.add(f"{name}.{key}", score[key])
+            part.add(f"{name}.speed_ratio", score["driven_m"] / scoring.length(row["odometry"]))
         _, front, rear = legs[0]
         bend = (math.tan(front) - math.tan(rear)) / TRUCK.wheelbase
         if name.startswith("circle"):
@@ -58,6 +70,23 @@ def run(options: Options) -> Part:
             part.add(f"{name}.radius_off_share", abs(off), 0.05)
     draw(options, rows)
     return part
+
+
+def formulas(part: Part) -> None:
+    """What has no need of a drive."""
+    front = np.linspace(-0.4, 0.4, 81)
+    for mode, rear in (("2ws", 0.0 * front), ("counter", -front), ("crab", front)):
+        vx, vy, wz = TRUCK.body_twist(1.0, front, rear)
+        slips = []
+        angles, speeds = TRUCK.wheel_angles(front, rear), TRUCK.wheel_speeds(1.0, front, rear)
+        for (x, y), angle, speed in zip(TRUCK.wheel_positions, angles, speeds, strict=True):
+            u, v = vx - wz * y, vy + wz * x
+            slips.append(np.hypot(u - speed * np.cos(angle), v - speed * np.sin(angle)))
+        part.add(f"formulas.{mode}.slip_max_m_s", float(np.max(slips)), 1e-6)
+    for name in ("front", "rear"):
+        axle = getattr(SteeringPolynomials(), name)
+        there_and_back = axle.axle_from_servo(axle.servo_from_axle(front))
+        part.add(f"formulas.{name}_servo_round_trip_rad", float(np.abs(there_and_back - front).max()), 1e-6)
 
 
 def drive(legs: list[tuple[float, float, float]]) -> dict[str, Any]:

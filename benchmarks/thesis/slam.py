@@ -33,6 +33,9 @@ def run(options: Options) -> Part:
         score = scoring.trajectory(found[name][:, 1:], found[f"true_{name}"])
         part.add(f"{name}.ate_m", score["ate_m"], goal)
         part.add(f"{name}.max_m", score["max_m"])
+        part.add(
+            f"{name}.rpe_1s_m", scoring.relative(found[name][:, 0], found[name][:, 1:], found[f"true_{name}"], 1.0)
+        )
         part.add(f"{name}.end_m", score["end_m"])
         part.add(f"{name}.driven_m", score["driven_m"])
     cells = grid.cells.reshape(grid.height, grid.width)

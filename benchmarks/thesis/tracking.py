@@ -1,6 +1,8 @@
 """5.5 Tracking: RMS and greatest distance from the path for each steering mode, our trackers and the published rules.
 
-The truck with dead time, lag and turning rate of its axles at the author's 0.2 m/s, from 5 cm beside the path.
+The truck with dead time, lag and turning rate of its axles at the author's 0.2 m/s, from 5 cm beside the path. The end
+is that of the path (1e6: it was not found), the steering effort what both axles turned; in crab the truck keeps its
+heading, whose error is then the path's turning.
 """
 
 import numpy as np
@@ -24,6 +26,10 @@ def run(options: Options) -> Part:
                 prefix = f"{course}.{tracker}.{mode}"
                 part.add(f"{prefix}.rms_mm", row.rms)
                 part.add(f"{prefix}.max_mm", row.worst)
+                part.add(f"{prefix}.heading_rms_rad", row.heading)
+                part.add(f"{prefix}.end_mm", min(row.end, 1e6))
+                part.add(f"{prefix}.steering_effort_rad", row.effort)
+                part.add(f"{prefix}.seconds", row.seconds)
                 part.add(f"{prefix}.arrived", int(row.arrived))
     if not options.quick:
         for course in courses:

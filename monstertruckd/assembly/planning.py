@@ -269,6 +269,7 @@ def _build_missions(config: TruckConfig, bus: Bus, clock: Clock, parts: MissionP
         parts,
         clock,
         file=None if virtual else config.state_directory / "mission.json",
+        localised=config.slam is not None and config.slam.mode == "localisation",
         offload=inline if virtual else in_thread,
         max_age=config.gate.max_request_age,
         inputs=MissionInputs(

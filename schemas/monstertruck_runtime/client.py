@@ -451,8 +451,15 @@ class TruckClient(Operator):
             "points", {**await self._answered(1.0), "order": order, "name": name, "x": x, "y": y, "yaw": yaw}
         )
 
-    async def mission(self, order: MissionOrder, mission: Mission | None = None) -> dict[str, Any]:
+    async def mission(
+        self, order: MissionOrder, mission: Mission | None = None, *, moved: bool = False
+    ) -> dict[str, Any]:
         """Start a mission, go on with one, or end it; answers with its ``number``. Progress is on ``plan/mission``.
+
+        Args:
+            order: what.
+            mission: to be started.
+            moved: go on with it although the robot is not where it was interrupted.
 
         Raises:
             RequestRefusedError: why it does not start, or none runs.
@@ -460,7 +467,8 @@ class TruckClient(Operator):
             NoAnswerError: no answer in time.
         """
         steps = None if mission is None else mission.model_dump(mode="json")
-        return await self.call("mission", {**await self._answered(1.0), "order": order, "mission": steps})
+        wanted = {"order": order, "mission": steps, "moved": moved}
+        return await self.call("mission", {**await self._answered(1.0), **wanted})
 
     async def path(self, path: DrivePath, lease: float = 1.0) -> None:
         """Request to follow a path computed here. Raises as ``drive`` does."""

@@ -250,6 +250,8 @@ class MissionRequest(Request):
     order: MissionOrder
     mission: Mission | None = None
     """Of a start."""
+    moved: bool = False
+    """It is gone on with although the robot is not where it was interrupted: its pose is right"""
 
 
 class PathRequest(Request):

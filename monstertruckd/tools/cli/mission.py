@@ -25,6 +25,9 @@ FileArgument = Annotated[Path, typer.Argument(help="Mission (YAML).", show_defau
 def run_command(
     file: Annotated[Path | None, typer.Argument(help="Mission (YAML).", show_default=False)] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the one that a restart interrupted.")] = False,
+    moved: Annotated[
+        bool, typer.Option("--moved", help="Go on though the robot is not where it was: its pose is right.")
+    ] = False,
     arm: Annotated[bool, typer.Option("--arm", help="Arm the robot first; it drives off at once.")] = False,
     robot: RobotOption = "truck",
     endpoint: EndpointOption = DEFAULT_ENDPOINT,
@@ -36,12 +39,14 @@ def run_command(
 
     if (file is None) is not resume:
         raise InputError("expected a mission's file, or --resume")
+    if moved and not resume:
+        raise InputError("--moved: expected with --resume only")
     mission = None if file is None else load(file)
 
     async def main(clock: Clock) -> "MissionEnd":
         async with TruckClient(robot, endpoint, clock=clock) as client:
             await _check(client, robot)
-            return await run_mission(client, mission, arm=arm, tell=None if json_output else print)
+            return await run_mission(client, mission, arm=arm, moved=moved, tell=None if json_output else print)
 
     end = run_wall(main)
     if json_output:

@@ -18,7 +18,9 @@ from monstertruck_schemas.topics import MISSION
 class MissionClient(Operator, Protocol):
     """Client of a robot that does missions."""
 
-    async def mission(self, order: MissionOrder, mission: Mission | None = None) -> dict[str, Any]:
+    async def mission(
+        self, order: MissionOrder, mission: Mission | None = None, *, moved: bool = False
+    ) -> dict[str, Any]:
         """Start, go on with or end one."""
         ...
 
@@ -42,9 +44,21 @@ class MissionEnd:
 
 
 async def run_mission(
-    client: MissionClient, mission: Mission | None, *, arm: bool, tell: Callable[[str], object] | None = None
+    client: MissionClient,
+    mission: Mission | None,
+    *,
+    arm: bool,
+    moved: bool = False,
+    tell: Callable[[str], object] | None = None,
 ) -> MissionEnd:
     """Start a mission, or go on with the interrupted one, and wait for its end; cancelled, it is stopped.
+
+    Args:
+        client: of the robot.
+        mission: None = the interrupted one.
+        arm: arm the robot first.
+        moved: see ``TruckClient.mission``.
+        tell: gets a line for each step.
 
     Raises:
         RequestRefusedError: the start or the arming was refused.
@@ -56,7 +70,7 @@ async def run_mission(
         if arm:
             await client.arm()
         try:
-            number = int((await client.mission(order, mission))["number"])
+            number = int((await client.mission(order, mission, moved=moved))["number"])
             return await _followed(states, number, tell)
         except BaseException as error:
             if not isinstance(error, TruckError) or isinstance(error, NoAnswerError):

@@ -1,5 +1,6 @@
 """Where a mission stands, and what follows a step: pure."""
 
+import math
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -11,7 +12,15 @@ from monstertruck_schemas.reasons import Reason
 FINAL = frozenset({Reason.CANCELLED, Reason.DISARMED, Reason.ESTOPPED, Reason.SHUTDOWN})
 """Ends of a step after which no policy counts: somebody, or the gate, has ended the mission."""
 GOOD = frozenset(
-    {Reason.OK, Reason.GOAL_REACHED, Reason.BEHAVIOUR_DONE, Reason.EXPLORED, Reason.BUDGET_SPENT, Reason.MISSION_DONE}
+    {
+        Reason.OK,
+        Reason.GOAL_REACHED,
+        Reason.BEHAVIOUR_DONE,
+        Reason.EXPLORED,
+        Reason.BUDGET_SPENT,
+        Reason.POINTS_FOUND,
+        Reason.MISSION_DONE,
+    }
 )
 """Ends of a step that was done."""
 
@@ -117,9 +126,11 @@ class SavedProgress(Schema):
     start: Pose2D
     index: int
     failures: int
+    at: Pose2D | None = None
+    """Where the robot was, in map"""
 
     @classmethod
-    def of(cls, progress: MissionProgress, source: str) -> "SavedProgress":
+    def of(cls, progress: MissionProgress, source: str, at: Pose | None = None) -> "SavedProgress":
         """What is kept of a mission."""
         x, y, yaw = progress.start
         return cls(
@@ -128,9 +139,14 @@ class SavedProgress(Schema):
             start=Pose2D(x=x, y=y, yaw=yaw),
             index=progress.index,
             failures=progress.failures,
+            at=None if at is None else Pose2D(x=at[0], y=at[1], yaw=at[2]),
         )
 
     def progress(self) -> MissionProgress:
         """The mission at the beginning of the step at which it was interrupted."""
         start = self.start.x, self.start.y, self.start.yaw
         return MissionProgress(self.mission, start, self.index, failures=self.failures)
+
+    def away(self, pose: Pose) -> float:
+        """Metres of a pose from where the robot was."""
+        return 0.0 if self.at is None else math.dist(pose[:2], (self.at.x, self.at.y))

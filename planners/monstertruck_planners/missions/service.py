@@ -68,8 +68,18 @@ REPORT: Final = SECOND // 2
 """Between two reports without a change, ns."""
 CHANGES: Final = ("number", "running", "step", "attempt", "outcome", "resumable")
 """Fields of the report whose change is reported at once."""
+STEP: Final = 0.5
+"""Metres after which it is noted anew where the robot is."""
+MOVED: Final = 1.0
+"""Metres from where it was interrupted at which a robot counts as moved, or its odometry as begun anew."""
 MOST_BYTES: Final = 1_000_000
 """Of the saved progress."""
+PASSING: Final = frozenset({Reason.PLANNER_STARTING, Reason.NO_MAP, Reason.LEASE_EXPIRED})
+"""Refusals of a goal that say nothing of its place: asked again..."""
+AGAIN: Final = 1.0
+"""...after so many seconds..."""
+PATIENCE: Final = 180.0
+"""...for so many; a planner compiles for a minute or two after an installation."""
 
 S = TypeVar("S")
 
@@ -137,6 +147,7 @@ class MissionService:
         parts: what steps are done by.
         clock: time.
         file: where the progress is kept, for a restart; None = nowhere.
+        localised: the robot finds its place in a known map, where poses hold after a restart, too.
         offload: where it is written.
         max_age: see ``GateConfig.max_request_age``.
         inputs: topics read.
@@ -152,6 +163,7 @@ class MissionService:
         clock: Clock,
         *,
         file: Path | None,
+        localised: bool,
         offload: Offload,
         max_age: float,
         inputs: MissionInputs,
@@ -159,6 +171,7 @@ class MissionService:
         events: EventSink,
     ) -> None:
         self._parts, self._clock, self._file, self._offload = parts, clock, file, offload
+        self._localised = localised
         self._max_age, self._in, self._out, self._events = max_age, inputs, state, events
         self._sequences = Sequences(max_age)
         self._seq = 0
@@ -168,6 +181,9 @@ class MissionService:
         self._began = 0
         self._end: StepEnd | None = None
         self._interrupted: SavedProgress | None = None
+        self._writing = asyncio.Lock()
+        self._noted: Pose | None = None
+        """Where the robot was when that was last kept."""
         self._task: asyncio.Task[None] | None = None
         self._tasks: asyncio.TaskGroup | None = None
         self._reported: MissionState | None = None
@@ -187,6 +203,7 @@ class MissionService:
                 while True:
                     await schedule.next()
                     self._report(self._clock.now())
+                    await self._note_place()
             finally:
                 self._parts.goals.hold(SOURCE, on=False)
 
@@ -206,9 +223,12 @@ class MissionService:
             raise RequestRefusedError(reason)
         running = self._task is not None and not self._task.done()
         if not starts:
-            if not running or self._task is None:
+            if running and self._task is not None:
+                self._task.cancel(request.source)
+            elif self._interrupted is not None:
+                self._drop(self._interrupted, request.source)
+            else:
                 raise RequestRefusedError(Reason.NOT_FOUND, "no mission is running")
-            self._task.cancel(request.source)
             return self._number
         if running:
             raise RequestRefusedError(Reason.BUSY, f"the mission of {self._source} is running, stop it first")
@@ -227,15 +247,29 @@ class MissionService:
         self._task = self._tasks.create_task(self._do_all(progress))
         return self._number
 
+    def _drop(self, interrupted: SavedProgress, source: str) -> None:
+        """Forget a mission that nobody wants to go on with."""
+        assert self._tasks is not None
+        self._interrupted = None
+        self._events(Reason.CANCELLED, Severity.INFO, SOURCE, f"{interrupted.mission.name}: given up by {source}")
+        self._tasks.create_task(self._forget())
+        self._report(self._clock.now())
+
     def _begin(self, request: MissionRequest) -> MissionProgress:
-        if request.order is MissionOrder.RESUME:
-            if self._interrupted is None:
-                raise RequestRefusedError(Reason.NOT_FOUND, "no mission was interrupted")
-            return self._interrupted.progress()
-        if request.mission is None:
+        resumed = self._interrupted if request.order is MissionOrder.RESUME else None
+        if resumed is None and request.order is MissionOrder.RESUME:
+            raise RequestRefusedError(Reason.NOT_FOUND, "no mission was interrupted")
+        if resumed is None and request.mission is None:
             raise InputError("mission: missing")
         if (pose := self._pose()) is None:
             raise RequestRefusedError(Reason.NO_MAP, "no pose in a map yet")
+        if resumed is not None:
+            if not self._localised and not request.moved and (away := resumed.away(pose)) > MOVED:
+                text = f"its pose is {away:.1f} m from where {resumed.mission.name} was interrupted"
+                hint = "if it was put there, `--moved` goes on; else its odometry began anew (`odometry.start`)"
+                raise RequestRefusedError(Reason.POSE_LOST, f"{text}: {hint}")
+            return resumed.progress()
+        assert request.mission is not None
         return MissionProgress(request.mission, pose)
 
     def _check(self, mission: Mission) -> None:
@@ -274,6 +308,7 @@ class MissionService:
             self._finish(outcome(progress, following))
         except asyncio.CancelledError as stopped:
             if not stopped.args:
+                await self._save(progress)
                 raise  # the daemon ends: the progress stays on the disk
             self._finish(StepEnd(Reason.CANCELLED, f"stopped by {stopped.args[0]}"))
         finally:
@@ -344,7 +379,9 @@ class MissionService:
         waypoints = tuple(Waypoint(x=a, y=b) for a, b in via)
         pose = Pose2D(x=x, y=y, yaw=math.remainder(yaw, math.tau))
         goals = self._parts.goals
-        number = goals.take(GoalRequest(**self._header(), frame="map", goal=pose, waypoints=waypoints))
+        number = await self._taken(
+            lambda: GoalRequest(**self._header(), frame="map", goal=pose, waypoints=waypoints)
+        )
 
         def end() -> StepEnd | None:
             goal = self._in.goal.latest
@@ -355,6 +392,21 @@ class MissionService:
             return StepEnd(goal.outcome, goal.text) if goal.phase is GoalPhase.IDLE else None
 
         return await self._until(end, lambda: goals.control(GoalControl(**self._header(), order=GoalOrder.CANCEL)))
+
+    async def _taken(self, request: Callable[[], GoalRequest]) -> int:
+        """Number of a goal, which is asked for again while what refuses it passes.
+
+        Raises:
+            RequestRefusedError: something else does, or it has not passed.
+        """
+        until = self._clock.now() + PATIENCE * SECOND
+        while True:
+            try:
+                return self._parts.goals.take(request())
+            except RequestRefusedError as error:
+                if error.refusal not in PASSING or self._clock.now() > until:
+                    raise
+            await self._clock.sleep(AGAIN)
 
     async def _explore(self, step: ExploreStep) -> StepEnd:
         explorer = self._parts.explorer
@@ -437,8 +489,17 @@ class MissionService:
     async def _save(self, progress: MissionProgress) -> None:
         if progress.returning:
             return
-        text = SavedProgress.of(progress, self._source).model_dump_json()
+        self._noted = self._pose() or self._noted
+        text = SavedProgress.of(progress, self._source, self._noted).model_dump_json()
         await self._write(lambda file: replace_file(file, text))
+
+    async def _note_place(self) -> None:
+        """Keep where the robot is while a mission runs."""
+        pose, noted, progress = self._pose(), self._noted, self._progress
+        running = progress is not None and self._end is None
+        if progress is None or not running or pose is None or noted is None or math.dist(pose[:2], noted[:2]) < STEP:
+            return
+        await self._save(progress)
 
     async def _forget(self) -> None:
         await self._write(lambda file: file.unlink(missing_ok=True))
@@ -447,7 +508,8 @@ class MissionService:
         if (file := self._file) is None:
             return
         try:
-            await self._offload(lambda: change(file))
+            async with self._writing:
+                await self._offload(lambda: change(file))
         except OSError as error:
             self._events(Reason.DISK_FULL, Severity.WARNING, SOURCE, f"{file}: progress not kept: {error}")
 

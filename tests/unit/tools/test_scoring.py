@@ -15,6 +15,13 @@ def test_a_trajectory_is_scored_without_alignment():
     assert score == pytest.approx({"ate_m": 0.05, "max_m": 0.05, "end_m": 0.05, "end_rad": 0.1, "driven_m": 2.0})
 
 
+def test_relative_errors_do_not_see_where_it_began():
+    stamps = np.arange(0.0, 5.0, 0.5)
+    truth = np.column_stack((0.2 * stamps, np.zeros(10), np.zeros(10)))
+    estimate = np.column_stack((np.ones(10), 0.22 * stamps, np.full(10, math.pi / 2)))  # elsewhere, 10 % too far
+    assert scoring.relative(stamps, estimate, truth, 1.0) == pytest.approx(0.02)
+
+
 def test_poses_between_stamps_turn_the_short_way():
     poses = np.array([[0.0, 0.0, 3.1], [1.0, 2.0, -3.1]])
     ((x, y, yaw),) = scoring.at(np.array([0.0, 1.0]), poses, np.array([0.5]))

@@ -66,6 +66,11 @@ def test_the_policy_of_a_step_counts_before_that_of_the_mission():
     assert outcome(back, following).reason is Reason.GOAL_UNREACHABLE
 
 
+def test_points_that_were_looked_for_and_found_are_no_failure():
+    at, following = after(progress({"do": "explore", "find": 2}, WAIT), StepEnd(Reason.POINTS_FOUND))
+    assert (at.index, at.failures, following) == (1, 0, "step")
+
+
 @pytest.mark.parametrize("reason", [Reason.CANCELLED, Reason.DISARMED])
 def test_who_cancels_or_disarms_ends_it_whatever_the_policy(reason: Reason):
     at, following = after(progress({**GO, "retries": 3, "on_failure": "continue"}, WAIT), StepEnd(reason))
@@ -89,17 +94,18 @@ def test_steps_have_short_names():
 class Pretended:
     """A robot whose goals end when they are told to."""
 
-    def __init__(self, clock: VirtualClock, file: Path | None = None) -> None:
+    def __init__(self, clock: VirtualClock, file: Path | None = None, *, localised: bool = False) -> None:
         self.clock, self.number, self.reached = clock, 0, [Reason.GOAL_REACHED] * 99
         self.latest = {"gate": None, "pose": None, "goal": None, "behaviour": None, "explore": None, "points": None}
         self.reports, self.events, self.goals, self.held = [], [], [], set()
+        self.refusals: list[RequestRefusedError] = []
         box = {name: self._box(name) for name in self.latest}
         dock = SimpleNamespace(name="dock", before=lambda away: Pose2D(x=7.0 - away, y=8.0, yaw=0.0))
         self.latest["points"] = SimpleNamespace(points=(dock,))
         self.latest["gate"] = SimpleNamespace(nonce="n", stamp=0, reasons=(), mode=SimpleNamespace(active=True))
-        self.seq = 0
+        self.seq, self.placed = 0, True
         self.service = MissionService(
-            MissionParts(self, None, None, frozenset()), clock, file=file, offload=inline, max_age=5.0,
+            MissionParts(self, None, None, frozenset()), clock, file=file, localised=localised, offload=inline, max_age=5.0,
             inputs=MissionInputs(**box), state=SimpleNamespace(next_seq=lambda: 1, put=self.reports.append),
             events=lambda reason, severity, source, text="", **_: self.events.append((reason, text)),
         )  # fmt: skip
@@ -109,6 +115,8 @@ class Pretended:
 
     def take(self, request):
         """As the goal service."""
+        if self.refusals:
+            raise self.refusals.pop(0)
         self.number += 1
         self.goals.append((request.goal.x, request.goal.y))
         self._say(GoalPhase.DRIVING, Reason.DRIVING)
@@ -127,22 +135,22 @@ class Pretended:
         state = GoalState(stamp=1, received=1, seq=0, frame="map", number=self.number, phase=phase, outcome=reason)
         self.latest["goal"] = state
 
-    def order(self, order: MissionOrder, *steps: dict, **more) -> int:
+    def order(self, order: MissionOrder, *steps: dict, moved: bool = False, **more) -> int:
         self.seq += 1
         now = self.clock.now()
         self.latest["gate"].stamp = now
-        pose = SimpleNamespace(received=now, pose=Pose2D(x=5.0, y=6.0, yaw=0.0))
-        self.latest["pose"] = pose
+        if self.placed:
+            self.latest["pose"] = SimpleNamespace(received=now, pose=Pose2D(x=5.0, y=6.0, yaw=0.0))
         request = MissionRequest(
             stamp=now, received=now, seq=self.seq, source="ann", role=Role.STATION, lease=1.0, nonce="n",
-            gate_stamp=now, order=order, mission=mission(*steps, **more) if steps else None,
+            gate_stamp=now, order=order, moved=moved, mission=mission(*steps, **more) if steps else None,
         )  # fmt: skip
         return self.service.take(request)
 
 
-def played(story, file: Path | None = None) -> Pretended:
+def played(story, file: Path | None = None, *, localised: bool = False) -> Pretended:
     async def main(clock: VirtualClock) -> Pretended:
-        robot = Pretended(clock, file)
+        robot = Pretended(clock, file, localised=localised)
         task = asyncio.create_task(robot.service.run(lambda: None))
         await clock.sleep(0.1)
         await story(robot)
@@ -232,6 +240,63 @@ def test_after_a_restart_it_can_be_gone_on_with_at_the_step_that_was_interrupted
     robot = played(resumed, file)
     assert robot.goals == [(7.0, 0.0), (5.0, 6.0)]
     assert robot.reports[-1].outcome is Reason.MISSION_DONE
+
+
+def test_just_restarted_it_waits_for_a_pose_and_for_the_planner(tmp_path: Path):
+    file = tmp_path / "mission.json"
+    file.write_text(SavedProgress.of(progress(GO), "ann").model_dump_json())
+
+    async def story(robot: Pretended) -> None:
+        robot.placed = False
+        with pytest.raises(RequestRefusedError, match="no pose"):
+            robot.order(MissionOrder.RESUME)
+        robot.placed = True
+        robot.refusals = [RequestRefusedError(Reason.PLANNER_STARTING)] * 3
+        robot.order(MissionOrder.RESUME)
+        await robot.clock.sleep(6.0)
+
+    robot = played(story, file)
+    assert robot.goals == [(1.0, 0.0)]
+    assert robot.reports[-1].outcome is Reason.MISSION_DONE
+
+
+@pytest.mark.parametrize("localised", [False, True])
+def test_where_odometry_began_anew_it_does_not_drive_by_places_that_are_elsewhere(tmp_path: Path, localised: bool):
+    file = tmp_path / "mission.json"
+
+    async def interrupted(robot: Pretended) -> None:
+        robot.order(MissionOrder.START, GO, WAIT)
+        robot.latest["pose"].pose = Pose2D(x=5.6, y=6.0, yaw=0.0)
+        await robot.clock.sleep(1.0)
+        assert json.loads(file.read_text())["at"]["x"] == 5.6, "kept while it drives"
+        robot.latest["pose"] = SimpleNamespace(received=robot.clock.now(), pose=Pose2D(x=8.0, y=6.0, yaw=0.0))
+
+    played(interrupted, file)
+    assert json.loads(file.read_text())["at"]["x"] == 8.0, "and at the end"
+
+    async def resumed(robot: Pretended) -> None:
+        if not localised:
+            with pytest.raises(RequestRefusedError, match=r"3\.0 m from where round was interrupted.*--moved"):
+                robot.order(MissionOrder.RESUME)
+        robot.order(MissionOrder.RESUME, moved=not localised)
+        await robot.clock.sleep(8.0)
+
+    robot = played(resumed, file, localised=localised)
+    assert robot.reports[-1].outcome is Reason.MISSION_DONE
+
+
+def test_an_interrupted_mission_can_be_given_up(tmp_path: Path):
+    file = tmp_path / "mission.json"
+    file.write_text(SavedProgress.of(progress(GO), "ann").model_dump_json())
+
+    async def story(robot: Pretended) -> None:
+        robot.order(MissionOrder.STOP)
+        assert not robot.reports[-1].resumable
+        await robot.clock.sleep(0.5)
+
+    robot = played(story, file)
+    assert not file.exists()
+    assert robot.events[-1] == (Reason.CANCELLED, "round: given up by ann")
 
 
 def test_a_damaged_file_is_reported_and_forgotten(tmp_path: Path):
