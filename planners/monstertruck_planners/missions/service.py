@@ -379,9 +379,7 @@ class MissionService:
         waypoints = tuple(Waypoint(x=a, y=b) for a, b in via)
         pose = Pose2D(x=x, y=y, yaw=math.remainder(yaw, math.tau))
         goals = self._parts.goals
-        number = await self._taken(
-            lambda: GoalRequest(**self._header(), frame="map", goal=pose, waypoints=waypoints)
-        )
+        number = await self._taken(lambda: GoalRequest(**self._header(), frame="map", goal=pose, waypoints=waypoints))
 
         def end() -> StepEnd | None:
             goal = self._in.goal.latest

@@ -105,7 +105,8 @@ class Pretended:
         self.latest["gate"] = SimpleNamespace(nonce="n", stamp=0, reasons=(), mode=SimpleNamespace(active=True))
         self.seq, self.placed = 0, True
         self.service = MissionService(
-            MissionParts(self, None, None, frozenset()), clock, file=file, localised=localised, offload=inline, max_age=5.0,
+            MissionParts(self, None, None, frozenset()),
+            clock, file=file, localised=localised, offload=inline, max_age=5.0,
             inputs=MissionInputs(**box), state=SimpleNamespace(next_seq=lambda: 1, put=self.reports.append),
             events=lambda reason, severity, source, text="", **_: self.events.append((reason, text)),
         )  # fmt: skip
