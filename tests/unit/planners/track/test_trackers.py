@@ -11,6 +11,7 @@ from pydantic import ValidationError
 from monstertruck_planners.route.motion import MotionPath
 from monstertruck_planners.track.catalog import TRACKERS, build_tracker
 from monstertruck_planners.track.config import TrackerConfig
+from monstertruck_planners.track.mpc import Solver
 from monstertruck_planners.track.path_tracker import TruckState
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.reasons import Reason
@@ -316,6 +317,32 @@ def test_a_missing_solver_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "monstertruck_planners.track.mpc", None)
     with pytest.raises(InputError, match=r"kind mpc: needs the extra \[planning\]"):
         build_tracker(TRACKER.validate_python({"kind": "mpc"}), STEERING)
+
+
+def feasible_plan(rng, last, most, step):
+    plan = np.empty(15)
+    for k in range(15):
+        last = plan[k] = np.clip(last + rng.uniform(-step, step), -most, most)
+    return plan
+
+
+def test_plans_of_mpc_keep_the_limits_exactly_and_no_other_is_better():
+    config = TRACKER.validate_python({"kind": "mpc", "angle": 0.3, "steering_rate": 1.0})
+    solver, rng = Solver(15, 1, config, 0.1), np.random.default_rng(5)
+    at_limit = 0
+    for _ in range(30):
+        half, wanted, last = rng.normal(size=(15, 15)), rng.uniform(-0.6, 0.6, 15), rng.uniform(-0.3, 0.3, 1)
+        quadratic, linear = half.T @ half, -(half.T @ half) @ wanted
+        plan = solver.solve(quadratic, linear, last)
+        changes = np.diff(plan, prepend=last)
+        assert max(np.abs(plan).max() - 0.3, np.abs(changes).max() - 0.1) < 1e-9
+        at_limit += np.count_nonzero((np.abs(plan) > 0.3 - 1e-9) | (np.abs(changes) > 0.1 - 1e-9)) > 3
+        smooth = np.eye(15) - np.eye(15, k=-1)
+        weight = 1.0 / (0.1 * config.rate_scale**2)
+        slope = quadratic @ plan + linear + weight * smooth.T @ (smooth @ plan - np.append(last, np.zeros(14)))
+        others = np.array([feasible_plan(rng, last[0], 0.3, 0.1) for _ in range(50)])
+        assert ((others - plan) @ slope).min() > -1e-4, "no way down from it"
+    assert at_limit > 20
 
 
 def test_a_planned_crab_is_driven_as_planned():
