@@ -164,13 +164,13 @@ def check(arguments: list[str]) -> int:
 
     ``arguments`` go to pytest.
 
-    Tests that fail are run once more, one after the other: on a busy computer some miss a time-out beside the others.
+    Tests that fail are run once more, one after the other: on a busy computer some miss a time-out while others run.
     Both results are printed; one that fails again fails the check.
     """
     tools = VENV / "bin"
     pytest = tools / "pytest"
     run(KERNELS[0], *BYTECODE)
-    compiling = subprocess.Popen(KERNELS, cwd=ROOT)  # beside mypy: each keeps one core busy for a minute
+    compiling = subprocess.Popen(KERNELS, cwd=ROOT)  # while mypy runs: each keeps one core busy for a minute
     try:
         for program, rest in (
             (Path(find_uv()), ["lock", "--check", "--quiet", "--system-certs"]),

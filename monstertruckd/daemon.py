@@ -11,7 +11,7 @@ from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -32,8 +32,9 @@ from monstertruck_runtime.actors.actor import ActorFactory
 from monstertruck_runtime.actors.remote import RPC as REMOTE_STEP
 from monstertruck_runtime.actors.remote import RemoteWorkQueue
 from monstertruck_runtime.clock import Clock, VirtualClock
-from monstertruck_runtime.errors import ConfigError
+from monstertruck_runtime.errors import ConfigError, InputError
 from monstertruck_runtime.mailbox import latest
+from monstertruck_runtime.ports import EventSink, Handler
 from monstertruck_runtime.service import OnBug, RestartPolicy, Scope, Service, scope, supervise
 from monstertruck_runtime.slowness import SlowComputer, factor_of
 from monstertruck_runtime.threads import Offload, in_daemon_thread, in_thread, inline
@@ -61,7 +62,6 @@ from monstertruckd.gate import rpc as gate_rpc
 from monstertruckd.gate.core import Gate
 from monstertruckd.gate.latch import EstopLatch, Latch, MemoryLatch, marks_folder
 from monstertruckd.gate.service import GateInputs, GateOutputs, GateService
-from monstertruckd.host import acknowledge
 from monstertruckd.host.health import ClockService, HealthBoard, MeterService
 from monstertruckd.host.journal import published
 from monstertruckd.host.notify import notify_from, status_line
@@ -70,6 +70,9 @@ from monstertruckd.host.versions import running_versions
 from monstertruckd.recorder.black_box import BlackBox
 from monstertruckd.recorder.recorder import LogDigest, Recorder
 from monstertruckd.recorder.recordings import Recordings
+
+LONGEST_WARNING: Final = 200
+"""Characters of a warning that is acknowledged."""
 
 
 class Daemon:
@@ -325,7 +328,7 @@ class Daemon:
         rpc.register("config", config, AccessRole.OBSERVER)
         rpc.register("versions", versions, AccessRole.OBSERVER)
         live.register(rpc)
-        acknowledge.register(rpc, self._events)
+        rpc.register("acknowledge", acknowledging(self._events))
         self._recordings().register(rpc)
         rpc.register(REMOTE_STEP, self._remote_steps.serve)
         gate_rpc.register(rpc, self.bus, self.clock)
@@ -444,6 +447,19 @@ class Daemon:
             offload=in_daemon_thread if self._seed is None else inline,
             log=lambda: None if self.recorder is None else self.recorder.path,
         )
+
+
+def acknowledging(events: EventSink) -> Handler:
+    """Remote call ``acknowledge``: an operator has seen a warning (``text``), which becomes an event in the log."""
+
+    async def acknowledge(payload: dict[str, Any]) -> dict[str, Any]:
+        text, by = payload.get("text"), str(payload.get("source", ""))
+        if not isinstance(text, str) or not text or len(text) > LONGEST_WARNING or not text.isprintable():
+            raise InputError(f"text: expected 1 to {LONGEST_WARNING} printable characters")
+        events(Reason.ACKNOWLEDGED, Severity.INFO, "operator", f"{by} has seen: {text}", by=by)
+        return {}
+
+    return acknowledge
 
 
 def _attachments(config: TruckConfig, body: Body, tree: Tree | None) -> dict[str, Any]:

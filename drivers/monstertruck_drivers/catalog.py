@@ -21,7 +21,7 @@ from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.plugins import Catalog, Plugin, load
 from monstertruck_schemas import topics
 from monstertruck_schemas.base import Schema
-from monstertruck_schemas.roles import SHAFTS, DeviceRole
+from monstertruck_schemas.roles import SHAFTS, DeviceRole, ServiceName
 from monstertruck_schemas.topics import CMD_DRIVES, DRIVES, Topic, Writer
 
 Probe = Callable[..., Awaitable[dict[str, Any]]]
@@ -62,6 +62,11 @@ class RoleSpec:
     """Driven shafts it may control, of those as many as its settings have (``shafts``); else the first one."""
     loads_hub: bool = False
     """It draws current (a motor, a sensor of pictures) or bandwidth as soon as its driver starts it."""
+
+    @property
+    def topic(self) -> Topic[Any]:
+        """Its own topic."""
+        return next(iter(self.writes.values()))
 
 
 def _shaft(index: int) -> RoleSpec:
@@ -230,41 +235,9 @@ class DeviceKind(Plugin):
         return cast("Probe", load(self.probe))
 
 
-RESERVED: Final = frozenset(
-    {
-        "behaviours",
-        "blackbox",
-        "bus",
-        "calibration",
-        "clock",
-        "explorer",
-        "gate",
-        "goals",
-        "ground",
-        "health",
-        "levelling",
-        "lidar_sonars",
-        "map",
-        "meter",
-        "missions",
-        "notify",
-        "odometry",
-        "path",
-        "peers",
-        "points",
-        "present",
-        "recorder",
-        "shafts",
-        "slam",
-        "stalls",
-        "tracker",
-        "transforms",
-        "usb",
-        "zenoh",
-    }
-)
-"""Names of the daemon's other services (a test compares them), and of what a section of the configuration has besides
-its roles."""
+RESERVED: Final = frozenset({*map(str, ServiceName), "present", "shafts"})
+"""Names that no role of another distribution may have: of the services that are no device, and of what a section of the
+configuration has besides its roles (a test compares)."""
 
 
 class DeviceCatalog(Catalog[DeviceKind]):

@@ -157,7 +157,7 @@ def _publisher(
 ) -> Publisher[Any] | None:
     """Write end of one of a role's topics; None where it is another configured role's own."""
     topic = role.writes[name]
-    owner = next((other for other in roles.values() if next(iter(other.writes.values())) is topic), role)
+    owner = next((other for other in roles.values() if other.topic is topic), role)
     if owner is not role:
         return None
     return scan_publisher(config, bus) if topic is topics.SCAN else bus.publisher(topic, Writer.DRIVER)

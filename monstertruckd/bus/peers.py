@@ -4,6 +4,7 @@ from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import Clock, Schedule
 from monstertruck_runtime.mailbox import latest
 from monstertruck_runtime.ports import Publisher, Ready
+from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.state import Odometry, Peer, Peers
 from monstertruck_schemas.topics import PEERS, POSE
 from monstertruckd.bus.zenoh_config import PeerConfig
@@ -17,7 +18,7 @@ class PeerService:
         out: ``state/peers``.
     """
 
-    name = "peers"
+    name = ServiceName.PEERS.value
 
     def __init__(self, clock: Clock, out: Publisher[Peers]) -> None:
         self._clock, self._out = clock, out

@@ -24,7 +24,7 @@ from monstertruck_runtime.ports import Ready
 from monstertruck_runtime.threads import ThreadHop, in_thread
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.roles import AccessRole
+from monstertruck_schemas.roles import AccessRole, ServiceName
 from monstertruck_schemas.topics import (
     CAMERA,
     KEY_ROOT,
@@ -76,7 +76,7 @@ class ZenohBridge:
         stand: take in what a test stand sees of the robot.
     """
 
-    name = "zenoh"
+    name = ServiceName.ZENOH.value
 
     def __init__(
         self, robot: str, bus: Bus, config: ZenohConfig, clock: Clock, rpc: Rpc, *, stand: bool = False

@@ -24,6 +24,7 @@ from monstertruck_runtime.threads import Offload
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.health import CalibrationHealth, CalibrationState
 from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.roles import DeviceRole, ServiceName
 from monstertruck_schemas.topics import BATTERY, CALIBRATION, COMPASS, DRIVE, ODOMETRY, POSE, SONAR, USB, Topic, Writer
 from monstertruck_schemas.usb import UsbTree
 from monstertruckd.bus.local import Bus
@@ -49,7 +50,7 @@ class Lifetime(NamedTuple):
     days: int
     metres: float | None
     """Way; None: it does not wear with the way."""
-    role: str
+    role: DeviceRole
     """Device that was measured."""
     topics: tuple[Topic[Any], ...]
     """What rests on it."""
@@ -57,16 +58,16 @@ class Lifetime(NamedTuple):
 
 _MOTION = (ODOMETRY, POSE)
 LIFETIMES: Final[dict[WizardName, Lifetime]] = {
-    "battery": Lifetime(365, None, "steering", (BATTERY,)),
-    "compass": Lifetime(90, None, "compass", (COMPASS, *_MOTION)),
-    "drive": Lifetime(180, 20_000.0, "drive", _MOTION),
-    "steering": Lifetime(90, 10_000.0, "steering", _MOTION),
-    "odometry": Lifetime(180, 20_000.0, "drive", _MOTION),
-    "lidar": Lifetime(180, 20_000.0, "lidar", (POSE,)),
-    "imu": Lifetime(90, None, "imu", _MOTION),
-    "slip": Lifetime(90, 5_000.0, "wheels", _MOTION),
-    "stabiliser": Lifetime(180, 20_000.0, "stabiliser", (POSE,)),
-    "sonar": Lifetime(180, 20_000.0, "sonar", (SONAR,)),
+    "battery": Lifetime(365, None, DeviceRole.STEERING, (BATTERY,)),
+    "compass": Lifetime(90, None, DeviceRole.COMPASS, (COMPASS, *_MOTION)),
+    "drive": Lifetime(180, 20_000.0, DeviceRole.DRIVE, _MOTION),
+    "steering": Lifetime(90, 10_000.0, DeviceRole.STEERING, _MOTION),
+    "odometry": Lifetime(180, 20_000.0, DeviceRole.DRIVE, _MOTION),
+    "lidar": Lifetime(180, 20_000.0, DeviceRole.LIDAR, (POSE,)),
+    "imu": Lifetime(90, None, DeviceRole.IMU, _MOTION),
+    "slip": Lifetime(90, 5_000.0, DeviceRole.WHEELS, _MOTION),
+    "stabiliser": Lifetime(180, 20_000.0, DeviceRole.STABILISER, (POSE,)),
+    "sonar": Lifetime(180, 20_000.0, DeviceRole.SONAR, (SONAR,)),
 }
 """By experience of such parts, none of it measured: tyres wear, linkages and mounts are knocked, iron changes."""
 
@@ -247,7 +248,7 @@ class CalibrationWatch:
         odometer: way in all.
     """
 
-    name = "calibration"
+    name = ServiceName.CALIBRATION.value
 
     def __init__(
         self,

@@ -32,7 +32,7 @@ from monstertruck_runtime.bodies import AnyBody, build_chassis
 from monstertruck_runtime.slowness import Board
 from monstertruck_schemas.base import Schema
 from monstertruck_schemas.body import TruckBody
-from monstertruck_schemas.roles import SHAFTS
+from monstertruck_schemas.roles import SHAFTS, DeviceRole
 from monstertruckd.bus.zenoh_config import PeerConfig, ZenohConfig
 from monstertruckd.config.device_safety import beyond_devices, unattended_times, weakened_devices
 from monstertruckd.gate.config import SIGHT, BodyLimits, GateConfig, beyond, weakened
@@ -228,7 +228,7 @@ class TruckConfig(Schema):
     def missing_actuators(self) -> str | None:
         """What the body needs to drive and steer, if some of it is not there."""
         chassis = self.chassis()
-        needed = (*SHAFTS[: len(chassis.shafts)], *(("steering",) if chassis.steered else ()))
+        needed = (*SHAFTS[: len(chassis.shafts)], *((DeviceRole.STEERING,) if chassis.steered else ()))
         if set(needed) <= self.devices.present().keys() | self.devices.shafts().keys():
             return None
         return f"the devices {', '.join(needed[:-1])} and {needed[-1]}"

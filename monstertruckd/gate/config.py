@@ -15,6 +15,7 @@ from pydantic import Field, model_validator
 from monstertruck_schemas import topics
 from monstertruck_schemas.base import LIVE, Schema
 from monstertruck_schemas.req import Role
+from monstertruck_schemas.roles import DeviceRole, ServiceName
 from monstertruck_schemas.topics import Topic
 
 Positive = Annotated[float, Field(gt=0)]
@@ -177,12 +178,12 @@ class GateConfig(Schema):
     max_latency: Positive = 0.4
     """Greatest time between a sample's stamp and its arrival, s; a later sample is not valid."""
     tolerated_failures: Annotated[tuple[str, ...], Field(strict=False)] = (
-        "recorder",
-        "camera",
-        "link",
-        "host",
-        "usb",
-        "stalls",
+        ServiceName.RECORDER.value,
+        DeviceRole.CAMERA.value,
+        DeviceRole.LINK.value,
+        DeviceRole.HOST.value,
+        ServiceName.USB.value,
+        ServiceName.STALLS.value,
     )
     """Services whose failure does not stop the truck."""
 

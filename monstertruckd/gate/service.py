@@ -19,6 +19,7 @@ from monstertruck_schemas.event import Event, Severity, Stop
 from monstertruck_schemas.health import HealthTable
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import STARTING, ControlRequest, DriveRequest
+from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.sensor import Attitude, Battery, DriveFeedback, LaserScan, SonarRanges, SteeringFeedback
 from monstertruck_schemas.state import GateMode, GateState
 from monstertruckd.gate.config import GateConfig
@@ -115,7 +116,7 @@ class GateService:
         weakened: settings less safe than the defaults, shown to everybody.
     """
 
-    name = "gate"
+    name = ServiceName.GATE.value
 
     def __init__(
         self,

@@ -11,7 +11,7 @@ from monstertruck_schemas.event import Cause, Event, Measurement, Severity
 from monstertruck_schemas.health import HealthTable, ServiceHealth, ServiceState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import DriveRequest, Role
-from monstertruck_schemas.roles import DeviceRole
+from monstertruck_schemas.roles import DeviceRole, ServiceName
 from monstertruck_schemas.sensor import DriveMode
 from monstertruck_schemas.state import GateMode
 from monstertruckd.gate.arbitration import Source
@@ -19,7 +19,7 @@ from monstertruckd.gate.config import GateConfig
 from monstertruckd.gate.limiter import CommandLimiter
 from monstertruckd.gate.sensors import STALE_SENSORS, SensorMonitor, ShaftCheck, SteeringCheck
 
-GATE: Final = "gate"
+GATE: Final = ServiceName.GATE.value
 """Source of causes that only the gate itself knows."""
 
 HUB_WINDOW: Final = SECOND

@@ -10,6 +10,7 @@ from monstertruck_runtime.ports import EventSink, Publisher, Ready
 from monstertruck_schemas.event import Event, Severity
 from monstertruck_schemas.health import HealthTable, LoopHealth, ServiceHealth, ServiceState
 from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.state import ClockOffset
 from monstertruck_schemas.topics import LOOP, RECORDER, Writer
 from monstertruckd.bus.local import Bus
@@ -43,7 +44,7 @@ class HealthBoard:
         on_hubs: services whose device hangs on a hub.
     """
 
-    name = "health"
+    name = ServiceName.HEALTH.value
 
     def __init__(
         self,
@@ -134,7 +135,7 @@ class HealthBoard:
 class ClockService:
     """Publishes real time minus daemon time; a step of real time is an event."""
 
-    name = "clock"
+    name = ServiceName.CLOCK.value
 
     def __init__(self, clock: Clock, out: Publisher[ClockOffset], events: EventSink) -> None:
         self._clock = clock
@@ -159,7 +160,7 @@ class ClockService:
 class MeterService:
     """Publishes the control tick's punctuality and the recorder's state once a second."""
 
-    name = "meter"
+    name = ServiceName.METER.value
 
     def __init__(
         self,

@@ -8,6 +8,7 @@ from typing import Final, Protocol
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.ports import Ready
 from monstertruck_schemas.health import ServiceHealth, ServiceState
+from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.state import GateMode
 
 PERIOD: Final = 1.0
@@ -62,7 +63,7 @@ class NotifyService:
         status: state of the robot, one line.
     """
 
-    name = "notify"
+    name = ServiceName.NOTIFY.value
 
     def __init__(
         self,

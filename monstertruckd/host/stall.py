@@ -13,6 +13,7 @@ from typing import Final
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.ports import Ready
 from monstertruck_runtime.threads import in_thread
+from monstertruck_schemas.roles import ServiceName
 
 log = logging.getLogger(__name__)
 
@@ -44,7 +45,7 @@ class StallWatch:
         interval: seconds, see ``INTERVAL``.
     """
 
-    name = "stalls"
+    name = ServiceName.STALLS.value
 
     def __init__(
         self,

@@ -22,6 +22,7 @@ from monstertruck_runtime.stop_text import causes_text
 from monstertruck_runtime.threads import Offload, in_daemon_thread
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.topics import TOPICS, Topic
 from monstertruckd.gate.stops import Trip
 from monstertruckd.recorder.config import BlackBoxConfig, Compression
@@ -195,7 +196,7 @@ class BlackBox:
         log: file of the run that is being written, named in every box.
     """
 
-    name = "blackbox"
+    name = ServiceName.BLACKBOX.value
 
     def __init__(
         self,

@@ -14,6 +14,7 @@ from monstertruck_schemas.body import Mount
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.plan import Path, TrackerState
 from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.state import Odometry
 from monstertruckd.recorder.config import MapRender
@@ -39,7 +40,7 @@ class MapService:
         events: where finished pictures are reported.
     """
 
-    name = "map"
+    name = ServiceName.MAP.value
 
     def __init__(
         self,

@@ -16,6 +16,7 @@ from monstertruck_runtime import wire
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_schemas.health import RecorderHealth
 from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.topics import TOPICS, Topic
 from monstertruckd.recorder.config import RecorderConfig
 from monstertruckd.recorder.log_file import LogEntry, LogFile, LogFolder, disk_reason, log_offset
@@ -208,7 +209,7 @@ class Recorder:
             by log time alone, and ``health`` names no file, so that two runs of one seed record the same.
     """
 
-    name = "recorder"
+    name = ServiceName.RECORDER.value
 
     def __init__(
         self,

@@ -25,6 +25,7 @@ from monstertruck_schemas import topics
 from monstertruck_schemas.base import Pose2D, Schema, Twist2D
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.sensor import Attitude, DriveFeedback, Imu, SteeringFeedback
 from monstertruck_schemas.state import Odometry
 
@@ -300,7 +301,7 @@ class OdometryService:
         rate: poses per second.
     """
 
-    name = "odometry"
+    name = ServiceName.ODOMETRY.value
 
     def __init__(
         self,

@@ -11,6 +11,7 @@ from typing import Final
 from monstertruck_runtime.clock import Clock, Schedule
 from monstertruck_runtime.errors import InputError, NotFoundError
 from monstertruck_runtime.ports import Publisher, Ready, Subscription
+from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.sensor import StabiliserFeedback
 from monstertruck_schemas.state import Odometry, Transform, Transforms
 
@@ -198,7 +199,7 @@ class TransformService:
         localised: transforms above base by localisation, which replace odometry and the fixed map to odom.
     """
 
-    name = "transforms"
+    name = ServiceName.TRANSFORMS.value
 
     def __init__(
         self,

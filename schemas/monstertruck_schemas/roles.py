@@ -1,4 +1,4 @@
-"""Roles of devices, by which the rest of the robot knows them, and of those who ask the robot for something."""
+"""Names that the whole robot shares: roles of devices, services that are no device, roles of those who ask."""
 
 from enum import StrEnum
 from typing import Final
@@ -29,6 +29,37 @@ class DeviceRole(StrEnum):
 
 SHAFTS: Final = (DeviceRole.DRIVE, DeviceRole.DRIVE_2, DeviceRole.DRIVE_3, DeviceRole.DRIVE_4)
 """Driven shafts in the order of the body's; each has a controller of this role, or ``WHEELS`` controls them all."""
+
+
+class ServiceName(StrEnum):
+    """Services that are no device. Each takes its name from here; no role of another package may have one of these."""
+
+    BEHAVIOURS = "behaviours"
+    BLACKBOX = "blackbox"
+    CALIBRATION = "calibration"
+    CLOCK = "clock"
+    EXPLORER = "explorer"
+    GATE = "gate"
+    GOALS = "goals"
+    GROUND = "ground"
+    HEALTH = "health"
+    LEVELLING = "levelling"
+    LIDAR_SONARS = "lidar_sonars"
+    MAP = "map"
+    METER = "meter"
+    MISSIONS = "missions"
+    NOTIFY = "notify"
+    ODOMETRY = "odometry"
+    PATH = "path"
+    PEERS = "peers"
+    POINTS = "points"
+    RECORDER = "recorder"
+    SLAM = "slam"
+    STALLS = "stalls"
+    TRACKER = "tracker"
+    TRANSFORMS = "transforms"
+    USB = "usb"
+    ZENOH = "zenoh"
 
 
 class AccessRole(StrEnum):

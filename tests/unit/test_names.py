@@ -1,6 +1,5 @@
 """Names and words of the sources: one class a name, and the words of the field instead of private ones."""
 
-import ast
 import re
 from collections import Counter
 from pathlib import Path
@@ -22,11 +21,11 @@ OLD_KEYS = ROOT / "monstertruckd" / "config" / "migrate.py"
 
 def test_every_class_has_a_name_of_its_own():
     names = Counter(
-        node.name
+        name
         for path in SOURCES
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-        if isinstance(node, ast.ClassDef)
+        for name in re.findall(r"^ *class (\w+)[:(\[]", path.read_text(encoding="utf-8"), re.MULTILINE)
     )
+    assert names.total() > 1000
     assert [name for name, count in names.items() if count > 1] == []
 
 

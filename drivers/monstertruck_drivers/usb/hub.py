@@ -30,9 +30,10 @@ from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.ports import EventSink, Publisher, Ready
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.usb import UsbNode, UsbState, UsbTree
 
-NAME: Final = "usb"
+NAME: Final = ServiceName.USB.value
 
 
 @dataclass(slots=True)

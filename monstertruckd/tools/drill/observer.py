@@ -21,6 +21,7 @@ from monstertruck_drivers.maestro.protocol import Code, Decoder, ServoCommand
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.truck import DriveTrain
 from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_schemas.roles import DeviceRole
 from monstertruck_sim.world.plant import TruthState
 from monstertruck_sim.world.world import World
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
@@ -59,6 +60,7 @@ ROOM: Final = np.linspace(0.0, 0.5, 26)
 """Ways ahead of which the ground is looked at, m."""
 REVERSES_BELOW: Final = 0.05
 """True speed, m/s, from which on a motor may not be asked to turn the other way."""
+WIRES: Final = (DeviceRole.DRIVE, DeviceRole.STEERING, DeviceRole.LIDAR, DeviceRole.COMPASS)
 STOP_CONTROLS: Final = frozenset((Control.QUICK_STOP, Control.DISABLE_VOLTAGE, Control.HALT))
 
 
@@ -434,8 +436,8 @@ class Observer:
         assert config.devices.steering is not None
         self._world = world
         self._clock = clock
-        taps = {r: WireTap(ports[r], clock) for r in ("drive", "steering", "lidar", "compass") if r in ports}
-        self.drive, self._servos = taps["drive"], taps["steering"]
+        taps: dict[str, WireTap] = {r: WireTap(ports[r], clock) for r in WIRES if r in ports}
+        self.drive, self._servos = taps[DeviceRole.DRIVE], taps[DeviceRole.STEERING]
         self._maestro = Decoder(crc=config.devices.steering.driver.use_crc)
         motor = config.sim.world.truck.motor
         drivetrain = DriveTrain(motor.ratio, config.sim.world.truck.wheel_radius)
@@ -576,7 +578,7 @@ def _indispensable(config: SimulatedTruckConfig, taps: Mapping[str, WireTap]) ->
     Without the deadman line nothing stops a drive that cannot be reached.
     """
     gate = config.gate
-    limits = {"drive": gate.drive, "steering": gate.steering, "lidar": gate.scan, "compass": gate.attitude}
+    limits = dict(zip(map(str, WIRES), (gate.drive, gate.steering, gate.scan, gate.attitude), strict=True))
     for role, tap in taps.items():
-        if limits[role].critical and (role != "drive" or config.sim.deadman_wired):
+        if limits[role].critical and (role != DeviceRole.DRIVE or config.sim.deadman_wired):
             yield role, tap, limits[role].stale_after

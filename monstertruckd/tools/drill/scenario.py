@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any, Final, cast
 
+from monstertruck_drivers.catalog import COMPASS, DRIVE, LIDAR, STEERING
 from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos.protocol import Control
 from monstertruck_runtime.clock import SECOND, VirtualClock
@@ -22,6 +23,7 @@ from monstertruck_schemas.event import Event
 from monstertruck_schemas.health import HealthTable, ServiceHealth, ServiceState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import DriveRequest, Order, Role
+from monstertruck_schemas.roles import DeviceRole
 from monstertruck_schemas.state import GateMode, GateState
 from monstertruck_schemas.topics import Topic
 from monstertruck_sim.faults import Fault, SimContext, apply
@@ -30,12 +32,7 @@ from monstertruckd.tools.drill.observer import AT_REST, Violation, stop_bytes, w
 from monstertruckd.tools.drill.truck import DaemonReport, DrillTruck
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
 
-SENSORS: Final[Mapping[str, Topic[Any]]] = {
-    "lidar": topics.SCAN,
-    "compass": topics.COMPASS,
-    "drive": topics.DRIVE,
-    "steering": topics.STEERING,
-}
+SENSORS: Final[Mapping[str, Topic[Any]]] = {role.name: role.topic for role in (LIDAR, COMPASS, DRIVE, STEERING)}
 TIMEOUT: Final = 10.0
 """Seconds in which a sound truck is ready, and drives when it is armed."""
 ALL: Final = 1 << 20
@@ -433,7 +430,7 @@ def _reaction(scenario: Scenario, got: Reaction) -> Iterator[str]:
         case Expect.STOP_BY_LINE:
             yield from _late(got.standstill_after_s, STANDSTILL_BY_LINE, "standstill")
         case Expect.ENDURE if got.reason is not None:
-            limit = STANDSTILL_AGAIN if scenario.device == "drive" else STOP_AFTER_SAMPLE + STANDSTILL
+            limit = STANDSTILL_AGAIN if scenario.device == DeviceRole.DRIVE else STOP_AFTER_SAMPLE + STANDSTILL
             yield from _late(got.standstill_after_s, limit, "standstill")
         case Expect.GO_ON | Expect.SLOW_DOWN if got.reason is not None or got.standstill_after_s is not None:
             yield f"stopped: {got.reason}"

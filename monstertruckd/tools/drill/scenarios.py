@@ -10,6 +10,7 @@ import numpy as np
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas import topics
 from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.roles import DeviceRole
 from monstertruck_schemas.topics import Topic
 from monstertruck_sim.faults import (
     ALL_ROUND,
@@ -28,15 +29,15 @@ from monstertruckd.tools.drill.scenario import SENSORS, Expect, Scenario, Scenar
 from monstertruckd.tools.simulation.config import DEADMAN_LINE
 
 STALE: Final[Mapping[str, Reason]] = {
-    "lidar": Reason.SCAN_STALE,
-    "compass": Reason.ATTITUDE_STALE,
-    "drive": Reason.DRIVE_STALE,
-    "steering": Reason.STEERING_STALE,
+    DeviceRole.LIDAR: Reason.SCAN_STALE,
+    DeviceRole.COMPASS: Reason.ATTITUDE_STALE,
+    DeviceRole.DRIVE: Reason.DRIVE_STALE,
+    DeviceRole.STEERING: Reason.STEERING_STALE,
 }
 BY_REQUESTS: Final[Mapping[str, Any]] = {"tracker": None, "path": None}
 HUNG_WORKER: Final[Mapping[str, Any]] = {"map": {"latency": 5.0, "deadline": 1.0, "period": 0.5}}
 """Its steps take five times as long as they may."""
-WITHOUT_LINE: Final = dict.fromkeys(SENSORS, Expect.STOP) | {"drive": Expect.STOP_AGAIN}
+WITHOUT_LINE: Final = dict.fromkeys(SENSORS, Expect.STOP) | {DeviceRole.DRIVE: Expect.STOP_AGAIN}
 
 
 def poison(topic: Topic[Any]) -> Action[ScenarioContext]:
@@ -121,14 +122,14 @@ def with_line() -> Iterator[Scenario]:
             Fault(f"drive: {name}, deadman line wired", command("drive", broken), command("drive", mended)),
             Expect.STOP_BY_LINE,
             seen=(Reason.DRIVE_STALE,),
-            device="drive",
+            device=DeviceRole.DRIVE,
             overlay=DEADMAN_LINE,
             timeout=4.0,
         )
     yield Scenario(
         Fault("steering: supply dips for 0.1 s, deadman line wired", command("steering", "brown_out 0.1")),
         Expect.STOP,
-        down={"drive": Reason.DEVICE_STOPPED},
+        down={DeviceRole.DRIVE: Reason.DEVICE_STOPPED},
         overlay=DEADMAN_LINE,
     )
 
@@ -137,12 +138,12 @@ def wrong_devices() -> Iterator[Scenario]:
     """Two cables exchanged while the truck stands."""
     wrong, silent = Reason.DEVICE_WRONG, Reason.DEVICE_TIMEOUT  # a servo controller says nothing to strange questions
     for one, other, reasons in (
-        ("lidar", "compass", (wrong, wrong)),
-        ("lidar", "drive", (wrong, wrong)),
-        ("lidar", "steering", (silent, wrong)),
-        ("compass", "drive", (wrong, wrong)),
-        ("compass", "steering", (silent, wrong)),
-        ("drive", "steering", (silent, wrong)),
+        (DeviceRole.LIDAR, DeviceRole.COMPASS, (wrong, wrong)),
+        (DeviceRole.LIDAR, DeviceRole.DRIVE, (wrong, wrong)),
+        (DeviceRole.LIDAR, DeviceRole.STEERING, (silent, wrong)),
+        (DeviceRole.COMPASS, DeviceRole.DRIVE, (wrong, wrong)),
+        (DeviceRole.COMPASS, DeviceRole.STEERING, (silent, wrong)),
+        (DeviceRole.DRIVE, DeviceRole.STEERING, (silent, wrong)),
     ):
         yield Scenario(
             Fault(
@@ -218,7 +219,7 @@ def of_answers() -> Iterator[Scenario]:
         Fault("drive: supply dips within an exchange", command("drive", "restart 1")),
         Expect.STOP_AGAIN,
         seen=(Reason.DRIVE_STALE,),
-        down={"drive": Reason.DEVICE_RESTARTED},
+        down={DeviceRole.DRIVE: Reason.DEVICE_RESTARTED},
     )
     yield Scenario(
         Fault("drive: shaft blocked", block_shaft(on=True), block_shaft(on=False)),
@@ -238,7 +239,7 @@ def of_the_truck() -> Iterator[Scenario]:
         ),
         Expect.STOP,
         seen=(Reason.DRIVE_FAULT,),
-        down={"drive": Reason.DEVICE_FAULT},
+        down={DeviceRole.DRIVE: Reason.DEVICE_FAULT},
         timeout=15.0,
     )
     yield Scenario(
@@ -250,7 +251,7 @@ def of_the_truck() -> Iterator[Scenario]:
         Fault("lidar: scans arrive 0.6 s old", command("lidar", "line delay 0.6"), command("lidar", "line delay 0")),
         Expect.STOP,
         seen=(Reason.SCAN_STALE,),
-        device="lidar",
+        device=DeviceRole.LIDAR,
     )
     yield Scenario(
         Fault(
@@ -261,7 +262,7 @@ def of_the_truck() -> Iterator[Scenario]:
         ),
         Expect.STOP,
         seen=(Reason.SCAN_STALE,),
-        device="lidar",
+        device=DeviceRole.LIDAR,
         resumes=True,
     )
     yield Scenario(

@@ -21,6 +21,7 @@ from monstertruck_schemas.body import Mount
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.health import OdometryHealth
 from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.sensor import Attitude, LaserScan
 from monstertruck_schemas.state import Ground, Odometry
 from monstertruck_schemas.topics import FUSION, ODOMETRY
@@ -65,7 +66,7 @@ class GroundService:
         save: folder the grid is saved to; None = nowhere.
     """
 
-    name = "ground"
+    name = ServiceName.GROUND.value
 
     def __init__(
         self,

@@ -29,7 +29,7 @@ from monstertruck_schemas.event import Severity
 from monstertruck_schemas.health import LocalisationStatus, SlamHealth
 from monstertruck_schemas.points import PointOfInterest, PointOrder, PointRequest, PointsOfInterest
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.roles import AccessRole
+from monstertruck_schemas.roles import AccessRole, ServiceName
 from monstertruck_schemas.sensor import Attitude, CompressedImage
 from monstertruck_schemas.state import GateState, Odometry
 from monstertruck_schemas.topics import POSE
@@ -114,7 +114,7 @@ class PointService:
         max_age: see ``GateConfig.max_request_age``.
     """
 
-    name = "points"
+    name = ServiceName.POINTS.value
 
     def __init__(
         self,

@@ -32,6 +32,7 @@ from monstertruck_schemas.body import Mount
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.health import LocalisationStatus, OdometryUse, SlamHealth
 from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.state import Grid, Odometry, ScanMotion, Transform
 
@@ -70,7 +71,7 @@ class SlamService:
         events: where closures, losses and unusable scans are reported.
     """
 
-    name = "slam"
+    name = ServiceName.SLAM.value
 
     def __init__(
         self,

@@ -17,6 +17,7 @@ from monstertruck_runtime.mailbox import Mailbox
 from monstertruck_runtime.ports import Publisher, Ready
 from monstertruck_schemas.base import FrameId, Schema
 from monstertruck_schemas.body import Mount
+from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.sensor import NO_ECHO, VALID_BEAM, LaserScan, SonarEcho, SonarRanges
 
 OPENING: Final = 0.01
@@ -120,7 +121,7 @@ class LidarSonars:
         out: ``sensor/sonar``.
     """
 
-    name = "lidar_sonars"
+    name = ServiceName.LIDAR_SONARS.value
 
     def __init__(
         self,

@@ -27,11 +27,11 @@ from monstertruck_schemas.event import Severity
 from monstertruck_schemas.plan import BehaviourState, GoalPhase, GoalState, TrackerState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import BehaviourOrder, BehaviourRequest, DriveRequest, RequestedTwist
-from monstertruck_schemas.roles import AccessRole
+from monstertruck_schemas.roles import AccessRole, ServiceName
 from monstertruck_schemas.state import GateMode, GateState, Odometry
 from monstertruck_schemas.topics import BEHAVIOUR, GATE, GOAL, ODOMETRY, TRACKER, Writer
 
-SOURCE: Final = "behaviours"
+SOURCE: Final = ServiceName.BEHAVIOURS.value
 """Of the drive requests."""
 LEASE: Final = 0.3
 """Of each, s."""

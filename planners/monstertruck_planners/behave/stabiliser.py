@@ -38,6 +38,7 @@ from monstertruck_runtime.mailbox import Mailbox, fifo, latest
 from monstertruck_runtime.ports import BusPort, Publisher, Ready, Subscription
 from monstertruck_schemas.base import Schema
 from monstertruck_schemas.plan import StabiliserCommand
+from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.sensor import Attitude
 from monstertruck_schemas.state import Odometry
 from monstertruck_schemas.topics import COMPASS, ODOMETRY, PLAN_STABILISER, Writer
@@ -212,7 +213,7 @@ class StabiliserService:
         compass: Subscription[Attitude],
         odometry: Mailbox[Odometry],
         out: Publisher[StabiliserCommand],
-        name: str = "levelling",
+        name: str = ServiceName.LEVELLING.value,
     ) -> None:
         self.name = name
         self._config = config

@@ -24,11 +24,12 @@ from monstertruck_schemas.plan import ExplorationPhase, ExplorationState, GoalPh
 from monstertruck_schemas.points import PointKind, PointsOfInterest
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import ExploreOrder, ExploreRequest, GoalControl, GoalOrder, GoalRequest
+from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.sensor import Battery, BatteryLevel
 from monstertruck_schemas.state import GateState, Grid, Odometry
 from monstertruck_schemas.topics import BATTERY, POSE, SLAM
 
-SOURCE: Final = "explorer"
+SOURCE: Final = ServiceName.EXPLORER.value
 """Of the goals."""
 RATE: Final = 5.0
 """Looks a second."""

@@ -24,6 +24,7 @@ from monstertruck_runtime.mailbox import Mailbox
 from monstertruck_runtime.ports import EventSink, Subscription
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.state import Grid, Odometry
 from monstertruck_schemas.topics import ODOMETRY
@@ -45,7 +46,7 @@ class RouteDeformation:
         events: where events go.
     """
 
-    name = "goals"
+    name = ServiceName.GOALS.value
 
     def __init__(
         self,

@@ -15,10 +15,11 @@ from monstertruck_runtime.requests import planner_request
 from monstertruck_schemas.plan import BehaviourState, GoalState, Path, TrackerState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import DriveRequest, GoalControl, GoalRequest
+from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.state import GateState, Grid, Ground, Odometry
 
-SOURCE: Final = "goals"
+SOURCE: Final = ServiceName.GOALS.value
 AT_REST: Final = 0.01
 """Speed of a truck at rest, m/s."""
 LEASE: Final = 0.25

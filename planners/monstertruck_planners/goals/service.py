@@ -44,6 +44,7 @@ from monstertruck_schemas.event import Severity
 from monstertruck_schemas.plan import MAX_COORDINATE, GoalPhase, GoalState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import GoalControl, GoalOrder, GoalRequest, Request
+from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.state import Grid, Ground, Odometry
 from monstertruck_schemas.topics import ODOMETRY, SCAN
@@ -82,7 +83,7 @@ class GoalService:
         deformation: of the routes; None = they are driven as they are.
     """
 
-    name = "goals"
+    name = ServiceName.GOALS.value
 
     def __init__(
         self,

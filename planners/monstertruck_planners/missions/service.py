@@ -57,10 +57,11 @@ from monstertruck_schemas.req import (
     MissionRequest,
     Waypoint,
 )
+from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.state import GateState, Odometry
 from monstertruck_schemas.topics import ODOMETRY
 
-SOURCE: Final = "missions"
+SOURCE: Final = ServiceName.MISSIONS.value
 """Of its goals, behaviours and explorations."""
 RATE: Final = 5.0
 """Looks a second."""

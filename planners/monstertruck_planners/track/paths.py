@@ -16,6 +16,7 @@ from monstertruck_schemas.event import Severity
 from monstertruck_schemas.plan import BehaviourState, Path
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import PathRequest
+from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.state import GateState
 
 HEADER = ["x", "y", "yaw", "direction"]
@@ -85,7 +86,7 @@ class PathService:
         max_age: seconds; see ``GateConfig.max_request_age``.
     """
 
-    name = "path"
+    name = ServiceName.PATH.value
 
     def __init__(
         self,

@@ -24,11 +24,12 @@ from monstertruck_schemas.event import Severity
 from monstertruck_schemas.plan import AxleResponse, Path, TrackerState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import DriveRequest
+from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.sensor import Attitude, LaserScan
 from monstertruck_schemas.state import GateMode, GateState, Odometry
 from monstertruck_schemas.topics import COMPASS, ODOMETRY, SCAN
 
-SOURCE: Final = "tracker"
+SOURCE: Final = ServiceName.TRACKER.value
 """Of the drive requests."""
 
 ROUGHNESS_WINDOW: Final = 2.0

@@ -1,19 +1,23 @@
 """What the composed daemon does with requests at the instant they arrive."""
 
+import asyncio
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
 
 from monstertruck_runtime.clock import VirtualClock, run_virtual
+from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.mailbox import fifo
 from monstertruck_schemas.base import Pose2D
+from monstertruck_schemas.event import Severity
 from monstertruck_schemas.health import ServiceHealth, ServiceState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import ControlRequest, GoalRequest, Order, Role
 from monstertruck_schemas.state import GateMode
 from monstertruck_schemas.topics import EVENT, REQ_CONTROL, REQ_GOAL
 from monstertruckd.config.load import load_truck
-from monstertruckd.daemon import Daemon
+from monstertruckd.daemon import Daemon, acknowledging
 
 DEMO = Path(__file__).resolve().parents[3] / "configs" / "demo.yaml"
 HEADER = {"stamp": 1, "received": 1, "seq": 1, "source": "ann", "role": Role.STATION, "lease": 1.0, "nonce": "any"}
@@ -58,3 +62,15 @@ def test_every_goal_is_answered(tmp_path: Path, count: int):
         assert "ann" in reported[0].text
 
     with_daemon(tmp_path, check)
+
+
+@pytest.mark.parametrize(
+    ("text", "seen"), [("tilt", True), ("", False), (None, False), ("x" * 201, False), ("a\nb", False)]
+)
+def test_a_warning_that_was_seen_is_an_event(text: str | None, seen: bool):
+    events: list[tuple[object, ...]] = []
+    acknowledge = acknowledging(lambda *event, **values: events.append((*event, values)))
+    with nullcontext() if seen else pytest.raises(InputError, match="1 to 200 printable"):
+        asyncio.run(acknowledge({"text": text, "source": "ann"}))
+    expected = (Reason.ACKNOWLEDGED, Severity.INFO, "operator", "ann has seen: tilt", {"by": "ann"})
+    assert events == ([expected] if seen else [])

@@ -11,12 +11,13 @@ import pytest
 from pydantic import ValidationError
 
 from monstertruck_drivers.catalog import DEVICES, LIDAR, RESERVED, DeviceKind, Duty, RoleSpec, start_order
-from monstertruck_drivers.config import Device, Devices, Monitors
+from monstertruck_drivers.config import Device, Devices, Monitors, _Devices, _Monitors
 from monstertruck_drivers.usb.config import UsbConfig
 from monstertruck_runtime.errors import ConfigError, InputError
 from monstertruck_runtime.ports import Publisher, Subscription
 from monstertruck_schemas import topics
-from monstertruck_schemas.roles import DeviceRole
+from monstertruck_schemas.base import Schema
+from monstertruck_schemas.roles import DeviceRole, ServiceName
 from monstertruckd.config.load import load_truck
 
 KINDS = list(DEVICES.values())
@@ -124,28 +125,32 @@ def kind_with(**changes: object) -> DeviceKind:
     return dataclasses.replace(DEVICES["hokuyo_urg"], roles=roles)
 
 
-def test_the_names_of_all_services_are_reserved():
+def test_services_that_are_no_device_take_their_names_from_the_table():
     root = Path(__file__).resolve().parents[3]
-    names = set()
+    names = []
     for folder in ("schemas", "planners", "drivers", "monstertruckd"):
         for file in (root / folder).rglob("*.py"):
-            for node in ast.walk(ast.parse(file.read_text())):
+            text = file.read_text()
+            for node in ast.walk(ast.parse(text)) if "    name = " in text else ():
                 if isinstance(node, ast.ClassDef) and {"run", "__aenter__"} & {
                     getattr(line, "name", "") for line in node.body
                 }:
-                    names |= set(service_name(node, file))
-    assert {"gate", "usb", "tracker", "slam", "recorder"} <= names
-    assert names <= RESERVED
+                    names += service_name(node, text)
+    of_table = {f"ServiceName.{name.name}.value" for name in ServiceName}
+    assert set(names) == of_table - {"ServiceName.LEVELLING.value"}, "levelling is a kind's: a default of its parameter"
 
 
-def service_name(node: ast.ClassDef, file: Path) -> Iterator[str]:
-    """The name a class gives its service, written there or in a constant of the module."""
+def service_name(node: ast.ClassDef, module: str) -> Iterator[str]:
+    """What a class gives its service for a name, there or in a constant of the module."""
     for line in node.body:
         if isinstance(line, ast.Assign) and ast.unparse(line.targets[0]) == "name":
-            if isinstance(line.value, ast.Constant):
-                yield line.value.value
-            else:
-                yield re.findall(rf'^{ast.unparse(line.value)}\b.*= "(\w+)"', file.read_text(), re.MULTILINE)[0]
+            value = ast.unparse(line.value)
+            yield re.findall(rf"^{value}\b.*= (.+)", module, re.MULTILINE)[0] if value.isupper() else value
+
+
+@pytest.mark.parametrize("section", [_Devices, _Monitors])
+def test_what_a_section_has_besides_its_roles_is_reserved(section: type[Schema]):
+    assert {name for name in vars(section) if not name.startswith("_")} - {*vars(Schema), "model_config"} <= RESERVED
 
 
 @pytest.mark.parametrize(
