@@ -1,6 +1,6 @@
 """The world in three dimensions: against closed forms, against the plane, and how fast it is.
 
-    python benchmarks/world3d.py [--parts scans mechanics turning step speed lap slopes rough patch drill fleet]
+    python benchmarks/world3d.py [--parts scans mechanics turning step speed lap slopes rough patch drill fleet robots]
         [--seeds 20] [--metres 60] [--count 200] [--keep FOLDER]
 
 ``scans``: standing scans without noise from free poses against the plane's. ``mechanics``: sag under a load, overturn
@@ -10,7 +10,8 @@ far half the step moves the end of a drive. ``speed``: one step, one swept scan,
 the whole daemon, its error, its speed, twice the same. ``slopes``: trucks that drive onto a hillside, by the daemon and
 without one. ``rough``: lidar, map and pose on hills of 5 degrees RMS. ``patch``: whether
 rough ground is found, and routes go round it. ``drill``: seeded faults, with a deadman line and without. ``fleet``: two
-robots and people, a daemon for each robot. The last line is JSON.
+robots and people, a daemon for each robot. ``robots``: every body drives a bend, one follows a wall by sonars. The last
+line is JSON.
 """
 
 import argparse
@@ -26,6 +27,7 @@ import mujoco
 import numpy as np
 from world3d_parts.fleet import fleet
 from world3d_parts.patch import patch
+from world3d_parts.robots import robots
 from world3d_parts.terrain import drilled, rough, slopes
 
 import monstertruck_sim.world3d.model as rigid_model
@@ -76,6 +78,10 @@ GOALS: dict[str, tuple[str, float]] = {
     "fleet_followed": (">=", 1.0),
     "fleet_contacts_by_robots": ("<=", 0.0),
     "fleet_same": (">=", 1.0),
+    "robots_reached": (">=", 1.0),
+    "robots_cross_track_cm": ("<=", 3.0),
+    "robots_wall_followed": (">=", 1.0),
+    "robots_wall_error_cm": ("<=", 3.0),
 }
 
 
@@ -344,7 +350,7 @@ PARTS: dict[str, Callable[[], dict[str, float]]] = {
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    names = [*PARTS, "lap", "slopes", "rough", "patch", "drill", "fleet"]
+    names = [*PARTS, "lap", "slopes", "rough", "patch", "drill", "fleet", "robots"]
     parser.add_argument("--parts", nargs="+", default=names, choices=names)
     parser.add_argument("--seeds", type=int, default=20, help="of the slopes")
     parser.add_argument("--metres", type=float, default=60.0, help="on rough ground")
@@ -358,6 +364,7 @@ def main() -> None:
         "rough": lambda: rough(arguments.metres),
         "patch": patch,
         "fleet": fleet,
+        "robots": robots,
         "drill": lambda: drilled(arguments.count),
     }
     for part in arguments.parts:

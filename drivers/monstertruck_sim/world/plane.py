@@ -13,6 +13,7 @@ from monstertruck_sim.world.obstacles import Box, Obstacle
 from monstertruck_sim.world.plant import Plant, Pose, Space, Twist
 from monstertruck_sim.world.scene import Surroundings
 from monstertruck_sim.world.sensors import PlaneSweep, Sweep
+from monstertruck_sim.world.sonar import Solids
 from monstertruck_sim.world.terrain import LEVEL, Terrain, rocking
 from monstertruck_sim.world.truck_plant import TruckPlant
 
@@ -26,6 +27,8 @@ class Engine(NamedTuple):
     plant: Plant
     space: Space
     sweep: Sweep
+    solids: Solids | None = None
+    """What sonars hear beside the walls."""
 
 
 class PlanOutline:

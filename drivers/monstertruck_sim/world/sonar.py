@@ -9,7 +9,7 @@ Model for Acoustic Sensor Robot Navigation", 1987; Borenstein and Koren, "Error 
 """
 
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from math import ceil, cos, inf, pi, sin
 from typing import Final, NamedTuple
 
@@ -39,6 +39,10 @@ _NEIGHBOURS: Final = 3
 """Rays on both sides that tell the direction of a wall at any distance."""
 _KEPT: Final = 32
 """Pings that are remembered: more than are sent before the sound of one dies away."""
+
+
+Solids = Callable[[float, float, float, float], Caster | None]
+"""What rays meet that leave a body with this yaw, pitch and roll, rad, and height, m, beside the walls of the map."""
 
 
 class Ping(NamedTuple):
@@ -109,6 +113,18 @@ def leaning(cast: Caster, yaw: float, pitch: float, roll: float, over: float) ->
         level = np.hypot(ahead, aside)
         ranges = cast(xs, ys, yaw + np.arctan2(aside, ahead), reach, times_ns) / level
         return np.where((ranges <= reach) & (ranges * up <= over), ranges, inf)
+
+    return along
+
+
+def nearer(one: Caster, other: Caster | None) -> Caster:
+    """What is met first of two."""
+    if other is None:
+        return one
+
+    def along(xs: Array, ys: Array, angles: Array, reach: float, times_ns: NDArray[np.int64] | None = None, /) -> Array:
+        ranges = one(xs, ys, angles, reach, times_ns), other(xs, ys, angles, reach, times_ns)
+        return np.asarray(np.minimum(*ranges))
 
     return along
 
@@ -235,12 +251,19 @@ class SimulatedSonars:
         config: true parameters.
         seed: of the noise; None = none.
         wall_height: over the ground, m.
+        solids: what they hear beside the walls; None = nothing.
     """
 
     def __init__(
-        self, plant: Plant, cast: Caster, config: SonarModelConfig, seed: int | None, wall_height: float = inf
+        self,
+        plant: Plant,
+        cast: Caster,
+        config: SonarModelConfig,
+        seed: int | None,
+        wall_height: float = inf,
+        solids: Solids | None = None,
     ) -> None:
-        self._plant, self._cast, self._config, self._seed = plant, cast, config, seed
+        self._plant, self._cast, self._config, self._seed, self._solids = plant, cast, config, seed, solids
         self._over = wall_height - config.height
         self._pings: deque[tuple[str, Ping, Caster, Surface | None]] = deque(maxlen=_KEPT)
         self._heard = 0
@@ -255,9 +278,10 @@ class SimulatedSonars:
         if place is None:
             raise InputError(f"no sonar {name} in sim.world.sonar.sonars; known: {', '.join(self._config.sonars)}")
         self._plant.advance(time_ns)
-        x, y, yaw, pitch, roll = self._plant.poses(np.array([time_ns]))[:5, 0].tolist()
+        x, y, yaw, pitch, roll, z = self._plant.poses(np.array([time_ns]))[:, 0].tolist()
         ping = placed(place, x, y, yaw, time_ns * 1e-9)
-        cast = leaning(self._cast, yaw, pitch, roll, self._over)
+        solids = None if self._solids is None else self._solids(yaw, pitch, roll, z)
+        cast = nearer(leaning(self._cast, yaw, pitch, roll, self._over), solids)
         found = surface(cast, ping, self._config) if self._config.model == "cone" else None
         self._pings.append((name, ping, cast, found))
 

@@ -61,7 +61,7 @@ class World:
         self._footprint = PlanOutline(self.scene, config.truck, name)
         if self.scene.overlap(self.scene.solid, self._footprint.box(start)) > 0:
             raise InputError(f"start: the truck at {start} touches what is not free on the map {config.map}")
-        self._plant, self._space, sweep = make_engine(config, self._footprint, start, noise_seed)
+        self._plant, self._space, sweep, solids = make_engine(config, self._footprint, start, noise_seed)
         self._plant.together = self.scene.advance
         self._plant.on_blocked = self._footprint.blocked
         self.scene.add_body(self)
@@ -78,7 +78,7 @@ class World:
         self.servos: ServoPlant = SimulatedServos(self._plant, config.battery, noise_seed)
         self.compass: AttitudeSource = SimulatedCompass(self._plant, config.compass, noise_seed)
         self.sonars: SonarSource = SimulatedSonars(
-            self._plant, cast, config.sonar, noise_seed, config.lidar.wall_height
+            self._plant, cast, config.sonar, noise_seed, config.lidar.wall_height, solids
         )
         self.imu: ImuSource = SimulatedImu(self._plant, config.imu, noise_seed)
 

@@ -157,7 +157,7 @@ class RigidSweep:
 
     def __init__(self, plant: RigidPlant, cast: Caster, ground: Uneven, config: LidarConfig) -> None:
         self._plant, self._cast, self._ground, self._config = plant, cast, ground, config
-        self._blocks = bool((plant.model.geom_group == Group.BLOCKS).any())
+        self._blocks = has_blocks(plant)
 
     def __call__(self, poses: Array, beams: Beams | None, times_ns: NDArray[np.int64]) -> Array:
         """As ``Sweep``."""
@@ -174,22 +174,70 @@ class RigidSweep:
     def _to_blocks(self, origins: Beams, yaw: Array, beams: Beams) -> Array:
         c, s = np.cos(yaw), np.sin(yaw)
         ways = np.stack([c * beams[0] - s * beams[1], s * beams[0] + c * beams[1], beams[2]], axis=1)
-        places = np.stack(origins, axis=1)
-        count = len(ways)
-        group = np.array([i == Group.BLOCKS for i in range(mujoco.mjNGROUP)], dtype=np.uint8)
-        geoms, met = np.empty(count, dtype=np.int32), np.empty(count)
-        ranges = np.full(count, np.inf)
-        for first in range(0, count, _RAYS):
-            part = slice(first, min(first + _RAYS, count))
-            size = part.stop - part.start
-            middle = places[first + size // 2]
-            mujoco.mj_multiRay(
-                self._plant.model, self._plant.data, middle, ways[part].ravel(), group, True, -1,
-                geoms[part], met[part], None, size, self._config.max_range + 0.1,
-            )  # fmt: skip
-            own = met[part] + ((middle - places[part]) * ways[part]).sum(axis=1)
-            ranges[part] = np.where(geoms[part] >= 0, own, np.inf)
-        return ranges
+        return to_blocks(self._plant, np.stack(origins, axis=1), ways, self._config.max_range + 0.1)
+
+
+class RigidEchoes:
+    """``Solids``: the blocks on the ground, met by rays of sonars that lean with the body.
+
+    Args:
+        plant: the robot, in its model.
+        height: of the sonars over the ground, m.
+    """
+
+    def __init__(self, plant: RigidPlant, height: float) -> None:
+        self._plant, self._height = plant, height
+        self._blocks = has_blocks(plant)
+
+    def __call__(self, yaw: float, pitch: float, roll: float, z: float) -> Caster | None:
+        """As ``Solids``."""
+        if not self._blocks:
+            return None
+        height = z + self._height
+
+        def along(
+            xs: Array, ys: Array, angles: Array, reach: float, times_ns: NDArray[np.int64] | None = None, /
+        ) -> Array:
+            flat = np.cos(angles - yaw), np.sin(angles - yaw), np.zeros(len(angles))
+            ahead, aside, up = turned(flat, np.array(pitch), np.array(roll))
+            c, s = np.cos(yaw), np.sin(yaw)
+            ways = np.stack([c * ahead - s * aside, s * ahead + c * aside, up], axis=1)
+            places = np.stack([xs, ys, np.full(len(angles), height)], axis=1)
+            ranges = to_blocks(self._plant, places, ways, reach)
+            return np.where(ranges <= reach, ranges, np.inf)
+
+        return along
+
+
+def has_blocks(plant: RigidPlant) -> bool:
+    """Whether anything stands on the ground that the kernels of walls and heights do not know."""
+    return bool((plant.model.geom_group == Group.BLOCKS).any())
+
+
+def to_blocks(plant: RigidPlant, places: Array, ways: Array, reach: float) -> Array:
+    """Ranges of beams to the blocks on the ground by MuJoCo's rays, m, (n,); inf = nothing within ``reach``.
+
+    Args:
+        plant: the robot, in its model.
+        places: where the beams begin, (n, 3), m; neighbours in the array are neighbours in space.
+        ways: unit vectors, (n, 3).
+        reach: m.
+    """
+    count = len(ways)
+    group = np.array([i == Group.BLOCKS for i in range(mujoco.mjNGROUP)], dtype=np.uint8)
+    geoms, met = np.empty(count, dtype=np.int32), np.empty(count)
+    ranges = np.full(count, np.inf)
+    for first in range(0, count, _RAYS):
+        part = slice(first, min(first + _RAYS, count))
+        size = part.stop - part.start
+        middle = places[first + size // 2]
+        mujoco.mj_multiRay(
+            plant.model, plant.data, middle, ways[part].ravel(), group, True, -1,
+            geoms[part], met[part], None, size, reach,
+        )  # fmt: skip
+        own = met[part] + ((middle - places[part]) * ways[part]).sum(axis=1)
+        ranges[part] = np.where(geoms[part] >= 0, own, np.inf)
+    return ranges
 
 
 def drive_line(truck: SimTruckConfig, parts: Mechanics) -> DriveLine:
@@ -267,4 +315,5 @@ def rigid(config: WorldConfig, footprint: PlanOutline, start: Pose) -> Engine:
     )  # fmt: skip
     space = RigidSpace(footprint, plant, ground, footprint.name)
     plant.before_steps = space.follow
-    return Engine(plant, space, RigidSweep(plant, space.cast, ground, config.lidar))
+    sweep = RigidSweep(plant, space.cast, ground, config.lidar)
+    return Engine(plant, space, sweep, RigidEchoes(plant, config.sonar.height))

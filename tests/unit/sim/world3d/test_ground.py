@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from monstertruck_runtime.errors import InputError
-from monstertruck_sim.world.config import WorldConfig
+from monstertruck_sim.world.config import SonarModelConfig, WorldConfig
 from monstertruck_sim.world.terrain import Profile
 from monstertruck_sim.world.world import World
 from monstertruck_sim.world3d.ground import blocks, ground_heights, scenery
@@ -119,8 +119,23 @@ def test_geometries_of_another_file_are_seen_and_touched(tmp_path):
     config = configured(map="yard", noise=False, mjcf=file, start={"x": 0.0, "y": 0.0, "yaw": 0.0})
     world = World(config, 1)
     assert world.lidar.scan(0)[384] == pytest.approx(1100 - 140, abs=1)
+    world.sonars.fire("f", 0)
+    assert world.sonars.range("f") == pytest.approx(1.1 - 0.12, abs=0.005)
     world.motor.command(0, -16_000.0, 20_000.0)
     assert world.truth(9_000_000_000).x == pytest.approx(1.1 - 0.235, abs=0.02)
+
+
+def test_a_sonar_that_leans_looks_over_a_low_thing(tmp_path, solid):
+    """0.15 m high, 1.6 m ahead: a sonar 0.12 m over the ground meets it, nose up by 5 degrees it does not."""
+    heard = []
+    for angle in (0.0, 5.0):
+        rise = ({"kind": "slope", "x": -1.0, "angle_deg": angle, "length": 1.2},) if angle else ()
+        middle = 0.075 + 1.2 * tan(radians(angle))
+        file = scene_file(tmp_path, f'<geom type="box" pos="1.7 0 {middle}" size="0.1 1 0.075"/>')
+        driver = solid(mjcf=file, start=(0.0, 0.0, 0.0), sonar=SonarModelConfig(model="beam"), ground=rise)
+        driver.world.sonars.fire("f", driver.now)
+        heard.append(driver.world.sonars.range("f"))
+    assert heard == [pytest.approx(1.6 - 0.12, abs=0.005), np.inf]
 
 
 @pytest.mark.parametrize(

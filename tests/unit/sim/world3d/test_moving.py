@@ -1,6 +1,6 @@
 """Beams leave from where the moving robot is, and robots that share a world see and stop each other."""
 
-from math import cos, pi
+from math import pi
 
 import numpy as np
 import pytest
@@ -13,23 +13,34 @@ SECOND = 1_000_000_000
 RPM = 644 / (2 * pi * 0.075) * 60
 
 
-def test_every_beam_of_a_sweep_leaves_from_where_the_robot_is_then(solid):
-    """Towards a wall at 0.2 m/s the last beams begin 13 mm nearer than the first ones."""
+@pytest.mark.parametrize("steering", [0.0, 0.35])
+def test_every_beam_of_a_sweep_leaves_from_where_the_robot_is_then(solid, steering):
+    """Put where the robot was at its instant, every beam ends on the straight wall; by one pose for all it does not.
+
+    Over a sweep the robot drives 0.02 m, or turns by 2 degrees as well.
+    """
     driver = solid(walls=[(3.0, -5.0, 3.2, 5.0)])
+    driver.steer(steering, -steering)
     driver.drive(0.2)
     driver.wait(2.0)
     begin = driver.now
-    places = []
+    poses = []
     for _ in range(51):
         truth = driver.world.truth(driver.now)
-        places.append((truth.x, truth.yaw))
+        poses.append((truth.x, truth.yaw))
         driver.wait(0.002)
     driver.wait(0.05)
     scan = driver.world.lidar.scan(begin) / 1000
-    for step in range(300, 470, 10):
-        at, yaw = (np.interp(step * 0.1 / 1024, np.arange(51) * 0.002, row) for row in np.transpose(places))
-        assert scan[step] == pytest.approx((3.0 - at - 0.14) / cos(yaw + (step - 384) * 2 * pi / 1024), abs=0.001)
-    assert places[-1][0] - places[0][0] == pytest.approx(0.02, abs=0.001)
+    steps = np.arange(210, 450, 10)
+    x, yaw = (np.interp(steps * 0.1 / 1024, np.arange(51) * 0.002, row) for row in np.transpose(poses))
+    bearings = (steps - 384) * 2 * pi / 1024
+
+    def ends(x, yaw):
+        return x + 0.14 * np.cos(yaw) + scan[steps] * np.cos(yaw + bearings)
+
+    assert ends(x, yaw) == pytest.approx(3.0, abs=0.002)
+    assert abs(ends(*poses[0]) - 3.0).max() > 0.007
+    assert abs(poses[-1][1] - poses[0][1]) > 0.035 or not steering
 
 
 def pair(gap):
