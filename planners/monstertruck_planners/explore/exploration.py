@@ -27,7 +27,7 @@ RETURNS: Final = 6
 SAVE: Final = 30.0
 """Seconds to wait for the map to be saved."""
 AGAIN: Final = 2.0
-"""Seconds between two goals for the way home, or after a goal that was not taken."""
+"""Seconds after a goal that was not taken, or for the way home; of those the next time twice as many."""
 STUCK: Final = 3
 """Goals in a row that fail without the robot leaving its place, after which the place is to blame..."""
 LEFT: Final = 0.3
@@ -97,6 +97,8 @@ class Observed:
     """Of the battery, 0 to 1; None = not measured."""
     low: bool = False
     """The battery's voltage is low."""
+    critical: bool = False
+    """It is too low to drive: the gate stops, and what is not saved may be lost."""
     saved: str | None = None
     """Where the map was saved after that was asked for; empty = nowhere."""
     found: int = 0
@@ -197,6 +199,8 @@ def tick(run: Exploration, seen: Observed, config: ExplorerConfig) -> Step:
         return _saving(run, seen)
     if seen.displaced:
         return _end(run, Reason.CANCELLED, f"the goal of {seen.displaced} is pursued now", Save())
+    if seen.critical:
+        return _end(run, Reason.BATTERY_CRITICAL, "it stands where it is", Cancel(), Save())
     if run.phase is ExplorationPhase.LOST:
         return _lost(run, seen, config)
     if seen.pose is None:
@@ -357,7 +361,8 @@ def _lost(run: Exploration, seen: Observed, config: ExplorerConfig) -> Step:
         found = replace(_enter(run, phase), waiting=False, not_before=run.now + SETTLE, nothing=0)
         return found, (Notice(Reason.POSE_FOUND, Severity.INFO, "goes on"),)
     if run.now - run.since > config.lost:
-        return _finish(replace(run, returns=False), Reason.POSE_LOST, f"not found for {config.lost:g} s")
+        text = f"its place was not found for {config.lost:g} s; it stands where it is"
+        return _finish(replace(run, returns=False), Reason.POSE_LOST, text)
     return run, ()
 
 
@@ -381,7 +386,7 @@ def _returning(run: Exploration, seen: Observed) -> Step:
         if seen.ended in HOPELESS or seen.ended is Reason.CANCELLED or run.home_goals >= RETURNS:
             text = f"{run.final_text}; not back at the start: {seen.ended_text or seen.ended.text}"
             return _end(run, seen.ended, text, Save())
-        return replace(run, target=None, not_before=run.now + AGAIN * run.home_goals), ()
+        return replace(run, target=None, not_before=run.now + AGAIN * 2 ** (run.home_goals - 1)), ()
     if run.now < run.not_before:
         return run, ()
     target = Viewpoint(run.home, run.home[:2])

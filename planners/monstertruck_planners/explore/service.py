@@ -237,6 +237,7 @@ class ExplorerService:
             answer=answer,
             charge=battery.charge if battery is not None and fresh else None,
             low=battery is not None and fresh and battery.level in LOW,
+            critical=battery is not None and fresh and battery.level is BatteryLevel.CRITICAL,
             saved=saved,
             found=self._found(),
         )

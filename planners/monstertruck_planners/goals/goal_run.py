@@ -97,6 +97,8 @@ class Observations:
     """Metres of the route ahead."""
     blocked: bool = False
     """The newest scan shows something on the way ahead."""
+    held: str = ""
+    """What keeps the truck from being armed, in words."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,7 +190,8 @@ def tick(run: GoalRun, observed: Observations, config: PlannerConfig) -> Step:
     if run.elapsed > config.timeout:
         return _end(run, Reason.GOAL_TIMEOUT, f"not reached within {config.timeout:g} s")
     if run.unarmed > config.unarmed_timeout:
-        return _end(run, Reason.DISARMED, f"not armed for {config.unarmed_timeout:g} s")
+        why = f": {observed.held}" if observed.held else ""
+        return _end(run, Reason.DISARMED, f"not armed for {config.unarmed_timeout:g} s{why}")
     match run.phase:
         case GoalPhase.PLANNING:
             return (run, ()) if observed.answer is None else _planned(run, observed, observed.answer, config)

@@ -260,6 +260,7 @@ class GoalService:
             along=along if followed is None else followed.before + along,
             left=self._left(followed, along),
             blocked=odometry is not None and followed is not None and self._blocked(followed, along, odometry, now),
+            held="" if gate is None else ", ".join(r.text for r in gate.reasons if r is not Reason.DISARMED),
         )
 
     def _left(self, followed: FollowedPath | None, along: float) -> float:

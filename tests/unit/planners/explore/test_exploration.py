@@ -182,6 +182,14 @@ def test_lost_it_stands_and_goes_on_once_it_is_found_or_gives_up():
     assert tale.saved().outcome is Reason.POSE_LOST
 
 
+def test_a_battery_that_may_give_out_any_moment_has_the_map_saved_at_once():
+    tale = Tale()
+    tale.drive()
+    tale.tell(low=True, critical=True)
+    assert tale.actions == (Cancel(), Save())
+    assert tale.saved().outcome is Reason.BATTERY_CRITICAL
+
+
 @pytest.mark.parametrize("reason", [Reason.DISARMED, Reason.BUSY])
 def test_where_no_place_helps_it_ends_where_it_stands(reason: Reason):
     tale = Tale()
@@ -218,6 +226,7 @@ def test_the_way_home_is_tried_again_and_given_up_in_the_end():
         tale.tell(1.0, ended=Reason.STUCK if tale.run.target is not None else None)
         sent += Go(HOME) in tale.actions
     assert sent == exploration.RETURNS
+    assert tale.now > 60.0, "somebody in a door goes on meanwhile"
     assert tale.saved().outcome is Reason.STUCK
     assert "not back at the start" in tale.run.text
 

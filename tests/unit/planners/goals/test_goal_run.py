@@ -181,8 +181,9 @@ def test_time_counts_only_while_the_truck_could_drive():
     assert story.run.outcome is Reason.GOAL_TIMEOUT
     waiting = Story(PlannerConfig(unarmed_timeout=20.0))
     waiting.tell(answer=WAY)
-    waiting.tell(210, armed=False)
+    waiting.tell(210, armed=False, held="battery critical")
     assert waiting.run.outcome is Reason.DISARMED
+    assert waiting.run.text == "not armed for 20 s: battery critical"
 
 
 def test_orders_pause_resume_and_cancel():
