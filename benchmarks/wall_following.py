@@ -202,6 +202,7 @@ def summary(results: list[Result]) -> dict[str, Any]:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=50, help="of study and arenas; faults have 20 at most")
+    parser.add_argument("--first", type=int, default=0, help="seed: a long run may be made in pieces")
     parser.add_argument("--jobs", type=int, default=2, help="processes")
     parser.add_argument(
         "--only", choices=("study", "arenas", "faults"), nargs="+", default=("study", "arenas", "faults")
@@ -211,17 +212,18 @@ def main() -> int:
     parser.add_argument("--figure", help="PNG of the runs of `start`")
     args = parser.parse_args()
     sides, jobs = ("left", "right"), []
+    every = range(args.first, args.first + args.seeds)
     rows = [row for row in METHODS if row[0][0] in args.method and row[1] in args.model]
     if "study" in args.only:
-        jobs += [Job("study", *row, side, s) for row, s, side in product(rows, range(args.seeds), sides)]
+        jobs += [Job("study", *row, side, s) for row, s, side in product(rows, every, sides)]
     if "start" in args.only:
         heading, side = start_rule(7, 5)
         mirror = 1.0 if side == "left" else -1.0
         jobs += [Job("start", *row, side, 0, start=(0.0, 0.0, heading * mirror)) for row in rows]
     if "arenas" in args.only:
-        jobs += [Job("arenas", "3", "cone", sides[s % 2], s) for s in range(args.seeds)]
+        jobs += [Job("arenas", "3", "cone", sides[s % 2], s) for s in every]
     if "faults" in args.only:
-        seeds = range(min(args.seeds, FAULT_SEEDS))
+        seeds = range(args.first, min(args.first + args.seeds, FAULT_SEEDS))
         jobs += [Job("faults", "3", "cone", sides[s % 2], s, fault) for fault, s in product(FAULTS, seeds)]
     groups: dict[str, list[Result]] = {}
     figures: dict[str, dict[str, Any]] = {}

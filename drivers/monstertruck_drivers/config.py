@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from monstertruck_drivers.link_quality.config import LinkQualityConfig
     from monstertruck_drivers.maestro.config import MaestroConfig
     from monstertruck_drivers.srf08.config import Srf08Config
+    from monstertruck_drivers.steppers.config import StepperConfig
 
 C = TypeVar("C", bound=Schema)
 
@@ -167,6 +168,7 @@ if TYPE_CHECKING:
         camera: Device[Schema] | None = None
         sonar: Device[Srf08Config] | None = None
         imu: Device[Schema] | None = None
+        wheels: Device[StepperConfig] | None = None
 
     class Monitors(_Monitors):
         """By name only what the robot's own code asks for."""

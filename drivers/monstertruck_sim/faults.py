@@ -24,10 +24,11 @@ from monstertruck_sim.console import Emulated
 from monstertruck_sim.robot import SimulatedRobot
 from monstertruck_sim.world.obstacles import Disc
 
-SERIAL: Final = ("drive", "steering", "lidar", "compass", "stabiliser")
+MORE_DRIVES: Final = ("drive_2", "drive_3", "drive_4")
+SERIAL: Final = ("drive", "steering", "lidar", "compass", "stabiliser", *MORE_DRIVES, "wheels", "sonar", "imu")
 """Roles of devices on a serial line."""
-VITAL: Final = ("drive", "steering", "lidar", "compass")
-"""The truck stops when one of these sends nothing."""
+VITAL: Final = ("drive", "steering", "lidar", "compass", *MORE_DRIVES, "wheels", "sonar")
+"""The robot stops when one of these sends nothing; the sonars where they guard it, without a lidar."""
 HOT: Final = 92.0
 """Temperature of a computer whose fan stands, degrees Celsius."""
 COOL: Final = 48.0
@@ -70,6 +71,12 @@ class FaultKind(StrEnum):
     MEMORY = "memory full"
     WORKER = "worker killed"
     OBSTACLE = "obstacle"
+    BAD_ANSWERS = "bad answers"
+    HELD_WHEEL = "held wheel"
+    DEAD_SONAR = "dead sonar"
+    STUCK_SONAR = "stuck sonar"
+    CROSS_TALK = "cross-talk"
+    WRONG_SIGN = "wrong sign"
 
 
 class RecorderDisk(Protocol):
@@ -284,6 +291,9 @@ class FaultCatalog:
         workers: tuple[str, ...] = (),
     ) -> None:
         self._roles = tuple(devices.present())
+        self._vital = frozenset(VITAL) - ({"sonar"} if "lidar" in self._roles else frozenset())
+        self._sonars = () if devices.sonar is None else tuple(devices.sonar.driver.sonars)
+        self._motors = 0 if devices.wheels is None else devices.wheels.driver.motors
         self._hubs = hubs_of(devices)
         self._monitors = monitors
         self._records = records
@@ -302,33 +312,28 @@ class FaultCatalog:
         return self._makers[kinds[rng.integers(len(kinds))]](rng)
 
     def _of_devices(self) -> Iterator[tuple[FaultKind, Maker]]:
-        serial = tuple(role for role in SERIAL if role in self._roles)
-        yield (
-            FaultKind.UNPLUG,
-            lambda rng: _unplug(rng, _pick(rng, self._roles)),
-        )
-        yield FaultKind.STALL, lambda rng: _cable(rng, FaultKind.STALL, _pick(rng, serial), *_switch("line stalled"))
+        serial, vital = tuple(role for role in SERIAL if role in self._roles), self._vital
+        yield FaultKind.UNPLUG, lambda rng: _unplug(rng, _pick(rng, self._roles), vital)
+        yield FaultKind.STALL, lambda rng: _stall(rng, _pick(rng, serial), vital)
         yield FaultKind.GARBAGE, lambda rng: _garbage(rng, _pick(rng, serial))
         yield FaultKind.BIT_ERRORS, lambda rng: _bit_errors(rng, _pick(rng, serial))
         yield FaultKind.SLOW, lambda rng: _slow(rng, _pick(rng, serial))
         yield FaultKind.SHORT_WRITE, lambda rng: _short_write(rng, _pick(rng, serial))
         yield FaultKind.RESET, lambda rng: _once(rng, FaultKind.RESET, _pick(rng, serial), "power-cycle")
-        yield FaultKind.WRONG_DEVICE, lambda rng: _wrong(rng, serial)
+        if len(serial) > 1:
+            yield FaultKind.WRONG_DEVICE, lambda rng: _wrong(rng, serial, vital)
         yield FaultKind.CLOCK_JUMP, _clock_jump
         yield FaultKind.OBSTACLE, _obstacle
         yield FaultKind.RAIL_SERVOS, _servo_rail
         yield FaultKind.BATTERY_OFF, _battery_off
         if "steering" in self._roles:
             yield FaultKind.BROWN_OUT, lambda rng: _brown_out(rng, self._roles)
-        if "compass" in self._roles:
-            yield (
-                FaultKind.FROZEN,
-                _frozen,
-            )
+        if frozen := tuple(role for role in ("compass", "imu") if role in self._roles):
+            yield FaultKind.FROZEN, lambda rng: _frozen(rng, frozen)
         if "lidar" in self._roles:
             yield FaultKind.BLIND, _blind
             yield FaultKind.CLOCK_DRIFT, _clock_drift
-        if late := tuple(role for role in ("drive", "steering") if role in self._roles):
+        if late := tuple(role for role in ("drive", "steering", "wheels") if role in self._roles):
             yield FaultKind.LATE_ANSWERS, lambda rng: _late_answers(rng, _pick(rng, late))
         if "drive" in self._roles:
             yield FaultKind.SUPPLY_DIP, _supply_dip
@@ -336,6 +341,19 @@ class FaultCatalog:
         if "stabiliser" in self._roles:
             yield FaultKind.ECHO, lambda rng: _cable(rng, FaultKind.ECHO, "stabiliser", *_switch("echo"))
             yield FaultKind.RAIL_12V, _rail_12v
+        yield from self._of_wheels_and_sonars()
+
+    def _of_wheels_and_sonars(self) -> Iterator[tuple[FaultKind, Maker]]:
+        sonars, motors = self._sonars, self._motors
+        if motors:
+            yield FaultKind.BAD_ANSWERS, lambda rng: _once(rng, FaultKind.BAD_ANSWERS, "wheels", _noise(rng))
+            yield FaultKind.HELD_WHEEL, lambda rng: _held_wheel(rng, motors)
+        if sonars:
+            yield FaultKind.DEAD_SONAR, lambda rng: _sonar(rng, FaultKind.DEAD_SONAR, _pick(rng, sonars), "dead")
+            yield FaultKind.STUCK_SONAR, lambda rng: _sonar(rng, FaultKind.STUCK_SONAR, _pick(rng, sonars), "stuck")
+            yield FaultKind.CROSS_TALK, lambda rng: _cross_talk(rng, _pick(rng, sonars))
+        if "imu" in self._roles:
+            yield FaultKind.WRONG_SIGN, lambda rng: _cable(rng, FaultKind.WRONG_SIGN, "imu", *_switch("inverted"))
 
     def _of_the_computer(self) -> Iterator[tuple[FaultKind, Maker]]:
         if self._hubs:
@@ -387,22 +405,48 @@ def _cable(
     start: tuple[str, ...],
     end: tuple[str, ...],
     *,
-    stops: bool = True,
+    stops: bool = False,
 ) -> CatalogFault:
-    must_stop = stops and role in VITAL
-    return _fault(kind, role, command(role, *start), command(role, *end), _hold(rng), must_stop=must_stop)
+    return _fault(kind, role, command(role, *start), command(role, *end), _hold(rng), must_stop=stops)
 
 
 def _once(rng: np.random.Generator, kind: FaultKind, role: str, *lines: str) -> CatalogFault:
     return _fault(kind, role, command(role, *lines), nothing, _hold(rng))
 
 
-def _unplug(rng: np.random.Generator, role: str) -> CatalogFault:
-    return _cable(rng, FaultKind.UNPLUG, role, ("unplug",), ("plug",))
+def _unplug(rng: np.random.Generator, role: str, vital: Collection[str]) -> CatalogFault:
+    return _cable(rng, FaultKind.UNPLUG, role, ("unplug",), ("plug",), stops=role in vital)
 
 
-def _frozen(rng: np.random.Generator) -> CatalogFault:
-    return _cable(rng, FaultKind.FROZEN, "compass", *_switch("frozen"), stops=False)
+def _stall(rng: np.random.Generator, role: str, vital: Collection[str]) -> CatalogFault:
+    return _cable(rng, FaultKind.STALL, role, *_switch("line stalled"), stops=role in vital)
+
+
+def _frozen(rng: np.random.Generator, roles: tuple[str, ...]) -> CatalogFault:
+    role = roles[0] if len(roles) == 1 else _pick(rng, roles)
+    return _cable(rng, FaultKind.FROZEN, role, *_switch("frozen"))
+
+
+def _noise(rng: np.random.Generator) -> str:
+    return f"noise {rng.integers(1, 12)}"
+
+
+def _held_wheel(rng: np.random.Generator, motors: int) -> CatalogFault:
+    """A stepper that is held loses steps, and nothing tells it."""
+    motor = int(rng.integers(motors)) + 1
+    return _cable(rng, FaultKind.HELD_WHEEL, "wheels", *_switch(f"overload {motor}"))
+
+
+def _sonar(rng: np.random.Generator, kind: FaultKind, name: str, fault: str) -> CatalogFault:
+    starts, ends = _switch(f"{fault} {name}")
+    return _fault(kind, name, command("sonar", *starts), command("sonar", *ends), _hold(rng))
+
+
+def _cross_talk(rng: np.random.Generator, name: str) -> CatalogFault:
+    """The sound of another sonar: an echo from a distance where nothing is."""
+    metres = rng.uniform(0.15, 3.0)
+    starts, ends = command("sonar", f"ghost {name} {metres:.2f}"), command("sonar", f"ghost {name} off")
+    return _fault(FaultKind.CROSS_TALK, f"{name}, {metres:.2f} m", starts, ends, _hold(rng))
 
 
 def _garbage(rng: np.random.Generator, role: str) -> CatalogFault:
@@ -412,17 +456,17 @@ def _garbage(rng: np.random.Generator, role: str) -> CatalogFault:
 
 def _bit_errors(rng: np.random.Generator, role: str) -> CatalogFault:
     start, end = (f"line flip_rate {10 ** rng.uniform(-4, -1.3)}",), ("line flip_rate 0", "line drop_rate 0")
-    return _cable(rng, FaultKind.BIT_ERRORS, role, start, end, stops=False)
+    return _cable(rng, FaultKind.BIT_ERRORS, role, start, end)
 
 
 def _slow(rng: np.random.Generator, role: str) -> CatalogFault:
     start = "line chunk 1" if rng.random() < 0.5 else f"line delay {rng.uniform(0.005, 0.15):.3f}"
-    return _cable(rng, FaultKind.SLOW, role, (start,), ("line chunk off", "line delay 0"), stops=False)
+    return _cable(rng, FaultKind.SLOW, role, (start,), ("line chunk off", "line delay 0"))
 
 
 def _short_write(rng: np.random.Generator, role: str) -> CatalogFault:
     start, end = (f"line short_writes {rng.integers(1, 20)}",), ("line short_writes 0",)
-    return _cable(rng, FaultKind.SHORT_WRITE, role, start, end, stops=False)
+    return _cable(rng, FaultKind.SHORT_WRITE, role, start, end)
 
 
 def _blind(rng: np.random.Generator) -> CatalogFault:
@@ -448,10 +492,10 @@ def _clock_drift(rng: np.random.Generator) -> CatalogFault:
 
 
 def _late_answers(rng: np.random.Generator, role: str) -> CatalogFault:
-    if role == "steering":
+    if role != "drive":
         return _once(rng, FaultKind.LATE_ANSWERS, role, f"late {rng.uniform(0.05, 0.25):.3f} {rng.integers(1, 5)}")
     start, end = (f"delay {rng.uniform(5.0, 80.0):.0f}",), ("delay 0",)
-    return _cable(rng, FaultKind.LATE_ANSWERS, role, start, end, stops=False)
+    return _cable(rng, FaultKind.LATE_ANSWERS, role, start, end)
 
 
 def _supply_dip(rng: np.random.Generator) -> CatalogFault:
@@ -464,9 +508,9 @@ def _blocked_shaft(rng: np.random.Generator) -> CatalogFault:
     return _fault(FaultKind.BLOCKED_SHAFT, "", held, free, 1.0 + _hold(rng), must_stop=True, disarms=True)
 
 
-def _wrong(rng: np.random.Generator, serial: tuple[str, ...]) -> CatalogFault:
+def _wrong(rng: np.random.Generator, serial: tuple[str, ...], vital: Collection[str]) -> CatalogFault:
     one, other = (str(role) for role in rng.choice(serial, 2, replace=False))
-    swap, stops = exchange_cables(one, other), bool({one, other} & {*VITAL})
+    swap, stops = exchange_cables(one, other), not {one, other}.isdisjoint(vital)
     return _fault(FaultKind.WRONG_DEVICE, f"{one}, {other}", swap, swap, _hold(rng), must_stop=stops)
 
 

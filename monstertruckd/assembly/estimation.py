@@ -1,6 +1,5 @@
 """Builds transforms, odometry and SLAM of a configuration, each with its ends of the bus."""
 
-import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -17,7 +16,7 @@ from monstertruck_estimation.points.service import TARGET as READER
 from monstertruck_estimation.points.service import PointFolders, PointInputs, PointService
 from monstertruck_estimation.points.tracking import PoseAsker
 from monstertruck_estimation.slam.service import SlamService
-from monstertruck_estimation.transforms import TransformService, compose, invert, mount
+from monstertruck_estimation.transforms import TransformService, compose, invert, mount, quaternion_from_rpy
 from monstertruck_kinematics.chassis import Chassis
 from monstertruck_planners.collision import Footprint, ScanPoints
 from monstertruck_runtime.actors.actor import WorkerActor
@@ -36,8 +35,6 @@ from monstertruckd.config.truck import TruckConfig
 
 SCANS: Final = 16
 """Scans that may wait for the estimation worker."""
-LEAST_UPRIGHT: Final = 0.7
-"""Share of the yaw rate that the z axis of an IMU has to feel."""
 ODOMETRIES: Final = 256
 """Poses and angles that may wait for a scan."""
 
@@ -96,23 +93,15 @@ def build_estimation(config: TruckConfig, bus: Bus, clock: Clock, body: Body) ->
         yield slam
     if config.missing_actuators() is not None:
         return
-    compass, slam_runs = config.devices.compass is not None, config.slam is not None
-    context = OdometryContext(body.chassis, clock, bus, compass=compass, slam=slam_runs, imu=_upright(config))
+    compass, imu = config.devices.compass is not None, config.devices.imu
+    turned = None if imu is None else quaternion_from_rpy(imu.mount.roll, imu.mount.pitch, imu.mount.yaw)
+    context = OdometryContext(body.chassis, clock, bus, compass=compass, slam=config.slam is not None, imu=turned)
     yield ODOMETRY.implementation(config.odometry)(config.odometry, context)
     ground = _build_ground(config, bus, clock)
     if ground is not None:
         yield ground
     if config.points is not None:
         yield _build_points(config, config.points, bus, clock, None if slam is None else slam.bases_at)
-
-
-def _upright(config: TruckConfig) -> float | None:
-    """See ``OdometryContext.imu``; None also for an IMU that lies on its side."""
-    imu = config.devices.imu
-    if imu is None:
-        return None
-    share = math.cos(imu.mount.roll) * math.cos(imu.mount.pitch)
-    return share if abs(share) > LEAST_UPRIGHT else None
 
 
 def _build_ground(config: TruckConfig, bus: Bus, clock: Clock) -> GroundService | None:

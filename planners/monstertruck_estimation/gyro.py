@@ -56,18 +56,20 @@ class Gyro:
         """It agrees with the wheels."""
         self.difference = 0.0
         """Turn by the gyroscope less turn by the wheels in the window, rad."""
+        self._left_out: int | None = None
+        """Since when it is not trusted, ns."""
 
     def observe(self, stamp: int, rate: float) -> None:
         """Take a yaw rate, rad/s, at ``stamp``, ns."""
         self._rates.append((stamp, rate))
 
-    def turned(self, since: int, stamp: int, wheels: float, way: float) -> float | None:
+    def turned(self, since: int, stamp: int, wheels: float | None, way: float) -> float | None:
         """Mean yaw rate between two readings of the wheels, rad/s; None = leave it to the wheels.
 
         Args:
             since: ns.
             stamp: ns.
-            wheels: mean yaw rate by the wheels, rad/s.
+            wheels: mean yaw rate by the wheels, rad/s; None = they slip, and judge nobody.
             way: of the fastest shaft, m.
         """
         found = [rate for at, rate in self._rates if since < at <= stamp]
@@ -79,13 +81,22 @@ class Gyro:
         mean, dt = math.fsum(found) / len(found), (stamp - since) / SECOND
         if way <= STILL:
             self._stand(mean, dt)
-            return 0.0
+            return 0.0 if self.trusted else None
         self._rest, self._rested = [], 0.0
         if self.bias is None:
             return None
         rate = mean - self.bias
-        self._judge(stamp, wheels * dt, rate * dt)
+        if wheels is None:
+            self._turns.clear()
+        else:
+            self._judge(stamp, wheels * dt, rate * dt)
         return rate if self.trusted else None
+
+    def wheels_slipped(self, since: int) -> None:
+        """Something else has shown that the wheels slip since then, ns: a disagreement with them was their fault."""
+        self._turns.clear()
+        if self._left_out is not None and self._left_out >= since:
+            self.trusted, self._left_out = True, None
 
     def _stand(self, mean: float, dt: float) -> None:
         self._rest.append(mean)
@@ -104,5 +115,7 @@ class Gyro:
         by_wheels, by_gyro = math.fsum(turn[1] for turn in turns), math.fsum(turn[2] for turn in turns)
         self.difference = by_gyro - by_wheels
         agrees = abs(self.difference) <= config.tolerance + config.share * max(abs(by_wheels), abs(by_gyro))
+        if self.trusted and not agrees:
+            self._left_out = stamp
         if self.trusted or abs(by_wheels) >= config.proof:
             self.trusted = agrees

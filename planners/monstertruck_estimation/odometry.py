@@ -13,20 +13,19 @@ from typing import Annotated, Any, Final, Literal, NamedTuple, Protocol
 import numpy as np
 from pydantic import Field
 
-from monstertruck_estimation.gyro import Gyro, GyroConfig
-from monstertruck_estimation.transforms import wrap_angle
+from monstertruck_estimation.gyro import GyroConfig
+from monstertruck_estimation.inertial import Inertial, InertialInput
+from monstertruck_estimation.transforms import Quaternion, wrap_angle
 from monstertruck_estimation.wheel_motion import WheelIncrement, WheelMotion
 from monstertruck_kinematics.chassis import Chassis
 from monstertruck_kinematics.elementary import Array, integrate, integration_jacobians
 from monstertruck_runtime.clock import ESTIMATES, SECOND, Clock, Schedule
-from monstertruck_runtime.mailbox import Mailbox, fifo, latest
-from monstertruck_runtime.ports import BusPort, EventSink, Publisher, Ready, Subscription
+from monstertruck_runtime.mailbox import fifo, latest
+from monstertruck_runtime.ports import BusPort, Publisher, Ready, Subscription
 from monstertruck_schemas import topics
 from monstertruck_schemas.base import Pose2D, Schema, Twist2D
-from monstertruck_schemas.event import Severity
-from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.roles import ServiceName
-from monstertruck_schemas.sensor import Attitude, DriveFeedback, Imu, SteeringFeedback
+from monstertruck_schemas.sensor import Attitude, DriveFeedback, SteeringFeedback
 from monstertruck_schemas.state import Odometry
 
 Vector = tuple[float, float, float]
@@ -166,9 +165,10 @@ class DeadReckoning:
     Args:
         config: start and noise.
         chassis: from motors and servos to the body's motion.
+        inertial: an inertial measurement unit whose yaw rate replaces that of the wheels.
     """
 
-    def __init__(self, config: OdometryConfig, chassis: Chassis) -> None:
+    def __init__(self, config: OdometryConfig, chassis: Chassis, inertial: Inertial | None = None) -> None:
         self._config = config
         self._chassis = chassis
         self._pose: Vector = (config.start.x, config.start.y, config.start.yaw)
@@ -181,8 +181,7 @@ class DeadReckoning:
         self._aligning: list[float] = []
         self._north: float | None = None
         self._compass_used: int | None = None
-        self.gyro = None if config.gyro is None else Gyro(config.gyro)
-        """Yaw rates of an inertial measurement unit, if there is one."""
+        self._gyro = None if inertial is None else inertial.gyro
         self._gyro_used: int | None = None
         self.rejected_headings = 0
         """Headings left out because they were too far off."""
@@ -202,7 +201,7 @@ class DeadReckoning:
             return
         self._driven += roll.way
         vx, vy, wz = roll.twist
-        rate = None if self.gyro is None else self.gyro.turned(roll.since, roll.stamp, wz, roll.way)
+        rate = None if self._gyro is None else self._gyro.turned(roll.since, roll.stamp, wz, roll.way)
         if rate is not None:
             wz, self._gyro_used = rate, roll.stamp
         pose = integrate(self._pose, vx, vy, wz, dt)
@@ -298,6 +297,7 @@ class OdometryService:
         compass: headings, if there is a compass.
         odometry: ``state/odometry``.
         pose: ``state/pose``; None = published by localisation.
+        imu: measurements of an inertial measurement unit, if there is one.
         rate: poses per second.
     """
 
@@ -313,6 +313,7 @@ class OdometryService:
         compass: Subscription[Attitude] | None,
         odometry: Publisher[Odometry],
         pose: Publisher[Odometry] | None,
+        imu: InertialInput | None = None,
         rate: float = 50.0,
     ) -> None:
         self._reckoning = reckoning
@@ -322,6 +323,7 @@ class OdometryService:
         self._compass = compass
         self._odometry = odometry
         self._pose = pose
+        self._imu = imu
         self._rate = rate
         self._reckoned: tuple[DriveFeedback, ...] = ()
         self._seen: tuple[object, object] = (None, None)
@@ -342,7 +344,9 @@ class OdometryService:
                     self._pose.put(message.model_copy(update={"frame": "map", "seq": self._pose.next_seq()}))
 
     def take(self) -> None:
-        """Pass new messages to the estimator."""
+        """Pass new messages to the estimator, and report changes."""
+        if self._imu is not None:
+            self._imu.take()
         steering = None if self._steering is None else self._steering.latest
         compass = None if self._compass is None else self._compass.latest
         before = self._seen
@@ -357,54 +361,12 @@ class OdometryService:
         if compass is not None and compass is not before[1] and self.accepts_compass():
             self._seen = (steering, compass)
             self._reckoning.observe_attitude(compass)
+        if self._imu is not None:
+            self._imu.report()
 
     def accepts_compass(self) -> bool:
         """Whether headings are used yet: they correct a pose, which begins with the first drive reading."""
         return bool(self._reckoned)
-
-
-class InertialOdometryService(OdometryService):
-    """``OdometryService`` whose wheels are helped by the yaw rate of an IMU; says when the two disagree.
-
-    Args:
-        reckoning: the filter.
-        gyro: its yaw rates.
-        rates: measurements of the IMU.
-        upright: see ``OdometryContext.imu``.
-        events: where a disagreement is reported.
-        clock: time.
-        inputs: as of ``OdometryService``.
-    """
-
-    def __init__(
-        self,
-        reckoning: DeadReckoning,
-        gyro: Gyro,
-        rates: Mailbox[Imu],
-        upright: float,
-        events: EventSink,
-        clock: Clock,
-        **inputs: Any,
-    ) -> None:
-        super().__init__(reckoning, clock, **inputs)
-        self._gyro = gyro
-        self._rates = rates
-        self._upright = upright
-        self._events = events
-
-    def take(self) -> None:
-        """Pass new messages to the estimator, and report changes."""
-        for imu in self._rates.drain():
-            self._gyro.observe(imu.stamp, imu.angular_velocity.z / self._upright)
-        before = self._gyro.trusted
-        super().take()
-        if self._gyro.trusted is not before:
-            off = round(self._gyro.difference, 3)
-            if before:
-                text = f"the IMU turned {off:+.2f} rad more than the wheels: the heading goes by the wheels"
-                self._events(Reason.IMU_DISAGREES, Severity.WARNING, self.name, text, difference=off)
-            else:
-                self._events(Reason.IMU_AGREES, Severity.INFO, self.name, "the IMU counts again", difference=off)
 
 
 def _message(estimate: OdometryEstimate, now: int, seq: int) -> Odometry:
@@ -435,8 +397,15 @@ class OdometryContext:
     """The robot has one."""
     slam: bool
     """SLAM publishes the pose in map and the motion between scans."""
-    imu: float | None = None
-    """Share of the base's yaw rate that the z axis of its IMU feels, -1 upside down; None = it has none."""
+    imu: Quaternion | None = None
+    """From the axes of its IMU to those of base; None = it has none."""
+
+    def inertial(self, config: GyroConfig | None) -> InertialInput | None:
+        """Its IMU, if there is one that counts."""
+        if self.imu is None or config is None:
+            return None
+        measured, events = self.bus.subscribe(topics.IMU, fifo(RATES)), self.bus.event_sink()
+        return InertialInput(Inertial(config, self.imu), measured, events, OdometryService.name)
 
     def inputs(self) -> dict[str, Any]:
         """Topics of an ``OdometryService``, by the names of its arguments."""
@@ -452,11 +421,6 @@ class OdometryContext:
 
 def build_reckoning(config: OdometryConfig, context: OdometryContext) -> OdometryService:
     """The service with its topics, for the catalog."""
-    reckoning, inputs = DeadReckoning(config, context.chassis), context.inputs()
-    if context.imu is None or reckoning.gyro is None:
-        return OdometryService(reckoning, context.clock, rate=config.rate, **inputs)
-    rates = context.bus.subscribe(topics.IMU, fifo(RATES))
-    upright, events = context.imu, context.bus.event_sink()
-    return InertialOdometryService(
-        reckoning, reckoning.gyro, rates, upright, events, context.clock, rate=config.rate, **inputs
-    )
+    imu = context.inertial(config.gyro)
+    reckoning = DeadReckoning(config, context.chassis, None if imu is None else imu.inertial)
+    return OdometryService(reckoning, context.clock, imu=imu, rate=config.rate, **context.inputs())

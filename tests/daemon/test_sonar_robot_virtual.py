@@ -13,7 +13,7 @@ from monstertruck_schemas import topics
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import DriveRequest, RequestedTwist
 from monstertruckd.config.load import load_config
-from monstertruckd.tools.simulation.config import SimulatedTruckConfig
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
 from monstertruckd.tools.simulation.operator import LocalOperator
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 
@@ -36,9 +36,9 @@ class Drive:
         self.frames = set()
 
 
-def drive(start, seconds, twist, *, at=(), model="cone"):
+def drive(start, seconds, twist, *, at=(), model="cone", **overlay):
     """Drive for so many seconds by ``twist`` (or a function of time); ``at``: (second, action on the rig) in turn."""
-    config, _ = load_config(FILE, SimulatedTruckConfig)
+    config = with_overlay(load_config(FILE, SimulatedTruckConfig)[0], overlay)
     x, y, yaw = start
     world = config.sim.world
     sonar = world.sonar.model_copy(update={"model": model})
@@ -161,7 +161,21 @@ def test_the_odometry_turns_with_the_imu():
     assert turned(seen) < 0.05
 
 
-@pytest.mark.parametrize("fault", ["inverted", "unplugged", "silent"])
+def test_the_fusion_turns_with_the_imu_and_leaves_out_one_with_the_wrong_sign():
+    def turn_round(rig):
+        rig.robot.emulators["imu"].inject("inverted", "on")
+
+    fused = {"odometry": {"kind": "fusion"}}
+    seen = drive((0.0, 0.0, 0.0), 4.0, (0.1, 0.5), **fused)
+    assert {"drive", "imu", "tilt"} == set(seen.odometry.sources)
+    assert turned(seen) < 0.03
+    seen = drive((0.0, 0.0, 0.0), 5.0, (0.1, 0.5), at=[(1.0, turn_round)], **fused)
+    assert {"drive", "tilt"} == set(seen.odometry.sources)
+    assert Reason.IMU_DISAGREES in seen.events
+    assert turned(seen) < 0.1, "what it told before it was noticed is taken back"
+
+
+@pytest.mark.parametrize("fault", ["inverted", "unplugged", pytest.param("silent", marks=pytest.mark.long)])
 def test_an_imu_that_fails_leaves_the_heading_to_the_wheels(fault):
     def act(rig):
         if fault == "unplugged":

@@ -4,6 +4,7 @@ from typing import Annotated, Final, Literal
 
 from pydantic import Field
 
+from monstertruck_estimation.gyro import GyroConfig
 from monstertruck_estimation.odometry import OdometrySettings
 from monstertruck_schemas.base import Pose2D, Schema
 
@@ -58,6 +59,15 @@ class ScanTrust(Schema):
     """Standard deviation by which the map, against which scans are matched, drifts from one to the next, m and rad."""
 
 
+class ImuTrust(GyroConfig):
+    """What the yaw rate of an inertial measurement unit is worth, and when it is left out."""
+
+    noise: Positive = 0.005
+    """Standard deviation of its turn, its bias included, rad per root second."""
+    scale: Share = 0.01
+    """Standard deviation of its scale."""
+
+
 class SlipConfig(Schema):
     """When the wheels are held to slip."""
 
@@ -78,7 +88,7 @@ class SlipConfig(Schema):
 
 
 class FusionConfig(OdometrySettings):
-    """Odometry from wheels, compass and scans, whichever there are."""
+    """Odometry from wheels, compass, IMU and scans, whichever there are."""
 
     kind: Literal["fusion"]
     start: Pose2D = Pose2D(x=0.0, y=0.0, yaw=0.0)
@@ -103,6 +113,8 @@ class FusionConfig(OdometrySettings):
     """Null leaves the wheels out"""
     compass: HeadingTrust | None = HeadingTrust()
     """Null leaves the compass out"""
+    imu: ImuTrust | None = ImuTrust()
+    """Null leaves the IMU out; it is used between readings of the wheels"""
     scans: ScanTrust | None = ScanTrust()
     """Null leaves the scans out; they are used where `slam` matches them"""
     slip: SlipConfig = SlipConfig()

@@ -27,6 +27,7 @@ from monstertruck_estimation.fusion.filter import (
     predict,
 )
 from monstertruck_estimation.fusion.slip import SlipChange, SlipDetector
+from monstertruck_estimation.inertial import Inertial
 from monstertruck_estimation.odometry import SOURCE_TIMEOUT, OdometryEstimate
 from monstertruck_estimation.se2 import SmoothedCorrection, compose, inverse
 from monstertruck_estimation.wheel_motion import WheelIncrement, WheelMotion, way_covariance
@@ -128,7 +129,7 @@ MARGIN: Final = (0.1, 0.1)
 """Allowance for errors of two scans in the limits of their motion, m and rad."""
 MAX_RECOMPUTED: Final = 6
 """Most measurements that one estimate recomputes, about a millisecond."""
-NAMES: Final = ("drive", "steering", "compass", "tilt", "lidar")
+NAMES: Final = ("drive", "steering", "compass", "imu", "tilt", "lidar")
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,15 +149,17 @@ class FusionStatus:
 
 
 class Fusion:
-    """Odometry from any subset of wheels, compass and scans.
+    """Odometry from any subset of wheels, compass and scans; an IMU helps the wheels.
 
     Args:
         config: noise and limits.
         chassis: from motors and servos to the body's motion; None = no wheels.
+        inertial: an IMU, if there is one.
     """
 
-    def __init__(self, config: FusionConfig, chassis: Chassis | None) -> None:
+    def __init__(self, config: FusionConfig, chassis: Chassis | None, inertial: Inertial | None = None) -> None:
         self._config = config
+        self._inertial = inertial
         self._chassis = chassis
         use = chassis is not None and config.wheels is not None
         self._wheels = WheelMotion(chassis, config.max_speed) if use and chassis is not None else None
@@ -191,7 +194,7 @@ class Fusion:
         if roll.lost:
             self._left_out["drive: counts from a new origin"] += 1
             return
-        way = self._way(roll, self._chassis)
+        way = self._felt(roll, self._way(roll, self._chassis))
         self._slip.wheels(way)
         if not self._insert(replace(way, slipping=self._slip.slipping)):
             self._left_out["drive: too late"] += 1
@@ -370,6 +373,8 @@ class Fusion:
         self._changes.append(change)
         if change.slipping and self._history is not None:
             self._history.rewrite(change.since, _slipping)
+        if change.slipping and self._inertial is not None:
+            self._inertial.gyro.wheels_slipped(change.since)
 
     def _way(self, roll: WheelIncrement, chassis: Chassis) -> WheelMeasurement:
         assert self._config.wheels is not None
@@ -378,9 +383,27 @@ class Fusion:
         noise = way_covariance(chassis, roll, trust.shaft_noise, trust.angle_noise, trust.slip_noise)
         return WheelMeasurement(roll.since, roll.stamp, delta, noise)
 
+    def _felt(self, roll: WheelIncrement, way: WheelMeasurement) -> WheelMeasurement:
+        """The motion of the wheels with turn and tilt by the IMU."""
+        inertial, trust = self._inertial, self._config.imu
+        if inertial is None or trust is None:
+            return way
+        wheels = None if self._slip.slipping else roll.twist[2]
+        trusted = inertial.gyro.trusted
+        rate = inertial.gyro.turned(roll.since, roll.stamp, wheels, roll.way)
+        if trusted and not inertial.gyro.trusted and self._history is not None:
+            self._history.rewrite(roll.since - round(trust.window * SECOND), _without_turn)
+        turn = None if rate is None else rate * roll.dt
+        variance = 0.0 if turn is None else trust.noise**2 * roll.dt + (trust.scale * turn) ** 2
+        return replace(way, turn=None if turn is None else (turn, variance), tilt=inertial.vertical.tilt(roll.stamp))
+
 
 def _slipping(measurement: Measurement) -> Measurement:
     return replace(measurement, slipping=True) if isinstance(measurement, WheelMeasurement) else measurement
+
+
+def _without_turn(measurement: Measurement) -> Measurement:
+    return replace(measurement, turn=None) if isinstance(measurement, WheelMeasurement) else measurement
 
 
 def _taken_back(measurement: Measurement) -> Measurement:

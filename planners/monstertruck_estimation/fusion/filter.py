@@ -26,6 +26,10 @@ class WheelMeasurement:
     """Shape (3, 3)."""
     slipping: bool = False
     """Measured while the wheels slip."""
+    turn: tuple[float, float] | None = None
+    """By a gyroscope in the same time, rad, and its variance, rad^2."""
+    tilt: tuple[float, float] | None = None
+    """Roll and pitch by an IMU, rad."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,15 +227,24 @@ def _way(state: FilterState, clone: slice, delta: Array) -> tuple[Array, Array]:
 def _wheels(state: FilterState, way: WheelMeasurement, config: FusionConfig) -> FilterState:
     slip, used = config.slip, state.used
     if state.wheels == way.since:
-        level = np.array((*_level(state), 1.0))
+        if way.tilt is not None:
+            used = {**used, "tilt": way.stamp}
+        level = np.array((*_level(state, way.tilt), 1.0))
         delta, dt = way.delta * level, (way.stamp - way.since) / SECOND
         residual, by_state = _way(state, WHEELS, delta)
-        signed = math.copysign(math.hypot(delta[0], delta[1]), delta[0])
-        residual[2] -= state.mean[TRIM] * signed
-        by_state[2, TRIM] = signed
         noise = way.covariance + np.diag((QUANTUM[0] ** 2, QUANTUM[0] ** 2, QUANTUM[1] ** 2))
         if way.slipping:
             noise = noise + np.diag(np.square((slip.speed * dt, slip.speed * dt, slip.turn * dt)))
+        if way.turn is not None:
+            turn, variance = way.turn
+            residual = np.append(residual, wrap_angle(turn - float(delta[2] - residual[2])))
+            by_state = np.vstack((by_state, by_state[2]))
+            wheels, noise = noise, np.zeros((4, 4))
+            noise[:3, :3], noise[3, 3] = wheels, variance
+            used = {**used, "imu": way.stamp}
+        signed = math.copysign(math.hypot(delta[0], delta[1]), delta[0])
+        residual[2] -= state.mean[TRIM] * signed
+        by_state[2, TRIM] = signed
         state = kalman_update(state, residual, by_state, noise)
         if not way.slipping:
             used = {**used, "drive": way.stamp}
@@ -239,11 +252,14 @@ def _wheels(state: FilterState, way: WheelMeasurement, config: FusionConfig) -> 
     return replace(state, mean=mean, covariance=covariance, wheels=way.stamp, used=used)
 
 
-def _level(state: FilterState) -> tuple[float, float]:
-    """Horizontal share of a motion along x and along y."""
-    if state.tilt is None or state.stamp - state.tilt[0] > FRESH:
+def _level(state: FilterState, felt: tuple[float, float] | None) -> tuple[float, float]:
+    """Horizontal share of a motion along x and along y; by the compass before the tilt ``felt`` by an IMU."""
+    if state.tilt is not None and state.stamp - state.tilt[0] <= FRESH:
+        felt = state.tilt[1:]
+    if felt is None:
         return 1.0, 1.0
-    return math.cos(state.tilt[2]), math.cos(state.tilt[1])
+    roll, pitch = felt
+    return math.cos(pitch), math.cos(roll)
 
 
 def _scan(state: FilterState, way: ScanMeasurement, config: FusionConfig) -> FilterState:

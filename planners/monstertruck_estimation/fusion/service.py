@@ -5,6 +5,7 @@ from typing import Final
 
 from monstertruck_estimation.fusion.config import FusionConfig
 from monstertruck_estimation.fusion.estimator import Fusion, FusionStatus
+from monstertruck_estimation.inertial import InertialInput
 from monstertruck_estimation.odometry import OdometryContext, OdometryService
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.mailbox import Mailbox, fifo
@@ -34,6 +35,7 @@ class FusionService(OdometryService):
         pose: ``state/pose``; None = published by localisation.
         health: ``health/odometry``.
         events: where slip and disturbances are reported.
+        imu: measurements of an IMU, if there is one.
         rate: poses per second.
     """
 
@@ -50,10 +52,19 @@ class FusionService(OdometryService):
         pose: Publisher[Odometry] | None,
         health: Publisher[OdometryHealth],
         events: EventSink,
+        imu: InertialInput | None = None,
         rate: float = 50.0,
     ) -> None:
         super().__init__(
-            fusion, clock, drives=drives, steering=steering, compass=compass, odometry=odometry, pose=pose, rate=rate
+            fusion,
+            clock,
+            drives=drives,
+            steering=steering,
+            compass=compass,
+            odometry=odometry,
+            pose=pose,
+            imu=imu,
+            rate=rate,
         )
         self._fusion = fusion
         self._scans = scans
@@ -112,9 +123,11 @@ class FusionService(OdometryService):
 def build_fusion(config: FusionConfig, context: OdometryContext) -> FusionService:
     """The service with its topics, for the catalog."""
     bus, inputs = context.bus, context.inputs()
+    imu = context.inertial(config.imu)
     return FusionService(
-        Fusion(config, context.chassis),
+        Fusion(config, context.chassis, None if imu is None else imu.inertial),
         context.clock,
+        imu=imu,
         scans=bus.subscribe(topics.SCAN_MOTION, fifo(SCANS)) if context.slam and config.scans is not None else None,
         health=bus.publisher(topics.FUSION, topics.Writer.ESTIMATION),
         events=bus.event_sink(),

@@ -6,10 +6,12 @@ import numpy as np
 
 from monstertruck_estimation.fusion.config import FusionConfig
 from monstertruck_estimation.fusion.estimator import Fusion
+from monstertruck_estimation.inertial import Inertial
 from monstertruck_estimation.se2 import between, compose
+from monstertruck_estimation.transforms import IDENTITY
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.base import Pose2D
-from monstertruck_schemas.sensor import Attitude, Vector3
+from monstertruck_schemas.sensor import Attitude, Imu, Vector3
 from monstertruck_schemas.state import ScanMotion
 from tests.unit.estimation.kit import CHASSIS, DRIVETRAIN, STEERING, drive_feedback, servo_feedback
 
@@ -26,6 +28,11 @@ def attitude(now, yaw, **more):
     return Attitude(stamp=now, received=now, seq=0, heading=(-yaw) % math.tau, **{"roll": 0.0, "pitch": 0.0, **more})
 
 
+def imu(now, rate=(0.0, 0.0, 0.0), force=(0.0, 0.0, 9.81)):
+    rate, force = (dict(zip("xyz", vector, strict=True)) for vector in (rate, force))
+    return Imu(stamp=now, received=now, seq=0, angular_velocity=Vector3(**rate), linear_acceleration=Vector3(**force))
+
+
 def scan_motion(since, stamp, delta, covariance):
     x, y, yaw = (float(value) for value in delta)
     return ScanMotion(
@@ -39,7 +46,7 @@ def scan_motion(since, stamp, delta, covariance):
 
 
 class Rig:
-    """Truth at 100 Hz, wheels and compass at 20 Hz, scans at 10 Hz that are matched 50 ms later.
+    """Truth and IMU at 100 Hz, wheels and compass at 20 Hz, scans at 10 Hz that are matched 50 ms later.
 
     Args:
         sensors: those that are there.
@@ -52,7 +59,12 @@ class Rig:
     delay = 5
 
     def __init__(self, sensors=ALL, seed=1, **settings):
-        self.fusion = Fusion(config(**settings), CHASSIS)
+        own = config(**settings)
+        self.inertial = Inertial(own.imu, IDENTITY) if "imu" in sensors else None
+        self.fusion = Fusion(own, CHASSIS, self.inertial)
+        self.gyro = 1.0
+        """Share of the yaw rate that the IMU shows."""
+        self.turned = 0.0
         self.sensors, self.rng = set(sensors), np.random.default_rng(seed)
         self.now, self.pose, self.motor = SECOND, (0.0, 0.0, 0.0), 0.0
         self.slip, self.magnet, self.field, self.north, self.degenerate = 1.0, 0.0, FIELD, 0.7, None
@@ -66,6 +78,7 @@ class Rig:
         for _ in range(round(seconds * 100)):
             before = self.pose
             self.pose = STEERING.integrate(self.pose, *STEERING.body_twist(speed, front, rear), 0.01)
+            self.turned = math.remainder(self.pose[2] - before[2], math.tau) / 0.01
             way = STEERING.drive_speed(speed, front, rear) * 0.01
             noise = self.wheel_noise * math.sqrt(math.hypot(self.pose[0] - before[0], self.pose[1] - before[1]))
             self.motor += DRIVETRAIN.motor_angle(way * self.slip + self.rng.normal(0.0, noise))
@@ -75,6 +88,9 @@ class Rig:
         return self
 
     def _observe(self, front, rear):
+        if "imu" in self.sensors:
+            rate = self.turned * self.gyro + 0.01 + self.rng.normal(0.0, 0.003)
+            self.inertial.observe(imu(self.now, (0.0, 0.0, rate)))
         if self.count % 5 == 0 and "wheels" in self.sensors:
             self.fusion.observe_steering(servo_feedback(self.now, front + self.crooked, rear - self.crooked))
             self.fusion.observe_drive(drive_feedback(self.now, self.motor))

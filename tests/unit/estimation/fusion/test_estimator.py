@@ -7,8 +7,10 @@ import pytest
 from monstertruck_estimation.fusion import estimator
 from monstertruck_estimation.fusion.config import SlipConfig
 from monstertruck_estimation.fusion.estimator import MAX_RECOMPUTED, Fusion
+from monstertruck_estimation.inertial import Inertial
+from monstertruck_estimation.transforms import IDENTITY
 from monstertruck_runtime.clock import SECOND
-from tests.unit.estimation.fusion.kit import ALL, TICK, Rig, attitude, config, scan_motion, wander
+from tests.unit.estimation.fusion.kit import ALL, TICK, Rig, attitude, config, imu, scan_motion, wander
 from tests.unit.estimation.kit import CHASSIS, drive_feedback, servo_feedback
 
 NAMES = {"wheels": {"drive", "steering"}, "compass": {"compass", "tilt"}, "scans": {"lidar"}}
@@ -42,6 +44,51 @@ def test_the_errors_are_as_great_as_the_covariance_says():
     runs = np.array([wander(Rig(ALL, seed=seed), seconds=12).nees()[-1] for seed in range(12)])
     assert runs.mean() < 3 * (1 + 3.3 * math.sqrt(2 / (3 * 12)))
     assert runs.mean() > 0.3, "much too modest"
+
+
+def test_an_imu_holds_the_heading_that_wheels_alone_lose():
+    errors = []
+    for sensors in (("wheels",), ("wheels", "imu")):
+        rig = Rig(sensors).drive(0.0, 0.0, 0.0, 0.6)
+        rig.crooked = 0.04
+        errors.append(rig.drive(0.3, 0.1, -0.1, 4.0).error()[1])
+    assert "imu" in rig.estimate.sources
+    assert errors[1] < 0.03 < 0.15 < errors[0]
+    assert errors[1] < 4 * math.sqrt(rig.estimate.pose_covariance[8])
+
+
+@pytest.mark.parametrize("share", [-1.0, 0.0], ids=["wrong sign", "stuck"])
+def test_an_imu_that_turns_against_the_wheels_is_left_out(share):
+    rig = Rig(("wheels", "imu")).drive(0.0, 0.0, 0.0, 1.0)
+    rig.gyro = share
+    rig.drive(0.3, 0.2, -0.2, 4.0)
+    assert "imu" not in rig.estimate.sources
+    assert rig.error()[1] < 0.1, "what it told before it was noticed is taken back"
+    rig.drive(0.0, 0.0, 0.0, 1.0)
+    assert "imu" not in rig.estimate.sources
+
+
+def test_wheels_that_slip_do_not_make_an_imu_suspect_and_the_heading_goes_by_it():
+    rig = Rig(("wheels", "imu", "scans")).drive(0.0, 0.0, 0.0, 0.6).drive(0.2, 0.2, -0.2, 1.0)
+    rig.slip = 2.5
+    rig.drive(0.2, 0.2, -0.2, 2.5)
+    assert [change.slipping for change in rig.changes] == [True]
+    assert rig.inertial.gyro.trusted
+    assert "imu" in rig.estimate.sources
+    assert rig.error()[1] < 0.06
+
+
+def test_on_a_slope_the_tilt_by_the_imu_shortens_the_way():
+    ways = []
+    for slope in (0.0, 0.4):
+        rig = Rig(("wheels",))
+        rig.fusion = Fusion(config(), CHASSIS, unit := Inertial(config().imu, IDENTITY))
+        for _ in range(200):
+            unit.observe(imu(rig.now, force=(-9.81 * math.sin(slope), 0.0, 9.81 * math.cos(slope))))
+            rig.drive(0.3, 0.0, 0.0, 0.01)
+        assert "tilt" in rig.estimate.sources
+        ways.append(rig.estimate.pose[0])
+    assert ways[1] == pytest.approx(ways[0] * math.cos(0.4), rel=0.01)
 
 
 def test_a_corridor_does_not_collapse_what_the_wheels_say_along_it():

@@ -7,6 +7,7 @@ from monstertruck_estimation.catalog import AnyOdometry
 from monstertruck_estimation.fusion.config import FusionConfig
 from monstertruck_estimation.fusion.service import FusionService
 from monstertruck_estimation.fusion.slip import SlipChange
+from monstertruck_estimation.inertial import InertialInput
 from monstertruck_estimation.odometry import OdometryConfig
 from monstertruck_runtime.clock import run_virtual
 from monstertruck_schemas.reasons import Reason
@@ -35,6 +36,9 @@ def served(rig, scans=None, seconds=0.1, health=None):
     """What a service over the rig's fusion tells in a tenth of a second."""
     events, odometry = [], Outbox()
 
+    def tell(reason, severity, source, text="", **_):
+        events.append((reason, text))
+
     async def main(clock):
         service = FusionService(
             rig.fusion,
@@ -46,7 +50,8 @@ def served(rig, scans=None, seconds=0.1, health=None):
             odometry=odometry,
             pose=None,
             health=Outbox() if health is None else health,
-            events=lambda reason, severity, source, text="", **_: events.append((reason, text)),
+            events=tell,
+            imu=None if rig.inertial is None else InertialInput(rig.inertial, Scans([]), tell, "odometry"),
         )
         task = asyncio.create_task(service.run(lambda: None))
         await clock.sleep(seconds)
@@ -82,6 +87,22 @@ def test_health_is_reported_once_a_second_and_at_once_when_it_changes():
     assert health[3].disturbed
     assert health[3].left_out == 1
     assert health[3].north is not None
+
+
+def test_an_imu_with_the_wrong_sign_is_an_event_and_no_source():
+    rig = Rig(("wheels", "imu"))
+    rig.gyro = -1.0
+    rig.drive(0.0, 0.0, 0.0, 1.0).drive(0.3, 0.2, -0.2, 3.0)
+    health = Outbox()
+    events, odometry = served(rig, health=health)
+    assert [reason for reason, _ in events] == [Reason.IMU_DISAGREES]
+    assert "imu" not in odometry[-1].sources
+    assert "imu" not in health[-1].sources
+    rig.gyro = 1.0
+    rig.drive(0.3, 0.2, -0.2, 3.0)
+    events, odometry = served(rig)
+    assert [reason for reason, _ in events] == [Reason.IMU_DISAGREES, Reason.IMU_AGREES] or not events
+    assert "imu" in odometry[-1].sources
 
 
 def test_the_motion_between_scans_is_taken_from_the_bus():

@@ -1,0 +1,140 @@
+"""What an inertial measurement unit tells an odometry: its yaw rate over level ground, and the body's tilt.
+
+The tilt is a complementary filter: the gyroscopes turn the vertical, the specific force draws it back (Mahony et al.
+2008, the direct form with one vector). The body's own acceleration averages out over ``SETTLE``.
+"""
+
+import math
+from typing import Final
+
+from monstertruck_estimation.body_tilt import GRAVITY, Tilt
+from monstertruck_estimation.gyro import Gyro, GyroConfig
+from monstertruck_estimation.transforms import Quaternion, Vector, rotate
+from monstertruck_runtime.clock import SECOND
+from monstertruck_runtime.mailbox import Mailbox
+from monstertruck_runtime.ports import EventSink
+from monstertruck_schemas.event import Severity
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.sensor import Imu, Vector3
+
+SETTLE: Final = 2.0
+"""Time constant with which the vertical follows the specific force, s."""
+PLAUSIBLE: Final = 1.0
+"""A force that differs more from gravity, m/s^2, says nothing of the vertical."""
+UNSURE: Final = 5.0
+"""Seconds without a plausible force after which the tilt is not known."""
+GAP: Final = 0.5
+"""Seconds without a measurement after which it begins anew."""
+STEEPEST: Final = 0.7
+"""Share of the vertical along the body's z axis below which it is no tilt of a robot that drives."""
+
+
+class InertialTilt:
+    """The vertical in base, by angular velocities and specific forces in base."""
+
+    def __init__(self) -> None:
+        self._up: Vector | None = None
+        self._stamp = 0
+        self._felt = 0
+
+    def observe(self, stamp: int, rate: Vector, force: Vector) -> None:
+        """Take a measurement at ``stamp``, ns: rad/s and m/s^2; one that is not later is passed over."""
+        dt = (stamp - self._stamp) / SECOND
+        if self._up is not None and dt <= 0.0:
+            return
+        strength = math.hypot(*force)
+        felt = _scaled(force, 1.0 / strength) if abs(strength - GRAVITY) < PLAUSIBLE else None
+        self._felt = self._felt if felt is None else stamp
+        if self._up is None or dt > GAP or stamp - self._felt > UNSURE * SECOND:
+            up = felt
+        else:
+            up = _sum(self._up, _scaled(_cross(self._up, rate), dt))
+            if felt is not None:
+                up = _sum(_scaled(up, 1.0 - dt / SETTLE), _scaled(felt, dt / SETTLE))
+        self._up = None if up is None else _scaled(up, 1.0 / math.hypot(*up))
+        self._stamp = stamp
+
+    def tilt(self, now: int) -> Tilt | None:
+        """Of the body at ``now``, ns; None where it is not known."""
+        if self._up is None or self._up[2] < STEEPEST or now - self._stamp > GAP * SECOND:
+            return None
+        x, y, z = self._up
+        return Tilt(math.atan2(y, z), -math.asin(x))
+
+    def yaw_rate(self, rate: Vector) -> float:
+        """Rate of the heading at an angular velocity of base, rad/s; about its z axis where the tilt is not known."""
+        if self._up is None or self._up[2] < STEEPEST:
+            return rate[2]
+        _, y, z = self._up
+        return (y * rate[1] + z * rate[2]) / (y * y + z * z)
+
+
+class Inertial:
+    """An inertial measurement unit in base.
+
+    Args:
+        config: what its yaw rate is worth.
+        mount: from its axes to those of base.
+    """
+
+    def __init__(self, config: GyroConfig, mount: Quaternion) -> None:
+        self.gyro = Gyro(config)
+        self.vertical = InertialTilt()
+        self._axes = tuple(rotate(mount, axis) for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
+
+    def observe(self, imu: Imu) -> None:
+        """Take a measurement."""
+        rate, force = self._in_base(imu.angular_velocity), self._in_base(imu.linear_acceleration)
+        self.vertical.observe(imu.stamp, rate, force)
+        self.gyro.observe(imu.stamp, self.vertical.yaw_rate(rate))
+
+    def _in_base(self, vector: Vector3) -> Vector:
+        x, y, z = self._axes
+        return _sum(_sum(_scaled(x, vector.x), _scaled(y, vector.y)), _scaled(z, vector.z))
+
+
+class InertialInput:
+    """Measurements of the bus for an ``Inertial``; says when its yaw rate and the wheels disagree.
+
+    Args:
+        inertial: the unit.
+        measured: its measurements.
+        events: where a disagreement is reported.
+        source: of the events.
+    """
+
+    def __init__(self, inertial: Inertial, measured: Mailbox[Imu], events: EventSink, source: str) -> None:
+        self.inertial = inertial
+        self._measured = measured
+        self._events = events
+        self._source = source
+        self._trusted = True
+
+    def take(self) -> None:
+        """Pass new measurements on."""
+        for imu in self._measured.drain():
+            self.inertial.observe(imu)
+
+    def report(self) -> None:
+        """Report a change of what its yaw rate is worth."""
+        gyro = self.inertial.gyro
+        if gyro.trusted is self._trusted:
+            return
+        self._trusted, off = gyro.trusted, round(gyro.difference, 3)
+        if gyro.trusted:
+            self._events(Reason.IMU_AGREES, Severity.INFO, self._source, "the IMU counts again", difference=off)
+        else:
+            text = f"the IMU turned {off:+.2f} rad more than the wheels: the heading goes by the wheels"
+            self._events(Reason.IMU_DISAGREES, Severity.WARNING, self._source, text, difference=off)
+
+
+def _scaled(vector: Vector, by: float) -> Vector:
+    return vector[0] * by, vector[1] * by, vector[2] * by
+
+
+def _sum(a: Vector, b: Vector) -> Vector:
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
+
+
+def _cross(a: Vector, b: Vector) -> Vector:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]

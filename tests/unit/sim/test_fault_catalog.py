@@ -1,0 +1,76 @@
+"""The faults that robots with sonars and with stepper motors can have."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from monstertruck_runtime.clock import SECOND, run_virtual
+from monstertruck_sim.faults import FaultCatalog, FaultKind, apply
+from monstertruckd.config.load import load_config
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig
+from monstertruckd.tools.simulation.virtual_rig import VirtualRig
+
+ROBOTS = Path(__file__).resolve().parents[3] / "configs" / "robots"
+SONARS = {FaultKind.DEAD_SONAR, FaultKind.STUCK_SONAR, FaultKind.CROSS_TALK, FaultKind.WRONG_SIGN, FaultKind.FROZEN}
+WHEELS = {FaultKind.BAD_ANSWERS, FaultKind.HELD_WHEEL, FaultKind.LATE_ANSWERS}
+
+
+def loaded(name):
+    return load_config(ROBOTS / f"{name}.yaml", SimulatedTruckConfig)[0]
+
+
+def only(catalog, kind, seed=1):
+    return catalog.draw(np.random.default_rng(seed), without=frozenset(catalog.kinds) - {kind})
+
+
+@pytest.mark.parametrize(("name", "kinds"), [("sonar", SONARS), ("skid_stand", WHEELS)])
+def test_a_robot_has_the_faults_of_its_devices_and_its_emulators_know_them(name, kinds):
+    config = loaded(name)
+    catalog = FaultCatalog(config.devices, records=False)
+    assert kinds <= set(catalog.kinds)
+    assert not (SONARS | WHEELS) - kinds & set(catalog.kinds) - {FaultKind.LATE_ANSWERS}
+
+    async def main(clock):
+        rig = VirtualRig(config, clock)
+        try:
+            for kind in kinds:
+                for seed in range(4):
+                    fault = only(catalog, kind, seed)
+                    await apply(fault.start, rig.context)
+                    await apply(fault.end, rig.context)
+        finally:
+            rig._folder.cleanup()
+
+    run_virtual(main, start=SECOND)
+
+
+def test_without_sonars_that_guard_it_a_robot_stops_and_with_a_lidar_it_need_not():
+    config = loaded("sonar")
+    lidar = loaded("differential").devices.lidar
+    for devices, stops in ((config.devices, True), (config.devices.model_copy(update={"lidar": lidar}), False)):
+        catalog, rng = FaultCatalog(devices, records=False), np.random.default_rng(3)
+        unplugged = [catalog.draw(rng, without=frozenset(catalog.kinds) - {FaultKind.UNPLUG}) for _ in range(40)]
+        assert {one.must_stop for one in unplugged if one.name == "unplug: sonar"} == {stops}
+        assert {one.must_stop for one in unplugged if one.name == "unplug: drive_2"} == {True}
+        assert {one.must_stop for one in unplugged if one.name == "unplug: imu"} == {False}
+
+
+def test_cross_talk_is_an_echo_from_where_nothing_is():
+    config = loaded("sonar")
+
+    async def hear(clock):
+        rig = VirtualRig(config, clock)
+        try:
+            fault = only(FaultCatalog(config.devices, records=False), FaultKind.CROSS_TALK)
+            await apply(fault.start, rig.context)
+            modules = rig.robot.emulators["sonar"].modules.values()
+            (ghost,) = [one.ghost for one in modules if one.ghost is not None]
+            await apply(fault.end, rig.context)
+            return ghost, [one.ghost for one in modules], fault.name
+        finally:
+            rig._folder.cleanup()
+
+    ghost, after, name = run_virtual(hear, start=SECOND)
+    assert set(after) == {None}
+    assert ghost * 343.0 / 2e6 == pytest.approx(float(name.split(", ")[1].removesuffix(" m")), abs=0.01)
