@@ -13,7 +13,8 @@ Parts: `metres`, 5 seeds; `costs`: frontiers of a map of 1000 x 1000 cells with 
 `exploration_parts/faults.py`.
 
 FOLDER has map_server files (stdr_simple_rooms, nav2_depot, stdr_hospital_section, movingai_berlin_0_256); without it
-the worlds of this repository are explored. Rows go to runs/exploration/PART.jsonl; with --resume those there count.
+the worlds of this repository are explored. `--worlds` takes the names of other files, too, and those of worlds that are
+generated: office3, maze1, hall2 (any number). Rows go to runs/exploration/PART.jsonl; with --resume those there count.
 """
 
 import argparse
@@ -29,6 +30,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from exploration_parts import daemon, faults
 from exploration_parts.arena import Arena
+from exploration_parts.generated import generated
 from exploration_parts.offline import offline_tour
 from exploration_parts.rover import SHARES, Rover, Run
 
@@ -110,7 +112,7 @@ def metres(arguments: argparse.Namespace) -> tuple[dict[str, float], dict[str, f
     for seed in range(arguments.seeds or 5):
         for reach in arguments.reach:
             for world in worlds:
-                arena = Arena.load(world, file_of(world, arguments.maps))
+                arena = generated(world) or Arena.load(world, file_of(world, arguments.maps))
                 for kind in arguments.kinds:
                     if not rows.has(world=world, kind=kind, seed=seed, reach=reach):
                         rows.add(row_of(run_of(arena, kind, reach, seed)))

@@ -36,10 +36,15 @@ class Arena:
     def load(cls, name: str, file: Path) -> "Arena":
         """Of a map_server file."""
         world = load_map(file)
-        blocked = np.pad(world.cells != FREE, 1, constant_values=True)  # nothing is seen beyond the edge
-        origin = world.origin[0] - world.resolution, world.origin[1] - world.resolution
-        field = DistanceField(blocked, world.resolution, (*origin, 0.0))
-        return cls(name, world.resolution, origin, blocked, clearance(blocked), field)
+        return cls.of(name, world.cells != FREE, world.resolution, world.origin[:2])
+
+    @classmethod
+    def of(cls, name: str, cells: NDArray[np.bool_], resolution: float, corner: tuple[float, float]) -> "Arena":
+        """Of cells that block, shape (rows, columns); the corner is that of the first one, m."""
+        blocked = np.pad(cells, 1, constant_values=True)  # nothing is seen beyond the edge
+        origin = corner[0] - resolution, corner[1] - resolution
+        field = DistanceField(blocked, resolution, (*origin, 0.0))
+        return cls(name, resolution, origin, blocked, clearance(blocked), field)
 
     def start(self, seed: int) -> Pose:
         """A random pose with room around in the largest part that the robot can drive in."""

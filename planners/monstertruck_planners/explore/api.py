@@ -63,6 +63,8 @@ BEHIND: Final = 4
 """Coarse cells over which the direction of a way is measured."""
 SIDEWARD: Final = 0.4
 """A frontier has to lie this far inside the angle of view, rad."""
+ASIDE: Final = tuple(math.radians(angle) for angle in (0.0, 45.0, -45.0, 90.0, -90.0))
+"""Headings that are tried where the robot has no room to face a frontier, from its direction, rad."""
 
 
 @dataclass(frozen=True)
@@ -89,6 +91,8 @@ class Outlook:
     """Shape (n, 2), m."""
     bearings: Array = attribute(default_factory=lambda: np.empty(0))
     """Directions of the frontier from there, shape (n,), rad."""
+    headings: Array = attribute(default_factory=lambda: np.empty(0))
+    """With these it is in view and the robot has room, shape (n,), rad."""
     gains: Array = attribute(default_factory=lambda: np.empty(0))
     """New area that is seen with that heading, shape (n,), m^2."""
 
@@ -299,25 +303,43 @@ class ExplorationView:
         return near
 
     def _look(self, frontier: Frontier, near: NDArray[np.int64]) -> Outlook:
-        """Places from which enough of a frontier is in sight, and nearly as much new area as from the best one."""
+        """Places with room, from which enough of a frontier is in sight, and nearly as much new area as from the best.
+
+        Room is asked for first: the places that show most are often those at the edge of unknown ground, which blocks.
+        """
         config, resolution, corner = self.setup.config, self.known.resolution, self.known.origin[:2]
         change, reached = self.known.changes, len(near)
         places = self._centres(near)
         places = places[np.hypot(*(places - frontier.middle).T) < AROUND]
         if not len(places):
             return Outlook(change, reached)
-        places = places[_spread(len(places), COMPARED)]
+        places, bearings, headings = self._with_room(places, frontier)
+        if not len(places):
+            return Outlook(change, reached)
+        some = _spread(len(places), COMPARED)
+        places, bearings, headings = places[some], bearings[some], headings[some]
         sample = frontier.points[_spread(len(frontier.points), SAMPLES)]
         here, there = ((v - corner) / resolution for v in (places, sample))
         share = shares_seen(self.known.cells, here, there, (config.reach - SHORT) / resolution)
         if share.max(initial=0.0) == 0.0:
             return Outlook(change, reached)
-        places = places[share >= min(SEEN, float(share.max()))]
-        places = places[_spread(len(places), PLACES)]
-        bearings = np.arctan2(*(frontier.middle - places).T[::-1])
-        gains = self.gains(np.column_stack((places, bearings)))
+        good = np.flatnonzero(share >= min(SEEN, float(share.max())))
+        good = good[_spread(len(good), PLACES)]
+        gains = self.gains(np.column_stack((places[good], headings[good])))
         worth = gains >= max(WORTH * float(gains.max()), LEAST)
-        return Outlook(change, reached, places[worth], bearings[worth], gains[worth])
+        good = good[worth]
+        return Outlook(change, reached, places[good], bearings[good], headings[good], gains[worth])
+
+    def _with_room(self, places: Array, frontier: Frontier) -> tuple[Array, Array, Array]:
+        """Those of the places (n, 2) that the footprint has room at, directions of a frontier from there, headings."""
+        bearings = np.arctan2(*(frontier.middle - places).T[::-1])
+        aside = [angle for angle in ASIDE if abs(angle) < self.setup.config.view / 2 - SIDEWARD or angle == 0.0]
+        headings = bearings[:, None] + aside
+        poses = np.column_stack((np.repeat(places, len(aside), axis=0), headings.ravel()))
+        free = self.free(poses).reshape(headings.shape)
+        room = free.any(axis=1)
+        first = np.argmax(free[room], axis=1)
+        return places[room], bearings[room], headings[room, first]
 
     def _option(self, frontier: Frontier, look: Outlook, ways: CostToGo) -> Option | None:
         """The nearest place to look at a frontier from."""
@@ -331,14 +353,12 @@ class ExplorationView:
             x, y = look.places[i].tolist()
             if any(math.dist((x, y), place) <= AVOIDED for place in self.avoided):
                 continue
-            at, bearing = (int(rows[i]), int(columns[i])), float(look.bearings[i])
-            headings = np.array((self._heading(ways, at, bearing), bearing))
-            poses = np.column_stack((np.full((2, 2), (x, y)), headings))
-            free = self._route_map.field.free(self.setup.footprint, poses, self.setup.margin)
-            if free.any():
-                yaw = float(headings[int(np.argmax(free))])
-                way = float(cost[i]) * self._cell / UNIT
-                return Option(frontier, (x, y, yaw), way, float(look.gains[i]), self._turn(ways, at))
+            at = int(rows[i]), int(columns[i])
+            yaw = self._heading(ways, at, float(look.bearings[i]))
+            if not self.free(np.array([(x, y, yaw)]))[0]:
+                yaw = float(look.headings[i])
+            way = float(cost[i]) * self._cell / UNIT
+            return Option(frontier, (x, y, yaw), way, float(look.gains[i]), self._turn(ways, at))
         return None
 
     def gains(self, poses: Array) -> Array:

@@ -162,6 +162,26 @@ def test_a_frontier_is_looked_at_from_where_the_robot_can_go_also_once_a_door_is
     assert math.dist(opened.frontier, (8.95, 5.0)) < 0.1
 
 
+def test_round_a_narrow_corner_it_looks_from_where_the_robot_has_room():
+    """The places that show most lie at the edge of unknown ground, where the footprint overlaps it."""
+    cells = np.full((100, 160), -1, np.int8)
+    cells[48:74, 8:140] = 100
+    cells[8:74, 8:32] = 100
+    cells[50:72, 10:138] = 0
+    cells[10:72, 10:30] = 0
+    row, column = np.mgrid[0:100, 0:160]
+    edge = np.minimum(46 + (column - 10) * 14 / 22, 60 - (column - 32) * 2)
+    cells[(row < edge) & (column < 40) & (cells == 0)] = -1
+    grid = Grid(
+        stamp=0, received=0, seq=0, frame="map", resolution=0.05, width=160, height=100,
+        origin=Pose2D(x=0.0, y=0.0, yaw=0.0), cells=cells.reshape(-1),
+    )  # fmt: skip
+    answer = step_of(InformationConfig(), grid).step(ExploreTask((4.0, 3.0, math.pi), choose=True))
+    assert answer.target is not None
+    assert math.dist(answer.target.frontier, (1.2, 2.8)) < 0.3
+    assert answer.target.gain > 1.0
+
+
 def test_a_tour_begins_with_the_near_end_of_the_row():
     """Nearest-next would leave the single place on the other side for a long way back."""
     first = np.array([1.0, 1.2, 4.0, 5.0])
