@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from monstertruck_kinematics.elementary import Array, integrate
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.sensor import VALID_BEAM, LaserScan
-from monstertruck_schemas.state import Grid
 
 if TYPE_CHECKING:
     from monstertruck_planners.collision_kernels import FieldData, FootprintData
     from monstertruck_planners.distance_kernels import Box
+    from monstertruck_schemas.state import Grid
 
 
 OCCUPIED = 50
@@ -390,7 +390,7 @@ class DistanceField:
                 self.changes.append(update_distances(self._distance, occupied, self.resolution, box))
 
     @classmethod
-    def from_grid(cls, grid: Grid, *, unknown_blocks: bool = True) -> "DistanceField":
+    def from_grid(cls, grid: "Grid", *, unknown_blocks: bool = True) -> "DistanceField":
         """Field of a ``state/map`` grid; unknown cells count as occupied, or as free."""
         cells = grid.cells.reshape(grid.height, grid.width)
         occupied = cells >= OCCUPIED
