@@ -21,6 +21,7 @@ _BEHIND, _ASIDE, _ABOVE = 1.25, 0.7, 0.95
 _SWING: Final = 0.12
 """Share of the way round that it makes from frame to frame."""
 _COLOURS: Final = 128
+_PLAIN: Final = Image.Dither.NONE
 
 
 class Film:
@@ -63,7 +64,7 @@ class Film:
         c, s = cos(self._heading), sin(self._heading)
         eye = x - _BEHIND * c + _ASIDE * s, y - _BEHIND * s - _ASIDE * c, z + _ABOVE
         picture = self._renderer.draw(self._plant.data, looking(eye, (x + 0.3 * c, y + 0.3 * s, z + 0.1)))
-        self.frames.append(Image.fromarray(picture).quantize(_COLOURS))
+        self.frames.append(Image.fromarray(picture).quantize(_COLOURS, Image.Quantize.MAXCOVERAGE, dither=_PLAIN))
 
     def save(self) -> None:
         """Write the file."""
