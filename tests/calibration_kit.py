@@ -267,6 +267,12 @@ def hidden(
         world["lidar"] = {"x": x, "y": y, "yaw": yaw, "pitch": pitch, "roll": roll}
     if "imu" in parts:
         world["imu"] = {"rate_scale": float(np.random.default_rng([seed, 13]).uniform(0.96, 1.04))}
+    if "camera" in parts:
+        own = np.random.default_rng([seed, 29])
+        names = "x", "y", "height", "yaw", "pitch", "roll", "field_of_view", "k1", "k2"
+        low = (0.16, -0.02, 0.23, -0.05, -0.04, -0.04, 1.05, -0.2, -0.01)
+        high = (0.2, 0.02, 0.27, 0.05, 0.04, 0.04, 1.15, 0.05, 0.03)
+        world["camera"] = dict(zip(names, own.uniform(low, high).tolist(), strict=True))
     if "stabiliser" in parts:
         own = np.random.default_rng([seed, 23])
         world["mount"] = {
@@ -410,7 +416,19 @@ def truths(config: SimulatedTruckConfig) -> dict[WizardName, dict[str, Value]]:
         "lidar": {name: getattr(world.lidar, name) for name in ("x", "y", "yaw", "pitch", "roll")},
         "imu": _imu_truth(config),
         "stabiliser": _stabiliser_truth(config),
+        "camera": _camera_truth(config),
     }
+
+
+def _camera_truth(config: SimulatedTruckConfig) -> dict[str, Value]:
+    device, camera = config.devices.camera, config.sim.world.camera
+    if device is None:
+        return {}
+    width, height = device.driver.width, device.driver.height
+    focal = width / 2 / math.tan(camera.field_of_view / 2)
+    found = {name: getattr(camera, name) for name in ("x", "y", "yaw", "pitch", "roll", "k1", "k2")}
+    found |= {"focal_x": focal, "focal_y": focal, "centre_x": (width - 1) / 2, "centre_y": (height - 1) / 2}
+    return found | {"z": camera.height, "p1": 0.0, "p2": 0.0}
 
 
 def _stabiliser_truth(config: SimulatedTruckConfig) -> dict[str, Value]:

@@ -4,20 +4,39 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Final
 
+import cv2
 import numpy as np
 
 from monstertruck_drivers.ax12.config import Ax12Config
 from monstertruck_drivers.ax12.protocol import STEP
 from monstertruck_drivers.srf08.config import Srf08Config
+from monstertruck_estimation.vision.board import BoardReader, BoardSighting
+from monstertruck_estimation.vision.lens import PARAMETERS, Lens, board_pose
 from monstertruck_kinematics.chassis import Dimensions, TruckChassis
-from monstertruck_kinematics.elementary import integrate
+from monstertruck_kinematics.elementary import Array, integrate
 from monstertruck_kinematics.truck import DriveTrain
 from monstertruck_kinematics.unsteered import SkidSteer
 from monstertruck_runtime.bodies import build_chassis
-from monstertruck_schemas.body import TruckBody
+from monstertruck_schemas.board import BoardConfig
+from monstertruck_schemas.body import Mount, TruckBody
 from monstertruck_schemas.sensor import Attitude, Imu, Vector3
 from monstertruckd.config.calibration import Estimate, Result
-from monstertruckd.tools.calibrate import battery, compass, drive, imu, lidar, odometry, slip, sonar, stabiliser, weave
+from monstertruckd.tools.calibrate import (
+    battery,
+    board_mount,
+    camera,
+    compass,
+    drive,
+    imu,
+    lidar,
+    odometry,
+    slip,
+    sonar,
+    stabiliser,
+    weave,
+)
+from monstertruckd.tools.calibrate.board_mount import LidarPlace
+from monstertruckd.tools.calibrate.board_views import BoardView
 from monstertruckd.tools.calibrate.response import ResponseFit, Steps
 from monstertruckd.tools.calibrate.statistics import NORMAL, Interval
 from monstertruckd.tools.calibrate.steering import BAND, SPAN
@@ -408,6 +427,81 @@ def mounted(
     return found
 
 
+def camera_fit(rng: np.random.Generator) -> list[Verdict]:
+    """A board held before camera and lidar: corners with noise, and the lidar's line on it."""
+    reader = BoardReader(BoardConfig())
+    lens = true_lens(rng)
+    believed = np.array((0.18, 0.0, 0.25, 0.0, 0.0, 0.0))
+    true = believed + rng.uniform(-1, 1, 6) * (0.03, 0.03, 0.03, 0.06, 0.06, 0.06)
+    lidar = LidarPlace.of(Mount(x=0.14, z=0.25, yaw=0.02))
+    size, far = 1 + board_mount.PRINT * rng.normal(), board_mount.RANGE * rng.normal()
+    views = held_boards(reader, lens, true, lidar, rng, size, far)
+    found, kept = camera.lens_of(views, reader, lens.size)
+    result = camera.result_of(found, len(kept), camera.mount_of(kept, reader, found, believed, lidar, {}))
+    values = dict(zip((*PARAMETERS, *board_mount.NAMES), (*lens.parameters, *true), strict=True))
+    return judged(result, {name: float(value) for name, value in values.items()})
+
+
+def true_lens(rng: np.random.Generator) -> Lens:
+    """A webcam's, about as nominal."""
+    focal, off = 522.2 * rng.uniform(0.94, 1.06), rng.uniform(-1, 1, 7)
+    middle = 319.5 + 8 * off[0], 239.5 + 8 * off[1]
+    matrix = np.array(((focal, 0.0, middle[0]), (0.0, focal * (1 + 0.003 * off[2]), middle[1]), (0.0, 0.0, 1.0)))
+    distortion = np.array((-0.1 + 0.1 * off[3], 0.03 * off[4], 0.001 * off[5], 0.001 * off[6], 0.0))
+    return Lens(matrix, distortion, (640, 480))
+
+
+def held_boards(
+    reader: BoardReader,
+    lens: Lens,
+    mount: Array,
+    lidar: LidarPlace,
+    rng: np.random.Generator,
+    size: float = 1.0,
+    far: float = 0.0,
+    count: int = 28,
+) -> list[BoardView]:
+    """Views of a board, as a camera with ``lens`` at ``mount`` and a lidar see them.
+
+    Args:
+        reader: of the board.
+        lens: true one.
+        mount: true one, as ``NAMES``.
+        lidar: where it is.
+        rng: of how it is held, and of the noise.
+        size: of the board, as a share of what is stated.
+        far: what the lidar measures too far, m.
+        count: views.
+    """
+    angles = np.linspace(-2.09, 2.09, 682)
+    origin = board_mount.in_camera(np.zeros((1, 3)), mount, lidar)[0]
+    beams = board_mount.in_camera(board_mount.directions(angles), mount, lidar) - origin
+    found: list[BoardView] = []
+    while len(found) < count:
+        axes = cv2.Rodrigues(np.array((*rng.uniform(-0.55, 0.55, 2), 0.0)))[0]
+        axes = axes @ cv2.Rodrigues(np.array((0.0, 0.0, rng.uniform(-0.35, 0.35))))[0]
+        middle = rng.uniform(0.45, 0.9) * np.array((*(rng.uniform(-1, 1, 2) * (0.31, 0.2)), 1.0))
+        wide, high = size * reader.board.width, size * reader.board.height
+        place = middle - axes @ (wide / 2, high / 2, 0.0)
+        shown, _ = cv2.projectPoints(size * reader.points, cv2.Rodrigues(axes)[0], place, lens.matrix, lens.distortion)
+        pixels = np.asarray(shown).reshape(-1, 2) + 0.15 * rng.standard_normal((len(reader.points), 2))
+        ids = np.flatnonzero(((pixels > 4) & (pixels < np.array(lens.size) - 5)).all(axis=1))
+        if ids.size < 8:
+            continue
+        away = beams @ axes[:, 2]
+        on = (origin + (axes[:, 2] @ (place - origin) / away)[:, None] * beams - place) @ axes
+        met = (away > 0) & (on[:, 0] > 0) & (on[:, 0] < wide) & (on[:, 1] > 0) & (on[:, 1] < high)
+        # The board is no plane: its middle is off, and it is warped.
+        off = board_mount.FLAT * rng.normal() + board_mount.WARPED * rng.normal() * (on[:, 0] - wide / 2)
+        noise = 0.005 / math.sqrt(5) * rng.standard_normal(angles.size)
+        ranges = np.where(met, (axes[:, 2] @ (place - origin) + off) / away + far + noise, 3.0)
+        sighting = BoardSighting(pixels[ids], ids, 0.5)
+        pose = board_pose(sighting, reader, lens)
+        assert pose is not None
+        found.append(BoardView(sighting, pose, angles, ranges))
+    return found
+
+
 LIGHT: Final[dict[str, Callable[[np.random.Generator], list[Verdict]]]] = {
     "battery": battery_fit,
     "drive": drive_fit,
@@ -419,6 +513,7 @@ LIGHT: Final[dict[str, Callable[[np.random.Generator], list[Verdict]]]] = {
     "slip": slip_fit,
     "sonar": sonar_fit,
     "stabiliser": stabiliser_fit,
+    "camera": camera_fit,
 }
 """By wizard."""
 HALF_WIDTHS: Final = {
@@ -450,6 +545,12 @@ HALF_WIDTHS: Final = {
         for name in ("l", "fl", "f", "fr", "r")
         for what, half in (("x", 0.015), ("y", 0.015), ("yaw", math.radians(3.0)))
     },
+    "camera.focal_x": 5.2,
+    "camera.focal_y": 5.2,
+    "camera.centre_x": 4.6,
+    "camera.centre_y": 4.6,
+    **{f"camera.{name}": 0.015 for name in ("x", "y", "z")},
+    **{f"camera.{name}": math.radians(half) for name, half in (("yaw", 0.5), ("pitch", 1.0), ("roll", 0.5))},
 }
 """Median half-widths at most: 0.1 V, 1 % of ways and wheels, 2 degrees by iron in 25 uT, 0.5 degrees of an axle (8.5
 us), 10 ms, 10 mm and 0.5 degrees of the lidar, 2 mm of turning centres, 15 mm and 3 degrees of sonars, 1 % of the

@@ -12,11 +12,15 @@ from monstertruck_drivers.ax12.config import Ax12Config
 from monstertruck_drivers.srf08.config import Srf08Config
 from monstertruck_estimation.se2 import between, compose
 from monstertruck_estimation.slam.scans import Scan, ScanGeometry, prepare
+from monstertruck_estimation.vision.board import BoardReader
 from monstertruck_kinematics.elementary import integrate
 from monstertruck_kinematics.unsteered import SkidSteer
 from monstertruck_runtime.errors import InputError
+from monstertruck_schemas.board import BoardConfig
+from monstertruck_schemas.body import Mount
 from monstertruckd.tools.calibrate import (
     battery,
+    camera,
     compass,
     drive,
     imu,
@@ -27,10 +31,22 @@ from monstertruckd.tools.calibrate import (
     stabiliser,
     steering,
 )
+from monstertruckd.tools.calibrate.board_mount import LidarPlace
 from monstertruckd.tools.calibrate.statistics import Interval
 from monstertruckd.tools.calibrate.steering_model import Maps, SteeringModel
 from monstertruckd.tools.calibrate.steps import Confirm, MoveRecord, MoveStep
-from tests.calibration_light import AHEAD, CHASSIS, MAPS, mounted, sonar_legs, square_legs, steered_leg, true_joints
+from tests.calibration_light import (
+    AHEAD,
+    CHASSIS,
+    MAPS,
+    held_boards,
+    mounted,
+    sonar_legs,
+    square_legs,
+    steered_leg,
+    true_joints,
+    true_lens,
+)
 
 Found = str
 """What the wizard said; empty: it noticed nothing."""
@@ -214,6 +230,17 @@ def wrong_stabiliser(rng: np.random.Generator) -> Found:
     return (result.again or "") if found == senses else ""
 
 
+def wrong_camera(rng: np.random.Generator) -> Found:
+    """The board was printed at another scale: fitted to the page, or on paper of another size."""
+    reader, lens, lidar = BoardReader(BoardConfig()), true_lens(rng), LidarPlace.of(Mount(x=0.14, z=0.25))
+    mount = np.array((0.18, 0.0, 0.25, 0.0, 0.0, 0.0))
+    size = float(rng.choice((0.94, 0.97 / 1.03, 1.06)))
+    views = held_boards(reader, lens, mount, lidar, rng, size)
+    found, kept = camera.lens_of(views, reader, lens.size)
+    said = complaint(lambda: camera.mount_of(kept, reader, found, mount, lidar, {}))
+    return said if "times as large as stated" in said else ""
+
+
 WRONG: Final[Mapping[str, Callable[[np.random.Generator], Found]]] = {
     "battery": wrong_battery,
     "drive": wrong_drive,
@@ -225,6 +252,7 @@ WRONG: Final[Mapping[str, Callable[[np.random.Generator], Found]]] = {
     "slip": wrong_slip,
     "sonar": wrong_sonar,
     "stabiliser": wrong_stabiliser,
+    "camera": wrong_camera,
 }
 """By wizard."""
 

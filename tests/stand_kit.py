@@ -3,8 +3,9 @@
 import cv2
 import numpy as np
 
+from monstertruck_estimation.vision.lens import Lens
 from monstertruckd.tools.stand.calibration import StandCalibration, calibrate
-from monstertruckd.tools.stand.camera import Lens, PlacedCamera
+from monstertruckd.tools.stand.camera import PlacedCamera
 from monstertruckd.tools.stand.config import MarkConfig, OverheadConfig
 from monstertruckd.tools.stand.render import PictureQuality, StandRenderer, board_in_view, level_tag
 

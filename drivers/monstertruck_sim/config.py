@@ -6,7 +6,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from monstertruck_schemas.base import Schema
-from monstertruck_sim.world.config import CameraConfig, WorldConfig
+from monstertruck_sim.world.config import CameraConfig, HeldBoard, WorldConfig
 
 
 class DrillConfig(Schema):
@@ -34,17 +34,6 @@ class CeilingCamera(CameraConfig):
     rendered: Literal[True] = True
 
 
-class BoardInView(Schema):
-    """A ChArUco board that somebody holds before the ceiling's cameras, another way in each picture."""
-
-    columns: Annotated[int, Field(ge=4, le=30)] = 8
-    rows: Annotated[int, Field(ge=4, le=30)] = 6
-    square: Annotated[float, Field(gt=0, le=1)] = 0.04
-    """m"""
-    marker: Annotated[float, Field(gt=0, le=1)] = 0.03
-    """m"""
-
-
 class StandConfig(Schema):
     """The test stand that sees the simulated robot from outside."""
 
@@ -56,7 +45,7 @@ class StandConfig(Schema):
     """Rad"""
     cameras: dict[Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,31}$")], CeilingCamera] = Field(default_factory=dict)
     """That `stand run` looks through, by name"""
-    board: BoardInView | None = None
+    board: HeldBoard | None = None
     """For the pictures by which `stand calibrate` finds their lenses"""
 
 

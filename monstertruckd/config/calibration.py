@@ -18,7 +18,7 @@ from pydantic import Field, ValidationError
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import ConfigError, NotFoundError
 from monstertruck_schemas.base import Schema
-from monstertruck_schemas.body import TurnDeficitConfig
+from monstertruck_schemas.body import LensConfig, Mount, TurnDeficitConfig
 from monstertruckd.config.edit import check_size
 from monstertruckd.config.truck import TruckConfig
 
@@ -30,7 +30,7 @@ CONFIDENCE: Final = 0.95
 Value = bool | int | float
 Grade = Literal["A", "B", "C"]
 WizardName = Literal[
-    "battery", "compass", "drive", "steering", "odometry", "lidar", "imu", "slip", "sonar", "stabiliser"
+    "battery", "compass", "drive", "steering", "odometry", "lidar", "imu", "slip", "sonar", "stabiliser", "camera"
 ]
 
 STEERING: Final = "devices.steering.driver"
@@ -39,6 +39,8 @@ LIDAR: Final = "devices.lidar.mount"
 IMU: Final = "devices.imu.driver.correction"
 STABILISER: Final = "devices.stabiliser.driver"
 SONAR: Final = "devices.sonar.driver"
+CAMERA_LENS: Final = "devices.camera.driver.lens"
+CAMERA_MOUNT: Final = "devices.camera.mount"
 
 KEYS: Final[dict[WizardName, tuple[str, ...]]] = {
     "battery": (
@@ -75,6 +77,10 @@ KEYS: Final[dict[WizardName, tuple[str, ...]]] = {
     ),
     "stabiliser": tuple(
         f"{STABILISER}.{joint}.{name}" for joint in ("pitch", "roll") for name in ("zero", "direction")
+    ),
+    "camera": (
+        *(f"{CAMERA_LENS}.{name}" for name in LensConfig.model_fields),
+        *(f"{CAMERA_MOUNT}.{name}" for name in Mount.model_fields),
     ),
 }
 """Values of the configuration that each wizard may set, ``*`` for any one name; a calibration never touches any other.

@@ -25,7 +25,19 @@ from monstertruck_schemas.event import Severity
 from monstertruck_schemas.health import CalibrationHealth, CalibrationState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.roles import DeviceRole, ServiceName
-from monstertruck_schemas.topics import BATTERY, CALIBRATION, COMPASS, DRIVE, ODOMETRY, POSE, SONAR, USB, Topic, Writer
+from monstertruck_schemas.topics import (
+    BATTERY,
+    CALIBRATION,
+    COMPASS,
+    DRIVE,
+    ODOMETRY,
+    POINTS,
+    POSE,
+    SONAR,
+    USB,
+    Topic,
+    Writer,
+)
 from monstertruck_schemas.usb import UsbTree
 from monstertruckd.bus.local import Bus
 from monstertruckd.config.calibration import Estimate, Grade, Result, ValidUntil, WizardName, utc
@@ -68,6 +80,7 @@ LIFETIMES: Final[dict[WizardName, Lifetime]] = {
     "slip": Lifetime(90, 5_000.0, DeviceRole.WHEELS, _MOTION),
     "stabiliser": Lifetime(180, 20_000.0, DeviceRole.STABILISER, (POSE,)),
     "sonar": Lifetime(180, 20_000.0, DeviceRole.SONAR, (SONAR,)),
+    "camera": Lifetime(365, 20_000.0, DeviceRole.CAMERA, (POINTS,)),
 }
 """By experience of such parts, none of it measured: tyres wear, linkages and mounts are knocked, iron changes."""
 
@@ -114,10 +127,21 @@ GOALS: Final[dict[str, Goal]] = {
     "sonar.*_x": Goal(0.015),
     "sonar.*_y": Goal(0.015),
     "sonar.*_yaw": Goal(0.052),
+    "camera.focal_x": Goal(0.01, share=True),
+    "camera.focal_y": Goal(0.01, share=True),
+    "camera.centre_x": Goal(4.6),
+    "camera.centre_y": Goal(4.6),
+    "camera.x": Goal(0.015),
+    "camera.y": Goal(0.015),
+    "camera.z": Goal(0.015),
+    "camera.yaw": Goal(0.0087),
+    "camera.pitch": Goal(0.0175),
+    "camera.roll": Goal(0.0087),
 }
 """Of the intervals, in the estimates' units: 1 % of ways, 0.5 degrees of steering (8.5 us), 2 degrees by iron
 in a horizontal field of 25 uT, 10 mm and 0.5 degrees of the lidar, 15 mm and 3 degrees of any sonar, 1
-degree (3.4 steps) of the stabiliser, 0.1 V."""
+degree (3.4 steps) of the stabiliser, 15 mm and 0.5 degrees (4.6 of 522 pixels) of the camera, of its pitch 1 degree,
+0.1 V."""
 
 
 def grade(wizard: WizardName, estimate: Estimate) -> Grade | None:

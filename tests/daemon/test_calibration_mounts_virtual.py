@@ -7,6 +7,7 @@ import pytest
 
 from monstertruckd.config.calibration import CalibrationStore, WizardName, with_values
 from monstertruckd.config.load import load_config
+from monstertruckd.tools.calibrate.camera import CameraWizard, camera_wizard
 from monstertruckd.tools.calibrate.imu import ImuWizard, imu_wizard
 from monstertruckd.tools.calibrate.lidar import LidarWizard, lidar_wizard
 from monstertruckd.tools.calibrate.odometry import odometry_wizard
@@ -97,6 +98,23 @@ def test_stabiliser(tmp_path: Path):
     assert (driver.pitch.direction, driver.roll.direction) == tuple(
         getattr(config.sim.world.mount, joint).direction for joint in ("pitch", "roll")
     )
+
+
+@pytest.mark.long
+def test_camera(tmp_path: Path):
+    overlay = {
+        "devices": {"camera": {"mount": {"x": 0.18, "z": 0.25}, "driver": {"kind": "webcam", "rate": 5}}},
+        "sim": {"world": {"camera": {"noise": 3.0}, "board": {}}},
+    }
+    overlay["devices"]["camera"]["port"] = {"path": tmp_path / "camera"}
+    config = hidden(with_overlay(truck(tmp_path, 7, "camera"), overlay), np.random.default_rng(7), 7, ("camera",))
+    found = judged(camera_wizard(CameraWizard(patience=120.0)), config, 7, outside=2)
+    assert found >= {"focal_x", "centre_y", "k1", "x", "z", "pitch"}
+    current = CalibrationStore(config.calibration_folder, config.robot).current()
+    assert current is not None
+    camera = with_values(config, current.results.values(), "calibration").devices.camera
+    assert camera.driver.lens.focal_x != config.devices.camera.driver.lens.focal_x
+    assert camera.mount != config.devices.camera.mount
 
 
 @pytest.mark.long

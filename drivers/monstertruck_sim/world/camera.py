@@ -7,7 +7,7 @@ is sampled by several rays in each pixel, so that a far tag blurs as it does on 
 from collections.abc import Callable, Sequence
 from functools import cache, lru_cache
 from math import ceil, cos, hypot, sin, tan
-from typing import Final, NamedTuple, Protocol
+from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,6 +71,16 @@ class FlatPanel(NamedTuple):
     """(3,): its upper edge, m."""
     down: Array
     """(3,): its left edge, m."""
+    rays: int = 1
+    """Of a pixel along and across, at least."""
+
+
+class Holder(Protocol):
+    """Somebody who holds a board before a camera."""
+
+    def panel_at(self, time_ns: int, place: CameraPlace, /) -> FlatPanel:
+        """The board at an instant, before a camera at ``place``."""
+        ...
 
 
 class Crowd(Protocol):
@@ -116,6 +126,7 @@ class SimulatedView:
         config: lens, mount and noise.
         tags: on the walls.
         crowd: who walks around.
+        holder: holds a board before it.
         wall_height: m.
         seed: of the noise; None = none.
 
@@ -131,10 +142,12 @@ class SimulatedView:
         *,
         tags: Sequence[TagConfig] = (),
         crowd: Crowd | None = None,
+        holder: Holder | None = None,
         wall_height: float = 0.6,
         seed: int | None = None,
     ) -> None:
         self.plant, self._cast, self.config, self.crowd, self._seed = plant, cast, config, crowd, seed
+        self._holder = holder
         self._wall_height = wall_height
         self._painters: dict[tuple[int, int], Painter] = {}
         self._panels = [tag_panel(tag) for tag in tags]
@@ -153,13 +166,22 @@ class SimulatedView:
         """``ViewSource``: asks the world at once, draws when called."""
         painter = self._painter(size)
         ranges = self.ranges(time_ns, painter.azimuths)
-        x, y, yaw = self.plant.poses(np.array([time_ns]))[:3, 0].tolist()
-        place = mounted((x, y, yaw), self.config)
+        place = self._place(time_ns)
         panels = self._in_view(place)
         if self.crowd is not None:
             panels += [person_panel(*person, place) for person in self.crowd.people_at(time_ns)]
+        if (board := self.board_at(time_ns)) is not None:
+            panels.append(board)
         grain = self.grain(time_ns)
         return lambda: grain(painter.picture(ranges, panels, place))
+
+    def board_at(self, time_ns: int) -> FlatPanel | None:
+        """The board that somebody holds before it; None = nobody does."""
+        return None if self._holder is None else self._holder.panel_at(time_ns, self._place(time_ns))
+
+    def _place(self, time_ns: int) -> CameraPlace:
+        x, y, yaw = self.plant.poses(np.array([time_ns]))[:3, 0].tolist()
+        return mounted((x, y, yaw), self.config)
 
     def _painter(self, size: tuple[int, int]) -> "Painter":
         if size not in self._painters:
@@ -259,7 +281,7 @@ class Painter:
         x0, y0, x1, y1 = max(int(x0), 0), max(int(y0), 0), min(int(x1), width), min(int(y1), height)
         if x0 >= x1 or y0 >= y1:
             return
-        finer = max(1, min(FINEST, int((RAYS / ((x1 - x0) * (y1 - y0))) ** 0.5)))
+        finer = max(panel.rays, min(FINEST, int((RAYS / ((x1 - x0) * (y1 - y0))) ** 0.5)))
         part = (np.arange(finer) + 0.5) / finer - 0.5
         us = (np.arange(x0, x1)[:, None] + part).ravel() - (width - 1) / 2
         vs = (np.arange(y0, y1)[:, None] + part).ravel() - (height - 1) / 2
@@ -325,9 +347,8 @@ class Painter:
 # Panels
 
 
-@cache
-def tag_pattern(tag: int) -> NDArray[np.uint8]:
-    """A tag of family 36h11 on its white paper, a pixel a cell, (10, 10).
+def opencv(key: str) -> Any:
+    """OpenCV, for what ``key`` of the configuration wants drawn.
 
     Raises:
         NotInstalledError: the extra ``vision`` is not there.
@@ -336,9 +357,20 @@ def tag_pattern(tag: int) -> NDArray[np.uint8]:
         import cv2  # noqa: PLC0415  # the library of an extra
     except ModuleNotFoundError as error:
         raise NotInstalledError(
-            "sim.world.tags: opencv is not installed: it comes with the extra vision "
+            f"{key}: opencv is not installed: it comes with the extra vision "
             "(pip install 'monstertruckd[vision]'; in a checkout: python3 -m monstertruckd.bootstrap sync)"
         ) from error
+    return cv2
+
+
+@cache
+def tag_pattern(tag: int) -> NDArray[np.uint8]:
+    """A tag of family 36h11 on its white paper, a pixel a cell, (10, 10).
+
+    Raises:
+        NotInstalledError: the extra ``vision`` is not there.
+    """
+    cv2 = opencv("sim.world.tags")
     family = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
     inner = cv2.aruco.generateImageMarker(family, tag, CELLS)
     return np.pad(np.where(np.asarray(inner) > 127, PAPER, INK).astype(np.uint8), RIM, constant_values=PAPER)

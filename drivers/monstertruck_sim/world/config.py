@@ -15,6 +15,7 @@ from monstertruck_kinematics.polynomials import AxlePolynomials, SteeringPolynom
 from monstertruck_kinematics.truck import DriveTrain
 from monstertruck_runtime.bodies import AnyBody, build_chassis
 from monstertruck_schemas.base import FrameId, Pose2D, Schema
+from monstertruck_schemas.board import BoardConfig
 from monstertruck_schemas.body import TruckBody
 
 Positive = Annotated[float, Field(gt=0)]
@@ -349,6 +350,15 @@ class TagConfig(Schema):
     """Side of its black square, m."""
     lies: bool = False
     """It faces upwards."""
+
+
+class HeldBoard(BoardConfig):
+    """A ChArUco board that somebody holds before a camera, every while another way."""
+
+    hold: Annotated[float, Field(ge=0.05, le=60)] = 1.5
+    """Seconds for which it is held still"""
+    printed_scale: Annotated[float, Field(gt=0.1, lt=10)] = 1.0
+    """Of the true board, against the sizes above"""
 
 
 class RoofTag(Schema):
@@ -711,6 +721,8 @@ class WorldConfig(Schema):
     """Who walks through it"""
     tags: Annotated[tuple[TagConfig, ...], Field(strict=False, max_length=500)] = ()
     """AprilTags on its walls, seen by the camera; extra vision"""
+    board: HeldBoard | None = None
+    """Somebody holds it before the robot's camera, where the lidar sees it, too; null = nobody does; extra vision"""
     roof: RoofTag | None = None
     """A tag on the robot; engine mujoco only"""
 

@@ -1,5 +1,6 @@
 """What the devices' sensing elements feel: the physics behind the emulators."""
 
+from collections.abc import Callable
 from math import atan2, cos, degrees, hypot, pi, radians, sin
 from typing import Protocol
 
@@ -8,6 +9,8 @@ from numpy.typing import NDArray
 
 from monstertruck_drivers.emulation import CompassReading, ImuReading, JointSource, MotorReading, PulseSource
 from monstertruck_kinematics.elementary import Array
+from monstertruck_sim.world.board import panel_ranges
+from monstertruck_sim.world.camera import FlatPanel, rotation
 from monstertruck_sim.world.config import (
     BatteryModelConfig,
     CompassModelConfig,
@@ -168,6 +171,8 @@ class SimulatedLidar:
 
     def __init__(self, plant: Plant, sweep: Sweep, config: LidarConfig, seed: int | None) -> None:
         self.joints: JointSource | None = None
+        self.board_at: Callable[[int], FlatPanel | None] = lambda _: None
+        """What somebody holds before the robot."""
         self._plant, self._sweep, self._config, self._seed = plant, sweep, config, seed
         self._lost = (np.arange(STEPS) < config.first_step) | (np.arange(STEPS) > config.last_step)
         """Steps that never measure."""
@@ -185,7 +190,17 @@ class SimulatedLidar:
         beams = self._mounted
         if self.joints is not None:
             beams = turned(LEVEL_BEAMS if beams is None else beams, *self.joints.angles(times))
-        return self._measure(self._sweep(poses, beams, times), time_ns)
+        ranges = self._sweep(poses, beams, times)
+        if (board := self.board_at(time_ns)) is not None:
+            ranges = np.minimum(ranges, self._held(board, poses[:, 0], LEVEL_BEAMS if beams is None else beams))
+        return self._measure(ranges, time_ns)
+
+    def _held(self, board: FlatPanel, pose: Array, beams: Beams) -> Array:
+        """Ranges of a board before a robot that stands, m; inf = none."""
+        x, y, yaw, pitch, roll, height = pose.tolist()
+        body, config = rotation(yaw, pitch, roll), self._config
+        origin = np.array((x, y, height)) + body @ np.array((config.x, config.y, config.height))
+        return panel_ranges(board, origin, np.stack(beams, axis=1) @ body.T)
 
     def _measure(self, ranges: Array, time_ns: int) -> NDArray[np.int32]:
         config = self._config

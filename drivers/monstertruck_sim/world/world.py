@@ -17,6 +17,7 @@ from monstertruck_drivers.emulation import (
 )
 from monstertruck_runtime.errors import InputError, NotInstalledError
 from monstertruck_runtime.map_files import load_map
+from monstertruck_sim.world.board import BoardHolder
 from monstertruck_sim.world.built_in import BUILT_IN, BuiltIn
 from monstertruck_sim.world.camera import SimulatedView
 from monstertruck_sim.world.config import TiltConfig, WorldConfig
@@ -70,7 +71,8 @@ class World:
         self.lidar: RangeSource = self._lidar
         pitch, roll = config.mount.pitch, config.mount.roll
         self._horns = Horn(pitch.zero, pitch.direction), Horn(roll.zero, roll.direction)
-        self.view = make_view(config, self._plant, cast, self.scene, noise_seed)
+        self.view = make_view(config, self._plant, cast, self.scene, seed)
+        self._lidar.board_at = self.view.board_at
         self.motors: tuple[MotorPlant, ...] = tuple(
             SimulatedMotor(self._plant, config.truck.motor, noise_seed, i) for i in range(len(self._plant.shafts))
         )
@@ -212,14 +214,21 @@ def make_engine(config: WorldConfig, footprint: PlanOutline, start: Pose, seed: 
     return plane(config, footprint, start, seed)
 
 
-def make_view(config: WorldConfig, plant: Plant, cast: Caster, scene: Surroundings, seed: int | None) -> SimulatedView:
+def make_view(config: WorldConfig, plant: Plant, cast: Caster, scene: Surroundings, seed: int) -> SimulatedView:
     """What the camera sees, drawn in the plane or rendered.
 
     Raises:
         NotInstalledError: this computer cannot render, or tags need a library that is not there.
     """
     drawn = SimulatedView(
-        plant, cast, config.camera, tags=config.tags, crowd=scene, wall_height=config.lidar.wall_height, seed=seed
+        plant,
+        cast,
+        config.camera,
+        tags=config.tags,
+        crowd=scene,
+        holder=None if config.board is None else BoardHolder(config.board, config.camera.field_of_view, seed),
+        wall_height=config.lidar.wall_height,
+        seed=seed if config.noise else None,
     )
     if not config.camera.rendered:
         return drawn

@@ -57,7 +57,15 @@ class RenderedView(SimulatedView):
         standing = [(x, y, floor, radius) for x, y, radius in people]
         renderer.arrange(self._rigid.data, eye, people=standing, hidden=self.HIDDEN)
         grain = self.grain(time_ns)
-        return lambda: grain(_bent(self._thread.submit(renderer.render).result(), wider, painter))
+        board = self.board_at(time_ns)
+
+        def draw() -> Picture:
+            picture = _bent(self._thread.submit(renderer.render).result(), wider, painter)
+            if board is not None:
+                painter.draw(picture, board, place, np.full(len(painter.azimuths), np.inf))
+            return grain(picture)
+
+        return draw
 
     def _place(self, time_ns: int) -> CameraPlace:
         x, y, yaw, pitch, roll, z = self._rigid.poses(np.array([time_ns]))[:, 0].tolist()

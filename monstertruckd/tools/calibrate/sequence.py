@@ -4,6 +4,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Final
 
+from monstertruck_schemas.body import LensConfig
 from monstertruckd.config.calibration import Result, WizardName
 from monstertruckd.config.truck import TruckConfig
 from monstertruckd.tools.calibrate.sonar import BODIES
@@ -33,9 +34,11 @@ ORDER: Final = (
     SequenceStep("imu", "rate_scale"),
     SequenceStep("slip", "icr_left"),
     SequenceStep("sonar", "cone"),
+    SequenceStep("camera", "focal_x"),
 )
 """The steering's direction needs the drive's sign, a compass circle the steering's direction, a taped straight wheels
-that are about straight, gains of the steering true metres and headings, squares and the lidar's mount all of them."""
+that are about straight, gains of the steering true metres and headings, squares and the lidar's mount all of them, and
+the camera's mount the lidar's."""
 
 
 def fits(step: SequenceStep, config: TruckConfig) -> bool:
@@ -49,6 +52,8 @@ def fits(step: SequenceStep, config: TruckConfig) -> bool:
             return truck and devices.steering is not None and devices.compass is not None and devices.drive is not None
         case "stabiliser":
             return devices.stabiliser is not None and devices.compass is not None and devices.lidar is not None
+        case "camera":
+            return devices.camera is not None and isinstance(getattr(devices.camera.driver, "lens", None), LensConfig)
         case "sonar":
             return "sonar" in devices.present() and config.body.kind in BODIES
         case "slip":

@@ -178,7 +178,23 @@ class Collect(Generic[M]):
     """Seconds in which they must have come"""
 
 
-Step = Number | Confirm | MoveStep | Collect[Any]
+@dataclass(frozen=True, slots=True)
+class WatchStep(Generic[M]):
+    """Messages of a topic as they come, while the operator does something, until enough was seen.
+
+    Of messages that come while one is looked at, the newest counts.
+    """
+
+    name: str
+    topic: Topic[M]
+    take: Callable[[M, dict[str, list[Any]]], tuple[float, float]]
+    """Gets a message, and those of ``also`` since the last call, by topic; returns how much of how much is done"""
+    also: tuple[Topic[Any], ...] = ()
+    timeout: float = 10.0
+    """Seconds without a message that end it"""
+
+
+Step = Number | Confirm | MoveStep | Collect[Any] | WatchStep[Any]
 
 
 class Panel(Protocol):

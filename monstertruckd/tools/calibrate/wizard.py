@@ -8,24 +8,27 @@ the calibration unchanged; the gate stops the truck as it does for any operator 
 
 import json
 from collections.abc import Awaitable, Callable, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, Final, TypeVar
 
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import InputError, NoAnswerError, RequestRefusedError
-from monstertruck_runtime.mailbox import fifo
+from monstertruck_runtime.mailbox import fifo, latest
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.config.calibration import Result, Value, WizardName, value_at
 from monstertruckd.config.calibration_rpc import SAVE
 from monstertruckd.config.truck import TruckConfig
 from monstertruckd.tools.calibrate.motion import MovedTruck, Mover
-from monstertruckd.tools.calibrate.steps import Collect, Confirm, MoveRecord, MoveStep, Number, Panel
+from monstertruckd.tools.calibrate.steps import Collect, Confirm, MoveRecord, MoveStep, Number, Panel, WatchStep
 
 M = TypeVar("M", bound=Message)
 T = TypeVar("T")
 
+WATCHED: Final = 64
+"""Messages kept between two looks."""
 CLEAR: Final = Confirm("clear", "The truck is about to move. Is the floor free as described?")
 
 
@@ -129,6 +132,23 @@ class WizardContext:
                 text = f"{step.topic.name}: {len(found)} of {step.count} messages came within {step.timeout:g} s"
                 raise NoAnswerError(text) from None
         return found
+
+    async def watch(self, step: WatchStep[M]) -> None:
+        """Messages as they come, until enough was seen; raises what ``step.take`` does.
+
+        Raises:
+            NoAnswerError: none came in time.
+        """
+        with ExitStack() as feeds:
+            newest = feeds.enter_context(self._truck.subscribe(step.topic, latest()))
+            others = {t.name: feeds.enter_context(self._truck.subscribe(t, fifo(WATCHED))) for t in step.also}
+            done, total = 0.0, 1.0
+            while done < total:
+                message = await newest.next_within(step.timeout)
+                if message is None:
+                    raise NoAnswerError(f"{step.topic.name}: no message came for {step.timeout:g} s")
+                done, total = step.take(message, {name: box.drain() for name, box in others.items()})
+                self._panel.progress(step.name, done, total)
 
     def fit(self, name: str, function: Callable[[], T]) -> T:
         """Compute a result from what was measured, as a step of its own."""

@@ -11,7 +11,15 @@ import typer
 
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruckd.tools.cli.options import EndpointOption, RobotOption, complete_config, with_parameters
-from monstertruckd.tools.cli.output import JsonOption, command_group, on_terminal, print_json, print_table, remark
+from monstertruckd.tools.cli.output import (
+    JsonOption,
+    command_group,
+    needs_extra,
+    on_terminal,
+    print_json,
+    print_table,
+    remark,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -219,6 +227,28 @@ def stabiliser(
     return stabiliser_wizard(StabiliserWizard(tape_error / 1000))
 
 
+@_wizard
+def camera(
+    columns: Annotated[int, typer.Option(min=4, max=30, help="Squares of the board, across.")] = 8,
+    rows: Annotated[int, typer.Option(min=4, max=30, help="And down.")] = 6,
+    square: Annotated[float, typer.Option(min=5, max=1000, help="Side of a square as printed, mm.")] = 40.0,
+    marker: Annotated[float, typer.Option(min=4, max=1000, help="Side of a marker as printed, mm.")] = 30.0,
+    lens_only: Annotated[bool, typer.Option("--lens-only", help="Not its place against the lidar.")] = False,
+    patience: Annotated[float, typer.Option(min=5, max=3600, help="Seconds without anything new that end it.")] = 60.0,
+) -> "Wizard":
+    """Lens of the camera, and where it sits against the lidar: a printed board held before both.
+
+    Nothing drives. Asks `board`; `stand print` makes the board.
+    """
+    from monstertruck_schemas.board import BoardConfig
+
+    with needs_extra("vision"):
+        from monstertruckd.tools.calibrate.camera import CameraWizard, camera_wizard
+
+    board = BoardConfig(columns=columns, rows=rows, square=square / 1000, marker=marker / 1000)
+    return camera_wizard(CameraWizard(board, lidar=not lens_only, patience=patience))
+
+
 @app.command("all")
 def all_(
     *,
@@ -265,6 +295,7 @@ def wizard_of(step: "SequenceStep") -> "Wizard":
         "slip": slip,
         "sonar": sonar,
         "stabiliser": stabiliser,
+        "camera": camera,
     }
     return others[step.name]()
 

@@ -23,11 +23,12 @@ from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruck_runtime.errors import InputError, NotFoundError
 from monstertruck_runtime.memory import settle
 from monstertruck_sim.computer import EmulatedComputer
-from monstertruck_sim.config import BoardInView, CeilingCamera
+from monstertruck_sim.config import CeilingCamera
 from monstertruck_sim.console import Commanded, CommandedGroup, Emulated, EmulatedFiles, FaultConsole
 from monstertruck_sim.faults import FaultInjector, SimContext
 from monstertruck_sim.robot import SimulatedRobot
 from monstertruck_sim.stand import SimulatedStand
+from monstertruck_sim.world.config import HeldBoard
 from monstertruck_sim.world.scene import Surroundings
 from monstertruck_sim.world.world import World
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, needs_computer
@@ -250,7 +251,7 @@ async def _see(clock: Clock, config: SimulatedTruckConfig, world: World) -> None
             await clock.sleep(STAND_RETRY)
 
 
-async def _watch(clock: Clock, world: World, camera: CeilingCamera, board: BoardInView | None, seed: int) -> None:
+async def _watch(clock: Clock, world: World, camera: CeilingCamera, board: HeldBoard | None, seed: int) -> None:
     """Serve a camera of the stand."""
     from monstertruck_sim.world3d.ceiling import CeilingView  # noqa: PLC0415  # the library of an extra
 

@@ -12,20 +12,18 @@ import cv2
 import numpy as np
 from pydantic import Field, ValidationError
 
-from monstertruck_estimation.vision.tags import Picture, Sighting, TagReader, dictionary
+from monstertruck_estimation.vision.board import BoardReader
+from monstertruck_estimation.vision.lens import Lens, LensFit, lens_from_pictures
+from monstertruck_estimation.vision.tags import Picture, Sighting, TagReader
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.fitting import least_squares
 from monstertruck_runtime.errors import ConfigError, InputError
 from monstertruck_schemas.base import Schema
-from monstertruckd.tools.stand.camera import Lens, PlacedCamera, meet, rotation_matrix
-from monstertruckd.tools.stand.config import BoardConfig, MarkConfig, OverheadConfig
+from monstertruckd.tools.stand.camera import PlacedCamera, meet, rotation_matrix
+from monstertruckd.tools.stand.config import MarkConfig, OverheadConfig
 
 Numbers = Annotated[tuple[float, ...], Field(strict=False)]
 
-LEAST_BOARDS: Final = 6
-"""Pictures of the board."""
-LEAST_CORNERS: Final = 8
-"""Of a board in a picture."""
 LEAST_MARKS: Final = 5
 """In sight of a camera."""
 SEEN: Final = 0.0005
@@ -61,31 +59,6 @@ class StandCalibration(Schema):
     def placed(self) -> dict[str, PlacedCamera]:
         """For use."""
         return {name: _placed(found) for name, found in self.cameras.items()}
-
-
-def fit_lens(pictures: Sequence[Picture], board: BoardConfig) -> tuple[Lens, float, int]:
-    """A lens from pictures of the board, the rms of its corners (pixels) and the pictures that showed it.
-
-    Raises:
-        InputError: too few of them show it.
-    """
-    printed = cv2.aruco.CharucoBoard((board.columns, board.rows), board.square, board.marker, dictionary())
-    detector = cv2.aruco.CharucoDetector(printed)
-    objects, images = [], []
-    for picture in pictures:
-        corners, ids, _, _ = detector.detectBoard(picture)
-        if ids is None or len(ids) < LEAST_CORNERS:
-            continue
-        points, shown = printed.matchImagePoints(corners, ids)
-        objects.append(np.asarray(points, dtype=np.float32))
-        images.append(np.asarray(shown, dtype=np.float32))
-    if len(objects) < LEAST_BOARDS:
-        raise InputError(f"the board is seen in {len(objects)} of {len(pictures)} pictures: expected {LEAST_BOARDS}")
-    height, width = pictures[0].shape
-    rms, matrix, distortion, _, _ = cv2.calibrateCamera(
-        objects, images, (width, height), None, None, flags=cv2.CALIB_FIX_K3
-    )
-    return Lens(np.asarray(matrix), np.ravel(distortion)[:5], (width, height)), float(rms), len(objects)
 
 
 def middles(sightings: Sequence[Sighting]) -> dict[int, Array]:
@@ -175,12 +148,13 @@ def calibrate(
     Raises:
         InputError: a camera lacks pictures or marks; it is named.
     """
-    lenses, seen, placed = {}, {}, {}
+    lenses: dict[str, tuple[LensFit, int]] = {}
+    seen, placed = {}, {}
     for name in config.cameras:
         try:
-            lenses[name] = fit_lens(boards[name], config.board)
+            lenses[name] = lens_from_pictures(boards[name], BoardReader(config.board))
             seen[name] = seen_marks(floors[name])
-            placed[name] = place(lenses[name][0], seen[name], config.marks)
+            placed[name] = place(lenses[name][0].lens, seen[name], config.marks)
         except InputError as error:
             raise InputError(f"camera {name}: {error}") from error
     joined = join(placed, seen, config.marks, config.ruler_error)
@@ -194,14 +168,14 @@ def calibrate(
     found = {}
     for name, camera in joined.items():
         own = [points[name][tag] - (m.x, m.y) for tag, m in config.marks.items() if tag in points[name]]
-        lens, rms, count = lenses[name]
+        fit, count = lenses[name]
         found[name] = CameraCalibration(
-            matrix=tuple(lens.matrix.ravel().tolist()),
-            distortion=tuple(lens.distortion.tolist()),
-            size=lens.size,
+            matrix=tuple(fit.lens.matrix.ravel().tolist()),
+            distortion=tuple(fit.lens.distortion.tolist()),
+            size=fit.lens.size,
             rotation=tuple(camera.rotation.tolist()),
             translation=tuple(camera.translation.tolist()),
-            lens_rms=rms,
+            lens_rms=fit.rms,
             place_rms=_rms(own),
             boards=count,
             marks=len(own),

@@ -1,7 +1,4 @@
-"""Lenses and places of cameras over a plane: from pixels to points of the stand, and back.
-
-The lens is Brown's (two radial and two tangential terms, a third radial one); the stand's plane is z = 0, z upwards.
-"""
+"""Places of cameras over a plane: from pixels to points of the stand, and back. Its plane is z = 0, z upwards."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -9,24 +6,8 @@ from functools import cached_property
 import cv2
 import numpy as np
 
+from monstertruck_estimation.vision.lens import Lens
 from monstertruck_kinematics.elementary import Array
-
-
-@dataclass(frozen=True)
-class Lens:
-    """What a camera makes of directions."""
-
-    matrix: Array
-    """(3, 3), pixels."""
-    distortion: Array
-    """(5,): k1, k2, p1, p2, k3."""
-    size: tuple[int, int]
-    """Width and height, pixels."""
-
-    def directions(self, pixels: Array) -> Array:
-        """X and y of the rays through pixels at z = 1 of the camera; (n, 2) both."""
-        points = np.ascontiguousarray(pixels, dtype=np.float64).reshape(-1, 1, 2)
-        return np.asarray(cv2.undistortPoints(points, self.matrix, self.distortion)).reshape(-1, 2)
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field
 
 from monstertruck_schemas.base import Schema
+from monstertruck_schemas.board import BoardConfig
 
 Metres = Annotated[float, Field(gt=0, le=10)]
 
@@ -41,17 +42,6 @@ class StandCamera(Schema):
     """Folder with pictures of the board, held anyhow: for the lens"""
     floor: Path
     """Folder with pictures of the table with its marks: for the camera's place"""
-
-
-class BoardConfig(Schema):
-    """Printed ChArUco board."""
-
-    columns: Annotated[int, Field(ge=4, le=30)] = 8
-    rows: Annotated[int, Field(ge=4, le=30)] = 6
-    square: Metres = 0.04
-    """m, as measured on the print"""
-    marker: Metres = 0.03
-    """m"""
 
 
 class MarkConfig(Schema):

@@ -12,8 +12,8 @@ import numpy as np
 
 from monstertruck_estimation.vision.tags import Picture, dictionary, drawn
 from monstertruck_kinematics.elementary import Array
+from monstertruck_schemas.board import BoardConfig
 from monstertruckd.tools.stand.camera import PlacedCamera
-from monstertruckd.tools.stand.config import BoardConfig
 
 FINER: Final = 2
 """Rays of a pixel, along and across."""

@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 
 from monstertruck_estimation.points.exchange import ReadAnswer, ReadTask, TagReading, Triple
+from monstertruck_estimation.vision.lens import Lens
 from monstertruck_estimation.vision.tags import Picture, Sighting, TagReader, drawn
 from monstertruck_kinematics.elementary import Array
-from monstertruck_schemas.body import LensConfig
 
 CELLS: Final = 8
 """Of a tag's black square, along a side."""
@@ -43,29 +43,16 @@ class ReadingStep:
             return ReadAnswer(unreadable=True)
         grey: Picture = np.asarray(cv2.cvtColor(colour, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
         found, refused = [], 0
-        matrix, distortion = camera_matrix(task.lens, grey.shape[1], grey.shape[0])
+        lens = Lens.of(task.lens, grey.shape[1], grey.shape[0])
         for sighting in self._reader.read(grey):
             margin = decode_margin(grey, sighting)
-            reading = placed(sighting, task.sizes.get(sighting.tag, task.size), matrix, distortion, margin)
+            reading = placed(sighting, task.sizes.get(sighting.tag, task.size), lens, margin)
             near = reading is not None and float(np.linalg.norm(reading.middle)) <= task.reach
             if reading is None or margin < task.margin or not near or reading.angle > task.angle:
                 refused += 1
                 continue
             found.append(_with_picture(reading, colour, sighting))
         return ReadAnswer(tuple(found), refused)
-
-
-def camera_matrix(lens: LensConfig, width: int, height: int) -> tuple[Array, Array]:
-    """OpenCV's matrix (3, 3) and distortion (5,) of a lens for pictures of another size than it was measured with."""
-    across, up = width / lens.width, height / lens.height
-    matrix = np.array(
-        (
-            (lens.focal_x * across, 0.0, (lens.centre_x + 0.5) * across - 0.5),
-            (0.0, lens.focal_y * up, (lens.centre_y + 0.5) * up - 0.5),
-            (0.0, 0.0, 1.0),
-        )
-    )
-    return matrix, np.array((lens.k1, lens.k2, lens.p1, lens.p2, lens.k3))
 
 
 def decode_margin(grey: Picture, sighting: Sighting) -> float:
@@ -84,12 +71,12 @@ def decode_margin(grey: Picture, sighting: Sighting) -> float:
     return float(np.where(white, share, -share).min())
 
 
-def placed(sighting: Sighting, size: float, matrix: Array, distortion: Array, margin: float) -> TagReading | None:
+def placed(sighting: Sighting, size: float, lens: Lens, margin: float) -> TagReading | None:
     """A tag before the camera; None if no pose fits."""
     half = size / 2
     square = np.array(((-half, half, 0), (half, half, 0), (half, -half, 0), (-half, -half, 0)))
     count, rotations, places, errors = cv2.solvePnPGeneric(
-        square, sighting.corners.reshape(4, 1, 2), matrix, distortion, flags=cv2.SOLVEPNP_IPPE_SQUARE
+        square, sighting.corners.reshape(4, 1, 2), lens.matrix, lens.distortion, flags=cv2.SOLVEPNP_IPPE_SQUARE
     )
     if not count:
         return None

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from monstertruck_estimation.points.config import PointsConfig
 from monstertruck_estimation.points.exchange import TagReading, Triple
 from monstertruck_estimation.se2 import Vector, compose
+from monstertruck_estimation.vision.mount import camera_axes
 from monstertruck_kinematics.elementary import Array
 from monstertruck_schemas.body import Mount
 from monstertruck_schemas.points import PointKind, PointOfInterest
@@ -226,7 +227,7 @@ def sighting(
     Of the two poses of a square the one is taken whose normal is level, as of a tag that hangs upright; where both are,
     and fit alike, its heading is uncertain.
     """
-    turned = axes(mount)
+    turned = camera_axes(mount.yaw, mount.pitch, mount.roll)
     place = turned @ np.array(reading.middle) + np.array((mount.x, mount.y, mount.z))
     normals = [turned @ np.array(normal) for normal in (reading.normal, reading.other_normal)]
     level = [abs(float(normal[2])) for normal in normals]
@@ -249,21 +250,6 @@ def sighting(
     yaw = math.atan2(normal[1], normal[0])
     x, y, z = (float(v) for v in place)
     return PointSighting(stamp, base, (x, y, z), yaw, tuple(spread.ravel().tolist()), reading.pixels)
-
-
-def axes(mount: Mount) -> Array:
-    """From the camera's axes (right, down, ahead) to base's, (3, 3)."""
-    cy, sy, cp, sp, cr, sr = (
-        f(v) for v in (mount.yaw, mount.pitch, mount.roll) for f in (math.cos, math.sin)
-    )  # fmt: skip
-    turned = np.array(
-        (
-            (cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
-            (sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),
-            (-sp, cp * sr, cp * cr),
-        )
-    )
-    return np.stack((-turned[:, 1], -turned[:, 2], turned[:, 0]), axis=1)
 
 
 def fused(sightings: Sequence[PointSighting], bases: Bases, config: PointsConfig) -> tuple[Array, float, Array]:

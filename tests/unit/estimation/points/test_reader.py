@@ -7,7 +7,8 @@ import pytest
 
 from monstertruck_drivers.webcam.emulator import jpeg
 from monstertruck_estimation.points.exchange import ReadTask
-from monstertruck_estimation.points.reader import ReadingStep, camera_matrix
+from monstertruck_estimation.points.reader import ReadingStep
+from monstertruck_estimation.vision.lens import Lens
 from monstertruck_schemas.body import LensConfig
 from monstertruck_sim.world.camera import Painter, mounted, tag_panel
 from monstertruck_sim.world.config import CameraConfig, TagConfig
@@ -64,5 +65,5 @@ def test_a_tag_of_another_size_is_farther_away():
 
 
 def test_a_lens_is_scaled_to_the_pictures():
-    matrix, _ = camera_matrix(LensConfig(), 320, 240)
+    matrix = Lens.of(LensConfig(), 320, 240).matrix
     assert matrix[0] == pytest.approx((261.1, 0.0, 159.5))

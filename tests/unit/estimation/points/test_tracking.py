@@ -10,7 +10,8 @@ import pytest
 from monstertruck_estimation.points.config import PointsConfig
 from monstertruck_estimation.points.exchange import TagReading
 from monstertruck_estimation.points.files import load, save
-from monstertruck_estimation.points.tracking import KEPT, PointMap, axes
+from monstertruck_estimation.points.tracking import KEPT, PointMap
+from monstertruck_estimation.vision.mount import camera_axes
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.body import Mount
 from monstertruck_schemas.points import PointKind
@@ -28,7 +29,7 @@ def reading(base, tag=TAG, number=7, **more) -> TagReading:
     dx, dy = tag[0] - base[0], tag[1] - base[1]
     place = np.array((c * dx + s * dy, -s * dx + c * dy, tag[2])) - (MOUNT.x, MOUNT.y, MOUNT.z)
     facing = tag[3] - base[2]
-    turned = axes(MOUNT).T
+    turned = camera_axes(MOUNT.yaw, MOUNT.pitch, MOUNT.roll).T
     normal = tuple(turned @ np.array((math.cos(facing), math.sin(facing), 0.0)))
     values = {
         "other_normal": normal,
@@ -93,7 +94,7 @@ def test_it_moves_with_what_the_mapper_corrects():
 def test_of_two_poses_of_a_square_the_upright_one_is_taken_and_a_doubt_is_told():
     points = PointMap(PointsConfig(), MOUNT)
     right = reading(BASES[0])
-    tilted = tuple(axes(MOUNT).T @ np.array((-0.8, 0.0, 0.6)))
+    tilted = tuple(camera_axes(MOUNT.yaw, MOUNT.pitch, MOUNT.roll).T @ np.array((-0.8, 0.0, 0.6)))
     for i, base in enumerate(BASES[:2]):
         one = replace(reading(base), normal=tilted, other_normal=right.normal, doubt=0.9)
         points.see(one, (i + 1) * SECOND, base, STILL, 0.0)

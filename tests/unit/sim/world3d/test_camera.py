@@ -13,8 +13,8 @@ from monstertruck_estimation.vision.tags import TagReader
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import NotInstalledError
 from monstertruck_schemas.base import Pose2D
-from monstertruck_sim.config import BoardInView, CeilingCamera
-from monstertruck_sim.world.config import CameraConfig, PersonConfig, RoofTag, Spot, TagConfig, WorldConfig
+from monstertruck_sim.config import CeilingCamera
+from monstertruck_sim.world.config import CameraConfig, HeldBoard, PersonConfig, RoofTag, Spot, TagConfig, WorldConfig
 from monstertruck_sim.world.world import World
 from monstertruck_sim.world3d.ceiling import CeilingView
 
@@ -84,5 +84,5 @@ def test_a_ceiling_camera_sees_the_tag_on_the_robot_and_a_board_that_is_held():
     assert seen.corners.mean(axis=0) == pytest.approx((319.5 + scale * 0.3, 239.5 - scale * 0.2), abs=1.0)
     front = seen.corners[:2].mean(axis=0) - seen.corners[2:].mean(axis=0)
     assert math.atan2(-front[1], front[0]) == pytest.approx(0.5, abs=0.05)
-    board = grey(CeilingView(world, above, BoardInView(), 1))
+    board = grey(CeilingView(world, above, HeldBoard(), 1))
     assert len(TagReader(1).read(board)) > 15

@@ -24,6 +24,7 @@ def names(steps):
 def test_a_truck_needs_everything_it_has_in_order():
     assert names(missing(TRUCK, {})) == [
         "battery", "drive", "steering", "compass", "drive", "steering", "odometry", "stabiliser", "lidar",
+        "camera",
     ]  # fmt: skip
 
 
@@ -40,7 +41,7 @@ def test_a_robot_with_sonars_needs_their_places():
 def test_what_is_fresh_is_skipped_and_a_first_look_is_taken_once():
     results = {"battery": result("battery", "gain"), "drive": result("drive", "inverted")}
     left = missing(TRUCK, results)
-    assert names(left) == ["steering", "compass", "drive", "steering", "odometry", "stabiliser", "lidar"]
+    assert names(left) == ["steering", "compass", "drive", "steering", "odometry", "stabiliser", "lidar", "camera"]
     assert [step.rough for step in left[:1]] == [True]
     results["drive"] = result("drive", "inverted", "drive_ratio")
     assert "drive" not in names(missing(TRUCK, results))

@@ -1,0 +1,287 @@
+"""Mount of the camera from a board that camera and lidar see: points of the lidar's line lie in the camera's plane.
+
+Zhang and Pless, "Extrinsic calibration of a camera and laser range finder (improves camera calibration)", IROS 2004: in
+every view the camera knows the board's plane, and the lidar's points on the board have to lie in it. A view gives two
+equations, how far the middle of the line is off the plane and how it is turned against it; views of other tilts give
+others, and six at least tell the six numbers of the mount. Fitted besides: how large the board really is, and by how
+much the lidar measures too far.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_estimation.vision.board import BoardReader
+from monstertruck_estimation.vision.lens import BoardPose, Lens, board_pose
+from monstertruck_estimation.vision.mount import camera_axes, rotation
+from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.fitting import FitResult, least_squares
+from monstertruck_runtime.errors import InputError
+from monstertruck_schemas.board import BoardConfig
+from monstertruck_schemas.body import Mount
+from monstertruckd.tools.calibrate.board_views import BoardView
+
+NAMES: Final = ("x", "y", "z", "yaw", "pitch", "roll")
+"""Of a mount, as parameters."""
+LEAST: Final = 10
+"""Beams on the board."""
+GAP: Final = 0.05
+"""Step of the range from beam to beam that no board makes, m."""
+EDGES: Final = 2
+"""Beams at both ends of the board that may have met its edge."""
+NEAR: Final = (0.2, 0.04)
+"""m: how far beams may be off the board's plane, at first and once the mount is known."""
+MARGIN: Final = (0.12, 0.0)
+"""m: by how much they may be beside the board, alike."""
+STRAIGHT: Final = 0.02
+"""m: root mean square by which the points of a line may be off it."""
+FLAT: Final = 0.001
+"""Standard deviation of a board's middle off its plane, m;"""
+WARPED: Final = 0.003
+"""and of the turn of a line on it, rad."""
+RANGE: Final = 0.004
+"""Standard deviation of what the lidar measures too far on such a surface, m."""
+PRINT: Final = 0.003
+"""Of the board's size, as a share: a ruler, and paper."""
+UNKNOWN: Final = 0.3
+"""And before the lidar is believed."""
+WRONG_SIZE: Final = 0.01
+"""Share by which the board's size must be wrong at least, to be named."""
+STRAY: Final = 5.0
+"""Residual of a view that does not belong to the others, in standard deviations."""
+LEAST_VIEWS: Final = 6
+REACH: Final = np.array((0.5, 0.5, 0.5, 0.8, 0.8, 0.8))
+"""By which the mount may be off, m and rad."""
+
+
+class LidarPlace(NamedTuple):
+    """Where the lidar is on the body, as configured."""
+
+    place: Array
+    """(3,), m."""
+    axes: Array
+    """(3, 3): from its axes to the body's."""
+
+    @classmethod
+    def of(cls, mount: Mount, pitch: float = 0.0, roll: float = 0.0) -> "LidarPlace":
+        """With the joints of its mount at ``pitch`` and ``roll``, rad."""
+        place = np.array((mount.x, mount.y, mount.z))
+        return cls(place, rotation(0.0, pitch, roll) @ rotation(mount.yaw, mount.pitch, mount.roll))
+
+
+@dataclass(frozen=True, slots=True)
+class BoardLine:
+    """A board seen by both."""
+
+    pose: BoardPose
+    """Of the board before the camera"""
+    ends: Array
+    """(2, 3): of the lidar's line on it, in the lidar's axes, m"""
+    sigmas: tuple[float, float]
+    """Standard deviations of how far the line's middle is off the plane, m, and of its turn, rad"""
+
+
+def line_on_board(
+    view: BoardView, reader: BoardReader, lens: Lens, mount: Array, lidar: LidarPlace, *, known: bool
+) -> BoardLine | None:
+    """The lidar's line on the board of a view; None = it is not there.
+
+    Args:
+        view: with scans.
+        reader: of the board.
+        lens: of the camera.
+        mount: of the camera, ``NAMES``.
+        lidar: where it is.
+        known: the mount has been fitted.
+    """
+    pose = board_pose(view.sighting, reader, lens)
+    if pose is None or not view.ranges.size:
+        return None
+    finite = np.isfinite(view.ranges)
+    flat = np.where(finite, view.ranges, 0.0)[:, None] * directions(view.angles)
+    on = in_board(flat, pose, mount, lidar)
+    board, margin = reader.board, MARGIN[known]
+    inside = (on[:, 0] > -margin) & (on[:, 0] < board.width + margin)
+    inside &= (on[:, 1] > -margin) & (on[:, 1] < board.height + margin)
+    run = longest(finite & inside & (np.abs(on[:, 2]) < NEAR[known]), view.ranges)[EDGES:-EDGES]
+    if run.size < LEAST:
+        return None
+    points = flat[run]
+    middle = points.mean(axis=0)
+    direction = np.linalg.svd(points - middle)[2][0]
+    along = (points - middle) @ direction
+    off = np.linalg.norm(points - middle - along[:, None] * direction, axis=1)
+    noise = float(np.sqrt(np.mean(off**2)))
+    if noise > STRAIGHT:
+        return None
+    half = float(np.abs(along).max())
+    ends = middle + np.array(((-half,), (half,))) * direction
+    by_plane = plane_sigmas(view, reader, lens, pose, in_camera(ends, mount, lidar))
+    lidar_sigmas = noise / math.sqrt(run.size), noise / math.sqrt(float(along @ along))
+    return BoardLine(
+        pose, ends, (math.hypot(lidar_sigmas[0], by_plane[0], FLAT), math.hypot(lidar_sigmas[1], by_plane[1], WARPED))
+    )
+
+
+def directions(angles: Array) -> Array:
+    """Unit vectors of beams in the lidar's axes, (n, 3)."""
+    return np.column_stack((np.cos(angles), np.sin(angles), np.zeros(angles.size)))
+
+
+def in_camera(points: Array, mount: Array, lidar: LidarPlace) -> Array:
+    """Points of the lidar in the camera's axes, m; (n, 3) both."""
+    x, y, z, yaw, pitch, roll = mount.tolist()
+    on_body = points @ lidar.axes.T + lidar.place
+    return np.asarray((on_body - (x, y, z)) @ camera_axes(yaw, pitch, roll))
+
+
+def in_board(points: Array, pose: BoardPose, mount: Array, lidar: LidarPlace) -> Array:
+    """Points of the lidar on the board, m: right, down, and behind it; (n, 3) both."""
+    return np.asarray((in_camera(points, mount, lidar) - pose.place) @ pose.axes)
+
+
+def longest(chosen: NDArray[np.bool_], ranges: Array) -> NDArray[np.intp]:
+    """Indices of the longest run of beams that are chosen, without a step of their ranges."""
+    step = np.zeros(chosen.size, dtype=bool)
+    with np.errstate(invalid="ignore"):
+        step[1:] = ~(np.abs(np.diff(ranges)) < GAP)
+    groups = np.cumsum(~chosen | step)
+    numbers, counts = np.unique(groups[chosen], return_counts=True)
+    if not numbers.size:
+        return np.empty(0, np.intp)
+    return np.flatnonzero(chosen & (groups == numbers[np.argmax(counts)]))
+
+
+def plane_sigmas(view: BoardView, reader: BoardReader, lens: Lens, pose: BoardPose, ends: Array) -> tuple[float, float]:
+    """By the noise of the corners: standard deviations of the plane at a line's middle, m, and of its slope, rad.
+
+    Args:
+        view: of the board.
+        reader: that found it.
+        lens: of the camera.
+        pose: of the board.
+        ends: of the line, in the camera's axes, m, (2, 3).
+    """
+    start = np.concatenate((np.ravel(cv2.Rodrigues(pose.axes)[0]), pose.place))
+    _, slopes = cv2.projectPoints(reader.points[view.sighting.ids], start[:3], start[3:], lens.matrix, lens.distortion)
+    jacobian = np.asarray(slopes)[:, :6]
+    count = 2 * len(view.sighting.ids)
+    noise = pose.rms**2 * len(view.sighting.ids) / max(count - 6, 1)
+    covariance = noise * np.linalg.inv(jacobian.T @ jacobian)
+    half = float(np.linalg.norm(ends[1] - ends[0])) / 2
+
+    def plane(parameters: Array) -> Array:
+        off = (ends - parameters[3:]) @ np.asarray(cv2.Rodrigues(parameters[:3])[0])[:, 2]
+        return np.array((off.mean(), (off[1] - off[0]) / (2 * half)))
+
+    gradient = np.column_stack([(plane(start + step) - plane(start - step)) / 2e-6 for step in 1e-6 * np.eye(6)])
+    middle, slope = np.sqrt(np.diag(gradient @ covariance @ gradient.T)).tolist()
+    return middle, slope
+
+
+def residuals(parameters: Array, lines: Sequence[BoardLine], lidar: LidarPlace) -> Array:
+    """Of lines against planes, over their standard deviations, (n, 2).
+
+    Args:
+        parameters: mount (``NAMES``), the board's size as a share of what is stated, and what the lidar measures too
+            far, m.
+        lines: seen.
+        lidar: where it is.
+    """
+    mount, size, far = parameters[:6], parameters[6], parameters[7]
+    ends = np.array([line.ends for line in lines])
+    lengths = np.linalg.norm(ends, axis=2, keepdims=True)
+    points = in_camera((ends * (1 - far / lengths)).reshape(-1, 3), mount, lidar).reshape(-1, 2, 3)
+    normals = np.array([line.pose.axes[:, 2] for line in lines])
+    places = np.array([line.pose.place for line in lines]) * size
+    off = np.einsum("nik,nk->ni", points - places[:, None], normals)
+    spans = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+    both = np.column_stack((off.mean(axis=1), (off[:, 1] - off[:, 0]) / spans))
+    return np.asarray(both / np.array([line.sigmas for line in lines]))
+
+
+def fit(lines: Sequence[BoardLine], mount: Array, lidar: LidarPlace, size_error: float) -> FitResult:
+    """Least squares; parameters as of ``residuals``.
+
+    Args:
+        lines: seen.
+        mount: first guess.
+        lidar: where it is.
+        size_error: standard deviation of the board's size, as a share.
+    """
+    start = np.array((*mount, 1.0, 0.0))
+    reach = np.array((*REACH, 0.5, 0.05))
+
+    def residual(parameters: Array) -> Array:
+        believed = ((parameters[6] - 1.0) / size_error, parameters[7] / RANGE)
+        return np.concatenate((residuals(parameters, lines, lidar).ravel(), believed))
+
+    return least_squares(residual, start, start - reach, start + reach)
+
+
+def fit_mount(
+    views: Sequence[BoardView], reader: BoardReader, lens: Lens, mount: Array, lidar: LidarPlace, focal_error: float
+) -> tuple[FitResult, list[BoardLine]]:
+    """The camera's mount, and the lines it rests on.
+
+    Args:
+        views: of the board, with scans.
+        reader: that found them.
+        lens: of the camera.
+        mount: as configured.
+        lidar: where it is.
+        focal_error: standard deviation of the focal length, as a share: it shows as the board's size.
+
+    Raises:
+        InputError: too few views, a board of another size, or views that do not fit each other.
+    """
+    found = mount
+    for known in (False, True):
+        lines = [o for v in views if (o := line_on_board(v, reader, lens, found, lidar, known=known)) is not None]
+        if len(lines) < LEAST_VIEWS:
+            raise InputError(
+                f"the lidar sees the board in {len(lines)} of {len(views)} views: expected {LEAST_VIEWS}; is its mount "
+                "right to 10 cm and 10 degrees in the configuration, and the camera's?"
+            )
+        loose = fit(lines, found, lidar, UNKNOWN)
+        lines = _agreeing(lines, loose, lidar)
+        loose = fit(lines, loose.parameters[:6], lidar, UNKNOWN)
+        found = loose.parameters[:6]
+    _check_size(loose, reader.board)
+    return fit(lines, found, lidar, math.hypot(PRINT, focal_error)), lines
+
+
+def _agreeing(lines: list[BoardLine], found: FitResult, lidar: LidarPlace) -> list[BoardLine]:
+    """Without strays, of which there may be one in five.
+
+    Raises:
+        InputError: there are more.
+    """
+    off = np.abs(residuals(found.parameters, lines, lidar)).max(axis=1)
+    limit = STRAY * max(1.0, float(np.median(off)))
+    kept = [line for line, residual in zip(lines, off.tolist(), strict=True) if residual < limit]
+    if len(kept) < max(LEAST_VIEWS, 0.8 * len(lines)):
+        raise InputError(
+            f"{len(lines) - len(kept)} of {len(lines)} views do not fit the others: the board is not flat, or "
+            "something else stands in the lidar's way"
+        )
+    return kept
+
+
+def _check_size(found: FitResult, board: BoardConfig) -> None:
+    """Raise where the lidar says that the board was printed at another scale.
+
+    Raises:
+        InputError: so it is.
+    """
+    size, sigma = float(found.parameters[6]), float(found.standard_errors[6])
+    if abs(size - 1.0) > WRONG_SIZE + 3.0 * sigma:
+        raise InputError(
+            f"by the lidar the board is {size:.3f} times as large as stated: measure a square, "
+            f"{1000 * size * board.square:.1f} mm instead of {1000 * board.square:.1f}; state --square and --marker"
+        )

@@ -1,0 +1,249 @@
+"""What the camera saw of a board that somebody holds, and what is still missing: pure, picture by picture.
+
+A view counts when the board was held still for a moment: its corners are averaged over that time, and the lidar's scans
+of the same time belong to it.
+"""
+
+import math
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+
+from monstertruck_estimation.vision.board import BoardReader, BoardSighting
+from monstertruck_estimation.vision.lens import BoardPose, Lens, board_pose
+from monstertruck_kinematics.elementary import Array
+from monstertruck_runtime.clock import SECOND
+from monstertruck_runtime.errors import InputError
+from monstertruck_schemas.sensor import VALID_BEAM, LaserScan
+
+HOLD: Final = round(0.7 * SECOND)
+"""For which the board is held still, ns."""
+STILL: Final = 1.0
+"""Pixels that four corners of five move meanwhile, at most: a single one may be found wrong."""
+LEAST_PICTURES: Final = 3
+"""Of a view."""
+ANOTHER: Final = 12.0
+"""Pixels by which corners differ from those of every other view, on average."""
+BLURRED: Final = 2.0
+"""Pixels: standard deviation of the step of an edge."""
+LEAST_SCANS: Final = 3
+"""Of a view."""
+ROWS: Final = ("upper", "middle", "lower")
+COLUMNS: Final = ("left", "middle", "right")
+IN_CELL: Final = 6
+"""Corners in each ninth of the picture."""
+VIEWS: Final = 24
+BEAMED: Final = 14
+"""Views in which the lidar sees the board, too."""
+TILT: Final = math.radians(12.0)
+TILTED: Final = 3
+"""Views tilted by more, to each of four sides;"""
+TILTED_BEAMED: Final = 3
+"""and those of them that the lidar sees."""
+DEEP: Final = 1.3
+"""Distance of the farthest view over that of the nearest."""
+SIDES: Final = ("left edge nearer", "right edge nearer", "upper edge nearer", "lower edge nearer")
+
+
+@dataclass(frozen=True)
+class BoardView:
+    """The board, held still."""
+
+    sighting: BoardSighting
+    """Corners averaged over its pictures"""
+    pose: BoardPose
+    """By the lens that was believed then"""
+    angles: Array
+    """Of the lidar's beams, rad, left positive; (n,); empty: it sent too few scans"""
+    ranges: Array
+    """Medians over the same time, m; inf = nothing; (n,)"""
+
+
+def of_scans(scans: Sequence[LaserScan]) -> tuple[Array, Array]:
+    """Angles of the beams, rad, and medians of their ranges, m; empty where there are too few."""
+    if len(scans) < LEAST_SCANS:
+        return np.empty(0), np.empty(0)
+    ranges = np.array([np.where(s.codes == VALID_BEAM, s.ranges, np.inf) for s in scans])
+    angles = scans[0].start_angle + scans[0].angle_increment * np.arange(ranges.shape[1], dtype=np.float64)
+    return angles, np.median(ranges, axis=0)
+
+
+@dataclass
+class BoardAttempts:
+    """Pictures since the last view, by what was wrong with them."""
+
+    pictures: int = 0
+    unseen: int = 0
+    blurred: int = 0
+    blur: float = 0.0
+    """Of the last blurred one, pixels"""
+    moved: int = 0
+
+
+@dataclass
+class BoardGuide:
+    """Takes pictures, keeps views, and says what is missing.
+
+    Args:
+        reader: of the board.
+        lens: as believed: only tilts and distances are judged by it.
+        beams: whether a view is one that the lidar sees, too; None = there is no lidar.
+        patience: s without a new view that end it.
+    """
+
+    reader: BoardReader
+    lens: Lens
+    beams: Callable[[BoardView], bool] | None
+    patience: float
+    views: list[BoardView] = field(default_factory=list)
+    seen_by_lidar: list[BoardView] = field(default_factory=list)
+    attempts: BoardAttempts = field(default_factory=BoardAttempts)
+    _held: list[tuple[int, BoardSighting]] = field(default_factory=list)
+    _scans: deque[LaserScan] = field(default_factory=lambda: deque(maxlen=64))
+    _since: int | None = None
+
+    def take(self, stamp: int, sighting: BoardSighting | None, scans: Iterable[LaserScan] = ()) -> BoardView | None:
+        """Take the next picture in; returns a view that has come of it.
+
+        Args:
+            stamp: of the picture, ns.
+            sighting: of the board in it; None = it is not seen.
+            scans: that have come since the last call.
+
+        Raises:
+            InputError: nothing new for too long: says what is wrong, or missing.
+        """
+        self._scans.extend(scans)
+        self._since = stamp if self._since is None else self._since
+        view = self._view(stamp, sighting)
+        if view is not None:
+            self.views.append(view)
+            if self.beams is not None and self.beams(view):
+                self.seen_by_lidar.append(view)
+            self.attempts, self._since = BoardAttempts(), stamp
+        elif stamp - self._since > self.patience * SECOND:
+            raise InputError(self.trouble())
+        return view
+
+    def _view(self, stamp: int, sighting: BoardSighting | None) -> BoardView | None:
+        attempts = self.attempts
+        attempts.pictures += 1
+        if sighting is None or sighting.blur > BLURRED:
+            self._held = []
+            if sighting is None:
+                attempts.unseen += 1
+            else:
+                attempts.blurred, attempts.blur = attempts.blurred + 1, sighting.blur
+            return None
+        if self._held and moved(self._held[0][1], sighting) > STILL:
+            attempts.moved += 1
+            self._held = []
+        self._held.append((stamp, sighting))
+        first = self._held[0][0]
+        if stamp - first < HOLD or len(self._held) < LEAST_PICTURES:
+            return None
+        mean = averaged([seen for _, seen in self._held])
+        self._held = self._held[-1:]
+        if any(apart(view.sighting, mean).mean() < ANOTHER for view in self.views if _shared(view.sighting, mean)):
+            return None
+        pose = board_pose(mean, self.reader, self.lens)
+        if pose is None:
+            return None
+        scans = [s for s in self._scans if first <= s.stamp and s.stamp + s.scan_time * SECOND <= stamp]
+        return BoardView(mean, pose, *of_scans(scans))
+
+    # What is missing
+
+    def missing(self) -> list[str]:
+        """What has to be shown yet, in words."""
+        found = [f"the board in the {cell} of the picture" for cell in self.uncovered()]
+        if self.views and not self.uncovered():
+            distances = [view.pose.place[2] for view in self.views]
+            if max(distances) < DEEP * min(distances):
+                found.append(f"the board nearer and farther than {min(distances):.2f} to {max(distances):.2f} m")
+        found += self._tilts(self.views, TILTED, "")
+        found += _more(VIEWS - len(self.views), "view of it", "views of it")
+        if self.beams is not None:
+            found += self._tilts(self.seen_by_lidar, TILTED_BEAMED, ", across the lidar's beam")
+            more = BEAMED - len(self.seen_by_lidar)
+            found += _more(more, "view across the lidar's beam", "views across the lidar's beam")
+        return found
+
+    def uncovered(self) -> list[str]:
+        """Ninths of the picture in which too few corners were seen."""
+        width, height = self.lens.size
+        counts = np.zeros((3, 3), np.int64)
+        for view in self.views:
+            x, y = view.sighting.corners.T
+            column = np.clip(x * 3 / width, 0, 2).astype(int)
+            row = np.clip(y * 3 / height, 0, 2).astype(int)
+            np.add.at(counts, (row, column), 1)
+        return [
+            "middle" if i == j == 1 else f"{row} {column}".removeprefix("middle ")
+            for i, row in enumerate(ROWS)
+            for j, column in enumerate(COLUMNS)
+            if counts[i, j] < IN_CELL
+        ]
+
+    @staticmethod
+    def _tilts(views: Sequence[BoardView], wanted: int, how: str) -> list[str]:
+        angles = np.array([(v.pose.turn, -v.pose.turn, v.pose.lean, -v.pose.lean) for v in views]).reshape(-1, 4)
+        short = wanted - (angles > TILT).sum(axis=0)
+        return [f"its {side}{how} ({more} more)" for side, more in zip(SIDES, short.tolist(), strict=True) if more > 0]
+
+    def progress(self) -> tuple[float, float]:
+        """How much of how much is done."""
+        left = len(self.missing())
+        return (1.0, 1.0) if not left else (len(self.views), len(self.views) + left)
+
+    def trouble(self) -> str:
+        """Why nothing new came, in a sentence."""
+        a, board = self.attempts, self.reader.board
+        shape = f"{board.columns} x {board.rows} squares"
+        within = f"in {self.patience:g} s"
+        if a.unseen > 0.8 * a.pictures:
+            strangers = sorted(self.reader.strangers)
+            if strangers:
+                return f"another board is shown: marker {strangers[0]} is none of {shape}; state --columns and --rows"
+            return f"no board of {shape} is seen {within} ({a.pictures} pictures): print one (`stand print`), light it"
+        if a.blurred > 0.4 * a.pictures:
+            return (
+                f"the pictures are blurred (edges of {a.blur:.1f} pixels, expected {BLURRED:g}): more light, a clean "
+                "and focused lens, a still hand"
+            )
+        if a.moved > 0.3 * a.pictures:
+            return f"the board was never held still for {HOLD / SECOND:g} s {within}"
+        return f"nothing new {within}; still missing: {'; '.join(self.missing())}"
+
+
+def apart(one: BoardSighting, other: BoardSighting) -> Array:
+    """Distances of the corners that both have, pixels; (n,)."""
+    _, a, b = np.intersect1d(one.ids, other.ids, return_indices=True)
+    return np.asarray(np.hypot(*(one.corners[a] - other.corners[b]).T))
+
+
+def moved(one: BoardSighting, other: BoardSighting) -> float:
+    """What four of five corners that both have moved by at most, pixels; inf where they have none."""
+    distances = apart(one, other)
+    return float(np.percentile(distances, 80)) if distances.size else math.inf
+
+
+def averaged(sightings: Sequence[BoardSighting]) -> BoardSighting:
+    """Means of the corners that most of them have."""
+    ids = np.concatenate([s.ids for s in sightings])
+    corners = np.concatenate([s.corners for s in sightings])
+    numbers, counts = np.unique(ids, return_counts=True)
+    kept = numbers[counts > len(sightings) / 2]
+    means = np.array([corners[ids == number].mean(axis=0) for number in kept])
+    return BoardSighting(means, kept, float(np.mean([s.blur for s in sightings])))
+
+
+def _shared(one: BoardSighting, other: BoardSighting) -> bool:
+    return np.intersect1d(one.ids, other.ids).size > 0
+
+
+def _more(count: int, one: str, several: str) -> list[str]:
+    return [] if count <= 0 else [f"{count} more {one if count == 1 else several}"]

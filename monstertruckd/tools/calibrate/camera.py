@@ -1,0 +1,228 @@
+"""Lens of the camera, and its mount against the lidar's, from a board that somebody holds before both.
+
+The lens by Zhang's method (``monstertruck_estimation.vision.lens``), the mount by Zhang and Pless's (``board_mount``).
+Nothing drives; the board is held still for a moment, again and again another way, and the wizard says what is missing.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import cv2
+import numpy as np
+
+from monstertruck_estimation.vision.board import BoardReader
+from monstertruck_estimation.vision.lens import PARAMETERS, Lens, LensFit, fit_lens
+from monstertruck_kinematics.elementary import Array
+from monstertruck_runtime.errors import InputError, RequestRefusedError
+from monstertruck_schemas import topics
+from monstertruck_schemas.board import BoardConfig
+from monstertruck_schemas.body import LensConfig
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.sensor import CompressedImage
+from monstertruckd.config.calibration import CAMERA_LENS, CAMERA_MOUNT, Estimate, Result
+from monstertruckd.tools.calibrate.board_mount import NAMES, LidarPlace, fit_mount, line_on_board
+from monstertruckd.tools.calibrate.board_views import BoardGuide, BoardView
+from monstertruckd.tools.calibrate.statistics import NORMAL, Interval, estimated, known_errors
+from monstertruckd.tools.calibrate.steps import Collect, Confirm, WatchStep
+from monstertruckd.tools.calibrate.wizard import Wizard, WizardContext
+
+ROOM: Final = "a printed board on something flat (`stand print`), 0.4 to 1 m before the camera; light; nothing drives"
+WORST: Final = 1.0
+"""Pixels: root mean square by which corners may be off."""
+STRAY: Final = 3.0
+"""Times the median by which the corners of a view may be off."""
+UNITS: Final = {"focal_x": "px", "focal_y": "px", "centre_x": "px", "centre_y": "px"}
+
+_BOARD: Final = Confirm(
+    "board", "Hold the board before the camera, each way for a second, tilted to all sides, over the whole picture. Go?"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class CameraWizard:
+    """Pictures and scans of a board, until enough was seen."""
+
+    board: BoardConfig = field(default_factory=BoardConfig)
+    lidar: bool = True
+    """Fit the mount, too, where the robot has a lidar"""
+    patience: float = 60.0
+    """Seconds without anything new that end it"""
+
+    async def __call__(self, context: WizardContext) -> Result:
+        """Measure."""
+        device = context.config.devices.camera
+        if device is None or not isinstance(believed := getattr(device.driver, "lens", None), LensConfig):
+            raise RequestRefusedError(Reason.NOT_SUPPORTED, "this robot has no camera whose lens it states")
+        (first,) = await context.collect(Collect("a picture", topics.CAMERA, 1))
+        height, width = decoded(first).shape
+        reader, lens = BoardReader(self.board), Lens.of(believed, width, height)
+        mount = np.array([getattr(device.mount, name) for name in NAMES])
+        lidar = await self._lidar(context) if self.lidar else None
+
+        def crossed(view: BoardView) -> bool:
+            return lidar is not None and line_on_board(view, reader, lens, mount, lidar, known=False) is not None
+
+        guide = BoardGuide(reader, lens, None if lidar is None else crossed, self.patience)
+        await context.confirm(_BOARD)
+
+        def take(message: CompressedImage, others: dict[str, list[Any]]) -> tuple[float, float]:
+            scans = others.get(topics.SCAN.name, [])
+            if guide.take(message.stamp, reader.read(decoded(message)), scans) is not None:
+                missing = guide.missing()
+                if missing:
+                    context.say(f"view {len(guide.views)}; still missing: {'; '.join(missing[:2])}")
+            return guide.progress()
+
+        also = () if lidar is None else (topics.SCAN,)
+        await context.watch(WatchStep("views of the board", topics.CAMERA, take, also))
+        found, views = context.fit("lens", lambda: lens_of(guide.views, reader, (width, height)))
+        if lidar is None:
+            return result_of(found, len(views))
+        halves = lidar_halves(context)
+        placed = context.fit("mount", lambda: mount_of(views, reader, found, mount, lidar, halves))
+        return result_of(found, len(views), placed)
+
+    async def _lidar(self, context: WizardContext) -> LidarPlace | None:
+        """Where it is; with the joints of its mount as they are now."""
+        devices = context.config.devices
+        if devices.lidar is None:
+            return None
+        pitch = roll = 0.0
+        if devices.stabiliser is not None:
+            joints = await context.collect(Collect("joints of the lidar's mount", topics.STABILISER, 20))
+            read = [(j.pitch, j.roll) for j in joints if j.pitch is not None and j.roll is not None]
+            if not read:
+                raise InputError("a servo of the stabiliser does not answer: where the lidar looks is not known")
+            pitch, roll = np.mean(np.array(read), axis=0).tolist()
+        return LidarPlace.of(devices.lidar.mount, pitch, roll)
+
+
+def camera_wizard(settings: CameraWizard | None = None) -> Wizard:
+    """Lens and mount of the camera."""
+    doc = "lens of the camera, and where it sits against the lidar, from a board held before both"
+    return Wizard("camera", doc, ROOM, settings or CameraWizard())
+
+
+def decoded(message: CompressedImage) -> Any:
+    """A picture, grey, (height, width).
+
+    Raises:
+        InputError: it is none.
+    """
+    grey = cv2.imdecode(np.frombuffer(message.data, np.uint8), cv2.IMREAD_GRAYSCALE)
+    if grey is None:
+        raise InputError(f"picture {message.sequence} of the camera cannot be decoded")
+    return grey
+
+
+def lens_of(views: Sequence[BoardView], reader: BoardReader, size: tuple[int, int]) -> tuple[LensFit, list[BoardView]]:
+    """The lens, and the views it rests on: without those whose corners are far off.
+
+    Raises:
+        InputError: corners that no lens explains.
+    """
+    found = fit_lens([view.sighting for view in views], reader, size)
+    kept = list(views)
+    off = np.array(found.by_view)
+    if (off > STRAY * np.median(off)).any():
+        kept = [view for view, one in zip(views, off.tolist(), strict=True) if one <= STRAY * np.median(off)]
+        found = fit_lens([view.sighting for view in kept], reader, size)
+    if found.rms > WORST:
+        raise InputError(
+            f"corners are off by {found.rms:.1f} pixels (expected {WORST:g} at most): the board is not flat, it "
+            "moved, or the lens is no pinhole with some distortion"
+        )
+    return found, kept
+
+
+@dataclass(frozen=True, slots=True)
+class PlacedMount:
+    """The camera's mount as measured."""
+
+    values: dict[str, Interval]
+    """By ``NAMES``."""
+    size: Interval
+    """Of the board, as a share of what is stated."""
+    lines: int
+
+
+def mount_of(
+    views: Sequence[BoardView],
+    reader: BoardReader,
+    found: LensFit,
+    mount: Array,
+    lidar: LidarPlace,
+    lidar_mount: dict[str, float],
+) -> PlacedMount:
+    """The mount, with what is known of lens and lidar.
+
+    Args:
+        views: of the board.
+        reader: that found them.
+        found: the lens.
+        mount: as configured, ``NAMES``.
+        lidar: where it is.
+        lidar_mount: half-widths of its own mount's intervals, by name.
+
+    Raises:
+        InputError: see ``fit_mount``; or the views do not tell the mount.
+    """
+    fx, fy = found.lens.parameters[:2]
+    focal = float(np.hypot(*found.sigmas[:2] / (fx, fy)) / math.sqrt(2))
+    fit, lines = fit_mount(views, reader, found.lens, mount, lidar, focal)
+    halves = known_errors(fit, 2 * len(lines) - len(NAMES))
+    if not np.isfinite(halves).all():
+        raise InputError("the views do not tell the camera's mount: it is more than half a metre off, or never tilted")
+    # The axis of the lens is known as well as its centre in the picture.
+    axis = {"yaw": NORMAL * found.sigmas[2] / fx, "pitch": NORMAL * found.sigmas[3] / fy}
+    values = {
+        name: Interval(float(value), float(half)).joined(axis.get(name, 0.0)).joined(lidar_mount.get(name, 0.0))
+        for name, value, half in zip(NAMES, fit.parameters, halves, strict=False)
+    }
+    return PlacedMount(values, Interval(float(fit.parameters[6]), float(halves[6])), len(lines))
+
+
+def lidar_halves(context: WizardContext) -> dict[str, float]:
+    """Half-widths of the lidar's own mount by its calibration, m and rad; none where it was not calibrated."""
+    known = context.known.get("lidar")
+    estimates = () if known is None else known.estimates
+    return {e.name: (e.high - e.low) / 2 for e in estimates if e.low is not None and e.high is not None}
+
+
+def result_of(found: LensFit, views: int, placed: PlacedMount | None = None) -> Result:
+    """Put together; without ``placed`` it is the lens alone."""
+    lens, (width, height) = found.lens, found.lens.size
+    sized = "pictures for which the lens holds"
+    estimates = [
+        Estimate(name=name, value=value, unit="px", samples=views, meaning=sized, key=f"{CAMERA_LENS}.{name}")
+        for name, value in (("width", width), ("height", height))
+    ]
+    for name, value, sigma in zip(PARAMETERS, lens.parameters.tolist(), found.sigmas.tolist(), strict=True):
+        interval = Interval(value, NORMAL * sigma)
+        text = "of Brown's lens; 95 % of the corners' noise"
+        key = f"{CAMERA_LENS}.{name}"
+        estimates.append(estimated(name, interval, UNITS.get(name, ""), found.corners, text, key))
+    zero = "sixth order of the radial distortion, not fitted"
+    estimates.append(Estimate(name="k3", value=0.0, samples=views, meaning=zero, key=f"{CAMERA_LENS}.k3"))
+    if placed is not None:
+        noise = "95 % of line and plane, lens and print, and of the lidar's mount where it was calibrated"
+        for name, interval in placed.values.items():
+            unit = "m" if name in ("x", "y", "z") else "rad"
+            text = f"of the camera on the body, by the lidar's; {noise}"
+            estimates.append(estimated(name, interval, unit, placed.lines, text, f"{CAMERA_MOUNT}.{name}"))
+        text = "of the board, as a share of what is stated, by lidar and ruler; for information"
+        estimates.append(estimated("board_size", placed.size, "", placed.lines, text))
+    crossed = "" if placed is None else f", {placed.lines} across the lidar's beam"
+    return Result(
+        wizard="camera",
+        measured=f"{views} views of a board{crossed}; corners off by {found.rms:.2f} pixels",
+        estimates=tuple(estimates),
+        unobserved=(
+            "a board that is bent: its corners fit a wrong lens",
+            *(("the mount: measured with the lidar only",) if placed is None else ()),
+            *(("height and tilt of the lidar itself: the camera's are against them",) if placed is not None else ()),
+        ),
+        partial=placed is None,
+    )

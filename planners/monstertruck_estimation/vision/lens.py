@@ -1,0 +1,145 @@
+"""Lenses: from pixels to directions, and how they are found from pictures of a flat board.
+
+The lens is Brown's (two radial and two tangential terms, a third radial one that stays 0). It is found from pictures of
+a board held anyhow: Zhang, "A flexible new technique for camera calibration", IEEE Transactions on Pattern Analysis and
+Machine Intelligence, 2000; by OpenCV's ``calibrateCameraExtended``.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import cv2
+import numpy as np
+
+from monstertruck_estimation.vision.board import BoardReader, BoardSighting
+from monstertruck_estimation.vision.tags import Picture
+from monstertruck_kinematics.elementary import Array
+from monstertruck_runtime.errors import InputError
+from monstertruck_schemas.body import LensConfig
+
+LEAST_BOARDS: Final = 6
+"""Pictures of the board."""
+PARAMETERS: Final = ("focal_x", "focal_y", "centre_x", "centre_y", "k1", "k2", "p1", "p2")
+"""Of a lens, that are fitted, in OpenCV's order."""
+
+
+@dataclass(frozen=True)
+class Lens:
+    """What a camera makes of directions."""
+
+    matrix: Array
+    """(3, 3), pixels."""
+    distortion: Array
+    """(5,): k1, k2, p1, p2, k3."""
+    size: tuple[int, int]
+    """Width and height, pixels."""
+
+    @classmethod
+    def of(cls, config: LensConfig, width: int, height: int) -> "Lens":
+        """As configured, for pictures of another size than it was measured with."""
+        across, up = width / config.width, height / config.height
+        matrix = np.array(
+            (
+                (config.focal_x * across, 0.0, (config.centre_x + 0.5) * across - 0.5),
+                (0.0, config.focal_y * up, (config.centre_y + 0.5) * up - 0.5),
+                (0.0, 0.0, 1.0),
+            )
+        )
+        distortion = np.array((config.k1, config.k2, config.p1, config.p2, config.k3))
+        return cls(matrix, distortion, (width, height))
+
+    def directions(self, pixels: Array) -> Array:
+        """X and y of the rays through pixels at z = 1 of the camera; (n, 2) both."""
+        points = np.ascontiguousarray(pixels, dtype=np.float64).reshape(-1, 1, 2)
+        return np.asarray(cv2.undistortPoints(points, self.matrix, self.distortion)).reshape(-1, 2)
+
+    @property
+    def parameters(self) -> Array:
+        """``PARAMETERS``, (8,)."""
+        (fx, _, cx), (_, fy, cy), _ = self.matrix.tolist()
+        return np.array((fx, fy, cx, cy, *self.distortion[:4]))
+
+
+class LensFit(NamedTuple):
+    """A lens, and how well it is known."""
+
+    lens: Lens
+    sigmas: Array
+    """(8,): standard deviations of ``PARAMETERS``."""
+    rms: float
+    """Of the corners, pixels: both axes together."""
+    corners: int
+    by_view: tuple[float, ...]
+    """The same of each view, pixels."""
+
+
+def fit_lens(views: Sequence[BoardSighting], reader: BoardReader, size: tuple[int, int]) -> LensFit:
+    """A lens from sightings of a board.
+
+    Args:
+        views: of the board.
+        reader: that found them.
+        size: width and height of the pictures, pixels.
+
+    Raises:
+        InputError: too few of them, or none of them tilted.
+    """
+    if len(views) < LEAST_BOARDS:
+        raise InputError(f"the board is seen in {len(views)} pictures: expected {LEAST_BOARDS}")
+    objects = [reader.points[view.ids].astype(np.float32) for view in views]
+    images = [view.corners.astype(np.float32) for view in views]
+    try:
+        rms, matrix, distortion, _, _, sigmas, _, off = cv2.calibrateCameraExtended(
+            objects, images, size, np.eye(3), np.zeros(5), flags=cv2.CALIB_FIX_K3
+        )
+    except cv2.error as error:
+        raise InputError(f"the pictures of the board tell no lens: {error.err}: hold it tilted") from error
+    count = sum(len(view.ids) for view in views)
+    lens = Lens(np.asarray(matrix), np.ravel(distortion)[:5], size)
+    return LensFit(lens, np.ravel(sigmas)[: len(PARAMETERS)], float(rms), count, tuple(np.ravel(off).tolist()))
+
+
+def lens_from_pictures(pictures: Sequence[Picture], reader: BoardReader) -> tuple[LensFit, int]:
+    """A lens from pictures of a board, and how many of them showed it; raises as ``fit_lens``."""
+    views = [view for picture in pictures if (view := reader.read(picture)) is not None]
+    if len(views) < LEAST_BOARDS:
+        raise InputError(f"the board is seen in {len(views)} of {len(pictures)} pictures: expected {LEAST_BOARDS}")
+    height, width = pictures[0].shape
+    return fit_lens(views, reader, (width, height)), len(views)
+
+
+class BoardPose(NamedTuple):
+    """Where a board is before a camera."""
+
+    axes: Array
+    """(3, 3), columns: its right, its down, and away from its face, in the camera's axes."""
+    place: Array
+    """(3,): its upper left corner, m."""
+    rms: float
+    """Of the corners, pixels."""
+
+    @property
+    def turn(self) -> float:
+        """By which it is turned about the vertical, rad: positive where its left edge is nearer."""
+        return math.atan2(-float(self.axes[0, 2]), float(self.axes[2, 2]))
+
+    @property
+    def lean(self) -> float:
+        """By which it leans, rad: positive where its upper edge is nearer."""
+        return math.atan2(-float(self.axes[1, 2]), float(self.axes[2, 2]))
+
+
+def board_pose(view: BoardSighting, reader: BoardReader, lens: Lens) -> BoardPose | None:
+    """Where a board is (Collins and Bartoli's solution, refined); None if no pose fits."""
+    points = reader.points[view.ids]
+    fine, turn, place = cv2.solvePnP(points, view.corners, lens.matrix, lens.distortion, flags=cv2.SOLVEPNP_IPPE)
+    if not fine:
+        return None
+    turn, place = cv2.solvePnPRefineLM(points, view.corners, lens.matrix, lens.distortion, turn, place)
+    shown, _ = cv2.projectPoints(points, turn, place, lens.matrix, lens.distortion)
+    off = np.asarray(shown).reshape(-1, 2) - view.corners
+    return BoardPose(
+        np.asarray(cv2.Rodrigues(turn)[0]), np.ravel(place), float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
+    )

@@ -1,0 +1,259 @@
+"""The camera's wizard: what it keeps of a board that is held, what it says is missing or wrong, and what it saves."""
+
+import math
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("cv2")
+
+import cv2
+
+from monstertruck_drivers.webcam.emulator import jpeg
+from monstertruck_estimation.vision.board import BoardReader, BoardSighting
+from monstertruck_estimation.vision.lens import Lens, board_pose, fit_lens
+from monstertruck_runtime.clock import SECOND
+from monstertruck_runtime.errors import InputError, RequestRefusedError
+from monstertruck_schemas import topics
+from monstertruck_schemas.board import BoardConfig
+from monstertruck_schemas.body import LensConfig, Mount
+from monstertruck_schemas.sensor import VALID_BEAM, CompressedImage, LaserScan
+from monstertruck_sim.world.config import CameraConfig, HeldBoard, WorldConfig
+from monstertruck_sim.world.world import World
+from monstertruckd.config.calibration import with_values
+from monstertruckd.config.load import load_config
+from monstertruckd.tools.calibrate import camera
+from monstertruckd.tools.calibrate.board_mount import LidarPlace, fit_mount, in_board, line_on_board
+from monstertruckd.tools.calibrate.board_views import BoardGuide, BoardView, averaged
+from monstertruckd.tools.calibrate.camera import CameraWizard
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig
+from tests.calibration_light import held_boards, true_lens
+
+BOARD = BoardConfig()
+READER = BoardReader(BOARD)
+NOMINAL = Lens.of(LensConfig(), 640, 480)
+MOUNT = np.array((0.18, 0.0, 0.25, 0.0, 0.0, 0.0))
+LIDAR = LidarPlace.of(Mount(x=0.14, z=0.25))
+TENTH = SECOND // 10
+CONFIGS = Path(__file__).resolve().parents[4] / "configs"
+
+
+def boards(seed, count=8, **more):
+    return held_boards(READER, NOMINAL, MOUNT, LIDAR, np.random.default_rng(seed), count=count, **more)
+
+
+def guide(*, beams=None, patience=20.0):
+    return BoardGuide(BoardReader(BOARD), NOMINAL, beams, patience)
+
+
+def scan_of(view, stamp):
+    step = float(view.angles[1] - view.angles[0])
+    return LaserScan(
+        stamp=stamp, received=stamp, seq=1, start_angle=float(view.angles[0]), end_angle=float(view.angles[-1]),
+        time_increment=0.1 / math.tau * step, scan_time=0.1, range_min=0.02, range_max=5.6, ranges=view.ranges,
+        codes=np.full(view.angles.size, VALID_BEAM, np.uint8),
+    )  # fmt: skip
+
+
+def shown(one: BoardGuide, view, start: int, seconds: float = 1.0):
+    """Hold a board still; returns the views that come of it."""
+    stamps = range(start, start + round(seconds * SECOND), 2 * TENTH)
+    return [found for t in stamps if (found := one.take(t, view.sighting, [scan_of(view, t - 2 * TENTH)])) is not None]
+
+
+def shown_in_turn(one: BoardGuide, sightings):
+    for k in range(200):
+        one.take(k * 2 * TENTH, sightings[k % len(sightings)])
+
+
+def test_a_board_that_is_held_still_is_a_view_once():
+    one, (view, other) = guide(), boards(1, 2)
+    (kept,) = shown(one, view, 0, 3.0)
+    assert kept.sighting.corners == pytest.approx(view.sighting.corners)
+    assert kept.ranges == pytest.approx(view.ranges)
+    assert len(shown(one, other, 4 * SECOND)) == 1
+    assert len(one.views) == 2
+
+
+def test_one_that_moves_is_none_and_neither_is_one_without_scans_seen_by_the_lidar():
+    one, (view,) = guide(), boards(1, 1)
+    for k in range(20):
+        drifting = view.sighting._replace(corners=view.sighting.corners + 0.6 * k)
+        assert one.take(k * 2 * TENTH, drifting) is None
+    alone = [found for k in range(6) if (found := one.take(10 * SECOND + k * 2 * TENTH, view.sighting)) is not None]
+    assert alone[0].ranges.size == 0
+    assert line_on_board(alone[0], READER, NOMINAL, MOUNT, LIDAR, known=False) is None
+
+
+def test_what_is_missing_is_said_and_named_at_the_end():
+    one = guide(beams=lambda view: False)
+    held = [view for view in boards(2, 60) if view.sighting.corners[:, 0].max() < 320][:5]
+    for k, view in enumerate(held):
+        shown(one, view, 2 * k * SECOND)
+    missing = one.missing()
+    assert {"upper right", "right", "lower right"} <= set(one.uncovered())
+    assert "the board in the right of the picture" in missing
+    assert f"{24 - len(held)} more views of it" in missing
+    assert "14 more views across the lidar's beam" in missing
+    with pytest.raises(InputError, match=r"nothing new in 20 s; still missing: the board in the .*right of"):
+        shown(one, held[0], 20 * SECOND, 30.0)
+
+
+@pytest.mark.parametrize(
+    ("sightings", "said"),
+    [
+        ([None], "no board of 8 x 6 squares is seen in 20 s"),
+        ([BoardSighting(np.zeros((9, 2)), np.arange(9), 3.1)], r"blurred \(edges of 3.1 pixels, expected 2\)"),
+        ([view.sighting for view in boards(3, 4)], "never held still for 0.7 s"),
+    ],
+)
+def test_what_is_wrong_is_named(sightings, said):
+    one = guide()
+    with pytest.raises(InputError, match=said):
+        shown_in_turn(one, sightings)
+
+
+def test_another_board_is_named():
+    printed = cv2.aruco.CharucoBoard((12, 9), 0.02, 0.015, cv2.aruco.getPredefinedDictionary(20))
+    one = guide()
+    picture = np.pad(printed.generateImage((560, 420)), ((30, 30), (40, 40)), constant_values=255)
+    one.reader.read(np.asarray(picture[200:], dtype=np.uint8))
+    with pytest.raises(InputError, match=r"another board is shown: marker [0-9]+ is none of 8 x 6 squares"):
+        shown_in_turn(one, [None])
+
+
+def test_corners_are_averaged():
+    (view,) = boards(4, 1)
+    noisy = [view.sighting._replace(corners=view.sighting.corners + d) for d in ((0.2, 0.0), (-0.2, 0.3), (0.0, -0.3))]
+    part = BoardSighting(view.sighting.corners[:1] + 5.0, np.array([99]), 0.5)
+    mean = averaged([*noisy, part])
+    assert mean.corners == pytest.approx(view.sighting.corners)
+    assert 99 not in mean.ids
+
+
+def test_too_few_boards_and_boards_that_no_lens_explains_are_refused():
+    views = boards(5, 10)
+    with pytest.raises(InputError, match="seen in 3 pictures: expected 6"):
+        fit_lens([view.sighting for view in views[:3]], READER, (640, 480))
+    rng = np.random.default_rng(1)
+    bent = [
+        BoardSighting(v.sighting.corners + rng.normal(0, 3, v.sighting.corners.shape), v.sighting.ids, 0.5)
+        for v in views
+    ]
+    with pytest.raises(InputError, match=r"corners are off by [0-9.]+ pixels .*not flat"):
+        camera.lens_of([SimpleNamespace(sighting=view) for view in bent], READER, (640, 480))
+
+
+def test_a_lidar_that_sees_no_board_is_named():
+    away = LidarPlace.of(Mount(x=0.14, z=0.9))
+    with pytest.raises(InputError, match="the lidar sees the board in 0 of 8 views"):
+        fit_mount(boards(6), READER, NOMINAL, MOUNT, away, 0.001)
+
+
+def test_the_simulated_world_shows_the_same_board_to_camera_and_lidar():
+    world = World(WorldConfig(map="yard", camera=CameraConfig(k1=-0.1, noise=3.0), board=HeldBoard()), 7)
+    world.truth(0)
+    lens = Lens(NOMINAL.matrix, np.array((-0.1, 0.0, 0.0, 0.0, 0.0)), (640, 480))
+    reader, crossed = BoardReader(BOARD), 0
+    for k in range(2):
+        stamp = round((1.5 * k + 0.7) * SECOND)
+        picture = camera.decoded(
+            SimpleNamespace(data=jpeg(world.view.exposure(stamp, (640, 480))(), k), sequence=k)  # type: ignore[arg-type]
+        )
+        sighting = reader.read(picture)
+        assert sighting is not None
+        assert 0.4 < sighting.blur < 1.0
+        blurred = reader.read(cv2.GaussianBlur(picture, (0, 0), 2.5))
+        assert blurred is None or blurred.blur > 2.0
+        ranges = np.mean([world.lidar.scan(stamp + i * TENTH) for i in range(5)], axis=0) / 1000
+        angles = (np.arange(769) - 384) * math.tau / 1024
+        pose = board_pose(sighting, reader, lens)
+        assert pose is not None
+        assert pose.rms < 0.4
+        view = BoardView(sighting, pose, angles, np.where(ranges > 0.02, ranges, np.inf))
+        line = line_on_board(view, reader, lens, MOUNT, LIDAR, known=True)
+        if line is not None:
+            crossed += 1
+            middle = np.mean(in_board(line.ends, pose, MOUNT, LIDAR), axis=0)
+            assert abs(middle[2]) < 0.006
+    assert crossed
+
+
+class Session:
+    """A context in which a board is held until the wizard has enough."""
+
+    def __init__(self, config, views):
+        self.config, self.known, self._views = config, {}, views
+        self.said: list[str] = []
+
+    def say(self, text):
+        self.said.append(text)
+
+    async def confirm(self, step):
+        return True
+
+    async def collect(self, step):
+        return [self._picture(0, 0)]
+
+    async def watch(self, step):
+        for k, view in enumerate(self._views):
+            for j in range(6):
+                stamp = 2 * k * SECOND + 2 * j * TENTH
+                scans = [scan_of(view, stamp - 2 * TENTH)]
+                done, total = step.take(self._picture(stamp, k), {topics.SCAN.name: scans} if step.also else {})
+                if done >= total:
+                    return
+        raise AssertionError("it never has enough")
+
+    def fit(self, name, function):
+        return function()
+
+    @staticmethod
+    def _picture(stamp, number):
+        return CompressedImage(stamp=stamp, received=stamp, seq=1, data=b"", sequence=number)
+
+
+@pytest.fixture
+def session(monkeypatch):
+    """Of a robot with a camera; its pictures are numbers of views that were seen already."""
+    config = load_config(CONFIGS / "board.yaml", SimulatedTruckConfig)[0]
+    lens = true_lens(np.random.default_rng(8))
+    mount = MOUNT + np.array((0.01, -0.02, 0.01, 0.03, 0.02, -0.03))
+    views = held_boards(READER, lens, mount, LIDAR, np.random.default_rng(8), count=70)
+
+    def decoded(message: CompressedImage) -> Any:
+        return np.full((480, 640), message.sequence, np.uint8)
+
+    monkeypatch.setattr(camera, "decoded", decoded)
+    monkeypatch.setattr(BoardReader, "read", lambda _, picture: views[int(picture[0, 0])].sighting)
+    return Session(config, views), lens, mount
+
+
+async def test_lens_and_mount_go_into_the_configuration(session):
+    context, lens, mount = session
+    result = await CameraWizard()(context)
+    assert not result.partial
+    assert any("still missing" in text for text in context.said)
+    device = with_values(context.config, [result], "test").devices.camera
+    assert device.driver.lens.focal_x == pytest.approx(lens.matrix[0, 0], abs=4.0)
+    assert (device.driver.lens.width, device.driver.lens.height) == (640, 480)
+    found = [getattr(device.mount, name) for name in ("x", "y", "z", "yaw", "pitch", "roll")]
+    assert found == pytest.approx(mount, abs=0.02)
+
+
+async def test_the_lens_alone_leaves_the_mount(session):
+    context, _, _ = session
+    result = await CameraWizard(lidar=False)(context)
+    assert result.partial
+    assert result.estimate("x") is None
+    assert result.estimate("k1").key == "devices.camera.driver.lens.k1"
+
+
+async def test_a_robot_without_a_camera_is_refused(session):
+    context, _, _ = session
+    context.config = load_config(CONFIGS / "yard.yaml", SimulatedTruckConfig)[0]
+    with pytest.raises(RequestRefusedError, match="no camera whose lens it states"):
+        await CameraWizard()(context)
