@@ -6,7 +6,7 @@ import pytest
 
 from tests.calibration_light import HALF_WIDTHS, LIGHT, coverage
 
-FITS = {"odometry": 12, "steering": 10, "lidar": 40, "sonar": 4, "camera": 6}
+FITS = {"odometry": 12, "steering": 10, "lidar": 40, "sonar": 4, "camera": 4}
 
 
 @pytest.mark.parametrize("wizard", LIGHT)
