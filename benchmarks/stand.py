@@ -19,9 +19,9 @@ import numpy as np
 
 from monstertruck_estimation.vision.tags import TagReader
 from monstertruck_runtime.clock import SECOND
-from monstertruckd.tools.stand.render import PictureQuality, level_tag
 from monstertruckd.tools.stand.tracking import StandTracker
 from tests.stand_kit import simulated
+from tests.stand_render import PictureQuality, level_tag
 
 OUTPUT = Path(__file__).resolve().parents[1] / "runs" / "benchmarks" / "stand.json"
 GOALS = {

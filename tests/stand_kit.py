@@ -7,7 +7,7 @@ from monstertruck_estimation.vision.lens import Lens
 from monstertruckd.tools.stand.calibration import StandCalibration, calibrate
 from monstertruckd.tools.stand.camera import PlacedCamera
 from monstertruckd.tools.stand.config import MarkConfig, OverheadConfig
-from monstertruckd.tools.stand.render import PictureQuality, StandRenderer, board_in_view, level_tag
+from tests.stand_render import PictureQuality, StandRenderer, board_in_view, level_tag
 
 GRID = ((-1.0, 0.75), (0.0, 0.75), (1.0, 0.75), (-1.0, -0.75), (0.0, -0.75), (1.0, -0.75))
 """Middles of six cameras' views over a table of 3 m x 3 m."""

@@ -274,15 +274,6 @@ class Description:
             name = joint.parent
         return x, y, z
 
-    @property
-    def mass_centre(self) -> Triple:
-        """Of all links together with all joints at zero, in the base frame, m."""
-        total = [0.0, 0.0, 0.0]
-        for link in self.links:
-            for i, (a, b) in enumerate(zip(self.frame(link.name), link.centre, strict=True)):
-                total[i] += link.mass * (a + b)
-        return total[0] / self.mass, total[1] / self.mass, total[2] / self.mass
-
 
 def box_inertia(mass: float, size: Triple) -> Triple:
     """Principal moments of a solid box, kg m^2."""

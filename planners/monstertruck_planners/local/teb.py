@@ -278,18 +278,6 @@ def _solve(matrix: Array, vector: Array) -> bool:
 
 
 @njit(cache=True)
-def cost_and_gradient(
-    field: FieldData, cover: CoveringDiscs, parameters: TebParameters, band: Array, direction: Array
-) -> tuple[float, Array]:
-    """Half the sum of squares, and its gradient, shape (4 n,)."""
-    n = len(band)
-    # Residuals at the last poses reach over the end.
-    system = NormalEquations(np.zeros((4 * n + WIDTH, WIDTH)), np.zeros(4 * n + WIDTH), np.zeros(WIDTH))
-    total = _assemble(field, cover, parameters, band, direction, system)
-    return 0.5 * total, system.gradient[: 4 * n].copy()
-
-
-@njit(cache=True)
 def optimise(
     field: FieldData, cover: CoveringDiscs, parameters: TebParameters, band: Array, direction: Array, iterations: int
 ) -> tuple[float, int]:

@@ -17,9 +17,9 @@ from monstertruck_runtime.errors import InputError
 from monstertruckd.tools.cli.main import app
 from monstertruckd.tools.stand.calibration import place, save
 from monstertruckd.tools.stand.config import MarkConfig, OverheadConfig, TaggedRobot
-from monstertruckd.tools.stand.render import level_tag
 from monstertruckd.tools.stand.tracking import StandTracker, TagPose, merged, tag_pose
 from tests.stand_kit import simulated
+from tests.stand_render import level_tag
 
 pytestmark = pytest.mark.timeout(300)
 
