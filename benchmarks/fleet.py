@@ -306,7 +306,7 @@ class Whole:
         start, speed = self.place, 0.1
         while True:
             with contextlib.suppress(TruckError, zenoh.ZError, TimeoutError):
-                if self.mode not in (GateMode.ARMED, GateMode.DRIVING):
+                if not self.mode.accepts_motion:
                     await self.routed.order(Order.ARM, hold=by_hand)
                 if by_hand:
                     way = float(self.place[0] - start[0])

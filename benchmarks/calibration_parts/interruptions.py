@@ -26,7 +26,6 @@ from monstertruck_runtime.errors import TruckError
 from monstertruck_runtime.mailbox import latest
 from monstertruck_schemas import topics
 from monstertruck_schemas.req import Role
-from monstertruck_schemas.state import GateMode
 from monstertruckd.config.calibration import CalibrationStore, Estimate, Result
 from monstertruckd.config.load import load_config
 from monstertruckd.tools.calibrate.drive import DriveWizard, drive_wizard
@@ -229,7 +228,7 @@ async def _interrupt(bench: Interrupted, found: Trial) -> None:
         found.wrong.append("the calibration has changed")
     async with _mode(bench) as gate:
         await bench.clock.sleep(1.0)
-        if gate.latest is None or gate.latest.mode not in (GateMode.DISARMED, GateMode.ESTOPPED):
+        if gate.latest is None or gate.latest.mode.active:
             found.wrong.append(f"the gate is {gate.latest.mode if gate.latest else 'silent'}")
     await taken_back(bench)
     await bench.clock.sleep(READY)

@@ -179,7 +179,7 @@ class Hand:
         """Arm and hold a key until the truck does what it should; again where a busy computer has disarmed it."""
         async with asyncio.timeout(ORDER_TIMEOUT):
             while not moves():
-                if self.gate.latest is None or self.gate.latest.mode not in (GateMode.ARMED, GateMode.DRIVING):
+                if self.gate.latest is None or not self.gate.latest.mode.accepts_motion:
                     await self.hold(None)
                     await order(self.client, Order.ARM)
                 if self._held != key:
