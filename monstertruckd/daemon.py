@@ -49,7 +49,7 @@ from monstertruckd.assembly.devices import Cabling, build_drivers, measures_batt
 from monstertruckd.assembly.estimation import Body, build_estimation
 from monstertruckd.assembly.planning import build_planners
 from monstertruckd.bus.local import Bus
-from monstertruckd.bus.peers import PeerEar, PeerService
+from monstertruckd.bus.peers import PeerService, PeerSubscriber
 from monstertruckd.bus.rpc import Rpc
 from monstertruckd.bus.zenoh_session import ZenohBridge
 from monstertruckd.config import calibration_rpc
@@ -221,7 +221,7 @@ class Daemon:
         yield self.peers
         if self._seed is None:
             for robot, where in self.config.peers.items():
-                yield PeerEar(robot, where, self.clock, self.peers)
+                yield PeerSubscriber(robot, where, self.clock, self.peers)
 
     @asynccontextmanager
     async def _outside(self) -> AsyncIterator[None]:

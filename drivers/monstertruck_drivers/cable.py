@@ -31,8 +31,8 @@ class DeviceEnd:
         self.on_bytes: Callable[[bool, bytes], None] | None = None
         """Called with all traffic: (True, bytes that reached the device), (False, bytes that reached the host)."""
         self._received = Link(name, lambda _: None, lambda: None)
-        self._out = _Way()
-        self._in = _Way()
+        self._out = _Direction()
+        self._in = _Direction()
         self._deliver: Callable[[bytes], None] | None = None
 
     def connect(self, deliver: Callable[[bytes], None] | None) -> None:
@@ -57,13 +57,13 @@ class DeviceEnd:
         data = self.faults.shorten(data)
         self._send(self._in, len(data), partial(self._accept, data))
 
-    def _send(self, way: "_Way", count: int, arrive: Callable[[], None], after: float = 0.0) -> None:
+    def _send(self, direction: "_Direction", count: int, arrive: Callable[[], None], after: float = 0.0) -> None:
         """Let ``count`` bytes arrive when those before them and they themselves are through."""
         delay = self.faults.delay + after
-        if self.baud is None and delay <= 0 and way.is_free():
+        if self.baud is None and delay <= 0 and direction.is_free():
             arrive()
         else:
-            way.enter(delay, count * 10 / self.baud if self.baud else 0.0, arrive)
+            direction.enter(delay, count * 10 / self.baud if self.baud else 0.0, arrive)
 
     def _emit(self, data: bytes) -> None:
         if self._deliver is not None and not self.faults.stalled:
@@ -78,7 +78,7 @@ class DeviceEnd:
             self._received.feed(data)
 
 
-class _Way:
+class _Direction:
     """One direction of the line. Timers may ring in any order; bytes arrive in that in which they were sent."""
 
     def __init__(self) -> None:

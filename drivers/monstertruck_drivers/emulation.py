@@ -48,7 +48,7 @@ class FileTree:
         }
 
 
-class Trail(bytearray):
+class ReceivedBytes(bytearray):
     """The newest bytes of a stream, ``KEPT`` at most: what an emulator was sent, for tests."""
 
     KEPT: Final = 1 << 16

@@ -42,7 +42,7 @@ class PeerService:
             self._out.put(message)
 
 
-class PeerEar:
+class PeerSubscriber:
     """Hears one other robot; its session reconnects by itself once there was one.
 
     Args:

@@ -20,7 +20,7 @@ OLD: Final = 2.0
 """Seconds after which a pose that did not change in time is shown as old."""
 
 
-class RobotGlimpse:
+class RobotSnapshot:
     """Newest pose and battery of one robot, decoded at every look and not at every message.
 
     Args:
@@ -68,7 +68,7 @@ class FleetBoard:
         self._clock = clock
         self._viewers: set[Viewer] = set()
         self._watched = asyncio.Event()
-        self._glimpses: dict[str, RobotGlimpse] = {}
+        self._snapshots: dict[str, RobotSnapshot] = {}
         self._rows: dict[str, dict[str, Any]] = {}
         """The last of each robot, which are shown as old when it is gone."""
 
@@ -96,14 +96,14 @@ class FleetBoard:
 
     def _look(self) -> str:
         for name, feed in self._feeds.items():
-            glimpse = self._glimpses.get(name)
-            if glimpse is not None and glimpse.client is not feed.client:
-                self._glimpses.pop(name).close()
-                glimpse = None
-            if glimpse is None and feed.client is not None:
-                glimpse = self._glimpses[name] = RobotGlimpse(feed.client, self._clock)
-            if glimpse is not None:
-                self._rows[name] = glimpse.row()
+            snapshot = self._snapshots.get(name)
+            if snapshot is not None and snapshot.client is not feed.client:
+                self._snapshots.pop(name).close()
+                snapshot = None
+            if snapshot is None and feed.client is not None:
+                snapshot = self._snapshots[name] = RobotSnapshot(feed.client, self._clock)
+            if snapshot is not None:
+                self._rows[name] = snapshot.row()
         return frames.text("fleet", robots=[self._row(name, feed) for name, feed in self._feeds.items()])
 
     def _row(self, name: str, feed: RobotFeed) -> dict[str, Any]:
@@ -120,5 +120,5 @@ class FleetBoard:
         }
 
     def _leave(self) -> None:
-        while self._glimpses:
-            self._glimpses.popitem()[1].close()
+        while self._snapshots:
+            self._snapshots.popitem()[1].close()

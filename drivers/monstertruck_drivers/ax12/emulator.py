@@ -12,7 +12,7 @@ from monstertruck_drivers.ax12.config import Ax12Config, JointConfig
 from monstertruck_drivers.ax12.protocol import Alarm, Ax12Parser, Instruction, Packet
 from monstertruck_drivers.ax12.unit import Load, Unit, Voltage, no_load, steady_voltage
 from monstertruck_drivers.cable import DeviceEnd
-from monstertruck_drivers.emulation import EmulatorSetup, Horn, Trail
+from monstertruck_drivers.emulation import EmulatorSetup, Horn, ReceivedBytes
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import InputError
 
@@ -77,7 +77,7 @@ class Ax12Bus:
         if len(ids) > UNITS_MAX or not all(0 <= ident <= p.ID_MAX for ident in ids):
             raise InputError(f"{name}: ids {tuple(ids)}: expected at most {UNITS_MAX}, each 0..{p.ID_MAX}")
         self.name = name
-        self.received = Trail()
+        self.received = ReceivedBytes()
         """Bytes the host sent, for tests."""
         self.latency_s = latency_s
         self._clock = clock

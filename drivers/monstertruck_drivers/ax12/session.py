@@ -1,4 +1,4 @@
-"""Question and answer on the half-duplex bus over one open link; shared by driver and probe."""
+"""Requests and replies on the half-duplex bus over one open link; shared by driver and probe."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ class Answer:
 
 
 class Ax12Session:
-    """One conversation; the host speaks first, always.
+    """One session; the host speaks first, always.
 
     A passive adapter gives back every byte that is sent. An echoed request looks like a status packet, even like a
     good one; so whether there is an echo is found out once, by a request no answer resembles, and from then on each

@@ -41,14 +41,14 @@ OVERSPEED = 1.5
 """Times the greatest speed: a shaft cannot have moved faster, so its counter was reset."""
 
 
-class Wanted(NamedTuple):
+class Setpoint(NamedTuple):
     """What the controller shall do: a power state, and the target of ENABLED."""
 
     goal: State
     rpm: int = 0
 
 
-def wanted(command: DriveCommand | None, now: int, config: EposConfig) -> Wanted:
+def setpoint_of(command: DriveCommand | None, now: int, config: EposConfig) -> Setpoint:
     """What the newest command means at ``now``; the host's deadman is here.
 
     Args:
@@ -60,14 +60,14 @@ def wanted(command: DriveCommand | None, now: int, config: EposConfig) -> Wanted
         ENABLED with a target in the controller's own sign, QUICK_STOP, or SWITCH_ON_DISABLED.
     """
     if command is None or command.action is DriveAction.DISABLE:
-        return Wanted(State.SWITCH_ON_DISABLED)
+        return Setpoint(State.SWITCH_ON_DISABLED)
     age = (now - command.stamp) / SECOND
     if command.action is DriveAction.QUICK_STOP or age > config.quick_stop_after:
-        return Wanted(State.QUICK_STOP)
+        return Setpoint(State.QUICK_STOP)
     if age > config.command_timeout:
-        return Wanted(State.ENABLED)
+        return Setpoint(State.ENABLED)
     rpm = round(command.motor_velocity / RAD_S_PER_RPM) * sign(config)
-    return Wanted(State.ENABLED, max(-config.max_motor_rpm, min(config.max_motor_rpm, rpm)))
+    return Setpoint(State.ENABLED, max(-config.max_motor_rpm, min(config.max_motor_rpm, rpm)))
 
 
 def sign(config: EposConfig) -> int:
@@ -300,7 +300,7 @@ class _DriveSession:
         if mark is not None:
             self._driver.odometer.restart()
             self._tell(Reason.DEVICE_RESTARTED, Severity.WARNING, "the controller restarted: position goes on")
-            if self._reported not in OFF or self._want().goal is not State.SWITCH_ON_DISABLED:
+            if self._reported not in OFF or self._setpoint().goal is not State.SWITCH_ON_DISABLED:
                 raise DeviceRestartedError("the controller restarted")
 
     async def make_safe(self) -> None:
@@ -360,10 +360,10 @@ class _DriveSession:
         _, raw = await self._read_row(od.VELOCITY_AVERAGED, od.POSITION)
         self._publish(raw, (self._line.began + self._line.ended) // 2)
         now = self._clock.now()
-        if now >= self._status_due or not settled(self._state, self._want().goal):
+        if now >= self._status_due or not settled(self._state, self._setpoint().goal):
             self._status_due = now + int(self._config.status_period * SECOND)
             await self._look()
-            await self._step(self._want().goal)
+            await self._step(self._setpoint().goal)
         elif now >= self._current_due:
             self._current_due = now + int(self._config.current_period * SECOND)
             self._current = await self._read(od.CURRENT) / 1000 * self._sign
@@ -424,26 +424,26 @@ class _DriveSession:
 
     # What to do
 
-    def _want(self) -> Wanted:
+    def _setpoint(self) -> Setpoint:
         """What the newest valid command asks for now; a moving motor is braked before it is switched off."""
         command = self._driver.commands.latest
         if command is not None and command.stamp < self._commands_after:
             command = None
-        want = wanted(command, self._clock.now(), self._config)
+        setpoint = setpoint_of(command, self._clock.now(), self._config)
         moving = self._state in POWERED and abs(self._rpm) > self._config.standstill_rpm
-        return Wanted(State.QUICK_STOP) if want.goal is State.SWITCH_ON_DISABLED and moving else want
+        return Setpoint(State.QUICK_STOP) if setpoint.goal is State.SWITCH_ON_DISABLED and moving else setpoint
 
     async def _act(self, *, also_faster: bool = False) -> None:
         """Send what must not wait: a quick stop, a slower target; at the start of a cycle a faster one too."""
-        want = self._want()
-        if want.goal is not State.QUICK_STOP:
+        setpoint = self._setpoint()
+        if setpoint.goal is not State.QUICK_STOP:
             self._stopping = False
         elif not self._stopping:
             await self._control(Control.QUICK_STOP)
             self._stopping = True
             if self._state in POWERED:
                 self._state = State.QUICK_STOP
-        rpm = self._target(want)
+        rpm = self._target(setpoint)
         if rpm != self._sent_rpm and (also_faster or _slower(rpm, self._sent_rpm)):
             self._sent_rpm = None  # if this fails, whether it arrived is not known
             await self._line.write(od.TARGET_VELOCITY, rpm)
@@ -451,11 +451,13 @@ class _DriveSession:
 
     def _is_urgent(self) -> bool:
         """Whether there is something that must not wait."""
-        want = self._want()
-        return (want.goal is State.QUICK_STOP and not self._stopping) or _slower(self._target(want), self._sent_rpm)
+        setpoint = self._setpoint()
+        return (setpoint.goal is State.QUICK_STOP and not self._stopping) or _slower(
+            self._target(setpoint), self._sent_rpm
+        )
 
-    def _target(self, want: Wanted) -> int:
-        return want.rpm if self._state is State.ENABLED else 0
+    def _target(self, setpoint: Setpoint) -> int:
+        return setpoint.rpm if self._state is State.ENABLED else 0
 
     async def _look(self) -> None:
         """Read the power state and judge its changes."""
@@ -483,7 +485,7 @@ class _DriveSession:
         Raises:
             DeviceStoppedError: it was.
         """
-        if self._want().rpm != 0:
+        if self._setpoint().rpm != 0:
             text = "quick stop by another than this program: the deadman line fell, or a second master commands"
             self._tell(Reason.DEVICE_STOPPED, Severity.WARNING, text)
             raise DeviceStoppedError(text)

@@ -27,7 +27,7 @@ from monstertruck_drivers.epos.protocol import (
     write_request,
 )
 from monstertruck_drivers.link import Link
-from monstertruck_drivers.talk import Need, Steps, Talk
+from monstertruck_drivers.transaction import Steps, Transaction, WaitFor
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import DeviceMismatchError, DeviceTimeoutError, ProtocolError, WrongDeviceError
 
@@ -95,7 +95,7 @@ class Exchanger:
         self._link = link
         self._clock = clock
         self._node = node
-        self._flight: Talk[Any] | None = None
+        self._flight: Transaction[Any] | None = None
         self._hurried = False
         """A task waits for the end of the exchange that is read."""
         self.quiet_until = quiet_until
@@ -212,7 +212,7 @@ class Exchanger:
     async def _transact(self, steps: Steps[T]) -> T:
         await self.finish()
         await self.settle()
-        self._flight = flight = Talk(self._link, steps)
+        self._flight = flight = Transaction(self._link, steps)
         try:
             return await flight.result()
         finally:
@@ -293,7 +293,7 @@ class Exchanger:
     def _ask(self, request: Frame) -> Steps[None]:
         for attempt in range(1 + BUSY_RETRIES):
             if attempt:
-                yield Need(0, BUSY_PAUSE)
+                yield WaitFor(0, BUSY_PAUSE)
             self._link.write(request.head)
             if (yield from self._acknowledge()) == READY:
                 return
@@ -329,7 +329,7 @@ class Exchanger:
 
     def _repeated(self, lengths: frozenset[int] | None) -> Steps[Frame | None]:
         """Refuse a damaged answer. Undocumented whether the controller repeats it or forgets it: listen which."""
-        yield Need(0, REST_OF_FRAME)
+        yield WaitFor(0, REST_OF_FRAME)
         self._link.discard()
         self._link.write(bytes((REFUSED,)))
         try:
@@ -350,7 +350,7 @@ class Exchanger:
     def _exactly(self, count: int, timeout: float) -> Steps[bytes]:
         asked = self._clock.now()
         try:
-            data = yield Need(count, timeout)
+            data = yield WaitFor(count, timeout)
         except TimeoutError:
             self._check_held_up(asked)
             raise DeviceTimeoutError(f"{self._link.name}: no answer within {timeout} s") from None

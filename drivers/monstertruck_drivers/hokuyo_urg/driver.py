@@ -1,4 +1,4 @@
-"""The scanner as a service, and the conversation with it.
+"""The scanner as a service, and the session with it.
 
 A session wakes the scanner from any state, asks, compares clocks and silences it; the driver streams scans in one
 until it is cancelled or lost.

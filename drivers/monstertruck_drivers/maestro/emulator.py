@@ -9,7 +9,7 @@ from typing import Final, Literal
 import numpy as np
 
 from monstertruck_drivers.cable import DeviceEnd, EmulatedPort
-from monstertruck_drivers.emulation import EmulatorSetup, ServoPlant, Trail
+from monstertruck_drivers.emulation import EmulatorSetup, ReceivedBytes, ServoPlant
 from monstertruck_drivers.maestro.protocol import (
     ADC_MAX,
     CHANNELS,
@@ -117,7 +117,7 @@ class MaestroEmulator:
         self.name = name
         self.usb = usb
         self.on_output = on_output
-        self.received = Trail()
+        self.received = ReceivedBytes()
         """Bytes the host sent to the Command Port, for tests."""
         self.analog_v = dict.fromkeys(range(CHANNELS), 2.4)
         """Volts at the inputs while there is no plant."""

@@ -1,4 +1,4 @@
-"""Question and answer with a Maestro over one open link; shared by driver and probe."""
+"""Requests and replies, with a Maestro over one open link; shared by driver and probe."""
 
 from typing import Final
 
@@ -16,7 +16,7 @@ RESYNC_TRIES: Final = 4
 
 
 class MaestroSession:
-    """One conversation. Answers carry no mark of their own: only their number and form can be checked.
+    """One session. Answers carry no mark of their own: only their number and form can be checked.
 
     Args:
         link: open link to the Command Port.

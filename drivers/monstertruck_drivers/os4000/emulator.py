@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from monstertruck_drivers.cable import DeviceEnd
-from monstertruck_drivers.emulation import AttitudeSource, CompassReading, EmulatorSetup, Trail
+from monstertruck_drivers.emulation import AttitudeSource, CompassReading, EmulatorSetup, ReceivedBytes
 from monstertruck_drivers.os4000.protocol import (
     BAUDS,
     ESC,
@@ -121,7 +121,7 @@ class Os4000Emulator:
     ) -> None:
         self.name = name
         self.settings = Settings(rate, fields)
-        self.received = Trail()
+        self.received = ReceivedBytes()
         """Bytes the host sent, for tests."""
         self.host_baud: int | None = None
         """Rate the host uses; None = the same as the unit."""

@@ -21,7 +21,7 @@ SAMPLES: Final = 6
 
 
 class Os4000Session:
-    """One conversation.
+    """One session.
 
     Args:
         link: open link, at the unit's baud rate.

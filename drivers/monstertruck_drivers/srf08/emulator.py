@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 
 from monstertruck_drivers.cable import DeviceEnd
-from monstertruck_drivers.emulation import EmulatorSetup, SonarSource, Trail
+from monstertruck_drivers.emulation import EmulatorSetup, ReceivedBytes, SonarSource
 from monstertruck_drivers.srf08.config import Srf08Config
 from monstertruck_drivers.srf08.protocol import (
     ABSENT,
@@ -79,7 +79,7 @@ class Srf08Emulator:
         self, clock: Clock, source: SonarSource | None = None, settings: Srf08Config | None = None, *, seed: int = 0
     ) -> None:
         self.name = "srf08"
-        self.received = Trail()
+        self.received = ReceivedBytes()
         """Bytes the host sent, for tests."""
         self.modules = {sonar.address: Module(name) for name, sonar in (settings or Srf08Config()).sonars.items()}
         self._clock = clock

@@ -1,4 +1,4 @@
-"""Question and answer with a USB-ISS and the sonars behind it; shared by driver and probe."""
+"""Requests and replies, with a USB-ISS and the sonars behind it; shared by driver and probe."""
 
 from typing import Final
 
@@ -12,7 +12,7 @@ ATTEMPTS: Final = 3
 
 
 class Srf08Session:
-    """One conversation.
+    """One session.
 
     Args:
         link: open link.

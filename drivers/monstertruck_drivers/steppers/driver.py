@@ -1,7 +1,7 @@
 """Drive service of several shafts on one stepper controller: ``cmd/drive*`` in, ``sensor/drive*`` out.
 
-One exchange a cycle: what the newest commands of all shafts want goes out, the status comes back and is the feedback of
-every shaft. The shafts have one state together: the most careful of their commands counts, and the oldest.
+One exchange a cycle: the set-points of all shafts go out, the status comes back and is the feedback of every shaft. The
+shafts have one state together: the most careful of their commands counts, and the oldest.
 
 The controller's watchdog stops the motors when the host is silent. The first request of every session is a quick stop,
 the last ones are a quick stop and, once the motors rest, coils off.
@@ -49,7 +49,7 @@ MODES: Final = {
 }
 
 
-class MotorsWanted(NamedTuple):
+class MotorSetpoints(NamedTuple):
     """What the motors shall do."""
 
     state: MotorState
@@ -57,7 +57,7 @@ class MotorsWanted(NamedTuple):
     """1/1000 step/s, in the controller's own sign; of RUN."""
 
 
-def wanted(commands: Sequence[DriveCommand | None], now: int, config: StepperConfig) -> MotorsWanted:
+def setpoint_of(commands: Sequence[DriveCommand | None], now: int, config: StepperConfig) -> MotorSetpoints:
     """What the newest commands of all shafts mean together; the host's own deadman is here.
 
     Args:
@@ -67,16 +67,16 @@ def wanted(commands: Sequence[DriveCommand | None], now: int, config: StepperCon
     """
     known = [command for command in commands if command is not None]
     if len(known) < len(commands) or any(command.action is DriveAction.DISABLE for command in known):
-        return MotorsWanted(MotorState.OFF)
+        return MotorSetpoints(MotorState.OFF)
     age = max(now - command.stamp for command in known) / SECOND
     if age > config.quick_stop_after or any(command.action is DriveAction.QUICK_STOP for command in known):
-        return MotorsWanted(MotorState.STOPPED)
+        return MotorSetpoints(MotorState.STOPPED)
     if age > config.command_timeout:
-        return MotorsWanted(MotorState.RUN, (0,) * len(known))
+        return MotorSetpoints(MotorState.RUN, (0,) * len(known))
     limit = config.max_rate
     steps = [min(max(command.motor_velocity / config.turn, -limit), limit) for command in known]
     rates = [-rate if inverted else rate for rate, inverted in zip(steps, config.inverted, strict=False)]
-    return MotorsWanted(MotorState.RUN, tuple(round(1000 * rate) for rate in rates))
+    return MotorSetpoints(MotorState.RUN, tuple(round(1000 * rate) for rate in rates))
 
 
 class StepperDriver:
@@ -179,9 +179,9 @@ class StepperDriver:
             if self._clock.now() >= due:
                 due = schedule.step()
             await self._until(due)
-            want = self._want()
+            setpoint = self._setpoint()
             try:
-                status = await self._exchange(session, motors, want)
+                status = await self._exchange(session, motors, setpoint)
             except (DeviceTimeoutError, ProtocolError):
                 misses += 1
                 if misses >= MISSES:
@@ -199,13 +199,13 @@ class StepperDriver:
                 self._events(Reason.DEVICE_PROTOCOL, Severity.WARNING, self.name, text)
                 noise = session.splitter.bad
 
-    def _want(self) -> MotorsWanted:
-        return wanted([commands.latest for commands in self._commands], self._clock.now(), self._config)
+    def _setpoint(self) -> MotorSetpoints:
+        return setpoint_of([commands.latest for commands in self._commands], self._clock.now(), self._config)
 
     def _is_urgent(self) -> bool:
         """Whether the motors run and are to stop."""
         running = self._last is not None and self._last[0].state is MotorState.RUN
-        return running and self._want().state is not MotorState.RUN
+        return running and self._setpoint().state is not MotorState.RUN
 
     async def _until(self, due: int) -> None:
         """Wait for the next cycle, or for a command that stops running motors; the last shaft's is the newest."""
@@ -214,15 +214,15 @@ class StepperDriver:
             if await last.next_within(left / SECOND, lambda _: not self._is_urgent()) is None or self._is_urgent():
                 return
 
-    async def _exchange(self, session: StepperSession, motors: int, want: MotorsWanted) -> Status:
-        if want.state is MotorState.OFF:
+    async def _exchange(self, session: StepperSession, motors: int, setpoint: MotorSetpoints) -> Status:
+        if setpoint.state is MotorState.OFF:
             verb = "D" if self._last is not None and not any(self._last[0].rates) else "Q"
             status = await session.status(verb, motors)
-        elif want.state is MotorState.STOPPED:
+        elif setpoint.state is MotorState.STOPPED:
             status = await session.status("Q", motors)
         else:
             try:
-                status = await session.status("R", motors, *want.rates, *(0,) * (motors - len(want.rates)))
+                status = await session.status("R", motors, *setpoint.rates, *(0,) * (motors - len(setpoint.rates)))
             except RequestRefusedByDeviceError as error:
                 if error.code == RefusalCode.TRIPPED:
                     text = f"{self._port.name}: the controller's watchdog stopped the motors"

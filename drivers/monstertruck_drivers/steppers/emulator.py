@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from typing import Final
 
 from monstertruck_drivers.cable import DeviceEnd
-from monstertruck_drivers.emulation import EmulatorSetup, MotorPlant, Trail
+from monstertruck_drivers.emulation import EmulatorSetup, MotorPlant, ReceivedBytes
 from monstertruck_drivers.epos.firmware import FreeMotor
 from monstertruck_drivers.steppers.protocol import (
     BAUD,
@@ -68,7 +68,7 @@ class StepperEmulator:
         steps_per_turn: int = 400,
     ) -> None:
         self.name = name
-        self.received = Trail()
+        self.received = ReceivedBytes()
         """Newest bytes from the host."""
         self._clock = clock
         self._identity = Identity(NAME, VERSION, motors, steps_per_turn, TICK_US)

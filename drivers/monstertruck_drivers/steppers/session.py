@@ -1,4 +1,4 @@
-"""Question and answer with the controller over one open link; shared by driver and probe."""
+"""Requests and replies, with the controller over one open link; shared by driver and probe."""
 
 from typing import Final
 
@@ -34,7 +34,7 @@ class RequestRefusedByDeviceError(ProtocolError):
 
 
 class StepperSession:
-    """One conversation. An answer belongs to its question by the sequence number: late ones are dropped.
+    """One session. An answer belongs to its question by the sequence number: late ones are dropped.
 
     Args:
         link: open link.

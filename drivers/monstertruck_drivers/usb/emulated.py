@@ -25,7 +25,7 @@ ENUMERATION: Final = 0.12
 
 
 @dataclass(slots=True)
-class _Thing:
+class _HubOrDevice:
     """A hub or device that exists, plugged in or not."""
 
     name: str
@@ -81,7 +81,7 @@ class EmulatedUsb:
         """Node numbers still taken by a process that has a vanished node open."""
         self.commands: list[Sequence[str]] = []
         """Programs that were run."""
-        self._things: dict[str, _Thing] = {}
+        self._devices: dict[str, _HubOrDevice] = {}
         self._devnums = count(2)
         (folder / "sys" / DEVICES).mkdir(parents=True)
         self.dev.mkdir()
@@ -95,10 +95,10 @@ class EmulatedUsb:
     def add_hub(self, name: str, *, ports: int = 4, usb_id: str = "05e3:0608", title: str = "USB2.0 Hub") -> None:
         """Create a hub and plug it in; root hubs come by themselves."""
         hub = parent_of(name)
-        if hub is not None and hub.startswith("usb") and hub not in self._things:
-            self._things[hub] = _Thing(hub, "1d6b:0002", "xHCI Host Controller", None, ports=8)
+        if hub is not None and hub.startswith("usb") and hub not in self._devices:
+            self._devices[hub] = _HubOrDevice(hub, "1d6b:0002", "xHCI Host Controller", None, ports=8)
             self.plug(hub)
-        self._things[name] = _Thing(name, usb_id, title, None, ports=ports)
+        self._devices[name] = _HubOrDevice(name, usb_id, title, None, ports=ports)
         self.plug(name)
 
     def add_device(
@@ -123,12 +123,12 @@ class EmulatedUsb:
             serial: serial number.
             cable: what a serial node leads to.
         """
-        self._things[name] = _Thing(name, usb_id, title, serial, node=node, interface=interface, cable=cable)
+        self._devices[name] = _HubOrDevice(name, usb_id, title, serial, node=node, interface=interface, cable=cable)
         self.plug(name)
 
     def knows(self, name: str) -> bool:
         """Whether such a hub or device exists, plugged in or not."""
-        return name in self._things
+        return name in self._devices
 
     def present(self, name: str) -> bool:
         """Whether it shows in the tree."""
@@ -143,38 +143,38 @@ class EmulatedUsb:
             name: place.
             number: of its node; None = lowest that is free.
         """
-        thing = self._things[name]
-        thing.plugged = True
+        device = self._devices[name]
+        device.plugged = True
         if self.present(name) or any(not self.present(hub) for hub in ancestors(name)):
             return
-        vendor, product = thing.usb_id.split(":")
+        vendor, product = device.usb_id.split(":")
         values = {
             "devnum": str(next(self._devnums)),
             "idVendor": vendor,
             "idProduct": product,
-            "bDeviceClass": "09" if thing.ports else "00",
-            "product": thing.title,
+            "bDeviceClass": "09" if device.ports else "00",
+            "product": device.title,
             "authorized": "1",
-            "power/control": "auto" if thing.ports or thing.autosuspend else "on",
+            "power/control": "auto" if device.ports or device.autosuspend else "on",
         }
-        if thing.serial is not None:
-            values["serial"] = thing.serial
+        if device.serial is not None:
+            values["serial"] = device.serial
         self._write(f"{DEVICES}/{name}", values)
-        if thing.ports:
-            for port in range(1, thing.ports + 1):
+        if device.ports:
+            for port in range(1, device.ports + 1):
                 child = f"{name[3:]}-{port}" if name.startswith("usb") else f"{name}.{port}"
                 self._write(port_directory(child), {"over_current_count": "0", "disable": "0"})
-        self._bind(thing, number)
+        self._bind(device, number)
         self.watcher.announce()
 
     def unplug(self, name: str) -> None:
         """Pull one hub or device out, and whatever hangs on it."""
-        self._things[name].plugged = False
+        self._devices[name].plugged = False
         self._vanish(name)
 
     def lose_hub(self, name: str) -> None:
         """The hub drops off the bus: its devices vanish, then itself, though every cable is in."""
-        self._vanish(self._things[name].name)
+        self._vanish(self._devices[name].name)
 
     async def return_hub(self, name: str, clock: Clock, *, first: float = 0.2, between: float = ENUMERATION) -> None:
         """The hub is enumerated again, then, one after the other, what is plugged into it.
@@ -188,21 +188,21 @@ class EmulatedUsb:
         await clock.sleep(first)
         self.plug(name)
         for child in self._behind(name):
-            if self._things[child].plugged:
+            if self._devices[child].plugged:
                 await clock.sleep(between)
                 self.plug(child)
 
     def move(self, name: str, to: str) -> None:
         """Plug a device into another port."""
         self.unplug(name)
-        thing = self._things.pop(name)
-        thing.name = to
-        self._things[to] = thing
+        device = self._devices.pop(name)
+        device.name = to
+        self._devices[to] = device
         self.plug(to)
 
     def over_current(self, name: str) -> None:
         """The port ``name`` hangs on draws too much and says so."""
-        name = self._things[name].name
+        name = self._devices[name].name
         attribute = f"{port_directory(name)}/over_current_count"
         seen = self.sysfs.number(attribute) or 0
         self._write(port_directory(name), {"over_current_count": str(seen + 1)})
@@ -210,7 +210,7 @@ class EmulatedUsb:
 
     def suspend_when_idle(self, name: str) -> None:
         """Some power saver lets the kernel suspend the device, now and after every replug."""
-        self._things[name].autosuspend = True
+        self._devices[name].autosuspend = True
         self._write(f"{DEVICES}/{name}", {"power/control": "auto"})
         self.watcher.announce()
 
@@ -227,69 +227,69 @@ class EmulatedUsb:
         if attribute == "disable":
             self._switch(self._at_port(folder), on=value == "0")
         elif attribute == "authorized":
-            thing = self._things[folder]
-            self._unbind(thing) if value == "0" else self._bind(thing, None)
+            device = self._devices[folder]
+            self._unbind(device) if value == "0" else self._bind(device, None)
             self.watcher.announce()
 
     # How it is done
 
     def _behind(self, hub: str) -> list[str]:
-        return sorted((name for name in self._things if hub in ancestors(name)), key=sort_key)
+        return sorted((name for name in self._devices if hub in ancestors(name)), key=sort_key)
 
     def _vanish(self, name: str) -> None:
         """Children first, as the kernel does."""
         for child in [*reversed(self._behind(name)), name]:
             if not self.present(child):
                 continue
-            self._unbind(self._things[child])
+            self._unbind(self._devices[child])
             for interface in self.sysfs.root.joinpath(DEVICES).glob(f"{_interface_prefix(child)}:*"):
                 shutil.rmtree(interface)
             shutil.rmtree(self.sysfs.root / DEVICES / child)
             self.watcher.announce()
 
-    def _bind(self, thing: _Thing, number: int | None) -> None:
+    def _bind(self, device: _HubOrDevice, number: int | None) -> None:
         """Drivers take the device: interface and node appear."""
-        if thing.node is None:
+        if device.node is None:
             return
-        taken = {other.node_name for other in self._things.values()} | {
-            f"{thing.node}{busy}" for busy in self.busy_numbers
+        taken = {other.node_name for other in self._devices.values()} | {
+            f"{device.node}{busy}" for busy in self.busy_numbers
         }
-        free = next(n for n in count() if f"{thing.node}{n}" not in taken) if number is None else number
-        thing.node_name = f"{thing.node}{free}"
-        interface = f"{DEVICES}/{thing.name}:1.{thing.interface}"
-        link = self.sysfs.root / DEVICES / thing.name / f"{thing.name}:1.{thing.interface}"
-        if thing.node == "ttyUSB":
-            self._write(f"{interface}/{thing.node_name}", {"latency_timer": str(FTDI_LATENCY)})
+        free = next(n for n in count() if f"{device.node}{n}" not in taken) if number is None else number
+        device.node_name = f"{device.node}{free}"
+        interface = f"{DEVICES}/{device.name}:1.{device.interface}"
+        link = self.sysfs.root / DEVICES / device.name / f"{device.name}:1.{device.interface}"
+        if device.node == "ttyUSB":
+            self._write(f"{interface}/{device.node_name}", {"latency_timer": str(FTDI_LATENCY)})
         else:
-            kind = "video4linux" if thing.node == "video" else "tty"
-            self._write(f"{interface}/{kind}/{thing.node_name}", {})
+            kind = "video4linux" if device.node == "video" else "tty"
+            self._write(f"{interface}/{kind}/{device.node_name}", {})
         link.symlink_to(Path("..") / link.name)
-        if thing.cable is not None:
-            thing.cable.plug()
-            if isinstance(thing.cable, PtyPort):
-                (self.dev / thing.node_name).symlink_to(thing.cable.name)
+        if device.cable is not None:
+            device.cable.plug()
+            if isinstance(device.cable, PtyPort):
+                (self.dev / device.node_name).symlink_to(device.cable.name)
 
-    def _unbind(self, thing: _Thing) -> None:
-        if thing.node_name is None:
+    def _unbind(self, device: _HubOrDevice) -> None:
+        if device.node_name is None:
             return
-        if thing.cable is not None:
-            thing.cable.unplug()
-        (self.dev / thing.node_name).unlink(missing_ok=True)
-        link = self.sysfs.root / DEVICES / thing.name / f"{thing.name}:1.{thing.interface}"
+        if device.cable is not None:
+            device.cable.unplug()
+        (self.dev / device.node_name).unlink(missing_ok=True)
+        link = self.sysfs.root / DEVICES / device.name / f"{device.name}:1.{device.interface}"
         link.unlink(missing_ok=True)
         shutil.rmtree(self.sysfs.root / DEVICES / link.name)
-        thing.node_name = None
+        device.node_name = None
 
-    def _at_port(self, folder: str) -> _Thing | None:
-        things = (thing for thing in self._things.values() if parent_of(thing.name) is not None)
-        return next((thing for thing in things if Path(port_directory(thing.name)).name == folder), None)
+    def _at_port(self, folder: str) -> _HubOrDevice | None:
+        devices = (device for device in self._devices.values() if parent_of(device.name) is not None)
+        return next((device for device in devices if Path(port_directory(device.name)).name == folder), None)
 
-    def _switch(self, thing: _Thing | None, *, on: bool) -> None:
+    def _switch(self, device: _HubOrDevice | None, *, on: bool) -> None:
         """A port's power; what hangs there follows it."""
-        if thing is not None and not on:
-            self._vanish(thing.name)
-        elif thing is not None and thing.plugged:
-            self.plug(thing.name)
+        if device is not None and not on:
+            self._vanish(device.name)
+        elif device is not None and device.plugged:
+            self.plug(device.name)
 
     def _write(self, path: str, values: dict[str, str]) -> None:
         folder = self.sysfs.root / path
@@ -299,9 +299,9 @@ class EmulatedUsb:
             (folder / attribute).write_text(f"{value}\n")
 
     def _serial(self, path: Path, baud: int) -> Port:
-        for thing in self._things.values():
-            if thing.node_name == path.name and isinstance(thing.cable, MemoryPort):
-                return thing.cable
+        for device in self._devices.values():
+            if device.node_name == path.name and isinstance(device.cable, MemoryPort):
+                return device.cable
         return SerialPort(path, baud)
 
     async def _run(self, arguments: Sequence[str]) -> tuple[int, str]:
@@ -310,11 +310,11 @@ class EmulatedUsb:
         if list(arguments[:1]) != ["uhubctl"] or "uhubctl" in self.refused:
             raise FileNotFoundError(errno.ENOENT, "No such file or directory", arguments[0])
         options = dict(zip(arguments[1::2], arguments[2::2], strict=True))
-        for thing in self._things.values():
-            hub = parent_of(thing.name) or ""
-            if (hub.removeprefix("usb"), str(port_of(thing.name))) == (options["-l"], options["-p"]):
-                self._switch(thing, on=False)
-                self._switch(thing, on=True)
+        for device in self._devices.values():
+            hub = parent_of(device.name) or ""
+            if (hub.removeprefix("usb"), str(port_of(device.name))) == (options["-l"], options["-p"]):
+                self._switch(device, on=False)
+                self._switch(device, on=True)
                 return 0, ""
         return 1, "No compatible devices detected!"
 

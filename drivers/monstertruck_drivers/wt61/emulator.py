@@ -6,7 +6,7 @@ from typing import Final
 import numpy as np
 
 from monstertruck_drivers.cable import DeviceEnd
-from monstertruck_drivers.emulation import EmulatorSetup, ImuReading, ImuSource, Trail
+from monstertruck_drivers.emulation import EmulatorSetup, ImuReading, ImuSource, ReceivedBytes
 from monstertruck_drivers.wt61.protocol import BAUD, GRAVITY, RATE, TOGGLE_SLEEP, Wt61Kind, Wt61Packet, build, measured
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import InputError
@@ -40,7 +40,7 @@ class Wt61Emulator:
 
     def __init__(self, clock: Clock, source: ImuSource | None = None, *, seed: int = 0) -> None:
         self.name = "wt61"
-        self.received = Trail()
+        self.received = ReceivedBytes()
         """Bytes the host sent, for tests."""
         self._clock = clock
         self._source = source or Bench()

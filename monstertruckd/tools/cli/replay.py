@@ -12,7 +12,7 @@ from monstertruckd.tools.cli.logs import LogArgument, TopicsOption, finish_log
 from monstertruckd.tools.cli.output import JsonOption, finish, print_json, print_table, progress, remark
 
 if TYPE_CHECKING:
-    from monstertruckd.tools.replay_check.comparison import Greatest, TopicComparison
+    from monstertruckd.tools.replay_check.comparison import GreatestDifference, TopicComparison
     from monstertruckd.tools.replay_check.result import Check
 
 CHECK = "Compute the log's outputs again from its sensors and compare them."
@@ -110,7 +110,7 @@ def _greatest(row: "TopicComparison") -> str:
     return ", ".join(parts) or ("" if row.equal == row.compared else "header")
 
 
-def _amount(one: "Greatest") -> str:
+def _amount(one: "GreatestDifference") -> str:
     from monstertruckd.tools.replay_check.comparison import Kind
 
     match one.kind:

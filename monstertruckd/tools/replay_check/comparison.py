@@ -158,7 +158,7 @@ UNREADABLE: Final = "not readable"
 
 
 @dataclass(frozen=True, slots=True)
-class Greatest:
+class GreatestDifference:
     """The greatest difference of a kind."""
 
     kind: Kind
@@ -171,7 +171,7 @@ class Greatest:
 
 
 @dataclass(frozen=True, slots=True)
-class First:
+class FirstDifference:
     """The first output that is off by more than the tolerance."""
 
     topic: str
@@ -210,8 +210,8 @@ class TopicComparison:
     """Differ by more than the tolerance."""
     headers: int = 0
     """Differ in their stamps or number."""
-    greatest: dict[Kind, Greatest] = field(default_factory=dict)
-    first: First | None = None
+    greatest: dict[Kind, GreatestDifference] = field(default_factory=dict)
+    first: FirstDifference | None = None
     _count: int = 0
     _recorded: dict[int, _TopicOutput] = field(default_factory=dict)
     _again: dict[int, _TopicOutput] = field(default_factory=dict)
@@ -274,10 +274,10 @@ class TopicComparison:
             return
         self.differing += 1
         if self.first is None or at < self.first.at:
-            self.first = First(self.topic.name, sequence, at, off)
+            self.first = FirstDifference(self.topic.name, sequence, at, off)
 
     def _keep(self, found: Iterable[Difference], sequence: int, at: float) -> None:
         for one in found:
             known = self.greatest.get(one.kind)
             if known is None or one.value > known.value:
-                self.greatest[one.kind] = Greatest(one.kind, one.value, one.field, sequence, at)
+                self.greatest[one.kind] = GreatestDifference(one.kind, one.value, one.field, sequence, at)

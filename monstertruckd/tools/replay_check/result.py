@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from monstertruck_schemas.reasons import Reason
-from monstertruckd.tools.replay_check.comparison import First, TopicComparison
+from monstertruckd.tools.replay_check.comparison import FirstDifference, TopicComparison
 
 ROUNDING: Final = 1e-6
 """SI units: what another processor's maths routines, which round otherwise, are off by is far less."""
@@ -54,7 +54,7 @@ class Check:
         return sum(comparison.equal for comparison in self.topics)
 
     @property
-    def first(self) -> First | None:
+    def first(self) -> FirstDifference | None:
         """The first output that is off by more than its topic's tolerance."""
         return min(
             (comparison.first for comparison in self.topics if comparison.first),

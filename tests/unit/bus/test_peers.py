@@ -10,7 +10,7 @@ from monstertruck_runtime.errors import ConfigError, NotFoundError
 from monstertruck_runtime.mailbox import latest
 from monstertruck_schemas.topics import PEERS, POSE, Writer
 from monstertruckd.bus.local import Bus
-from monstertruckd.bus.peers import PeerEar, PeerService
+from monstertruckd.bus.peers import PeerService, PeerSubscriber
 from monstertruckd.bus.zenoh_config import PeerConfig
 from monstertruckd.tools.simulation.config import load_simulated
 from tests.bus_kit import free_endpoint, odometry, running_robot
@@ -48,8 +48,8 @@ async def test_another_robot_is_heard_over_its_own_endpoint():
     async with running_robot(robot="ann") as ann:
         out = ann.bus.publisher(POSE, Writer.ESTIMATION)
         ready = asyncio.Event()
-        ear = PeerEar("ann", PeerConfig(endpoint=ann.endpoint), clock, service)
-        tasks = [asyncio.create_task(ear.run(ready.set)), asyncio.create_task(service.run(lambda: None))]
+        subscriber = PeerSubscriber("ann", PeerConfig(endpoint=ann.endpoint), clock, service)
+        tasks = [asyncio.create_task(subscriber.run(ready.set)), asyncio.create_task(service.run(lambda: None))]
         try:
             with bus.subscribe(PEERS, latest()) as heard:
                 async with asyncio.timeout(20):
@@ -70,7 +70,7 @@ async def test_a_robot_that_is_not_there_is_an_error_that_is_tried_again():
     clock = WallClock()
     service = PeerService(clock, Bus(clock).publisher(PEERS, Writer.ESTIMATION))
     with pytest.raises(NotFoundError):
-        await PeerEar("ann", PeerConfig(endpoint=free_endpoint()), clock, service).run(lambda: None)
+        await PeerSubscriber("ann", PeerConfig(endpoint=free_endpoint()), clock, service).run(lambda: None)
 
 
 @pytest.mark.parametrize(

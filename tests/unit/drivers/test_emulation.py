@@ -2,14 +2,14 @@
 
 import sys
 
-from monstertruck_drivers.emulation import Trail
+from monstertruck_drivers.emulation import ReceivedBytes
 
 
 def test_a_trail_keeps_the_newest_bytes_and_is_small():
-    trail = Trail()
+    trail = ReceivedBytes()
     for number in range(1000):
         trail.extend(bytes([number % 256]) * 1000)
-    assert len(trail) == Trail.KEPT
+    assert len(trail) == ReceivedBytes.KEPT
     assert trail[-1] == 999 % 256
     assert trail.endswith(bytes([999 % 256]) * 1000)
-    assert sys.getsizeof(trail) < 3 * Trail.KEPT
+    assert sys.getsizeof(trail) < 3 * ReceivedBytes.KEPT

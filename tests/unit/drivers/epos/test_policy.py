@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from monstertruck_drivers.epos.config import EposConfig
-from monstertruck_drivers.epos.driver import Odometer, Wanted, drive_mode, settled, wanted
+from monstertruck_drivers.epos.driver import Odometer, Setpoint, drive_mode, setpoint_of, settled
 from monstertruck_drivers.epos.exchange import ControllerIdentity
 from monstertruck_drivers.epos.protocol import State
 from monstertruck_runtime.clock import SECOND
@@ -17,8 +17,8 @@ from monstertruck_schemas.cmd import DriveAction, DriveCommand
 from monstertruck_schemas.sensor import DriveMode
 
 CONFIG = EposConfig()
-OFF = Wanted(State.SWITCH_ON_DISABLED)
-STOP = Wanted(State.QUICK_STOP)
+OFF = Setpoint(State.SWITCH_ON_DISABLED)
+STOP = Setpoint(State.QUICK_STOP)
 FASTEST = 600_000.0
 
 
@@ -30,12 +30,12 @@ def command(action: DriveAction, rpm: float = 0.0) -> DriveCommand:
 @pytest.mark.parametrize(
     ("age", "action", "rpm", "expected"),
     [
-        (0.0, DriveAction.RUN, 1000, Wanted(State.ENABLED, -1000)),
-        (0.25, DriveAction.RUN, -1000, Wanted(State.ENABLED, 1000)),
-        (-0.1, DriveAction.RUN, 30000, Wanted(State.ENABLED, -18000)),
-        (0.0, DriveAction.RUN, -30000, Wanted(State.ENABLED, 18000)),
-        (0.26, DriveAction.RUN, 1000, Wanted(State.ENABLED, 0)),
-        (1.0, DriveAction.RUN, 1000, Wanted(State.ENABLED, 0)),
+        (0.0, DriveAction.RUN, 1000, Setpoint(State.ENABLED, -1000)),
+        (0.25, DriveAction.RUN, -1000, Setpoint(State.ENABLED, 1000)),
+        (-0.1, DriveAction.RUN, 30000, Setpoint(State.ENABLED, -18000)),
+        (0.0, DriveAction.RUN, -30000, Setpoint(State.ENABLED, 18000)),
+        (0.26, DriveAction.RUN, 1000, Setpoint(State.ENABLED, 0)),
+        (1.0, DriveAction.RUN, 1000, Setpoint(State.ENABLED, 0)),
         (1.01, DriveAction.RUN, 1000, STOP),
         (0.0, DriveAction.QUICK_STOP, 1000, STOP),
         (9.0, DriveAction.QUICK_STOP, 0, STOP),
@@ -43,27 +43,27 @@ def command(action: DriveAction, rpm: float = 0.0) -> DriveCommand:
         (9.0, DriveAction.DISABLE, 0, OFF),
     ],
 )
-def test_commands_and_their_deadman(age: float, action: DriveAction, rpm: float, expected: Wanted):
-    assert wanted(command(action, rpm), SECOND + round(age * SECOND), CONFIG) == expected
+def test_commands_and_their_deadman(age: float, action: DriveAction, rpm: float, expected: Setpoint):
+    assert setpoint_of(command(action, rpm), SECOND + round(age * SECOND), CONFIG) == expected
 
 
 @pytest.mark.parametrize(
     ("age", "before", "after"),
     [
-        (SECOND // 4, Wanted(State.ENABLED, -1000), Wanted(State.ENABLED, 0)),
-        (SECOND, Wanted(State.ENABLED, 0), STOP),
+        (SECOND // 4, Setpoint(State.ENABLED, -1000), Setpoint(State.ENABLED, 0)),
+        (SECOND, Setpoint(State.ENABLED, 0), STOP),
     ],
 )
-def test_a_command_counts_to_the_last_instant_of_its_time(age: int, before: Wanted, after: Wanted):
+def test_a_command_counts_to_the_last_instant_of_its_time(age: int, before: Setpoint, after: Setpoint):
     run = command(DriveAction.RUN, 1000)
-    assert wanted(run, SECOND + age, CONFIG) == before
-    assert wanted(run, SECOND + age + 1, CONFIG) == after
+    assert setpoint_of(run, SECOND + age, CONFIG) == before
+    assert setpoint_of(run, SECOND + age + 1, CONFIG) == after
 
 
 def test_no_command_is_off_and_the_sign_is_configured():
-    assert wanted(None, 0, CONFIG) == OFF
+    assert setpoint_of(None, 0, CONFIG) == OFF
     forward = EposConfig(inverted=False)
-    assert wanted(command(DriveAction.RUN, 500), SECOND, forward) == Wanted(State.ENABLED, 500)
+    assert setpoint_of(command(DriveAction.RUN, 500), SECOND, forward) == Setpoint(State.ENABLED, 500)
 
 
 def test_a_motor_that_is_off_needs_no_quick_stop():

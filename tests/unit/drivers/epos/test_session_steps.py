@@ -11,7 +11,7 @@ import pytest
 from monstertruck_drivers.cable import MemoryPort
 from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos.config import EposConfig
-from monstertruck_drivers.epos.driver import RAD_S_PER_RPM, EposDriver, Wanted, _DriveSession
+from monstertruck_drivers.epos.driver import RAD_S_PER_RPM, EposDriver, Setpoint, _DriveSession
 from monstertruck_drivers.epos.exchange import ObjectError
 from monstertruck_drivers.epos.objects import ObjectEntry
 from monstertruck_drivers.epos.protocol import FAULTED, OFF, POWERED, Control, State
@@ -261,9 +261,9 @@ def test_a_fault_that_is_gone_makes_older_commands_void_and_is_reported_when_it_
         rig.line.values[od.STATUSWORD] = State.SWITCH_ON_DISABLED.value
         await session._look()
         assert (session._fault, rig.driver.reported_fault) == (None, None)
-        assert session._want().goal is State.SWITCH_ON_DISABLED
+        assert session._setpoint().goal is State.SWITCH_ON_DISABLED
         rig.say(DriveAction.RUN, 100)
-        assert session._want().goal is State.ENABLED
+        assert session._setpoint().goal is State.ENABLED
         rig.line.values[od.STATUSWORD] = State.FAULT.value
         await session._look()
         assert rig.events.reasons() == [Reason.DRIVE_FAULT, Reason.DEVICE_READY, Reason.DRIVE_FAULT]
@@ -278,7 +278,7 @@ def test_a_fault_that_is_gone_makes_older_commands_void_and_is_reported_when_it_
 def test_a_command_counts_from_the_instant_the_session_began(early: int, goal: State):
     async def test(rig: Steps) -> None:
         rig.say(DriveAction.RUN, 100, rig.clock.now() - early)
-        assert rig.session._want().goal is goal
+        assert rig.session._setpoint().goal is goal
 
     steps(test)
 
@@ -289,7 +289,7 @@ def test_only_a_motor_that_turns_under_power_is_braked_before_it_is_switched_off
     async def test(rig: Steps) -> None:
         rig.session._state, rig.session._rpm = state, rpm
         moves = state in POWERED and abs(rpm) > 60
-        assert rig.session._want().goal is (State.QUICK_STOP if moves else State.SWITCH_ON_DISABLED)
+        assert rig.session._setpoint().goal is (State.QUICK_STOP if moves else State.SWITCH_ON_DISABLED)
 
     steps(test)
 
@@ -346,7 +346,7 @@ def test_a_target_is_that_of_a_controller_that_is_enabled():
         rig.say(DriveAction.RUN, 700)
         for state in State:
             rig.session._state = state
-            assert rig.session._target(rig.session._want()) == (700 if state is State.ENABLED else 0)
+            assert rig.session._target(rig.session._setpoint()) == (700 if state is State.ENABLED else 0)
 
     steps(test)
 
@@ -540,7 +540,7 @@ def test_a_quick_stop_by_another_ends_the_session(
     async def test(rig: Steps) -> None:
         session = rig.session
         session._reported, session._control_sent = before, control
-        monkeypatch.setattr(session, "_want", lambda: Wanted(State.ENABLED, rpm))
+        monkeypatch.setattr(session, "_setpoint", lambda: Setpoint(State.ENABLED, rpm))
         rig.line.values[od.STATUSWORD] = State.QUICK_STOP.value
         with pytest.raises(DeviceStoppedError) if raises else contextlib.nullcontext():
             await session._look()

@@ -8,7 +8,7 @@ import pytest
 
 from monstertruck_drivers.cable import MemoryPort
 from monstertruck_drivers.steppers.config import StepperConfig
-from monstertruck_drivers.steppers.driver import wanted
+from monstertruck_drivers.steppers.driver import setpoint_of
 from monstertruck_drivers.steppers.probe import probe
 from monstertruck_drivers.steppers.protocol import Line, MotorState, Splitter
 from monstertruck_runtime.clock import SECOND, run_virtual
@@ -91,12 +91,12 @@ def command(now, action=DriveAction.RUN, rate=1.0):
 def test_the_most_careful_command_and_the_oldest_count_for_all():
     config, now = StepperConfig(motors=2), 10 * SECOND
     run, off = command(now), command(now, DriveAction.DISABLE)
-    assert wanted((run, run), now, config).state is MotorState.RUN
-    assert wanted((run, None), now, config).state is MotorState.OFF
-    assert wanted((run, off), now, config).state is MotorState.OFF
-    assert wanted((run, command(now, DriveAction.QUICK_STOP)), now, config).state is MotorState.STOPPED
-    assert wanted((run, command(now - SECOND // 2)), now, config).rates == (0, 0)
-    assert wanted((run, command(now - 2 * SECOND)), now, config).state is MotorState.STOPPED
+    assert setpoint_of((run, run), now, config).state is MotorState.RUN
+    assert setpoint_of((run, None), now, config).state is MotorState.OFF
+    assert setpoint_of((run, off), now, config).state is MotorState.OFF
+    assert setpoint_of((run, command(now, DriveAction.QUICK_STOP)), now, config).state is MotorState.STOPPED
+    assert setpoint_of((run, command(now - SECOND // 2)), now, config).rates == (0, 0)
+    assert setpoint_of((run, command(now - 2 * SECOND)), now, config).state is MotorState.STOPPED
 
 
 def test_a_quick_stop_does_not_wait_for_the_next_cycle():

@@ -1,4 +1,4 @@
-"""Conversations over a link that go on in the very callback that brings the next bytes.
+"""Transactions over a link that go on in the very callback that brings the next bytes.
 
 A handshake byte by byte costs a coroutine a wake-up of its task per byte; here the bytes go straight to a generator.
 """
@@ -13,23 +13,23 @@ from monstertruck_runtime.errors import DeviceLostError
 T = TypeVar("T")
 
 
-class Need(NamedTuple):
-    """What a conversation waits for: so many bytes within so many seconds; of size 0: that time."""
+class WaitFor(NamedTuple):
+    """What a transaction waits for: so many bytes within so many seconds; of size 0: that time."""
 
     size: int
     within: float
 
 
-Steps = Generator[Need, bytes, T]
+Steps = Generator[WaitFor, bytes, T]
 """Yields what it needs and is sent the bytes; ``TimeoutError`` and ``DeviceLostError`` are thrown in."""
 
 
-class Talk(Generic[T]):
-    """One conversation, begun at once and carried to its end whether or not a task waits for it.
+class Transaction(Generic[T]):
+    """One transaction, begun at once and carried to its end whether or not a task waits for it.
 
     Args:
         link: of which it is the only reader until it has ended.
-        steps: the conversation.
+        steps: the transaction.
     """
 
     def __init__(self, link: Link, steps: Steps[T]) -> None:
@@ -44,10 +44,10 @@ class Talk(Generic[T]):
         self._advance(None)
 
     async def result(self) -> T:
-        """Wait for the end; a cancelled wait does not end the conversation.
+        """Wait for the end; a cancelled wait does not end the transaction.
 
         Raises:
-            Exception: what the conversation raised.
+            Exception: what the transaction raised.
         """
         await self.end()
         if self._error is not None:
@@ -100,15 +100,15 @@ class Talk(Generic[T]):
         """Go on until bytes are needed that are not here yet."""
         try:
             while True:
-                need = self._steps.send(data) if error is None else self._steps.throw(error)  # type: ignore[arg-type]
-                self._size, error, data = need.size, None, None
-                if need.size:
+                wait = self._steps.send(data) if error is None else self._steps.throw(error)  # type: ignore[arg-type]
+                self._size, error, data = wait.size, None, None
+                if wait.size:
                     try:
-                        data = self._link.take(need.size)
+                        data = self._link.take(wait.size)
                     except DeviceLostError as lost:
                         error = lost
                 if data is None and error is None:
-                    self._link.begin_wait(self, self._loop.time() + need.within)
+                    self._link.begin_wait(self, self._loop.time() + wait.within)
                     return
         except StopIteration as stop:
             self._finish(stop.value, None)

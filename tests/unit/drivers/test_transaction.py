@@ -3,7 +3,7 @@ import asyncio
 import pytest
 
 from monstertruck_drivers.link import Link
-from monstertruck_drivers.talk import Need, Talk
+from monstertruck_drivers.transaction import Transaction, WaitFor
 from monstertruck_runtime.clock import SECOND, run_virtual
 from monstertruck_runtime.errors import DeviceLostError
 
@@ -17,22 +17,22 @@ def on_link(scenario):
 
 
 def greet(link):
-    name = yield Need(3, 1.0)
+    name = yield WaitFor(3, 1.0)
     link.write(b"hello " + name)
-    rest = yield Need(2, 1.0)
+    rest = yield WaitFor(2, 1.0)
     return name + rest
 
 
 def test_it_answers_within_the_callback_that_brings_the_bytes():
     async def scenario(link, written, _):
-        talk = Talk(link, greet(link))
+        transaction = Transaction(link, greet(link))
         link.feed(b"an")
         assert written == []
         link.feed(b"nab")
         assert written == [b"hello ann"]
         link.feed(b"cd")
-        assert talk.ended
-        assert await talk.result() == b"annab"
+        assert transaction.ended
+        assert await transaction.result() == b"annab"
         assert await link.read() == b"cd"
 
     on_link(scenario)
@@ -41,22 +41,22 @@ def test_it_answers_within_the_callback_that_brings_the_bytes():
 def test_bytes_that_are_here_already_are_not_waited_for():
     async def scenario(link, _, __):
         link.feed(b"annbc")
-        talk = Talk(link, greet(link))
-        assert talk.ended
-        assert await talk.result() == b"annbc"
+        transaction = Transaction(link, greet(link))
+        assert transaction.ended
+        assert await transaction.result() == b"annbc"
 
     on_link(scenario)
 
 
 def test_it_goes_on_when_nobody_waits_any_more():
     async def scenario(link, written, _):
-        talk = Talk(link, greet(link))
-        waiting = asyncio.create_task(talk.result())
+        transaction = Transaction(link, greet(link))
+        waiting = asyncio.create_task(transaction.result())
         await asyncio.sleep(0)
         waiting.cancel()
         await asyncio.wait([waiting])
         link.feed(b"annbc")
-        await talk.end()
+        await transaction.end()
         assert written == [b"hello ann"]
 
     on_link(scenario)
@@ -65,13 +65,13 @@ def test_it_goes_on_when_nobody_waits_any_more():
 def test_a_wait_may_be_too_long():
     def repeated():
         try:
-            yield Need(1, 0.5)
+            yield WaitFor(1, 0.5)
         except TimeoutError:
             return "late"
 
     async def scenario(link, _, clock):
         begin = clock.now()
-        assert await Talk(link, repeated()).result() == "late"
+        assert await Transaction(link, repeated()).result() == "late"
         assert (clock.now() - begin) / SECOND == pytest.approx(0.5, abs=0.01)
 
     on_link(scenario)
@@ -79,14 +79,14 @@ def test_a_wait_may_be_too_long():
 
 def test_a_pause_ends_by_time_not_by_bytes():
     def pausing():
-        yield Need(0, 0.5)
+        yield WaitFor(0, 0.5)
 
     async def scenario(link, _, clock):
         begin = clock.now()
-        talk = Talk(link, pausing())
+        transaction = Transaction(link, pausing())
         link.feed(b"x")
-        assert not talk.ended
-        await talk.end()
+        assert not transaction.ended
+        await transaction.end()
         assert (clock.now() - begin) / SECOND == pytest.approx(0.5, abs=0.01)
         assert link.discard() == 1
 
@@ -96,17 +96,17 @@ def test_a_pause_ends_by_time_not_by_bytes():
 @pytest.mark.parametrize("count", [1, 0], ids=["bytes", "pause"])
 def test_a_lost_link_ends_every_wait(count):
     def steps(link):
-        yield Need(count, 9.0)
+        yield WaitFor(count, 9.0)
         link.write(b"?")
 
     async def scenario(link, _, clock):
-        talk = Talk(link, steps(link))
+        transaction = Transaction(link, steps(link))
         link.lose("unplugged")
-        assert talk.ended
+        assert transaction.ended
         with pytest.raises(DeviceLostError, match="unplugged"):
-            await talk.result()
+            await transaction.result()
         with pytest.raises(DeviceLostError):
-            await Talk(link, steps(link)).result()
+            await Transaction(link, steps(link)).result()
 
     on_link(scenario)
 
@@ -116,15 +116,15 @@ def test_broken_off_it_gives_the_link_back():
 
     def steps():
         try:
-            yield Need(1, 1.0)
+            yield WaitFor(1, 1.0)
         finally:
             ended.append(True)
 
     async def scenario(link, _, __):
-        talk = Talk(link, steps())
-        talk.cancel()
+        transaction = Transaction(link, steps())
+        transaction.cancel()
         assert ended == [True]
-        await talk.end()
+        await transaction.end()
         link.feed(b"x")
         assert await link.exactly(1, 0.1) == b"x"
 
@@ -133,9 +133,9 @@ def test_broken_off_it_gives_the_link_back():
 
 def test_two_readers_are_refused():
     async def scenario(link, _, __):
-        talk = Talk(link, greet(link))
+        transaction = Transaction(link, greet(link))
         with pytest.raises(RuntimeError, match="two readers"):
             await link.read()
-        talk.cancel()
+        transaction.cancel()
 
     on_link(scenario)
