@@ -41,17 +41,18 @@ ROOT = Path(__file__).resolve().parent.parent
 VENV = ROOT / ".venv"
 TRACED = ("tests/unit/schemas", "tests/unit/gate", "tests/unit/runtime/wire", "tests/unit/drivers")
 """Where the tests of the parts are whose coverage is a gate (marked in tests/conftest.py)."""
-TESTS = ("-n", "2", "--dist", "worksteal", "--hypothesis-profile", "ci")
+TESTS = ("-n", "2", "--dist", "worksteal", "--hypothesis-profile", "ci", "--assert", "plain", "--showlocals")
 """Two at a time, neighbours in one process, for what they share is cached; property tests have the same examples every
-time, and no time limit. Plain pytest draws new ones."""
-FAILED_ALONE = ("-n", "0", "--last-failed", "--last-failed-no-failures", "none", "--cov-append")
+time, and no time limit. Plain pytest draws new ones. Values of local variables stand for those in assertions, whose
+rewriting would take as long as a thousand tests."""
+FAILED_ALONE = ("-n", "0", "--last-failed", "--last-failed-no-failures", "none", "--cov-append", "--assert", "rewrite")
 TESTS_FAILED = 1
 """Exit code of pytest; others mean that it did not run them."""
 KERNELS: tuple[Path, str, str] = (VENV / "bin" / "python", "-m", "monstertruckd.tools.install.kernels")
 """Compiles what goals and maps need: after the first lap in the background, for nobody should wait for it before."""
-BYTECODE = ("-m", "compileall", "-q", "-j", "2", "monstertruckd", "drivers", "planners", "schemas")
-"""Python's arguments that compile our own packages, once for the hundreds of processes that the tests start: where
-PYTHONDONTWRITEBYTECODE is set none of them would leave its work to the next."""
+BYTECODE = ("-m", "compileall", "-q", "-j", "2", "monstertruckd", "drivers", "planners", "schemas", "tests")
+"""Python's arguments that compile our own packages and the tests, once for the hundreds of processes that the tests
+start: where PYTHONDONTWRITEBYTECODE is set none of them would leave its work to the next."""
 EXTRAS = {"demo": ("sim",), "check": ("dev",), "sync": ("dev",)}
 
 

@@ -2,13 +2,15 @@
 
 import asyncio
 from collections.abc import AsyncIterator, Callable
+from functools import cache
 from pathlib import Path
 
 import pytest
 import uvloop
 
 UNIT = Path(__file__).parent / "unit"
-TRACED = (UNIT / "schemas", UNIT / "gate", UNIT / "runtime" / "wire")
+TRACED = (("schemas",), ("gate",), ("runtime", "wire"))
+"""Folders of unit tests."""
 WIRE_FORMATS = ("protocol", "parser", "codec")
 
 
@@ -23,9 +25,16 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark the tests of the parts whose coverage is a gate: they run under the tracer, which would slow all others."""
     for item in items:
-        wire_format = UNIT / "drivers" in item.path.parents and any(word in item.nodeid for word in WIRE_FORMATS)
-        if wire_format or any(folder in item.path.parents for folder in TRACED):
+        below = _parts(item.path)
+        wire_format = below[:1] == ("drivers",) and any(word in item.nodeid for word in WIRE_FORMATS)
+        if wire_format or any(below[: len(folder)] == folder for folder in TRACED):
             item.add_marker("traced")
+
+
+@cache
+def _parts(path: Path) -> tuple[str, ...]:
+    """Of a path below the unit tests; of others none."""
+    return path.relative_to(UNIT).parts if path.is_relative_to(UNIT) else ()
 
 
 def pytest_asyncio_loop_factories() -> dict[str, Callable[[], asyncio.AbstractEventLoop]]:

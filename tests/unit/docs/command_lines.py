@@ -4,6 +4,7 @@ import re
 import shlex
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -164,7 +165,8 @@ class Line:
         return shlex.split(self.text)[1:]
 
 
-def lines() -> list[Line]:
+@cache
+def lines() -> tuple[Line, ...]:
     """Every command line in a code block, each once."""
     found: dict[str, Line] = {}
     for page in PAGES:
@@ -172,7 +174,7 @@ def lines() -> list[Line]:
             if SHELL.fullmatch(text):
                 plain = re.sub(rf"^(?:sudo )?({PROGRAMS})", lambda m: Path(m[1]).name, text.partition("  #")[0].strip())
                 found.setdefault(plain, Line(f"{page.relative_to(ROOT)}:{number}", plain))
-    return list(found.values())
+    return tuple(found.values())
 
 
 def _code(text: str) -> Iterator[tuple[int, str]]:
@@ -195,9 +197,14 @@ def inline() -> list[tuple[str, str]]:
     ]
 
 
+def is_ours(line: Line) -> bool:
+    """Whether it begins with our own command."""
+    return line.text.startswith("monstertruckd ")
+
+
 def ours() -> list[Line]:
     """Lines that begin with our own command."""
-    return [line for line in lines() if line.text.startswith("monstertruckd ")]
+    return list(filter(is_ours, lines()))
 
 
 def needs_truck(line: Line) -> bool:
@@ -211,13 +218,18 @@ def starts_truck(line: Line) -> bool:
     return line.arguments[0] in {"run", "simulate"}
 
 
+@cache
+def _root() -> Any:
+    return typer.main.get_command(app)
+
+
 def resolve(words: list[str]) -> tuple[Any, list[str]]:
     """Command, and the words behind its name.
 
     Raises:
         LookupError: no such command.
     """
-    command: Any = typer.main.get_command(app)
+    command = _root()
     rest = list(words)
     while hasattr(command, "commands"):
         if not rest or rest[0] not in command.commands:
