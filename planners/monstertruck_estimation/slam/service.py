@@ -50,6 +50,8 @@ CORRECTIONS: Final = {"closed": "closure {}", "joined": "two submaps are joined"
 PLACELESS: Final = frozenset({LocalisationStatus.SEARCHING, LocalisationStatus.OUTSIDE})
 """The pose in map means nothing."""
 MATCHED: Final = frozenset({LocalisationStatus.MAPPING, LocalisationStatus.LOCALISED, LocalisationStatus.DEGENERATE})
+QUIET: Final = 30 * SECOND
+"""It is said once in this time that scans leave a direction open: along a corridor they do and do not in turn, ns."""
 
 
 class SlamService:
@@ -98,6 +100,7 @@ class SlamService:
         self._correction = SmoothedCorrection(config.slew, config.jump)
         self._newest: SlamEstimate | None = None
         self._status: LocalisationStatus | None = None
+        self._degenerate_said: int | None = None
         self._use = OdometryUse.NONE
         self._refused: str | None = None
         self._left_out = 0
@@ -368,15 +371,17 @@ class SlamService:
         if estimate.status is self._status:
             return
         before, self._status = self._status, estimate.status
-        if estimate.status is LocalisationStatus.DEGENERATE:
+        said, now = self._degenerate_said, self._clock.now()
+        if estimate.status is LocalisationStatus.DEGENERATE and (said is None or now - said >= QUIET):
+            self._degenerate_said = now
             text = f"along {estimate.direction:.2f} rad in map"
             self._events(Reason.MATCH_DEGENERATE, Severity.WARNING, self.name, text)
-        elif estimate.status is LocalisationStatus.OUTSIDE:
+        if estimate.status is LocalisationStatus.OUTSIDE:
             self._events(Reason.OUTSIDE_MAP, Severity.WARNING, self.name, "the search goes on")
         elif estimate.status not in MATCHED:
             text = "the place found was wrong: searching" if "refuted" in estimate.events else str(estimate.status)
             self._events(Reason.POSE_LOST, Severity.WARNING, self.name, text)
-        elif before is not None:
+        elif before is not None and before not in MATCHED:
             self._events(Reason.POSE_FOUND, Severity.INFO, self.name, str(estimate.status))
 
     def _skip(self, why: str) -> None:

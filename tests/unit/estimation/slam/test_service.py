@@ -2,7 +2,7 @@
 
 import asyncio
 from pathlib import Path
-from typing import Self
+from typing import ClassVar, Self
 
 import numpy as np
 import pytest
@@ -10,10 +10,11 @@ import pytest
 from monstertruck_estimation.slam import service as module
 from monstertruck_estimation.slam.config import SlamConfig
 from monstertruck_estimation.slam.service import SlamService
-from monstertruck_estimation.slam.worker_io import WorkerInput, WorkerOutput
+from monstertruck_estimation.slam.worker_io import SlamEstimate, WorkerInput, WorkerOutput
 from monstertruck_runtime.clock import VirtualClock, run_virtual
 from monstertruck_runtime.mailbox import Mailbox, fifo
 from monstertruck_schemas.body import Mount
+from monstertruck_schemas.health import LocalisationStatus
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import LaserScan
 
@@ -23,6 +24,8 @@ class FakeWorker:
 
     tasks: list[WorkerInput]
     at_once: int
+    statuses: ClassVar[list[LocalisationStatus]] = []
+    """Of the scans to come."""
 
     def __init__(self, name: str, target: str, clock: VirtualClock, **settings: float) -> None:
         FakeWorker.tasks, FakeWorker.at_once = [], 0
@@ -43,7 +46,13 @@ class FakeWorker:
         FakeWorker.at_once = max(FakeWorker.at_once, self._busy)
         await self._clock.sleep(0.05)
         self._busy -= 1
-        return WorkerOutput(saved=None if task.save is None else str(task.save))
+        saved = None if task.save is None else str(task.save)
+        if not self.statuses or task.scan is None:
+            return WorkerOutput(saved=saved)
+        counts = {"scans": 1, "keys": 1, "closures": 0, "rejected": 0}
+        status, pose = self.statuses.pop(0), (0.0, 0.0, 0.0)
+        made = SlamEstimate(task.scan.stamp, pose, (0.0,) * 9, None, status, 1.0, 0.0, 0.0, 0.0, "")
+        return WorkerOutput(made, saved=saved, counts=counts)
 
 
 class Nowhere:
@@ -96,6 +105,19 @@ def test_a_map_that_is_asked_for_is_saved_though_no_scan_comes(monkeypatch, tmp_
 
     assert told(story, monkeypatch, tmp_path) == [(Reason.MAP_SAVED, str(tmp_path))]
     assert [task.scan is None for task in FakeWorker.tasks[:2]] == [False, True]
+
+
+def test_along_a_corridor_it_does_not_say_with_every_scan_that_a_direction_is_open(monkeypatch, tmp_path: Path):
+    fits, open_, lost = LocalisationStatus.MAPPING, LocalisationStatus.DEGENERATE, LocalisationStatus.LOST
+    FakeWorker.statuses[:] = [fits, open_, fits, open_, fits, lost, open_, fits]
+
+    async def story(clock, scans, service):
+        while FakeWorker.statuses:
+            scans.put(scan(clock))
+            await clock.sleep(0.2)
+
+    said = [reason for reason, _ in told(story, monkeypatch, tmp_path)]
+    assert said == [Reason.MATCH_DEGENERATE, Reason.POSE_LOST, Reason.POSE_FOUND]
 
 
 def test_with_scans_it_is_saved_once_with_the_next_one(monkeypatch, tmp_path: Path):
