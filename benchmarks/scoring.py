@@ -62,6 +62,14 @@ def length(poses: Array) -> float:
     return float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum())
 
 
+def sharpest(points: Array) -> float:
+    """Greatest curvature of a line of points (n, >= 2), 1/m: its turn at a point over half the pieces beside it."""
+    step = np.diff(points[:, :2], axis=0)
+    step = step[np.hypot(*step.T) > 1e-6]
+    long, turn = np.hypot(*step.T), np.diff(np.unwrap(np.arctan2(step[:, 1], step[:, 0])))
+    return float((np.abs(turn) / (0.5 * (long[1:] + long[:-1]))).max()) if len(turn) else 0.0
+
+
 def distance(places: Array, points: Array) -> Array:
     """Distances (m,) of places (m, 2) from a polyline (n, 2), m."""
     begin, step = points[:-1], np.diff(points, axis=0)

@@ -48,16 +48,20 @@ def run(options: Options) -> Part:
 
 def one(planner, vehicle, arena: Arena, ground: RouteMap, start, goal) -> dict | None:  # noqa: ANN001
     begin = time.thread_time()
-    path = planner.plan(ground, vehicle.reference_pose(start), vehicle.reference_pose(goal)).path
+    result = planner.plan(ground, vehicle.reference_pose(start), vehicle.reference_pose(goal))
     used = time.thread_time() - begin
-    if path is None:
+    path, poses = result.path, result.poses
+    if path is not None:
+        length, cusps, bend = path.length, path.cusps, float(np.abs(path.segments[:, 1]).max())
+        poses = path.sample(0.05).poses
+    elif poses is not None:  # cell by cell, no motion
+        length, cusps, bend = scoring.length(poses), 0, scoring.sharpest(poses)
+    else:
         return None
-    poses = path.sample(0.05).poses
     base = poses.copy()
     base[:, :2] -= vehicle.reference * np.column_stack((np.cos(poses[:, 2]), np.sin(poses[:, 2])))
     return {
-        "length_m": path.length, "time_ms": 1e3 * used, "cusps": path.cusps, "poses": base,
-        "bend": float(np.abs(path.segments[:, 1]).max() * vehicle.radius),
+        "length_m": length, "time_ms": 1e3 * used, "cusps": cusps, "poses": base, "bend": bend * vehicle.radius,
         "clearance_m": scoring.clearance(arena.truth, BARE, base),
     }  # fmt: skip
 

@@ -53,6 +53,12 @@ def test_distance_from_a_line_and_clearance_of_a_footprint():
     assert room == pytest.approx(3.0 - 2.235, abs=0.06)
 
 
+def test_the_sharpest_turn_of_a_line_of_points():
+    angles = np.linspace(0.0, 3.0, 400)
+    assert scoring.sharpest(0.5 * np.column_stack((np.cos(angles), np.sin(angles)))) == pytest.approx(2.0, rel=1e-3)
+    assert scoring.sharpest(np.array([[0.0, 0.0], [0.05, 0.0], [0.05, 0.05]])) == pytest.approx(math.pi / 2 / 0.05)
+
+
 def test_a_period_without_an_instant_is_missed():
     assert scoring.missed([0.05, 0.1, 0.35, 0.9], 0.0, 1.0, 0.2) == pytest.approx(0.4)
     assert scoring.missed([], 2.0, 3.0, 0.2) == 1.0
