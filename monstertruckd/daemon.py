@@ -55,7 +55,7 @@ from monstertruckd.bus.zenoh_session import ZenohBridge
 from monstertruckd.config import calibration_rpc
 from monstertruckd.config.calibration import CalibrationStore
 from monstertruckd.config.expiry import CalibrationWatch, WayCounter
-from monstertruckd.config.live_rpc import LiveConfig
+from monstertruckd.config.live import LiveConfig
 from monstertruckd.config.load import Tree, resolved
 from monstertruckd.config.truck import TruckConfig
 from monstertruckd.gate import rpc as gate_rpc

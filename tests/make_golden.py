@@ -12,8 +12,7 @@ import numpy as np
 
 from monstertruck_runtime.yaml_files import read_yaml, yaml_text
 from monstertruckd import __version__
-from monstertruckd.config.load import load_tree
-from monstertruckd.config.migrate import VERSION
+from monstertruckd.config.load import VERSION, load_tree
 from monstertruckd.tools.demo.runs import run_fast_demo
 from monstertruckd.tools.logs.report.collect import collect
 from monstertruckd.tools.logs.summary import info

@@ -19,8 +19,7 @@ from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.plan import GoalPhase
 from monstertruck_schemas.req import GoalRequest, Role
 from monstertruck_sim.world.obstacles import Box
-from monstertruckd.config.load import load_config, load_tree
-from monstertruckd.config.migrate import VERSION
+from monstertruckd.config.load import VERSION, load_config, load_tree
 from monstertruckd.tools.demo.runs import run_fast_demo, write_overlay
 from monstertruckd.tools.logs.summary import info
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig

@@ -4,7 +4,8 @@ A reply, and the final message of a query that is dropped, waits for room toward
 takes nothing. Neither the event loop nor the threads in which queries arrive may stand still so long.
 
 Zenoh serves no station while it hangs up on one, and that takes 2 s more for each further thread that is still waiting
-for room there: with eight of them, 14 s. So one owner has one reply under way.
+for room there: with eight of them, 14 s. So one owner has one reply under way. Those whose key names nobody have one
+together: Zenoh does not say which session a query comes from, and what a client says of itself could be anything.
 """
 
 import logging

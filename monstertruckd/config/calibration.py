@@ -17,15 +17,18 @@ from pydantic import Field, ValidationError
 
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import ConfigError, NotFoundError
+from monstertruck_runtime.small_files import require_file
 from monstertruck_schemas.base import Schema
 from monstertruck_schemas.body import LensConfig, Mount, TurnDeficitConfig
-from monstertruckd.config.edit import check_size
 from monstertruckd.config.truck import TruckConfig
 
 C = TypeVar("C", bound=TruckConfig)
 
 CONFIDENCE: Final = 0.95
 """Of every interval: of a hundred trucks measured like this, so many have their true value inside."""
+
+MOST_BYTES: Final = 1_000_000
+"""Of one file."""
 
 Value = bool | int | float
 Grade = Literal["A", "B", "C"]
@@ -216,7 +219,7 @@ class CalibrationStore:
             ConfigError: it is damaged, too long, or of another truck; names the file and what to do.
         """
         try:
-            check_size(path)
+            require_file(path, MOST_BYTES)
             file = CalibrationFile.model_validate_json(path.read_bytes())
         except (OSError, ValidationError) as error:
             what = error.strerror if isinstance(error, OSError) else _first_mistake(error)

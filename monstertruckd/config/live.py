@@ -1,64 +1,33 @@
-"""Settings that may be changed while the robot runs: which there are, and the file that keeps them.
+"""Settings that may be changed while the robot runs, and the remote calls for them: ``settings`` and ``set``.
 
 A setting is live if its model marks it (``monstertruck_schemas.base.LIVE``). Whatever is changed, the whole
 configuration is validated as at the start, so that nothing passes the ceilings of the body.
 """
 
-import io
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
-from pathlib import Path
+import asyncio
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
 from typing import Any, Final, TypeVar
 
 from pydantic import ValidationError
-from pydantic.fields import FieldInfo
-from ruamel.yaml import YAML
-from ruamel.yaml.comments import CommentedMap
 
-from monstertruck_runtime.errors import ConfigError, InputError
-from monstertruck_runtime.small_files import replace_file
-from monstertruck_schemas.base import LIVE, Schema
-from monstertruckd.config.edit import YamlText
+from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.ports import EventSink
+from monstertruck_runtime.threads import Offload
+from monstertruck_schemas.base import LiveValue, live_settings
+from monstertruck_schemas.event import Severity
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.roles import AccessRole
+from monstertruckd.bus.rpc import Rpc
+from monstertruckd.config.load import SavedSettings, put_settings
 from monstertruckd.config.truck import TruckConfig
 
 T = TypeVar("T", bound=TruckConfig)
 
-Value = float | int | bool | str
-
-HEAD: Final = (
-    "Settings changed while the robot ran (monstertruckd set --save); they replace those of the configuration."
-)
-
-
-@dataclass(frozen=True, slots=True)
-class LiveSetting:
-    """One setting that may be changed while the robot runs."""
-
-    key: str
-    """Dotted."""
-    value: Value
-    meaning: str
-    above: float | None = None
-    """Bound of the value alone, exclusive; the whole configuration may allow less."""
-    at_least: float | None = None
-    below: float | None = None
-    at_most: float | None = None
-
-
-def live_settings(config: Schema, prefix: str = "") -> Iterator[LiveSetting]:
-    """All live settings of a configuration, in its order."""
-    for name, field in type(config).model_fields.items():
-        value = getattr(config, name)
-        if isinstance(value, Schema):
-            yield from live_settings(value, f"{prefix}{name}.")
-        elif LIVE in field.metadata:
-            meaning = " ".join((field.description or "").replace("``", "").split())
-            yield LiveSetting(f"{prefix}{name}", value, meaning, *_bounds(field))
-
-
-def _bounds(field: FieldInfo) -> tuple[float | None, ...]:
-    names = ("gt", "ge", "lt", "le")
-    return tuple(next((getattr(m, name) for m in field.metadata if hasattr(m, name)), None) for name in names)
+LIST: Final = "settings"
+SET: Final = "set"
+MOST: Final = 32
+"""Settings changed by one call."""
 
 
 def with_settings(config: T, values: Mapping[str, Any]) -> T:
@@ -72,7 +41,7 @@ def with_settings(config: T, values: Mapping[str, Any]) -> T:
     for key in values:
         if key not in known:
             raise InputError(f"{key}: cannot be changed while the robot runs; there are {', '.join(sorted(known))}")
-    _put(data, values)
+    put_settings(data, values)
     try:
         return type(config).model_validate(data)
     except ValidationError as error:
@@ -82,87 +51,75 @@ def with_settings(config: T, values: Mapping[str, Any]) -> T:
         raise InputError(f"{where}: {text}" if where else text) from error
 
 
-def _put(data: dict[str, Any], values: Mapping[str, Any]) -> None:
-    """Put live settings, by dotted key, into a configuration's plain data, which is not validated."""
-    for key, value in values.items():
-        section = data
-        *way, last = key.split(".")
-        for part in way:
-            section = section[part]
-        section[last] = value
-
-
-class SavedSettings:
-    """The file of live settings that outlast the run; its methods may block for a file system's time.
+class LiveConfig:
+    """The running configuration, of which live settings may be replaced.
 
     Args:
-        folder: the robot's ``state_directory``; the file in it is made when the first setting is saved.
-        robot: its name.
+        config: as the daemon began with.
+        apply: gives every part its settings, between two ticks of the gate.
+        events: gets an event for every change, with who made it.
+        offload: where configurations are validated and files written.
     """
 
-    def __init__(self, folder: Path, robot: str) -> None:
-        self.path = folder / f"settings-{robot}.yaml"
+    def __init__(
+        self, config: TruckConfig, apply: Callable[[TruckConfig], None], events: EventSink, offload: Offload
+    ) -> None:
+        self.config = config
+        self._began = {setting.key: setting.value for setting in live_settings(config)}
+        self._apply = apply
+        self._events = events
+        self._offload = offload
+        self._saved = SavedSettings(config.state_directory, config.robot)
+        self._start = config
+        self._kept: dict[str, LiveValue] = {}
+        """Saved in this run."""
+        self._turn = asyncio.Lock()
 
-    def values(self) -> dict[str, tuple[Value, int]]:
-        """Saved values by dotted key, each with its line; empty without a file.
+    def register(self, rpc: Rpc) -> None:
+        """Serve ``settings`` and ``set``."""
+        rpc.register(LIST, self._list, AccessRole.OBSERVER)
+        rpc.register(SET, self._set, AccessRole.ENGINEER)
 
-        Raises:
-            ConfigError: the file is damaged; names the line.
-        """
-        if not self.path.exists():
-            return {}
-        text = YamlText.read(self.path)
-        content = _load(text.text) or {}
-        found = {}
-        for key, value in _leaves(content, ()):
-            node = text.node(*key)
-            found[".".join(key)] = value, 1 if node is None else node.start_mark.line + 1
-        return found
+    async def _list(self, _: dict[str, Any]) -> dict[str, Any]:
+        rows = [asdict(setting) | {"began": self._began[setting.key]} for setting in live_settings(self.config)]
+        return {"settings": rows, "file": str(self._saved.path)}
 
-    def put(self, values: Mapping[str, tuple[Value, int]], config: TruckConfig, data: dict[str, Any]) -> None:
-        """Put saved values into a configuration's plain data, which is not validated.
-
-        Raises:
-            ConfigError: one is no live setting of the configuration; names the line.
-        """
-        known = {setting.key for setting in live_settings(config)}
-        for key, (_, line) in values.items():
-            if key not in known:
-                raise ConfigError(f"{self.path}:{line}: {key}: is no setting that can be changed while running")
-        _put(data, {key: value for key, (value, _) in values.items()})
-
-    def save(self, values: Mapping[str, Value]) -> None:
-        """Add settings, or replace them; whatever else is in the file stays, comments too.
-
-        Raises:
-            ConfigError: the file is damaged, or cannot be written; nothing has changed then.
-        """
-        content = _load(YamlText.read(self.path).text) if self.path.exists() else None
-        if content is None:
-            content = CommentedMap()
-            content.yaml_set_start_comment(HEAD)
+    async def _set(self, payload: dict[str, Any]) -> dict[str, Any]:
+        values, save, by = _values(payload.get("values")), payload.get("save", False), str(payload.get("source", ""))
+        if not isinstance(save, bool):
+            raise InputError(f"save: expected true or false, got {save!r}")
+        async with self._turn:
+            changed = await self._offload(lambda: with_settings(self.config, values))
+            if save:
+                await self._offload(lambda: self._keep(values))
+            before = {setting.key: setting.value for setting in live_settings(self.config)}
+            weaker = [text for text in changed.weakened() if text not in self.config.weakened()]
+            self.config = changed
+            self._apply(changed)
         for key, value in values.items():
-            *way, last = key.split(".")
-            section = content
-            for part in way:
-                section = section.setdefault(part, CommentedMap())
-            section[last] = value
-        out = io.StringIO()
-        YAML(typ="rt", pure=True).dump(content, out)
-        try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            replace_file(self.path, out.getvalue())
-        except OSError as error:
-            raise ConfigError(f"{self.path}: settings cannot be saved: {error.strerror}") from error
+            text = f"{key}: {before[key]} to {value} by {by}{', saved' if save else ''}"
+            self._events(
+                Reason.SETTING_CHANGED, Severity.INFO, "settings", text, key=key, value=value, by=by, saved=save
+            )
+        return {"values": values, "file": str(self._saved.path) if save else None, "weakened": weaker}
+
+    def _keep(self, values: dict[str, LiveValue]) -> None:
+        """Save settings, unless the next start would refuse them without those that are not saved."""
+        kept = self._kept | values
+        with_settings(self._start, kept)
+        self._saved.save(values)
+        self._kept = kept
 
 
-def _load(text: str) -> Any:
-    return YAML(typ="rt", pure=True).load(text)
+def _values(given: Any) -> dict[str, LiveValue]:
+    """Settings from outside.
 
-
-def _leaves(value: Any, key: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], Value]]:
-    if isinstance(value, dict):
-        for name, inner in value.items():
-            yield from _leaves(inner, (*key, str(name)))
-    else:
-        yield key, value
+    Raises:
+        InputError: there are none, or too many; what the values may be is said by their models.
+    """
+    if not isinstance(given, dict) or not 0 < len(given) <= MOST:
+        raise InputError(f"values: expected 1 to {MOST} settings by their dotted names")
+    for key, value in given.items():
+        if not isinstance(value, float | int | bool | str):
+            raise InputError(f"{key}: expected a plain value, got {type(value).__name__}")
+    return given

@@ -1,30 +1,33 @@
-"""Loads a robot's configuration: YAML merged along ``include:``, validated, with the robot's calibration on top.
+"""Loads a robot's configuration: YAML merged along ``include:``, validated, with saved settings and calibration on top.
 
 Every value remembers its file and line; every complaint is one line with file, line, key and what was expected.
 YAML is read as version 1.2: ``true`` and ``false`` are the only booleans, ``1e-3`` is a number, ``0o17`` is octal.
 """
 
 import difflib
+import io
 import json
 import os
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Final, Self, TypeVar
 
 from pydantic import BaseModel, TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
-from ruamel.yaml.error import YAMLError
-from ruamel.yaml.nodes import Node, ScalarNode, SequenceNode
+from ruamel.yaml import YAML
+from ruamel.yaml.comments import CommentedMap
+from ruamel.yaml.composer import Composer, ComposerError, MaxDepthExceededError
+from ruamel.yaml.error import MarkedYAMLError, YAMLError
+from ruamel.yaml.nodes import CollectionNode, MappingNode, Node, ScalarNode, SequenceNode
+from ruamel.yaml.reader import ReaderError
 
 from monstertruck_runtime.endpoints import emulated_ports
 from monstertruck_runtime.errors import ConfigError
 from monstertruck_runtime.plugins import kind_of, models_in
-from monstertruck_schemas.base import Schema
+from monstertruck_runtime.small_files import replace_file, require_file
+from monstertruck_schemas.base import LiveValue, Schema, live_settings
 from monstertruckd.config.calibration import CalibrationStore, Result, WizardName, put_values
-from monstertruckd.config.edit import YamlText, node_kind, reader
-from monstertruckd.config.live import SavedSettings
-from monstertruckd.config.migrate import OLDEST, VERSION, bring_up_to_date
 from monstertruckd.config.truck import ROBOT, TruckConfig
 
 Key = tuple[str | int, ...]
@@ -33,6 +36,16 @@ T = TypeVar("T", bound=TruckConfig)
 
 PLACEHOLDER = "{robot}"
 """In texts, for the robot's name."""
+HEAD: Final = (
+    "Settings changed while the robot ran (monstertruckd set --save); they replace those of the configuration."
+)
+MOST_BYTES: Final = 1_000_000
+"""Of one file."""
+DEEPEST: Final = 50
+"""Sections and lists within each other."""
+MOST_NODES: Final = 5_000
+"""Keys and values of one file as they are written: read in a quarter of a second; a full configuration has some
+hundreds."""
 MOST_VALUES = 20_000
 """Of one file; a full configuration has a few hundred."""
 MOST_MISTAKES = 50
@@ -98,6 +111,9 @@ def resolved(config: Schema) -> dict[str, Any]:
     return dumped
 
 
+# Saved settings and calibration
+
+
 def calibrated(config: T, tree: Tree) -> tuple[T, Tree]:
     """The configuration with the settings that were saved while the robot ran and the newest calibration, and the tree.
 
@@ -142,7 +158,93 @@ def _calibrated_origins(results: Mapping[WizardName, Result], lines: Mapping[Key
     }
 
 
-# YAML
+class SavedSettings:
+    """The file of live settings that outlast the run; its methods may block for a file system's time.
+
+    Args:
+        folder: the robot's ``state_directory``; the file in it is made when the first setting is saved.
+        robot: its name.
+    """
+
+    def __init__(self, folder: Path, robot: str) -> None:
+        self.path = folder / f"settings-{robot}.yaml"
+
+    def values(self) -> dict[str, tuple[LiveValue, int]]:
+        """Saved values by dotted key, each with its line; empty without a file.
+
+        Raises:
+            ConfigError: the file is damaged; names the line.
+        """
+        if not self.path.exists():
+            return {}
+        text = YamlText.read(self.path)
+        content = _with_comments(text.text) or {}
+        found = {}
+        for key, value in _leaves(content, ()):
+            node = text.node(*key)
+            found[".".join(key)] = value, 1 if node is None else node.start_mark.line + 1
+        return found
+
+    def put(self, values: Mapping[str, tuple[LiveValue, int]], config: TruckConfig, data: dict[str, Any]) -> None:
+        """Put saved values into a configuration's plain data, which is not validated.
+
+        Raises:
+            ConfigError: one is no live setting of the configuration; names the line.
+        """
+        known = {setting.key for setting in live_settings(config)}
+        for key, (_, line) in values.items():
+            if key not in known:
+                raise ConfigError(f"{self.path}:{line}: {key}: is no setting that can be changed while running")
+        put_settings(data, {key: value for key, (value, _) in values.items()})
+
+    def save(self, values: Mapping[str, LiveValue]) -> None:
+        """Add settings, or replace them; whatever else is in the file stays, comments too.
+
+        Raises:
+            ConfigError: the file is damaged, or cannot be written; nothing has changed then.
+        """
+        content = _with_comments(YamlText.read(self.path).text) if self.path.exists() else None
+        if content is None:
+            content = CommentedMap()
+            content.yaml_set_start_comment(HEAD)
+        for key, value in values.items():
+            *way, last = key.split(".")
+            section = content
+            for part in way:
+                section = section.setdefault(part, CommentedMap())
+            section[last] = value
+        out = io.StringIO()
+        YAML(typ="rt", pure=True).dump(content, out)
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            replace_file(self.path, out.getvalue())
+        except OSError as error:
+            raise ConfigError(f"{self.path}: settings cannot be saved: {error.strerror}") from error
+
+
+def _with_comments(text: str) -> Any:
+    return YAML(typ="rt", pure=True).load(text)
+
+
+def _leaves(value: Any, key: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], LiveValue]]:
+    if isinstance(value, dict):
+        for name, inner in value.items():
+            yield from _leaves(inner, (*key, str(name)))
+    else:
+        yield key, value
+
+
+def put_settings(data: dict[str, Any], values: Mapping[str, Any]) -> None:
+    """Put live settings, by dotted key, into a configuration's plain data, which is not validated."""
+    for key, value in values.items():
+        section = data
+        *way, last = key.split(".")
+        for part in way:
+            section = section[part]
+        section[last] = value
+
+
+# Files that include others
 
 
 def load_tree(path: Path) -> Tree:
@@ -281,6 +383,222 @@ def _build_mapping(node: Node, builder: _Builder, key: Key) -> dict[str, Any]:
         builder.origins[*key, name] = where
         result[name] = _build(value_node, builder, (*key, name))
     return result
+
+
+# YAML text
+
+
+class _BoundedComposer(Composer):
+    """Builds the nodes of one document, until there are too many."""
+
+    count = 0
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        """One node with all below it."""
+        self.count += 1
+        if self.count > MOST_NODES:
+            place = self.parser.peek_event().start_mark
+            raise ComposerError(None, None, f"more than {MOST_NODES} keys and values", place)
+        return super().compose_node(parent, index)
+
+
+def reader() -> YAML:
+    """Reads one document of plain data."""
+    yaml = YAML(typ="safe", pure=True)
+    yaml.max_depth = DEEPEST
+    yaml.Composer = _BoundedComposer
+    return yaml
+
+
+def node_kind(node: Node) -> str:
+    """What stands there, for complaints."""
+    kinds = ((MappingNode, "a mapping"), (SequenceNode, "a list"))
+    return next((name for kind, name in kinds if isinstance(node, kind)), "a plain value")
+
+
+def _compose(text: str, path: Path) -> MappingNode | None:
+    _check_directives(text, path)
+    try:
+        node = reader().compose(text)
+    except ReaderError as error:
+        line = text.count("\n", 0, error.position) + 1
+        raise ConfigError(
+            f"{path}:{line}: not valid YAML: character {chr(error.character)!r} is not allowed"
+        ) from error
+    except MarkedYAMLError as error:
+        line = error.problem_mark.line + 1 if error.problem_mark else 1
+        too_deep = isinstance(error, MaxDepthExceededError)
+        problem = f"nested more than {DEEPEST} times" if too_deep else f"not valid YAML: {error.problem}"
+        raise ConfigError(f"{path}:{line}: {problem}") from error
+    except YAMLError as error:
+        raise ConfigError(f"{path}:1: not valid YAML: {error}") from error
+    if node is not None and not isinstance(node, MappingNode):
+        raise ConfigError(f"{path}:1: expected a mapping of sections, found {node_kind(node)}")
+    return node
+
+
+def _check_directives(text: str, path: Path) -> None:
+    for number, line in enumerate(text.removeprefix("\ufeff").splitlines(), 1):
+        words = line.split()
+        if words and not line.startswith(("%", "#")):
+            return
+        if words[:1] == ["%YAML"] and words[1:2] != ["1.2"]:
+            raise ConfigError(f"{path}:{number}: {line.strip()}: expected YAML 1.2; leave this line out")
+
+
+class YamlText:
+    """A YAML mapping, or nothing, as text.
+
+    Args:
+        text: content.
+        path: its file, for complaints.
+
+    Raises:
+        ConfigError: it is not YAML 1.2, is nested too deeply, or is something else than a mapping.
+    """
+
+    def __init__(self, text: str, path: Path) -> None:
+        self.path = path
+        self._set(text)
+
+    @classmethod
+    def read(cls, path: Path) -> Self:
+        """Content of a file.
+
+        Raises:
+            ConfigError: it cannot be read, is longer than ``MOST_BYTES``, or is refused as above.
+        """
+        try:
+            require_file(path, MOST_BYTES)
+            return cls(path.read_text(encoding="utf-8"), path)
+        except (OSError, UnicodeDecodeError) as error:
+            reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
+            raise ConfigError(f"{path}: cannot be read: {reason}") from error
+
+    def _set(self, text: str) -> None:
+        self.text = text
+        self.root = _compose(text, self.path)
+
+    def node(self, *key: str) -> Node | None:
+        """What stands at ``key``; None if nothing does."""
+        pair = self._pair(key)
+        return None if pair is None else pair[1]
+
+    def value(self, *key: str) -> str | None:
+        """The plain value at ``key`` as it is written, without quotes; None for anything else."""
+        node = self.node(*key)
+        return node.value if isinstance(node, ScalarNode) else None
+
+    def names(self, *key: str) -> list[str]:
+        """Keys of the mapping at ``key``; none if there is no mapping."""
+        node = self.node(*key) if key else self.root
+        return [name.value for name, _ in node.value] if isinstance(node, MappingNode) else []
+
+    def replace(self, key: tuple[str, ...], text: str) -> bool:
+        """Write ``text`` where the value at ``key`` stands; False if there is none."""
+        node = self.node(*key)
+        if node is None:
+            return False
+        self._set(self.text[: node.start_mark.index] + text + self.text[_end(node) :])
+        return True
+
+    def rename(self, key: tuple[str, ...], name: str) -> bool:
+        """Call the last part of ``key`` by another name; False if it is not there."""
+        pair = self._pair(key)
+        if pair is None:
+            return False
+        start, end = pair[0].start_mark.index, pair[0].end_mark.index
+        quoted = json.dumps(name) if self.text[start] in "\"'" else name
+        self._set(self.text[:start] + quoted + self.text[end:])
+        return True
+
+    def _pair(self, key: tuple[str, ...]) -> tuple[Node, Node] | None:
+        node = self.root
+        pair = None
+        for part in key:
+            if not isinstance(node, MappingNode):
+                return None
+            pair = next(((name, value) for name, value in node.value if name.value == part), None)
+            if pair is None:
+                return None
+            node = pair[1]
+        return pair
+
+
+def _end(node: Node) -> int:
+    """Index behind the node's last character; a block's own mark lies behind the blanks and comments after it."""
+    if isinstance(node, CollectionNode) and not node.flow_style and node.value:
+        last = node.value[-1]
+        return _end(last[1] if isinstance(last, tuple) else last)
+    end: int = node.end_mark.index
+    return end
+
+
+# Keys of older versions
+
+
+Step = Callable[[YamlText], None]
+"""Edits one file from its version to the next; must do nothing to what is already so."""
+
+RENAMED: Final = (
+    (("gate", "obstacle", "beside"), "side_clearance"),
+    (("odometry", "compass", "patience"), "steady_time"),
+    (("placement", "deformer"), "local_planner"),
+    (("planner", "deform"), "local_planner"),
+    (("planner", "ladder"), "recovery"),
+    (("planner", "local", "beside"), "rejoin_distance"),
+    (("planner", "local", "patience"), "blocked_timeout"),
+    (("planner", "local", "rejoin"), "rejoin_clearance"),
+    (("planner", "route", "greed"), "heuristic_weight"),
+    (("planner", "sightings"), "blocked_scans"),
+    (("slam", "mapper", "thinning"), "pruning"),
+    (("tracker", "turn_within"), "steering_distance"),
+    (("usb", "patience"), "empty_timeout"),
+)
+"""Keys of version 1, as of release 0.1.0, and what version 2 calls their last part."""
+
+
+def _rename_keys(text: YamlText) -> None:
+    for key, name in RENAMED:
+        text.rename(key, name)
+
+
+VERSION: Final = 2
+"""Of the configuration files that this program writes."""
+STEPS: Final[dict[int, Step]] = {1: _rename_keys}
+"""By the version they start from."""
+OLDEST: Final = min(STEPS)
+
+
+def run_steps(text: YamlText, version: int, steps: Mapping[int, Step], target: int) -> None:
+    """Bring a text from ``version`` to ``target``.
+
+    Raises:
+        ConfigError: there is no step from a version between them.
+    """
+    for number in range(version, target):
+        if number not in steps:
+            raise ConfigError(f"{text.path}: no way from version {number} to {number + 1}")
+        steps[number](text)
+        text.replace(("version",), str(number + 1))
+
+
+def bring_up_to_date(text: YamlText, inherited: int | None) -> int | None:
+    """Give the keys of a file of an older version their present names, in memory only.
+
+    Args:
+        text: content of the file.
+        inherited: version of the file that includes it.
+
+    Returns:
+        The version it had; None if that is missing or not known, and nothing was done.
+    """
+    said = text.value("version")
+    version = inherited if text.node("version") is None else int(said) if said and said.isdecimal() else None
+    if version is None or not OLDEST <= version <= VERSION:
+        return None
+    run_steps(text, version, STEPS, VERSION)
+    return version
 
 
 # Validation

@@ -5,48 +5,15 @@ one as ``NAME.vN``. A file that includes others is written last: an upgrade that
 because a step does nothing to a key that is already as it should be.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
 
 from ruamel.yaml.nodes import Node, ScalarNode, SequenceNode
 
 from monstertruck_runtime.errors import ConfigError, InputError
 from monstertruck_runtime.small_files import replace_file
-from monstertruckd.config.edit import YamlText
-
-Step = Callable[[YamlText], None]
-"""Edits one file from its version to the next; must do nothing to what is already so."""
-
-RENAMED: Final = (
-    (("gate", "obstacle", "beside"), "side_clearance"),
-    (("odometry", "compass", "patience"), "steady_time"),
-    (("placement", "deformer"), "local_planner"),
-    (("planner", "deform"), "local_planner"),
-    (("planner", "ladder"), "recovery"),
-    (("planner", "local", "beside"), "rejoin_distance"),
-    (("planner", "local", "patience"), "blocked_timeout"),
-    (("planner", "local", "rejoin"), "rejoin_clearance"),
-    (("planner", "route", "greed"), "heuristic_weight"),
-    (("planner", "sightings"), "blocked_scans"),
-    (("slam", "mapper", "thinning"), "pruning"),
-    (("tracker", "turn_within"), "steering_distance"),
-    (("usb", "patience"), "empty_timeout"),
-)
-"""Keys of version 1, as of release 0.1.0, and what version 2 calls their last part."""
-
-
-def _rename_keys(text: YamlText) -> None:
-    for key, name in RENAMED:
-        text.rename(key, name)
-
-
-VERSION: Final = 2
-"""Of the configuration files that this program writes."""
-STEPS: Final[dict[int, Step]] = {1: _rename_keys}
-"""By the version they start from."""
-OLDEST: Final = min(STEPS)
+from monstertruckd.config.load import STEPS, VERSION, Step, YamlText, run_steps
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,34 +65,8 @@ def _visit(
     before, version = text.text, _version(text, inherited, target)
     for name in _includes(text):
         _visit(path.parent / name, version, steps, target, upgrades, (*including, place))
-    _upgrade(text, version, steps, target)
+    run_steps(text, version, steps, target)
     upgrades[place] = Upgrade(path, version, before, text.text)
-
-
-def _upgrade(text: YamlText, version: int, steps: Mapping[int, Step], target: int) -> None:
-    for number in range(version, target):
-        if number not in steps:
-            raise ConfigError(f"{text.path}: no way from version {number} to {number + 1}")
-        steps[number](text)
-        text.replace(("version",), str(number + 1))
-
-
-def bring_up_to_date(text: YamlText, inherited: int | None) -> int | None:
-    """Give the keys of a file of an older version their present names, in memory only.
-
-    Args:
-        text: content of the file.
-        inherited: version of the file that includes it.
-
-    Returns:
-        The version it had; None if that is missing or not known, and nothing was done.
-    """
-    said = text.value("version")
-    version = inherited if text.node("version") is None else int(said) if said and said.isdecimal() else None
-    if version is None or not OLDEST <= version <= VERSION:
-        return None
-    _upgrade(text, version, STEPS, VERSION)
-    return version
 
 
 def _version(text: YamlText, inherited: int | None, target: int) -> int:

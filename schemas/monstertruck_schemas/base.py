@@ -4,12 +4,14 @@ Units are SI and radians everywhere; frames follow REP 103 (x forward, y left, z
 (map > odom > base > sensors). A value that is absent is ``None``, never NaN.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Annotated, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, PlainSerializer, PlainValidator, ValidationInfo, WithJsonSchema
+from pydantic.fields import FieldInfo
 
 
 class Live:
@@ -17,6 +19,7 @@ class Live:
 
 
 LIVE: Final = Live()
+LiveValue = float | int | bool | str
 
 
 class Schema(BaseModel):
@@ -39,6 +42,37 @@ class Schema(BaseModel):
         return all(_equal(a, b) for a, b in zip(self.__dict__.values(), other.__dict__.values(), strict=True))
 
     __hash__ = None  # type: ignore[assignment]  # messages carry arrays
+
+
+@dataclass(frozen=True, slots=True)
+class LiveSetting:
+    """One setting that may be changed while the robot runs."""
+
+    key: str
+    """Dotted."""
+    value: LiveValue
+    meaning: str
+    above: float | None = None
+    """Bound of the value alone, exclusive; the whole configuration may allow less."""
+    at_least: float | None = None
+    below: float | None = None
+    at_most: float | None = None
+
+
+def live_settings(config: Schema, prefix: str = "") -> Iterator[LiveSetting]:
+    """All live settings of a configuration, in its order."""
+    for name, field in type(config).model_fields.items():
+        value = getattr(config, name)
+        if isinstance(value, Schema):
+            yield from live_settings(value, f"{prefix}{name}.")
+        elif LIVE in field.metadata:
+            meaning = " ".join((field.description or "").replace("``", "").split())
+            yield LiveSetting(f"{prefix}{name}", value, meaning, *_bounds(field))
+
+
+def _bounds(field: FieldInfo) -> tuple[float | None, ...]:
+    names = ("gt", "ge", "lt", "le")
+    return tuple(next((getattr(m, name) for m in field.metadata if hasattr(m, name)), None) for name in names)
 
 
 def _equal(a: object, b: object) -> bool:

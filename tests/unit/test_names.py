@@ -16,7 +16,8 @@ PRIVATE = re.compile(
     re.IGNORECASE,
 )
 """reported, request, search, path check, recovery behaviour, fault, host context, pruning, without waiting"""
-OLD_KEYS = ROOT / "monstertruckd" / "config" / "migrate.py"
+OLD_KEY = re.compile(r'^    \(\("\w+", .*"\),$')
+"""A row of the table of keys that were renamed."""
 
 
 def test_every_class_has_a_name_of_its_own():
@@ -33,8 +34,7 @@ def test_sources_and_pages_use_the_words_of_the_field():
     found = [
         f"{path.relative_to(ROOT)}:{number}: {line}"
         for path in (*SOURCES, *PAGES)
-        if path != OLD_KEYS
         for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1)
-        if PRIVATE.search(line)
+        if PRIVATE.search(line) and not OLD_KEY.match(line)
     ]
     assert found == []

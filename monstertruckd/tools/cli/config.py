@@ -88,7 +88,8 @@ def migrate(
 
     Comments stay, and so does the previous file, next to the new one as NAME.vN.
     """
-    from monstertruckd.config.migrate import VERSION, carry_out, plan
+    from monstertruckd.config.load import VERSION
+    from monstertruckd.config.migrate import carry_out, plan
 
     upgrades = plan(config)
     if not dry_run:

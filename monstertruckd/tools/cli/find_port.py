@@ -10,7 +10,7 @@ from monstertruck_drivers.usb.config import UsbPortConfig
 from monstertruck_drivers.usb.tree import TreeSnapshot, UsbDevice, parent_of, place, port_of, read_device, read_tree
 from monstertruck_runtime.errors import ConfigError, InputError, NoAnswerError
 from monstertruck_runtime.small_files import replace_file
-from monstertruckd.config.edit import YamlText
+from monstertruckd.config.load import YamlText
 
 POLL: Final = 0.2
 SETTLE: Final = 0.4

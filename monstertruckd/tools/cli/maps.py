@@ -193,8 +193,7 @@ def load_command(
     from monstertruck_runtime.errors import InputError
     from monstertruck_runtime.small_files import replace_file
     from monstertruck_runtime.yaml_files import read_yaml, yaml_text
-    from monstertruckd.config.load import load_truck
-    from monstertruckd.config.migrate import VERSION
+    from monstertruckd.config.load import VERSION, load_truck
 
     load(place)
     load_truck(config)

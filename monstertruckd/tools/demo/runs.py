@@ -22,8 +22,7 @@ from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import SECOND, Clock, VirtualClock, WallClock, run_virtual
 from monstertruck_runtime.errors import NoAnswerError, NotFoundError
 from monstertruck_runtime.yaml_files import yaml_text
-from monstertruckd.config.load import load_config, load_tree
-from monstertruckd.config.migrate import VERSION
+from monstertruckd.config.load import VERSION, load_config, load_tree
 from monstertruckd.tools.demo.summary import Summary, log_figures
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 from monstertruckd.tools.simulation.operator import Lap, LocalOperator, drive_lap

@@ -14,8 +14,7 @@ from monstertruck_runtime.errors import ConfigError, InputError, TruckError
 from monstertruck_schemas.event import Event
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.topics import EVENT
-from monstertruckd.config.edit import YamlText
-from monstertruckd.config.migrate import bring_up_to_date
+from monstertruckd.config.load import YamlText, bring_up_to_date
 from monstertruckd.config.truck import TruckConfig
 from monstertruckd.recorder.log_file import NAME, RUN_LOG
 from monstertruckd.recorder.reader import CONFIG, LogMessage, LogReader, attached_config, open_log

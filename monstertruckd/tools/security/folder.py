@@ -24,7 +24,7 @@ from monstertruck_schemas.base import Schema
 from monstertruck_schemas.req import Role
 from monstertruck_schemas.roles import AccessRole
 from monstertruckd.bus.zenoh_config import OwnerName, TlsConfig, ZenohConfig
-from monstertruckd.config.migrate import VERSION
+from monstertruckd.config.load import VERSION
 from monstertruckd.tools.security.certificates import (
     DAY,
     Certificate,

@@ -7,15 +7,15 @@ import pytest
 from monstertruck_runtime.clock import run_virtual
 from monstertruck_runtime.errors import ConfigError, InputError
 from monstertruck_runtime.threads import inline
+from monstertruck_schemas.base import live_settings
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.roles import AccessRole
 from monstertruckd.bus.access import EVERYTHING, Grant, Sender
 from monstertruckd.bus.rpc import Rpc
 from monstertruckd.config.calibration import CalibrationStore, Estimate, Result
-from monstertruckd.config.live import SavedSettings, live_settings, with_settings
-from monstertruckd.config.live_rpc import LiveConfig
-from monstertruckd.config.load import load_truck
+from monstertruckd.config.live import LiveConfig, with_settings
+from monstertruckd.config.load import SavedSettings, load_truck
 from monstertruckd.config.truck import TruckConfig
 from monstertruckd.tools.cli import settings
 from tests.unit.gate.rig import Rig

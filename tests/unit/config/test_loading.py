@@ -115,7 +115,6 @@ BOMB = "version: 2\nname: t\na0: &a0 [1, 1]\n" + "".join(
         ("version: 2\nname: a\0b\n", 2, r"not valid YAML: character '\x00' is not allowed"),
         ("version: 2\nname:\n  " + "[" * 5000, 3, "nested more than 50 times"),
         ("version: 2\nname:\n" + "".join(f"{' ' * n}a:\n" for n in range(1, 900)), 51, "nested more than 50 times"),
-        ("name: " + "x" * 50_000_000, 1, "50000006 bytes: expected at most 1000000"),
         (
             "version: 2\n" + "".join(f"k{n}: &a{n} {n}\n" for n in range(19_000)),
             2500,
@@ -123,7 +122,7 @@ BOMB = "version: 2\nname: t\na0: &a0 [1, 1]\n" + "".join(
         ),
         ("version: 2\nname: [" + "1," * 200_000 + "1]", 2, "more than 5000 keys and values"),
     ],
-    ids=["cycle", "deep cycle", "bomb", "YAML 1.1", "NUL", "flow", "block", "size", "keys", "list"],
+    ids=["cycle", "deep cycle", "bomb", "YAML 1.1", "NUL", "flow", "block", "keys", "list"],
 )
 def test_hostile_text_is_one_clear_line_and_soon(tmp_path: Path, text: str, line: int, expected: str):
     file = write(tmp_path, text)
@@ -136,10 +135,15 @@ def test_hostile_text_is_one_clear_line_and_soon(tmp_path: Path, text: str, line
     assert "\n" not in str(caught.value)
 
 
-def test_a_pipe_is_no_file(tmp_path: Path):
+def test_what_would_be_read_for_ever_is_refused(tmp_path: Path):
     os.mkfifo(tmp_path / "pipe.yaml")
-    for name in (tmp_path / "pipe.yaml", Path("/dev/zero")):
-        with pytest.raises(ConfigError, match="not a file of text"):
+    long = write(tmp_path, "name: " + "x" * 5_000_000)
+    for name, why in (
+        (tmp_path / "pipe.yaml", "Not a regular file"),
+        (Path("/dev/zero"), "Not a regular file"),
+        (long, "5000006 bytes, expected at most 1000000"),
+    ):
+        with pytest.raises(ConfigError, match=f"{name}: cannot be read: {why}"):
             load_config(name, Root)
 
 

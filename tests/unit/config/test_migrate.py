@@ -8,9 +8,8 @@ import pytest
 
 from monstertruck_estimation.fusion.config import FusionConfig
 from monstertruck_runtime.errors import ConfigError, InputError
-from monstertruckd.config.edit import YamlText
-from monstertruckd.config.load import load_config, load_tree, load_truck
-from monstertruckd.config.migrate import Step, carry_out, plan
+from monstertruckd.config.load import Step, YamlText, load_config, load_tree, load_truck
+from monstertruckd.config.migrate import carry_out, plan
 from monstertruckd.config.truck import TruckConfig
 from monstertruckd.tools.replay_check.recorded import recorded_config
 from tests.unit.config.test_loading import Root

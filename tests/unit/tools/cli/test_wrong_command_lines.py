@@ -29,7 +29,7 @@ WRONG = (
     ("run -c", 2, "Error: Option '-c' requires an argument."),
     ("run -c /nonexistent.yaml", 2, "/nonexistent.yaml: cannot be read: No such file or directory"),
     ("run -c .", 2, ".: cannot be read: Is a directory"),
-    ("run -c /dev/null", 2, "/dev/null: cannot be read: not a file of text"),
+    ("run -c /dev/null", 2, "/dev/null: cannot be read: Not a regular file"),
     ("simulate --config", 2, "Error: Option '--config' requires an argument."),
     ("simulate -c /nonexistent.yaml", 2, "/nonexistent.yaml: cannot be read: No such file or directory"),
     (
