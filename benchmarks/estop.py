@@ -26,20 +26,19 @@ import json
 import os
 import sys
 import time
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
+from benchmarks.estop_parts.processes import ORDER_TIMEOUT, order, process
 from monstertruck_drivers.cable import PtyPort
 from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos.protocol import Control, FrameError, Opcode, decode_body, join
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import SECOND, Clock, run_wall
-from monstertruck_runtime.errors import TruckError
 from monstertruck_runtime.mailbox import latest
 from monstertruck_schemas import topics
 from monstertruck_schemas.req import Order
@@ -55,7 +54,6 @@ RATE = 10_000
 MISSED = 1.0
 DRIVEN = 0.3
 """Seconds of driving before each emergency stop, and a random share of a tick more."""
-ORDER_TIMEOUT = 40.0
 GOAL_MS = 35.0
 
 
@@ -161,42 +159,6 @@ class Stops:
                     pass
                 return at
         return None
-
-
-@asynccontextmanager
-async def process(core: int | None, output: Path, *arguments: str) -> AsyncIterator[asyncio.subprocess.Process]:
-    """A Python process while the context lasts; on one core, if one is named."""
-    pipe = asyncio.subprocess.PIPE
-    with output.open("ab") as errors:
-        running = await asyncio.create_subprocess_exec(
-            sys.executable, *arguments, cwd=ROOT, stdin=pipe, stdout=pipe, stderr=errors
-        )
-    if core is not None:
-        os.sched_setaffinity(running.pid, {core})
-    try:
-        yield running
-    finally:
-        if running.returncode is None:
-            running.terminate()
-        await running.wait()
-
-
-async def order(client: TruckClient, what: Order) -> None:
-    """Give an order until it is carried out; no tracker drives.
-
-    Raises:
-        TruckError, TimeoutError: why it was not carried out in the end.
-    """
-    end = time.monotonic() + ORDER_TIMEOUT
-    while True:
-        try:
-            await client.order(what, hold=what is Order.ARM)
-        except (TruckError, TimeoutError):
-            if time.monotonic() > end:
-                raise
-            await asyncio.sleep(0.05)
-        else:
-            return
 
 
 async def press(client: TruckClient, stops: Stops, forward: bool, more: float) -> float | None:

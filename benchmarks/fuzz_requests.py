@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import zenoh
 
-from benchmarks.estop import order, process
+from benchmarks.estop_parts.processes import order, process
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import Clock, run_wall
 from monstertruck_runtime.errors import TruckError

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from playwright.async_api import Page
 
-from benchmarks.estop import ORDER_TIMEOUT, order, process
+from benchmarks.estop_parts.processes import ORDER_TIMEOUT, order, process
 from monstertruck_drivers.cable import PtyPort
 from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos.protocol import FrameError, Opcode, decode_body, join
