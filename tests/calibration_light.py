@@ -399,31 +399,31 @@ def stabiliser_fit(rng: np.random.Generator) -> list[Verdict]:
 
 
 def true_joints(
-    settings: Ax12Config, said: stabiliser.Lean, zeros: tuple[float, float], directions: tuple[int, int]
-) -> stabiliser.Lean:
+    settings: Ax12Config, said: stabiliser.RollPitch, zeros: tuple[float, float], directions: tuple[int, int]
+) -> stabiliser.RollPitch:
     """What joints really are that the driver says to be at ``said``, rad."""
     pitch, roll = (
         direction * (joint.zero + joint.direction * angle / STEP - zero) * STEP
         for joint, angle, zero, direction in zip((settings.pitch, settings.roll), said, zeros, directions, strict=True)
     )
-    return stabiliser.Lean(pitch, roll)
+    return stabiliser.RollPitch(pitch, roll)
 
 
 def mounted(
     settings: Ax12Config, zeros: tuple[float, float], directions: tuple[int, int], rng: np.random.Generator
-) -> list[tuple[stabiliser.Lean, stabiliser.Lean, stabiliser.Standing]]:
+) -> list[tuple[stabiliser.RollPitch, stabiliser.RollPitch, stabiliser.RestMeasurement]]:
     """The truck level, nose low, right side low: its true tilt, what the driver says of the joints, what was read."""
     angles = np.linspace(-2.09, 2.09, 682)
     found = []
     for pitch, roll in ((0.01, -0.005), (0.155, 0.0), (0.0, 0.185)):
-        body = stabiliser.Lean(pitch, roll)
-        seen = stabiliser.Lean(pitch + stabiliser.TILT * rng.normal(), roll + stabiliser.TILT * rng.normal())
-        said = stabiliser.Lean(round(-pitch / STEP) * STEP, round(-roll / STEP) * STEP)
+        body = stabiliser.RollPitch(pitch, roll)
+        seen = stabiliser.RollPitch(pitch + stabiliser.TILT * rng.normal(), roll + stabiliser.TILT * rng.normal())
+        said = stabiliser.RollPitch(round(-pitch / STEP) * STEP, round(-roll / STEP) * STEP)
         really = true_joints(settings, said, zeros, directions)
         up = stabiliser.beams_up(body, really, angles)
         ranges = np.minimum(np.where(up < 0.0, 0.25 / np.maximum(-up, 1e-9), np.inf), 3.5)
         ranges = ranges * (1 + 0.01 * rng.normal(size=angles.size))
-        found.append((body, said, stabiliser.Standing(seen, said, angles, ranges)))
+        found.append((body, said, stabiliser.RestMeasurement(seen, said, angles, ranges)))
     return found
 
 

@@ -60,7 +60,7 @@ class Sweep(Protocol):
         ...
 
 
-class Uneven(Protocol):
+class UnevenGround(Protocol):
     """Ground with a height."""
 
     def height(self, x: Array, y: Array) -> Array:
@@ -125,7 +125,7 @@ class PlaneSweep:
 
 def over(
     cast: Caster,
-    ground: Uneven,
+    ground: UnevenGround,
     config: LidarConfig,
     origins: Beams,
     yaw: Array,

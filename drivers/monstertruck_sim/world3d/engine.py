@@ -23,7 +23,7 @@ from monstertruck_sim.world.mechanics import description, mechanics, platform_wh
 from monstertruck_sim.world.obstacles import Box, Disc, Obstacle
 from monstertruck_sim.world.plane import Engine, PlanOutline, without
 from monstertruck_sim.world.plant import Caster, Pose
-from monstertruck_sim.world.sensors import LEVEL_BEAMS, Beams, Uneven, over, turned
+from monstertruck_sim.world.sensors import LEVEL_BEAMS, Beams, UnevenGround, over, turned
 from monstertruck_sim.world3d.ground import blocks, ground_heights, scenery
 from monstertruck_sim.world3d.model import (
     PARKED,
@@ -31,7 +31,7 @@ from monstertruck_sim.world3d.model import (
     TALL,
     DriveLine,
     Group,
-    Site,
+    StaticScene,
     load,
     rectangles,
 )
@@ -49,7 +49,7 @@ class LevelGround:
         return np.zeros(np.broadcast(x, y).shape)
 
     def cast(self, xs: Array, ys: Array, zs: Array, headings: Array, rises: Array, reach: float) -> Array:
-        """As ``Uneven``."""
+        """As ``UnevenGround``."""
         with np.errstate(divide="ignore"):
             met = np.where(rises < 0.0, zs / -rises, np.inf)
         return np.where(met <= reach, met, np.inf)
@@ -65,7 +65,7 @@ class RigidSpace:
         name: of the robot.
     """
 
-    def __init__(self, footprint: PlanOutline, plant: RigidPlant, ground: Uneven, name: str) -> None:
+    def __init__(self, footprint: PlanOutline, plant: RigidPlant, ground: UnevenGround, name: str) -> None:
         self._footprint, self._scene, self._plant, self._ground, self._name = (
             footprint, footprint.scene, plant, ground, name,
         )  # fmt: skip
@@ -155,7 +155,7 @@ class RigidSweep:
         config: of the lidar.
     """
 
-    def __init__(self, plant: RigidPlant, cast: Caster, ground: Uneven, config: LidarConfig) -> None:
+    def __init__(self, plant: RigidPlant, cast: Caster, ground: UnevenGround, config: LidarConfig) -> None:
         self._plant, self._cast, self._ground, self._config = plant, cast, ground, config
         self._blocks = has_blocks(plant)
 
@@ -296,17 +296,17 @@ def rigid(config: WorldConfig, footprint: PlanOutline, start: Pose) -> Engine:
     rows, columns = place.map.cells.shape
     bounds = x0, x0 + columns * resolution, y0, y0 + rows * resolution
     heights = ground_heights(config, place.profile, bounds, start)
-    ground: Uneven = heights if heights is not None else LevelGround()
+    ground: UnevenGround = heights if heights is not None else LevelGround()
     parts = mechanics(truck, config.mechanics)
     robot = description(truck, parts, head=LidarHead((config.lidar.x, config.lidar.y, config.lidar.height)))
     drive = drive_line(truck, parts)
     longest = 80 if heights is None else round(0.25 / resolution)
     walls = rectangles(place.map.cells == OCCUPIED, resolution, place.map.origin, longest)
     scene_files = scenery(config.mjcf) if config.mjcf is not None else ((), ())
-    site = Site(
+    static_scene = StaticScene(
         walls, config.lidar.wall_height, heights, blocks(config.ground, heights), scene_files, config.tags, config.roof
     )
-    model = load(robot, drive, parts.friction, site)
+    model = load(robot, drive, parts.friction, static_scene)
     plant = RigidPlant(
         truck, config.battery, start, model, drive,
         wheel_steering(truck),

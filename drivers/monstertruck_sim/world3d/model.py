@@ -97,7 +97,7 @@ class Block:
 
 
 @dataclass(frozen=True, slots=True)
-class Site:
+class StaticScene:
     """Everything around the robot that does not move.
 
     Args:
@@ -119,7 +119,7 @@ class Site:
     roof: RoofTag | None = None
 
 
-EMPTY: Final = Site(np.zeros((0, 4)), TALL, None)
+EMPTY: Final = StaticScene(np.zeros((0, 4)), TALL, None)
 """Level ground without anything."""
 
 
@@ -155,14 +155,14 @@ def _first(row: NDArray[np.bool_], start: int) -> int | None:
     return None if len(where) == 0 else start + int(where[0])
 
 
-def mjcf(description: Description, drive: DriveLine, friction: float, site: Site) -> str:
+def mjcf(description: Description, drive: DriveLine, friction: float, scene: StaticScene) -> str:
     """The whole model as text.
 
     Args:
         description: of the robot; its first link moves freely.
         drive: its drive line.
         friction: between tyres and everything.
-        site: around it.
+        scene: around it.
     """
     root = Element("mujoco", model=description.name)
     SubElement(root, "compiler", angle="radian", boundmass="0", boundinertia="0", autolimits="true")
@@ -187,9 +187,9 @@ def mjcf(description: Description, drive: DriveLine, friction: float, site: Site
     _materials(asset)
     world = SubElement(root, "worldbody")
     SubElement(world, "light", pos="0 0 6", dir="0.2 0.1 -1", directional="true", diffuse="0.45 0.45 0.45")
-    _ground(asset, world, site.heights)
-    _walls(world, site)
-    for i, block in enumerate(site.blocks):
+    _ground(asset, world, scene.heights)
+    _walls(world, scene)
+    for i, block in enumerate(scene.blocks):
         SubElement(
             world,
             "geom",
@@ -201,32 +201,32 @@ def mjcf(description: Description, drive: DriveLine, friction: float, site: Site
             euler=_text(0.0, block.pitch, block.yaw),
             rgba="0.55 0.5 0.42 1",
         )
-    _scenery(asset, world, site.scenery)
-    _tags(asset, world, site.tags)
+    _scenery(asset, world, scene.scenery)
+    _tags(asset, world, scene.tags)
     _spare(world)
     body = _robot(world, description)
-    if (roof := site.roof) is not None:
+    if (roof := scene.roof) is not None:
         _paper(asset, body, "roof", roof.size, (roof.x, roof.y, roof.z), (0.0, -1.0, 0.0, 1.0, 0.0, 0.0))
     _drive(root, description, drive)
     return ET.tostring(root, encoding="unicode")
 
 
-def load(description: Description, drive: DriveLine, friction: float, site: Site) -> mujoco.MjModel:
+def load(description: Description, drive: DriveLine, friction: float, scene: StaticScene) -> mujoco.MjModel:
     """``mjcf`` compiled, with the heights in it.
 
     Raises:
         InputError: the scenery of another file does not fit.
     """
     try:
-        model = mujoco.MjModel.from_xml_string(mjcf(description, drive, friction, site))
+        model = mujoco.MjModel.from_xml_string(mjcf(description, drive, friction, scene))
     except ValueError as error:
         raise InputError(f"sim.world: MuJoCo refuses the model: {' '.join(str(error).split())}") from error
-    if (heights := site.heights) is not None:
+    if (heights := scene.heights) is not None:
         low, high = float(heights.z.min()), float(heights.z.max())
         model.hfield_data[:] = ((heights.z - low) / max(high - low, _FLAT)).astype(np.float32).ravel()
-    named = {f"tag_{i}": tag.tag for i, tag in enumerate(site.tags)}
-    if site.roof is not None:
-        named["roof"] = site.roof.tag
+    named = {f"tag_{i}": tag.tag for i, tag in enumerate(scene.tags)}
+    if scene.roof is not None:
+        named["roof"] = scene.roof.tag
     for name, tag in named.items():
         texture = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_TEXTURE, name)
         shades = np.kron(tag_pattern(tag), np.ones((_TAG_PIXELS, _TAG_PIXELS), np.uint8))
@@ -275,10 +275,10 @@ def _ground(asset: Element, world: Element, heights: HeightGrid | None) -> None:
     SubElement(world, "geom", ground, type="hfield", hfield="heights", pos=place)
 
 
-def _walls(world: Element, site: Site) -> None:
-    for i, (x0, y0, x1, y1) in enumerate(site.walls):
-        low, high = (0.0, 0.0) if site.heights is None else site.heights.between(x0, y0, x1, y1)
-        top, bottom = high + site.wall_height, low - 0.2
+def _walls(world: Element, scene: StaticScene) -> None:
+    for i, (x0, y0, x1, y1) in enumerate(scene.walls):
+        low, high = (0.0, 0.0) if scene.heights is None else scene.heights.between(x0, y0, x1, y1)
+        top, bottom = high + scene.wall_height, low - 0.2
         SubElement(
             world,
             "geom",

@@ -63,7 +63,7 @@ _NOSE: Final = Confirm("nose", "Put the rear wheels on blocks, so that the nose 
 _SIDE: Final = Confirm("side", "Put the left wheels on blocks instead, so that the right side is low. Done?")
 
 
-class Lean(NamedTuple):
+class RollPitch(NamedTuple):
     """Two angles, rad, REP 103: pitch nose down, roll right side down positive."""
 
     pitch: float
@@ -71,12 +71,12 @@ class Lean(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Standing:
+class RestMeasurement:
     """What was measured while the truck stood."""
 
-    body: Lean
+    body: RollPitch
     """By the compass"""
-    joints: Lean
+    joints: RollPitch
     """As the driver says"""
     angles: Array
     """Of the beams, rad, left positive; (n,)"""
@@ -86,7 +86,7 @@ class Standing:
     @classmethod
     def of(
         cls, scans: Sequence[LaserScan], tilts: Sequence[Attitude], joints: Sequence[StabiliserFeedback]
-    ) -> "Standing":
+    ) -> "RestMeasurement":
         """From messages.
 
         Raises:
@@ -98,8 +98,8 @@ class Standing:
         pitch, roll = np.mean(np.array(read), axis=0).tolist()
         ranges = np.array([np.where(s.codes == VALID_BEAM, s.ranges, np.inf) for s in scans])
         angles = scans[0].start_angle + scans[0].angle_increment * np.arange(ranges.shape[1], dtype=np.float64)
-        body = Lean(float(np.mean([a.pitch for a in tilts])), float(np.mean([a.roll for a in tilts])))
-        return cls(body, Lean(pitch, roll), angles, np.median(ranges, axis=0))
+        body = RollPitch(float(np.mean([a.pitch for a in tilts])), float(np.mean([a.roll for a in tilts])))
+        return cls(body, RollPitch(pitch, roll), angles, np.median(ranges, axis=0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,12 +137,12 @@ class StabiliserWizard:
         )
 
     @staticmethod
-    async def _stand(context: WizardContext) -> tuple[Standing, list[LaserScan]]:
+    async def _stand(context: WizardContext) -> tuple[RestMeasurement, list[LaserScan]]:
         await context.collect(Collect("the truck comes to rest", topics.SCAN, 20))
         scans = await context.collect(Collect("what the lidar sees", topics.SCAN, 10))
         tilts = await context.collect(Collect("the truck's tilt", topics.COMPASS, 20))
         joints = await context.collect(Collect("positions of the servos", topics.STABILISER, 20))
-        return Standing.of(scans, tilts, joints), scans
+        return RestMeasurement.of(scans, tilts, joints), scans
 
 
 def stabiliser_wizard(settings: StabiliserWizard | None = None) -> Wizard:
@@ -152,9 +152,9 @@ def stabiliser_wizard(settings: StabiliserWizard | None = None) -> Wizard:
 
 
 def result_of(
-    flat: Standing,
-    nose: Standing,
-    side: Standing,
+    flat: RestMeasurement,
+    nose: RestMeasurement,
+    side: RestMeasurement,
     heights: Heights,
     walls: tuple[float, float],
     settings: Ax12Config,
@@ -175,11 +175,11 @@ def result_of(
         InputError: the blocks are missing, a joint does not follow, or what the lidar sees fits neither direction.
     """
     error = math.hypot(tape_error * math.sqrt(2), FLAT * tape_error)
-    lies = Lean(
+    lies = RollPitch(
         math.asin(max(-1.0, min(1.0, (heights.centre - heights.ahead) / walls[0]))),
         math.asin(max(-1.0, min(1.0, (heights.left - heights.centre) / walls[1]))),
     )
-    really = Lean(lies.pitch - flat.body.pitch, lies.roll - flat.body.roll)
+    really = RollPitch(lies.pitch - flat.body.pitch, lies.roll - flat.body.roll)
     joints = (settings.pitch, settings.roll)
     changes = [_turns(stand, flat, heights.centre, axis, really) for axis, stand in enumerate((nose, side))]
     estimates: list[Estimate] = []
@@ -223,7 +223,7 @@ def result_of(
     )
 
 
-def _turns(stand: Standing, flat: Standing, height: float, axis: int, really: Lean) -> int:
+def _turns(stand: RestMeasurement, flat: RestMeasurement, height: float, axis: int, really: RollPitch) -> int:
     """+1 where a joint turns as its driver says, -1 where it turns the other way.
 
     Raises:
@@ -244,15 +244,15 @@ def _turns(stand: Standing, flat: Standing, height: float, axis: int, really: Le
         )
     direction = (0.0, -math.pi / 2)[axis]
 
-    def lidar(turn: Callable[[Lean], Lean]) -> Lean:
-        offset = turn(Lean(moved[0], moved[1]))
-        return Lean(really.pitch + offset.pitch, really.roll + offset.roll)
+    def lidar(turn: Callable[[RollPitch], RollPitch]) -> RollPitch:
+        offset = turn(RollPitch(moved[0], moved[1]))
+        return RollPitch(really.pitch + offset.pitch, really.roll + offset.roll)
 
-    wrong = lidar(lambda m: Lean(-m.pitch, m.roll) if axis == 0 else Lean(m.pitch, -m.roll))
-    swapped = (lidar(lambda m: Lean(m.roll, m.pitch)), lidar(lambda m: Lean(-m.roll, -m.pitch)))
-    loose = lidar(lambda _: Lean(0.0, 0.0))
+    wrong = lidar(lambda m: RollPitch(-m.pitch, m.roll) if axis == 0 else RollPitch(m.pitch, -m.roll))
+    swapped = (lidar(lambda m: RollPitch(m.roll, m.pitch)), lidar(lambda m: RollPitch(-m.roll, -m.pitch)))
+    loose = lidar(lambda _: RollPitch(0.0, 0.0))
 
-    def seen(joints: Lean) -> float | None:
+    def seen(joints: RollPitch) -> float | None:
         return _on_floor(stand, flat, joints, height, direction)
 
     turned, leaning = seen(wrong), seen(loose)
@@ -275,7 +275,9 @@ def _turns(stand: Standing, flat: Standing, height: float, axis: int, really: Le
     )
 
 
-def _on_floor(stand: Standing, flat: Standing, joints: Lean, height: float, direction: float) -> float | None:
+def _on_floor(
+    stand: RestMeasurement, flat: RestMeasurement, joints: RollPitch, height: float, direction: float
+) -> float | None:
     """Share of the beams around ``direction`` (rad) that measure the floor of a lidar with such joints (rad).
 
     None: it would be hardly nearer than what a level lidar sees there.
@@ -289,7 +291,7 @@ def _on_floor(stand: Standing, flat: Standing, joints: Lean, height: float, dire
     return float((np.abs(stand.ranges[due] / floor[due] - 1) < NEAR).mean())
 
 
-def beams_up(body: Lean, joints: Lean, angles: Array) -> Array:
+def beams_up(body: RollPitch, joints: RollPitch, angles: Array) -> Array:
     """Rise of beams in the level frame, per metre: third row of Ry(p) Rx(r) Ry(a) Rx(b) on (cos, sin, 0); (n,)."""
     row = np.array((-math.sin(body.pitch), math.sin(body.roll) * math.cos(body.pitch),
                     math.cos(body.roll) * math.cos(body.pitch)))  # fmt: skip

@@ -80,7 +80,7 @@ class Frontier:
 
 
 @dataclass(frozen=True)
-class Outlook:
+class Viewpoints:
     """Places from where a frontier is looked at; they hold as long as nothing changes around it."""
 
     change: int
@@ -138,7 +138,7 @@ class Remembered:
     """What is computed again only where the map differs."""
 
     route_map: RouteMap | None = None
-    looks: dict[bytes, Outlook] = attribute(default_factory=dict)
+    looks: dict[bytes, Viewpoints] = attribute(default_factory=dict)
     """By a frontier's cells."""
 
 
@@ -236,7 +236,7 @@ class ExplorationView:
 
     def _find_options(self, ways: CostToGo) -> list[Option]:
         options = []
-        seen: dict[bytes, Outlook] = {}
+        seen: dict[bytes, Viewpoints] = {}
         reached = ways.cost < UNREACHED
         for frontier in self._frontiers():
             if any(math.dist(frontier.middle, place) < BANNED for place in self.banned):
@@ -302,7 +302,7 @@ class ExplorationView:
         near += (top, left)
         return near
 
-    def _look(self, frontier: Frontier, near: NDArray[np.int64]) -> Outlook:
+    def _look(self, frontier: Frontier, near: NDArray[np.int64]) -> Viewpoints:
         """Places with room, from which enough of a frontier is in sight, and nearly as much new area as from the best.
 
         Room is asked for first: the places that show most are often those at the edge of unknown ground, which blocks.
@@ -312,23 +312,23 @@ class ExplorationView:
         places = self._centres(near)
         places = places[np.hypot(*(places - frontier.middle).T) < AROUND]
         if not len(places):
-            return Outlook(change, reached)
+            return Viewpoints(change, reached)
         places, bearings, headings = self._with_room(places, frontier)
         if not len(places):
-            return Outlook(change, reached)
+            return Viewpoints(change, reached)
         some = _spread(len(places), COMPARED)
         places, bearings, headings = places[some], bearings[some], headings[some]
         sample = frontier.points[_spread(len(frontier.points), SAMPLES)]
         here, there = ((v - corner) / resolution for v in (places, sample))
         share = shares_seen(self.known.cells, here, there, (config.reach - SHORT) / resolution)
         if share.max(initial=0.0) == 0.0:
-            return Outlook(change, reached)
+            return Viewpoints(change, reached)
         good = np.flatnonzero(share >= min(SEEN, float(share.max())))
         good = good[_spread(len(good), PLACES)]
         gains = self.gains(np.column_stack((places[good], headings[good])))
         worth = gains >= max(WORTH * float(gains.max()), LEAST)
         good = good[worth]
-        return Outlook(change, reached, places[good], bearings[good], headings[good], gains[worth])
+        return Viewpoints(change, reached, places[good], bearings[good], headings[good], gains[worth])
 
     def _with_room(self, places: Array, frontier: Frontier) -> tuple[Array, Array, Array]:
         """Those of the places (n, 2) that the footprint has room at, directions of a frontier from there, headings."""
@@ -341,7 +341,7 @@ class ExplorationView:
         first = np.argmax(free[room], axis=1)
         return places[room], bearings[room], headings[room, first]
 
-    def _option(self, frontier: Frontier, look: Outlook, ways: CostToGo) -> Option | None:
+    def _option(self, frontier: Frontier, look: Viewpoints, ways: CostToGo) -> Option | None:
         """The nearest place to look at a frontier from."""
         if not len(look.places):
             return None

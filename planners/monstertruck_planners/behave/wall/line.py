@@ -95,7 +95,7 @@ Phase = Literal["settle", "search", "brake", "turn", "follow", "stop"]
 Pose = tuple[float, float, float]
 
 
-class Ear(NamedTuple):
+class SonarMount(NamedTuple):
     """Mount of a sonar in base, with the wall on the left."""
 
     x: float
@@ -113,7 +113,7 @@ class LineState:
     """Between two steps; poses with the wall on the left."""
 
     phase: Phase = "settle"
-    ears: tuple[Ear, ...] = ()
+    mounts: tuple[SonarMount, ...] = ()
     poses: tuple[tuple[int, Pose, float], ...] = ()
     """Of the last second by the odometry, with their stamps and speeds, m/s."""
     pose: Pose = (0.0, 0.0, 0.0)
@@ -179,11 +179,11 @@ class WallLine:
     def step(self, inputs: Inputs, state: LineState, t: float) -> BehaviourStep:
         """One step; see ``Behaviour``."""
         sonars, odometry = inputs.of(SONAR), inputs.of(ODOMETRY)
-        if not state.ears:
-            ears = self._mounts(inputs.of(TRANSFORMS))
-            if isinstance(ears, str):
-                return BehaviourStep(None, state, state.phase, Reason.INPUT_CONTRADICTORY, ears)
-            state = replace(state, ears=ears)
+        if not state.mounts:
+            mounts = self._mounts(inputs.of(TRANSFORMS))
+            if isinstance(mounts, str):
+                return BehaviourStep(None, state, state.phase, Reason.INPUT_CONTRADICTORY, mounts)
+            state = replace(state, mounts=mounts)
         state = self._moved(state, odometry, inputs.of(IMU).angular_velocity.z * self._mirror, t)
         cone = self._cone(sonars)
         if sonars.stamp != state.heard:
@@ -206,18 +206,18 @@ class WallLine:
 
     # Inputs
 
-    def _mounts(self, transforms: Transforms) -> tuple[Ear, ...] | str:
+    def _mounts(self, transforms: Transforms) -> tuple[SonarMount, ...] | str:
         """Mounts of the sonars, or what is missing."""
         found = {transform.child: transform for transform in transforms.transforms}
-        ears = []
+        mounts = []
         for name in self._names:
             mount = found.get(f"sonar_{name}")
             if mount is None:
                 return f"state/transforms has no frame sonar_{name}: expected the mounts of {', '.join(self._names)}"
             x, y, _ = mount.translation
             yaw = 2.0 * math.atan2(mount.rotation[2], mount.rotation[3])
-            ears.append(Ear(x, y * self._mirror, yaw * self._mirror))
-        return tuple(ears)
+            mounts.append(SonarMount(x, y * self._mirror, yaw * self._mirror))
+        return tuple(mounts)
 
     def _cone(self, sonars: SonarRanges) -> Cone:
         config = self._config
@@ -276,9 +276,9 @@ class WallLine:
             if not measured:
                 continue
             (x, y, yaw), _ = _at(state.poses, echo.stamp, self._config.play)
-            ear = state.ears[number]
+            mount = state.mounts[number]
             c, s = math.cos(yaw), math.sin(yaw)
-            place = x + c * ear.x - s * ear.y, y + s * ear.x + c * ear.y, yaw + ear.yaw
+            place = x + c * mount.x - s * mount.y, y + s * mount.x + c * mount.y, yaw + mount.yaw
             rows.append((*place, echo.range, number, state.travelled, t))
         echoes = state.echoes[state.echoes[:, 5] > state.travelled - self._config.window]
         if rows:
@@ -353,7 +353,7 @@ class WallLine:
                     rows = rows[residuals(rows, state.wall, cone) < -NEARER]
                 ranges = rows[:, 3]
                 if len(ranges) >= 2:
-                    left = min(left, float(np.median(ranges)) + state.ears[number].reach - self._keep(state))
+                    left = min(left, float(np.median(ranges)) + state.mounts[number].reach - self._keep(state))
         near = fresh[np.isin(fresh[:, 4], (DIAGONAL, FRONT, FAR))][-6:, 3]
         return min(left, 0.0) if np.count_nonzero(near < TOUCHING) >= 2 else left
 
@@ -364,8 +364,8 @@ class WallLine:
 
     def _keep(self, state: LineState) -> float:
         """Distance of the robot's middle from walls, m."""
-        ear = state.ears[SIDE]
-        return self._config.distance + ear.y
+        mount = state.mounts[SIDE]
+        return self._config.distance + mount.y
 
     # Faults
 
@@ -508,9 +508,9 @@ class WallLine:
         """Distance of the side sonar from the wall less the one wanted, m; of a state with a wall."""
         assert state.wall is not None
         x, y, yaw = state.pose
-        ear = state.ears[SIDE]
+        mount = state.mounts[SIDE]
         c, s = math.cos(yaw), math.sin(yaw)
-        return state.wall.distance(x + c * ear.x - s * ear.y, y + s * ear.x + c * ear.y) - self._config.distance
+        return state.wall.distance(x + c * mount.x - s * mount.y, y + s * mount.x + c * mount.y) - self._config.distance
 
     def _sense(self, state: LineState) -> float:
         """-1 to turn right: always from one wall to the next, from free ground the shorter way."""

@@ -9,7 +9,7 @@ from monstertruck_sim.world.config import MechanicsConfig, SimTruckConfig
 from monstertruck_sim.world.mechanics import mechanics
 from monstertruck_sim.world3d.engine import drive_line
 from monstertruck_sim.world3d.heights import HeightGrid
-from monstertruck_sim.world3d.model import Group, Site, load
+from monstertruck_sim.world3d.model import Group, StaticScene, load
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +23,9 @@ def hills():
 @pytest.fixture(scope="module")
 def model(hills):
     parts = mechanics(SimTruckConfig(), MechanicsConfig())
-    return load(truck_description(), drive_line(SimTruckConfig(), parts), 0.5, Site(np.zeros((0, 4)), 0.6, hills))
+    return load(
+        truck_description(), drive_line(SimTruckConfig(), parts), 0.5, StaticScene(np.zeros((0, 4)), 0.6, hills)
+    )
 
 
 def beams(count):

@@ -7,7 +7,7 @@ from monstertruck_kinematics.description import truck_description
 from monstertruck_sim.world.config import MechanicsConfig, SimTruckConfig
 from monstertruck_sim.world.mechanics import mechanics
 from monstertruck_sim.world3d.engine import drive_line
-from monstertruck_sim.world3d.model import Block, Site, load, rectangles
+from monstertruck_sim.world3d.model import Block, StaticScene, load, rectangles
 
 
 def test_rectangles_cover_every_solid_cell_once_and_no_other():
@@ -29,8 +29,8 @@ def test_the_model_has_the_descriptions_mass_and_joints():
     parts = mechanics(SimTruckConfig(), MechanicsConfig())
     description = truck_description(mechanics=parts)
     walls = np.array([[1.0, 1.0, 2.0, 1.1]])
-    site = Site(walls, 0.6, None, (Block(1.0, 0.0, 0.02, 0.1, 1.0, 0.04),))
-    model = load(description, drive_line(SimTruckConfig(), parts), 0.5, site)
+    scene = StaticScene(walls, 0.6, None, (Block(1.0, 0.0, 0.02, 0.1, 1.0, 0.04),))
+    model = load(description, drive_line(SimTruckConfig(), parts), 0.5, scene)
     bodies = {model.body(i).name: model.body_mass[i] for i in range(model.nbody)}
     assert sum(bodies[link.name] for link in description.links) == pytest.approx(7.25)
     assert {model.joint(i).name for i in range(1, model.njnt)} == {

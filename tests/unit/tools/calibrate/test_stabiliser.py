@@ -8,7 +8,7 @@ import pytest
 
 from monstertruck_drivers.ax12.config import Ax12Config, JointConfig
 from monstertruck_runtime.errors import InputError
-from monstertruckd.tools.calibrate.stabiliser import Heights, Lean, beams_up, result_of
+from monstertruckd.tools.calibrate.stabiliser import Heights, RollPitch, beams_up, result_of
 from tests.calibration_light import mounted, stabiliser_fit
 
 SETTINGS = Ax12Config()
@@ -52,11 +52,11 @@ def test_swapped_servos_and_a_loose_horn_are_named():
     flat, nose, side = stands()
     for sign in (1, -1):
         with pytest.raises(InputError, match="pitch and roll servo are swapped"):
-            judge(flat, seen(nose, Lean(0.0, sign * nose.joints.pitch)), side)
+            judge(flat, seen(nose, RollPitch(0.0, sign * nose.joints.pitch)), side)
         with pytest.raises(InputError, match="pitch and roll servo are swapped"):
-            judge(flat, nose, seen(side, Lean(sign * side.joints.roll, 0.0)))
+            judge(flat, nose, seen(side, RollPitch(sign * side.joints.roll, 0.0)))
     with pytest.raises(InputError, match="horn of the roll joint is loose"):
-        judge(flat, nose, seen(side, Lean(0.0, 0.0)))
+        judge(flat, nose, seen(side, RollPitch(0.0, 0.0)))
 
 
 def test_blocks_that_are_missing_or_in_the_way_and_joints_that_rest_are_refused():
