@@ -1,7 +1,7 @@
 """Wizards against hidden truth: 20 trucks, all values of each off, calibrated in the order of docs/calibration.md.
 
     python benchmarks/calibration.py [--seeds 20] [--jobs 1] [--light 200]
-    python benchmarks/calibration.py --part swapped|interruptions [--count 20]
+    python benchmarks/calibration.py --part swapped|interruptions|square [--count 20]
 
 Every session runs the whole daemon on a virtual clock: real drivers, emulated devices, the safety gate; the operator
 has a tape, a string and a meter with errors of their own. Judged is whether the true value lies in the stated interval,
@@ -12,6 +12,7 @@ each: how often the truth lies inside, how wide the intervals are. ``--seeds 0``
 ``--part swapped``: a swapped cable or a wrong sign, drawn for every wizard, that it has to name in every case.
 ``--part interruptions``: Ctrl-C, a cable, the emergency stop, a low battery, a lost lease, and kill -9 of wizard and
 daemon at random instants: the old file is intact, the truck neutral, and the wizard runs again (half an hour).
+``--part square``: closing error of dead reckoning after a square of 10 m, before and after ``calibrate all``.
 """
 
 import argparse
@@ -30,6 +31,7 @@ from typing import Any
 
 import numpy as np
 from calibration_parts.interruptions import interruptions
+from calibration_parts.square import square
 
 from monstertruck_runtime.errors import TruckError
 from monstertruckd.config.calibration import CalibrationStore, with_values
@@ -146,6 +148,7 @@ def swapped(count: int) -> tuple[dict[str, Any], dict[str, Any], bool]:
 PARTS: dict[str, Callable[[int], tuple[dict[str, Any], dict[str, Any], bool]]] = {
     "swapped": swapped,
     "interruptions": interruptions,
+    "square": square,
 }
 """Besides the trucks."""
 

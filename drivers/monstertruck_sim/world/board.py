@@ -65,7 +65,7 @@ def held(board: HeldBoard, place: CameraPlace, rng: np.random.Generator, field_o
         place.centre + to_map @ corner,
         to_map @ right * wide,
         to_map @ down * high,
-        rays=2,  # of less the edges would have steps, and the corners found be off by half a pixel
+        smooth=True,
     )
 
 

@@ -71,8 +71,9 @@ class FlatPanel(NamedTuple):
     """(3,): its upper edge, m."""
     down: Array
     """(3,): its left edge, m."""
-    rays: int = 1
-    """Of a pixel along and across, at least."""
+    smooth: bool = False
+    """Sampled between its own pixels (OpenCV), and twice a pixel of the picture along and across at least, so that its
+    edges are where they are to a small part of a pixel."""
 
 
 class Holder(Protocol):
@@ -281,7 +282,7 @@ class Painter:
         x0, y0, x1, y1 = max(int(x0), 0), max(int(y0), 0), min(int(x1), width), min(int(y1), height)
         if x0 >= x1 or y0 >= y1:
             return
-        finer = max(panel.rays, min(FINEST, int((RAYS / ((x1 - x0) * (y1 - y0))) ** 0.5)))
+        finer = max(1 + panel.smooth, min(FINEST, int((RAYS / ((x1 - x0) * (y1 - y0))) ** 0.5)))
         part = (np.arange(finer) + 0.5) / finer - 0.5
         us = (np.arange(x0, x1)[:, None] + part).ravel() - (width - 1) / 2
         vs = (np.arange(y0, y1)[:, None] + part).ravel() - (height - 1) / 2
@@ -293,14 +294,16 @@ class Painter:
             points = way[..., None] * rays
             on = points + (place.centre - panel.corner)
             rows, columns = panel.opaque.shape
-            u = np.floor(on @ panel.right / (panel.right @ panel.right) * columns)
-            v = np.floor(on @ panel.down / (panel.down @ panel.down) * rows)
+            across = on @ panel.right / (panel.right @ panel.right) * columns
+            along = on @ panel.down / (panel.down @ panel.down) * rows
+            u, v = np.floor(across), np.floor(along)
             inside = (u >= 0) & (u < columns) & (v >= 0) & (v < rows) & (way > 0)
         u, v = np.where(inside, u, 0).astype(np.intp), np.where(inside, v, 0).astype(np.intp)
         inside &= panel.opaque[v, u] & self._unhidden(points, place, ranges)
         shape = (y1 - y0, finer, x1 - x0, finer)
         share = inside.reshape(shape).mean(axis=(1, 3))[..., None]
-        colours = np.where(inside[..., None], panel.texture[v, u], 0).reshape(*shape, 3).mean(axis=(1, 3))
+        shades = _between(panel.texture, across, along) if panel.smooth else panel.texture[v, u]
+        colours = np.where(inside[..., None], shades, 0).reshape(*shape, 3).mean(axis=(1, 3))
         window = picture[y0:y1, x0:x1]
         window[:] = np.rint(colours + (1 - share) * window).astype(np.uint8)
 
@@ -345,6 +348,13 @@ class Painter:
 
 
 # Panels
+
+
+def _between(texture: NDArray[np.uint8], across: Array, along: Array) -> NDArray[np.uint8]:
+    """A texture at places in its pixels, whose corners are whole numbers, by bilinear interpolation."""
+    cv2 = opencv("sim.world.board")
+    at = (np.nan_to_num(places - 0.5, posinf=-1.0, neginf=-1.0).astype(np.float32) for places in (across, along))
+    return np.asarray(cv2.remap(texture, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), dtype=np.uint8)
 
 
 def opencv(key: str) -> Any:

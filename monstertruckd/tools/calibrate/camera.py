@@ -201,7 +201,7 @@ def result_of(found: LensFit, views: int, placed: PlacedMount | None = None) -> 
     ]
     for name, value, sigma in zip(PARAMETERS, lens.parameters.tolist(), found.sigmas.tolist(), strict=True):
         interval = Interval(value, NORMAL * sigma)
-        text = "of Brown's lens; 95 % of the corners' noise"
+        text = "of Brown's lens; 95 % of the corners"
         key = f"{CAMERA_LENS}.{name}"
         estimates.append(estimated(name, interval, UNITS.get(name, ""), found.corners, text, key))
     zero = "sixth order of the radial distortion, not fitted"

@@ -67,7 +67,7 @@ class LensFit(NamedTuple):
 
     lens: Lens
     sigmas: Array
-    """(8,): standard deviations of ``PARAMETERS``."""
+    """(8,): standard deviations of ``PARAMETERS``, by the corners' noise or by how views disagree, the larger one."""
     rms: float
     """Of the corners, pixels: both axes together."""
     corners: int
@@ -91,14 +91,48 @@ def fit_lens(views: Sequence[BoardSighting], reader: BoardReader, size: tuple[in
     objects = [reader.points[view.ids].astype(np.float32) for view in views]
     images = [view.corners.astype(np.float32) for view in views]
     try:
-        rms, matrix, distortion, _, _, sigmas, _, off = cv2.calibrateCameraExtended(
+        rms, matrix, distortion, turns, places, sigmas, _, off = cv2.calibrateCameraExtended(
             objects, images, size, np.eye(3), np.zeros(5), flags=cv2.CALIB_FIX_K3
         )
     except cv2.error as error:
         raise InputError(f"the pictures of the board tell no lens: {error.err}: hold it tilted") from error
     count = sum(len(view.ids) for view in views)
     lens = Lens(np.asarray(matrix), np.ravel(distortion)[:5], size)
-    return LensFit(lens, np.ravel(sigmas)[: len(PARAMETERS)], float(rms), count, tuple(np.ravel(off).tolist()))
+    poses = zip(views, turns, places, strict=True)
+    spread = sigmas_by_view([_slopes(view, reader, lens, turn, place) for view, turn, place in poses])
+    return LensFit(
+        lens, np.maximum(np.ravel(sigmas)[: len(PARAMETERS)], spread), float(rms), count, tuple(np.ravel(off).tolist())
+    )
+
+
+def sigmas_by_view(views: Sequence[tuple[Array, Array, Array]]) -> Array:
+    """Standard deviations of a lens's parameters by how views disagree, (8,).
+
+    What is wrong with the corners of a view may be alike (a board that is bent, an edge that pixels cut slantwise), so
+    corners are no independent measurements, but views are: the covariance by clusters of Liang and Zeger
+    ("Longitudinal data analysis using generalized linear models", Biometrika 1986), with their number's correction.
+
+    Args:
+        views: by view, slopes by the parameters of the lens (2 n, 8) and of the pose (2 n, 6), and residuals (2 n,).
+    """
+    information, scores = np.zeros((len(PARAMETERS), len(PARAMETERS))), []
+    for by_lens, by_pose, off in views:
+        rest = by_lens - by_pose @ np.linalg.lstsq(by_pose, by_lens, rcond=None)[0]
+        information += rest.T @ rest
+        scores.append(rest.T @ off)
+    inverse = np.linalg.inv(information)
+    covariance = inverse @ np.sum([np.outer(score, score) for score in scores], axis=0) @ inverse
+    correction = len(views) / max(len(views) - len(PARAMETERS), 1)
+    return np.asarray(np.sqrt(np.diag(covariance) * correction))
+
+
+def _slopes(
+    view: BoardSighting, reader: BoardReader, lens: Lens, turn: Array, place: Array
+) -> tuple[Array, Array, Array]:
+    """As ``sigmas_by_view`` wants them."""
+    shown, slopes = cv2.projectPoints(reader.points[view.ids], turn, place, lens.matrix, lens.distortion)
+    found = np.asarray(slopes, dtype=np.float64)
+    return found[:, 6 : 6 + len(PARAMETERS)], found[:, :6], (view.corners - np.asarray(shown).reshape(-1, 2)).ravel()
 
 
 def lens_from_pictures(pictures: Sequence[Picture], reader: BoardReader) -> tuple[LensFit, int]:
