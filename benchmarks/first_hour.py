@@ -204,7 +204,7 @@ def main() -> int:
     }
     parser.add_argument("--only", nargs="*", choices=[*parts], default=[*parts])
     options = parser.parse_args()
-    # Python keeps what it has compiled, unless it is told not to, as some containers do.
+    # Python keeps what it has compiled, unless it is set not to, as some containers do.
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
     figures: dict[str, float] = {}
     print("| wait for | s | goal s |\n|---|---:|---:|")

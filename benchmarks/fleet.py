@@ -164,7 +164,7 @@ class GivenUpError(Exception):
 
 @dataclass
 class Program:
-    """A process that is read all the time: what it said last is told where it ends or does not come up."""
+    """A process that is read all the time: what it said last is reported where it ends or does not come up."""
 
     name: str
     running: asyncio.subprocess.Process

@@ -31,8 +31,8 @@ GOALS = {
     "hand_over_jump_mm": 5.0,
     "frames_per_second_of_each_on_2_cores": 25.0,
     "identities_lost": 0,
-    "bump_told_s": 10.0,
-    "unplugged_told_s": 10.0,
+    "bump_reported_s": 10.0,
+    "unplugged_reported_s": 10.0,
 }
 CROSSING = 10.0
 """Seconds that five robots cross, 25 pictures each."""
@@ -124,15 +124,15 @@ def faults(stand: Any) -> tuple[float, float]:
     lens = found.placed()["c1"].lens
     shift = math.tan(math.radians(2.0)) * lens.matrix[0, 0]
     bumped = [s._replace(corners=s.corners + np.array((0.0, shift))) for s in seen["c1"]]
-    told = {"c1": math.inf, "c2": math.inf}
+    reported = {"c1": math.inf, "c2": math.inf}
     for k in range(50, 350):
         now = k * SECOND // 25
         tracker.take(now, {name: bumped if name == "c1" else tags for name, tags in seen.items() if name != "c2"})
         for text in tracker.complaints(now):
             name = text.split()[1]
-            if name in told:
-                told[name] = min(told[name], (k - 50) / 25)
-    return told["c1"], told["c2"]
+            if name in reported:
+                reported[name] = min(reported[name], (k - 50) / 25)
+    return reported["c1"], reported["c2"]
 
 
 def main() -> int:
@@ -143,7 +143,7 @@ def main() -> int:
     parser.add_argument("--crossing", type=float, default=CROSSING)
     arguments = parser.parse_args()
     off, turned, dim, jumps, overlaps = [], [], [], [], []
-    lost, unseen, cost, told = 0, 0.0, [], []
+    lost, unseen, cost, reported = 0, 0.0, [], []
     for seed in range(arguments.seeds):
         stand = simulated(seed, robots=5)
         overlaps.append(stand[2].overlap_rms)
@@ -156,7 +156,7 @@ def main() -> int:
         mistaken, longest, spent = crossing(stand, arguments.crossing)
         lost, unseen = lost + mistaken, max(unseen, longest)
         cost.append(spent)
-        told.append(faults(stand))
+        reported.append(faults(stand))
         print(f"stand {seed}: {1000 * float(np.sqrt(np.mean(np.square(off)))):.2f} mm so far", flush=True)
     figures = {
         "stands": arguments.seeds,
@@ -173,8 +173,8 @@ def main() -> int:
         "crossing_s": arguments.crossing,
         "identities_lost": lost,
         "longest_unseen_s": round(unseen, 2),
-        "bump_told_s": max(bump for bump, _ in told),
-        "unplugged_told_s": max(gone for _, gone in told),
+        "bump_reported_s": max(bump for bump, _ in reported),
+        "unplugged_reported_s": max(gone for _, gone in reported),
     }
     met = all(
         figures[name] >= goal if name.startswith("frames") else figures[name] <= goal for name, goal in GOALS.items()

@@ -2,7 +2,7 @@
 
 Emulated truck, its daemon pinned to one core; world, emulators, station, browser on the other. The page drives to and
 fro with the keyboard. Instants of clicks and heartbeats are the browser's own, brought to this computer's monotonic
-clock by the quickest of many round trips, so that delays are never told too short.
+clock by the quickest of many round trips, so that delays are never stated too short.
 
     click     click on the emergency stop to the first quick stop on the drive controller's wire
     drive     a heartbeat with the opposite speed to the first bytes that change the motor's target

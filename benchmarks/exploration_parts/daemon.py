@@ -47,7 +47,7 @@ Happen = Callable[["Story"], Awaitable[None]]
 
 
 @dataclass
-class Told:
+class RunRecord:
     """What became of one exploration."""
 
     state: ExplorationState
@@ -125,9 +125,9 @@ class Story:
         }  # fmt: skip
 
 
-def told(
+def recorded_run(
     world: str, seed: int, happen: Happen | None = None, *, budget: float = BUDGET, limit: float = LIMIT, **more: Any
-) -> Told:
+) -> RunRecord:
     """One exploration of a world of this repository; it starts where the light harness does.
 
     Args:
@@ -163,12 +163,12 @@ def told(
 
         run_virtual(main, start=SECOND)
         result["off_share"] = off_share(Path(folder) / "map", arena, result["story"].added)
-    return Told(**result)
+    return RunRecord(**result)
 
 
 def explored(world: str, seed: int) -> dict[str, Any]:
     """One run, judged."""
-    run = told(world, seed)
+    run = recorded_run(world, seed)
     metres, covered = known(run)
     here = run.true[-1, 1:3]
     return {
@@ -186,7 +186,7 @@ def driven(true: Array) -> Array:
     return np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(true[:, 1:3], axis=0).T))))
 
 
-def known(run: Told) -> tuple[dict[float, float], float]:
+def known(run: RunRecord) -> tuple[dict[float, float], float]:
     """Metres at which each share of what can be reached was known, and the share at the end."""
     x, y = run.story.arena.reachable(run.start)
     rest = np.column_stack((x, y))

@@ -16,7 +16,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from exploration_parts.daemon import Story, Told, told
+from exploration_parts.daemon import RunRecord, Story, recorded_run
 from monstertruck_planners.collision import Footprint
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError, TruckError
@@ -70,7 +70,7 @@ def explored(seed: int, fault: str) -> dict[str, Any]:
                 noted(story)
                 story.rig.world.set_charge(story.clock.now(), float(rng.uniform(0.05, 0.12)))
 
-    return judged(told("rooms", seed, happen, budget=BUDGET, limit=LIMIT, people=people), fault, seed)
+    return judged(recorded_run("rooms", seed, happen, budget=BUDGET, limit=LIMIT, people=people), fault, seed)
 
 
 def noted(story: Story) -> None:
@@ -124,7 +124,7 @@ async def arm_again(story: Story, after: float) -> None:
             continue
 
 
-def judged(run: Told, fault: str, seed: int) -> dict[str, Any]:
+def judged(run: RunRecord, fault: str, seed: int) -> dict[str, Any]:
     """What is kept of a run."""
     state, at = run.state, run.story.at
     reasons = {event.reason for event in run.events if event.stamp / SECOND >= at}

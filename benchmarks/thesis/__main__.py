@@ -75,9 +75,9 @@ def write_report(out: Path) -> None:
         page.append("<table><tr><th>figure<th>value<th>goal</tr>")
         for key, value in saved["figures"].items():
             goal = saved["goals"].get(key)
-            told = "" if goal is None else f"at most {goal:g}{'' if value <= goal else ' (not met)'}"
-            lines.append(f"| {key} | {value:.4g} | {told} |")
-            page.append(f"<tr><td>{html.escape(key)}<td>{value:.4g}<td>{told}</tr>")
+            goal_text = "" if goal is None else f"at most {goal:g}{'' if value <= goal else ' (not met)'}"
+            lines.append(f"| {key} | {value:.4g} | {goal_text} |")
+            page.append(f"<tr><td>{html.escape(key)}<td>{value:.4g}<td>{goal_text}</tr>")
         page.append("</table>")
     (out / "index.md").write_text("\n".join(lines) + "\n")
     (out / "index.html").write_text("\n".join(page))

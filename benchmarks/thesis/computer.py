@@ -51,7 +51,7 @@ def run(options: Options) -> Part:
     )
     rows: dict[str, list[dict[str, Any]]] = {}
     for name in TRACKERS:
-        at = functools.cache(functools.partial(told, rows.setdefault(name, []), name, seconds))
+        at = functools.cache(functools.partial(result_of, rows.setdefault(name, []), name, seconds))
         for factor in factors:
             for what in ("control", "mapping"):
                 part.add(f"{name}.x{factor:g}.{what}_missed_share", at(factor)[what])
@@ -79,7 +79,7 @@ def modules(part: Part, name: str, row: dict[str, Any]) -> None:
             part.add(f"{prefix}.turn_{key}", value)
 
 
-def told(rows: list[dict[str, Any]], name: str, seconds: float, factor: float) -> dict[str, Any]:
+def result_of(rows: list[dict[str, Any]], name: str, seconds: float, factor: float) -> dict[str, Any]:
     """The run of a set-up at a factor, printed and added to its ``rows``."""
     row = drive(TRACKERS[name], factor, seconds)
     print(f"  {name} x{factor:.3g}: control {row['control']:.3f}, mapping {row['mapping']:.3f}", flush=True)
