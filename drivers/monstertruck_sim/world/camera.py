@@ -10,8 +10,8 @@ from math import ceil, cos, hypot, sin, tan
 from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
-from PIL import Image
 
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.errors import NotInstalledError
@@ -233,21 +233,24 @@ class Painter:
             edge = float(np.abs(angles).max())
             count = ceil(width * edge / (config.field_of_view / 2))
             fan = np.linspace(edge, -edge, count)
-            self._column: NDArray[np.intp] | slice = np.clip(
-                np.rint((edge - angles) / (2 * edge) * (count - 1)), 0, count - 1
-            ).astype(np.intp)
-            self._slope = (-up / level).astype(np.float32)
+            column = np.clip(np.rint((edge - angles) / (2 * edge) * (count - 1)), 0, count - 1)
+            slope = (-up / level).astype(np.float32)
             self._along = np.ones(count, np.float32)
         else:
             fan = np.arctan2((width - 1) / 2 - np.arange(width), self._focal)
-            self._column = slice(None)
-            self._slope = ((np.arange(height) - (height - 1) / 2) / self._focal).astype(np.float32)[:, None]
+            column = np.arange(width)
+            slope = ((np.arange(height) - (height - 1) / 2) / self._focal).astype(np.float32)[:, None]
             self._along = np.cos(fan).astype(np.float32)
         self._fan = fan
         self.azimuths: Array = fan + config.yaw
         """Of the directions in which it wants to know ranges, from the robot's axis, rad; falling."""
-        depth = np.minimum(np.abs(self._slope) * self._focal / (height / 2), 1.0) * 63
-        self._ground = (np.where(self._slope > 0, FLOOR, SKY) + depth).astype(np.uint8)
+        depth = np.minimum(np.abs(slope) * self._focal / (height / 2), 1.0) * 63
+        ground = (np.where(slope > 0, FLOOR, SKY) + depth).astype(np.uint8)
+        self._column, self._slope, self._ground = (
+            np.array(np.broadcast_to(part, (height, width)), order="C")
+            for part in (column.astype(np.int32), slope, ground)
+        )
+        """Of every pixel: its azimuth's place in the fan, how far it looks down, its shade where no wall is."""
 
     def picture(self, ranges: Array, panels: Sequence[FlatPanel], place: CameraPlace) -> Picture:
         """Draw.
@@ -259,11 +262,8 @@ class Painter:
         """
         depth = np.maximum(ranges * self._along, 0.05).astype(np.float32)
         shade = (WALLS + 127 / (1 + depth / HALF_SHADE)).astype(np.uint8)
-        column, slope = self._column, self._slope
-        is_wall = (slope > (-self._above / depth)[column]) & (slope < (self._below / depth)[column])
-        image = Image.fromarray(np.where(is_wall, shade[column], self._ground))
-        image.putpalette(_palette())
-        picture: Picture = np.array(image.convert("RGB"))
+        edges = -self._above / depth, self._below / depth
+        picture: Picture = _painted(self._slope, self._column, *edges, shade, self._ground, _palette())
         for panel in panels:
             self.draw(picture, panel, place, ranges)
         return picture
@@ -347,6 +347,13 @@ class Painter:
         return x, y
 
 
+def compile_kernels() -> None:
+    """Compile what draws, where that is not done yet: a second in which nothing else runs in this process."""
+    config = CameraConfig()
+    picture = Painter(config, (2, 2), 0.6).picture(np.ones(2), (), mounted((0.0, 0.0, 0.0), config))
+    _grainy(picture, 0, 1.0, 0, 0)
+
+
 # Panels
 
 
@@ -428,20 +435,54 @@ def _person() -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
 
 
 @cache
-def _palette() -> bytes:
+def _palette() -> NDArray[np.uint8]:
+    """(256, 3)."""
     rows = np.zeros((256, 3))
     ramp = np.linspace(0.0, 1.0, 64)[:, None]
     rows[WALLS:FLOOR] = np.linspace(0.1, 1.0, 128)[:, None] * (225, 215, 200)
     rows[FLOOR:SKY] = (60, 55, 50) + ramp * (60, 55, 45)
     rows[SKY:] = (215, 220, 225) - ramp * (95, 65, 25)
-    return rows.astype(np.uint8).tobytes()
+    return rows.astype(np.uint8)
 
 
 def _grainy(picture: Picture, seed: int, noise: float, row: int, column: int) -> Picture:
-    height, width = picture.shape[:2]
-    grain = _grain(seed, noise, height, width)[row : row + height, column : column + width, None]
-    noisy: Picture = np.clip(picture + grain, 0, 255).astype(np.uint8)
+    noisy: Picture = _added(picture, _grain(seed, noise, *picture.shape[:2]), row, column)
     return noisy
+
+
+@njit(cache=True)
+def _added(picture: Picture, grain: NDArray[np.int16], row: int, column: int) -> Picture:
+    """With the part of the grain that begins at (row, column), the same in all colours."""
+    height, width, colours = picture.shape
+    noisy = np.empty_like(picture)
+    for i in range(height):
+        for j in range(width):
+            more = grain[row + i, column + j]
+            for k in range(colours):
+                noisy[i, j, k] = min(max(picture[i, j, k] + more, 0), 255)
+    return noisy
+
+
+@njit(cache=True)
+def _painted(
+    slope: NDArray[np.float32],
+    column: NDArray[np.int32],
+    upper: NDArray[np.float32],
+    lower: NDArray[np.float32],
+    shade: NDArray[np.uint8],
+    ground: NDArray[np.uint8],
+    palette: NDArray[np.uint8],
+) -> Picture:
+    """Colours of pixels (height, width): of the wall in their column of the fan between its slopes, or the ground's."""
+    height, width = slope.shape
+    picture = np.empty((height, width, 3), np.uint8)
+    for i in range(height):
+        for j in range(width):
+            at = column[i, j]
+            colour = palette[shade[at] if upper[at] < slope[i, j] < lower[at] else ground[i, j]]
+            for k in range(3):
+                picture[i, j, k] = colour[k]
+    return picture
 
 
 @lru_cache(maxsize=4)

@@ -1,6 +1,7 @@
-"""Compiles the kernels of all workers ahead of their first use: ``python -m monstertruckd.tools.install.kernels``.
+"""Compiles kernels ahead of their first use: ``python -m monstertruckd.tools.install.kernels``.
 
-numba keeps them next to the modules, or in ``NUMBA_CACHE_DIR``. Where they are up to date this takes seconds.
+Those of all workers and of the emulated camera. numba keeps them next to the modules, or in ``NUMBA_CACHE_DIR``. Where
+they are up to date this takes seconds.
 """
 
 import importlib
@@ -13,11 +14,12 @@ from monstertruck_planners.steps import STEPS
 
 WORKERS: Final = (TARGET, *STEPS.values())
 """``module:factory``; each compiles when it is built."""
+CAMERA: Final = "monstertruck_sim.world.camera:compile_kernels"
 
 
 def compile_kernels() -> None:
-    """Build every worker once; those whose packages are not installed are left out."""
-    for target in WORKERS:
+    """Build every worker once, and draw a picture; what needs packages that are not installed is left out."""
+    for target in (*WORKERS, CAMERA):
         module, _, factory = target.partition(":")
         with suppress(ModuleNotFoundError):
             getattr(importlib.import_module(module), factory)()
