@@ -15,16 +15,22 @@ A jump is a change of the speed or yaw rate asked for, from one step to the next
 Ramps of method 3 are evaluated at 100 Hz. The last line is JSON.
 
     python benchmarks/wall_following.py [--seeds 50] [--jobs 2] [--only study arenas faults] [--figure FILE.png]
+
+``--resume FOLDER`` keeps every run there; the same command goes on after an interruption. Of the same program only.
 """
 
 import argparse
 import json
 import math
+import pickle
+import re
 import sys
 from collections import Counter
 from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from itertools import product
 from multiprocessing import get_context
+from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import matplotlib.pyplot as plt
@@ -37,6 +43,7 @@ from monstertruck_planners.behave.api import Behaviour
 from monstertruck_planners.behave.wall.config import WallLineConfig, WallPdConfig, WallSwitchingConfig
 from monstertruck_planners.behave.wall.line import WallLine
 from monstertruck_planners.behave.wall.published import WallPd, WallSwitching
+from monstertruck_runtime.small_files import replace_file
 from monstertruck_schemas.reasons import Reason
 from monstertruck_sim.world.config import FIVE_SONARS
 
@@ -127,6 +134,20 @@ def do(job: Job) -> Result:
     return Result(job, run._replace(ramps=[]), errors_along(arena, run.track), steepest(run))
 
 
+def kept(job: Job, folder: Path | None) -> Result:
+    """``do``, or what it gave before."""
+    if folder is None:
+        return do(job)
+    name = "-".join(re.sub(r"[^a-z0-9.]+", "_", str(value)) for value in job if not isinstance(value, tuple))
+    file = folder / f"{name}.pickle"
+    if file.exists():
+        found: Result = pickle.loads(file.read_bytes())
+        return found
+    result = do(job)
+    replace_file(file, pickle.dumps(result))
+    return result
+
+
 def steepest(run: WallRun) -> tuple[float, float]:
     """Greatest acceleration and jerk of the planned ramps at 100 Hz."""
     acceleration = jerk = 0.0
@@ -202,7 +223,7 @@ def summary(results: list[Result]) -> dict[str, Any]:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=50, help="of study and arenas; faults have 20 at most")
-    parser.add_argument("--first", type=int, default=0, help="seed: a long run may be made in pieces")
+    parser.add_argument("--resume", type=Path, metavar="FOLDER", help="keep runs there, and drive none again")
     parser.add_argument("--jobs", type=int, default=2, help="processes")
     parser.add_argument(
         "--only", choices=("study", "arenas", "faults"), nargs="+", default=("study", "arenas", "faults")
@@ -212,7 +233,9 @@ def main() -> int:
     parser.add_argument("--figure", help="PNG of the runs of `start`")
     args = parser.parse_args()
     sides, jobs = ("left", "right"), []
-    every = range(args.first, args.first + args.seeds)
+    every = range(args.seeds)
+    if args.resume is not None:
+        args.resume.mkdir(parents=True, exist_ok=True)
     rows = [row for row in METHODS if row[0][0] in args.method and row[1] in args.model]
     if "study" in args.only:
         jobs += [Job("study", *row, side, s) for row, s, side in product(rows, every, sides)]
@@ -223,13 +246,13 @@ def main() -> int:
     if "arenas" in args.only:
         jobs += [Job("arenas", "3", "cone", sides[s % 2], s) for s in every]
     if "faults" in args.only:
-        seeds = range(args.first, min(args.first + args.seeds, FAULT_SEEDS))
+        seeds = range(min(args.seeds, FAULT_SEEDS))
         jobs += [Job("faults", "3", "cone", sides[s % 2], s, fault) for fault, s in product(FAULTS, seeds)]
     groups: dict[str, list[Result]] = {}
     figures: dict[str, dict[str, Any]] = {}
     expected = Counter(row_of(job) for job in jobs)
     with ProcessPoolExecutor(args.jobs, mp_context=get_context("spawn")) as pool:
-        for result in pool.map(do, jobs):
+        for result in pool.map(partial(kept, folder=args.resume), jobs):
             name = row_of(result.job)
             results = groups.setdefault(name, [])
             results.append(result)

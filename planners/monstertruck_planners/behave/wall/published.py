@@ -272,6 +272,8 @@ class WallPd(_Wall):
         if state.gaps != (None, None):
             return replace(state, error=None), v, self._along_line(state)
         error = self._distance(ranges) - config.distance
+        if config.lead:
+            error += v * config.lead * math.sin(wall_angle(ranges.diagonal, ranges.side, config.offset))
         change = 0.0 if state.error is None else error - state.error
         return replace(state, error=error), v, config.k_p * error + config.k_d * change
 
@@ -304,7 +306,8 @@ class WallPd(_Wall):
     def _gaps(self, state: WallState, ranges: Ranges) -> WallState:
         """Which sonars look into a gap: from a jump up on, until they measure the wall again or it is too long.
 
-        A jump down out of no known gap ends a niche that it started beside: its echoes were none of the wall.
+        A jump down out of no known gap ends a niche that it started beside: its echoes were none of the wall. Where it
+        begins, a diagonal range much longer than that along a wall is one into a gap as well.
         """
         before, (side, diagonal), now = state.before, state.gaps, state.travelled
         niche = side is None and bool(before) and before[-1].side - ranges.side > JUMP[1]
@@ -312,7 +315,8 @@ class WallPd(_Wall):
             side = now if side is None else side
         elif side is not None and ranges.side < self._config.seen and now - side > EDGE:
             side = None
-        if before and ranges.diagonal - before[-1].diagonal > JUMP[1]:
+        known = before[-1].diagonal if before else ranges.side / math.cos(DIAGONAL)
+        if ranges.diagonal - known > JUMP[1]:
             diagonal = now
         elif ranges.diagonal * math.cos(DIAGONAL) - ranges.side < BACK:
             diagonal = None

@@ -54,6 +54,24 @@ def test_yaw_rate_is_twelve_times_the_error_and_its_plain_difference():
     assert second.motion.wz == pytest.approx(12 * 0.01 + 11.3 * 0.01)
 
 
+def test_a_robot_that_is_late_swings_along_the_wall_and_with_its_lead_it_does_not():
+    left = []
+    for lead in (0.0, 0.3):
+        robot = Robot(LONG_WALL, (0.0, 0.05, 0.0), ahead=0.05, late=2)
+        run = drive(WallPd(WallPdConfig(offset=0.05, lead=lead)), robot, 20.0)
+        left.append(np.abs(run.poses[100:, 1]).max())
+    assert left[1] < 0.005 < 0.012 < left[0]
+
+
+def test_following_that_begins_with_the_diagonal_sonar_in_a_gap_goes_along_the_wall():
+    walls = [(-10.0, 0.35, 0.0, 0.35), (0.4, 0.35, 30.0, 0.35), (0.0, 0.35, 0.0, 1.85), (0.4, 0.35, 0.4, 1.85)]
+    for start in (-0.35, -0.25, -0.15):
+        robot = Robot(walls, (start, 0.0, 0.0), ahead=0.05)
+        run = drive(WallPd(WallPdConfig(offset=0.05, gap=0.6, aligned=0.0, seen=0.6)), robot, 8.0)
+        assert run.poses[-1, 0] > 1.0
+        assert np.abs(run.poses[:, 1]).max() < 0.035
+
+
 @pytest.mark.parametrize("side", ["left", "right"])
 @pytest.mark.parametrize("make", ["pd", "switching"])
 def test_a_lap_of_a_hall_ends_with_its_reason_and_without_contact(side, make):

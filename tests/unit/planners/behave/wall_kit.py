@@ -102,7 +102,14 @@ class Robot:
     """Of the side sonars before the axle, m."""
     bias: float = 0.0
     """Of the gyroscope, rad/s."""
+    late: int = 0
+    """Steps after which it does what it is asked for."""
     count: int = 0
+    asked: list[RequestedMotion] = field(default_factory=list)
+
+    def ask(self, motion):
+        self.asked.append(motion)
+        self.motion = self.asked[max(len(self.asked) - 1 - self.late, 0)]
 
     def inputs(self):
         x, y, yaw = self.pose
@@ -178,6 +185,6 @@ def drive(behaviour: Behaviour, robot: Robot, seconds: float) -> Drive:
         clearance = min(clearance, robot.clearance)
         if step.outcome is not Reason.DRIVING:
             break
-        robot.motion = step.motion or RequestedMotion()
+        robot.ask(step.motion or RequestedMotion())
         robot.move()
     return Drive(steps, np.array(poses), clearance)
