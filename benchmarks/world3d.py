@@ -355,7 +355,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=20, help="of the slopes")
     parser.add_argument("--metres", type=float, default=60.0, help="on rough ground")
     parser.add_argument("--count", type=int, default=200, help="of faults")
-    parser.add_argument("--keep", type=Path, help="folder for the laps' logs")
+    parser.add_argument("--keep", type=Path, help="folder for the laps' logs and the drill's finished legs")
     arguments = parser.parse_args()
     figures: dict[str, float] = {}
     calls = PARTS | {
@@ -365,7 +365,7 @@ def main() -> None:
         "patch": patch,
         "fleet": fleet,
         "robots": robots,
-        "drill": lambda: drilled(arguments.count),
+        "drill": lambda: drilled(arguments.count, arguments.keep),
     }
     for part in arguments.parts:
         figures |= calls[part]()

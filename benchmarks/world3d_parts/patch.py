@@ -27,8 +27,8 @@ ENDS = (0.5, 6.0)
 PATCH = (2.4, 4.0)
 """Where the stones begin and end along x, m."""
 WIDTHS = {"narrow": 0.5, "spanning": 6.0}
-"""Of the patch, m: one that is felt as a whole on one trip, with room on both sides, and one from wall to wall."""
-TRIPS = 2
+"""Of the patch, m: one with room on both sides, half as wide again as the truck, and one from wall to wall."""
+TRIPS = 4
 LIMIT = 240.0
 """Seconds a trip may take."""
 STONE = 0.125
@@ -144,6 +144,7 @@ def patch() -> dict[str, float]:
             f"patch_{name}_reached": sum(trip.reached for trip in ways) / len(ways),
             f"patch_{name}_first_m_on_stones": ways[0].on(width),
             f"patch_{name}_last_m_on_stones": ways[-1].on(width),
+            f"patch_{name}_trips_over_it": sum(trip.on(width) > 0.0 for trip in ways),
             f"patch_{name}_rough_on": on,
             f"patch_{name}_rough_off": off,
             f"patch_{name}_detour": ways[-1].length / (ENDS[1] - ENDS[0]),

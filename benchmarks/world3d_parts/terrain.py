@@ -1,6 +1,6 @@
 """The whole daemon on uneven ground: level lidar, map and pose on hills; side slopes with the gate and without it."""
 
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from math import acos, degrees, hypot, pi, radians, tan
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -96,7 +96,7 @@ def over(ground: list[dict[str, Any]], metres: float, *, stabilised: bool) -> Dr
         plant = world.plant
         assert isinstance(plant, RigidPlant)
         assert await truck.until(truck.drives, 30.0, Order.ARM)
-        lidar, body, errors, way = [], [], [], 0.0
+        lidar, body, errors, way, told = [], [], [], 0.0, 10.0
         then = world.truth(clock.now())
         limit = clock.now() + round(metres / 0.1 * SECOND)
         while way < metres and clock.now() < limit:
@@ -109,12 +109,20 @@ def over(ground: list[dict[str, Any]], metres: float, *, stabilised: bool) -> Dr
             then = now
             if (heard := pose.latest) is not None:
                 errors.append(hypot(heard.pose.x - now.x, heard.pose.y - now.y))
+            if way > told:
+                told += 10.0
+                tilt = f"lidar {_rms(lidar):.2f} degrees RMS, {max(lidar):.2f} at most"
+                print(f"{way:.0f} m: {tilt}; pose {_rms(errors) * 100:.2f} cm", flush=True)
         await clock.sleep(2.0)
         grid = grids.latest
         walls = np.zeros(0) if grid is None else to_walls(grid, world)
         return Driven(np.array(lidar), np.array(body), np.array(errors), way, grid, walls)
 
     return run(with_overlay(base, overlay), drive)
+
+
+def _rms(values: Sequence[float] | np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else 0.0
 
 
 def to_walls(grid: Grid, world: World) -> np.ndarray:
@@ -139,20 +147,19 @@ def rough(metres: float) -> dict[str, float]:
         "unstabilised": over(hills(), metres, stabilised=False),
     }
     for name, it in runs.items():
-        rms = {key: float(np.sqrt((values**2).mean())) for key, values in (("lidar", it.lidar), ("body", it.body))}
         settled = it.lidar[min(SETTLED, len(it.lidar) - 1) :]
         figures |= {
             f"{name}_way": it.way,
-            f"{name}_body_deg_rms": rms["body"],
-            f"{name}_lidar_deg_rms": rms["lidar"],
+            f"{name}_body_deg_rms": _rms(it.body),
+            f"{name}_lidar_deg_rms": _rms(it.lidar),
             f"{name}_lidar_deg_max": float(it.lidar.max()),
-            f"{name}_lidar_settled_deg_rms": float(np.sqrt((settled**2).mean())),
+            f"{name}_lidar_settled_deg_rms": _rms(settled),
             f"{name}_lidar_settled_deg_max": float(settled.max()),
-            f"{name}_ate_cm": float(np.sqrt((it.errors**2).mean())) * 100 if len(it.errors) else float("inf"),
+            f"{name}_ate_cm": _rms(it.errors) * 100 if len(it.errors) else float("inf"),
         }
         if len(it.walls):
             real = it.walls[it.walls < GHOST]
-            figures[f"{name}_wall_error_cm"] = float(np.sqrt((real**2).mean())) * 100
+            figures[f"{name}_wall_error_cm"] = _rms(real) * 100
             figures[f"{name}_ghost_share"] = float((it.walls >= GHOST).mean())
     if "rough_wall_error_cm" in figures:
         figures["rough_over_flat_walls"] = figures["rough_wall_error_cm"] / figures["flat_wall_error_cm"]
@@ -189,6 +196,7 @@ def slopes(seeds: int) -> dict[str, float]:
         alone.motor.command(0, -0.2 * RPM, 20_000.0)
         tilt = max(_tilted(alone, step * SECOND // 20) for step in range(1, 500))
         bare += tilt > FALLEN
+        print(f"seed {seed}: {fallen} overturned with the gate, {bare} without", flush=True)
     return {
         "slope_seeds": seeds,
         "slope_overturned": fallen,
@@ -197,10 +205,13 @@ def slopes(seeds: int) -> dict[str, float]:
     }
 
 
-def drilled(count: int) -> dict[str, float]:
-    """Seeded faults on the whole truck, with its deadman line; metres without computer, with the line and without."""
+def drilled(count: int, keep: Path | None = None) -> dict[str, float]:
+    """Seeded faults on the whole truck, with its deadman line; metres without computer, with the line and without.
+
+    With a folder to ``keep`` them in, a second run goes on behind the legs that the first one finished.
+    """
     truck = load_config(CONFIGS / "full3d.yaml", SimulatedTruckConfig)[0]
-    report = Drill(1, count, truck).run(jobs=default_jobs())
+    report = Drill(1, count, truck).run(jobs=default_jobs(), resume=None if keep is None else keep / "drill.jsonl")
     figures = {f"drill_{k}": float(value) for k, value in report.figures().items() if isinstance(value, int | float)}
     figures["drill_computer_power_faults"] = sum(o.kind is FaultKind.COMPUTER_POWER for o in report.outcomes)
     for name, overlay in (("with", DEADMAN_LINE), ("without", {})):
