@@ -1,7 +1,7 @@
 """The world in three dimensions: against closed forms, against the plane, and how fast it is.
 
-    python benchmarks/world3d.py [--parts scans mechanics turning step speed lap slopes rough patch drill fleet robots]
-        [--seeds 20] [--metres 60] [--count 200] [--keep FOLDER]
+    python benchmarks/world3d.py
+        [--parts scans mechanics turning step speed lap slopes rough patch drill fleet robots webcam] [--seeds 20] [--metres 60] [--count 200] [--keep FOLDER]
 
 ``scans``: standing scans without noise from free poses against the plane's. ``mechanics``: sag under a load, overturn
 angle, pull of the clutch, a lifted wheel. ``turning``: radius in every steering mode against ``common_motion`` (least
@@ -10,8 +10,8 @@ far half the step moves the end of a drive. ``speed``: one step, one swept scan,
 the whole daemon, its error, its speed, twice the same. ``slopes``: trucks that drive onto a hillside, by the daemon and
 without one. ``rough``: lidar, map and pose on hills of 5 degrees RMS. ``patch``: whether
 rough ground is found, and routes go round it. ``drill``: seeded faults, with a deadman line and without. ``fleet``: two
-robots and people, a daemon for each robot. ``robots``: every body drives a bend, one follows a wall by sonars. The last
-line is JSON.
+robots and people, a daemon for each robot. ``robots``: every body drives a bend, one follows a wall by sonars.
+``webcam``: the whole daemon with its rendered camera. The last line is JSON.
 """
 
 import argparse
@@ -29,6 +29,7 @@ from world3d_parts.fleet import fleet
 from world3d_parts.patch import patch
 from world3d_parts.robots import robots
 from world3d_parts.terrain import drilled, rough, slopes
+from world3d_parts.webcam import webcam
 
 import monstertruck_sim.world3d.model as rigid_model
 import monstertruck_sim.world3d.plant as rigid_plant
@@ -82,6 +83,8 @@ GOALS: dict[str, tuple[str, float]] = {
     "robots_cross_track_cm": ("<=", 3.0),
     "robots_wall_followed": (">=", 1.0),
     "robots_wall_error_cm": ("<=", 3.0),
+    "webcam_speed": (">=", 1.0),
+    "webcam_pictures_per_s": (">=", 14.5),
 }
 
 
@@ -350,7 +353,7 @@ PARTS: dict[str, Callable[[], dict[str, float]]] = {
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    names = [*PARTS, "lap", "slopes", "rough", "patch", "drill", "fleet", "robots"]
+    names = [*PARTS, "lap", "slopes", "rough", "patch", "drill", "fleet", "robots", "webcam"]
     parser.add_argument("--parts", nargs="+", default=names, choices=names)
     parser.add_argument("--seeds", type=int, default=20, help="of the slopes")
     parser.add_argument("--metres", type=float, default=60.0, help="on rough ground")
@@ -365,6 +368,7 @@ def main() -> None:
         "patch": patch,
         "fleet": fleet,
         "robots": robots,
+        "webcam": webcam,
         "drill": lambda: drilled(arguments.count, arguments.keep),
     }
     for part in arguments.parts:

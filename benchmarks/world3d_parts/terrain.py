@@ -1,12 +1,13 @@
 """The whole daemon on uneven ground: level lidar, map and pose on hills; side slopes with the gate and without it."""
 
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable
 from math import acos, degrees, hypot, pi, radians, tan
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt
+from scoring import rms
 
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.mailbox import latest
@@ -111,18 +112,14 @@ def over(ground: list[dict[str, Any]], metres: float, *, stabilised: bool) -> Dr
                 errors.append(hypot(heard.pose.x - now.x, heard.pose.y - now.y))
             if way > told:
                 told += 10.0
-                tilt = f"lidar {_rms(lidar):.2f} degrees RMS, {max(lidar):.2f} at most"
-                print(f"{way:.0f} m: {tilt}; pose {_rms(errors) * 100:.2f} cm", flush=True)
+                tilt = f"lidar {rms(np.array(lidar)):.2f} degrees RMS, {max(lidar):.2f} at most"
+                print(f"{way:.0f} m: {tilt}; pose {rms(np.array(errors)) * 100:.2f} cm", flush=True)
         await clock.sleep(2.0)
         grid = grids.latest
         walls = np.zeros(0) if grid is None else to_walls(grid, world)
         return Driven(np.array(lidar), np.array(body), np.array(errors), way, grid, walls)
 
     return run(with_overlay(base, overlay), drive)
-
-
-def _rms(values: Sequence[float] | np.ndarray) -> float:
-    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else 0.0
 
 
 def to_walls(grid: Grid, world: World) -> np.ndarray:
@@ -150,16 +147,16 @@ def rough(metres: float) -> dict[str, float]:
         settled = it.lidar[min(SETTLED, len(it.lidar) - 1) :]
         figures |= {
             f"{name}_way": it.way,
-            f"{name}_body_deg_rms": _rms(it.body),
-            f"{name}_lidar_deg_rms": _rms(it.lidar),
+            f"{name}_body_deg_rms": rms(it.body),
+            f"{name}_lidar_deg_rms": rms(it.lidar),
             f"{name}_lidar_deg_max": float(it.lidar.max()),
-            f"{name}_lidar_settled_deg_rms": _rms(settled),
+            f"{name}_lidar_settled_deg_rms": rms(settled),
             f"{name}_lidar_settled_deg_max": float(settled.max()),
-            f"{name}_ate_cm": _rms(it.errors) * 100 if len(it.errors) else float("inf"),
+            f"{name}_ate_cm": rms(it.errors) * 100 if len(it.errors) else float("inf"),
         }
         if len(it.walls):
             real = it.walls[it.walls < GHOST]
-            figures[f"{name}_wall_error_cm"] = _rms(real) * 100
+            figures[f"{name}_wall_error_cm"] = rms(real) * 100
             figures[f"{name}_ghost_share"] = float((it.walls >= GHOST).mean())
     if "rough_wall_error_cm" in figures:
         figures["rough_over_flat_walls"] = figures["rough_wall_error_cm"] / figures["flat_wall_error_cm"]
