@@ -1,7 +1,8 @@
 """The world in three dimensions: against closed forms, against the plane, and how fast it is.
 
     python benchmarks/world3d.py
-        [--parts scans mechanics turning step speed lap slopes rough patch drill fleet robots webcam] [--seeds 20] [--metres 60] [--count 200] [--keep FOLDER]
+        [--parts scans mechanics turning step speed lap slopes rough patch drill fleet robots webcam]
+        [--seeds 20] [--metres 60] [--count 200] [--keep FOLDER]
 
 ``scans``: standing scans without noise from free poses against the plane's. ``mechanics``: sag under a load, overturn
 angle, pull of the clutch, a lifted wheel. ``turning``: radius in every steering mode against ``common_motion`` (least
