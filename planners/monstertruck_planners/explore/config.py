@@ -34,6 +34,8 @@ class ExplorerConfig(Schema):
     """How often a place is tried before it is given up for good"""
     lost: Positive = 60.0
     """Seconds without a place in the map after which it ends"""
+    around: bool = True
+    """Meanwhile it drives half a metre to and fro, for who stands still sees nothing new"""
     reserve: Annotated[float, Field(ge=1)] = 1.5
     """It drives home when the charge falls below that of the way back times this"""
     full_range: Positive = 2000.0

@@ -28,6 +28,10 @@ SAVE: Final = 30.0
 """Seconds to wait for the map to be saved."""
 AGAIN: Final = 2.0
 """Seconds after a goal that was not taken, or for the way home; of those the next time twice as many."""
+STANDS: Final = 5.0
+"""Seconds for which a robot that is lost stands before it drives a little."""
+AROUND: Final = ((0.6, 0.0, 0.0), (-0.9, 0.0, 0.0), (0.6, 0.25, 0.8), (0.6, -0.25, -0.8))
+"""Poses in base to which it then drives in turn: who stands still sees nothing new."""
 STUCK: Final = 3
 """Goals in a row that fail without the robot leaving its place, after which the place is to blame..."""
 LEFT: Final = 0.3
@@ -86,6 +90,8 @@ class Observed:
     """Seconds."""
     pose: Pose | None
     """Of the base, in map; None = not known, or not to be trusted."""
+    believed: Pose | None = None
+    """The pose even if it is not to be trusted."""
     ended: Reason | None = None
     """How the newest goal ended; None = it is pursued, or there was none."""
     ended_text: str = ""
@@ -161,6 +167,8 @@ class Exploration:
     goals: int = 0
     failures: int = 0
     home_goals: int = 0
+    looks: int = 0
+    """Short drives since it was lost."""
 
     @property
     def running(self) -> bool:
@@ -204,7 +212,7 @@ def tick(run: Exploration, seen: Observed, config: ExplorerConfig) -> Step:
     if run.phase is ExplorationPhase.LOST:
         return _lost(run, seen, config)
     if seen.pose is None:
-        lost = replace(_enter(run, ExplorationPhase.LOST), target=None, backing=False)
+        lost = replace(_enter(run, ExplorationPhase.LOST), target=None, backing=False, looks=0)
         return lost, (Cancel(), Notice(Reason.POSE_LOST, Severity.WARNING, "waits where it stands"))
     if run.phase is ExplorationPhase.RETURNING:
         return _returning(run, seen)
@@ -358,12 +366,24 @@ def _ask(run: Exploration) -> Step:
 def _lost(run: Exploration, seen: Observed, config: ExplorerConfig) -> Step:
     if seen.pose is not None:
         phase = ExplorationPhase.LOOKING if run.final is Reason.DRIVING else ExplorationPhase.RETURNING
-        found = replace(_enter(run, phase), waiting=False, not_before=run.now + SETTLE, nothing=0)
-        return found, (Notice(Reason.POSE_FOUND, Severity.INFO, "goes on"),)
+        found = replace(_enter(run, phase), waiting=False, target=None, not_before=run.now + SETTLE, nothing=0)
+        stop = () if run.target is None else (Cancel(),)
+        return found, (*stop, Notice(Reason.POSE_FOUND, Severity.INFO, "goes on"))
     if run.now - run.since > config.lost:
         text = f"its place was not found for {config.lost:g} s; it stands where it is"
         return _finish(replace(run, returns=False), Reason.POSE_LOST, text)
-    return run, ()
+    if run.target is not None:
+        if seen.ended is Reason.CANCELLED:
+            return _end(run, Reason.CANCELLED, f"its goal was cancelled: {seen.ended_text}", Save())
+        return (run, ()) if seen.ended is None else (replace(run, target=None, not_before=run.now + AGAIN), ())
+    if not config.around or seen.believed is None or run.now < max(run.since + STANDS, run.not_before):
+        return run, ()
+    x, y, yaw = seen.believed
+    ahead, left, turn = AROUND[run.looks % len(AROUND)]
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    pose = x + cos * ahead - sin * left, y + sin * ahead + cos * left, math.remainder(yaw + turn, math.tau)
+    say = () if run.looks else (Notice(Reason.RECOVERING, Severity.INFO, "its place is not known: looks around"),)
+    return replace(run, target=Viewpoint(pose, pose[:2]), looks=run.looks + 1), (Go(pose), *say)
 
 
 def _finish(run: Exploration, outcome: Reason, text: str) -> Step:

@@ -231,6 +231,7 @@ class ExplorerService:
         return Observed(
             now=now / SECOND,
             pose=self._pose(now),
+            believed=self._believed(now),
             ended=ended,
             ended_text=text,
             displaced=displaced,
@@ -261,14 +262,19 @@ class ExplorerService:
             return None, "", ""
         return goal.outcome, goal.text, ""
 
+    def _believed(self, now: int) -> Pose | None:
+        """Of the base in map, whatever it is worth."""
+        pose = self._in.pose.latest
+        return None if pose is None or now - pose.received > POSE.fresh_for() * SECOND else pose_of(pose)
+
     def _pose(self, now: int) -> Pose | None:
         """Of the base in map, while it is known."""
-        pose, slam = self._in.pose.latest, self._in.slam.latest
-        if pose is None or now - pose.received > POSE.fresh_for() * SECOND:
+        pose, slam = self._believed(now), self._in.slam.latest
+        if pose is None:
             return None
         if slam is None or slam.standing not in NO_PLACE or now - slam.received > SLAM.fresh_for() * SECOND:
             self._placed = now
-        return pose_of(pose) if now - self._placed <= LOST_FOR * SECOND else None
+        return pose if now - self._placed <= LOST_FOR * SECOND else None
 
     # Decisions
 

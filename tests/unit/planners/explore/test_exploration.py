@@ -182,6 +182,26 @@ def test_lost_it_stands_and_goes_on_once_it_is_found_or_gives_up():
     assert tale.saved().outcome is Reason.POSE_LOST
 
 
+def test_lost_it_drives_to_and_fro_until_it_is_found():
+    tale = Tale()
+    tale.drive()
+    tale.pose, here = None, (2.0, 1.0, math.pi / 2)
+    tale.tell(believed=here)
+    tale.tell(exploration.STANDS - 1.0, believed=here)
+    assert tale.actions == (), "whoever carried it is still there"
+    tale.tell(1.5, believed=here)
+    assert tale.actions[0] == Go(pytest.approx((2.0, 1.6, math.pi / 2)))
+    assert tale.said() == [Reason.RECOVERING]
+    tale.tell(believed=here)
+    assert tale.actions == (), "the goal is pursued"
+    tale.tell(believed=here, ended=Reason.GOAL_UNREACHABLE)
+    tale.tell(exploration.AGAIN, believed=here)
+    assert tale.actions == (Go(pytest.approx((2.0, 0.1, math.pi / 2))),)
+    tale.pose = (5.0, 5.0, 0.0)
+    tale.tell(believed=tale.pose)
+    assert (tale.run.phase, tale.actions[0], tale.said()) == (Phase.LOOKING, Cancel(), [Reason.POSE_FOUND])
+
+
 def test_a_battery_that_may_give_out_any_moment_has_the_map_saved_at_once():
     tale = Tale()
     tale.drive()
