@@ -157,6 +157,14 @@ def test_every_kind_is_on_the_catalog_of_the_whole_truck_and_what_needs_hubs_is_
     assert missing == {*hubs, FaultKind.RAIL_12V, FaultKind.ECHO, FaultKind.NETWORK, FaultKind.MEMORY}
 
 
+def test_a_robot_that_it_cannot_judge_is_refused_with_the_key():
+    sonar, _ = load_config(CONFIGS / "robots" / "sonar.yaml", SimulatedTruckConfig)
+    with pytest.raises(InputError, match=r"devices\.steering: sonar has none: expected a robot that a tracker drives"):
+        Drill(1, 1, sonar)
+    with pytest.raises(InputError, match="tracker: "):
+        Drill(1, 1, with_overlay(demo(), {"tracker": None}))
+
+
 def test_draws_are_the_seeds():
     catalog = catalog_of(full())
     names = [[catalog.draw(rng).name for _ in range(50)] for rng in map(np.random.default_rng, (1, 1, 2))]

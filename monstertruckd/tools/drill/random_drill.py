@@ -191,9 +191,19 @@ class Drill:
         count: how many faults.
         config: the simulated truck.
         leg: faults of one truck.
+
+    Raises:
+        InputError: the robot has no motor, servos or tracker: nothing drives it, or the observer cannot judge it.
     """
 
     def __init__(self, seed: int, count: int, config: SimulatedTruckConfig, *, leg: int = LEG) -> None:
+        needed = {"devices.drive": config.devices.drive, "devices.steering": config.devices.steering}
+        for key, there in (needed | {"tracker": config.tracker}).items():
+            if there is None:
+                raise InputError(
+                    f"{key}: {config.robot} has none: expected a robot that a tracker drives by motor and servos; "
+                    "others have random faults by `sim: { drill: {} }`"
+                )
         self.seed = seed
         self.count = count
         self._config = config
