@@ -16,7 +16,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from exploration_parts.daemon import RunRecord, Story, recorded_run
+from exploration_parts.arena import Arena
+from exploration_parts.daemon import CONFIGS, RunRecord, Story, recorded_run
 from monstertruck_planners.collision import Footprint
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError, TruckError
@@ -27,6 +28,12 @@ from monstertruck_sim.world.obstacles import Box
 FAULTS: Final = ("kidnap", "door", "person", "lidar", "battery")
 DOORS: Final = ((2.45, 3.1, 0.9, 0.1), (7.65, 3.1, 0.9, 0.1), (3.85, 4.8, 0.9, 0.1), (6.85, 4.8, 0.9, 0.1))
 """Of the rooms: middle, length, width, m."""
+WALK: Final = (
+    (1.2, 3.95), (2.45, 3.95), (2.45, 2.2), (2.45, 3.95), (6.85, 3.95), (6.85, 5.8), (6.85, 3.95), (8.8, 3.95)
+)  # fmt: skip
+"""Of the person, round and round, through the hall and into two rooms, m."""
+APART: Final = 1.5
+"""Metres from the truck at which the person begins, at least."""
 BUDGET, LIMIT = 240.0, 600.0
 """Seconds of exploring, and until the end."""
 WHEN: Final = (15.0, 60.0)
@@ -48,7 +55,7 @@ SAYS: Final = {
 def explored(seed: int, fault: str) -> dict[str, Any]:
     """One run, judged."""
     rng = np.random.default_rng([31, seed, FAULTS.index(fault)])
-    people = [{"speed": 0.5, "before": ("stop", "turn")[seed % 2]}] if fault == "person" else []
+    people = [walker(seed, rng)] if fault == "person" else []
 
     async def happen(story: Story) -> None:
         await story.clock.sleep(float(rng.uniform(*WHEN)))
@@ -71,6 +78,14 @@ def explored(seed: int, fault: str) -> dict[str, Any]:
                 story.rig.world.set_charge(story.clock.now(), float(rng.uniform(0.05, 0.12)))
 
     return judged(recorded_run("rooms", seed, happen, budget=BUDGET, limit=LIMIT, people=people), fault, seed)
+
+
+def walker(seed: int, rng: np.random.Generator) -> dict[str, Any]:
+    """Settings of somebody who begins away from the truck."""
+    start = Arena.load("rooms", CONFIGS / "worlds" / "rooms.yaml").start(seed)
+    first = next(int(k) for k in rng.permutation(len(WALK)) if math.dist(WALK[k], start[:2]) > APART)
+    places = [{"x": x, "y": y} for x, y in (*WALK[first:], *WALK[:first])]
+    return {"waypoints": places, "speed": 0.5, "before": ("stop", "turn")[seed % 2]}
 
 
 def noted(story: Story) -> None:
