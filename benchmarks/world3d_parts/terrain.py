@@ -97,7 +97,7 @@ def over(ground: list[dict[str, Any]], metres: float, *, stabilised: bool) -> Dr
         plant = world.plant
         assert isinstance(plant, RigidPlant)
         assert await truck.until(truck.drives, 30.0, Order.ARM)
-        lidar, body, errors, way, told = [], [], [], 0.0, 10.0
+        lidar, body, errors, way, report = [], [], [], 0.0, 10.0
         then = world.truth(clock.now())
         limit = clock.now() + round(metres / 0.1 * SECOND)
         while way < metres and clock.now() < limit:
@@ -110,8 +110,8 @@ def over(ground: list[dict[str, Any]], metres: float, *, stabilised: bool) -> Dr
             then = now
             if (heard := pose.latest) is not None:
                 errors.append(hypot(heard.pose.x - now.x, heard.pose.y - now.y))
-            if way > told:
-                told += 10.0
+            if way > report:
+                report += 10.0
                 tilt = f"lidar {rms(np.array(lidar)):.2f} degrees RMS, {max(lidar):.2f} at most"
                 print(f"{way:.0f} m: {tilt}; pose {rms(np.array(errors)) * 100:.2f} cm", flush=True)
         await clock.sleep(2.0)
