@@ -14,7 +14,7 @@ same seeds for all; odometry and gyroscope with errors of their own.
 A jump is a change of the speed or yaw rate asked for, from one step to the next, of more than 0.8 m/s^2 or rad/s^2.
 Ramps of method 3 are evaluated at 100 Hz. The last line is JSON.
 
-    python benchmarks/wall_following.py [--seeds 50] [--jobs 2] [--only study arenas faults] [--figure FILE.png]
+    python benchmarks/wall_following.py [--seeds 50] [--jobs 2] [--only study start arenas faults] [--figure FILE.png]
 
 ``--resume FOLDER`` keeps every run there; the same command goes on after an interruption. Of the same program only.
 """
@@ -225,9 +225,7 @@ def main() -> int:
     parser.add_argument("--seeds", type=int, default=50, help="of study and arenas; faults have 20 at most")
     parser.add_argument("--resume", type=Path, metavar="FOLDER", help="keep runs there, and drive none again")
     parser.add_argument("--jobs", type=int, default=2, help="processes")
-    parser.add_argument(
-        "--only", choices=("study", "arenas", "faults"), nargs="+", default=("study", "arenas", "faults")
-    )
+    parser.add_argument("--only", choices=PARTS, nargs="+", default=PARTS)
     parser.add_argument("--method", choices=("1", "2", "3"), nargs="+", default=("1", "2", "3"))
     parser.add_argument("--model", choices=("beam", "cone"), nargs="+", default=("beam", "cone"))
     parser.add_argument("--figure", help="PNG of the runs of `start`")
