@@ -50,6 +50,8 @@ WORLDS: Final = {
 }
 SHIPPED: Final = ("rooms", "corridor_maze", "loop", "yard")
 OURS, PEERS = "information", ("nearest", "author")
+SHORTER = "nearest", "offline"
+"""The aim is to be no longer than the shorter one of these."""
 OUT = Path(__file__).resolve().parents[1] / "runs" / "exploration"
 
 
@@ -183,6 +185,11 @@ def summary(rows: list[dict[str, Any]]) -> tuple[dict[str, float], dict[str, flo
             if kind in PEERS and (OURS, share) in means:
                 name = f"{world}_{reach:g}_{share}_over_{kind}"
                 figures[name], goals[name] = round(means[OURS, share] / mean, 4), 1.0
+        for share in (f"{share:.0%}" for share in SHARES):
+            if all((kind, share) in means for kind in (OURS, *SHORTER)):
+                name = f"{world}_{reach:g}_{share}_over_shorter"
+                shorter = min(means[kind, share] for kind in SHORTER)
+                figures[name], goals[name] = round(means[OURS, share] / shorter, 4), 1.0
     ours = [row for row in rows if row["kind"] == OURS]
     figures["runs"] = len(ours)
     figures["not_99"] = sum("99%" not in row["metres"] for row in ours)
