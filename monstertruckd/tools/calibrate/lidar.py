@@ -96,7 +96,7 @@ class LidarLeg:
         Raises:
             InputError: too few scans at rest, or scans that do not fit together.
         """
-        scans, after = (_at_rest(found) for found in record.at_rest(topics.SCAN))
+        scans, after = (resting_scan(found) for found in record.at_rest(topics.SCAN))
         _, front, rear = record.steps()
         axles = chassis.steering(float(np.median(front)), float(np.median(rear)))
         way = record.way(chassis.drivetrain) / chassis.bicycle.drive_speed(1.0, *axles)
@@ -354,7 +354,7 @@ def _geometry(scan: LaserScan) -> ScanGeometry:
     return ScanGeometry(scan.start_angle, scan.angle_increment, scan.range_min, scan.range_max)
 
 
-def _at_rest(scans: Sequence[LaserScan]) -> Scan:
+def resting_scan(scans: Sequence[LaserScan]) -> Scan:
     """Points of the mean of scans at rest, in the lidar's frame.
 
     Raises:
@@ -431,7 +431,7 @@ def _yaws(record: MoveRecord) -> tuple[Array, Array, Array, Array, Array] | None
     before = [scan for scan in scans if scan.stamp < record.left]
     if len(before) < LEAST_SCANS or len(odometry) < 2 or len(scans) < 4 * LEAST_SCANS:
         return None
-    cloud = Cloud.of(_at_rest(before))
+    cloud = Cloud.of(resting_scan(before))
     pose, stamps, yaws = np.zeros(3), [], []
     for scan in scans:
         # The middle of a scan, which takes a tenth of a second, stands for it.

@@ -7,12 +7,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from monstertruckd.tools.cli.options import complete_config
+from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
+from monstertruckd.tools.cli.options import EndpointOption, RobotOption, complete_config
 from monstertruckd.tools.cli.output import JsonOption, console, finish, print_json, remark
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from monstertruck_runtime.clock import Clock
     from monstertruckd.tools.doctor.context import Finding
 
+CLEAR = "The truck is about to drive 20 cm ahead and back. Is half a metre free all around, and somebody at the switch?"
 STYLES = {"ok": "green", "warn": "yellow", "fail": "bold red"}
 
 
@@ -30,19 +35,33 @@ def doctor(
     fix: Annotated[
         bool, typer.Option("--fix", help="Run the safe ones of the commands that fix something, each after asking.")
     ] = False,
-    yes: Annotated[bool, typer.Option("--yes", "-y", help="With --fix: without asking.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="With --fix and --drive: without asking.")] = False,
+    drive: Annotated[
+        bool,
+        typer.Option("--drive", help="Drive 20 cm there and back, after asking, to find sensors with a wrong sign."),
+    ] = False,
+    robot: RobotOption = "truck",
+    endpoint: EndpointOption = DEFAULT_ENDPOINT,
     json_output: JsonOption = False,
 ) -> None:
     """Check the computer: software, service, rights, cables, devices, clock, disk, network.
 
     Every finding comes with the command that fixes it. Ends with the code of the first failure; warnings end with 0.
+    With --drive the daemon has to run: the drive goes through its gate, as any operator's does.
     """
     from monstertruck_runtime.clock import run_wall
     from monstertruckd.tools.doctor.checks import examine
     from monstertruckd.tools.doctor.context import first_failure, inspect
     from monstertruckd.tools.install.files import Program
 
-    findings = run_wall(lambda clock: examine(inspect(root, Program.present(), config, os.getuid(), clock)))
+    async def all_findings(clock: "Clock") -> "list[Finding]":
+        context = inspect(root, Program.present(), config, os.getuid(), clock)
+        found = await examine(context)
+        return found + (await _drive(robot, endpoint, clock, context.command) if drive else [])
+
+    if drive and not (yes or typer.confirm(CLEAR, err=True)):
+        drive = False
+    findings = run_wall(all_findings)
     reason = first_failure(findings)
     if json_output:
         print_json({"reason": reason, "findings": findings})
@@ -51,6 +70,28 @@ def doctor(
     if fix:
         _mend(findings, yes=yes)
     finish(reason, f"not ready to drive: {reason.text}")
+
+
+async def _drive(robot: str, endpoint: str, clock: "Clock", command: "Callable[..., str]") -> "list[Finding]":
+    """Findings of a drive through the daemon's gate."""
+    import json
+
+    from monstertruck_runtime.client import TruckClient
+    from monstertruck_runtime.errors import TruckError
+    from monstertruckd.config.truck import TruckConfig
+    from monstertruckd.tools.calibrate.motion import Mover
+    from monstertruckd.tools.doctor.context import fail
+    from monstertruckd.tools.doctor.drive import signs
+
+    try:
+        async with TruckClient(robot, endpoint, clock=clock, timeout=10.0) as client:
+            running = await client.call("config")
+            running.pop("sim", None)
+            config = TruckConfig.model_validate_json(json.dumps(running))
+            mover = Mover(client, clock, config.chassis())
+            return await signs(lambda step: mover.move(step, lambda _: None), config, command)
+    except TruckError as error:
+        return [fail("signs", error.reason, str(error))]
 
 
 def _mend(findings: "Sequence[Finding]", *, yes: bool) -> None:

@@ -1,0 +1,196 @@
+"""Drives of 20 cm there and back, to both sides, where allowed: sensors, motor and steering with a wrong sign show.
+
+Motor and steering say how far the robot goes and turns; the lidar's scans, compass and IMU each say it by themselves.
+One of them that disagrees with the motor and the others has the wrong sign; where all disagree, it is the motor's or
+the steering's own.
+"""
+
+import math
+from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from monstertruck_estimation.se2 import between, compose
+from monstertruck_estimation.slam.registration import Cloud, register
+from monstertruck_kinematics.chassis import TruckChassis
+from monstertruck_kinematics.elementary import Array
+from monstertruck_runtime.clock import SECOND
+from monstertruck_runtime.errors import InputError, RequestRefusedError, TruckError
+from monstertruck_schemas import topics
+from monstertruck_schemas.reasons import Reason
+from monstertruckd.config.truck import TruckConfig
+from monstertruckd.tools.calibrate.lidar import LEAST_OVERLAP, resting_scan
+from monstertruckd.tools.calibrate.steps import MoveRecord, MoveStep
+from monstertruckd.tools.doctor.context import Finding, fail, fine, warn
+
+METRES: Final = 0.2
+SPEED: Final = 0.06
+ANGLE: Final = 0.045
+"""Of both axles, against each other, rad: so little that the gate bears a turn to the wrong side."""
+LEAST_TURN: Final = 0.1
+"""Turn in all, rad, that tells a sign;"""
+CLEAR: Final = 0.3
+"""and share of it that a sensor must have seen."""
+AHEAD: Final = 0.05
+"""Way that tells one, m."""
+SIGN_ONLY: Final = "calibrate drive --sign-only"
+ROUGH: Final = "calibrate steering --rough"
+
+Drives = Callable[[MoveStep], Awaitable[MoveRecord]]
+
+
+@dataclass(frozen=True, slots=True)
+class Movement:
+    """One move, as everything tells it."""
+
+    way: float
+    """By the motor, m, negative backwards"""
+    turn: float
+    """By motor and steering, rad, left positive"""
+    seen: Mapping[str, float]
+    """Turn by each sensor, rad"""
+    way_seen: float | None
+    """By the lidar, m; None = it does not tell"""
+
+
+async def signs(drives: Drives, config: TruckConfig, command: Callable[..., str]) -> list[Finding]:
+    """Drive, and compare.
+
+    Args:
+        drives: moves the robot as an operator; raises where the gate refuses.
+        config: the daemon's.
+        command: of this installation.
+    """
+    chassis = config.chassis()
+    if not isinstance(chassis, TruckChassis):
+        text = f"body {config.body.kind}: only one with two steered axles is driven"
+        return [warn("signs", Reason.NOT_SUPPORTED, text)]
+    present = config.devices.present()
+    also = tuple(topic for role, topic in (("lidar", topics.SCAN), ("imu", topics.IMU)) if role in present)
+    lidar = None if config.devices.lidar is None else np.array(config.devices.lidar.mount.planar)
+    moves: list[Movement] = []
+    for side, steered in (("left", ANGLE), ("right", -ANGLE)):
+        for way, speed in (("ahead", SPEED), ("back", -SPEED)):
+            step = MoveStep(f"20 cm {way}, wheels {side}", speed, steered, -steered, METRES, also=also)
+            try:
+                moves.append(movement(await drives(step), chassis, lidar))
+            except TruckError as error:
+                reason = error.refusal if isinstance(error, RequestRefusedError) else error.reason
+                return [fail("signs", reason, f"{step.name}: {error}")]
+    return list(judged(moves, command))
+
+
+def movement(record: MoveRecord, chassis: TruckChassis, lidar: Array | None) -> Movement:
+    """What a move was.
+
+    Args:
+        record: with scans and IMU, where there are.
+        chassis: of the robot.
+        lidar: its mount, m and rad; None = there is none.
+    """
+    way, turn = by_wheels(record, chassis)
+    seen: dict[str, float] = {}
+    if len(record.attitude) > 1:
+        seen["compass"] = record.turned()
+    imu = record.of(topics.IMU)
+    if len(imu) > 1:
+        stamps = np.array([m.stamp for m in imu]) / SECOND
+        rates = np.array([m.angular_velocity.z for m in imu])
+        still = rates[np.array([m.stamp for m in imu]) < record.left]
+        rates = rates - (still.mean() if still.size else 0.0)
+        seen["IMU"] = float(np.sum(np.diff(stamps) * (rates[1:] + rates[:-1]) / 2))
+    moved = None if lidar is None else by_lidar(record, (way, turn), lidar)
+    if moved is not None:
+        seen["lidar"] = float(moved[2])
+    return Movement(way, turn, seen, None if moved is None else float(moved[0]))
+
+
+def by_wheels(record: MoveRecord, chassis: TruckChassis) -> tuple[float, float]:
+    """Way, m, and turn, rad, by motor and steering."""
+    motor, front, rear = record.steps()
+    way = turn = 0.0
+    for step, servos in zip(motor.tolist(), zip(front.tolist(), rear.tolist(), strict=True), strict=True):
+        axles = chassis.steering(*servos)
+        along = float(chassis.drivetrain.distance(step)) / chassis.bicycle.drive_speed(1.0, *axles)
+        way += along
+        turn += along * chassis.bicycle.curvature(*axles)
+    return way, turn
+
+
+def by_lidar(record: MoveRecord, wheels: tuple[float, float], mount: Array) -> Array | None:
+    """Motion of the body by the scans of its rests, m and rad, (3,); None where they do not tell it.
+
+    What the wheels say is one guess; that they go the other way, or turn the other way, are others.
+    """
+    try:
+        before, after = (resting_scan(found) for found in record.at_rest(topics.SCAN))
+    except InputError:
+        return None
+    cloud, best, moved = Cloud.of(before), LEAST_OVERLAP, None
+    for along, sense in ((1, 1), (-1, -1), (1, -1), (-1, 1)):
+        way, turn = along * wheels[0], sense * wheels[1]
+        body = np.array((way * math.cos(turn / 2), way * math.sin(turn / 2), turn))
+        found = register(after, cloud, between(mount, compose(body, mount)), reach=0.15)
+        found = register(after, cloud, found.pose)
+        if found.overlap > best:
+            best, moved = found.overlap, compose(compose(mount, found.pose), between(mount, np.zeros(3)))
+    return None if moved is None else np.asarray(moved)
+
+
+def judged(moves: list[Movement], command: Callable[..., str]) -> Iterator[Finding]:
+    """Findings of all moves together: turns and ways of a move back count with their signs."""
+    turn = sum(abs(move.turn) for move in moves)
+    if turn < LEAST_TURN:
+        text = f"motor and steering turned it by {math.degrees(turn):.0f} degrees in all: too little to tell a sign"
+        yield warn("signs", Reason.STEERING_DEAD, text)
+        return
+    shares = shares_of_turn(moves)
+    against = [name for name, share in shares.items() if share < -CLEAR]
+    agree = [name for name, share in shares.items() if share > CLEAR]
+    along = sum(move.way_seen * move.way for move in moves if move.way_seen is not None and abs(move.way) > AHEAD)
+    backward = along < 0.0
+    if backward and "lidar" in against:
+        seen = "by the lidar it goes back where the motor counts ahead: the motor's sign is wrong"
+        yield fail("sign motor", Reason.BAD_CONFIG, seen, command(*SIGN_ONLY.split()))
+    elif backward:
+        seen = "by the lidar it goes back where the motor counts ahead, and turns as it should: the lidar looks back"
+        yield fail("sign lidar", Reason.BAD_CONFIG, f"{seen} (its mount's yaw is near 3.14), or motor and steering err")
+    elif along > 0.0:
+        yield fine("sign motor", "the lidar sees it go where the motor counts")
+    if shares and not agree and not against:
+        seen = f"{', '.join(shares)} saw nothing of the turn: the direction of one axle is wrong, or a servo is loose"
+        yield fail("sign steering", Reason.STEERING_DEAD, seen, command(*ROUGH.split()))
+    elif agree or not against:
+        yield from _turns(shares, against, [name for name in agree if not (backward and name == "lidar")])
+    elif not backward:  # a motor that turns the other way turns the robot the other way, too
+        seen = f"{', '.join(against)} turned against the steering: the wheels' directions are wrong"
+        yield fail("sign steering", Reason.STEERING_DEAD, seen, command(*ROUGH.split()))
+
+
+def shares_of_turn(moves: Sequence[Movement]) -> dict[str, float]:
+    """What each sensor saw of the turn by motor and steering: 1 = all of it, below 0 = against it.
+
+    Wheels that are off centre turn the robot by so much a metre, to whichever side they are steered: that is left out.
+    """
+    found = {}
+    for name in ("compass", "IMU", "lidar"):
+        rows = [(move.turn, move.way, move.seen[name]) for move in moves if name in move.seen]
+        if len(rows) > 1:
+            turns, ways, seen = np.array(rows).T
+            found[name] = float(np.linalg.lstsq(np.column_stack((turns, ways)), seen, rcond=None)[0][0])
+    return found
+
+
+def _turns(shares: Mapping[str, float], against: Sequence[str], agree: Sequence[str]) -> Iterator[Finding]:
+    """Of sensors that turned as motor and steering say, against it, or hardly."""
+    for name, share in shares.items():
+        if name in against:
+            seen = f"it turns against the steering and the {', '.join(agree)}: it is mounted upside down"
+            yield fail(f"sign {name}", Reason.BAD_CONFIG, seen)
+        elif name in agree:
+            yield fine(f"sign {name}", "turns as motor and steering do")
+        elif abs(share) <= CLEAR:
+            seen = f"it saw {share:.0%} of the turn by motor and steering: it is stuck, or far from right"
+            yield warn(f"sign {name}", Reason.DEVICE_FAULT, seen)
