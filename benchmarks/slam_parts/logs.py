@@ -11,6 +11,7 @@ import numpy as np
 from monstertruck_estimation.se2 import between, interpolate
 from monstertruck_estimation.slam.scans import ScanGeometry
 from monstertruck_runtime.clock import SECOND
+from slam_parts import drawn
 
 MANIFEST = {
     "intel.npz": (
@@ -73,7 +74,14 @@ def verified(folder: Path) -> None:
 
 
 def load(folder: Path, name: str) -> Log:
-    """``intel`` (joined), ``intel1`` (the first 1088 s), ``intel4`` (those cut to 4 m), ``aces`` or ``csail``."""
+    """``intel`` (joined), ``intel1`` (the first 1088 s), ``intel4`` (those cut to 4 m), ``aces`` or ``csail``.
+
+    Or MAP-SEED: a drive drawn through a map of the folder ``maps`` beside ``folder``, see ``drawn``.
+    """
+    kind, _, seed = name.partition("-")
+    if kind in drawn.MAPS:
+        stamps, ranges, odom, poses, geometry = drawn.drawn(folder.parent / "maps", kind, int(seed or 1))
+        return Log(name, stamps, ranges, odom, geometry, np.column_stack((stamps / SECOND, poses)))
     file = name.rstrip("14")
     with np.load(folder / f"{file}.npz") as data:
         arrays = {key: data[key] for key in data.files}
