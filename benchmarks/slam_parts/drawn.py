@@ -19,7 +19,7 @@ from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.map_files import FREE, OCCUPIED, WorldMap, load_map
 
 MAPS = {"hospital": "stdr_hospital_section", "depot": "nav2_depot", "robocup": "stdr_robocup"}
-WAY, STEP, PERIOD = 150.0, 0.1, 0.2
+WAY, STEP, PERIOD = 240.0, 0.1, 0.2
 """Driven, m; between two scans at most, m, and s. Where it turns, scans are no more than ``TURN`` rad apart."""
 TURN = 0.2
 CLEARANCE, CELL = 0.4, 0.15

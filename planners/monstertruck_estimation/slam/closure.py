@@ -300,12 +300,13 @@ class LoopCloser:
         window = min(window[0], MAX_WINDOW[0]), min(window[1], MAX_WINDOW[1])
         # All of the window, not only what is round the candidate: a place that looks alike must not win by default.
         numbers = keyframes.well_known(candidate)
-        numbers = numbers[~np.isin(numbers, own)]
+        # Nor what is known from the query itself: it would be matched to its own neighbours, which closes no loop.
+        numbers = np.setdiff1d(numbers, np.union1d(own, keyframes.well_known(at)))
         numbers = numbers[_distance(keyframes, at)[numbers] < window[0] + keyframes.config.local_reach]
         if not len(numbers):
             return None
         numbers = numbers[np.linspace(0, len(numbers) - 1, min(len(numbers), PLACE_KEYS)).astype(np.intp)]
-        yield EDGE * len(keyframes.edges) + ELEMENT * sum(len(keyframes.frames[k].scan) for k in numbers)
+        yield 2 * EDGE * len(keyframes.edges) + ELEMENT * sum(len(keyframes.frames[k].scan) for k in numbers)
         submap = keyframes.submap(numbers)
         yield submap.grid_cost(LEVELS)
         grid = submap.grid(LEVELS)

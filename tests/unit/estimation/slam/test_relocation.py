@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from monstertruck_estimation.se2 import between, compose
-from monstertruck_estimation.slam.budget import ScanBudget
+from monstertruck_estimation.slam.budget import ScanBudget, finished
 from monstertruck_estimation.slam.closure import JOIN_CONTRADICTION, LoopCloser, crossed
 from monstertruck_estimation.slam.config import MapperConfig
 from monstertruck_estimation.slam.keyframes import KeyframeMap
@@ -147,6 +147,30 @@ def test_aligning_a_submap_never_moves_the_map():
     keyframes.place(8, eighth, 10)
     assert keyframes.poses[:10] == pytest.approx(there)
     assert between(keyframes.poses[8], keyframes.poses[12]) == pytest.approx(between(eighth, there[7]))
+
+
+class Searched(KeyframeMap):
+    """Remembers which keyframes were merged."""
+
+    def submap(self, numbers):
+        self.merged = numbers
+        return super().submap(numbers)
+
+
+def test_a_loop_is_not_searched_for_in_what_is_known_from_the_keyframe_itself():
+    keyframes, closer, way = Searched(MapperConfig()), LoopCloser(), rounds(70, 1.4, 3.6, 2.2)[:60]
+    odom, rng = drifting(way, 0.004, 1.01), np.random.default_rng(3)
+    for k, pose in enumerate(way):
+        keyframes.add(scan(HALL, pose, noise=0.01, rng=rng), k * SECOND, odom[k])
+        if k:
+            keyframes.add_odometry_edge(between(odom[k - 1], odom[k]), np.diag((0.05**2, 0.05**2, 0.01**2)))
+    overlapped = closed = 0
+    for at in range(50, 59):
+        known, keyframes.merged = keyframes.well_known(at), ()
+        closed += finished(closer._close(keyframes, at))
+        overlapped += np.isin(keyframes.merged, known).sum()
+    assert closed >= 3
+    assert not overlapped
 
 
 def test_submaps_joined_at_a_wrong_place_look_through_each_other():
