@@ -126,6 +126,9 @@ INSTEAD = {
     "monstertruckd calibrate slip": Instead(None, MOVES),
     "monstertruckd calibrate sonar": Instead(None, MOVES),
     "monstertruckd calibrate stabiliser": Instead(None, "asks somebody who lifts the truck"),
+    "monstertruckd calibrate camera": Instead(
+        None, "needs a board held before a camera: tests/daemon/test_calibration_mounts_virtual.py"
+    ),
     "monstertruckd demo --fast -c robot.yaml": Instead(None, OWN_DEVICE),
     "monstertruckd emulate ranger --link /tmp/ranger": Instead(None, OWN_DEVICE),
     "monstertruckd probe ranger --port /tmp/ranger": Instead(None, OWN_DEVICE),
@@ -210,6 +213,8 @@ def ours() -> list[Line]:
 def needs_truck(line: Line) -> bool:
     """Whether a running daemon has to answer."""
     command, _ = resolve(line.arguments)
+    if command.name == "doctor":
+        return "--drive" in line.arguments
     return "--endpoint" in options_of(command) and command.name != "replay"
 
 
