@@ -1,4 +1,4 @@
-"""What an inertial measurement unit tells an odometry: its yaw rate over level ground, and the body's tilt.
+"""What an inertial measurement unit gives the odometry: its yaw rate over level ground, and the body's tilt.
 
 The tilt is a complementary filter: the gyroscopes turn the vertical, the specific force draws it back (Mahony et al.
 2008, the direct form with one vector). The body's own acceleration averages out over ``SETTLE``.

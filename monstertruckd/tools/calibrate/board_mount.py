@@ -37,7 +37,7 @@ EDGES: Final = 2
 NEAR: Final = (0.2, 0.04)
 """m: how far beams may be off the board's plane, at first and once the mount is known."""
 MARGIN: Final = (0.12, 0.0)
-"""m: by how much they may be beside the board, alike."""
+"""m: by how much they may miss the board, at first and once the mount is known."""
 STRAIGHT: Final = 0.02
 """m: root mean square by which the points of a line may be off it."""
 FLAT: Final = 0.001

@@ -28,13 +28,13 @@ from monstertruckd.tools.doctor.context import Finding, fail, fine, warn
 METRES: Final = 0.2
 SPEED: Final = 0.06
 ANGLE: Final = 0.045
-"""Of both axles, against each other, rad: so little that the gate bears a turn to the wrong side."""
+"""Of both axles, against each other, rad: so little that the gate tolerates a turn to the wrong side."""
 LEAST_TURN: Final = 0.1
-"""Turn in all, rad, that tells a sign;"""
+"""Least turn of all moves together, rad, by which a sign can be judged;"""
 CLEAR: Final = 0.3
 """and share of it that a sensor must have seen."""
 AHEAD: Final = 0.05
-"""Way that tells one, m."""
+"""Least way of a move by which a sign can be judged, m."""
 SIGN_ONLY: Final = "calibrate drive --sign-only"
 ROUGH: Final = "calibrate steering --rough"
 
@@ -43,7 +43,7 @@ Drives = Callable[[MoveStep], Awaitable[MoveRecord]]
 
 @dataclass(frozen=True, slots=True)
 class Movement:
-    """One move, as everything tells it."""
+    """One move, as each source measured it."""
 
     way: float
     """By the motor, m, negative backwards"""
@@ -52,7 +52,7 @@ class Movement:
     seen: Mapping[str, float]
     """Turn by each sensor, rad"""
     way_seen: float | None
-    """By the lidar, m; None = it does not tell"""
+    """By the lidar, m; None = its scans do not match"""
 
 
 async def signs(drives: Drives, config: TruckConfig, command: Callable[..., str]) -> list[Finding]:
@@ -120,7 +120,7 @@ def by_wheels(record: MoveRecord, chassis: TruckChassis) -> tuple[float, float]:
 
 
 def by_lidar(record: MoveRecord, wheels: tuple[float, float], mount: Array) -> Array | None:
-    """Motion of the body by the scans of its rests, m and rad, (3,); None where they do not tell it.
+    """Motion of the body by the scans at rest before and after, m and rad, (3,); None where they do not match.
 
     What the wheels say is one guess; that they go the other way, or turn the other way, are others.
     """

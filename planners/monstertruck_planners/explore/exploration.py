@@ -8,6 +8,9 @@ import math
 from dataclasses import dataclass, field, replace
 from typing import Final
 
+import numpy as np
+
+from monstertruck_planners.collision import placed
 from monstertruck_planners.explore.attempts import Attempts
 from monstertruck_planners.explore.config import ExplorerConfig
 from monstertruck_planners.explore.exchange import ExploreAnswer, Viewpoint
@@ -27,7 +30,7 @@ RETURNS: Final = 6
 SAVE: Final = 30.0
 """Seconds to wait for the map to be saved."""
 AGAIN: Final = 2.0
-"""Seconds after a goal that was not taken, or for the way home; of those the next time twice as many."""
+"""Seconds from a refused goal to the next one; on the way home twice as many after each failure."""
 STANDS: Final = 5.0
 """Seconds for which a robot that is lost stands before it drives a little."""
 AROUND: Final = ((0.6, 0.0, 0.0), (-0.9, 0.0, 0.0), (0.6, 0.25, 0.8), (0.6, -0.25, -0.8))
@@ -378,10 +381,8 @@ def _lost(run: Exploration, seen: Observed, config: ExplorerConfig) -> Step:
         return (run, ()) if seen.ended is None else (replace(run, target=None, not_before=run.now + AGAIN), ())
     if not config.around or seen.believed is None or run.now < max(run.since + STANDS, run.not_before):
         return run, ()
-    x, y, yaw = seen.believed
-    ahead, left, turn = AROUND[run.looks % len(AROUND)]
-    cos, sin = math.cos(yaw), math.sin(yaw)
-    pose = x + cos * ahead - sin * left, y + sin * ahead + cos * left, math.remainder(yaw + turn, math.tau)
+    x, y, yaw = placed(np.array((AROUND[run.looks % len(AROUND)],)), seen.believed)[0].tolist()
+    pose = x, y, math.remainder(yaw, math.tau)
     say = () if run.looks else (Notice(Reason.RECOVERING, Severity.INFO, "its place is not known: looks around"),)
     return replace(run, target=Viewpoint(pose, pose[:2]), looks=run.looks + 1), (Go(pose), *say)
 
