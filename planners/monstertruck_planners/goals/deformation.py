@@ -31,6 +31,8 @@ from monstertruck_schemas.topics import ODOMETRY
 
 ONWARD: Final = 0.05
 """Metres along the route that are progress."""
+RETRY: Final = 10.0
+"""Seconds after which a deforming step that did not start is started again."""
 
 
 class RouteDeformation:
@@ -81,7 +83,7 @@ class RouteDeformation:
             report: is given the finding before and the answer.
         """
         async with self._actor as actor:
-            await actor.start()
+            await self._started(actor)
             self._fresh = True
             while True:
                 task = self._task(await self._scan.next())
@@ -97,6 +99,17 @@ class RouteDeformation:
                     was = self._finding
                     self._note(answer)
                     report(was, answer)
+
+    async def _started(self, actor: Actor) -> None:
+        """Start what deforms; meanwhile routes are driven as they were planned, and planned anew where blocked."""
+        while True:
+            try:
+                await actor.start()
+            except WorkerError as error:
+                self._events(error.reason, Severity.ERROR, self.name, f"routes are not deformed: {error}")
+                await self._clock.sleep(RETRY)
+            else:
+                return
 
     def begin(self, route: PlanAnswer) -> None:
         """Another route is driven from now on."""

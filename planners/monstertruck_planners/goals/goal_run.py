@@ -272,7 +272,9 @@ def _arrived(run: GoalRun, observed: Observations, config: PlannerConfig) -> Ste
     away, turned = apart(observed.pose, run.goal)
     off = f"{away:.3f} m and {turned:.3f} rad away"
     error = max(away / config.position_tolerance, turned / config.yaw_tolerance)
-    if error <= (config.aim if run.misses < config.corrections else 1.0):
+    if run.via:
+        off = f"{len(run.via)} waypoint{'s' if len(run.via) > 1 else ''} not passed"
+    elif error <= (config.aim if run.misses < config.corrections else 1.0):
         return _end(run, Reason.GOAL_REACHED, off, Severity.INFO)
     if run.misses >= MISSES:
         return _end(run, Reason.GOAL_MISSED, off)

@@ -4,10 +4,12 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.collision import Footprint, first_contact, placed, poses_relative
 from monstertruck_planners.goals.exchange import PlanAnswer, Pose, pose_of
+from monstertruck_planners.track.segments import stops
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.mailbox import Mailbox
 from monstertruck_runtime.ports import EventSink, Publisher, Subscription
@@ -128,12 +130,11 @@ class PathPublisher:
         driven = followed.before + followed.along(report)
         if speed > AT_REST and report is not None:
             rest = speed * speed / (2 * self._deceleration) + STANDSTILL_PATH
-            count = kept_poses(followed.travelled, report.along, rest)
-            steering = followed.message.steering[:count]
-            clearance = followed.message.clearance[:count]
-            self._publish(
-                followed.poses[:count], followed.message.directions[:count], steering, name, driven, clearance
-            )
+            path = followed.message
+            at_rest = stops(path.directions[1:], path.steering[1:])
+            kept = kept_poses(followed.travelled, report.along, rest, np.flatnonzero(at_rest) + 1)
+            poses, directions = followed.poses[kept], path.directions[kept]
+            self._publish(poses, directions, path.steering[kept], name, driven, path.clearance[kept])
         else:
             ahead = np.array([[0.0, 0.0, 0.0], [STANDSTILL_PATH, 0.0, 0.0]])
             self._publish(placed(ahead, pose_of(odometry)), np.ones(2), (), name, driven)
@@ -210,6 +211,18 @@ def path_blocked(footprint: Footprint, poses: Array, points: Array, at: Pose) ->
     return first_contact(footprint, poses_relative(poses, at), points) is not None
 
 
-def kept_poses(travelled: Array, along: float, rest: float) -> int:
-    """How many of a path's poses are kept if it is to end ``rest`` metres behind ``along``; two at least."""
-    return max(int(np.searchsorted(travelled, along + rest)) + 1, 2)
+def kept_poses(travelled: Array, along: float, rest: float, cusps: NDArray[np.intp]) -> slice:
+    """Poses of a path that are kept if it is to end ``rest`` metres behind ``along``; two at least.
+
+    None before that: a path may come back over its beginning, and that is not to be driven again. Nor any behind the
+    next cusp: the truck comes to rest there anyway.
+
+    Args:
+        travelled: shape (n,), metres from the path's start.
+        along: where the truck is, m.
+        rest: m.
+        cusps: shape (k,), indices of the poses at which it comes to rest.
+    """
+    first = min(max(int(np.searchsorted(travelled, along, side="right")) - 1, 0), len(travelled) - 2)
+    end = max(int(np.searchsorted(travelled, along + rest)), first + 1)
+    return slice(first, min([end, *cusps[cusps > first].tolist()]) + 1)

@@ -36,7 +36,7 @@ from monstertruck_planners.goals.path_publisher import (
 )
 from monstertruck_runtime.actors.actor import Actor
 from monstertruck_runtime.clock import SECOND, Clock, Schedule
-from monstertruck_runtime.errors import RequestRefusedError, WorkerError
+from monstertruck_runtime.errors import RequestRefusedError, TruckError
 from monstertruck_runtime.ports import Ready, RpcRegistry
 from monstertruck_runtime.requests import Sequences, parse_request, refusal
 from monstertruck_schemas.base import Pose2D
@@ -206,11 +206,13 @@ class GoalService:
         """State of a goal once it is known whether a way leads there.
 
         Raises:
-            RequestRefusedError: none does.
+            RequestRefusedError: none does, or another goal has taken its place.
         """
         while (state := self._reported) is None or (state.number == number and _undecided(state)):
             await self._changed.wait()
-        if state.number == number and state.routes == 0 and state.phase is GoalPhase.IDLE:
+        if state.number != number:
+            raise RequestRefusedError(Reason.CANCELLED, f"another goal of {state.source} took its place")
+        if state.routes == 0 and state.phase is GoalPhase.IDLE:
             raise RequestRefusedError(state.outcome, state.text)
         return state
 
@@ -364,7 +366,7 @@ class GoalService:
         assert self._actor is not None
         try:
             answer: PlanAnswer = await self._actor.step(task)
-        except WorkerError as error:
+        except TruckError as error:
             self._fresh = True
             self._out.events(error.reason, Severity.ERROR, self.name, str(error))
             return PlanAnswer(error.reason, str(error).partition("\n")[0])

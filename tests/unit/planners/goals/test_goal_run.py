@@ -95,6 +95,18 @@ def test_an_end_beside_the_goal_is_planned_again_but_not_for_ever():
     assert story.run.outcome is Reason.GOAL_MISSED
 
 
+def test_a_goal_is_not_reached_before_its_waypoints_are_passed():
+    story = Story()
+    story.run = replace(story.run, via=((1.0, 1.0, None),))
+    for _ in range(goal_run.MISSES):
+        story.tell(answer=WAY)
+        assert reported(story.tell(outcome=Reason.GOAL_REACHED, pose=GOAL)) == [Reason.GOAL_MISSED]
+        assert story.phase is GoalPhase.PLANNING
+    story.tell(answer=WAY)
+    story.tell(outcome=Reason.GOAL_REACHED, pose=GOAL)
+    assert (story.run.outcome, story.run.text) == (Reason.GOAL_MISSED, "1 waypoint not passed")
+
+
 def test_a_place_within_the_tolerance_is_corrected_once_then_taken():
     story = Story()
     for outcome in (Reason.DRIVING, Reason.GOAL_REACHED):
@@ -278,8 +290,10 @@ def test_the_way_ahead_is_blocked_by_what_stands_on_it_only():
     assert path_blocked(BODY, way, np.array([[1.0, 0.1]]), at)
     assert not path_blocked(BODY, way, np.array([[1.0, 0.3], [2.5, 0.0]]), at)
     assert not path_blocked(BODY, way, np.empty((0, 2)), at)
-    assert travelled[kept_poses(travelled, 1.0, 0.2) - 1] == pytest.approx(1.2, abs=0.06)
-    assert kept_poses(travelled, 0.0, 0.0) == 2
+    none = np.zeros(0, np.intp)
+    assert travelled[kept_poses(travelled, 1.0, 0.2, none)][[0, -1]] == pytest.approx([1.0, 1.2], abs=0.06)
+    assert kept_poses(travelled, 0.0, 0.0, none) == slice(0, 2)
+    assert len(travelled[kept_poses(travelled, travelled[-1] + 1.0, 0.0, none)]) == 2
 
 
 # Planning

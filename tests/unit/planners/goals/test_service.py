@@ -1,11 +1,17 @@
-"""The goal service before it runs."""
+"""The goal service before it runs, what it answers, and what it does about planners that fail."""
 
+import asyncio
 from types import SimpleNamespace
 
 import pytest
 
+from monstertruck_planners.goals import deformation
+from monstertruck_planners.goals.deformation import RouteDeformation
 from monstertruck_planners.goals.service import GoalService
-from monstertruck_runtime.errors import RequestRefusedError
+from monstertruck_runtime.clock import run_virtual
+from monstertruck_runtime.errors import InputError, RequestRefusedError, WorkerError
+from monstertruck_runtime.mailbox import Mailbox, latest
+from monstertruck_schemas.plan import GoalPhase, GoalState
 from monstertruck_schemas.reasons import Reason
 
 
@@ -38,3 +44,66 @@ def test_a_running_behaviour_excludes_a_goal_and_lets_one_be_cancelled(monkeypat
     service._examine(None, "goal", moves=False)
     running.running = False
     service._examine(None, "goal", moves=True)
+
+
+def test_who_waits_for_the_way_to_a_goal_is_not_told_of_another_goals_way():
+    async def main() -> None:
+        service = GoalService.__new__(GoalService)
+        service._changed = asyncio.Event()
+        state = GoalState(stamp=0, received=0, seq=0, frame="map", number=1, phase=GoalPhase.PLANNING)
+        service._reported = state
+        waiting = asyncio.create_task(service.settled(1))
+        await asyncio.sleep(0)
+        service._reported = state.model_copy(update={"number": 2})
+        service._changed.set()
+        with pytest.raises(RequestRefusedError, match="another goal") as refused:
+            await waiting
+        assert refused.value.refusal is Reason.CANCELLED
+
+    asyncio.run(main())
+
+
+def test_a_planner_in_the_loop_that_refuses_its_input_is_an_answer_and_an_event():
+    class Refusing:
+        async def step(self, task: object) -> object:
+            raise InputError("map: not readable")
+
+    told: list[tuple[object, ...]] = []
+    service = GoalService.__new__(GoalService)
+    service._actor, service._fresh = Refusing(), False
+    service._out = SimpleNamespace(events=lambda *event: told.append(event))
+    answer = asyncio.run(service._ask(None))
+    assert (answer.reason, answer.poses, service._fresh) == (Reason.BAD_INPUT, None, True)
+    assert [event[0] for event in told] == [Reason.BAD_INPUT]
+
+
+def test_without_the_worker_that_deforms_routes_goals_go_on_and_it_is_tried_again():
+    told: list[Reason] = []
+
+    class Failing:
+        starts = 0
+
+        async def __aenter__(self):
+            return self
+
+        async def __aexit__(self, *_):
+            pass
+
+        async def start(self):
+            self.starts += 1
+            if self.starts < 3:
+                raise WorkerError("worker local did not start")
+
+    async def main(clock):
+        actor = Failing()
+        setup = SimpleNamespace(config=SimpleNamespace(local=None))
+        service = RouteDeformation(
+            setup, clock, actor, scan=Mailbox(latest()), pose=None, grid=None, events=lambda *e, **_: told.append(e[0])
+        )
+        task = asyncio.create_task(service.run(lambda *_: None))
+        await clock.sleep(3 * deformation.RETRY)
+        assert (actor.starts, task.done()) == (3, False)
+        task.cancel()
+
+    run_virtual(main)
+    assert told == [WorkerError.reason] * 2

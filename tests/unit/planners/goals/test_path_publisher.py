@@ -1,0 +1,49 @@
+"""Paths that end early: the truck brakes where it is and drives nothing of the path again."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from monstertruck_planners.goals.exchange import PlanAnswer
+from monstertruck_planners.goals.path_publisher import PathPublisher
+from monstertruck_planners.track.segments import SegmentedPath
+from monstertruck_schemas.reasons import Reason
+
+X = np.concatenate((np.arange(21), np.arange(19, -1, -1))) * 0.05
+THERE_AND_BACK = PlanAnswer(
+    Reason.OK,
+    poses=np.column_stack((X, np.zeros((len(X), 2)))),
+    directions=np.where(np.arange(len(X)) <= 20, 1.0, -1.0),
+    steering=("counter",) * len(X),
+    clearance=np.full(len(X), 0.3),
+)
+"""One metre ahead and back."""
+
+
+class Outbox(list):
+    def next_seq(self) -> int:
+        return len(self)
+
+    put = list.append
+
+
+@pytest.mark.parametrize("along", [0.02, 0.5, 0.98, 1.02, 1.5, 1.98])
+def test_a_path_cut_short_begins_where_the_truck_is(along: float):
+    paths, tracker = Outbox(), SimpleNamespace(latest=None)
+    backward = along > 1.0
+    x, speed = 1.0 - abs(1.0 - along), -0.1 if backward else 0.1
+    pose = SimpleNamespace(x=x, y=0.0, yaw=0.0)
+    odometry = SimpleNamespace(frame="map", pose=pose, twist=SimpleNamespace(vx=speed))
+    inputs = SimpleNamespace(pose=SimpleNamespace(latest=odometry), tracker=tracker)
+    publisher = PathPublisher(SimpleNamespace(now=lambda: 0), inputs, SimpleNamespace(path=paths), 0.3)
+    publisher.follow(THERE_AND_BACK, "goal")
+    tracker.latest = SimpleNamespace(path=paths[-1].name, along=along, outcome=Reason.DRIVING)
+    publisher.brake("held-up")
+    path = SegmentedPath(paths[-1], (x, 0.0, 0.0), 2.0)
+    left = path.length - path.along(path.start)
+    assert left < 0.15, "the truck brakes within a few centimetres"
+    assert path.segments[path.start.segment].direction == (-1.0 if backward else 1.0)
+    # What was driven counts once.
+    assert publisher.followed.before == pytest.approx(along)
+    assert path.along(path.start) < 0.06
