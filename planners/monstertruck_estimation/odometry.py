@@ -14,6 +14,7 @@ import numpy as np
 from pydantic import Field
 
 from monstertruck_estimation.gyro import GyroConfig
+from monstertruck_estimation.heading_turns import HeadingTurns
 from monstertruck_estimation.inertial import Inertial, InertialInput
 from monstertruck_estimation.transforms import Quaternion, wrap_angle
 from monstertruck_estimation.wheel_motion import WheelIncrement, WheelMotion
@@ -21,9 +22,11 @@ from monstertruck_kinematics.chassis import Chassis
 from monstertruck_kinematics.elementary import Array, integrate, integration_jacobians
 from monstertruck_runtime.clock import ESTIMATES, SECOND, Clock, Schedule
 from monstertruck_runtime.mailbox import fifo, latest
-from monstertruck_runtime.ports import BusPort, Publisher, Ready, Subscription
+from monstertruck_runtime.ports import BusPort, EventSink, Publisher, Ready, Subscription
 from monstertruck_schemas import topics
 from monstertruck_schemas.base import Pose2D, Schema, Twist2D
+from monstertruck_schemas.event import Severity
+from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.sensor import Attitude, DriveFeedback, SteeringFeedback
 from monstertruck_schemas.state import Odometry
@@ -183,8 +186,13 @@ class DeadReckoning:
         self._compass_used: int | None = None
         self._gyro = None if inertial is None else inertial.gyro
         self._gyro_used: int | None = None
+        self._turns = HeadingTurns()
+        self._otherwise = 0
+        """Headings in a row that were too far off while they are used, or right while they are left out."""
         self.rejected_headings = 0
         """Headings left out because they were too far off."""
+        self.doubt: str | None = None
+        """Why headings are left out, in words; None while they are used."""
 
     def observe_steering(self, feedback: SteeringFeedback) -> None:
         """Take the servo angles being sent, unless the servo controller marks them untrusted."""
@@ -208,11 +216,19 @@ class DeadReckoning:
         moved = self._covariance.moved(pose[0] - self._pose[0], pose[1] - self._pose[1])
         self._covariance = moved.plus(self._slipped(roll))
         self._pose = pose
+        self._turns.moved(wz * dt, roll.way)
 
     def observe_attitude(self, attitude: Attitude) -> None:
         """Take a heading: the first ones find north, the others correct the yaw."""
         config = self._config.compass
-        if config is None or attitude.heading_disturbed or not self._wheels.known:
+        if config is None or not self._wheels.known:
+            return
+        if attitude.heading_disturbed:
+            self._turns.forget()
+            return
+        if self._turns.observe(-attitude.heading):
+            self._contradict()
+        if self._turns.contrary is not None:
             return
         ahead = min(max((attitude.stamp - self._wheels.stamp) / SECOND, -1.0), self._config.max_prediction)
         yaw = self._pose[2] + self._wheels.twist[2] * ahead
@@ -223,7 +239,12 @@ class DeadReckoning:
             return
         innovation = wrap_angle(off - self._north)
         variance = self._covariance.ww + config.noise**2
-        if innovation**2 > config.gate**2 * variance:
+        off = innovation**2 > config.gate**2 * variance
+        self._otherwise = self._otherwise + 1 if off is (self.doubt is None) else 0
+        if self._otherwise >= config.alignment:
+            self._otherwise = 0
+            self.doubt = f"it is {innovation:+.2f} rad off what the wheels say" if off else None
+        if off:
             self.rejected_headings += 1
             return
         x, y, heading = self._pose
@@ -231,6 +252,7 @@ class DeadReckoning:
         self._pose = (x + gain_x * innovation, y + gain_y * innovation, heading + gain * innovation)
         self._covariance = self._covariance.corrected(gain_x, gain_y, gain)
         self._compass_used = attitude.stamp
+        self._turns.corrected(gain * innovation)
 
     def estimate(self, now: int) -> OdometryEstimate | None:
         """Pose predicted to ``now`` (ns); None before the first drive reading."""
@@ -238,10 +260,18 @@ class DeadReckoning:
             return None
         age = max((now - self._wheels.stamp) / SECOND, 0.0)
         twist = self._wheels.twist
-        x, y, yaw = integrate(self._pose, *twist, min(age, self._config.max_prediction))
+        ahead = min(age, self._config.max_prediction)
+        x, y, yaw = integrate(self._pose, *twist, ahead)
         # The predicted way turns with the uncertain yaw; an uncertain speed, alike in all directions, adds to it.
         moved = self._covariance.moved(x - self._pose[0], y - self._pose[1])
         covariance = moved.plus(term * age**2 for term in self._drift)
+        twist_covariance = self._twist_covariance
+        if (waited := age - ahead) > 0.0:
+            # Nobody knows whether it still drives: the pose waits, at no speed, as uncertain as if it did.
+            pace, turn = twist[0] ** 2 + twist[1] ** 2, twist[2] ** 2
+            lost = PlanarCovariance(xx=pace, yy=pace, ww=turn)
+            covariance = covariance.plus(term * waited**2 for term in lost)
+            twist, twist_covariance = (0.0, 0.0, 0.0), self._drift.plus(lost).matrix()
         sources = ["drive"]
         for name, used in (
             ("steering", self._wheels.steered),
@@ -254,10 +284,23 @@ class DeadReckoning:
             pose=(x, y, wrap_angle(yaw)),
             twist=twist,
             pose_covariance=covariance.matrix(),
-            twist_covariance=self._twist_covariance,
+            twist_covariance=twist_covariance,
             age=age,
             sources=tuple(sources),
         )
+
+    def _contradict(self) -> None:
+        """Headings turn against the robot, or no longer do: take back what they did; north is found anew afterwards."""
+        self._north, self._otherwise, self.doubt = None, 0, None
+        self._aligning.clear()
+        contrary = self._turns.contrary
+        if contrary is None:
+            return
+        self.doubt, by = contrary.text, contrary.correction
+        x, y, yaw = self._pose
+        self._pose = (x, y, yaw - by)
+        aside = (by * contrary.way) ** 2
+        self._covariance = self._covariance.plus(PlanarCovariance(xx=aside, yy=aside, ww=by**2))
 
     def _lose(self, dt: float) -> None:
         """The drive counts from a new origin: what it did in between is not known."""
@@ -286,6 +329,10 @@ class DeadReckoning:
             )
 
 
+def _untold(*_: Any, **__: Any) -> None:
+    """Sink of the events of an odometry that is given none."""
+
+
 class OdometryService:
     """Publishes odometry on an absolute schedule, in odom and, without localisation, unchanged in map.
 
@@ -298,6 +345,7 @@ class OdometryService:
         odometry: ``state/odometry``.
         pose: ``state/pose``; None = published by localisation.
         imu: measurements of an inertial measurement unit, if there is one.
+        events: where it is reported that headings are left out.
         rate: poses per second.
     """
 
@@ -314,6 +362,7 @@ class OdometryService:
         odometry: Publisher[Odometry],
         pose: Publisher[Odometry] | None,
         imu: InertialInput | None = None,
+        events: EventSink = _untold,
         rate: float = 50.0,
     ) -> None:
         self._reckoning = reckoning
@@ -324,9 +373,11 @@ class OdometryService:
         self._odometry = odometry
         self._pose = pose
         self._imu = imu
+        self._events = events
         self._rate = rate
         self._reckoned: tuple[DriveFeedback, ...] = ()
         self._seen: tuple[object, object] = (None, None)
+        self._doubted = False
 
     async def run(self, ready: Ready) -> None:
         """Publish until cancelled; the first pose follows the first drive reading."""
@@ -363,6 +414,19 @@ class OdometryService:
             self._reckoning.observe_attitude(compass)
         if self._imu is not None:
             self._imu.report()
+        if isinstance(self._reckoning, DeadReckoning):
+            self.report_compass(self._reckoning.doubt)
+
+    def report_compass(self, doubt: str | None, returned: str = "") -> None:
+        """Report that the headings are left out, and why, or that they count again."""
+        if self._doubted is (doubt is not None):
+            return
+        self._doubted = doubt is not None
+        if doubt is None:
+            self._events(Reason.HEADING_RETURNED, Severity.INFO, self.name, returned)
+        else:
+            text = f"{doubt}; the yaw goes on without it"
+            self._events(Reason.HEADING_DISTURBED, Severity.WARNING, self.name, text)
 
     def accepts_compass(self) -> bool:
         """Whether headings are used yet: they correct a pose, which begins with the first drive reading."""
@@ -423,4 +487,5 @@ def build_reckoning(config: OdometryConfig, context: OdometryContext) -> Odometr
     """The service with its topics, for the catalog."""
     imu = context.inertial(config.gyro)
     reckoning = DeadReckoning(config, context.chassis, None if imu is None else imu.inertial)
-    return OdometryService(reckoning, context.clock, imu=imu, rate=config.rate, **context.inputs())
+    events = context.bus.event_sink()
+    return OdometryService(reckoning, context.clock, imu=imu, events=events, rate=config.rate, **context.inputs())

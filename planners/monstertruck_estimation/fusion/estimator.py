@@ -27,6 +27,7 @@ from monstertruck_estimation.fusion.filter import (
     predict,
 )
 from monstertruck_estimation.fusion.slip import SlipChange, SlipDetector
+from monstertruck_estimation.heading_turns import HeadingTurns
 from monstertruck_estimation.inertial import Inertial
 from monstertruck_estimation.odometry import SOURCE_TIMEOUT, OdometryEstimate
 from monstertruck_estimation.se2 import SmoothedCorrection, compose, inverse
@@ -138,14 +139,19 @@ class FusionStatus:
 
     slipping: bool
     """The wheels slip."""
-    disturbed: bool
-    """The compass is rejected."""
+    doubt: str | None
+    """Why the compass is rejected; None while it is used."""
     north: float | None
     """Yaw in odom of the compass's zero, rad; None until it was found."""
     trim: float
     """Estimated error of the wheels' curvature, rad/m."""
     left_out: dict[str, int]
     """Readings that could not be used, by sensor and reason."""
+
+    @property
+    def disturbed(self) -> bool:
+        """The compass is rejected."""
+        return self.doubt is not None
 
 
 class Fusion:
@@ -164,6 +170,7 @@ class Fusion:
         use = chassis is not None and config.wheels is not None
         self._wheels = WheelMotion(chassis, config.max_speed) if use and chassis is not None else None
         self._slip = SlipDetector(config.slip, 0.0 if config.compass is None else config.compass.local)
+        self._turns = HeadingTurns()
         self._history: MeasurementHistory | None = None
         self._last: dict[str, int] = {}
         self._shown: tuple[int, Array] | None = None
@@ -196,6 +203,10 @@ class Fusion:
             return
         way = self._felt(roll, self._way(roll, self._chassis))
         self._slip.wheels(way)
+        if way.turn is None and self._slip.slipping:
+            self._turns.forget()
+        else:
+            self._turns.moved(float(way.delta[2]) if way.turn is None else way.turn[0], roll.way)
         if not self._insert(replace(way, slipping=self._slip.slipping)):
             self._left_out["drive: too late"] += 1
 
@@ -207,13 +218,17 @@ class Fusion:
             return
         if not self._later("compass", attitude.stamp):
             return
+        if attitude.heading_disturbed:
+            self._turns.forget()
+        else:
+            self._turns.observe(-attitude.heading)
         field = attitude.magnetic_field
         strength = None if field is None else math.hypot(field.x, field.y, field.z)
         heading = HeadingMeasurement(
             stamp=attitude.stamp,
             # The device counts clockwise from north.
             yaw=-attitude.heading,
-            disturbed=attitude.heading_disturbed,
+            disturbed=attitude.heading_disturbed or self._turns.contrary is not None,
             field=strength if strength is not None and math.isfinite(strength) and strength > 0 else None,
             tilt=(attitude.roll, attitude.pitch) if attitude.tilt_valid else None,
         )
@@ -268,11 +283,16 @@ class Fusion:
         gate = None if state is None else state.gate
         return FusionStatus(
             slipping=self._slip.slipping,
-            disturbed=gate is not None and gate.disturbed,
+            doubt=self._doubt if gate is not None and gate.disturbed else None,
             north=None if state is None or not state.gate.anchored else float(state.mean[6]),
             trim=0.0 if state is None else float(state.mean[TRIM]),
             left_out=dict(self._left_out),
         )
+
+    @property
+    def _doubt(self) -> str:
+        contrary = self._turns.contrary
+        return "its headings or its field are off" if contrary is None else contrary.text
 
     @property
     def state(self) -> FilterState | None:

@@ -64,13 +64,12 @@ class FusionService(OdometryService):
             odometry=odometry,
             pose=pose,
             imu=imu,
+            events=events,
             rate=rate,
         )
         self._fusion = fusion
         self._scans = scans
         self._health = health
-        self._events = events
-        self._disturbed = False
         self._published: tuple[int, tuple[bool, bool]] | None = None
 
     def take(self) -> None:
@@ -83,15 +82,7 @@ class FusionService(OdometryService):
             severity = Severity.WARNING if change.slipping else Severity.INFO
             self._events(reason, severity, self.name, change.text)
         status = self._fusion.status()
-        if status.disturbed is not self._disturbed:
-            self._disturbed = status.disturbed
-            if status.disturbed:
-                self._events(Reason.HEADING_DISTURBED, Severity.WARNING, self.name, "the yaw goes on without it")
-            else:
-                self._events(
-                    Reason.HEADING_RETURNED, Severity.INFO, self.name, f"north at {status.north or 0:.2f} rad in odom"
-                )
-
+        self.report_compass(status.doubt, f"north at {status.north or 0:.2f} rad in odom")
         self._publish_health(status)
 
     def _publish_health(self, status: FusionStatus) -> None:

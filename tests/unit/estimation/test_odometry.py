@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from monstertruck_estimation.odometry import OdometryService, PlanarCovariance
 from monstertruck_kinematics.chassis import Dimensions, truck_chassis
 from monstertruck_runtime.clock import SECOND, run_virtual
+from monstertruck_schemas.reasons import Reason
 from tests.unit.estimation.kit import DRIVETRAIN, Truck, drive_feedback, heading, servo_feedback, spread
 
 
@@ -106,6 +107,9 @@ def test_a_prediction_does_not_run_on_for_ever():
     truck.drive(0.2, 0.0, 0.0, 1.0)
     far = truck.reckoning.estimate(truck.now + 5 * SECOND)
     assert far.pose[0] == pytest.approx(truck.pose[0] + 0.2 * 0.3)
+    assert far.twist == (0.0, 0.0, 0.0), "a pose that waits has no speed"
+    assert spread(far.pose_covariance)[0] > 0.2 * 4.7, "the truck may have driven on"
+    assert spread(far.twist_covariance)[0] > 0.2
 
 
 def test_sideways_uncertainty_comes_from_the_heading():
@@ -201,6 +205,42 @@ def test_a_sudden_turn_of_the_compass_alone_is_rejected():
     truck.drive(0.2, 0.0, 0.0, 6.0)
     assert truck.error()[1] < 0.01
     assert truck.reckoning.rejected_headings > 10
+
+
+def test_a_compass_of_the_wrong_sign_is_found_by_its_turns_and_taken_back():
+    truck = Truck(compass_error=lambda truck: -2.0 * truck.pose[2])
+    truck.drive(0.2, 0.0, 0.0, 1.0)
+    assert truck.reckoning.doubt is None
+    truck.drive(0.2, 0.04, -0.04, 6.0)  # so slowly that no heading is far off
+    assert truck.reckoning.rejected_headings == 0
+    assert "wrong sign" in truck.reckoning.doubt
+    assert truck.error()[1] < 0.01
+    x, y, _ = spread(truck.estimate.pose_covariance)
+    assert truck.error()[0] < 3 * math.hypot(x, y)
+    truck.compass_error = lambda truck: 0.4
+    truck.drive(0.2, 0.3, -0.3, 3.0)
+    assert truck.reckoning.doubt is None, "it turns with the truck again"
+    assert "compass" in truck.estimate.sources
+    assert truck.error()[1] < 0.02, "north was found anew"
+
+
+def test_headings_that_stay_off_are_reported_and_their_return_is():
+    told = []
+    truck = Truck(compass_error=lambda truck: 0.6 if 3.0 < truck.now / SECOND < 5.0 else 0.0)
+    service = OdometryService(
+        truck.reckoning,
+        None,
+        drives=[],
+        steering=None,
+        compass=None,
+        odometry=None,
+        pose=None,
+        events=lambda reason, *_: told.append(reason),
+    )
+    for _ in range(6):
+        truck.drive(0.2, 0.0, 0.0, 1.0)
+        service.report_compass(truck.reckoning.doubt)
+    assert told == [Reason.HEADING_DISTURBED, Reason.HEADING_RETURNED]
 
 
 def test_headings_before_the_first_drive_reading_are_ignored():

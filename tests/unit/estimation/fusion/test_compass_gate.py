@@ -154,3 +154,13 @@ def test_the_deviation_of_the_compass_does_not_count_as_slip():
     rig = Rig(SENSORS).drive(0.3, 0.2, -0.2, 4.0)
     disturbed(rig, 2.0, magnet=0.7, field=FIELD * 1.5)
     assert rig.drive(0.3, 0.2, -0.2, 4.0).changes == []
+
+
+def test_a_compass_of_the_wrong_sign_is_left_out_however_slowly_it_turns():
+    rig = Rig(("wheels", "compass"))
+    rig.drive(0.0, 0.0, 0.0, 0.5)
+    for _ in range(40):
+        rig.drive(0.3, 0.05, -0.05, 0.1)
+        rig.magnet = -2.0 * rig.pose[2]
+    assert "wrong sign" in rig.fusion.status().doubt
+    assert rig.error()[1] < 3 * math.sqrt(rig.estimate.pose_covariance[8])
