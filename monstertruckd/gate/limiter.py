@@ -61,6 +61,9 @@ MAX_SPEED: Final = 1e3
 ROUNDING: Final = 1e-6
 """Relative difference up to which two motions are the same."""
 
+LEAST: Final = 1e-6
+"""A motion of less pace is none, m/s: what is left of one that ends has the direction of its rounding errors."""
+
 Way = tuple[float, float, float]
 """Motion of the base per metre of pace: m/m, m/m, rad/m."""
 
@@ -799,7 +802,7 @@ class CommandLimiter:
             limits[Reason.SONAR_STALE] = 0.0
             return
         courses = ((wanted, motion.pace(wanted, shafts)), (motion.twist, motion.present_pace))
-        ways = [_scaled(twist, 1.0 / pace) for twist, pace in courses if twist != STILL]
+        ways = [_scaled(twist, 1.0 / pace) for twist, pace in courses if twist != STILL and pace >= LEAST]
         delay = sonars.delay(now) + config.reaction
         reach = config.obstacle.ahead + config.speed * (delay + config.speed / (2 * config.obstacle.deceleration))
         views = [sonars.look(way, reach, now) for way in ways]
@@ -822,7 +825,7 @@ class CommandLimiter:
         """Sweep the footprint along the commanded motion, along ``wanted``, and as the wheels are seen to stand."""
         motion = self._motion
         courses = ((wanted, motion.pace(wanted, shafts)), (motion.twist, motion.present_pace))
-        moving = [(twist, pace) for twist, pace in courses if twist != STILL]
+        moving = [(twist, pace) for twist, pace in courses if twist != STILL and pace >= LEAST]
         if not moving or not self._sensors.scan_fresh(now):
             return
         ways = [_scaled(twist, 1.0 / pace) for twist, pace in moving]

@@ -248,11 +248,9 @@ class Chassis(ABC):
 
         Angles within reach come back as they were.
         """
-        if self.linkage is None:
-            return angles
         if self.freedom == "both":
-            return self._reach.limited(angles[0], angles[1])
-        front = clip(angles[0], *self._front_reach)
+            return angles if self.linkage is None else self._reach.limited(angles[0], angles[1])
+        front = angles[0] if self.linkage is None else clip(angles[0], *self._front_reach)
         return front, self._rear(front)
 
     @property

@@ -293,8 +293,9 @@ class _DriveSession:
             found = await self._line.read(od.MARK, attempts)
             if found == mark:
                 return
-            await self._line.write(od.MARK, found + 1, attempts)
-            self._driver.mark = found + 1
+            following = od.MARK.decode(found + 1)
+            await self._line.write(od.MARK, following, attempts)
+            self._driver.mark = following
         except ObjectError:
             return
         if mark is not None:

@@ -234,3 +234,34 @@ def test_a_change_of_rounding_in_the_turn_alone_is_no_motion_of_its_own(kind: st
     target = (vx, vy + 1e-18, wz + 1e-17)
     motion.accelerate(target, 0.02)
     assert motion.twist == pytest.approx(target, abs=1e-12)
+
+
+TINY = 1e-310
+"""Its reciprocal is infinite."""
+
+
+@pytest.mark.parametrize("kind", ["truck", "ackermann", "skid_steer", "wheels"])
+def test_a_motion_too_slow_to_have_a_direction_is_none(kind):
+    robot = Robot(kind).armed()
+    slow = [TINY] * len(robot.shafts)
+    asks = (lambda: robot.drive(speed=TINY), lambda: robot.twist(vx=-TINY), lambda: robot.roll(*slow))
+    for ask in asks:
+        assert ask() is Reason.OK
+        assert max(map(abs, robot.tick().speeds)) < 1e-300
+
+
+def test_what_rounding_leaves_of_a_motion_that_ends_is_not_taken_for_a_direction():
+    robot = Robot("ackermann").armed()
+    assert robot.twist(vx=-0.1, wz=-1.57) is Reason.OK
+    robot.tick(11)
+    assert robot.roll(0.436) is Reason.OK  # passes through standstill
+    robot.tick(12)
+    assert robot.out.mode is GateMode.DRIVING
+
+
+@pytest.mark.parametrize("kind", ["differential", "skid_steer"])
+def test_an_angle_that_is_taken_although_it_is_off_by_rounding_does_no_harm(kind):
+    robot = Robot(kind).armed()
+    assert robot.drive(speed=0.2, front=0.1, rear=1e-6) is Reason.OK
+    robot.tick(3)
+    assert robot.out.mode is GateMode.DRIVING

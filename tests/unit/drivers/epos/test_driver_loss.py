@@ -10,6 +10,7 @@ from unittest.mock import AsyncMock
 import pytest
 
 from monstertruck_drivers.cable import DeviceEnd
+from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos.driver import RAD_S_PER_RPM, _DriveSession
 from monstertruck_drivers.epos.protocol import Control, State
 from monstertruck_runtime.clock import SECOND
@@ -247,6 +248,17 @@ def test_a_counter_that_restarted_while_unplugged_is_no_motion(marked: bool, mon
             await rig.settle(1.5)
             assert rig.newest.received > rig.clock.now() - SECOND // 10
             assert rig.newest.position == position
+
+    on_bench(test)
+
+
+def test_a_mark_that_another_master_left_at_the_greatest_value_goes_on_from_zero():
+    async def test(rig: Rig) -> None:
+        rig.emulator.firmware.write(od.MARK.index, od.MARK.sub, od.MARK.limits[1])
+        async with rig.supervised():
+            await rig.drive(6_000)
+        assert [mark for _, mark in rig.writes(od.MARK)] == [0]
+        assert rig.driver.mark == 0
 
     on_bench(test)
 
