@@ -42,7 +42,7 @@ from monstertruck_runtime.errors import InputError, NotInstalledError
 from monstertruck_schemas.base import Pose2D
 from monstertruck_sim.world.config import MechanicsConfig, ServoModelConfig, SimTruckConfig, WorldConfig
 from monstertruck_sim.world.world import World
-from monstertruck_sim.world3d.picture import WorldRenderer, looking
+from monstertruck_sim.world3d.picture import WorldRenderer, looking_at
 from monstertruck_sim.world3d.plant import RigidPlant
 from monstertruckd.tools.demo.runs import run_fast_demo
 
@@ -318,7 +318,7 @@ def speed() -> dict[str, float]:
     except NotInstalledError as error:
         print(f"no pictures: {error}")
         return figures
-    eye = looking((-1.5, -2.4, 1.0), (0.0, -1.7, 0.1))
+    eye = looking_at((-1.5, -2.4, 1.0), (0.0, -1.7, 0.1))
     renderer.draw(data, eye)
     waits = []
     for _ in range(9):  # by the clock, for the software that draws has threads of its own

@@ -194,7 +194,7 @@ def check(arguments: list[str]) -> int:
         (pytest, [*TESTS, "-m", "traced and not wall", "--cov", "--cov-report=", *TRACED]),
         (tools / "coverage", ["report"]),
         (pytest, [*TESTS, "-m", "not wall and not traced and not long", *arguments]),
-        (pytest, [*TESTS, "-m", "wall", *arguments]),
+        (pytest, [*TESTS, "-m", "wall and not long", *arguments]),
     ]
     for program, rest in steps:
         code = step(program, rest)

@@ -6,7 +6,7 @@ from typing import Final, NamedTuple
 from PIL import Image
 
 from monstertruck_sim.world.world import World, make_scene
-from monstertruck_sim.world3d.picture import WorldRenderer, looking
+from monstertruck_sim.world3d.picture import WorldRenderer, looking_at
 from monstertruck_sim.world3d.plant import RigidPlant
 from monstertruckd.tools.shipped import shipped
 from monstertruckd.tools.simulation.config import load_simulated
@@ -54,7 +54,7 @@ def main() -> None:
         view = VIEWS.get(name, View())
         eye = tuple(a + b for a, b in zip(view.at, view.aside, strict=True))
         renderer = WorldRenderer(plant.model, *SIZE)
-        picture = renderer.draw(plant.data, looking((eye[0], eye[1], eye[2]), view.at))
+        picture = renderer.draw(plant.data, looking_at((eye[0], eye[1], eye[2]), view.at))
         renderer.close()
         image = Image.fromarray(picture).quantize(COLOURS, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
         image.save(PICTURES / f"{name}.png", optimize=True)

@@ -59,6 +59,7 @@ def test_lidar(tmp_path: Path):
     assert judged(wizard, truck(tmp_path, 2, "lidar"), 2) == {"x", "y", "yaw", "pitch", "roll"}
 
 
+@pytest.mark.long
 def test_imu(tmp_path: Path):
     wizard = imu_wizard(ImuWizard(rounds=1))
     assert judged(wizard, truck(tmp_path, 3, "imu"), 3) >= {"rate_z", "rate_scale", "force_x"}

@@ -72,6 +72,7 @@ async def drive_away(truck: Robot, client: TruckClient) -> asyncio.subprocess.Pr
     return wizard
 
 
+@pytest.mark.long
 async def test_a_wizard_that_is_killed_leaves_truck_neutral_and_file_intact(tmp_path: Path):
     """By Ctrl-C, which it says, by kill -9, and at last because the daemon is killed."""
     async with truck_with_a_calibration(tmp_path) as (truck, client, before):

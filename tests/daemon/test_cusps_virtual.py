@@ -31,8 +31,8 @@ def corridor(width: float, folder: Path) -> Path:
 @pytest.mark.parametrize(
     ("width", "kind", "seed", "gate"),
     [
-        (0.8, "lqr", 1, {"obstacle": {"ahead": 0.01, "side_clearance": 0.01}}),
-        (0.8, "mpc", 2, {"obstacle": {"ahead": 0.01, "side_clearance": 0.01}}),
+        pytest.param(0.8, "lqr", 1, {"obstacle": {"ahead": 0.01, "side_clearance": 0.01}}, marks=pytest.mark.long),
+        pytest.param(0.8, "mpc", 2, {"obstacle": {"ahead": 0.01, "side_clearance": 0.01}}, marks=pytest.mark.long),
         (0.9, "lqr", 3, {}),
     ],
 )

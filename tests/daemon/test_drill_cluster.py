@@ -25,7 +25,7 @@ pytestmark = [
 ]
 
 
-def drill(count: int = 3) -> Drill:
+def drill(count: int = 2) -> Drill:
     """Legs of one fault each."""
     config = load_config(ROOT / "configs" / "demo.yaml", SimulatedTruckConfig)[0]
     return Drill(7, count, with_overlay(config, {"recorder": None}), leg=1)
@@ -61,6 +61,7 @@ def processes(folder: Path, workers: int) -> Iterator[tuple[str, list[subprocess
             process.wait()
 
 
+@pytest.mark.long
 def test_the_report_is_that_of_one_process_though_a_worker_is_killed_midway(tmp_path: Path):
     with processes(tmp_path, 2) as (address, workers):
         done: list[FaultOutcome] = []

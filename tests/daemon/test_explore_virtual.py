@@ -38,7 +38,7 @@ def corner_room(folder: Path) -> Path:
     return folder / "corner.yaml"
 
 
-class Story:
+class ExploringTruck:
     """A truck in the room, and somebody who asks it to explore."""
 
     def __init__(self, rig: VirtualRig) -> None:
@@ -58,8 +58,8 @@ class Story:
                     return state
 
 
-def tell(story, folder: Path, **overlay) -> tuple[Story, np.ndarray]:
-    """Let it happen; returns the story and the truth."""
+def run_scenario(scenario, folder: Path, **overlay) -> tuple[ExploringTruck, np.ndarray]:
+    """Let it happen; returns the scenario and the truth."""
     config = load_config(CONFIGS / "explore.yaml", SimulatedTruckConfig)[0]
     base = {
         "recorder": None,
@@ -72,13 +72,13 @@ def tell(story, folder: Path, **overlay) -> tuple[Story, np.ndarray]:
     }
     config = with_overlay(with_overlay(config, base), overlay)
 
-    async def main(clock: VirtualClock) -> tuple[Story, np.ndarray]:
+    async def main(clock: VirtualClock) -> tuple[ExploringTruck, np.ndarray]:
         rig = VirtualRig(config, clock)
-        told = Story(rig)
+        truck = ExploringTruck(rig)
         async with rig.running():
             await clock.sleep(4.0)
-            await story(told)
-        return told, rig.truth.array()
+            await scenario(truck)
+        return truck, rig.truth.array()
 
     return run_virtual(main, start=SECOND)
 
@@ -87,17 +87,17 @@ def tell(story, folder: Path, **overlay) -> tuple[Story, np.ndarray]:
 def test_it_explores_a_room_drives_home_and_saves_the_map(tmp_path: Path):
     ends = []
 
-    async def story(told: Story) -> None:
+    async def scenario(truck: ExploringTruck) -> None:
         with pytest.raises(RequestRefusedError) as refused:
-            await told.order(ExploreOrder.START)
+            await truck.order(ExploreOrder.START)
         assert refused.value.refusal is Reason.DISARMED
-        await told.operator.arm()
-        assert await told.order(ExploreOrder.START) == {"number": 1}
+        await truck.operator.arm()
+        assert await truck.order(ExploreOrder.START) == {"number": 1}
         with pytest.raises(RequestRefusedError, match="is running") as refused:
-            await told.order(ExploreOrder.START)
-        ends.append(await told.end(280.0))
+            await truck.order(ExploreOrder.START)
+        ends.append(await truck.end(280.0))
 
-    told, truth = tell(story, tmp_path)
+    truck, truth = run_scenario(scenario, tmp_path)
     state = ends[0]
     assert state.outcome is Reason.EXPLORED, state.text
     assert not truth[:, 5].any(), "collided"
@@ -105,33 +105,33 @@ def test_it_explores_a_room_drives_home_and_saves_the_map(tmp_path: Path):
     assert state.travelled > 4.0
     grid = load(tmp_path / "map").grid
     assert (grid.cells == FREE).sum() * grid.resolution**2 > 14.0  # of 16.8 m^2, walls rounded off
-    reasons = {event.reason for event in told.events.drain() if event.source == "explorer"}
+    reasons = {event.reason for event in truck.events.drain() if event.source == "explorer"}
     assert {Reason.EXPLORATION_STARTED, Reason.FRONTIER_CHOSEN, Reason.EXPLORED} <= reasons
 
 
-def test_it_stops_when_told_to_and_gives_way_to_other_goals(tmp_path: Path):
+def test_it_stops_on_request_and_gives_way_to_other_goals(tmp_path: Path):
     ends = []
 
-    async def story(told: Story) -> None:
-        await told.operator.arm()
-        await told.order(ExploreOrder.START)
-        await told.clock.sleep(5.0)
-        await told.order(ExploreOrder.STOP)
-        ends.append(await told.end(60.0))
+    async def scenario(truck: ExploringTruck) -> None:
+        await truck.operator.arm()
+        await truck.order(ExploreOrder.START)
+        await truck.clock.sleep(5.0)
+        await truck.order(ExploreOrder.STOP)
+        ends.append(await truck.end(60.0))
         with pytest.raises(RequestRefusedError, match="no exploration"):
-            await told.order(ExploreOrder.STOP)
-        await told.order(ExploreOrder.START, home=False)
-        await told.clock.sleep(4.0)
+            await truck.order(ExploreOrder.STOP)
+        await truck.order(ExploreOrder.START, home=False)
+        await truck.clock.sleep(4.0)
         goal = {"goal": {"x": 2.6, "y": 1.2, "yaw": 0.0}, "frame": "map"}
-        await told.operator.call("goal", {**await told.operator.header(), **goal})
-        ends.append(await told.end(60.0))
-        cancel = {**await told.operator.header(), "order": GoalOrder.CANCEL}
-        await told.operator.call("goal_control", cancel)
-        await told.clock.sleep(2.0)
-        await told.order(ExploreOrder.START, home=True, budget=6.0)
-        ends.append(await told.end(120.0))
+        await truck.operator.call("goal", {**await truck.operator.header(), **goal})
+        ends.append(await truck.end(60.0))
+        cancel = {**await truck.operator.header(), "order": GoalOrder.CANCEL}
+        await truck.operator.call("goal_control", cancel)
+        await truck.clock.sleep(2.0)
+        await truck.order(ExploreOrder.START, home=True, budget=6.0)
+        ends.append(await truck.end(120.0))
 
-    _, truth = tell(story, tmp_path)
+    _, truth = run_scenario(scenario, tmp_path)
     assert [state.outcome for state in ends] == [Reason.CANCELLED, Reason.CANCELLED, Reason.BUDGET_SPENT]
     assert "operator" in ends[0].text
     assert "goal of operator" in ends[1].text
@@ -156,18 +156,18 @@ def doubled(folder: Path) -> float:
 def test_a_lidar_that_is_gone_for_a_while_stops_it_and_armed_again_it_goes_on(tmp_path: Path):
     ends = []
 
-    async def story(told: Story) -> None:
-        await told.operator.arm()
-        await told.order(ExploreOrder.START, home=False)
-        await told.clock.sleep(8.0)
-        told.rig.ports["lidar"].unplug()
-        await told.clock.sleep(5.0)
-        told.rig.ports["lidar"].plug()
-        await told.clock.sleep(6.0)
-        await told.operator.arm()
-        ends.append(await told.end(200.0))
+    async def scenario(truck: ExploringTruck) -> None:
+        await truck.operator.arm()
+        await truck.order(ExploreOrder.START, home=False)
+        await truck.clock.sleep(8.0)
+        truck.rig.ports["lidar"].unplug()
+        await truck.clock.sleep(5.0)
+        truck.rig.ports["lidar"].plug()
+        await truck.clock.sleep(6.0)
+        await truck.operator.arm()
+        ends.append(await truck.end(200.0))
 
-    _, truth = tell(story, tmp_path)
+    _, truth = run_scenario(scenario, tmp_path)
     assert ends[0].outcome is Reason.EXPLORED, ends[0].text
     assert not truth[:, 5].any()
     assert doubled(tmp_path) < 0.05
@@ -177,12 +177,12 @@ def test_a_lidar_that_is_gone_for_a_while_stops_it_and_armed_again_it_goes_on(tm
 def test_far_from_home_it_turns_back_while_the_charge_suffices(tmp_path: Path):
     ends = []
 
-    async def story(told: Story) -> None:
-        await told.operator.arm()
-        await told.order(ExploreOrder.START)
-        ends.append(await told.end(200.0))
+    async def scenario(truck: ExploringTruck) -> None:
+        await truck.operator.arm()
+        await truck.order(ExploreOrder.START)
+        ends.append(await truck.end(200.0))
 
-    _, truth = tell(story, tmp_path, explorer={"full_range": 3.0})
+    _, truth = run_scenario(scenario, tmp_path, explorer={"full_range": 3.0})
     assert ends[0].outcome is Reason.CHARGE_SPENT
     assert "are kept for" in ends[0].text
     assert "back at the start" in ends[0].text

@@ -54,7 +54,7 @@ def expected(name: str, move: str) -> tuple[float, float, float]:
 
 
 @pytest.mark.parametrize(("name", "move"), CASES)
-def test_a_body_moves_as_it_is_told(name: str, move: str):
+def test_a_body_moves_as_commanded(name: str, move: str):
     moved = drive_move(name, **MOVES[move])
     assert arrived(moved), (moved.end.outcome, moved.end.text)
     assert moved.moved[:2] == pytest.approx(expected(name, move)[:2], abs=0.015)

@@ -76,16 +76,21 @@ main()
     "stage",
     [
         "monstertruckd.tools.cli.main",
-        "monstertruckd.tools.cli.main:app",
-        "monstertruckd.run",
         "monstertruckd.config.load:load_config",
-        "monstertruckd.run:run_wall",
-        "monstertruckd.gate.latch:EstopLatch.prepare",
         "zenoh:open",
-        "monstertruckd.bus.zenoh_session:ZenohBridge._declare_inputs",
-        "monstertruck_drivers.epos.driver:EposDriver.run",
         "monstertruckd.gate.service:GateService.run",
         "monstertruck_runtime.actors.process:WorkerProcess.__init__",
+        *(
+            pytest.param(stage, marks=pytest.mark.long)
+            for stage in (
+                "monstertruckd.tools.cli.main:app",
+                "monstertruckd.run",
+                "monstertruckd.run:run_wall",
+                "monstertruckd.gate.latch:EstopLatch.prepare",
+                "monstertruckd.bus.zenoh_session:ZenohBridge._declare_inputs",
+                "monstertruck_drivers.epos.driver:EposDriver.run",
+            )
+        ),
     ],
 )
 async def test_sigterm_at_any_stage_of_the_start_is_an_ordinary_end(stage: str, tmp_path: Path):
@@ -113,6 +118,7 @@ def catches_sigterm(process: int) -> bool:
     return bool(int(caught, 16) & 1 << (signal.SIGTERM - 1))
 
 
+@pytest.mark.long
 async def test_sigterm_at_any_moment_of_the_start_is_an_ordinary_end(tmp_path: Path):
     async with robot(tmp_path, base=ROOT / "configs" / "slam.yaml") as truck:
         await truck.start_simulator()

@@ -172,7 +172,7 @@ def test_the_fusion_turns_with_the_imu_and_leaves_out_one_with_the_wrong_sign():
     seen = drive((0.0, 0.0, 0.0), 5.0, (0.1, 0.5), at=[(1.0, turn_round)], **fused)
     assert {"drive", "tilt"} == set(seen.odometry.sources)
     assert Reason.IMU_DISAGREES in seen.events
-    assert turned(seen) < 0.1, "what it told before it was noticed is taken back"
+    assert turned(seen) < 0.1, "what it reported before it was noticed is taken back"
 
 
 @pytest.mark.parametrize("fault", ["inverted", "unplugged", pytest.param("silent", marks=pytest.mark.long)])

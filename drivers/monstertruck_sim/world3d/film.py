@@ -1,4 +1,4 @@
-"""A run as a moving picture: an eye follows the robot; frames are taken by the world's clock."""
+"""A run as a moving picture: a camera follows the robot; frames are taken by the world's clock."""
 
 from math import cos, sin
 from pathlib import Path
@@ -9,7 +9,7 @@ from PIL import Image
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import InputError
 from monstertruck_sim.world.world import World
-from monstertruck_sim.world3d.picture import WorldRenderer, looking
+from monstertruck_sim.world3d.picture import WorldRenderer, looking_at
 from monstertruck_sim.world3d.plant import RigidPlant
 
 RATE: Final = 8
@@ -17,7 +17,7 @@ RATE: Final = 8
 SIZE: Final = (480, 320)
 """Pixels."""
 _BEHIND, _ASIDE, _ABOVE = 1.25, 0.7, 0.95
-"""Place of the eye from the robot, m; it swings round behind a robot that turns."""
+"""Place of the camera from the robot, m; it swings round behind a robot that turns."""
 _SWING: Final = 0.12
 """Share of the way round that it makes from frame to frame."""
 _COLOURS: Final = 128
@@ -62,8 +62,8 @@ class Film:
         z = self._plant.height
         self._heading += _SWING * (yaw - self._heading)
         c, s = cos(self._heading), sin(self._heading)
-        eye = x - _BEHIND * c + _ASIDE * s, y - _BEHIND * s - _ASIDE * c, z + _ABOVE
-        picture = self._renderer.draw(self._plant.data, looking(eye, (x + 0.3 * c, y + 0.3 * s, z + 0.1)))
+        camera = x - _BEHIND * c + _ASIDE * s, y - _BEHIND * s - _ASIDE * c, z + _ABOVE
+        picture = self._renderer.draw(self._plant.data, looking_at(camera, (x + 0.3 * c, y + 0.3 * s, z + 0.1)))
         self.frames.append(Image.fromarray(picture).quantize(_COLOURS, Image.Quantize.MAXCOVERAGE, dither=_PLAIN))
 
     def save(self) -> None:

@@ -17,11 +17,11 @@ Picture = NDArray[np.uint8]
 
 
 @dataclass(frozen=True, slots=True)
-class Eye:
+class CameraPose:
     """From where a picture is taken.
 
     Args:
-        place: of the eye, m.
+        place: of the camera, m.
         ahead: unit vector, the axis of the picture.
         up: unit vector, at a right angle to it.
         field_of_view: from the lower to the upper edge, rad.
@@ -33,13 +33,15 @@ class Eye:
     field_of_view: float = 1.0
 
 
-def looking(place: tuple[float, float, float], at: tuple[float, float, float], field_of_view: float = 1.0) -> Eye:
-    """An upright eye that looks at a point."""
+def looking_at(
+    place: tuple[float, float, float], at: tuple[float, float, float], field_of_view: float = 1.0
+) -> CameraPose:
+    """An upright camera that looks at a point."""
     ahead = np.subtract(at, place) / np.linalg.norm(np.subtract(at, place))
     left = np.cross((0.0, 0.0, 1.0), ahead)
     left /= np.linalg.norm(left)
     up = np.cross(ahead, left)
-    return Eye(place, _triple(ahead), _triple(up), field_of_view)
+    return CameraPose(place, _triple(ahead), _triple(up), field_of_view)
 
 
 class WorldRenderer:
@@ -77,15 +79,15 @@ class WorldRenderer:
         self._option = mujoco.MjvOption()
         self._pixels = np.empty((height, width, 3), np.uint8)
 
-    def draw(self, data: mujoco.MjData, eye: Eye, *, shadows: bool = True) -> Picture:
+    def draw(self, data: mujoco.MjData, camera_pose: CameraPose, *, shadows: bool = True) -> Picture:
         """The world at the state of ``data``."""
-        self.arrange(data, eye, shadows=shadows)
+        self.arrange(data, camera_pose, shadows=shadows)
         return self.render()
 
     def arrange(
         self,
         data: mujoco.MjData,
-        eye: Eye,
+        camera_pose: CameraPose,
         *,
         shadows: bool = True,
         people: Sequence[Somebody] = (),
@@ -95,7 +97,7 @@ class WorldRenderer:
 
         Args:
             data: state of the world.
-            eye: from where.
+            camera_pose: from where.
             shadows: are drawn.
             people: who is there.
             hidden: groups that are left out.
@@ -108,9 +110,9 @@ class WorldRenderer:
         for somebody in people:
             self._add(*somebody)
         near = 0.01
-        half = near * np.tan(eye.field_of_view / 2)
+        half = near * np.tan(camera_pose.field_of_view / 2)
         for part in self._scene.camera:
-            part.pos[:], part.forward[:], part.up[:] = eye.place, eye.ahead, eye.up
+            part.pos[:], part.forward[:], part.up[:] = camera_pose.place, camera_pose.ahead, camera_pose.up
             part.frustum_near, part.frustum_far = near, 100.0
             part.frustum_bottom, part.frustum_top = -half, half
             part.frustum_center, part.frustum_width = 0.0, half * self._view.width / self._view.height

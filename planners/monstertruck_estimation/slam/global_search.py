@@ -1,10 +1,11 @@
 """Global localisation: where on a saved map the robot is, and that it is on none of it.
 
 A local map is built of the first scans (one scan of a 4 m lidar looks alike in many rooms); at every keyframe its
-surroundings are matched to the whole saved map by branch and bound (Hess et al. 2016, section V). What one look finds
-is a hypothesis. It becomes the answer when a look some way further on has found the same place, when what was seen
-between both fits, too, and when the beams of all the time since the first look do not contradict the saved grid. Ground
-that is not on the map fits nowhere, but contradicts nothing: a robot that has crossed it is found when it is back.
+surroundings are matched to the whole saved map by branch and bound (Hess et al. 2016, section V). What one search finds
+is a hypothesis. It becomes the answer when a search some way further on has found the same place, when what was seen
+between both fits, too, and when the beams of all the time since the first search do not contradict the saved grid.
+Ground that is not on the map fits nowhere, but contradicts nothing: a robot that has crossed it is found when it is
+back.
 """
 
 import math
@@ -43,27 +44,27 @@ AMBIGUOUS_RATIO: Final = 0.97
 MIN_SEPARATION: Final = 1.0
 """Distance at which places are different, m."""
 CONFIRM_TOLERANCE: Final = (0.3, 0.1)
-"""Two looks found the same place if they differ by less, m and rad."""
+"""Two searches found the same place if they differ by less, m and rad."""
 BASELINE: Final = (0.8, 3.0)
 """Way between two looks that makes a place certain, m: if both found it unique, and if not."""
 BROKEN: Final = frozenset({MappingEvent.APART, MappingEvent.PRUNED})
 """After these events keyframes of the local map are elsewhere, or have other numbers: it begins anew."""
 OUTSIDE_AFTER: Final = 10 * SECOND
-"""Time after which a robot that no look has found on the map is outside it, ns."""
+"""Time after which a robot that no search has found on the map is outside it, ns."""
 
 
 @dataclass
 class Hypothesis:
-    """A place that a look has found, and what later looks said of it."""
+    """A place that a search has found, and what later searches found of it."""
 
     pose: Array
-    """Shape (3,), in the saved map: the keyframe of the newest look that found it."""
-    looks: list[tuple[int, bool]]
-    """Keyframe of every look that found it, and whether it found no other place nearly as good."""
+    """Shape (3,), in the saved map: the keyframe of the newest search that found it."""
+    searches: list[tuple[int, bool]]
+    """Keyframe of every search that found it, and whether it found no other place nearly as good."""
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
+class SearchResult:
     """What one search of the whole map found."""
 
     pose: Array
@@ -86,9 +87,9 @@ class GlobalLocaliser:
         self._mount = np.zeros(2)
         self._begin_local_map()
         self._seen_on_map: int | None = None
-        """Stamp of the newest look that found any place, or of the first scan, ns."""
+        """Stamp of the newest search that found any place, or of the first scan, ns."""
         self.outside = False
-        """No look has found a place for ``OUTSIDE_AFTER``."""
+        """No search has found a place for ``OUTSIDE_AFTER``."""
         low, high = submap.cloud.points.min(axis=0), submap.cloud.points.max(axis=0)
         self._middle = np.array((*((low + high) / 2), 0.0))
         self._half = float((high - low).max() / 2) + 1.0
@@ -113,10 +114,10 @@ class GlobalLocaliser:
             self._mount = np.array(mount[:2])
             moved = between(*self._mapper.map.poses[-2:])[:2] if self._ways else np.zeros(2)
             self._ways.append((self._ways[-1] if self._ways else 0.0) + math.hypot(*moved))
-            look = self._look()
-            if look is not None:
+            result = self._search()
+            if result is not None:
                 self._seen_on_map = stamp
-                found = None if look.ambiguous else self._judged(look)
+                found = None if result.ambiguous else self._confirmed(result)
         self.outside = stamp - self._seen_on_map >= OUTSIDE_AFTER
         return found
 
@@ -126,7 +127,7 @@ class GlobalLocaliser:
         """Way driven at every keyframe, m."""
         self._hypotheses: list[Hypothesis] = []
 
-    def _look(self) -> Look | None:
+    def _search(self) -> SearchResult | None:
         """Search the whole map for the surroundings of the newest keyframe; None if they fit nowhere."""
         known = self._mapper.map
         newest = len(known) - 1
@@ -147,41 +148,41 @@ class GlobalLocaliser:
         fit = register(query, self._submap.cloud, peak.pose)
         if fit.overlap < MIN_OVERLAP or self._contradiction(numbers, newest, fit.pose) > MAX_CONTRADICTION:
             return None
-        return Look(fit.pose, peak.rival < UNIQUE_RATIO * peak.score, ambiguous)
+        return SearchResult(fit.pose, peak.rival < UNIQUE_RATIO * peak.score, ambiguous)
 
-    def _judged(self, look: Look) -> Array | None:
-        """Compare a look with the hypotheses; its pose if that makes one certain."""
+    def _confirmed(self, result: SearchResult) -> Array | None:
+        """Compare a result with the hypotheses; its pose if that makes one certain."""
         known = self._mapper.map
         newest = len(known) - 1
-        same = next((h for h in self._hypotheses if self._agree(h, look.pose)), None)
+        same = next((h for h in self._hypotheses if self._agree(h, result.pose)), None)
         if same is None:
-            self._hypotheses.append(Hypothesis(look.pose, [(newest, look.unique)]))
+            self._hypotheses.append(Hypothesis(result.pose, [(newest, result.unique)]))
             return None
-        same.pose = look.pose
-        same.looks.append((newest, look.unique))
+        same.pose = result.pose
+        same.searches.append((newest, result.unique))
         since = self._far_enough(same)
-        return look.pose if since is not None and self._foreseen(same, since) else None
+        return result.pose if since is not None and self._foreseen(same, since) else None
 
     def _far_enough(self, hypothesis: Hypothesis) -> int | None:
-        """Keyframe of the last look that is as far from the newest one as ``BASELINE`` asks; None if there is none."""
-        newest, unique = hypothesis.looks[-1]
-        for key, also in reversed(hypothesis.looks):
+        """Keyframe of the last search that is as far from the newest one as ``BASELINE`` asks; None if none is."""
+        newest, unique = hypothesis.searches[-1]
+        for key, also in reversed(hypothesis.searches):
             if self._ways[newest] - self._ways[key] >= BASELINE[0 if unique and also else 1]:
                 return key
         return None
 
     def _agree(self, hypothesis: Hypothesis, pose: Array) -> bool:
         poses = self._mapper.map.poses
-        off = between(compose(hypothesis.pose, between(poses[hypothesis.looks[-1][0]], poses[-1])), pose)
+        off = between(compose(hypothesis.pose, between(poses[hypothesis.searches[-1][0]], poses[-1])), pose)
         return math.hypot(off[0], off[1]) < CONFIRM_TOLERANCE[0] and abs(float(off[2])) < CONFIRM_TOLERANCE[1]
 
     def _foreseen(self, hypothesis: Hypothesis, since: int) -> bool:
-        """Whether all seen from keyframe ``since`` on fits the map, and nothing since the first look contradicts it."""
+        """Whether all seen since keyframe ``since`` fits the map, and nothing since the first search contradicts it."""
         newest = len(self._mapper.map) - 1
         query = self._merged(np.arange(since, newest + 1), newest)
         if measure(query, self._submap.cloud, hypothesis.pose).overlap < MIN_OVERLAP:
             return False
-        numbers = np.arange(hypothesis.looks[0][0], newest + 1)
+        numbers = np.arange(hypothesis.searches[0][0], newest + 1)
         return self._contradiction(numbers, newest, hypothesis.pose) <= MAX_CONTRADICTION
 
     def _merged(self, numbers: NDArray[np.intp], centre: int) -> Scan:

@@ -128,7 +128,7 @@ async def test_stations_see_and_ask_their_own_robots_and_robots_say_only_their_o
         await asyncio.sleep(0.2)
         watching.cancel()
         await asyncio.gather(watching, return_exceptions=True)
-        assert found == ["hare"], "a station is told of the robots that know it"
+        assert found == ["hare"], "a station learns of the robots that know it"
 
 
 def _robot_session(folder: Folder, endpoint: str) -> str:

@@ -101,13 +101,13 @@ def test_the_watch_marks_messages_tells_once_and_counts_the_way(tmp_path):
 
     async def main(clock: VirtualClock):
         bus = Bus(clock)
-        told = []
+        events = []
         watch = CalibrationWatch(
             TRUCK,
             {"battery": old},
             bus,
             clock,
-            lambda *args, **_: told.append(args[0]),
+            lambda *args, **_: events.append(args[0]),
             inline,
             WayCounter(tmp_path / "odometer.json"),
         )
@@ -129,11 +129,11 @@ def test_the_watch_marks_messages_tells_once_and_counts_the_way(tmp_path):
         newest = bus.newest(topics.CALIBRATION)
         task.cancel()
         await asyncio.wait([task])
-        return degraded, told, newest
+        return degraded, events, newest
 
-    degraded, told, newest = run_virtual(main)
+    degraded, events, newest = run_virtual(main)
     assert degraded
-    assert told == [Reason.CALIBRATION_EXPIRED]
+    assert events == [Reason.CALIBRATION_EXPIRED]
     assert newest.wizards[0].expired
     way = 1000.0 * TRUCK.geometry.wheel_radius / TRUCK.geometry.drive_ratio
     assert newest.odometer == pytest.approx(119 * way, abs=2 * way)
@@ -142,14 +142,20 @@ def test_the_watch_marks_messages_tells_once_and_counts_the_way(tmp_path):
     assert kept.metres == pytest.approx(128 * way, abs=2 * way)
 
 
-def test_another_device_on_the_same_port_is_told_and_the_old_one_counts_again(tmp_path):
+def test_another_device_on_the_same_port_is_reported_and_the_old_one_counts_again(tmp_path):
     node = UsbNode(name="1-1.2", role="drive", serial="A1", state=UsbState.PRESENT)
 
     async def main(clock: VirtualClock):
         bus = Bus(clock)
-        told = []
+        events = []
         watch = CalibrationWatch(
-            TRUCK, {}, bus, clock, lambda *args, **_: told.append(args), inline, WayCounter(tmp_path / "odometer.json")
+            TRUCK,
+            {},
+            bus,
+            clock,
+            lambda *args, **_: events.append(args),
+            inline,
+            WayCounter(tmp_path / "odometer.json"),
         )
         tree = bus.publisher(topics.USB, Writer.DAEMON)
         task = asyncio.create_task(watch.run(lambda: None))
@@ -166,11 +172,11 @@ def test_another_device_on_the_same_port_is_told_and_the_old_one_counts_again(tm
         seen = [await plugged(serial) for serial in ("A1", "B2", None, "A1")]
         task.cancel()
         await asyncio.wait([task])
-        return saved, seen, told
+        return saved, seen, events
 
-    saved, seen, told = run_virtual(main)
+    saved, seen, events = run_virtual(main)
     assert saved.estimates[0].valid_until is not None
     assert saved.estimates[0].valid_until.serial == "A1"
     other = "drive was the device with serial number A1, it is B2"
     assert seen == ["", other, other, ""]  # an unplugged device is still the one that was seen last
-    assert [args[3] for args in told] == [f"drive: {other}"]
+    assert [args[3] for args in events] == [f"drive: {other}"]

@@ -94,7 +94,7 @@ def test_a_change_is_applied_as_a_whole_and_said_with_who_made_it(config: TruckC
     assert not SavedSettings(config.state_directory, config.robot).path.exists()
 
 
-def test_who_makes_the_robot_less_safe_than_by_default_is_told(
+def test_who_makes_the_robot_less_safe_than_by_default_is_warned(
     config: TruckConfig, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     robot = Robot(config)

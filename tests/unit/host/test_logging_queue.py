@@ -90,8 +90,8 @@ def test_the_journal_is_recognised_by_the_stream_it_named(tmp_path: Path):
     [
         ("tcp/user:hunter2@host:7447", "tcp/***@host:7447"),
         ("tcp/[::1]:7447 and tls/host:7447", "tcp/[::1]:7447 and tls/host:7447"),
-        ("http://user:hunt@er2/x", "http://***@er2/x"),
-        ("http://user:hunt@er2@host/x", "http://***@host/x"),
+        ("http://user:pass@er2/x", "http://***@er2/x"),
+        ("http://user:pass@er2@host/x", "http://***@host/x"),
         ("http://hunter2@host/x", "http://***@host/x"),
         ("Authorization: Bearer hunter2", "Authorization: Bearer ***"),
         ("{'Authorization': 'Basic hunter2'}", "{'Authorization': '***'}"),

@@ -240,7 +240,7 @@ def test_what_only_has_a_logs_name_does_not_stop_the_recording(config, failures)
     assert sum(1 for _ in open_log(folder / "run-000004-000.mcap")) == 60
 
 
-def test_a_log_that_cannot_be_removed_stays_and_is_told_of_once(config, failures, monkeypatch, caplog):
+def test_a_log_that_cannot_be_removed_stays_and_is_reported_once(config, failures, monkeypatch, caplog):
     folder = Path(config.directory)
     folder.mkdir()
     for run in (1, 2):

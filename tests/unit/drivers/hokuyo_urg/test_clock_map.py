@@ -104,7 +104,7 @@ def two_clocks(
 ) -> tuple[np.ndarray, ClockMap]:
     """Errors of the stamps, ms, of a stream whose host's clock is slewed by a share ``slew`` from ``at`` s on.
 
-    From 60 s on scans arrive ``jump_ms`` later. ``lasts``: s of the slew. ``nominal``: latency the map is told, ns.
+    From 60 s on scans arrive ``jump_ms`` later. ``lasts``: s of the slew. ``nominal``: latency the map is given, ns.
     """
     rng = np.random.default_rng(2)
     rate, origin = 1 + drift_ppm * 1e-6, 12_345_678_901

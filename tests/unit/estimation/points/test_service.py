@@ -90,16 +90,16 @@ class Rig:
         })  # fmt: skip
 
 
-def told(story, folder, **more) -> Rig:
+def run_scenario(story, folder, **more) -> Rig:
     async def main(clock) -> Rig:
         rig = Rig(clock, folder, **more)
         serving = asyncio.create_task(rig.service.run(lambda: None))
-        telling = asyncio.create_task(story(rig))
-        await asyncio.wait([serving, telling], return_when=asyncio.FIRST_COMPLETED)
+        acting = asyncio.create_task(story(rig))
+        await asyncio.wait([serving, acting], return_when=asyncio.FIRST_COMPLETED)
         serving.cancel()
         with suppress(asyncio.CancelledError):
             await serving
-        await telling
+        await acting
         return rig
 
     return run_virtual(main)
@@ -113,7 +113,7 @@ def test_a_tag_in_pictures_becomes_a_point_with_a_picture_and_is_saved(tmp_path)
         with pytest.raises(NotFoundError):
             await rig.calls["point_picture"]({"name": "tag-4"})
 
-    rig = told(story, tmp_path)
+    rig = run_scenario(story, tmp_path)
     assert not rig.out[0].points, "late joiners know that there is none"
     (point,) = rig.out[-1].points
     # The picture is always the same, so the tag goes along with the robot: sightings agree within what is allowed.
@@ -128,13 +128,13 @@ def test_nothing_is_read_of_a_tilted_robot_and_a_standing_one_is_left_alone(tmp_
     async def tilted(rig: Rig) -> None:
         await rig.drive(1.5, tilt=0.3)
 
-    assert not any(message.points for message in told(tilted, tmp_path).out)
+    assert not any(message.points for message in run_scenario(tilted, tmp_path).out)
 
     async def standing(rig: Rig) -> None:
         rig.speed = 0.0
         await rig.drive(3.0)
 
-    assert told(standing, tmp_path).out[-1].points[0].sightings == 2
+    assert run_scenario(standing, tmp_path).out[-1].points[0].sightings == 2
 
 
 def test_places_are_marked_moved_with_the_map_and_removed(tmp_path):
@@ -163,9 +163,9 @@ def test_places_are_marked_moved_with_the_map_and_removed(tmp_path):
         await rig.ask(PointOrder.REMOVE, "here")
         await rig.drive(1.5, show=b"")
 
-    rig = told(story, tmp_path, ask=lambda stamps: moved.get("asked", {}))
+    rig = run_scenario(story, tmp_path, ask=lambda stamps: moved.get("asked", {}))
     assert [point.name for point in rig.out[-1].points] == ["there"]
-    again = told(lambda rig: rig.drive(1.2, show=b""), None, load=tmp_path)
+    again = run_scenario(lambda rig: rig.drive(1.2, show=b""), None, load=tmp_path)
     assert [point.name for point in again.out[-1].points] == ["there"]
 
 
@@ -185,7 +185,7 @@ def test_a_place_far_from_here_is_marked_where_it_is_in_the_map_of_today(tmp_pat
         await rig.drive(1.5, show=b"")
         assert rig.out[-1].points[0].y == pytest.approx(3.3), "from then on it goes along"
 
-    told(story, tmp_path, ask=lambda stamps: answers.get("now", {}))
+    run_scenario(story, tmp_path, ask=lambda stamps: answers.get("now", {}))
 
 
 def test_what_cannot_be_read_is_not_written_over_and_the_last_mark_is_kept(tmp_path):
@@ -195,14 +195,14 @@ def test_what_cannot_be_read_is_not_written_over_and_the_last_mark_is_kept(tmp_p
         await rig.drive(1.0, show=b"")
         await rig.ask(PointOrder.MARK, "dock")
 
-    rig = told(story, tmp_path, load=tmp_path)
+    rig = run_scenario(story, tmp_path, load=tmp_path)
     assert (tmp_path / "points.json").read_text() == "[{}]"
     assert any("not saved over it" in text for _, text in rig.events)
-    told(story, tmp_path / "new")
+    run_scenario(story, tmp_path / "new")
     assert [point.name for point, _ in files.load(tmp_path / "new")] == ["dock"]
 
 
-def test_files_are_written_by_a_thread_and_failures_are_told_by_the_loop(tmp_path):
+def test_files_are_written_by_a_thread_and_failures_are_reported_by_the_loop(tmp_path):
     (tmp_path / "file").touch()
     inside = []
 
@@ -219,7 +219,7 @@ def test_files_are_written_by_a_thread_and_failures_are_told_by_the_loop(tmp_pat
         await rig.drive(1.0, show=b"")
         await rig.ask(PointOrder.MARK, "dock")
 
-    rig = told(story, tmp_path / "file" / "folder")
+    rig = run_scenario(story, tmp_path / "file" / "folder")
     assert [by for by, text in rig.events if "points not saved" in text] == [0]
 
 
@@ -231,5 +231,5 @@ def test_a_robot_that_is_lost_marks_no_place_of_its_own_and_reads_no_tags(tmp_pa
         await rig.ask(PointOrder.MARK, "there", x=1.0, y=3.0)
         await rig.drive(1.5)
 
-    rig = told(story, tmp_path, standing=LocalisationStatus.LOST)
+    rig = run_scenario(story, tmp_path, standing=LocalisationStatus.LOST)
     assert [point.name for point in rig.out[-1].points] == ["there"]

@@ -91,7 +91,7 @@ def test_it_moves_with_what_the_mapper_corrects():
     assert points.stamps() == tuple(moved)
 
 
-def test_of_two_poses_of_a_square_the_upright_one_is_taken_and_a_doubt_is_told():
+def test_of_two_poses_of_a_square_the_upright_one_is_taken_and_a_doubt_is_reported():
     points = PointMap(PointsConfig(), MOUNT)
     right = reading(BASES[0])
     tilted = tuple(camera_axes(MOUNT.yaw, MOUNT.pitch, MOUNT.roll).T @ np.array((-0.8, 0.0, 0.6)))

@@ -79,7 +79,7 @@ def test_what_cannot_be_reached_is_infinitely_far():
     assert np.isinf(covariances[2]).all()
 
 
-def test_thinning_hands_relations_over_so_that_the_optimum_stays():
+def test_pruning_hands_relations_over_so_that_the_optimum_stays():
     truth = rounds(200, 2.0, 8.0, 6.0)
     bent = drifted(truth, 0.0003)
     edges = chain(bent, [(k, k + 99, between(truth[k], truth[k + 99])) for k in range(100)])

@@ -62,7 +62,7 @@ def test_motion_during_the_scan_is_undone():
     assert off(prepare(values, moving, twist)) < 0.5 * off(prepare(values, moving))
 
 
-def test_thinning_keeps_one_point_per_square_and_no_more_than_asked():
+def test_pruning_keeps_one_point_per_square_and_no_more_than_asked():
     scan = prepare(ranges(ROOM, (2.0, 0.0, 1.5)), LIDAR)
     pruned = scan.downsampled(0.2, 1000)
     cells = np.floor(pruned.points / 0.2)

@@ -73,7 +73,7 @@ def scan(clock: VirtualClock) -> LaserScan:
     )  # fmt: skip
 
 
-def told(story, monkeypatch: pytest.MonkeyPatch, folder: Path) -> list[tuple[Reason, str]]:
+def events_of(story, monkeypatch: pytest.MonkeyPatch, folder: Path) -> list[tuple[Reason, str]]:
     """Let a service run through it; returns the events while it ran."""
     monkeypatch.setattr(module, "WorkerActor", FakeWorker)
     events: list[tuple[Reason, str]] = []
@@ -103,7 +103,7 @@ def test_a_map_that_is_asked_for_is_saved_though_no_scan_comes(monkeypatch, tmp_
         assert service.save_soon()
         await clock.sleep(2.0)
 
-    assert told(story, monkeypatch, tmp_path) == [(Reason.MAP_SAVED, str(tmp_path))]
+    assert events_of(story, monkeypatch, tmp_path) == [(Reason.MAP_SAVED, str(tmp_path))]
     assert [task.scan is None for task in FakeWorker.tasks[:2]] == [False, True]
 
 
@@ -116,7 +116,7 @@ def test_along_a_corridor_it_does_not_say_with_every_scan_that_a_direction_is_op
             scans.put(scan(clock))
             await clock.sleep(0.2)
 
-    said = [reason for reason, _ in told(story, monkeypatch, tmp_path)]
+    said = [reason for reason, _ in events_of(story, monkeypatch, tmp_path)]
     assert said == [Reason.MATCH_DEGENERATE, Reason.POSE_LOST, Reason.POSE_FOUND]
 
 
@@ -128,7 +128,7 @@ def test_with_scans_it_is_saved_once_with_the_next_one(monkeypatch, tmp_path: Pa
             if k == 5:
                 service.save_soon()
 
-    assert told(story, monkeypatch, tmp_path) == [(Reason.MAP_SAVED, str(tmp_path))]
+    assert events_of(story, monkeypatch, tmp_path) == [(Reason.MAP_SAVED, str(tmp_path))]
     assert FakeWorker.at_once == 1
 
 
@@ -137,5 +137,5 @@ def test_before_the_first_scan_there_is_nothing_to_save(monkeypatch, tmp_path: P
         service.save_soon()
         await clock.sleep(3.0)
 
-    assert told(story, monkeypatch, tmp_path) == []
+    assert events_of(story, monkeypatch, tmp_path) == []
     assert FakeWorker.tasks == []

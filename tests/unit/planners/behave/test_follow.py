@@ -40,9 +40,9 @@ def run(leader, *, seconds=40.0, start=(-1.5, 0.0, 0.0), silent_from=math.inf, *
         t = i * PERIOD
         v, w = leader(t)
         it = integrate(it, v, 0.0, w, PERIOD)
-        told = heard(it, (v, w), min(t, silent_from), now=t)
+        peers = heard(it, (v, w), min(t, silent_from), now=t)
         own = odometry(x=me[0], y=me[1], yaw=math.remainder(me[2], math.tau), vx=twist[0], wz=twist[1])
-        step = behaviour.step(Inputs({POSE.name: own, PEERS.name: told}), state, t)
+        step = behaviour.step(Inputs({POSE.name: own, PEERS.name: peers}), state, t)
         state = step.state
         rows.append((t, step, me, it))
         if step.outcome is not Reason.DRIVING:
@@ -86,8 +86,8 @@ def test_it_stops_when_the_leader_is_silent_and_says_so():
 
 def test_a_leader_that_was_never_heard_and_one_that_is_too_far_end_it():
     behaviour = LeaderFollower(FollowConfig(leader="bob"), BODY)
-    told = heard((0.0, 0.0, 0.0), (0.0, 0.0), 1.0, now=1.0)
-    inputs = Inputs({POSE.name: odometry(), PEERS.name: told})
+    peers = heard((0.0, 0.0, 0.0), (0.0, 0.0), 1.0, now=1.0)
+    inputs = Inputs({POSE.name: odometry(), PEERS.name: peers})
     assert behaviour.step(inputs, behaviour.begin(), 0.0).text == "bob was not heard yet"
     far = run(lambda t: (0.0, 0.0), start=(-7.0, 0.0, 0.0))[-1][1]
     assert far.outcome is Reason.PATH_LOST
@@ -98,8 +98,8 @@ def test_a_leader_that_was_put_elsewhere_begins_a_new_way():
     behaviour = LeaderFollower(FollowConfig(leader="ann"), BODY)
     state = behaviour.begin()
     for i, x in enumerate((1.0, 1.03, 1.06, 3.0)):
-        told = heard((x, 0.0, 0.0), (0.1, 0.0), i * PERIOD, now=i * PERIOD)
-        state = behaviour.step(Inputs({POSE.name: odometry(), PEERS.name: told}), state, i * PERIOD).state
+        peers = heard((x, 0.0, 0.0), (0.1, 0.0), i * PERIOD, now=i * PERIOD)
+        state = behaviour.step(Inputs({POSE.name: odometry(), PEERS.name: peers}), state, i * PERIOD).state
     assert state.points == ((3.0, 0.0),)
 
 

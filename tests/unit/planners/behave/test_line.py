@@ -23,7 +23,9 @@ def follower(**settings):
     return WallLine(WallLineConfig(rate=10.0, beam=True, lead=0.0, **settings))
 
 
-@pytest.mark.parametrize(("side", "heading"), [("left", 0.3), ("right", 2.0), ("left", -2.5)])
+@pytest.mark.parametrize(
+    ("side", "heading"), [("left", 0.3), ("right", 2.0), pytest.param("left", -2.5, marks=pytest.mark.long)]
+)
 def test_a_lap_of_a_hall_ends_with_its_reason_and_keeps_the_distance(side, heading):
     done = drive(follower(side=side, lap_length=6.0), Robot(HALL, (0.1, -0.1, heading), bias=0.01), 300.0)
     assert done.outcome is Reason.BEHAVIOUR_DONE

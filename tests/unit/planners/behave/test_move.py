@@ -38,8 +38,8 @@ def drive(body=DIFFERENTIAL, *, seconds=60.0, slow=lambda t: 1.0, reasons=(), **
         twist = tuple(slow(t) * part for part in asked[-3])
         pose = integrate(pose, *twist, PERIOD)
         yaw = math.remainder(pose[2], math.tau)
-        told = odometry(x=pose[0], y=pose[1], yaw=yaw, vx=twist[0], wz=twist[2], now=0)
-        step = move.step(Inputs({ODOMETRY.name: told, GATE.name: gate(commanded, reasons)}), state, t)
+        measured = odometry(x=pose[0], y=pose[1], yaw=yaw, vx=twist[0], wz=twist[2], now=0)
+        step = move.step(Inputs({ODOMETRY.name: measured, GATE.name: gate(commanded, reasons)}), state, t)
         state = step.state
         rows.append((t, step, pose))
         if step.outcome is not Reason.DRIVING:

@@ -20,7 +20,7 @@ NOTHING = ExploreAnswer(known=10.0, home=1.0)
 
 
 class Tale:
-    """An exploration that is told what is observed."""
+    """An exploration with given observations."""
 
     def __init__(self, **more) -> None:
         more = {"home": True, "budget": 1000.0} | more

@@ -92,7 +92,7 @@ def test_steps_have_short_names():
 
 
 class Pretended:
-    """A robot whose goals end when they are told to."""
+    """A robot whose goals end on request."""
 
     def __init__(self, clock: VirtualClock, file: Path | None = None, *, localised: bool = False) -> None:
         self.clock, self.number, self.reached = clock, 0, [Reason.GOAL_REACHED] * 99

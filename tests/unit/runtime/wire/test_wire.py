@@ -29,7 +29,7 @@ from monstertruck_schemas.sensor import Attitude, Battery, BatteryLevel, Compres
 from monstertruck_schemas.state import Grid
 from tests.unit.runtime import messages
 
-modest = settings(max_examples=25, deadline=None, suppress_health_check=list(HealthCheck))
+modest = settings(max_examples=10, deadline=None, suppress_health_check=list(HealthCheck))
 ALL = pytest.mark.parametrize("topic", t.TOPICS, ids=lambda topic: topic.name)
 PROTOBUF = pytest.mark.parametrize("topic", messages.PROTOBUF, ids=lambda topic: topic.name)
 

@@ -11,7 +11,7 @@ from monstertruck_runtime.errors import InputError, NotInstalledError
 from monstertruck_sim.world.config import WorldConfig
 from monstertruck_sim.world.world import World
 from monstertruck_sim.world3d.film import RATE, SIZE, Film
-from monstertruck_sim.world3d.picture import WorldRenderer, looking
+from monstertruck_sim.world3d.picture import WorldRenderer, looking_at
 
 
 @pytest.fixture(scope="module")
@@ -31,9 +31,9 @@ def renderer(world):
 
 def test_the_robot_is_in_the_middle_of_a_picture_that_looks_at_it(world, renderer):
     world.truth(0)
-    with_it = renderer.draw(world.plant.data, looking((-1.5, 0.0, 0.8), (0.0, 0.0, 0.15))).astype(int)
+    with_it = renderer.draw(world.plant.data, looking_at((-1.5, 0.0, 0.8), (0.0, 0.0, 0.15))).astype(int)
     assert with_it.shape == (120, 160, 3)
-    beside = renderer.draw(world.plant.data, looking((-1.5, 2.0, 0.8), (0.0, 2.0, 0.15))).astype(int)
+    beside = renderer.draw(world.plant.data, looking_at((-1.5, 2.0, 0.8), (0.0, 2.0, 0.15))).astype(int)
     blue = [(picture[..., 2] - picture[..., 0] > 40) for picture in (with_it, beside)]
     rows, columns = np.nonzero(blue[0][40:])
     assert len(rows) > 50
@@ -42,7 +42,7 @@ def test_the_robot_is_in_the_middle_of_a_picture_that_looks_at_it(world, rendere
 
 
 def test_the_upper_half_of_a_level_view_is_sky_and_the_lower_half_is_ground(world, renderer):
-    picture = renderer.draw(world.plant.data, looking((-8.0, -8.0, 3.0), (-9.0, -9.0, 3.0))).astype(int)
+    picture = renderer.draw(world.plant.data, looking_at((-8.0, -8.0, 3.0), (-9.0, -9.0, 3.0))).astype(int)
     assert picture[:40, :, 2].mean() > picture[:40, :, 0].mean() + 10  # blue
     assert abs(picture[80:, :, 2].mean() - picture[80:, :, 0].mean()) < 10  # grey
 

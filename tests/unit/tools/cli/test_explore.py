@@ -57,7 +57,7 @@ def test_what_is_no_duration_is_refused_with_an_example(text: str):
         seconds_of(text)
 
 
-def test_it_is_followed_to_its_end_and_told_of_in_short_lines():
+def test_it_is_followed_to_its_end_and_printed_in_short_lines():
     there = Pose2D(x=12.0, y=-3.0, yaw=0.0)
     robot = Robot(
         state(2, ExplorationPhase.IDLE, Reason.EXPLORED),

@@ -110,7 +110,7 @@ def test_a_configuration_that_is_refused_is_not_written(tmp_path: Path):
     assert not output.exists()
 
 
-def test_a_folder_that_cannot_be_made_is_told_before_the_map_is_built(log: Path, tmp_path: Path):
+def test_a_folder_that_cannot_be_made_is_reported_before_the_map_is_built(log: Path, tmp_path: Path):
     (tmp_path / "file").touch()
     done = CliRunner().invoke(app, ["map", "build", str(log), "-o", str(tmp_path / "file")])
     assert done.exit_code == 3

@@ -13,10 +13,10 @@ DRAWS = "import sys, time; open(sys.argv[1], 'a').write(' '.join(sys.argv[2:]) +
 
 async def test_it_runs_while_a_viewer_listens_and_the_station_waits_for_neither(tmp_path: Path, monkeypatch):
     monkeypatch.setattr(live_process, "LOOK", 0.05)
-    told = tmp_path / "told"
+    drawn = tmp_path / "drawn"
 
     def starts() -> int:
-        return len(told.read_text().splitlines()) if told.exists() else 0
+        return len(drawn.read_text().splitlines()) if drawn.exists() else 0
 
     async def until(count: int) -> None:
         async with asyncio.timeout(20):
@@ -26,7 +26,7 @@ async def test_it_runs_while_a_viewer_listens_and_the_station_waits_for_neither(
     server = await asyncio.start_server(lambda _, writer: writer.close(), "127.0.0.1", 0)
     port = server.sockets[0].getsockname()[1]
     server.close()
-    viewer, program = f"rerun+http://127.0.0.1:{port}/proxy", (sys.executable, "-c", DRAWS, str(told))
+    viewer, program = f"rerun+http://127.0.0.1:{port}/proxy", (sys.executable, "-c", DRAWS, str(drawn))
     showing = asyncio.create_task(live_process.show_live("truck", "tcp/x:1", WallClock(), viewer, program))
     await asyncio.sleep(0.2)
     assert starts() == 0, "nobody would look at it"
@@ -42,4 +42,4 @@ async def test_it_runs_while_a_viewer_listens_and_the_station_waits_for_neither(
         async with asyncio.timeout(2):
             await showing
     server.close()
-    assert set(told.read_text().splitlines()) == {f"truck tcp/x:1 {viewer}"}
+    assert set(drawn.read_text().splitlines()) == {f"truck tcp/x:1 {viewer}"}
