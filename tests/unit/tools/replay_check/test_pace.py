@@ -58,7 +58,7 @@ def test_results_of_workers_count_when_they_are_called_in_their_order():
             await delivery_of(clock).wait(clock, 2 * SECOND)
             reported.append((name, clock.now()))
 
-        turns.next()  # nobody waits
+        turns.next()  # without waiting
         tasks = [asyncio.create_task(step(name)) for name in "abc"]
         for instant in (5 * SECOND, 6 * SECOND):
             await clock.reach(instant)
