@@ -1,8 +1,9 @@
 """5.5 Tracking: RMS and greatest distance from the path for each steering mode, our trackers and the published rules.
 
 The truck with dead time, lag and turning rate of its axles at the author's 0.2 m/s, from 5 cm beside the path. The end
-is that of the path (1e6: it was not found), the steering effort what both axles turned; in crab the truck keeps its
-heading, whose error is then the path's turning.
+is that of the path (1e6: it was not found), the steering effort what both axles turned. In crab the truck keeps its
+heading, so it is asked for only on the course that never turns farther from it than the axles do; the heading's error
+is then the path's turning.
 """
 
 import numpy as np
@@ -10,16 +11,18 @@ from navigation_parts import Options, Part
 from navigation_parts.tracking import TRUCK, Result, built_in, drive
 
 MODES = ("front", "counter", "crab", "hybrid")
+SHIFTS = "shifts"
+"""To the side and back twice, by 0.36 m over 2 m, at most 0.28 rad from straight on."""
 TRACKERS = {"lqr": "ours", "fuzzy": "fuzzy, our rules", "fuzzy_published": "published"}
 
 
 def run(options: Options) -> Part:
     part = Part()
-    courses = {name: 1.4 * points for name, points in built_in().items()}
+    courses = {name: 1.4 * points for name, points in built_in().items()} | {SHIFTS: shifts()}
     found: dict[tuple[str, str, str], Result] = {}
     for course, points in list(courses.items())[: 1 if options.quick else None]:
         for tracker in TRACKERS:
-            for mode in MODES[:2] if options.quick else MODES:
+            for mode in MODES[:2] if options.quick else modes(course):
                 way = points[:120] if options.quick else points
                 row = drive(way, tracker, 0.2, "lag", "forward", TRUCK, steering=mode, angle=0.4)
                 found[course, tracker, mode] = row
@@ -33,11 +36,22 @@ def run(options: Options) -> Part:
                 part.add(f"{prefix}.arrived", int(row.arrived))
     if not options.quick:
         for course in courses:
-            for mode in ("front", "counter", "hybrid"):
+            for mode in modes(course):
                 ours, theirs = (found[course, tracker, mode] for tracker in ("lqr", "fuzzy_published"))
                 part.add(f"{course}.{mode}.ours_over_published_rms", ours.rms / theirs.rms, 1.0)
     draw(options, found, courses)
     return part
+
+
+def modes(course: str) -> tuple[str, ...]:
+    """How the truck can follow a course."""
+    return MODES if course == SHIFTS else tuple(mode for mode in MODES if mode != "crab")
+
+
+def shifts() -> np.ndarray:
+    """Places of the course that a truck in crab can follow, shape (n, 2), m."""
+    x = np.arange(0.0, 8.0, 0.025)
+    return np.column_stack((x, 0.18 * (1.0 - np.cos(np.pi * x / 2.0))))
 
 
 def draw(options: Options, found: dict, courses: dict[str, np.ndarray]) -> None:
@@ -47,6 +61,9 @@ def draw(options: Options, found: dict, courses: dict[str, np.ndarray]) -> None:
     figure = Figure(figsize=(14, 4 * len(names)), layout="constrained")
     for line, course in zip(figure.subplots(len(names), 4, squeeze=False), names, strict=True):
         for axes, mode in zip(line, MODES, strict=True):
+            if mode not in modes(course):
+                axes.set_axis_off()
+                continue
             axes.plot(*courses[course].T, color="0.7", lw=4)
             for tracker in TRACKERS:
                 if (row := found.get((course, tracker, mode))) is not None:
