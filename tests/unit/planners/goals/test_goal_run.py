@@ -95,6 +95,18 @@ def test_an_end_beside_the_goal_is_planned_again_but_not_for_ever():
     assert story.run.outcome is Reason.GOAL_MISSED
 
 
+def test_a_goal_where_the_truck_stands_is_reached_without_driving():
+    here = (1.0, 1.5, 0.0)
+    answer = PlanningStep().step(task(goal=(1.0, 1.5, 1e-9), setup=setup(), grid=hall()))
+    assert answer.poses is not None
+    story = Story()
+    story.run = replace(story.run, goal=here)
+    actions = story.tell(answer=answer, pose=here)
+    assert reported(actions) == [Reason.GOAL_REACHED]
+    assert not any(isinstance(action, Follow) for action in actions), "no tracker takes a path without length"
+    assert (story.run.outcome, story.run.routes) == (Reason.GOAL_REACHED, 1)
+
+
 def test_a_goal_is_not_reached_before_its_waypoints_are_passed():
     story = Story()
     story.run = replace(story.run, via=((1.0, 1.0, None),))
