@@ -12,6 +12,7 @@ from monstertruck_estimation.ground.config import GroundConfig
 from monstertruck_estimation.ground.grid import RESOLUTION, GroundGrid, planes
 from monstertruck_estimation.ground.terrain import TerrainEstimator
 from monstertruck_estimation.scan_tilt import ScanAngles, plane_slopes
+from monstertruck_estimation.transforms import wrap_angle
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND, Clock, Schedule, VirtualClock
 from monstertruck_runtime.mailbox import Mailbox
@@ -143,7 +144,7 @@ class GroundService:
             self._see(scan, pose)
         if self._marked is None:
             self._marked = pose
-        elif np.hypot(*(pose - self._marked)[:2]) > MOVED or abs(pose[2] - self._marked[2]) > TURNED:
+        elif np.hypot(*(pose - self._marked)[:2]) > MOVED or abs(wrap_angle(pose[2] - self._marked[2])) > TURNED:
             self._marked = pose
             roughness = self._terrain.roughness * self._wheelbase / math.sqrt(2.0)
             if (slip := self._slip.latest) is not None and slip.slipping and self._fresh(slip, now):

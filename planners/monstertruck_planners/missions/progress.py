@@ -2,7 +2,9 @@
 
 import math
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
 
 from monstertruck_planners.goals.exchange import Pose
 from monstertruck_schemas.base import Pose2D, Schema
@@ -124,10 +126,16 @@ class SavedProgress(Schema):
     mission: Mission
     source: str
     start: Pose2D
-    index: int
-    failures: int
+    index: Annotated[int, Field(ge=0)]
+    failures: Annotated[int, Field(ge=0)]
     at: Pose2D | None = None
     """Where the robot was, in map"""
+
+    @model_validator(mode="after")
+    def _at_a_step(self) -> Self:
+        if self.index >= len(self.mission.steps):
+            raise ValueError(f"index {self.index}: expected one of {len(self.mission.steps)} steps, from 0")
+        return self
 
     @classmethod
     def of(cls, progress: MissionProgress, source: str, at: Pose | None = None) -> "SavedProgress":

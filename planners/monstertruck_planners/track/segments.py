@@ -172,7 +172,7 @@ class SegmentedPath:
         steps = _steps(path)
         first = _nearest(steps.points, steps.directions, start, closed=path.closed)
         if path.closed:
-            steps = _rolled(steps, first)
+            steps = _distinct(_rolled(steps, first), path)
             first = 0
         self.name = path.name
         self.frame = path.frame
@@ -242,12 +242,29 @@ def _steps(path: Path) -> PathSteps:
         points, yaws = np.concatenate((points, points[:1])), np.concatenate((yaws, yaws[:1]))
         arriving, steering = np.concatenate((arriving, directions[:1])), steering + path.steering[:1]
         clearance = np.concatenate((clearance, clearance[:1]))
-    step = np.diff(points, axis=0)
-    real = np.hypot(step[:, 0], step[:, 1]) > LEAST_STEP
-    kept = np.concatenate(([True], real))
-    if steering:
-        steering = tuple(mode for mode, is_real in zip(steering, real.tolist(), strict=True) if is_real)
-    return PathSteps(points[kept], np.unwrap(yaws[kept]), arriving[real], steering, clearance[kept])
+    return _distinct(PathSteps(points, yaws, arriving, steering, clearance), path)
+
+
+def _distinct(steps: PathSteps, path: Path) -> PathSteps:
+    """Without points that lie less than ``LEAST_STEP`` from the one that is kept before them.
+
+    Raises:
+        InputError: only one is left.
+    """
+    points, kept = steps.points, np.arange(len(steps.points))
+    while True:
+        step = np.diff(points[kept], axis=0)
+        real = np.hypot(step[:, 0], step[:, 1]) > LEAST_STEP
+        if real.all():
+            break
+        kept = kept[np.concatenate(([True], real))]
+    if len(kept) < 2:
+        _refuse(path, "expected different poses, all are in one place")
+    arriving = kept[1:] - 1
+    steering = tuple(steps.steering[i] for i in arriving.tolist()) if steps.steering else ()
+    return PathSteps(
+        points[kept], np.unwrap(steps.yaws[kept]), steps.directions[arriving], steering, steps.clearance[kept]
+    )
 
 
 def _rolled(steps: PathSteps, first: int) -> PathSteps:

@@ -45,7 +45,16 @@ class Rig:
         )  # fmt: skip
 
     async def drive(
-        self, seconds, pitch=lambda _: 0.0, *, slipping=False, speed=SPEED, fresh=True, scanned=None, accelerates=0.0
+        self,
+        seconds,
+        pitch=lambda _: 0.0,
+        *,
+        slipping=False,
+        speed=SPEED,
+        yaw=0.0,
+        fresh=True,
+        scanned=None,
+        accelerates=0.0,
     ):
         serving = asyncio.create_task(self.service.run(lambda: None))
         x, still = 0.0, speed
@@ -60,7 +69,8 @@ class Rig:
             self.beside.put(felt)
             if fresh or i == 0:
                 self.pose.put(Odometry(
-                    **header, frame="map", pose=Pose2D(x=x, y=0.0, yaw=0.0), twist=Twist2D(vx=speed, vy=0.0, wz=0.0),
+                    **header, frame="map", pose=Pose2D(x=x, y=0.0, yaw=yaw if i % 4 else -yaw),
+                    twist=Twist2D(vx=speed, vy=0.0, wz=0.0),
                     pose_covariance=np.zeros(9), twist_covariance=np.zeros(9), age=0.0, sources=(),
                 ))  # fmt: skip
             self.slip.put(OdometryHealth(**header, slipping=slipping, disturbed=False, sources=()))
@@ -103,7 +113,7 @@ def test_ground_on_which_wheels_slip_is_rough():
     assert layer(driven(8, slipping=True), "roughness", 0.8) == pytest.approx(0.05)
 
 
-@pytest.mark.parametrize("how", [{"speed": 0.0}, {"fresh": False}])
+@pytest.mark.parametrize("how", [{"speed": 0.0}, {"speed": 0.0, "yaw": math.pi}, {"fresh": False}])
 def test_nothing_is_learnt_at_rest_or_without_a_fresh_pose(how):
     assert driven(8, lambda _: 0.1, **how) is None
 

@@ -300,9 +300,10 @@ def test_an_interrupted_mission_can_be_given_up(tmp_path: Path):
     assert robot.events[-1] == (Reason.CANCELLED, "round: given up by ann")
 
 
-def test_a_damaged_file_is_reported_and_forgotten(tmp_path: Path):
+@pytest.mark.parametrize("text", ["{", SavedProgress.of(progress(GO), "ann").model_dump_json().replace(":0", ":7")])
+def test_a_damaged_file_is_reported_and_forgotten(tmp_path: Path, text: str):
     file = tmp_path / "mission.json"
-    file.write_text("{")
+    file.write_text(text)
 
     async def story(robot: Pretended) -> None:
         assert not robot.reports[-1].resumable

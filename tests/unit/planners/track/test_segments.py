@@ -107,3 +107,12 @@ def test_poses_ahead_look_where_the_truck_looks():
 def test_impossible_paths_are_refused(bad, hint):
     with pytest.raises(InputError, match=hint):
         segmented(bad)
+
+
+def test_steps_of_micrometres_that_lead_back_make_no_step_of_length_0():
+    there_and_back = [(0.0, 0.0), (0.9e-6, 0.0), (1.8e-6, 0.0), (0.0, 0.0)]
+    segment = segmented(path([*there_and_back, (1.0, 0.0)])).segments[0]
+    assert segment.length == pytest.approx(1.0)
+    assert segment.at(0.0).point == (0.0, 0.0)
+    with pytest.raises(InputError, match="one place"):
+        segmented(path(there_and_back))
