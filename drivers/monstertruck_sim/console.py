@@ -10,6 +10,7 @@ from typing import Protocol, TextIO
 from monstertruck_drivers.cable import EmulatedPort, LineFaults
 from monstertruck_drivers.emulation import Emulator, FileEmulator
 from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.readable import when_readable
 
 CABLE = (
     "of its cable: plug, unplug, power-cycle, line stalled|deaf on|off, line delay SECONDS, line chunk BYTES|off, "
@@ -135,15 +136,18 @@ class FaultConsole:
         """Carry out lines until cancelled; the end of the input ends the commands, not the devices."""
         if not _pollable(self._source):
             await asyncio.Event().wait()
-        reader = asyncio.StreamReader()
-        loop = asyncio.get_running_loop()
-        transport, _ = await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(reader), self._source)
+        source, news, rest = self._source.fileno(), asyncio.Event(), b""
+        when_readable(source, news.set)
         try:
-            while line := await reader.readline():
-                self.execute(line.decode(errors="replace"))
-            await asyncio.Event().wait()
+            while await news.wait() and (data := _read(source)):
+                news.clear()
+                *lines, rest = (rest + data).split(b"\n")
+                for line in lines:
+                    self.execute(line.decode(errors="replace"))
+            self.execute(rest.decode(errors="replace"))
         finally:
-            transport.close()
+            asyncio.get_running_loop().remove_reader(source)
+        await asyncio.Event().wait()
 
     def execute(self, line: str) -> None:
         """Carry out one line; answers ``ok`` or an error."""
@@ -156,6 +160,14 @@ class FaultConsole:
             self._say(f"error: {error}")
         else:
             self._say("ok")
+
+
+def _read(source: int) -> bytes:
+    """What was written meanwhile, a line or more; nothing: it has ended, or the terminal is gone."""
+    try:
+        return os.read(source, 65536)
+    except OSError:
+        return b""
 
 
 def _pollable(source: TextIO) -> bool:

@@ -9,6 +9,7 @@ import re
 import sys
 import threading
 from collections.abc import Mapping
+from copy import copy
 from typing import Final, TextIO
 
 DEPTH: Final = 1000
@@ -110,14 +111,25 @@ class LogOutputThread:
 
 
 class PlainFormatter(logging.Formatter):
-    """One line a record, without secrets, with journald's priority in front where the journal reads."""
+    """One line a record, without secrets, with journald's priority in front where the journal reads.
 
-    def __init__(self, *, journal: bool) -> None:
+    Args:
+        journal: whether that reads.
+        terminal: whether somebody looks on: of a record with an attribute ``brief`` (a text; None = without) that is
+            shown instead of its message.
+    """
+
+    def __init__(self, *, journal: bool, terminal: bool = False) -> None:
         super().__init__("%(levelname)-7s %(name)s: %(message)s")
         self._journal = journal
+        self._terminal = terminal
 
     def format(self, record: logging.LogRecord) -> str:
         """The record's text; every line of a traceback keeps the priority."""
+        brief = getattr(record, "brief", None) if self._terminal else None
+        if brief is not None:
+            record = copy(record)
+            record.msg, record.args = brief, None
         text = shown(super().format(record))
         if not self._journal:
             return text
@@ -143,7 +155,7 @@ def read_by_journal(stream: TextIO, environment: Mapping[str, str] = os.environ)
 def start_logging(*, verbose: bool, stream: TextIO = sys.stderr) -> LogOutputThread:
     """Send all logging to ``stream`` from a thread; ``stop()`` of what is returned writes what still waits."""
     output = logging.StreamHandler(stream)
-    output.setFormatter(PlainFormatter(journal=read_by_journal(stream)))
+    output.setFormatter(PlainFormatter(journal=read_by_journal(stream), terminal=stream.isatty()))
     handler = LossyQueueHandler()
     root = logging.getLogger()
     root.setLevel(logging.DEBUG if verbose else logging.INFO)

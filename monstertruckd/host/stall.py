@@ -32,7 +32,8 @@ _NAME: Final = re.compile(r"stall-(\d{6,})\.txt")
 class StallWatch:
     """Service that watches the control tick from a thread of its own.
 
-    A dump goes to the log, which another thread writes, and into a file. It is made with the interpreter's lock held.
+    A dump goes into a file and to the log, which another thread writes; on a terminal the log names the file alone. It
+    is made with the interpreter's lock held.
     An extension that never gives the lock back is left to systemd's watchdog, whose SIGABRT stops the process before
     it dumps: ``faulthandler.dump_traceback_later`` walks the stacks of running threads, and a daemon that was merely
     stopped and continued died of that.
@@ -100,7 +101,7 @@ class StallWatch:
             return
         self._dumped = now
         what, text = f"no control tick for {silent / SECOND:.2f} s", _tracebacks()
-        log.error("%s; all threads:\n%s", what, text)
+        brief = None
         try:
             number = self._make_room()
             path = self._folder / f"stall-{number:06d}.txt"
@@ -108,7 +109,8 @@ class StallWatch:
         except OSError as error:
             log.warning("tracebacks are in the log only: %s", error)
         else:
-            log.warning("tracebacks are in %s", path)
+            brief = f"{what}; what all threads did meanwhile is in {path}"
+        log.error("%s; all threads:\n%s", what, text, extra={"brief": brief})
 
     def _make_room(self) -> int:
         """Remove the oldest dumps; the next one's number."""

@@ -143,4 +143,5 @@ def test_a_lap_that_a_stop_interrupts_is_driven_to_its_end():
 
     lap = run_virtual(main, start=SECOND)
     assert lap.outcome is Reason.GOAL_REACHED
-    assert lap.interruptions == (Reason.DRIVE_STALE,)
+    assert lap.stops == (Reason.DRIVE_STALE,)
+    assert lap.armed_again == 1

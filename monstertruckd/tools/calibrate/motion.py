@@ -43,6 +43,19 @@ LATE: Final = (
     "truck's own computer, and repeat it; nothing was saved"
 )
 """What to do about a lease that expired."""
+SILENT: Final = (
+    "a device was silent (`monstertruckd status` names it), or the truck's computer is too busy: end what keeps it so, "
+    "and repeat the wizard; nothing was saved"
+)
+"""What to do about measurements or ticks that came too late."""
+ADVICE: Final = {
+    Reason.LEASE_EXPIRED: LATE,
+    Reason.SCAN_STALE: SILENT,
+    Reason.DRIVE_STALE: SILENT,
+    Reason.STEERING_STALE: SILENT,
+    Reason.ATTITUDE_STALE: SILENT,
+    Reason.TICK_STALLED: SILENT,
+}
 
 
 class MovedTruck(Operator, Protocol):
@@ -268,5 +281,5 @@ class _Run:
         if not reasons and state.mode.active:  # armed still, but this wizard's requests hold it no longer
             reasons = [Reason.LEASE_EXPIRED]
         text = ", ".join(reason.text for reason in reasons) or f"the truck is {state.mode}"
-        advice = f"; {LATE}" if Reason.LEASE_EXPIRED in reasons else ""
+        advice = "".join(f"; {text}" for text in dict.fromkeys(ADVICE[r] for r in reasons if r in ADVICE))
         raise RequestRefusedError(reasons[0] if reasons else Reason.DISARMED, f"stopped by the gate: {text}{advice}")

@@ -10,9 +10,9 @@ from types import TracebackType
 from typing import Self
 
 from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.readable import when_readable
 from monstertruckd.tools.calibrate.steps import Confirm, Number
 from monstertruckd.tools.cli.output import progress, remark
-from monstertruckd.tools.cli.terminal import when_readable
 
 WORDS = {"y": True, "yes": True, "n": False, "no": False}
 

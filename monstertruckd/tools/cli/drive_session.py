@@ -19,6 +19,7 @@ from rich.text import Text
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import TruckError
+from monstertruck_runtime.readable import when_readable
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order, Role
 from monstertruck_schemas.state import GateMode, GateState
@@ -27,7 +28,7 @@ from monstertruckd.tools.cli.driving_modes import SteeringMode
 from monstertruckd.tools.cli.gamepad import Action, PadMapping, key_for
 from monstertruckd.tools.cli.gamepad_device import PadLink
 from monstertruckd.tools.cli.teleop import MODE_KEYS, STEPS, Command, KeyReader, Teleop, TeleopRequest
-from monstertruckd.tools.cli.terminal import every_key, forget_input, when_readable
+from monstertruckd.tools.cli.terminal import every_key, forget_input
 from monstertruckd.tools.status import screen
 from monstertruckd.tools.status.screen import ScreenState
 from monstertruckd.tools.status.watch import PERIOD, Follower

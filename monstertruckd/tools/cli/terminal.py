@@ -1,9 +1,8 @@
 """A terminal that hands over every key at once, and is itself again afterwards, whatever happens."""
 
-import asyncio
 import os
 import termios
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import IO, Any, Final
 
@@ -33,21 +32,6 @@ def every_key(keyboard: IO[Any], screen: IO[Any]) -> Iterator[None]:
         yield
     finally:
         _restore(keyboard, screen, before)
-
-
-def when_readable(fd: int, callback: Callable[[], object]) -> None:
-    """Have the loop call back, and leave the mode of ``fd`` alone.
-
-    uvloop makes it non-blocking, for ever, and with it the screen and whatever else shares the open terminal.
-
-    Raises:
-        PermissionError: it is a file.
-    """
-    blocking = os.get_blocking(fd)
-    try:
-        asyncio.get_running_loop().add_reader(fd, callback)
-    finally:
-        os.set_blocking(fd, blocking)
 
 
 def _restore(keyboard: IO[Any], screen: IO[Any], before: list[Any]) -> None:

@@ -72,7 +72,7 @@ class Summary:
         rows = [
             ("outcome", self.lap.outcome.text + (", COLLIDED" if self.collided else "")),
             ("lap time", f"{self.lap.seconds:.1f} s"),
-            *self._interruption_row(),
+            *self._stops_row(),
             ("distance, true", f"{self.distance:.2f} m"),
             ("cross-track RMS", f"{self.lap.cross_track_rms * 100:.2f} cm"),
             *self._closing_row(),
@@ -86,11 +86,12 @@ class Summary:
             rows.append(("sha256", self.digest))
         return rows + [("file", str(file)) for file in self.files]
 
-    def _interruption_row(self) -> list[tuple[str, str]]:
+    def _stops_row(self) -> list[tuple[str, str]]:
         """Nothing, for a lap without a stop."""
-        counts = Counter(reason.text for reason in self.lap.interruptions)
+        counts = Counter(reason.text for reason in self.lap.stops)
         text = ", ".join(f"{count} x {reason}" for reason, count in counts.items())
-        return [("stopped on the way", f"{text}; armed again")] if text else []
+        again = f"; armed again {self.lap.armed_again} x" if self.lap.armed_again else ""
+        return [("stopped on the way", text + again)] if text else []
 
     def _closing_row(self) -> list[tuple[str, str]]:
         if not self.closed:
@@ -105,7 +106,8 @@ class Summary:
             "lap_s": self.lap.seconds,
             "distance_m": self.distance,
             "cross_track_rms_m": self.lap.cross_track_rms,
-            "interruptions": [reason.value for reason in self.lap.interruptions],
+            "stops": [reason.value for reason in self.lap.stops],
+            "armed_again": self.lap.armed_again,
             "closing_error_m": self.closing_error if self.closed else None,
             "lateness_p99_s": self.lateness_p99,
             "lateness_max_s": self.lateness_max,

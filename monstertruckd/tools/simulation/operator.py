@@ -95,8 +95,10 @@ class Lap:
     """Daemon time at which the path was done or given up, ns."""
     cross_track: Array
     """Every reported distance from the path, m."""
-    interruptions: tuple[Reason, ...] = ()
-    """Why the truck had to be armed again on the way, in order."""
+    stops: tuple[Reason, ...] = ()
+    """Why the gate stopped the truck on the way, in order."""
+    armed_again: int = 0
+    """How many of them left it disarmed."""
 
     @property
     def seconds(self) -> float:
@@ -123,13 +125,14 @@ async def drive_lap(operator: Operator, clock: Clock, *, timeout: float = 30.0, 
     """
     with (
         operator.subscribe(topics.GATE, latest()) as gate,
-        operator.subscribe(topics.STOP, latest()) as stop,
+        operator.subscribe(topics.STOP, fifo(256)) as stop,
         operator.subscribe(topics.TRACKER, fifo(256)) as tracker,
     ):
         await _arm(operator, clock, timeout)
         start = clock.now()
         cross_track: list[float] = []
-        interruptions: list[Reason] = []
+        stops: dict[int, Reason] = {}
+        armed_again = 0
         try:
             async with clock.deadline(limit):
                 while True:
@@ -137,11 +140,13 @@ async def drive_lap(operator: Operator, clock: Clock, *, timeout: float = 30.0, 
                     if report.received < start:
                         continue
                     cross_track.append(report.cross_track)
+                    stops |= {one.number: one.reason for one in stop.drain() if one.stamp >= start}
                     if report.outcome is not Reason.DRIVING and report.along > 0:
-                        return Lap(report.outcome, start, report.stamp, np.array(cross_track), tuple(interruptions))
+                        reasons = tuple(stops.values())
+                        return Lap(report.outcome, start, report.stamp, np.array(cross_track), reasons, armed_again)
                     state = gate.latest
-                    if state is not None and not state.mode.active and len(interruptions) < INTERRUPTIONS:
-                        interruptions.append(stop.latest.reason if stop.latest is not None else Reason.DISARMED)
+                    if state is not None and not state.mode.active and armed_again < INTERRUPTIONS:
+                        armed_again += 1
                         await _arm(operator, clock, timeout)
         except TimeoutError:
             held = ", ".join(reason.text for reason in gate.latest.reasons) if gate.latest else ""

@@ -75,6 +75,14 @@ def test_the_journal_gets_priorities_on_every_line():
     assert PlainFormatter(journal=True).format(record) == "<3>ERROR   x: a\n<3>b"
 
 
+def test_a_terminal_gets_the_brief_form_of_a_long_record():
+    record = logging.makeLogRecord({"levelname": "ERROR", "name": "x", "msg": "%s\n%s", "args": ("late", "stacks")})
+    assert PlainFormatter(journal=False, terminal=True).format(record) == "ERROR   x: late\nstacks"
+    record.brief = "late; stacks are in a file"
+    assert PlainFormatter(journal=False, terminal=True).format(record) == "ERROR   x: late; stacks are in a file"
+    assert PlainFormatter(journal=False).format(record) == "ERROR   x: late\nstacks", "a file gets all of it"
+
+
 def test_the_journal_is_recognised_by_the_stream_it_named(tmp_path: Path):
     with (tmp_path / "journal").open("w") as stream, (tmp_path / "elsewhere").open("w") as other:
         status = os.fstat(stream.fileno())

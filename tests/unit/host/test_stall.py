@@ -64,8 +64,9 @@ def test_a_blocked_loop_is_dumped_while_it_is_blocked_and_not_again_soon(tmp_pat
     assert text.startswith("no control tick for 0.")
     assert "a_driver_that_waits_for_its_device" in text
     assert "a_driver_that_waits_for_its_device" in caplog.text
-    levels = {record.levelno for record in caplog.records if "all threads" in record.message}
-    assert levels == {logging.ERROR}
+    (dumped,) = (record for record in caplog.records if "all threads" in record.message)
+    assert dumped.levelno == logging.ERROR
+    assert dumped.brief.endswith(str(file)), "a terminal is not filled with it"
     assert "the control tick is back after 0." in caplog.text
 
 

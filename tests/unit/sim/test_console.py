@@ -1,5 +1,9 @@
 """Faults by standard input: an unknown word is answered by all that are known, the cable's too."""
 
+import asyncio
+import os
+import pty
+
 import pytest
 
 from monstertruck_drivers.cable import MemoryPort
@@ -7,7 +11,7 @@ from monstertruck_drivers.catalog import DEVICES
 from monstertruck_drivers.emulation import EmulatorSetup
 from monstertruck_runtime.clock import VirtualClock, VirtualLoop
 from monstertruck_runtime.errors import InputError
-from monstertruck_sim.console import Emulated
+from monstertruck_sim.console import Emulated, FaultConsole
 from monstertruck_sim.world.config import WorldConfig
 from monstertruck_sim.world.world import World
 
@@ -29,3 +33,45 @@ def test_the_answer_names_faults_of_the_device_and_of_its_cable(device: str, wor
             emulated.command(["line"])
     finally:
         loop.close()
+
+
+class Recorded:
+    """Keeps what it is told."""
+
+    def __init__(self) -> None:
+        self.commands: list[list[str]] = []
+
+    def command(self, words: list[str]) -> None:
+        """Keep it."""
+        self.commands.append(words)
+
+
+async def test_a_terminal_keeps_its_mode_so_that_long_lines_of_others_are_not_lost_on_it():
+    user, program = pty.openpty()
+    target, said = Recorded(), []
+    with os.fdopen(program, "r") as terminal:
+        running = asyncio.create_task(FaultConsole(target, terminal, said.append).run())
+        for line in (b"lidar unp", b"lug\nlidar", b" plug\n\n"):
+            os.write(user, line)
+            await asyncio.sleep(0.01)
+        assert os.get_blocking(terminal.fileno())
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
+        assert os.get_blocking(terminal.fileno())
+    os.close(user)
+    assert target.commands == [["lidar", "unplug"], ["lidar", "plug"]]
+    assert said == ["ok", "ok"]
+
+
+async def test_the_end_of_the_input_ends_the_last_line_and_nothing_else():
+    reading, writing = os.pipe()
+    target = Recorded()
+    with os.fdopen(reading, "r") as source:
+        running = asyncio.create_task(FaultConsole(target, source, lambda _: None).run())
+        os.write(writing, b"lidar unplug\ndrive stall")
+        os.close(writing)
+        await asyncio.sleep(0.05)
+        assert not running.done()
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
+    assert target.commands == [["lidar", "unplug"], ["drive", "stall"]]

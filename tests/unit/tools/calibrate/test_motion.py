@@ -38,6 +38,15 @@ def test_an_expired_lease_says_what_to_do():
     assert "repeat it; nothing was saved" in str(error)
 
 
+def test_a_silent_device_says_what_to_do_once():
+    error = stopped(Reason.DRIVE_STALE, Reason.SCAN_STALE)
+    assert str(error).startswith(
+        "stopped by the gate: no fresh drive feedback, no fresh lidar scan; a device was silent"
+    )
+    assert str(error).count("repeat the wizard") == 1
+    assert ";" not in str(stopped(Reason.OBSTACLE_STOP))
+
+
 @pytest.mark.parametrize(
     ("held", "kind", "said"),
     [

@@ -12,7 +12,8 @@ from typing import IO
 
 import pytest
 
-from monstertruckd.tools.cli.terminal import REPORT_OFF, REPORT_ON, every_key, forget_input, when_readable
+from monstertruck_runtime.readable import when_readable
+from monstertruckd.tools.cli.terminal import REPORT_OFF, REPORT_ON, every_key, forget_input
 
 
 @pytest.fixture
