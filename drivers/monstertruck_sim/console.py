@@ -139,8 +139,11 @@ class FaultConsole:
         source, news, rest = self._source.fileno(), asyncio.Event(), b""
         when_readable(source, news.set)
         try:
-            while await news.wait() and (data := _read(source)):
+            while True:
+                await news.wait()
                 news.clear()
+                if not (data := _read(source)):
+                    break
                 *lines, rest = (rest + data).split(b"\n")
                 for line in lines:
                     self.execute(line.decode(errors="replace"))

@@ -50,6 +50,8 @@ MOST_VALUES = 20_000
 """Of one file; a full configuration has a few hundred."""
 MOST_MISTAKES = 50
 """Named at once."""
+ALIEN = 0.75
+"""Share of unknown sections from which on a file is of another kind."""
 YAML_1_1 = ("yes", "no", "on", "off")
 """Booleans of YAML 1.1 in lower case: text since 1.2."""
 
@@ -608,8 +610,11 @@ def validated(tree: Tree, path: Path, model: type[S]) -> tuple[S, Tree]:
     """Validate what was read and merged from ``path``; see ``load_config``."""
     version = tree.data.get("version")
     if version != VERSION:
+        if version is None:
+            raise ConfigError(f"{path}:1: version: missing; write `version: {VERSION}`")
         origin = tree.origin(("version",)) or f"{path}:1"
         raise ConfigError(f"{origin}: version: expected {OLDEST} to {VERSION}, found {version!r}")
+    _require_kind(tree.data, path, model)
     _locate_files(tree, getattr(model, "FILE_KEYS", ()))
     _give_ports(tree.data)
     try:
@@ -622,6 +627,15 @@ def validated(tree: Tree, path: Path, model: type[S]) -> tuple[S, Tree]:
         return model.model_validate_json(text), tree
     except ValidationError as error:
         raise ConfigError("\n".join(_explain(tree, path, model, error))) from error
+
+
+def _require_kind(data: dict[str, Any], path: Path, model: type[Schema]) -> None:
+    """Tell a mission from a robot's configuration in one line, instead of by every key that it has."""
+    found = [str(key) for key in data if key != "version"]
+    strange = set(found) - set(model.model_fields)
+    if len(strange) > 1 and len(strange) >= ALIEN * len(found):
+        expected = [name for name, field in model.model_fields.items() if field.is_required() and name != "version"]
+        raise ConfigError(f"{path}:1: another kind of file: expected {', '.join(expected)}, found {', '.join(found)}")
 
 
 def _locate_files(tree: Tree, keys: tuple[tuple[str, ...], ...]) -> None:

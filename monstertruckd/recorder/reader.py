@@ -197,6 +197,9 @@ class LogReader:
         except FileNotFoundError:
             msg = f"{path}: no such log"
             raise NotFoundError(msg) from None
+        except IsADirectoryError:
+            msg = f"{path}: a folder; `monstertruckd log list {path}` lists the logs in it"
+            raise InputError(msg) from None
         except OSError as error:
             msg = f"{path}: cannot be read: {error.strerror}"
             raise InputError(msg) from None

@@ -538,7 +538,8 @@ class TruckClient(Operator):
         try:
             self._session = zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
         except zenoh.ZError as error:
-            msg = f"no robot answers at {self.endpoint} within {self._timeout} s"
+            msg = f"no robot answers at {self.endpoint} within {self._timeout:g} s: is its daemon running there "
+            msg += "(`monstertruckd run`, or `simulate --run`), or is it elsewhere (--endpoint)?"
             raise NotFoundError(msg) from error
 
     def _take_name(self, owner: str) -> None:

@@ -19,6 +19,8 @@ from monstertruck_runtime.yaml_files import read_yaml, yaml_text
 
 FREE, OCCUPIED, UNKNOWN = 0, 100, -1
 """Cell values, as in an occupancy grid message."""
+YAML = "map.yaml"
+"""In the folder of a saved map."""
 
 _REQUIRED = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh")
 _MODES = ("trinary", "scale", "raw")
@@ -51,7 +53,7 @@ class WorldMap:
 
 
 def load_map(path: Path) -> WorldMap:
-    """Read a map_server YAML file and the image it names (relative to the YAML).
+    """Read a map_server YAML file, or the one in a folder of ours, and the image it names (relative to the YAML).
 
     Thresholds apply as in map_server: with p = darkness in 0..1 (lightness if ``negate``), p > occupied_thresh
     is occupied, p < free_thresh free, the rest unknown. ``mode: raw`` takes the pixel value itself as percent.
@@ -60,6 +62,8 @@ def load_map(path: Path) -> WorldMap:
     Raises:
         InputError: file, key and expectation of whatever is wrong.
     """
+    if path.is_dir():
+        path /= YAML
     keys = _read_keys(path)
     sums, opaque = _read_image(path, path.parent / str(keys["image"]))
     mode, values = keys["mode"], np.arange(3 * 255 + 1) / 3.0

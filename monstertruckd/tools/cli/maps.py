@@ -20,6 +20,19 @@ if TYPE_CHECKING:
     from monstertruckd.tools.logs.scans import LogGeometry, ScanLog
 
 
+LABELS = {
+    "log": "kind of log",
+    "keys": "key scans",
+    "closures": "loops closed",
+    "rejected": "matches rejected",
+    "left_out": "scans left out",
+    "standing": "status of scans",
+    "odometry_ahead_s": "odometry ahead, s",
+    "poses": "poses by",
+}
+"""Names of facts that do not explain themselves."""
+
+
 class FrontChoice(StrEnum):
     """Scan matchers."""
 
@@ -313,7 +326,7 @@ def _print(facts: dict[str, Any], json_output: bool) -> None:
         print_json(facts)
         return
     for name, value in facts.items():
-        print(f"{name.replace('_', ' '):18} {_text(value)}")
+        print(f"{LABELS.get(name, name.replace('_', ' ')):18} {_text(value)}")
 
 
 def _text(value: Any) -> str:

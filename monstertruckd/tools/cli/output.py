@@ -105,6 +105,7 @@ def print_table(
     *,
     right: Sequence[str] = (),
     title: str | None = None,
+    fold: bool = True,
 ) -> None:
     """Print rows under headings: on a terminal as a table that folds, in a pipe one unfolded line for each row.
 
@@ -113,8 +114,9 @@ def print_table(
         rows: cells.
         right: headings of the columns set to the right, the numbers.
         title: a line above, on terminals only.
+        fold: False = never: the terminal breaks lines at its edge, so that a path that is copied from it is whole.
     """
-    if not on_terminal(sys.stdout):
+    if not (fold and on_terminal(sys.stdout)):
         print("\n".join(_aligned(headings, rows, right)))
         return
     from rich.table import Table
@@ -274,14 +276,18 @@ def _usage_in_one_line() -> Iterator[None]:
     except NoArgsIsHelpError:  # a group without a command: its help is the answer
         raise
     except UsageError as error:
-        complaint = " ".join(error.format_message().split()).removesuffix(".")
+        complaint = " ".join(error.format_message().split()).removesuffix(".").replace(": Value error, ", ": ")
         command = "monstertruckd" if error.ctx is None else error.ctx.command_path
         remark(f"Error: {complaint}. Try '{command} -h'.")
         raise typer.Exit(error.exit_code) from None
 
 
 def _interrupt(_: int, frame: FrameType | None) -> None:
-    """SIGTERM does what Ctrl-C does at that moment, even where a shell made a job in the background ignore that."""
+    """SIGTERM does what Ctrl-C does at that moment, even where a shell made a job in the background ignore that.
+
+    A second one, such as timeout(1) sends to the whole group, does not disturb the end that the first one began.
+    """
+    signal.signal(signal.SIGTERM, lambda *_: None)
     handler = signal.getsignal(signal.SIGINT)
     if callable(handler):
         handler(signal.SIGINT, frame)

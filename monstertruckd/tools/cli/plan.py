@@ -38,7 +38,9 @@ PoseArgument = Annotated[
 
 
 def plan(
-    map_file: Annotated[Path, typer.Argument(metavar="MAP", help="map_server YAML file.", show_default=False)],
+    map_file: Annotated[
+        Path, typer.Argument(metavar="MAP", help="Folder of a saved map, or a map_server YAML.", show_default=False)
+    ],
     start: PoseArgument,
     goal: PoseArgument,
     planner: Annotated[

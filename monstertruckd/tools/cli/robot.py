@@ -10,9 +10,11 @@ from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruckd.tools.cli.options import ConfigOption, EndpointOption, RobotOption
 from monstertruckd.tools.cli.output import JsonOption, needs_extra, print_json, print_table, until_stopped
 
+VerboseOption = Annotated[bool, typer.Option("--verbose", "-v", help="Log what is of use to developers only, too.")]
+
 
 @needs_extra("robot")
-def run(config: ConfigOption, verbose: Annotated[bool, typer.Option("--verbose", "-v")] = False) -> None:
+def run(config: ConfigOption, verbose: VerboseOption = False) -> None:
     """Run the daemon until SIGTERM or Ctrl-C: neutral first, then everything is closed in order."""
     from monstertruckd.run import run_daemon
 

@@ -92,8 +92,9 @@ def print_tags(out: Path, numbers: str, columns: int, rows: int) -> Iterator[Pat
 
     from monstertruck_estimation.vision.tags import dictionary, drawn
 
+    tags = _numbers(numbers)
     out.mkdir(parents=True, exist_ok=True)
-    for tag in _numbers(numbers):
+    for tag in tags:
         path = out / f"tag-{tag:03d}.png"
         cv2.imwrite(str(path), cv2.copyMakeBorder(drawn(tag, 800), 160, 160, 160, 160, cv2.BORDER_CONSTANT, value=255))
         yield path
@@ -175,7 +176,10 @@ def _numbers(text: str) -> list[int]:
     try:
         for part in text.split(","):
             first, _, last = part.partition("-")
-            found += range(int(first), int(last or first) + 1)
+            numbers = range(int(first), int(last or first) + 1)
+            if not numbers:
+                raise ValueError(part)
+            found += numbers
     except ValueError:
         raise InputError(f"tags {text!r}: expected numbers such as 0-3,100") from None
     if not all(0 <= tag <= 586 for tag in found):

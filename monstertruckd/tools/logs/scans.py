@@ -228,7 +228,9 @@ def _carmen(path: Path, given: dict[str, Any]) -> ScanLog:
                 except (ValueError, IndexError, OverflowError) as error:
                     raise InputError(f"{path}:{number}: expected FLASER n, n ranges, 6 numbers, time") from error
                 scans.append(_sick(stamp, ranges, odom, {"range_max": LONGEST_RANGE} | given))
-    except (OSError, EOFError, UnicodeDecodeError) as error:
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: not a log with scans: neither MCAP, npz nor text") from error
+    except (OSError, EOFError) as error:
         raise InputError(f"{path}: not a log with scans: {error}") from error
     return ScanLog("carmen", scans, (begin or 0.0) - BEGIN / SECOND, _missing(given))
 

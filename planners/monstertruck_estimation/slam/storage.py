@@ -21,10 +21,10 @@ from monstertruck_estimation.slam.scans import SLIDE, Scan
 from monstertruck_estimation.slam.worker_io import GridPatch
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.errors import InputError
-from monstertruck_runtime.map_files import FREE, OCCUPIED, UNKNOWN, WorldMap, load_map, save_map
+from monstertruck_runtime.map_files import FREE, OCCUPIED, UNKNOWN, YAML, WorldMap, load_map, save_map
 from monstertruck_runtime.small_files import replace_file
 
-YAML, GRAPH = "map.yaml", "graph.npz"
+GRAPH: Final = "graph.npz"
 VERSION: Final = 1
 ELEMENTS: Final = tuple(field.name for field in dataclasses.fields(Scan))
 """Arrays of a scan: of a file that was written before there were so many, the others are zeros."""

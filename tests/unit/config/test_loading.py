@@ -76,7 +76,8 @@ def test_a_good_file(tmp_path: Path):
         ("version: 2\nname: t\nwheel:\n  count: 1.5\n", 4, "wheel.count: "),
         ("version: 2\n", 1, "name: missing; it has no default"),
         ("version: 3\nname: t\n", 1, "version: expected 1 to 2, found 3"),
-        ("name: t\n", 1, "version: expected 1 to 2, found None"),
+        ("name: t\n", 1, "version: missing; write `version: 2`"),
+        ("version: 2\nsteps: []\non_failure: return\n", 1, "another kind of file: expected name, found steps, on_fai"),
         ("version: 2\nname: t\nname: u\n", 3, "name: given twice in one section"),
         ("version: 2\nname: t\nmap: nowhere.yaml\n", 3, "map: no such file"),
         ("version: 2\nname: t\ninclude: nowhere.yaml\n", 3, "include: no such file"),
@@ -148,7 +149,7 @@ def test_what_would_be_read_for_ever_is_refused(tmp_path: Path):
 
 
 def test_of_many_mistakes_the_first_are_named(tmp_path: Path):
-    file = write(tmp_path, "version: 2\nname: t\n" + "".join(f"k{n}: {n}\n" for n in range(2000)))
+    file = write(tmp_path, "version: 2\nname: t\nwheel:\n" + "".join(f"  k{n}: {n}\n" for n in range(2000)))
     begin = process_time()
     with pytest.raises(ConfigError) as caught:
         load_config(file, Root)

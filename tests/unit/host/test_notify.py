@@ -200,7 +200,9 @@ def test_the_status_names_what_does_not_work():
     assert status_line(GateMode.DISARMED, rows) == "disarmed; not ready: lidar (backoff)"
 
 
-def test_the_daemon_tells_from_its_first_tick_to_its_end(tmp_path: Path):
+def test_the_daemon_tells_from_its_first_tick_to_its_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))  # not the devices of a `simulate` that runs on this computer
+
     async def main(clock: VirtualClock) -> list[str]:
         config, _ = load_truck(DEMO)
         quiet = config.model_copy(update={"state_directory": tmp_path, "recorder": None})

@@ -36,7 +36,7 @@ def test_the_answer_names_faults_of_the_device_and_of_its_cable(device: str, wor
 
 
 class Recorded:
-    """Keeps what it is told."""
+    """Keeps the commands it gets."""
 
     def __init__(self) -> None:
         self.commands: list[list[str]] = []

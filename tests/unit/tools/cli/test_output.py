@@ -74,7 +74,10 @@ def test_a_missing_package_is_one_sentence(capsys: pytest.CaptureFixture[str]):
 
 def test_an_interrupt_gives_up_but_is_the_ordinary_end_of_what_runs_until_stopped():
     def finite() -> None:
-        signal.raise_signal(signal.SIGTERM)
+        try:
+            signal.raise_signal(signal.SIGTERM)
+        finally:
+            signal.raise_signal(signal.SIGTERM)  # timeout(1) sends two: the second one disturbs no end
 
     def endless() -> None:
         async def main(clock: object) -> None:
@@ -229,6 +232,14 @@ def test_a_piped_table_is_a_line_for_each_row_whatever_its_width(capsys: pytest.
     assert lines[1].startswith("a        5  word word")
     assert lines[2] == "long  12.5"
     assert not any(line.endswith(" ") for line in lines)
+
+
+def test_a_path_is_whole_on_a_terminal_too(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("monstertruckd.tools.cli.output.on_terminal", lambda _: True)
+    monkeypatch.setenv("COLUMNS", "40")
+    path = "runs/demo/logs/blackbox/blackbox-000001-drive_stale.mcap"
+    print_table(("MB", "log"), [("0.4", path)], fold=False)
+    assert capsys.readouterr().out.splitlines()[1].endswith(path)
 
 
 def test_progress_is_silent_where_nobody_looks(capsys: pytest.CaptureFixture[str]):

@@ -57,7 +57,7 @@ def test_errors_name_the_file(tmp_path, use):
     with pytest.raises(InputError, match=r"text\.mcap: not an MCAP log"):
         use(tmp_path / "text.mcap")
     (tmp_path / "folder.mcap").mkdir()
-    with pytest.raises(InputError, match=r"folder\.mcap: cannot be read: Is a directory"):
+    with pytest.raises(InputError, match=r"folder\.mcap: a folder; `monstertruckd log list"):
         use(tmp_path / "folder.mcap")
 
 
