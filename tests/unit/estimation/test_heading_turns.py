@@ -7,7 +7,7 @@ import pytest
 from monstertruck_estimation.heading_turns import LONGEST, HeadingTurns
 
 
-def told(share, turn=1.0, way=1.0, start=3.0, steps=40):
+def contradicted(share, turn=1.0, way=1.0, start=3.0, steps=40):
     """Whether headings that show ``share`` of a turn, rad, on a way, m, turn against it."""
     turns = HeadingTurns()
     for k in range(steps + 1):
@@ -18,16 +18,16 @@ def told(share, turn=1.0, way=1.0, start=3.0, steps=40):
 
 @pytest.mark.parametrize("turn", [1.0, -1.0, 7.0])
 def test_headings_that_turn_the_other_way_are_contrary(turn):
-    assert told(-1.0, turn)
-    assert told(-0.6, turn)
-    assert not told(1.0, turn)
-    assert not told(0.0, turn), "stuck, or slipping wheels: nobody knows who is right"
+    assert contradicted(-1.0, turn)
+    assert contradicted(-0.6, turn)
+    assert not contradicted(1.0, turn)
+    assert not contradicted(0.0, turn), "stuck, or slipping wheels: nobody knows who is right"
 
 
 def test_a_slow_drift_is_no_turn_and_a_spot_turn_is_one():
-    assert not told(-1.0, turn=0.5, way=3 * LONGEST)
-    assert told(-1.0, turn=0.5, way=0.0)
-    assert not told(-1.0, turn=0.2)
+    assert not contradicted(-1.0, turn=0.5, way=3 * LONGEST)
+    assert contradicted(-1.0, turn=0.5, way=0.0)
+    assert not contradicted(-1.0, turn=0.2)
 
 
 def test_they_count_again_once_they_turn_along():

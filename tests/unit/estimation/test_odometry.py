@@ -225,7 +225,7 @@ def test_a_compass_of_the_wrong_sign_is_found_by_its_turns_and_taken_back():
 
 
 def test_headings_that_stay_off_are_reported_and_their_return_is():
-    told = []
+    reported = []
     truck = Truck(compass_error=lambda truck: 0.6 if 3.0 < truck.now / SECOND < 5.0 else 0.0)
     service = OdometryService(
         truck.reckoning,
@@ -235,12 +235,12 @@ def test_headings_that_stay_off_are_reported_and_their_return_is():
         compass=None,
         odometry=None,
         pose=None,
-        events=lambda reason, *_: told.append(reason),
+        events=lambda reason, *_: reported.append(reason),
     )
     for _ in range(6):
         truck.drive(0.2, 0.0, 0.0, 1.0)
         service.report_compass(truck.reckoning.doubt)
-    assert told == [Reason.HEADING_DISTURBED, Reason.HEADING_RETURNED]
+    assert reported == [Reason.HEADING_DISTURBED, Reason.HEADING_RETURNED]
 
 
 def test_headings_before_the_first_drive_reading_are_ignored():

@@ -46,7 +46,7 @@ def test_a_running_behaviour_excludes_a_goal_and_lets_one_be_cancelled(monkeypat
     service._examine(None, "goal", moves=True)
 
 
-def test_who_waits_for_the_way_to_a_goal_is_not_told_of_another_goals_way():
+def test_who_waits_for_the_way_to_a_goal_is_not_informed_of_another_goals_way():
     async def main() -> None:
         service = GoalService.__new__(GoalService)
         service._changed = asyncio.Event()
@@ -68,17 +68,17 @@ def test_a_planner_in_the_loop_that_refuses_its_input_is_an_answer_and_an_event(
         async def step(self, task: object) -> object:
             raise InputError("map: not readable")
 
-    told: list[tuple[object, ...]] = []
+    reported: list[tuple[object, ...]] = []
     service = GoalService.__new__(GoalService)
     service._actor, service._fresh = Refusing(), False
-    service._out = SimpleNamespace(events=lambda *event: told.append(event))
+    service._out = SimpleNamespace(events=lambda *event: reported.append(event))
     answer = asyncio.run(service._ask(None))
     assert (answer.reason, answer.poses, service._fresh) == (Reason.BAD_INPUT, None, True)
-    assert [event[0] for event in told] == [Reason.BAD_INPUT]
+    assert [event[0] for event in reported] == [Reason.BAD_INPUT]
 
 
 def test_without_the_worker_that_deforms_routes_goals_go_on_and_it_is_tried_again():
-    told: list[Reason] = []
+    reported: list[Reason] = []
 
     class Failing:
         starts = 0
@@ -98,7 +98,13 @@ def test_without_the_worker_that_deforms_routes_goals_go_on_and_it_is_tried_agai
         actor = Failing()
         setup = SimpleNamespace(config=SimpleNamespace(local=None))
         service = RouteDeformation(
-            setup, clock, actor, scan=Mailbox(latest()), pose=None, grid=None, events=lambda *e, **_: told.append(e[0])
+            setup,
+            clock,
+            actor,
+            scan=Mailbox(latest()),
+            pose=None,
+            grid=None,
+            events=lambda *e, **_: reported.append(e[0]),
         )
         task = asyncio.create_task(service.run(lambda *_: None))
         await clock.sleep(3 * deformation.RETRY)
@@ -106,4 +112,4 @@ def test_without_the_worker_that_deforms_routes_goals_go_on_and_it_is_tried_agai
         task.cancel()
 
     run_virtual(main)
-    assert told == [WorkerError.reason] * 2
+    assert reported == [WorkerError.reason] * 2
