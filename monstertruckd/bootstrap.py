@@ -41,10 +41,14 @@ ROOT = Path(__file__).resolve().parent.parent
 VENV = ROOT / ".venv"
 TRACED = ("tests/unit/schemas", "tests/unit/gate", "tests/unit/runtime/wire", "tests/unit/drivers")
 """Where the tests of the parts are whose coverage is a gate (marked in tests/conftest.py)."""
-TESTS = ("-n", "2", "--dist", "worksteal", "--hypothesis-profile", "ci", "--assert", "plain", "--showlocals")
-"""Two at a time, neighbours in one process, for what they share is cached; property tests have the same examples every
-time, and no time limit. Plain pytest draws new ones. Values of local variables stand for those in assertions, whose
-rewriting would take as long as a thousand tests."""
+TESTS = ("--dist", "worksteal", "--hypothesis-profile", "ci", "--assert", "plain", "--showlocals")
+"""Neighbours run in one process, for what they share is cached; property tests have the same examples every time, and
+no time limit. Plain pytest draws new ones. Values of local variables stand for those in assertions, whose rewriting
+would take as long as a thousand tests."""
+THREE = ("-n", "3")
+"""Tests at a time on the two cores of a small computer: some wait for a process or a time-out."""
+TWO = ("-n", "2")
+"""Tests on the wall clock at a time: each runs a truck and a daemon, which must not be late."""
 FAILED_ALONE = ("-n", "0", "--last-failed", "--last-failed-no-failures", "none", "--cov-append", "--assert", "rewrite")
 TESTS_FAILED = 1
 """Exit code of pytest; others mean that it did not run them."""
@@ -191,10 +195,10 @@ def check(arguments: list[str]) -> int:
         compiling.kill()
         compiling.wait()
     steps: list[tuple[Path, list[str]]] = [
-        (pytest, [*TESTS, "-m", "traced and not wall", "--cov", "--cov-report=", *TRACED]),
+        (pytest, [*THREE, *TESTS, "-m", "traced and not wall", "--cov", "--cov-report=", *TRACED]),
         (tools / "coverage", ["report"]),
-        (pytest, [*TESTS, "-m", "not wall and not traced and not long", *arguments]),
-        (pytest, [*TESTS, "-m", "wall and not long", *arguments]),
+        (pytest, [*THREE, *TESTS, "-m", "not wall and not traced and not long", *arguments]),
+        (pytest, [*TWO, *TESTS, "-m", "wall and not long", *arguments]),
     ]
     for program, rest in steps:
         code = step(program, rest)

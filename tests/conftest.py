@@ -1,13 +1,21 @@
-"""For every test: the product's event loop, no leaked tasks."""
+"""For every test: the product's event loop, no leaked tasks, and what is the same for all of them made once."""
 
 import asyncio
+import inspect
 from collections.abc import AsyncIterator, Callable
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 
 import pytest
+import typer.testing
 import uvloop
 
+from monstertruckd.config import load
+
+load._compose = lru_cache(maxsize=256)(load._compose)
+"""A configuration file that many tests load is parsed once: a tenth of a second each time."""
+typer.testing._get_command = cache(typer.testing._get_command)
+"""The tree of commands is built once, not for every invocation: 40 ms each time."""
 UNIT = Path(__file__).parent / "unit"
 TRACED = (("schemas",), ("gate",), ("runtime", "wire"))
 """Folders of unit tests."""
@@ -28,6 +36,8 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark the tests of the parts whose coverage is a gate: they run under the tracer, which would slow all others."""
     for item in items:
+        if inspect.iscoroutinefunction(getattr(item, "obj", None)):
+            item.fixturenames.insert(0, "no_leaked_tasks")  # type: ignore[attr-defined]  # others have no loop
         below = _below(item.path)
         wire_format = below[:1] == ("drivers",) and any(word in item.nodeid for word in WIRE_FORMATS)
         if wire_format or any(below[: len(folder)] == folder for folder in TRACED):
@@ -45,7 +55,7 @@ def pytest_asyncio_loop_factories() -> dict[str, Callable[[], asyncio.AbstractEv
     return {"uvloop": uvloop.new_event_loop}
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture
 async def no_leaked_tasks() -> AsyncIterator[None]:
     """Fail a test that leaves asyncio tasks running."""
     before = asyncio.all_tasks()

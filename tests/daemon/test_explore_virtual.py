@@ -15,7 +15,7 @@ from monstertruck_runtime.map_files import FREE, OCCUPIED, WorldMap, load_map, s
 from monstertruck_schemas import topics
 from monstertruck_schemas.plan import ExplorationPhase
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import ExploreOrder, GoalOrder
+from monstertruck_schemas.req import ExploreOrder
 from monstertruckd.config.load import load_config
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
 from monstertruckd.tools.simulation.operator import LocalOperator
@@ -125,19 +125,28 @@ def test_it_stops_on_request_and_gives_way_to_other_goals(tmp_path: Path):
         goal = {"goal": {"x": 2.6, "y": 1.2, "yaw": 0.0}, "frame": "map"}
         await truck.operator.call("goal", {**await truck.operator.header(), **goal})
         ends.append(await truck.end(60.0))
-        cancel = {**await truck.operator.header(), "order": GoalOrder.CANCEL}
-        await truck.operator.call("goal_control", cancel)
-        await truck.clock.sleep(2.0)
+
+    _, truth = run_scenario(scenario, tmp_path)
+    assert [state.outcome for state in ends] == [Reason.CANCELLED, Reason.CANCELLED]
+    assert "operator" in ends[0].text
+    assert "goal of operator" in ends[1].text
+    assert not truth[:, 5].any()
+    assert ends[0].phase is ExplorationPhase.IDLE
+
+
+@pytest.mark.long
+def test_a_spent_budget_ends_it_at_the_start(tmp_path: Path):
+    ends = []
+
+    async def scenario(truck: ExploringTruck) -> None:
+        await truck.operator.arm()
         await truck.order(ExploreOrder.START, home=True, budget=6.0)
         ends.append(await truck.end(120.0))
 
     _, truth = run_scenario(scenario, tmp_path)
-    assert [state.outcome for state in ends] == [Reason.CANCELLED, Reason.CANCELLED, Reason.BUDGET_SPENT]
-    assert "operator" in ends[0].text
-    assert "goal of operator" in ends[1].text
-    assert "back at the start" in ends[2].text
+    assert ends[0].outcome is Reason.BUDGET_SPENT
+    assert "back at the start" in ends[0].text
     assert not truth[:, 5].any()
-    assert ends[0].phase is ExplorationPhase.IDLE
 
 
 def doubled(folder: Path) -> float:

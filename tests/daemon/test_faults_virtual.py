@@ -16,11 +16,32 @@ from monstertruckd.tools.drill.observer import Violation
 from monstertruckd.tools.drill.scenario import Expect, Reaction, Scenario, measure, shortcomings
 from monstertruckd.tools.drill.scenarios import SCENARIOS
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
+from tests.long_kit import mostly_long
 
 pytestmark = [pytest.mark.virtual, pytest.mark.timeout(120)]
 
 DEMO = Path(__file__).resolve().parents[2] / "configs" / "demo.yaml"
 BY_NAME = {scenario.name: scenario for scenario in SCENARIOS}
+LIKE_OTHERS = {
+    *(
+        f"{role}: {line}"
+        for role in ("lidar", "compass", "steering")
+        for line in ("garbage on the line", "one-byte reads")
+    ),
+    "compass: stalled",
+    "steering: stalled",
+    "lidar and compass: cables exchanged",
+    "lidar and steering: cables exchanged",
+    "compass and drive: cables exchanged",
+    "drive and steering: cables exchanged",
+    "lidar: right half covered",
+    "lidar: sun ahead",
+    "lidar: clock 1 % slow",
+    "lidar: clock slewed by 10 %",
+    "drive: answers 80 ms late",
+    "bug in the steering's driver",
+}
+"""Left to the long tests: another device has the same fault, or the same device on its other side."""
 
 
 @cache
@@ -32,7 +53,7 @@ def drill(scenario: Scenario) -> Reaction:
     return run_virtual(lambda clock: measure(scenario, config(), clock))
 
 
-@pytest.mark.parametrize("name", BY_NAME)
+@pytest.mark.parametrize("name", mostly_long(BY_NAME, BY_NAME.keys() - LIKE_OTHERS))
 def test_a_fault_ends_as_it_should(name: str):
     scenario = BY_NAME[name]
     assert shortcomings(scenario, drill(scenario)) == []
@@ -68,11 +89,11 @@ def test_an_obstacle_is_kept_at_a_distance():
 
 
 def short_demo(folder: Path, seed: int) -> str:
-    """Digest of a run along the first 2 m of the lap."""
+    """Digest of a run along the first metre of the lap."""
     folder.mkdir()
     whole = (DEMO.parent / "paths" / "loop.csv").read_text().splitlines()
     path = folder / "short.csv"
-    path.write_text("\n".join(whole[:41]) + "\n")
+    path.write_text("\n".join(whole[:21]) + "\n")
     file = folder / "short.yaml"
     overlay = {"include": str(DEMO), "version": 1, "path": {"file": str(path), "closed": False}}
     file.write_text(yaml_text(overlay))

@@ -59,6 +59,7 @@ def test_a_robot_stops_before_another_that_its_lidar_sees():
     assert 0.02 < gap < 0.3
 
 
+@pytest.mark.long
 def test_in_three_dimensions_each_has_its_daemon_and_stops_before_the_other():
     world = {"engine": "mujoco", "ground": [{"kind": "hills", "height": 0.01, "wavelength": 1.5}]}
     near = {"x": -1.9, "y": 0.0, "yaw": 0.0}
@@ -73,6 +74,7 @@ def test_in_three_dimensions_each_has_its_daemon_and_stops_before_the_other():
     assert abs(speed) < 0.02, "before it stands the first one, 1.7 m before its goal"
 
 
+@pytest.mark.long
 def test_a_robot_without_eyes_runs_into_it_and_the_world_says_so():
     rigs, contacts, outcome = drive(*fleet(second=BLIND))
     assert outcome is not Reason.BEHAVIOUR_DONE
@@ -145,6 +147,7 @@ def follow(*, silent_after: float | None = None) -> tuple[list[VirtualRig], list
     return run_virtual(main, start=SECOND)
 
 
+@pytest.mark.long
 def test_a_robot_follows_another_round_a_bend_at_its_distance():
     rigs, contacts, states = follow()
     assert contacts == []

@@ -7,6 +7,7 @@ import pytest
 
 from monstertruck_schemas.reasons import Reason
 from tests.daemon.move_kit import arrived, drive_move
+from tests.long_kit import mostly_long
 
 pytestmark = [pytest.mark.virtual, pytest.mark.timeout(120)]
 
@@ -31,6 +32,13 @@ REAR = {"ackermann": -0.16, "bicycle": -0.16, "tricycle": -0.16, "skid_steer": -
 """x of the point of base that the radius is measured at, m: abeam of the turning centre."""
 CASES = [(name, move) for name, can in CAN.items() for move in can.split()]
 CANNOT = [(name, move) for name, can in CAN.items() for move in MOVES if move not in can.split()]
+KEPT = {
+    ("truck", "left"), ("truck", "back"), ("ackermann", "right"), ("bicycle", "straight"), ("tricycle", "back"),
+    ("differential", "spot"), ("skid_steer", "left"), ("independent", "side"), ("omni", "right"), ("mecanum", "spot"),
+    ("synchro", "straight"),
+}  # fmt: skip
+"""Every body, every move."""
+REFUSED = {("truck", "spot"), ("differential", "side"), ("synchro", "left")}
 WHY = {
     "spot": "cannot turn on the spot",
     "side": "cannot move sideways",
@@ -53,7 +61,7 @@ def expected(name: str, move: str) -> tuple[float, float, float]:
     return x + c * -x + s * radius, radius + s * -x - c * radius, turn
 
 
-@pytest.mark.parametrize(("name", "move"), CASES)
+@pytest.mark.parametrize(("name", "move"), mostly_long(CASES, KEPT))
 def test_a_body_moves_as_commanded(name: str, move: str):
     moved = drive_move(name, **MOVES[move])
     assert arrived(moved), (moved.end.outcome, moved.end.text)
@@ -65,7 +73,7 @@ def test_a_body_moves_as_commanded(name: str, move: str):
     assert np.abs(np.diff(moved.truth[-10:, 1:3], axis=0)).max() < 1e-3
 
 
-@pytest.mark.parametrize(("name", "move"), CANNOT)
+@pytest.mark.parametrize(("name", "move"), mostly_long(CANNOT, REFUSED))
 def test_what_a_body_cannot_do_is_refused_with_the_reason_and_nothing_moves(name: str, move: str):
     moved = drive_move(name, **MOVES[move])
     assert moved.refused is not None

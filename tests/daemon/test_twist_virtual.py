@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, field
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from monstertruckd.config.load import load_config
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 from monstertruckd.tools.simulation.operator import LocalOperator
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
+from tests.long_kit import mostly_long
 
 pytestmark = [pytest.mark.virtual, pytest.mark.timeout(120)]
 
@@ -86,8 +88,13 @@ def assert_odometry_agrees(seen: Seen) -> None:
     assert math.remainder(pose.yaw - yaw, math.tau) == pytest.approx(0.0, abs=0.05)
 
 
-@pytest.mark.parametrize("name", ["differential", "skid_steer", "omni", "mecanum", "independent"])
-@pytest.mark.parametrize("side", [1, -1])
+@pytest.mark.parametrize(
+    ("name", "side"),
+    mostly_long(
+        product(("differential", "skid_steer", "omni", "mecanum", "independent"), (1, -1)),
+        {("differential", 1), ("skid_steer", -1), ("omni", 1), ("mecanum", -1), ("independent", 1)},
+    ),
+)
 def test_turning_on_the_spot(name: str, side: int):
     seen = drive(name, (4.0, (0.0, 0.0, 0.5 * side)))
     ahead, aside, turned = seen.moved
@@ -99,8 +106,12 @@ def test_turning_on_the_spot(name: str, side: int):
     assert_odometry_agrees(seen)
 
 
-@pytest.mark.parametrize("name", ["omni", "mecanum", "independent"])
-@pytest.mark.parametrize("side", [1, -1])
+@pytest.mark.parametrize(
+    ("name", "side"),
+    mostly_long(
+        product(("omni", "mecanum", "independent"), (1, -1)), {("omni", 1), ("mecanum", 1), ("independent", -1)}
+    ),
+)
 def test_moving_sideways(name: str, side: int):
     seen = drive(name, (5.0, (0.0, 0.1 * side, 0.0)))
     ahead, aside, turned = seen.moved
@@ -111,7 +122,7 @@ def test_moving_sideways(name: str, side: int):
     assert_odometry_agrees(seen)
 
 
-@pytest.mark.parametrize("name", ["mecanum", "independent"])
+@pytest.mark.parametrize("name", mostly_long(["mecanum", "independent"], {"independent"}))
 def test_one_motion_after_the_other(name: str):
     seen = drive(name, (4.0, (0.12, 0.0, 0.0)), (4.0, (0.0, 0.0, 0.4)), (4.0, (0.0, -0.1, 0.0)), (1.0, (0.0, 0.0, 0.0)))
     assert not seen.truth[:, 5].any()

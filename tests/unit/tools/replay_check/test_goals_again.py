@@ -62,6 +62,7 @@ def test_a_flipped_byte_of_a_request_is_found(tmp_path):
     assert rows[topics.PATH].greatest[Kind.LENGTH].value == pytest.approx(0.1, abs=0.05)
 
 
+@pytest.mark.long
 def test_a_flipped_byte_of_a_scan_is_found_by_what_was_planned_on_its_map(tmp_path):
     def byte_of_a_range(payload):
         scan = wire.decode(topics.SCAN, payload)
@@ -97,6 +98,7 @@ def test_a_changed_route_is_found_and_driven_on(tmp_path):
     assert rows[topics.TRACKER].greatest[Kind.LENGTH].value == pytest.approx(1e-4, rel=0.2)
 
 
+@pytest.mark.long
 def test_routes_of_another_planner_are_held_against_those_that_were_driven(tmp_path):
     def two_axles(config):
         config["planner"]["route"] |= {"swing_cost": 2.0, "crab_cost": 20.0}
@@ -112,6 +114,7 @@ def test_routes_of_another_planner_are_held_against_those_that_were_driven(tmp_p
     assert goal is None or set(goal.fields) <= {"remaining", "outcome", "text"}, "of another route"
 
 
+@pytest.mark.long
 def test_another_deformation_shows_where_it_begins(tmp_path):
     def closer(config):
         config["planner"]["local"]["clearance"] = 0.02
@@ -134,6 +137,7 @@ def late(one):
     return replace(one, log_time=one.log_time + 300_000, stamp=later["stamp"], payload=payload)
 
 
+@pytest.mark.long
 def test_a_run_of_the_wall_clock_has_several_stamps_in_a_tick(tmp_path):
     messages = [late(one) for one in open_log(GOALS)]
     log = write(tmp_path / "wall.mcap", messages, attachments_of(GOALS), real_offset_ns="7")
@@ -196,6 +200,7 @@ def test_a_map_that_is_gone_leaves_the_planner_out(tmp_path):
     assert check.figures()["left_out"] == check.left_out
 
 
+@pytest.mark.long
 def test_a_log_without_reports_leaves_the_planner_out(tmp_path):
     check = computed_again(changed(GOALS, tmp_path / "log.mcap", lambda one: None if one.topic == "plan/goal" else one))
     assert check.left_out == "the log holds no report on goals"
