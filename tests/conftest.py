@@ -7,15 +7,8 @@ from functools import cache, lru_cache
 from pathlib import Path
 
 import pytest
-import typer.testing
 import uvloop
 
-from monstertruckd.config import load
-
-load._compose = lru_cache(maxsize=256)(load._compose)
-"""A configuration file that many tests load is parsed once: a tenth of a second each time."""
-typer.testing._get_command = cache(typer.testing._get_command)
-"""The tree of commands is built once, not for every invocation: 40 ms each time."""
 UNIT = Path(__file__).parent / "unit"
 TRACED = (("schemas",), ("gate",), ("runtime", "wire"))
 """Folders of unit tests."""
@@ -35,6 +28,7 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark the tests of the parts whose coverage is a gate: they run under the tracer, which would slow all others."""
+    _make_once()
     for item in items:
         if inspect.iscoroutinefunction(getattr(item, "obj", None)):
             item.fixturenames.insert(0, "no_leaked_tasks")  # type: ignore[attr-defined]  # others have no loop
@@ -42,6 +36,19 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         wire_format = below[:1] == ("drivers",) and any(word in item.nodeid for word in WIRE_FORMATS)
         if wire_format or any(below[: len(folder)] == folder for folder in TRACED):
             item.add_marker("traced")
+
+
+def _make_once() -> None:
+    """Parse a configuration file once (0.1 s), and build the tree of commands once (40 ms).
+
+    Imported here and not above, where the tracer of a worker would not yet see it.
+    """
+    import typer.testing
+
+    from monstertruckd.config import load
+
+    load._compose = lru_cache(maxsize=256)(load._compose)
+    typer.testing._get_command = cache(typer.testing._get_command)
 
 
 @cache
