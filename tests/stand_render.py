@@ -3,7 +3,7 @@
 Every pixel is a bundle of 2 x 2 rays, which stands for its area; then blur, light and noise.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -149,8 +149,3 @@ class StandRenderer:
             small = cv2.GaussianBlur(small, (0, 0), look.blur)
         noise = self._rng.standard_normal(small.shape, dtype=np.float32) * look.noise
         return np.asarray(np.clip(look.light * np.asarray(small) + noise, 0, 255), dtype=np.uint8)
-
-
-def tags_of(places: Mapping[int, tuple[float, float, float, float]], size: float) -> list[Placard]:
-    """Level tags at x, y, yaw and height."""
-    return [level_tag(tag, size, *place) for tag, place in places.items()]

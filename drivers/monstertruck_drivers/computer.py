@@ -2,14 +2,15 @@
 
 import asyncio
 import logging
+import os
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Protocol, Self
 
-from monstertruck_drivers.host_health.readings import Disk, disk_of
 from monstertruck_drivers.link import Port, SerialPort
 from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.errors import DeviceError
 from monstertruck_runtime.threads import Offload, in_thread
 
 
@@ -168,6 +169,31 @@ class Machine:
     run: Callable[[Sequence[str]], Awaitable[tuple[int, str]]] = run_command
     serial: Callable[[Path, int], Port] = SerialPort
     """A serial node and a baud rate to a port."""
+
+
+@dataclass(frozen=True, slots=True)
+class Disk:
+    """A file system."""
+
+    total: int
+    """Bytes."""
+    free: int
+    """Bytes that ordinary users may still take."""
+
+
+def disk_of(path: Path) -> Disk:
+    """The file system of ``path`` or of its nearest parent that exists.
+
+    Raises:
+        DeviceError: it cannot be asked.
+    """
+    while not path.exists() and path != path.parent:
+        path = path.parent
+    try:
+        found = os.statvfs(path)
+    except OSError as error:
+        raise DeviceError(f"{path}: {error.strerror}") from error
+    return Disk(found.f_frsize * found.f_blocks, found.f_frsize * found.f_bavail)
 
 
 ROOT = Path("/")

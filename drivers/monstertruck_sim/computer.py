@@ -6,9 +6,8 @@ from pathlib import Path
 
 from monstertruck_drivers.cable import DeviceEnd, EmulatedPort
 from monstertruck_drivers.catalog import UsbIdentity
-from monstertruck_drivers.computer import Computer
+from monstertruck_drivers.computer import Computer, Disk
 from monstertruck_drivers.config import Devices
-from monstertruck_drivers.host_health.readings import Disk
 from monstertruck_drivers.usb.config import UsbPortConfig
 from monstertruck_drivers.usb.emulated import EmulatedUsb
 from monstertruck_drivers.usb.tree import ancestors

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from monstertruck_drivers.computer import Disk
 from monstertruck_runtime.errors import DeviceError, ProtocolError
 from monstertruck_runtime.small_files import number_of, text_of
 
@@ -26,16 +27,6 @@ class Times:
 
     busy: int
     total: int
-
-
-@dataclass(frozen=True, slots=True)
-class Disk:
-    """A file system."""
-
-    total: int
-    """Bytes."""
-    free: int
-    """Bytes that ordinary users may still take."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,18 +171,3 @@ def _firmware_throttled(file: Path) -> bool:
         return bool(int(text_of(file) or "0", 16) & THROTTLED_NOW)
     except ValueError:
         return False
-
-
-def disk_of(path: Path) -> Disk:
-    """The file system of ``path`` or of its nearest parent that exists.
-
-    Raises:
-        DeviceError: it cannot be asked.
-    """
-    while not path.exists() and path != path.parent:
-        path = path.parent
-    try:
-        found = os.statvfs(path)
-    except OSError as error:
-        raise DeviceError(f"{path}: {error.strerror}") from error
-    return Disk(found.f_frsize * found.f_blocks, found.f_frsize * found.f_bavail)

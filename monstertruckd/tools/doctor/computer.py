@@ -6,8 +6,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
+from monstertruck_drivers.computer import disk_of
 from monstertruck_drivers.host_health.config import HostHealthConfig
-from monstertruck_drivers.host_health.readings import disk_of, read_host
+from monstertruck_drivers.host_health.readings import read_host
 from monstertruck_drivers.link_quality.config import LinkQualityConfig
 from monstertruck_drivers.link_quality.driver import LinkJudge
 from monstertruck_drivers.link_quality.interfaces import choose, read_interfaces

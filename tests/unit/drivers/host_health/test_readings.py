@@ -7,13 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from monstertruck_drivers.computer import ROOT, Computer
+from monstertruck_drivers.computer import ROOT, Computer, disk_of
 from monstertruck_drivers.host_health.emulator import HostEmulator
 from monstertruck_drivers.host_health.probe import probe
 from monstertruck_drivers.host_health.readings import (
     Times,
     busy_share,
-    disk_of,
     parse_meminfo,
     parse_stat,
     read_host,
