@@ -9,6 +9,8 @@ import importlib
 import itertools
 import weakref
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from types import TracebackType
 from typing import Any, Literal, Protocol, Self, TypeVar
 
@@ -188,6 +190,8 @@ class WorkerActor:
         self._answer_timeout = start_timeout if answer_timeout is None else answer_timeout
         self._virtual = isinstance(clock, VirtualClock)
         self._process: WorkerProcess | None = None
+        self._thread: ThreadPoolExecutor | None = None
+        """Waits for the process: for a minute, maybe, which must not take a place from other blocking work."""
         self._built = False
         """The process has reported that it can take steps."""
         self._lock = asyncio.Lock()
@@ -250,7 +254,7 @@ class WorkerActor:
                 process.receive(self._start_timeout)
             else:
                 async with self._clock.deadline(self._start_timeout):
-                    await asyncio.to_thread(process.receive)
+                    await self._wait(process.receive)
         except TimeoutError:
             msg = f"worker {self.name} did not start within {self._start_timeout} s"
             raise WorkerTimeoutError(msg) from None
@@ -259,7 +263,7 @@ class WorkerActor:
     async def _step_really(self, process: WorkerProcess, inputs: Any) -> Any:
         try:
             async with self._clock.deadline(self._deadline):
-                return await asyncio.to_thread(process.exchange, inputs)
+                return await self._wait(partial(process.exchange, inputs))
         except TimeoutError:
             raise self._late() from None
 
@@ -290,12 +294,18 @@ class WorkerActor:
 
     def _spawn(self) -> WorkerProcess:
         self._process, self._built = WorkerProcess(self.name, self._target, self._answer_timeout), False
+        self._thread = ThreadPoolExecutor(1, f"worker {self.name}")
         return self._process
 
     async def _discard(self) -> None:
         process, self._process = self._process, None
+        if self._thread is not None:
+            self._thread.shutdown(wait=False)  # it ends with the process
         if process is not None:
             await self._blocking(process.kill)
+
+    async def _wait(self, function: Callable[[], T]) -> T:
+        return await asyncio.get_running_loop().run_in_executor(self._thread, function)
 
     async def _blocking(self, function: Callable[[], T]) -> T:
         """On the virtual clock no virtual time passes meanwhile, on the wall clock the loop goes on."""

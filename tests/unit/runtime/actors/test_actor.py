@@ -6,15 +6,19 @@ import signal
 import subprocess
 import sys
 import textwrap
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from monstertruck_runtime.actors import actor
 from monstertruck_runtime.actors.actor import WorkerActor, delivery_of
 from monstertruck_runtime.clock import SECOND, VirtualClock, WallClock, run_virtual
 from monstertruck_runtime.errors import WorkerError, WorkerTimeoutError
 from monstertruck_runtime.slowness import SlowComputer
+from monstertruck_runtime.threads import in_thread
 
 ROOT = Path(__file__).parents[4]
 
@@ -328,3 +332,35 @@ def test_results_due_together_are_delivered_in_the_order_of_waiting_and_cancelle
         return delivered
 
     assert run_virtual(main) == [99, *(number for number in range(50) if number != 7), 100]
+
+
+async def test_a_busy_worker_takes_no_place_from_other_blocking_work(monkeypatch: pytest.MonkeyPatch):
+    """A computer of two cores has six such places: fewer than a full robot has workers."""
+    answer = threading.Event()
+
+    class Process:
+        pid = 1
+
+        def __init__(self, *_: object) -> None:
+            pass
+
+        def receive(self) -> None:
+            pass
+
+        def exchange(self, _: object) -> None:
+            answer.wait()
+
+        def kill(self) -> None:
+            answer.set()
+
+    monkeypatch.setattr(actor, "WorkerProcess", Process)
+    asyncio.get_running_loop().set_default_executor(ThreadPoolExecutor(1))
+    async with counter(WallClock()) as worker:
+        await worker.start()
+        step = asyncio.create_task(worker.step(None))
+        await asyncio.sleep(0.01)
+        other = asyncio.create_task(in_thread(lambda: "stored"))
+        done, _ = await asyncio.wait([other], timeout=2.0)
+        answer.set()
+        await asyncio.wait([other, step])
+        assert done == {other}
