@@ -78,12 +78,15 @@ def stop(port: str, node: int, baud: int) -> None:
         NotStoppedError: the controller did not accept a command.
         FrameError: an answer was damaged.
     """
-    line = os.open(port, os.O_RDWR | os.O_NOCTTY)
+    # An adapter that was plugged in anew waits for a carrier, which no controller gives, before it opens.
+    line = os.open(port, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
     try:
         tty.setraw(line)
         settings = termios.tcgetattr(line)
+        settings[2] |= termios.CLOCAL | termios.CREAD
         settings[4] = settings[5] = getattr(termios, f"B{baud}")
         termios.tcsetattr(line, termios.TCSANOW, settings)
+        os.set_blocking(line, True)
         termios.tcflush(line, termios.TCIOFLUSH)
         brake, switch_off = stop_frames(node)
         exchange(line, brake)

@@ -179,13 +179,9 @@ class SavedSettings:
         """
         if not self.path.exists():
             return {}
-        text = YamlText.read(self.path)
-        content = _with_comments(text.text) or {}
-        found = {}
-        for key, value in _leaves(content, ()):
-            node = text.node(*key)
-            found[".".join(key)] = value, 1 if node is None else node.start_mark.line + 1
-        return found
+        root, origins = YamlText.read(self.path).root, dict[Key, Origin]()
+        content = {} if root is None else _build(root, _Builder(self.path, origins), ())
+        return {".".join(key): (value, origins[key].line) for key, value in _leaves(content, ())}
 
     def put(self, values: Mapping[str, tuple[LiveValue, int]], config: TruckConfig, data: dict[str, Any]) -> None:
         """Put saved values into a configuration's plain data, which is not validated.
@@ -205,7 +201,7 @@ class SavedSettings:
         Raises:
             ConfigError: the file is damaged, or cannot be written; nothing has changed then.
         """
-        content = _with_comments(YamlText.read(self.path).text) if self.path.exists() else None
+        content = _with_comments(YamlText.read(self.path).text) if self.values() else None
         if content is None:
             content = CommentedMap()
             content.yaml_set_start_comment(HEAD)
@@ -214,6 +210,8 @@ class SavedSettings:
             section = content
             for part in way:
                 section = section.setdefault(part, CommentedMap())
+                if not isinstance(section, CommentedMap):
+                    raise ConfigError(f"{self.path}: {part}: expected a mapping of settings")
             section[last] = value
         out = io.StringIO()
         YAML(typ="rt", pure=True).dump(content, out)
@@ -231,7 +229,7 @@ def _with_comments(text: str) -> Any:
 def _leaves(value: Any, key: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], LiveValue]]:
     if isinstance(value, dict):
         for name, inner in value.items():
-            yield from _leaves(inner, (*key, str(name)))
+            yield from _leaves(inner, (*key, name))
     else:
         yield key, value
 
@@ -361,7 +359,7 @@ def _build(node: Node, builder: _Builder, key: Key) -> Any:
     if isinstance(node, ScalarNode):
         try:
             return builder.scalar(node)
-        except (YAMLError, ValueError) as error:
+        except (YAMLError, ValueError, KeyError) as error:
             raise ConfigError(f"{where}: cannot read the value: {error}") from error
     builder.around.append(node)
     built: Any

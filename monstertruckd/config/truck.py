@@ -271,7 +271,7 @@ class TruckConfig(Schema):
             wanted = ", ".join(f"{role} ({shaft})" for role, shaft in zip(SHAFTS, chassis.shafts, strict=False))
             raise ValueError(f"body {self.body.kind} is driven by {wanted}; got {', '.join(shafts)}")
         steering = self.devices.steering
-        if steering is not None and chassis.steered:
+        if steering is not None:
             self._check_servos(steering.driver, chassis)
         if self.tracker is not None:
             if lack := self.missing_actuators():
@@ -287,8 +287,9 @@ class TruckConfig(Schema):
     def _check_servos(self, driver: MaestroConfig, chassis: Chassis) -> None:
         wanted = len(chassis.straight)
         if len(driver.servos) != wanted:
+            has = f"has {wanted} servos" if chassis.steered else "steers nothing"
             raise ValueError(
-                f"body {self.body.kind} has {wanted} servos: expected front_right and rear_right of devices.steering"
+                f"body {self.body.kind} {has}: expected front_right and rear_right of devices.steering"
                 f" {'given' if wanted > len(driver.servos) else 'null'}"
             )
         if (

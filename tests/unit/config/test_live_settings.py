@@ -162,6 +162,10 @@ def test_what_the_next_start_would_refuse_is_not_saved(config: TruckConfig):
         ("gate:\n  rate: 10\n", r":2: gate\.rate: is no setting"),
         ("gate:\n  speed: 9.0\n", "at most"),
         ("gate: [\n", "not valid YAML"),
+        ("gate:\n  speed: 0.2\n  speed: 0.1\n", ":3: speed: given twice"),
+        ("gate:\n  speed: 2001-99-99\n", ":2: cannot read the value"),
+        ('gate:\n  speed: !!bool x\n', ":2: cannot read the value"),
+        ("gate: [1, 2]\n", ":1: gate: "),
     ],
 )
 def test_a_damaged_file_of_saved_settings_is_named(tmp_path: Path, text: str, said: str):
@@ -170,6 +174,15 @@ def test_a_damaged_file_of_saved_settings_is_named(tmp_path: Path, text: str, sa
     (tmp_path / "settings-truck.yaml").write_text(text)
     with pytest.raises(ConfigError, match=f"settings-truck.yaml.*{said}"):
         load_truck(file)
+
+
+@pytest.mark.parametrize("text", ["gate: [1, 2]\n", "gate: 0.2\n", "gate:\n  speed: 0.2\n  speed: 0.1\n"])
+def test_a_damaged_file_of_saved_settings_is_not_written_over(config: TruckConfig, text: str):
+    file = config.state_directory / f"settings-{config.robot}.yaml"
+    file.write_text(text)
+    with pytest.raises(ConfigError, match=r"settings-truck\.yaml"):
+        Robot(config).set({"gate.speed": 0.15}, save=True)
+    assert file.read_text() == text
 
 
 def test_only_an_engineer_sets_and_everybody_may_look(config: TruckConfig):

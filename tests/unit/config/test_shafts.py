@@ -55,6 +55,15 @@ def test_a_side_each_takes_two_motors():
             {"devices__drive_3": {"port": {"path": "/dev/x"}, "driver": {"kind": "epos"}}},
             "both publish sensor/drive_3; a topic has one writer",
         ),
+        (
+            {
+                "devices__steering": {
+                    "port": {"path": "/dev/x"},
+                    "driver": {"kind": "maestro", "front_right": {"channel": 2}, "rear_right": {"channel": 3}},
+                }
+            },
+            "body skid_steer steers nothing: expected front_right and rear_right of devices.steering null",
+        ),
     ],
 )
 def test_what_does_not_go_together_is_refused(changes: dict[str, Any], said: str):

@@ -290,3 +290,18 @@ def test_as_a_program_it_ends_with_the_code_and_needs_the_ports(monkeypatch):
     controller = Controller(0, 0)
     assert ended(monkeypatch, f"{controller.path}=3") == 0
     controller.close()
+
+
+def test_a_line_without_a_carrier_holds_up_nothing(neutral, monkeypatch):
+    """As an adapter is that was plugged in anew since the daemon opened it."""
+    controller = Controller(0, 0)
+    settings = termios.tcgetattr(controller.slave)
+    settings[2] &= ~termios.CLOCAL
+    termios.tcsetattr(controller.slave, termios.TCSANOW, settings)
+    flags = []
+    opened = os.open
+    monkeypatch.setattr(neutral.os, "open", lambda path, how: (flags.append(how), opened(path, how))[1])
+    assert neutral.main([f"{controller.path}=3@115200"]) == 0
+    assert flags[0] & os.O_NONBLOCK
+    assert termios.tcgetattr(controller.slave)[2] & termios.CLOCAL
+    controller.close()
