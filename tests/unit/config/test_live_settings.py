@@ -164,7 +164,7 @@ def test_what_the_next_start_would_refuse_is_not_saved(config: TruckConfig):
         ("gate: [\n", "not valid YAML"),
         ("gate:\n  speed: 0.2\n  speed: 0.1\n", ":3: speed: given twice"),
         ("gate:\n  speed: 2001-99-99\n", ":2: cannot read the value"),
-        ('gate:\n  speed: !!bool x\n', ":2: cannot read the value"),
+        ("gate:\n  speed: !!bool x\n", ":2: cannot read the value"),
         ("gate: [1, 2]\n", ":1: gate: "),
     ],
 )
