@@ -355,4 +355,6 @@ class _SerialProtocol(asyncio.Protocol):
         self.link.feed(data)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        self.link.lose(f"unplugged ({exc})" if exc else "unplugged")
+        # An error without a number is pyserial's own guess at why there is nothing to read: the cable is out.
+        number = exc.errno if isinstance(exc, OSError) else None
+        self.link.lose("unplugged" if number is None else f"unplugged ({os.strerror(number)})")

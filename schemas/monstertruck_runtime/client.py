@@ -68,6 +68,8 @@ M = TypeVar("M", bound=Message)
 
 _HOP_DEPTH = 1024
 
+LOOK: Final = 0.5
+"""Seconds in which the robots that are there answer."""
 ORDER_TIMEOUT: Final = 6.0
 """Seconds to wait for the outcome of an order: the robot itself gives up after 5 s."""
 
@@ -255,7 +257,7 @@ class TruckClient(Operator):
             return wire.decode(topic, _payload(reply))
         if await self.alive():
             return None
-        raise self._absent()
+        raise await self._absent()
 
     async def alive(self) -> bool:
         """Whether the robot's daemon serves at this moment."""
@@ -288,7 +290,7 @@ class TruckClient(Operator):
     async def _call(self, rpc: str, payload: dict[str, Any], timeout: float | None) -> bytes:
         replies = await self._get(rpc_key(self.robot, rpc, self.source), json.dumps(payload), timeout)
         if not replies:
-            raise self._absent()
+            raise await self._absent()
         return _payload(replies[0])
 
     # Requests
@@ -589,8 +591,14 @@ class TruckClient(Operator):
         await done
         return replies
 
-    def _absent(self) -> NotFoundError:
-        return NotFoundError(f"no robot {self.robot!r} at {self.endpoint}")
+    async def _absent(self) -> NotFoundError:
+        """That the robot is not there, and which ones are."""
+        replies = await self._collect(
+            lambda handler: self._open_session().liveliness().get(alive_key("*"), handler, timeout=LOOK)
+        )
+        names = sorted({str(reply.ok.key_expr).split("/")[1] for reply in replies if reply.ok is not None})
+        there = f"; there {'is' if len(names) == 1 else 'are'} {', '.join(names)} (--robot NAME)" if names else ""
+        return NotFoundError(f"no robot {self.robot!r} at {self.endpoint}{there}")
 
 
 def _deliver(topic: Topic[M], mailbox: Mailbox[M], data: bytes) -> None:

@@ -93,6 +93,12 @@ INSTEAD = {
     "monstertruckd goto 8.5 6 0 --arm": Instead(
         None, "needs a robot that plans; tests/daemon/test_goals_virtual.py has one"
     ),
+    "monstertruckd mission run configs/missions/rooms.yaml --arm": Instead(
+        None, "drives for minutes; tests/daemon/test_missions_virtual.py runs one"
+    ),
+    "monstertruckd behave start line_left --robot sonar --arm": Instead(
+        None, "needs the robot with sonars; tests/daemon/test_wall_following_virtual.py has it"
+    ),
     "monstertruckd station --users users.yaml --add-user ann --role pilot": Instead(None, "asks for a password"),
     "monstertruckd station --host 0.0.0.0 --certificate station.pem --key station.key --users users.yaml "
     "--name station.local": Instead(None, "serves until it is stopped; tests/unit/station/test_login.py logs in"),

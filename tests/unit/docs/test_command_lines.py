@@ -102,6 +102,14 @@ def test_what_sentences_name_is_there(page: str, text: str):
         _look_up(text)
 
 
+@pytest.mark.parametrize("file", sorted((ROOT / "configs").rglob("*.yaml")), ids=lambda file: file.name)
+def test_what_the_head_of_a_configuration_names_is_there(file: Path):
+    head = file.read_text(encoding="utf-8")
+    for text in re.findall(r"# .*?(?=monstertruckd [a-z])(.+)", head):
+        for call in re.findall(r"monstertruckd [a-z][^,`(;#]*", text):
+            _look_up(call.strip())
+
+
 def _look_up(text: str) -> None:
     words = text.split()[1:]
     if words[0] == "--install-completion":

@@ -254,7 +254,7 @@ async def test_serial_port_over_a_pty(tmp_path: Path):
         await port.open()
     pty.unplug()
     async with asyncio.timeout(1):
-        with pytest.raises(DeviceLostError):
+        with pytest.raises(DeviceLostError, match=r"dev: unplugged$"):
             await link.read()
     link.close()
     pty.plug()

@@ -256,6 +256,12 @@ async def test_nobody_at_the_endpoint():
             pass
 
 
+async def test_who_asks_for_another_robot_learns_which_one_is_there():
+    async with running_robot(robot="sonar") as robot, TruckClient("truck", robot.endpoint, timeout=0.5) as client:
+        with pytest.raises(NotFoundError, match=r"no robot 'truck' at tcp/\S+; there is sonar \(--robot NAME\)$"):
+            await client.call("config")
+
+
 async def test_the_loop_runs_while_the_client_dials():
     beats = 0
 
