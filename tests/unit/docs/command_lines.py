@@ -97,7 +97,7 @@ INSTEAD = {
         None, "drives for minutes; tests/daemon/test_missions_virtual.py runs one"
     ),
     "monstertruckd behave start line_left --robot sonar --arm": Instead(
-        None, "needs the robot with sonars; tests/daemon/test_wall_following_virtual.py has it"
+        None, "needs the robot with sonars; tests/daemon/test_sonar_robot_virtual.py has it"
     ),
     "monstertruckd station --users users.yaml --add-user ann --role pilot": Instead(None, "asks for a password"),
     "monstertruckd station --host 0.0.0.0 --certificate station.pem --key station.key --users users.yaml "
