@@ -158,6 +158,13 @@ IMU: Final = RoleSpec(
     frame=True,
     start=11,
 )
+ENCODERS: Final = RoleSpec(
+    name=DeviceRole.ENCODERS.value,
+    duty=Duty.SENSOR,
+    doc="Encoders of the two rear wheels of a tricycle",
+    writes={"out": topics.ENCODERS},
+    start=11,
+)
 BATTERY: Final = RoleSpec(
     name=DeviceRole.BATTERY.value,
     duty=Duty.MONITOR,
@@ -184,6 +191,7 @@ OUR_ROLES: Final = (
     CAMERA,
     SONAR,
     IMU,
+    ENCODERS,
     BATTERY,
     LINK,
     HOST,
@@ -377,6 +385,16 @@ DEVICES: Final = DeviceCatalog(
         probe="monstertruck_drivers.wt61.probe:probe",
         baud=WT61_BAUD,
         usb=UsbIdentity("1a86:7523", "USB2.0-Serial", "ttyUSB"),
+    ),
+    DeviceKind(
+        name="roboclaw",
+        doc="Encoders of two wheels on a Basicmicro RoboClaw",
+        roles=(ENCODERS,),
+        settings="monstertruck_drivers.roboclaw.config:RoboclawConfig",
+        implementation="monstertruck_drivers.roboclaw.driver:RoboclawDriver",
+        emulator="monstertruck_drivers.roboclaw.emulator:emulated",
+        probe="monstertruck_drivers.roboclaw.probe:probe",
+        usb=UsbIdentity("03eb:2404", "USB Roboclaw", "ttyACM"),
     ),
     DeviceKind(
         name="iio",

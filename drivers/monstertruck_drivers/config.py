@@ -168,6 +168,7 @@ if TYPE_CHECKING:
         camera: Device[Schema] | None = None
         sonar: Device[Srf08Config] | None = None
         imu: Device[Schema] | None = None
+        encoders: Device[Schema] | None = None
         wheels: Device[StepperConfig] | None = None
 
     class Monitors(_Monitors):

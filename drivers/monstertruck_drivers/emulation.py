@@ -199,6 +199,14 @@ class ImuSource(Protocol):
         ...
 
 
+class WheelSource(Protocol):
+    """What the encoders of the rear wheels count."""
+
+    def wheels(self, time_ns: int) -> tuple[float, float]:
+        """Angle of the left and of the right wheel, rad, forward positive; it grows from turn to turn."""
+        ...
+
+
 class SonarSource(Protocol):
     """What the robot's sonars hear, by their names."""
 
@@ -284,6 +292,11 @@ class Physics(Protocol):
     @property
     def imu(self) -> ImuSource:
         """Angular velocity and specific force."""
+        ...
+
+    @property
+    def wheels(self) -> WheelSource:
+        """Rear wheels that roll along."""
         ...
 
     def battery_volts(self, time_ns: int) -> float:

@@ -95,7 +95,10 @@ def build_estimation(config: TruckConfig, bus: Bus, clock: Clock, body: Body) ->
         return
     compass, imu = config.devices.compass is not None, config.devices.imu
     turned = None if imu is None else quaternion_from_rpy(imu.mount.roll, imu.mount.pitch, imu.mount.yaw)
-    context = OdometryContext(body.chassis, clock, bus, compass=compass, slam=config.slam is not None, imu=turned)
+    encoders = config.devices.encoders is not None
+    context = OdometryContext(
+        body.chassis, clock, bus, compass=compass, slam=config.slam is not None, imu=turned, encoders=encoders
+    )
     yield ODOMETRY.implementation(config.odometry)(config.odometry, context)
     ground = _build_ground(config, bus, clock)
     if ground is not None:

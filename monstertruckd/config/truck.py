@@ -15,8 +15,9 @@ from monstertruck_estimation.catalog import AnyOdometry
 from monstertruck_estimation.ground.config import GroundConfig
 from monstertruck_estimation.odometry import OdometryConfig
 from monstertruck_estimation.points.config import PointsConfig
+from monstertruck_estimation.rear_wheels import RearWheelConfig
 from monstertruck_estimation.slam.config import SlamConfig
-from monstertruck_kinematics.chassis import AXLES, WHEEL_REACH, Chassis, Dimensions
+from monstertruck_kinematics.chassis import AXLES, WHEEL_REACH, Chassis, Dimensions, TricycleChassis
 from monstertruck_kinematics.truck import DriveTrain
 from monstertruck_planners.behave.api import BehaviourConfig
 from monstertruck_planners.behave.catalog import AnyBehaviour, AnyLevelling
@@ -270,6 +271,10 @@ class TruckConfig(Schema):
         if shafts and set(shafts) != set(SHAFTS[: len(chassis.shafts)]):
             wanted = ", ".join(f"{role} ({shaft})" for role, shaft in zip(SHAFTS, chassis.shafts, strict=False))
             raise ValueError(f"body {self.body.kind} is driven by {wanted}; got {', '.join(shafts)}")
+        if self.devices.encoders is not None and not isinstance(chassis, TricycleChassis):
+            raise ValueError(f"devices.encoders: expected of body tricycle, body is {self.body.kind}")
+        if isinstance(self.odometry, RearWheelConfig) and self.devices.encoders is None:
+            raise ValueError("odometry.kind encoders needs the device encoders")
         steering = self.devices.steering
         if steering is not None:
             self._check_servos(steering.driver, chassis)

@@ -14,6 +14,12 @@ ODOMETRY: Final = Catalog(
         doc="Wheels along the steered arc, the heading held by the compass",
     ),
     Plugin(
+        name="encoders",
+        settings="monstertruck_estimation.rear_wheels:RearWheelConfig",
+        implementation="monstertruck_estimation.rear_wheels:build_rear_wheels",
+        doc="Encoders of a tricycle's rear wheels, judged by the driven wheel",
+    ),
+    Plugin(
         name="fusion",
         settings="monstertruck_estimation.fusion.config:FusionConfig",
         implementation="monstertruck_estimation.fusion.service:build_fusion",

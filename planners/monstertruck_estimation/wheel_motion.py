@@ -70,6 +70,11 @@ class WheelMotion:
         return self._turns is not None
 
     @property
+    def front(self) -> float:
+        """Newest angle of the front axle, rad."""
+        return self._angles[0]
+
+    @property
     def twist(self) -> Vector:
         """Velocity (vx, vy, wz) at the newest pace and the newest steering angles; m/s, rad/s."""
         return self._chassis.twist(self._pace, *self._angles)

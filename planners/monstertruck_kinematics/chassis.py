@@ -368,6 +368,31 @@ class FamilyChassis(Chassis):
 
 
 @dataclass(frozen=True)
+class TricycleChassis(FamilyChassis):
+    """One steered wheel in front, two that roll along on the rear axle, whose encoders measure the motion.
+
+    Args:
+        family: the drive.
+    """
+
+    family: Tricycle
+
+    def twist_of_rear(self, left: float, right: float) -> Twist[float]:
+        """Twist of the base from the speeds of the rear wheels, m/s."""
+        twist = self.family.odometry(left / self.family.radius, right / self.family.radius)
+        return twist_at(*twist, -self.origin, 0.0)
+
+    def rear_of_twist(self, twist: Twist[float]) -> tuple[float, float]:
+        """Speeds of the left and of the right rear wheel, m/s."""
+        half = twist[2] * self.family.track / 2.0
+        return twist[0] - half, twist[0] + half
+
+    def lean(self, front: float) -> float:
+        """Share by which the right rear wheel is faster than its axle, at an angle of the front wheel."""
+        return self.family.track / 2.0 * math.tan(front) / self.family.wheelbase
+
+
+@dataclass(frozen=True)
 class SynchroChassis(Chassis):
     """Synchro drive: one motor rolls all wheels, one servo turns them together.
 
@@ -607,8 +632,9 @@ def tricycle_chassis(size: Dimensions, driven: Literal["front", "rear"] = "front
         size: the robot's.
         driven: axle that the motor drives.
     """
-    return _steered_front(
-        size, size.ideal(DIRECT), Tricycle(size.wheelbase, driven, size.drivetrain.wheel_radius, track=size.track)
+    family = Tricycle(size.wheelbase, driven, size.drivetrain.wheel_radius, track=size.track)
+    return TricycleChassis(
+        size.centred, size.drivetrain, ("drive",), "front", size.ideal(DIRECT), family, origin=-size.centred.l_r
     )
 
 

@@ -118,13 +118,19 @@ class Reason(StrEnum):
     MATCH_DEGENERATE = "match_degenerate", 91, "the scans say nothing along one direction"
     TIME_OFFSET = "time_offset", 92, "odometry and scans are stamped by clocks that disagree"
     SCAN_LEFT_OUT = "scan_left_out", 93, "a scan cannot be used"
-    WHEEL_SLIP = "wheel_slip", 94, "the wheels do not hold the ground: scans or compass tell another motion"
+    WHEEL_SLIP = (
+        "wheel_slip",
+        94,
+        "the driven wheels do not hold the ground: other sensors tell another motion",
+    )
     HEADING_DISTURBED = "heading_disturbed", 95, "the compass is disturbed: its headings are left out"
     WITNESS_DISAGREES = "witness_disagrees", 98, "another scan odometry measures another motion than the map's"
     IMU_DISAGREES = "imu_disagrees", 99, "the IMU and the wheels tell another turn"
+    ENCODERS_DISAGREE = "encoders_disagree", 89, "an encoder of the rear wheels counts what the wheel cannot have done"
     OUTSIDE_MAP = "outside_map", 97, "what the scans see is nowhere on the saved map"
     WHEEL_GRIP = "wheel_grip", 0, "the wheels hold the ground again"
     IMU_AGREES = "imu_agrees", 0, "the yaw rate of the IMU counts again"
+    ENCODERS_AGREE = "encoders_agree", 0, "the encoders of the rear wheels count again"
     HEADING_RETURNED = "heading_returned", 0, "the headings of the compass count again"
     POSE_FOUND = "pose_found", 0, "the scans fit the map again"
     ODOMETRY_DROPPED = "odometry_dropped", 96, "scans contradict odometry, or it is missing: mapping uses scans alone"

@@ -22,6 +22,7 @@ class DeviceRole(StrEnum):
     CAMERA = "camera"
     SONAR = "sonar"
     IMU = "imu"
+    ENCODERS = "encoders"
     BATTERY = "battery"
     LINK = "link"
     HOST = "host"

@@ -200,6 +200,15 @@ class Imu(Message):
     """Of the unit, degree Celsius."""
 
 
+class WheelEncoders(Message):
+    """Two wheels that nothing drives, as their own encoders count them: the rear wheels of a tricycle."""
+
+    left: float
+    """Angle of the left wheel since the driver's first reading, rad, unwrapped, forward positive."""
+    right: float
+    """Of the right wheel."""
+
+
 class CompressedImage(Message):
     """One picture of the camera; ``stamp`` is when it was exposed, as far as the camera states it."""
 

@@ -50,6 +50,7 @@ from monstertruck_schemas.sensor import (
     StabiliserFeedback,
     StandPose,
     SteeringFeedback,
+    WheelEncoders,
 )
 from monstertruck_schemas.state import ClockOffset, GateState, Grid, Ground, Odometry, Peers, ScanMotion, Transforms
 from monstertruck_schemas.usb import UsbTree
@@ -156,6 +157,9 @@ SONAR: Final = Topic(
     "sensor/sonar", SonarRanges, W.DRIVER, "Nearest echo of each sonar of the robot", 10, stale_after=0.3
 )
 IMU: Final = Topic("sensor/imu", Imu, W.DRIVER, "Angular velocity and specific force", 50, stale_after=0.2)
+ENCODERS: Final = Topic(
+    "sensor/encoders", WheelEncoders, W.DRIVER, "Rear wheels of a tricycle, by their encoders", 25, stale_after=0.2
+)
 
 ODOMETRY: Final = Topic(
     "state/odometry",

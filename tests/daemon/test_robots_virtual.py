@@ -10,7 +10,8 @@ import pytest
 from monstertruck_runtime.bodies import BODIES
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.errors import ConfigError
-from monstertruck_runtime.mailbox import latest
+from monstertruck_runtime.mailbox import fifo, latest
+from monstertruck_runtime.ports import Subscription
 from monstertruck_schemas import topics
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.state import Odometry
@@ -65,6 +66,45 @@ def test_a_robot_drives_its_bend(name: str):
     assert [motor.reading(0).turns != 0 for motor in rig.world.motors] == [True] * shafts
 
 
+def test_a_tricycle_names_a_stuck_encoder_and_drives_on_without_it_and_without_both():
+    config, _ = load_config(FOLDER / "tricycle.yaml", SimulatedTruckConfig)
+    config = config.model_copy(update={"recorder": None})
+
+    async def main(clock: VirtualClock) -> None:
+        rig = VirtualRig(config, clock)
+        sources: list[tuple[str, ...]] = []
+
+        async def happen(odometry: Subscription[Odometry]) -> None:
+            for seconds, act in (
+                (4.0, lambda: None),
+                (0.1, lambda: rig.robot.emulators["encoders"].inject("stuck", "left", "on")),
+                (4.0, rig.ports["encoders"].unplug),
+                (1.0, lambda: None),
+            ):
+                await clock.sleep(seconds)
+                assert odometry.latest is not None
+                sources.append(odometry.latest.sources[:2])
+                act()
+
+        with (
+            rig.bus.subscribe(topics.EVENT, fifo(4096)) as events,
+            rig.bus.subscribe(topics.ODOMETRY, latest()) as odometry,
+        ):
+            async with rig.running(), asyncio.TaskGroup() as group:
+                group.create_task(happen(odometry))
+                lap = await drive_lap(LocalOperator(rig.daemon, clock), clock, limit=40)
+                told = {event.reason: event.text for event in events.drain()}
+            assert lap.outcome is Reason.GOAL_REACHED
+            assert lap.interruptions == ()
+            assert "left is stuck; right and steering carry on" in told[Reason.ENCODERS_DISAGREE]
+            assert Reason.DEVICE_LOST in told
+            assert sources == [("encoders", "drive")] * 3 + [("drive", "steering")]
+            assert odometry.latest is not None
+            assert math.dist((odometry.latest.pose.x, odometry.latest.pose.y), rig.truth.array()[-1, 1:3]) < 0.03
+
+    run_virtual(main, start=SECOND)
+
+
 # Configurations that do not fit the body
 
 
@@ -103,6 +143,14 @@ def test_a_robot_drives_its_bend(name: str):
         (
             "include: {0}/skid_steer.yaml\nversion: 1\nbody: {{icr_left: -0.3}}\n",
             "icr_left is -0.3: expected more than icr_right",
+        ),
+        (
+            "include: {0}/tricycle.yaml\nversion: 1\nbody: {{kind: bicycle}}\n",
+            "devices.encoders: expected of body tricycle, body is bicycle",
+        ),
+        (
+            "include: {0}/tricycle.yaml\nversion: 1\ndevices: {{encoders: null}}\n",
+            "odometry.kind encoders needs the device encoders",
         ),
         ("include: {0}/ackermann.yaml\nversion: 1\nbody: {{kind: hovercraft}}\n", "body: "),
         (

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from monstertruck_drivers.emulation import CompassReading, ImuReading, JointSource, MotorReading, PulseSource
 from monstertruck_kinematics.elementary import Array
+from monstertruck_runtime.clock import SECOND
 from monstertruck_sim.world.board import panel_ranges
 from monstertruck_sim.world.camera import FlatPanel, rotation
 from monstertruck_sim.world.config import (
@@ -17,6 +18,7 @@ from monstertruck_sim.world.config import (
     ImuModelConfig,
     LidarConfig,
     MotorConfig,
+    SimTruckConfig,
 )
 from monstertruck_sim.world.noise import (
     ANALOG,
@@ -29,7 +31,7 @@ from monstertruck_sim.world.noise import (
     WhiteNoise,
     generator,
 )
-from monstertruck_sim.world.plant import GRAVITY, Caster, Plant, Vector
+from monstertruck_sim.world.plant import GRAVITY, Caster, Plant, Pose, Vector
 from monstertruck_sim.world.terrain import Terrain
 
 STEPS = 769
@@ -40,6 +42,8 @@ _STEP_ANGLE = 2 * pi / 1024
 BEAM_ANGLES = (np.arange(STEPS) - 384) * _STEP_ANGLE
 _BEAM_DELAYS = (np.arange(STEPS) * (SWEEP_NS // 1024)).astype(np.int64)
 _LEVEL = 1e-4
+CARRIED = 5.0
+"""A robot that was faster than this between two looks was carried, m/s."""
 
 Beams = tuple[Array, Array, Array]
 """Directions: components x, y, z, each (n,)."""
@@ -371,6 +375,42 @@ class SimulatedImu:
             acceleration=(felt[3], felt[4], felt[5]),
             temperature_c=config.temperature_c,
         )
+
+
+class SimulatedRearWheels:
+    """``WheelSource``: the wheels on the rear axle roll as the ground passes, whatever the driven wheel does.
+
+    Args:
+        plant: what moves the robot.
+        config: track and radius.
+    """
+
+    def __init__(self, plant: Plant, config: SimTruckConfig) -> None:
+        self._plant = plant
+        self._half, self._radius = config.track / 2, config.wheel_radius
+        self._pose: Pose | None = None
+        self._at = 0
+        self._rolled = [0.0, 0.0]
+
+    def wheels(self, time_ns: int) -> tuple[float, float]:
+        """Angles at ``time_ns``, rad."""
+        self._plant.advance(time_ns)
+        x, y, yaw = self._plant.pose
+        if self._pose is not None:
+            self._roll(self._pose, (x, y, yaw), time_ns - self._at)
+        self._pose, self._at = (x, y, yaw), time_ns
+        return self._rolled[0] / self._radius, self._rolled[1] / self._radius
+
+    def _roll(self, before: Pose, now: Pose, dt: int) -> None:
+        """Along an arc; nothing where the robot was carried."""
+        way = hypot(now[0] - before[0], now[1] - before[1])
+        if way > CARRIED * dt / SECOND:
+            return
+        turn, middle = now[2] - before[2], (now[2] + before[2]) / 2
+        chord = (now[0] - before[0]) * cos(middle) + (now[1] - before[1]) * sin(middle)
+        forward = chord * (turn / 2 / sin(turn / 2) if turn else 1.0)
+        self._rolled[0] += forward - self._half * turn
+        self._rolled[1] += forward + self._half * turn
 
 
 def turned(beams: Beams, pitch: Array, roll: Array) -> Beams:

@@ -14,6 +14,7 @@ from monstertruck_drivers.emulation import (
     RangeSource,
     ServoPlant,
     SonarSource,
+    WheelSource,
 )
 from monstertruck_runtime.errors import InputError, NotInstalledError
 from monstertruck_runtime.map_files import load_map
@@ -30,6 +31,7 @@ from monstertruck_sim.world.sensors import (
     SimulatedImu,
     SimulatedLidar,
     SimulatedMotor,
+    SimulatedRearWheels,
     SimulatedServos,
 )
 from monstertruck_sim.world.sonar import SimulatedSonars
@@ -83,6 +85,7 @@ class World:
             self._plant, cast, config.sonar, noise_seed, config.lidar.wall_height, solids
         )
         self.imu: ImuSource = SimulatedImu(self._plant, config.imu, noise_seed)
+        self.wheels: WheelSource = SimulatedRearWheels(self._plant, config.truck)
 
     def battery_volts(self, time_ns: int) -> float:
         """Voltage behind the battery's divider."""

@@ -1,0 +1,1 @@
+"""Basicmicro RoboClaw, used as a counter of two quadrature encoders."""

@@ -1,0 +1,36 @@
+"""Settings of a RoboClaw that counts encoders."""
+
+import math
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from monstertruck_drivers.roboclaw.protocol import ADDRESSES
+from monstertruck_schemas.base import Schema
+
+
+class RoboclawConfig(Schema):
+    """RoboClaw with an encoder on either rear wheel; its outputs for motors stay empty."""
+
+    kind: Literal["roboclaw"] = "roboclaw"
+    address: Annotated[int, Field(ge=ADDRESSES[0], le=ADDRESSES[1])] = ADDRESSES[0]
+    """Of packet serial, 128 to 135"""
+    counts_per_turn: Annotated[int, Field(ge=8, le=1_000_000)] = 4096
+    """Edges of both channels in one turn of the WHEEL"""
+    left: Literal[1, 2] = 1
+    """Input of the left wheel; the right wheel has the other one"""
+    left_inverted: bool = False
+    """Driving forward counts down"""
+    right_inverted: bool = False
+    """Likewise"""
+    rate: Annotated[float, Field(ge=5, le=50)] = 25.0
+    """Readings a second"""
+    answer_timeout: Annotated[float, Field(gt=0, le=0.2)] = 0.03
+    """Seconds in which an answer must come"""
+    max_rate: Annotated[float, Field(gt=0, le=1000)] = 10.0
+    """Of a wheel, rad/s; counts that would need more mean that the unit counts anew"""
+
+    @property
+    def count(self) -> float:
+        """Angle of one count, rad."""
+        return math.tau / self.counts_per_turn

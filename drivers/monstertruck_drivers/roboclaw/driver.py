@@ -1,0 +1,112 @@
+"""Encoder service: counters of two wheels become ``sensor/encoders``."""
+
+from typing import Final
+
+from monstertruck_drivers.link import Port
+from monstertruck_drivers.roboclaw.config import RoboclawConfig
+from monstertruck_drivers.roboclaw.protocol import step
+from monstertruck_drivers.roboclaw.session import RoboclawSession
+from monstertruck_runtime.clock import QUESTIONS, SECOND, Clock, Schedule
+from monstertruck_runtime.errors import DeviceRestartedError, DeviceTimeoutError, ProtocolError
+from monstertruck_runtime.ports import EventSink, Publisher, Ready
+from monstertruck_schemas.event import Severity
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.sensor import WheelEncoders
+
+MISSES: Final = 3
+"""Readings in a row without a usable answer that end the session."""
+
+
+class RoboclawDriver:
+    """Asks for both counters; counts are added up over the unit's restarts, so that a position never jumps.
+
+    Args:
+        config: see ``RoboclawConfig``.
+        port: where it hangs.
+        clock: time.
+        out: angles of the wheels.
+        events: who answers, and its restarts.
+        name: of the service.
+    """
+
+    def __init__(
+        self,
+        config: RoboclawConfig,
+        port: Port,
+        clock: Clock,
+        out: Publisher[WheelEncoders],
+        events: EventSink,
+        name: str = "encoders",
+    ) -> None:
+        self.name = name
+        self._config = config
+        self._port = port
+        self._clock = clock
+        self._out = out
+        self._events = events
+        self._turned = [0, 0]
+        """Counts of inputs 1 and 2 since the driver was made."""
+
+    async def run(self, ready: Ready) -> None:
+        """Serve one session.
+
+        Raises:
+            DeviceLostError: unplugged.
+            DeviceRestartedError: the unit counts anew.
+            DeviceTimeoutError, ProtocolError: no usable answers.
+            WrongDeviceError: something else answers.
+            PortBusyError: another process holds the port.
+        """
+        config = self._config
+        async with await self._port.open() as link:
+            session = RoboclawSession(link, self._clock, config.address, config.answer_timeout)
+            self._events(Reason.DEVICE_READY, Severity.INFO, self.name, await session.identify())
+            schedule = Schedule(self._clock, config.rate, QUESTIONS)
+            last: tuple[tuple[int, int], int] | None = None
+            misses = 0
+            while True:
+                await schedule.next()
+                asked = self._clock.now()
+                try:
+                    counts = await session.counts()
+                except (DeviceTimeoutError, ProtocolError):
+                    misses += 1
+                    if misses >= MISSES:
+                        raise
+                    continue
+                misses = 0
+                stamp = (asked + self._clock.now()) // 2
+                if last is None:
+                    ready()
+                else:
+                    self._count(last[0], counts, (stamp - last[1]) / SECOND)
+                last = counts, stamp
+                self._publish(stamp)
+
+    def _count(self, before: tuple[int, int], now: tuple[int, int], dt: float) -> None:
+        """Add up what was counted in ``dt`` seconds.
+
+        Raises:
+            DeviceRestartedError: more than wheels turn in that time.
+        """
+        steps = [step(old, new) for old, new in zip(before, now, strict=True)]
+        if max(map(abs, steps)) * self._config.count > self._config.max_rate * dt:
+            text = f"{self._port.name}: counters jumped by {steps[0]} and {steps[1]}: the unit counts anew"
+            self._events(Reason.DEVICE_RESTARTED, Severity.WARNING, self.name, text)
+            raise DeviceRestartedError(text)
+        self._turned = [turned + by for turned, by in zip(self._turned, steps, strict=True)]
+
+    def _publish(self, stamp: int) -> None:
+        config = self._config
+        first, second = self._turned
+        left, right = (first, second) if config.left == 1 else (second, first)
+        self._out.put(
+            WheelEncoders(
+                stamp=stamp,
+                received=self._clock.now(),
+                seq=self._out.next_seq(),
+                frame=self.name,
+                left=(-left if config.left_inverted else left) * config.count,
+                right=(-right if config.right_inverted else right) * config.count,
+            )
+        )

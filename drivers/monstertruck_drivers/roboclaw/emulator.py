@@ -1,0 +1,140 @@
+"""The device side of a RoboClaw with two encoders, byte for byte.
+
+Habits of the real thing: it is silent unless asked, and to a request with another address; drops half a request after
+10 ms; counts from 0 after every power-up; an encoder that is not wired counts nothing, without a word.
+"""
+
+from math import floor, tau
+from typing import Final
+
+from monstertruck_drivers.cable import DeviceEnd
+from monstertruck_drivers.emulation import EmulatorSetup, ReceivedBytes, WheelSource
+from monstertruck_drivers.roboclaw.config import RoboclawConfig
+from monstertruck_drivers.roboclaw.protocol import PACKET_GAP, Command, counted, signed
+from monstertruck_runtime.clock import MILLISECOND, SECOND, Clock
+from monstertruck_runtime.errors import InputError
+
+VERSION: Final = b"USB RoboClaw 2x7a v4.3.6\n\x00"
+THINKING: Final = MILLISECOND
+"""Ns from a request to its answer."""
+
+
+class StandingWheels:
+    """Wheels that never turn."""
+
+    def wheels(self, time_ns: int) -> tuple[float, float]:
+        """Always 0."""
+        return 0.0, 0.0
+
+
+class RoboclawEmulator:
+    """A unit with its encoders wired as the settings say.
+
+    Faults (``inject``): ``stuck left|right on|off`` (an encoder's disc slips on its shaft), ``mirrored left|right
+    on|off`` (its channels are exchanged: it counts the other way), ``silent on|off`` (hears, says nothing), ``noise
+    COUNT`` (so many answers have a wrong byte), ``reset`` (the supply drops: counters at 0).
+
+    Args:
+        clock: time.
+        source: what the wheels do.
+        settings: address, counts per turn, which input is whose.
+    """
+
+    def __init__(self, clock: Clock, source: WheelSource | None = None, settings: RoboclawConfig | None = None) -> None:
+        self.name = "roboclaw"
+        self.received = ReceivedBytes()
+        """Newest bytes from the host."""
+        self._clock = clock
+        self._source = source or StandingWheels()
+        self._settings = settings or RoboclawConfig()
+        self._stuck = {"left": False, "right": False}
+        self._mirrored = {"left": False, "right": False}
+        self._silent = False
+        self._noise = 0
+        self._angles: tuple[float, float] | None = None
+        """Of the wheels when they were last looked at, rad."""
+        self._counted = [0.0, 0.0]
+        """Left and right, since power-up."""
+
+    def power_cycle(self) -> None:
+        """Supply off and on: counters at 0."""
+        self._look()
+        self._counted = [0.0, 0.0]
+
+    def inject(self, fault: str, *values: str) -> None:
+        """Start or end a fault, see the class.
+
+        Raises:
+            InputError: unknown fault or bad value.
+        """
+        self._look()
+        match fault, values:
+            case "stuck", (("left" | "right") as side, ("on" | "off") as word):
+                self._stuck[side] = word == "on"
+            case "mirrored", (("left" | "right") as side, ("on" | "off") as word):
+                self._mirrored[side] = word == "on"
+            case "silent", (("on" | "off") as word,):
+                self._silent = word == "on"
+            case "noise", (count,) if count.isdigit():
+                self._noise = int(count)
+            case "reset", ():
+                self.power_cycle()
+            case _:
+                raise InputError(
+                    f"{self.name}: fault {' '.join((fault, *values))!r} not understood; known: stuck left|right on|off,"
+                    " mirrored left|right on|off, silent on|off, noise COUNT, reset"
+                )
+
+    async def run(self, end: DeviceEnd) -> None:
+        """Answer for ever."""
+        end.on_plug = self._plugged
+        buffer, last = b"", 0
+        while True:
+            data = await end.read()
+            now = self._clock.now()
+            self.received.extend(data)
+            buffer = data if now - last > PACKET_GAP * SECOND else buffer + data
+            last = now
+            while len(buffer) >= 2:
+                asked, buffer = buffer[:2], buffer[2:]
+                await self._clock.sleep_until(self._clock.now() + THINKING)
+                self._answer(end, asked)
+
+    def _plugged(self, plugged: bool) -> None:
+        """The port is its supply."""
+        if plugged:
+            self.power_cycle()
+
+    def _answer(self, end: DeviceEnd, asked: bytes) -> None:
+        address, command = asked
+        if address != self._settings.address or self._silent:
+            return
+        if command == Command.VERSION:
+            data = VERSION
+        elif command == Command.COUNTS:
+            self._look()
+            left, right = map(floor, self._counted)
+            data = counted(left, right) if self._settings.left == 1 else counted(right, left)
+        else:
+            return
+        answer = signed(asked, data)
+        if self._noise > 0:
+            self._noise -= 1
+            answer = answer[:3] + bytes((answer[3] ^ 0x10,)) + answer[4:]
+        end.write(answer)
+
+    def _look(self) -> None:
+        """Count what the wheels turned since the last look."""
+        now = self._source.wheels(self._clock.now())
+        before, self._angles = self._angles or now, now
+        settings = self._settings
+        inverted = settings.left_inverted, settings.right_inverted
+        for i, side in enumerate(("left", "right")):
+            if not self._stuck[side]:
+                turned = (now[i] - before[i]) / tau * settings.counts_per_turn
+                self._counted[i] += -turned if self._mirrored[side] != inverted[i] else turned
+
+
+def emulated(setup: EmulatorSetup) -> RoboclawEmulator:
+    """The encoders of a simulated robot's rear wheels."""
+    return RoboclawEmulator(setup.clock, setup.physics.wheels, setup.settings)

@@ -1,0 +1,63 @@
+"""Packet serial of the RoboClaw (Basicmicro, "RoboClaw Series User Manual", chapters "Packet Serial", "Encoders").
+
+A request is the unit's address, a command and its arguments. An answer is the data and a CRC of two bytes, high byte
+first, over the request's address and command and the data: CRC-16 with polynomial 0x1021 that begins at 0. A request
+that is cut for more than 10 ms is dropped.
+"""
+
+import binascii
+import struct
+from enum import IntEnum
+from typing import Final
+
+NAME: Final = b"roboclaw"
+"""In what the unit says of itself, in capitals or not."""
+ADDRESSES: Final = (0x80, 0x87)
+"""Lowest and highest."""
+LONGEST_NAME: Final = 48
+PACKET_GAP: Final = 0.01
+"""Seconds without a byte after which the unit drops what it has of a request."""
+COUNTER: Final = 1 << 32
+_COUNTS: Final = struct.Struct(">II")
+_CRC: Final = struct.Struct(">H")
+COUNTS_SIZE: Final = _COUNTS.size + _CRC.size
+
+
+class Command(IntEnum):
+    """Requests that are used: they move and change nothing."""
+
+    VERSION = 21
+    """Answer: a text that ends with a line feed and 0."""
+    COUNTS = 78
+    """Answer: both counters, 32 bits each."""
+
+
+def request(address: int, command: Command) -> bytes:
+    """Bytes of a request without arguments."""
+    return bytes((address, command))
+
+
+def signed(asked: bytes, data: bytes) -> bytes:
+    """An answer to a request: the data and their CRC."""
+    return data + _CRC.pack(binascii.crc_hqx(asked + data, 0))
+
+
+def is_intact(asked: bytes, answer: bytes) -> bool:
+    """Whether the CRC at the end of an answer to ``asked`` is right."""
+    return len(answer) > _CRC.size and signed(asked, answer[: -_CRC.size]) == answer
+
+
+def counts(answer: bytes) -> tuple[int, int]:
+    """Counters 1 and 2, without a sign, of an intact answer to ``COUNTS``."""
+    first, second = _COUNTS.unpack(answer[: _COUNTS.size])
+    return first, second
+
+
+def counted(first: int, second: int) -> bytes:
+    """Data of an answer to ``COUNTS``."""
+    return _COUNTS.pack(first % COUNTER, second % COUNTER)
+
+
+def step(before: int, now: int) -> int:
+    """Counts between two readings of a counter that wraps, in [-2^31, 2^31)."""
+    return (now - before + COUNTER // 2) % COUNTER - COUNTER // 2

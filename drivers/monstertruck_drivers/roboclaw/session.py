@@ -1,0 +1,88 @@
+"""Requests and answers of one RoboClaw; shared by driver and probe."""
+
+from typing import Final
+
+from monstertruck_drivers.link import Link
+from monstertruck_drivers.roboclaw.protocol import (
+    COUNTS_SIZE,
+    LONGEST_NAME,
+    NAME,
+    PACKET_GAP,
+    Command,
+    counts,
+    is_intact,
+    request,
+)
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError, WrongDeviceError
+
+ATTEMPTS: Final = 3
+
+
+class RoboclawSession:
+    """One session.
+
+    Args:
+        link: open link.
+        clock: time.
+        address: of the unit.
+        timeout: seconds in which an answer comes.
+    """
+
+    def __init__(self, link: Link, clock: Clock, address: int, timeout: float) -> None:
+        self._link = link
+        self._clock = clock
+        self._address = address
+        self._timeout = timeout
+
+    async def identify(self) -> str:
+        """What the unit calls itself.
+
+        Raises:
+            DeviceLostError: unplugged.
+            DeviceTimeoutError: silence.
+            WrongDeviceError: something else answers.
+        """
+        heard = b""
+        for _ in range(ATTEMPTS):
+            answer = await self._text()
+            heard = answer or heard
+            asked = request(self._address, Command.VERSION)
+            if is_intact(asked, answer) and NAME in answer.lower():
+                return answer.partition(b"\n")[0].decode("ascii", "replace")
+            # A host that died may have left half a request, which is dropped after a pause.
+            await self._clock.sleep(2 * PACKET_GAP)
+        if not heard:
+            raise DeviceTimeoutError(f"{self._link.name}: silence; expected a RoboClaw at address {self._address}")
+        raise WrongDeviceError(f"{self._link.name}: {heard.hex(' ')} is not the answer of a RoboClaw")
+
+    async def counts(self) -> tuple[int, int]:
+        """Both counters.
+
+        Raises:
+            DeviceLostError: unplugged.
+            DeviceTimeoutError: no answer in time.
+            ProtocolError: a damaged one.
+        """
+        asked = request(self._address, Command.COUNTS)
+        self._link.discard()
+        self._link.write(asked)
+        try:
+            answer = await self._link.exactly(COUNTS_SIZE, self._timeout)
+        except TimeoutError:
+            raise DeviceTimeoutError(f"{self._link.name}: the RoboClaw does not answer") from None
+        if not is_intact(asked, answer):
+            raise ProtocolError(f"{self._link.name}: answer {answer.hex(' ')} has a wrong CRC")
+        return counts(answer)
+
+    async def _text(self) -> bytes:
+        """What comes after a question for the version."""
+        self._link.discard()
+        self._link.write(request(self._address, Command.VERSION))
+        answer, until = b"", self._clock.now() + round(self._timeout * SECOND)
+        while len(answer) <= LONGEST_NAME and not is_intact(request(self._address, Command.VERSION), answer):
+            try:
+                answer += await self._link.read(max(until - self._clock.now(), 0) / SECOND)
+            except TimeoutError:
+                break
+        return answer

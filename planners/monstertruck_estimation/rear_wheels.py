@@ -1,0 +1,449 @@
+"""Odometry of a tricycle by the encoders of its rear wheels, judged by its driven wheel.
+
+The rear wheels are not driven, so they do not slip, and tell speed and turn without the steering angle. The front wheel
+tells the same by its rate and angle: thdot = (v_s/d) sin(alpha). Over a stretch both have to agree. An encoder that is
+stuck, mirrored or loose is left out, what it measured since the first sign of it is taken back, and the other wheel
+goes on with the turn of the steering; without both, or while nothing is heard of them, the front wheel goes on alone.
+"""
+
+import math
+from collections import deque
+from dataclasses import dataclass, replace
+from typing import Annotated, Final, Literal, NamedTuple
+
+from pydantic import Field
+
+from monstertruck_estimation.inertial import Inertial
+from monstertruck_estimation.odometry import (
+    DeadReckoning,
+    OdometryConfig,
+    OdometryContext,
+    OdometryService,
+    PlanarCovariance,
+    Vector,
+)
+from monstertruck_estimation.wheel_motion import WheelIncrement
+from monstertruck_kinematics.chassis import TricycleChassis
+from monstertruck_runtime.clock import SECOND
+from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.mailbox import Mailbox, fifo
+from monstertruck_runtime.ports import EventSink
+from monstertruck_schemas import topics
+from monstertruck_schemas.base import Schema
+from monstertruck_schemas.event import Severity
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.sensor import DriveFeedback, WheelEncoders
+
+Positive = Annotated[float, Field(gt=0)]
+Pair = tuple[float, float]
+"""Of the left and of the right wheel."""
+
+SIDES: Final = ("left", "right")
+WAITING: Final = 32
+"""Readings that may wait."""
+LATE: Final = SECOND // 5
+"""Readings this far apart have something missing between them, ns."""
+KEPT: Final = 256
+"""Readings, and poses, that are kept."""
+STANDS: Final = 0.2
+"""Share of the expected way below which a wheel stands."""
+RUNS: Final = 1.5
+"""Share of the driven wheel's way beyond which both rear wheels cannot have rolled."""
+NARROW: Final = 0.3
+"""Share of the axle's speed below which a wheel says nothing about it: the robot turns about it."""
+
+
+class EncoderConfig(Schema):
+    """When encoders are believed."""
+
+    stretch: Positive = 0.1
+    """Newest way over which rear wheels and driven wheel are compared, m,"""
+    proof: Positive = 0.3
+    """and the way after a difference over which it has to last; until then the driven wheel carries the pose"""
+    tolerance: Positive = 0.02
+    """Tolerated difference, m,"""
+    share: Annotated[float, Field(ge=0, lt=1)] = 0.12
+    """and as a share of the greater way: the driven wheel slips a little, the steering lags"""
+
+
+class RearWheelConfig(OdometryConfig):
+    """Encoders of the rear wheels; start, trust and compass as of dead reckoning."""
+
+    kind: Literal["encoders"] = "encoders"  # type: ignore[assignment]  # each kind has its own word
+    encoders: EncoderConfig = EncoderConfig()
+    """How they are judged"""
+
+
+class Verdict(NamedTuple):
+    """What a window says of the encoders."""
+
+    trusted: tuple[bool, bool] = (True, True)
+    slips: bool = False
+    """The driven wheel does, not they."""
+    text: str = ""
+
+    @property
+    def kind(self) -> tuple[tuple[bool, bool], bool, bool]:
+        """Verdicts of one kind differ in figures only."""
+        return self.trusted, self.slips, bool(self.text)
+
+
+def judged(expected: Pair, counted: Pair, turned: float, least: float, config: EncoderConfig) -> Verdict | None:
+    """Which of two encoders can be right; None = too little of a way.
+
+    Two that agree with each other and with the steering are right, and the driven wheel slips; two that roll as far as
+    it on average are right too, and the steering is not where it is said to be.
+
+    Args:
+        expected: ways of the wheels by rate and angle of the front wheel, m.
+        counted: ways by the encoders, m.
+        turned: how much further the right wheel rolls than the left one, by the counted mean and the steering alone, m.
+        least: way of some wheel for a verdict, m.
+        config: limits.
+    """
+    if max(map(abs, (*expected, *counted))) < least:
+        return None
+
+    def agree(one: float, other: float) -> bool:
+        return abs(one - other) <= config.tolerance + config.share * max(abs(one), abs(other))
+
+    right_ones = agree(counted[0], expected[0]), agree(counted[1], expected[1])
+    if all(right_ones):
+        return Verdict()
+    if not any(right_ones) and agree(counted[0], expected[1]) and agree(counted[1], expected[0]):
+        return Verdict((False, False), text="left and right are exchanged")
+    rolled, driven = sum(counted) / 2, sum(expected) / 2
+    if agree(rolled, driven) and not any(right_ones):
+        text = f"the robot turns otherwise than it is steered: right less left {counted[1] - counted[0]:+.2f} m"
+        return Verdict(text=f"{text}, by the steering {expected[1] - expected[0]:+.2f} m")
+    if abs(counted[1] - counted[0] - turned) <= config.tolerance + config.share * abs(rolled):
+        share = rolled / driven if abs(driven) > config.tolerance else math.inf
+        if STANDS < share <= RUNS or share == math.inf:
+            text = f"the rear wheels roll {rolled:.2f} m, the driven wheel {driven:.2f} m"
+            return Verdict(slips=True, text=text)
+    faults = [
+        f"{side} {_fault(want, have, agrees=agree(have, -want))}"
+        for side, want, have, right in zip(SIDES, expected, counted, right_ones, strict=True)
+        if not right
+    ]
+    return Verdict(right_ones, text=", ".join(faults))
+
+
+def _fault(want: float, have: float, *, agrees: bool) -> str:
+    if abs(have) <= STANDS * abs(want):
+        return "is stuck"
+    return "counts the wrong way" if agrees else f"rolls {have:.2f} m where the driven wheel says {want:.2f} m"
+
+
+@dataclass(frozen=True, slots=True)
+class EncoderWay:
+    """Ways of both wheels between two readings, m."""
+
+    since: int
+    """ns."""
+    stamp: int
+    ways: Pair
+    front: float
+    """Mean steering angle, rad."""
+
+
+class Compared(NamedTuple):
+    """What both say of one reading of the motor."""
+
+    since: int
+    """ns."""
+    way: float
+    """Of the wheel that rolled furthest, m, positive."""
+    expected: Pair
+    """By the driven wheel, m."""
+    counted: Pair
+    """m."""
+    turned: float
+    """See ``judged``."""
+
+
+class Encoders:
+    """Newest readings of both encoders, and what they are worth.
+
+    Args:
+        config: limits.
+        chassis: the body.
+    """
+
+    def __init__(self, config: EncoderConfig, chassis: TricycleChassis) -> None:
+        self.config = config
+        self.verdict = Verdict()
+        self._chassis = chassis
+        self._rolled: deque[tuple[int, Pair]] = deque(maxlen=KEPT)
+        """(ns, positions in m)."""
+        self._compared: deque[Compared] = deque()
+        self._since: int | None = None
+        """When the stretch of the first difference began, ns; None = there is none."""
+        self._doubted = False
+        """The first difference speaks against an encoder."""
+
+    @property
+    def believed(self) -> tuple[bool, bool]:
+        """Which of them may carry the pose."""
+        return (False, False) if self._doubted else self.verdict.trusted
+
+    @property
+    def stamp(self) -> int | None:
+        """Of the newest reading, ns."""
+        return self._rolled[-1][0] if self._rolled else None
+
+    def observe(self, reading: WheelEncoders, front: float) -> EncoderWay | None:
+        """What was rolled since the last reading; None = not known, or the reading is not later."""
+        radius = self._chassis.drivetrain.wheel_radius
+        now = (reading.left * radius, reading.right * radius)
+        before = self._rolled[-1] if self._rolled else None
+        if not all(map(math.isfinite, now)) or (before is not None and reading.stamp <= before[0]):
+            return None
+        if before is not None and reading.stamp - before[0] > LATE:
+            self._rolled.clear()
+            self._compared.clear()
+            before = None
+        self._rolled.append((reading.stamp, now))
+        if before is None:
+            return None
+        ways = now[0] - before[1][0], now[1] - before[1][1]
+        return EncoderWay(before[0], reading.stamp, ways, front)
+
+    def compare(self, roll: WheelIncrement) -> int | None:
+        """Judge by what the driven wheel did.
+
+        Returns:
+            Since when an encoder is not believed that was until now, ns; None = there is none.
+        """
+        start, end = self._at(roll.since), self._at(roll.stamp)
+        if roll.lost or start is None or end is None:
+            self._compared.clear()
+            self._since, self._doubted = None, False
+            return None
+        left, right = self._chassis.rear_of_twist(roll.twist)
+        expected, counted = (left * roll.dt, right * roll.dt), (end[0] - start[0], end[1] - start[1])
+        way = max(map(abs, (*expected, *counted)))
+        if way == 0.0:
+            return None
+        turned = sum(counted) * self._chassis.lean(roll.angles[0])
+        self._compared.append(Compared(roll.since, way, expected, counted, turned))
+        return self._judge()
+
+    def _judge(self) -> int | None:
+        """Of the newest stretch; a verdict that is another one has to be confirmed by a longer one after it."""
+        ways, doubted, since = self._compared, self._doubted, self._since
+        stretch = self.config.stretch if since is None else self.config.proof
+        total = math.fsum(one.way for one in ways)
+        while total - ways[0].way >= stretch:
+            total -= ways.popleft().way
+        if since is not None and total < stretch:
+            return None
+        verdict = judged(
+            (math.fsum(one.expected[0] for one in ways), math.fsum(one.expected[1] for one in ways)),
+            (math.fsum(one.counted[0] for one in ways), math.fsum(one.counted[1] for one in ways)),
+            math.fsum(one.turned for one in ways),
+            stretch / 2,
+            self.config,
+        )
+        if verdict is None:
+            return None
+        wrong = not all(verdict.trusted)
+        if verdict.kind == self.verdict.kind:
+            self._since, self._doubted = None, False
+            return None
+        if since is None:
+            self._since, self._doubted = ways[0].since, wrong
+        else:
+            self._since, self._doubted, self.verdict = None, False, verdict
+        begun = ways[0].since if since is None else since
+        ways.clear()
+        return begun if wrong and not doubted else None
+
+    def _at(self, stamp: int) -> Pair | None:
+        """Positions at an instant, m; None where they are not known."""
+        readings = self._rolled
+        if len(readings) < 2 or stamp < readings[0][0] or stamp - readings[-1][0] > LATE:
+            return None
+        i = next(i for i in range(len(readings) - 1, 0, -1) if readings[i - 1][0] <= stamp)
+        (since, before), (until, after) = readings[i - 1], readings[i]
+        share = (stamp - since) / (until - since)
+        return before[0] + share * (after[0] - before[0]), before[1] + share * (after[1] - before[1])
+
+
+class RearWheelReckoning(DeadReckoning):
+    """Dead reckoning whose pose the rear wheels carry while they are believed, else the driven wheel.
+
+    Args:
+        config: start, noise, judgement.
+        chassis: the body.
+        inertial: an inertial measurement unit whose yaw rate replaces that of the wheels.
+    """
+
+    def __init__(self, config: RearWheelConfig, chassis: TricycleChassis, inertial: Inertial | None = None) -> None:
+        super().__init__(config, chassis, inertial)
+        self.encoders = Encoders(config.encoders, chassis)
+        self._tricycle = chassis
+        self._front = 0.0
+        self._ways: deque[EncoderWay] = deque(maxlen=KEPT)
+        self._rolls: deque[WheelIncrement] = deque(maxlen=KEPT)
+        self._kept: deque[tuple[int, Vector, PlanarCovariance]] = deque(maxlen=KEPT)
+        """(ns, pose, covariance) before each motion."""
+        self._at: int | None = None
+        """Instant of the pose, ns."""
+        self._carrying: WheelIncrement | None = None
+        """Newest motion by the encoders, if they carry the pose."""
+
+    def observe_encoders(self, reading: WheelEncoders) -> None:
+        """Take the angles of both rear wheels and move the pose along the arc they rolled."""
+        front = self._wheels.front
+        way = self.encoders.observe(reading, (self._front + front) / 2)
+        self._front = front
+        if way is not None:
+            self._ways.append(way)
+        self._go_on()
+
+    def observe_drive(self, *shafts: DriveFeedback) -> None:
+        """Take the position of the motor: it judges the encoders, and stands in for them."""
+        roll = self._wheels.observe_drive(*shafts)
+        if self._at is None and self._wheels.known:
+            self._at = self._wheels.stamp
+        if roll is None:
+            return
+        self._rolls.append(roll)
+        since = self.encoders.compare(roll)
+        if since is not None:
+            self._take_back(since)
+        self._go_on()
+
+    @property
+    def _reached(self) -> int:
+        return self._at or 0
+
+    @property
+    def _twist(self) -> Vector:
+        return self._wheels.twist if self._carrying is None else self._carrying.twist
+
+    @property
+    def _carriers(self) -> tuple[str, ...]:
+        return ("drive",) if self._carrying is None else ("encoders", "drive")
+
+    def _go_on(self) -> None:
+        """Move the pose as far as is known."""
+        while self._at is not None and (found := self._next(self._at)) is not None:
+            roll, by_encoders = found
+            self._kept.append((self._at, self._pose, self._covariance))
+            self._move(roll)
+            self._at = roll.stamp
+            self._carrying = roll if by_encoders else None
+
+    def _next(self, at: int) -> tuple[WheelIncrement, bool] | None:
+        """The next motion from ``at`` on, and whether it is the encoders'; None = nothing more is known."""
+        until: int | None = None
+        if self._heard() and any(self.encoders.believed):
+            way = next((way for way in self._ways if way.stamp > at), None)
+            if way is None:
+                return None
+            if way.since <= at:
+                roll = self._by_encoders(way)
+                if roll is not None:
+                    return _part(roll, at, way.stamp), True
+            until = way.stamp if way.since <= at else way.since
+        driven = next((roll for roll in self._rolls if roll.stamp > at), None)
+        if driven is None:
+            return None
+        return _part(driven, at, driven.stamp if until is None else min(until, driven.stamp)), False
+
+    def _heard(self) -> bool:
+        """Whether the encoders are as fresh as the motor."""
+        newest = self.encoders.stamp
+        return newest is not None and self._wheels.stamp - newest <= LATE
+
+    def _by_encoders(self, way: EncoderWay) -> WheelIncrement | None:
+        """Motion by the wheels that are believed; None = the one that is says nothing here."""
+        dt, lean = (way.stamp - way.since) / SECOND, self._tricycle.lean(way.front)
+        left, right = way.ways[0] / dt, way.ways[1] / dt
+        trusted = self.encoders.believed
+        if not all(trusted):
+            speed, share = (left, 1.0 - lean) if trusted[0] else (right, 1.0 + lean)
+            if abs(share) < NARROW:
+                return None
+            left, right = speed / share * (1.0 - lean), speed / share * (1.0 + lean)
+        rolled = max(abs(left), abs(right)) * dt
+        twist = self._tricycle.twist_of_rear(left, right)
+        return WheelIncrement(way.since, way.stamp, twist, rolled, (twist[0],), (way.front, 0.0))
+
+    def _take_back(self, since: int) -> None:
+        """Return to the pose at that instant, ns, or to the oldest one that is kept."""
+        for stamp, pose, covariance in self._kept:
+            if stamp >= since:
+                self._at, self._pose, self._covariance = stamp, pose, covariance
+                self._kept.clear()
+                if self._gyro is not None:
+                    self._gyro.wheels_slipped(stamp)
+                return
+
+
+def _part(roll: WheelIncrement, since: int, stamp: int) -> WheelIncrement:
+    """The part of a motion from ``since`` (or its beginning) to ``stamp``; one that is not known stays whole."""
+    since = max(since, roll.since)
+    share = (stamp - since) / (roll.stamp - roll.since)
+    return replace(roll, since=since, stamp=stamp, way=roll.way * share)
+
+
+class EncoderInput:
+    """Readings of the bus for a ``RearWheelReckoning``; says when encoders and driven wheel disagree.
+
+    Args:
+        reckoning: the estimator.
+        measured: readings.
+        events: where a disagreement is reported.
+        source: of the events.
+    """
+
+    def __init__(
+        self, reckoning: RearWheelReckoning, measured: Mailbox[WheelEncoders], events: EventSink, source: str
+    ) -> None:
+        self._reckoning = reckoning
+        self._measured = measured
+        self._events = events
+        self._source = source
+        self._told = Verdict()
+
+    def take(self) -> None:
+        """Pass new readings on."""
+        for reading in self._measured.drain():
+            self._reckoning.observe_encoders(reading)
+
+    def report(self) -> None:
+        """Report another verdict."""
+        now, told = self._reckoning.encoders.verdict, self._told
+        if now is told:
+            return
+        self._told = now
+        wrong, was_wrong = (bool(verdict.text) and not verdict.slips for verdict in (now, told))
+        if now.slips:
+            self._events(Reason.WHEEL_SLIP, Severity.WARNING, self._source, now.text)
+        elif told.slips:
+            self._events(Reason.WHEEL_GRIP, Severity.INFO, self._source, "rear wheels and driven wheel agree again")
+        if wrong:
+            left, right = now.trusted
+            carriers = "the drive carries on", f"{SIDES[not left]} and steering carry on", "both still count"
+            text = f"encoders of the rear wheels: {now.text}; {carriers[left + right]}"
+            self._events(Reason.ENCODERS_DISAGREE, Severity.WARNING, self._source, text, left=left, right=right)
+        elif was_wrong:
+            self._events(Reason.ENCODERS_AGREE, Severity.INFO, self._source, "the encoders count again")
+
+
+def build_rear_wheels(config: RearWheelConfig, context: OdometryContext) -> OdometryService:
+    """The service with its topics, for the catalog.
+
+    Raises:
+        InputError: the body has no rear wheels with encoders.
+    """
+    if not isinstance(context.chassis, TricycleChassis) or not context.encoders:
+        raise InputError("odometry.kind encoders: expected body tricycle and the device encoders")
+    imu = context.inertial(config.gyro)
+    reckoning = RearWheelReckoning(config, context.chassis, None if imu is None else imu.inertial)
+    measured = context.bus.subscribe(topics.ENCODERS, fifo(WAITING))
+    encoders = EncoderInput(reckoning, measured, context.bus.event_sink(), OdometryService.name)
+    return OdometryService(reckoning, context.clock, imu=imu, encoders=encoders, rate=config.rate, **context.inputs())
