@@ -74,7 +74,7 @@ class RearWheelConfig(OdometryConfig):
     """How they are judged"""
 
 
-class Verdict(NamedTuple):
+class EncoderVerdict(NamedTuple):
     """What a window says of the encoders."""
 
     trusted: tuple[bool, bool] = (True, True)
@@ -88,7 +88,7 @@ class Verdict(NamedTuple):
         return self.trusted, self.slips, bool(self.text)
 
 
-def judged(expected: Pair, counted: Pair, turned: float, least: float, config: EncoderConfig) -> Verdict | None:
+def judged(expected: Pair, counted: Pair, turned: float, least: float, config: EncoderConfig) -> EncoderVerdict | None:
     """Which of two encoders can be right; None = too little of a way.
 
     Two that agree with each other and with the steering are right, and the driven wheel slips; two that roll as far as
@@ -109,24 +109,24 @@ def judged(expected: Pair, counted: Pair, turned: float, least: float, config: E
 
     right_ones = agree(counted[0], expected[0]), agree(counted[1], expected[1])
     if all(right_ones):
-        return Verdict()
+        return EncoderVerdict()
     if not any(right_ones) and agree(counted[0], expected[1]) and agree(counted[1], expected[0]):
-        return Verdict((False, False), text="left and right are exchanged")
+        return EncoderVerdict((False, False), text="left and right are exchanged")
     rolled, driven = sum(counted) / 2, sum(expected) / 2
     if agree(rolled, driven) and not any(right_ones):
         text = f"the robot turns otherwise than it is steered: right less left {counted[1] - counted[0]:+.2f} m"
-        return Verdict(text=f"{text}, by the steering {expected[1] - expected[0]:+.2f} m")
+        return EncoderVerdict(text=f"{text}, by the steering {expected[1] - expected[0]:+.2f} m")
     if abs(counted[1] - counted[0] - turned) <= config.tolerance + config.share * abs(rolled):
         share = rolled / driven if abs(driven) > config.tolerance else math.inf
         if STANDS < share <= RUNS or share == math.inf:
             text = f"the rear wheels roll {rolled:.2f} m, the driven wheel {driven:.2f} m"
-            return Verdict(slips=True, text=text)
+            return EncoderVerdict(slips=True, text=text)
     faults = [
         f"{side} {_fault(want, have, agrees=agree(have, -want))}"
         for side, want, have, right in zip(SIDES, expected, counted, right_ones, strict=True)
         if not right
     ]
-    return Verdict(right_ones, text=", ".join(faults))
+    return EncoderVerdict(right_ones, text=", ".join(faults))
 
 
 def _fault(want: float, have: float, *, agrees: bool) -> str:
@@ -172,7 +172,7 @@ class Encoders:
 
     def __init__(self, config: EncoderConfig, chassis: TricycleChassis) -> None:
         self.config = config
-        self.verdict = Verdict()
+        self.verdict = EncoderVerdict()
         self._chassis = chassis
         self._rolled: deque[tuple[int, Pair]] = deque(maxlen=KEPT)
         """(ns, positions in m)."""
@@ -407,7 +407,7 @@ class EncoderInput:
         self._measured = measured
         self._events = events
         self._source = source
-        self._told = Verdict()
+        self._reported = EncoderVerdict()
 
     def take(self) -> None:
         """Pass new readings on."""
@@ -416,14 +416,14 @@ class EncoderInput:
 
     def report(self) -> None:
         """Report another verdict."""
-        now, told = self._reckoning.encoders.verdict, self._told
-        if now is told:
+        now, reported = self._reckoning.encoders.verdict, self._reported
+        if now is reported:
             return
-        self._told = now
-        wrong, was_wrong = (bool(verdict.text) and not verdict.slips for verdict in (now, told))
+        self._reported = now
+        wrong, was_wrong = (bool(verdict.text) and not verdict.slips for verdict in (now, reported))
         if now.slips:
             self._events(Reason.WHEEL_SLIP, Severity.WARNING, self._source, now.text)
-        elif told.slips:
+        elif reported.slips:
             self._events(Reason.WHEEL_GRIP, Severity.INFO, self._source, "rear wheels and driven wheel agree again")
         if wrong:
             left, right = now.trusted

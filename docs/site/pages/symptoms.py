@@ -106,7 +106,7 @@ SYMPTOMS: Final = (
             "response_differs": "`monstertruckd calibrate steering`.",
             "heading_disturbed": "Iron nearby; at home too: `monstertruckd calibrate compass`.",
             "wheel_slip": "Smooth floor, or a wheel in the air.",
-            "encoders_disagree": "Look at the encoder that is named: its disc, cable, and side; `left_inverted`, `right_inverted`.",
+            "encoders_disagree": "Look at the encoder that is named: its disc, its cable, its side.",
             "imu_disagrees": "`monstertruckd calibrate imu`; is it screwed down?",
             "time_offset": "`monstertruckd calibrate lidar` prints the offset.",
             "odometry_dropped": "Look at the wheels; calibrate drive and odometry.",

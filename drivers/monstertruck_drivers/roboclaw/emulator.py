@@ -10,7 +10,7 @@ from typing import Final
 from monstertruck_drivers.cable import DeviceEnd
 from monstertruck_drivers.emulation import EmulatorSetup, ReceivedBytes, WheelSource
 from monstertruck_drivers.roboclaw.config import RoboclawConfig
-from monstertruck_drivers.roboclaw.protocol import PACKET_GAP, Command, counted, signed
+from monstertruck_drivers.roboclaw.protocol import PACKET_GAP, RoboclawCommand, counted, signed
 from monstertruck_runtime.clock import MILLISECOND, SECOND, Clock
 from monstertruck_runtime.errors import InputError
 
@@ -109,9 +109,9 @@ class RoboclawEmulator:
         address, command = asked
         if address != self._settings.address or self._silent:
             return
-        if command == Command.VERSION:
+        if command == RoboclawCommand.VERSION:
             data = VERSION
-        elif command == Command.COUNTS:
+        elif command == RoboclawCommand.COUNTS:
             self._look()
             left, right = map(floor, self._counted)
             data = counted(left, right) if self._settings.left == 1 else counted(right, left)

@@ -23,7 +23,7 @@ _CRC: Final = struct.Struct(">H")
 COUNTS_SIZE: Final = _COUNTS.size + _CRC.size
 
 
-class Command(IntEnum):
+class RoboclawCommand(IntEnum):
     """Requests that are used: they move and change nothing."""
 
     VERSION = 21
@@ -32,7 +32,7 @@ class Command(IntEnum):
     """Answer: both counters, 32 bits each."""
 
 
-def request(address: int, command: Command) -> bytes:
+def request(address: int, command: RoboclawCommand) -> bytes:
     """Bytes of a request without arguments."""
     return bytes((address, command))
 

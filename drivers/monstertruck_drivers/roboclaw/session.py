@@ -8,7 +8,7 @@ from monstertruck_drivers.roboclaw.protocol import (
     LONGEST_NAME,
     NAME,
     PACKET_GAP,
-    Command,
+    RoboclawCommand,
     counts,
     is_intact,
     request,
@@ -47,7 +47,7 @@ class RoboclawSession:
         for _ in range(ATTEMPTS):
             answer = await self._text()
             heard = answer or heard
-            asked = request(self._address, Command.VERSION)
+            asked = request(self._address, RoboclawCommand.VERSION)
             if is_intact(asked, answer) and NAME in answer.lower():
                 return answer.partition(b"\n")[0].decode("ascii", "replace")
             # A host that died may have left half a request, which is dropped after a pause.
@@ -64,7 +64,7 @@ class RoboclawSession:
             DeviceTimeoutError: no answer in time.
             ProtocolError: a damaged one.
         """
-        asked = request(self._address, Command.COUNTS)
+        asked = request(self._address, RoboclawCommand.COUNTS)
         self._link.discard()
         self._link.write(asked)
         try:
@@ -78,9 +78,9 @@ class RoboclawSession:
     async def _text(self) -> bytes:
         """What comes after a question for the version."""
         self._link.discard()
-        self._link.write(request(self._address, Command.VERSION))
+        self._link.write(request(self._address, RoboclawCommand.VERSION))
         answer, until = b"", self._clock.now() + round(self._timeout * SECOND)
-        while len(answer) <= LONGEST_NAME and not is_intact(request(self._address, Command.VERSION), answer):
+        while len(answer) <= LONGEST_NAME and not is_intact(request(self._address, RoboclawCommand.VERSION), answer):
             try:
                 answer += await self._link.read(max(until - self._clock.now(), 0) / SECOND)
             except TimeoutError:

@@ -11,7 +11,16 @@ from monstertruck_drivers.roboclaw.config import RoboclawConfig
 from monstertruck_drivers.roboclaw.driver import RoboclawDriver
 from monstertruck_drivers.roboclaw.emulator import VERSION, RoboclawEmulator
 from monstertruck_drivers.roboclaw.probe import probe
-from monstertruck_drivers.roboclaw.protocol import COUNTER, Command, counted, counts, is_intact, request, signed, step
+from monstertruck_drivers.roboclaw.protocol import (
+    COUNTER,
+    RoboclawCommand,
+    counted,
+    counts,
+    is_intact,
+    request,
+    signed,
+    step,
+)
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.errors import (
     DeviceLostError,
@@ -70,7 +79,7 @@ def crc(data):
 
 
 def test_bytes_of_the_manual():
-    asked = request(0x80, Command.COUNTS)
+    asked = request(0x80, RoboclawCommand.COUNTS)
     assert asked == bytes((0x80, 78))
     answer = signed(asked, counted(6, -1))
     assert answer[:8] == bytes.fromhex("00000006 ffffffff")
@@ -85,12 +94,12 @@ def test_counters_wrap(by, before):
 
 @given(st.binary(max_size=60), st.integers(0, 7))
 def test_one_wrong_bit_is_noticed(data, bit):
-    asked = request(0x80, Command.VERSION)
+    asked = request(0x80, RoboclawCommand.VERSION)
     answer = signed(asked, data + b"\x00")
     assert is_intact(asked, answer)
     wrong = answer[:-3] + bytes((answer[-3] ^ 1 << bit,)) + answer[-2:]
     assert not is_intact(asked, wrong)
-    assert not is_intact(request(0x81, Command.VERSION), answer)
+    assert not is_intact(request(0x81, RoboclawCommand.VERSION), answer)
 
 
 @pytest.mark.parametrize(
