@@ -146,6 +146,16 @@ class OdometryEstimate:
     sources: tuple[str, ...]
 
 
+class SensorInput(Protocol):
+    """Messages of one more sensor, which an estimator does not have to know."""
+
+    def take(self) -> None:
+        """Pass new ones on, before those of the wheels."""
+
+    def report(self) -> None:
+        """Report what changed."""
+
+
 class OdometryEstimator(Protocol):
     """Estimator of an ``OdometryService``."""
 
@@ -201,8 +211,26 @@ class DeadReckoning:
     def observe_drive(self, *shafts: DriveFeedback) -> None:
         """Take the position of every motor and move the pose along the arc driven since the last ones."""
         roll = self._wheels.observe_drive(*shafts)
-        if roll is None:
-            return
+        if roll is not None:
+            self._move(roll)
+
+    @property
+    def _reached(self) -> int:
+        """Instant of the pose, ns."""
+        return self._wheels.stamp
+
+    @property
+    def _twist(self) -> Vector:
+        """With which the pose is carried on."""
+        return self._wheels.twist
+
+    @property
+    def _carriers(self) -> tuple[str, ...]:
+        """What moves the pose now."""
+        return ("drive",)
+
+    def _move(self, roll: WheelIncrement) -> None:
+        """Along the arc that wheels rolled."""
         dt = roll.dt
         if roll.lost:
             self._lose(dt)
@@ -230,8 +258,8 @@ class DeadReckoning:
             self._contradict()
         if self._turns.contrary is not None:
             return
-        ahead = min(max((attitude.stamp - self._wheels.stamp) / SECOND, -1.0), self._config.max_prediction)
-        yaw = self._pose[2] + self._wheels.twist[2] * ahead
+        ahead = min(max((attitude.stamp - self._reached) / SECOND, -1.0), self._config.max_prediction)
+        yaw = self._pose[2] + self._twist[2] * ahead
         # The device counts clockwise from north.
         off = -attitude.heading - yaw
         if self._north is None:
@@ -258,8 +286,8 @@ class DeadReckoning:
         """Pose predicted to ``now`` (ns); None before the first drive reading."""
         if not self._wheels.known:
             return None
-        age = max((now - self._wheels.stamp) / SECOND, 0.0)
-        twist = self._wheels.twist
+        age = max((now - self._reached) / SECOND, 0.0)
+        twist = self._twist
         ahead = min(age, self._config.max_prediction)
         x, y, yaw = integrate(self._pose, *twist, ahead)
         # The predicted way turns with the uncertain yaw; an uncertain speed, alike in all directions, adds to it.
@@ -272,7 +300,7 @@ class DeadReckoning:
             lost = PlanarCovariance(xx=pace, yy=pace, ww=turn)
             covariance = covariance.plus(term * waited**2 for term in lost)
             twist, twist_covariance = (0.0, 0.0, 0.0), self._drift.plus(lost).matrix()
-        sources = ["drive"]
+        sources = [*self._carriers]
         for name, used in (
             ("steering", self._wheels.steered),
             ("compass", self._compass_used),
@@ -345,6 +373,7 @@ class OdometryService:
         odometry: ``state/odometry``.
         pose: ``state/pose``; None = published by localisation.
         imu: measurements of an inertial measurement unit, if there is one.
+        encoders: those of wheels that roll along, if the estimator takes them.
         events: where it is reported that headings are left out.
         rate: poses per second.
     """
@@ -362,6 +391,7 @@ class OdometryService:
         odometry: Publisher[Odometry],
         pose: Publisher[Odometry] | None,
         imu: InertialInput | None = None,
+        encoders: SensorInput | None = None,
         events: EventSink = _untold,
         rate: float = 50.0,
     ) -> None:
@@ -372,7 +402,7 @@ class OdometryService:
         self._compass = compass
         self._odometry = odometry
         self._pose = pose
-        self._imu = imu
+        self._also = tuple(also for also in (imu, encoders) if also is not None)
         self._events = events
         self._rate = rate
         self._reckoned: tuple[DriveFeedback, ...] = ()
@@ -396,8 +426,8 @@ class OdometryService:
 
     def take(self) -> None:
         """Pass new messages to the estimator, and report changes."""
-        if self._imu is not None:
-            self._imu.take()
+        for also in self._also:
+            also.take()
         steering = None if self._steering is None else self._steering.latest
         compass = None if self._compass is None else self._compass.latest
         before = self._seen
@@ -412,8 +442,8 @@ class OdometryService:
         if compass is not None and compass is not before[1] and self.accepts_compass():
             self._seen = (steering, compass)
             self._reckoning.observe_attitude(compass)
-        if self._imu is not None:
-            self._imu.report()
+        for also in self._also:
+            also.report()
         if isinstance(self._reckoning, DeadReckoning):
             self.report_compass(self._reckoning.doubt)
 
@@ -463,6 +493,8 @@ class OdometryContext:
     """SLAM publishes the pose in map and the motion between scans."""
     imu: Quaternion | None = None
     """From the axes of its IMU to those of base; None = it has none."""
+    encoders: bool = False
+    """Its rear wheels have encoders."""
 
     def inertial(self, config: GyroConfig | None) -> InertialInput | None:
         """Its IMU, if there is one that counts."""

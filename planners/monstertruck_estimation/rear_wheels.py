@@ -378,6 +378,7 @@ class RearWheelReckoning(DeadReckoning):
             if stamp >= since:
                 self._at, self._pose, self._covariance = stamp, pose, covariance
                 self._kept.clear()
+                self._turns.forget()
                 if self._gyro is not None:
                     self._gyro.wheels_slipped(stamp)
                 return
@@ -445,5 +446,8 @@ def build_rear_wheels(config: RearWheelConfig, context: OdometryContext) -> Odom
     imu = context.inertial(config.gyro)
     reckoning = RearWheelReckoning(config, context.chassis, None if imu is None else imu.inertial)
     measured = context.bus.subscribe(topics.ENCODERS, fifo(WAITING))
-    encoders = EncoderInput(reckoning, measured, context.bus.event_sink(), OdometryService.name)
-    return OdometryService(reckoning, context.clock, imu=imu, encoders=encoders, rate=config.rate, **context.inputs())
+    events = context.bus.event_sink()
+    encoders = EncoderInput(reckoning, measured, events, OdometryService.name)
+    return OdometryService(
+        reckoning, context.clock, imu=imu, encoders=encoders, events=events, rate=config.rate, **context.inputs()
+    )
