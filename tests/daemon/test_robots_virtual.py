@@ -93,11 +93,11 @@ def test_a_tricycle_names_a_stuck_encoder_and_drives_on_without_it_and_without_b
             async with rig.running(), asyncio.TaskGroup() as group:
                 group.create_task(happen(odometry))
                 lap = await drive_lap(LocalOperator(rig.daemon, clock), clock, limit=40)
-                told = {event.reason: event.text for event in events.drain()}
+                reported = {event.reason: event.text for event in events.drain()}
             assert lap.outcome is Reason.GOAL_REACHED
-            assert lap.interruptions == ()
-            assert "left is stuck; right and steering carry on" in told[Reason.ENCODERS_DISAGREE]
-            assert Reason.DEVICE_LOST in told
+            assert lap.stops == ()
+            assert "left is stuck; right and steering carry on" in reported[Reason.ENCODERS_DISAGREE]
+            assert Reason.DEVICE_LOST in reported
             assert sources == [("encoders", "drive")] * 3 + [("drive", "steering")]
             assert odometry.latest is not None
             assert math.dist((odometry.latest.pose.x, odometry.latest.pose.y), rig.truth.array()[-1, 1:3]) < 0.03
