@@ -43,7 +43,7 @@ HOME: Final = 0.1
 BUDGET, LIMIT = 1800.0, 3600.0
 """Seconds of exploring, and until the end."""
 
-Happen = Callable[["Story"], Awaitable[None]]
+Happen = Callable[["ExploringTruck"], Awaitable[None]]
 
 
 @dataclass
@@ -64,10 +64,10 @@ class RunRecord:
     off_share: float
     """Share of the saved map's walls that are none."""
     seconds: float
-    story: "Story"
+    truck: "ExploringTruck"
 
 
-class Story:
+class ExploringTruck:
     """A truck that explores.
 
     Args:
@@ -94,7 +94,7 @@ class Story:
         truth = self.rig.world.truth(self.clock.now())
         return truth.x, truth.y, truth.yaw
 
-    async def tell(self, budget: float, limit: float, happen: Happen | None) -> dict[str, Any]:
+    async def explore(self, budget: float, limit: float, happen: Happen | None) -> dict[str, Any]:
         """From arming to the end of the exploration."""
         await self.operator.arm()
         order = {"order": ExploreOrder.START, "home": True, "budget": budget}
@@ -115,7 +115,7 @@ class Story:
         await self.clock.sleep(2.0)
         pose, here = self.poses.latest, self.here
         return {
-            "state": state, "late": late, "events": self.events.drain(), "start": self.start, "story": self,
+            "state": state, "late": late, "events": self.events.drain(), "start": self.start, "truck": self,
             "grids": sorted(
                 [(grid, True) for grid in self.maps.drain()] + [(tile, False) for tile in self.tiles.drain()],
                 key=lambda pair: pair[0].received,
@@ -158,11 +158,11 @@ def recorded_run(
             rig = VirtualRig(config, clock)
             async with rig.running():
                 await clock.sleep(4.0)
-                result.update(await Story(rig, arena, start).tell(budget, limit, happen))
+                result.update(await ExploringTruck(rig, arena, start).explore(budget, limit, happen))
             result["true"] = rig.truth.array()
 
         run_virtual(main, start=SECOND)
-        result["off_share"] = off_share(Path(folder) / "map", arena, result["story"].added)
+        result["off_share"] = off_share(Path(folder) / "map", arena, result["truck"].added)
     return RunRecord(**result)
 
 
@@ -188,7 +188,7 @@ def driven(true: Array) -> Array:
 
 def known(run: RunRecord) -> tuple[dict[float, float], float]:
     """Metres at which each share of what can be reached was known, and the share at the end."""
-    x, y = run.story.arena.reachable(run.start)
+    x, y = run.truck.arena.reachable(run.start)
     rest = np.column_stack((x, y))
     count, way, share = len(rest), driven(run.true), 0.0
     metres: dict[float, float] = {}

@@ -17,7 +17,7 @@ from typing import Any, Final
 import numpy as np
 
 from exploration_parts.arena import Arena
-from exploration_parts.daemon import CONFIGS, RunRecord, Story, recorded_run
+from exploration_parts.daemon import CONFIGS, ExploringTruck, RunRecord, recorded_run
 from monstertruck_planners.collision import Footprint
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError, TruckError
@@ -57,25 +57,25 @@ def explored(seed: int, fault: str) -> dict[str, Any]:
     rng = np.random.default_rng([31, seed, FAULTS.index(fault)])
     people = [walker(seed, rng)] if fault == "person" else []
 
-    async def happen(story: Story) -> None:
-        await story.clock.sleep(float(rng.uniform(*WHEN)))
+    async def happen(truck: ExploringTruck) -> None:
+        await truck.clock.sleep(float(rng.uniform(*WHEN)))
         match fault:
             case "kidnap":
-                carry_off(story, rng)
-                await arm_again(story, 4.0)
+                carry_off(truck, rng)
+                await arm_again(truck, 4.0)
             case "door":
-                await shut_door(story, opens=seed % 2 == 1)
+                await shut_door(truck, opens=seed % 2 == 1)
             case "lidar":
-                noted(story)
-                story.rig.ports["lidar"].unplug()
-                await story.clock.sleep(UNPLUGGED)
-                story.rig.ports["lidar"].plug()
-                await arm_again(story, 6.0)
+                noted(truck)
+                truck.rig.ports["lidar"].unplug()
+                await truck.clock.sleep(UNPLUGGED)
+                truck.rig.ports["lidar"].plug()
+                await arm_again(truck, 6.0)
             case "battery":
-                while math.dist(story.here[:2], story.start[:2]) < FAR:
-                    await story.clock.sleep(0.5)
-                noted(story)
-                story.rig.world.set_charge(story.clock.now(), float(rng.uniform(0.05, 0.12)))
+                while math.dist(truck.here[:2], truck.start[:2]) < FAR:
+                    await truck.clock.sleep(0.5)
+                noted(truck)
+                truck.rig.world.set_charge(truck.clock.now(), float(rng.uniform(0.05, 0.12)))
 
     return judged(recorded_run("rooms", seed, happen, budget=BUDGET, limit=LIMIT, people=people), fault, seed)
 
@@ -88,60 +88,60 @@ def walker(seed: int, rng: np.random.Generator) -> dict[str, Any]:
     return {"waypoints": places, "speed": 0.5, "before": ("stop", "turn")[seed % 2]}
 
 
-def noted(story: Story) -> None:
+def noted(truck: ExploringTruck) -> None:
     """The fault comes now."""
-    story.at = story.clock.now() / SECOND
+    truck.at = truck.clock.now() / SECOND
 
 
-def carry_off(story: Story, rng: np.random.Generator) -> None:
+def carry_off(truck: ExploringTruck, rng: np.random.Generator) -> None:
     """Somewhere else."""
-    arena = story.arena
+    arena = truck.arena
     low, size = np.array(arena.origin), np.array(arena.blocked.shape[::-1]) * arena.resolution
     while True:
         x, y = (low + size * rng.random(2)).tolist()
         pose = x, y, float(rng.uniform(-math.pi, math.pi))
-        far = CARRIED[0] < math.dist(pose[:2], story.here[:2]) < CARRIED[1]
+        far = CARRIED[0] < math.dist(pose[:2], truck.here[:2]) < CARRIED[1]
         if far and arena.truth.free(Footprint(), np.array([pose]), 0.15)[0]:
             break
-    noted(story)
-    story.rig.world.carry(story.clock.now(), pose)
+    noted(truck)
+    truck.rig.world.carry(truck.clock.now(), pose)
 
 
-async def shut_door(story: Story, *, opens: bool) -> None:
+async def shut_door(truck: ExploringTruck, *, opens: bool) -> None:
     """The nearest one that the truck is not in."""
     while True:
-        here = story.here[:2]
+        here = truck.here[:2]
         doors = sorted(DOORS, key=lambda door: math.dist(here, door[:2]))
         leaf = Box(*next(door for door in doors if math.dist(here, door[:2]) > 0.7))
         try:
-            story.rig.world.add(story.clock.now(), leaf)
+            truck.rig.world.add(truck.clock.now(), leaf)
         except InputError:
-            await story.clock.sleep(1.0)
+            await truck.clock.sleep(1.0)
             continue
         break
-    noted(story)
-    story.added.append(leaf)
+    noted(truck)
+    truck.added.append(leaf)
     if opens:
-        await story.clock.sleep(SHUT)
-        story.rig.world.remove(story.clock.now(), leaf)
+        await truck.clock.sleep(SHUT)
+        truck.rig.world.remove(truck.clock.now(), leaf)
 
 
-async def arm_again(story: Story, after: float) -> None:
+async def arm_again(truck: ExploringTruck, after: float) -> None:
     """As somebody does who put it right; again where it is refused."""
     for _ in range(10):
-        await story.clock.sleep(after)
-        gate = story.rig.bus.newest(topics.GATE)
+        await truck.clock.sleep(after)
+        gate = truck.rig.bus.newest(topics.GATE)
         if gate is not None and gate.mode.active:
             return
         try:
-            await story.operator.arm()
+            await truck.operator.arm()
         except TruckError:
             continue
 
 
 def judged(run: RunRecord, fault: str, seed: int) -> dict[str, Any]:
     """What is kept of a run."""
-    state, at = run.state, run.story.at
+    state, at = run.state, run.truck.at
     reasons = {event.reason for event in run.events if event.stamp / SECOND >= at}
     wanted, saved = SAYS.get(fault, set()), "map in" in state.text
     return {

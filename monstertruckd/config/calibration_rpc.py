@@ -51,7 +51,7 @@ def register(
     def real_time() -> int:
         return clock.now() + clock.real_offset()
 
-    def tell(path: Path, what: str, by: Any) -> dict[str, Any]:
+    def announced(path: Path, what: str, by: Any) -> dict[str, Any]:
         events(Reason.OK, Severity.INFO, "calibration", f"{path}: {what}; counts from the next start", by=str(by))
         return {"file": str(path)}
 
@@ -80,7 +80,7 @@ def register(
         await offload(lambda: with_values(config, [result], "result"))
         path = await offload(lambda: store.save(stamped(result), real_time()))
         saved = (await offload(lambda: store.load(path))).results[result.wizard]
-        answer = tell(path, f"{result.wizard} calibrated", payload.get("source"))
+        answer = announced(path, f"{result.wizard} calibrated", payload.get("source"))
         return answer | {"result": saved.model_dump(mode="json")}
 
     async def undo(payload: dict[str, Any]) -> dict[str, Any]:
@@ -90,7 +90,7 @@ def register(
             raise InputError(f"wizard: expected one of {known}, got {payload.get('wizard')!r}")
         at_rest()
         path = await offload(lambda: store.undo(wizard, real_time()))
-        return tell(path, f"calibration of {wizard} undone", payload.get("source"))
+        return announced(path, f"calibration of {wizard} undone", payload.get("source"))
 
     rpc.register(SHOW, show, AccessRole.OBSERVER)
     rpc.register(SAVE, save, AccessRole.ENGINEER)

@@ -96,13 +96,13 @@ class NotifyService:
     async def run(self, ready: Ready) -> None:
         """Tell until cancelled."""
         ready()
-        while not (self._up and self._ticks() and self._tell("READY=1")):
+        while not (self._up and self._ticks() and self._notify("READY=1")):
             await self._clock.sleep(POLL)
         while True:
             await self._clock.sleep(self._period)
-            self._tell()
+            self._notify()
 
-    def _tell(self, *first: str) -> bool:
+    def _notify(self, *first: str) -> bool:
         """Send what is news; a status that did not arrive is news again the next time.
 
         Only the ticks since the last look count, notified or not: a gate that limps must not save them up for a ping.

@@ -166,13 +166,13 @@ class RobotFeed:
         self._watched.set()
         viewer.show("link", self._link)
         if self._facts is not None:
-            viewer.tell(self._facts)
+            viewer.send(self._facts)
         for kind, frame in self._newest.items():
             viewer.show(kind, frame)
         for event in self._events:
-            viewer.tell(event)
+            viewer.send(event)
         for part in self.map.tiles.values():
-            viewer.tell(part)
+            viewer.send(part)
 
     def detach(self, viewer: Viewer) -> None:
         """Show it there no longer."""
@@ -230,7 +230,7 @@ class RobotFeed:
         except TruckError as error:
             log.warning("robot %s does not say what it is: %s", self.address.name, error)
             return False
-        self._tell(self._facts)
+        self._send(self._facts)
         return True
 
     async def _sample(self, client: TruckClient) -> None:
@@ -272,14 +272,14 @@ class RobotFeed:
         for grid in maps.drain():
             self._show("map", self.map.take(grid))
         for part in tiles.drain():
-            self._tell(self.map.change(part))
+            self._send(self.map.change(part))
 
     def _take_event(self, event: Event) -> None:
         if event.reason is Reason.SETTING_CHANGED:
             self._known = False
         frame = frames.message("event", event)
         self._events.append(frame)
-        self._tell(frame)
+        self._send(frame)
 
     def _set_link(self, round_trip: float | None, text: str) -> None:
         self.alive, self.round_trip = round_trip is not None, round_trip
@@ -294,9 +294,9 @@ class RobotFeed:
         for viewer in self._viewers:
             viewer.show(kind, frame)
 
-    def _tell(self, frame: Frame) -> None:
+    def _send(self, frame: Frame) -> None:
         for viewer in self._viewers:
-            viewer.tell(frame)
+            viewer.send(frame)
 
 
 POSE: Final = Shown(topics.ODOMETRY, "pose", frames.pose)

@@ -109,7 +109,7 @@ class Pilot:
                 with suppress(TruckError):  # the feed says what is wrong
                     async with self._session() as client:
                         self._client = client
-                        self._viewer.tell(frames.text("pilot", source=client.source))
+                        self._viewer.send(frames.text("pilot", source=client.source))
                         await asyncio.Event().wait()
                 await self._clock.sleep(RETRY)
         finally:
@@ -132,7 +132,7 @@ class Pilot:
         if late > LATEST:
             if now / SECOND - self._said_late > TELL_LATE:
                 self._said_late = now / SECOND
-                self._viewer.tell(frames.text("late", seconds=round(late, 3)))
+                self._viewer.send(frames.text("late", seconds=round(late, 3)))
             return
         if self._client is not None and (self._driving is None or self._driving.done()):
             self._driving = asyncio.create_task(self._request(self._client, motion))
@@ -145,12 +145,12 @@ class Pilot:
             else:
                 await client.drive_twist(*motion.twist, lease=LEASE)
         except TruckError as error:
-            self._viewer.tell(frames.text("trouble", text=str(error)))
+            self._viewer.send(frames.text("trouble", text=str(error)))
 
     def ask(self, command: Asked) -> None:
         """Carry out a command, and send its outcome to the browser. An emergency stop has left when this returns."""
         if self._client is None:
-            self._viewer.tell(frames.refusal(command.id, NotFoundError("no link to the robot")))
+            self._viewer.send(frames.refusal(command.id, NotFoundError("no link to the robot")))
             return
         task = asyncio.create_task(self._outcome(command.id, _call(self._client, command)))
         self._answers.add(task)
@@ -160,10 +160,10 @@ class Pilot:
         try:
             value = await call
         except TruckError as error:
-            self._viewer.tell(frames.refusal(number, error))
+            self._viewer.send(frames.refusal(number, error))
         else:
             more = {"value": value} if isinstance(value, dict) else {}
-            self._viewer.tell(frames.text("answer", id=number, ok=True, **more))
+            self._viewer.send(frames.text("answer", id=number, ok=True, **more))
 
 
 def _call(client: TruckClient, command: Asked) -> Coroutine[Any, Any, Any]:

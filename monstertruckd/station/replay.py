@@ -137,7 +137,7 @@ class ReplayFeed:
     def attach(self, viewer: Viewer) -> None:
         """Show it in a browser."""
         self._viewers.add(viewer)
-        self._greet(viewer)
+        self._send_all(viewer)
 
     def detach(self, viewer: Viewer) -> None:
         """Show it there no longer."""
@@ -155,19 +155,19 @@ class ReplayFeed:
             self._seek(min(max(self._begin + round(at * SECOND), self._begin), self._end))
             for viewer in self._viewers:
                 viewer.forget()
-                viewer.tell(frames.text("robot", name=self.name))
-                self._greet(viewer)
-        self._say()
+                viewer.send(frames.text("robot", name=self.name))
+                self._send_all(viewer)
+        self._send_state()
 
-    def _greet(self, viewer: Viewer) -> None:
-        viewer.tell(self._facts)
+    def _send_all(self, viewer: Viewer) -> None:
+        viewer.send(self._facts)
         viewer.show("link", frames.text("link", alive=True, round_trip=0.0, text=""))
         for kind, frame in self._newest.items():
             viewer.show(kind, frame)
         for part in self.map.tiles.values():
-            viewer.tell(part)
+            viewer.send(part)
         for event in self._events():
-            viewer.tell(event)
+            viewer.send(event)
         viewer.show("replay", self._state())
 
     def _events(self) -> Iterator[Frame]:
@@ -192,14 +192,14 @@ class ReplayFeed:
                 for kind in AGAIN_KINDS:
                     if kind in self._newest:
                         self._show(kind, self._newest[kind])
-                self._say()
+                self._send_state()
 
     def _play(self, at: int) -> None:
         self._at = at
         self._playing = at < self._end
         self._look(at)
         for event in self._tracks[topics.EVENT.name].up_to(at):
-            self._tell(frames.message("event", event))
+            self._send(frames.message("event", event))
 
     def _seek(self, at: int) -> None:
         self._at = at
@@ -222,7 +222,7 @@ class ReplayFeed:
         if (grid := self._tracks[topics.MAP.name].newest(at)) is not None:
             self._show("map", self.map.take(grid))  # type: ignore[arg-type]  # the topic's model
         for part in self._tracks[topics.MAP_TILES.name].up_to(at):
-            self._tell(self.map.change(part))  # type: ignore[arg-type]
+            self._send(self.map.change(part))  # type: ignore[arg-type]
 
     def _state(self) -> str:
         return frames.text(
@@ -233,7 +233,7 @@ class ReplayFeed:
             rate=self._rate,
         )
 
-    def _say(self) -> None:
+    def _send_state(self) -> None:
         for viewer in self._viewers:
             viewer.show("replay", self._state())
 
@@ -242,9 +242,9 @@ class ReplayFeed:
         for viewer in self._viewers:
             viewer.show(kind, frame)
 
-    def _tell(self, frame: Frame) -> None:
+    def _send(self, frame: Frame) -> None:
         for viewer in self._viewers:
-            viewer.tell(frame)
+            viewer.send(frame)
 
 
 def _facts(reader: RecordedLog) -> str:

@@ -207,7 +207,7 @@ class Station:
             self.replays[title] = feed = await in_thread(lambda: ReplayFeed(title, file, open_log, self._clock))
         self._follow(feed)
         for each in self._viewers:
-            each.tell(frames.text("robots", names=self.names))
+            each.send(frames.text("robots", names=self.names))
         return title
 
     def _found(self, address: RobotAddress) -> None:
@@ -218,7 +218,7 @@ class Station:
         self.feeds[address.name] = RobotFeed(address, self._clock)
         self._follow(self.feeds[address.name])
         for viewer in self._viewers:
-            viewer.tell(frames.text("robots", names=self.names))
+            viewer.send(frames.text("robots", names=self.names))
 
     def application(self) -> web.Application:
         """All routes."""
@@ -325,7 +325,7 @@ class Station:
                     browser.take(received.data)
                 except (InputError, NotPermittedError) as error:
                     log.warning("browser %s: message refused: %s", name, error)
-                    browser.viewer.tell(frames.text("trouble", text=str(error)))
+                    browser.viewer.send(frames.text("trouble", text=str(error)))
         finally:
             self._viewers.discard(browser.viewer)
             self._sockets.discard(socket)
@@ -350,8 +350,8 @@ class _Browser:
         self._pilot: Pilot | None = None
         self._session: asyncio.Task[None] | None = None
         self._ending: set[asyncio.Task[None]] = set()
-        self.viewer.tell(frames.text("hello", version=__version__, user=user.name, role=user.role.value))
-        self.viewer.tell(frames.text("robots", names=station.names))
+        self.viewer.send(frames.text("hello", version=__version__, user=user.name, role=user.role.value))
+        self.viewer.send(frames.text("robots", names=station.names))
 
     def take(self, data: str) -> None:
         """Obey one message.
@@ -364,7 +364,7 @@ class _Browser:
         refused = self._refusal(command)
         if refused is not None:
             if isinstance(command, commands.Asked):
-                self.viewer.tell(frames.refusal(command.id, refused))
+                self.viewer.send(frames.refusal(command.id, refused))
             raise refused
         match command:
             case Heartbeat():
@@ -376,7 +376,7 @@ class _Browser:
             case ReplayRecording():
                 self._begin(self._replay(command))
             case EchoRequest():
-                self.viewer.tell(frames.text("pong", at=command.at))
+                self.viewer.send(frames.text("pong", at=command.at))
             case LookAtFleet():
                 self._board.show(self.viewer, command.on)
             case Watch():
@@ -406,9 +406,9 @@ class _Browser:
                 raise InputError("no robot is looked at")
             name = await self._station.replay(feed.address, command.name, self._user.name, self.viewer)
         except TruckError as error:
-            self.viewer.tell(frames.refusal(command.id, error))
+            self.viewer.send(frames.refusal(command.id, error))
         else:
-            self.viewer.tell(frames.text("answer", id=command.id, ok=True, value={"robot": name}))
+            self.viewer.send(frames.text("answer", id=command.id, ok=True, value={"robot": name}))
 
     def _watch(self, robot: str) -> None:
         if (replay := self._station.replays.get(robot)) is not None:
@@ -418,7 +418,7 @@ class _Browser:
         if feed is None:
             raise InputError(f"robot {robot!r}: expected one of {', '.join(self._station.names)}")
         self._leave()
-        self.viewer.tell(frames.text("robot", name=robot))
+        self.viewer.send(frames.text("robot", name=robot))
         self._feed = feed
         feed.attach(self.viewer)
         self._pilot = Pilot(feed.address, self._name, self.viewer, self._clock)
@@ -429,7 +429,7 @@ class _Browser:
         if self._feed is not None:
             self._feed.detach(self.viewer)
         self.viewer.forget()
-        self.viewer.tell(frames.text("robot", name=replay.name))
+        self.viewer.send(frames.text("robot", name=replay.name))
         self._feed = replay
         replay.attach(self.viewer)
 

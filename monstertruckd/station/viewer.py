@@ -25,7 +25,7 @@ class Viewer:
         self._newest[kind] = frame
         self._news.set()
 
-    def tell(self, frame: Frame) -> None:
+    def send(self, frame: Frame) -> None:
         """Send ``frame`` behind all that were given so."""
         self.lost += len(self._ordered) == MOST_WAITING
         self._ordered.append(frame)

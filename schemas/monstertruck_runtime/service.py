@@ -111,15 +111,15 @@ async def supervise(
             lost = error
         except (Exception, asyncio.CancelledError) as error:
             if isinstance(error, asyncio.CancelledError) and _asked_to_end():
-                session.tell(ServiceState.STOPPED)
+                session.report_state(ServiceState.STOPPED)
                 raise
-            session.tell(ServiceState.FAILED, Reason.INTERNAL, "unexpected exception, see the log")
+            session.report_state(ServiceState.FAILED, Reason.INTERNAL, "unexpected exception, see the log")
             log.exception("%s: bug", service.name)
             if on_bug is OnBug.EXIT:
                 raise RuntimeError(f"{service.name} failed") from error
             return
         else:
-            session.tell(ServiceState.FAILED, Reason.INTERNAL, "ended by itself")
+            session.report_state(ServiceState.FAILED, Reason.INTERNAL, "ended by itself")
             log.error("%s: bug: ended by itself", service.name)
             if on_bug is OnBug.EXIT:
                 raise RuntimeError(f"{service.name} ended by itself")
@@ -127,7 +127,7 @@ async def supervise(
 
         if isinstance(lost, PortBusyError) and on_bug is OnBug.EXIT and session.starts == 1:
             # Two daemons must not lie in wait for each other's actuators.
-            session.tell(ServiceState.FAILED, lost.reason, str(lost))
+            session.report_state(ServiceState.FAILED, lost.reason, str(lost))
             raise PortBusyError(f"{service.name}: {lost}")
         detail = str(lost) or type(lost).__name__
         # The first failure of an outage is news, its repetitions are not.
@@ -139,12 +139,12 @@ async def supervise(
             restarts.popleft()
         exhausted = policy.budget is not None and len(restarts) > policy.budget
         if exhausted or isinstance(lost, DeviceMismatchError):
-            session.tell(ServiceState.FAILED, lost.reason, detail)
+            session.report_state(ServiceState.FAILED, lost.reason, detail)
             log.error("%s: given up: %s", service.name, detail)
             return
         if session.ready_at is not None and now - session.ready_at >= policy.settled_after * SECOND:
             delay = policy.first_delay
-        session.tell(ServiceState.BACKOFF, lost.reason, detail)
+        session.report_state(ServiceState.BACKOFF, lost.reason, detail)
         del lost  # its traceback holds all of the session, and this very frame
         await clock.sleep(delay * (1 + policy.jitter * float(rng.uniform(-1, 1))))
         delay = min(delay * policy.factor, policy.max_delay)
@@ -180,15 +180,15 @@ class _Session:
     def start(self) -> None:
         self.starts += 1
         self.ready_at = None
-        self.tell(ServiceState.STARTING)
+        self.report_state(ServiceState.STARTING)
 
     def ready(self) -> None:
         if self.ready_at is None:
             self.ready_at = self._clock.now()
-            self.tell(ServiceState.READY)
+            self.report_state(ServiceState.READY)
             log.info("%s: ready", self._name)
 
-    def tell(self, state: ServiceState, reason: Reason = Reason.OK, detail: str = "") -> None:
+    def report_state(self, state: ServiceState, reason: Reason = Reason.OK, detail: str = "") -> None:
         self._report(
             ServiceHealth(
                 name=self._name,

@@ -57,10 +57,10 @@ class Drive:
         return np.hypot([pose.pose.x for pose in poses] - x, [pose.pose.y for pose in poses] - y)
 
 
-Story = Callable[[VirtualRig], Awaitable[None]]
+Scenario = Callable[[VirtualRig], Awaitable[None]]
 
 
-def lap(seconds: float) -> Story:
+def lap(seconds: float) -> Scenario:
     """The truck is armed and follows its path for some seconds."""
 
     async def story(rig: VirtualRig) -> None:
@@ -70,7 +70,7 @@ def lap(seconds: float) -> Story:
     return story
 
 
-def driven(base: str, story: Story, *more: Topic[Any], **overlay: Any) -> Drive:
+def driven(base: str, story: Scenario, *more: Topic[Any], **overlay: Any) -> Drive:
     """Let ``story`` happen to the truck of a configuration with an overlay; ``more`` topics are listened to."""
     config = load_config(CONFIGS / base, SimulatedTruckConfig)[0]
     config = with_overlay(config, {"recorder": None, "map": None, **overlay})

@@ -38,7 +38,7 @@ def test_a_mission_is_driven_and_followed():
     async def story(trip: Trip) -> None:
         client = MissionOperator(trip.rig.daemon, trip.clock)
         with trip.rig.bus.subscribe(topics.MISSION, fifo(4096)) as states:
-            ends.append(await run_mission(client, mission, arm=True, tell=lines.append))
+            ends.append(await run_mission(client, mission, arm=True, report=lines.append))
             ends.append(states.latest)
 
     rig = travel(story)

@@ -146,7 +146,7 @@ class Joint:
     async def _look_after(self, session: Ax12Session, present: Present, error: Alarm) -> None:
         now = self._clock.now()
         changed, self._error = error != self._error, error
-        self._tell_alarms(error, now)
+        self._report_alarms(error, now)
         if self.torque is TorqueState.HOLDING and (changed or now >= self._check_at):
             await self._check_torque(session, present)
         cool = present.temperature <= self._config.alarm.cool_below
@@ -158,7 +158,7 @@ class Joint:
         if not limit:
             self._go_limp()
         elif not enabled or speed != self._config.speed_word:
-            self._tell(Reason.DEVICE_FAULT, Severity.WARNING, "lost its settings, as by a brown-out: sent again")
+            self._report(Reason.DEVICE_FAULT, Severity.WARNING, "lost its settings, as by a brown-out: sent again")
             await self._hold(session, present)
 
     async def _hold(self, session: Ax12Session, present: Present) -> None:
@@ -177,7 +177,7 @@ class Joint:
         self._held_at = self._clock.now()
         if self._outage:
             self._outage = False
-            self._tell(Reason.DEVICE_READY, Severity.INFO, "holds again")
+            self._report(Reason.DEVICE_READY, Severity.INFO, "holds again")
 
     def _go_limp(self) -> None:
         """Rest, the longer the sooner it tripped again."""
@@ -188,7 +188,7 @@ class Joint:
         self._hold_at = now + round(self._rest * SECOND)
         if not self._outage:
             text = f"limp after {alarm_names(self._error)}: rests {self._rest:g} s"
-            self._tell(Reason.DEVICE_FAULT, Severity.ERROR, text, error=int(self._error))
+            self._report(Reason.DEVICE_FAULT, Severity.ERROR, text, error=int(self._error))
         self._outage = True
         self._rest = min(2 * self._rest, alarm.rest_max)
 
@@ -200,12 +200,12 @@ class Joint:
         self._present = None
         self._error = Alarm(0)
         self._ask_at = self._clock.now() + round(self._config.absent_interval * SECOND)
-        self.tell_absent(why)
+        self.report_absent(why)
 
-    def tell_absent(self, why: str) -> None:
+    def report_absent(self, why: str) -> None:
         """Report that the unit does not answer."""
         self._outage = True
-        self._tell(Reason.DEVICE_TIMEOUT, Severity.WARNING, f"does not answer, asked again once in a while: {why}")
+        self._report(Reason.DEVICE_TIMEOUT, Severity.WARNING, f"does not answer, asked again once in a while: {why}")
 
     async def _settings(self, session: Ax12Session) -> tuple[int, int, int]:
         """Torque switch, moving speed, torque limit."""
@@ -218,7 +218,7 @@ class Joint:
         """Store the status level that answers everything; whether this write is answered depends on the old one."""
         with contextlib.suppress(DeviceTimeoutError):
             await session.write(self.id, p.STATUS_LEVEL, ANSWERS_ALL, retries=0)
-        self._tell(Reason.DEVICE_MISMATCH, Severity.INFO, "did not answer everything: status level set to 2")
+        self._report(Reason.DEVICE_MISMATCH, Severity.INFO, "did not answer everything: status level set to 2")
 
     def _check(self, stored: bytes) -> None:
         model = word(stored, p.MODEL_NUMBER.address)
@@ -234,7 +234,7 @@ class Joint:
 
     # Reports
 
-    def _tell_alarms(self, error: Alarm, now: int) -> None:
+    def _report_alarms(self, error: Alarm, now: int) -> None:
         """Each bit once, until all were clear for a while."""
         if not error:
             if self._reported and now - self._clean_since >= self._config.alarm.settled_after * SECOND:
@@ -244,9 +244,9 @@ class Joint:
         new = error & ~self._reported
         self._reported |= error
         if new:
-            self._tell(Reason.DEVICE_FAULT, Severity.WARNING, f"reports {alarm_names(new)}", error=int(error))
+            self._report(Reason.DEVICE_FAULT, Severity.WARNING, f"reports {alarm_names(new)}", error=int(error))
 
-    def _tell(self, reason: Reason, severity: Severity, text: str, **values: Value) -> None:
+    def _report(self, reason: Reason, severity: Severity, text: str, **values: Value) -> None:
         self._events(reason, severity, self._source, f"{self._name} joint (unit {self.id}) {text}", **values)
 
 
@@ -326,7 +326,7 @@ class Ax12Driver:
                 f"{self._port.name}: silence; expected AX-12A units {ids}: is the 12 V rail up, the adapter at TTL?"
             )
         for joint, why in missing.items():
-            joint.tell_absent(why)
+            joint.report_absent(why)
 
     async def _serve(self, session: Ax12Session) -> None:
         schedule = Schedule(self._clock, self._config.rate, QUESTIONS)

@@ -262,7 +262,7 @@ class _DriveSession:
         await self._line.shorten_silence()
         await self._check_mark(ATTEMPTS)
         await self._prepare()
-        self._tell(
+        self._report(
             Reason.DEVICE_READY, Severity.INFO, f"EPOS, software 0x{identity.software:04X}", **identity.as_values()
         )
 
@@ -300,7 +300,7 @@ class _DriveSession:
             return
         if mark is not None:
             self._driver.odometer.restart()
-            self._tell(Reason.DEVICE_RESTARTED, Severity.WARNING, "the controller restarted: position goes on")
+            self._report(Reason.DEVICE_RESTARTED, Severity.WARNING, "the controller restarted: position goes on")
             if self._reported not in OFF or self._setpoint().goal is not State.SWITCH_ON_DISABLED:
                 raise DeviceRestartedError("the controller restarted")
 
@@ -377,9 +377,9 @@ class _DriveSession:
         median = sorted(durations)[RECENT // 2] / SECOND
         if median > SLOW_EXCHANGE and not self._slow:
             text = f"answers take {median * 1000:.0f} ms: feedback comes too seldom to drive by"
-            self._tell(Reason.SLOW_LINK, Severity.WARNING, text, seconds=median)
+            self._report(Reason.SLOW_LINK, Severity.WARNING, text, seconds=median)
         elif median < QUICK_EXCHANGE and self._slow:
-            self._tell(Reason.SLOW_LINK, Severity.INFO, "answers come quickly again", seconds=median)
+            self._report(Reason.SLOW_LINK, Severity.INFO, "answers come quickly again", seconds=median)
         self._slow = median > (QUICK_EXCHANGE if self._slow else SLOW_EXCHANGE)
 
     async def _idle(self, until: int) -> None:
@@ -474,7 +474,7 @@ class _DriveSession:
         if self._state in FAULTED:
             await self._attend_fault()
         elif self._fault is not None:
-            self._tell(Reason.DEVICE_READY, Severity.INFO, f"fault {od.fault_text(self._fault)} is gone")
+            self._report(Reason.DEVICE_READY, Severity.INFO, f"fault {od.fault_text(self._fault)} is gone")
             self._fault = None
             self._commands_after = self._clock.now()
         if self._state not in FAULTED:
@@ -488,7 +488,7 @@ class _DriveSession:
         """
         if self._setpoint().rpm != 0:
             text = "quick stop by another than this program: the deadman line fell, or a second master commands"
-            self._tell(Reason.DEVICE_STOPPED, Severity.WARNING, text)
+            self._report(Reason.DEVICE_STOPPED, Severity.WARNING, text)
             raise DeviceStoppedError(text)
 
     async def _step(self, goal: State) -> None:
@@ -500,7 +500,7 @@ class _DriveSession:
         if late > GOAL_LIMIT and not self._late_reported:
             self._late_reported = True
             text = f"controller stays in {self._state.name}, wanted {goal.name}"
-            self._tell(Reason.DEVICE_TIMEOUT, Severity.WARNING, text)
+            self._report(Reason.DEVICE_TIMEOUT, Severity.WARNING, text)
         control = next_control(self._state, goal)
         if control is Control.SHUTDOWN:
             await self._prepare()
@@ -552,7 +552,7 @@ class _DriveSession:
             if self._fault != self._driver.reported_fault:
                 self._driver.reported_fault = self._fault
                 text = "history, newest first: " + ", ".join(map(od.fault_text, history))
-                self._tell(Reason.DRIVE_FAULT, Severity.ERROR, text, code=self._fault)
+                self._report(Reason.DRIVE_FAULT, Severity.ERROR, text, code=self._fault)
         elif self._state is State.FAULT and now >= self._reset_due:
             await self._reset_fault(now, self._fault)
 
@@ -575,7 +575,7 @@ class _DriveSession:
         await self._control(Control.DISABLE_VOLTAGE)
         await self._control(Control.FAULT_RESET)
 
-    def _tell(self, reason: Reason, severity: Severity, text: str, **values: float | None) -> None:
+    def _report(self, reason: Reason, severity: Severity, text: str, **values: float | None) -> None:
         self._driver.events(reason, severity, self._driver.name, text, **values)
 
 

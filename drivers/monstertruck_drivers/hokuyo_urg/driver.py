@@ -358,7 +358,7 @@ class HokuyoDriver:
         anchor = await session.compare_clocks()
         if anchor is None:
             text = "refuses its time-adjust mode: the age of its scans is assumed, not measured"
-            self._tell(Severity.WARNING, text, reason=Reason.CLOCK_DRIFT)
+            self._report(Severity.WARNING, text, reason=Reason.CLOCK_DRIFT)
         mapping = ClockMap(round((_sweep(geometry) + TRANSFER) * SECOND), anchor)
         shape = (geometry.first_step, geometry.last_step, config.cluster)
         command = scan_command(config.scan_format, *shape, skip=config.skip)
@@ -377,7 +377,7 @@ class HokuyoDriver:
                 if outcome is StatusMeaning.DATA and (block := self._decode(reply, shape, bad)) is not None:
                     if first:
                         ready()
-                        self._tell_ready(sensor)
+                        self._report_ready(sensor)
                     bad, first = 0, False
                     due = self._deadline(config.stale_periods * interval)
                     self._publish(block, self._stamp(mapping, block, session.arrival), geometry, session.arrival)
@@ -391,10 +391,10 @@ class HokuyoDriver:
     async def _other_status(self, session: ScipSession, status: str, outcome: StatusMeaning, interval: float) -> float:
         """React to a scan block without data; returns the seconds to wait for the next scan."""
         if outcome is StatusMeaning.VERIFYING:
-            self._tell(Severity.WARNING, f"sensor verifies a suspected fault, status {status}", status=status)
+            self._report(Severity.WARNING, f"sensor verifies a suspected fault, status {status}", status=status)
             return self._config.verify_timeout
         if outcome is StatusMeaning.RESUMED:
-            self._tell(Severity.INFO, "sensor resumed after verification", reason=Reason.DEVICE_READY, status=status)
+            self._report(Severity.INFO, "sensor resumed after verification", reason=Reason.DEVICE_READY, status=status)
             return self._config.first_scan_periods * interval
         if outcome is StatusMeaning.FAULT:
             await session.reset()
@@ -407,11 +407,11 @@ class HokuyoDriver:
         restarts, slews = mapping.restarts, mapping.slews
         stamp = mapping.stamp(block.counter, arrival)
         if mapping.restarts > restarts:
-            self._tell(Severity.WARNING, "sensor's clock restarted", counter=block.counter)
+            self._report(Severity.WARNING, "sensor's clock restarted", counter=block.counter)
         if mapping.slews > slews and arrival >= self._slew_due:
             self._slew_due = arrival + round(SLEW_PERIOD * SECOND)
             text = f"the sensor's clock and the computer's run apart by {mapping.drift:.1%}: followed"
-            self._tell(Severity.WARNING, text, reason=Reason.CLOCK_DRIFT)
+            self._report(Severity.WARNING, text, reason=Reason.CLOCK_DRIFT)
         if mapping.late < TOO_LATE * SECOND:
             self._late_since = None
         elif self._late_since is None:
@@ -437,7 +437,7 @@ class HokuyoDriver:
             if block is not None:
                 if first:
                     ready()
-                    self._tell_ready(sensor)
+                    self._report_ready(sensor)
                 bad, first = 0, False
                 age = _sweep(geometry) + TRANSFER
                 self._publish(block, session.arrival - round(age * SECOND), geometry, session.arrival)
@@ -466,7 +466,7 @@ class HokuyoDriver:
         except ProtocolError as error:
             self.dropped += 1
             if bad == 0:
-                self._tell(Severity.WARNING, str(error), reason=Reason.DEVICE_PROTOCOL, dropped=self.dropped)
+                self._report(Severity.WARNING, str(error), reason=Reason.DEVICE_PROTOCOL, dropped=self.dropped)
             return None
 
     def _publish(self, block: ScanBlock, step_0: int, geometry: Parameters, received: int) -> None:
@@ -495,8 +495,8 @@ class HokuyoDriver:
         )
         self.scans += 1
 
-    def _tell_ready(self, sensor: Sensor) -> None:
-        self._tell(
+    def _report_ready(self, sensor: Sensor) -> None:
+        self._report(
             Severity.INFO,
             sensor.state.status if sensor.state else "",
             reason=Reason.DEVICE_READY,
@@ -506,7 +506,7 @@ class HokuyoDriver:
             dialect=sensor.dialect.value,
         )
 
-    def _tell(
+    def _report(
         self, severity: Severity, text: str, *, reason: Reason = Reason.DEVICE_FAULT, **values: str | int
     ) -> None:
         self._events(reason, severity, self.name, text, **values)

@@ -159,7 +159,7 @@ class MaestroEmulator:
         for channel, home in self._home.items():
             if isinstance(home, int | float):
                 self._aim(channel, round(4 * home))
-        self._tell_outputs()
+        self._report_outputs()
 
     def set_serial_timeout(self, seconds: float) -> None:
         """Store the silence after which all channels go home; 0 = never."""
@@ -258,7 +258,7 @@ class MaestroEmulator:
             self._timed_out = False
             self._fed_again.set()
             answers += self._obey(item)
-        self._tell_outputs()
+        self._report_outputs()
         return answers
 
     def _obey(self, command: ServoCommand) -> bytes:
@@ -311,14 +311,14 @@ class MaestroEmulator:
         self._advance()
         self._errors |= error
         self._go_home()
-        self._tell_outputs()
+        self._report_outputs()
 
     def _go_home(self) -> None:
         for channel, home in self._home.items():
             if home != "ignore":
                 self._aim(channel, 0 if home == "off" else round(4 * home))
 
-    def _tell_outputs(self) -> None:
+    def _report_outputs(self) -> None:
         for channel in self._outputs:
             level = self.output(channel)
             if level != self._levels[channel]:

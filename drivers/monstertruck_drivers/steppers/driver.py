@@ -150,7 +150,7 @@ class StepperDriver:
 
     async def _start(self, session: StepperSession) -> Identity:
         config = self._config
-        session.tell("Q")
+        session.send("Q")
         identity = await session.identify()
         if identity.motors < config.motors or identity.steps_per_turn != config.steps_per_turn:
             raise DeviceMismatchError(
@@ -278,4 +278,4 @@ class StepperDriver:
                 await session.status("D", motors, attempts=ATTEMPTS)
             return
         with contextlib.suppress(DeviceLostError):
-            session.tell("Q")
+            session.send("Q")

@@ -53,7 +53,7 @@ class StepperSession:
         self._timeout = timeout
         self._seq = 0
 
-    def tell(self, verb: str, *words: int) -> int:
+    def send(self, verb: str, *words: int) -> int:
         """Send a request without waiting for its answer; returns its number.
 
         Raises:
@@ -73,7 +73,7 @@ class StepperSession:
         """
         for _ in range(attempts):
             self.asked = self._clock.now()
-            answer = await self._answer(self.tell(verb, *words))
+            answer = await self._answer(self.send(verb, *words))
             if answer is not None:
                 if answer.verb == "e":
                     code, why = _reason(answer)

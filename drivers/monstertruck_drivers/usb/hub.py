@@ -183,7 +183,7 @@ class HubCoordinator:
             slot.free_at = now
             if self._looked:
                 if before is None or not _alike(before, slot.device):
-                    self._tell_if_moved(name, slot.device)
+                    self._report_if_moved(name, slot.device)
                 if slot.device.hub:  # a new hub's devices start one after the other, too
                     self._outages[name] = _HubOutage(name, now, now, {name}, announced=False)
 
@@ -207,7 +207,7 @@ class HubCoordinator:
             members = group.union(*(outage.members for outage in inner))
             since = min(lost[name] for name in group)
             self._outages[hub] = _HubOutage(hub, since, now, members, announced=True)
-            self._tell_lost(hub, members)
+            self._report_lost(hub, members)
 
     def _lost_hub(self, name: str, lost: Mapping[str, int]) -> str | None:
         """Topmost hub whose loss explains that of ``name``; None if it vanished alone."""
@@ -241,7 +241,7 @@ class HubCoordinator:
             for turn, name in zip(turns, starting, strict=True):
                 self._slots[name].free_at = now + turn * _ns(self._config.stagger)
             if outage.announced or starting:
-                self._tell_returned(outage, back, now)
+                self._report_returned(outage, back, now)
 
     def _loads(self, name: str) -> bool:
         return self._roles.get(name) in self._config.start_apart
@@ -268,7 +268,7 @@ class HubCoordinator:
 
     # Telling
 
-    def _tell_lost(self, hub: str, members: set[str]) -> None:
+    def _report_lost(self, hub: str, members: set[str]) -> None:
         devices = sorted((name for name in members if not self._is_hub(name)), key=sort_key)
         what = "vanished" if hub in members else "is there, but all behind it vanished"
         self._events(
@@ -281,7 +281,7 @@ class HubCoordinator:
             roles=self._roles_at(devices),
         )
 
-    def _tell_returned(self, outage: _HubOutage, back: list[str], now: int) -> None:
+    def _report_returned(self, outage: _HubOutage, back: list[str], now: int) -> None:
         missing = sorted((m for m in outage.members if not self._slots[m].present), key=sort_key)
         text = f"hub {outage.hub} is back with {self._names(back) or 'no devices'}"
         if missing:
@@ -297,7 +297,7 @@ class HubCoordinator:
             seconds=(now - outage.since) / SECOND,
         )
 
-    def _tell_if_moved(self, name: str, device: UsbDevice) -> None:
+    def _report_if_moved(self, name: str, device: UsbDevice) -> None:
         """A device that looks like a missing one came at another place. It is reported, never used there."""
         for other, slot in self._slots.items():
             known = slot.device

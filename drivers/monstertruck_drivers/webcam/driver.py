@@ -115,10 +115,10 @@ class WebcamDriver:
         config = self._config
         wanted = Mode(config.width, config.height, config.rate)
         async with await self._source.open(wanted, config.buffers) as stream:
-            self._tell_mode(wanted, stream.mode)
+            self._report_mode(wanted, stream.mode)
             await self._serve(stream, ready)
 
-    def _tell_mode(self, wanted: Mode, granted: Mode) -> None:
+    def _report_mode(self, wanted: Mode, granted: Mode) -> None:
         if granted != wanted and granted != self._reported_mode:
             text = f"the camera gives {granted}, configured is {wanted}"
             self._events(Reason.DEVICE_MISMATCH, Severity.INFO, self.name, text)

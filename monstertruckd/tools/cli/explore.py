@@ -67,8 +67,8 @@ def explore(
             if stop:
                 await client.explore(ExploreOrder.STOP)
                 return None
-            tell = None if json_output else print
-            return await run_exploration(client, home=home, budget=seconds, find=find, arm=arm, tell=tell)
+            report = None if json_output else print
+            return await run_exploration(client, home=home, budget=seconds, find=find, arm=arm, report=report)
 
     end = run_wall(main)
     if end is None:

@@ -53,7 +53,7 @@ async def run_exploration(
     budget: float | None,
     find: int | None = None,
     arm: bool,
-    tell: Callable[[str], object] | None = None,
+    report: Callable[[str], object] | None = None,
 ) -> ExplorationEnd:
     """Start an exploration and wait for its end; cancelled or without an answer, it is stopped.
 
@@ -63,7 +63,7 @@ async def run_exploration(
         budget: likewise, s.
         find: likewise.
         arm: arm the robot first.
-        tell: gets a line of progress now and then.
+        report: gets a line of progress now and then.
 
     Raises:
         RequestRefusedError: the start or the arming was refused.
@@ -74,7 +74,7 @@ async def run_exploration(
             await client.arm()
         try:
             number = int((await client.explore(ExploreOrder.START, home=home, budget=budget, find=find))["number"])
-            return await _followed(states, number, tell)
+            return await _followed(states, number, report)
         except BaseException as error:
             if not isinstance(error, TruckError) or isinstance(error, NoAnswerError):
                 with suppress(TruckError):
@@ -83,7 +83,7 @@ async def run_exploration(
 
 
 async def _followed(
-    states: Mailbox[ExplorationState], number: int, tell: Callable[[str], object] | None
+    states: Mailbox[ExplorationState], number: int, report: Callable[[str], object] | None
 ) -> ExplorationEnd:
     shown: ExplorationState | None = None
     async for state in states:
@@ -92,9 +92,9 @@ async def _followed(
         if state.number > number:
             return ExplorationEnd(Reason.CANCELLED, f"{state.source} started another one", 0.0, 0.0, 0.0, 0)
         changed = shown is None or (state.phase, state.goals) != (shown.phase, shown.goals)
-        if tell is not None and (changed or shown is None or state.elapsed - shown.elapsed >= EVERY):
+        if report is not None and (changed or shown is None or state.elapsed - shown.elapsed >= EVERY):
             shown = state
-            tell(progress_line(state))
+            report(progress_line(state))
         if not state.running:
             return ExplorationEnd(state.outcome, state.text, state.elapsed, state.travelled, state.known, state.goals)
     raise NoAnswerError("the link to the robot was closed")

@@ -46,7 +46,7 @@ def run_command(
     async def main(clock: Clock) -> "MissionEnd":
         async with TruckClient(robot, endpoint, clock=clock) as client:
             await _check(client, robot)
-            return await run_mission(client, mission, arm=arm, moved=moved, tell=None if json_output else print)
+            return await run_mission(client, mission, arm=arm, moved=moved, report=None if json_output else print)
 
     end = run_wall(main)
     if json_output:

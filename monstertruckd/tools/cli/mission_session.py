@@ -49,7 +49,7 @@ async def run_mission(
     *,
     arm: bool,
     moved: bool = False,
-    tell: Callable[[str], object] | None = None,
+    report: Callable[[str], object] | None = None,
 ) -> MissionEnd:
     """Start a mission, or go on with the interrupted one, and wait for its end; cancelled, it is stopped.
 
@@ -58,7 +58,7 @@ async def run_mission(
         mission: None = the interrupted one.
         arm: arm the robot first.
         moved: see ``TruckClient.mission``.
-        tell: gets a line for each step.
+        report: gets a line for each step.
 
     Raises:
         RequestRefusedError: the start or the arming was refused.
@@ -71,7 +71,7 @@ async def run_mission(
             await client.arm()
         try:
             number = int((await client.mission(order, mission, moved=moved))["number"])
-            return await _followed(states, number, tell)
+            return await _followed(states, number, report)
         except BaseException as error:
             if not isinstance(error, TruckError) or isinstance(error, NoAnswerError):
                 with suppress(TruckError):
@@ -79,17 +79,17 @@ async def run_mission(
             raise
 
 
-async def _followed(states: Mailbox[MissionState], number: int, tell: Callable[[str], object] | None) -> MissionEnd:
+async def _followed(states: Mailbox[MissionState], number: int, report: Callable[[str], object] | None) -> MissionEnd:
     shown = (0, 0)
     async for state in states:
         if state.number < number or state.resumable:
             continue
         if state.number > number:
             return MissionEnd(state.name, Reason.CANCELLED, f"{state.source} started another one", 0.0, 0, 0)
-        if tell is not None and (state.step, state.attempt) != shown and state.running:
+        if report is not None and (state.step, state.attempt) != shown and state.running:
             shown = state.step, state.attempt
             again = f", attempt {state.attempt}" if state.attempt > 1 else ""
-            tell(f"{state.elapsed:6.0f} s  step {state.step} of {state.steps}: {state.doing}{again}")
+            report(f"{state.elapsed:6.0f} s  step {state.step} of {state.steps}: {state.doing}{again}")
         if not state.running:
             return MissionEnd(state.name, state.outcome, state.text, state.elapsed, state.step, state.failures)
     raise NoAnswerError("the link to the robot was closed")

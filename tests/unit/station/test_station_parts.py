@@ -91,7 +91,7 @@ async def test_a_browser_that_does_not_read_gets_the_newest_only_and_bounded_eve
     for number in range(3 * MOST_WAITING):
         viewer.show("scan", str(number))
         viewer.show("camera", b"picture")
-        viewer.tell(f"event {number}")
+        viewer.send(f"event {number}")
     received = [await viewer.next() for _ in range(MOST_WAITING + 2)]
     assert received[0] == f"event {2 * MOST_WAITING}"
     assert received[-2:] == [str(3 * MOST_WAITING - 1), b"picture"], "the newest; pictures of the camera last"

@@ -13,7 +13,7 @@ from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.plan import ExplorationPhase
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.state import Grid
-from tests.unit.planners.explore.test_exploration import NOTHING, Tale
+from tests.unit.planners.explore.test_exploration import NOTHING, SteppedExploration
 
 MIDDLE = (2.5, 2.5, 0.0)
 
@@ -60,14 +60,14 @@ def test_faces_point_away_from_their_wall():
 
 
 def test_it_ends_when_enough_is_found_and_says_how_much_was_not():
-    tale = Tale(find=3)
-    tale.drive()
-    tale.tell(found=2)
-    assert tale.run.phase is ExplorationPhase.DRIVING
-    tale.tell(found=3)
-    assert tale.run.phase is ExplorationPhase.RETURNING
-    assert tale.run.final is Reason.POINTS_FOUND
-    short = Tale(find=3)
+    stepped = SteppedExploration(find=3)
+    stepped.drive()
+    stepped.step(found=2)
+    assert stepped.run.phase is ExplorationPhase.DRIVING
+    stepped.step(found=3)
+    assert stepped.run.phase is ExplorationPhase.RETURNING
+    assert stepped.run.final is Reason.POINTS_FOUND
+    short = SteppedExploration(find=3)
     while short.run.final is Reason.DRIVING:
         short.look(NOTHING)
     assert short.run.final is Reason.EXPLORED

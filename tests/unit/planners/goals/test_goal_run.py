@@ -31,7 +31,7 @@ CONFIG = PlannerConfig()
 WAY = PlanAnswer(Reason.OK, poses=np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]]), directions=np.ones(2), length=2.0)
 
 
-class Story:
+class SteppedRun:
     """A run that is given facts; time passes by 0.1 s a fact."""
 
     def __init__(self, config: PlannerConfig = CONFIG) -> None:
@@ -40,7 +40,7 @@ class Story:
         self.run, actions = goal_run.begin(1, GOAL, "tester", 0.0)
         self.done: list[Action] = list(actions)
 
-    def tell(self, count: int = 1, **observed: Any) -> tuple[Action, ...]:
+    def step(self, count: int = 1, **observed: Any) -> tuple[Action, ...]:
         actions: list[Action] = []
         for _ in range(count):
             self.now += 0.1
@@ -64,163 +64,163 @@ def reported(actions: Iterable[Action]) -> list[Reason]:
 
 
 def test_a_goal_is_planned_followed_and_reached():
-    story = Story()
-    assert story.done == [Report(Reason.GOAL_ACCEPTED, goal_run.Severity.INFO, story.done[0].text), Plan(clear=True)]  # type: ignore[union-attr]
-    assert story.tell() == ()
-    actions = story.tell(answer=WAY)
-    assert (story.phase, actions[0], reported(actions)) == (GoalPhase.DRIVING, Follow(WAY), [Reason.ROUTE_FOUND])
-    assert story.tell(10, along=1.0, at_rest=False) == ()
-    assert story.tell(outcome=Reason.GOAL_REACHED, at_rest=False, pose=GOAL) == (), "still rolling"
-    actions = story.tell(outcome=Reason.GOAL_REACHED, pose=(1.95, 0.02, 0.05 + math.tau))
-    assert (story.run.outcome, story.run.active) == (Reason.GOAL_REACHED, False)
+    run = SteppedRun()
+    assert run.done == [Report(Reason.GOAL_ACCEPTED, goal_run.Severity.INFO, run.done[0].text), Plan(clear=True)]  # type: ignore[union-attr]
+    assert run.step() == ()
+    actions = run.step(answer=WAY)
+    assert (run.phase, actions[0], reported(actions)) == (GoalPhase.DRIVING, Follow(WAY), [Reason.ROUTE_FOUND])
+    assert run.step(10, along=1.0, at_rest=False) == ()
+    assert run.step(outcome=Reason.GOAL_REACHED, at_rest=False, pose=GOAL) == (), "still rolling"
+    actions = run.step(outcome=Reason.GOAL_REACHED, pose=(1.95, 0.02, 0.05 + math.tau))
+    assert (run.run.outcome, run.run.active) == (Reason.GOAL_REACHED, False)
     assert (Halt() in actions, reported(actions)) == (True, [Reason.GOAL_REACHED])
-    assert story.tell(answer=WAY) == ()
+    assert run.step(answer=WAY) == ()
 
 
 @pytest.mark.parametrize("reason", [Reason.GOAL_BLOCKED, Reason.GOAL_OUTSIDE, Reason.GOAL_UNREACHABLE])
 def test_a_goal_without_a_way_is_refused_at_once(reason: Reason):
-    story = Story()
-    story.tell(answer=PlanAnswer(reason, "why"))
-    assert (story.run.outcome, story.run.text, story.run.recoveries) == (reason, "why", 0)
+    run = SteppedRun()
+    run.step(answer=PlanAnswer(reason, "why"))
+    assert (run.run.outcome, run.run.text, run.run.recoveries) == (reason, "why", 0)
 
 
 def test_an_end_beside_the_goal_is_planned_again_but_not_for_ever():
-    story = Story()
+    run = SteppedRun()
     for _ in range(goal_run.MISSES):
-        story.tell(answer=WAY)
-        assert reported(story.tell(outcome=Reason.GOAL_REACHED, pose=(1.7, 0.0, 0.0))) == [Reason.GOAL_MISSED]
-        assert story.phase is GoalPhase.PLANNING
-    story.tell(answer=WAY)
-    story.tell(outcome=Reason.GOAL_REACHED, pose=(2.0, 0.0, 0.3))
-    assert story.run.outcome is Reason.GOAL_MISSED
+        run.step(answer=WAY)
+        assert reported(run.step(outcome=Reason.GOAL_REACHED, pose=(1.7, 0.0, 0.0))) == [Reason.GOAL_MISSED]
+        assert run.phase is GoalPhase.PLANNING
+    run.step(answer=WAY)
+    run.step(outcome=Reason.GOAL_REACHED, pose=(2.0, 0.0, 0.3))
+    assert run.run.outcome is Reason.GOAL_MISSED
 
 
 def test_a_goal_where_the_truck_stands_is_reached_without_driving():
     here = (1.0, 1.5, 0.0)
     answer = PlanningStep().step(task(goal=(1.0, 1.5, 1e-9), setup=setup(), grid=hall()))
     assert answer.poses is not None
-    story = Story()
-    story.run = replace(story.run, goal=here)
-    actions = story.tell(answer=answer, pose=here)
+    run = SteppedRun()
+    run.run = replace(run.run, goal=here)
+    actions = run.step(answer=answer, pose=here)
     assert reported(actions) == [Reason.GOAL_REACHED]
     assert not any(isinstance(action, Follow) for action in actions), "no tracker takes a path without length"
-    assert (story.run.outcome, story.run.routes) == (Reason.GOAL_REACHED, 1)
+    assert (run.run.outcome, run.run.routes) == (Reason.GOAL_REACHED, 1)
 
 
 def test_a_goal_is_not_reached_before_its_waypoints_are_passed():
-    story = Story()
-    story.run = replace(story.run, via=((1.0, 1.0, None),))
+    run = SteppedRun()
+    run.run = replace(run.run, via=((1.0, 1.0, None),))
     for _ in range(goal_run.MISSES):
-        story.tell(answer=WAY)
-        assert reported(story.tell(outcome=Reason.GOAL_REACHED, pose=GOAL)) == [Reason.GOAL_MISSED]
-        assert story.phase is GoalPhase.PLANNING
-    story.tell(answer=WAY)
-    story.tell(outcome=Reason.GOAL_REACHED, pose=GOAL)
-    assert (story.run.outcome, story.run.text) == (Reason.GOAL_MISSED, "1 waypoint not passed")
+        run.step(answer=WAY)
+        assert reported(run.step(outcome=Reason.GOAL_REACHED, pose=GOAL)) == [Reason.GOAL_MISSED]
+        assert run.phase is GoalPhase.PLANNING
+    run.step(answer=WAY)
+    run.step(outcome=Reason.GOAL_REACHED, pose=GOAL)
+    assert (run.run.outcome, run.run.text) == (Reason.GOAL_MISSED, "1 waypoint not passed")
 
 
 def test_a_place_within_the_tolerance_is_corrected_once_then_taken():
-    story = Story()
+    run = SteppedRun()
     for outcome in (Reason.DRIVING, Reason.GOAL_REACHED):
-        story.tell(answer=WAY)
-        story.tell(outcome=Reason.GOAL_REACHED, pose=(2.0, 0.0, 0.15))
-        assert story.run.outcome is outcome
+        run.step(answer=WAY)
+        run.step(outcome=Reason.GOAL_REACHED, pose=(2.0, 0.0, 0.15))
+        assert run.run.outcome is outcome
 
 
 def test_an_obstacle_on_the_way_is_planned_round_while_the_truck_drives_on():
-    story = Story()
-    story.tell(answer=WAY)
-    assert story.tell(CONFIG.blocked_scans - 1, blocked=True, along=0.2) == ()
-    actions = story.tell(blocked=True, along=0.3)
+    run = SteppedRun()
+    run.step(answer=WAY)
+    assert run.step(CONFIG.blocked_scans - 1, blocked=True, along=0.2) == ()
+    actions = run.step(blocked=True, along=0.3)
     assert (reported(actions), Plan() in actions, Halt() in actions) == ([Reason.PATH_BLOCKED], True, False)
 
 
 def test_the_recovery_behaviours_are_tried_in_order_and_then_the_goal_is_given_up():
-    story = Story()
-    story.tell(answer=WAY)
+    run = SteppedRun()
+    run.step(answer=WAY)
     stuck = round(CONFIG.stuck / 0.1) + 2
-    assert Plan(clear=True) in story.tell(stuck)
-    story.tell(answer=WAY)
-    assert Plan("escape") in story.tell(stuck)
-    story.tell(answer=WAY)
-    assert story.phase is GoalPhase.BACKING_OUT
-    assert Plan() in story.tell(outcome=Reason.GOAL_REACHED)
-    story.tell(answer=WAY)
-    story.tell(stuck)
-    assert story.phase is GoalPhase.WAITING
-    assert Plan() in story.tell(round(CONFIG.wait / 0.1) + 2)
-    story.tell(answer=PlanAnswer(Reason.GOAL_UNREACHABLE, "walled in"))
-    assert (story.phase, story.run.recoveries) == (GoalPhase.PLANNING, 4)
-    story.tell(answer=PlanAnswer(Reason.GOAL_UNREACHABLE, "walled in"))
-    assert (story.run.outcome, story.run.text) == (Reason.GOAL_UNREACHABLE, "walled in")
+    assert Plan(clear=True) in run.step(stuck)
+    run.step(answer=WAY)
+    assert Plan("escape") in run.step(stuck)
+    run.step(answer=WAY)
+    assert run.phase is GoalPhase.BACKING_OUT
+    assert Plan() in run.step(outcome=Reason.GOAL_REACHED)
+    run.step(answer=WAY)
+    run.step(stuck)
+    assert run.phase is GoalPhase.WAITING
+    assert Plan() in run.step(round(CONFIG.wait / 0.1) + 2)
+    run.step(answer=PlanAnswer(Reason.GOAL_UNREACHABLE, "walled in"))
+    assert (run.phase, run.run.recoveries) == (GoalPhase.PLANNING, 4)
+    run.step(answer=PlanAnswer(Reason.GOAL_UNREACHABLE, "walled in"))
+    assert (run.run.outcome, run.run.text) == (Reason.GOAL_UNREACHABLE, "walled in")
 
 
 def test_the_recovery_behaviours_begin_anew_once_the_truck_is_nearer_to_the_goal_than_ever():
-    story = Story()
-    story.tell(answer=WAY)
-    story.tell(round(CONFIG.stuck / 0.1) + 2, left=1.8)
-    story.tell(answer=WAY)
-    assert story.run.next_recovery == 1
+    run = SteppedRun()
+    run.step(answer=WAY)
+    run.step(round(CONFIG.stuck / 0.1) + 2, left=1.8)
+    run.step(answer=WAY)
+    assert run.run.next_recovery == 1
     for left in (1.9, 1.8, 1.35):
-        story.tell(along=2.0 - left, left=left)
-        assert story.run.next_recovery == 1
-    story.tell(along=0.75, left=1.25)
-    assert story.run.next_recovery == 0
+        run.step(along=2.0 - left, left=left)
+        assert run.run.next_recovery == 1
+    run.step(along=0.75, left=1.25)
+    assert run.run.next_recovery == 0
 
 
 def test_driving_to_and_fro_between_two_ways_that_are_blocked_ends():
-    story = Story(PlannerConfig(routes=1000))
+    run = SteppedRun(PlannerConfig(routes=1000))
     for _ in range(12):
-        story.tell(answer=WAY)
-        story.tell(5, along=1.0, left=3.0)
-        story.tell(round(CONFIG.stuck / 0.1) + 2, along=2.0, left=1.0)
-        if story.phase is GoalPhase.WAITING:
-            story.tell(round(CONFIG.wait / 0.1) + 2)
-        elif story.run.planned == "escape":
-            story.tell(answer=PlanAnswer(Reason.STUCK))
-            story.tell(round(CONFIG.wait / 0.1) + 2)
-    assert (story.run.outcome, story.run.recoveries) == (Reason.STUCK, 4)
+        run.step(answer=WAY)
+        run.step(5, along=1.0, left=3.0)
+        run.step(round(CONFIG.stuck / 0.1) + 2, along=2.0, left=1.0)
+        if run.phase is GoalPhase.WAITING:
+            run.step(round(CONFIG.wait / 0.1) + 2)
+        elif run.run.planned == "escape":
+            run.step(answer=PlanAnswer(Reason.STUCK))
+            run.step(round(CONFIG.wait / 0.1) + 2)
+    assert (run.run.outcome, run.run.recoveries) == (Reason.STUCK, 4)
 
 
 def test_a_failed_escape_is_the_next_recovery_behaviour():
-    story = Story(PlannerConfig(recovery=("back_out", "wait")))
-    story.tell(answer=PlanAnswer(Reason.START_BLOCKED))
-    story.tell(answer=PlanAnswer(Reason.STUCK, "both ends"))
-    assert story.phase is GoalPhase.WAITING
+    run = SteppedRun(PlannerConfig(recovery=("back_out", "wait")))
+    run.step(answer=PlanAnswer(Reason.START_BLOCKED))
+    run.step(answer=PlanAnswer(Reason.STUCK, "both ends"))
+    assert run.phase is GoalPhase.WAITING
 
 
 def test_a_lost_path_is_planned_anew():
-    story = Story()
-    story.tell(answer=WAY)
-    assert Plan() in story.tell(outcome=Reason.PATH_LOST)
+    run = SteppedRun()
+    run.step(answer=WAY)
+    assert Plan() in run.step(outcome=Reason.PATH_LOST)
 
 
 def test_time_counts_only_while_the_truck_could_drive():
-    story = Story(PlannerConfig(timeout=5.0, unarmed_timeout=20.0))
-    story.tell(answer=WAY)
-    story.tell(190, armed=False)
-    assert story.run.active
+    run = SteppedRun(PlannerConfig(timeout=5.0, unarmed_timeout=20.0))
+    run.step(answer=WAY)
+    run.step(190, armed=False)
+    assert run.run.active
     for i in range(60):
-        story.tell(along=0.05 * i)
-    assert story.run.outcome is Reason.GOAL_TIMEOUT
-    waiting = Story(PlannerConfig(unarmed_timeout=20.0))
-    waiting.tell(answer=WAY)
-    waiting.tell(210, armed=False, held="battery critical")
+        run.step(along=0.05 * i)
+    assert run.run.outcome is Reason.GOAL_TIMEOUT
+    waiting = SteppedRun(PlannerConfig(unarmed_timeout=20.0))
+    waiting.step(answer=WAY)
+    waiting.step(210, armed=False, held="battery critical")
     assert waiting.run.outcome is Reason.DISARMED
     assert waiting.run.text == "not armed for 20 s: battery critical"
 
 
 def test_orders_pause_resume_and_cancel():
-    story = Story()
-    story.tell(answer=WAY)
-    assert story.order(GoalOrder.RESUME) == ()
-    assert Halt() in story.order(GoalOrder.PAUSE)
-    assert story.tell(1000) == ()
-    assert Plan() in story.order(GoalOrder.RESUME)
-    assert story.phase is GoalPhase.PLANNING
-    assert Halt() in story.order(GoalOrder.CANCEL)
-    assert story.run.outcome is Reason.CANCELLED
-    assert story.order(GoalOrder.CANCEL) == ()
+    run = SteppedRun()
+    run.step(answer=WAY)
+    assert run.order(GoalOrder.RESUME) == ()
+    assert Halt() in run.order(GoalOrder.PAUSE)
+    assert run.step(1000) == ()
+    assert Plan() in run.order(GoalOrder.RESUME)
+    assert run.phase is GoalPhase.PLANNING
+    assert Halt() in run.order(GoalOrder.CANCEL)
+    assert run.run.outcome is Reason.CANCELLED
+    assert run.order(GoalOrder.CANCEL) == ()
 
 
 def test_somebody_elses_path_is_left_alone():
@@ -230,12 +230,12 @@ def test_somebody_elses_path_is_left_alone():
 
 
 def test_routes_are_limited():
-    story = Story(PlannerConfig(routes=2))
+    run = SteppedRun(PlannerConfig(routes=2))
     for _ in range(2):
-        story.tell(answer=WAY)
-        story.tell(outcome=Reason.PATH_LOST)
-    assert isinstance(story.run, GoalRun)
-    assert story.run.outcome is Reason.STUCK
+        run.step(answer=WAY)
+        run.step(outcome=Reason.PATH_LOST)
+    assert isinstance(run.run, GoalRun)
+    assert run.run.outcome is Reason.STUCK
 
 
 # Backing out
@@ -445,19 +445,19 @@ def test_backing_out_sees_the_map_behind_the_truck_too():
 
 
 def test_waypoints_are_passed_one_by_one_and_asked_for_until_then():
-    story = Story()
-    story.run, _ = goal_run.begin(2, GOAL, "tester", 0.0, ((1.0, 0.0, None), (1.5, 0.0, 0.0)))
-    story.tell(answer=WAY)
-    assert story.tell(pose=(0.5, 0.0, 0.0)) == ()
-    assert reported(story.tell(pose=(0.8, 0.1, 0.0), along=0.8)) == [Reason.WAYPOINT_PASSED]
-    assert story.run.via == ((1.5, 0.0, 0.0),)
-    assert story.tell(pose=(1.0, 0.1, 0.0), along=1.0) == ()
+    run = SteppedRun()
+    run.run, _ = goal_run.begin(2, GOAL, "tester", 0.0, ((1.0, 0.0, None), (1.5, 0.0, 0.0)))
+    run.step(answer=WAY)
+    assert run.step(pose=(0.5, 0.0, 0.0)) == ()
+    assert reported(run.step(pose=(0.8, 0.1, 0.0), along=0.8)) == [Reason.WAYPOINT_PASSED]
+    assert run.run.via == ((1.5, 0.0, 0.0),)
+    assert run.step(pose=(1.0, 0.1, 0.0), along=1.0) == ()
 
 
 def test_a_miss_is_corrected_by_another_route():
-    story = Story()
-    story.tell(answer=WAY)
-    assert Plan(afresh=True) in story.tell(outcome=Reason.GOAL_REACHED, pose=(1.85, 0.0, 0.0))
+    run = SteppedRun()
+    run.step(answer=WAY)
+    assert Plan(afresh=True) in run.step(outcome=Reason.GOAL_REACHED, pose=(1.85, 0.0, 0.0))
 
 
 def test_a_route_over_waypoints_passes_them_and_is_kept_only_as_long_as_it_does():
@@ -522,25 +522,25 @@ def test_a_route_too_long_for_one_path_is_driven_in_parts_that_the_tracker_takes
 
 @pytest.mark.parametrize("outcome", [Reason.GOAL_REACHED, Reason.GOAL_MISSED])
 def test_at_the_end_of_a_part_the_rest_is_planned(outcome: Reason):
-    story = Story()
-    story.tell(answer=replace(WAY, complete=False, text="the first 2.00 m of 9.00"))
-    assert Plan() in story.tell(outcome=outcome, pose=(2.0, 0.0, 0.0))
-    assert story.run.misses == 0
+    run = SteppedRun()
+    run.step(answer=replace(WAY, complete=False, text="the first 2.00 m of 9.00"))
+    assert Plan() in run.step(outcome=outcome, pose=(2.0, 0.0, 0.0))
+    assert run.run.misses == 0
 
 
 def test_a_missed_cusp_is_planned_anew_from_there():
-    story = Story()
-    story.tell(answer=WAY)
-    actions = story.tell(outcome=Reason.CUSP_MISSED, pose=(1.0, 0.1, 0.0))
+    run = SteppedRun()
+    run.step(answer=WAY)
+    actions = run.step(outcome=Reason.CUSP_MISSED, pose=(1.0, 0.1, 0.0))
     assert Plan() in actions
     assert reported(actions) == [Reason.CUSP_MISSED]
 
 
 def test_an_end_off_the_path_is_judged_by_the_goal():
-    story = Story()
-    story.tell(answer=WAY)
-    story.tell(outcome=Reason.GOAL_MISSED, pose=(1.97, 0.0, 0.0))
-    assert story.run.outcome is Reason.GOAL_REACHED
+    run = SteppedRun()
+    run.step(answer=WAY)
+    run.step(outcome=Reason.GOAL_MISSED, pose=(1.97, 0.0, 0.0))
+    assert run.run.outcome is Reason.GOAL_REACHED
 
 
 @pytest.mark.parametrize("goal", [(1e308, 1.0, 0.0), (2.0, 1.5, 1e308), (-1e5, 1.0, 0.0)])

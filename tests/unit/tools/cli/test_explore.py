@@ -67,7 +67,7 @@ def test_it_is_followed_to_its_end_and_printed_in_short_lines():
         state(3, ExplorationPhase.IDLE, Reason.EXPLORED, text="12 m^2", travelled=5.0, known=12.0, goals=1),
     )
     lines: list[str] = []
-    end = asyncio.run(run_exploration(robot, home=True, budget=60.0, arm=True, tell=lines.append))
+    end = asyncio.run(run_exploration(robot, home=True, budget=60.0, arm=True, report=lines.append))
     assert (end.reason, end.text, end.travelled, end.known) == (Reason.EXPLORED, "12 m^2", 5.0, 12.0)
     assert robot.orders == [("arm",), (ExploreOrder.START, True, 60.0)]
     assert len(lines) == 3
