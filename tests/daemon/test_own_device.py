@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 from mcap.reader import make_reader
 
+from monstertruck_runtime.yaml_files import yaml_text
 from tests.daemon.wall_kit import end
 from tests.plugin_kit import ROOT, files_of, installed, run_with, written
 
@@ -38,7 +39,12 @@ def messages(log: Path, topic: str) -> list[dict[str, Any]]:
 
 @pytest.mark.virtual
 def test_it_is_driven_and_recorded(project: Path, target: Path, tmp_path: Path):
-    out = run_with(target, "demo", "--fast", "-c", str(project / "robot.yaml"), "-o", str(tmp_path / "run"))
+    points = (ROOT / "configs" / "paths" / "loop.csv").read_text().splitlines()
+    (tmp_path / "begin.csv").write_text("\n".join(points[:61]) + "\n")
+    config = tmp_path / "begin.yaml"
+    path = {"file": str(tmp_path / "begin.csv"), "closed": False}
+    config.write_text(yaml_text({"include": str(project / "robot.yaml"), "version": 1, "path": path}))
+    out = run_with(target, "demo", "--fast", "-c", str(config), "-o", str(tmp_path / "run"))
     assert "sensor/ranger" in out
     (log,) = (tmp_path / "run" / "logs").glob("*.mcap")
     found = messages(log, "sensor/ranger")
