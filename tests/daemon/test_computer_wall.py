@@ -137,12 +137,12 @@ async def test_real_time_descriptors_and_edited_files_stop_nothing(tmp_path: Pat
         async with truck.client() as client:
             await truck.drive(client)
             with client.subscribe(topics.EVENT, fifo(4096)) as events:
-                for seconds in (3600, -86_400, 10**8, 0):
+                for seconds in (3600, -86_400, 0):
                     async with drives_on(truck, client):
                         set_real_time(seconds)
                         await asyncio.sleep(1.2)
                 steps = [event for event in events.drain() if event.reason is Reason.CLOCK_STEPPED]
-            assert len(steps) >= 4
+            assert len(steps) >= 3
 
             written = truck.config.read_text()
             async with drives_on(truck, client):

@@ -88,7 +88,7 @@ async def becomes(condition: Callable[[], bool]) -> None:
 async def _wrong_requests_move_nothing(
     made: Robot, client: TruckClient, gate: Mailbox[GateState], odometry: Mailbox[Odometry]
 ) -> None:
-    """A thousand on every key, from another process; `benchmarks/fuzz_requests.py` sends more."""
+    """Three hundred on every key, from another process; `benchmarks/fuzz_requests.py` sends more."""
     before = await odometry.next()
     names = ",".join(await call_names(client))
     fuzzer = await asyncio.create_subprocess_exec(
@@ -98,7 +98,7 @@ async def _wrong_requests_move_nothing(
         "--fuzzer",
         made.endpoint,
         names,
-        "1000",
+        "300",
         "1",
         "2000",
         cwd=ROOT,

@@ -109,6 +109,7 @@ def test_the_way_to_the_next_goal_does_not_back_into_what_was_seen_on_the_way_to
     assert not travel(story).truth.array()[:, 5].any(), "collided"
 
 
+@pytest.mark.long
 def test_the_published_set_up_comes_near_its_goal_and_touches_nothing():
     """The yardstick keeps its published faults: at the goal it drives to and fro."""
 

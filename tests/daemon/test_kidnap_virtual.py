@@ -40,6 +40,7 @@ async def pursue(rig: VirtualRig, truck: LocalTruck, corners: tuple[tuple[float,
         await rig.clock.sleep(0.1)
 
 
+@pytest.mark.long
 def test_a_truck_that_is_carried_is_lost_until_its_places_are_joined():
     at = []
 

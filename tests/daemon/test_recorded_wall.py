@@ -13,7 +13,7 @@ from monstertruck_runtime.yaml_files import yaml_text
 pytestmark = [pytest.mark.wall, pytest.mark.timeout(120)]
 
 RECORDING = Path(__file__).resolve().parents[1] / "data" / "urg04lx_exp2.dat.gz"
-SCANS = 80
+SCANS = 40
 
 
 async def test_every_recorded_scan_reaches_another_process_exactly(tmp_path: Path):

@@ -254,6 +254,7 @@ def processes_below(parent: int, name: str) -> list[int]:
     return found
 
 
+@pytest.mark.long
 async def test_a_goal_set_with_the_mouse_is_reached_in_the_world(tmp_path: Path):
     async with robot(tmp_path, base=ROOT / "configs/goals.yaml") as made:
         await started(made)

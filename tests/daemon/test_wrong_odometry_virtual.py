@@ -15,6 +15,7 @@ from tests.daemon.slam_kit import driven, lap
 pytestmark = [pytest.mark.virtual, pytest.mark.timeout(300)]
 
 
+@pytest.mark.long
 def test_mirrored_turns_are_reported_and_the_pose_stays_true(monkeypatch: pytest.MonkeyPatch):
     right, first = DeadReckoning.estimate, []
 

@@ -134,9 +134,9 @@ def assert_counted(scans: list[Scan], times: list[int]) -> None:
 
 
 @pytest.mark.wall
-async def test_a_hundred_scans_of_a_moving_truck_are_the_worlds():
+async def test_scans_of_a_moving_truck_are_the_worlds():
     def work(laser: Client) -> list[Scan]:
-        scans = list(islice(laser.iter_dist(), 100))
+        scans = list(islice(laser.iter_dist(), 40))
         laser.standby()
         return scans
 
@@ -144,15 +144,15 @@ async def test_a_hundred_scans_of_a_moving_truck_are_the_worlds():
     recorded = Recorded(world.lidar)
     started = world.truth(clock.now())
     world.motor.command(clock.now(), -8000.0, 10_000.0)
-    scans = await use(recorded, work, timer_start=COUNTER - 5000)
+    scans = await use(recorded, work, timer_start=COUNTER - 2000)
 
-    assert len(scans) == 100
+    assert len(scans) == 40
     for (scan, _, _), said in zip(scans, recorded.revolutions, strict=False):
         np.testing.assert_array_equal(scan, said[FIELD])
-    assert_counted(scans, recorded.times[:100])
+    assert_counted(scans, recorded.times[:40])
     assert scans[-1][1] < scans[0][1]
     assert {0, 19} <= {int(code) for scan, _, _ in scans for code in scan[scan < 20]}
-    assert world.truth(clock.now()).x > started.x + 0.5
+    assert world.truth(clock.now()).x > started.x + 0.2
 
 
 async def test_what_the_sensor_says_of_itself():
