@@ -82,6 +82,8 @@ class InformationConfig(ExplorerConfig):
     """Seconds that half a turn at the start costs"""
     better: Annotated[float, Field(ge=1)] = 4.0
     """How many times as much per second another frontier has to show, to be preferred to the one that is pursued"""
+    follow: NotNegative = 2.0
+    """A frontier this near to where the pursued one was is what became of it, m; 0: that is not asked"""
 
 
 class TourConfig(ExplorerConfig):
