@@ -23,7 +23,7 @@ from monstertruck_schemas.topics import Topic
 from monstertruckd.station import frames
 from monstertruckd.station.address import RobotAddress
 from monstertruckd.station.frames import Frame
-from monstertruckd.station.viewer import Viewer
+from monstertruckd.station.viewer import Viewer, Viewers
 
 log = logging.getLogger(__name__)
 
@@ -149,9 +149,8 @@ class RobotFeed:
         self.client: TruckClient | None = None
         """While there is a session."""
         self._clock = clock
-        self._viewers: set[Viewer] = set()
+        self._viewers = Viewers()
         self._watched = asyncio.Event()
-        self._newest: dict[str, Frame] = {}
         self._events: deque[str] = deque(maxlen=KEPT_EVENTS)
         self._facts: str | None = None
         self._known = False
@@ -167,7 +166,7 @@ class RobotFeed:
         viewer.show("link", self._link)
         if self._facts is not None:
             viewer.send(self._facts)
-        for kind, frame in self._newest.items():
+        for kind, frame in self._viewers.newest.items():
             viewer.show(kind, frame)
         for event in self._events:
             viewer.send(event)
@@ -230,7 +229,7 @@ class RobotFeed:
         except TruckError as error:
             log.warning("robot %s does not say what it is: %s", self.address.name, error)
             return False
-        self._send(self._facts)
+        self._viewers.send(self._facts)
         return True
 
     async def _sample(self, client: TruckClient) -> None:
@@ -255,7 +254,7 @@ class RobotFeed:
                         self._take_event(event)
                     await self._clock.sleep(TICK)
             # Whoever looks next begins with what is published then, not with what was true long ago.
-            self._newest.clear()
+            self._viewers.newest.clear()
 
     def _take(self, shown: Shown[M], box: Mailbox[M], taken: dict[str, tuple[Message, int]], now: int) -> None:
         newest = box.latest
@@ -266,37 +265,28 @@ class RobotFeed:
         frame = shown.encode(newest)
         pause = max(shown.period, 0.0 if shown.budget is None else len(frame) / shown.budget)
         taken[shown.kind] = newest, now + round(pause * SECOND)
-        self._show(shown.kind, frame)
+        self._viewers.show(shown.kind, frame)
 
     def _take_map(self, maps: Mailbox[Grid], tiles: Mailbox[Grid]) -> None:
         for grid in maps.drain():
-            self._show("map", self.map.take(grid))
+            self._viewers.show("map", self.map.take(grid))
         for part in tiles.drain():
-            self._send(self.map.change(part))
+            self._viewers.send(self.map.change(part))
 
     def _take_event(self, event: Event) -> None:
         if event.reason is Reason.SETTING_CHANGED:
             self._known = False
         frame = frames.message("event", event)
         self._events.append(frame)
-        self._send(frame)
+        self._viewers.send(frame)
 
     def _set_link(self, round_trip: float | None, text: str) -> None:
         self.alive, self.round_trip = round_trip is not None, round_trip
         if not self.alive:
-            self._newest = {kind: frame for kind, frame in self._newest.items() if kind == "map"}
+            self._viewers.newest = {kind: frame for kind, frame in self._viewers.newest.items() if kind == "map"}
         self._link = frames.text("link", alive=self.alive, round_trip=round_trip, text=text)
         for viewer in self._viewers:
             viewer.show("link", self._link)
-
-    def _show(self, kind: str, frame: Frame) -> None:
-        self._newest[kind] = frame
-        for viewer in self._viewers:
-            viewer.show(kind, frame)
-
-    def _send(self, frame: Frame) -> None:
-        for viewer in self._viewers:
-            viewer.send(frame)
 
 
 POSE: Final = Shown(topics.ODOMETRY, "pose", frames.pose)

@@ -13,7 +13,7 @@ from monstertruck_schemas.base import Message
 from monstertruckd.station import frames
 from monstertruckd.station.feed import POSE, SHOWN, TICK, MapStore
 from monstertruckd.station.frames import Frame
-from monstertruckd.station.viewer import Viewer
+from monstertruckd.station.viewer import Viewer, Viewers
 
 log = logging.getLogger(__name__)
 
@@ -99,8 +99,7 @@ class ReplayFeed:
         self.name = name
         self.map = MapStore()
         self._clock = clock
-        self._viewers: set[Viewer] = set()
-        self._newest: dict[str, Frame] = {}
+        self._viewers = Viewers()
         shown = (*SHOWN, POSE)
         ways = (topics.POSE, topics.MAP, topics.MAP_TILES, topics.EVENT)
         self._tracks = {topic.name: RecordedTopic() for topic in (*(row.topic for row in shown), *ways)}
@@ -162,7 +161,7 @@ class ReplayFeed:
     def _send_all(self, viewer: Viewer) -> None:
         viewer.send(self._facts)
         viewer.show("link", frames.text("link", alive=True, round_trip=0.0, text=""))
-        for kind, frame in self._newest.items():
+        for kind, frame in self._viewers.newest.items():
             viewer.show(kind, frame)
         for part in self.map.tiles.values():
             viewer.send(part)
@@ -190,8 +189,8 @@ class ReplayFeed:
             if self._viewers and now >= due:
                 due = now + round(AGAIN * SECOND)
                 for kind in AGAIN_KINDS:
-                    if kind in self._newest:
-                        self._show(kind, self._newest[kind])
+                    if kind in self._viewers.newest:
+                        self._viewers.show(kind, self._viewers.newest[kind])
                 self._send_state()
 
     def _play(self, at: int) -> None:
@@ -199,11 +198,11 @@ class ReplayFeed:
         self._playing = at < self._end
         self._look(at)
         for event in self._tracks[topics.EVENT.name].up_to(at):
-            self._send(frames.message("event", event))
+            self._viewers.send(frames.message("event", event))
 
     def _seek(self, at: int) -> None:
         self._at = at
-        self._newest.clear()
+        self._viewers.newest.clear()
         version, self.map = self.map.version, MapStore()
         self.map.version = version
         for track in self._tracks.values():
@@ -218,11 +217,11 @@ class ReplayFeed:
         """Show what came up to ``at``."""
         for name, row in self._shown:
             if (message := self._tracks[name].newest(at)) is not None:
-                self._show(row.kind, row.encode(message))
+                self._viewers.show(row.kind, row.encode(message))
         if (grid := self._tracks[topics.MAP.name].newest(at)) is not None:
-            self._show("map", self.map.take(grid))  # type: ignore[arg-type]  # the topic's model
+            self._viewers.show("map", self.map.take(grid))  # type: ignore[arg-type]  # the topic's model
         for part in self._tracks[topics.MAP_TILES.name].up_to(at):
-            self._send(self.map.change(part))  # type: ignore[arg-type]
+            self._viewers.send(self.map.change(part))  # type: ignore[arg-type]
 
     def _state(self) -> str:
         return frames.text(
@@ -236,15 +235,6 @@ class ReplayFeed:
     def _send_state(self) -> None:
         for viewer in self._viewers:
             viewer.show("replay", self._state())
-
-    def _show(self, kind: str, frame: Frame) -> None:
-        self._newest[kind] = frame
-        for viewer in self._viewers:
-            viewer.show(kind, frame)
-
-    def _send(self, frame: Frame) -> None:
-        for viewer in self._viewers:
-            viewer.send(frame)
 
 
 def _facts(reader: RecordedLog) -> str:

@@ -1,4 +1,4 @@
-"""What waits to be sent to one browser: never more than the newest message of each kind, and a few events."""
+"""What waits to be sent to browsers: never more than the newest message of each kind, and a few events."""
 
 import asyncio
 from collections import deque
@@ -45,3 +45,22 @@ class Viewer:
             return self._ordered.popleft()
         kind = next((kind for kind in self._newest if kind != "camera"), "camera")
         return self._newest.pop(kind)
+
+
+class Viewers(set[Viewer]):
+    """Browsers that look at the same robot or recording, and the newest frame of each kind that they are shown."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.newest: dict[str, Frame] = {}
+
+    def show(self, kind: str, frame: Frame) -> None:
+        """Show a frame everywhere, and keep it for whoever comes later."""
+        self.newest[kind] = frame
+        for viewer in self:
+            viewer.show(kind, frame)
+
+    def send(self, frame: Frame) -> None:
+        """Send a frame everywhere, behind all that were given so."""
+        for viewer in self:
+            viewer.send(frame)
