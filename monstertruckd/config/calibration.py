@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Annotated, Any, Final, Literal, TypeVar
 
 import numpy as np
-from pydantic import Field, ValidationError
+from pydantic import AfterValidator, Field, ValidationError
 
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import ConfigError, NotFoundError
@@ -90,6 +90,20 @@ KEYS: Final[dict[WizardName, tuple[str, ...]]] = {
 Where two wizards measure the same value, the newer measurement counts."""
 
 
+def _date(text: str) -> str:
+    """A date as ``utc`` writes it, or nothing.
+
+    Raises:
+        ValueError: something else.
+    """
+    if text:
+        np.datetime64(text.removesuffix("Z"), "s")
+    return text
+
+
+Date = Annotated[str, Field(pattern=r"^(\d{4}-.*)?$"), AfterValidator(_date)]
+
+
 class Estimate(Schema):
     """One measured value."""
 
@@ -130,7 +144,7 @@ class Result(Schema):
     """What one run of a wizard measured."""
 
     wizard: WizardName
-    date: str = ""
+    date: Date = ""
     """Of the newest estimate; set when it is saved"""
     measured: str
     """What was done, in a sentence"""

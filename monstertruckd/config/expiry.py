@@ -151,7 +151,8 @@ def grade(wizard: WizardName, estimate: Estimate) -> Grade | None:
     if goal is None or estimate.low is None or estimate.high is None:
         return None
     half = (estimate.high - estimate.low) / 2
-    share = half / (goal.half * abs(estimate.value) if goal.share else goal.half)
+    meant = goal.half * abs(estimate.value) if goal.share else goal.half
+    share = half / meant if meant else np.inf
     return "A" if share <= 1.0 else "B" if share <= 2.0 else "C"
 
 
@@ -239,9 +240,10 @@ class WayCounter:
     def load(self) -> None:
         """Read it; a damaged or missing file begins at 0."""
         try:
-            self.metres = float(json.loads((text_of(self.file) if self.file else None) or "{}").get("metres", 0.0))
-        except (ValueError, AttributeError, TypeError):
-            self.metres = 0.0
+            metres = float(json.loads((text_of(self.file) if self.file else None) or "{}").get("metres", 0.0))
+        except (ValueError, AttributeError, TypeError, OverflowError, RecursionError):
+            metres = 0.0
+        self.metres = metres if 0.0 <= metres < np.inf else 0.0
         self.written = self.metres
 
     def save(self) -> None:

@@ -305,7 +305,7 @@ class EmulatedUsb:
         return SerialPort(path, baud)
 
     async def _run(self, arguments: Sequence[str]) -> tuple[int, str]:
-        """The only program there is: a uhubctl that cycles one port."""
+        """The only program there is: a uhubctl that switches one port."""
         self.commands.append(arguments)
         if list(arguments[:1]) != ["uhubctl"] or "uhubctl" in self.refused:
             raise FileNotFoundError(errno.ENOENT, "No such file or directory", arguments[0])
@@ -313,8 +313,7 @@ class EmulatedUsb:
         for device in self._devices.values():
             hub = parent_of(device.name) or ""
             if (hub.removeprefix("usb"), str(port_of(device.name))) == (options["-l"], options["-p"]):
-                self._switch(device, on=False)
-                self._switch(device, on=True)
+                self._switch(device, on=options["-a"] == "on")
                 return 0, ""
         return 1, "No compatible devices detected!"
 

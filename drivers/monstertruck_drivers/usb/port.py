@@ -107,7 +107,7 @@ class PortPower:
         self._pace(name)
         try:
             if method is CycleMethod.UHUBCTL:
-                await self._uhubctl(name)
+                await self._cycle_by_uhubctl(name)
             elif method is CycleMethod.PORT:
                 await self._toggle(f"{port_directory(name)}/disable", "1", "0", self.config.off_time)
             else:
@@ -138,12 +138,17 @@ class PortPower:
         finally:
             await machine.offload(lambda: machine.sysfs.write(attribute, on))
 
-    async def _uhubctl(self, name: str) -> None:
+    async def _cycle_by_uhubctl(self, name: str) -> None:
+        """Off and on by one run each: its own ``cycle``, ended between them, would leave the port without power."""
+        try:
+            await self._uhubctl(name, "off")
+            await self._machine.clock.sleep(self.config.off_time)
+        finally:
+            await self._uhubctl(name, "on")
+
+    async def _uhubctl(self, name: str, action: str) -> None:
         hub = str(parent_of(name)).removeprefix("usb")
-        delay = f"{self.config.off_time:g}"
-        code, output = await self._machine.run(
-            ["uhubctl", "-l", hub, "-p", str(port_of(name)), "-a", "cycle", "-d", delay]
-        )
+        code, output = await self._machine.run(["uhubctl", "-l", hub, "-p", str(port_of(name)), "-a", action])
         if code:
             raise DeviceError(f"{place(name)}: uhubctl failed with {code}: {output}")
 

@@ -81,6 +81,8 @@ KINDS: dict[str, Callable[[Path], object]] = {
     "negative": value("drive", -640.0),
     "an absurd ratio": value("drive", 1e300),
     "a key of the gate": value("drive", 9.0, "gate.speed"),
+    "a date that is none": edited(lambda data: data["results"]["drive"].update(date="yesterday")),
+    "a date of no calendar": edited(lambda data: data["results"]["drive"].update(date="2026-99-99T00:00:00Z")),
     "a key that is not there": value("drive", 9.0, "geometry.drive"),
 }
 

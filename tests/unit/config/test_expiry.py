@@ -84,7 +84,13 @@ def test_what_rests_on_it_is_named():
     assert degraded_topics([]) == frozenset()
 
 
-@pytest.mark.parametrize("text", ["", "{", "[1]", '{"metres": "x"}'])
+@pytest.mark.parametrize(
+    "text",
+    [
+        *("", "{", "[1]", "[" * 100_000),
+        *(f'{{"metres": {value}}}' for value in ('"x"', "NaN", "1e999", "-1", "1" + 400 * "0")),
+    ],
+)
 def test_a_damaged_odometer_begins_at_nothing(text, tmp_path):
     file = tmp_path / "odometer.json"
     file.write_text(text)
@@ -94,6 +100,11 @@ def test_a_damaged_odometer_begins_at_nothing(text, tmp_path):
     replace(odometer, metres=12.34).save()
     odometer.load()
     assert odometer.metres == 12.3
+
+
+def test_a_value_of_zero_has_the_worst_grade_where_its_interval_is_meant_as_a_share_of_it():
+    estimate = Estimate(name="wheelbase", value=0.0, low=-0.1, high=0.1, samples=1, meaning="test")
+    assert grade("odometry", estimate) == "C"
 
 
 def test_the_watch_marks_messages_tells_once_and_counts_the_way(tmp_path):

@@ -34,8 +34,8 @@ def test_the_device_vanishes_and_comes_back(tmp_path: Path, method: CycleMethod)
     assert severity is Severity.WARNING
     assert "hub 1-1 port 1" in text
     assert values == {"method": method.value}
-    commands = [["uhubctl", "-l", "1-1", "-p", "1", "-a", "cycle", "-d", "2"]] if method is CycleMethod.UHUBCTL else []
-    assert bench.usb.commands == commands
+    commands = [["uhubctl", "-l", "1-1", "-p", "1", "-a", action] for action in ("off", "on")]
+    assert bench.usb.commands == (commands if method is CycleMethod.UHUBCTL else [])
 
 
 def test_power_stays_off_for_its_time_and_comes_back_when_cancelled(tmp_path: Path):
@@ -52,6 +52,17 @@ def test_power_stays_off_for_its_time_and_comes_back_when_cancelled(tmp_path: Pa
         assert (bench.clock.now() - start) / SECOND == pytest.approx(2)
 
     play(tmp_path, scene, by(CycleMethod.PORT))
+
+
+def test_uhubctl_leaves_no_port_without_power_when_cancelled(tmp_path: Path):
+    async def scene(bench: Bench) -> None:
+        with pytest.raises(TimeoutError):
+            async with bench.clock.deadline(1):
+                await bench.power.cycle("1-1.1")
+        assert bench.usb.present("1-1.1")
+        assert [command[-1] for command in bench.usb.commands] == ["off", "on"]
+
+    play(tmp_path, scene, by(CycleMethod.UHUBCTL))
 
 
 def test_cycles_of_one_port_become_rarer(tmp_path: Path):
