@@ -189,6 +189,8 @@ class SimulatedOperator:
                 before = self._before
                 along = math.cos(before.yaw) * (truth.x - before.x) + math.sin(before.yaw) * (truth.y - before.y)
                 return along > 0
+            case "turned":
+                return math.remainder(truth.yaw - self._before.yaw, math.tau) > 0
             case "another":
                 if self._charges:
                     self._rig.world.set_charge(self._rig.clock.now(), self._charges.pop(0))

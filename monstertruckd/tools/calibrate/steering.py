@@ -56,6 +56,9 @@ SCALE: Final = 0.02
 SEEN: Final = 5.0
 """Standard errors of a turn that make its direction sure."""
 
+_TURNED: Final = Confirm(
+    "turned", "Steered to the left and driving ahead: did the truck turn to the LEFT, seen from above?", fact=True
+)
 _STRING: Final = Confirm(
     "string", "Lay a string along the truck's left side, 2.5 m ahead, and mark the middle of that side on it. Done?"
 )
@@ -91,6 +94,7 @@ class SteeringWizard:
         if self.rough or wrong:
             again = f"{' and '.join(wrong)} wheels steer the other way: restart the daemon, and measure the rest"
             if len(wrong) == len(AXLES):
+                await self._check_compass(context)
                 again += "; swapped cables look the same: do the FRONT wheels turn when the front ones are steered?"
             return context.fit("centres", lambda: _rough(arcs, model, start, again if wrong else None))
         legs = [leg for axle in await self._arcs(context, maps, ARC) for leg in axle]
@@ -104,6 +108,21 @@ class SteeringWizard:
         return result.model_copy(update={"estimates": (*result.estimates, *estimates(answer))})
 
     # Driving
+
+    @staticmethod
+    async def _check_compass(context: WizardContext) -> None:
+        """The compass says that both axles steer the other way: the operator sees whether it is the compass.
+
+        Raises:
+            InputError: it is.
+        """
+        speed, angle, metres = ROUGH
+        await context.move(MoveStep("front wheels left once more, to see where it turns", speed, angle, 0.0, metres))
+        if await context.confirm(_TURNED):
+            raise InputError(
+                "the truck turns as it is steered, and the compass the other way: it is mounted upside down, or its "
+                "heading has the wrong sign; nothing was saved"
+            )
 
     @staticmethod
     async def _arcs(

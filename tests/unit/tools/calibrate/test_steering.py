@@ -1,6 +1,8 @@
 """Pulse maps and turn deficit from legs: what turns tell, what only the string tells, and stops."""
 
+import asyncio
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,8 +12,9 @@ from monstertruck_kinematics.polynomials import F_CORRECTED, G_PRINTED, AxlePoly
 from monstertruck_kinematics.truck import DriveTrain
 from monstertruck_runtime.errors import InputError
 from monstertruckd.config.calibration import KEYS
-from monstertruckd.tools.calibrate.steering import AxleTravel, _deficits, _rough, steered_senses
+from monstertruckd.tools.calibrate.steering import AxleTravel, SteeringWizard, _deficits, _rough, steered_senses
 from monstertruckd.tools.calibrate.steering_model import Maps, SteeringModel, SteeringRun, half_widths
+from monstertruckd.tools.calibrate.steps import Confirm, MoveRecord, MoveStep
 
 CHASSIS = truck_chassis(Dimensions(DriveTrain()))
 assert isinstance(CHASSIS, TruckChassis)
@@ -71,14 +74,20 @@ def test_without_a_string_the_common_error_of_both_axles_is_not_seen_and_the_int
     assert halves[1] < 8
 
 
-@pytest.mark.parametrize("signs", [(1, 1), (-1, 1), (1, -1), (-1, -1)])
-def test_directions_by_the_sense_of_the_turn(signs: tuple[int, int]):
-    true = Maps(TRUE.centres, (TRUE.scales[0] * signs[0], TRUE.scales[1] * signs[1]))
-    arcs = tuple(
+def short_arcs(true: Maps) -> tuple[list[SteeringRun], list[SteeringRun]]:
+    """Those at the wizard's beginning."""
+    arcs = [
         [leg(*(axle == 0) * np.array((s * 0.1, 0.0)) + (axle == 1) * np.array((0.0, s * 0.1)), d * 0.4, true)
          for s in (1, -1) for d in (1, -1)]
         for axle in (0, 1)
-    )  # fmt: skip
+    ]  # fmt: skip
+    return arcs[0], arcs[1]
+
+
+@pytest.mark.parametrize("signs", [(1, 1), (-1, 1), (1, -1), (-1, -1)])
+def test_directions_by_the_sense_of_the_turn(signs: tuple[int, int]):
+    true = Maps(TRUE.centres, (TRUE.scales[0] * signs[0], TRUE.scales[1] * signs[1]))
+    arcs = short_arcs(true)
     assert steered_senses(arcs) == signs  # type: ignore[arg-type]
     start = Maps(BELIEVED.centres, (BELIEVED.scales[0] * signs[0], BELIEVED.scales[1] * signs[1]))
     result = _rough(arcs, MODEL, start, None)  # type: ignore[arg-type]
@@ -90,6 +99,38 @@ def test_directions_by_the_sense_of_the_turn(signs: tuple[int, int]):
         assert centre.low is not None
         assert centre.high is not None
         assert centre.low < true.centres[axle] < centre.high
+
+
+@pytest.mark.parametrize("turned_left", [True, False])
+def test_where_both_axles_seem_to_steer_the_other_way_the_operator_sees_whether_it_is_the_compass(
+    turned_left: bool, monkeypatch: pytest.MonkeyPatch
+):
+    asked: list[str] = []
+
+    async def arcs(*_: object) -> tuple[list[SteeringRun], list[SteeringRun]]:
+        return short_arcs(Maps(TRUE.centres, (-TRUE.scales[0], -TRUE.scales[1])))
+
+    async def confirm(step: Confirm) -> bool:
+        asked.append(step.name)
+        return turned_left
+
+    async def move(step: MoveStep) -> MoveRecord:
+        asked.append(step.name)
+        return MoveRecord()
+
+    monkeypatch.setattr(SteeringWizard, "_arcs", staticmethod(arcs))
+    monkeypatch.setattr(Maps, "of", lambda _: BELIEVED)
+    context = SimpleNamespace(
+        chassis=CHASSIS, config=None, confirm=confirm, move=move, fit=lambda _, compute: compute()
+    )
+    wizard = SteeringWizard(rough=True)
+    if turned_left:
+        with pytest.raises(InputError, match="the compass the other way"):
+            asyncio.run(wizard(context))  # type: ignore[arg-type]
+    else:
+        result = asyncio.run(wizard(context))  # type: ignore[arg-type]
+        assert [result.estimate(f"{name}_direction").value for name in ("front", "rear")] == [1, 1]  # type: ignore[union-attr]
+    assert asked[-1] == "turned"
 
 
 def test_wheels_that_do_not_steer_are_named():
