@@ -21,7 +21,7 @@ from monstertruck_planners.collision import (
     placed,
     points_relative,
     poses_relative,
-    scan_points,
+    scan_points_at,
 )
 from monstertruck_planners.goals.exchange import DeformAnswer, DeformTask, LocalRoute, Pose, Setup, explained_within
 from monstertruck_planners.goals.plan_step import answer_of
@@ -240,7 +240,7 @@ class DeformStep:
 
         Obstacles are its points, and where the lidar does not see or look those that it saw before.
         """
-        pose, points = task.pose, scan_points(task.scan, setup.lidar)
+        pose, points = task.pose, scan_points_at(task.scan, setup.lidar, task.stamp, task.twist)
         (sensor,) = placed(np.array([setup.lidar]), pose)
         ends = placed(np.column_stack((points, np.zeros(len(points)))), pose)[:, :2]
         self._window.add_scan((sensor[0], sensor[1]), pose[:2], ends, np.ones(len(points), np.bool_))

@@ -16,6 +16,7 @@ from monstertruck_planners.goals.exchange import (
     deviation_of,
     level,
     pose_of,
+    twist_of,
 )
 from monstertruck_runtime.actors.actor import Actor
 from monstertruck_runtime.clock import SECOND, Clock
@@ -200,6 +201,8 @@ class RouteDeformation:
             grid=grid if self._fresh or grid is not self._sent_grid else None,
             way=way,
             deviation=deviation_of(odometry),
+            stamp=odometry.stamp,
+            twist=twist_of(odometry),
         )
         self._fresh, self._sent_grid = False, grid
         return task

@@ -123,6 +123,10 @@ class DeformTask:
     way: LocalRoute | None = None
     deviation: float = 0.0
     """Standard deviation of the position, m."""
+    stamp: int = 0
+    """Of the pose, ns."""
+    twist: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Vx, vy, wz of the base since the scan, m/s and rad/s."""
 
 
 Finding = Literal["idle", "free", "kept", "new", "blocked"]
@@ -166,3 +170,8 @@ def explained_within(config: PlannerConfig, deviation: float) -> float:
 def pose_of(odometry: Odometry) -> Pose:
     """x, y (m), yaw (rad)."""
     return odometry.pose.x, odometry.pose.y, odometry.pose.yaw
+
+
+def twist_of(odometry: Odometry) -> tuple[float, float, float]:
+    """Vx, vy (m/s), wz (rad/s)."""
+    return odometry.twist.vx, odometry.twist.vy, odometry.twist.wz

@@ -9,7 +9,7 @@ from typing import Any, Final, TypeVar
 import numpy as np
 
 from monstertruck_kinematics.elementary import Array
-from monstertruck_planners.collision import placed, scan_points
+from monstertruck_planners.collision import placed, scan_points_at
 from monstertruck_planners.goals import goal_run
 from monstertruck_planners.goals.deformation import RouteDeformation, event_of
 from monstertruck_planners.goals.exchange import (
@@ -23,6 +23,7 @@ from monstertruck_planners.goals.exchange import (
     deviation_of,
     level,
     pose_of,
+    twist_of,
 )
 from monstertruck_planners.goals.goal_run import Action, Follow, GoalRun, Halt, Observations, Plan, Report
 from monstertruck_planners.goals.path_publisher import (
@@ -112,7 +113,7 @@ class GoalService:
         self._fresh = True
         self._sent_grid: Grid | None = None
         self._sent_ground: Ground | None = None
-        self._scanned: LaserScan | None = None
+        self._scanned: tuple[LaserScan, Odometry] | None = None
         self._points: Array = np.empty((0, 2))
         self._seen: deque[tuple[Pose, Array]] = deque(maxlen=SEEN)
         """Poses and returns in base of scans since the last plan."""
@@ -283,7 +284,7 @@ class GoalService:
     def _blocked(self, followed: FollowedPath, along: float, odometry: Odometry, now: int) -> bool:
         if self._deformation is not None and self._deformation.active:
             return self._deformation.blocked(now)
-        points = self._scan(now)
+        points = self._scan(odometry, now)
         if not len(points):
             return False
         pose = pose_of(odometry)
@@ -297,19 +298,21 @@ class GoalService:
         if pose is None or self._before is None or math.dist(pose[:2], self._before[:2]) > JUMP:
             self._seen.clear()
         self._before = pose
-        if pose is None or (self._seen and not _moved_on(self._seen[-1][0], pose)):
+        if odometry is None or pose is None or (self._seen and not _moved_on(self._seen[-1][0], pose)):
             return
-        if len(points := self._scan(now)):
+        if len(points := self._scan(odometry, now)):
             self._seen.append((pose, points))
 
-    def _scan(self, now: int) -> Array:
-        """Returns of the newest scan in base; none if it is old or tilted."""
+    def _scan(self, odometry: Odometry, now: int) -> Array:
+        """Returns of the newest scan in base as it is now; none if it is old or tilted."""
         scan = None if self._in.scan is None else self._in.scan.latest
         if scan is None or now - scan.received > SCAN.fresh_for() * SECOND:
             return np.empty((0, 2))
-        if scan is not self._scanned:
-            points = scan_points(scan, self._setup.lidar) if level(scan, self._config) else np.empty((0, 2))
-            self._scanned, self._points = scan, points
+        if self._scanned is None or self._scanned[0] is not scan or self._scanned[1] is not odometry:
+            points = np.empty((0, 2))
+            if level(scan, self._config):
+                points = scan_points_at(scan, self._setup.lidar, odometry.stamp, twist_of(odometry))
+            self._scanned, self._points = (scan, odometry), points
         return self._points
 
     # Decisions
@@ -348,7 +351,7 @@ class GoalService:
             plan.what,
             pose,
             run.goal,
-            _in_map(self._scan(now), pose),
+            _in_map(self._scan(odometry, now), pose),
             setup=self._setup if self._fresh else None,
             grid=grid if grid is not self._sent_grid or self._fresh else None,
             ground=ground if ground is not self._sent_ground or self._fresh else None,

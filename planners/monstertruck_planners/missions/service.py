@@ -82,6 +82,9 @@ AGAIN: Final = 1.0
 PATIENCE: Final = 180.0
 """...for so many; a planner compiles for a minute or two after an installation."""
 
+SILENT: Final = 10.0
+"""Seconds without a report of what does a step, which comes twice a second, after which it has failed."""
+
 S = TypeVar("S")
 
 
@@ -390,7 +393,10 @@ class MissionService:
                 return StepEnd(Reason.CANCELLED, f"the goal of {goal.source} is pursued now")
             return StepEnd(goal.outcome, goal.text) if goal.phase is GoalPhase.IDLE else None
 
-        return await self._until(end, lambda: goals.control(GoalControl(**self._header(), order=GoalOrder.CANCEL)))
+        def stop() -> None:
+            goals.control(GoalControl(**self._header(), order=GoalOrder.CANCEL))
+
+        return await self._until(end, stop, self._in.goal)
 
     async def _taken(self, request: Callable[[], GoalRequest]) -> int:
         """Number of a goal, which is asked for again while what refuses it passes.
@@ -420,7 +426,10 @@ class MissionService:
             ended = state is not None and state.number == number and not state.running
             return StepEnd(state.outcome, state.text) if ended and state is not None else None
 
-        return await self._until(end, lambda: explorer.take(ExploreRequest(**self._header(), order=ExploreOrder.STOP)))
+        def stop() -> None:
+            explorer.take(ExploreRequest(**self._header(), order=ExploreOrder.STOP))
+
+        return await self._until(end, stop, self._in.explore)
 
     async def _behave(self, name: str, settings: dict[str, Any], distance: float | None) -> StepEnd:
         behaviours = self._parts.behaviours
@@ -443,7 +452,7 @@ class MissionService:
             number = behaviours.take(
                 BehaviourRequest(**self._header(), order=BehaviourOrder.START, behaviour=name, settings=settings)
             )
-            result = await self._until(end, stop)
+            result = await self._until(end, stop, self._in.behaviour)
             state = self._in.behaviour.latest
             if state is not None and state.number == number and state.running:
                 stop()
@@ -451,16 +460,23 @@ class MissionService:
         finally:
             self._parts.goals.hold(SOURCE, on=True)
 
-    async def _until(self, end: Callable[[], StepEnd | None], stop: Callable[[], object]) -> StepEnd:
-        """Wait for an end; cancelled or out of time, have it stopped."""
-        schedule = Schedule(self._clock, RATE)
+    async def _until(
+        self, end: Callable[[], StepEnd | None], stop: Callable[[], object], reports: Subscription[Any]
+    ) -> StepEnd:
+        """Wait for an end; cancelled, out of time or without ``reports``, have it stopped."""
+        schedule, since = Schedule(self._clock, RATE), self._clock.now()
+        ended: StepEnd | None = None
         try:
             while (ended := end()) is None:
+                newest = reports.latest
+                heard = since if newest is None else max(since, newest.received)
+                if self._clock.now() - heard > SILENT * SECOND:
+                    return StepEnd(Reason.SERVICE_FAILED, f"what does the step has said nothing for {SILENT:g} s")
                 await schedule.next()
-        except BaseException:
-            with contextlib.suppress(TruckError):
-                stop()
-            raise
+        finally:
+            if ended is None:
+                with contextlib.suppress(TruckError):
+                    stop()
         return ended
 
     def _header(self) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """Paths, and a truck that obeys with the rates of the real one."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 from pydantic import TypeAdapter
@@ -9,8 +10,10 @@ from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.track.catalog import AnyTracker, build_tracker
 from monstertruck_planners.track.path_tracker import TruckState
 from monstertruck_planners.track.segments import SegmentedPath
+from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.plan import Path
 from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.sensor import VALID_BEAM, LaserScan
 
 STEERING = FourWheelSteering()
 TRACKER = TypeAdapter(AnyTracker)
@@ -89,3 +92,24 @@ class Follower:
 
     def along(self):
         return np.array([self.path.along(c.progress) for c in self.log])
+
+
+def scanned_on_the_move(wall, lidar=(0.14, 0.0, 0.0), late=0.2):
+    """A truck that turns on its way to a wall at x = ``wall``: a scan that began ``late`` s ago, odometry of now."""
+    twist, now, each = STEERING.body_twist(0.2, 0.33, -0.33), 10 * SECOND, 0.1 / 1024
+    pose, bearings, ranges = (0.0, 0.0, 0.3), np.linspace(-0.3, 0.6, 200), []
+    for i, bearing in enumerate(bearings.tolist()):
+        x, y, yaw = STEERING.integrate(pose, *twist, i * each - late)
+        x, y = x + math.cos(yaw) * lidar[0] - math.sin(yaw) * lidar[1], y + math.sin(yaw) * lidar[0]
+        ranges.append((wall - x) / math.cos(yaw + lidar[2] + bearing))
+    scan = LaserScan(
+        stamp=now - round(late * SECOND), received=now - SECOND // 20, seq=0, start_angle=-0.3, end_angle=0.6,
+        time_increment=each, scan_time=0.1, range_min=0.06, range_max=4.1, ranges=np.array(ranges),
+        codes=np.full(len(ranges), VALID_BEAM, np.uint8),
+    )  # fmt: skip
+    odometry = SimpleNamespace(
+        stamp=now,
+        pose=SimpleNamespace(**dict(zip(("x", "y", "yaw"), pose, strict=True))),
+        twist=SimpleNamespace(**dict(zip(("vx", "vy", "wz"), twist, strict=True))),
+    )
+    return scan, odometry, lidar

@@ -3,16 +3,22 @@
 import asyncio
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
+from monstertruck_planners.collision import placed
 from monstertruck_planners.goals import deformation
+from monstertruck_planners.goals.config import PlannerConfig
+from monstertruck_planners.goals.deform_step import DeformStep, Window
 from monstertruck_planners.goals.deformation import RouteDeformation
+from monstertruck_planners.goals.exchange import DeformTask, pose_of, twist_of
 from monstertruck_planners.goals.service import GoalService
 from monstertruck_runtime.clock import run_virtual
 from monstertruck_runtime.errors import InputError, RequestRefusedError, WorkerError
 from monstertruck_runtime.mailbox import Mailbox, latest
 from monstertruck_schemas.plan import GoalPhase, GoalState
 from monstertruck_schemas.reasons import Reason
+from tests.unit.planners.kit import scanned_on_the_move
 
 
 @pytest.mark.parametrize(
@@ -113,3 +119,22 @@ def test_without_the_worker_that_deforms_routes_goals_go_on_and_it_is_tried_agai
 
     run_virtual(main)
     assert reported == [WorkerError.reason] * 2
+
+
+def test_returns_of_a_scan_lie_where_they_are_though_the_truck_turned_since():
+    scan, odometry, lidar = scanned_on_the_move(wall=2.5)
+    service = GoalService.__new__(GoalService)
+    service._in, service._scanned = SimpleNamespace(scan=SimpleNamespace(latest=scan)), None
+    service._config, service._setup = PlannerConfig(), SimpleNamespace(lidar=lidar)
+    points = service._scan(odometry, odometry.stamp)
+    there = placed(np.column_stack((points, np.zeros(len(points)))), pose_of(odometry))
+    assert np.abs(there[:, 0] - 2.5).max() < 0.002
+
+
+def test_the_window_of_the_local_planner_has_them_there_too():
+    scan, odometry, lidar = scanned_on_the_move(wall=1.0)
+    step = DeformStep()
+    step._window = Window()
+    task = DeformTask(scan, pose_of(odometry), stamp=odometry.stamp, twist=twist_of(odometry))
+    step._observe(SimpleNamespace(lidar=lidar), task)
+    assert set(np.floor(step._window.obstacles[:, 0] / 0.04).tolist()) <= {24.0, 25.0}, "cells on either side of 1 m"

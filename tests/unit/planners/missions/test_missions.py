@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 
 from monstertruck_planners.missions.progress import MissionProgress, SavedProgress, StepEnd, after, in_words, outcome
-from monstertruck_planners.missions.service import MissionInputs, MissionParts, MissionService
+from monstertruck_planners.missions.service import SILENT, MissionInputs, MissionParts, MissionService
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.errors import NotFoundError, RequestRefusedError
 from monstertruck_runtime.threads import inline
@@ -193,6 +193,18 @@ def test_a_mission_is_done_step_by_step_and_keeps_the_robot_armed(tmp_path: Path
     assert not robot.held
     assert not file.exists()
     assert [report.step for report in robot.reports if report.running][-1] == 4
+
+
+def test_a_step_fails_when_what_does_it_falls_silent():
+    async def story(robot: Pretended) -> None:
+        robot.order(MissionOrder.START, GO)
+        await robot.clock.sleep(1.0)
+        robot.task.cancel()  # no report any more
+        await robot.clock.sleep(SILENT + 1.0)
+
+    robot = played(story)
+    assert (robot.reports[-1].running, robot.reports[-1].outcome) == (False, Reason.SERVICE_FAILED)
+    assert robot.latest["goal"].outcome is Reason.CANCELLED, "in case it only says nothing"
 
 
 def test_stopped_it_cancels_its_goal():
