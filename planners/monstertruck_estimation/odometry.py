@@ -300,7 +300,7 @@ class DeadReckoning:
             lost = PlanarCovariance(xx=pace, yy=pace, ww=turn)
             covariance = covariance.plus(term * waited**2 for term in lost)
             twist, twist_covariance = (0.0, 0.0, 0.0), self._drift.plus(lost).matrix()
-        sources = [*self._carriers]
+        sources = [*self._carriers] if now - self._reached <= SOURCE_TIMEOUT else []
         for name, used in (
             ("steering", self._wheels.steered),
             ("compass", self._compass_used),

@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from monstertruck_estimation.scan_tilt import ScanAngles, plane_slopes
-from monstertruck_estimation.se2 import SmoothedCorrection, Vector, between, interpolate
+from monstertruck_estimation.se2 import SmoothedCorrection, Vector, between, interpolate, rotation
 from monstertruck_estimation.slam.config import SlamConfig
 from monstertruck_estimation.slam.worker_io import (
     GridPatch,
@@ -22,6 +22,7 @@ from monstertruck_estimation.slam.worker_io import (
     WorkerOutput,
 )
 from monstertruck_estimation.transforms import planar
+from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.actors.actor import WorkerActor
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import WorkerError
@@ -43,6 +44,8 @@ HISTORY: Final = 128
 """Poses of odometry kept: 2.5 s at 50 Hz."""
 STALE: Final = SECOND // 5
 """Odometry older than the scan by more than this is not used, ns."""
+UNMATCHED: Final = SECOND
+"""Without a scan that can be used for so long, ns, the lidar is no source of the pose, which odometry carries on."""
 UNSCANNED: Final = 1.0
 """A map that is asked for is saved without a scan if no usable one comes within so many seconds."""
 CORRECTIONS: Final = {"closed": "closure {}", "joined": "two submaps are joined"}
@@ -99,6 +102,9 @@ class SlamService:
         self._history: deque[tuple[int, Vector]] = deque(maxlen=HISTORY)
         self._correction = SmoothedCorrection(config.slew, config.jump)
         self._newest: SlamEstimate | None = None
+        self._latest: Odometry | None = None
+        self._matched_at: Odometry | None = None
+        """Odometry when the newest estimate came."""
         self._status: LocalisationStatus | None = None
         self._degenerate_said: int | None = None
         self._use = OdometryUse.NONE
@@ -188,8 +194,13 @@ class SlamService:
                 "pose": Pose2D(x=x, y=y, yaw=yaw),
             }
             if self._newest is not None:
-                update["pose_covariance"] = np.array(self._newest.covariance)
-                update["sources"] = (*message.sources, "lidar")
+                known = np.array(self._newest.covariance)
+                if message.stamp - self._newest.stamp <= UNMATCHED:
+                    update["sources"] = (*message.sources, "lidar")
+                elif self._matched_at is not None:
+                    known = carried_on(known, self._matched_at, message, self._correction.value[2])
+                update["pose_covariance"] = known
+            self._latest = message
             self._pose.put(message.model_copy(update=update))
 
     def _publish_pose(self, estimate: SlamEstimate, scan: LaserScan) -> None:
@@ -340,7 +351,7 @@ class SlamService:
         at_once = found or self._newest is None or estimate.odometry is OdometryUse.CONTRADICTED
         if estimate.map_from_odom is not None and estimate.status not in PLACELESS:
             self._correction.set_target(estimate.map_from_odom, at_once=at_once)
-        self._newest = estimate
+        self._newest, self._matched_at = estimate, self._latest
         if estimate.moved is not None:
             self._motions.put(scan_motion(estimate.stamp, estimate.moved, now, self._motions.next_seq()))
         self._report(estimate, outputs)
@@ -397,6 +408,27 @@ class SlamService:
             self._events(Reason.MAP_SAVED, Severity.INFO, self.name, f"{outputs.saved}{poses}")
         if outputs.error is not None:
             self._events(Reason.BAD_INPUT, Severity.WARNING, self.name, f"map not saved: {outputs.error}")
+
+
+def carried_on(covariance: Array, before: Odometry, now: Odometry, turn: float) -> Array:
+    """Covariance of a pose in map, (9,), that was known at ``before`` and that odometry has carried on until ``now``.
+
+    Args:
+        covariance: (9,), then.
+        before: odometry then.
+        now: and now.
+        turn: of odom in map, rad.
+    """
+    way = np.array((now.pose.x - before.pose.x, now.pose.y - before.pose.y))
+    swung, swing, turned = np.eye(3), np.eye(3), np.eye(3)
+    swung[:2, 2] = -way[1], way[0]
+    turned[:2, :2] = rotation(turn)
+    swing[:2, 2] = turned[:2, :2] @ swung[:2, 2]
+    gained = now.pose_covariance.reshape(3, 3) - swung @ before.pose_covariance.reshape(3, 3) @ swung.T
+    sizes, axes = np.linalg.eigh((gained + gained.T) / 2)
+    gained = (axes * np.maximum(sizes, 0.0)) @ axes.T  # a compass may have taken some of it away
+    found = swing @ covariance.reshape(3, 3) @ swing.T + turned @ gained @ turned.T
+    return np.asarray(found.ravel())
 
 
 def grid_message(patch: GridPatch, now: int, seq: int) -> Grid:

@@ -1,12 +1,14 @@
 """The service around the worker: a map that is asked for is saved, with scans and without."""
 
 import asyncio
+import math
 from pathlib import Path
 from typing import ClassVar, Self
 
 import numpy as np
 import pytest
 
+from monstertruck_estimation.odometry import _message as odometry_message
 from monstertruck_estimation.slam import service as module
 from monstertruck_estimation.slam.config import SlamConfig
 from monstertruck_estimation.slam.service import SlamService
@@ -17,6 +19,8 @@ from monstertruck_schemas.body import Mount
 from monstertruck_schemas.health import LocalisationStatus
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import LaserScan
+from monstertruck_schemas.state import Odometry
+from tests.unit.estimation.kit import Truck, drive_feedback
 
 
 class FakeWorker:
@@ -139,3 +143,54 @@ def test_before_the_first_scan_there_is_nothing_to_save(monkeypatch, tmp_path: P
 
     assert events_of(story, monkeypatch, tmp_path) == []
     assert FakeWorker.tasks == []
+
+
+def test_a_pose_that_no_scan_confirms_is_as_uncertain_as_odometry_makes_it(monkeypatch, tmp_path: Path):
+    monkeypatch.setattr(module, "WorkerActor", FakeWorker)
+    turn, poses = 1.1, []
+
+    class Poses(Nowhere):
+        def put(self, message: Odometry) -> None:
+            poses.append(message)
+
+    async def main(clock: VirtualClock) -> None:
+        scans, odometry = Mailbox(fifo(4)), Mailbox(fifo(64))
+        service = SlamService(
+            SlamConfig(mode="mapping"), Mount(), clock, scan=scans, odometry=odometry, angles=None, pose=Poses(),
+            whole=Nowhere(), tiles=Nowhere(), motion=Nowhere(), health=Nowhere(), events=lambda *_, **__: None,
+        )  # fmt: skip
+        task = asyncio.create_task(service.run(lambda: None))
+        await clock.sleep(0.1)
+        truck = Truck()
+        truck.now = clock.now()
+        truck.drive(0.2, 0.0, 0.0, 5.0)  # what it knew badly before the map was found does not count
+        for k in range(600):
+            truck.drive(0.2, 0.0, 0.0, 0.02)
+            truck.reckoning.observe_drive(drive_feedback(truck.now, truck.motor))
+            found = truck.reckoning.estimate(truck.now)
+            await clock.sleep_until(truck.now)
+            odometry.put(odometry_message(found, truck.now, k))
+            await clock.sleep(0.0)
+            if k == 20:
+                status = LocalisationStatus.MAPPING
+                estimate = SlamEstimate(
+                    truck.now, (0.0, 0.0, 0.0), tuple((np.eye(3) * 1e-4).ravel()), (0.0, 0.0, turn), status,
+                    1.0, 0.0, 0.0, 0.0, "",
+                )  # fmt: skip
+                counts = dict.fromkeys(("scans", "keys", "closures", "rejected"), 0)
+                service._take(WorkerOutput(estimate, counts=counts), scan(clock))
+        task.cancel()
+        await asyncio.wait([task])
+
+    run_virtual(main)
+    soon, late = poses[40], poses[-1]
+    assert np.sqrt(np.diag(soon.pose_covariance.reshape(3, 3))) == pytest.approx([0.01] * 3)
+    assert ("lidar" in soon.sources, "lidar" in late.sources) == (True, False)
+    # 11.6 m further, along the truck's axis in map and across it, as dead reckoning alone says it.
+    along, across = (np.array((math.cos(a), math.sin(a), 0.0)) for a in (turn, turn + math.pi / 2))
+    way = 0.2 * 0.02 * 579
+    swung = 0.05**2 * way**3 / 3 + 0.01**2 * way + (0.01 * way) ** 2 + 0.01**2
+    cov = late.pose_covariance.reshape(3, 3)
+    assert along @ cov @ along == pytest.approx(0.02**2 * way + 0.01**2, rel=0.05)
+    assert across @ cov @ across == pytest.approx(swung, rel=0.05)
+    assert cov[2, 2] == pytest.approx(0.05**2 * way + 0.01**2, rel=0.05)
