@@ -15,6 +15,10 @@ STILL: Final = 1e-4
 """Way of the fastest shaft between two readings, m, up to which the robot stands."""
 KEPT: Final = 100
 """Rates that are kept."""
+LONG: Final = 20 * SECOND
+"""Turns are compared over so long as well, ns: what a bias that has crept away adds up to."""
+TRIM: Final = 0.05
+"""Curvature by which the wheels may be off all the time, rad/m."""
 LATE: Final = SECOND // 10
 """A rate this much older than the wheels' reading still stands for it, ns."""
 
@@ -34,6 +38,8 @@ class GyroConfig(Schema):
     """and as a share of the greater turn: wheels slip"""
     proof: Positive = 0.3
     """Turn of the wheels in the window with which an IMU that was left out has to agree to count again, rad"""
+    drift: Annotated[float, Field(ge=0)] = 5e-5
+    """How fast the bias may change after a rest, rad/s^2: as it warms up by two degrees a minute"""
 
 
 class Gyro:
@@ -50,6 +56,12 @@ class Gyro:
         self._rested = 0.0
         self._turns: deque[tuple[int, float, float]] = deque()
         """(ns, turn by the wheels, turn by the gyroscope), rad."""
+        self._long: deque[tuple[int, float, float, float]] = deque()
+        """The same, with what the wheels may be off, rad."""
+        self._sums = (0.0, 0.0)
+        """Of what it holds: difference of the turns, and what the wheels may be off, rad."""
+        self._known = 0
+        """When the bias was last known, ns."""
         self.bias: float | None = None
         """rad/s; None = the robot has not stood long enough."""
         self.trusted = True
@@ -76,35 +88,51 @@ class Gyro:
         if not found and self._rates and stamp - self._rates[-1][0] <= LATE:
             found = [self._rates[-1][1]]
         if not found:
-            self._turns.clear()
+            self._forget()
             return None
         mean, dt = math.fsum(found) / len(found), (stamp - since) / SECOND
         if way <= STILL:
-            self._stand(mean, dt)
+            self._stand(mean, dt, stamp)
             return 0.0 if self.trusted else None
         self._rest, self._rested = [], 0.0
         if self.bias is None:
             return None
         rate = mean - self.bias
         if wheels is None:
-            self._turns.clear()
+            self._forget()
         else:
             self._judge(stamp, wheels * dt, rate * dt)
+            self._judge_long(stamp, wheels * dt, rate * dt, way)
         return rate if self.trusted else None
+
+    def variance(self, stamp: int, dt: float) -> float:
+        """What the drift of the bias adds in ``dt`` seconds to the variance of the turn since the last rest, rad^2.
+
+        A bias that has changed at a rate d for the time T has turned the heading by d T^2 / 2.
+        """
+        rested = (stamp - self._known) / SECOND
+        return self._config.drift**2 * rested**3 * dt
+
+    def _forget(self) -> None:
+        """What comes next is not to be compared with what was."""
+        self._turns.clear()
+        self._long.clear()
+        self._sums = (0.0, 0.0)
 
     def wheels_slipped(self, since: int) -> None:
         """Something else has shown that the wheels slip since then, ns: a disagreement with them was their fault."""
-        self._turns.clear()
+        self._forget()
         if self._left_out is not None and self._left_out >= since:
             self.trusted, self._left_out = True, None
 
-    def _stand(self, mean: float, dt: float) -> None:
+    def _stand(self, mean: float, dt: float, stamp: int) -> None:
+        self._forget()
         self._rest.append(mean)
         self._rested += dt
         if self._rested >= self._config.rest:
             bias = math.fsum(self._rest) / len(self._rest)
             if abs(bias) <= self._config.max_bias:
-                self.bias = bias
+                self.bias, self._known = bias, stamp
             self._rest, self._rested = [], 0.0
 
     def _judge(self, stamp: int, wheels: float, gyro: float) -> None:
@@ -119,3 +147,20 @@ class Gyro:
             self._left_out = stamp
         if self.trusted or abs(by_wheels) >= config.proof:
             self.trusted = agrees
+
+    def _judge_long(self, stamp: int, wheels: float, gyro: float, way: float) -> None:
+        """Give the bias up, until the robot rests, where it has crept away: too slowly for the short window."""
+        config, rows = self._config, self._long
+        if not self.trusted:
+            rows.clear()
+            self._sums = (0.0, 0.0)
+            return
+        rows.append((stamp, wheels, gyro, config.share * abs(wheels) + TRIM * way))
+        off, allowed = self._sums[0] + gyro - wheels, self._sums[1] + rows[-1][3]
+        while stamp - rows[0][0] > LONG:
+            _, by_wheels, by_gyro, may = rows.popleft()
+            off, allowed = off - (by_gyro - by_wheels), allowed - may
+        self._sums = (off, allowed)
+        if stamp - rows[0][0] > LONG // 4 and abs(off) > config.tolerance + allowed:
+            self.difference, self.trusted, self._left_out, self.bias = off, False, stamp, None
+            self._forget()

@@ -237,12 +237,18 @@ class DeadReckoning:
             return
         self._driven += roll.way
         vx, vy, wz = roll.twist
+        trusted = self._gyro is not None and self._gyro.trusted
         rate = None if self._gyro is None else self._gyro.turned(roll.since, roll.stamp, wz, roll.way)
-        if rate is not None:
+        drifted = 0.0
+        if rate is not None and self._gyro is not None:
             wz, self._gyro_used = rate, roll.stamp
+            drifted = self._gyro.variance(roll.stamp, dt) if roll.way > 0.0 else 0.0
         pose = integrate(self._pose, vx, vy, wz, dt)
         moved = self._covariance.moved(pose[0] - self._pose[0], pose[1] - self._pose[1])
         self._covariance = moved.plus(self._slipped(roll))
+        if trusted and self._gyro is not None and not self._gyro.trusted:
+            drifted = self._gyro.difference**2
+        self._covariance = self._covariance.plus(PlanarCovariance(ww=drifted))
         self._pose = pose
         self._turns.moved(wz * dt, roll.way)
 

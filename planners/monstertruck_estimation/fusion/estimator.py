@@ -412,9 +412,14 @@ class Fusion:
         trusted = inertial.gyro.trusted
         rate = inertial.gyro.turned(roll.since, roll.stamp, wheels, roll.way)
         if trusted and not inertial.gyro.trusted and self._history is not None:
-            self._history.rewrite(roll.since - round(trust.window * SECOND), _without_turn)
+            crept = inertial.gyro.bias is None
+            seconds = self._config.horizon if crept else trust.window
+            self._history.rewrite(roll.since - round(seconds * SECOND), _without_turn)
         turn = None if rate is None else rate * roll.dt
-        variance = 0.0 if turn is None else trust.noise**2 * roll.dt + (trust.scale * turn) ** 2
+        variance = 0.0
+        if turn is not None:
+            drifted = inertial.gyro.variance(roll.stamp, roll.dt) if roll.way > 0.0 else 0.0
+            variance = trust.noise**2 * roll.dt + (trust.scale * turn) ** 2 + drifted
         return replace(way, turn=None if turn is None else (turn, variance), tilt=inertial.vertical.tilt(roll.stamp))
 
 

@@ -57,3 +57,32 @@ def test_without_rates_the_wheels_go_on():
     gyro, now = at_rest()
     assert run(gyro, 1.0, wheels=0.3, rate=None, start=now)[0] is None
     assert gyro.trusted
+
+
+def test_a_bias_that_creeps_away_is_given_up_until_the_robot_rests():
+    gyro, now = at_rest(0.0)
+    answers = []
+    for k in range(50):
+        answer, now = run(gyro, 1.0, wheels=0.0, rate=0.0005 * k, start=now)
+        answers.append(answer)
+    assert answers[20] is not None
+    assert abs(gyro.difference) < 0.5, "it has not turned the heading by more than that in 20 s"
+    assert (answers[-1], gyro.bias, gyro.trusted) == (None, None, False)
+    now = run(gyro, 1.0, wheels=0.0, rate=0.025, way=0.0, start=now)[1]
+    answer, _ = run(gyro, 2.0, wheels=0.4, rate=0.425, start=now)
+    assert answer == pytest.approx(0.4), "it rested, and turns with the wheels"
+
+
+def test_a_good_gyroscope_keeps_its_trust_though_wheels_are_a_little_off():
+    gyro, now = at_rest(0.0)
+    for k in range(60):
+        turn = 0.4 if k % 20 < 10 else -0.4
+        answer, now = run(gyro, 1.0, wheels=turn * 1.1 + 0.008, rate=turn, start=now)
+    assert answer == pytest.approx(-0.4)
+
+
+def test_the_drift_of_its_bias_makes_the_turn_uncertain_by_the_cube_of_the_time_since_a_rest():
+    gyro, now = at_rest(0.0)
+    times = range(100)
+    summed = sum(gyro.variance(now + round((k + 0.5) * 1e9), 1.0) for k in times)
+    assert summed**0.5 == pytest.approx(GyroConfig().drift * len(times) ** 2 / 2, rel=0.02)

@@ -10,6 +10,7 @@ from monstertruck_estimation.fusion.estimator import MAX_RECOMPUTED, Fusion
 from monstertruck_estimation.inertial import Inertial
 from monstertruck_estimation.transforms import IDENTITY
 from monstertruck_runtime.clock import SECOND
+from monstertruck_schemas.sensor import Vector3
 from tests.unit.estimation.fusion.kit import ALL, TICK, Rig, attitude, config, imu, scan_motion, wander
 from tests.unit.estimation.kit import CHASSIS, drive_feedback, servo_feedback
 
@@ -66,6 +67,22 @@ def test_an_imu_that_turns_against_the_wheels_is_left_out(share):
     assert rig.error()[1] < 0.1, "what it reported before it was noticed is taken back"
     rig.drive(0.0, 0.0, 0.0, 1.0)
     assert "imu" not in rig.estimate.sources
+
+
+def test_an_imu_whose_bias_creeps_away_is_left_out_and_not_believed_more_than_it_is_worth():
+    rig = Rig(("wheels", "imu", "compass")).drive(0.0, 0.0, 0.0, 1.0)
+    begun, gyro = rig.now, rig.inertial.gyro
+    observe = rig.inertial.observe
+    rig.inertial.observe = lambda one: observe(
+        one.model_copy(update={"angular_velocity": Vector3(x=0.0, y=0.0, z=one.angular_velocity.z + drifted())})
+    )
+
+    def drifted():
+        return 2e-3 * (rig.now - begun) / SECOND
+
+    rig.drive(0.2, 0.0, 0.0, 22.0)
+    assert (gyro.trusted, "imu" in rig.estimate.sources) == (False, False)
+    assert rig.error()[1] < 4 * math.sqrt(rig.estimate.pose_covariance[8])
 
 
 def test_wheels_that_slip_do_not_make_an_imu_suspect_and_the_heading_goes_by_it():
