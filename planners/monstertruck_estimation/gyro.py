@@ -105,11 +105,13 @@ class Gyro:
             self._judge_long(stamp, wheels * dt, rate * dt, way)
         return rate if self.trusted else None
 
-    def variance(self, stamp: int, dt: float) -> float:
+    def variance(self, stamp: int, dt: float, way: float) -> float:
         """What the drift of the bias adds in ``dt`` seconds to the variance of the turn since the last rest, rad^2.
 
         A bias that has changed at a rate d for the time T has turned the heading by d T^2 / 2.
         """
+        if way <= STILL or self.bias is None:
+            return 0.0
         rested = (stamp - self._known) / SECOND
         return self._config.drift**2 * rested**3 * dt
 

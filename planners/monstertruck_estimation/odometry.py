@@ -242,7 +242,7 @@ class DeadReckoning:
         drifted = 0.0
         if rate is not None and self._gyro is not None:
             wz, self._gyro_used = rate, roll.stamp
-            drifted = self._gyro.variance(roll.stamp, dt) if roll.way > 0.0 else 0.0
+            drifted = self._gyro.variance(roll.stamp, dt, roll.way)
         pose = integrate(self._pose, vx, vy, wz, dt)
         moved = self._covariance.moved(pose[0] - self._pose[0], pose[1] - self._pose[1])
         self._covariance = moved.plus(self._slipped(roll))

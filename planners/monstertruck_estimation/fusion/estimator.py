@@ -418,7 +418,7 @@ class Fusion:
         turn = None if rate is None else rate * roll.dt
         variance = 0.0
         if turn is not None:
-            drifted = inertial.gyro.variance(roll.stamp, roll.dt) if roll.way > 0.0 else 0.0
+            drifted = inertial.gyro.variance(roll.stamp, roll.dt, roll.way)
             variance = trust.noise**2 * roll.dt + (trust.scale * turn) ** 2 + drifted
         return replace(way, turn=None if turn is None else (turn, variance), tilt=inertial.vertical.tilt(roll.stamp))
 

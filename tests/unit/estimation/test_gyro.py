@@ -84,5 +84,7 @@ def test_a_good_gyroscope_keeps_its_trust_though_wheels_are_a_little_off():
 def test_the_drift_of_its_bias_makes_the_turn_uncertain_by_the_cube_of_the_time_since_a_rest():
     gyro, now = at_rest(0.0)
     times = range(100)
-    summed = sum(gyro.variance(now + round((k + 0.5) * 1e9), 1.0) for k in times)
+    summed = sum(gyro.variance(now + round((k + 0.5) * 1e9), 1.0, 0.1) for k in times)
     assert summed**0.5 == pytest.approx(GyroConfig().drift * len(times) ** 2 / 2, rel=0.02)
+    assert gyro.variance(now + 10**11, 1.0, 0.0) == 0.0, "a robot that stands does not turn"
+    assert Gyro(GyroConfig()).variance(10**15, 1.0, 0.1) == 0.0, "it is not used before it rested"
