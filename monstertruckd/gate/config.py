@@ -318,7 +318,8 @@ def _beyond_checks(config: GateConfig) -> Iterator[str]:
 def stopping_distance(config: GateConfig) -> float:
     """Distance from where the newest scan was taken to standstill, at worst, m."""
     delay = config.scan.stale_after + config.max_latency + config.reaction
-    return config.obstacle.ahead + config.speed * delay + config.speed**2 / (2 * config.deceleration)
+    speed = config.speed  # a product of any numbers is one, while a power may raise OverflowError
+    return config.obstacle.ahead + speed * delay + speed * speed / (2 * config.deceleration)
 
 
 def required_sensors(config: GateConfig) -> dict[str, SensorLimit]:

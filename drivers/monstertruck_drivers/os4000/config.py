@@ -29,7 +29,7 @@ class IronConfig(Schema):
 
     @model_validator(mode="after")
     def _keeps_directions_apart(self) -> Self:
-        if not self.soft_xy**2 < self.soft_xx * self.soft_yy:
+        if not self.soft_xy * self.soft_xy < self.soft_xx * self.soft_yy:
             raise ValueError(f"soft_xy {self.soft_xy}: expected less than the root of soft_xx * soft_yy")
         return self
 

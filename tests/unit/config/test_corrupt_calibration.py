@@ -80,6 +80,7 @@ KINDS: dict[str, Callable[[Path], object]] = {
     "text": value("drive", "640"),
     "negative": value("drive", -640.0),
     "an absurd ratio": value("drive", 1e300),
+    "more iron than there is": value("compass", 1e308, "devices.compass.driver.iron.soft_xy"),
     "a key of the gate": value("drive", 9.0, "gate.speed"),
     "a date that is none": edited(lambda data: data["results"]["drive"].update(date="yesterday")),
     "a date of no calendar": edited(lambda data: data["results"]["drive"].update(date="2026-99-99T00:00:00Z")),

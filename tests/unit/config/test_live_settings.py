@@ -67,6 +67,7 @@ def test_what_is_live_is_marked_and_says_its_bounds(config: TruckConfig):
     [
         ({"gate.rate": 10.0}, "gate.rate: cannot be changed while the robot runs"),
         ({"gate.speed": 9.0}, "at most"),
+        ({"gate.speed": 1e308}, "at most"),
         ({"gate.speed": -1.0}, r"gate\.speed: Input should be greater than 0"),
         ({"gate.speed": "fast"}, r"gate\.speed: Input should be a valid number"),
         ({"gate.reverse_speed": 0.22}, "at most gate.speed"),
