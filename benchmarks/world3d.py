@@ -359,13 +359,15 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=20, help="of the slopes")
     parser.add_argument("--metres", type=float, default=60.0, help="on rough ground")
     parser.add_argument("--count", type=int, default=200, help="of faults")
-    parser.add_argument("--keep", type=Path, help="folder for the laps' logs and the drill's finished legs")
+    parser.add_argument(
+        "--keep", type=Path, help="folder for the laps' logs, and for finished drives and legs of the drill"
+    )
     arguments = parser.parse_args()
     figures: dict[str, float] = {}
     calls = PARTS | {
         "lap": lambda: lap(arguments.keep),
         "slopes": lambda: slopes(arguments.seeds),
-        "rough": lambda: rough(arguments.metres),
+        "rough": lambda: rough(arguments.metres, arguments.keep),
         "patch": patch,
         "fleet": fleet,
         "robots": robots,

@@ -58,7 +58,7 @@ const send = WebSocket.prototype.send;
 WebSocket.prototype.send = function (data) {
   send.call(this, data);
   const message = JSON.parse(data);
-  if (message.do === "drive") beats.push([message.at, message.speed, message.front]);
+  if (message.do === "drive") beats.push([performance.now(), message.speed, message.front]);
 };
 addEventListener("pointerdown", (event) => event.target.closest("#estop") && clicks.push(event.timeStamp), true);
 """

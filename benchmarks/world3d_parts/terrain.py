@@ -32,6 +32,8 @@ WAVE = 1.5
 GHOST = 0.15
 """An occupied cell of the map this far from every wall is none, m."""
 OCCUPIED_FROM = 65
+SLOWEST = 0.05
+"""A truck that is slower than this in the mean has got stuck, m/s."""
 SETTLED = 500
 """Samples, ten seconds from where the truck has begun to drive on a slope."""
 FALLEN = radians(60.0)
@@ -46,12 +48,19 @@ class Driven(NamedTuple):
     lidar: np.ndarray
     """Tilt of the scan plane at every 20 ms."""
     body: np.ndarray
-    errors: np.ndarray
-    """Of the pose in the map."""
-    way: float
-    grid: Grid | None
+    poses: np.ndarray
+    """In the map, m and rad; shape (n, 3)."""
+    true: np.ndarray
+    """At the same instants."""
+    way: np.ndarray
+    """Metres driven so far at every sample."""
     walls: np.ndarray
     """Distance of every occupied cell from the nearest wall."""
+
+    @property
+    def errors(self) -> np.ndarray:
+        """Of the pose; nothing is aligned."""
+        return np.hypot(*(self.poses - self.true)[:, :2].T)
 
 
 def run(config: SimulatedTruckConfig, drive: Callable[[DrillTruck], Awaitable[Any]]) -> Any:
@@ -97,9 +106,9 @@ def over(ground: list[dict[str, Any]], metres: float, *, stabilised: bool) -> Dr
         plant = world.plant
         assert isinstance(plant, RigidPlant)
         assert await truck.until(truck.drives, 30.0, Order.ARM)
-        lidar, body, errors, way, report = [], [], [], 0.0, 10.0
+        lidar, body, poses, true, ways, way, report = [], [], [], [], [], 0.0, 5.0
         then = world.truth(clock.now())
-        limit = clock.now() + round(metres / 0.1 * SECOND)
+        limit = clock.now() + round(metres / SLOWEST * SECOND)
         while way < metres and clock.now() < limit:
             await clock.sleep(0.02)
             now = world.truth(clock.now())
@@ -109,17 +118,28 @@ def over(ground: list[dict[str, Any]], metres: float, *, stabilised: bool) -> Dr
             way += hypot(now.x - then.x, now.y - then.y)
             then = now
             if (heard := pose.latest) is not None:
-                errors.append(hypot(heard.pose.x - now.x, heard.pose.y - now.y))
+                poses.append((heard.pose.x, heard.pose.y, heard.pose.yaw))
+                true.append((now.x, now.y, now.yaw))
+                ways.append(way)
             if way > report:
-                report += 10.0
+                report += 5.0
                 tilt = f"lidar {rms(np.array(lidar)):.2f} degrees RMS, {max(lidar):.2f} at most"
-                print(f"{way:.0f} m: {tilt}; pose {rms(np.array(errors)) * 100:.2f} cm", flush=True)
+                error = np.hypot(*(np.array(poses) - np.array(true))[:, :2].T)
+                print(f"{way:.0f} m: {tilt}; pose {rms(error) * 100:.2f} cm", flush=True)
         await clock.sleep(2.0)
         grid = grids.latest
         walls = np.zeros(0) if grid is None else to_walls(grid, world)
-        return Driven(np.array(lidar), np.array(body), np.array(errors), way, grid, walls)
+        return Driven(*(np.array(each) for each in (lidar, body, poses, true, ways)), walls)
 
     return run(with_overlay(base, overlay), drive)
+
+
+def aligned_ate(poses: np.ndarray, true: np.ndarray) -> float:
+    """RMS distance once the whole way is turned and moved onto the true one, by least squares (Umeyama 1991); m."""
+    a, b = poses[:, :2] - poses[:, :2].mean(0), true[:, :2] - true[:, :2].mean(0)
+    turn = np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a * b).sum())
+    c, s = np.cos(turn), np.sin(turn)
+    return rms(np.hypot(*(a @ np.array([[c, s], [-s, c]]) - b).T))
 
 
 def to_walls(grid: Grid, world: World) -> np.ndarray:
@@ -135,24 +155,39 @@ def to_walls(grid: Grid, world: World) -> np.ndarray:
     return np.asarray(far[row, column])
 
 
-def rough(metres: float) -> dict[str, float]:
-    """Lidar, map and pose on hills; on the flat for comparison, and without stabiliser."""
+def kept(keep: Path | None, name: str, metres: float, drive: Callable[[], Driven]) -> Driven:
+    """A drive, or what is in the folder of one that was finished before."""
+    file = None if keep is None else keep / f"{name}-{metres:g}.npz"
+    if file is None:
+        return drive()
+    if not file.exists():
+        file.parent.mkdir(parents=True, exist_ok=True)
+        np.savez(file, **drive()._asdict())
+    with np.load(file) as saved:
+        return Driven(**{field: saved[field] for field in Driven._fields})
+
+
+def rough(metres: float, keep: Path | None = None) -> dict[str, float]:
+    """Lidar, map and pose on hills; on the flat for comparison, and without stabiliser.
+
+    With a folder to ``keep`` them in, drives that are finished are not driven again.
+    """
     figures: dict[str, float] = {}
-    runs = {
-        "flat": over([], metres, stabilised=True),
-        "rough": over(hills(), metres, stabilised=True),
-        "unstabilised": over(hills(), metres, stabilised=False),
-    }
-    for name, it in runs.items():
+    grounds = {"flat": ([], True), "rough": (hills(), True), "unstabilised": (hills(), False)}
+    for name, (ground, stabilised) in grounds.items():
+        it = kept(
+            keep, name, metres, lambda ground=ground, with_it=stabilised: over(ground, metres, stabilised=with_it)
+        )
         settled = it.lidar[min(SETTLED, len(it.lidar) - 1) :]
         figures |= {
-            f"{name}_way": it.way,
+            f"{name}_way": float(it.way[-1]) if len(it.way) else 0.0,
             f"{name}_body_deg_rms": rms(it.body),
             f"{name}_lidar_deg_rms": rms(it.lidar),
             f"{name}_lidar_deg_max": float(it.lidar.max()),
             f"{name}_lidar_settled_deg_rms": rms(settled),
             f"{name}_lidar_settled_deg_max": float(settled.max()),
             f"{name}_ate_cm": rms(it.errors) * 100 if len(it.errors) else float("inf"),
+            f"{name}_ate_aligned_cm": aligned_ate(it.poses, it.true) * 100 if len(it.poses) else float("inf"),
         }
         if len(it.walls):
             real = it.walls[it.walls < GHOST]

@@ -25,7 +25,8 @@ class Watch(_Command):
     """Look at a robot."""
 
     do: Literal["watch"]
-    robot: Annotated[str, Field(max_length=64)]
+    robot: Annotated[str, Field(max_length=200)]
+    """Name of a robot, or of a recording that is shown."""
 
 
 class LookAtFleet(_Command):
@@ -47,8 +48,10 @@ class Heartbeat(_Command):
     """One heartbeat of a hand on stick, keys or gamepad: what the input says at this moment."""
 
     do: Literal["drive"]
-    at: Number
-    """The browser's time when the input was read, ms."""
+    heard: Number
+    """The station's time in the newest answer to a ``ping``, ms..."""
+    since: Number
+    """...and how long before the input was read that came, by the browser's clock, ms."""
     input: Literal["stick", "keys", "gamepad"]
     speed: Number = 0.0
     front: Number = 0.0

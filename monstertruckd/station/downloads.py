@@ -75,8 +75,8 @@ async def fetch(
 
 def _session(address: RobotAddress, user: str, clock: Clock) -> TruckClient:
     tls = tls_for(address.endpoint)
-    source = f"{own_source(None if tls is None else tls.owner())}-{user}{'.' * bool(user)}files"
-    return TruckClient(address.name, address.endpoint, source=source[-64:], clock=clock, timeout=WAIT, tls=tls)
+    source = own_source(None if tls is None else tls.owner(), f"{user}{'.' * bool(user)}files")
+    return TruckClient(address.name, address.endpoint, source=source, clock=clock, timeout=WAIT, tls=tls)
 
 
 async def _stream(

@@ -12,7 +12,7 @@ from typing import Any, Final, Generic, TypeVar
 
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import SECOND, Clock
-from monstertruck_runtime.errors import InputError, NotFoundError, NotPermittedError, TruckError
+from monstertruck_runtime.errors import TruckError
 from monstertruck_runtime.mailbox import Mailbox, fifo, latest
 from monstertruck_schemas import topics
 from monstertruck_schemas.base import Message
@@ -23,7 +23,7 @@ from monstertruck_schemas.topics import Topic
 from monstertruckd.station import frames
 from monstertruckd.station.address import RobotAddress
 from monstertruckd.station.frames import Frame
-from monstertruckd.station.viewer import Viewer, Viewers
+from monstertruckd.station.viewer import MOST_TILES, Place, Viewer, Viewers
 
 log = logging.getLogger(__name__)
 
@@ -37,9 +37,6 @@ RETRY: Final = 1.0
 """Seconds between two attempts to reach a robot, and in which one that is there answers."""
 KEPT_EVENTS: Final = 200
 """Events a browser gets when it begins to look at a robot."""
-MOST_TILES: Final = 400
-"""Changed parts of the map that are kept until the whole map comes again."""
-
 
 GROUND_BUDGET: Final = 20_000.0
 """Bytes a second that pictures of the ground may take."""
@@ -99,7 +96,7 @@ class MapStore:
 
     version: int = 0
     grid: Grid | None = None
-    tiles: dict[tuple[float, float], bytes] = field(default_factory=dict)
+    tiles: dict[Place, bytes] = field(default_factory=dict)
     _packed: bytes | None = None
 
     def take(self, grid: Grid) -> str:
@@ -109,12 +106,12 @@ class MapStore:
         self.tiles.clear()
         return frames.text("map", version=self.version, **frames.grid_head(grid))
 
-    def change(self, part: Grid) -> bytes:
-        """A changed part; returns its frame."""
-        frame = frames.tile(part)
-        if len(self.tiles) < MOST_TILES:
-            self.tiles[part.origin.x, part.origin.y] = frame
-        return frame
+    def change(self, part: Grid) -> tuple[Place, bytes]:
+        """A changed part; returns its place and its frame."""
+        place, frame = (part.origin.x, part.origin.y), frames.tile(part, self.version)
+        if place in self.tiles or len(self.tiles) < MOST_TILES:
+            self.tiles[place] = frame
+        return place, frame
 
     async def packed(self) -> bytes | None:
         """All cells, compressed (zlib); None before the first map."""
@@ -156,6 +153,8 @@ class RobotFeed:
         self._known = False
         """Whether ``_facts`` are those of the robot as it runs."""
         self._link = frames.text("link", alive=False, round_trip=None, text="")
+        self._runs = 0
+        """Of the robot's daemon, so far as they were seen to begin."""
 
     # Browsers
 
@@ -163,15 +162,18 @@ class RobotFeed:
         """Show this robot in a browser, beginning with all that is known."""
         self._viewers.add(viewer)
         self._watched.set()
+        self._send_all(viewer)
+
+    def _send_all(self, viewer: Viewer) -> None:
         viewer.show("link", self._link)
         if self._facts is not None:
-            viewer.send(self._facts)
+            viewer.show("facts", self._facts)
         for kind, frame in self._viewers.newest.items():
             viewer.show(kind, frame)
         for event in self._events:
             viewer.send(event)
-        for part in self.map.tiles.values():
-            viewer.send(part)
+        for place, part in self.map.tiles.items():
+            viewer.patch(place, part)
 
     def detach(self, viewer: Viewer) -> None:
         """Show it there no longer."""
@@ -192,8 +194,12 @@ class RobotFeed:
                         await self._follow(client)
                     finally:
                         self.client = None  # before the session closes, which takes a while
-            except (InputError, NotFoundError, NotPermittedError) as error:
+            except TruckError as error:
                 self._set_link(None, str(error))
+                await self._clock.sleep(RETRY)
+            except Exception as bug:  # the other robots are followed all the same
+                log.exception("robot %s cannot be followed", self.address.name)
+                self._set_link(None, f"{type(bug).__name__}: {bug}")
                 await self._clock.sleep(RETRY)
 
     async def _follow(self, client: TruckClient) -> None:
@@ -213,7 +219,10 @@ class RobotFeed:
         while True:
             sent = self._clock.now()
             try:
-                self.gate = await client.get_retained(topics.GATE)
+                gate = await client.get_retained(topics.GATE)
+                if self.gate is not None and gate is not None and gate.nonce != self.gate.nonce:
+                    self._begin_anew()
+                self.gate = gate or self.gate
             except TruckError as error:
                 self._known = False
                 self._set_link(None, str(error))
@@ -222,14 +231,27 @@ class RobotFeed:
                 self._known = self._known or await self._learn(client)
             await self._clock.sleep(PING)
 
+    def _begin_anew(self) -> None:
+        """The daemon was started again: what its last run said of itself is true no longer."""
+        self._runs += 1
+        self._known = False
+        self._facts = None
+        self._viewers.newest.clear()
+        self.map.tiles.clear()
+        for viewer in self._viewers:
+            viewer.forget_states()
+            viewer.send(frames.text("robot", name=self.address.name))
+            self._send_all(viewer)
+
     async def _learn(self, client: TruckClient) -> bool:
         """Ask what the robot is; whether it answered."""
         try:
             self._facts = frames.facts(await client.call("config"), await client.call("versions"))
-        except TruckError as error:
-            log.warning("robot %s does not say what it is: %s", self.address.name, error)
+        except (TruckError, KeyError, TypeError, AttributeError) as error:  # of another release
+            log.warning("robot %s does not say what it is: %r", self.address.name, error)
             return False
-        self._viewers.send(self._facts)
+        for viewer in self._viewers:
+            viewer.show("facts", self._facts)
         return True
 
     async def _sample(self, client: TruckClient) -> None:
@@ -243,7 +265,8 @@ class RobotFeed:
                 maps = stack.enter_context(client.subscribe(topics.MAP, latest()))
                 tiles = stack.enter_context(client.subscribe(topics.MAP_TILES, fifo(MOST_TILES)))
                 taken: dict[str, tuple[Message, int]] = {}
-                while self._viewers:
+                run = self._runs
+                while self._viewers and run == self._runs:
                     now = self._clock.now()
                     for shown, box in boxes:
                         self._take(shown, box, taken, now)
@@ -271,7 +294,7 @@ class RobotFeed:
         for grid in maps.drain():
             self._viewers.show("map", self.map.take(grid))
         for part in tiles.drain():
-            self._viewers.send(self.map.change(part))
+            self._viewers.patch(*self.map.change(part))
 
     def _take_event(self, event: Event) -> None:
         if event.reason is Reason.SETTING_CHANGED:

@@ -137,7 +137,7 @@ class FoxgloveServer:
     def _session(self) -> TruckClient:
         name, endpoint = self._address.name, self._address.endpoint
         tls = tls_for(endpoint)
-        source = f"{own_source(None if tls is None else tls.owner())}-foxglove"[-64:]
+        source = own_source(None if tls is None else tls.owner(), "foxglove")
         return TruckClient(name, endpoint, source=source, clock=self._clock, timeout=RETRY, tls=tls)
 
     async def _follow(self, client: TruckClient) -> None:

@@ -122,9 +122,9 @@ def grid_head(of: Grid) -> dict[str, Any]:
     }
 
 
-def tile(of: Grid) -> bytes:
-    """A part of the map; payload: int8 cells, row 0 at the lowest y."""
-    return binary("tile", of.cells.tobytes(), **grid_head(of))
+def tile(of: Grid, version: int) -> bytes:
+    """A part of the map that changed since that version; payload: int8 cells, row 0 at the lowest y."""
+    return binary("tile", of.cells.tobytes(), version=version, **grid_head(of))
 
 
 def ground(of: Ground) -> bytes:

@@ -8,7 +8,7 @@ import asyncio
 import json
 import math
 from collections import deque
-from collections.abc import Coroutine, Sequence
+from collections.abc import Callable, Coroutine, Sequence
 from contextlib import suppress
 from typing import Any, Final
 
@@ -20,12 +20,13 @@ from ruamel.yaml.events import AliasEvent
 
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import SECOND, Clock
-from monstertruck_runtime.errors import InputError, NotFoundError, TruckError
+from monstertruck_runtime.errors import InputError, NoAnswerError, NotFoundError, RequestRefusedError, TruckError
 from monstertruck_runtime.stations import own_source, tls_for
 from monstertruck_runtime.threads import in_thread
 from monstertruck_schemas.mission import Mission
 from monstertruck_schemas.plan import Path
-from monstertruck_schemas.req import MissionOrder
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import UNCONDITIONAL, MissionOrder
 from monstertruckd.station import frames
 from monstertruckd.station.address import RobotAddress
 from monstertruckd.station.commands import (
@@ -51,9 +52,13 @@ from monstertruckd.station.viewer import Viewer
 LEASE: Final = 0.25
 """Seconds for which a heartbeat stands."""
 LATEST: Final = 0.2
-"""A heartbeat that took so much longer than the quickest ones, s, is dropped."""
+"""A heartbeat that took so much longer than the quickest ones, s, is dropped..."""
+OLDEST: Final = 1.5
+"""...and one that took so long altogether, with the way of what it was measured by, however slow the others were."""
 MEMORY: Final = 200
 """Heartbeats among which the quickest is looked for."""
+MOST_ASKED: Final = 16
+"""Commands of one browser whose outcome is waited for at once."""
 RETRY: Final = 1.0
 """Seconds between two attempts to reach the robot, and in which it answers."""
 TELL_LATE: Final = 1.0
@@ -69,15 +74,21 @@ LONGEST: Final = 200.0
 
 
 class DelayWatch:
-    """How much longer than the quickest messages one took, from the sender's own times; clocks are not compared."""
+    """Which heartbeats were held up on their way, by what the browser heard last of the station; s.
+
+    The browser says which of the station's times it heard, and how long before it read its input: what has passed
+    since, without that, are the ways of both messages. So no clock is compared with another one's.
+    """
 
     def __init__(self) -> None:
-        self._offsets: deque[float] = deque(maxlen=MEMORY)
+        self._ways: deque[float] = deque(maxlen=MEMORY)
 
-    def of(self, sent: float, received: float) -> float:
-        """Seconds late; both times in seconds, each of its own clock."""
-        self._offsets.append(received - sent)
-        return received - sent - min(self._offsets)
+    def late(self, heard: float, since: float, now: float) -> float | None:
+        """How late a heartbeat is, or None if it is not; ``heard`` and ``now`` are of the station's clock."""
+        way = now - heard - max(since, 0.0)
+        self._ways.append(way)
+        late = way - min(self._ways)
+        return way if way > OLDEST else late if late > LATEST else None
 
 
 class Pilot:
@@ -88,13 +99,24 @@ class Pilot:
         name: of the browser, behind the station's own name.
         viewer: where answers go.
         clock: the station's time.
+        spare: another session with the robot, if there is one, for stops while this browser's own is not there.
     """
 
-    def __init__(self, address: RobotAddress, name: str, viewer: Viewer, clock: Clock) -> None:
+    def __init__(
+        self,
+        address: RobotAddress,
+        name: str,
+        viewer: Viewer,
+        clock: Clock,
+        spare: Callable[[], TruckClient | None] = lambda: None,
+    ) -> None:
         self._address = address
+        self._spare = spare
         self._name = name
         self._client: TruckClient | None = None
         """While the robot's endpoint answers."""
+        self._ready = False
+        """Whether a heartbeat goes on at once."""
         self._viewer = viewer
         self._clock = clock
         self._lateness = DelayWatch()
@@ -110,6 +132,10 @@ class Pilot:
                     async with self._session() as client:
                         self._client = client
                         self._viewer.send(frames.text("pilot", source=client.source))
+                        while not self._ready:
+                            with suppress(NoAnswerError):
+                                await client.ready()
+                                self._ready = True
                         await asyncio.Event().wait()
                 await self._clock.sleep(RETRY)
         finally:
@@ -122,19 +148,19 @@ class Pilot:
     def _session(self) -> TruckClient:
         name, endpoint = self._address.name, self._address.endpoint
         tls = tls_for(endpoint)
-        source = f"{own_source(None if tls is None else tls.owner())}-{self._name}"
-        return TruckClient(name, endpoint, source=source[-64:], clock=self._clock, timeout=RETRY, tls=tls)
+        source = own_source(None if tls is None else tls.owner(), self._name)
+        return TruckClient(name, endpoint, source=source, clock=self._clock, timeout=RETRY, tls=tls)
 
     def drive(self, motion: Heartbeat) -> None:
-        """Pass one heartbeat on, unless it is late or the one before still waits for the robot."""
-        now = self._clock.now()
-        late = self._lateness.of(motion.at / 1e3, now / SECOND)
-        if late > LATEST:
-            if now / SECOND - self._said_late > TELL_LATE:
-                self._said_late = now / SECOND
+        """Pass one heartbeat on, unless it is late or would have to wait for the robot."""
+        now = self._clock.now() / SECOND
+        late = self._lateness.late(motion.heard / 1e3, motion.since / 1e3, now)
+        if late is not None:
+            if now - self._said_late > TELL_LATE:
+                self._said_late = now
                 self._viewer.send(frames.text("late", seconds=round(late, 3)))
             return
-        if self._client is not None and (self._driving is None or self._driving.done()):
+        if self._client is not None and self._ready and (self._driving is None or self._driving.done()):
             self._driving = asyncio.create_task(self._request(self._client, motion))
 
     async def _request(self, client: TruckClient, motion: Heartbeat) -> None:
@@ -149,10 +175,16 @@ class Pilot:
 
     def ask(self, command: Asked) -> None:
         """Carry out a command, and send its outcome to the browser. An emergency stop has left when this returns."""
-        if self._client is None:
+        stops = isinstance(command, GiveOrder) and command.order in UNCONDITIONAL
+        client = self._client or (self._spare() if stops else None)
+        if client is None:
             self._viewer.send(frames.refusal(command.id, NotFoundError("no link to the robot")))
             return
-        task = asyncio.create_task(self._outcome(command.id, _call(self._client, command)))
+        if len(self._answers) >= MOST_ASKED and not stops:
+            why = f"{MOST_ASKED} commands of this browser are under way"
+            self._viewer.send(frames.refusal(command.id, RequestRefusedError(Reason.BUSY, why)))
+            return
+        task = asyncio.create_task(self._outcome(command.id, _call(client, command)))
         self._answers.add(task)
         task.add_done_callback(self._answers.discard)
 

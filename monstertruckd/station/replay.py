@@ -97,6 +97,7 @@ class ReplayFeed:
 
     def __init__(self, name: str, file: Path, open_log: LogOpener, clock: Clock) -> None:
         self.name = name
+        self.robot = name.partition(" ")[0]
         self.map = MapStore()
         self._clock = clock
         self._viewers = Viewers()
@@ -133,6 +134,11 @@ class ReplayFeed:
 
     # Browsers
 
+    @property
+    def watched(self) -> bool:
+        """Whether a browser shows it."""
+        return bool(self._viewers)
+
     def attach(self, viewer: Viewer) -> None:
         """Show it in a browser."""
         self._viewers.add(viewer)
@@ -153,18 +159,18 @@ class ReplayFeed:
         if at is not None:
             self._seek(min(max(self._begin + round(at * SECOND), self._begin), self._end))
             for viewer in self._viewers:
-                viewer.forget()
+                viewer.forget_states()
                 viewer.send(frames.text("robot", name=self.name))
                 self._send_all(viewer)
         self._send_state()
 
     def _send_all(self, viewer: Viewer) -> None:
-        viewer.send(self._facts)
+        viewer.show("facts", self._facts)
         viewer.show("link", frames.text("link", alive=True, round_trip=0.0, text=""))
         for kind, frame in self._viewers.newest.items():
             viewer.show(kind, frame)
-        for part in self.map.tiles.values():
-            viewer.send(part)
+        for place, part in self.map.tiles.items():
+            viewer.patch(place, part)
         for event in self._events():
             viewer.send(event)
         viewer.show("replay", self._state())
@@ -221,7 +227,7 @@ class ReplayFeed:
         if (grid := self._tracks[topics.MAP.name].newest(at)) is not None:
             self._viewers.show("map", self.map.take(grid))  # type: ignore[arg-type]  # the topic's model
         for part in self._tracks[topics.MAP_TILES.name].up_to(at):
-            self._viewers.send(self.map.change(part))  # type: ignore[arg-type]
+            self._viewers.patch(*self.map.change(part))  # type: ignore[arg-type]
 
     def _state(self) -> str:
         return frames.text(

@@ -52,7 +52,15 @@ LOOK: Final = 1.0
 END: Final = 5.0
 """Seconds that sessions with robots may take to close at the end."""
 LANGUAGE: Final = "en"
+MOST_BROWSERS: Final = 32
+"""At once: each holds a session with a robot, of which that has a number of places..."""
+MOST_OF_USER: Final = 8
+"""...and this many of one user who logs in, so that nobody takes them all."""
+USUAL_PORTS: Final = {"http": 80, "https": 443}
+"""Browsers leave these out of a name."""
 
+OWN_SITE: Final = ("same-origin", "none")
+"""Values of the Sec-Fetch-Site header of what the page itself, or the person, asks for."""
 HEADERS: Final = {
     "Content-Security-Policy": "default-src 'self'; img-src 'self' blob: data:; frame-ancestors 'none'; "
     "base-uri 'none'; form-action 'self'",
@@ -91,13 +99,25 @@ class Place:
     def url(self) -> str:
         """What to open in a browser."""
         host = f"[{self.host}]" if ":" in self.host else self.host
-        return f"{'http' if self.tls is None else 'https'}://{host}:{self.port}/"
+        return f"{self.scheme}://{host}:{self.port}/"
+
+    @property
+    def scheme(self) -> str:
+        """Of the page's address."""
+        return "http" if self.tls is None else "https"
 
     @property
     def names(self) -> frozenset[str]:
         """Values of the Host header that mean this server: a page of another name that resolves here is refused."""
-        names = (self.host, *self.aliases, "localhost", "127.0.0.1", "[::1]")
-        return frozenset(f"{name}:{self.port}" for name in names)
+        own = f"[{self.host}]" if ":" in self.host else self.host
+        names = {name.lower() for name in (own, *self.aliases, "localhost", "127.0.0.1", "[::1]")}
+        usual = names if self.port == USUAL_PORTS[self.scheme] else ()
+        return frozenset((*(f"{name}:{self.port}" for name in names), *usual))
+
+    @property
+    def origins(self) -> frozenset[str]:
+        """Values of the Origin header that mean this server's page: another scheme is another page."""
+        return frozenset(f"{self.scheme}://{name}" for name in self.names)
 
 
 class Station:
@@ -126,10 +146,11 @@ class Station:
             raise InputError("two robots of one name: expected a name of its own for each")
         self._board = FleetBoard(self.feeds, clock)
         self._discoveries = [Discovery(endpoint, clock, self._found) for endpoint in routers]
-        self._following: set[asyncio.Task[None]] = set()
+        self._following: dict[RobotFeed | ReplayFeed, asyncio.Task[None]] = {}
         self._viewers: set[Viewer] = set()
         self._sockets: set[web.WebSocketResponse] = set()
-        self._browsers = itertools.count(1)
+        self._numbers = itertools.count(1)
+        self._browsers: list[_Browser] = []
         self._run = secrets.token_hex(2)
         """Tells this run's browsers from those of another, whose sequence numbers the robot remembers."""
         self._strings = _strings()
@@ -160,12 +181,13 @@ class Station:
             ready()
             while True:  # robots may come while others are followed
                 done, _ = await asyncio.wait(
-                    [*self._following, *discovering], return_when=asyncio.FIRST_COMPLETED, timeout=LOOK
+                    [*self._following.values(), *discovering], return_when=asyncio.FIRST_COMPLETED, timeout=LOOK
                 )
                 for task in done:
-                    task.result()
+                    if not task.cancelled():  # of a recording that was dropped
+                        task.result()
         finally:
-            tasks = [*self._following, *discovering]
+            tasks = [*self._following.values(), *discovering]
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
@@ -174,7 +196,18 @@ class Station:
                 shutil.rmtree(self._folder, ignore_errors=True)
 
     def _follow(self, feed: RobotFeed | ReplayFeed) -> None:
-        self._following.add(asyncio.create_task(feed.run()))
+        self._following[feed] = asyncio.create_task(feed.run())
+
+    def _drop_replay(self) -> None:
+        """Make room for another recording: the oldest that nobody looks at goes.
+
+        Raises:
+            InputError: all are looked at.
+        """
+        name = next((name for name, feed in self.replays.items() if not feed.watched), None)
+        if name is None:
+            raise InputError(f"{MOST_REPLAYS} recordings are looked at already: expected fewer at once")
+        self._following.pop(self.replays.pop(name)).cancel()
 
     @property
     def names(self) -> list[str]:
@@ -195,7 +228,7 @@ class Station:
             if title in self.replays:
                 return title
             if len(self.replays) >= MOST_REPLAYS:
-                raise InputError(f"{MOST_REPLAYS} recordings are shown already: start the station anew")
+                self._drop_replay()
             if self._folder is None:
                 self._folder = Path(tempfile.mkdtemp(prefix="monstertruckd-station-"))
             file, open_log = self._folder / f"{address.name}-{name}", self._open_log
@@ -205,6 +238,7 @@ class Station:
 
             await fetch(address, name, user, self._clock, file, progress)
             self.replays[title] = feed = await in_thread(lambda: ReplayFeed(title, file, open_log, self._clock))
+            file.unlink(missing_ok=True)
         self._follow(feed)
         for each in self._viewers:
             each.send(frames.text("robots", names=self.names))
@@ -245,13 +279,16 @@ class Station:
         if request.host not in self.place.names:
             raise self._refused(request, f"host {request.host!r} is not this station's name")
         origin = request.headers.get("Origin")
-        foreign = origin is not None and origin.partition("://")[2] not in self.place.names
+        foreign = origin is not None and origin not in self.place.origins
         if foreign or (request.path == "/socket" and origin is None):
             raise self._refused(request, f"origin {origin!r} is not this station's page")
+        # Pictures and links of other sites come without an origin.
+        if request.path != "/" and request.headers.get("Sec-Fetch-Site", OWN_SITE[0]) not in OWN_SITE:
+            raise self._refused(request, "asked for by the page of another site")
         if self.place.users is None:
             request[USER] = LOCAL
         else:
-            user = await self.place.users.who(request.headers.get("Authorization"))
+            user = await self.place.users.who(request.headers.get("Authorization"), request.remote or "")
             if user is None:
                 log.warning("%s %s from %s refused: no valid login", request.method, request.path, request.remote)
                 challenge = {"WWW-Authenticate": 'Basic realm="monstertruckd", charset="UTF-8"'}
@@ -307,12 +344,24 @@ class Station:
     # One browser
 
     async def _socket(self, request: web.Request) -> web.StreamResponse:
+        user = request[USER]
+        count, own = len(self._browsers), sum(each.user.name == user.name for each in self._browsers)
+        if count >= MOST_BROWSERS or (user is not LOCAL and own >= MOST_OF_USER):
+            log.warning("browser at %s refused: %d are connected, %d of this user", request.remote, count, own)
+            raise web.HTTPServiceUnavailable(text="too many browsers", headers=HEADERS)
+        name = f"{user.name}{'-' * bool(user.name)}{self._run}.{next(self._numbers)}"
+        browser = _Browser(name, user, self, self._board, self._clock)
+        self._browsers.append(browser)
+        try:
+            return await self._converse(request, browser)
+        finally:
+            self._browsers.remove(browser)
+
+    async def _converse(self, request: web.Request, browser: "_Browser") -> web.WebSocketResponse:
+        name = browser.name
         socket = web.WebSocketResponse(max_msg_size=commands.MOST_BYTES, heartbeat=BEAT, compress=False)
         await socket.prepare(request)
-        user = request[USER]
-        name = f"{user.name}{'-' * bool(user.name)}{self._run}.{next(self._browsers)}"
         log.info("browser %s connected from %s", name, request.remote)
-        browser = _Browser(name, user, self, self._board, self._clock)
         self._viewers.add(browser.viewer)
         self._sockets.add(socket)
         sending = asyncio.create_task(_send(socket, browser.viewer))
@@ -342,8 +391,8 @@ class _Browser:
     def __init__(self, name: str, user: StationUser, station: Station, board: FleetBoard, clock: Clock) -> None:
         self.viewer = Viewer()
         self._board = board
-        self._name = name
-        self._user = user
+        self.name = name
+        self.user = user
         self._station = station
         self._clock = clock
         self._feed: RobotFeed | ReplayFeed | None = None
@@ -363,9 +412,7 @@ class _Browser:
         command = commands.parse(data)
         refused = self._refusal(command)
         if refused is not None:
-            if isinstance(command, commands.Asked):
-                self.viewer.send(frames.refusal(command.id, refused))
-            raise refused
+            raise self._answered(command, refused)
         match command:
             case Heartbeat():
                 if self._pilot is not None:
@@ -374,22 +421,30 @@ class _Browser:
                 if isinstance(self._feed, ReplayFeed):
                     self._feed.control(command.at, command.playing, command.rate)
             case ReplayRecording():
+                if len(self._ending) >= MOST_REPLAYS:
+                    raise self._answered(command, InputError("recordings are being fetched already"))
                 self._begin(self._replay(command))
             case EchoRequest():
-                self.viewer.send(frames.text("pong", at=command.at))
+                self.viewer.send(frames.text("pong", at=command.at, now=self._clock.now() / 1e6))
             case LookAtFleet():
                 self._board.show(self.viewer, command.on)
             case Watch():
                 self._watch(command.robot)
             case _:
                 if self._pilot is None:
-                    raise InputError("no robot is looked at")
+                    raise self._answered(command, InputError("no robot is looked at"))
                 self._pilot.ask(command)
+
+    def _answered(self, command: commands.AnyCommand, error: TruckError) -> TruckError:
+        """The error, reported as the outcome of a command that has one."""
+        if isinstance(command, commands.Asked):
+            self.viewer.send(frames.refusal(command.id, error))
+        return error
 
     def _refusal(self, command: commands.AnyCommand) -> NotPermittedError | None:
         """Why the user may not ask for that now."""
-        if not self._user.may(needed := commands.needed(command)):
-            return NotPermittedError(f"user {self._user.name!r} is {self._user.role.value}: expected {needed.value}")
+        if not self.user.may(needed := commands.needed(command)):
+            return NotPermittedError(f"user {self.user.name!r} is {self.user.role.value}: expected {needed.value}")
         if isinstance(self._feed, ReplayFeed) and not _while_replaying(command):
             return NotPermittedError("a recording is shown: nothing but a stop goes to the robot")
         return None
@@ -404,7 +459,7 @@ class _Browser:
         try:
             if not isinstance(feed, RobotFeed):
                 raise InputError("no robot is looked at")
-            name = await self._station.replay(feed.address, command.name, self._user.name, self.viewer)
+            name = await self._station.replay(feed.address, command.name, self.user.name, self.viewer)
         except TruckError as error:
             self.viewer.send(frames.refusal(command.id, error))
         else:
@@ -421,17 +476,23 @@ class _Browser:
         self.viewer.send(frames.text("robot", name=robot))
         self._feed = feed
         feed.attach(self.viewer)
-        self._pilot = Pilot(feed.address, self._name, self.viewer, self._clock)
+        self._take_pilot(feed)
+
+    def _take_pilot(self, feed: RobotFeed) -> None:
+        self._pilot = Pilot(feed.address, self.name, self.viewer, self._clock, lambda: feed.client)
         self._session = asyncio.create_task(self._pilot.run())
+        self.viewer.send(frames.text("stops", robot=feed.address.name))
 
     def _show_replay(self, replay: ReplayFeed) -> None:
-        """Show a recording; the session with the robot stays, so that its emergency stop is at hand."""
+        """Show a recording; the session with the robot stays, or begins, so that its emergency stop is at hand."""
         if self._feed is not None:
             self._feed.detach(self.viewer)
         self.viewer.forget()
         self.viewer.send(frames.text("robot", name=replay.name))
         self._feed = replay
         replay.attach(self.viewer)
+        if self._pilot is None:
+            self._take_pilot(self._station.feeds[replay.robot])
 
     def _leave(self) -> None:
         if self._feed is not None:

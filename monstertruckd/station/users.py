@@ -8,6 +8,8 @@ import hmac
 import secrets
 import stat
 from collections import OrderedDict
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Self
@@ -27,6 +29,8 @@ SHORTEST: Final = 8
 PAUSE: Final = 1.0
 """Seconds that a wrong password costs, one attempt after the other."""
 REMEMBERED: Final = 256
+MOST_HASHES: Final = 2
+"""Computed at once."""
 NO_HASH: Final = ":".join(("00" * LENGTH,) * 2)
 """Compared with for unknown names, so that they take as long as known ones."""
 
@@ -59,7 +63,9 @@ class StationUsers:
         self._known: OrderedDict[bytes, StationUser] = OrderedDict()
         """Headers that were right, by their hash: a page asks for a dozen files."""
         self._secret = secrets.token_bytes(LENGTH)
-        self._turn = asyncio.Lock()
+        self._turns: dict[str, tuple[asyncio.Lock, int]] = {}
+        """Of every address that waits, and how many of its attempts do."""
+        self._hashing = asyncio.Semaphore(MOST_HASHES)
 
     @classmethod
     def load(cls, file: Path) -> Self:
@@ -78,8 +84,11 @@ class StationUsers:
             raise NotPermittedError(f"{file}: others may read it; expected mode 600 (chmod 600 {file})")
         return cls({name: _row(file, name, value) for name, value in (read_yaml(file) or {}).items()})
 
-    async def who(self, header: str | None) -> StationUser | None:
-        """The user of an ``Authorization`` header of the scheme Basic (RFC 7617); None = nobody."""
+    async def who(self, header: str | None, address: str = "") -> StationUser | None:
+        """The user of an ``Authorization`` header of the scheme Basic (RFC 7617); None = nobody.
+
+        Attempts of one address are looked at one after the other: whoever guesses holds up nobody elsewhere.
+        """
         credentials = _credentials(header)
         if credentials is None:
             return None
@@ -87,8 +96,9 @@ class StationUsers:
         if mark not in self._known:
             name, password = credentials
             role, kept = self._rows.get(name, (AccessRole.OBSERVER, NO_HASH))
-            async with self._turn:
-                right = await in_thread(lambda: _matches(password, kept))
+            async with self._turn(address):
+                async with self._hashing:
+                    right = await in_thread(lambda: _matches(password, kept))
                 if not right or name not in self._rows:
                     await asyncio.sleep(PAUSE)
                     return None
@@ -96,6 +106,20 @@ class StationUsers:
             while len(self._known) > REMEMBERED:
                 self._known.popitem(last=False)
         return self._known[mark]
+
+    @asynccontextmanager
+    async def _turn(self, address: str) -> AsyncIterator[None]:
+        lock, waiting = self._turns.get(address, (asyncio.Lock(), 0))
+        self._turns[address] = lock, waiting + 1
+        try:
+            async with lock:
+                yield
+        finally:
+            waiting = self._turns[address][1] - 1
+            if waiting:
+                self._turns[address] = lock, waiting
+            else:
+                del self._turns[address]
 
 
 def add_user(file: Path, name: str, role: AccessRole, password: str) -> None:

@@ -489,9 +489,13 @@ class TruckClient(Operator):
             express=True,
         )
 
-    async def _answered(self, lease: float) -> dict[str, Any]:
-        """Header of a request once the robot's nonce is known; one task at a time waits for it."""
-        async with self._asking:
+    async def ready(self) -> None:
+        """Wait until the robot's nonce is known: until then requests wait, and what they ask for grows old.
+
+        Raises:
+            NoAnswerError: it did not come in time.
+        """
+        async with self._asking:  # one task at a time waits for it
             gate = self._followed_gate()
             if gate.latest is None:
                 try:
@@ -500,6 +504,10 @@ class TruckClient(Operator):
                 except TimeoutError:
                     msg = f"robot {self.robot!r} does not publish its gate state at {self.endpoint}"
                     raise NoAnswerError(msg) from None
+
+    async def _answered(self, lease: float) -> dict[str, Any]:
+        """Header of a request once the robot's nonce is known."""
+        await self.ready()
         return self._header(lease)
 
     def _followed_gate(self) -> Mailbox[GateState]:

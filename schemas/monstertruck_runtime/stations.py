@@ -17,6 +17,8 @@ from monstertruck_runtime.errors import InputError, NotFoundError, NotPermittedE
 
 TLS_VARIABLE: Final = "MONSTERTRUCKD_TLS"
 """Names the folder of the station's certificate."""
+LONGEST_SOURCE: Final = 64
+"""Characters of a source's name."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,15 +92,23 @@ def session_config(endpoint: str, timeout: float, tls: ClientTls | None) -> dict
     return config
 
 
-def own_source(owner: str | None = None) -> str:
-    """Name of this program in requests: of the certificate's owner, or of the user, with host and process number."""
+def own_source(owner: str | None = None, program: str = "") -> str:
+    """Name of this program in requests: of the certificate's owner, or of the user, with host and process number.
+
+    Args:
+        owner: common name of the certificate, which is kept whole.
+        program: tells several of one process apart. The host's name gives way to it, and to its end its beginning.
+    """
+    end = f"{os.getpid()}{'-' * bool(program)}{program}"
+    host = _plain(socket.gethostname())
     if owner is not None:
-        return f"{owner}:{_plain(socket.gethostname())}-{os.getpid()}"[:64]
+        room = LONGEST_SOURCE - len(owner) - 1
+        return f"{owner}:{host[: max(room - len(end) - 1, 0)]}-{end[-max(room - 1, 0) :]}"[:LONGEST_SOURCE]
     try:
         user = getpass.getuser()
     except (KeyError, OSError):  # a user id without a name
         user = str(os.getuid())
-    return f"{_plain(user)}@{_plain(socket.gethostname())}"[:56] + f":{os.getpid()}"
+    return f"{_plain(user)}@{host}"[: LONGEST_SOURCE - len(end) - 1] + f":{end}"
 
 
 def tls_for(endpoint: str) -> ClientTls | None:

@@ -8,6 +8,7 @@ const GRACE = 5000; // ms for which neutral heartbeats keep an armed truck armed
 const DEAD = 0.08;
 const BLIND = 0.1; // metres that the truck may travel on the lease and the way of a request
 const LEASE = 0.25;
+const UNKNOWN = 1500; // ms that the way to the robot and back is taken to be until it is measured
 const MODES = ["front", "rear", "counter", "crab", "twist"];
 const KEYS = { w: [0, 1], s: [0, -1], a: [-1, 0], d: [1, 0] };
 const ARROWS = { ArrowUp: "w", ArrowDown: "s", ArrowLeft: "a", ArrowRight: "d" };
@@ -15,7 +16,7 @@ const ARROWS = { ArrowUp: "w", ArrowDown: "s", ArrowLeft: "a", ArrowRight: "d" }
 export class Drive {
   constructor(link) {
     this.link = link;
-    this.held = new Set();
+    this.held = new Map(); // names of the keys that are down, by their places on the keyboard
     this.stick = null;
     this.rest = 0;
     this.last = "stick";
@@ -57,7 +58,11 @@ export class Drive {
       this.pointer = event.pointerId;
       take(event);
     });
-    stick.addEventListener("pointermove", (event) => event.pointerId === this.pointer && take(event));
+    stick.addEventListener("pointermove", (event) => {
+      if (event.pointerId !== this.pointer) return;
+      if (event.buttons & 1) take(event);
+      else this.pointer = this.stick = null; // released where the page does not see it: above a menu
+    });
     for (const end of ["pointerup", "pointercancel", "lostpointercapture"]) {
       stick.addEventListener(end, (event) => {
         if (event.pointerId === this.pointer) this.pointer = this.stick = null;
@@ -65,18 +70,22 @@ export class Drive {
     }
     window.addEventListener("keydown", (event) => this.key(event, true));
     window.addEventListener("keyup", (event) => this.key(event, false));
-    for (const end of ["blur", "pagehide"]) window.addEventListener(end, () => this.letGo());
+    // Whoever gets the release of a key or button then, it is not the page.
+    for (const end of ["blur", "pagehide", "contextmenu"]) window.addEventListener(end, () => this.letGo());
+    for (const end of ["focusin", "mousedown"]) window.addEventListener(end, (event) => typing(event) && this.held.clear());
     document.addEventListener("visibilitychange", () => document.hidden && this.letGo());
     this.speed.addEventListener("input", () => this.showSpeed());
   }
 
   key(event, down) {
-    const typing = event.target instanceof Element && event.target.closest("select, input:not([type=range])");
     const name = ARROWS[event.key] && document.activeElement?.id === "stick" ? ARROWS[event.key] : event.key.toLowerCase();
-    if (!down) return void this.held.delete(ARROWS[event.key] ?? name), void this.held.delete(name);
-    if (typing || event.ctrlKey || event.altKey || event.metaKey) return;
+    // By its place: with Shift or AltGr a key that is released has another name than when it was pressed.
+    if (!down) return void this.held.delete(event.code);
+    // While Meta is held, no release of another key is seen.
+    if (event.ctrlKey || event.altKey || event.metaKey) return void this.held.clear();
+    if (typing(event)) return;
     if (name in KEYS) {
-      this.held.add(name);
+      this.held.set(event.code, name);
       event.preventDefault();
     } else if (MODES[Number(name) - 1] && !event.repeat) {
       const option = this.steering.options[Number(name) - 1];
@@ -99,10 +108,12 @@ export class Drive {
   input() {
     if (this.stick) return ["stick", ...this.stick];
     if (this.held.size) {
-      const sum = [...this.held].map((key) => KEYS[key]).reduce(([x, y], [kx, ky]) => [x + kx, y + ky], [0, 0]);
+      const sum = [...new Set(this.held.values())].map((key) => KEYS[key]).reduce(([x, y], [kx, ky]) => [x + kx, y + ky], [0, 0]);
       return ["keys", ...sum];
     }
-    const pad = [...(navigator.getGamepads?.() ?? [])].find((each) => each?.connected && each.mapping === "standard");
+    // A gamepad is read by every page that is in view: it drives the robot of the one that has the focus.
+    const pads = document.hasFocus() ? navigator.getGamepads?.() ?? [] : [];
+    const pad = [...pads].find((each) => each?.connected && each.mapping === "standard");
     this.pad = pad ?? null;
     if (pad?.buttons[5]?.pressed || pad?.buttons[7]?.pressed) {
       const [x, y] = [pad.axes[0], -pad.axes[1]].map((v) => (Math.abs(v) < DEAD ? 0 : v));
@@ -113,9 +124,8 @@ export class Drive {
 
   /** Speed allowed by the slider and by the delay: lease and round trip together cost BLIND metres at most. */
   limit() {
-    const delay = this.link.roundTrip();
-    const safe = delay === null ? Infinity : BLIND / (LEASE + delay / 1000);
-    return Math.min(Number(this.speed.value), safe);
+    const delay = this.link.roundTrip() ?? UNKNOWN;
+    return Math.min(Number(this.speed.value), BLIND / (LEASE + delay / 1000));
   }
 
   beat() {
@@ -137,7 +147,9 @@ export class Drive {
     const limit = this.limit();
     const speed = Math.abs(y) < DEAD ? 0 : y * limit;
     const steer = -x * (this.facts?.gate.angle ?? 0.36);
-    const motion = { do: "drive", at: performance.now(), input };
+    const heard = this.link.heard(performance.now());
+    if (!heard) return;
+    const motion = { do: "drive", ...heard, input };
     switch (this.steering.value) {
       case "front": Object.assign(motion, { speed, front: steer, rear: 0 }); break;
       case "rear": Object.assign(motion, { speed, front: 0, rear: -steer }); break;
@@ -161,12 +173,18 @@ export class Drive {
     setText(this.byId("input"), text);
     const slowed = this.limit() < Number(this.speed.value) - 0.001;
     const delay = this.link.roundTrip();
-    setText(this.byId("speed-note"), slowed ? words("speed.slowed", { speed: number(this.limit()), delay: number(delay, 0) }) : "");
+    const note = delay === null ? "speed.unknown" : "speed.slowed";
+    setText(this.byId("speed-note"), slowed ? words(note, { speed: number(this.limit()), delay: number(delay, 0) }) : "");
   }
 
   showSpeed() {
     setText(this.byId("speed-value"), words("speed.value", { speed: number(Number(this.speed.value)) }));
   }
+}
+
+/** Whether an event is about a field of text or a list, which take keys themselves. */
+function typing({ target }) {
+  return target instanceof Element && target.closest("select, input:not([type=range])") !== null;
 }
 
 function setText(element, text) {

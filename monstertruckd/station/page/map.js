@@ -164,12 +164,13 @@ export class MapView {
     if (!reply.ok) return;
     const cells = new Int8Array(await reply.arrayBuffer());
     if (robot !== this.link.robot || this.wanted !== message.version || cells.length !== message.width * message.height) return;
-    this.tiles.clear();
+    for (const [place, { version }] of this.tiles) if (version < message.version) this.tiles.delete(place);
     this.grid = this.paint({ ...message, cells });
     this.dirty = true;
   }
 
   takeTile(message) {
+    if (message.version < this.grid?.version) return;
     const image = this.paint({ ...message, cells: new Int8Array(message.payload) });
     this.tiles.set(message.origin.join(), image);
     this.dirty = true;

@@ -48,9 +48,7 @@ export class Panels {
   constructor(link) {
     this.link = link;
     this.seen = new Set();
-    this.source = null;
     link.on("robot", () => this.clear());
-    link.on("pilot", ({ source }) => (this.source = source));
     link.on("stop", (stop) => this.showStop(stop));
     link.on("event", (event) => this.addEvent(event));
     link.on("health", (table) => this.showServices(table));
@@ -65,13 +63,17 @@ export class Panels {
 
   clear() {
     this.seen.clear();
-    this.source = null;
     byId("events").replaceChildren();
     byId("services").replaceChildren();
     byId("banners").replaceChildren();
     byId("chain").hidden = true;
     byId("camera").hidden = true;
     setText("refusal", "");
+  }
+
+  /** By which name the robot knows this page. */
+  get source() {
+    return this.link.newest.pilot?.source ?? null;
   }
 
   get alive() {

@@ -7,9 +7,10 @@ export class ReplayBar {
   /** watch: called with the robot's name when the recording is closed. */
   constructor(link, watch) {
     this.link = link;
-    this.robot = null; // looked at before
+    this.robot = null; // which the emergency stop acts on
     this.held = false;
     link.on("robot", ({ name }) => this.opened(name));
+    link.on("stops", ({ robot }) => this.showStops(robot));
     link.on("replay", (state) => this.show(state));
     byId("replay-play").onclick = () => this.send({ playing: !this.state?.playing });
     byId("replay-rate").onchange = () => this.send({ rate: Number(byId("replay-rate").value) });
@@ -27,13 +28,14 @@ export class ReplayBar {
   }
 
   opened(name) {
-    const robots = this.link.newest.robots?.names ?? [];
     this.recording = name.includes(" ");
-    if (!this.recording) this.robot = name;
-    this.robot ??= robots[0];
     byId("replay").hidden = !this.recording;
     document.body.dataset.replay = this.recording;
-    byId("replay-stop").textContent = words("replay.stop", { robot: this.robot });
+  }
+
+  showStops(robot) {
+    this.robot = robot;
+    byId("replay-stop").textContent = words("replay.stop", { robot });
   }
 
   show(state) {

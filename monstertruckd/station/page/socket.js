@@ -1,6 +1,8 @@
 // The one WebSocket to the station: newest messages by kind with their time of arrival, and answers to orders.
 const RETRY = 1000;
 const PING = 500;
+const ECHOES = 20; // answers to pings, of which the quickest one counts
+const KEPT = ["open", "hello", "robots", "fleet", "pilot", "stops"]; // what the station says, not a robot
 
 export class Link {
   constructor() {
@@ -8,11 +10,13 @@ export class Link {
     this.arrived = {};
     this.listeners = {};
     this.delay = null; // ms to the station and back
+    this.asked = null; // since when a ping waits for its answer
+    this.echoes = []; // [the station's time, the browser's at which it came], ms
     this.open = false;
     this.waiting = new Map();
     this.number = 0;
     this.robot = null;
-    setInterval(() => this.send({ do: "ping", at: performance.now() }), PING);
+    setInterval(() => this.ping(), PING);
     this.connect();
   }
 
@@ -40,16 +44,29 @@ export class Link {
     socket.onopen = () => this.setOpen(true);
     socket.onclose = () => {
       this.setOpen(false);
-      for (const settle of this.waiting.values()) settle({ ok: false, reason: "timeout", text: "" });
-      this.waiting.clear();
+      this.settle();
       setTimeout(() => this.connect(), RETRY);
     };
   }
 
   setOpen(open) {
     this.open = open;
-    this.delay = null;
+    this.delay = this.asked = null;
+    this.echoes = [];
+    if (open) this.ping();
     this.emit("open", open);
+  }
+
+  ping() {
+    const at = performance.now();
+    if (this.send({ do: "ping", at })) this.asked ??= at;
+  }
+
+  /** The station's time and how long ago it was that, ms, by the answer that was least under way; null before the first. */
+  heard(at) {
+    if (!this.echoes.length) return null;
+    const [time, came] = this.echoes.reduce((best, echo) => (echo[0] - echo[1] >= best[0] - best[1] ? echo : best));
+    return { heard: time, since: Math.max(at - came, 0) };
   }
 
   take(data) {
@@ -65,9 +82,27 @@ export class Link {
       this.waiting.get(message.id)?.(message);
       this.waiting.delete(message.id);
     } else if (kind === "pong") {
-      const delay = performance.now() - message.at;
+      const now = performance.now();
+      const delay = now - message.at;
+      this.asked = null;
+      this.echoes.push([message.now, now]);
+      if (this.echoes.length > ECHOES) this.echoes.shift();
       this.delay = this.delay === null ? delay : Math.max(delay, 0.8 * this.delay + 0.2 * delay);
-    } else this.emit(kind, message.m ?? message);
+    } else {
+      if (kind === "robot") this.forget();
+      this.emit(kind, message.m ?? message);
+    }
+  }
+
+  /** What was said of a robot is void: another one is shown, or it began anew. */
+  forget() {
+    for (const kind of Object.keys(this.newest)) if (!KEPT.includes(kind)) delete this.newest[kind], delete this.arrived[kind];
+  }
+
+  /** Nobody answers any longer what waits for an answer. */
+  settle() {
+    for (const done of this.waiting.values()) done({ ok: false, reason: "timeout", text: "" });
+    this.waiting.clear();
   }
 
   /** Send at once, or not at all. */
@@ -90,8 +125,9 @@ export class Link {
   }
 
   watch(robot) {
-    const kept = ["open", "hello", "robots", "fleet"];
-    for (const kind of Object.keys(this.newest)) if (!kept.includes(kind)) delete this.newest[kind], delete this.arrived[kind];
+    this.forget();
+    delete this.newest.pilot;
+    this.settle(); // the session that they were asked by ends
     this.robot = robot;
     this.send({ do: "watch", robot });
   }
@@ -99,6 +135,8 @@ export class Link {
   /** Milliseconds from a hand to the robot and back to the screen; null while unknown. */
   roundTrip() {
     const robot = this.newest.link?.round_trip;
-    return this.delay === null || robot == null ? null : this.delay + 1000 * robot;
+    if (this.delay === null || robot == null) return null;
+    const waits = this.asked === null ? 0 : performance.now() - this.asked;
+    return Math.max(this.delay, waits) + 1000 * robot;
   }
 }

@@ -12,6 +12,7 @@ import pytest
 from monstertruck_runtime.clock import WallClock
 from monstertruck_runtime.errors import InputError, NotFoundError, NotPermittedError
 from monstertruck_schemas.roles import AccessRole
+from monstertruckd.station import server as server_module
 from monstertruckd.station import users
 from monstertruckd.station.address import RobotAddress
 from monstertruckd.station.server import Place, Station
@@ -56,6 +57,19 @@ async def test_who_logs_in_and_who_does_not(file: Path):
         assert await known.who(header) is None
 
 
+async def test_whoever_guesses_holds_up_nobody_at_another_address(file: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(users, "PAUSE", 60.0)
+    known = StationUsers.load(file)
+    guesses = [asyncio.create_task(known.who(basic("ann", str(number)), "10.0.0.9")) for number in range(20)]
+    await asyncio.sleep(0.05)
+    async with asyncio.timeout(10):
+        assert await known.who(basic("ann", "correct horse"), "10.0.0.1") is not None
+    for guess in guesses:
+        guess.cancel()
+    await asyncio.gather(*guesses, return_exceptions=True)
+    assert known._turns == {}
+
+
 def test_a_file_of_users_is_private_and_wrong_ones_are_refused(file: Path, tmp_path: Path):
     assert file.stat().st_mode & 0o777 == 0o600
     assert "correct horse" not in file.read_text()
@@ -84,7 +98,9 @@ def test_users_are_replaced_as_a_whole(file: Path, tmp_path: Path):
     assert "bob" in file.read_text()
 
 
-async def test_an_observer_sees_and_may_stop_and_nothing_else_over_tls(file: Path, tmp_path: Path, caplog):
+async def test_an_observer_sees_and_may_stop_and_nothing_else_over_tls(
+    file: Path, tmp_path: Path, caplog, monkeypatch: pytest.MonkeyPatch
+):
     server, client = self_signed(tmp_path)
     robot = RobotAddress("truck", "tcp/127.0.0.1:1")
     station = Station([robot], WallClock(), Place(port=free_port(), tls=server, users=StationUsers.load(file)))
@@ -105,6 +121,9 @@ async def test_an_observer_sees_and_may_stop_and_nothing_else_over_tls(file: Pat
             async with session.ws_connect("/socket", origin=url[:-1], headers=login) as socket:
                 hello = await socket.receive_json()
                 assert (hello["user"], hello["role"]) == ("olga", "observer")
+                monkeypatch.setattr(server_module, "MOST_OF_USER", 1)
+                async with session.get("/socket", headers={"Origin": url[:-1], **login}) as reply:
+                    assert reply.status == 503, "one user does not take all places"
                 await socket.send_json({"do": "watch", "robot": "truck"})
                 wanted = {1: "not_permitted", 2: "not_permitted", 3: "not_found"}
                 await socket.send_json({"do": "order", "id": 1, "order": "arm"})

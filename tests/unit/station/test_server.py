@@ -13,7 +13,7 @@ from yarl import URL
 
 from monstertruck_runtime.clock import WallClock
 from monstertruck_runtime.errors import BusyError, InputError
-from monstertruckd.station import commands
+from monstertruckd.station import commands, server
 from monstertruckd.station.address import RobotAddress
 from monstertruckd.station.server import Place, Station
 from monstertruckd.tools.demo.runs import free_endpoint
@@ -92,10 +92,15 @@ async def test_other_sites_and_other_names_are_refused_and_logged(caplog: pytest
             ("/socket", {}),
             ("/socket", {"Origin": f"http://{ours}.evil.example"}),
             ("/robots/truck/recordings/run.mcap", {"Origin": "http://evil.example"}),
+            ("/socket", {"Origin": f"https://{ours}"}),
+            ("/robots/truck/recordings/run.mcap", {"Sec-Fetch-Site": "cross-site"}),
+            ("/robots/truck/map/1", {"Sec-Fetch-Site": "same-site"}),
         ):
             async with session.get(path, headers=headers) as reply:
                 assert reply.status == 403, (path, headers)
-        assert caplog.text.count("refused") == 5
+        assert caplog.text.count("refused") == 8
+        async with session.get("/", headers={"Sec-Fetch-Site": "cross-site"}) as reply:
+            assert reply.status == 200, "a link to the page"
         for method in ("POST", "PUT", "DELETE"):
             async with session.request(method, "/robots/truck/recordings/run.mcap", data=b"x=1") as reply:
                 assert reply.status == 405, "what a form of another site can send changes nothing"
@@ -111,6 +116,7 @@ async def test_a_browser_is_answered_although_the_robot_is_absent_and_wrong_mess
         assert hello["kind"] == "hello"
         await socket.receive_json()
         await socket.send_json({"do": "order", "id": 1, "order": "estop"})
+        assert (await socket.receive_json())["id"] == 1, "whatever is asked is answered"
         assert (await socket.receive_json())["kind"] == "trouble"
         await socket.send_json({"do": "watch", "robot": "truck"})
         await socket.send_json({"do": "order", "id": 2, "order": "estop"})
@@ -166,3 +172,17 @@ async def test_robots_of_a_router_appear_in_every_browser():
                     names = (await socket.receive_json()).get("names", names)
         second.undeclare()
         first.undeclare()
+
+
+async def test_browsers_are_bounded_and_one_that_goes_leaves_its_place(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(server, "MOST_BROWSERS", 2)
+    async with serving() as (station, session):
+        async with connected(station, session), connected(station, session):
+            with pytest.raises(aiohttp.WSServerHandshakeError, match="503"):
+                async with connected(station, session):
+                    pass
+        async with asyncio.timeout(5):
+            while station._browsers:
+                await asyncio.sleep(0.01)
+        async with connected(station, session) as socket:
+            assert (await socket.receive_json())["kind"] == "hello"

@@ -3,26 +3,32 @@
 import asyncio
 import json
 import re
+import ssl
 import struct
 
 import numpy as np
 import pytest
 
+from monstertruck_runtime import stations
 from monstertruck_runtime.clock import WallClock
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.mailbox import Mailbox
+from monstertruck_runtime.stations import own_source
 from monstertruck_schemas.base import Pose2D
-from monstertruck_schemas.req import Role
+from monstertruck_schemas.req import Order, Role
 from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.state import GateMode, GateState, Grid
+from monstertruck_schemas.topics import SOURCE_NAME
 from monstertruckd.station import commands, frames
+from monstertruckd.station import feed as feed_module
 from monstertruckd.station.address import RobotAddress
 from monstertruckd.station.commands import GiveOrder, Heartbeat
-from monstertruckd.station.feed import MapStore, RobotFeed
-from monstertruckd.station.pilot import LATEST, DelayWatch
-from monstertruckd.station.server import PAGE
-from monstertruckd.station.viewer import MOST_WAITING, Viewer
+from monstertruckd.station.feed import KEPT_EVENTS, MapStore, RobotFeed
+from monstertruckd.station.pilot import LATEST, MEMORY, MOST_ASKED, OLDEST, DelayWatch, Pilot
+from monstertruckd.station.server import PAGE, Place
+from monstertruckd.station.users import StationUsers
+from monstertruckd.station.viewer import MOST_TILES, MOST_WAITING, Viewer
 
 
 def grid(width: int = 4, height: int = 3, x: float = 0.0) -> Grid:
@@ -79,9 +85,14 @@ async def test_a_map_is_announced_fetched_and_changed_by_tiles():
     assert packed is not None
     assert await store.packed() is packed, "one compression for all browsers"
     store.change(grid(2, 2, x=0.2))
-    store.change(grid(2, 2, x=0.2))
-    store.change(grid(2, 2, x=0.4))
-    assert len(store.tiles) == 2
+    place, tile = store.change(grid(2, 2, x=0.2))
+    assert place == (0.2, -1.0)
+    assert head_and_payload(tile)[0]["version"] == 1, "of the map that it changes"
+    for i in range(1, MOST_TILES + 1):
+        store.change(grid(2, 2, x=0.2 * i))
+    assert len(store.tiles) == MOST_TILES
+    store.change(grid(1, 1, x=0.2))
+    assert head_and_payload(store.tiles[0.2, -1.0])[0]["width"] == 1, "the newest of each place, however many there are"
     store.take(grid())
     assert store.tiles == {}, "the whole map holds them"
 
@@ -92,9 +103,13 @@ async def test_a_browser_that_does_not_read_gets_the_newest_only_and_bounded_eve
         viewer.show("scan", str(number))
         viewer.show("camera", b"picture")
         viewer.send(f"event {number}")
-    received = [await viewer.next() for _ in range(MOST_WAITING + 2)]
+        viewer.patch((number % 2, 0.0), str(-number))
+    received = [await viewer.next() for _ in range(MOST_WAITING + 4)]
     assert received[0] == f"event {2 * MOST_WAITING}"
-    assert received[-2:] == [str(3 * MOST_WAITING - 1), b"picture"], "the newest; pictures of the camera last"
+    last = 3 * MOST_WAITING - 1
+    assert received[-4:] == [str(last), str(1 - last), str(-last), b"picture"], (
+        "the newest; pictures of the camera last"
+    )
     assert viewer.lost == 2 * MOST_WAITING
     waiting = asyncio.create_task(viewer.next())
     await asyncio.sleep(0)
@@ -106,14 +121,14 @@ async def test_a_browser_that_does_not_read_gets_the_newest_only_and_bounded_eve
 def test_commands_are_read_and_wrong_ones_refused_by_field():
     order = commands.parse('{"do": "order", "id": 3, "order": "estop"}')
     assert isinstance(order, GiveOrder)
-    motion = commands.parse('{"do": "drive", "at": 1.5, "input": "keys", "speed": 0.1, "front": 0.2}')
+    motion = commands.parse('{"do": "drive", "heard": 1.5, "since": 2, "input": "keys", "speed": 0.1, "front": 0.2}')
     assert isinstance(motion, Heartbeat)
     assert motion.role is Role.KEYBOARD
     for wrong, field in (
         ('{"do": "order", "id": 3, "order": "explode"}', "order"),
-        ('{"do": "drive", "at": 1, "input": "keys", "speed": NaN}', "speed"),
+        ('{"do": "drive", "heard": 1, "since": 2, "input": "keys", "speed": NaN}', "speed"),
         ('{"do": "fly"}', "message"),
-        ('{"do": "drive", "at": 1, "input": "keys", "role": "estop"}', "role"),
+        ('{"do": "drive", "heard": 1, "since": 2, "input": "keys", "role": "estop"}', "role"),
         ("[]", "message"),
         ("{", "message"),
     ):
@@ -121,11 +136,16 @@ def test_commands_are_read_and_wrong_ones_refused_by_field():
             commands.parse(wrong)
 
 
-def test_a_heartbeat_that_was_held_up_is_known_by_the_times_of_the_others():
-    lateness = DelayWatch()
+def test_a_heartbeat_that_was_held_up_is_known_by_the_ways_of_the_others_and_by_its_own():
+    watch = DelayWatch()
     for number in range(20):
-        assert lateness.of(1000.0 + 0.05 * number, 7.0 + 0.05 * number + 0.003 * (number % 2)) < 0.01
-    assert lateness.of(1001.0, 8.5) > LATEST
+        assert watch.late(7.0, 0.05 * number, 7.01 + 0.05 * number + 0.003 * (number % 2)) is None
+    assert watch.late(7.0, 1.0, 8.0 + 1.5 * LATEST) == pytest.approx(1.5 * LATEST, abs=0.02)
+    # A way that was always long: what the hand did before it says nothing of now.
+    for number in range(2 * MEMORY):
+        assert watch.late(20.0, 0.05 * number, 20.1 + OLDEST + 0.05 * number) is not None
+    # A computer that slept: its clock stood, and what it hears next it counts from.
+    assert watch.late(60.0, 0.02, 60.03) is None
 
 
 def test_every_text_of_the_page_is_in_the_table_and_none_is_left_over():
@@ -177,3 +197,151 @@ async def test_a_browser_never_begins_with_what_was_true_when_another_one_left()
     finally:
         sampling.cancel()
         await asyncio.gather(sampling, return_exceptions=True)
+
+
+async def test_a_browser_that_comes_late_gets_everything_however_much_there_is():
+    feed, viewer = RobotFeed(RobotAddress("truck", "tcp/127.0.0.1:1"), WallClock()), Viewer()
+    feed._facts = frames.text("facts")
+    for number in range(KEPT_EVENTS):
+        feed._events.append(frames.text("event", number=number))
+    feed.map.take(grid())
+    for number in range(MOST_TILES):
+        feed.map.change(grid(2, 2, x=0.2 * number))
+    viewer.send(frames.text("robot", name="truck"))
+    feed.attach(viewer)
+    received = [await viewer.next() for _ in range(3 + KEPT_EVENTS + MOST_TILES)]
+    kinds = [json.loads(frame)["kind"] for frame in received if isinstance(frame, str)]
+    assert (kinds[0], kinds.count("event"), kinds.count("facts")) == ("robot", KEPT_EVENTS, 1)
+    assert viewer.lost == 0
+
+
+class RestartedRobot(PublishedRobot):
+    """Client of a robot whose daemon is started anew, and which says strange things of itself."""
+
+    def __init__(self):
+        super().__init__()
+        self.nonce = "first"
+        self.asked = 0
+
+    async def get_retained(self, topic):
+        self.asked += 1
+        return gate_state(self.nonce)
+
+    async def call(self, name, payload=None):
+        return {"robot": "truck"}  # no gate: another release
+
+
+def gate_state(nonce: str = "n") -> GateState:
+    return GateState(stamp=1, received=1, seq=0, mode=GateMode.DRIVING, nonce=nonce, speed_limit=0.2)
+
+
+async def test_a_daemon_that_was_started_anew_is_another_robot_and_strange_facts_end_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    monkeypatch.setattr(feed_module, "PING", 0.01)
+    robot, feed = RestartedRobot(), RobotFeed(RobotAddress("truck", "tcp/127.0.0.1:1"), WallClock())
+    viewer = Viewer()
+    following = asyncio.create_task(feed._follow(robot))
+    try:
+        feed.attach(viewer)
+        async with asyncio.timeout(5):
+            while "state/gate" not in robot.boxes or robot.asked < 3:
+                await asyncio.sleep(0.01)
+            box = robot.boxes["state/gate"]
+            box.put(gate_state())
+            while json.loads(await viewer.next())["kind"] != "gate":
+                pass
+            robot.nonce = "second"
+            while robot.boxes.get("state/gate", box) is box:
+                await asyncio.sleep(0.01)
+            assert robot.boxes["state/gate"].latest is None, "nothing of the run before is shown on"
+            kinds = []
+            while "robot" not in kinds:
+                kinds.append(json.loads(await viewer.next())["kind"])
+            assert "gate" not in kinds[kinds.index("robot") :]
+        assert not following.done()
+    finally:
+        following.cancel()
+        await asyncio.gather(following, return_exceptions=True)
+
+
+async def test_a_robot_that_cannot_be_followed_ends_no_station(monkeypatch: pytest.MonkeyPatch):
+    class Strange:
+        def __init__(self, *args, **more):
+            pass
+
+        async def __aenter__(self):
+            raise ValueError("out of range float values")
+
+        async def __aexit__(self, *error):
+            pass
+
+    monkeypatch.setattr(feed_module, "TruckClient", Strange)
+    feed = RobotFeed(RobotAddress("truck", "tcp/127.0.0.1:1"), WallClock())
+    running = asyncio.create_task(feed.run())
+    async with asyncio.timeout(5):
+        while "out of range" not in feed._link:
+            await asyncio.sleep(0.01)
+    assert not running.done()
+    running.cancel()
+
+
+class Orders:
+    """Client of a robot that never says how an order ended."""
+
+    def __init__(self):
+        self.given: list[Order] = []
+
+    def order(self, order, *, hold=False):
+        self.given.append(order)
+        return asyncio.Event().wait()
+
+    async def drive(self, *motion, lease):
+        self.given.append(Order.ARM)
+
+
+async def test_a_stop_goes_by_any_session_and_other_commands_of_one_browser_are_bounded():
+    spare, viewer, own = Orders(), Viewer(), Orders()
+    pilot = Pilot(RobotAddress("truck", "tcp/127.0.0.1:1"), "page", viewer, WallClock(), lambda: spare)
+    for order in ("arm", "estop"):
+        pilot.ask(commands.parse(json.dumps({"do": "order", "id": 1, "order": order})))
+    assert spare.given == [Order.ESTOP], "the page's own session is not there yet: nothing but a stop takes another one"
+    pilot._client = own
+    for _ in range(2 * MOST_ASKED):
+        pilot.ask(commands.parse('{"do": "order", "id": 2, "order": "arm"}'))
+    pilot.ask(commands.parse('{"do": "order", "id": 3, "order": "estop"}'))
+    assert own.given.count(Order.ARM) < MOST_ASKED + 1
+    assert own.given[-1] is Order.ESTOP
+    answers = [json.loads(await viewer.next()) for _ in range(2)]
+    assert [answer["reason"] for answer in answers] == ["not_found", "busy"]
+    own.given.clear()
+    for ready in (False, True):
+        pilot._ready = ready
+        beat = {"do": "drive", "heard": WallClock().now() / 1e6, "since": 0, "input": "keys", "speed": 0.1}
+        pilot.drive(commands.parse(json.dumps(beat)))
+        await asyncio.sleep(0)
+        assert len(own.given) == ready, "a heartbeat that would have to wait grows old"
+    for task in pilot._answers:
+        task.cancel()
+
+
+def test_the_page_is_asked_for_by_the_names_and_the_scheme_that_browsers_use():
+    local = Place(port=80)
+    assert {"localhost", "localhost:80", "[::1]"} <= local.names
+    assert "localhost" not in Place(port=8470).names
+    users, tls = StationUsers({}), ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
+    wide = Place("fd00::7", 443, tls, users, ("Robots.Example",))
+    assert {"[fd00::7]", "[fd00::7]:443", "robots.example"} <= wide.names
+    assert "https://robots.example" in wide.origins
+    assert "http://robots.example:443" not in wide.origins, "anybody on the network can serve a page without TLS"
+
+
+@pytest.mark.parametrize("owner", [None, "a-station", "o" * 30, "o" * 62])
+def test_a_source_keeps_its_owner_and_what_tells_it_apart(owner: str | None, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(stations.socket, "gethostname", lambda: "a-laptop-with-a-long-name.of.some.department.example")
+    names = [own_source(owner, f"{'u' * 24}-beef.{number}") for number in (1, 2)]
+    assert all(SOURCE_NAME.fullmatch(name) for name in names)
+    if owner is not None:
+        assert {name.partition(":")[0] for name in names} == {owner}
+    if owner is None or len(owner) < 60:
+        assert names[0] != names[1]

@@ -4,6 +4,7 @@ import asyncio
 import base64
 import contextlib
 import json
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -300,10 +301,48 @@ async def test_a_recording_plays_by_itself_at_its_rate_to_its_end():
         ({"do": "seek", "at": 1.0}, True),
         ({"do": "watch", "robot": "truck"}, True),
         ({"do": "order", "id": 1, "order": "arm"}, False),
-        ({"do": "drive", "at": 0.0, "input": "keys", "speed": 0.1}, False),
+        ({"do": "drive", "heard": 0.0, "since": 0.0, "input": "keys", "speed": 0.1}, False),
         ({"do": "goal", "id": 1, "goal": [0, 0, 0]}, False),
         ({"do": "set", "id": 1, "key": "gate.speed", "value": 0.1}, False),
     ],
 )
 def test_while_a_recording_is_shown_nothing_but_a_stop_goes_to_the_robot(asked: dict, obeyed: bool):
     assert server._while_replaying(commands.parse(json.dumps(asked))) is obeyed
+
+
+async def test_the_emergency_stop_of_a_recording_acts_on_its_robot_although_the_page_begins_with_it():
+    station = Station([RobotAddress("ann", "tcp/127.0.0.1:1"), RobotAddress("bob", "tcp/127.0.0.1:1")], WallClock())
+    station.replays["bob run-1"] = ReplayFeed("bob run-1", Path("run-1.mcap"), RecordedDrive, WallClock())
+    browser = server._Browser("page", server.LOCAL, station, station._board, WallClock())
+    try:
+        browser.take('{"do": "watch", "robot": "bob run-1"}')
+        begun = await shown(browser.viewer)
+        assert of(begun, "stops") == [{"kind": "stops", "robot": "bob"}]
+        browser.take('{"do": "order", "id": 5, "order": "estop"}')
+        (answer,) = of(await shown(browser.viewer), "answer")
+        assert answer["text"] == "no link to the robot", "and is not refused for want of one"
+    finally:
+        await browser.close()
+
+
+async def test_a_recording_that_nobody_looks_at_makes_room_for_another(monkeypatch: pytest.MonkeyPatch):
+    async def fetched(address, name, user, clock, file, progress):
+        file.write_bytes(b"x")
+
+    monkeypatch.setattr(server, "fetch", fetched)
+    monkeypatch.setattr(server, "MOST_REPLAYS", 2)
+    address, viewer = RobotAddress("truck", "tcp/127.0.0.1:1"), Viewer()
+    station = Station([address], WallClock(), open_log=RecordedDrive)
+    try:
+        titles = [await station.replay(address, f"run-{number}.mcap", "", viewer) for number in range(2)]
+        station.replays[titles[0]].attach(viewer)
+        titles.append(await station.replay(address, "run-2.mcap", "", viewer))
+        assert list(station.replays) == [titles[0], titles[2]]
+        station.replays[titles[2]].attach(viewer)
+        with pytest.raises(InputError, match="looked at"):
+            await station.replay(address, "run-3.mcap", "", viewer)
+        assert list(station._folder.iterdir()) == [], "they are in memory"
+    finally:
+        for task in station._following.values():
+            task.cancel()
+        shutil.rmtree(station._folder)

@@ -1,0 +1,164 @@
+"""The page's scripts in a real browser; the station is played by the test, message by message."""
+
+import asyncio
+import json
+from pathlib import Path
+from typing import Any
+
+from playwright.async_api import Page
+
+from tests.daemon.browser_kit import NEEDS_CHROMIUM, chromium
+from tests.unit.station.test_server import serving
+
+pytestmark = NEEDS_CHROMIUM
+
+PLAYED = """
+window.sent = [];
+window.WebSocket = class {
+  static OPEN = 1;
+  readyState = 1;
+  constructor() { window.socket = this; setTimeout(() => this.onopen(), 0); }
+  send(text) {
+    const message = JSON.parse(text);
+    window.sent.push(message);
+    const answer = { kind: "pong", at: message.at, now: 5000 + message.at };
+    if (message.do === "ping" && window.answers) setTimeout(() => say(answer), 0);
+  }
+};
+window.answers = true;
+window.say = (...messages) => messages.forEach((m) => window.socket.onmessage({ data: JSON.stringify(m) }));
+"""
+"""Instead of the browser's WebSocket: what the page sends is kept, what the station would say is said by the test."""
+
+FACTS = {
+    "kind": "facts",
+    "robot": "truck",
+    "body": "truck",
+    "gate": {"speed": 0.2, "reverse_speed": 0.15, "angle": 0.36, "tilt": {}, "leases": {}},
+    "devices": [],
+    "behaviours": [],
+    "versions": {},
+}
+
+
+async def say(page: Page, *messages: dict[str, Any]) -> None:
+    await page.evaluate("(messages) => say(...messages)", list(messages))
+
+
+async def beats(page: Page, seconds: float = 0.12) -> list[dict[str, Any]]:
+    """Heartbeats that the page sends from now on which ask for motion."""
+    await page.evaluate("void (window.sent = [])")
+    await asyncio.sleep(seconds)
+    sent = json.loads(await page.evaluate("JSON.stringify(window.sent)"))
+    return [each for each in sent if each["do"] == "drive" and each["speed"] != 0.0]
+
+
+async def nothing_drives_once_the_hand_is_gone(page: Page) -> None:
+    await page.keyboard.down("w")
+    assert await beats(page)
+    await page.keyboard.up("w")
+    assert not await beats(page)
+
+    key = "new KeyboardEvent('{}', {{ key: '{}', code: 'KeyW', bubbles: true, {} }})"
+    for release in (
+        key.format("keyup", "ł", ""),  # AltGr came in between
+        "new KeyboardEvent('keydown', { key: 'Meta', code: 'MetaLeft', metaKey: true, bubbles: true })",
+        "new MouseEvent('contextmenu', { bubbles: true })",
+        "new FocusEvent('blur')",
+    ):
+        await page.evaluate(f"window.dispatchEvent({key.format('keydown', 'w', '')})")
+        assert await beats(page), release
+        await page.evaluate(f"window.dispatchEvent({release})")
+        assert not await beats(page), release
+
+    await page.keyboard.down("w")
+    assert await beats(page)
+    await page.focus("#steering")  # a list may swallow the release
+    assert not await beats(page)
+    await page.keyboard.up("w")
+
+    box = await page.locator("#stick").bounding_box()
+    assert box is not None
+    await page.mouse.move(box["x"] + box["width"] / 2, box["y"] + 10)
+    await page.mouse.down()
+    assert await beats(page)
+    loose = "new PointerEvent('pointermove', { pointerId: 1, buttons: 0 })"
+    await page.evaluate(f"document.querySelector('#stick').dispatchEvent({loose})")
+    assert not await beats(page), "a mouse without a button pressed holds no stick"
+    await page.mouse.up()
+
+
+async def a_gamepad_drives_the_robot_of_the_page_that_has_the_focus(page: Page) -> None:
+    await page.evaluate(
+        """() => {
+            const buttons = Array.from({ length: 17 }, (_, i) => ({ pressed: i === 5 }));
+            const pad = { connected: true, mapping: "standard", id: "pad", axes: [0, -0.9], buttons };
+            navigator.getGamepads = () => [pad];
+        }"""
+    )
+    assert await beats(page)
+    await page.evaluate("void (document.hasFocus = () => false)")
+    assert not await beats(page)
+
+
+async def an_unknown_way_is_taken_to_be_slow(page: Page) -> None:
+    await page.fill("#speed", "0.2")
+    await page.focus("#stick")
+    await page.keyboard.down("w")
+    beat = (await beats(page))[-1]
+    assert beat["speed"] > 0.18
+    assert beat["heard"] > 5000
+    assert beat["since"] >= 0.0
+    await page.evaluate("void (window.answers = false)")
+    assert (await beats(page, 0.9))[-1]["speed"] < 0.16, "what is waited for in vain is no quick answer"
+    await page.evaluate("void (window.answers = true)")
+    assert max(beat["speed"] for beat in await beats(page, 0.8)) > 0.18
+    await say(page, {"kind": "link", "alive": False, "round_trip": None, "text": "gone"})
+    assert (await beats(page))[-1]["speed"] < 0.06, "what is not known is taken to be slow"
+    # Another run of the robot, or another robot: what was said of this one is void.
+    await say(page, {"kind": "goal", "m": {"number": 3, "phase": "driving", "remaining": 1.0, "goal": [1, 1, 0]}})
+    assert await page.inner_text("#goal-text")
+    await say(page, {"kind": "robot", "name": "truck"})
+    assert not await page.is_visible("#goal")
+
+
+async def parts_of_the_map_outlive_the_whole_map_that_they_belong_to(page: Page) -> None:
+    grid = {"width": 2, "height": 2, "resolution": 0.1, "origin": [0, 0, 0], "frame": "map"}
+    await page.route("**/robots/truck/map/*", lambda route: route.fulfill(body=bytes([0, 0, 0, 0])))
+    kept = await page.evaluate(
+        """async (grid) => {
+            const { MapView } = await import("/page/map.js");
+            const link = { on() {}, newest: {}, robot: "truck" };
+            const map = new MapView(document.querySelector("#map"), link, () => {});
+            const tile = (version, x) => {
+                map.takeTile({ ...grid, version, origin: [x, 0, 0], payload: new ArrayBuffer(4) });
+            };
+            tile(1, 1);
+            tile(2, 2);
+            await map.takeMap({ ...grid, version: 2 });
+            tile(1, 3);
+            tile(2, 4);
+            return [...map.tiles.values()].map(({ origin }) => origin[0]);
+        }""",
+        grid,
+    )
+    assert kept == [2, 4]
+
+
+async def test_the_page_drives_as_the_hand_does_and_shows_what_is_true(tmp_path: Path):
+    """All in one browser, for it takes seconds to start."""
+    async with serving() as (station, _), chromium(tmp_path) as browser:
+        page = await browser.new_page()
+        errors: list[str] = []
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        await page.add_init_script(PLAYED)
+        await page.goto(station.place.url)
+        await page.wait_for_selector("html[data-ready=true]")
+        await say(page, {"kind": "hello", "version": "1", "user": "", "role": "engineer"})
+        await say(page, {"kind": "robots", "names": ["truck"]}, {"kind": "robot", "name": "truck"}, FACTS)
+        await say(page, {"kind": "link", "alive": True, "round_trip": 0.02, "text": ""})
+        await nothing_drives_once_the_hand_is_gone(page)
+        await a_gamepad_drives_the_robot_of_the_page_that_has_the_focus(page)
+        await an_unknown_way_is_taken_to_be_slow(page)
+        await parts_of_the_map_outlive_the_whole_map_that_they_belong_to(page)
+        assert errors == []
