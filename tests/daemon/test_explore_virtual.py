@@ -15,7 +15,7 @@ from monstertruck_runtime.map_files import FREE, OCCUPIED, WorldMap, load_map, s
 from monstertruck_schemas import topics
 from monstertruck_schemas.plan import ExplorationPhase
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import ExploreOrder
+from monstertruck_schemas.req import ExploreOrder, GoalOrder
 from monstertruckd.config.load import load_config
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
 from monstertruckd.tools.simulation.operator import LocalOperator
@@ -109,7 +109,8 @@ def test_it_explores_a_room_drives_home_and_saves_the_map(tmp_path: Path):
     assert {Reason.EXPLORATION_STARTED, Reason.FRONTIER_CHOSEN, Reason.EXPLORED} <= reasons
 
 
-def test_it_stops_on_request_and_gives_way_to_other_goals(tmp_path: Path):
+@pytest.mark.parametrize("budget", [None, pytest.param(6.0, marks=pytest.mark.long)])
+def test_it_stops_on_request_and_gives_way_to_other_goals(budget: float | None, tmp_path: Path):
     ends = []
 
     async def scenario(truck: ExploringTruck) -> None:
@@ -126,27 +127,21 @@ def test_it_stops_on_request_and_gives_way_to_other_goals(tmp_path: Path):
         await truck.operator.call("goal", {**await truck.operator.header(), **goal})
         ends.append(await truck.end(60.0))
 
+        if budget is not None:
+            cancel = {**await truck.operator.header(), "order": GoalOrder.CANCEL}
+            await truck.operator.call("goal_control", cancel)
+            await truck.clock.sleep(2.0)
+            await truck.order(ExploreOrder.START, home=True, budget=budget)
+            spent = await truck.end(120.0)
+            assert spent.outcome is Reason.BUDGET_SPENT
+            assert "back at the start" in spent.text
+
     _, truth = run_scenario(scenario, tmp_path)
     assert [state.outcome for state in ends] == [Reason.CANCELLED, Reason.CANCELLED]
     assert "operator" in ends[0].text
     assert "goal of operator" in ends[1].text
     assert not truth[:, 5].any()
     assert ends[0].phase is ExplorationPhase.IDLE
-
-
-@pytest.mark.long
-def test_a_spent_budget_ends_it_at_the_start(tmp_path: Path):
-    ends = []
-
-    async def scenario(truck: ExploringTruck) -> None:
-        await truck.operator.arm()
-        await truck.order(ExploreOrder.START, home=True, budget=6.0)
-        ends.append(await truck.end(120.0))
-
-    _, truth = run_scenario(scenario, tmp_path)
-    assert ends[0].outcome is Reason.BUDGET_SPENT
-    assert "back at the start" in ends[0].text
-    assert not truth[:, 5].any()
 
 
 def doubled(folder: Path) -> float:
