@@ -27,10 +27,20 @@ SPARE: Final = 0.05
 """By which the critical angle of a wall may be greater than stated, rad."""
 INERTIA: Final = (0.05, 0.03)
 """Standard deviations of the estimate before: rad, m."""
-GUESSES: Final = 24
-"""Directions from which a line is fitted without an estimate before."""
-STEPS: Final = 4, 10
-"""Of Gauss and Newton, from an estimate and from a guess."""
+GUESSES: Final = 24, 5
+"""Directions from which a line is fitted without an estimate before, and the best ones that are fitted to the end,"""
+DISTINCT: Final = 0.05
+"""which differ by so much, rad or m."""
+STEPS: Final = 4, 4, 6
+"""Of Gauss and Newton: from an estimate, from all guesses, and further from the best ones."""
+SAMPLED: Final = 40
+"""Echoes to which all guesses are fitted, taken evenly out of more."""
+LONGEST: Final = 0.3
+"""Greatest step of a fit, rad and m."""
+SETTLED: Final = 1e-5
+"""A step of all fits below this, rad and m, is the last one."""
+FREE: Final = (math.inf, math.inf)
+"""Inertia without an estimate before."""
 
 
 class WallEstimate(NamedTuple):
@@ -63,24 +73,23 @@ class Cone:
     half: float
     critical: float
 
-    def ranges(self, echoes: Array, normal: Array, distance: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
-        """What sonars measure of walls.
+    def shares(self, axis: Array, normal: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """What sonars measure of walls, as a share of their distance.
 
         Args:
-            echoes: see ``ECHO``; (..., n) of columns.
+            axis: of the sonars, rad.
             normal: of the walls, rad.
-            distance: from the sonars to the walls, m.
 
         Returns:
-            Ranges, m; their derivative by the wall's direction at a fixed distance, m/rad; whether sound comes back.
+            Range over distance; the derivative of its logarithm by the wall's direction, 1/rad; whether sound comes
+            back.
         """
-        off = np.remainder(normal - echoes[..., 2] + math.pi, math.tau) - math.pi
+        off = normal - axis
+        off -= math.tau * np.rint(off * (1.0 / math.tau))
         beyond = np.maximum(np.abs(off) - self.half, 0.0)
         heard = beyond <= self.critical + SPARE
-        beyond = np.where(heard, beyond, 0.0)
-        share = 1.0 / np.cos(beyond)
-        slope = np.where(heard & (np.abs(off) > self.half), np.sign(off) * np.tan(beyond), 0.0)
-        return distance * share, distance * share * slope, heard
+        slope = np.tan(beyond * heard)
+        return np.sqrt(1.0 + slope * slope), np.copysign(slope, off), heard
 
     def hears(self, axis: float, normal: float) -> bool:
         """Whether a sonar hears a wall of that direction."""
@@ -110,8 +119,8 @@ def deviation(ranges: Array) -> Array:
 def residuals(echoes: Array, line: WallEstimate, cone: Cone) -> Array:
     """(n,) measured less expected range of every echo, in standard deviations; inf where none is expected."""
     distance = line.offset - math.cos(line.normal) * echoes[:, 0] - math.sin(line.normal) * echoes[:, 1]
-    expected, _, heard = cone.ranges(echoes, np.array(line.normal), distance)
-    return np.where(heard, (echoes[:, 3] - expected) / deviation(echoes[:, 3]), np.inf)
+    share, _, heard = cone.shares(echoes[:, 2], np.array(line.normal))
+    return np.where(heard, (echoes[:, 3] - distance * share) / deviation(echoes[:, 3]), np.inf)
 
 
 def refine(echoes: Array, before: WallEstimate, at: tuple[float, float], cone: Cone) -> EstimateFit:
@@ -131,12 +140,32 @@ def refine(echoes: Array, before: WallEstimate, at: tuple[float, float], cone: C
 
 def search(echoes: Array, at: tuple[float, float], cone: Cone) -> EstimateFit:
     """Fit a line to at least three echoes without an estimate: the best of several directions; see ``refine``."""
-    normals = np.linspace(-math.pi, math.pi, GUESSES, endpoint=False)
-    offsets = echoes[:, :2] - at
+    normals = np.linspace(-math.pi, math.pi, GUESSES[0], endpoint=False)
+    sample = echoes
+    if len(echoes) > SAMPLED:  # not every so many-th one, which could all be of one sonar
+        sample = echoes[np.linspace(0, len(echoes) - 1, SAMPLED).astype(int)]
+    offsets = sample[:, :2] - at
     along = offsets[:, 0] * np.cos(normals)[:, None] + offsets[:, 1] * np.sin(normals)[:, None]
-    share, _, _ = cone.ranges(echoes, normals[:, None], np.ones_like(along))
-    distances = np.median(echoes[:, 3] / share + along, axis=1)
-    return _best(echoes, *_fitted(echoes, normals, distances, at, cone, (math.inf, math.inf), STEPS[1]), at, cone)
+    share, _, _ = cone.shares(sample[:, 2], normals[:, None])
+    distances = np.median(sample[:, 3] / share + along, axis=1)
+    normals, distances, cost, _ = _fitted(sample, normals, distances, at, cone, FREE, STEPS[1])
+    best = _distinct(normals, distances, np.where(distances > 0.0, cost, np.inf))
+    return _best(echoes, *_fitted(echoes, normals[best], distances[best], at, cone, FREE, STEPS[2]), at, cone)
+
+
+def _distinct(normals: Array, distances: Array, cost: Array) -> list[int]:
+    """The best guesses, without those that lead to the same line as a better one."""
+    found: list[tuple[float, float]] = []
+    best = []
+    for i in np.argsort(cost, kind="stable").tolist():
+        normal, distance = float(normals[i]), float(distances[i])
+        if any(abs(math.remainder(normal - n, math.tau)) < DISTINCT and abs(distance - d) < DISTINCT for n, d in found):
+            continue
+        found.append((normal, distance))
+        best.append(i)
+        if len(best) == GUESSES[1]:
+            break
+    return best
 
 
 def _fitted(
@@ -149,25 +178,35 @@ def _fitted(
     steps: int,
 ) -> tuple[Array, Array, Array, Array]:
     """Directions, distances, costs (k,), and information (k, 3) of k fits after some steps."""
-    x, y = echoes[:, 0] - at[0], echoes[:, 1] - at[1]
-    weight = 1.0 / deviation(echoes[:, 3]) ** 2
-    first_normals, first_distances = normals, distances
-    held = 1.0 / np.array(inertia) ** 2
+    x, y, axis, ranges = np.ascontiguousarray(echoes[:, :4].T)
+    x, y = x - at[0], y - at[1]
+    weight = 1.0 / deviation(ranges) ** 2
+    damping = weight / ROBUST**2
+    first = np.stack([normals, distances])
+    lines = first
+    held = 1.0 / np.array(inertia)[:, None] ** 2
+    terms = np.empty((len(normals), 3, len(echoes)))
+    """Of every fit and echo: derivatives of the range by direction and distance, and what is missing of it."""
     for _ in range(steps):
-        c, s = np.cos(normals)[:, None], np.sin(normals)[:, None]
-        far = distances[:, None] - c * x - s * y
-        expected, by_angle, heard = cone.ranges(echoes, normals[:, None], far)
-        share = expected / np.where(np.abs(far) < 1e-9, 1e-9, far)
-        missing = np.where(heard, echoes[:, 3] - expected, UNHEARD)
-        kept = heard * weight / (1.0 + missing**2 * weight / ROBUST**2)
-        da, dd = (s * x - c * y) * share + by_angle, share
-        aa, ad, dd2 = (kept * da * da).sum(1) + held[0], (kept * da * dd).sum(1), (kept * dd * dd).sum(1) + held[1]
-        ga = (kept * da * missing).sum(1) + held[0] * (first_normals - normals)
-        gd = (kept * dd * missing).sum(1) + held[1] * (first_distances - distances)
-        determinant = np.maximum(aa * dd2 - ad * ad, 1e-12 * (1.0 + aa * dd2))
-        normals = normals + np.clip((dd2 * ga - ad * gd) / determinant, -0.3, 0.3)
-        distances = distances + np.clip((aa * gd - ad * ga) / determinant, -0.3, 0.3)
-    return normals, distances, np.log1p(missing**2 * weight / ROBUST**2).sum(1), np.stack([aa, ad, dd2], axis=1)
+        c, s = np.cos(lines[0])[:, None], np.sin(lines[0])[:, None]
+        share, slope, heard = cone.shares(axis, lines[0][:, None])
+        far = lines[1][:, None] - c * x - s * y
+        terms[:, 0] = (s * x - c * y + far * slope) * share
+        terms[:, 1] = share
+        missing = np.where(heard, ranges - far * share, UNHEARD)
+        terms[:, 2] = missing
+        kept = heard * weight / (1.0 + missing * missing * damping)
+        sums = (terms * kept[:, None]) @ terms.transpose(0, 2, 1)
+        aa, ad, dd = sums[:, 0, 0] + held[0], sums[:, 0, 1], sums[:, 1, 1] + held[1]
+        ga, gd = sums[:, :2, 2].T + held * (first - lines)
+        determinant = np.maximum(aa * dd - ad * ad, 1e-12 * (1.0 + aa * dd))
+        step = np.stack([dd * ga - ad * gd, aa * gd - ad * ga]) / determinant
+        step = np.minimum(np.maximum(step, -LONGEST), LONGEST)
+        lines = lines + step
+        if np.abs(step).max() < SETTLED:
+            break
+    cost = np.log1p(missing * missing * damping).sum(1)
+    return lines[0], lines[1], cost, np.stack([aa, ad, dd], axis=1)
 
 
 def _best(
