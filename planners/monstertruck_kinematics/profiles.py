@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -103,6 +103,13 @@ class TimedRamp:
         return t - self.begin >= self.shape.duration
 
 
+_SHORTEST: Final = 1e-3
+"""Duration from which on ramps are tried, s."""
+_COARSE: Final = np.linspace(0.0, 1.0, 97)
+_FINE: Final = np.linspace(0.0, 1.0, 65)
+"""Shares of the span, of its logarithm and of one of its parts, that are tried."""
+
+
 def shortest_ramp(v0: float, a0: float, v1: float, max_acceleration: float, max_jerk: float) -> CubicRamp:
     """The shortest cubic ramp from the present speed and acceleration within limits.
 
@@ -136,11 +143,12 @@ def shortest_ramp(v0: float, a0: float, v1: float, max_acceleration: float, max_
         return (ends <= jerk) & (~inside | (peak <= limit))
 
     long = 2.0 * abs(change) / max_acceleration + 8.0 * (limit / max_jerk) + (6.0 * abs(change) / max_jerk) ** 0.5
-    times = np.geomspace(1e-3, max(long, 1e-2), 97)
-    first = int(np.argmax(kept(times)))
+    times = _SHORTEST * np.exp(_COARSE * math.log(max(long, 1e-2) / _SHORTEST))
+    found = kept(times)
+    first = int(np.argmax(found))
     if first == 0:
-        return CubicRamp(v0, v1, float(times[0] if kept(times[:1])[0] else times[-1]), a0)
-    between = np.linspace(times[first - 1], times[first], 65)
+        return CubicRamp(v0, v1, float(times[0] if found[0] else times[-1]), a0)
+    between = times[first - 1] + _FINE * (times[first] - times[first - 1])
     return CubicRamp(v0, v1, float(between[int(np.argmax(kept(between)))]), a0)
 
 

@@ -316,10 +316,11 @@ class WallLine:
         found = [line for group in groups if (line := self._faced(state, cone, group)) is not None]
         return min(found, key=lambda line: self._way_to(state, line), default=None)
 
-    def _faced(self, state: LineState, cone: Cone, group: tuple[int, ...]) -> WallEstimate | None:
-        """A wall ahead by some sonars."""
+    def _faced(self, state: LineState, cone: Cone, group: tuple[int, int]) -> WallEstimate | None:
+        """A wall ahead by the sonars from one number to another."""
         echoes, pose = state.echoes, state.pose
-        rows = echoes[(echoes[:, 5] > state.travelled - _reach(state)) & np.isin(echoes[:, 4], group)]
+        own = (echoes[:, 4] >= group[0]) & (echoes[:, 4] <= group[1])
+        rows = echoes[(echoes[:, 5] > state.travelled - _reach(state)) & own]
         fresh = _fresh(rows, state)
         if len(rows) < LEAST or not len(fresh) or fresh[:, 3].min() > NEAR:
             return None
@@ -354,7 +355,7 @@ class WallLine:
                 ranges = rows[:, 3]
                 if len(ranges) >= 2:
                     left = min(left, float(np.median(ranges)) + state.mounts[number].reach - self._keep(state))
-        near = fresh[np.isin(fresh[:, 4], (DIAGONAL, FRONT, FAR))][-6:, 3]
+        near = fresh[fresh[:, 4] >= DIAGONAL][-6:, 3]
         return min(left, 0.0) if np.count_nonzero(near < TOUCHING) >= 2 else left
 
     def _way_to(self, state: LineState, line: WallEstimate) -> float:
@@ -445,6 +446,8 @@ class WallLine:
                     return self._steer(self._to(replace(state, v=self._ramp(state.v, 0.0, t)), "stop"), t)
         state = self._steer(state, t)
         left, speed = self._left(state, cone, t), state.v.at(t)
+        if left == math.inf:
+            return state
         brake = shortest_ramp(speed, state.v.acceleration(t), 0.0, config.braking, config.jerk)
         if left - speed / config.rate > brake.distance:
             return state
