@@ -216,8 +216,15 @@ def summary(results: list[Result]) -> dict[str, Any]:
         "wheel": round(max(r.run.wheels for r in results), 3),
         "acceleration": round(max(r.ramp[0] for r in results), 4),
         "jerk": round(max(r.ramp[1] for r in results), 3),
+        "step_ms": dict(zip(("median", "p99", "max"), _step_times(results), strict=True)),
         "reasons": dict(Counter(str(r.run.reason) for r in results)),
     }
+
+
+def _step_times(results: list[Result]) -> list[float]:
+    """Processor time of the behaviour's steps, ms: median, 99 of 100, greatest."""
+    costs = np.concatenate([r.run.costs for r in results]) * 1000
+    return [round(float(value), 2) for value in np.percentile(costs, (50, 99, 100))]
 
 
 def main() -> int:

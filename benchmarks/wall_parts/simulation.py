@@ -8,6 +8,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from time import thread_time
 from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
@@ -71,6 +72,8 @@ class WallRun(NamedTuple):
     """Greatest speed of a wheel, m/s."""
     ramps: list[TimedRamp]
     """That were planned."""
+    costs: Array
+    """Processor time of every step of the behaviour, without the simulation, s."""
 
     def jumps(self) -> tuple[int, int, float, float]:
         """How often speed and yaw rate asked for jump from one step to the next, and their greatest changes."""
@@ -211,6 +214,7 @@ def drive_along(
     asked: list[tuple[float, float]] = []
     track: list[tuple[float, ...]] = []
     ramps: list[TimedRamp] = []
+    costs: list[float] = []
     motion, end, ended, contact = RequestedMotion(), Reason.TIMEOUT, None, False
     text, steps, wheels, heard, phase = "", round(1 / (rate * FINE)), 0.0, None, ""
     mirror = 1.0 if side == "left" else -1.0
@@ -226,7 +230,9 @@ def drive_along(
             if fault is not None and fault.kind == "imu" and t >= fault.at + IMU_STALE and IMU in pilot.reads:
                 end, text, ended = Reason.INPUT_STALE, "sensor/imu", t
             else:
-                step = pilot.step(_inputs(heard, body, bias, frames, now, rng), state, t)
+                inputs, begun = _inputs(heard, body, bias, frames, now, rng), thread_time()
+                step = pilot.step(inputs, state, t)
+                costs.append(thread_time() - begun)
                 state, phase = step.state, step.phase
                 if watch is not None:
                     watch(t, body, step)
@@ -249,7 +255,7 @@ def drive_along(
             break
     return WallRun(
         end, text, contact, ended if ended is not None else t, np.array(asked), 1 / rate,
-        np.array(track).reshape(-1, 5), wheels, ramps,
+        np.array(track).reshape(-1, 5), wheels, ramps, np.array(costs),
     )  # fmt: skip
 
 
