@@ -27,11 +27,11 @@ SPARE: Final = 0.05
 """By which the critical angle of a wall may be greater than stated, rad."""
 INERTIA: Final = (0.05, 0.03)
 """Standard deviations of the estimate before: rad, m."""
-GUESSES: Final = 16, 4
+GUESSES: Final = 24, 5
 """Directions from which a line is fitted without an estimate before, and the best ones that are fitted to the end,"""
 DISTINCT: Final = 0.05
 """which differ by so much, rad or m."""
-STEPS: Final = 4, 4, 5
+STEPS: Final = 4, 4, 6
 """Of Gauss and Newton: from an estimate, from all guesses, and further from the best ones."""
 SAMPLED: Final = 40
 """Echoes to which all guesses are fitted, taken evenly out of more."""
