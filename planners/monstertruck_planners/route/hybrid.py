@@ -7,6 +7,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import chain
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -374,7 +375,7 @@ class _PlanningRun:
         """The best route found in the budget that is left.
 
         Motions without translations are found in half the time: they come first, as for a vehicle that has no others,
-        and what they give is kept unless translations make it shorter. So these make no route longer.
+        and what they give is kept unless translations make it shorter and no dearer. So these make no route longer.
         """
         segments = first
         if holds_translations(first):
@@ -386,7 +387,9 @@ class _PlanningRun:
         if self.crab > 0.0:
             self.model = self.planner.motion_model(RESOLUTIONS[0], self.crab)
             routes = [segments, first] if holds_translations(first) else [segments]
-            segments = min((segments, *map(self._polished, routes)), key=self._detours)
+            cost = self._cost(segments) + 1e-9
+            polished = [route for route in map(self._polished, routes) if self._cost(route) <= cost]
+            segments = min((segments, *polished), key=self._detours)
         return segments
 
     def _detours(self, segments: Array) -> tuple[int, float]:
@@ -414,6 +417,11 @@ class _PlanningRun:
     def _improve_in_rounds(self, segments: Array) -> Array:
         """Smooth the best route and others in turn until nothing gains or only the last share is left."""
         others = self._starts(segments)
+        cheapest = next(others)  # along the cheapest way, while the first route may lead straight ahead
+        if len(cheapest) and self._cost(cheapest) < self._cost(segments):
+            segments = cheapest
+        else:
+            others = chain([cheapest], others)
         best, cost = self._smoothed(segments, NO_SEGMENTS, np.inf)
         idle = 0
         while self.budget.remaining() > FINAL_SHARE and idle < MAX_IDLE_ROUNDS:

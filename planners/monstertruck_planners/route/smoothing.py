@@ -26,6 +26,7 @@ from monstertruck_planners.route.search import (
     VehicleMotions,
     count_cusps,
     many_cusps_cost,
+    route_cost,
     segments_cost,
     segments_free,
 )
@@ -171,6 +172,30 @@ def _cusps_with_ends(segments: Array, count: int, before: float, after: float) -
 
 
 @njit(cache=True)
+def _around(path: EditablePath, begin: float, i: int, end: float, j: int) -> tuple[float, float]:
+    """Directions (sign; 0: none) before and after the stretch from ``begin`` (in segment i) to ``end`` (in j)."""
+    before, after = path.segments[i, 0], path.segments[j, 0]
+    if begin - path.travelled[i] <= MIN_SEGMENT:
+        before = path.segments[i - 1, 0] if i > 0 else 0.0
+    if path.travelled[j + 1] - end <= MIN_SEGMENT:
+        after = path.segments[j + 1, 0] if j + 1 < path.used[0] else 0.0
+    return before, after
+
+
+@njit(cache=True)
+def _whole_cost(field: FieldData, layer: CostLayer, model: VehicleMotions, path: EditablePath) -> float:
+    return route_cost(field, layer, model, path.poses[0], path.segments[: path.used[0]])
+
+
+@njit(cache=True)
+def _restore(path: EditablePath, segments: Array, used: int) -> None:
+    """The segments from before a trial."""
+    path.segments[:used] = segments[:used]
+    path.used[0] = used
+    _update_poses(path, 0)
+
+
+@njit(cache=True)
 def shortcut(
     field: FieldData,
     footprint: FootprintData,
@@ -199,11 +224,11 @@ def shortcut(
     old, new, word = np.empty((len(path.segments), 3)), np.empty((2 * MAX_SEGMENTS, 3)), np.empty((MAX_SEGMENTS, 3))
     spare, best, scratch = np.empty((len(path.segments) + 12, 3)), np.empty(8), np.empty((4, 3))
     a, b, q = np.empty(3), np.empty(3), np.empty(3)
+    before_trial = np.empty_like(path.segments)
+    whole = _whole_cost(field, layer, model, path)
     kept, cusps = 0, count_cusps(path.segments, path.used[0], 0.0)
     for n in range(len(random)):
         total = path.travelled[path.used[0]]
-        if total < 1e-6:
-            break
         # Short stretches are tried oftener than long ones.
         length = min(reach, total) * random[n, 0] ** 2 + 0.02
         begin = random[n, 1] * (total + length) - length
@@ -214,14 +239,7 @@ def shortcut(
         i, j = _segment_at(path, begin), _segment_at(path, end)
         _pose_at(path, i, begin, a)
         _pose_at(path, j, end, b)
-        before = (
-            path.segments[i, 0]
-            if begin - path.travelled[i] > MIN_SEGMENT
-            else (path.segments[i - 1, 0] if i > 0 else 0.0)
-        )
-        after = path.segments[j, 0] if path.travelled[j + 1] - end > MIN_SEGMENT else (
-            path.segments[j + 1, 0] if j + 1 < path.used[0] else 0.0
-        )  # fmt: skip
+        before, after = _around(path, begin, i, end, j)
         count = _stretch_segments(path, begin, i, end, j, old)
         present = segments_cost(field, layer, model, a, old, count, before)
         if after * old[count - 1, 0] < 0.0:
@@ -257,7 +275,15 @@ def shortcut(
         cost += many_cusps_cost(model, others, new_cusps)
         if cost >= present - 1e-6 or not segments_free(field, footprint, model, a, new, many):
             continue
+        # Costs are summed at places along each segment, so those of a stretch are not quite its share of the route's.
+        used = path.used[0]
+        before_trial[:used] = path.segments[:used]
         _splice(path, begin, i, end, j, new, many, spare)
+        changed = _whole_cost(field, layer, model, path)
+        if changed >= whole - 1e-6:
+            _restore(path, before_trial, used)
+            continue
+        whole = changed
         cusps = count_cusps(path.segments, path.used[0], 0.0)
         kept += 1
     return kept

@@ -7,7 +7,10 @@ import pytest
 from monstertruck_planners.route.api import RouteMap, Vehicle
 from monstertruck_planners.route.config import HybridConfig
 from monstertruck_planners.route.hybrid import HybridPlanner
+from monstertruck_planners.route.hybrid_search import RESOLUTIONS
+from monstertruck_planners.route.motion import MotionPath
 from monstertruck_planners.route.replan import KeepPolicy, ViaPoint, plan_through, remaining_route, replan
+from monstertruck_planners.route.smoothing import current_segments, editable, shortcut
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.reasons import Reason
 from tests.unit.planners.route.route_kit import CAR, TRUCK, assert_drivable, ground, room
@@ -185,3 +188,34 @@ def test_the_truck_in_its_three_ways():
     assert rear == pytest.approx([1.0, 0.84, math.pi / 2])
     with pytest.raises(InputError, match="shape"):
         RouteMap(ground().field, tilt=np.zeros((2, 2)))
+
+
+@pytest.mark.parametrize("planner", [FRONT, BOTH])
+def test_more_effort_makes_no_route_dearer_over_rough_ground(planner):
+    cells = room()
+    rough = np.zeros(cells.shape)
+    rough[16:25, 45:77] = 0.01
+    where = RouteMap.from_cells(cells, 0.05, roughness=rough)
+    costs = []
+    for effort in (2000, 8000, 20000):
+        more = HybridPlanner(planner.vehicle, HybridConfig(effort=effort))
+        result = more.plan(where, (1.0, 1.03, 0.0), (5.2, 1.03, 0.0))
+        assert result.cost == pytest.approx(more.cost(where, result.path), abs=1e-6)
+        costs.append(result.cost)
+    assert costs == sorted(costs, reverse=True)
+
+
+def test_no_shortcut_makes_a_route_dearer():
+    """Costs of a stretch are summed at other places than those of the whole: what seems to gain may lose."""
+    cells, random = room(), np.random.default_rng(3)
+    where = RouteMap.from_cells(cells, 0.05, roughness=0.02 * random.random(cells.shape))
+    field, layer = where.field.data(), where.cost_layer(FRONT.costs)
+    model = FRONT.motion_model(RESOLUTIONS[0], 0.0)
+    first = FRONT.plan(ground(WALL), START, GOAL).path
+    path = editable(*first.copied())
+    cost = FRONT.cost(where, first)
+    for _ in range(300):
+        shortcut(field, FRONT.footprint, layer, model, path, 10.0, 0.25, random.random((20, 6)))
+        now = FRONT.cost(where, MotionPath(first.copied()[0], current_segments(path).copy()))
+        assert now <= cost + 1e-9
+        cost = now
