@@ -77,6 +77,8 @@ class FaultKind(StrEnum):
     STUCK_SONAR = "stuck sonar"
     CROSS_TALK = "cross-talk"
     WRONG_SIGN = "wrong sign"
+    STUCK_ENCODER = "stuck encoder"
+    MIRRORED_ENCODER = "mirrored encoder"
 
 
 class RecorderDisk(Protocol):
@@ -354,6 +356,9 @@ class FaultCatalog:
             yield FaultKind.CROSS_TALK, lambda rng: _cross_talk(rng, _pick(rng, sonars))
         if "imu" in self._roles:
             yield FaultKind.WRONG_SIGN, lambda rng: _cable(rng, FaultKind.WRONG_SIGN, "imu", *_switch("inverted"))
+        if "encoders" in self._roles:
+            yield FaultKind.STUCK_ENCODER, lambda rng: _encoder(rng, FaultKind.STUCK_ENCODER, "stuck")
+            yield FaultKind.MIRRORED_ENCODER, lambda rng: _encoder(rng, FaultKind.MIRRORED_ENCODER, "mirrored")
 
     def _of_the_computer(self) -> Iterator[tuple[FaultKind, Maker]]:
         if self._hubs:
@@ -440,6 +445,12 @@ def _held_wheel(rng: np.random.Generator, motors: int) -> CatalogFault:
 def _sonar(rng: np.random.Generator, kind: FaultKind, name: str, fault: str) -> CatalogFault:
     starts, ends = _switch(f"{fault} {name}")
     return _fault(kind, name, command("sonar", *starts), command("sonar", *ends), _hold(rng))
+
+
+def _encoder(rng: np.random.Generator, kind: FaultKind, fault: str) -> CatalogFault:
+    side = _pick(rng, ("left", "right"))
+    starts, ends = _switch(f"{fault} {side}")
+    return _fault(kind, side, command("encoders", *starts), command("encoders", *ends), _hold(rng))
 
 
 def _cross_talk(rng: np.random.Generator, name: str) -> CatalogFault:

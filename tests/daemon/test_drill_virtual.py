@@ -152,6 +152,7 @@ def test_a_file_of_something_else_is_refused(tmp_path: Path, text: str, expected
 def test_every_kind_is_on_the_catalog_of_the_whole_truck_and_what_needs_hubs_is_not_without():
     others = {FaultKind.BAD_ANSWERS, FaultKind.HELD_WHEEL, FaultKind.WRONG_SIGN}  # of wheels, sonars, IMU
     others |= {FaultKind.DEAD_SONAR, FaultKind.STUCK_SONAR, FaultKind.CROSS_TALK}
+    others |= {FaultKind.STUCK_ENCODER, FaultKind.MIRRORED_ENCODER}
     assert set(catalog_of(full()).kinds) == set(FaultKind) - others
     missing = set(FaultKind) - others - set(catalog_of(demo()).kinds)
     hubs = {FaultKind.HUB_LOSS, FaultKind.RAIL_ELECTRONICS, FaultKind.COMPUTER_POWER}

@@ -1,4 +1,4 @@
-"""The faults that robots with sonars and with stepper motors can have."""
+"""The faults that robots with sonars, with stepper motors and with encoders can have."""
 
 from pathlib import Path
 
@@ -15,6 +15,8 @@ ROBOTS = Path(__file__).resolve().parents[3] / "configs" / "robots"
 SONARS = {FaultKind.DEAD_SONAR, FaultKind.STUCK_SONAR, FaultKind.CROSS_TALK, FaultKind.WRONG_SIGN, FaultKind.FROZEN}
 WHEELS = {FaultKind.BAD_ANSWERS, FaultKind.HELD_WHEEL, FaultKind.LATE_ANSWERS}
 
+ENCODERS = {FaultKind.STUCK_ENCODER, FaultKind.MIRRORED_ENCODER, FaultKind.FROZEN}
+
 
 def loaded(name):
     return load_config(ROBOTS / f"{name}.yaml", SimulatedTruckConfig)[0]
@@ -24,7 +26,7 @@ def only(catalog, kind, seed=1):
     return catalog.draw(np.random.default_rng(seed), without=frozenset(catalog.kinds) - {kind})
 
 
-@pytest.mark.parametrize(("name", "kinds"), [("sonar", SONARS), ("skid_stand", WHEELS)])
+@pytest.mark.parametrize(("name", "kinds"), [("sonar", SONARS), ("skid_stand", WHEELS), ("tricycle", ENCODERS)])
 def test_a_robot_has_the_faults_of_its_devices_and_its_emulators_know_them(name, kinds):
     config = loaded(name)
     catalog = FaultCatalog(config.devices, records=False)
