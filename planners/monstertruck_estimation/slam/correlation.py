@@ -113,13 +113,15 @@ def correlate(
     offsets = _rotated(points, guess, turns, grid.origin[0], grid.origin[1])
     penalty = (DOUBT * (RESOLUTION / deviation[0]) ** 2, DOUBT / deviation[1] ** 2)
     zone = (10**9, 10**9, 10**9, -1.0, -1.0)
-    score, k, ix, iy = _search(grid.levels, offsets, turns, cells, *penalty, least, work, *zone)
+    place = grid.levels, offsets, turns, cells, *penalty
+    blocks = _coarsest(*place)
+    score, k, ix, iy = _search(*place, *blocks, least, work, *zone)
     if k < 0:
         return None
     rival = 0.0
     if apart > 0:
         zone = (k, ix, iy, apart / RESOLUTION, apart / lever / step)
-        rival = max(_search(grid.levels, offsets, turns, cells, *penalty, 0.8 * score, work, *zone)[0], 0.0)
+        rival = max(_search(*place, *blocks, 0.8 * score, work, *zone)[0], 0.0)
     pose = guess + np.array((ix * RESOLUTION, iy * RESOLUTION, turns[k]))
     return Peak(pose, float(score), float(rival))
 
@@ -203,26 +205,8 @@ def _least_square(low, width):  # type: ignore[no-untyped-def] # noqa: ANN001, A
 
 
 @njit(cache=True)
-def _search(  # type: ignore[no-untyped-def] # noqa: ANN202, C901
-    levels,  # noqa: ANN001
-    offsets,  # noqa: ANN001
-    turns,  # noqa: ANN001
-    cells,  # noqa: ANN001
-    by_cell,  # noqa: ANN001
-    by_turn,  # noqa: ANN001
-    least,  # noqa: ANN001
-    most,  # noqa: ANN001
-    shut_k,  # noqa: ANN001
-    shut_x,  # noqa: ANN001
-    shut_y,  # noqa: ANN001
-    shut_cells,  # noqa: ANN001
-    shut_turns,  # noqa: ANN001
-):
-    """Depth-first branch and bound; (score, turn index, x cells, y cells), turn index -1 if nothing reached ``least``.
-
-    It ends when more than ``most`` blocks were looked at.
-    Poses within ``shut_cells`` and ``shut_turns`` of (shut_x, shut_y, shut_k) do not count.
-    """
+def _coarsest(levels, offsets, turns, cells, by_cell, by_turn):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+    """Blocks of the coarsest level (turn index, x, y, level), the greatest bound first, and their bounds."""
     top = levels.shape[0] - 1
     while top > 0 and (1 << top) > 2 * cells:
         top -= 1
@@ -230,7 +214,7 @@ def _search(  # type: ignore[no-untyped-def] # noqa: ANN202, C901
     per_axis = (2 * cells + width) // width
     count = turns.size * per_axis * per_axis
     bounds = np.empty(count)
-    blocks = np.empty((count, 3), np.int32)
+    blocks = np.empty((count, 4), np.int32)
     n = 0
     for k in range(turns.size):
         for by in range(per_axis):
@@ -239,49 +223,103 @@ def _search(  # type: ignore[no-untyped-def] # noqa: ANN202, C901
                 doubt = by_turn * turns[k] ** 2
                 doubt += by_cell * (_least_square(ix, width) + _least_square(iy, width))
                 bounds[n] = _bound(levels[top], offsets[k], ix, iy) - doubt
-                blocks[n, 0], blocks[n, 1], blocks[n, 2] = k, ix, iy
+                blocks[n, 0], blocks[n, 1], blocks[n, 2], blocks[n, 3] = k, ix, iy, top
                 n += 1
+    order = np.argsort(-bounds, kind="mergesort")
+    return blocks[order], bounds[order]
+
+
+@njit(cache=True)
+def _search(  # type: ignore[no-untyped-def] # noqa: ANN202
+    levels,  # noqa: ANN001
+    offsets,  # noqa: ANN001
+    turns,  # noqa: ANN001
+    cells,  # noqa: ANN001
+    by_cell,  # noqa: ANN001
+    by_turn,  # noqa: ANN001
+    blocks,  # noqa: ANN001
+    bounds,  # noqa: ANN001
+    least,  # noqa: ANN001
+    most,  # noqa: ANN001
+    shut_k,  # noqa: ANN001
+    shut_x,  # noqa: ANN001
+    shut_y,  # noqa: ANN001
+    shut_cells,  # noqa: ANN001
+    shut_turns,  # noqa: ANN001
+):
+    """Best-first branch and bound; (score, turn index, x cells, y cells), turn index -1 if nothing reached ``least``.
+
+    It begins with the sorted ``blocks`` of the coarsest level, and ends when more than ``most`` below it were looked
+    at. The block of the greatest bound is next, whatever its size: depth first, a search that ends early would have
+    seen one corner of a great window, and not the place that fits.
+    Poses within ``shut_cells`` and ``shut_turns`` of (shut_x, shut_y, shut_k) do not count.
+    """
     best, best_k, best_x, best_y = least, -1, 0, 0
-    work = 0
-    stack = np.empty((4 * (top + 1) + 4, 4), np.int32)
-    stack_bound = np.empty(4 * (top + 1) + 4)
-    for m in np.argsort(-bounds, kind="mergesort"):
-        if bounds[m] <= best or work > most:
-            break
-        stack[0, 0], stack[0, 1], stack[0, 2], stack[0, 3] = blocks[m, 0], blocks[m, 1], blocks[m, 2], top
-        stack_bound[0] = bounds[m]
-        size = 1
-        while size:
+    work, taken = 0, 0
+    # Blocks below the coarsest level wait in a heap.
+    keys, heap, size = np.empty(1024), np.empty((1024, 4), np.int32), 0
+    while work <= most:
+        if size and (taken == bounds.size or keys[0] >= bounds[taken]):
+            bound, block = keys[0], heap[0]
+            k, x, y, level = block[0], block[1], block[2], block[3]
             size -= 1
-            if stack_bound[size] <= best:
+            _sink(keys, heap, size)
+        elif taken < bounds.size:
+            bound, block = bounds[taken], blocks[taken]
+            k, x, y, level = block[0], block[1], block[2], block[3]
+            taken += 1
+        else:
+            break
+        if bound <= best:
+            break
+        if level == 0:
+            near = math.hypot(x - shut_x, y - shut_y) <= shut_cells and abs(k - shut_k) <= shut_turns
+            if not near and abs(x) <= cells and abs(y) <= cells:
+                best, best_k, best_x, best_y = bound, k, x, y
+            continue
+        half = 1 << (level - 1)
+        for q in range(4):
+            cx, cy = x + (q & 1) * half, y + (q >> 1) * half
+            doubt = by_turn * turns[k] ** 2
+            doubt += by_cell * (_least_square(cx, half) + _least_square(cy, half))
+            bound = _bound(levels[level - 1], offsets[k], cx, cy) - doubt
+            work += 1
+            if bound <= best:
                 continue
-            k, x, y, level = stack[size, 0], stack[size, 1], stack[size, 2], stack[size, 3]
-            if level == 0:
-                near = math.hypot(x - shut_x, y - shut_y) <= shut_cells and abs(k - shut_k) <= shut_turns
-                if not near and abs(x) <= cells and abs(y) <= cells:
-                    best, best_k, best_x, best_y = stack_bound[size], k, x, y
-                continue
-            half = 1 << (level - 1)
-            first = size
-            for q in range(4):
-                cx, cy = x + (q & 1) * half, y + (q >> 1) * half
-                doubt = by_turn * turns[k] ** 2
-                doubt += by_cell * (_least_square(cx, half) + _least_square(cy, half))
-                bound = _bound(levels[level - 1], offsets[k], cx, cy) - doubt
-                work += 1
-                if bound <= best:
-                    continue
-                # Insert so that the most promising child is on top.
-                at = size
-                while at > first and stack_bound[at - 1] > bound:
-                    stack_bound[at] = stack_bound[at - 1]
-                    for e in range(4):
-                        stack[at, e] = stack[at - 1, e]
-                    at -= 1
-                stack_bound[at] = bound
-                stack[at, 0], stack[at, 1], stack[at, 2], stack[at, 3] = k, cx, cy, level - 1
-                size += 1
+            if size == keys.size:
+                keys, heap = np.concatenate((keys, np.empty(size))), np.concatenate((heap, np.empty_like(heap)))
+            _float(keys, heap, size, bound, k, cx, cy, level - 1)
+            size += 1
     return best if best_k >= 0 else 0.0, best_k, best_x, best_y
+
+
+@njit(cache=True)
+def _float(keys, heap, at, bound, k, x, y, level):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+    """Add a block to the heap at its end, ``at``."""
+    while at:
+        above = (at - 1) // 2
+        if keys[above] >= bound:
+            break
+        keys[at], heap[at] = keys[above], heap[above]
+        at = above
+    keys[at] = bound
+    heap[at, 0], heap[at, 1], heap[at, 2], heap[at, 3] = k, x, y, level
+
+
+@njit(cache=True)
+def _sink(keys, heap, size):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+    """Put the last block, ``size``, in the place of the first, which was taken."""
+    bound = keys[size]
+    at = 0
+    while 2 * at + 1 < size:
+        below = 2 * at + 1
+        if below + 1 < size and keys[below + 1] > keys[below]:
+            below += 1
+        if keys[below] <= bound:
+            break
+        keys[at], heap[at] = keys[below], heap[below]
+        at = below
+    keys[at], heap[at] = bound, heap[size]
 
 
 MERGE_CELL: Final = 0.05

@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from monstertruck_estimation.se2 import between, compose
+from monstertruck_estimation.se2 import between, compose, inverse, transform
 from monstertruck_estimation.slam.correlation import LikelihoodGrid, Submap, correlate, merged
 from monstertruck_estimation.slam.kiss_matcher import KissMatcher
 from monstertruck_estimation.slam.registration import Cloud, register
@@ -50,6 +50,19 @@ def test_the_search_returns_the_greatest_score_of_its_window():
             column = correlate(grid, points, at, (0.5, 1e-9), (1e3, 1e3), 0.0)
             best = max(best, column.score)
     assert peak.score == pytest.approx(best, abs=0.02)
+
+
+def test_a_search_that_ends_early_has_looked_at_the_most_promising_places_of_the_whole_window():
+    rng = np.random.default_rng(3)
+    clutter, sparse = rng.uniform((-10, -10), (2, 10), (1000, 2)), rng.uniform((2, -10), (10, 10), (200, 2))
+    points, place = np.concatenate((clutter, sparse)), np.array((6.0, -5.0, 1.0))
+    seen = transform(inverse(place), points)
+    query = seen[np.hypot(*seen.T) < 4.0]
+    # Depth first, the clutter took all of the work, and a place of a score of 0.3 was the result.
+    peak = correlate(LikelihoodGrid.of(dots(points), 7), query, np.zeros(3), (11.0, math.pi), (1e6, 1e6), 0.3)
+    assert peak is not None
+    assert peak.score > 0.9
+    assert peak.pose == pytest.approx(place, abs=0.05)
 
 
 def test_a_square_room_is_its_own_rival():
