@@ -73,6 +73,8 @@ class Peak:
     """Mean likelihood of the points there, 0..1."""
     rival: float
     """Best score of a clearly different pose in the window; 0 if none came near."""
+    unseen: float = 0.0
+    """Greatest score a better rival may have, as the search for it has ended early; 0 if it has not."""
 
 
 def look_ups(points: Array, window: tuple[float, float], levels: int) -> float:
@@ -115,15 +117,16 @@ def correlate(
     zone = (10**9, 10**9, 10**9, -1.0, -1.0)
     place = grid.levels, offsets, turns, cells, *penalty
     blocks = _coarsest(*place)
-    score, k, ix, iy = _search(*place, *blocks, least, work, *zone)
+    score, k, ix, iy, _ = _search(*place, *blocks, least, work, *zone)
     if k < 0:
         return None
-    rival = 0.0
+    rival = unseen = 0.0
     if apart > 0:
         zone = (k, ix, iy, apart / RESOLUTION, apart / lever / step)
-        rival = max(_search(*place, *blocks, 0.8 * score, work, *zone)[0], 0.0)
+        best, *_, unseen = _search(*place, *blocks, 0.8 * score, work, *zone)
+        rival = max(best, 0.0)
     pose = guess + np.array((ix * RESOLUTION, iy * RESOLUTION, turns[k]))
-    return Peak(pose, float(score), float(rival))
+    return Peak(pose, float(score), float(rival), float(unseen))
 
 
 def _lever(points: Array) -> float:
@@ -247,11 +250,12 @@ def _search(  # type: ignore[no-untyped-def] # noqa: ANN202
     shut_cells,  # noqa: ANN001
     shut_turns,  # noqa: ANN001
 ):
-    """Best-first branch and bound; (score, turn index, x cells, y cells), turn index -1 if nothing reached ``least``.
+    """Best-first branch and bound: score, turn index, x cells, y cells, and what a pose not looked at may score.
 
-    It begins with the sorted ``blocks`` of the coarsest level, and ends when more than ``most`` below it were looked
-    at. The block of the greatest bound is next, whatever its size: depth first, a search that ends early would have
-    seen one corner of a great window, and not the place that fits.
+    The turn index is -1 if nothing reached ``least``. The search begins with the sorted ``blocks`` of the coarsest
+    level, and ends early when more than ``most`` below it were looked at. The block of the greatest bound is next,
+    whatever its size: depth first, a search that ends early would have seen one corner of a great window, and not the
+    place that fits.
     Poses within ``shut_cells`` and ``shut_turns`` of (shut_x, shut_y, shut_k) do not count.
     """
     best, best_k, best_x, best_y = least, -1, 0, 0
@@ -290,7 +294,10 @@ def _search(  # type: ignore[no-untyped-def] # noqa: ANN202
                 keys, heap = np.concatenate((keys, np.empty(size))), np.concatenate((heap, np.empty_like(heap)))
             _float(keys, heap, size, bound, k, cx, cy, level - 1)
             size += 1
-    return best if best_k >= 0 else 0.0, best_k, best_x, best_y
+    left = 0.0
+    if work > most:
+        left = max(keys[0] if size else 0.0, bounds[taken] if taken < bounds.size else 0.0)
+    return best if best_k >= 0 else 0.0, best_k, best_x, best_y, left
 
 
 @njit(cache=True)

@@ -31,12 +31,12 @@ QUERY_KEYS: Final = 6
 """Keyframes that make the query: more would carry the drift of a search without odometry."""
 MIN_POINTS: Final = 30
 MIN_SCORE: Final = 0.6
-MIN_OVERLAP: Final = 0.85
-"""Share of the query's points that must fit the place found: in a recording from an office right places had 0.92 and
-more, wrong ones 0.84 at most."""
-MAX_CONTRADICTION: Final = 0.15
-"""Greatest share of beams that contradict the saved grid at a place found: of a recording in an office, right places
-had 0.08 on the median, wrong ones 0.45."""
+MIN_OVERLAP: Final = (0.85, 0.7)
+"""Share of the query's points that must fit the place found, and a unique one: in a recording from an office right
+places had 0.92 and more, wrong ones 0.84 at most; at the edge of the map unique ones of 0.7 were right."""
+MAX_CONTRADICTION: Final = (0.15, 0.3)
+"""Greatest share of beams that contradict the saved grid, likewise: of a recording in an office, right places had 0.08
+on the median, wrong ones 0.45; with beams of 30 m unique right ones of another had 0.27."""
 UNIQUE_RATIO: Final = 0.85
 """A place is unique if the next best scores less than this share of it."""
 AMBIGUOUS_RATIO: Final = 0.97
@@ -145,10 +145,13 @@ class GlobalLocaliser:
         if peak is None:
             return None
         ambiguous = peak.rival > AMBIGUOUS_RATIO * peak.score
+        unique = max(peak.rival, peak.unseen) < UNIQUE_RATIO * peak.score
         fit = register(query, self._submap.cloud, peak.pose)
-        if fit.overlap < MIN_OVERLAP or self._contradiction(numbers, newest, fit.pose) > MAX_CONTRADICTION:
+        if fit.overlap < MIN_OVERLAP[unique]:
             return None
-        return SearchResult(fit.pose, peak.rival < UNIQUE_RATIO * peak.score, ambiguous)
+        if self._contradiction(numbers, newest, fit.pose) > MAX_CONTRADICTION[unique]:
+            return None
+        return SearchResult(fit.pose, unique, ambiguous)
 
     def _confirmed(self, result: SearchResult) -> Array | None:
         """Compare a result with the hypotheses; its pose if that makes one certain."""
@@ -161,14 +164,17 @@ class GlobalLocaliser:
         same.pose = result.pose
         same.searches.append((newest, result.unique))
         since = self._far_enough(same)
-        return result.pose if since is not None and self._foreseen(same, since) else None
+        return result.pose if since is not None and self._foreseen(same, *since) else None
 
-    def _far_enough(self, hypothesis: Hypothesis) -> int | None:
-        """Keyframe of the last search that is as far from the newest one as ``BASELINE`` asks; None if none is."""
+    def _far_enough(self, hypothesis: Hypothesis) -> tuple[int, bool] | None:
+        """The last search that is as far from the newest one as ``BASELINE`` asks; None if none is.
+
+        Its keyframe, and whether both found the place unique.
+        """
         newest, unique = hypothesis.searches[-1]
         for key, also in reversed(hypothesis.searches):
             if self._ways[newest] - self._ways[key] >= BASELINE[0 if unique and also else 1]:
-                return key
+                return key, unique and also
         return None
 
     def _agree(self, hypothesis: Hypothesis, pose: Array) -> bool:
@@ -176,14 +182,20 @@ class GlobalLocaliser:
         off = between(compose(hypothesis.pose, between(poses[hypothesis.searches[-1][0]], poses[-1])), pose)
         return math.hypot(off[0], off[1]) < CONFIRM_TOLERANCE[0] and abs(float(off[2])) < CONFIRM_TOLERANCE[1]
 
-    def _foreseen(self, hypothesis: Hypothesis, since: int) -> bool:
-        """Whether all seen since keyframe ``since`` fits the map, and nothing since the first search contradicts it."""
+    def _foreseen(self, hypothesis: Hypothesis, since: int, unique: bool) -> bool:
+        """Whether all seen since keyframe ``since`` fits the map, and nothing since the first search contradicts it.
+
+        Nor may any stretch of it: the way out of a room that only looks like one of the map is short.
+        """
         newest = len(self._mapper.map) - 1
         query = self._merged(np.arange(since, newest + 1), newest)
-        if measure(query, self._submap.cloud, hypothesis.pose).overlap < MIN_OVERLAP:
+        if measure(query, self._submap.cloud, hypothesis.pose).overlap < MIN_OVERLAP[unique]:
             return False
         numbers = np.arange(hypothesis.searches[0][0], newest + 1)
-        return self._contradiction(numbers, newest, hypothesis.pose) <= MAX_CONTRADICTION
+        stretches = np.array_split(numbers, math.ceil(len(numbers) / QUERY_KEYS))
+        if any(self._contradiction(some, newest, hypothesis.pose) > MAX_CONTRADICTION[1] for some in stretches):
+            return False
+        return self._contradiction(numbers, newest, hypothesis.pose) <= MAX_CONTRADICTION[unique]
 
     def _merged(self, numbers: NDArray[np.intp], centre: int) -> Scan:
         """The numbered keyframes in the frame of ``centre``."""

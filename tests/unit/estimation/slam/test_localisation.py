@@ -58,6 +58,14 @@ def test_a_place_is_found_by_a_second_look_and_is_right(odom: bool):
         assert math.hypot(*(np.array(estimate.pose) - pose)[:2]) < 0.1
 
 
+def test_a_place_without_a_rival_is_found_where_a_fifth_of_the_beams_contradict_the_map():
+    truth = rounds(80, laps=0.25)
+    # Of the box in the middle, a third has been taken away.
+    estimates = followed(SavedMap(drawn(), None), [*EMPTY, *box(-1.0, -0.6, 0.4, 0.7)], truth)
+    assert estimates[-1].status in PLACED
+    assert math.hypot(*(np.array(estimates[-1].pose) - truth[-1])[:2]) < 0.1
+
+
 @pytest.mark.parametrize("odom", [True, False])
 def test_a_robot_that_is_carried_while_it_is_searched_for_is_found_where_it_then_is(odom: bool):
     walls = [*ROOM, *box(-19.0, -1.0, -13.0, 4.0), *box(-17.0, 1.5, -16.0, 2.5)]

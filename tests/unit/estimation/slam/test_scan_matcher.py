@@ -59,10 +59,16 @@ def test_a_search_that_ends_early_has_looked_at_the_most_promising_places_of_the
     seen = transform(inverse(place), points)
     query = seen[np.hypot(*seen.T) < 4.0]
     # Depth first, the clutter took all of the work, and a place of a score of 0.3 was the result.
-    peak = correlate(LikelihoodGrid.of(dots(points), 7), query, np.zeros(3), (11.0, math.pi), (1e6, 1e6), 0.3)
+    grid = LikelihoodGrid.of(dots(points), 7)
+    peak = correlate(grid, query, np.zeros(3), (11.0, math.pi), (1e6, 1e6), 0.3)
     assert peak is not None
     assert peak.score > 0.9
     assert peak.pose == pytest.approx(place, abs=0.05)
+    # A search for rivals that ends early says what one may score.
+    near = correlate(grid, query, place, (11.0, 0.1), (1e6, 1e6), 0.3, apart=1.0, work=5_000)
+    assert near is not None
+    assert near.rival < near.unseen < near.score
+    assert correlate(grid, query, place, (11.0, 0.1), (1e6, 1e6), 0.3, apart=1.0).unseen == 0.0
 
 
 def test_a_square_room_is_its_own_rival():
