@@ -115,15 +115,15 @@ def correlate(
     offsets = _rotated(points, guess, turns, grid.origin[0], grid.origin[1])
     penalty = (DOUBT * (RESOLUTION / deviation[0]) ** 2, DOUBT / deviation[1] ** 2)
     zone = (10**9, 10**9, 10**9, -1.0, -1.0)
-    place = grid.levels, offsets, turns, cells, *penalty
-    blocks = _coarsest(*place)
-    score, k, ix, iy, _ = _search(*place, *blocks, least, work, *zone)
+    blocks, bounds = _coarsest(grid.levels, offsets, turns, cells, *penalty)
+    place = offsets, turns, cells, *penalty, blocks, bounds
+    score, k, ix, iy, _ = _search(grid.levels, *place, least, work, *zone)
     if k < 0:
         return None
     rival = unseen = 0.0
     if apart > 0:
         zone = (k, ix, iy, apart / RESOLUTION, apart / lever / step)
-        best, *_, unseen = _search(*place, *blocks, 0.8 * score, work, *zone)
+        best, *_, unseen = _search(grid.levels, *place, 0.8 * score, work, *zone)
         rival = max(best, 0.0)
     pose = guess + np.array((ix * RESOLUTION, iy * RESOLUTION, turns[k]))
     return Peak(pose, float(score), float(rival), float(unseen))
