@@ -28,7 +28,7 @@ class Nearest:
 
 
 class Information:
-    """The most new area per second of way.
+    """The most new area per second of way, large areas counting for less than their size.
 
     A goal that is pursued is kept unless another one is much better: what is new there becomes less on the way, as it
     comes into sight, and a robot that turns to whatever is best at each instant leaves a bit of everything behind. So
@@ -66,7 +66,8 @@ class Information:
 
     def _rate(self, option: Option) -> float:
         config = self._config
-        return option.gain / (1.0 + option.way / config.speed + config.turning * option.turn / math.pi)
+        seconds = 1.0 + option.way / config.speed + config.turning * option.turn / math.pi
+        return option.gain**config.power / seconds
 
 
 class Author:

@@ -121,6 +121,15 @@ def test_information_prefers_the_wide_opening_to_the_narrow_one_a_little_nearer(
     assert chosen.frontier[0] > 8.0
 
 
+@pytest.mark.parametrize(("power", "far"), [(1.0, True), (0.1, False)])
+def test_the_less_information_counts_area_the_more_it_goes_to_what_is_near(power, far):
+    wide, narrow = (8.95, 3.0, 8.95, 7.0), (1.0, 4.75, 1.0, 5.25)
+    step = step_of(InformationConfig(turning=0.0, power=power), hall(wide, narrow))
+    chosen = step.step(ExploreTask((4.6, 5.0, 1.57), choose=True)).target
+    assert chosen is not None
+    assert (chosen.frontier[0] > 8.0) is far
+
+
 @pytest.mark.parametrize(("better", "kept"), [(20.0, True), (1.0, False)])
 def test_information_keeps_its_goal_unless_another_one_is_that_much_better(better, kept):
     wide, narrow = (8.95, 3.0, 8.95, 7.0), (1.0, 4.75, 1.0, 5.25)
