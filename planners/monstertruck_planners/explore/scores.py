@@ -67,7 +67,7 @@ class Information:
     def _rate(self, option: Option) -> float:
         config = self._config
         seconds = 1.0 + option.way / config.speed + config.turning * option.turn / math.pi
-        return option.gain**config.power / seconds
+        return math.pow(option.gain, config.power) / seconds
 
 
 class Author:
