@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from monstertruck_estimation.se2 import Vector, between, compose, compose_jacobians, inverse
 from monstertruck_estimation.slam.budget import ScanBudget
-from monstertruck_estimation.slam.closure import PART_CONTRADICTION, LoopCloser
+from monstertruck_estimation.slam.closure import CONTRADICTION, PART_CONTRADICTION, LoopCloser
 from monstertruck_estimation.slam.config import GridConfig, MapperConfig
 from monstertruck_estimation.slam.correlation import Submap
 from monstertruck_estimation.slam.grid import NONE, GridBuilder, passed_ends
@@ -132,13 +132,14 @@ class Mapper:
         if self._stamp is not None and stamp <= self._stamp:
             return None
         dt = 0.0 if self._stamp is None else _evenly((stamp - self._stamp) / SECOND, period)
+        self._loss.arrive(stamp)
         (delta, noise), match = self._best_match(scan, self._motion.predict(dt, odom))
         if again is not None and match.accepted and DESKEW_PERIOD[0] <= dt <= DESKEW_PERIOD[1]:
             scan = again(velocity(between(self._pose, match.pose), dt))
             match = self._matched(scan, delta, noise)
         self._since_key = _moved(*self._since_key, delta, noise)
         if self._submap is not None:
-            self._loss.take(stamp, match)
+            self._loss.take(match)
         trusted = not self._motion.check.contradicted
         self._motion.learn(dt, delta, noise, between(self._pose, match.pose), match)
         if trusted and self._motion.check.contradicted:
@@ -183,8 +184,9 @@ class Mapper:
         if self._submap is None:
             return rejected(guess, covariance, MatchStatus.EMPTY)
         match = self._front.match(scan, delta, guess, covariance, self._submap)
-        doubtful = self._loss.suspects(match, guess, covariance)
-        if doubtful and contradicts(self.map, scan, match.pose, PART_CONTRADICTION):
+        suspect, after_gap = self._loss.suspects(match, guess, covariance), self._loss.after_gap and match.accepted
+        most = PART_CONTRADICTION if suspect else CONTRADICTION
+        if (suspect or after_gap) and contradicts(self.map, scan, match.pose, most):
             return rejected(guess, covariance, MatchStatus.CONTRADICTED)
         return match
 

@@ -37,7 +37,8 @@ class LossDetector:
     """Whether scans fit the map.
 
     After a misfit or a gap the overlap must return to its mean less ``OVERLAP_DROP``, and after a gap the match must
-    constrain all directions: a half fit, or one wall, is found in many places.
+    constrain all directions: a half fit, or one wall, is found in many places. That it looks through no wall of the map
+    is for the mapper to judge: rooms of one shape overlap wherever they are.
     """
 
     def __init__(self) -> None:
@@ -72,13 +73,16 @@ class LossDetector:
         since = (self._stamp or 0) - self.fitted
         return self._misfits >= LOST_SCANS and since >= LOST_AFTER * SECOND
 
-    def take(self, stamp: int, match: ScanMatch) -> None:
-        """Take the match of a scan at ``stamp``, ns."""
+    def arrive(self, stamp: int) -> None:
+        """A scan of ``stamp``, ns, is there, and will be matched."""
         if self._stamp is not None:
             dt = (stamp - self._stamp) / SECOND
             self.after_gap |= dt > max(GAP[0], GAP[1] * self._period)
             self._period += (dt - self._period) * (PERIOD_GAIN if self._period else 1.0)
         self._stamp = stamp
+
+    def take(self, match: ScanMatch) -> None:
+        """Take the match of the scan that arrived."""
         doubt = self._misfits or self.after_gap
         least = max(LOW_OVERLAP, self._usual - OVERLAP_DROP) if doubt else LOW_OVERLAP
         if not match.accepted or match.overlap < least or (self.after_gap and match.degenerate):

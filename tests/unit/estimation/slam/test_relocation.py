@@ -65,6 +65,21 @@ def test_the_map_is_single_and_right_afterwards(carried):
     assert mapper.map.joined().all()
 
 
+def test_after_a_gap_a_room_of_the_same_outline_is_another_if_it_looks_through_the_cupboards():
+    outline, mapper, rng = box(-2.5, -2.0, 2.5, 2.0), Mapper(), np.random.default_rng(3)
+    cupboards = [*box(1.2, -0.5, 1.6, 0.9), *box(-1.0, 1.1, 0.3, 1.4), *box(-0.8, -1.6, 0.6, -1.2)]
+    way = np.linspace((-1.4, 0.0, 0.0), (0.2, 0.0, 0.0), 60)
+    for k, pose in enumerate(way):
+        mapper.step(scan([*outline, *cupboards], pose, noise=0.01, rng=rng), int(k * 1e8), pose)
+    steps = [
+        mapper.step(scan(outline, way[-1], noise=0.01, rng=rng), int((60 + k / 10) * SECOND), way[-1])
+        for k in range(30)
+    ]
+    assert not any(step.match.accepted for step in steps[:2])
+    assert mapper.lost
+    assert any(MappingEvent.APART in step.events for step in steps)
+
+
 def test_somewhere_else_it_stays_apart_and_is_not_saved():
     way = rounds(120, 0.6, 3.6, 2.2)
     elsewhere = [*box(-2.0, -1.5, 2.4, 1.9), *box(0.6, 0.2, 1.1, 0.5), *box(-1.6, 0.9, -1.1, 1.9)]
@@ -191,7 +206,8 @@ NONE = rejected(np.zeros(3), np.eye(3), MatchStatus.OVERLAP)
 def watched(matches, period=0.1):
     loss = LossDetector()
     for k, match in enumerate(matches):
-        loss.take(round((k + 1) * period * SECOND), match)
+        loss.arrive(round((k + 1) * period * SECOND))
+        loss.take(match)
     return loss
 
 
@@ -208,9 +224,11 @@ def test_after_a_misfit_a_half_fit_is_none():
 
 def test_after_a_gap_a_corridor_proves_nothing():
     loss = watched([fit(0.95)] * 5)
-    loss.take(70 * SECOND, fit(0.95, degeneracy=0.01))
+    loss.arrive(70 * SECOND)
+    loss.take(fit(0.95, degeneracy=0.01))
     assert not loss.fits
-    loss.take(round(70.1 * SECOND), fit(0.95))
+    loss.arrive(round(70.1 * SECOND))
+    loss.take(fit(0.95))
     assert loss.fits
     assert watched([fit(0.95)] * 5, period=8.0).fits
 
