@@ -80,12 +80,8 @@ class InformationConfig(ExplorerConfig):
     """Of driving, m/s"""
     turning: NotNegative = 4.0
     """Seconds that half a turn at the start costs"""
-    power: Annotated[float, Field(gt=0, le=2)] = 0.7
-    """New area counts to the power of this: 1 for what it is, less for what is near first"""
     better: Annotated[float, Field(ge=1)] = 4.0
     """How many times as much per second another frontier has to show, to be preferred to the one that is pursued"""
-    follow: NotNegative = 2.0
-    """A frontier this near to where the pursued one was is what became of it, m; 0: that is not asked"""
 
 
 class TourConfig(ExplorerConfig):

@@ -28,12 +28,10 @@ class Nearest:
 
 
 class Information:
-    """The most new area per second of way, large areas counting for less than their size.
+    """The most new area per second of way.
 
     A goal that is pursued is kept unless another one is much better: what is new there becomes less on the way, as it
-    comes into sight, and a robot that turns to whatever is best at each instant leaves a bit of everything behind. So
-    is what became of its frontier, which recedes along a corridor or shrinks to what is behind a corner: coming back
-    for it later costs the way in and out.
+    comes into sight, and a robot that turns to whatever is best at each instant leaves a bit of everything behind.
 
     Args:
         config: settings.
@@ -50,24 +48,13 @@ class Information:
         if not view.options:
             return None
         best = max(view.options, key=self._rate)
-        kept = still if still is not None or pursued is None else self._successor(view, pursued)
-        if kept is None or self._rate(best) >= self._config.better * self._rate(kept):
-            return best.target
-        return pursued if kept is still else kept.target
-
-    def _successor(self, view: ExplorationView, pursued: Viewpoint) -> Option | None:
-        """What became of a frontier that is gone."""
-
-        def away(option: Option) -> float:
-            return math.dist(option.frontier.middle, pursued.frontier)
-
-        near = [option for option in view.options if away(option) < self._config.follow]
-        return min(near, key=away, default=None)
+        if still is not None and self._rate(best) < self._config.better * self._rate(still):
+            return pursued
+        return best.target
 
     def _rate(self, option: Option) -> float:
         config = self._config
-        seconds = 1.0 + option.way / config.speed + config.turning * option.turn / math.pi
-        return math.pow(option.gain, config.power) / seconds
+        return option.gain / (1.0 + option.way / config.speed + config.turning * option.turn / math.pi)
 
 
 class Author:
