@@ -78,7 +78,7 @@ class DriveWizard:
             await context.confirm(_MARK)
             speed = self.speed if run % 2 == 0 else -min(self.speed, 0.12)
             name = f"run {run + 1} of {self.runs}, {'forward' if speed > 0 else 'back'}"
-            track = await context.move(MoveStep(name, speed, metres=self.metres))
+            track = await context.move(MoveStep(name, speed, metres=self.metres, marked=True))
             runs.append(TapedRun.of(track, await context.ask(_DISTANCE)))
             tracks.append(track)
         delays = context.fit("dead time and lag", lambda: drive_estimates(tracks, float(context.value(RATE))))

@@ -6,6 +6,7 @@ from contextlib import ExitStack, asynccontextmanager, suppress
 from typing import Any, Final, Protocol
 
 from monstertruck_kinematics.chassis import Chassis
+from monstertruck_kinematics.truck import DriveTrain
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError, TruckError
 from monstertruck_runtime.mailbox import Mailbox, fifo
@@ -48,6 +49,10 @@ SILENT: Final = (
     "and repeat the wizard; nothing was saved"
 )
 """What to do about measurements or ticks that came too late."""
+REPEATS: Final = 2
+"""Times that a move begins anew after a stop that passed."""
+UNMOVED: Final = 0.01
+"""Way, m, up to which a truck still stands where its move began."""
 ADVICE: Final = {
     Reason.LEASE_EXPIRED: LATE,
     Reason.SCAN_STALE: SILENT,
@@ -56,6 +61,7 @@ ADVICE: Final = {
     Reason.ATTITUDE_STALE: SILENT,
     Reason.TICK_STALLED: SILENT,
 }
+"""By the reasons that may pass: a move that one of them stopped is driven again."""
 
 
 class MovedTruck(Operator, Protocol):
@@ -80,10 +86,13 @@ class Mover:
         self._clock = clock
         self._drivetrain = chassis.drivetrain
 
-    async def move(self, move: MoveStep, report: Callable[[float], None]) -> MoveRecord:
+    async def move(
+        self, move: MoveStep, report: Callable[[float], None], say: Callable[[str], None] = lambda _: None
+    ) -> MoveRecord:
         """Drive ``move`` and return what was measured; ``report`` is called with the metres driven.
 
-        However it ends, the truck is stopped and disarmed.
+        However it ends, the truck is stopped and disarmed. After a stop that passed, such as a late request, it drives
+        back to where the move began and once more, ``REPEATS`` times at most, and tells ``say``.
 
         Raises:
             RequestRefusedError: the gate refused, stopped the truck, or holds it; with its reason.
@@ -100,17 +109,30 @@ class Mover:
         ):
             feeds = drive, steering, attitude, gate, steering_commands, drive_commands
             also = {t.name: besides.enter_context(self._truck.subscribe(t, fifo(DEPTH))) for t in move.also}
-            run = _Run(self._truck, self._clock, feeds, also)
-            async with self._armed(run):
-                if move.approach:
-                    await run.hold(0.0, move.approach, move.approach, STEERING)
-                await run.hold(0.0, move.front, move.rear, STEERING)
-                run.begin()
-                await run.hold(0.0, move.front, move.rear, move.rest)
-                await self._drive(run, move, report)
-                await run.rest(move.front, move.rear)
-                await run.hold(0.0, move.front, move.rear, move.rest)
+            for left in reversed(range(REPEATS + 1)):
+                run = _Run(self._truck, self._clock, feeds, also)
+                try:
+                    await self._once(run, move, report)
+                    break
+                except RequestRefusedError as error:
+                    way = await run.coasted(self._drivetrain) if left and error.refusal in ADVICE else None
+                    if way is None or (move.marked and way > UNMOVED):
+                        raise
+                    say(f"{move.name}: {error.refusal.text}; back to where it began, and once more")
+                if way > UNMOVED:
+                    await self._once(_Run(self._truck, self._clock, feeds, also), move.back(way), report)
             return run.track
+
+    async def _once(self, run: "_Run", move: MoveStep, report: Callable[[float], None]) -> None:
+        async with self._armed(run):
+            if move.approach:
+                await run.hold(0.0, move.approach, move.approach, STEERING)
+            await run.hold(0.0, move.front, move.rear, STEERING)
+            run.begin()
+            await run.hold(0.0, move.front, move.rear, move.rest)
+            await self._drive(run, move, report)
+            await run.rest(move.front, move.rear)
+            await run.hold(0.0, move.front, move.rear, move.rest)
 
     async def _drive(self, run: "_Run", move: MoveStep, report: Callable[[float], None]) -> None:
         run.track.left = self._clock.now()
@@ -259,6 +281,28 @@ class _Run:
         if still < 0:
             raise NoAnswerError(f"the drive does not come to rest within {SETTLE:g} s")
         self.track.arrived = still
+
+    async def coasted(self, drivetrain: DriveTrain) -> float | None:
+        """Wait until a truck that was stopped rests, and what stopped it has passed.
+
+        Returns:
+            Metres that it has come; None: the one or the other does not happen.
+        """
+        end = self._clock.now() + round(SETTLE * SECOND)
+        since: DriveFeedback | None = None
+        while self._clock.now() < end:
+            await self._clock.sleep(PERIOD)
+            self._take()
+            newest = self.track.drive[-1] if self.track.drive else None
+            if since is None or newest is None or abs(newest.position - since.position) > STILL:
+                since = newest
+            elif newest.stamp - since.stamp > AT_REST * SECOND and not self._lasting():
+                return abs(self.track.way(drivetrain))
+        return None
+
+    def _lasting(self) -> bool:
+        """Whether the gate still names a reason that stopped the truck."""
+        return self.state is None or any(reason in ADVICE for reason in self.state.reasons)
 
     def _take(self) -> None:
         drive, steering, attitude, gate, steering_commands, drive_commands = self._feeds

@@ -98,12 +98,13 @@ class OdometryWizard:
         legs, taped = [], 0.0
         way = "left" if sense > 0 else "right"
         for number in range(1, 5):
-            side = MoveStep(f"square to the {way}, side {number} of 4", SPEED, metres=self.side)
+            side = MoveStep(f"square to the {way}, side {number} of 4", SPEED, metres=self.side, marked=True)
             legs.append(SteeringRun.of(await context.move(side), maps))
             if number == 1:
                 taped = await context.ask(_SIDE)
             name = f"corner {number} of 4"
-            arc = MoveStep(name, CORNER, sense * ANGLE, -sense * ANGLE, 1.5 * corner, done=_turned_a_quarter)
+            angle = sense * ANGLE
+            arc = MoveStep(name, CORNER, angle, -angle, 1.5 * corner, done=_turned_a_quarter, marked=True)
             legs.append(SteeringRun.of(await context.move(arc), maps))
         return Square(tuple(legs), taped, (await context.ask(_AHEAD) / 100, await context.ask(_LEFT) / 100))
 

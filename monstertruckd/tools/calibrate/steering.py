@@ -164,7 +164,8 @@ class SteeringWizard:
             side = APPROACH if run % 2 == 0 else -APPROACH
             if self.strings:
                 await context.confirm(_STRING)
-            track = await context.move(MoveStep("straight ahead", speed, metres=metres, approach=side))
+            ahead = MoveStep("straight ahead", speed, metres=metres, approach=side, marked=bool(self.strings))
+            track = await context.move(ahead)
             offset = await context.ask(_OFFSET) / 100 if self.strings else None
             sigma = math.hypot(self.string_error * metres, 0.003)
             legs.append(SteeringRun.of(track, maps, offset, sigma))

@@ -3,7 +3,7 @@
 import itertools
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Final, Generic, Protocol, TypeVar
 
 import numpy as np
@@ -156,6 +156,13 @@ class MoveStep:
     """Ends the way earlier"""
     also: tuple[Topic[Any], ...] = ()
     """Topics that are recorded besides"""
+    marked: bool = False
+    """The operator measures from where it begins, so that it cannot begin anew once the truck has moved"""
+
+    def back(self, way: float) -> "MoveStep":
+        """Back over the first ``way`` m of it, m; of a weaving move straight back."""
+        back = replace(self, name=f"{self.name}, back", speed=-self.speed, metres=way, done=None, also=())
+        return replace(back, front=0.0, rear=0.0, weave=()) if self.weave else back
 
     def side(self, seconds: float) -> int:
         """Sign of the axle angles so long after the truck set off."""

@@ -113,7 +113,11 @@ class WizardContext:
     async def move(self, step: MoveStep) -> MoveRecord:
         """Drive; raises as ``Mover.move`` does."""
         self._panel.say(f"moving: {step.name}")
-        return await self._mover.move(step, lambda way: self._panel.progress(step.name, way, step.metres))
+
+        def report(way: float) -> None:
+            self._panel.progress(step.name, way, step.metres)
+
+        return await self._mover.move(step, report, self._panel.say)
 
     async def collect(self, step: Collect[M]) -> list[M]:
         """Messages of a topic.

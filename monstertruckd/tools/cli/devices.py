@@ -41,7 +41,7 @@ def emulate(
         Path | None,
         typer.Option("--link", "-l", help="Symlink to create for the pty; default: where the emulated truck has it."),
     ] = None,
-    seed: Annotated[int, typer.Option(help="Seed of the device's noise.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the device's noise.")] = 0,
 ) -> None:
     """Emulate one device, byte for byte, alone on a pty: for third-party clients and bench work.
 
@@ -74,7 +74,7 @@ def probe(
         Path | None,
         typer.Option("--port", "-p", help="Device node, e.g. /dev/truck/lidar; of a camera also a pattern."),
     ] = None,
-    baud: Annotated[int | None, typer.Option(help="Bits per second; default: the device's own.")] = None,
+    baud: Annotated[int | None, typer.Option(min=1, help="Bits per second; default: the device's own.")] = None,
     json_output: JsonOption = False,
 ) -> None:
     """Handshake with a device and print its identity, state and first samples. Moves nothing."""

@@ -9,7 +9,7 @@ import typer
 from monstertruck_runtime.clock import Clock, run_wall
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruck_runtime.errors import NotFoundError
-from monstertruckd.tools.cli.options import EndpointOption, RobotOption, ViaOption, parse_pose
+from monstertruckd.tools.cli.options import EndpointOption, RobotOption, ViaOption, parse_pose, require_finite
 from monstertruckd.tools.cli.output import JsonOption, finish, print_json
 
 if TYPE_CHECKING:
@@ -40,6 +40,7 @@ def goto(
     from monstertruckd.tools.cli.goto_session import on_the_terminal
 
     places = [parse_pose(text, yaw_needed=False) for text in via or ()]
+    require_finite((x, y, yaw), *places)
 
     async def main(client: "TruckClient", clock: Clock) -> "Arrival":
         if (await client.call("config")).get("planner") is None:

@@ -35,9 +35,9 @@ from monstertruckd.tools.cli import (
     tune,
     usb,
 )
-from monstertruckd.tools.cli.output import HELP_SETTINGS, HELP_STYLE, CommandGroup
+from monstertruckd.tools.cli.output import HELP_SETTINGS, HELP_STYLE, CommandGroup, Commands
 
-app = typer.Typer(
+app = Commands(
     name="monstertruckd",
     cls=CommandGroup,
     help="One daemon that owns every device of a four-wheel-steer robot truck, drives it and records everything.",

@@ -1,6 +1,7 @@
 """Options and arguments that many commands share, with what a shell completes for them."""
 
 import inspect
+import math
 from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Annotated, Any
@@ -106,6 +107,17 @@ def parse_pose(text: str, *, yaw_needed: bool = True) -> tuple[float, ...]:
     if len(values) != 3 and (yaw_needed or len(values) != 2):
         raise InputError(f"pose {text!r}: expected {expected}, m and rad")
     return values
+
+
+def require_finite(*poses: tuple[float, ...]) -> None:
+    """Refuse poses of a request before a robot is asked.
+
+    Raises:
+        InputError: one holds nan or an infinite number.
+    """
+    for pose in poses:
+        if not all(map(math.isfinite, pose)):
+            raise InputError(f"pose {','.join(f'{value:g}' for value in pose)}: expected finite numbers, m and rad")
 
 
 ViaOption = Annotated[

@@ -19,10 +19,10 @@ from contextlib import contextmanager, suppress
 from enum import Enum
 from pathlib import PurePath
 from types import FrameType
-from typing import TYPE_CHECKING, Annotated, Any, Final, TextIO
+from typing import TYPE_CHECKING, Annotated, Any, Final, TextIO, cast
 
 import typer
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
 from monstertruck_runtime.clock import WallClock, run_wall
 from monstertruck_runtime.errors import NotInstalledError, RequestRefusedError, TruckError
@@ -31,6 +31,8 @@ from monstertruck_schemas.reasons import Reason
 if TYPE_CHECKING:
     from rich.console import Console
     from typer._click import Context
+    from typer.core import TyperOption
+    from typer.models import CommandFunctionType
 
 PIPE_WIDTH: Final = 200
 """Width of text that does not go to a terminal: wide enough to cut nothing."""
@@ -210,9 +212,33 @@ def until_stopped(main: Callable[[WallClock], Coroutine[Any, Any, None]]) -> Non
         run_wall(main)
 
 
+class NumberCommand(TyperCommand):
+    """One command: refuses nan, which passes every comparison with a least or greatest value, before anything runs."""
+
+    def make_context(self, *arguments: Any, **settings: Any) -> "Context":
+        """Read its options."""
+        context = super().make_context(*arguments, **settings)
+        for parameter in self.params:
+            value = context.params.get(parameter.name or "")
+            numbers = value if isinstance(value, list | tuple) else [value]
+            if any(isinstance(number, float) and math.isnan(number) for number in numbers):
+                raise typer.BadParameter("expected a number, not nan", context, cast("TyperOption", parameter))
+        return context
+
+
+class Commands(typer.Typer):
+    """Commands, each of which is a ``NumberCommand``."""
+
+    def command(
+        self, name: str | None = None, **settings: Any
+    ) -> "Callable[[CommandFunctionType], CommandFunctionType]":
+        """Add a command."""
+        return super().command(name, **{"cls": NumberCommand, **settings})
+
+
 def command_group(text: str) -> typer.Typer:
     """An empty group of commands that ``text`` describes."""
-    return typer.Typer(help=text, no_args_is_help=True, rich_markup_mode=HELP_STYLE)
+    return Commands(help=text, no_args_is_help=True, rich_markup_mode=HELP_STYLE)
 
 
 class CommandGroup(TyperGroup):

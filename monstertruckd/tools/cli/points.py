@@ -9,7 +9,7 @@ from monstertruck_runtime.clock import Clock, run_wall
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruck_runtime.errors import InputError, NoAnswerError, NotFoundError
 from monstertruckd.tools.cli.goto import ArmOption, drive_and_tell
-from monstertruckd.tools.cli.options import EndpointOption, RobotOption
+from monstertruckd.tools.cli.options import EndpointOption, RobotOption, require_finite
 from monstertruckd.tools.cli.output import JsonOption, command_group, print_json, print_table, remark
 
 if TYPE_CHECKING:
@@ -102,6 +102,7 @@ def mark_command(
 
     if (x is None) is not (y is None):
         raise InputError("expected x and y, or neither")
+    require_finite(tuple(value for value in (x, y, yaw) if value is not None))
     place = None if x is None or y is None else (x, y)
     _ask(lambda client: client.point(PointOrder.MARK, name, place, yaw), robot, endpoint)
     remark(f"marked {name}")

@@ -30,8 +30,9 @@ def circle_command(
     endpoint: EndpointOption = DEFAULT_ENDPOINT,
 ) -> None:
     """Arm and drive a circle to the left, open loop; the daemon's log has the run. Takes the role engineer."""
-    from monstertruckd.tools.study.runs import circle_plan
+    from monstertruckd.tools.study.runs import check_circle, circle_plan
 
+    check_circle(ratio, reference, laps)
     _drive(lambda config: circle_plan(config, ratio, reference, laps), robot, endpoint)
 
 
@@ -44,8 +45,9 @@ def straight_command(
     endpoint: EndpointOption = DEFAULT_ENDPOINT,
 ) -> None:
     """Arm and drive to and fro along a line, open loop; the daemon's log has the run. Takes the role engineer."""
-    from monstertruckd.tools.study.runs import straight_plan
+    from monstertruckd.tools.study.runs import check_straight, straight_plan
 
+    check_straight(length, passes, reference)
     _drive(lambda config: straight_plan(config, length, passes, reference), robot, endpoint)
 
 

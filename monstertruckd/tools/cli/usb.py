@@ -42,7 +42,7 @@ def find_port(
     write: Annotated[
         Path | None, typer.Option("--write", "-w", help="Configuration file to put the port into.")
     ] = None,
-    wait: Annotated[float, typer.Option(help="Seconds to wait for the cable.")] = 60.0,
+    wait: Annotated[float, typer.Option(min=0.1, help="Seconds to wait for the cable.")] = 60.0,
     json_output: JsonOption = False,
 ) -> None:
     """Unplug the cable: this names its hub and port and prints the line for the configuration."""

@@ -65,9 +65,7 @@ def circle_plan(config: TruckConfig, ratio: float, reference: float, laps: float
     Raises:
         InputError: numbers that make no circle.
     """
-    if not ratio > 1.0:
-        raise InputError(f"ratio {ratio:g}: expected more than 1 (2, 3, inf)")
-    _require(reference, laps, "laps")
+    check_circle(ratio, reference, laps)
     left = 0.0 if math.isinf(ratio) else reference / ratio
     rate = config.geometry.wheel_radius * (reference - left) / config.geometry.track
     return [Stretch(left, reference, SETTLING + laps * math.tau / rate)]
@@ -85,15 +83,27 @@ def straight_plan(config: TruckConfig, length: float, passes: int, reference: fl
     Raises:
         InputError: numbers that make no line.
     """
-    _require(reference, length, "length")
-    if passes < 1:
-        raise InputError(f"passes {passes}: expected at least 1")
+    check_straight(length, passes, reference)
     seconds = length / (config.geometry.wheel_radius * reference)
     plan: list[Stretch] = []
     for i in range(passes):
         sign = -1.0 if i % 2 else 1.0
         plan += [Stretch(sign * reference, sign * reference, seconds), Stretch(0.0, 0.0, PAUSE)]
     return plan
+
+
+def check_circle(ratio: float, reference: float, laps: float) -> None:
+    """Refuse numbers that make no circle, of any robot; arguments and error as ``circle_plan``'s."""
+    if not ratio > 1.0:
+        raise InputError(f"ratio {ratio:g}: expected more than 1 (2, 3, inf)")
+    _require(reference, laps, "laps")
+
+
+def check_straight(length: float, passes: int, reference: float) -> None:
+    """Refuse numbers that make no line, of any robot; arguments and error as ``straight_plan``'s."""
+    _require(reference, length, "length")
+    if passes < 1:
+        raise InputError(f"passes {passes}: expected at least 1")
 
 
 def _require(reference: float, size: float, name: str) -> None:

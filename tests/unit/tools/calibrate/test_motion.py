@@ -1,11 +1,18 @@
 """Moves of the wizards: what ends them early has its reason, and says what to do."""
 
+import asyncio
+from contextlib import suppress
+from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
-from monstertruck_runtime.clock import run_virtual
+from monstertruck_kinematics.truck import DriveTrain
+from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError
+from monstertruck_runtime.mailbox import Mailbox
+from monstertruck_schemas import topics
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.state import GateMode
 from monstertruckd.tools.calibrate import motion
@@ -73,3 +80,121 @@ def test_a_run_that_is_held_ends_by_what_holds_it(held: tuple[Reason, ...], kind
         run_virtual(main)
     assert str(ended.value) == said
     assert getattr(ended.value, "refusal", Reason.TIMEOUT) is (held[0] if held else Reason.TIMEOUT)
+
+
+class HinderedTruck:
+    """Drives as requested until it comes past a place: there its gate stops it, as often as listed.
+
+    Args:
+        clock: time.
+        stops: place, m from the start in the direction ahead, reason, and the seconds until that has passed.
+    """
+
+    source = "wizard"
+
+    def __init__(self, clock: VirtualClock, *stops: tuple[float, Reason, float]) -> None:
+        self.x = 0.0
+        self.turns: list[float] = []
+        """Places where it changed its direction."""
+        self._clock = clock
+        self._stops = list(stops)
+        self._boxes: dict[str, list[Mailbox[Any]]] = {}
+        self._mode, self._reason, self._until, self._speed = GateMode.DISARMED, Reason.DISARMED, 0, 0.0
+        self._way = 0.0
+
+    def subscribe(self, topic, delivery):
+        box = Mailbox(delivery)
+        self._boxes.setdefault(topic.name, []).append(box)
+        return box
+
+    async def arm(self, *, hold=False):
+        if self._reasons():
+            raise RequestRefusedError(self._reasons()[0])
+        self._mode = GateMode.DRIVING
+
+    async def disarm(self):
+        self._mode = GateMode.DISARMED
+
+    async def drive(self, speed, front, rear=0.0, lease=0.3):
+        if speed and self._mode is GateMode.DRIVING and speed != self._way:
+            self.turns.append(self.x)
+            self._way = speed
+        self._speed = speed
+
+    def _reasons(self):
+        return (self._reason,) if self._clock.now() < self._until else ()
+
+    async def publish(self) -> None:
+        """Go on and tell, every 20 ms."""
+        drivetrain = DriveTrain()
+        while True:
+            await self._clock.sleep(0.02)
+            speed = self._speed if self._mode is GateMode.DRIVING else 0.0
+            self.x += 0.02 * speed
+            if self._stops and speed > 0.0 and self.x > self._stops[0][0]:
+                _, self._reason, seconds = self._stops.pop(0)
+                self._mode, self._until = GateMode.DISARMED, self._clock.now() + round(seconds * SECOND)
+            now = self._clock.now()
+            position = drivetrain.motor_angle(self.x)
+            state = SimpleNamespace(mode=self._mode, reasons=self._reasons(), holder=self.source)
+            for box in self._boxes.get(topics.GATE.name, ()):
+                box.put(state)
+            for box in self._boxes.get(topics.DRIVE.name, ()):
+                box.put(SimpleNamespace(stamp=now, position=position, current=None))
+
+
+def hindered(step: MoveStep, *stops: tuple[float, Reason, float]) -> tuple[HinderedTruck, Any, list[str]]:
+    """Truck, record or error, and what was said."""
+    said: list[str] = []
+
+    async def main(clock: VirtualClock):
+        truck = HinderedTruck(clock, *stops)
+        publishing = asyncio.create_task(truck.publish())
+        try:
+            mover = motion.Mover(truck, clock, SimpleNamespace(drivetrain=DriveTrain()))
+            try:
+                return truck, await mover.move(step, lambda _: None, said.append), said
+            except RequestRefusedError as error:
+                return truck, error, said
+        finally:
+            publishing.cancel()
+            with suppress(asyncio.CancelledError):
+                await publishing
+
+    return run_virtual(main)
+
+
+def test_after_a_stop_that_passed_it_drives_back_and_once_more():
+    truck, record, said = hindered(STEP, (0.4, Reason.SCAN_STALE, 0.3), (0.7, Reason.LEASE_EXPIRED, 0.1))
+    assert truck.turns == pytest.approx([0.0, 0.4, 0.0, 0.7, 0.0], abs=0.05)
+    assert truck.x == pytest.approx(1.0, abs=0.05)
+    assert record.way(DriveTrain()) == pytest.approx(1.0, abs=0.05), "of the last one alone"
+    assert said == [
+        "run: no fresh lidar scan; back to where it began, and once more",
+        "run: no fresh drive request within its lease; back to where it began, and once more",
+    ]
+
+
+def test_one_that_lasts_or_comes_a_third_time_ends_the_move_by_its_reason():
+    _, error, said = hindered(STEP, (0.4, Reason.SCAN_STALE, 60.0))
+    assert (error.refusal, said) == (Reason.SCAN_STALE, [])
+    assert str(error).startswith("stopped by the gate: no fresh lidar scan")
+    _, error, said = hindered(STEP, *3 * [(0.4, Reason.LEASE_EXPIRED, 0.1)])
+    assert (error.refusal, len(said)) == (Reason.LEASE_EXPIRED, 2)
+    _, error, said = hindered(STEP, (0.4, Reason.OBSTACLE_STOP, 0.1))
+    assert (error.refusal, said) == (Reason.OBSTACLE_STOP, []), "that is the operator's to see"
+
+
+def test_a_move_that_is_measured_from_a_mark_begins_anew_only_there():
+    marked = replace(STEP, marked=True)
+    _, error, said = hindered(marked, (0.4, Reason.LEASE_EXPIRED, 0.1))
+    assert (error.refusal, said) == (Reason.LEASE_EXPIRED, [])
+    truck, _, said = hindered(marked, (0.0, Reason.LEASE_EXPIRED, 0.1))
+    assert len(said) == 1
+    assert truck.x == pytest.approx(1.0, abs=0.05)
+
+
+def test_a_weaving_move_goes_straight_back():
+    weaving = replace(STEP, front=0.3, rear=-0.3, weave=(1.0,))
+    assert weaving.back(0.4) == replace(STEP, name="run, back", speed=-0.2, metres=0.4)
+    assert replace(STEP, front=0.3).back(0.4) == replace(STEP, name="run, back", speed=-0.2, metres=0.4, front=0.3)

@@ -1,11 +1,15 @@
 """Command lines that somebody gets wrong: one sentence and the reason's exit code."""
 
 import shlex
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from typer.core import TyperGroup
+from typer.main import get_command
 
 from monstertruckd.tools.cli.main import app
+from monstertruckd.tools.cli.output import NumberCommand
 
 ROOT = Path(__file__).resolve().parents[4]
 
@@ -91,6 +95,18 @@ WRONG = (
     ("goto 1 2", 2, "Error: Missing argument 'yaw'."),
     ("goto 1 2 x", 2, "Error: Invalid value for 'yaw': Input should be a valid number, unable to pa"),
     ("goto 1 2 3 --via 1", 3, "pose '1': expected x,y or x,y,yaw, m and rad"),
+    ("goto nan 2 3", 2, "Error: Invalid value for 'x': expected a number, not nan"),
+    ("goto 1 -inf 3", 3, "pose 1,-inf,3: expected finite numbers, m and rad"),
+    ("goto 1 2 3 --via 1,nan", 3, "pose 1,nan: expected finite numbers, m and rad"),
+    ("points mark dock 1 1e999", 3, "pose 1,inf: expected finite numbers, m and rad"),
+    ("points goto dock --distance nan", 2, "Error: Invalid value for '--distance': "),
+    ("emulate lidar --seed -1", 2, "Error: Invalid value for '--seed': Input should be greater than or equal to 0"),
+    ("study circle --ratio 0", 3, "ratio 0: expected more than 1 (2, 3, inf)"),
+    ("study circle --laps inf", 3, "laps inf: expected a number above 0"),
+    ("study straight --passes 0", 3, "passes 0: expected at least 1"),
+    ("study straight --reference -1", 3, "reference -1: expected a number above 0"),
+    ("kinematics radius-table --limit nan", 2, "Error: Invalid value for '--limit' / '-l': expected a number"),
+    ("map build x.npz --mount 0 nan 0", 2, "Error: Invalid value for '--mount': expected a number, not nan"),
     ("replay", 2, "Error: Missing argument 'log'."),
     ("replay /nonexistent.mcap", 4, "/nonexistent.mcap: no such log"),
     ("replay configs/truck.yaml", 3, "configs/truck.yaml: not an MCAP log"),
@@ -193,6 +209,16 @@ def test_a_wrong_command_line_is_one_clear_line(
     (complaint,) = said.err.strip().splitlines()
     assert (ended.value.code, complaint[: len(expected)], said.out) == (code, expected, "")
     assert not complaint.startswith("Error: ") or " Try '" in complaint
+
+
+def test_every_command_refuses_nan():
+    def below(group: TyperGroup) -> Iterator[object]:
+        for command in group.commands.values():
+            yield from below(command) if isinstance(command, TyperGroup) else [command]
+
+    root = get_command(app)
+    assert isinstance(root, TyperGroup)
+    assert {type(command) for command in below(root)} == {NumberCommand}
 
 
 def test_they_are_sixty_at_least():
