@@ -2,6 +2,7 @@
 
 import ipaddress
 import json
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,8 +24,10 @@ hung up on. Zenoh's own 5 s are long for those whose requests wait behind it; a 
 LOCAL_SESSIONS: Final = 16
 """Places of the robot's own command line."""
 
-OwnerName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-][A-Za-z0-9_.@-]{0,31}$")]
-"""Common name of a certificate: one part of a key, without the colon that begins the name of one of its programs."""
+OWNER_NAME: Final = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.@-]{0,31}")
+"""Common names of certificates: one part of a key, without the colon that begins the name of one of its programs, and
+without a first dot: the name is that of a folder, too."""
+OwnerName = Annotated[str, Field(pattern=f"^{OWNER_NAME.pattern}$")]
 Owners = Annotated[tuple[OwnerName, ...], Field(strict=False)]
 
 

@@ -40,6 +40,7 @@ from monstertruckd.gate.config import SIGHT, BodyLimits, GateConfig, beyond, wea
 from monstertruckd.recorder.config import BlackBoxConfig, MapRender, RecorderConfig
 
 ROBOT: Final = "truck"
+RobotName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,31}$")]
 """A robot's name where none is given."""
 BLIND: Final = "devices: no range sensor: nothing stops the robot before an obstacle"
 
@@ -115,7 +116,7 @@ class TruckConfig(Schema):
     """Keys that name files which must exist; they are relative to the file that says them."""
 
     version: Literal[2]
-    robot: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,31}$")] = ROBOT
+    robot: RobotName = ROBOT
     """Name of this robot in every key"""
     body: AnyBody = TruckBody()
     """Kind of robot, with what only this kind has"""

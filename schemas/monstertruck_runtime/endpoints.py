@@ -26,6 +26,11 @@ def is_endpoint(text: str) -> bool:
     return protocol_of(text) in _OTHERS and bool(_address(text))
 
 
+def endpoint_of(protocol: str, host: str, port: int) -> str:
+    """Of a host's name or address; those of IPv6 stand in brackets."""
+    return f"{protocol}/[{host}]:{port}" if ":" in host else f"{protocol}/{host}:{port}"
+
+
 def protocol_of(endpoint: str) -> str:
     """Protocol of an endpoint, e.g. ``tcp``."""
     return endpoint.partition("/")[0]

@@ -8,7 +8,6 @@ import typer
 
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.roles import AccessRole
-from monstertruckd.tools.cli.options import RobotOption
 from monstertruckd.tools.cli.output import JsonOption, command_group, finish, print_json, print_table, remark
 
 if TYPE_CHECKING:
@@ -20,7 +19,7 @@ FolderOption = Annotated[
     Path, typer.Option("--folder", "-f", help="Folder of the authority; keep it off the robot.", show_default=False)
 ]
 HERE = Path("security")
-NameArgument = Annotated[str, typer.Argument(help="Name of the station: letters, digits and . _ - @.")]
+NameArgument = Annotated[str, typer.Argument(help="Name of the station: letters, digits and . _ - @, no . or @ first.")]
 RESTART = (
     "Takes effect once these files are on the robot and its daemon was restarted; restart it while the truck stands."
 )
@@ -28,43 +27,44 @@ RESTART = (
 
 @app.command("init")
 def init(
-    robot: RobotOption = "truck",
+    robot: Annotated[str | None, typer.Option("--robot", "-r", help="Name of the robot; truck at first.")] = None,
     address: Annotated[
         list[str] | None,
-        typer.Option("--address", "-a", help="Address or host name that stations dial; repeatable."),
+        typer.Option("--address", "-a", help="Address or host name that stations dial, at first this computer's own."),
     ] = None,
     place: Annotated[Path | None, typer.Option(help="Where the robot keeps its files.")] = None,
     days: Annotated[int, typer.Option(min=1, help="Until the robot's certificate expires.")] = 825,
     folder: FolderOption = HERE,
 ) -> None:
-    """Make an authority and the robot's certificate and configuration; again: renew the robot's certificate."""
-    from monstertruckd.tools.security.folder import PLACE
+    """Make an authority and the robot's certificate and configuration; again: renew the robot's certificate.
 
+    What is not given stays as it was.
+    """
     kept = _folder(folder)
-    new = kept.init(robot, tuple(address or ("localhost", "127.0.0.1")), place or PLACE, _now(), days)
+    new = kept.init(robot, tuple(address) if address else None, place, _now(), days)
     print(f"{'authority made' if new else 'certificate of the robot renewed'} in {folder}")
     _say_robot(kept)
-    if new:
-        remark("Next: monstertruckd security add NAME --role pilot")
 
 
 @app.command("add")
 def add(
     name: NameArgument,
-    role: Annotated[AccessRole, typer.Option(help="What it may do.")] = AccessRole.PILOT,
+    role: Annotated[AccessRole | None, typer.Option(help="What it may do; a new one: pilot.")] = None,
     rank: Annotated[
-        Literal["gamepad", "keyboard", "station"], typer.Option(help="Highest priority it may claim.")
-    ] = "station",
+        Literal["gamepad", "keyboard", "station"] | None,
+        typer.Option(help="Highest priority it may claim; a new one: station."),
+    ] = None,
     days: Annotated[int, typer.Option(min=1, help="Until its certificate expires.")] = 365,
     folder: FolderOption = HERE,
 ) -> None:
-    """Certify a station; again: renew its certificate."""
+    """Certify a station; again: renew its certificate. Role and rank that are not given stay as they were."""
     from monstertruck_schemas.req import Role
 
     kept = _folder(folder)
-    changed = kept.add(name, role, Role(rank), _now(), days)
+    changed = kept.add(name, role, None if rank is None else Role(rank), _now(), days)
     target = kept.path / "stations" / name
-    print(f"{name}: {role.value}, rank {rank}, {days} days; its files: {target}")
+    station = kept.register().stations[name]
+    print(f"{name}: {station.role.value}, rank {station.rank.value}, {days} days; its files: {target}")
     remark(f"To the station, into ~/.config/monstertruckd/tls: {shlex.quote(str(target))}/*")
     if changed:
         _say_robot(kept)
@@ -79,9 +79,9 @@ def show(folder: FolderOption = HERE, json_output: JsonOption = False) -> None:
     if json_output:
         print_json([{"name": r.name, "role": r.role, "rank": r.rank, "days": r.days} for r in rows])
     else:
-        cells = [(row.name, row.role, row.rank, str(row.days)) for row in rows]
+        cells = [(row.name, row.role, row.rank, "not here" if row.days is None else str(row.days)) for row in rows]
         print_table(("name", "role", "rank", "days left"), cells, right=("days left",))
-    expired = [row.name for row in rows if row.days < 0]
+    expired = [row.name for row in rows if row.days is not None and row.days < 0]
     finish(Reason.NOT_PERMITTED if expired else Reason.OK, f"expired: {', '.join(expired)}")
 
 
@@ -173,6 +173,12 @@ def _now() -> int:
 
 
 def _say_robot(folder: "Folder") -> None:
-    place = folder.register().place
+    register = folder.register()
+    place = register.place
     remark(f"To the robot, into {place} (robot.key readable by its daemon alone): {shlex.quote(str(folder.robot))}/*")
     remark(f"The robot's configuration has `include: {place}/zenoh.yaml`. {RESTART}")
+    if register.router is not None:
+        remark("The router keeps to its old rules until `security router` is run again and it is restarted.")
+    if not register.of_role(AccessRole.PILOT, AccessRole.ENGINEER):
+        remark("With these files it does not start: nobody could drive.")
+        remark("Next: monstertruckd security add NAME --role pilot")

@@ -49,6 +49,8 @@ class Certificate:
         Raises:
             OSError: one cannot be written.
         """
+        if key.exists():
+            key.chmod(0o600)  # a file that is replaced keeps its mode
         replace_file(key, self.key_pem, 0o600)
         replace_file(certificate, b"".join((self.pem, *chain)))
 
@@ -104,6 +106,11 @@ def seconds_left(certificate: x509.Certificate, now: int) -> int:
         now: real time, s.
     """
     return round(certificate.not_valid_after_utc.timestamp()) - now
+
+
+def began(certificate: x509.Certificate) -> int:
+    """Real time from which a certificate is good, s."""
+    return round(certificate.not_valid_before_utc.timestamp())
 
 
 def new_authority(name: str, now: int, days: int) -> Certificate:

@@ -10,12 +10,18 @@
     router.pem                      authority of the fleet's router, where there is one
 """
 
+import fcntl
+import ipaddress
+import os
+import re
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal, Self, TypeVar
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 
 from monstertruck_runtime.errors import InputError, NotFoundError
 from monstertruck_runtime.small_files import replace_file
@@ -23,11 +29,13 @@ from monstertruck_runtime.yaml_files import read_yaml, yaml_text
 from monstertruck_schemas.base import Schema
 from monstertruck_schemas.req import Role
 from monstertruck_schemas.roles import AccessRole
-from monstertruckd.bus.zenoh_config import OwnerName, TlsConfig, ZenohConfig
+from monstertruckd.bus.zenoh_config import OWNER_NAME, OwnerName, TlsConfig, ZenohConfig
 from monstertruckd.config.load import VERSION
+from monstertruckd.config.truck import ROBOT, RobotName
 from monstertruckd.tools.security.certificates import (
     DAY,
     Certificate,
+    began,
     issue,
     load,
     new_authority,
@@ -45,6 +53,11 @@ ROUTER_FILE: Final = "router.pem"
 """Certificate of the authority of the fleet's router, if there is one."""
 PLACE: Final = Path("/etc/monstertruckd/security")
 """Where the robot keeps its files."""
+
+WRITTEN: Final = "# Written by `monstertruckd security`; include it in the robot's configuration.\n"
+FIRST: Final[dict[str, Any]] = {"robot": ROBOT, "addresses": ("localhost", "127.0.0.1")}
+"""Of an authority for which nothing else is given."""
+HOST_NAME: Final = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,251}[A-Za-z0-9])?")
 
 S = TypeVar("S", bound=Schema)
 Rank = Literal[Role.GAMEPAD, Role.KEYBOARD, Role.STATION]
@@ -68,13 +81,20 @@ class TrustedRouter(Schema):
 class CertificateRegister(Schema):
     """What an authority has certified."""
 
-    robot: str
+    robot: RobotName
     addresses: tuple[str, ...] = Field(min_length=1)
     """Addresses and host names of the robot."""
     place: Path = PLACE
     """Where the robot keeps its files."""
     stations: dict[OwnerName, CertifiedStation] = {}
     router: TrustedRouter | None = None
+
+    @field_validator("addresses")
+    @classmethod
+    def _dialled(cls, given: tuple[str, ...]) -> tuple[str, ...]:
+        for address in given:
+            require_address(address)
+        return given
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -94,8 +114,8 @@ class Expiry:
     name: str
     role: str
     rank: str
-    days: int
-    """Until it expires; negative = since then."""
+    days: int | None
+    """Until it expires; negative = since then; None = its file is not here."""
 
 
 class Folder:
@@ -121,62 +141,89 @@ class Folder:
             raise NotFoundError(f"{self.path}: no authority here; monstertruckd security init makes one")
         return _validated(CertificateRegister, read_yaml(file), file)
 
-    def init(self, robot: str, addresses: tuple[str, ...], place: Path, now: int, days: int = ROBOT_DAYS) -> bool:
+    def init(
+        self,
+        robot: str | None,
+        addresses: tuple[str, ...] | None,
+        place: Path | None,
+        now: int,
+        days: int = ROBOT_DAYS,
+    ) -> bool:
         """Make an authority, or renew the robot's certificate; True if there was none.
 
         Args:
-            robot: its name.
-            addresses: what stations dial.
+            robot: its name; None = as before, like all that is None, at first truck.
+            addresses: what stations dial; at first this computer's own.
             place: where the robot keeps its files.
             now: real time, s.
             days: until the robot's certificate expires.
 
         Raises:
-            InputError: the names make no sense, or the folder cannot be written.
+            InputError: the names or days make no sense, or the register of an authority with stations is missing.
+            OSError: the folder cannot be written.
         """
-        new = not (self.path / "register.yaml").exists()
-        kept = {} if new else self.register().model_dump(include={"stations", "router"})
-        made = {"robot": robot, "addresses": addresses, "place": place, **kept}
-        register = _validated(CertificateRegister, made, self.path)
+        named = {"robot": robot, "addresses": addresses, "place": place}
+        given = {name: value for name, value in named.items() if value is not None}
+        _validated(CertificateRegister, FIRST | given, self.path)
+        if days > AUTHORITY_DAYS:
+            raise InputError(f"{days} days: expected at most {AUTHORITY_DAYS}, those of the authority")
         self.path.mkdir(mode=0o700, parents=True, exist_ok=True)
-        if new:
-            new_authority(f"Authority of {robot}", now, AUTHORITY_DAYS).save(*self._files("authority"))
-        self.robot.mkdir(mode=0o700, exist_ok=True)
-        authority = self.authority()
-        issue(authority, robot, now, days * DAY, server=addresses).save(
-            self.robot / "robot.pem", self.robot / "robot.key"
-        )
-        self._write(register)
+        with self._alone():
+            new = not (self.path / "register.yaml").exists()
+            if new and (names := sorted(file.stem for file in self.path.glob("issuers/*.pem"))):
+                raise InputError(
+                    f"{self.path}: register.yaml is missing beside certificates of {', '.join(names)}: restore it, "
+                    "or remove the folder issuers to begin anew, without them"
+                )
+            before = FIRST if new else self.register().model_dump()
+            register = _validated(CertificateRegister, before | given, self.path)
+            # A start that was broken off may have left one that is good.
+            if new and not self._files("authority")[0].exists():
+                new_authority(f"Authority of {register.robot}", now, AUTHORITY_DAYS).save(*self._files("authority"))
+            self.robot.mkdir(mode=0o700, exist_ok=True)
+            authority = self.authority()
+            _require_time(authority, now, days)
+            issue(authority, register.robot, now, days * DAY, server=register.addresses).save(
+                self.robot / "robot.pem", self.robot / "robot.key"
+            )
+            self._write(register)
         return new
 
-    def add(self, name: str, role: AccessRole, rank: Role, now: int, days: int = STATION_DAYS) -> bool:
+    def add(self, name: str, role: AccessRole | None, rank: Role | None, now: int, days: int = STATION_DAYS) -> bool:
         """Certify a station, or renew its certificate; True if the robot must be restarted to know it.
 
         Args:
             name: common name, and the source of its requests.
-            role: what it may do.
-            rank: highest priority it may claim.
+            role: what it may do; None = as before, at first a pilot.
+            rank: highest priority it may claim; None = as before, at first a station.
             now: real time, s.
             days: until its certificate expires.
 
         Raises:
-            InputError: a name or rank that makes no sense.
+            InputError: a name, rank or number of days that makes no sense.
             NotFoundError: there is no authority here.
         """
-        before = self.register()
-        made = {**before.stations, name: {"role": role, "rank": rank}}
-        register = _validated(CertificateRegister, before.model_dump() | {"stations": made}, name)
-        files = self._files(f"issuers/{name}")
-        files[0].parent.mkdir(mode=0o700, exist_ok=True)
-        if not files[1].exists():
-            new_issuer(self.authority(), f"Issuer of {name}", now, AUTHORITY_DAYS).save(*files)
-        issuer = load(*files)
-        target = self.path / "stations" / name
-        target.mkdir(mode=0o700, parents=True, exist_ok=True)
-        issue(issuer, name, now, days * DAY).save(target / "station.pem", target / "station.key", issuer.pem)
-        replace_file(target / "ca.pem", self._trusted())
-        self._write(register)
-        return register != before
+        if not OWNER_NAME.fullmatch(name):
+            raise InputError(f"{name!r}: expected a name of up to 32 letters, digits and . _ - @; first no . or @")
+        with self._alone():
+            before = self.register()
+            known = before.stations.get(name, CertifiedStation(role=AccessRole.PILOT))
+            made = {**before.stations, name: {"role": role or known.role, "rank": rank or known.rank}}
+            register = _validated(CertificateRegister, before.model_dump() | {"stations": made}, name)
+            authority = self.authority()
+            _require_time(authority, now, days)
+            files = self._files(f"issuers/{name}")
+            files[0].parent.mkdir(mode=0o700, exist_ok=True)
+            if not files[0].exists():  # written after its key
+                new_issuer(authority, f"Issuer of {name}", now, seconds_left(authority.certificate, now) // DAY).save(
+                    *files
+                )
+            issuer = load(*files)
+            target = self.path / "stations" / name
+            target.mkdir(mode=0o700, parents=True, exist_ok=True)
+            issue(issuer, name, now, days * DAY).save(target / "station.pem", target / "station.key", issuer.pem)
+            replace_file(target / "ca.pem", self._trusted())
+            return self._write(register)
 
     def revoke(self, name: str) -> None:
         """Forget a station and its issuer.
@@ -184,14 +231,17 @@ class Folder:
         Raises:
             NotFoundError: there is no such station.
         """
-        register = self.register()
-        if name not in register.stations:
-            raise NotFoundError(f"no station {name!r}; there are {', '.join(register.stations) or 'none'}")
-        stations = {other: station for other, station in register.stations.items() if other != name}
-        self._write(register.model_copy(update={"stations": stations}))
-        for file in self._files(f"issuers/{name}"):
-            file.unlink(missing_ok=True)
-        shutil.rmtree(self.path / "stations" / name, ignore_errors=True)
+        with self._alone():
+            register = self.register()
+            if name not in register.stations:
+                raise NotFoundError(f"no station {name!r}; there are {', '.join(register.stations) or 'none'}")
+            stations = {other: station for other, station in register.stations.items() if other != name}
+            kept = register.model_copy(update={"stations": stations})
+            self._write_robot(kept)
+            for file in self._files(f"issuers/{name}"):
+                file.unlink(missing_ok=True)
+            shutil.rmtree(self.path / "stations" / name, ignore_errors=True)
+            self._write(kept)  # last: what was broken off before can be asked for again
 
     def join(self, name: str, endpoint: str, authority: bytes) -> None:
         """Let the robot dial a router and its stations trust it.
@@ -204,13 +254,15 @@ class Folder:
         Raises:
             InputError: the name is taken by a station.
         """
-        before = self.register()
-        made = before.model_dump() | {"router": {"name": name, "endpoint": endpoint}}
-        register = _validated(CertificateRegister, made, name)
-        replace_file(self.path / ROUTER_FILE, authority)
-        for station in register.stations:
-            replace_file(self.path / "stations" / station / "ca.pem", self._trusted())
-        self._write(register)
+        with self._alone():
+            made = self.register().model_dump() | {"router": {"name": name, "endpoint": endpoint}}
+            register = _validated(CertificateRegister, made, name)
+            replace_file(self.path / ROUTER_FILE, authority)
+            for station in register.stations:
+                target = self.path / "stations" / station
+                target.mkdir(mode=0o700, parents=True, exist_ok=True)  # it may have been moved to the station
+                replace_file(target / "ca.pem", self._trusted())
+            self._write(register)
 
     def authority(self) -> Certificate:
         """The authority.
@@ -240,7 +292,7 @@ class Folder:
             ),
         ]
         return [
-            Expiry(name, role, rank, seconds_left(read_certificate(file), now) // DAY)
+            Expiry(name, role, rank, seconds_left(read_certificate(file), now) // DAY if file.exists() else None)
             for name, role, rank, file in rows
         ]
 
@@ -252,18 +304,43 @@ class Folder:
         """
         return _validated(ZenohConfig, _zenoh(self.register()), self.path)
 
-    def _write(self, register: CertificateRegister) -> None:
-        """The register, and what follows from it for the robot."""
+    @contextmanager
+    def _alone(self) -> Iterator[None]:
+        """Whoever else changes this folder waits, so that no change is lost."""
+        try:
+            handle = os.open(self.path, os.O_RDONLY)
+        except FileNotFoundError:
+            self.register()  # says what is missing
+            raise
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX)
+            yield
+        finally:
+            os.close(handle)
+
+    def _write(self, register: CertificateRegister) -> bool:
+        """What follows for the robot, then the register; True if the robot's files are others than before."""
+        changed = self._write_robot(register)
         replace_file(self.path / "register.yaml", yaml_text(register.model_dump(mode="json")))
+        return changed
+
+    def _write_robot(self, register: CertificateRegister) -> bool:
         driving = register.of_role(AccessRole.PILOT, AccessRole.ENGINEER)
-        for file, names in (("stations.pem", tuple(register.stations)), ("pilots.pem", driving)):
-            issuers = [self._files(f"issuers/{name}")[0].read_bytes() for name in names]
-            replace_file(self.robot / file, b"".join([*issuers, *([self._router()] if file == "stations.pem" else [])]))
-        replace_file(
-            self.robot / "zenoh.yaml",
-            "# Written by `monstertruckd security`; include it in the robot's configuration.\n"
-            + yaml_text({"version": VERSION, "zenoh": _zenoh(register)}),
-        )
+        everybody = [*self._issuers(tuple(register.stations)), self._router()]
+        files = {
+            "stations.pem": b"".join(everybody),
+            "pilots.pem": b"".join(self._issuers(driving)),
+            "zenoh.yaml": (WRITTEN + yaml_text({"version": VERSION, "zenoh": _zenoh(register)})).encode(),
+        }
+        changed = False
+        for name, content in files.items():
+            file = self.robot / name
+            changed |= not file.exists() or file.read_bytes() != content
+            replace_file(file, content)
+        return changed
+
+    def _issuers(self, names: tuple[str, ...]) -> list[bytes]:
+        return [self._files(f"issuers/{name}")[0].read_bytes() for name in names]
 
     def _router(self) -> bytes:
         """Who certified the fleet's router; nothing without one."""
@@ -302,6 +379,35 @@ def _zenoh(register: CertificateRegister) -> dict[str, Any]:
         "connect": [] if router is None else [router.endpoint],
         "tls": tls,
     }
+
+
+def require_address(address: str) -> None:
+    """Refuse what no station can dial.
+
+    Raises:
+        ValueError: it is neither an IP address nor a host name.
+    """
+    try:
+        ipaddress.ip_address(address)
+    except ValueError:
+        if not HOST_NAME.fullmatch(address):
+            raise ValueError(f"{address!r}: expected an IP address or a host name (letters, digits, - and .)") from None
+
+
+def _require_time(authority: Certificate, now: int, days: int) -> None:
+    """Refuse what would not be good for so long.
+
+    Raises:
+        InputError: the authority has not begun, which a wrong clock makes it, or expires before.
+    """
+    early = began(authority.certificate) - now
+    if early > 0:
+        raise InputError(
+            f"the authority begins in {early / DAY:.1f} days: this computer's clock is wrong, or was when it was made"
+        )
+    left = seconds_left(authority.certificate, now) // DAY
+    if days > left:
+        raise InputError(f"{days} days: the authority expires in {left}; a new one takes another folder")
 
 
 def _validated(model: type[S], data: Any, where: Path | str) -> S:

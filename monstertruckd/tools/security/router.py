@@ -13,11 +13,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
+from monstertruck_runtime.endpoints import endpoint_of
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.small_files import replace_file
 from monstertruckd.bus.access import router_rules
 from monstertruckd.tools.security.certificates import DAY, issue, load, new_authority
-from monstertruckd.tools.security.folder import AUTHORITY_DAYS, PORT, ROBOT_DAYS, Folder
+from monstertruckd.tools.security.folder import AUTHORITY_DAYS, PORT, ROBOT_DAYS, Folder, require_address
 
 ROUTER: Final = "router"
 """Common name of its certificate."""
@@ -41,9 +42,14 @@ def make_router(
         port: where it listens.
 
     Raises:
-        InputError: two of them have one name.
+        InputError: two of them have one name, or an address is none.
         NotFoundError: a folder is none of an authority.
     """
+    for address in addresses:
+        try:
+            require_address(address)
+        except ValueError as error:
+            raise InputError(f"--address {error}") from None
     registers = [folder.register() for folder in robots]
     names = [ROUTER, *(register.robot for register in registers), *{n for each in registers for n in each.stations}]
     if twice := sorted({name for name in names if names.count(name) > 1}):
@@ -51,7 +57,7 @@ def make_router(
     target = path / "router"
     target.mkdir(mode=0o700, parents=True, exist_ok=True)
     files = path / "authority.pem", path / "authority.key"
-    if not files[1].exists():
+    if not files[0].exists():  # written after its key
         new_authority(f"Authority of {ROUTER}", now, AUTHORITY_DAYS).save(*files)
     authority = load(*files)
     issue(authority, ROUTER, now, ROBOT_DAYS * DAY, server=addresses).save(target / "router.pem", target / "router.key")
@@ -60,7 +66,7 @@ def make_router(
     fleet = {register.robot: tuple(register.stations) for register in registers}
     replace_file(target / "zenoh.json5", json.dumps(router_session(place, port, fleet), indent=2).encode() + b"\n")
     for folder in robots:
-        folder.join(ROUTER, f"tls/{addresses[0]}:{port}", authority.pem)
+        folder.join(ROUTER, endpoint_of("tls", addresses[0], port), authority.pem)
 
 
 def router_session(place: Path, port: int, fleet: dict[str, tuple[str, ...]]) -> dict[str, Any]:
