@@ -87,7 +87,7 @@ JUDGED: Final = 20
 DISAGREES, AGREES = 0.2, 0.7
 """Share of them on the wall below which a sonar contradicts another one, whose share is above the second figure."""
 FOLLOWED: Final = 0.5
-"""Way along a wall after which a lap begins, m."""
+"""A lap does not begin where the robot followed a wall for less, m."""
 
 STANDSTILL: Final = TimedRamp(0.0, CubicRamp(0.0, 0.0, 1.0))
 
@@ -494,6 +494,8 @@ class WallLine:
             return state
         kept = state.echoes[np.abs(residuals(state.echoes, wall, cone)) < TIGHT].copy()
         kept[:, 4] = np.where(kept[:, 4] <= DIAGONAL, kept[:, 4], OWN)
+        if state.begun is None or state.travelled - state.since < FOLLOWED:
+            state = replace(state, begun=state.pose, since=state.travelled)
         return replace(self._to(state, "follow"), wall=wall, ahead=None, echoes=kept, seen=state.travelled)
 
     def _steer(self, state: LineState, t: float) -> LineState:
@@ -522,14 +524,11 @@ class WallLine:
         return math.copysign(1.0, math.remainder(state.ahead.heading - state.pose[2], math.tau))
 
     def _lap(self, state: LineState) -> LineState:
-        """Begin and count laps by odometry."""
+        """Count laps by odometry."""
         config, (x, y, yaw) = self._config, state.pose
-        if state.begun is None:
-            if state.travelled - state.marks[0] < FOLLOWED:
-                return state
-            return replace(state, begun=(x, y, yaw), since=state.travelled)
-        way = state.travelled - state.since
+        assert state.begun is not None
         bx, by, byaw = state.begun
+        way = state.travelled - state.since
         passed = (x - bx) * math.cos(byaw) + (y - by) * math.sin(byaw) >= 0.0
         near = math.hypot(x - bx, y - by) <= config.lap_radius + 0.01 * way
         if way < config.lap_length or not passed or not near or math.cos(yaw - byaw) < math.cos(0.6):

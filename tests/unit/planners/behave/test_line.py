@@ -36,6 +36,13 @@ def test_a_lap_of_a_hall_ends_with_its_reason_and_keeps_the_distance(side, headi
     assert {step.phase for step in done.steps} == {"settle", "search", "brake", "turn", "follow", "stop"}
 
 
+def test_a_lap_that_began_just_before_a_corner_ends_though_the_odometry_has_drifted():
+    robot = Robot(HALL, (0.8, 0.8, math.pi / 2 - 0.2), creep=-3e-4)
+    done = drive(follower(lap_length=6.0), robot, 100.0)
+    assert done.outcome is Reason.BEHAVIOUR_DONE
+    assert done.steps[-1].text.startswith("1 lap, ")
+
+
 def test_every_ramp_keeps_acceleration_and_jerk_at_100_hz_and_speeds_do_not_jump():
     done = drive(follower(lap_length=6.0), Robot(HALL, (0.1, -0.1, 0.3)), 300.0)
     for ramp in {ramp for step in done.steps for ramp in (step.state.v, step.state.w)}:
@@ -144,7 +151,7 @@ def test_a_front_sonar_that_hears_nothing_is_made_up_for_by_the_diagonal_one():
     robot = Robot(corner, (0.5, 0.0, 0.1))
     robot.stuck = {"f": None, "fr": None}
     behaviour, state, clearance = follower(), None, math.inf
-    state = replace(behaviour.begin(), phase="follow", wall=WallEstimate(math.pi / 2, 0.35))
+    state = replace(behaviour.begin(), phase="follow", wall=WallEstimate(math.pi / 2, 0.35), begun=robot.pose)
     for i in range(200):
         step = behaviour.step(robot.inputs(), state, i * PERIOD)
         state, robot.motion = step.state, step.motion or RequestedMotion()

@@ -102,6 +102,8 @@ class Robot:
     """Of the side sonars before the axle, m."""
     bias: float = 0.0
     """Of the gyroscope, rad/s."""
+    creep: float = 0.0
+    """Error of the odometry along x, m more in every step."""
     late: int = 0
     """Steps after which it does what it is asked for."""
     count: int = 0
@@ -127,7 +129,7 @@ class Robot:
         return Inputs(
             {
                 SONAR.name: sonars(ranges, dead=self.dead, now=now),
-                ODOMETRY.name: odometry(x, y, yaw, vx, wz, now),
+                ODOMETRY.name: odometry(x + self.creep * self.count, y, yaw, vx, wz, now),
                 IMU.name: imu(wz + self.bias, now),
                 TRANSFORMS.name: frames(self.ahead),
             }
