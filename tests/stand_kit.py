@@ -29,6 +29,20 @@ def hidden_camera(
     return PlacedCamera(Lens(matrix, distortion, (640, 480)), np.ravel(cv2.Rodrigues(axes)[0]), -axes @ centre)
 
 
+def turned(camera: PlacedCamera, axis: str, angle: float) -> PlacedCamera:
+    """A camera that somebody has knocked: turned where it hangs.
+
+    Args:
+        camera: before.
+        axis: its own one: "right", "down" or "ahead".
+        angle: rad.
+    """
+    vector = np.zeros(3)
+    vector[("right", "down", "ahead").index(axis)] = angle
+    axes = cv2.Rodrigues(vector)[0] @ camera.axes
+    return PlacedCamera(camera.lens, np.ravel(cv2.Rodrigues(axes)[0]), -axes @ camera.centre)
+
+
 def marks() -> dict[int, tuple[float, float]]:
     """Tags on the table: a lattice of 0.5 m, as a person would lay them."""
     lattice = [(x, y) for y in (-1.4, -0.75, -0.05, 0.7, 1.4) for x in (-1.42, -0.95, -0.45, 0.05, 0.5, 0.95, 1.42)]

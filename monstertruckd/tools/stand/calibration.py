@@ -150,10 +150,11 @@ def calibrate(
     """
     lenses: dict[str, tuple[LensFit, int]] = {}
     seen, placed = {}, {}
+    robots = {robot.tag for robot in config.robots.values()}  # one that stands there is no mark: it is above the table
     for name in config.cameras:
         try:
             lenses[name] = lens_from_pictures(boards[name], BoardReader(config.board))
-            seen[name] = seen_marks(floors[name])
+            seen[name] = {tag: px for tag, px in seen_marks(floors[name]).items() if tag not in robots}
             placed[name] = place(lenses[name][0].lens, seen[name], config.marks)
         except InputError as error:
             raise InputError(f"camera {name}: {error}") from error

@@ -2,7 +2,7 @@
 
 Each camera that sees a robot's tag gives a pose on the plane of the tag; they are averaged with weights that fall to
 nothing towards a picture's border, so that a robot leaves a camera's view gradually. Who is who the tags say. A pose
-that no robot can have reached is left out, until it is seen again and again.
+that no robot can have reached is left out, until it is seen again and again; so is what a camera sees that has moved.
 """
 
 import math
@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from monstertruck_estimation.vision.tags import Sighting
+from monstertruck_estimation.vision.tags import EVERYWHERE, Sighting
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND
 from monstertruckd.tools.stand.camera import PlacedCamera
@@ -30,9 +30,13 @@ STUBBORN: Final = 5
 PIXEL: Final = 0.2
 """Standard deviation of a corner, pixels."""
 BUMPED: Final = 0.005
-"""m: marks seen this far from their places, on average over those of a camera and over time: the camera has moved."""
+"""m: marks of a camera that are shifted, turned or scaled by this much, rms over the marks: the camera has moved."""
 BUMP_TIME: Final = 3.0
 """Seconds over which that is averaged."""
+BLIND: Final = 5.0
+"""Seconds without any mark, and"""
+BLIND_PICTURES: Final = 2 * EVERYWHERE
+"""so many pictures, in two of which at least marks were looked for: it looks elsewhere."""
 SILENT: Final = 1.0
 """Seconds without a picture after which a camera counts as lost."""
 
@@ -112,11 +116,36 @@ class CameraState:
 
     heard: int
     """Stamp of its newest picture, ns."""
-    pictures: int = 0
-    off: Array = field(default_factory=lambda: np.zeros(2))
-    """Smoothed distance of its marks from their places, m."""
+    marked: int
+    """Stamp of the newest one with marks, ns."""
+    unmarked: int = 0
+    """Pictures since."""
+    off: Array = field(default_factory=lambda: np.zeros(4))
+    """Smoothed `shift_of` its marks, m."""
     lost: bool = False
-    bumped: bool = False
+    moved: bool = False
+
+    @property
+    def distance(self) -> float:
+        """By how much its marks are off, m."""
+        return float(np.sqrt(self.off @ self.off))
+
+
+def shift_of(seen: Array, places: Array) -> Array:
+    """What is common to marks that are not in their places, (4,): to x, to y, by a turn and by a scale, m rms over them.
+
+    Errors of the ruler are not common to them.
+
+    Args:
+        seen: where they are seen, (n, 2), m.
+        places: where they lie, (n, 2), m.
+    """
+    off, arms = seen - places, places - places.mean(axis=0)
+    spread = math.sqrt(float(np.mean(np.sum(arms**2, axis=1))))
+    if spread == 0.0:
+        return np.append(off.mean(axis=0), np.zeros(2))
+    turn = np.mean(arms[:, 0] * off[:, 1] - arms[:, 1] * off[:, 0]) / spread
+    return np.append(off.mean(axis=0), (turn, np.mean(np.sum(arms * off, axis=1)) / spread))
 
 
 class StandTracker:
@@ -140,7 +169,7 @@ class StandTracker:
         self._robots = {robot.tag: (name, robot) for name, robot in robots.items()}
         self.marks = marks
         self._known: dict[str, _Known] = {}
-        self.cameras = {name: CameraState(now) for name in cameras}
+        self.cameras = {name: CameraState(now, now) for name in cameras}
         self.left_out = 0
         """Impossible poses."""
 
@@ -149,6 +178,8 @@ class StandTracker:
         seen: dict[int, list[tuple[str, TagPose]]] = {}
         for name, sightings in pictures.items():
             self._watch(name, stamp, sightings)
+            if self.cameras[name].moved:
+                continue
             for sighting in sightings:
                 if (entry := self._robots.get(sighting.tag)) is not None:
                     pose = tag_pose(self._cameras[name], sighting, entry[1].height)
@@ -167,17 +198,25 @@ class StandTracker:
         said = []
         for name, state in self.cameras.items():
             lost = now - state.heard > SILENT * SECOND
-            bumped = not lost and float(np.hypot(*state.off)) > BUMPED
             if lost != state.lost:
                 said.append(
                     f"camera {name} " + (f"sends no picture for {SILENT:g} s" if lost else "sends pictures again")
                 )
-            if bumped != state.bumped and not lost:
-                millimetres = 1000 * float(np.hypot(*state.off))
-                text = f"has moved: its marks are {millimetres:.0f} mm from their places, calibrate the stand again"
-                said.append(f"camera {name} " + (text if bumped else "sees its marks in their places again"))
-                state.bumped = bumped
-            state.lost = lost
+                state.lost = lost
+            if lost:
+                continue
+            blind = now - state.marked > BLIND * SECOND and state.unmarked > BLIND_PICTURES
+            moved = bool(self.marks) and (blind or state.distance > BUMPED)
+            if moved and not state.moved:
+                what = (
+                    f"sees none of its marks for {BLIND:g} s"
+                    if blind
+                    else f"has moved: its marks are {1000 * state.distance:.0f} mm from their places"
+                )
+                said.append(f"camera {name} {what}: it is left out, calibrate the stand again")
+            elif state.moved and not moved:
+                said.append(f"camera {name} sees its marks in their places again")
+            state.moved = moved
         return said
 
     def _believed(self, pose: RobotPose) -> bool:
@@ -197,17 +236,16 @@ class StandTracker:
     def _watch(self, name: str, stamp: int, sightings: Sequence[Sighting]) -> None:
         """Marks of a camera that are not where they were when it was calibrated."""
         state, camera = self.cameras[name], self._cameras[name]
-        seconds = (stamp - state.heard) / SECOND
-        state.heard, state.pictures = stamp, state.pictures + 1
-        off = []
-        for sighting in sightings:
-            if sighting.tag in self.marks:
-                mark = self.marks[sighting.tag]
-                middle = camera.on_plane(sighting.corners).mean(axis=0)
-                off.append(middle - (mark.x, mark.y))
-        if off:
-            share = 1.0 - math.exp(-max(min(seconds, 1.0), 0.0) / BUMP_TIME)
-            state.off = state.off + share * (np.mean(off, axis=0) - state.off)
+        state.heard, state.unmarked = stamp, state.unmarked + 1
+        seen = [s for s in sightings if s.tag in self.marks]
+        if not seen:
+            return
+        seconds = (stamp - state.marked) / SECOND
+        state.marked, state.unmarked = stamp, 0
+        points = np.array([camera.on_plane(sighting.corners).mean(axis=0) for sighting in seen])
+        places = np.array([(self.marks[s.tag].x, self.marks[s.tag].y) for s in seen])
+        share = 1.0 - math.exp(-min(max(seconds, 0.0), 1.0) / BUMP_TIME)
+        state.off = state.off + share * (shift_of(points, places) - state.off)
 
 
 def _robot_pose(name: str, robot: TaggedRobot, stamp: int, tag: TagPose, cameras: tuple[str, ...]) -> RobotPose:
