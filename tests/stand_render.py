@@ -30,6 +30,7 @@ class Placard:
     """A flat picture somewhere."""
 
     texture: Picture
+    """Grey, or blue, green and red"""
     origin: Array
     """(3,): of its upper left corner, m."""
     right: Array
@@ -59,6 +60,35 @@ def level_tag(tag: int, size: float, x: float, y: float, yaw: float, height: flo
     rim = round(TEXTURE * RIM)
     texture = cv2.copyMakeBorder(drawn(tag, TEXTURE), rim, rim, rim, rim, cv2.BORDER_CONSTANT, value=255)
     return Placard(np.asarray(texture, dtype=np.uint8), origin, right * side, -ahead * side)
+
+
+PLATE: Final = (0.2, 0.12)
+"""Length and width of a plate with discs, m."""
+DISC: Final = 0.04
+"""m across."""
+PAINTS: Final = {
+    "red": (40, 40, 200),
+    "yellow": (30, 200, 220),
+    "green": (60, 170, 50),
+    "blue": (200, 90, 30),
+    "magenta": (170, 40, 190),
+}
+"""Blue, green and red."""
+
+
+def disc_plate(
+    front: str, rear: str, x: float, y: float, yaw: float, *, apart: float = 0.1, height: float = 0.08
+) -> Placard:
+    """A dark plate with two coloured discs, its front towards ``yaw``."""
+    scale = 1000
+    texture = np.full((round(PLATE[0] * scale), round(PLATE[1] * scale), 3), 45, np.uint8)
+    for paint, ahead in ((front, 0.5), (rear, -0.5)):
+        middle = round(PLATE[1] * scale / 2), round((PLATE[0] / 2 - ahead * apart) * scale)
+        cv2.circle(texture, middle, round(DISC * scale / 2), PAINTS[paint], -1)
+    forward = np.array((np.cos(yaw), np.sin(yaw), 0.0))
+    right = np.array((forward[1], -forward[0], 0.0))
+    origin = np.array((x, y, height)) + (forward * PLATE[0] - right * PLATE[1]) / 2
+    return Placard(texture, origin, right * PLATE[1], -forward * PLATE[0])
 
 
 def board_in_view(board: BoardConfig, camera: PlacedCamera, rng: np.random.Generator) -> Placard:
@@ -98,8 +128,9 @@ class StandRenderer:
         self._floor = self._table()
 
     def picture(self, placards: Sequence[Placard], look: PictureQuality | None = None) -> Picture:
-        """With what is given, the last one on top."""
-        image = self._floor.copy()
+        """With what is given, the last one on top; in colour where something is coloured."""
+        colour = any(placard.texture.ndim == 3 for placard in placards)
+        image = np.repeat(self._floor[..., None], 3, axis=2) if colour else self._floor.copy()
         for placard in placards:
             self._draw(image, placard)
         return self._spoiled(image, look or self._look)
@@ -121,7 +152,7 @@ class StandRenderer:
         normal = np.cross(placard.right, placard.down)
         way = float(normal @ (placard.origin - camera.centre)) / (rays @ normal)
         points = way[..., None] * rays + (camera.centre - placard.origin)
-        rows, columns = placard.texture.shape
+        rows, columns = placard.texture.shape[:2]
         u = (points @ placard.right) / float(placard.right @ placard.right) * columns - 0.5
         v = (points @ placard.down) / float(placard.down @ placard.down) * rows - 0.5
         inside = (u > -0.5) & (u < columns - 0.5) & (v > -0.5) & (v < rows - 0.5) & (way > 0)
@@ -133,7 +164,7 @@ class StandRenderer:
             borderMode=cv2.BORDER_REPLICATE,
         )
         part = image[y0:y1, x0:x1]
-        part[inside] = sampled[inside]
+        part[inside] = sampled[inside] if sampled.ndim == part.ndim else sampled[inside][:, None]
 
     def _table(self) -> Array:
         """The empty table: grey, with the grain of wood."""

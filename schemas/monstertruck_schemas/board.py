@@ -1,10 +1,12 @@
-"""The printed board by which cameras are calibrated."""
+"""What is printed for cameras: the board by which they are calibrated, and colours of discs that robots carry."""
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field
 
 from monstertruck_schemas.base import Schema
+
+Colour = Literal["red", "yellow", "green", "blue", "magenta"]
 
 
 class BoardConfig(Schema):

@@ -15,8 +15,8 @@ from monstertruckd.tools.cli.output import remark
 if TYPE_CHECKING:
     from monstertruck_schemas.sensor import StandPose
     from monstertruckd.tools.stand.config import OverheadConfig
+    from monstertruckd.tools.stand.poses import RobotPose
     from monstertruckd.tools.stand.track import Stream
-    from monstertruckd.tools.stand.tracking import RobotPose
 
 RETRY = 2.0
 """Seconds after which a robot that is not there is looked for again."""
@@ -26,14 +26,15 @@ async def run(clock: Clock, config: "OverheadConfig", endpoint: str) -> None:
     """Track live, and publish to every robot that is there."""
     from monstertruckd.tools.stand.track import StandRun
 
-    robots = {name: RobotLink(name, endpoint, clock) for name in config.robots}
+    robots = {name: RobotLink(name, endpoint, clock) for name in config.names}
     tasks = [asyncio.create_task(link.run(), name=f"robot {name}") for name, link in robots.items()]
     tracker = _tracker(config, clock.now())
     try:
         live = any(camera.source.kind != "file" for camera in config.cameras.values())
         put = partial(_publish, robots)
         remark(f"tracks {', '.join(robots)} with {len(config.cameras)} cameras")
-        await StandRun(tracker, _streams(config), config.rate, clock, put, remark, live=live).run()
+        run = StandRun(tracker, _streams(config), config.rate, clock, put, remark, live=live, colours=config.colours)
+        await run.run()
     finally:
         for task in tasks:
             task.cancel()
@@ -45,7 +46,9 @@ async def track(clock: Clock, config: "OverheadConfig", out: Path) -> int:
     from monstertruckd.tools.stand.track import StandRun
 
     poses: list[RobotPose] = []
-    await StandRun(_tracker(config, 0), _streams(config), config.rate, clock, poses.append, remark, live=False).run()
+    tracker, streams = _tracker(config, 0), _streams(config)
+    run = StandRun(tracker, streams, config.rate, clock, poses.append, remark, live=False, colours=config.colours)
+    await run.run()
     with out.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(("stamp_ns", "robot", "x_m", "y_m", "yaw_rad", "sigma_m", "cameras"))
@@ -162,13 +165,16 @@ def _tracker(config: "OverheadConfig", now: int) -> Any:
     placed = load(config.calibration).placed()
     if missing := config.cameras.keys() - placed.keys():
         raise InputError(f"{config.calibration}: {', '.join(sorted(missing))} not in it: run `stand calibrate` again")
-    return StandTracker({name: placed[name] for name in config.cameras}, config.robots, config.marks, now)
+    return StandTracker({name: placed[name] for name in config.cameras}, config.robots, config.marks, now, config.blobs)
 
 
 def _streams(config: "OverheadConfig") -> dict[str, "Stream"]:
     from monstertruckd.tools.stand.sources import stream
 
-    return {name: partial(stream, camera.source, config.size, config.rate) for name, camera in config.cameras.items()}
+    return {
+        name: partial(stream, camera.source, config.size, config.rate, colour=bool(config.colours))
+        for name, camera in config.cameras.items()
+    }
 
 
 def _numbers(text: str) -> list[int]:

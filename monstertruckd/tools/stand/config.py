@@ -1,14 +1,15 @@
 """Configuration of the test stand: cameras, marks on the table, robots."""
 
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from monstertruck_schemas.base import Schema
-from monstertruck_schemas.board import BoardConfig
+from monstertruck_schemas.board import BoardConfig, Colour
 
 Metres = Annotated[float, Field(gt=0, le=10)]
+RobotName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,31}$")]
 
 
 class VideoDevice(Schema):
@@ -51,18 +52,45 @@ class MarkConfig(Schema):
     y: float
 
 
-class TaggedRobot(Schema):
-    """A robot with a tag on it."""
+class MarkedRobot(Schema):
+    """A robot that carries a marker."""
 
-    tag: Annotated[int, Field(ge=0, le=586)]
     x: float = 0.0
-    """Of the tag's middle before the robot's, m"""
+    """Of the marker's middle before the robot's, m"""
     y: float = 0.0
     """And left of it, m"""
     yaw: float = 0.0
-    """Of the tag's upper edge's direction against the robot's left, rad"""
+    """Of the marker against the robot, left positive, rad"""
     height: Annotated[float, Field(ge=0, le=2)] = 0.08
-    """Of the tag over the table, m"""
+    """Of the marker over the table, m"""
+
+
+class TaggedRobot(MarkedRobot):
+    """A robot with a tag on it, whose upper edge lies towards the front."""
+
+    tag: Annotated[int, Field(ge=0, le=586)]
+
+
+class BlobRobot(MarkedRobot):
+    """A robot with two coloured discs on it, one before the other."""
+
+    front: Colour
+    rear: Colour
+    apart: Annotated[float, Field(gt=0.03, le=1)]
+    """Distance of the discs' middles, m"""
+    start: Annotated[tuple[float, float] | None, Field(strict=False)] = None
+    """Where it stands at the beginning, m: for robots that look like others"""
+
+    @model_validator(mode="after")
+    def _two_colours(self) -> Self:
+        if self.front == self.rear:
+            raise ValueError(f"front and rear are {self.front}: expected two colours, which say where its front is")
+        return self
+
+    @property
+    def colours(self) -> frozenset[Colour]:
+        """Both."""
+        return frozenset((self.front, self.rear))
 
 
 class OverheadConfig(Schema):
@@ -83,6 +111,34 @@ class OverheadConfig(Schema):
     """Side of the black square of tags on the table, m"""
     ruler_error: Annotated[float, Field(gt=0, le=0.1)] = 0.0015
     """Standard deviation of a mark's place, m"""
-    robots: dict[Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,31}$")], TaggedRobot]
+    robots: dict[RobotName, TaggedRobot] = {}
+    """With tags"""
+    blobs: dict[RobotName, BlobRobot] = {}
+    """With coloured discs"""
     calibration: Path = Path("runs/stand/calibration.json")
     """Written by `stand calibrate`"""
+
+    @property
+    def names(self) -> list[str]:
+        """Of all robots."""
+        return [*self.robots, *self.blobs]
+
+    @property
+    def colours(self) -> frozenset[Colour]:
+        """Of all discs."""
+        return frozenset(colour for robot in self.blobs.values() for colour in robot.colours)
+
+    @model_validator(mode="after")
+    def _told_apart(self) -> Self:
+        if not self.names:
+            raise ValueError("robots and blobs are empty: expected a robot")
+        if both := sorted(self.robots.keys() & self.blobs.keys()):
+            raise ValueError(f"{', '.join(both)}: expected in robots or in blobs, not in both")
+        tags = [robot.tag for robot in self.robots.values()]
+        if twice := sorted({tag for tag in tags if tags.count(tag) > 1 or tag in self.marks}):
+            raise ValueError(f"tag {twice[0]}: expected on one robot, and not among the marks")
+        for name, robot in self.blobs.items():
+            alike = [other for other, its in self.blobs.items() if other != name and its.colours == robot.colours]
+            if alike and robot.start is None:
+                raise ValueError(f"blobs.{name} has the colours of {alike[0]}: expected `start`, where it stands first")
+        return self

@@ -23,8 +23,12 @@ from monstertruckd.tools.stand.config import FileSource, RenderedCamera, VideoDe
 ENDINGS: Final = (".png", ".jpg", ".jpeg", ".pgm")
 
 
-def pictures_in(folder: Path) -> list[Picture]:
-    """All pictures of a folder in the order of their names, grey.
+FLAGS: Final = {False: cv2.IMREAD_GRAYSCALE, True: cv2.IMREAD_COLOR}
+"""Of OpenCV's readers, by whether there is colour."""
+
+
+def pictures_in(folder: Path, *, colour: bool = False) -> list[Picture]:
+    """All pictures of a folder in the order of their names, grey or blue, green and red.
 
     Raises:
         InputError: there is none, or one cannot be read.
@@ -32,11 +36,13 @@ def pictures_in(folder: Path) -> list[Picture]:
     files = sorted(path for path in folder.glob("*") if path.suffix.lower() in ENDINGS) if folder.is_dir() else []
     if not files:
         raise InputError(f"{folder}: no pictures in it ({', '.join(ENDINGS)}): take some with `stand snap`")
-    return [_read(path) for path in files]
+    return [_read(path, colour=colour) for path in files]
 
 
-def stream(source: VideoDevice | FileSource | RenderedCamera, size: tuple[int, int], rate: float) -> Iterator[Picture]:
-    """Pictures one after the other, grey; blocks for each.
+def stream(
+    source: VideoDevice | FileSource | RenderedCamera, size: tuple[int, int], rate: float, *, colour: bool = False
+) -> Iterator[Picture]:
+    """Pictures one after the other, grey or blue, green and red; blocks for each.
 
     Raises:
         DeviceLostError: the camera is not there, or sends no more.
@@ -44,12 +50,13 @@ def stream(source: VideoDevice | FileSource | RenderedCamera, size: tuple[int, i
     """
     if isinstance(source, FileSource):
         if source.path.is_dir():
-            yield from pictures_in(source.path)
+            yield from pictures_in(source.path, colour=colour)
             return
-        yield from _frames(source.path, cv2.VideoCapture(str(source.path)), InputError("cannot be read as a film"))
+        capture = cv2.VideoCapture(str(source.path))
+        yield from _frames(source.path, capture, InputError("cannot be read as a film"), colour=colour)
         return
     if isinstance(source, RenderedCamera):
-        yield from _rendered(source.port, Mode(*size, rate))
+        yield from _rendered(source.port, Mode(*size, rate), colour=colour)
         return
     capture = cv2.VideoCapture(str(source.device), cv2.CAP_V4L2)
     for what, value in (
@@ -59,11 +66,11 @@ def stream(source: VideoDevice | FileSource | RenderedCamera, size: tuple[int, i
         (cv2.CAP_PROP_BUFFERSIZE, 1),
     ):
         capture.set(what, value)
-    yield from _frames(source.device, capture, DeviceLostError("cannot be opened"))
+    yield from _frames(source.device, capture, DeviceLostError("cannot be opened"), colour=colour)
     raise DeviceLostError(f"{source.device}: sends no more pictures")
 
 
-def _rendered(port: Path, mode: Mode) -> Iterator[Picture]:
+def _rendered(port: Path, mode: Mode, *, colour: bool) -> Iterator[Picture]:
     """Pictures of an emulated camera, the newest one whenever one is asked for."""
     box: queue.Queue[bytes | BaseException] = queue.Queue(1)
     ended = threading.Event()
@@ -75,7 +82,7 @@ def _rendered(port: Path, mode: Mode) -> Iterator[Picture]:
             found = box.get()
             if isinstance(found, BaseException):
                 raise found
-            picture = cv2.imdecode(np.frombuffer(found, np.uint8), cv2.IMREAD_GRAYSCALE)
+            picture = cv2.imdecode(np.frombuffer(found, np.uint8), FLAGS[colour])
             if picture is not None:
                 yield np.asarray(picture, dtype=np.uint8)
     finally:
@@ -100,7 +107,7 @@ def _read_port(port: Path, mode: Mode, box: "queue.Queue[bytes | BaseException]"
         put(error)
 
 
-def _frames(name: Path, capture: cv2.VideoCapture, closed: Exception) -> Iterator[Picture]:
+def _frames(name: Path, capture: cv2.VideoCapture, closed: Exception, *, colour: bool) -> Iterator[Picture]:
     try:
         if not capture.isOpened():
             raise type(closed)(f"{name}: {closed}")
@@ -108,13 +115,13 @@ def _frames(name: Path, capture: cv2.VideoCapture, closed: Exception) -> Iterato
             there, picture = capture.read()
             if not there:
                 return
-            yield _grey(np.asarray(picture))
+            yield np.asarray(picture) if colour else _grey(np.asarray(picture))
     finally:
         capture.release()
 
 
-def _read(path: Path) -> Picture:
-    picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+def _read(path: Path, *, colour: bool) -> Picture:
+    picture = cv2.imread(str(path), FLAGS[colour])
     if picture is None:
         raise InputError(f"{path}: cannot be read as a picture")
     return np.asarray(picture, dtype=np.uint8)

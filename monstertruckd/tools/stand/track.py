@@ -1,20 +1,47 @@
-"""Cameras to poses: a thread for each camera reads tags, the loop joins what they saw at one instant."""
+"""Cameras to poses: a thread for each camera reads tags and discs, the loop joins what they saw at one instant."""
 
 import asyncio
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import suppress
 from typing import Final
 
+import cv2
+import numpy as np
+
+from monstertruck_estimation.vision.blobs import Blob, BlobReader
 from monstertruck_estimation.vision.tags import Picture, Sighting, TagReader
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import TruckError
-from monstertruckd.tools.stand.tracking import RobotPose, StandTracker
+from monstertruck_schemas.board import Colour
+from monstertruckd.tools.stand.poses import RobotPose
+from monstertruckd.tools.stand.tracking import StandTracker
 
 RETRY: Final = 1.0
 """Seconds after which a lost camera is tried again."""
 
 Stream = Callable[[], Iterator[Picture]]
+
+
+class StandReader:
+    """Reads one camera's pictures.
+
+    Args:
+        marks: tags that lie on the table.
+        colours: of robots' discs; empty: pictures may be grey.
+    """
+
+    def __init__(self, marks: Collection[int], colours: Collection[Colour]) -> None:
+        self._tags = TagReader(still=marks)
+        self._blobs = BlobReader(colours) if colours else None
+
+    def read(self, picture: Picture) -> list[Sighting | Blob]:
+        """Tags and discs in a picture, grey or blue, green and red."""
+        grey = picture if picture.ndim == 2 else np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
+        found: list[Sighting | Blob] = list(self._tags.read(grey))
+        if self._blobs is not None and picture.ndim == 3:
+            found += self._blobs.read(picture)
+        return found
 
 
 class StandRun:
@@ -28,6 +55,7 @@ class StandRun:
         put: gets every pose.
         say: gets what is wrong with a camera.
         live: a source that ends is a fault, and tried again.
+        colours: of robots' discs; pictures have to be in colour for any.
     """
 
     def __init__(
@@ -40,6 +68,7 @@ class StandRun:
         say: Callable[[str], object],
         *,
         live: bool,
+        colours: Collection[Colour] = (),
     ) -> None:
         self._tracker = tracker
         self._streams = streams
@@ -48,7 +77,8 @@ class StandRun:
         self._put = put
         self._say = say
         self._live = live
-        self._newest: dict[str, tuple[int, list[Sighting]]] = {}
+        self._colours = colours
+        self._newest: dict[str, tuple[int, list[Sighting | Blob]]] = {}
         self._ended = threading.Event()
 
     async def run(self) -> None:
@@ -61,7 +91,7 @@ class StandRun:
     async def _play(self) -> None:
         """Recorded pictures: the first ones of all cameras are of one instant, and so on."""
         iterators = {name: stream() for name, stream in self._streams.items()}
-        readers = {name: TagReader(still=self._tracker.marks) for name in iterators}
+        readers = {name: StandReader(self._tracker.marks, self._colours) for name in iterators}
         began, count = self._clock.now(), 0
         while iterators:
             seen = {}
@@ -106,7 +136,7 @@ class StandRun:
         """One camera, in a thread of its own: OpenCV gives the interpreter free while it works."""
         said = ""
         while not self._ended.is_set():
-            reader = TagReader(still=self._tracker.marks)
+            reader = StandReader(self._tracker.marks, self._colours)
             try:
                 for picture in stream():
                     at = self._clock.now()

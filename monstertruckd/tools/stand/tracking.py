@@ -1,34 +1,33 @@
 """From tags in several cameras' pictures to the poses of robots, without jumps where one camera hands over to the next.
 
 Each camera that sees a robot's tag gives a pose on the plane of the tag; they are averaged with weights that fall to
-nothing towards a picture's border, so that a robot leaves a camera's view gradually. Who is who the tags say. A pose
+nothing towards a picture's border, so that a robot leaves a camera's view gradually. Who is who the tags say, or where
+robots with coloured discs came from. A pose
 that no robot can have reached is left out, until it is seen again and again; so is what a camera sees that has moved.
 """
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 
+from monstertruck_estimation.vision.blobs import Blob
 from monstertruck_estimation.vision.tags import EVERYWHERE, Sighting
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND
 from monstertruckd.tools.stand.camera import PlacedCamera
-from monstertruckd.tools.stand.config import MarkConfig, TaggedRobot
+from monstertruckd.tools.stand.config import BlobRobot, MarkConfig, TaggedRobot
+from monstertruckd.tools.stand.identities import Identities
+from monstertruckd.tools.stand.poses import MarkerPose, RobotPose, merged, robot_pose, tag_pose
 
-FADE: Final = 0.12
-"""Of a picture's height: nearer to its border a sighting counts less."""
-LEAST_WEIGHT: Final = 1e-3
 FASTEST: Final = 3.0
 """m/s: robots are not faster;"""
 SLACK: Final = 0.05
 """and this much, m, is no jump."""
 STUBBORN: Final = 5
 """Pictures after which an impossible pose is believed."""
-PIXEL: Final = 0.2
-"""Standard deviation of a corner, pixels."""
 BUMPED: Final = 0.005
 """m: marks of a camera that are shifted, turned or scaled by this much, rms over the marks: the camera has moved."""
 BUMP_TIME: Final = 3.0
@@ -39,69 +38,6 @@ BLIND_PICTURES: Final = 2 * EVERYWHERE
 """so many pictures, in two of which at least marks were looked for: it looks elsewhere."""
 SILENT: Final = 1.0
 """Seconds without a picture after which a camera counts as lost."""
-
-
-class TagPose(NamedTuple):
-    """A tag on its plane, as one camera sees it."""
-
-    x: float
-    y: float
-    yaw: float
-    """Of the direction in which its printed upper edge lies from its middle, rad."""
-    weight: float
-    sigma: float
-    """Standard deviation of x and y, m."""
-    heading_sigma: float
-
-
-class RobotPose(NamedTuple):
-    """A robot on the stand."""
-
-    robot: str
-    stamp: int
-    x: float
-    y: float
-    yaw: float
-    sigma: float
-    heading_sigma: float
-    cameras: tuple[str, ...]
-
-
-def tag_pose(camera: PlacedCamera, sighting: Sighting, height: float) -> TagPose:
-    """Where a level tag is.
-
-    The tag's x axis is the direction in which its printed upper edge lies, as a robot's front.
-    """
-    points = camera.on_plane(sighting.corners, height)
-    middle = points.mean(axis=0)
-    up = (points[0] + points[1]) - (points[2] + points[3])
-    right = (points[1] + points[2]) - (points[0] + points[3])
-    ahead = up + np.array((-right[1], right[0]))
-    side = float(np.hypot(*(points - np.roll(points, 1, axis=0)).T).mean())
-    per_pixel = side / max(sighting.size, 1.0)
-    weight = min(max(camera.border(sighting.corners) / FADE, 0.0), 1.0) + LEAST_WEIGHT
-    sigma = PIXEL * per_pixel
-    return TagPose(
-        float(middle[0]),
-        float(middle[1]),
-        math.atan2(ahead[1], ahead[0]),
-        weight,
-        sigma / 2,
-        sigma / side,
-    )
-
-
-def merged(poses: Sequence[TagPose]) -> TagPose:
-    """Weighted mean of what several cameras see of one tag."""
-    weights = np.array([pose.weight for pose in poses])
-    weights /= weights.sum()
-    x, y = (float(weights @ [getattr(pose, axis) for pose in poses]) for axis in ("x", "y"))
-    yaw = math.atan2(weights @ [math.sin(p.yaw) for p in poses], weights @ [math.cos(p.yaw) for p in poses])
-    sigma, turn = (
-        math.sqrt(float(weights**2 @ [getattr(pose, name) ** 2 for pose in poses]))
-        for name in ("sigma", "heading_sigma")
-    )
-    return TagPose(x, y, yaw, float(max(pose.weight for pose in poses)), sigma, turn)
 
 
 @dataclass(slots=True)
@@ -132,7 +68,7 @@ class CameraState:
 
 
 def shift_of(seen: Array, places: Array) -> Array:
-    """What is common to marks that are not in their places, (4,): to x, to y, by a turn and by a scale, m rms over them.
+    """What is common to marks that are off their places, (4,): to x, to y, by a turn and by a scale, m rms over them.
 
     Errors of the ruler are not common to them.
 
@@ -153,9 +89,10 @@ class StandTracker:
 
     Args:
         cameras: placed.
-        robots: by name.
+        robots: with tags, by name.
         marks: tags on the table, by number.
         now: stamp of the begin, ns.
+        blobs: robots with coloured discs, by name.
     """
 
     def __init__(
@@ -164,38 +101,48 @@ class StandTracker:
         robots: Mapping[str, TaggedRobot],
         marks: Mapping[int, MarkConfig],
         now: int = 0,
+        blobs: Mapping[str, BlobRobot] | None = None,
     ) -> None:
         self._cameras = cameras
-        self._robots = {robot.tag: (name, robot) for name, robot in robots.items()}
+        self._robots = robots
+        self._tagged = {robot.tag: (name, robot) for name, robot in robots.items()}
+        self._blobs = blobs or {}
+        self._identities = Identities(self._blobs)
         self.marks = marks
         self._known: dict[str, _Known] = {}
         self.cameras = {name: CameraState(now, now) for name in cameras}
         self.left_out = 0
         """Impossible poses."""
 
-    def take(self, stamp: int, pictures: Mapping[str, Sequence[Sighting]]) -> list[RobotPose]:
-        """Poses at ``stamp``, ns, from the tags in the cameras' pictures of that instant."""
-        seen: dict[int, list[tuple[str, TagPose]]] = {}
-        for name, sightings in pictures.items():
-            self._watch(name, stamp, sightings)
-            if self.cameras[name].moved:
+    def take(self, stamp: int, pictures: Mapping[str, Sequence[Sighting | Blob]]) -> list[RobotPose]:
+        """Poses at ``stamp``, ns, from the tags and discs in the cameras' pictures of that instant."""
+        seen: dict[str, list[tuple[str, MarkerPose]]] = {}
+        for camera, found in pictures.items():
+            sightings = [one for one in found if isinstance(one, Sighting)]
+            self._watch(camera, stamp, sightings)
+            if self.cameras[camera].moved:
                 continue
+            placed = self._cameras[camera]
             for sighting in sightings:
-                if (entry := self._robots.get(sighting.tag)) is not None:
-                    pose = tag_pose(self._cameras[name], sighting, entry[1].height)
-                    seen.setdefault(sighting.tag, []).append((name, pose))
+                if (entry := self._tagged.get(sighting.tag)) is not None:
+                    seen.setdefault(entry[0], []).append((camera, tag_pose(placed, sighting, entry[1].height)))
+            discs = [one for one in found if isinstance(one, Blob)]
+            for name, pose in self._identities.seen(stamp, placed, discs):
+                seen.setdefault(name, []).append((camera, pose))
         poses = []
-        for tag, found in seen.items():
-            name, robot = self._robots[tag]
-            whole = merged([pose for _, pose in found])
-            where = _robot_pose(name, robot, stamp, whole, tuple(camera for camera, _ in found))
+        for name, places in seen.items():
+            whole = merged([pose for _, pose in places])
+            if name in self._blobs:
+                self._identities.learn(stamp, name, whole)
+            robot = self._blobs.get(name) or self._robots[name]
+            where = robot_pose(name, robot, stamp, whole, tuple(camera for camera, _ in places))
             if self._believed(where):
                 poses.append(where)
         return poses
 
     def complaints(self, now: int) -> list[str]:
-        """What is newly wrong with cameras, or right again."""
-        said = []
+        """What is newly wrong with cameras, or right again, and robots that are not told from each other."""
+        said = self._identities.complaints()
         for name, state in self.cameras.items():
             lost = now - state.heard > SILENT * SECOND
             if lost != state.lost:
@@ -246,10 +193,3 @@ class StandTracker:
         places = np.array([(self.marks[s.tag].x, self.marks[s.tag].y) for s in seen])
         share = 1.0 - math.exp(-min(max(seconds, 0.0), 1.0) / BUMP_TIME)
         state.off = state.off + share * (shift_of(points, places) - state.off)
-
-
-def _robot_pose(name: str, robot: TaggedRobot, stamp: int, tag: TagPose, cameras: tuple[str, ...]) -> RobotPose:
-    yaw = math.remainder(tag.yaw - robot.yaw, math.tau)
-    c, s = math.cos(yaw), math.sin(yaw)
-    x, y = tag.x - c * robot.x + s * robot.y, tag.y - s * robot.x - c * robot.y
-    return RobotPose(name, stamp, x, y, yaw, tag.sigma, tag.heading_sigma, cameras)

@@ -19,7 +19,8 @@ from monstertruckd.tools.cli.main import app
 from monstertruckd.tools.stand import calibration
 from monstertruckd.tools.stand.calibration import calibrate, place, save
 from monstertruckd.tools.stand.config import MarkConfig, OverheadConfig, TaggedRobot
-from monstertruckd.tools.stand.tracking import StandTracker, TagPose, merged, shift_of, tag_pose
+from monstertruckd.tools.stand.poses import MarkerPose, merged, tag_pose
+from monstertruckd.tools.stand.tracking import StandTracker, shift_of
 from tests.stand_kit import simulated, turned
 from tests.stand_render import level_tag
 
@@ -66,7 +67,7 @@ def test_cameras_agree_where_both_see_a_robot(stand):
 
 
 def test_a_robot_near_a_border_counts_less():
-    sure, faint = TagPose(0.0, 0.0, 3.1, 1.0, 0.001, 0.01), TagPose(0.1, 0.0, -3.1, 0.001, 0.001, 0.01)
+    sure, faint = MarkerPose(0.0, 0.0, 3.1, 1.0, 0.001, 0.01), MarkerPose(0.1, 0.0, -3.1, 0.001, 0.001, 0.01)
     assert merged([sure, faint]).x < 0.001
     assert abs(merged([sure, sure._replace(yaw=-3.1)]).yaw) > 3.1, "headings are averaged across the turn"
 
@@ -137,8 +138,8 @@ def test_errors_of_the_ruler_do_not_look_like_a_camera_that_has_moved():
     places = np.array([(x, y) for x in (-0.5, 0.0, 0.5) for y in (-0.5, 0.5)])
     ruler = np.array([(1, 0), (-1, 0), (0, 0), (0, 0), (-1, 0), (1, 0)])
     assert np.abs(shift_of(places + 0.01 * ruler, places)).max() < 1e-9
-    assert shift_of(places + (0.01, 0.0), places) == pytest.approx((0.01, 0, 0, 0))
-    assert shift_of(places[:1] + (0.0, 0.01), places[:1]) == pytest.approx((0, 0.01, 0, 0))
+    assert shift_of(places + np.array((0.01, 0.0)), places) == pytest.approx((0.01, 0, 0, 0))
+    assert shift_of(places[:1] + np.array((0.0, 0.01)), places[:1]) == pytest.approx((0, 0.01, 0, 0))
     assert shift_of(1.01 * places, places)[3] == pytest.approx(0.01 * math.hypot(0.5, 0.5 * math.sqrt(2 / 3)))
 
 

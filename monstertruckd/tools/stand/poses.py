@@ -1,0 +1,95 @@
+"""Poses of markers in one picture, and of robots by several: tags, and pairs of coloured discs."""
+
+import math
+from collections.abc import Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from monstertruck_estimation.vision.tags import Sighting
+from monstertruck_kinematics.elementary import Array
+from monstertruckd.tools.stand.camera import PlacedCamera
+from monstertruckd.tools.stand.config import BlobRobot, TaggedRobot
+
+FADE: Final = 0.12
+"""Of a picture's height: nearer to its border a sighting counts less."""
+LEAST_WEIGHT: Final = 1e-3
+PIXEL: Final = 0.2
+"""Standard deviation of a corner, pixels."""
+
+
+class MarkerPose(NamedTuple):
+    """A tag, or a pair of discs, on its plane, as one camera sees it."""
+
+    x: float
+    y: float
+    yaw: float
+    """Of the direction in which a tag's printed upper edge, or the front disc, lies from the middle, rad."""
+    weight: float
+    sigma: float
+    """Standard deviation of x and y, m."""
+    heading_sigma: float
+
+
+class RobotPose(NamedTuple):
+    """A robot on the stand."""
+
+    robot: str
+    stamp: int
+    x: float
+    y: float
+    yaw: float
+    sigma: float
+    heading_sigma: float
+    cameras: tuple[str, ...]
+
+
+def tag_pose(camera: PlacedCamera, sighting: Sighting, height: float) -> MarkerPose:
+    """Where a level tag is.
+
+    The tag's x axis is the direction in which its printed upper edge lies, as a robot's front.
+    """
+    points = camera.on_plane(sighting.corners, height)
+    middle = points.mean(axis=0)
+    up = (points[0] + points[1]) - (points[2] + points[3])
+    right = (points[1] + points[2]) - (points[0] + points[3])
+    ahead = up + np.array((-right[1], right[0]))
+    side = float(np.hypot(*(points - np.roll(points, 1, axis=0)).T).mean())
+    per_pixel = side / max(sighting.size, 1.0)
+    sigma = PIXEL * per_pixel
+    return MarkerPose(
+        float(middle[0]),
+        float(middle[1]),
+        math.atan2(ahead[1], ahead[0]),
+        weight_of(camera, sighting.corners),
+        sigma / 2,
+        sigma / side,
+    )
+
+
+def weight_of(camera: PlacedCamera, pixels: Array) -> float:
+    """Of what lies at these pixels, (n, 2): 1, and less near the picture's border."""
+    return min(max(camera.border(pixels) / FADE, 0.0), 1.0) + LEAST_WEIGHT
+
+
+def merged(poses: Sequence[MarkerPose]) -> MarkerPose:
+    """Weighted mean of what several cameras see of one marker."""
+    weights = np.array([pose.weight for pose in poses])
+    weights /= weights.sum()
+    x, y = (float(weights @ [getattr(pose, axis) for pose in poses]) for axis in ("x", "y"))
+    yaw = math.atan2(weights @ [math.sin(p.yaw) for p in poses], weights @ [math.cos(p.yaw) for p in poses])
+    sigma, turn = (
+        math.sqrt(float(weights**2 @ [getattr(pose, name) ** 2 for pose in poses]))
+        for name in ("sigma", "heading_sigma")
+    )
+    return MarkerPose(x, y, yaw, float(max(pose.weight for pose in poses)), sigma, turn)
+
+
+def robot_pose(
+    name: str, robot: TaggedRobot | BlobRobot, stamp: int, tag: MarkerPose, cameras: tuple[str, ...]
+) -> RobotPose:
+    """Of a robot from its marker."""
+    yaw = math.remainder(tag.yaw - robot.yaw, math.tau)
+    c, s = math.cos(yaw), math.sin(yaw)
+    x, y = tag.x - c * robot.x + s * robot.y, tag.y - s * robot.x - c * robot.y
+    return RobotPose(name, stamp, x, y, yaw, tag.sigma, tag.heading_sigma, cameras)

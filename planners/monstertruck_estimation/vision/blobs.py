@@ -1,0 +1,80 @@
+"""Coloured discs in a picture: pixels of a hue, those that touch each other joined, and their middle.
+
+So SwisTrack finds robots (Lochmatter et al., "SwisTrack", IROS 2008).
+"""
+
+from collections.abc import Collection
+from typing import Final, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_kinematics.elementary import Array
+from monstertruck_schemas.board import Colour
+
+ColourPicture = NDArray[np.uint8]
+"""Blue, green and red, (height, width, 3)."""
+
+HUES: Final[dict[Colour, tuple[int, int]]] = {
+    "red": (166, 12),
+    "yellow": (18, 42),
+    "green": (46, 80),
+    "blue": (96, 132),
+    "magenta": (138, 162),
+}
+"""First and last hue of each, in OpenCV's half degrees; red passes 180."""
+SATURATED: Final = 90
+"""Of 255, at least: tables and floors are less."""
+BRIGHT: Final = 30
+"""Of 255, at least: in the dark every hue is noise."""
+LEAST: Final = 12
+"""Pixels of a disc."""
+MOST: Final = 0.02
+"""Share of the picture: more is no disc."""
+ROUND: Final = 1.8
+"""Longer side of a disc's box over its shorter one, at most."""
+
+
+class Blob(NamedTuple):
+    """A disc in a picture."""
+
+    colour: Colour
+    middle: Array
+    """(2,), pixels."""
+    pixels: int
+
+
+class BlobReader:
+    """Reads the discs of one camera's pictures.
+
+    Args:
+        colours: that are looked for.
+    """
+
+    def __init__(self, colours: Collection[Colour]) -> None:
+        self._colours = sorted(colours)
+
+    def read(self, picture: ColourPicture) -> list[Blob]:
+        """Discs of a picture; those that its border cuts are left out."""
+        hsv = cv2.cvtColor(picture, cv2.COLOR_BGR2HSV)
+        height, width = picture.shape[:2]
+        found: list[Blob] = []
+        for colour in self._colours:
+            count, _, boxes, middles = cv2.connectedComponentsWithStats(_of_hue(hsv, *HUES[colour]))
+            for k in range(1, count):
+                x, y, wide, high, pixels = (int(v) for v in boxes[k])
+                if not LEAST <= pixels <= MOST * width * height or max(wide, high) > ROUND * min(wide, high):
+                    continue
+                if x > 0 and y > 0 and x + wide < width and y + high < height:
+                    found.append(Blob(colour, np.asarray(middles[k], dtype=np.float64), pixels))
+        return found
+
+
+def _of_hue(hsv: ColourPicture, first: int, last: int) -> NDArray[np.uint8]:
+    def between(low: int, high: int) -> NDArray[np.uint8]:
+        return np.asarray(
+            cv2.inRange(hsv, np.array((low, SATURATED, BRIGHT)), np.array((high, 255, 255))), dtype=np.uint8
+        )
+
+    return between(first, last) if first <= last else between(first, 179) | between(0, last)
