@@ -129,7 +129,7 @@ class OverheadConfig(Schema):
         return frozenset(colour for robot in self.blobs.values() for colour in robot.colours)
 
     @model_validator(mode="after")
-    def _told_apart(self) -> Self:
+    def _distinct(self) -> Self:
         if not self.names:
             raise ValueError("robots and blobs are empty: expected a robot")
         if both := sorted(self.robots.keys() & self.blobs.keys()):

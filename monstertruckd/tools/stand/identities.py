@@ -26,7 +26,7 @@ NEAR: Final = 0.06
 SWERVE: Final = 1.0
 """and this much more for each second since it was seen, m/s."""
 AT_START: Final = 0.15
-"""m from its start at which a robot is known that cannot be told from others."""
+"""m from its start at which a robot is known that cannot be distinguished from others."""
 UNSURE: Final = 0.5
 """Seconds out of sight after which robots that look alike may be mistaken for each other."""
 MIDDLE: Final = 0.1
@@ -110,7 +110,7 @@ class Identities:
             track.stamp, track.place = stamp, place
 
     def complaints(self) -> list[str]:
-        """Robots that are newly not told from each other."""
+        """Robots that are newly not distinguished."""
         new = sorted(self._mistakable - self._said)
         self._said |= self._mistakable
         if not new:

@@ -141,7 +141,7 @@ class StandTracker:
         return poses
 
     def complaints(self, now: int) -> list[str]:
-        """What is newly wrong with cameras, or right again, and robots that are not told from each other."""
+        """What is newly wrong with cameras, or right again, and robots that are not distinguished."""
         said = self._identities.complaints()
         for name, state in self.cameras.items():
             lost = now - state.heard > SILENT * SECOND

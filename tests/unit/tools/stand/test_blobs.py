@@ -1,4 +1,4 @@
-"""Robots with coloured discs: found in pictures, told from each other, and not guessed at."""
+"""Robots with coloured discs: found in pictures, distinguished, and not guessed at."""
 
 import itertools
 import math
@@ -153,7 +153,7 @@ ROBOT = "{ front: red, rear: blue, apart: 0.1 }"
         (f"blobs: {{ a: {ROBOT}, b: {{ front: blue, rear: red, apart: 0.1 }} }}", "blobs.a has the colours of b"),
     ],
 )
-def test_robots_that_cannot_be_told_apart_are_refused(tmp_path, robots, said):
+def test_robots_that_cannot_be_distinguished_are_refused(tmp_path, robots, said):
     file = tmp_path / "stand.yaml"
     camera = "cameras: { c1: { source: { kind: file, path: film }, boards: b, floor: f } }"
     file.write_text(f"version: 2\n{camera}\nmarks: {{ 100: {{ x: 0.0, y: 0.0 }} }}\n{robots}\n")
