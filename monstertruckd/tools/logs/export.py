@@ -5,13 +5,17 @@ the stamps inside them needs log times and stamps of one clock.
 """
 
 import csv
+import errno
 import json
+import os
 import shutil
-from collections.abc import Callable, Iterator
+import zipfile
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from enum import Enum
+from functools import cache
 from pathlib import Path
-from typing import Any, Final, TypeVar, get_args
+from typing import Any, Final, TypeVar, get_args, get_type_hints
 
 import numpy as np
 from mcap.records import Attachment, Header, Metadata
@@ -21,7 +25,7 @@ from pydantic import BaseModel
 
 from monstertruck_runtime import wire
 from monstertruck_runtime.errors import InputError
-from monstertruck_schemas.base import Schema
+from monstertruck_schemas.base import Nanoseconds, Schema
 from monstertruck_schemas.state import ClockOffset
 from monstertruck_schemas.topics import BY_NAME
 from monstertruckd.recorder.log_file import TIMES, Channels
@@ -105,9 +109,16 @@ def export_npz(
             arrays: dict[str, NDArray[Any]] = {}
             for name, values in table.items():
                 arrays |= _column(name, values)
-            with place(topic).open("wb") as file:
-                np.savez_compressed(file, allow_pickle=False, **arrays)
+            _write_npz(place(topic), arrays)
     return files
+
+
+def _write_npz(file: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Write arrays by any names: numpy's own function takes none called ``file``, which journal records have."""
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, array in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, array, allow_pickle=False)
 
 
 @contextmanager
@@ -117,12 +128,14 @@ def _tables(directory: Path, suffix: str, files: dict[str, Path]) -> Iterator[Ca
 
         def place(topic: str) -> Path:
             files[topic] = directory / f"{_stem(topic)}{suffix}"
+            if files[topic].is_dir():
+                raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(files[topic]))
             parts.append(files[topic].with_name(files[topic].name + ".part"))
             return parts[-1]
 
         yield place
-    for part, file in zip(parts, files.values(), strict=True):
-        part.replace(file)
+        for part, file in zip(parts, files.values(), strict=True):
+            part.replace(file)
 
 
 def _folder(directory: str | Path) -> Path:
@@ -210,8 +223,16 @@ def _column(name: str, values: list[Any]) -> dict[str, NDArray[Any]]:
 
 S = TypeVar("S", bound=Schema)
 
-_TIME_FIELDS: Final = {"stamp", "received", "since", "gate_stamp"}
-"""Fields with daemon time, in messages and nested records."""
+_DIFFERENCES: Final = {"offset", "stepped"}
+"""Fields in ns that are no instants."""
+
+
+@cache
+def _instants(model: type[Schema]) -> frozenset[str]:
+    """Fields of a message or nested record that hold daemon time."""
+    hints = get_type_hints(model, include_extras=True)
+    fields = {name for name, hint in hints.items() if Nanoseconds in (hint, *get_args(hint))}
+    return frozenset(fields - _DIFFERENCES)
 
 
 def export_mcap(
@@ -220,7 +241,7 @@ def export_mcap(
     """Write the selected messages to a new file with log times, stamps and headers in UNIX time.
 
     Returns:
-        The file by topic.
+        The file by topic; it is not made if no message is selected.
 
     Raises:
         NotFoundError: no such log.
@@ -243,6 +264,8 @@ def export_mcap(
                 at, stamp = entry.log_time + offset, max(0, message.stamp + offset)
                 writer.add_message(channels.of(topic), at, payload, stamp, entry.sequence)
             writer.finish()  # type: ignore[no-untyped-call]
+        if not topics:
+            file.unlink()
     except FileExistsError:
         msg = f"{file}: is there already"
         raise InputError(msg) from None
@@ -257,7 +280,7 @@ def in_unix_time(record: S, offset: int) -> S:
     changes: dict[str, Any] = {}
     for name in type(record).model_fields:
         value = getattr(record, name)
-        if name in _TIME_FIELDS and value is not None:
+        if name in _instants(type(record)) and value is not None:
             changes[name] = value + offset
         elif isinstance(value, Schema):
             changes[name] = in_unix_time(value, offset)

@@ -6,6 +6,7 @@ Stamps are real time. Frames and units are those of REP 103 and 105 already.
 
 import json
 import math
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
@@ -43,7 +44,7 @@ def export_ros2(
     """Write a ROS 2 bag (MCAP storage, CDR).
 
     Returns:
-        The bag by topic of the log.
+        The bag by topic of the log; it is not made if no message is selected.
 
     Raises:
         NotFoundError: no such log.
@@ -70,6 +71,8 @@ def export_ros2(
                     connections[name] = bag.add_connection(name, kind, typestore=_STORE, offered_qos_profiles=qos)
                     topics[entry.topic] = directory
                 bag.write(connections[name], max(0, entry.log_time + offset), _STORE.serialize_cdr(ros, kind))
+        if not topics:
+            shutil.rmtree(directory)
     except WriterError as error:
         msg = f"{directory}: no bag can be made there: {error}"
         raise InputError(msg) from error

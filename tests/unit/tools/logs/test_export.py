@@ -14,13 +14,14 @@ from rosbags.interfaces import QosDurability
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError, NotFoundError
 from monstertruck_schemas import topics as t
-from monstertruck_schemas.base import Pose2D
+from monstertruck_schemas.base import Pose2D, Twist2D
+from monstertruck_schemas.event import LogLevel, LogRecord
 from monstertruck_schemas.health import HealthTable, ServiceHealth, ServiceState
 from monstertruck_schemas.plan import Path as TruckPath
 from monstertruck_schemas.sensor import Battery, BatteryLevel, CompressedImage
-from monstertruck_schemas.state import Grid, Transform, Transforms
+from monstertruck_schemas.state import ClockOffset, Grid, Peer, Peers, Transform, Transforms
 from monstertruckd.recorder.reader import open_log
-from monstertruckd.tools.logs.export import export_csv, export_mcap, export_npz
+from monstertruckd.tools.logs.export import export_csv, export_mcap, export_npz, in_unix_time
 from monstertruckd.tools.logs.messages import Selection, real_offset, utc
 from monstertruckd.tools.logs.ros2 import export_ros2
 from tests.unit.recorder.conftest import scan
@@ -125,6 +126,30 @@ def test_pictures_become_files(log, tmp_path, export):
     assert f"sensor_camera/{pictures[0].name}".encode() in files["sensor/camera"].read_bytes() or export is export_npz
 
 
+def test_the_journal_whose_column_is_called_file_has_a_table_too(tmp_path):
+    writer = Writer(tmp_path / "run.mcap")
+    line = LogRecord(stamp=SECOND, received=SECOND, seq=0, level=LogLevel.INFO, name="gate", text="up", file="gate.py")
+    writer.put(t.LOG, line)
+    writer.log.finish()
+    with np.load(export_npz(tmp_path / "run.mcap", tmp_path / "out")["event/log"], allow_pickle=False) as table:
+        assert (table["file"].tolist(), table["stamp"].tolist()) == (["gate.py"], [SECOND])
+
+
+@pytest.mark.parametrize("export", [export_csv, export_npz])
+def test_a_table_that_cannot_get_its_name_leaves_nothing_behind(log, tmp_path, export):
+    ending = "csv" if export is export_csv else "npz"
+    (tmp_path / f"out/state_gate.{ending}").mkdir(parents=True)
+    with pytest.raises(IsADirectoryError, match=rf"state_gate\.{ending}'"):
+        export(log, tmp_path / "out", Selection(("state/odometry", "state/gate")))
+    assert [path.name for path in (tmp_path / "out").iterdir()] == [f"state_gate.{ending}"]
+
+
+@pytest.mark.parametrize("export", [export_mcap, export_ros2])
+def test_a_part_without_messages_leaves_the_name_free(log, tmp_path, export):
+    assert export(log, tmp_path / "out", Selection(start=1000.0)) == {}
+    assert export(log, tmp_path / "out", Selection(("state/gate",))).keys() == {"state/gate"}
+
+
 def test_selection_by_topic_and_time(log, tmp_path):
     seen = []
     chosen = Selection(("state/odometry", "state/gate"), start=0.2, end=0.5)
@@ -222,6 +247,14 @@ def test_dated_log_shows_dates_in_stock_readers(log, tmp_path):
             first = decoded if channel.topic == "state/odometry" else decoded.transforms[0]
             assert abs(first.timestamp.seconds * SECOND + first.timestamp.nanos - message.log_time) < 10
         assert [a.name for a in reader.iter_attachments()] == ["config.json"]
+
+
+def test_every_instant_in_a_message_is_dated():
+    peer = Peer(robot="digger", pose=Pose2D(x=0.0, y=0.0, yaw=0.0), twist=Twist2D(vx=0.0, vy=0.0, wz=0.0), heard=7)
+    dated = in_unix_time(Peers(stamp=9, received=9, seq=0, peers=(peer,)), MAY_2026)
+    assert (dated.stamp, dated.received, dated.peers[0].heard) == (MAY_2026 + 9, MAY_2026 + 9, MAY_2026 + 7)
+    stepped = ClockOffset(stamp=9, received=9, seq=0, offset=MAY_2026 + 5, stepped=3)
+    assert (in_unix_time(stepped, MAY_2026).offset, in_unix_time(stepped, MAY_2026).stepped) == (5, 3)
 
 
 def test_dated_log_is_a_log_like_any_other(log, tmp_path):
