@@ -5,10 +5,12 @@ synced and then renamed, so that after any crash the newest one is whole. No fil
 writes a newer file with the older value.
 """
 
+import fcntl
 import os
 import re
 import threading
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, TypeVar
 
@@ -220,7 +222,7 @@ class CalibrationStore:
             return []
         except OSError as error:
             raise ConfigError(f"{self.folder}: calibration cannot be read: {error.strerror}") from error
-        return sorted(names, key=_number)
+        return sorted(names, key=lambda path: (_number(path), path.name))
 
     def newest(self) -> Path | None:
         """The file that counts."""
@@ -262,7 +264,7 @@ class CalibrationStore:
         Raises:
             ConfigError: the newest file is damaged, or the new one cannot be written; nothing has changed then.
         """
-        with self._writing:
+        with self._alone():
             current = self.current()
             before = current.results.get(result.wizard) if current is not None else None
             saved = result.over(before, utc(real_ns))
@@ -277,13 +279,32 @@ class CalibrationStore:
             NotFoundError: this wizard has never changed anything.
             ConfigError: see ``save``.
         """
-        with self._writing:
+        with self._alone():
             history = [self.load(path).results.get(wizard) for path in reversed(self.files())]
             if all(result is None for result in history):
                 raise NotFoundError(f"{self.folder}: {wizard} was never calibrated, there is nothing to undo")
             before = next((result for result in history if result != history[0]), None)
             change = f"{wizard} as it was " + ("before any calibration" if before is None else f"on {before.date}")
             return self._write({wizard: before}, change, real_ns)
+
+    @contextmanager
+    def _alone(self) -> Iterator[None]:
+        """Keep other writers out, in this process and in others, from the reading of the newest file to the next one.
+
+        Raises:
+            ConfigError: the folder cannot be made or opened.
+        """
+        with self._writing:
+            try:
+                self.folder.mkdir(parents=True, exist_ok=True)
+                folder = os.open(self.folder, os.O_RDONLY | os.O_DIRECTORY)
+            except OSError as error:
+                raise ConfigError(f"{self.folder}: calibration cannot be written: {error.strerror}") from error
+            try:
+                fcntl.flock(folder, fcntl.LOCK_EX)
+                yield
+            finally:
+                os.close(folder)
 
     def _write(self, changed: dict[WizardName, Result | None], change: str, real_ns: int) -> Path:
         current = self.current()
@@ -305,7 +326,6 @@ class CalibrationStore:
         return path
 
     def _put(self, path: Path, data: bytes) -> None:
-        self.folder.mkdir(parents=True, exist_ok=True)
         draft = path.with_suffix(".new")
         with draft.open("wb") as file:
             file.write(data)

@@ -278,24 +278,34 @@ def _named(value: Any, robot: str) -> Any:
 
 
 def _load(path: Path, including: tuple[Path, ...], inherited: int | None) -> Tree:
+    own, text = Tree({}), YamlText.read(path)
     if path.resolve() in including:
         raise ConfigError(f"{path}: includes itself through {' > '.join(map(str, including))}")
-    own, text = Tree({}), YamlText.read(path)
     version = bring_up_to_date(text, inherited)
     if text.root is not None:
         own.data = _build(text.root, _Builder(path, own.origins), ())
     return _with_includes(own, path, including, version)
 
 
+def included(path: Path, name: str) -> Path:
+    """File that ``name`` means in the file ``path``: relative to its folder, behind a link where that leads.
+
+    Without ``..`` in it, where that means the same: not behind a link to a folder.
+    """
+    joined = path.parent / name
+    short = Path(os.path.normpath(joined))
+    return short if os.path.realpath(short) == os.path.realpath(joined) else joined
+
+
 def _with_includes(own: Tree, path: Path, including: tuple[Path, ...], version: int | None) -> Tree:
-    included = own.data.pop("include", [])
+    given = own.data.pop("include", [])
     where = own.origins.get(("include",))
-    names = [included] if isinstance(included, str) else included
+    names = [given] if isinstance(given, str) else given
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise ConfigError(f"{where}: include: expected a file name or a list of file names")
     merged = Tree({}, files=[path.resolve()])
     for name in names:
-        target = Path(os.path.normpath(path.parent / name))
+        target = included(path, name)
         if not target.is_file():
             raise ConfigError(f"{where}: include: no such file: {target}")
         tree = _load(target, (*including, path.resolve()), version)

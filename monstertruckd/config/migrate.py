@@ -13,7 +13,7 @@ from ruamel.yaml.nodes import Node, ScalarNode, SequenceNode
 
 from monstertruck_runtime.errors import ConfigError, InputError
 from monstertruck_runtime.small_files import replace_file
-from monstertruckd.config.load import STEPS, VERSION, Step, YamlText, run_steps
+from monstertruckd.config.load import STEPS, VERSION, Step, YamlText, included, run_steps
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,15 +56,15 @@ def _visit(
     upgrades: dict[Path, Upgrade],
     including: tuple[Path, ...],
 ) -> None:
+    text = YamlText.read(path)
     place = path.resolve()
     if place in including:
         raise ConfigError(f"{path}: includes itself through {' > '.join(map(str, including))}")
     if place in upgrades:
         return
-    text = YamlText.read(path)
     before, version = text.text, _version(text, inherited, target)
     for name in _includes(text):
-        _visit(path.parent / name, version, steps, target, upgrades, (*including, place))
+        _visit(included(path, name), version, steps, target, upgrades, (*including, place))
     run_steps(text, version, steps, target)
     upgrades[place] = Upgrade(path, version, before, text.text)
 

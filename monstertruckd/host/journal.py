@@ -61,11 +61,15 @@ class Journal(logging.Handler):
         self._hop: ThreadHop[_Line] = ThreadHop(self._publish, DEPTH, on_loss, rank=lambda line: line.level)
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Queue the record; never waits."""
+        """Queue the record; never waits, and complains of a wrong log call as every handler does."""
         here = threading.get_ident() == self._loop_thread
         if (here and self._publishing) or (self._reproducible and not here):
             return
-        text = shown(self.format(record))
+        try:
+            text = shown(self.format(record))
+        except Exception:  # whatever formatting its arguments raises
+            self.handleError(record)
+            return
         name = Path(record.pathname).name
         self._hop.put(_Line(self._clock.now(), record.levelno, record.name, text, name, record.lineno))
 

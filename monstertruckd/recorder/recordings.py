@@ -8,7 +8,7 @@ import asyncio
 import base64
 import re
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -20,6 +20,7 @@ from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.roles import AccessRole
 from monstertruckd.bus.rpc import Rpc
+from monstertruckd.recorder.repair import in_use
 
 LIST: Final = "recordings"
 READ: Final = "recording_read"
@@ -47,7 +48,7 @@ class Recording:
     kind: str
     """``run``, or ``blackbox``: the minute before a stop."""
     open: bool
-    """It is being written."""
+    """It is being written: by this daemon, or by another one or a repair that has it locked."""
 
 
 class Recordings:
@@ -108,7 +109,7 @@ class Recordings:
         return found
 
     async def _list(self, _: dict[str, Any]) -> dict[str, Any]:
-        rows = await self._offload(lambda: [row for _, row in self._files()])
+        rows = await self._offload(lambda: [replace(row, open=_is_open(path, row)) for path, row in self._files()])
         rows.sort(key=lambda row: row.modified, reverse=True)
         return {"recordings": [asdict(row) for row in rows[:MOST]], "left_out": max(len(rows) - MOST, 0)}
 
@@ -144,7 +145,7 @@ class Recordings:
 
         def delete() -> Recording:
             path, row = self._find(payload)
-            if row.open:
+            if _is_open(path, row):
                 raise BusyError(f"recording {row.name}: it is being written")
             try:
                 path.unlink()
@@ -156,3 +157,10 @@ class Recordings:
         text = f"{row.name} ({row.bytes / 1e6:.1f} MB) deleted by {by}"
         self._events(Reason.RECORDING_DELETED, Severity.INFO, "recorder", text, name=row.name, by=by)
         return {"name": row.name, "bytes": row.bytes}
+
+
+def _is_open(path: Path, row: Recording) -> bool:
+    try:
+        return row.open or in_use(path)
+    except OSError:  # gone, or not ours to read
+        return False

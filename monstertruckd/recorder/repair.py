@@ -37,9 +37,9 @@ class Recovery:
 
 
 def in_use(path: Path) -> bool:
-    """Whether the file is locked by a recorder or a repair."""
+    """Whether the file is locked by a recorder or a repair; two who ask at once do not see each other."""
     with path.open("rb") as file:
-        return not _lock(file)
+        return not _lock(file, fcntl.LOCK_SH)
 
 
 def recover(source: str | Path, target: str | Path, stop: threading.Event | None = None) -> Recovery:
@@ -61,7 +61,7 @@ def recover(source: str | Path, target: str | Path, stop: threading.Event | None
     reader = LogReader(source)
     part = target.with_name(target.name + _PART)
     with source.open("rb") as original:
-        if not _lock(original):
+        if not _lock(original, fcntl.LOCK_EX):
             msg = f"{source}: is being written"
             raise InputError(msg)
         in_place = target.exists()
@@ -114,9 +114,9 @@ def _unfinished(path: Path) -> bool:
     return path.is_file() and not is_finished(path) and not in_use(path)
 
 
-def _lock(file: BinaryIO) -> bool:
+def _lock(file: BinaryIO, how: int) -> bool:
     try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(file, how | fcntl.LOCK_NB)
     except BlockingIOError:
         return False
     return True

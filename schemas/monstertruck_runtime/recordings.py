@@ -4,10 +4,14 @@ import base64
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Final
 
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.errors import InputError, NotFoundError
 from monstertruck_runtime.threads import in_thread
+
+SAME: Final = 4096
+"""Bytes of what is there that are compared with the robot's before more is added to them."""
 
 
 async def fetch_recording(
@@ -25,17 +29,22 @@ async def fetch_recording(
         most: bytes of which it may be; None = any number.
 
     Raises:
-        InputError: it is larger than that, or than what the file holds already.
+        InputError: it is larger than that, or the file holds more than it, or something else.
         TruckError: the robot refuses, is not there, or has no such recording.
     """
-    at = await in_thread(lambda: to.stat().st_size if to.exists() else 0)
+    held = await in_thread(lambda: to.stat().st_size if to.exists() else 0)
+    at = max(held - SAME, 0)
+    end = await in_thread(partial(_read, to, at)) if held else b""
     while True:
         answer = await truck.call("recording_read", {"name": name, "offset": at})
         data, size = base64.b64decode(answer["data"]), int(answer["bytes"])
         if most is not None and size > most:
             raise InputError(f"{name}: {size / 1e6:.0f} MB: expected at most {most / 1e6:.0f} MB")
-        if at > size:
-            raise InputError(f"{to}: {at} bytes: expected the beginning of {name}, which has {size}")
+        if held > size:
+            raise InputError(f"{to}: {held} bytes: expected the beginning of {name}, which has {size}")
+        if not data.startswith(end):
+            raise InputError(f"{to}: is not the beginning of {name}; move it away, or fetch to another file")
+        end = b""
         await in_thread(partial(put, to, at, data))
         at += len(data)
         progress(at / max(size, 1))
@@ -43,6 +52,12 @@ async def fetch_recording(
             return size
         if not data:
             raise NotFoundError(f"{name}: became shorter while it was fetched")
+
+
+def _read(file: Path, at: int) -> bytes:
+    with file.open("rb") as part:
+        part.seek(at)
+        return part.read()
 
 
 def put(file: Path, at: int, data: bytes) -> None:

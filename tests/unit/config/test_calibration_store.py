@@ -1,6 +1,7 @@
 """The folder of calibration files: whole after any crash, the one before kept, undone by a newer one."""
 
 import os
+import threading
 from pathlib import Path
 
 import pytest
@@ -116,6 +117,24 @@ def test_a_failure_while_writing_leaves_the_old_file(
             store.save(ratio(650.0), NOON)
     assert {path: path.read_bytes() for path in store.files()} == before
     assert value(store) == 640.0
+
+
+def test_two_writers_of_one_folder_keep_what_the_other_measured(
+    store: CalibrationStore, monkeypatch: pytest.MonkeyPatch
+):
+    other, put = CalibrationStore(store.folder, "truck"), store._put
+    second = threading.Thread(target=other.save, args=(gain(1.02), NOON))
+
+    def meanwhile(path: Path, data: bytes) -> None:
+        second.start()
+        second.join(0.1)
+        put(path, data)
+
+    monkeypatch.setattr(store, "_put", meanwhile)
+    store.save(ratio(640.0), NOON)
+    second.join()
+    assert [path.name[:4] for path in store.files()] == ["0001", "0002"]
+    assert (value(store), value(store, "battery")) == (640.0, 1.02)
 
 
 def test_a_torn_draft_is_no_calibration(store: CalibrationStore):

@@ -10,7 +10,8 @@ from pydantic import Field
 
 from monstertruck_runtime.errors import ConfigError
 from monstertruck_schemas.base import Schema
-from monstertruckd.config.load import load_config, load_tree, resolved
+from monstertruckd.config.load import included, load_config, load_tree, resolved
+from monstertruckd.config.migrate import plan
 
 
 class Wheel(Schema):
@@ -218,6 +219,23 @@ def test_a_circle_of_includes_is_refused(tmp_path: Path):
     write(tmp_path, "include: truck.yaml\n", "other.yaml")
     with pytest.raises(ConfigError, match="includes itself"):
         load_tree(write(tmp_path, "include: other.yaml\n"))
+
+
+def test_an_include_leads_behind_a_linked_folder_as_the_system_does(tmp_path: Path):
+    (tmp_path / "robots/mine").mkdir(parents=True)
+    (tmp_path / "etc").symlink_to(tmp_path / "robots/mine")
+    write(tmp_path, "version: 2\nrobot: t\n", "robots/base.yaml")
+    write(tmp_path, "version: 2\ninclude: ../base.yaml\n", "robots/mine/truck.yaml")
+    assert load_tree(tmp_path / "etc/truck.yaml").data == {"version": 2, "robot": "t"}
+    assert [upgrade.path for upgrade in plan(tmp_path / "etc/truck.yaml")] == []
+    assert included(tmp_path / "robots/mine/truck.yaml", "../base.yaml") == tmp_path / "robots/base.yaml"
+
+
+def test_a_link_to_itself_is_one_line(tmp_path: Path):
+    (tmp_path / "loop.yaml").symlink_to("loop.yaml")
+    for read in (load_tree, plan):
+        with pytest.raises(ConfigError, match="loop.yaml.*symbolic links"):
+            read(tmp_path / "loop.yaml")
 
 
 def test_an_empty_file_is_an_empty_tree(tmp_path: Path):

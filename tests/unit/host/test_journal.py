@@ -12,7 +12,7 @@ from monstertruck_schemas import topics
 from monstertruck_schemas.event import LogLevel
 from monstertruck_schemas.topics import Writer
 from monstertruckd.bus.local import Bus
-from monstertruckd.host.journal import DEPTH, published
+from monstertruckd.host.journal import DEPTH, Journal, published
 from monstertruckd.host.logging_queue import LONGEST
 
 log = logging.getLogger("monstertruckd.test")
@@ -111,6 +111,18 @@ def test_a_reader_that_logs_does_not_hear_itself_for_ever():
         assert [record.text for record in bench.inbox.drain()] == ["once"]
 
     on_bench(scenario)
+
+
+def test_a_wrong_log_call_is_not_a_failure_of_who_made_it(capsys):
+    async def scenario(bench):
+        journal = Journal(bench.clock, bench.out, bench.bus.add_drops, reproducible=True)
+        for text, arguments in (("%d scans", ("three",)), ("goes on", ())):
+            journal.handle(logging.LogRecord(log.name, logging.ERROR, __file__, 1, text, arguments, None))
+        await bench.clock.sleep(0.1)
+        assert [record.text for record in bench.inbox.drain()] == ["goes on"]
+
+    on_bench(scenario)
+    assert "Logging error" in capsys.readouterr().err
 
 
 def test_a_burst_is_bounded_loses_the_least_and_counts_it():

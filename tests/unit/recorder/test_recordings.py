@@ -1,6 +1,7 @@
 """Calls for recordings: what is listed, how fast it leaves, and what is refused."""
 
 import base64
+import fcntl
 import os
 from pathlib import Path
 
@@ -8,8 +9,10 @@ import pytest
 
 from monstertruck_runtime.clock import SECOND, run_virtual
 from monstertruck_runtime.errors import BusyError, InputError, NotFoundError
+from monstertruck_runtime.recordings import fetch_recording
 from monstertruck_runtime.threads import inline
 from monstertruckd.bus.rpc import Rpc
+from monstertruckd.recorder.repair import in_use
 from monstertruckd.recorder.recordings import CHUNK, RATE, TURN, Recordings
 
 
@@ -107,6 +110,44 @@ def test_a_recording_is_deleted_with_an_event_and_the_one_being_written_is_not(f
     _, events = asked(folder, scenario)
     assert events == ["run-000001-000.mcap (0.3 MB) deleted by ann"]
     assert not (folder / "run-000001-000.mcap").exists()
+
+
+def test_what_another_daemon_writes_is_open_and_stays(folder: Path):
+    async def scenario(call, _):
+        with (folder / "run-000001-000.mcap").open("rb") as other, (folder / "run-000002-000.mcap").open("rb") as reader:
+            fcntl.flock(other, fcntl.LOCK_EX)
+            fcntl.flock(reader, fcntl.LOCK_SH)
+            with pytest.raises(BusyError, match="being written"):
+                await call("recording_delete", name="run-000001-000.mcap")
+            assert in_use(folder / "run-000001-000.mcap")
+            assert not in_use(folder / "run-000002-000.mcap")
+            return {row["name"]: row["open"] for row in (await call("recordings"))["recordings"]}
+
+    rows, _ = asked(folder, scenario)
+    assert rows["run-000001-000.mcap"]
+    assert not rows["blackbox-000001-estopped.mcap"]
+
+
+def test_a_fetch_goes_on_with_the_same_recording_alone(folder: Path, tmp_path: Path):
+    name, part = "run-000001-000.mcap", tmp_path / "fetched.mcap"
+    whole = (folder / name).read_bytes()
+
+    async def scenario(call, _):
+        class Robot:
+            async def call(self, what, payload):
+                return await call(what, **payload)
+
+        part.write_bytes(whole[:200_000])
+        assert await fetch_recording(Robot(), name, part, lambda _: None) == len(whole)
+        assert part.read_bytes() == whole
+        assert await fetch_recording(Robot(), name, part, lambda _: None) == len(whole)
+        part.write_bytes(os.urandom(100_000))  # of another robot, whose recordings have the same names
+        before = part.read_bytes()
+        with pytest.raises(InputError, match=r"fetched\.mcap: is not the beginning of run-000001-000\.mcap"):
+            await fetch_recording(Robot(), name, part, lambda _: None)
+        assert part.read_bytes() == before
+
+    asked(folder, scenario)
 
 
 def test_what_goes_wrong_with_a_file_is_said_and_no_bug(folder: Path, monkeypatch: pytest.MonkeyPatch):
