@@ -67,7 +67,7 @@ class Journal(logging.Handler):
             return
         try:
             text = shown(self.format(record))
-        except Exception:  # whatever formatting its arguments raises
+        except Exception:  # noqa: BLE001  # whatever formatting its arguments raises
             self.handleError(record)
             return
         name = Path(record.pathname).name

@@ -312,8 +312,15 @@ class LogReader:
             self.flaws.append("lacks an attachment or metadata")
 
     def preamble(self) -> Iterator[McapRecord]:
-        """The records before the first message: the recorder writes attachments and metadata there."""
-        return itertools.takewhile(lambda record: not isinstance(record, McapMessage), self.records())
+        """The records before the first message: the recorder writes attachments and metadata there.
+
+        What an iteration to the end found wrong stays known.
+        """
+        damage, flaws = self.damage, self.flaws
+        try:
+            yield from itertools.takewhile(lambda record: not isinstance(record, McapMessage), self.records())
+        finally:
+            self.damage, self.flaws = damage, flaws
 
     def config(self) -> dict[str, Any]:
         """The attached configuration as plain values; empty where there is none. Raises as ``attached_config`` does."""
@@ -339,23 +346,28 @@ class LogReader:
 
 
 def attached_config(log: Path, attachments: Mapping[str, bytes]) -> dict[str, Any] | None:
-    """The daemon's configuration among what is attached to ``log``, as plain values; None where there is none.
+    """The daemon's configuration among what is attached to ``log``; see ``attached_values``."""
+    return attached_values(log, attachments, CONFIG)
+
+
+def attached_values(log: Path, attachments: Mapping[str, bytes], name: str) -> dict[str, Any] | None:
+    """Plain values of the JSON attachment ``name`` among those of ``log``; None where there is none.
 
     Raises:
         InputError: it is damaged.
         ConfigError: it is no JSON object.
     """
-    if CONFIG + DAMAGED in attachments:
-        raise InputError(f"{log}: {CONFIG} in it is damaged")
-    data = attachments.get(CONFIG)
+    if name + DAMAGED in attachments:
+        raise InputError(f"{log}: {name} in it is damaged")
+    data = attachments.get(name)
     if data is None:
         return None
     try:
         values = json.loads(data)
-    except ValueError as error:
-        raise ConfigError(f"{log}: {CONFIG}: {error}") from None
+    except (ValueError, RecursionError) as error:
+        raise ConfigError(f"{log}: {name}: {error}") from None
     if not isinstance(values, dict):
-        raise ConfigError(f"{log}: {CONFIG}: expected an object")
+        raise ConfigError(f"{log}: {name}: expected an object")
     return values
 
 

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
+from monstertruck_runtime.errors import InputError
+from monstertruckd.tools.cli.logs import finish_log
 from monstertruckd.tools.cli.options import EndpointOption, RobotOption
 from monstertruckd.tools.cli.output import JsonOption, command_group, print_json, print_table, remark
 
@@ -14,6 +16,7 @@ if TYPE_CHECKING:
 
     from monstertruckd.config.truck import TruckConfig
     from monstertruckd.tools.study.log import Run
+    from monstertruckd.tools.study.report import Result
     from monstertruckd.tools.study.runs import Stretch
 
 app = command_group("The skid-steer study: circles and passes by wheel speeds, open loop, and what a test stand saw.")
@@ -58,17 +61,24 @@ def analyse_command(
     json_output: JsonOption = False,
 ) -> None:
     """Radii, speeds, drifts of the centre, spread, bend and turns, beside the paper's, and its figures."""
-    from monstertruckd.config.truck import Geometry
+    from monstertruckd.recorder.reader import open_log
+    from monstertruckd.tools.logs.geometry import recorded_geometry
     from monstertruckd.tools.study import report
     from monstertruckd.tools.study.log import read_runs
 
     runs: list[Run] = []
-    config: dict[str, Any] = {}
-    for log in logs:
-        found, config = read_runs(log)
+    robots: list[tuple[Path, Any]] = []
+    readers = [open_log(log) for log in logs]
+    for reader in readers:
+        found, config = read_runs(reader)
+        if "geometry" not in config:
+            raise InputError(f"{reader.path}: config.json is not attached: expected a log that the daemon recorded")
+        robots.append((reader.path, recorded_geometry(reader.path, config)))
+        if robots[-1][1] != robots[0][1]:
+            raise InputError(f"{reader.path}: is of another robot than {robots[0][0]}: their geometry differs")
         runs += found
-    results = report.analyse(runs)
-    geometry = Geometry.model_validate(config.get("geometry", {}), strict=False)
+    results = _results(runs)
+    geometry = robots[0][1]
     values = report.as_values(results, geometry.wheel_radius, geometry.track / 2)
     if out is not None:
         from monstertruckd.tools.study.plots import draw
@@ -77,10 +87,34 @@ def analyse_command(
             remark(f"wrote {path}")
     if json_output:
         print_json(values)
-        return
-    print_table(report.HEADINGS, list(report.rows(values)), right=report.HEADINGS[2:7])
-    for slip in values["slips_of_the_paper"]:
-        typer.echo(f"the paper: {slip}")
+    else:
+        print_table(report.HEADINGS, list(report.rows(values)), right=report.HEADINGS[2:7])
+        for slip in values["slips_of_the_paper"]:
+            typer.echo(f"the paper: {slip}")
+    for reader in readers:
+        finish_log(reader.path, reader.fault)
+
+
+def _results(runs: "list[Run]") -> "list[Result]":
+    """What the runs say; those that say nothing, such as one that was stopped at once, are named and left out.
+
+    Raises:
+        InputError: none says anything.
+    """
+    from monstertruckd.tools.study.report import analyse
+
+    results: list[Result] = []
+    wrong: list[InputError] = []
+    for run in runs:
+        try:
+            results += analyse([run])
+        except InputError as error:
+            wrong.append(error)
+    if not results:
+        raise wrong[0]
+    for error in wrong:
+        remark(f"left out: {error}")
+    return results
 
 
 def _drive(plan: "Callable[[TruckConfig], list[Stretch]]", robot: str, endpoint: str) -> None:

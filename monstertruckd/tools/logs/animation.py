@@ -18,6 +18,7 @@ from monstertruck_schemas.state import Odometry, Transforms
 from monstertruck_schemas.topics import ODOMETRY, PATH, POSE, SCAN, TRANSFORMS
 from monstertruckd.config.truck import Geometry
 from monstertruckd.recorder.reader import LogReader, spare_log
+from monstertruckd.tools.logs.geometry import recorded_geometry
 from monstertruckd.tools.logs.messages import Progress
 from monstertruckd.tools.logs.report.scan_map import PlacedScans
 
@@ -109,7 +110,8 @@ def animate(
         ``frames`` and ``seconds`` of the picture, ``bytes`` of the file.
 
     Raises:
-        InputError: the log holds no pose, or too many pictures at this speed; ``output`` is a log or not a GIF.
+        InputError: the log holds no pose, a robot's size that cannot be, or too many pictures at this speed;
+            ``output`` is a log or not a GIF.
         CommandFailedError: the file cannot be written.
     """
     if output.suffix.lower() != ".gif":
@@ -121,7 +123,7 @@ def animate(
     if len(scenes) > MOST_FRAMES:
         needed = speed * len(scenes) / MOST_FRAMES
         raise InputError(f"{len(scenes)} pictures, at most {MOST_FRAMES}: expected --speed {math.ceil(needed)} or more")
-    canvas = _AnimationCanvas(scenes, width, Geometry.model_validate(reader.config().get("geometry", {})))
+    canvas = _AnimationCanvas(scenes, width, recorded_geometry(reader.path, reader.config()))
     frames = [canvas.frame(scene) for scene in scenes]
     shown = round(1000 / FRAMES_PER_SECOND)
     try:

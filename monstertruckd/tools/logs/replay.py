@@ -1,14 +1,14 @@
 """Plays a log back on Zenoh, on the log's own clock."""
 
 import asyncio
-import json
 from collections.abc import Callable, Collection
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from monstertruck_runtime.clock import ReplayClock, run_replay
-from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.errors import ConfigError, InputError
 from monstertruck_runtime.ports import Ready
 from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.topics import BY_NAME
@@ -16,7 +16,7 @@ from monstertruckd.bus.local import Bus
 from monstertruckd.bus.rpc import Rpc
 from monstertruckd.bus.zenoh_config import ZenohConfig
 from monstertruckd.bus.zenoh_session import ZenohBridge
-from monstertruckd.recorder.reader import LogReader, open_log
+from monstertruckd.recorder.reader import LogReader, attached_values, open_log
 from monstertruckd.tools.logs.messages import Selection, first_offset
 
 
@@ -84,7 +84,9 @@ def replay_log(
 def _rpc(clock: ReplayClock, reader: LogReader) -> Rpc:
     """Answers to what a station asks a robot: its configuration and versions, as attached to the log."""
     rpc = Rpc(clock)
-    attached = {"config": reader.config(), "versions": json.loads(reader.attachments().get("versions.json", b"{}"))}
+    attached = {"config": reader.config()}
+    with suppress(InputError, ConfigError):  # nothing but people reads them
+        attached["versions"] = attached_values(reader.path, reader.attachments(), "versions.json") or {}
     for name, value in attached.items():
         if value:
             rpc.register(name, partial(_answer, value), AccessRole.OBSERVER)

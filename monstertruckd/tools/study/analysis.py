@@ -15,6 +15,8 @@ LEAST: Final = 40
 """Poses of a run, at least."""
 LEAST_TURN: Final = 1.0
 """Radians that a circle must turn: less does not tell its centre from its radius."""
+LEAST_WAY: Final = 0.01
+"""Metres that a pass must cover: less has no direction."""
 SETTLED: Final = 1.0
 """Seconds at the beginning of a run, or of a pass, that do not count: ramps, and the turn at a reversal."""
 VELOCITY_WINDOW: Final = 1.0
@@ -122,7 +124,7 @@ def line(times: Array, poses: Array, directions: Array) -> StraightPasses:
         directions: shape (n,), sign of the commanded speed at each pose, 0 where none was commanded.
 
     Raises:
-        InputError: too few poses, numbers that are not finite, or no pass long enough.
+        InputError: too few poses, numbers that are not finite, no pass long enough, or one without way.
     """
     times, poses = _checked(times, poses)
     heading = np.unwrap(poses[2])
@@ -137,6 +139,9 @@ def line(times: Array, poses: Array, directions: Array) -> StraightPasses:
         raise InputError(f"no pass has {LEAST} poses after its first {SETTLED:g} s")
     ends = [_fitted(times[part], poses[:, part]) for part in passes]
     lengths = np.array([np.hypot(*(end - begin)) for begin, _, end in ends])
+    if lengths.min() < LEAST_WAY:
+        number, way = int(lengths.argmin()) + 1, 1000 * lengths.min()
+        raise InputError(f"pass {number} covers {way:.1f} mm: expected at least {1000 * LEAST_WAY:g}")
     begin, _, end = ends[0]
     ahead = (end - begin) / np.hypot(*(end - begin))
     across = [np.array([-ahead[1], ahead[0]]) @ (poses[:2, part] - begin[:, None]) for part in passes]

@@ -9,11 +9,12 @@ import numpy as np
 
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND
-from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.errors import InputError, NotFoundError, TruckError
+from monstertruck_schemas.base import Message
 from monstertruck_schemas.req import DriveRequest
 from monstertruck_schemas.sensor import StandPose
 from monstertruck_schemas.topics import REQ_DRIVE, STAND_POSE
-from monstertruckd.recorder.reader import open_log
+from monstertruckd.recorder.reader import LogReader, open_log
 from monstertruckd.tools.study.runs import SETTLING
 
 PAUSE: Final = 3 * SECOND
@@ -50,30 +51,39 @@ class Run:
         return f"one side locked, {fast:.2f} rad/s" if slow < EQUAL else f"{fast / slow:.3g}:1, {fast:.2f} rad/s"
 
 
-def read_runs(path: Path) -> tuple[list[Run], dict[str, Any]]:
+def read_runs(log: Path | LogReader) -> tuple[list[Run], dict[str, Any]]:
     """All runs of a log, and the robot's configuration as plain values.
 
     Raises:
         NotFoundError: no such file.
-        InputError: it is no log, or has no run by shaft speeds, or no poses of a stand.
+        InputError: it is no log, or has no run by shaft speeds, or no poses of a stand, or an invalid one of either.
     """
-    reader = open_log(path)
+    reader = open_log(log)
+    path = reader.path
     asked: list[tuple[int, float, float]] = []
     seen: list[tuple[int, float, float, float]] = []
-    for entry in reader:
-        if entry.topic == REQ_DRIVE.name:
-            request = entry.decode()
-            if isinstance(request, DriveRequest) and request.shafts is not None and len(request.shafts) > 1:
-                asked.append((request.received, request.shafts[0], request.shafts[1]))
-        elif entry.topic == STAND_POSE.name:
-            pose = entry.decode()
-            assert isinstance(pose, StandPose)
-            seen.append((pose.stamp, pose.pose.x, pose.pose.y, pose.pose.yaw))
+    for message in _messages(reader):
+        if isinstance(message, DriveRequest) and message.shafts is not None and len(message.shafts) > 1:
+            asked.append((message.received, message.shafts[0], message.shafts[1]))
+        elif isinstance(message, StandPose):
+            seen.append((message.stamp, message.pose.x, message.pose.y, message.pose.yaw))
     if not asked:
         raise InputError(f"{path}: nobody drove by shaft speeds in it (`study circle`, `study straight`)")
     if not seen:
         raise InputError(f"{path}: no poses of a test stand in it: expected `stand: simulator` or `overhead`")
     return [_run(part, np.array(seen)) for part in _parts(asked)], reader.config()
+
+
+def _messages(reader: LogReader) -> Iterator[Message]:
+    """Requests and poses; those of another schema are skipped."""
+    for entry in reader:
+        if entry.topic in (REQ_DRIVE.name, STAND_POSE.name):
+            try:
+                yield entry.decode()
+            except NotFoundError:
+                continue
+            except TruckError as error:
+                raise InputError(f"{reader.path}: {entry.topic} number {entry.sequence}: {error}") from error
 
 
 def _parts(asked: list[tuple[int, float, float]]) -> Iterator[list[tuple[int, float, float]]]:

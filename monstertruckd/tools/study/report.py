@@ -46,9 +46,9 @@ def as_values(results: Sequence[Result], radius: float, half_track: float) -> di
     measured = [
         MeasuredCircle(run.name, run.left, run.right, found.radius, found.speed)
         for run, found in results
-        if isinstance(found, Circle)
+        if isinstance(found, Circle) and run.left + run.right
     ]
-    if len({one.left / one.right for one in measured}) >= 2:
+    if len({round(math.atan2(one.left, one.right), 9) for one in measured}) >= 2:
         fit = fit_circles(measured, skid_model("symmetric", radius, half_track))
         values["symmetric_model"] = {name: value for name, value, _ in fit.parameter_table()}
     return values
@@ -63,8 +63,8 @@ def _circle(run: Run, found: Circle, radius: float, half_track: float) -> dict[s
         "drift_speed": math.hypot(*found.drift),
         "ideal_speed": abs(speed),
         "ideal_radius": abs(speed / turn),
-        "speed_deviation": found.speed / abs(speed) - 1.0,
-        "radius_deviation": found.radius / abs(speed / turn) - 1.0,
+        "speed_deviation": found.speed / abs(speed) - 1.0 if speed else None,
+        "radius_deviation": found.radius / abs(speed / turn) - 1.0 if speed else None,
     }
     if (row := published.nearest(run.left, run.right)) is not None:
         values["published"] = {

@@ -12,8 +12,8 @@ from monstertruck_runtime.errors import BusyError, InputError, NotFoundError
 from monstertruck_runtime.recordings import fetch_recording
 from monstertruck_runtime.threads import inline
 from monstertruckd.bus.rpc import Rpc
-from monstertruckd.recorder.repair import in_use
 from monstertruckd.recorder.recordings import CHUNK, RATE, TURN, Recordings
+from monstertruckd.recorder.repair import in_use
 
 
 @pytest.fixture
@@ -114,7 +114,10 @@ def test_a_recording_is_deleted_with_an_event_and_the_one_being_written_is_not(f
 
 def test_what_another_daemon_writes_is_open_and_stays(folder: Path):
     async def scenario(call, _):
-        with (folder / "run-000001-000.mcap").open("rb") as other, (folder / "run-000002-000.mcap").open("rb") as reader:
+        with (
+            (folder / "run-000001-000.mcap").open("rb") as other,
+            (folder / "run-000002-000.mcap").open("rb") as reader,
+        ):
             fcntl.flock(other, fcntl.LOCK_EX)
             fcntl.flock(reader, fcntl.LOCK_SH)
             with pytest.raises(BusyError, match="being written"):

@@ -11,13 +11,14 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from monstertruck_runtime import wire
-from monstertruck_runtime.clock import SECOND
+from monstertruck_runtime.clock import SECOND, VirtualClock
 from monstertruck_runtime.errors import InputError, NotFoundError
 from monstertruck_schemas import topics as t
 from monstertruckd.recorder.log_file import LogEntry, LogFile
 from monstertruckd.recorder.reader import open_log
 from monstertruckd.recorder.repair import recover, recover_directory
 from monstertruckd.tools.logs.export import export_csv, export_npz
+from monstertruckd.tools.logs.replay import _rpc
 from monstertruckd.tools.logs.summary import info
 from tests.unit.tools.logs.run_kit import MAKERS, write
 
@@ -81,6 +82,13 @@ def test_message_without_its_channel_counts_as_damage(tmp_path):
     reader = open_log(file)
     assert list(reader) == []
     assert "message of an unknown channel" in reader.damage
+
+
+def test_versions_that_are_none_do_not_keep_a_log_from_being_replayed(tmp_path):
+    attached = {"config": {"robot": "digger"}, "versions": ["odd"]}
+    LogFile(tmp_path / "run.mcap", "lz4", 1 << 16, attached, {}, SECOND).finish()
+    rpc = _rpc(VirtualClock(), open_log(tmp_path / "run.mcap"))
+    assert (rpc.serves("config"), rpc.serves("versions")) == (True, False)
 
 
 def test_foreign_topic_is_readable_but_not_decoded(tmp_path):
