@@ -112,8 +112,8 @@ def _results(runs: "list[Run]") -> "list[Result]":
             wrong.append(error)
     if not results:
         raise wrong[0]
-    for error in wrong:
-        remark(f"left out: {error}")
+    for why in wrong:
+        remark(f"left out: {why}")
     return results
 
 

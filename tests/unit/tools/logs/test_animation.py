@@ -56,7 +56,7 @@ def test_what_cannot_be_drawn_is_refused(tmp_path: Path, monkeypatch: pytest.Mon
 def test_a_cut_log_is_drawn_and_ends_with_its_own_exit_code(tmp_path: Path):
     log = tmp_path / "cut.mcap"
     log.write_bytes(GOLDEN.read_bytes()[: GOLDEN.stat().st_size * 2 // 3])
-    done = CliRunner().invoke(app, ["log", "animate", str(log), str(tmp_path / "cut.gif"), "--width", "64"])
+    done = CliRunner().invoke(app, ["animate", str(log), str(tmp_path / "cut.gif"), "--width", "64"])
     assert done.exit_code == 9
     assert "cut.mcap: ends or is damaged after byte" in done.output
 

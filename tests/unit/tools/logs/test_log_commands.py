@@ -7,13 +7,13 @@ import json
 import os
 from pathlib import Path
 
-import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from monstertruck_runtime.errors import NotFoundError
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.tools.cli.main import app
+from monstertruckd.tools.logs import export
 from monstertruckd.tools.logs.messages import Selection
 
 GOLDEN = max((Path(__file__).parents[3] / "data" / "golden").glob("*/run.mcap"))
@@ -233,15 +233,15 @@ def test_an_interrupted_export_leaves_nothing_that_looks_whole(tmp_path, monkeyp
 
 
 def test_tables_get_their_names_together(tmp_path, monkeypatch):
-    write, written = np.savez_compressed, []
+    write, written = export._write_npz, []
 
-    def interrupted(file, **arrays):
+    def interrupted(file, arrays):
         if written:
             raise KeyboardInterrupt
         written.append(file.name)
-        write(file, **arrays)
+        write(file, arrays)
 
-    monkeypatch.setattr(np, "savez_compressed", interrupted)
+    monkeypatch.setattr(export, "_write_npz", interrupted)
     topics = ("--topic", "sensor/scan", "--topic", "state/odometry")
     assert run("export", GOLDEN, tmp_path, "--format", "npz", *topics).exit_code == 6
     assert written

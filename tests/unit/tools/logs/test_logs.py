@@ -11,7 +11,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from monstertruck_runtime import wire
-from monstertruck_runtime.clock import SECOND, VirtualClock
+from monstertruck_runtime.clock import SECOND, WallClock
 from monstertruck_runtime.errors import InputError, NotFoundError
 from monstertruck_schemas import topics as t
 from monstertruckd.recorder.log_file import LogEntry, LogFile
@@ -87,7 +87,7 @@ def test_message_without_its_channel_counts_as_damage(tmp_path):
 def test_versions_that_are_none_do_not_keep_a_log_from_being_replayed(tmp_path):
     attached = {"config": {"robot": "digger"}, "versions": ["odd"]}
     LogFile(tmp_path / "run.mcap", "lz4", 1 << 16, attached, {}, SECOND).finish()
-    rpc = _rpc(VirtualClock(), open_log(tmp_path / "run.mcap"))
+    rpc = _rpc(WallClock(), open_log(tmp_path / "run.mcap"))
     assert (rpc.serves("config"), rpc.serves("versions")) == (True, False)
 
 
