@@ -26,7 +26,7 @@ class Sysfs:
     def text(self, path: str) -> str | None:
         """Content of an attribute without surrounding blanks; None if it is not there or cannot be read."""
         try:
-            return (self.root / path).read_text(errors="replace").strip()
+            return (self.root / path).read_text(errors="backslashreplace").strip()
         except OSError:
             return None
 
@@ -155,7 +155,7 @@ async def run_command(arguments: Sequence[str]) -> tuple[int, str]:
         process.kill()
         await process.wait()
         raise
-    return process.returncode or 0, output.decode(errors="replace").strip()
+    return process.returncode or 0, output.decode(errors="backslashreplace").strip()
 
 
 @dataclass(frozen=True, slots=True)

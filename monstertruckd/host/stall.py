@@ -126,4 +126,4 @@ def _tracebacks() -> str:
     with os.fdopen(os.memfd_create("stall"), "w+b") as memory:
         faulthandler.dump_traceback(file=memory)
         memory.seek(0)
-        return memory.read().decode(errors="replace")
+        return memory.read().decode(errors="backslashreplace")

@@ -636,7 +636,7 @@ def _refusal(data: bytes) -> TruckError:
         fields = json.loads(data)
         reason, text = Reason(fields["reason"]), str(fields["text"])  # type: ignore[call-arg]  # look-up by value
     except (ValueError, KeyError, TypeError):
-        text = data.decode(errors="replace")
+        text = data.decode(errors="backslashreplace")
         return NoAnswerError("no answer in time") if text == "Timeout" else RequestRefusedError(Reason.INTERNAL, text)
     kinds: dict[Reason, type[TruckError]] = {
         Reason.NOT_FOUND: NotFoundError,

@@ -10,7 +10,7 @@ from pathlib import Path
 def text_of(file: Path) -> str | None:
     """Content without the white space around it; None if it is not there or cannot be read."""
     try:
-        return file.read_text(encoding="utf-8", errors="replace").strip()
+        return file.read_text(encoding="utf-8", errors="backslashreplace").strip()
     except OSError:
         return None
 

@@ -128,7 +128,7 @@ def read_text(file: Path) -> str:
         DeviceError: anything else.
     """
     try:
-        return file.read_text(encoding="ascii", errors="replace").strip()
+        return file.read_text(encoding="ascii", errors="backslashreplace").strip()
     except OSError as error:
         text = f"{file}: {error.strerror}"
         if error.errno in _GONE:

@@ -459,7 +459,8 @@ def parse_fields(lines: list[bytes], *, sums: bool = True) -> dict[str, str]:
             if not (sum_matches(line) or sum_matches(note + line[-1:]) or key == b"SERI"):
                 raise ProtocolError(f"SCIP: bad checksum in {line!r}")
             value = value[:-1]
-        fields[key.decode("latin-1")] = value.removesuffix(b";").decode("latin-1").strip()
+        name, text = (part.decode("ascii", "backslashreplace") for part in (key, value.removesuffix(b";")))
+        fields[name] = text.strip()
     return fields
 
 

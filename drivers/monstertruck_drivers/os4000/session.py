@@ -125,7 +125,7 @@ class Os4000Session:
         self.parser.text = []
         self._link.write(protocol.key(command))
         await self.listen(seconds, count=1000)
-        return [line.decode("ascii", "replace") for line in self.parser.text]
+        return [line.decode("ascii", "backslashreplace") for line in self.parser.text]
 
 
 def observed_fields(heard: list[tuple[int, Sentence]]) -> Fields:

@@ -49,7 +49,7 @@ class RoboclawSession:
             heard = answer or heard
             asked = request(self._address, RoboclawCommand.VERSION)
             if is_intact(asked, answer) and NAME in answer.lower():
-                return answer.partition(b"\n")[0].decode("ascii", "replace")
+                return answer.partition(b"\n")[0].decode("ascii", "backslashreplace")
             # A host that died may have left half a request, which is dropped after a pause.
             await self._clock.sleep(2 * PACKET_GAP)
         if not heard:

@@ -205,4 +205,4 @@ def fourcc(pixel_format: int) -> str:
 
 
 def _text(raw: bytes) -> str:
-    return raw.split(b"\0", 1)[0].decode("utf-8", "replace")
+    return raw.split(b"\0", 1)[0].decode("utf-8", "backslashreplace")

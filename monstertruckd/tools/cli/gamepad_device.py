@@ -126,7 +126,7 @@ class PadLink:
 def described(file: int, mapping: PadMapping) -> Pad | None:
     """The gamepad behind an open input device; None if it is another device, or not one that the mapping is for."""
     try:
-        name = fcntl.ioctl(file, _read_request(0x06, 256), bytes(256)).split(b"\0")[0].decode(errors="replace")
+        name = fcntl.ioctl(file, _read_request(0x06, 256), bytes(256)).split(b"\0")[0].decode(errors="backslashreplace")
         keys = fcntl.ioctl(file, _read_request(0x20 + EV_KEY, 96), bytes(96))
         if not keys[BUTTONS["south"] // 8] >> BUTTONS["south"] % 8 & 1 or not mapping.fits(name):
             return None

@@ -5,11 +5,13 @@ fields it does not know and only ever grows.
 """
 
 import json
+import re
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, Final, TypeVar
 
 from pydantic import ValidationError
+from pydantic_core import PydanticSerializationError
 
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.wire import foxglove
@@ -20,6 +22,9 @@ M = TypeVar("M", bound=Message)
 
 VERSION: Final = 1
 """Version of every schema; counts changes that are not plain growth."""
+
+_BYTE: Final = re.compile("[\udc80-\udcff]")
+"""What Python reads for a byte that it cannot decode (PEP 383)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,9 +48,26 @@ def encode(topic: Topic[M], message: M) -> bytes:
     if type(message) is not topic.model:
         msg = f"{topic.name}: expected {topic.model.__name__}, got {type(message).__name__}"
         raise InputError(msg)
-    if topic.foxglove is None:
+    if topic.foxglove is not None:
+        return foxglove.encode(message)
+    try:
         return message.model_dump_json(exclude_none=True).encode()
-    return foxglove.encode(message)
+    except PydanticSerializationError:
+        return json.dumps(_escaped(message.model_dump(mode="json", exclude_none=True)), allow_nan=False).encode()
+
+
+def _escaped(value: Any) -> Any:
+    r"""``value`` with what UTF-8 cannot carry escaped: bytes of a file's name that are no text as ``\xff``."""
+    match value:
+        case str():
+            bytes_shown = _BYTE.sub(lambda byte: f"\\x{ord(byte[0]) - 0xDC00:02x}", value)
+            return bytes_shown.encode("utf-8", "backslashreplace").decode()
+        case dict():
+            return {key: _escaped(each) for key, each in value.items()}
+        case list():
+            return [_escaped(each) for each in value]
+        case _:
+            return value
 
 
 def decode(topic: Topic[M], data: bytes) -> M:

@@ -295,6 +295,14 @@ def test_path_of_incomplete_rows_is_refused():
         wire.encode(t.PATH, Path(stamp=0, received=0, seq=0, poses=[1, 2], directions=[]))
 
 
+def test_bytes_that_are_no_text_travel_escaped():
+    said = {"reason": Reason.OK, "severity": Severity.INFO, "source": "x"}
+    event = Event(stamp=1, received=1, seq=1, text="map \udcffä\ud800", values={"file": "\udce9.mcap"}, **said)
+    read = wire.decode(t.EVENT, wire.encode(t.EVENT, event))
+    assert read.text == r"map \xffä\ud800"
+    assert read.values == {"file": r"\xe9.mcap"}
+
+
 def test_message_of_another_topic_is_refused():
     with pytest.raises(InputError, match="state/map: expected Grid, got LaserScan"):
         wire.encode(t.MAP, scan())
