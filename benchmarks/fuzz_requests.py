@@ -1,12 +1,16 @@
 """A fuzzer on every key by which something may be asked of a running robot, from a process of its own.
 
     python -m benchmarks.fuzz_requests [--count 100000] [--seed 1] [--rate 2000]
+    python -m benchmarks.fuzz_requests --gate [--count 100000] [--seed 1]
 
 Emulated truck and daemon as ``monstertruckd simulate`` and ``run`` are. The fuzzer knows the keys of all requests and
 the names of all calls, and takes another name every time; it does not know the robot's nonce. It sends noise, and
 requests that would be right but for the nonce, with bytes flipped, cut, doubled, fields of wrong types, huge and
 nested. The truck must not move and never be armed: stopped it may be, for an emergency stop is taken from everybody.
 Afterwards no service may have failed, and the truck has to obey its operator.
+
+``--gate`` asks the gates of all kinds of bodies instead, without a daemon, for as many ticks: numbers, times and orders
+at which arithmetic or the state machine may break (``fuzz_parts/gate.py``). The last line is JSON.
 """
 
 import argparse
@@ -160,10 +164,27 @@ async def attack(clock: Clock, folder: Path, count: int, seed: int, rate: float)
         }
 
 
+def of_gates(ticks: int, seed: int) -> int:
+    """Fuzz the gates of all bodies; 0 = all goals met."""
+    from benchmarks.fuzz_parts import gate  # noqa: PLC0415 - needs the tests
+
+    done, found = gate.fuzz(seed, ticks)
+    for finding in found:
+        print(f"{finding.kind}: {finding.error}")
+        for what, values in finding.actions:
+            print(f"    {what} {' '.join(f'{name}={value}' for name, value in values.items())}")
+    figures = {"ticks": done, "bodies": len(gate.BODIES), "findings": len(found)}
+    goals = {"ticks": 100_000, "findings": 0}
+    met = done >= goals["ticks"] and not found
+    print(json.dumps({"bench": "fuzz_gate", "figures": figures, "goals": goals, "met": met}))
+    return 0 if met else 1
+
+
 def main() -> int:
     """Fuzz; 0 = all goals met."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--count", type=int, default=100_000)
+    parser.add_argument("--gate", action="store_true", help="the gates of all bodies, without a daemon")
+    parser.add_argument("--count", type=int, default=100_000, help="messages, or ticks of gates")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--rate", type=float, default=2000.0, help="messages a second")
     parser.add_argument("--fuzzer", nargs=5, help=argparse.SUPPRESS)
@@ -172,6 +193,8 @@ def main() -> int:
         endpoint, names, count, seed, rate = options.fuzzer
         fuzz(endpoint, names.split(","), int(count), int(seed), float(rate))
         return 0
+    if options.gate:
+        return of_gates(options.count, options.seed)
     with TemporaryDirectory(prefix="fuzz-") as folder:
         figures = run_wall(lambda clock: attack(clock, Path(folder), options.count, options.seed, options.rate))
     for name, value in figures.items():

@@ -58,6 +58,9 @@ goes where the lidar does not look."""
 MAX_SPEED: Final = 1e3
 """Requests are scaled down to this in every component before anything else, m/s and rad/s: sums of them stay finite."""
 
+FASTEST: Final = 1e6
+"""What a motor says beyond this counts as this, m/s: its square is still a number."""
+
 ROUNDING: Final = 1e-6
 """Relative difference up to which two motions are the same."""
 
@@ -791,6 +794,7 @@ class CommandLimiter:
     def stopping_distance(self, now: int) -> float:
         """Distance travelled if stopped now, m, by the greater of measured and commanded speed."""
         speed = max(abs(self._sensors.speed(now) or 0.0), *map(abs, self._motion.shaft_speeds))
+        speed = min(speed, FASTEST)
         return speed * self._config.reaction + speed**2 / (2 * self._config.deceleration)
 
     def _check_sonars(self, now: int, wanted: Twist[float], shafts: Speeds | None, limits: dict[Reason, float]) -> None:

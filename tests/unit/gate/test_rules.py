@@ -593,6 +593,13 @@ def test_driving_on_needs_twice_the_speed_at_which_it_stopped():
     assert not at(allowed(0.04) + 0.02, rig)
 
 
+def test_a_motor_that_claims_any_speed_does_not_end_the_gate():
+    rig = Rig().armed()
+    rig.gate.observe_drive(feedback(rig.now).model_copy(update={"velocity": 1e300}))
+    rig.tick(sense=False)
+    assert math.isfinite(rig.out.stopping_distance)
+
+
 def test_the_stopping_distance_counts_reaction_and_braking_at_the_greater_speed():
     rig = Rig().driving(speed=0.2)
     rig.tick()
