@@ -35,7 +35,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.state import GateState, Odometry
 from monstertruck_schemas.topics import GATE, POSE
 from monstertruck_sim.world.scene import MOVING, Contact
-from monstertruckd.tools.cli.behave_session import BehaviourClient, BehaviourEnd, run_behaviour
+from monstertruckd.tools.cli.runs import BehaviourClient, RunEnd, run_behaviour
 from monstertruckd.tools.demo.runs import free_endpoint
 from monstertruckd.tools.simulation.config import load_simulated
 from monstertruckd.tools.simulation.operator import LocalOperator
@@ -171,7 +171,7 @@ class Pilot:
         gate = self.gate.latest
         try:
             armed = gate is not None and gate.mode.accepts_motion
-            end: BehaviourEnd = await run_behaviour(self.driver, "move", arm=not armed, settings=settings)
+            end: RunEnd = await run_behaviour(self.driver, "move", arm=not armed, settings=settings)
         except (RequestRefusedError, NoAnswerError) as error:
             self.score.held[getattr(error, "refusal", error.reason).value] += 1
             await self.clock.sleep(0.5)

@@ -9,7 +9,7 @@ from monstertruck_runtime.mailbox import fifo
 from monstertruck_schemas import topics
 from monstertruck_schemas.mission import Mission
 from monstertruck_schemas.reasons import Reason
-from monstertruckd.tools.cli.mission_session import run_mission
+from monstertruckd.tools.cli.runs import run_mission
 from monstertruckd.tools.simulation.operator import LocalOperator
 from tests.daemon.goal_kit import Trip, assert_at, travel
 
@@ -44,7 +44,7 @@ def test_a_mission_is_driven_and_followed():
     rig = travel(story)
     end, state = ends
     assert end.reason is Reason.MISSION_INCOMPLETE, end.text
-    assert (end.failures, end.step) == (1, 5)
+    assert (end.figures["failures"], end.figures["step"]) == (1, 5)
     assert state.steps == 5
     assert [line.partition("step ")[2][:1] for line in lines] == list("12345")
     assert_at(rig, 1.0, 3.95, 0.0)

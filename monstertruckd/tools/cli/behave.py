@@ -1,23 +1,24 @@
 """``monstertruckd behave``: list, start and stop what reacts to sensors without a path."""
 
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from monstertruck_runtime.clock import Clock, run_wall
+from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruck_runtime.errors import NotFoundError
+from monstertruckd.tools.cli.connection import require_section, with_robot
 from monstertruckd.tools.cli.options import EndpointOption, RobotOption
-from monstertruckd.tools.cli.output import JsonOption, command_group, finish, print_json, print_table
+from monstertruckd.tools.cli.output import JsonOption, command_group, print_end, print_json, print_table
 
 if TYPE_CHECKING:
     from monstertruck_runtime.client import TruckClient
-    from monstertruckd.tools.cli.behave_session import BehaviourEnd
+    from monstertruckd.tools.cli.runs import RunEnd
 
 app = command_group("Behaviours: motion in reaction to sensors, without a path, such as following a wall.")
 
 NameArgument = Annotated[str, typer.Argument(help="Name in the configuration.", show_default=False)]
-STOP_ANY: Final = ""
+WITHOUT = "has no behaviours"
 
 
 @app.command("list")
@@ -25,18 +26,16 @@ def list_command(
     robot: RobotOption = "truck", endpoint: EndpointOption = DEFAULT_ENDPOINT, json_output: JsonOption = False
 ) -> None:
     """Print the behaviours that the robot's configuration has."""
-    from monstertruck_runtime.client import TruckClient
 
-    async def main(clock: Clock) -> dict[str, Any]:
-        async with TruckClient(robot, endpoint, clock=clock) as client:
-            try:
-                return await client.call("behaviours")
-            except NotFoundError:
-                if await client.alive():
-                    return {}
-                raise
+    async def main(client: "TruckClient", _: Clock) -> dict[str, Any]:
+        try:
+            return await client.call("behaviours")
+        except NotFoundError:
+            if await client.alive():
+                return {}
+            raise
 
-    found = run_wall(main)
+    found = with_robot(main, robot, endpoint)
     if json_output:
         print_json(found)
     elif found:
@@ -54,44 +53,25 @@ def start_command(
     json_output: JsonOption = False,
 ) -> None:
     """Start a behaviour and follow it to its end, whose reason is the exit code. Ctrl-C stops it."""
-    from monstertruck_runtime.client import TruckClient
-    from monstertruckd.tools.cli.behave_session import run_behaviour
+    from monstertruckd.tools.cli.runs import run_behaviour
 
-    async def main(clock: Clock) -> "BehaviourEnd":
-        async with TruckClient(robot, endpoint, clock=clock) as client:
-            await _check(client, name)
-            return await run_behaviour(client, name, arm=arm)
+    async def main(client: "TruckClient", _: Clock) -> "RunEnd":
+        known = await require_section(client, "behaviours", WITHOUT)
+        if name not in known:
+            raise NotFoundError(f"no behaviour {name!r}: expected one of {', '.join(known)}")
+        return await run_behaviour(client, name, arm=arm)
 
-    end = run_wall(main)
-    if json_output:
-        print_json(end.as_json())
-    elif not end.reason.exit_code:
-        print(f"{end.reason.text}: {end.text}")
-    finish(end.reason, f"{end.reason.text}: {end.text}")
+    end = with_robot(main, robot, endpoint)
+    print_end(end.reason, end.text, end.as_json(), json_output=json_output)
 
 
 @app.command("stop")
 def stop_command(robot: RobotOption = "truck", endpoint: EndpointOption = DEFAULT_ENDPOINT) -> None:
     """Stop the behaviour that runs."""
-    from monstertruck_runtime.client import TruckClient
     from monstertruck_schemas.req import BehaviourOrder
 
-    async def main(clock: Clock) -> None:
-        async with TruckClient(robot, endpoint, clock=clock) as client:
-            await _check(client, STOP_ANY)
-            await client.behave(BehaviourOrder.STOP)
+    async def main(client: "TruckClient", _: Clock) -> None:
+        await require_section(client, "behaviours", WITHOUT)
+        await client.behave(BehaviourOrder.STOP)
 
-    run_wall(main)
-
-
-async def _check(client: "TruckClient", name: str) -> None:
-    """Refuse a robot without behaviours, or without this one.
-
-    Raises:
-        NotFoundError: naming those there are.
-    """
-    known = (await client.call("config")).get("behaviours") or {}
-    if not known:
-        raise NotFoundError("the robot has no behaviours: expected a section `behaviours` in its configuration")
-    if name and name not in known:
-        raise NotFoundError(f"no behaviour {name!r}: expected one of {', '.join(known)}")
+    with_robot(main, robot, endpoint)

@@ -5,11 +5,12 @@ import sys
 import textwrap
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
+from monstertruckd.tools.cli.connection import robot_config, with_robot
 from monstertruckd.tools.cli.options import EndpointOption, RobotOption, complete_config, with_parameters
 from monstertruckd.tools.cli.output import (
     JsonOption,
@@ -26,13 +27,19 @@ if TYPE_CHECKING:
 
     from monstertruck_runtime.client import TruckClient
     from monstertruck_runtime.clock import Clock
-    from monstertruckd.config.calibration import Estimate, Result, WizardName
+    from monstertruckd.config.calibration import CalibrationFile, Estimate, Result, WizardName
     from monstertruckd.tools.calibrate.sequence import SequenceStep
     from monstertruckd.tools.calibrate.wizard import Wizard
 
 app = command_group(
     "Measure what only this very truck can tell: guided, step by step, given up at any step with Ctrl-C."
 )
+
+TIMEOUT: Final = 10.0
+"""Seconds to wait for the link and for answers."""
+
+WIZARDS: "dict[str, Callable[..., Wizard]]" = {}
+"""What makes each from the options of its command, by name."""
 
 YesOption = Annotated[bool, typer.Option("--yes", "-y", help="Take it that everything asked to be done is done.")]
 AnswerOption = Annotated[
@@ -78,6 +85,7 @@ def _wizard(make: "Callable[..., Wizard]") -> "Callable[..., Wizard]":
     ) -> None:
         _run(make(**own), _Call(robot, endpoint, config, answer or [], yes, undo, json_output))
 
+    WIZARDS[make.__name__] = make
     app.command(make.__name__)(with_parameters(command, make, command))
     return make
 
@@ -286,39 +294,24 @@ def wizard_of(step: "SequenceStep") -> "Wizard":
         return drive(sign_only=step.rough)
     if step.name == "steering":
         return steering(rough=step.rough)
-    others = {
-        "battery": battery,
-        "compass": compass,
-        "odometry": odometry,
-        "lidar": lidar,
-        "imu": imu,
-        "slip": slip,
-        "sonar": sonar,
-        "stabiliser": stabiliser,
-        "camera": camera,
-    }
-    return others[step.name]()
+    return WIZARDS[step.name]()
 
 
 async def _steps_left(call: _Call, clock: "Clock") -> "tuple[list[SequenceStep], bool]":
     """Steps that are still to be done, and whether the daemon runs on an older calibration than there is."""
     from monstertruck_schemas.topics import CALIBRATION
-    from monstertruckd.config.calibration import CalibrationFile
     from monstertruckd.config.calibration_rpc import SHOW
-    from monstertruckd.config.truck import TruckConfig
     from monstertruckd.tools.calibrate.sequence import missing
 
     async with _client(call.robot, call.endpoint, clock) as client:
-        running = await client.call("config")
-        running.pop("sim", None)
+        config = await robot_config(client)
         state = await client.call(SHOW)
         health = await client.get_retained(CALIBRATION)
-    content = state["content"]
-    results = {} if content is None else CalibrationFile.model_validate_json(_json(content)).results
+    file = _file(state)
+    results = {} if file is None else file.results
     dates = {row.wizard: row.date for row in health.wizards if row.expired} if health is not None else {}
     expired = {name for name, date in dates.items() if name in results and results[name].date == date}
-    steps = missing(TruckConfig.model_validate_json(_json(running)), results, expired)
-    return steps, state["loaded"] != state["newest"]
+    return missing(config, results, expired), state["loaded"] != state["newest"]
 
 
 async def _until_restarted(call: _Call, clock: "Clock") -> None:
@@ -341,8 +334,6 @@ def show(
     json_output: JsonOption = False,
 ) -> None:
     """Print what was calibrated, when, how well, and which file the daemon runs on."""
-    from monstertruck_runtime.clock import run_wall
-    from monstertruckd.config.calibration import CalibrationFile
     from monstertruckd.config.calibration_rpc import SHOW
 
     if config is not None:
@@ -350,14 +341,8 @@ def show(
         newest, file = store.newest(), store.current()
         state: dict[str, Any] = {"folder": str(store.folder), "newest": newest, "content": file}
     else:
-
-        async def ask(clock: "Clock") -> dict[str, Any]:
-            async with _client(robot, endpoint, clock) as client:
-                return await client.call(SHOW)
-
-        state = run_wall(ask)
-        content = state["content"]
-        file = None if content is None else CalibrationFile.model_validate_json(_json(content))
+        state = with_robot(lambda client, _: client.call(SHOW), robot, endpoint, TIMEOUT)
+        file = _file(state)
     if json_output:
         print_json(state)
         return
@@ -388,36 +373,32 @@ def _run(wizard: "Wizard", call: _Call) -> None:
 
 
 async def _run_wizard(wizard: "Wizard", call: _Call, clock: "Clock") -> "tuple[Result, str]":
-    from monstertruckd.config.calibration import CalibrationFile
     from monstertruckd.config.calibration_rpc import SHOW
-    from monstertruckd.config.truck import TruckConfig
     from monstertruckd.tools.calibrate.wizard import calibrate
     from monstertruckd.tools.cli.calibrate_panel import TerminalPanel
 
     async with _client(call.robot, call.endpoint, clock) as client:
-        running = await client.call("config")
-        running.pop("sim", None)  # the world's truth is nothing a wizard may know
-        config = TruckConfig.model_validate_json(_json(running))
-        content = (await client.call(SHOW))["content"]
-        known = {} if content is None else CalibrationFile.model_validate_json(_json(content)).results
+        config = await robot_config(client)
+        file = _file(await client.call(SHOW))
+        known = {} if file is None else file.results
         with TerminalPanel(call.answers, yes=call.yes) as panel:
             return await calibrate(wizard, client, panel, clock, config, known)
 
 
 def _undo(name: "WizardName", call: _Call) -> None:
-    from monstertruck_runtime.clock import WallClock, run_wall
+    from monstertruck_runtime.clock import WallClock
     from monstertruckd.config.calibration_rpc import UNDO
 
     if call.config is not None:
         clock = WallClock()
         file = str(_store(call.config).undo(name, clock.now() + clock.real_offset()))
     else:
-
-        async def ask(clock: "Clock") -> dict[str, Any]:
-            async with _client(call.robot, call.endpoint, clock) as client:
-                return await client.call(UNDO, {"wizard": name, "source": client.source})
-
-        file = run_wall(ask)["file"]
+        file = with_robot(
+            lambda client, _: client.call(UNDO, {"wizard": name, "source": client.source}),
+            call.robot,
+            call.endpoint,
+            TIMEOUT,
+        )["file"]
     if call.json_output:
         print_json({"file": file})
     remark(f"{name}: as before, in {file}; it counts from the next start of the daemon")
@@ -426,7 +407,7 @@ def _undo(name: "WizardName", call: _Call) -> None:
 def _client(robot: str, endpoint: str, clock: "Clock") -> "TruckClient":
     from monstertruck_runtime.client import TruckClient
 
-    return TruckClient(robot, endpoint, clock=clock, timeout=10.0)
+    return TruckClient(robot, endpoint, clock=clock, timeout=TIMEOUT)
 
 
 def _store(config: Path) -> Any:
@@ -438,10 +419,14 @@ def _store(config: Path) -> Any:
     return CalibrationStore(loaded.calibration_folder, loaded.robot)
 
 
-def _json(value: Any) -> str:
+def _file(state: dict[str, Any]) -> "CalibrationFile | None":
+    """The newest file of a robot that answers with ``state``."""
     import json
 
-    return json.dumps(value)
+    from monstertruckd.config.calibration import CalibrationFile
+
+    content = state["content"]
+    return None if content is None else CalibrationFile.model_validate_json(json.dumps(content))
 
 
 def _print(result: "Result") -> None:

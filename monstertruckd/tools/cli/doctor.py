@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
+from monstertruckd.tools.cli.connection import robot_config
 from monstertruckd.tools.cli.options import EndpointOption, RobotOption, complete_config
 from monstertruckd.tools.cli.output import JsonOption, console, finish, print_json, remark
 
@@ -74,20 +75,15 @@ def doctor(
 
 async def _drive(robot: str, endpoint: str, clock: "Clock", command: "Callable[..., str]") -> "list[Finding]":
     """Findings of a drive through the daemon's gate."""
-    import json
-
     from monstertruck_runtime.client import TruckClient
     from monstertruck_runtime.errors import TruckError
-    from monstertruckd.config.truck import TruckConfig
     from monstertruckd.tools.calibrate.motion import Mover
     from monstertruckd.tools.doctor.context import fail
     from monstertruckd.tools.doctor.drive import signs
 
     try:
         async with TruckClient(robot, endpoint, clock=clock, timeout=10.0) as client:
-            running = await client.call("config")
-            running.pop("sim", None)
-            config = TruckConfig.model_validate_json(json.dumps(running))
+            config = await robot_config(client)
             mover = Mover(client, clock, config.chassis())
             return await signs(lambda step: mover.move(step, lambda _: None), config, command)
     except TruckError as error:

@@ -5,15 +5,16 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from monstertruck_runtime.clock import Clock, run_wall
+from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
-from monstertruck_runtime.errors import InputError, NotFoundError
+from monstertruck_runtime.errors import InputError
+from monstertruckd.tools.cli.connection import require_section, with_robot
 from monstertruckd.tools.cli.options import EndpointOption, RobotOption
-from monstertruckd.tools.cli.output import JsonOption, finish, print_json
+from monstertruckd.tools.cli.output import JsonOption, print_end
 
 if TYPE_CHECKING:
     from monstertruck_runtime.client import TruckClient
-    from monstertruckd.tools.cli.explore_session import ExplorationEnd
+    from monstertruckd.tools.cli.runs import RunEnd
 
 UNITS: Final = {"": 1.0, "s": 1.0, "min": 60.0, "h": 3600.0}
 
@@ -55,37 +56,20 @@ def explore(
 
     Prints its progress, and ends with it; its reason is the exit code. Ctrl-C stops it.
     """
-    from monstertruck_runtime.client import TruckClient
     from monstertruck_schemas.req import ExploreOrder
-    from monstertruckd.tools.cli.explore_session import run_exploration
+    from monstertruckd.tools.cli.runs import run_exploration
 
     seconds = None if budget is None else seconds_of(budget)
 
-    async def main(clock: Clock) -> "ExplorationEnd | None":
-        async with TruckClient(robot, endpoint, clock=clock) as client:
-            await _check(client, robot)
-            if stop:
-                await client.explore(ExploreOrder.STOP)
-                return None
-            report = None if json_output else print
-            return await run_exploration(client, home=home, budget=seconds, find=find, arm=arm, report=report)
+    async def main(client: "TruckClient", _: Clock) -> "RunEnd | None":
+        await require_section(client, "explorer", "does not explore")
+        if stop:
+            await client.explore(ExploreOrder.STOP)
+            return None
+        report = None if json_output else print
+        return await run_exploration(client, home=home, budget=seconds, find=find, arm=arm, report=report)
 
-    end = run_wall(main)
+    end = with_robot(main, robot, endpoint)
     if end is None:
         return
-    if json_output:
-        print_json(end.as_json())
-    elif not end.reason.exit_code:
-        print(f"{end.reason.text}: {end.text}")
-    finish(end.reason, f"{end.reason.text}: {end.text}")
-
-
-async def _check(client: "TruckClient", robot: str) -> None:
-    """Refuse a robot that does not explore.
-
-    Raises:
-        NotFoundError: naming what is missing.
-    """
-    if (await client.call("config")).get("explorer") is None:
-        text = f"robot {robot!r} does not explore: expected a section `explorer` in its configuration"
-        raise NotFoundError(text)
+    print_end(end.reason, end.text, end.as_json(), json_output=json_output)

@@ -1,16 +1,15 @@
 """``goto`` and ``track``: send the truck to a pose or along a path, and follow it there."""
 
-from collections.abc import Callable, Coroutine
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from monstertruck_runtime.clock import Clock, run_wall
+from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
-from monstertruck_runtime.errors import NotFoundError
+from monstertruckd.tools.cli.connection import require_section, with_robot
 from monstertruckd.tools.cli.options import EndpointOption, RobotOption, ViaOption, parse_pose, require_finite
-from monstertruckd.tools.cli.output import JsonOption, finish, print_json
+from monstertruckd.tools.cli.output import JsonOption, print_end
 
 if TYPE_CHECKING:
     from monstertruck_runtime.client import TruckClient
@@ -43,12 +42,12 @@ def goto(
     require_finite((x, y, yaw), *places)
 
     async def main(client: "TruckClient", clock: Clock) -> "Arrival":
-        if (await client.call("config")).get("planner") is None:
-            raise NotFoundError(f"robot {robot!r} has no planner: expected a section `planner` in its configuration")
+        await require_section(client, "planner", "has no planner")
         with on_the_terminal() as report:
             return await drive_to(client, clock, (x, y, yaw), places, arm=arm, report=report)
 
-    drive_and_tell(main, robot, endpoint, json_output=json_output)
+    end = with_robot(main, robot, endpoint, ROUTE_TIMEOUT)
+    print_end(end.reason, end.text, end.as_json(), json_output=json_output)
 
 
 def track(
@@ -75,26 +74,5 @@ def track(
         with on_the_terminal() as report:
             return await follow(client, clock, there, arm=arm, report=report)
 
-    drive_and_tell(main, robot, endpoint, json_output=json_output)
-
-
-def drive_and_tell(
-    drive: Callable[["TruckClient", Clock], Coroutine[Any, Any, "Arrival"]],
-    robot: str,
-    endpoint: str,
-    *,
-    json_output: bool,
-) -> None:
-    """Connect, drive, and print how it ended; its reason is the exit code."""
-    from monstertruck_runtime.client import TruckClient
-
-    async def main(clock: Clock) -> "Arrival":
-        async with TruckClient(robot, endpoint, clock=clock, timeout=ROUTE_TIMEOUT) as client:
-            return await drive(client, clock)
-
-    arrival = run_wall(main)
-    if json_output:
-        print_json(arrival.as_json())
-    elif not arrival.reason.exit_code:
-        print(f"{arrival.reason.text}: {arrival.text}")
-    finish(arrival.reason, f"{arrival.reason.text}: {arrival.text}")
+    end = with_robot(main, robot, endpoint, ROUTE_TIMEOUT)
+    print_end(end.reason, end.text, end.as_json(), json_output=json_output)

@@ -13,6 +13,7 @@ import typer
 
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruck_schemas.reasons import Reason
+from monstertruckd.tools.cli.connection import with_robot
 from monstertruckd.tools.cli.options import EndpointOption, RobotOption, complete_topic
 from monstertruckd.tools.cli.output import (
     JsonOption,
@@ -139,26 +140,15 @@ def fetch_command(
 
     The robot gives 1 MB/s at most, and one recording at a time.
     """
-    from monstertruck_runtime.client import TruckClient
-    from monstertruck_runtime.clock import Clock, run_wall
     from monstertruck_runtime.recordings import fetch_recording
 
-    to = output or Path(Path(name or "").name)
-
-    async def rows(clock: Clock) -> list[dict[str, Any]]:
-        async with TruckClient(robot, endpoint, clock=clock) as truck:
-            found: list[dict[str, Any]] = (await truck.call("recordings"))["recordings"]
-            return found
-
-    async def fetched(clock: Clock) -> int:
-        async with TruckClient(robot, endpoint, clock=clock, timeout=5.0) as truck:
-            with progress(f"fetching {name}", 1.0) as shown:
-                return await fetch_recording(truck, name or "", to, shown)
-
     if name is None:
-        _show_recordings(run_wall(rows), json_output=json_output)
+        rows = with_robot(lambda client, _: client.call("recordings"), robot, endpoint)["recordings"]
+        _show_recordings(rows, json_output=json_output)
         return
-    size = run_wall(fetched)
+    to = output or Path(Path(name).name)
+    with progress(f"fetching {name}", 1.0) as shown:
+        size = with_robot(lambda client, _: fetch_recording(client, name, to, shown), robot, endpoint, 5.0)
     if json_output:
         print_json({"name": name, "file": str(to), "bytes": size})
     else:

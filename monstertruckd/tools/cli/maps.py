@@ -11,12 +11,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
+from monstertruckd.tools.cli.connection import with_robot
 from monstertruckd.tools.cli.logs import finish_log
 from monstertruckd.tools.cli.options import ConfigOption, EndpointOption, RobotOption, with_parameters
 from monstertruckd.tools.cli.output import JsonOption, command_group, needs_extra, print_json, progress, remark
 
 if TYPE_CHECKING:
     from monstertruck_estimation.slam.worker_io import SlamEstimate, WorkerOutput
+    from monstertruck_runtime.client import TruckClient
+    from monstertruck_runtime.clock import Clock
     from monstertruckd.tools.logs.scans import LogGeometry, ScanLog
 
 
@@ -168,27 +171,24 @@ def save(
     """Save the map of a running robot as map_server files."""
     from monstertruck_estimation.slam.storage import trinary
     from monstertruck_estimation.slam.worker_io import GridPatch
-    from monstertruck_runtime.client import TruckClient
-    from monstertruck_runtime.clock import Clock, run_wall
     from monstertruck_runtime.errors import NoAnswerError
     from monstertruck_runtime.mailbox import latest
     from monstertruck_runtime.map_files import save_map
     from monstertruck_schemas.state import Grid
     from monstertruck_schemas.topics import MAP
 
-    async def newest(clock: Clock) -> Grid:
-        async with TruckClient(robot, endpoint, clock=clock) as client:
-            with client.subscribe(MAP, latest()) as maps:
-                try:
-                    async with clock.deadline(timeout):
-                        return await maps.next()
-                except TimeoutError:
-                    text = f"{robot} published no map within {timeout:g} s"
-                    if (await client.call("config")).get("slam") is None:
-                        text += ": its configuration has no section `slam`, as configs/slam.yaml has"
-                    raise NoAnswerError(text) from None
+    async def newest(client: "TruckClient", clock: "Clock") -> Grid:
+        with client.subscribe(MAP, latest()) as maps:
+            try:
+                async with clock.deadline(timeout):
+                    return await maps.next()
+            except TimeoutError:
+                text = f"{robot} published no map within {timeout:g} s"
+                if (await client.call("config")).get("slam") is None:
+                    text += ": its configuration has no section `slam`, as configs/slam.yaml has"
+                raise NoAnswerError(text) from None
 
-    grid = run_wall(newest)
+    grid = with_robot(newest, robot, endpoint)
     cells = grid.cells.reshape(grid.height, grid.width)
     save_map(trinary(GridPatch(cells, (grid.origin.x, grid.origin.y), grid.resolution)), output.with_suffix(".yaml"))
     remark(f"wrote {output.with_suffix('.yaml')}")

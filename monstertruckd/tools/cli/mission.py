@@ -5,19 +5,21 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from monstertruck_runtime.clock import Clock, run_wall
+from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruck_runtime.errors import ConfigError, InputError, NotFoundError
+from monstertruckd.tools.cli.connection import require_section, with_robot
 from monstertruckd.tools.cli.options import EndpointOption, RobotOption
-from monstertruckd.tools.cli.output import JsonOption, command_group, finish, print_json, print_table
+from monstertruckd.tools.cli.output import JsonOption, command_group, print_end, print_json, print_table
 
 if TYPE_CHECKING:
     from monstertruck_runtime.client import TruckClient
     from monstertruck_schemas.mission import Mission
-    from monstertruckd.tools.cli.mission_session import MissionEnd
+    from monstertruckd.tools.cli.runs import RunEnd
 
 app = command_group("Missions: steps that the robot does one after the other.")
 
+WITHOUT = "does no missions"
 FileArgument = Annotated[Path, typer.Argument(help="Mission (YAML).", show_default=False)]
 
 
@@ -34,8 +36,7 @@ def run_command(
     json_output: JsonOption = False,
 ) -> None:
     """Check a mission, start it and follow it to its end, whose reason is the exit code. Ctrl-C stops it."""
-    from monstertruck_runtime.client import TruckClient
-    from monstertruckd.tools.cli.mission_session import run_mission
+    from monstertruckd.tools.cli.runs import run_mission
 
     if (file is None) is not resume:
         raise InputError("expected a mission's file, or --resume")
@@ -43,17 +44,12 @@ def run_command(
         raise InputError("--moved: expected with --resume only")
     mission = None if file is None else load(file)
 
-    async def main(clock: Clock) -> "MissionEnd":
-        async with TruckClient(robot, endpoint, clock=clock) as client:
-            await _check(client, robot)
-            return await run_mission(client, mission, arm=arm, moved=moved, report=None if json_output else print)
+    async def main(client: "TruckClient", _: Clock) -> "RunEnd":
+        await require_section(client, "planner", WITHOUT)
+        return await run_mission(client, mission, arm=arm, moved=moved, report=None if json_output else print)
 
-    end = run_wall(main)
-    if json_output:
-        print_json(end.as_json())
-    elif not end.reason.exit_code:
-        print(f"{end.reason.text}: {end.text}")
-    finish(end.reason, f"{end.reason.text}: {end.text}")
+    end = with_robot(main, robot, endpoint)
+    print_end(end.reason, end.text, end.as_json(), json_output=json_output)
 
 
 @app.command("check")
@@ -99,15 +95,13 @@ def list_command(
 @app.command("stop")
 def stop_command(robot: RobotOption = "truck", endpoint: EndpointOption = DEFAULT_ENDPOINT) -> None:
     """End the mission that runs; the robot brakes and stands."""
-    from monstertruck_runtime.client import TruckClient
     from monstertruck_schemas.req import MissionOrder
 
-    async def main(clock: Clock) -> None:
-        async with TruckClient(robot, endpoint, clock=clock) as client:
-            await _check(client, robot)
-            await client.mission(MissionOrder.STOP)
+    async def main(client: "TruckClient", _: Clock) -> None:
+        await require_section(client, "planner", WITHOUT)
+        await client.mission(MissionOrder.STOP)
 
-    run_wall(main)
+    with_robot(main, robot, endpoint)
 
 
 def load(file: Path) -> "Mission":
@@ -120,13 +114,3 @@ def load(file: Path) -> "Mission":
     from monstertruckd.config.load import load_config
 
     return load_config(file, Mission)[0]
-
-
-async def _check(client: "TruckClient", robot: str) -> None:
-    """Refuse a robot that does no missions.
-
-    Raises:
-        NotFoundError: naming what is missing.
-    """
-    if (await client.call("config")).get("planner") is None:
-        raise NotFoundError(f"robot {robot!r} does no missions: expected a section `planner` in its configuration")

@@ -5,14 +5,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from monstertruck_runtime.clock import Clock, run_wall
+from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruck_runtime.errors import InputError
+from monstertruckd.tools.cli.connection import with_robot
 from monstertruckd.tools.cli.options import EndpointOption, RobotOption
-from monstertruckd.tools.cli.output import JsonOption, finish, print_json
+from monstertruckd.tools.cli.output import JsonOption, print_end
 
 if TYPE_CHECKING:
-    from monstertruckd.tools.cli.behave_session import BehaviourEnd
+    from monstertruck_runtime.client import TruckClient
+    from monstertruckd.tools.cli.runs import RunEnd
 
 
 class MoveProfile(StrEnum):
@@ -47,8 +49,7 @@ def move(
 
     Ends at the end of the move, or with the reason why it was refused or given up. Ctrl-C stops it.
     """
-    from monstertruck_runtime.client import TruckClient
-    from monstertruckd.tools.cli.behave_session import run_behaviour
+    from monstertruckd.tools.cli.runs import run_behaviour
 
     spot = radius == 0.0
     given = {
@@ -63,16 +64,11 @@ def move(
     settings = {name: value for name, value in given.items() if value is not None}
     _check(settings)
 
-    async def main(clock: Clock) -> "BehaviourEnd":
-        async with TruckClient(robot, endpoint, clock=clock) as client:
-            return await run_behaviour(client, "move", arm=arm, settings=settings)
+    async def main(client: "TruckClient", _: Clock) -> "RunEnd":
+        return await run_behaviour(client, "move", arm=arm, settings=settings)
 
-    end = run_wall(main)
-    if json_output:
-        print_json(end.as_json())
-    elif not end.reason.exit_code:
-        print(f"{end.reason.text}: {end.text}")
-    finish(end.reason, f"{end.reason.text}: {end.text}")
+    end = with_robot(main, robot, endpoint)
+    print_end(end.reason, end.text, end.as_json(), json_output=json_output)
 
 
 def _check(settings: dict[str, Any]) -> None:

@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from monstertruck_runtime.clock import Clock, run_wall
+from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError, TruckError
 from monstertruck_schemas.reasons import Reason
+from monstertruckd.tools.cli.connection import with_robot
 from monstertruckd.tools.cli.options import EndpointOption, RobotOption
 from monstertruckd.tools.cli.output import JsonOption, finish, print_json, remark
 
@@ -88,17 +89,16 @@ async def _announce(client: "TruckClient", *, hold: bool) -> None:
 
 
 def _run(name: str, robot: str, endpoint: str, *, json_output: bool, hold: bool = False) -> None:
-    from monstertruck_runtime.client import TruckClient
     from monstertruck_schemas.req import Order
 
-    async def main(clock: Clock) -> OrderOutcome:
-        async with TruckClient(robot, endpoint, clock=clock) as client:
-            order = Order(name)
-            if order is Order.ARM:
-                await _announce(client, hold=hold)
-            return await give(client, order, hold=hold)
+    order = Order(name)
 
-    outcome = run_wall(main)
+    async def main(client: "TruckClient", _: Clock) -> OrderOutcome:
+        if order is Order.ARM:
+            await _announce(client, hold=hold)
+        return await give(client, order, hold=hold)
+
+    outcome = with_robot(main, robot, endpoint)
     if json_output:
         print_json(outcome.as_json())
     elif outcome.reason is Reason.OK:

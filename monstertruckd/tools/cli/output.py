@@ -206,6 +206,25 @@ def finish(reason: Reason, text: str = "") -> None:
         raise typer.Exit(reason.exit_code)
 
 
+def print_end(reason: Reason, text: str, values: Mapping[str, Any], *, json_output: bool) -> None:
+    """Print how a drive or another run ended, and end the command by its reason.
+
+    Args:
+        reason: of the end.
+        text: the end in words.
+        values: what is printed as JSON.
+        json_output: whether it is.
+
+    Raises:
+        Exit: the reason is no success.
+    """
+    if json_output:
+        print_json(values)
+    elif not reason.exit_code:
+        print(f"{reason.text}: {text}")
+    finish(reason, f"{reason.text}: {text}")
+
+
 def until_stopped(main: Callable[[WallClock], Coroutine[Any, Any, None]]) -> None:
     """Run ``main(clock)`` until it returns, or until Ctrl-C or SIGTERM: its ordinary ends."""
     with suppress(KeyboardInterrupt):

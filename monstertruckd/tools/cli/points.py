@@ -5,17 +5,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from monstertruck_runtime.clock import Clock, run_wall
+from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruck_runtime.errors import InputError, NoAnswerError, NotFoundError
-from monstertruckd.tools.cli.goto import ArmOption, drive_and_tell
+from monstertruckd.tools.cli.connection import require_section, with_robot
+from monstertruckd.tools.cli.goto import ROUTE_TIMEOUT, ArmOption
 from monstertruckd.tools.cli.options import EndpointOption, RobotOption, require_finite
-from monstertruckd.tools.cli.output import JsonOption, command_group, print_json, print_table, remark
+from monstertruckd.tools.cli.output import JsonOption, command_group, print_end, print_json, print_table, remark
 
 if TYPE_CHECKING:
     from monstertruck_runtime.client import TruckClient
     from monstertruck_runtime.drives import Arrival
-    from monstertruck_schemas.points import PointOfInterest
+    from monstertruck_schemas.points import PointOfInterest, PointOrder
 
 app = command_group("Points of interest in the map: tags that the camera found, places that were marked.")
 
@@ -23,6 +24,7 @@ NameArgument = Annotated[str, typer.Argument(help="Of the point, such as tag-7 o
 MapOption = Annotated[
     Path | None, typer.Option("--map", help="Folder of a saved map, instead of a robot.", show_default=False)
 ]
+WITHOUT = "keeps no points of interest"
 WAIT = 3.0
 """Seconds to wait for the robot's list."""
 
@@ -85,7 +87,8 @@ def goto_command(
         with on_the_terminal() as report:
             return await drive_to(client, clock, (pose.x, pose.y, pose.yaw), [], arm=arm, report=report)
 
-    drive_and_tell(main, robot, endpoint, json_output=json_output)
+    end = with_robot(main, robot, endpoint, ROUTE_TIMEOUT)
+    print_end(end.reason, end.text, end.as_json(), json_output=json_output)
 
 
 @app.command("mark", context_settings={"ignore_unknown_options": True})
@@ -104,7 +107,7 @@ def mark_command(
         raise InputError("expected x and y, or neither")
     require_finite(tuple(value for value in (x, y, yaw) if value is not None))
     place = None if x is None or y is None else (x, y)
-    _ask(lambda client: client.point(PointOrder.MARK, name, place, yaw), robot, endpoint)
+    _order(PointOrder.MARK, robot, endpoint, name, place, yaw)
     remark(f"marked {name}")
 
 
@@ -115,7 +118,7 @@ def remove_command(
     """Have a point of interest forgotten."""
     from monstertruck_schemas.points import PointOrder
 
-    _ask(lambda client: client.point(PointOrder.REMOVE, name), robot, endpoint)
+    _order(PointOrder.REMOVE, robot, endpoint, name)
     remark(f"removed {name}")
 
 
@@ -127,36 +130,22 @@ def _points(folder: Path | None, robot: str, endpoint: str) -> "list[PointOfInte
             raise NotFoundError(f"{folder}: no {FILE} in it")
         return [point for point, _ in load(folder)]
 
-    async def main(client: "TruckClient", clock: Clock) -> "list[PointOfInterest]":
-        return await _newest(client, clock)
-
-    found: list[PointOfInterest] = _with(main, robot, endpoint)
-    return found
+    return with_robot(_newest, robot, endpoint)
 
 
-def _ask(order: Any, robot: str, endpoint: str) -> None:
+def _order(order: "PointOrder", robot: str, endpoint: str, *what: Any) -> None:
     async def main(client: "TruckClient", _: Clock) -> None:
-        await order(client)
+        await require_section(client, "points", WITHOUT)
+        await client.point(order, *what)
 
-    _with(main, robot, endpoint)
-
-
-def _with(main: Any, robot: str, endpoint: str) -> Any:
-    from monstertruck_runtime.client import TruckClient
-
-    async def session(clock: Clock) -> Any:
-        async with TruckClient(robot, endpoint, clock=clock) as client:
-            if (await client.call("config")).get("points") is None:
-                raise NotFoundError(f"robot {robot!r} keeps no points of interest: expected a section `points`")
-            return await main(client, clock)
-
-    return run_wall(session)
+    with_robot(main, robot, endpoint)
 
 
 async def _newest(client: "TruckClient", clock: Clock) -> "list[PointOfInterest]":
     from monstertruck_runtime.mailbox import latest
     from monstertruck_schemas.topics import POINTS
 
+    await require_section(client, "points", WITHOUT)
     with client.subscribe(POINTS, latest()) as box:
         try:
             async with clock.deadline(WAIT):

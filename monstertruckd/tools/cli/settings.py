@@ -5,9 +5,9 @@ from typing import Annotated, Any
 
 import typer
 
-from monstertruck_runtime.clock import Clock, run_wall
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruck_runtime.errors import NotFoundError
+from monstertruckd.tools.cli.connection import with_robot
 from monstertruckd.tools.cli.options import EndpointOption, RobotOption
 from monstertruckd.tools.cli.output import JsonOption, print_json, print_table, remark
 
@@ -22,7 +22,11 @@ def get(
 
     What is bounded by other settings or by the robot's body is said when it is refused.
     """
-    rows = [row for row in _call(robot, endpoint, "settings", {})["settings"] if _below(row["key"], key)]
+    rows = [
+        row
+        for row in with_robot(lambda client, _: client.call("settings"), robot, endpoint)["settings"]
+        if _below(row["key"], key)
+    ]
     if not rows:
         raise NotFoundError(
             f"{key}: no setting that may be changed while the robot runs; `monstertruckd get` lists all"
@@ -50,23 +54,14 @@ def set_value(
     The whole configuration is checked as at the start: nothing passes the ceilings of the robot's body. Without --save
     it is forgotten when the daemon ends.
     """
-    answer = _call(robot, endpoint, "set", {"values": {key: _parsed(value)}, "save": save})
+    change = {"values": {key: _parsed(value)}, "save": save}
+    answer = with_robot(lambda client, _: client.call("set", change), robot, endpoint)
     if json_output:
         print_json(answer)
     else:
         print(f"{key} is {value}" + (f", saved in {answer['file']}" if save else " until the daemon ends"))
     for text in answer["weakened"]:
         remark(f"less safe than by default: {text}")
-
-
-def _call(robot: str, endpoint: str, name: str, payload: dict[str, Any]) -> dict[str, Any]:
-    from monstertruck_runtime.client import TruckClient
-
-    async def main(clock: Clock) -> dict[str, Any]:
-        async with TruckClient(robot, endpoint, clock=clock) as client:
-            return await client.call(name, payload)
-
-    return run_wall(main)
 
 
 def _below(key: str, wanted: str | None) -> bool:

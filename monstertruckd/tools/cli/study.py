@@ -7,6 +7,7 @@ import typer
 
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruck_runtime.errors import InputError
+from monstertruckd.tools.cli.connection import robot_config, with_robot
 from monstertruckd.tools.cli.logs import finish_log
 from monstertruckd.tools.cli.options import EndpointOption, RobotOption
 from monstertruckd.tools.cli.output import JsonOption, command_group, print_json, print_table, remark
@@ -14,6 +15,8 @@ from monstertruckd.tools.cli.output import JsonOption, command_group, print_json
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from monstertruck_runtime.client import TruckClient
+    from monstertruck_runtime.clock import Clock
     from monstertruckd.config.truck import TruckConfig
     from monstertruckd.tools.study.log import Run
     from monstertruckd.tools.study.report import Result
@@ -118,16 +121,13 @@ def _results(runs: "list[Run]") -> "list[Result]":
 
 
 def _drive(plan: "Callable[[TruckConfig], list[Stretch]]", robot: str, endpoint: str) -> None:
-    from monstertruck_runtime.client import TruckClient
-    from monstertruck_runtime.clock import Clock, run_wall
-    from monstertruckd.config.truck import TruckConfig
     from monstertruckd.tools.study.runs import drive
 
-    async def main(clock: Clock) -> float:
-        async with TruckClient(robot, endpoint, clock=clock) as client:
-            config = TruckConfig.model_validate(await client.call("config"), strict=False)
-            stretches = plan(config)
-            remark(f"drives for {sum(stretch.seconds for stretch in stretches):.0f} s; Ctrl-C stops the robot")
-            return await drive(client, clock, config, stretches)
+    async def main(client: "TruckClient", clock: "Clock") -> float:
+        config = await robot_config(client)
+        stretches = plan(config)
+        remark(f"drives for {sum(stretch.seconds for stretch in stretches):.0f} s; Ctrl-C stops the robot")
+        return await drive(client, clock, config, stretches)
 
-    remark(f"done in {run_wall(main):.0f} s; analyse the log with `monstertruckd study analyse`")
+    seconds = with_robot(main, robot, endpoint)
+    remark(f"done in {seconds:.0f} s; analyse the log with `monstertruckd study analyse`")

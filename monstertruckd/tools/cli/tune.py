@@ -5,13 +5,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from monstertruck_runtime.clock import Clock, run_wall
+from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruck_runtime.errors import InputError, NotFoundError
+from monstertruckd.tools.cli.connection import require_section, with_robot
 from monstertruckd.tools.cli.options import EndpointOption, RobotOption
 from monstertruckd.tools.cli.output import command_group, print_table, remark
 
 if TYPE_CHECKING:
+    from monstertruck_runtime.client import TruckClient
     from monstertruckd.tools.tune.recipe import WallGains
     from monstertruckd.tools.tune.runs import TuningRun
 
@@ -28,7 +30,6 @@ def wall_command(
     endpoint: EndpointOption = DEFAULT_ENDPOINT,
 ) -> None:
     """Arm the robot, which stands beside a wall, and raise K_p and K_d by the coursework's recipe, run by run."""
-    from monstertruck_runtime.client import TruckClient
     from monstertruckd.tools.tune.runs import tune
 
     runs: list[TuningRun] = []
@@ -37,18 +38,17 @@ def wall_command(
         runs.append(run)
         remark(run.text)
 
-    async def main(clock: Clock) -> "WallGains | None":
-        async with TruckClient(robot, endpoint, clock=clock) as client:
-            config = ((await client.call("config")).get("behaviours") or {}).get(name)
-            if config is None:
-                raise NotFoundError(f"no behaviour {name!r}: see `monstertruckd behave list`")
-            if config["kind"] != "wall_pd":
-                raise InputError(f"{name} is of kind {config['kind']}: expected wall_pd, which has these gains")
-            await client.arm()
-            return await tune(client, name, float(config["distance"]), first, seconds, lambda: clock.sleep(1.5), report)
+    async def main(client: "TruckClient", clock: Clock) -> "WallGains | None":
+        config = (await require_section(client, "behaviours", "has no behaviours")).get(name)
+        if config is None:
+            raise NotFoundError(f"no behaviour {name!r}: see `monstertruckd behave list`")
+        if config["kind"] != "wall_pd":
+            raise InputError(f"{name} is of kind {config['kind']}: expected wall_pd, which has these gains")
+        await client.arm()
+        return await tune(client, name, float(config["distance"]), first, seconds, lambda: clock.sleep(1.5), report)
 
     try:
-        best = run_wall(main)
+        best = with_robot(main, robot, endpoint)
     finally:
         if plot is not None and runs:
             from monstertruckd.tools.tune.plots import draw

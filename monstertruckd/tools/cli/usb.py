@@ -8,6 +8,7 @@ import typer
 
 from monstertruck_runtime.clock import run_wall
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
+from monstertruckd.tools.cli.connection import with_robot
 from monstertruckd.tools.cli.options import EndpointOption, RobotOption, complete_role
 from monstertruckd.tools.cli.output import JsonOption, console, on_terminal, print_json, remark
 
@@ -21,7 +22,7 @@ def usb(
     """USB hubs, ports and devices of a running robot: what hangs where, its role, state and replugs."""
     from monstertruckd.tools.cli.usb_tree import draw, local_tree, plain, robot_tree
 
-    nodes = run_wall(local_tree if local else lambda clock: robot_tree(clock, robot, endpoint))
+    nodes = run_wall(local_tree) if local else with_robot(lambda client, _: robot_tree(client), robot, endpoint)
     if json_output:
         print_json(nodes)
     elif not nodes:

@@ -23,16 +23,15 @@ STATE_STYLE = {
 }
 
 
-async def robot_tree(clock: Clock, robot: str, endpoint: str) -> tuple[UsbNode, ...]:
+async def robot_tree(client: TruckClient) -> tuple[UsbNode, ...]:
     """Tree a running robot published last.
 
     Raises:
-        NotFoundError: the robot is not there, or watches no USB tree.
+        NotFoundError: it watches no USB tree.
     """
-    async with TruckClient(robot, endpoint, clock=clock) as client:
-        tree = await client.get_retained(USB)
+    tree = await client.get_retained(USB)
     if tree is None:
-        raise NotFoundError(f"robot {robot!r} watches no USB tree; --local shows this machine's")
+        raise NotFoundError(f"robot {client.robot!r} watches no USB tree; --local shows this machine's")
     return tree.nodes
 
 

@@ -12,8 +12,8 @@ from monstertruck_runtime.mailbox import Mailbox, fifo
 from monstertruck_schemas.plan import BehaviourState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import BehaviourOrder
-from monstertruckd.tools.cli.behave_session import run_behaviour
 from monstertruckd.tools.cli.main import app
+from monstertruckd.tools.cli.runs import run_behaviour
 
 
 def state(number=1, *, running=True, outcome=Reason.DRIVING, text=""):
@@ -68,7 +68,7 @@ def run(*reports, arm=False, refuses=None, seconds=60.0):
 def test_it_ends_with_the_behaviours_own_end():
     done = state(running=False, outcome=Reason.BEHAVIOUR_DONE, text="1 lap")
     robot, end = run(state(), state(), done, arm=True)
-    assert (end.reason, end.text, end.travelled) == (Reason.BEHAVIOUR_DONE, "1 lap", 0.3)
+    assert (end.reason, end.text, end.figures["travelled"]) == (Reason.BEHAVIOUR_DONE, "1 lap", 0.3)
     assert robot.orders == ["arm", BehaviourOrder.START]
     assert end.as_json()["values"] == {"distance": 0.3}
 

@@ -11,7 +11,7 @@ from monstertruck_schemas.plan import ExplorationPhase, ExplorationState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import ExploreOrder
 from monstertruckd.tools.cli.explore import seconds_of
-from monstertruckd.tools.cli.explore_session import progress_line, run_exploration
+from monstertruckd.tools.cli.runs import progress_line, run_exploration
 
 
 def state(number: int, phase: ExplorationPhase, outcome: Reason = Reason.DRIVING, **more) -> ExplorationState:
@@ -68,7 +68,12 @@ def test_it_is_followed_to_its_end_and_printed_in_short_lines():
     )
     lines: list[str] = []
     end = asyncio.run(run_exploration(robot, home=True, budget=60.0, arm=True, report=lines.append))
-    assert (end.reason, end.text, end.travelled, end.known) == (Reason.EXPLORED, "12 m^2", 5.0, 12.0)
+    assert (end.reason, end.text, end.figures["travelled"], end.figures["known"]) == (
+        Reason.EXPLORED,
+        "12 m^2",
+        5.0,
+        12.0,
+    )
     assert robot.orders == [("arm",), (ExploreOrder.START, True, 60.0)]
     assert len(lines) == 3
     assert "to (12.0, -3.0)" in lines[0]

@@ -22,6 +22,8 @@ from monstertruckd.tools.cli.main import app
 class Unplanned:
     """A robot that drives paths and nothing else."""
 
+    robot = "truck"
+
     def __init__(self, *_, **__):
         pass
 

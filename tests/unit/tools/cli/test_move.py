@@ -5,9 +5,9 @@ from typer.testing import CliRunner
 
 from monstertruck_runtime import client
 from monstertruck_schemas.reasons import Reason
-from monstertruckd.tools.cli import behave_session
-from monstertruckd.tools.cli.behave_session import BehaviourEnd
+from monstertruckd.tools.cli import runs
 from monstertruckd.tools.cli.main import app
+from monstertruckd.tools.cli.runs import RunEnd
 
 
 @pytest.mark.parametrize(
@@ -56,10 +56,10 @@ def test_a_move_reaches_the_robot_as_settings_of_the_behaviour(monkeypatch, opti
 
     async def run(_, name, *, arm, settings):
         asked.update(name=name, arm=arm, settings=settings)
-        return BehaviourEnd(name, Reason.BEHAVIOUR_DONE, "0.5 m", 1.0, 0.5, {})
+        return RunEnd(Reason.BEHAVIOUR_DONE, "0.5 m", {})
 
     monkeypatch.setattr(client, "TruckClient", Robot)
-    monkeypatch.setattr(behave_session, "run_behaviour", run)
+    monkeypatch.setattr(runs, "run_behaviour", run)
     result = CliRunner().invoke(app, ["move", *options, "--arm"])
     assert result.exit_code == 0, result.output
     assert asked == {"name": "move", "arm": True, "settings": settings}

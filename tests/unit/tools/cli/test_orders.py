@@ -112,10 +112,7 @@ def test_no_answer_is_no_outcome(error: TruckError):
 def shown(
     monkeypatch: pytest.MonkeyPatch, command: Callable[..., None], outcome: OrderOutcome, *, json_output: bool = False
 ) -> int:
-    def run_wall(main: Any) -> OrderOutcome:
-        return outcome
-
-    monkeypatch.setattr(orders, "run_wall", run_wall)
+    monkeypatch.setattr(orders, "with_robot", lambda *_: outcome)
     try:
         command("truck", "tcp/127.0.0.1:1", json_output)
     except typer.Exit as ended:

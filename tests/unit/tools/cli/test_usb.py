@@ -69,6 +69,8 @@ def test_the_drawn_tree_nests_by_port():
 
 def fake_client(tree: UsbTree | None) -> type:
     class Client:
+        robot = "truck"
+
         def __init__(self, *_: Any, **__: Any) -> None:
             pass
 
@@ -87,13 +89,13 @@ def fake_client(tree: UsbTree | None) -> type:
 
 def test_usb_asks_the_robot(monkeypatch: pytest.MonkeyPatch):
     tree = UsbTree(stamp=0, received=0, seq=0, nodes=NODES)
-    monkeypatch.setattr("monstertruckd.tools.cli.usb_tree.TruckClient", fake_client(tree))
+    monkeypatch.setattr("monstertruck_runtime.client.TruckClient", fake_client(tree))
     result = CliRunner().invoke(app(), ["usb", "--json"])
     assert [UsbNode.model_validate(row, strict=False) for row in json.loads(result.stdout)] == list(NODES)
     result = CliRunner().invoke(app(), ["usb"])
     assert result.stdout.splitlines() == plain(NODES), "piped, it is the table"
 
-    monkeypatch.setattr("monstertruckd.tools.cli.usb_tree.TruckClient", fake_client(None))
+    monkeypatch.setattr("monstertruck_runtime.client.TruckClient", fake_client(None))
     result = CliRunner().invoke(app(), ["usb"])
     assert isinstance(result.exception, NotFoundError)
 

@@ -1,0 +1,63 @@
+"""A command's connection to one robot."""
+
+import json
+from collections.abc import Callable, Coroutine
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from monstertruck_runtime.clock import Clock, run_wall
+from monstertruck_runtime.errors import NotFoundError
+
+if TYPE_CHECKING:
+    from monstertruck_runtime.client import TruckClient
+    from monstertruckd.config.truck import TruckConfig
+
+T = TypeVar("T")
+
+
+def with_robot(
+    main: "Callable[[TruckClient, Clock], Coroutine[Any, Any, T]]", robot: str, endpoint: str, timeout: float = 2.5
+) -> T:
+    """Connect, run ``main(client, clock)``, and return what it returns.
+
+    Args:
+        main: what is done with the robot.
+        robot: its name.
+        endpoint: where it listens.
+        timeout: seconds to wait for the link and for answers.
+
+    Raises:
+        NotFoundError: no robot answers there.
+    """
+    from monstertruck_runtime.client import TruckClient
+
+    async def session(clock: Clock) -> T:
+        async with TruckClient(robot, endpoint, clock=clock, timeout=timeout) as client:
+            return await main(client, clock)
+
+    return run_wall(session)
+
+
+async def robot_config(client: "TruckClient") -> "TruckConfig":
+    """The configuration that the robot runs on, without the section ``sim``: no tool may know the world's truth."""
+    from monstertruckd.config.truck import TruckConfig
+
+    running = await client.call("config")
+    running.pop("sim", None)
+    return TruckConfig.model_validate_json(json.dumps(running))
+
+
+async def require_section(client: "TruckClient", section: str, lacks: str) -> Any:
+    """Return a section of the robot's configuration, as JSON.
+
+    Args:
+        client: of the robot.
+        section: its name.
+        lacks: what the robot does not do without it, such as "does not explore".
+
+    Raises:
+        NotFoundError: the configuration does not have it.
+    """
+    found = (await client.call("config")).get(section)
+    if not found:
+        raise NotFoundError(f"robot {client.robot!r} {lacks}: expected a section `{section}` in its configuration")
+    return found

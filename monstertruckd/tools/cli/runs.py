@@ -1,0 +1,196 @@
+"""A behaviour, an exploration or a mission from its start to its end, as a client of the robot."""
+
+from collections.abc import Awaitable, Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any, Final, Protocol, TypeVar
+
+from monstertruck_runtime.errors import NoAnswerError, TruckError
+from monstertruck_runtime.mailbox import fifo
+from monstertruck_runtime.requests import Operator
+from monstertruck_schemas.mission import Mission
+from monstertruck_schemas.plan import BehaviourState, ExplorationState, MissionState
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import BehaviourOrder, ExploreOrder, MissionOrder
+from monstertruck_schemas.topics import BEHAVIOUR, EXPLORE, MISSION, Topic
+from monstertruckd.tools.cli.output import progress
+
+EVERY: Final = 5.0
+"""Seconds between two lines on an exploration that does the same all the time."""
+
+S = TypeVar("S", BehaviourState, ExplorationState, MissionState)
+Report = Callable[[str], object]
+"""Gets a line of progress now and then."""
+
+
+class BehaviourClient(Operator, Protocol):
+    """Client of a robot that has behaviours."""
+
+    async def behave(
+        self, order: BehaviourOrder, behaviour: str = "", settings: Mapping[str, Any] | None = None
+    ) -> dict[str, Any]:
+        """Start or stop a behaviour."""
+        ...
+
+
+class ExploringClient(Operator, Protocol):
+    """Client of a robot that explores."""
+
+    async def explore(
+        self, order: ExploreOrder, *, home: bool | None = None, budget: float | None = None, find: int | None = None
+    ) -> dict[str, Any]:
+        """Start an exploration, or end it."""
+        ...
+
+
+class MissionClient(Operator, Protocol):
+    """Client of a robot that does missions."""
+
+    async def mission(
+        self, order: MissionOrder, mission: Mission | None = None, *, moved: bool = False
+    ) -> dict[str, Any]:
+        """Start, go on with or end one."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class RunEnd:
+    """How a run ended."""
+
+    reason: Reason
+    text: str
+    figures: dict[str, Any]
+    """Of its last report: seconds ``elapsed``, and what else its kind has."""
+
+    def as_json(self) -> dict[str, Any]:
+        """Everything as plain data."""
+        return {"reason": self.reason, "text": self.text, **self.figures}
+
+
+async def run_behaviour(
+    client: BehaviourClient, name: str, *, arm: bool, settings: Mapping[str, Any] | None = None
+) -> RunEnd:
+    """Start a behaviour and wait for its end, see ``_run``; ``settings`` replace the configured ones."""
+    with progress(name) as bar:
+        return await _run(
+            client,
+            BEHAVIOUR,
+            lambda: client.behave(BehaviourOrder.START, name, settings),
+            lambda: client.behave(BehaviourOrder.STOP, name),
+            lambda state: bar(state.elapsed),
+            ("behaviour", "elapsed", "travelled", "values"),
+            arm=arm,
+        )
+
+
+async def run_exploration(
+    client: ExploringClient,
+    *,
+    home: bool | None,
+    budget: float | None,
+    find: int | None = None,
+    arm: bool,
+    report: Report | None = None,
+) -> RunEnd:
+    """Start an exploration and wait for its end, see ``_run``; its arguments are those of ``TruckClient.explore``."""
+    shown: ExplorationState | None = None
+
+    def show(state: ExplorationState) -> None:
+        nonlocal shown
+        changed = shown is None or (state.phase, state.goals) != (shown.phase, shown.goals)
+        if report is not None and (changed or shown is None or state.elapsed - shown.elapsed >= EVERY):
+            shown = state
+            report(progress_line(state))
+
+    return await _run(
+        client,
+        EXPLORE,
+        lambda: client.explore(ExploreOrder.START, home=home, budget=budget, find=find),
+        lambda: client.explore(ExploreOrder.STOP),
+        show,
+        ("elapsed", "travelled", "known", "goals"),
+        arm=arm,
+    )
+
+
+async def run_mission(
+    client: MissionClient, mission: Mission | None, *, arm: bool, moved: bool = False, report: Report | None = None
+) -> RunEnd:
+    """Start a mission and wait for its end, see ``_run``.
+
+    Args:
+        client: of the robot.
+        mission: None = go on with the interrupted one.
+        arm: arm the robot first.
+        moved: see ``TruckClient.mission``.
+        report: gets a line for each step.
+
+    Raises:
+        NotFoundError: the robot cannot do one of the steps.
+    """
+    order = MissionOrder.RESUME if mission is None else MissionOrder.START
+    shown = (0, 0)
+
+    def show(state: MissionState) -> None:
+        nonlocal shown
+        if report is not None and (state.step, state.attempt) != shown and state.running:
+            shown = state.step, state.attempt
+            again = f", attempt {state.attempt}" if state.attempt > 1 else ""
+            report(f"{state.elapsed:6.0f} s  step {state.step} of {state.steps}: {state.doing}{again}")
+
+    return await _run(
+        client,
+        MISSION,
+        lambda: client.mission(order, mission, moved=moved),
+        lambda: client.mission(MissionOrder.STOP),
+        show,
+        ("name", "elapsed", "step", "failures"),
+        arm=arm,
+    )
+
+
+async def _run(
+    client: Operator,
+    topic: Topic[S],
+    start: Callable[[], Awaitable[dict[str, Any]]],
+    stop: Callable[[], Awaitable[object]],
+    show: Callable[[S], None],
+    figures: tuple[str, ...],
+    *,
+    arm: bool,
+) -> RunEnd:
+    """Start a run and wait for its end; cancelled or without an answer, it is stopped.
+
+    Raises:
+        RequestRefusedError: the start or the arming was refused.
+        NoAnswerError: the robot does not answer.
+    """
+    with client.subscribe(topic, fifo(256)) as states:
+        if arm:
+            await client.arm()
+        try:
+            number = int((await start())["number"])
+            last: dict[str, Any] = {}
+            async for state in states:
+                if state.number > number:
+                    return RunEnd(Reason.CANCELLED, f"{state.source} started another one", last)
+                if state.number == number:
+                    show(state)
+                    last = {name: getattr(state, name) for name in figures}
+                    if not state.running:
+                        return RunEnd(state.outcome, state.text, last)
+            raise NoAnswerError("the link to the robot was closed")
+        except BaseException as error:
+            if not isinstance(error, TruckError) or isinstance(error, NoAnswerError):
+                with suppress(TruckError):
+                    await stop()
+            raise
+
+
+def progress_line(state: ExplorationState) -> str:
+    """How far an exploration has come, in less than 80 characters."""
+    where = "" if state.target is None else f" to ({state.target.x:.1f}, {state.target.y:.1f})"
+    return (
+        f"{state.elapsed:5.0f} s {state.travelled:6.1f} m  {state.known:6.1f} m^2 known, "
+        f"{state.frontiers:2d} frontiers  {state.phase}{where}"
+    )
