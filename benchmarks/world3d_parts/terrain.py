@@ -1,8 +1,9 @@
 """The whole daemon on uneven ground: level lidar, map and pose on hills; side slopes with the gate and without it."""
 
 from collections.abc import Awaitable, Callable
-from math import acos, degrees, hypot, pi, radians, tan
+from math import acos, ceil, degrees, hypot, pi, radians, tan
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -32,8 +33,8 @@ WAVE = 1.5
 GHOST = 0.15
 """An occupied cell of the map this far from every wall is none, m."""
 OCCUPIED_FROM = 65
-SLOWEST = 0.05
-"""A truck that is slower than this in the mean has got stuck, m/s."""
+STANDS = 20.0
+"""A truck that stands for this time does not drive on, s."""
 SETTLED = 500
 """Samples, ten seconds from where the truck has begun to drive on a slope."""
 FALLEN = radians(60.0)
@@ -87,12 +88,32 @@ def hills() -> list[dict[str, Any]]:
     return [feature | {"height": 0.05 * tan(radians(ROUGH_DEG)) / tan(radians(slope))}, ramp]
 
 
+def laps(metres: float, folder: Path) -> Path:
+    """A path file there of as many laps of the demo as are that long."""
+    header, *points = (CONFIGS / "paths" / "loop.csv").read_text().splitlines()
+    places = np.array([point.split(",")[:2] for point in points], dtype=float)
+    lap = float(np.hypot(*np.diff(places, axis=0).T).sum())
+    file = folder / "laps.csv"
+    file.write_text("\n".join([header, *points[:-1] * ceil(metres / lap), points[-1]]) + "\n")
+    return file
+
+
 def over(ground: list[dict[str, Any]], metres: float, *, stabilised: bool) -> Driven:
-    """Laps of the demo with a map that grows."""
+    """Laps of the demo with a map that grows.
+
+    Raises:
+        RuntimeError: the truck came to a stand before that way.
+    """
+    with TemporaryDirectory() as folder:
+        return _over(ground, metres, laps(metres, Path(folder)), stabilised=stabilised)
+
+
+def _over(ground: list[dict[str, Any]], metres: float, path: Path, *, stabilised: bool) -> Driven:
     base = load_config(CONFIGS / "full3d.yaml", SimulatedTruckConfig)[0]
     overlay: dict[str, Any] = {
         "recorder": None,
         "map": None,
+        "path": {"file": path, "closed": False},
         "slam": {"mode": "mapping"},
         "gate": {"tilt": {"slow": 0.3}},
         "sim": {"world": {"ground": ground}},
@@ -108,10 +129,14 @@ def over(ground: list[dict[str, Any]], metres: float, *, stabilised: bool) -> Dr
         assert await truck.until(truck.drives, 30.0, Order.ARM)
         lidar, body, poses, true, ways, way, report = [], [], [], [], [], 0.0, 5.0
         then = world.truth(clock.now())
-        limit = clock.now() + round(metres / SLOWEST * SECOND)
-        while way < metres and clock.now() < limit:
+        moved = clock.now()
+        while way < metres:
             await clock.sleep(0.02)
             now = world.truth(clock.now())
+            if truck.drives():
+                moved = clock.now()
+            elif clock.now() - moved > STANDS * SECOND:
+                raise RuntimeError(f"the truck stands after {way:.1f} m")
             up = plant.data.body("lidar_head").xmat[8]
             lidar.append(degrees(acos(min(1.0, float(up)))))
             body.append(degrees(hypot(now.pitch, now.roll)))
