@@ -42,7 +42,8 @@ def line(axes: Any, begin: tuple[float, float], end: tuple[float, float], text: 
     axes.plot([begin[0], end[0]], [begin[1], end[1]], color=colour, linewidth=1.6, zorder=0)
     if text:
         x, y = (begin[0] + end[0]) / 2, (begin[1] + end[1]) / 2
-        axes.text(x, y + 0.08, text, ha="center", va="bottom", fontsize=7.5, color=colour)
+        label = {"facecolor": "white", "edgecolor": "none", "pad": 1.5}
+        axes.text(x, y, text, ha="center", va="center", fontsize=7.5, color=colour, bbox=label)
 
 
 def sheet(title: str, width: float, height: float) -> tuple[Any, Any]:
@@ -83,7 +84,7 @@ def power() -> None:
     red, blue = "#b03030", "#2050a0"
     box(axes, 0.0, 2.0, "6S LiPo, 22.2 V\nin its bag", "#f6d0d0")
     box(axes, 3.6, 2.0, "fuse 15 A\nmain switch", "#f6d0d0", width=2.0)
-    line(axes, (1.35, 2.0), (2.55, 2.0), "25.2 V full", red)
+    line(axes, (1.35, 2.0), (2.55, 2.0), "25.2 V", red)
     loads = (
         (4.4, "drive controller\nEPOS 24/1", "direct", red),
         (3.2, "converter 5 V, 5 A\ncomputer", "", red),
@@ -98,7 +99,9 @@ def power() -> None:
     line(axes, (9.1, 4.4), (11.05, 4.4), "", red)
     box(axes, 11.8, 0.8, "servo\ncontroller", "#f5e6cc", width=1.6)
     line(axes, (9.1, 0.8), (10.95, 0.8), "signal", "#333")
-    line(axes, (11.8, 1.2), (8.6, 3.98), "deadman: channel to quick-stop input", blue)
+    line(axes, (11.8, 1.2), (11.8, 3.8), "deadman: channel\nto quick-stop input", blue)
+    line(axes, (11.8, 3.8), (8.6, 3.8), "", blue)
+    line(axes, (8.6, 3.8), (8.6, 3.98), "", blue)
     line(axes, (0.0, 1.6), (0.0, -1.2), "", "#333")
     line(axes, (0.0, -1.2), (11.8, -1.2), "divider 10 : 1 to analog input, pack voltage", "#333")
     line(axes, (11.8, -1.2), (11.8, 0.4), "", "#333")
