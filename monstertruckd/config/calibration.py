@@ -127,6 +127,8 @@ class Estimate(Schema):
     """By the width of its interval; None: it has none, or no goal"""
     valid_until: "ValidUntil | None" = None
     """Set when it is saved; None: of an older release"""
+    file: Annotated[int, Field(ge=0)] = 0
+    """Number of the file in which it was first saved: clocks may be wrong; 0: not yet, or by an older release"""
 
 
 class ValidUntil(Schema):
@@ -162,9 +164,9 @@ class Result(Schema):
     again: str | None = None
     """What has to be done before the calibration is complete"""
 
-    def over(self, before: "Result | None", date: str) -> "Result":
-        """This result as it is saved on ``date``, with what it keeps of the one ``before``."""
-        fresh = tuple(e if e.date else e.model_copy(update={"date": date}) for e in self.estimates)
+    def over(self, before: "Result | None", date: str, file: int = 0) -> "Result":
+        """This result as it is saved on ``date`` in the file of that number, with what it keeps of ``before``."""
+        fresh = tuple(e.model_copy(update={"date": e.date or date, "file": file}) for e in self.estimates)
         names = {estimate.name for estimate in fresh}
         old = before.estimates if self.partial and before is not None else ()
         kept = tuple(estimate for estimate in old if estimate.name not in names)
@@ -267,7 +269,7 @@ class CalibrationStore:
         with self._alone():
             current = self.current()
             before = current.results.get(result.wizard) if current is not None else None
-            saved = result.over(before, utc(real_ns))
+            saved = result.over(before, utc(real_ns), 1 if current is None else current.number + 1)
             return self._write({result.wizard: saved}, f"{result.wizard} calibrated", real_ns)
 
     def undo(self, wizard: WizardName, real_ns: int) -> Path:
@@ -309,7 +311,7 @@ class CalibrationStore:
     def _write(self, changed: dict[WizardName, Result | None], change: str, real_ns: int) -> Path:
         current = self.current()
         others = current.results.items() if current is not None else ()
-        results = {**{name: result for name, result in others if name not in changed}, **changed}  # the newest is last
+        results = {**{name: result for name, result in others if name not in changed}, **changed}
         number = 1 if current is None else current.number + 1
         file = CalibrationFile(
             number=number,
@@ -376,10 +378,18 @@ def put_values(data: dict[str, Any], results: Iterable[Result], source: Path | s
     Raises:
         ConfigError: a value that no wizard may set.
     """
-    for result in results:
-        for estimate in result.estimates:
-            if estimate.key is not None:
-                _set(data, estimate, result, source)
+    for result, _, estimate in in_order(results):
+        _set(data, estimate, result, source)
+
+
+def in_order(results: Iterable[Result]) -> list[tuple[Result, int, Estimate]]:
+    """Estimates that set a value, each with its result and its index there, the newest last.
+
+    A result that was measured in part only keeps estimates that are older than those of another wizard: of a value that
+    both set, the newer one counts.
+    """
+    rows = [(result, k, e) for result in results for k, e in enumerate(result.estimates) if e.key is not None]
+    return sorted(rows, key=lambda row: (row[2].file, "" if row[2].file else row[2].date or row[0].date))
 
 
 def _set(data: dict[str, Any], estimate: Estimate, result: Result, source: Path | str) -> None:

@@ -27,7 +27,7 @@ from monstertruck_runtime.errors import ConfigError
 from monstertruck_runtime.plugins import kind_of, models_in
 from monstertruck_runtime.small_files import replace_file, require_file
 from monstertruck_schemas.base import LiveValue, Schema, live_settings
-from monstertruckd.config.calibration import CalibrationStore, Result, WizardName, put_values
+from monstertruckd.config.calibration import CalibrationStore, Result, WizardName, in_order, put_values
 from monstertruckd.config.truck import ROBOT, TruckConfig
 
 Key = tuple[str | int, ...]
@@ -153,9 +153,8 @@ def calibrated(config: T, tree: Tree) -> tuple[T, Tree]:
 
 def _calibrated_origins(results: Mapping[WizardName, Result], lines: Mapping[Key, Origin]) -> dict[Key, Origin]:
     return {
-        tuple(estimate.key.split(".")): lines["results", wizard, "estimates", index, "value"]
-        for wizard, result in results.items()
-        for index, estimate in enumerate(result.estimates)
+        tuple(estimate.key.split(".")): lines["results", result.wizard, "estimates", index, "value"]
+        for result, index, estimate in in_order(results.values())
         if estimate.key is not None
     }
 

@@ -13,6 +13,9 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, Final, TypeVar
 
+import numpy as np
+from pydantic import ValidationError
+
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import InputError, NoAnswerError, RequestRefusedError
 from monstertruck_runtime.mailbox import fifo, latest
@@ -20,6 +23,7 @@ from monstertruck_schemas.base import Message
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.config.calibration import Result, Value, WizardName, value_at
 from monstertruckd.config.calibration_rpc import SAVE
+from monstertruckd.config.expiry import state_of
 from monstertruckd.config.truck import TruckConfig
 from monstertruckd.tools.calibrate.motion import MovedTruck, Mover
 from monstertruckd.tools.calibrate.steps import Collect, Confirm, MoveRecord, MoveStep, Number, Panel, WatchStep
@@ -52,7 +56,7 @@ class WizardContext:
         panel: the operator.
         clock: time.
         config: the daemon's, calibration included.
-        known: the truck's calibration so far, by wizard.
+        known: the truck's calibration so far, by wizard; what has expired, or is of another part, does not count.
     """
 
     def __init__(
@@ -65,7 +69,11 @@ class WizardContext:
     ) -> None:
         self.config = config
         self.chassis = config.chassis()
-        self.known = known
+        now = clock.now() + clock.real_offset()
+        self.expired = {
+            name: why for name, result in known.items() if (why := state_of(result, config, now, 0.0).expired)
+        }
+        self.known = {name: result for name, result in known.items() if name not in self.expired}
         self._truck = truck
         self._panel = panel
         self._clock = clock
@@ -155,9 +163,17 @@ class WizardContext:
                 self._panel.progress(step.name, done, total)
 
     def fit(self, name: str, function: Callable[[], T]) -> T:
-        """Compute a result from what was measured, as a step of its own."""
+        """Compute a result from what was measured, as a step of its own.
+
+        Raises:
+            InputError: there is none, as the measurements do not determine it; and what ``function`` raises.
+        """
         self._panel.say(f"computing: {name}")
-        return function()
+        try:
+            return function()
+        except (ValidationError, np.linalg.LinAlgError, ZeroDivisionError) as error:
+            text = str(error).splitlines()[0]
+            raise InputError(f"{name}: cannot be computed from what was measured ({text}): measure again") from error
 
 
 async def calibrate(
@@ -176,6 +192,9 @@ async def calibrate(
     panel.say(f"{wizard.name}: {wizard.doc}")
     if wizard.room:
         panel.say(f"room: {wizard.room}")
-    result = await wizard.run(WizardContext(truck, panel, clock, config, known))
+    context = WizardContext(truck, panel, clock, config, known)
+    if why := context.expired.get(wizard.name):
+        panel.say(f"nothing of the calibration before is used, it has expired: {why}")
+    result = await wizard.run(context)
     saved = await truck.call(SAVE, {"result": result.model_dump(mode="json"), "source": truck.source})
     return Result.model_validate_json(json.dumps(saved["result"])), str(saved["file"])

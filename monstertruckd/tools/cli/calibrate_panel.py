@@ -3,6 +3,7 @@
 import asyncio
 import os
 import sys
+import termios
 from collections import defaultdict, deque
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -90,8 +91,10 @@ class TerminalPanel:
                 return word
             if not text and not step.fact:
                 return True
+            wrong = f"{step.name}: {text!r} is neither yes nor no"
             if not typed:
-                raise InputError(f"{step.name}: {text!r} is neither yes nor no")
+                raise InputError(wrong)
+            remark(wrong)
 
     async def _answer(self, name: str, question: str) -> tuple[str, bool]:
         """The answer, and whether it was typed."""
@@ -100,8 +103,15 @@ class TerminalPanel:
             value = self._given[name].popleft()
             remark(f"{question} {value}")
             return value, False
+        self._forget()
         remark(question)
         return await self._line(name), True
+
+    def _forget(self) -> None:
+        """Leave out what was typed before the question: an Enter too much would let the truck move."""
+        if os.isatty(source := sys.stdin.fileno()):
+            termios.tcflush(source, termios.TCIFLUSH)
+            self._rest = b""
 
     async def _line(self, name: str) -> str:
         """A line of standard input. Nothing is read ahead of the question by a thread that Ctrl-C could not end."""

@@ -8,7 +8,7 @@ import pytest
 
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import ConfigError, NotFoundError
-from monstertruckd.config.calibration import CalibrationStore, Estimate, Result, with_values
+from monstertruckd.config.calibration import CalibrationStore, Estimate, Result, in_order, with_values
 from monstertruckd.config.load import load_config
 from monstertruckd.config.truck import TruckConfig
 
@@ -74,6 +74,37 @@ def test_a_partial_result_keeps_what_it_did_not_measure(store: CalibrationStore)
     assert [estimate.name for estimate in current.results["drive"].estimates] == ["drive_ratio"], "all was measured"
     store.undo("drive", NOON)
     assert value(store) is True
+
+
+def test_a_sign_alone_does_not_bring_back_a_ratio_that_another_wizard_measured_since(store: CalibrationStore):
+    config = load_config(Path(__file__).resolve().parents[3] / "configs" / "truck.yaml", TruckConfig)[0]
+
+    def used() -> float:
+        current = store.current()
+        assert current is not None
+        return with_values(config, current.results.values(), "test").geometry.drive_ratio
+
+    squares = ratio(650.0).model_copy(update={"wizard": "odometry"})
+    sign = Estimate(name="inverted", value=True, samples=1, meaning="test")
+    store.save(ratio(640.0), NOON)
+    store.save(squares, 0)  # a robot without a clock of its own
+    store.save(Result(wizard="drive", measured="seen", estimates=(sign,), partial=True), NOON)
+    assert used() == 650.0
+    store.undo("odometry", NOON)
+    assert used() == 640.0
+    store.undo("odometry", NOON)
+    store.save(ratio(645.0), NOON)
+    assert used() == 645.0
+
+
+def test_of_files_of_older_releases_the_dates_decide(store: CalibrationStore):
+    rows = [("drive", 640.0, "2026-11-21T12:00:00Z"), ("odometry", 650.0, "2026-11-21T13:00:00Z")]
+    results = []
+    for wizard, value_, date in rows:
+        found = ratio(value_)
+        dated = tuple(e.model_copy(update={"date": date}) for e in found.estimates)
+        results.append(found.model_copy(update={"wizard": wizard, "estimates": dated}))
+    assert [row.wizard for row, _, _ in in_order(reversed(results))] == ["drive", "odometry"]
 
 
 def test_numbers_decide_not_dates(store: CalibrationStore):

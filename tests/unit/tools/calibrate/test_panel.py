@@ -1,6 +1,8 @@
 """The operator at a terminal: answers given beforehand, typed ones, and none."""
 
+import asyncio
 import os
+import pty
 import sys
 from collections.abc import Iterator
 
@@ -66,6 +68,19 @@ async def test_typed_lines(keyboard: int, capsys: pytest.CaptureFixture[str]):
     err = capsys.readouterr().err
     assert "'two' is no number" in err
     assert "50 is not within" in err
+
+
+async def test_what_was_typed_before_the_question_is_no_answer(monkeypatch: pytest.MonkeyPatch):
+    typing, terminal = pty.openpty()
+    with os.fdopen(terminal) as stdin:
+        monkeypatch.setattr(sys, "stdin", stdin)
+        os.write(typing, b"\n\n")  # Enter, pressed while the truck still drove
+        answer = asyncio.create_task(TerminalPanel([]).confirm(READY))
+        await asyncio.sleep(0.05)
+        assert not answer.done()
+        os.write(typing, b"n\n")
+        assert not await answer
+    os.close(typing)
 
 
 async def test_no_answer_names_the_option(monkeypatch: pytest.MonkeyPatch):

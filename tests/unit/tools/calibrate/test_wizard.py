@@ -12,7 +12,8 @@ from monstertruck_runtime.mailbox import Mailbox
 from monstertruck_schemas import topics
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import Battery, BatteryLevel
-from monstertruckd.config.calibration import Estimate, Result
+from monstertruckd.config.calibration import Estimate, Result, ValidUntil
+from monstertruckd.config.expiry import part_of
 from monstertruckd.config.load import load_config
 from monstertruckd.config.truck import TruckConfig
 from monstertruckd.tools.calibrate.steps import Collect, Confirm, Number
@@ -66,12 +67,12 @@ class Panel:
         return self._yes
 
 
-def run(steps, panel: Panel | None = None, truck: Truck | None = None):
+def run(steps, panel: Panel | None = None, truck: Truck | None = None, known=None):
     """Run a wizard of the given coroutine function; returns what ``calibrate`` does."""
     wizard = Wizard("battery", "test", "a table", steps)
 
     async def main(clock: VirtualClock):
-        return await calibrate(wizard, truck or Truck(), panel or Panel(), clock, CONFIG, {})
+        return await calibrate(wizard, truck or Truck(), panel or Panel(), clock, CONFIG, known or {})
 
     return run_virtual(main)
 
@@ -131,6 +132,40 @@ def test_messages_are_collected_within_their_time():
     with pytest.raises(NoAnswerError, match="sensor/battery: 0 of 3 messages came within 5 s"):
         run(steps, panel, truck)
     assert "voltage 3/3" in panel.said
+
+
+@pytest.mark.parametrize("part", ["maestro of another truck", None])
+def test_what_was_measured_on_another_part_is_not_used(part: str | None):
+    until = ValidUntil(date="2099-01-01T00:00:00Z", part=part or part_of(CONFIG, "steering"))
+    estimate = RESULT.estimates[0].model_copy(update={"valid_until": until})
+    known = {"battery": RESULT.model_copy(update={"estimates": (estimate,)})}
+    panel = Panel()
+
+    async def steps(context: WizardContext) -> Result:
+        assert context.known.keys() == (set() if part else {"battery"})
+        return RESULT
+
+    run(steps, panel, known=known)
+    said = [text for text in panel.said if "has expired" in text]
+    assert len(said) == (1 if part else 0)
+    assert not part or said[0].startswith("nothing of the calibration before is used, it has expired: steering was mae")
+
+
+def test_measurements_that_determine_nothing_are_named_and_not_saved():
+    truck = Truck()
+
+    async def steps(context: WizardContext) -> Result:
+        return context.fit("scale", lambda: RESULT.model_copy(update={"date": 1 / 0}))
+
+    with pytest.raises(InputError, match=r"scale: cannot be computed from what was measured .*: measure again"):
+        run(steps, truck=truck)
+
+    async def infinite(context: WizardContext) -> Result:
+        return context.fit("scale", lambda: Estimate(name="gain", value=1.0, low=float("nan"), samples=1, meaning="t"))
+
+    with pytest.raises(InputError, match="scale: cannot be computed"):
+        run(infinite, truck=truck)
+    assert not truck.calls
 
 
 def test_values_of_the_running_configuration():
