@@ -385,7 +385,7 @@ def stabiliser_fit(rng: np.random.Generator) -> list[Verdict]:
     stands = mounted(settings, zeros, directions, rng)
     height, walls = 0.25, (2.0, 2.5)
     true = true_joints(settings, stands[0][1], zeros, directions)
-    sigma = math.hypot(0.002 * math.sqrt(2), stabiliser.FLAT * 0.002) / math.sqrt(2)
+    sigma = math.hypot(0.002 * math.sqrt(2), lidar.FLAT * 0.002) / math.sqrt(2)
     centre, ahead, left = (
         height,
         height - walls[0] * math.sin(stands[0][0].pitch + true.pitch),

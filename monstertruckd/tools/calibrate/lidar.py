@@ -64,10 +64,12 @@ TILT: Final = math.radians(0.2)
 """Standard deviation of the compass's tilt, rad."""
 FLAT: Final = 0.5
 """Share of the tape's standard deviation that a floor is uneven by."""
+MOST_TILT: Final = math.sin(math.radians(20.0))
+"""Rise of the beam per metre, at most: more is a wrong number."""
 HEIGHTS: Final = (
     Number("centre", "Height of the lidar's beam over the floor, at its window, cm", 1.0, 200.0),
-    Number("ahead", "Height of the beam on the wall straight ahead, cm", 0.0, 250.0),
-    Number("left", "Height of the beam on the wall straight to the left, cm", 0.0, 250.0),
+    Number("ahead", "Height of the beam on the wall straight ahead, cm", 1.0, 250.0),
+    Number("left", "Height of the beam on the wall straight to the left, cm", 1.0, 250.0),
 )
 
 
@@ -143,11 +145,12 @@ class LidarWizard:
         """Measure."""
         believed = tuple(float(context.value(f"{LIDAR}.{name}")) for name in ("x", "y", "yaw"))
         mount = (believed[0], believed[1], believed[2])
+        # First, so that a wrong number is refused before anything is driven, and nobody walks there afterwards.
+        level = await self._level(context) if self.heights else ()
         await context.confirm(CLEAR)
         chassis = context.chassis
         legs = [LidarLeg.of(await context.move(move), chassis, mount) for move in self._moves(chassis)]
         weaving = [await context.move(_with_scans(move)) for move in weaves(1)]
-        level = await self._level(context) if self.heights else ()
         crab = crab_error(context)
         offset = context.fit("offset of the clocks", lambda: time_offset(weaving))
         return context.fit("mount", lambda: result_of(legs, mount, crab, offset, level))
@@ -177,12 +180,13 @@ class LidarWizard:
         scans = await context.collect(Collect("distances of the walls", topics.SCAN, 10))
         tilt = await context.collect(Collect("the truck's tilt", topics.COMPASS, 20))
         ahead, left = (beam_distance(scans, angle) for angle in (0.0, QUARTER))
-        centre, front, side = [(await context.ask(step)) / 100 for step in HEIGHTS]
+        heights = [(await context.ask(step)) / 100 for step in HEIGHTS]
+        pitch, roll = beam_tilt(heights, (ahead, left))
         body = tuple(float(np.mean([getattr(a, name) for a in tilt])) for name in ("pitch", "roll"))
         error = math.hypot(self.tape_error * math.sqrt(2), FLAT * self.tape_error)
         found = (
-            ("pitch", math.asin((centre - front) / ahead) - body[0], ahead, "nose down positive"),
-            ("roll", math.asin((side - centre) / left) - body[1], left, "right side down positive"),
+            ("pitch", pitch - body[0], ahead, "nose down positive"),
+            ("roll", roll - body[1], left, "right side down positive"),
         )
         return tuple(
             estimated(
@@ -384,6 +388,27 @@ def beam_distance(scans: Sequence[LaserScan], angle: float) -> float:
     if not found:
         raise InputError(f"no wall is seen at {math.degrees(angle):.0f} degrees: the heights need one there")
     return float(np.median(found))
+
+
+def beam_tilt(heights: Sequence[float], walls: tuple[float, float]) -> tuple[float, float]:
+    """Pitch, nose down positive, and roll, right side down positive, of the beam's plane, rad.
+
+    Args:
+        heights: of the beam at the lidar, on the wall ahead and on the one to the left, m.
+        walls: distances of these, m.
+
+    Raises:
+        InputError: heights that no lidar has.
+    """
+    centre, ahead, left = heights
+    falls, rises = (centre - ahead) / walls[0], (left - centre) / walls[1]
+    for name, height, wall, slope in (("ahead", ahead, walls[0], falls), ("left", left, walls[1], rises)):
+        if abs(slope) > MOST_TILT:
+            raise InputError(
+                f"{name}: a beam {100 * centre:.0f} cm at the lidar and {100 * height:.0f} cm on a wall {wall:.1f} "
+                f"m away leans by more than {math.degrees(math.asin(MOST_TILT)):.0f} degrees: measure again, in cm"
+            )
+    return math.asin(falls), math.asin(rises)
 
 
 def _with_scans(move: MoveStep) -> MoveStep:

@@ -23,7 +23,7 @@ from monstertruck_schemas import topics
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import VALID_BEAM, Attitude, LaserScan, StabiliserFeedback
 from monstertruckd.config.calibration import STABILISER, Estimate, Result
-from monstertruckd.tools.calibrate.lidar import HEIGHTS, beam_distance
+from monstertruckd.tools.calibrate.lidar import FLAT, HEIGHTS, beam_distance, beam_tilt
 from monstertruckd.tools.calibrate.statistics import NORMAL, Interval
 from monstertruckd.tools.calibrate.steps import Collect, Confirm
 from monstertruckd.tools.calibrate.wizard import Wizard, WizardContext
@@ -34,8 +34,6 @@ ROOM: Final = (
 )
 TILT: Final = math.radians(0.2)
 """Standard deviation of the compass's tilt, rad."""
-FLAT: Final = 0.5
-"""Share of the tape's standard deviation that a floor is uneven by."""
 SETTLED: Final = 0.3
 """Position, steps, to which a unit reads itself: half a step, evenly."""
 BLOCKS: Final = (math.radians(4.0), math.radians(15.0))
@@ -126,7 +124,9 @@ class StabiliserWizard:
         await context.confirm(_LEVEL)
         flat, scans = await self._stand(context)
         ahead, left = (beam_distance(scans, angle) for angle in (0.0, math.pi / 2))
-        heights = Heights(*[(await context.ask(step)) / 100 for step in HEIGHTS])
+        asked = [(await context.ask(step)) / 100 for step in HEIGHTS]
+        beam_tilt(asked, (ahead, left))
+        heights = Heights(*asked)
         await context.confirm(_NOSE)
         nose, _ = await self._stand(context)
         await context.confirm(_SIDE)
@@ -172,13 +172,11 @@ def result_of(
         tape_error: standard deviation of a height, m.
 
     Raises:
-        InputError: the blocks are missing, a joint does not follow, or what the lidar sees fits neither direction.
+        InputError: heights that no lidar has; the blocks are missing, a joint does not follow, or what the lidar sees
+            fits neither direction.
     """
     error = math.hypot(tape_error * math.sqrt(2), FLAT * tape_error)
-    lies = RollPitch(
-        math.asin(max(-1.0, min(1.0, (heights.centre - heights.ahead) / walls[0]))),
-        math.asin(max(-1.0, min(1.0, (heights.left - heights.centre) / walls[1]))),
-    )
+    lies = RollPitch(*beam_tilt((heights.centre, heights.ahead, heights.left), walls))
     really = RollPitch(lies.pitch - flat.body.pitch, lies.roll - flat.body.roll)
     joints = (settings.pitch, settings.roll)
     changes = [_turns(stand, flat, heights.centre, axis, really) for axis, stand in enumerate((nose, side))]

@@ -174,7 +174,7 @@ def lidar(
 ) -> "Wizard":
     """Where the lidar sits on the body, and its clock against odometry's: quarter circles and straights.
 
-    Asks `clear` and, with heights, `centre`, `ahead` and `left` (cm).
+    Asks with heights `centre`, `ahead` and `left` (cm), and `clear`.
     """
     from monstertruckd.tools.calibrate.lidar import LidarWizard, lidar_wizard
 

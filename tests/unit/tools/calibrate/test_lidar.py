@@ -7,7 +7,15 @@ import numpy as np
 import pytest
 
 from monstertruck_runtime.errors import InputError
-from monstertruckd.tools.calibrate.lidar import LidarLeg, fit_mount, fit_offset, result_of, seen_motion
+from monstertruckd.tools.calibrate.lidar import (
+    HEIGHTS,
+    LidarLeg,
+    beam_tilt,
+    fit_mount,
+    fit_offset,
+    result_of,
+    seen_motion,
+)
 
 TRUE = np.array((0.13, 0.02, 0.04, 1.01, 0.0))
 
@@ -53,3 +61,14 @@ def test_an_offset_of_the_clocks(offset):
     assert found.value.low - 0.002 < offset < found.value.high + 0.002
     assert found.value.half < 0.005
     assert math.isfinite(found.value.half)
+
+
+def test_the_tilt_of_the_beam_follows_from_its_heights():
+    assert beam_tilt((0.25, 0.21, 0.28), (2.0, 3.0)) == pytest.approx((0.02, 0.01), abs=1e-5)
+
+
+@pytest.mark.parametrize(("heights", "named"), [((0.25, 2.5, 0.25), "ahead"), ((0.25, 0.25, 1.8), "left")])
+def test_heights_that_no_lidar_has_are_refused_by_name(heights, named):
+    with pytest.raises(InputError, match=rf"^{named}: a beam 25 cm at .* measure again, in cm"):
+        beam_tilt(heights, (2.0, 2.0))
+    assert all(step.low == 1.0 for step in HEIGHTS), "metres in place of cm are refused, too"
