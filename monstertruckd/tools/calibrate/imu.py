@@ -33,6 +33,8 @@ LEAST: Final = 2
 """Turns that tell the scale, at least."""
 MOVED: Final = 0.02
 """Greatest standard deviation of a resting yaw rate, rad/s: more is a unit that is being moved."""
+SILENT: Final = 0.5
+"""Seconds without a reading: what the robot turned meanwhile is not known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +54,7 @@ class Turn:
         """From a move; rates as published with a correction by ``bias`` (rad/s) and ``scale``.
 
         Raises:
-            InputError: no readings of the unit, or too few headings at rest.
+            InputError: no readings of the unit, or none for a while, or too few headings at rest.
         """
         readings = record.of(topics.IMU)
         if len(readings) < 2:
@@ -63,6 +65,9 @@ class Turn:
         turned += math.tau * round((record.turned() - turned) / math.tau)
         over = abs(math.remainder(turned, math.tau))
         between = (stamps >= record.left / SECOND - 0.2) & (stamps <= record.arrived / SECOND + 0.2)
+        heard = np.concatenate(((record.left / SECOND,), stamps[between], (record.arrived / SECOND,)))
+        if (silent := float(np.diff(heard).max())) > SILENT:
+            raise InputError(f"the unit was silent for {silent:.1f} s while the truck turned: measure again")
         integral = float(np.trapezoid(rates[between], stamps[between]))
         seconds = float(np.ptp(stamps[between]))
         return cls(integral, seconds, turned, math.hypot(noise, HEADING, 0.01 * min(over, 1.0)))

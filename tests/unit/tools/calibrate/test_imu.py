@@ -7,10 +7,13 @@ import pytest
 
 from monstertruck_drivers.wt61.config import ImuCorrection
 from monstertruck_drivers.wt61.driver import corrected_force, corrected_rate
+from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError
+from monstertruck_schemas import topics
 from monstertruck_schemas.sensor import Attitude, Imu, Vector3
 from monstertruckd.tools.calibrate.imu import Turn, rate_scale, result_of
 from monstertruckd.tools.calibrate.statistics import Interval
+from monstertruckd.tools.calibrate.steps import MoveRecord
 
 NONE = {"rate_x": 0.0, "rate_y": 0.0, "rate_z": 0.0, "rate_scale": 1.0, "force_x": 0.0, "force_y": 0.0}
 LEVEL = [Attitude(stamp=1, received=1, seq=1, heading=0.0, pitch=0.0, roll=0.0)]
@@ -55,6 +58,34 @@ def test_the_scale_makes_a_full_turn_one():
     assert rate_scale(turns, Interval(0.005, 0.0005)).value == pytest.approx(1 / 1.04, rel=1e-4)
     with pytest.raises(InputError, match="one to each side"):
         rate_scale(turns[:1] * 2, Interval(0.0, 0.001))
+
+
+@pytest.mark.parametrize(
+    ("lost", "said"), [(range(0), None), (range(40, 70), "silent for 3.1 s"), (range(80, 101), "s")]
+)
+def test_a_unit_that_was_silent_while_the_truck_turned_is_refused(lost, said):
+    def stamped(model, k, **values):
+        return model(stamp=k * SECOND // 10, received=k, seq=k, **values)
+
+    yaw = [0.0 if k < 20 else min(k - 20, 60) * math.tau / 60 for k in range(101)]
+    rate = [math.tau / 6 if 20 <= k < 80 else 0.0 for k in range(101)]
+    record = MoveRecord(
+        attitude=[stamped(Attitude, k, heading=(-y) % math.tau, pitch=0.0, roll=0.0) for k, y in enumerate(yaw)],
+        left=2 * SECOND,
+        arrived=9 * SECOND,
+    )
+    force = Vector3(x=0.0, y=0.0, z=9.8)
+    record.others[topics.IMU.name] = [
+        stamped(Imu, k, angular_velocity=Vector3(x=0.0, y=0.0, z=w), linear_acceleration=force)
+        for k, w in enumerate(rate)
+        if k not in lost
+    ]
+    if said is None:
+        turn = Turn.of(record, 0.0, 1.0)
+        assert (turn.integral, turn.turned) == pytest.approx((math.tau, math.tau), rel=0.02)
+        return
+    with pytest.raises(InputError, match=said):
+        Turn.of(record, 0.0, 1.0)
 
 
 def test_the_driver_takes_them_out():
