@@ -288,9 +288,12 @@ def rigid(config: WorldConfig, footprint: PlanOutline, start: Pose) -> Engine:
     """One robot of rigid bodies.
 
     Raises:
-        InputError: a file of the world is not there or does not fit.
+        InputError: a file of the world is not there or does not fit, there are too many people, or the robot cannot
+            stand where it begins.
     """
     scene = footprint.scene
+    if len(scene.people) > SPARE:
+        raise InputError(f"sim.world.people: {len(scene.people)}: expected at most {SPARE} with engine mujoco")
     place, truck = scene.place, config.truck
     resolution, (x0, y0) = place.map.resolution, place.map.origin
     rows, columns = place.map.cells.shape

@@ -90,7 +90,7 @@ def _pictured(config: HeightImage) -> HeightGrid:
         with Image.open(config.file) as image:
             grey = np.asarray(image.convert("I" if image.mode.startswith("I") else "L"), dtype=np.float64)
             white = 65535.0 if image.mode.startswith("I") else 255.0
-    except (OSError, UnidentifiedImageError) as error:
+    except (OSError, UnidentifiedImageError, Image.DecompressionBombError) as error:
         raise InputError(f"sim.world.height_image: {config.file}: {error}") from error
     return HeightGrid(np.ascontiguousarray(grey[::-1]) / white * config.height, config.resolution, (config.x, config.y))
 
@@ -125,10 +125,14 @@ def _standing(
 
 
 def scenery(path: Path) -> tuple[list[ET.Element], list[ET.Element]]:
-    """Assets, and bodies and geometries, of an MJCF file.
+    """Assets, and bodies and geometries, of an MJCF file; angles in radians, files of assets by their whole names.
+
+    Its angles are degrees unless its ``compiler`` says otherwise, and its assets' files lie where that says (MuJoCo XML
+    reference, element compiler).
 
     Raises:
-        InputError: it is no MJCF file, or something in it moves.
+        InputError: it is no MJCF file, something in it moves, or it has what is not taken over: classes of defaults,
+            another sequence of Euler angles.
     """
     try:
         root = ET.parse(path).getroot()  # noqa: S314  # a file that the user names himself
@@ -136,11 +140,33 @@ def scenery(path: Path) -> tuple[list[ET.Element], list[ET.Element]]:
         raise InputError(f"sim.world.mjcf: {path}: {error}") from error
     if root.tag != "mujoco":
         raise InputError(f"sim.world.mjcf: {path}: expected <mujoco>, found <{root.tag}>")
-    for tag in ("joint", "freejoint", "actuator", "include"):
+    for tag in ("joint", "freejoint", "flexcomp", "composite", "actuator", "include"):
         if next(root.iter(tag), None) is not None:
             raise InputError(f"sim.world.mjcf: {path}: <{tag}>: expected geometries that do not move, in one file")
+    if next(root.iter("default"), None) is not None:
+        raise InputError(f"sim.world.mjcf: {path}: <default>: expected geometries that say all of themselves")
+    compiler = {name: value for element in root.findall("compiler") for name, value in element.items()}
+    if (sequence := compiler.get("eulerseq", "xyz")) != "xyz":
+        raise InputError(f"sim.world.mjcf: {path}: compiler eulerseq {sequence}: expected xyz")
     assets = [asset for section in root.findall("asset") for asset in section]
     for asset in assets:
-        if (file := asset.get("file")) is not None:
-            asset.set("file", str((path.parent / file).resolve()))
-    return assets, [element for section in root.findall("worldbody") for element in section if element.tag != "light"]
+        folder = compiler.get("texturedir" if asset.tag == "texture" else "meshdir", compiler.get("assetdir", ""))
+        for name, file in asset.items():
+            if name.startswith("file"):
+                asset.set(name, str((path.parent / folder / file).resolve()))
+    placed = [element for section in root.findall("worldbody") for element in section if element.tag != "light"]
+    if compiler.get("angle", "degree") == "degree":
+        _use_radians(path, placed)
+    return assets, placed
+
+
+def _use_radians(path: Path, elements: Sequence[ET.Element]) -> None:
+    for element in (inner for outer in elements for inner in outer.iter()):
+        for name, first in (("euler", 0), ("axisangle", 3)):
+            if (text := element.get(name)) is not None:
+                try:
+                    values = [float(word) for word in text.split()]
+                except ValueError:
+                    raise InputError(f"sim.world.mjcf: {path}: {name} {text!r}: expected numbers") from None
+                turned = values[:first] + [radians(angle) for angle in values[first:]]
+                element.set(name, " ".join(map(repr, turned)))

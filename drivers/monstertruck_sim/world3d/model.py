@@ -3,11 +3,12 @@
 Geometries are in groups: ground, walls, blocks on the ground, the robot, and what can move or be put there.
 """
 
+import logging
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import Final
+from typing import ClassVar, Final
 from xml.etree import ElementTree as ET
 from xml.etree.ElementTree import Element, SubElement
 
@@ -30,6 +31,20 @@ PARKED: Final = -50.0
 """Height at which spare ones wait, m."""
 TALL: Final = 0.6
 """Height of what is put into a world, m."""
+
+log = logging.getLogger(__name__)
+
+
+class Warnings:
+    """What MuJoCo warned of; its own way is a file in the present folder."""
+
+    count: ClassVar[int] = 0
+
+    @classmethod
+    def take(cls, text: str) -> None:
+        """Count one and log it."""
+        cls.count += 1
+        log.warning("MuJoCo: %s", " ".join(text.split()))
 
 
 # Two geometries touch where a bit of the type of one is in the affinity of the other.
@@ -217,6 +232,7 @@ def load(description: Description, drive: DriveLine, friction: float, scene: Sta
     Raises:
         InputError: the scenery of another file does not fit.
     """
+    mujoco.set_mju_user_warning(Warnings.take)
     try:
         model = mujoco.MjModel.from_xml_string(mjcf(description, drive, friction, scene))
     except ValueError as error:

@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 
 from monstertruck_kinematics.description import HEAD_JOINTS, Mechanics
 from monstertruck_kinematics.elementary import Array
+from monstertruck_runtime.errors import CommandFailedError, InputError
 from monstertruck_sim.world.actuators import RPM
 from monstertruck_sim.world.config import BatteryModelConfig, SimTruckConfig
 from monstertruck_sim.world.plant import GriddedPlant, Pose, Vector
-from monstertruck_sim.world3d.model import HEAD_LAG, TIMESTEP, DriveLine, Group
+from monstertruck_sim.world3d.model import HEAD_LAG, TIMESTEP, DriveLine, Group, Warnings
 
 _FREED: Final = 0.005
 _STANDING: Final = 0.01
@@ -26,6 +27,14 @@ _FELT: Final = 0.05
 """Time constant with which an accelerometer feels the body's acceleration, s: its mount and filter."""
 _SETTLE: Final = 400
 """Steps that a robot which was put down gets to come to rest."""
+_RESTS: Final = 0.5
+"""Speed upwards or downwards that one which came to rest cannot have, m/s."""
+_UNSTABLE: Final = (
+    mujoco.mjtWarning.mjWARN_BADQPOS,
+    mujoco.mjtWarning.mjWARN_BADQVEL,
+    mujoco.mjtWarning.mjWARN_BADQACC,
+)
+"""Warnings after which MuJoCo begins again where its model does: elsewhere, without a word to anybody."""
 
 Ground = Callable[[float, float], float]
 """Height under a point of the map, m."""
@@ -141,7 +150,11 @@ class RigidPlant(GriddedPlant):
         self._remember()
 
     def _put(self, pose: Pose) -> None:
-        """Let it settle on its springs at a pose, held in its place."""
+        """Let it settle on its springs at a pose, held in its place.
+
+        Raises:
+            InputError: it does not: something of the ground or of an MJCF file reaches into it.
+        """
         data = self.data
         around = data.mocap_pos.copy(), data.mocap_quat.copy()
         mujoco.mj_resetData(self.model, data)
@@ -153,10 +166,15 @@ class RigidPlant(GriddedPlant):
         self._steered = []
         self._deflection[:] = 0.0
         self._command(0.0, [servo.angle for servo in self._servos])
+        self._warned = Warnings.count
         for _ in range(_SETTLE):
             mujoco.mj_step(self.model, data)
+            if Warnings.count != self._warned:
+                break
             data.qpos[:2] = x, y
             data.qvel[:2] *= 0.5
+        if self._unstable() or not abs(data.qvel[2]) < _RESTS:
+            raise InputError(f"the robot does not come to rest at ({x:.2f}, {y:.2f}): something is in its place there")
         data.qvel[:] = 0.0
         mujoco.mj_forward(self.model, data)
         self._twist, self._stuck_at = (0.0, 0.0, 0.0), None
@@ -174,10 +192,26 @@ class RigidPlant(GriddedPlant):
         self._command(dt, servos)
         before = self.data.qvel[:3].copy()
         mujoco.mj_step(self.model, self.data)
+        if Warnings.count != self._warned:
+            self._require_stable()
         self._roll()
         self._read(before)
         self._draw(dt, self._slip())
         self._touch()
+
+    def _unstable(self) -> bool:
+        return any(self.data.warning[which].number for which in _UNSTABLE)
+
+    def _require_stable(self) -> None:
+        """After a warning, which may be of another robot's model.
+
+        Raises:
+            CommandFailedError: numbers of this one grew beyond all bounds.
+        """
+        self._warned = Warnings.count
+        if self._unstable():
+            x, y, _ = self._pose
+            raise CommandFailedError(f"the simulation of the robot at ({x:.2f}, {y:.2f}) became unstable")
 
     def _roll(self) -> None:
         """Tyres give way where they touch the ground; rolling on brings a fresh piece of them there.

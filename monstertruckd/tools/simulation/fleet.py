@@ -10,7 +10,7 @@ from monstertruck_sim.world.scene import Surroundings
 from monstertruck_sim.world.world import make_scene
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, needs_computer
 
-SHARED: Final = ("map", "engine", "ground", "height_image", "mjcf")
+SHARED: Final = ("map", "engine", "rough", "ground", "height_image", "mjcf")
 """What robots of one world have in common."""
 
 

@@ -52,6 +52,7 @@ def test_two_robots_of_one_name_are_refused():
             {"sim": {"world": {"engine": "mujoco"}}},
             "second: sim.world.engine is mujoco: expected that of leader, plane",
         ),
+        ({"sim": {"world": {"rough": ({"x": 1.0, "y": 0.0},)}}}, "second: sim.world.rough is (RoughPatch(x=1.0"),
         ({"sim": {"world": {"people": ({},)}}}, "second: sim.world.people: expected none, or those of leader"),
     ],
 )

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.errors import CommandFailedError, InputError
 from monstertruck_sim.world.config import SonarModelConfig, WorldConfig
 from monstertruck_sim.world.terrain import Profile
 from monstertruck_sim.world.world import World
@@ -86,6 +86,13 @@ def test_what_is_no_picture_is_refused(tmp_path):
         heights(height_image={"file": tmp_path / "hill.png"})
 
 
+def test_a_picture_that_would_fill_the_memory_is_refused(tmp_path, monkeypatch):
+    Image.fromarray(np.zeros((3, 4), np.uint8)).save(tmp_path / "hill.png")
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 5)
+    with pytest.raises(InputError, match=r"height_image: .*hill\.png: Image size \(12 pixels\)"):
+        heights(height_image={"file": tmp_path / "hill.png"})
+
+
 def test_steps_stand_on_the_ground_with_their_height():
     config = configured(
         {"kind": "slope", "x": 0.0, "angle_deg": 10.0, "length": 2.0},
@@ -155,6 +162,59 @@ def test_other_files_that_do_not_fit_are_refused(tmp_path, text, reason):
     file.write_text(text)
     with pytest.raises(InputError, match=reason):
         World(configured(map="yard", mjcf=file), 1)
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        ("<default><geom type='box'/></default>", "<default>: expected geometries that say all"),
+        ("<compiler eulerseq='zyx'/>", "eulerseq zyx: expected xyz"),
+        ("<worldbody><body><flexcomp name='f'/></body></worldbody>", "<flexcomp>: expected geometries that do not"),
+        ("<worldbody><geom euler='0 0 north'/></worldbody>", "euler '0 0 north': expected numbers"),
+    ],
+)
+def test_what_would_be_taken_for_something_else_is_refused(tmp_path, content, reason):
+    (tmp_path / "scene.xml").write_text(f"<mujoco>{content}</mujoco>")
+    with pytest.raises(InputError, match=reason):
+        scenery(tmp_path / "scene.xml")
+
+
+@pytest.mark.parametrize(("compiler", "turn"), [("", pi / 2), ('<compiler angle="radian"/>', 90.0)])
+def test_angles_of_another_file_are_degrees_unless_it_says_otherwise(tmp_path, compiler, turn):
+    body = '<body euler="0 0 90"><geom axisangle="0 1 0 90"/></body>'
+    (tmp_path / "scene.xml").write_text(f"<mujoco>{compiler}<worldbody>{body}</worldbody></mujoco>")
+    (found,) = scenery(tmp_path / "scene.xml")[1]
+    assert [float(word) for word in found.get("euler").split()] == [0.0, 0.0, turn]
+    assert [float(word) for word in found.find("geom").get("axisangle").split()] == [0.0, 1.0, 0.0, turn]
+
+
+def test_files_of_assets_lie_where_the_compiler_says(tmp_path):
+    compiler = '<compiler meshdir="shapes" assetdir="all"/>'
+    assets = '<asset><mesh name="a" file="a.stl"/><texture name="b" type="2d" file="b.png"/></asset>'
+    (tmp_path / "scene.xml").write_text(f"<mujoco>{compiler}{assets}</mujoco>")
+    found = [asset.get("file") for asset in scenery(tmp_path / "scene.xml")[0]]
+    assert found == [str(tmp_path / "shapes/a.stl"), str(tmp_path / "all/b.png")]
+
+
+@pytest.mark.parametrize("place", ["0 0 0", "nan 0 0"])
+def test_a_robot_that_begins_inside_of_something_is_refused(tmp_path, place, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    file = scene_file(tmp_path, f'<geom type="box" size="20 20 5" pos="{place}"/>')
+    with pytest.raises(InputError, match=r"does not come to rest at \(0\.00, 0\.00\)"):
+        World(configured(map="yard", noise=False, mjcf=file, start={"x": 0.0, "y": 0.0, "yaw": 0.0}), 1)
+    assert not (tmp_path / "MUJOCO_LOG.TXT").exists()
+
+
+def test_more_people_than_there_are_bodies_for_are_refused():
+    with pytest.raises(InputError, match=r"sim\.world\.people: 25: expected at most 24"):
+        World(configured(map="yard", noise=False, people=[{"radius": 0.05}] * 25), 1)
+
+
+def test_numbers_beyond_all_bounds_end_the_simulation_instead_of_moving_the_robot(solid):
+    driver = solid()
+    driver.world.plant.data.qvel[0] = np.nan
+    with pytest.raises(CommandFailedError, match="became unstable"):
+        driver.world.truth(driver.now + 100_000_000)
 
 
 def test_a_file_that_is_not_there_is_refused(tmp_path):
