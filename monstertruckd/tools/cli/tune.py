@@ -10,7 +10,7 @@ from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruck_runtime.errors import InputError, NotFoundError
 from monstertruckd.tools.cli.connection import require_section, with_robot
 from monstertruckd.tools.cli.options import EndpointOption, RobotOption
-from monstertruckd.tools.cli.output import command_group, print_table, remark
+from monstertruckd.tools.cli.output import command_group, needs_extra, print_table, remark
 
 if TYPE_CHECKING:
     from monstertruck_runtime.client import TruckClient
@@ -32,6 +32,11 @@ def wall_command(
     """Arm the robot, which stands beside a wall, and raise K_p and K_d by the coursework's recipe, run by run."""
     from monstertruckd.tools.tune.runs import tune
 
+    if plot is not None:
+        with needs_extra("plot"):
+            from monstertruckd.tools.tune.plots import require_drawable
+
+            require_drawable(plot)
     runs: list[TuningRun] = []
 
     def report(run: "TuningRun") -> None:

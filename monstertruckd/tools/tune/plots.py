@@ -6,9 +6,26 @@ from pathlib import Path
 from typing import Final
 
 from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.small_files import require_place
 from monstertruckd.tools.tune.runs import TuningRun
 
 COLUMNS: Final = 4
+
+
+def require_drawable(path: Path) -> None:
+    """Refuse a picture that cannot be written, before the minutes whose result it is to show.
+
+    Raises:
+        InputError: it has no ending of a picture.
+        OSError: nothing can be written there.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415 - of this command only
+
+    known = FigureCanvasAgg.get_supported_filetypes()
+    if path.suffix[1:].lower() not in known:
+        raise InputError(f"{path}: expected a name that ends with .png or another of {', '.join(sorted(known))}")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    require_place(path)
 
 
 def draw(runs: Sequence[TuningRun], path: Path) -> None:

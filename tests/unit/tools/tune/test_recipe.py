@@ -6,14 +6,17 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from monstertruck_planners.behave.wall.config import WallPdConfig
 from monstertruck_planners.behave.wall.published import WallPd
+from monstertruck_runtime import client
 from monstertruck_runtime.errors import RequestRefusedError
 from monstertruck_runtime.mailbox import Mailbox
 from monstertruck_schemas.plan import BehaviourState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import BehaviourOrder
+from monstertruckd.tools.cli.main import app
 from monstertruckd.tools.tune.plots import draw
 from monstertruckd.tools.tune.recipe import CALM, MOST, OVERSHOOTS, RunVerdict, judged, recipe
 from monstertruckd.tools.tune.runs import tune
@@ -114,3 +117,14 @@ def test_overshoot_is_a_share_of_the_step_and_steady_the_end():
     assert verdict.steady < 0.005
     with pytest.raises(ValueError, match="9 samples"):
         judged([0.0] * 9)
+
+
+@pytest.mark.parametrize(
+    ("name", "said"), [("runs.txt", "expected a name that ends with .png"), ("there.png", "Is a directory")]
+)
+def test_a_plot_that_cannot_be_written_is_refused_before_the_robot_drives(tmp_path, monkeypatch, name, said):
+    monkeypatch.setattr(client, "TruckClient", None)  # nobody is asked
+    (tmp_path / "there.png").mkdir()
+    done = CliRunner().invoke(app, ["tune", "wall", "--plot", str(tmp_path / name)])
+    assert done.exit_code == 3
+    assert said in done.stderr
