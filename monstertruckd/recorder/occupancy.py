@@ -7,8 +7,6 @@ from numpy.typing import NDArray
 
 from monstertruck_kinematics.elementary import Array
 
-Bytes = NDArray[np.uint8]
-
 _GROW = 32
 """Cells of margin added at a time, so that growing is rare."""
 

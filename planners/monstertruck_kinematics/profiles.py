@@ -7,8 +7,7 @@ from typing import Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from monstertruck_kinematics.drive import Drive
-from monstertruck_kinematics.elementary import Array, KinematicsError, integrate, require_finite, require_positive
+from monstertruck_kinematics.elementary import Array, KinematicsError, require_finite, require_positive
 
 
 @dataclass(frozen=True)
@@ -339,64 +338,3 @@ class BasicMove:
             return 0.0, 0.0, 1.0
         ahead, aside = (round(part, 15) for part in (math.cos(self.bearing), math.sin(self.bearing)))
         return ahead, aside, 1.0 / self.radius
-
-
-@dataclass(frozen=True)
-class DrivenMove:
-    """Samples of a driven move.
-
-    Attributes:
-        times: (N,) s.
-        commands: (m, N) of the drive.
-        twists: (3, N) in the body frame.
-        poses: (3, N) in the world frame.
-    """
-
-    times: Array
-    commands: Array
-    twists: Array
-    poses: Array
-
-
-def drive_move(
-    drive: Drive,
-    move: BasicMove,
-    profile: MotionProfile,
-    *,
-    period: float = 0.02,
-    start: tuple[float, float, float] = (0.0, 0.0, 0.0),
-) -> DrivenMove:
-    """Commands and poses of a move under a motion profile, for any drive family.
-
-    The steering angle is constant over the whole move, including its ends where the speed is 0.
-
-    Args:
-        drive: the robot.
-        move: what to drive.
-        profile: over ``move.profile_distance``.
-        period: between samples, s; the last sample is the move's end.
-        start: pose at the beginning.
-
-    Raises:
-        KinematicsError: the profile has another distance, the drive cannot perform the move, or not within its limits.
-    """
-    require_positive("period", period)
-    ends = profile.position(np.array([profile.duration]))
-    if abs(float(ends[0]) - move.profile_distance) > 1e-9 * (1.0 + abs(move.profile_distance)):
-        raise KinematicsError(f"profile covers {float(ends[0]):.6g}: expected the move's {move.profile_distance:.6g}")
-    times = np.append(np.arange(0.0, profile.duration, period), profile.duration)
-    rates = profile.speed(times)
-    once, twice = (np.array(drive.inverse(tuple(k * d for d in move.direction))) for k in (1.0, 2.0))
-    # Speeds are proportional to the rate, angles independent of it: every input is affine in it.
-    commands = once[:, None] + (twice - once)[:, None] * (rates - 1.0)
-    kept = np.array(drive.limited(tuple(commands)))
-    for name, wanted, allowed in zip(drive.inputs, commands, kept, strict=True):
-        if np.abs(wanted - allowed).max() > 1e-9 * (1.0 + np.abs(wanted).max()):
-            worst = float(wanted[np.abs(wanted).argmax()])
-            raise KinematicsError(f"{name} would be {worst:.6g}: the move is beyond the drive's limits")
-    distances = profile.position(times)
-    unit = tuple(d * distances for d in move.direction)
-    origin = (np.full_like(times, start[0]), np.full_like(times, start[1]), np.full_like(times, start[2]))
-    poses = integrate(origin, unit[0], unit[1], unit[2], 1.0)
-    twists = np.array(move.direction)[:, None] * rates
-    return DrivenMove(times, commands, twists, np.array(poses))

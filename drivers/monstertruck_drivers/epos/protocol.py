@@ -33,8 +33,6 @@ ANSWER = 0x00
 """Opcode of every answer."""
 
 MAX_WORDS = 63
-FRAME_TIMEOUT = 0.5
-"""Seconds without a byte after which the controller forgets a frame (object 0x2005)."""
 
 
 class FrameError(ValueError):

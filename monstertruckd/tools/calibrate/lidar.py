@@ -50,8 +50,6 @@ LEAST_SCANS: Final = 3
 """At each rest."""
 SCAN: Final = 0.002
 """Least standard deviation of a registered position, m: walls are not straight to less."""
-SCAN_TURN: Final = 0.001
-"""And of a turn, rad."""
 CRAB: Final = 0.005
 """Standard deviation of the direction of travel on one leg, by tyres, rad."""
 DRIFT: Final = 0.006

@@ -38,8 +38,6 @@ LINKAGE: Final = 0.004
 """Share of a turn by which a linkage is off its polynomials, half a 95 % interval."""
 SAME: Final = 0.5
 """Share of the turn by the steering that the compass must see."""
-PRIORS: Final = 3
-"""Beliefs among the residuals."""
 BELIEVED: Final = (0.05, 0.05, math.radians(6.0))
 """Standard deviations before anything is measured: share of way and of wheelbase, servo angle, rad."""
 

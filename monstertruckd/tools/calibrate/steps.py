@@ -201,9 +201,6 @@ class WatchStep(Generic[M]):
     """Seconds without a message that end it"""
 
 
-Step = Number | Confirm | MoveStep | Collect[Any] | WatchStep[Any]
-
-
 class Panel(Protocol):
     """The operator's side of a wizard: a terminal, a script, or a simulated operator."""
 

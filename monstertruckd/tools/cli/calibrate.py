@@ -31,9 +31,7 @@ if TYPE_CHECKING:
     from monstertruckd.tools.calibrate.sequence import SequenceStep
     from monstertruckd.tools.calibrate.wizard import Wizard
 
-app = command_group(
-    "Measure what only this very truck can tell: guided, step by step, given up at any step with Ctrl-C."
-)
+app = command_group("Calibrate this truck: guided, step by step; Ctrl-C gives up at any step.")
 
 TIMEOUT: Final = 10.0
 """Seconds to wait for the link and for answers."""
@@ -41,7 +39,7 @@ TIMEOUT: Final = 10.0
 WIZARDS: "dict[str, Callable[..., Wizard]]" = {}
 """What makes each from the options of its command, by name."""
 
-YesOption = Annotated[bool, typer.Option("--yes", "-y", help="Take it that everything asked to be done is done.")]
+YesOption = Annotated[bool, typer.Option("--yes", "-y", help="Answer yes wherever something is to be done.")]
 AnswerOption = Annotated[
     list[str] | None,
     typer.Option("--answer", "-a", metavar="NAME=VALUE", help="Answer beforehand; repeated in the order of asking."),
@@ -135,8 +133,8 @@ def compass() -> "Wizard":
 
 @_wizard
 def battery(
-    meter_error: Annotated[float, typer.Option(min=0, max=10, help="Greatest error of the meter, percent.")] = 0.5,
-    meter_digits: Annotated[float, typer.Option(min=0, max=1, help="And the rest of it, V.")] = 0.02,
+    meter_error: Annotated[float, typer.Option(min=0, max=10, help="Greatest error of the meter, percent...")] = 0.5,
+    meter_digits: Annotated[float, typer.Option(min=0, max=1, help="...plus a constant part, V.")] = 0.02,
     fresh: Annotated[bool, typer.Option("--fresh", help="Forget the readings of earlier runs.")] = False,
 ) -> "Wizard":
     """Scale of the battery voltage from a multimeter; nothing moves.
@@ -238,10 +236,10 @@ def stabiliser(
 @_wizard
 def camera(
     columns: Annotated[int, typer.Option(min=4, max=30, help="Squares of the board, across.")] = 8,
-    rows: Annotated[int, typer.Option(min=4, max=30, help="And down.")] = 6,
+    rows: Annotated[int, typer.Option(min=4, max=30, help="Squares of the board, down.")] = 6,
     square: Annotated[float, typer.Option(min=5, max=1000, help="Side of a square as printed, mm.")] = 40.0,
     marker: Annotated[float, typer.Option(min=4, max=1000, help="Side of a marker as printed, mm.")] = 30.0,
-    lens_only: Annotated[bool, typer.Option("--lens-only", help="Not its place against the lidar.")] = False,
+    lens_only: Annotated[bool, typer.Option("--lens-only", help="Calibrate the lens only, not the mount.")] = False,
     patience: Annotated[float, typer.Option(min=5, max=3600, help="Seconds without anything new that end it.")] = 60.0,
 ) -> "Wizard":
     """Lens of the camera, and where it sits against the lidar: a printed board held before both.
@@ -260,7 +258,7 @@ def camera(
 @app.command("all")
 def all_(
     *,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print what is still to be done, and end.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only print what is still to be done.")] = False,
     yes: YesOption = False,
     answer: AnswerOption = None,
     robot: RobotOption = "truck",

@@ -101,7 +101,7 @@ def simulate(
         Path | None,
         typer.Option(help="Film a run on the virtual clock instead, FILE.gif; engine mujoco.", show_default=False),
     ] = None,
-    seconds: Annotated[float, typer.Option(min=1.0, max=3600.0, help="Of the film, of the run's time.")] = 30.0,
+    seconds: Annotated[float, typer.Option(min=1.0, max=3600.0, help="Length of the film, s of the run.")] = 30.0,
 ) -> None:
     """Serve simulated robots' devices behind ptys: at the ports their configurations name, else in a folder of yours.
 

@@ -8,9 +8,9 @@ from typing import Annotated
 import typer
 
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
-from monstertruckd.tools.cli.driving_modes import SPEEDS, SteeringMode
 from monstertruckd.tools.cli.options import EndpointOption, RobotOption
 from monstertruckd.tools.cli.output import on_terminal, until_stopped
+from monstertruckd.tools.driving.modes import SPEEDS, SteeringMode
 
 
 def drive(
@@ -42,9 +42,9 @@ def drive(
     start arms, A stops, B is the emergency stop, X resets it, Y or the cross change steering and speed.
     """
     from monstertruck_runtime.errors import InputError
-    from monstertruckd.tools.cli.drive_session import DriveSession
-    from monstertruckd.tools.cli.gamepad import PadMapping, read_mapping
-    from monstertruckd.tools.cli.teleop import Teleop
+    from monstertruckd.tools.driving.gamepad import PadMapping, read_mapping
+    from monstertruckd.tools.driving.session import DriveSession
+    from monstertruckd.tools.driving.teleop import Teleop
 
     if not (on_terminal(sys.stdin) and on_terminal(sys.stdout)):
         raise InputError("drive reads keys as they are held: it needs a terminal")

@@ -47,11 +47,12 @@ app = command_group("Build, show, save and use occupancy maps.")
 
 Log = Annotated[Path, typer.Argument(help="MCAP, CARMEN text (.gz), npz or URG text (.dat).", show_default=False)]
 MapPlace = Annotated[Path, typer.Argument(help="Folder of a saved map, or a map_server YAML.", show_default=False)]
-StartAngle = Annotated[float | None, typer.Option(help="Of an npz or CARMEN log: angle of the first beam, degrees.")]
-AngleIncrement = Annotated[float | None, typer.Option(help="The same: angle between beams, degrees.")]
-RangeMax = Annotated[float | None, typer.Option(min=0.1, help="The same: ranges from here on are no returns, m.")]
+StartAngle = Annotated[float | None, typer.Option(help="Angle of the first beam, degrees; for npz and CARMEN logs.")]
+AngleIncrement = Annotated[float | None, typer.Option(help="Angle between beams, degrees; the same.")]
+RangeMax = Annotated[float | None, typer.Option(min=0.1, help="Ranges from here on are no returns, m; the same.")]
 LidarMount = Annotated[
-    tuple[float, float, float] | None, typer.Option("--mount", help="The same: lidar in base: x, y (m), yaw (degrees).")
+    tuple[float, float, float] | None,
+    typer.Option("--mount", help="Lidar in base: x, y (m), yaw (degrees); the same."),
 ]
 Trajectory = Annotated[
     Path | None,

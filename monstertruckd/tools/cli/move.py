@@ -28,7 +28,7 @@ class MoveProfile(StrEnum):
 def move(
     radius: Annotated[
         float | None,
-        typer.Option(help="Of the arc, m; centre on the left positive, 0 = on the spot, left out = straight."),
+        typer.Option(help="Radius of the arc, m; centre on the left positive, 0 = on the spot, left out = straight."),
     ] = None,
     length: Annotated[float | None, typer.Option(help="Way, m; backwards negative.")] = None,
     angle: Annotated[float | None, typer.Option(help="Turn, rad; counter-clockwise positive.")] = None,

@@ -1,4 +1,4 @@
-"""One habit for every command: ``--json``, plain text in pipes, progress on long work, exit codes by reason.
+"""What all commands share: ``--json``, plain text in pipes, progress on long work, exit codes by reason.
 
 Results go to standard output, everything else (remarks, progress, errors) to standard error. Errors are raised as
 ``TruckError``; ``CommandGroup`` prints them as one sentence and ends with their reason's exit code. Ctrl-C and SIGTERM

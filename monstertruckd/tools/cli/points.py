@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 app = command_group("Points of interest in the map: tags that the camera found, places that were marked.")
 
-NameArgument = Annotated[str, typer.Argument(help="Of the point, such as tag-7 or dock.", show_default=False)]
+NameArgument = Annotated[str, typer.Argument(help="Name of the point, such as tag-7 or dock.", show_default=False)]
 MapOption = Annotated[
     Path | None, typer.Option("--map", help="Folder of a saved map, instead of a robot.", show_default=False)
 ]

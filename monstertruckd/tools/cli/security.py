@@ -137,7 +137,7 @@ def router(
 
 @app.command("check")
 def check(
-    endpoint: Annotated[str, typer.Option("--endpoint", "-e", help="Of the running robot: tls/HOST:PORT.")],
+    endpoint: Annotated[str, typer.Option("--endpoint", "-e", help="Where the running robot listens: tls/HOST:PORT.")],
     folder: FolderOption = HERE,
     json_output: JsonOption = False,
 ) -> None:

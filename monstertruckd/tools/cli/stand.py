@@ -20,7 +20,7 @@ StandFile = Annotated[Path, typer.Option("--config", "-c", help="The stand's YAM
 @app.command("run")
 @needs_extra("vision")
 def run_command(config: StandFile, endpoint: EndpointOption = DEFAULT_ENDPOINT) -> None:
-    """Track the robots and tell their daemons, until Ctrl-C: `mt/stand/sensor/pose_<robot>`.
+    """Track the robots and send their poses to their daemons, until Ctrl-C: `mt/stand/sensor/pose_<robot>`.
 
     A daemon with `stand: overhead` records it. Cameras that are gone, or have moved, are named.
     """
@@ -93,8 +93,8 @@ def snap_command(
 def print_command(
     out: Annotated[Path, typer.Argument(help="Folder for the PNGs.", show_default=False)],
     tags: Annotated[str, typer.Option(help="Numbers of the tags: 0-3,100-134.")] = "0-3",
-    columns: Annotated[int, typer.Option(min=4, max=30, help="Of the board.")] = 8,
-    rows: Annotated[int, typer.Option(min=4, max=30, help="Of the board.")] = 6,
+    columns: Annotated[int, typer.Option(min=4, max=30, help="Squares of the board, across.")] = 8,
+    rows: Annotated[int, typer.Option(min=4, max=30, help="Squares of the board, down.")] = 6,
 ) -> None:
     """Tags and board to be printed; measure the print, and write its sizes into the stand's YAML."""
     from monstertruckd.tools.cli.stand_session import print_tags

@@ -43,7 +43,7 @@ def station(
         str | None,
         typer.Option("--add-user", metavar="USER", help="Add a user to --users, asking for a password; end."),
     ] = None,
-    role: Annotated[AccessRole, typer.Option("--role", help="Of the added user.")] = AccessRole.PILOT,
+    role: Annotated[AccessRole, typer.Option("--role", help="Role of the added user.")] = AccessRole.PILOT,
     foxglove: Annotated[
         bool, typer.Option("--foxglove", help="Also serve the first robot to Foxglove's app on this machine.")
     ] = False,

@@ -29,7 +29,7 @@ Reference = Annotated[float, typer.Option(help="Rate of the faster side's wheels
 
 @app.command("circle")
 def circle_command(
-    ratio: Annotated[float, typer.Option(help="Of the sides' wheel rates: 2, 3, or inf (left side locked).")] = 2.0,
+    ratio: Annotated[float, typer.Option(help="Ratio of the wheel rates: 2, 3, or inf (left side locked).")] = 2.0,
     reference: Reference = 1.57,
     laps: Annotated[float, typer.Option(help="Laps of the ideal robot; one that skids turns less.")] = 5.0,
     robot: RobotOption = "skid_stand",
@@ -44,7 +44,7 @@ def circle_command(
 
 @app.command("straight")
 def straight_command(
-    length: Annotated[float, typer.Option(help="Of a pass, m.")] = 0.682,
+    length: Annotated[float, typer.Option(help="Length of a pass, m.")] = 0.682,
     passes: Annotated[int, typer.Option(help="To and fro.")] = 12,
     reference: Reference = 1.57,
     robot: RobotOption = "skid_stand",

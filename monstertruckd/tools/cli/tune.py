@@ -24,7 +24,7 @@ app = command_group("Gains found by runs of the robot.")
 def wall_command(
     name: Annotated[str, typer.Argument(help="A behaviour of kind wall_pd.")] = "wall_left",
     first: Annotated[float, typer.Option(min=0.1, max=100, help="K_p of the first run.")] = 6.0,
-    seconds: Annotated[float, typer.Option(min=4, max=60, help="Of following that make a run.")] = 8.0,
+    seconds: Annotated[float, typer.Option(min=4, max=60, help="Seconds of following in each run.")] = 8.0,
     plot: Annotated[Path | None, typer.Option("--plot", help="PNG of all runs.", show_default=False)] = None,
     robot: RobotOption = "sonar",
     endpoint: EndpointOption = DEFAULT_ENDPOINT,

@@ -8,7 +8,6 @@ from pydantic import Field
 from monstertruck_schemas.base import Schema
 
 Positive = Annotated[float, Field(gt=0)]
-Share = Annotated[float, Field(ge=0, le=1)]
 NotNegative = Annotated[float, Field(ge=0)]
 
 

@@ -12,7 +12,6 @@ from monstertruck_schemas.base import Schema
 from monstertruck_schemas.plan import Steering
 
 Positive = Annotated[float, Field(gt=0)]
-Share = Annotated[float, Field(ge=0)]
 
 STEERING_MODES: Final[dict[Steering, tuple[float, float]]] = {
     "front": (0.1, 0.0),

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from monstertruckd.tools.cli.driving_modes import SPEEDS, SteeringMode
 from monstertruckd.tools.cli.robot import reasons
+from monstertruckd.tools.driving.modes import SPEEDS, SteeringMode
 
 PAGE = (Path(__file__).resolve().parents[3] / "docs" / "command-line.md").read_text()
 

@@ -8,9 +8,9 @@ from rich.console import Console
 from monstertruck_runtime.clock import SECOND, run_virtual
 from monstertruck_schemas import topics
 from monstertruck_schemas.state import GateMode, GateState
-from monstertruckd.tools.cli.drive_session import Stream, draw
 from monstertruckd.tools.cli.live import _explain_silence, shortened
-from monstertruckd.tools.cli.teleop import Teleop, TeleopRequest
+from monstertruckd.tools.driving.session import Stream, draw
+from monstertruckd.tools.driving.teleop import Teleop, TeleopRequest
 from monstertruckd.tools.status.screen import ScreenState
 
 

@@ -11,7 +11,7 @@ from typing import Final, Literal
 
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.req import Order
-from monstertruckd.tools.cli.driving_modes import SPEEDS, SteeringMode
+from monstertruckd.tools.driving.modes import SPEEDS, SteeringMode
 
 ESCAPE: Final = b"\x1b"
 PASTE: Final = b"\x1b[200~"

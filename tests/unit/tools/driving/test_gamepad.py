@@ -11,12 +11,12 @@ import pytest
 from monstertruck_runtime.clock import SECOND, WallClock
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.req import Role
-from monstertruckd.tools.cli import gamepad_device
-from monstertruckd.tools.cli.drive_session import REST, DriveSession
-from monstertruckd.tools.cli.driving_modes import SteeringMode
-from monstertruckd.tools.cli.gamepad import AXES, BUTTONS, EVENT, Pad, PadMapping, key_for, read_mapping
-from monstertruckd.tools.cli.gamepad_device import EFFECT, PadLink
-from monstertruckd.tools.cli.teleop import Teleop
+from monstertruckd.tools.driving import gamepad_device
+from monstertruckd.tools.driving.gamepad import AXES, BUTTONS, EVENT, Pad, PadMapping, key_for, read_mapping
+from monstertruckd.tools.driving.gamepad_device import EFFECT, PadLink
+from monstertruckd.tools.driving.modes import SteeringMode
+from monstertruckd.tools.driving.session import REST, DriveSession
+from monstertruckd.tools.driving.teleop import Teleop
 
 RANGES = {0: (-32768, 32767), 1: (-32768, 32767), 3: (-32768, 32767), 5: (0, 255), 16: (-1, 1), 17: (-1, 1)}
 SYN = EVENT.pack(1700000000, 1, 0, 0, 0)

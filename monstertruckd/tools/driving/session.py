@@ -24,11 +24,11 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order, Role
 from monstertruck_schemas.state import GateMode, GateState
 from monstertruck_schemas.topics import GATE
-from monstertruckd.tools.cli.driving_modes import SteeringMode
-from monstertruckd.tools.cli.gamepad import Action, PadMapping, key_for
-from monstertruckd.tools.cli.gamepad_device import PadLink
-from monstertruckd.tools.cli.teleop import MODE_KEYS, STEPS, Command, KeyReader, Teleop, TeleopRequest
-from monstertruckd.tools.cli.terminal import every_key, forget_input
+from monstertruckd.tools.driving.gamepad import Action, PadMapping, key_for
+from monstertruckd.tools.driving.gamepad_device import PadLink
+from monstertruckd.tools.driving.modes import SteeringMode
+from monstertruckd.tools.driving.teleop import MODE_KEYS, STEPS, Command, KeyReader, Teleop, TeleopRequest
+from monstertruckd.tools.driving.terminal import every_key, forget_input
 from monstertruckd.tools.status import screen
 from monstertruckd.tools.status.screen import ScreenState
 from monstertruckd.tools.status.watch import PERIOD, Follower

@@ -6,8 +6,8 @@ from hypothesis import strategies as st
 
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.req import Order
-from monstertruckd.tools.cli.driving_modes import SPEEDS, SteeringMode
-from monstertruckd.tools.cli.teleop import MODE_KEYS, STEPS, KeyReader, Teleop, TeleopRequest, axles
+from monstertruckd.tools.driving.modes import SPEEDS, SteeringMode
+from monstertruckd.tools.driving.teleop import MODE_KEYS, STEPS, KeyReader, Teleop, TeleopRequest, axles
 
 START = 5 * SECOND
 

@@ -17,8 +17,8 @@ from pydantic import Field, ValidationError
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.yaml_files import read_yaml
 from monstertruck_schemas.base import Schema
-from monstertruckd.tools.cli.driving_modes import SteeringMode
-from monstertruckd.tools.cli.teleop import MODE_KEYS, TURN_RADIUS, TeleopRequest, axles
+from monstertruckd.tools.driving.modes import SteeringMode
+from monstertruckd.tools.driving.teleop import MODE_KEYS, TURN_RADIUS, TeleopRequest, axles
 
 EVENT: Final = struct.Struct("llHHi")
 """Seconds, microseconds, type, code, value."""

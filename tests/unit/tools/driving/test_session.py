@@ -6,8 +6,8 @@ import io
 
 from monstertruck_runtime.clock import WallClock
 from monstertruck_schemas.req import Order
-from monstertruckd.tools.cli.drive_session import DriveSession
-from monstertruckd.tools.cli.teleop import TeleopRequest
+from monstertruckd.tools.driving.session import DriveSession
+from monstertruckd.tools.driving.teleop import TeleopRequest
 
 
 class Gone(io.StringIO):

@@ -15,7 +15,7 @@ from typing import Final
 
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.readable import when_readable
-from monstertruckd.tools.cli.gamepad import AXES, BUTTONS, EV_KEY, EVENT, Action, Pad, PadMapping
+from monstertruckd.tools.driving.gamepad import AXES, BUTTONS, EV_KEY, EVENT, Action, Pad, PadMapping
 
 FOLDER: Final = Path("/dev/input")
 LOOK: Final = 1.0

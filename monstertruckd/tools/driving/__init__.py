@@ -1,0 +1,1 @@
+"""Driving by hand: the keys of a terminal or a gamepad as a deadman switch."""
