@@ -48,7 +48,10 @@ would take as long as a thousand tests."""
 THREE = ("-n", "3")
 """Tests at a time on the two cores of a small computer: some wait for a process or a time-out."""
 TWO = ("-n", "2")
-"""Tests on the wall clock at a time: each runs a truck and a daemon, which must not be late."""
+"""Tests on the wall clock at a time: each runs a truck and a daemon, which must not be late. Three where the computer
+has nothing else to do: together they ask for less of it than two beside two busy programs."""
+IDLE = 1.0
+"""Load below which that is so, as the check begins."""
 FAILED_ALONE = ("-n", "0", "--last-failed", "--last-failed-no-failures", "none", "--cov-append", "--assert", "rewrite")
 TESTS_FAILED = 1
 """Exit code of pytest; others mean that it did not run them."""
@@ -174,19 +177,21 @@ def check(arguments: list[str]) -> int:
     """
     tools = VENV / "bin"
     pytest = tools / "pytest"
+    at_a_time = THREE if os.getloadavg()[0] < IDLE else TWO
     run(KERNELS[0], *BYTECODE)
-    compiling = subprocess.Popen(KERNELS, cwd=ROOT)  # while mypy runs: each keeps one core busy for a minute
+    compiling = subprocess.Popen(KERNELS, cwd=ROOT)  # while what needs none runs: it keeps one core busy for a minute
     try:
-        for program, rest in (
+        code = steps(
             (Path(find_uv()), ["lock", "--check", "--quiet", "--system-certs"]),
             (tools / "ruff", ["check", "."]),
             (tools / "ruff", ["format", "--check", "."]),
             (tools / "lint-imports", []),
             (tools / "mypy", []),
-        ):
-            code = step(program, rest)
-            if code:
-                return code
+            (pytest, [*THREE, *TESTS, "-m", "traced and not wall", "--cov", "--cov-report=", *TRACED]),
+            (tools / "coverage", ["report"]),
+        )
+        if code:
+            return code
         print(f"==> {' '.join(map(str, KERNELS))}", flush=True)
         code = compiling.wait()  # no test's time-out counts a compilation
         if code:
@@ -194,16 +199,18 @@ def check(arguments: list[str]) -> int:
     finally:
         compiling.kill()
         compiling.wait()
-    steps: list[tuple[Path, list[str]]] = [
-        (pytest, [*THREE, *TESTS, "-m", "traced and not wall", "--cov", "--cov-report=", *TRACED]),
-        (tools / "coverage", ["report"]),
+    return steps(
         (pytest, [*THREE, *TESTS, "-m", "not wall and not traced and not long", *arguments]),
-        (pytest, [*TWO, *TESTS, "-m", "wall and not long", *arguments]),
-    ]
-    for program, rest in steps:
-        code = step(program, rest)
-        if program == pytest and code == TESTS_FAILED:
-            code = step(program, [*rest, *FAILED_ALONE])
+        (pytest, [*at_a_time, *TESTS, "-m", "wall and not long", *arguments]),
+    )
+
+
+def steps(*programs: tuple[Path, list[str]]) -> int:
+    """Run one check after the other; returns the exit code of the first that fails, or 0."""
+    for program, arguments in programs:
+        code = step(program, arguments)
+        if program.name == "pytest" and code == TESTS_FAILED:
+            code = step(program, [*arguments, *FAILED_ALONE])
         if code:
             return code
     return 0

@@ -656,8 +656,11 @@ def _locate_files(tree: Tree, keys: tuple[tuple[str, ...], ...]) -> None:
             continue
         origin = tree.origins[key]
         file = (origin.file.parent / name).resolve()
+        if file.is_dir() and key[-1] == "map":  # of a saved map, as `plan` and `map show` take it
+            file /= "map.yaml"
         if not file.is_file():
-            raise ConfigError(f"{origin}: {'.'.join(key)}: no such file: {file}")
+            problem = "expected a file, found a folder" if file.is_dir() else "no such file"
+            raise ConfigError(f"{origin}: {'.'.join(key)}: {problem}: {file}")
         section[key[-1]] = str(file)
         if origin.file.resolve() in tree.files and not Path(name).is_absolute():
             tree.files.append(file)

@@ -40,8 +40,14 @@ LIKE_OTHERS = {
     "lidar: clock slewed by 10 %",
     "drive: answers 80 ms late",
     "bug in the steering's driver",
+    "battery low",
+    "battery critical before arming",
 }
-"""Left to the long tests: another device has the same fault, or the same device on its other side."""
+"""Left to the long tests: another device has the same fault, the same device on its other side, or it takes half a
+minute to show in the whole daemon what the unit tests of the gate show.
+"""
+COMPARED = {"lidar: clock slewed by -10 %", "drive: answers 40 ms late", "battery critical"}
+"""Noticed by what was measured before, for which the truck has to drive some seconds."""
 
 
 @cache
@@ -50,7 +56,8 @@ def config() -> SimulatedTruckConfig:
 
 
 def drill(scenario: Scenario) -> Reaction:
-    return run_virtual(lambda clock: measure(scenario, config(), clock))
+    driven = 3.0 if scenario.name in COMPARED | LIKE_OTHERS else 0.7
+    return run_virtual(lambda clock: measure(scenario, config(), clock, driven))
 
 
 @pytest.mark.parametrize("name", mostly_long(BY_NAME, BY_NAME.keys() - LIKE_OTHERS))

@@ -255,6 +255,7 @@ async def test_one_terminal_holds_truck_and_daemon_and_the_daemon_ends_first(tmp
         said = (tmp_path / "simulate.txt").read_text()
         assert "bug" not in said
         assert "lost" not in said
+        assert "ready" not in said.splitlines(), "the daemon says when all of it is"
         assert info(truck.logs()[0])["damage"] is None
 
 

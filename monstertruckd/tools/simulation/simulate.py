@@ -197,7 +197,8 @@ async def _serve(clock: Clock, robots: Sequence[ServedRobot], truth: Path | None
     tasks.append(asyncio.create_task(console.run(), name="console"))
     waiting = asyncio.create_task(stop.wait())
     settle()
-    _say("ready")
+    if not daemons_of:  # who will say themselves when all of their services are
+        _say("ready")
     ended_by = 0
     async with AsyncExitStack() as stack:
         if daemons_of:

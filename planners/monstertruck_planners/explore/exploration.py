@@ -27,6 +27,8 @@ PATIENCE: Final = 30.0
 """Seconds to wait for a first map."""
 RETURNS: Final = 6
 """Goals for the way home."""
+BESIDE: Final = 1.0
+"""Metres from the start at which it counts as back, where the start itself is blocked, as beside a wall."""
 SAVE: Final = 30.0
 """Seconds to wait for the map to be saved."""
 AGAIN: Final = 2.0
@@ -170,6 +172,8 @@ class Exploration:
     goals: int = 0
     failures: int = 0
     home_goals: int = 0
+    blocked: int = 0
+    """Of them: at which the robot cannot stand."""
     looks: int = 0
     """Short drives since it was lost."""
 
@@ -403,15 +407,27 @@ def _returning(run: Exploration, seen: Observed) -> Step:
         if seen.ended is None:
             return run, ()
         if seen.ended is Reason.GOAL_REACHED:
-            return _end(run, run.final, f"{run.final_text}; back at the start", Save())
+            return _back_home(run, run.target.pose)
+        if seen.ended is Reason.GOAL_BLOCKED and seen.pose is not None:
+            if math.dist(seen.pose[:2], run.home[:2]) <= BESIDE:
+                return _back_home(run, seen.pose)
+            run = replace(run, blocked=run.blocked + 1)
         if seen.ended in HOPELESS or seen.ended is Reason.CANCELLED or run.home_goals >= RETURNS:
             text = f"{run.final_text}; not back at the start: {seen.ended_text or seen.ended.text}"
             return _end(run, seen.ended, text, Save())
         return replace(run, target=None, not_before=run.now + AGAIN * 2 ** (run.home_goals - 1)), ()
     if run.now < run.not_before:
         return run, ()
-    target = Viewpoint(run.home, run.home[:2])
-    return replace(run, target=target, home_goals=run.home_goals + 1), (Go(run.home),)
+    beside = [pose for pose in run.trail if 0.0 < math.dist(pose[:2], run.home[:2]) <= BESIDE]
+    places = (run.home, *beside)
+    pose = places[run.blocked % len(places)]
+    return replace(run, target=Viewpoint(pose, pose[:2]), home_goals=run.home_goals + 1), (Go(pose),)
+
+
+def _back_home(run: Exploration, pose: Pose) -> Step:
+    away = math.dist(pose[:2], run.home[:2])
+    where = "back at the start" if pose == run.home else f"{away:.1f} m from the start, which is blocked"
+    return _end(run, run.final, f"{run.final_text}; {where}", Save())
 
 
 def _saving(run: Exploration, seen: Observed) -> Step:

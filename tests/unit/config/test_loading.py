@@ -62,6 +62,13 @@ def test_a_good_file(tmp_path: Path):
     assert resolved(config)["wheel"] == {"radius": 0.1, "count": 4}
 
 
+def test_a_map_may_be_the_folder_of_a_saved_one(tmp_path: Path):
+    (tmp_path / "saved").mkdir()
+    (tmp_path / "saved" / "map.yaml").touch()
+    config, _ = load_config(write(tmp_path, "version: 2\nname: t\nmap: saved\n"), Root)
+    assert config.map == tmp_path / "saved" / "map.yaml"
+
+
 @pytest.mark.parametrize(
     ("text", "line", "expected"),
     [

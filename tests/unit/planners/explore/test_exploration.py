@@ -251,6 +251,32 @@ def test_the_way_home_is_tried_again_and_given_up_in_the_end():
     assert "not back at the start" in stepped.run.text
 
 
+def test_where_the_start_is_blocked_a_place_beside_it_is_home():
+    """As for a robot that was started beside a wall: it stood where no goal may be."""
+    stepped = SteppedExploration()
+    stepped.run = replace(stepped.run, trail=(HOME, (1.6, 2.0, 0.5)))
+    stepped.pose = (3.0, 2.0, 0.5)
+    stepped.exhaust()
+    stepped.step()
+    assert stepped.actions == (Go(HOME),)
+    stepped.step(ended=Reason.GOAL_BLOCKED)
+    stepped.step(exploration.AGAIN)
+    assert stepped.actions == (Go((1.6, 2.0, 0.5)),)
+    stepped.step(ended=Reason.GOAL_REACHED)
+    assert stepped.saved().outcome is Reason.EXPLORED
+    assert "0.6 m from the start, which is blocked" in stepped.run.text
+
+
+def test_a_robot_that_stands_beside_its_blocked_start_is_back():
+    stepped = SteppedExploration()
+    stepped.exhaust()
+    stepped.pose = (1.9, 2.0, 0.5)
+    stepped.step()
+    stepped.step(ended=Reason.GOAL_BLOCKED)
+    assert stepped.saved().outcome is Reason.EXPLORED
+    assert "0.9 m from the start, which is blocked" in stepped.run.text
+
+
 def test_without_a_map_or_a_place_to_save_it_says_so():
     stepped = SteppedExploration(home=False)
     while stepped.run.phase is Phase.LOOKING:
