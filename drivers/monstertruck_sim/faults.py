@@ -25,6 +25,8 @@ from monstertruck_sim.robot import SimulatedRobot
 from monstertruck_sim.world.obstacles import Disc
 
 MORE_DRIVES: Final = ("drive_2", "drive_3", "drive_4")
+DRIVES: Final = ("drive", *MORE_DRIVES)
+"""Roles of controllers of one motor."""
 SERIAL: Final = ("drive", "steering", "lidar", "compass", "stabiliser", *MORE_DRIVES, "wheels", "sonar", "imu")
 """Roles of devices on a serial line."""
 VITAL: Final = ("drive", "steering", "lidar", "compass", *MORE_DRIVES, "wheels", "sonar")
@@ -233,9 +235,9 @@ def place_obstacle(gap: float) -> Action[SimContext]:
     return place
 
 
-def block_shaft(*, on: bool) -> Action[SimContext]:
-    """Hold the driven shaft, or let it go."""
-    return lambda context: context.robot.world.block_shaft(context.clock.now(), on=on)
+def block_shaft(shaft: int = 0, *, on: bool) -> Action[SimContext]:
+    """Hold a driven shaft, or let it go."""
+    return lambda context: context.robot.world.block_shaft(context.clock.now(), shaft, on=on)
 
 
 def clear_obstacles(context: SimContext) -> None:
@@ -266,10 +268,13 @@ Maker = Callable[[np.random.Generator], CatalogFault]
 """Draws a fault of one kind."""
 
 
-def hubs_of(devices: Devices) -> tuple[str, ...]:
-    """Hubs that devices are connected to."""
-    ports = (device.port for device in devices.present().values())
-    return tuple(sorted({port.hub for port in ports if isinstance(port, UsbPortConfig)}))
+def hubs_of(devices: Devices, without: Collection[str] = ()) -> tuple[str, ...]:
+    """Hubs that devices are connected to, but for those of the roles ``without``."""
+    hubs: dict[str, set[str]] = {}
+    for role, device in devices.present().items():
+        if isinstance(device.port, UsbPortConfig):
+            hubs.setdefault(device.port.hub, set()).add(role)
+    return tuple(sorted(hub for hub, roles in hubs.items() if roles.isdisjoint(without)))
 
 
 class FaultCatalog:
@@ -281,6 +286,7 @@ class FaultCatalog:
         records: whether its daemon writes a log.
         restarts: whether its computer can be switched off.
         workers: names of its daemon's worker processes.
+        unguarded: roles of motor controllers that nothing stops while they cannot be reached: nothing cuts them off.
     """
 
     def __init__(
@@ -291,12 +297,17 @@ class FaultCatalog:
         records: bool,
         restarts: bool = False,
         workers: tuple[str, ...] = (),
+        unguarded: Collection[str] = (),
     ) -> None:
         self._roles = tuple(devices.present())
+        self._guarded = tuple(role for role in self._roles if role not in unguarded)
+        self._drives = tuple(role for role in DRIVES if role in self._roles)
         self._vital = frozenset(VITAL) - ({"sonar"} if "lidar" in self._roles else frozenset())
         self._sonars = () if devices.sonar is None else tuple(devices.sonar.driver.sonars)
         self._motors = 0 if devices.wheels is None else devices.wheels.driver.motors
-        self._hubs = hubs_of(devices)
+        self._hubs = hubs_of(devices, unguarded)
+        self._all_hubs = self._hubs == hubs_of(devices)
+        """Whether all of them may be lost at once."""
         self._monitors = monitors
         self._records = records
         self._restarts = restarts
@@ -315,19 +326,25 @@ class FaultCatalog:
 
     def _of_devices(self) -> Iterator[tuple[FaultKind, Maker]]:
         serial, vital = tuple(role for role in SERIAL if role in self._roles), self._vital
-        yield FaultKind.UNPLUG, lambda rng: _unplug(rng, _pick(rng, self._roles), vital)
-        yield FaultKind.STALL, lambda rng: _stall(rng, _pick(rng, serial), vital)
+        guarded = tuple(role for role in serial if role in self._guarded)
+        if self._guarded:
+            yield FaultKind.UNPLUG, lambda rng: _unplug(rng, _pick(rng, self._guarded), vital)
+        if guarded:
+            yield FaultKind.STALL, lambda rng: _stall(rng, _pick(rng, guarded), vital)
         yield FaultKind.GARBAGE, lambda rng: _garbage(rng, _pick(rng, serial))
         yield FaultKind.BIT_ERRORS, lambda rng: _bit_errors(rng, _pick(rng, serial))
         yield FaultKind.SLOW, lambda rng: _slow(rng, _pick(rng, serial))
         yield FaultKind.SHORT_WRITE, lambda rng: _short_write(rng, _pick(rng, serial))
         yield FaultKind.RESET, lambda rng: _once(rng, FaultKind.RESET, _pick(rng, serial), "power-cycle")
-        if len(serial) > 1:
-            yield FaultKind.WRONG_DEVICE, lambda rng: _wrong(rng, serial, vital)
+        if len(guarded) > 1:
+            yield FaultKind.WRONG_DEVICE, lambda rng: _wrong(rng, guarded, vital)
         yield FaultKind.CLOCK_JUMP, _clock_jump
-        yield FaultKind.OBSTACLE, _obstacle
-        yield FaultKind.RAIL_SERVOS, _servo_rail
-        yield FaultKind.BATTERY_OFF, _battery_off
+        if "lidar" in self._roles:
+            yield FaultKind.OBSTACLE, _obstacle
+        if "steering" in self._roles:
+            yield FaultKind.RAIL_SERVOS, _servo_rail
+        if self._drives:
+            yield FaultKind.BATTERY_OFF, _battery_off
         if "steering" in self._roles:
             yield FaultKind.BROWN_OUT, lambda rng: _brown_out(rng, self._roles)
         if frozen := tuple(role for role in ("compass", "imu") if role in self._roles):
@@ -335,15 +352,18 @@ class FaultCatalog:
         if "lidar" in self._roles:
             yield FaultKind.BLIND, _blind
             yield FaultKind.CLOCK_DRIFT, _clock_drift
-        if late := tuple(role for role in ("drive", "steering", "wheels") if role in self._roles):
-            yield FaultKind.LATE_ANSWERS, lambda rng: _late_answers(rng, _pick(rng, late))
-        if "drive" in self._roles:
-            yield FaultKind.SUPPLY_DIP, _supply_dip
-            yield FaultKind.BLOCKED_SHAFT, _blocked_shaft
+        yield from self._of_motors()
         if "stabiliser" in self._roles:
             yield FaultKind.ECHO, lambda rng: _cable(rng, FaultKind.ECHO, "stabiliser", *_switch("echo"))
             yield FaultKind.RAIL_12V, _rail_12v
         yield from self._of_wheels_and_sonars()
+
+    def _of_motors(self) -> Iterator[tuple[FaultKind, Maker]]:
+        if late := tuple(role for role in ("drive", "steering", *MORE_DRIVES, "wheels") if role in self._roles):
+            yield FaultKind.LATE_ANSWERS, lambda rng: _late_answers(rng, _pick(rng, late))
+        if drives := self._drives:
+            yield FaultKind.SUPPLY_DIP, lambda rng: _supply_dip(rng, drives)
+            yield FaultKind.BLOCKED_SHAFT, lambda rng: _blocked_shaft(rng, len(drives))
 
     def _of_wheels_and_sonars(self) -> Iterator[tuple[FaultKind, Maker]]:
         sonars, motors = self._sonars, self._motors
@@ -363,6 +383,7 @@ class FaultCatalog:
     def _of_the_computer(self) -> Iterator[tuple[FaultKind, Maker]]:
         if self._hubs:
             yield FaultKind.HUB_LOSS, lambda rng: _hubs(rng, FaultKind.HUB_LOSS, (_pick(rng, self._hubs),))
+        if self._hubs and self._all_hubs:
             yield FaultKind.RAIL_ELECTRONICS, lambda rng: _hubs(rng, FaultKind.RAIL_ELECTRONICS, self._hubs)
             if self._restarts:
                 yield FaultKind.COMPUTER_POWER, lambda rng: _computer_power(rng, self._hubs)
@@ -503,20 +524,23 @@ def _clock_drift(rng: np.random.Generator) -> CatalogFault:
 
 
 def _late_answers(rng: np.random.Generator, role: str) -> CatalogFault:
-    if role != "drive":
+    if role not in DRIVES:
         return _once(rng, FaultKind.LATE_ANSWERS, role, f"late {rng.uniform(0.05, 0.25):.3f} {rng.integers(1, 5)}")
     start, end = (f"delay {rng.uniform(5.0, 80.0):.0f}",), ("delay 0",)
     return _cable(rng, FaultKind.LATE_ANSWERS, role, start, end)
 
 
-def _supply_dip(rng: np.random.Generator) -> CatalogFault:
+def _supply_dip(rng: np.random.Generator, roles: tuple[str, ...]) -> CatalogFault:
     """The controller restarts while the host waits for its answer; until it is up the truck coasts."""
-    return _fault(FaultKind.SUPPLY_DIP, "drive", command("drive", "restart 1"), nothing, 1.0 + _hold(rng), disarms=True)
+    role = roles[0] if len(roles) == 1 else _pick(rng, roles)
+    return _fault(FaultKind.SUPPLY_DIP, role, command(role, "restart 1"), nothing, 1.0 + _hold(rng), disarms=True)
 
 
-def _blocked_shaft(rng: np.random.Generator) -> CatalogFault:
-    held, free = block_shaft(on=True), block_shaft(on=False)
-    return _fault(FaultKind.BLOCKED_SHAFT, "", held, free, 1.0 + _hold(rng), must_stop=True, disarms=True)
+def _blocked_shaft(rng: np.random.Generator, shafts: int) -> CatalogFault:
+    """One shaft of several does not hold the robot: the others turn until the gate has noticed."""
+    shaft = 0 if shafts == 1 else int(rng.integers(shafts))
+    held, free, where = block_shaft(shaft, on=True), block_shaft(shaft, on=False), "" if shafts == 1 else DRIVES[shaft]
+    return _fault(FaultKind.BLOCKED_SHAFT, where, held, free, 1.0 + _hold(rng), must_stop=shafts == 1, disarms=True)
 
 
 def _wrong(rng: np.random.Generator, serial: tuple[str, ...], vital: Collection[str]) -> CatalogFault:
@@ -655,14 +679,14 @@ def _battery_off(rng: np.random.Generator) -> CatalogFault:
     def pull(context: SimContext) -> None:
         context.robot.world.connect_battery(context.clock.now(), connected=False)
         context.robot.world.supply_servos(context.clock.now(), on=False)
-        context.command("drive", "power off")
-        context.command("stabiliser", "power off")
+        for role in (*DRIVES, "stabiliser"):
+            context.command(role, "power off")
 
     def plug(context: SimContext) -> None:
         context.robot.world.connect_battery(context.clock.now(), connected=True)
         context.robot.world.supply_servos(context.clock.now(), on=True)
-        context.command("drive", "power on")
-        context.command("stabiliser", "power on")
+        for role in (*DRIVES, "stabiliser"):
+            context.command(role, "power on")
 
     return _fault(FaultKind.BATTERY_OFF, "", pull, plug, _hold(rng), must_stop=True)
 

@@ -1,7 +1,7 @@
 """The observer of a drill: checks invariants by the bytes on two wires and the world's truth, not by the daemon's word.
 
-It sees the wires of drive, steering, lidar and compass, the true state of the truck and the operator's orders.
-A hundred times a second each rule says what is unsafe in an ``Observation``.
+It sees the wires of all motor controllers, of steering, lidar and compass, the true state of the robot and the
+operator's orders. A hundred times a second each rule says what is unsafe in an ``Observation``.
 """
 
 import math
@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Final
+from typing import Final, Protocol
 
 import numpy as np
 
@@ -18,12 +18,17 @@ from monstertruck_drivers.cable import MemoryPort
 from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos.protocol import Control, FrameError, Opcode, decode_body, join
 from monstertruck_drivers.maestro.protocol import Code, Decoder, ServoCommand
+from monstertruck_drivers.steppers.config import StepperConfig
+from monstertruck_drivers.steppers.protocol import Splitter
+from monstertruck_kinematics.chassis import STILL, WHEEL_REACH, Chassis
+from monstertruck_kinematics.drive import Twist
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.truck import DriveTrain
 from monstertruck_runtime.clock import SECOND, Clock
-from monstertruck_schemas.roles import DeviceRole
+from monstertruck_schemas.roles import SHAFTS, DeviceRole
 from monstertruck_sim.world.plant import TruthState
 from monstertruck_sim.world.world import World
+from monstertruckd.gate.config import GateConfig
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 
 PERIOD: Final = SECOND // 100
@@ -60,7 +65,9 @@ ROOM: Final = np.linspace(0.0, 0.5, 26)
 """Ways ahead of which the ground is looked at, m."""
 REVERSES_BELOW: Final = 0.05
 """True speed, m/s, from which on a motor may not be asked to turn the other way."""
-WIRES: Final = (DeviceRole.DRIVE, DeviceRole.STEERING, DeviceRole.LIDAR, DeviceRole.COMPASS)
+MOTORS: Final = (*SHAFTS, DeviceRole.WHEELS)
+"""Roles of motor controllers."""
+WIRES: Final = (*MOTORS, DeviceRole.STEERING, DeviceRole.LIDAR, DeviceRole.COMPASS)
 STOP_CONTROLS: Final = frozenset((Control.QUICK_STOP, Control.DISABLE_VOLTAGE, Control.HALT))
 
 
@@ -123,6 +130,99 @@ def stop_bytes(tap: WireTap, since: int) -> int | None:
     return None
 
 
+class MotorWire(Protocol):
+    """What the bytes to a motor controller ask its motors for."""
+
+    tap: WireTap
+
+    def read(self) -> Iterator[tuple[int, int, float]]:
+        """(ns, shaft, m/s over ground) of what has come since the last call; 0 = any stop."""
+        ...
+
+    def forget(self) -> None:
+        """What has come before does not count."""
+        ...
+
+
+class _Taken:
+    """Takes every item of a tap once."""
+
+    def __init__(self, tap: WireTap) -> None:
+        self.tap = tap
+        self._read = 0
+
+    def _fresh(self) -> list[tuple[int, bytes]]:
+        fresh = self.tap.to_device[self._read :]
+        self._read += len(fresh)
+        return fresh
+
+    def forget(self) -> None:
+        """See ``MotorWire``."""
+        self._read = 0
+        self.tap.to_device.clear()
+        self.tap.to_host.clear()
+
+
+class _EposWire(_Taken):
+    """One shaft.
+
+    Args:
+        tap: its cable.
+        shaft: index.
+        rpm: of the motor at 1 m/s, in the controller's sign.
+    """
+
+    def __init__(self, tap: WireTap, shaft: int, rpm: float) -> None:
+        super().__init__(tap)
+        self._shaft, self._rpm = shaft, rpm
+
+    def read(self) -> Iterator[tuple[int, int, float]]:
+        """See ``MotorWire``."""
+        for instant, index, value in _writes(self._fresh()):
+            if index == od.TARGET_VELOCITY.index:
+                rpm = value - (1 << 32) if value >= 1 << 31 else value
+                yield instant, self._shaft, rpm / self._rpm
+            elif index == od.CONTROLWORD.index and value in STOP_CONTROLS:
+                yield instant, self._shaft, 0.0
+
+
+class _StepperWire(_Taken):
+    """All shafts of a body with steppers.
+
+    Args:
+        tap: the controller's cable.
+        config: of the driver.
+        drivetrain: motor to wheel.
+    """
+
+    def __init__(self, tap: WireTap, config: StepperConfig, drivetrain: DriveTrain) -> None:
+        super().__init__(tap)
+        self._lines = Splitter()
+        step = drivetrain.speed(config.turn) / 1000
+        self._speeds = [-step if inverted else step for inverted in config.inverted[: config.motors]]
+        """Over ground at a rate of 1, m/s."""
+
+    def read(self) -> Iterator[tuple[int, int, float]]:
+        """See ``MotorWire``."""
+        for instant, data in self._fresh():
+            for line in self._lines.feed(data):
+                if line.verb == "R":
+                    asked = zip(line.words, self._speeds, strict=False)
+                    yield from ((instant, shaft, int(rate) * each) for shaft, (rate, each) in enumerate(asked))
+                elif line.verb in ("Q", "D"):
+                    yield from ((instant, shaft, 0.0) for shaft in range(len(self._speeds)))
+
+
+def _motor_wires(config: SimulatedTruckConfig, taps: Mapping[str, WireTap]) -> list[MotorWire]:
+    truck = config.sim.world.truck
+    drivetrain = DriveTrain(truck.motor.ratio, truck.wheel_radius)
+    rpm = drivetrain.motor_rate(1.0) * 30 / math.pi * (-1 if truck.motor.inverted else 1)
+    wires: list[MotorWire] = [_EposWire(taps[role], i, rpm) for i, role in enumerate(SHAFTS) if role in taps]
+    if config.devices.wheels is not None:
+        wires.append(_StepperWire(taps[DeviceRole.WHEELS], config.devices.wheels.driver, drivetrain))
+    return wires
+
+
 @dataclass(frozen=True, slots=True)
 class Observation:
     """What is seen at one instant."""
@@ -130,10 +230,12 @@ class Observation:
     now: int
     """Ns."""
     truth: TruthState
-    targets: tuple[tuple[int, float], ...]
-    """Speeds that bytes since the one before ask the motor for: (ns, m/s over ground); 0 = any stop."""
-    target: float
-    """Speed that the newest bytes ask for, m/s."""
+    twist: Twist[float]
+    """True one, of the body: m/s, m/s, rad/s."""
+    targets: tuple[tuple[int, int, float], ...]
+    """Speeds that bytes since the one before ask motors for: (ns, shaft, m/s over ground); 0 = any stop."""
+    target: tuple[float, ...]
+    """Speed of every shaft that the newest bytes ask for, m/s."""
     pulses: tuple[tuple[int, float], ...]
     """Pulses that bytes since the one before ask the servos for: (channel, us)."""
 
@@ -198,8 +300,9 @@ class _Standstill:
         if not moving:
             return
         ordered = min((at for at in (self.disarmed, self.estopped) if at is not None), default=now)
-        if now > ordered + STOPS_ASKING_WITHIN * SECOND and any(asked for _, asked in seen.targets):
-            yield "stopping bytes", f"{seen.target:.3f} m/s asked for at {speed:.3f} m/s though it was ordered to stop"
+        asked = max((abs(each) for *_, each in seen.targets), default=0.0)
+        if now > ordered + STOPS_ASKING_WITHIN * SECOND and asked > 0:
+            yield "stopping bytes", f"{asked:.3f} m/s asked for at {speed:.3f} m/s though it was ordered to stop"
         limit = round(STOPS_WITHIN * SECOND)
         if self.disarmed is not None and now > self.disarmed + limit:
             yield "disarmed", f"{speed:.3f} m/s though disarmed"
@@ -215,20 +318,34 @@ class _Speeds:
     """Speeds, true and asked for, stay within the limits; nobody asks for the other direction before standstill.
 
     Args:
+        chassis: of the body.
         backwards: limit, m/s.
         forwards: limit, m/s.
     """
 
-    def __init__(self, backwards: float, forwards: float) -> None:
+    def __init__(self, chassis: Chassis, backwards: float, forwards: float) -> None:
+        self._chassis = chassis
         self._limits = backwards, forwards
 
     def __call__(self, seen: Observation) -> Broken:
         speed = seen.truth.v
         if abs(speed) > (most := self._limits[speed > 0]) * SPEED_MARGIN:
             yield "speed", f"{speed:.3f} m/s: at most {most:.3f}"
-        for _, asked in seen.targets:
-            if abs(asked) > (most := self._limits[asked > 0]) * 1.01:
+        for *_, asked in seen.targets:
+            most = self._limits[asked > 0] if len(seen.target) == 1 else max(self._limits)
+            if abs(asked) > most * 1.01:
                 yield "speed bytes", f"{asked:.3f} m/s: at most {most:.3f}"
+        if len(seen.target) == 1:
+            yield from self._reversal(speed, [asked for *_, asked in seen.targets])
+        elif seen.targets and not self._chassis.steered:
+            vx, vy, _ = self._chassis.twist(self._chassis.input_speeds(seen.target))
+            travelled = math.hypot(*seen.twist[:2])
+            along = (vx * seen.twist[0] + vy * seen.twist[1]) / max(travelled, REVERSES_BELOW)
+            yield from self._reversal(travelled, [along + AT_REST])
+
+    @staticmethod
+    def _reversal(speed: float, targets: Iterable[float]) -> Broken:
+        for asked in targets:
             if abs(speed) > REVERSES_BELOW and asked * speed < 0:
                 yield "reversal bytes", f"{asked:.3f} m/s at {speed:.3f} m/s"
 
@@ -237,27 +354,44 @@ class _Ramp:
     """Bytes ask for a speed no sooner than the ramp from the one before.
 
     Args:
-        acceleration: of the ramp, m/s^2.
+        accelerations: of each shaft's ramp, m/s^2.
     """
 
-    def __init__(self, acceleration: float) -> None:
-        self._acceleration = acceleration
-        self._newest: tuple[float, int] | None = None
+    def __init__(self, accelerations: Iterable[float]) -> None:
+        self._accelerations = tuple(accelerations)
+        self._newest: list[tuple[float, int] | None] = [None] * len(self._accelerations)
         """Greatest speed that the ramp allows the bytes to ask for, m/s, and when it did, ns; None = it begins anew."""
 
     def __call__(self, seen: Observation) -> Broken:
-        for instant, speed in seen.targets:
+        for instant, shaft, speed in seen.targets:
             if speed == 0:  # a drive that was stopped for a moment may go on as fast as before
-                self._newest = None
+                self._newest[shaft] = None
                 continue
-            ramp = abs(speed) + self._acceleration * RAMP_SLACK
-            if self._newest is not None:
-                before, then = self._newest
-                allowed = before + self._acceleration * (instant - then) / SECOND
+            acceleration = self._accelerations[shaft]
+            ramp = abs(speed) + acceleration * RAMP_SLACK
+            if (newest := self._newest[shaft]) is not None:
+                before, then = newest
+                allowed = before + acceleration * (instant - then) / SECOND
                 if abs(speed) > allowed * 1.01:
                     yield "ramp bytes", f"{speed:.3f} m/s: at most {allowed:.3f} so soon"
                 ramp = min(ramp, allowed)
-            self._newest = ramp, instant
+            self._newest[shaft] = ramp, instant
+
+
+def _accelerations(chassis: Chassis, config: GateConfig) -> tuple[float, ...]:
+    """Greatest acceleration of each shaft within the limits of the body's, m/s^2."""
+    if len(chassis.shafts) == 1:
+        return (config.acceleration,)
+    if chassis.steered:  # each wheel rolls along where it is turned to
+        reach = math.hypot(chassis.bicycle.wheelbase, chassis.bicycle.track) / 2
+        return (config.acceleration + config.yaw_acceleration * reach,) * len(chassis.shafts)
+    forward, turned = chassis.shafts_along((1.0, 0.0, 0.0)), chassis.shafts_along(chassis.possible((0.0, 0.0, 1.0)))
+    free = chassis.freedom == "both"
+    aside = chassis.shafts_along((0.0, 1.0, 0.0)) if free else (0.0,) * len(forward)
+    return tuple(
+        config.acceleration * math.hypot(x, y) + config.yaw_acceleration * abs(turn)
+        for x, y, turn in zip(forward, aside, turned, strict=True)
+    )
 
 
 class _HeldShaft:
@@ -268,26 +402,72 @@ class _HeldShaft:
         self._held = Duration()
 
     def __call__(self, seen: Observation) -> Broken:
-        if self._held.update(seen.now, so=seen.target != 0 and self._world.shaft_blocked()) > HELD_WITHIN:
-            yield "held shaft", f"{seen.target:.3f} m/s asked for though the shaft is held"
+        held = [asked for shaft, asked in enumerate(seen.target) if asked and self._world.shaft_blocked(shaft)]
+        if self._held.update(seen.now, so=bool(held)) > HELD_WITHIN:
+            yield "held shaft", f"{held[0]:.3f} m/s asked for though the shaft is held"
 
 
-class _Pulses:
-    """Servos are asked for angles within their limits and those of the axles, and the truck turns as they ask.
+class _Steering:
+    """The steering angles that the newest pulses ask for; straight ahead for a body without servos.
 
     Args:
-        config: of the truck, with a steering device.
+        config: of the robot.
     """
 
     def __init__(self, config: SimulatedTruckConfig) -> None:
-        assert config.devices.steering is not None
         truck = config.sim.world.truck
-        self._limits = {servo.channel: servo for servo in config.devices.steering.driver.servos}
-        self._chassis = truck.chassis()
-        self._angle = config.gate.angle + ANGLE_MARGIN
-        self._models = {servo.channel: servo for servo in (truck.front_servo, truck.rear_servo)}
+        self.chassis = truck.chassis()
+        self._models = {servo.channel: servo for servo in truck.servos}
         self._arms = dict.fromkeys(self._models, 0.0)
-        """Servo angles that the newest pulses ask for, rad."""
+        """Servo angles, rad."""
+
+    def take(self, channel: int, pulse_us: float) -> None:
+        """A pulse is asked for."""
+        if (model := self._models.get(channel)) is not None:
+            self._arms[channel] = math.radians((pulse_us - model.centre_us) / model.us_per_degree)
+
+    @property
+    def angles(self) -> tuple[float, ...]:
+        """Of the axles or wheels, rad."""
+        return self.chassis.steering(*self._arms.values())
+
+
+class _Pulses:
+    """Servos are asked for angles within their limits and those of the axles.
+
+    Args:
+        config: of the truck, with a steering device.
+        steering: what the pulses steer.
+    """
+
+    def __init__(self, config: SimulatedTruckConfig, steering: _Steering) -> None:
+        assert config.devices.steering is not None
+        self._steering = steering
+        self._limits = {servo.channel: servo for servo in config.devices.steering.driver.servos}
+        wheels = len(steering.chassis.straight) > 2
+        self._angle = (WHEEL_REACH if wheels else config.gate.angle) + ANGLE_MARGIN
+
+    def __call__(self, seen: Observation) -> Broken:
+        for channel, pulse_us in seen.pulses:
+            limits = self._limits.get(channel)
+            if limits is not None and not limits.min_us - 0.5 <= pulse_us <= limits.max_us + 0.5:
+                yield "pulse bytes", f"{pulse_us:.1f} us: {limits.min_us:g} to {limits.max_us:g}"
+            self._steering.take(channel, pulse_us)
+            if (angle := max(map(abs, self._steering.angles))) > self._angle:
+                yield "angle bytes", f"axle at {angle:.3f} rad: at most {self._angle:.3f}"
+
+
+class _Turning:
+    """The robot turns as the bytes ask: pulses, and the motors where it has several.
+
+    Args:
+        steering: of the pulses.
+    """
+
+    def __init__(self, steering: _Steering) -> None:
+        self._steering = steering
+        self._course: Twist[float] = STILL
+        """Of several motors, the newest motion that was asked for."""
         self._turn_errors: deque[tuple[int, float]] = deque()
 
     def begin(self) -> None:
@@ -295,31 +475,26 @@ class _Pulses:
         self._turn_errors.clear()
 
     def __call__(self, seen: Observation) -> Broken:
-        for channel, pulse_us in seen.pulses:
-            yield from self._check_pulse(channel, pulse_us)
-        yield from self._check_turn(seen.now, seen.truth)
-
-    def _check_pulse(self, channel: int, pulse_us: float) -> Broken:
-        limits, model = self._limits.get(channel), self._models.get(channel)
-        if limits is not None and not limits.min_us - 0.5 <= pulse_us <= limits.max_us + 0.5:
-            yield "pulse bytes", f"{pulse_us:.1f} us: {limits.min_us:g} to {limits.max_us:g}"
-        if model is not None:
-            self._arms[channel] = math.radians((pulse_us - model.centre_us) / model.us_per_degree)
-        if (angle := max(map(abs, self._steering()))) > self._angle:
-            yield "angle bytes", f"axle at {angle:.3f} rad: at most {self._angle:.3f}"
-
-    def _check_turn(self, now: int, truth: TruthState) -> Broken:
-        """The true rate of turn against the one that the pulses ask for, while the truck drives."""
-        asked = self._chassis.bicycle.body_twist(truth.v, *self._steering())[2]
-        self._turn_errors.append((now, (truth.wz - asked) * PERIOD / SECOND))
+        now = seen.now
+        self._turn_errors.append((now, (seen.truth.wz - self._asked(seen)) * PERIOD / SECOND))
         while now - self._turn_errors[0][0] > TURN_WINDOW * SECOND:
             self._turn_errors.popleft()
         if abs(error := sum(turn for _, turn in self._turn_errors)) > TURN_ERROR:
             yield "steering", f"turned {error:+.2f} rad off within {TURN_WINDOW:g} s"
 
-    def _steering(self) -> tuple[float, ...]:
-        """Axle angles that the newest pulses ask for, rad."""
-        return self._chassis.steering(*self._arms.values())
+    def _asked(self, seen: Observation) -> float:
+        """Rate of turn that is asked for at the true pace, rad/s."""
+        chassis, angles = self._steering.chassis, self._steering.angles
+        if len(seen.target) == 1:
+            return chassis.bicycle.body_twist(seen.truth.v, *angles)[2]
+        if any(seen.target):
+            self._course = chassis.twist(chassis.input_speeds(seen.target, *angles), *angles)
+        asked = self._pace(self._course)
+        return self._course[2] * min(self._pace(seen.twist) / asked, 1.0) if asked > 0 else 0.0
+
+    def _pace(self, twist: Twist[float]) -> float:
+        """Size of a motion: speed of the base, or of the wheels that turn it, m/s."""
+        return max(math.hypot(*twist[:2]), abs(twist[2]) * self._steering.chassis.bicycle.track / 2)
 
 
 class _Silence:
@@ -426,47 +601,54 @@ class Observer:
     Args:
         config: of the truck, for its limits.
         world: the simulated world.
-        ports: whose wires are tapped: drive and steering, and those of lidar and compass where it has them.
+        ports: whose wires are tapped: those of the motors, and of steering, lidar and compass where it has them.
         clock: time.
     """
 
     def __init__(
         self, config: SimulatedTruckConfig, world: World, ports: Mapping[str, MemoryPort], clock: Clock
     ) -> None:
-        assert config.devices.steering is not None
         self._world = world
         self._clock = clock
         taps: dict[str, WireTap] = {r: WireTap(ports[r], clock) for r in WIRES if r in ports}
-        self.drive, self._servos = taps[DeviceRole.DRIVE], taps[DeviceRole.STEERING]
-        self._maestro = Decoder(crc=config.devices.steering.driver.use_crc)
-        motor = config.sim.world.truck.motor
-        drivetrain = DriveTrain(motor.ratio, config.sim.world.truck.wheel_radius)
-        self._rpm = drivetrain.motor_rate(1.0) * 30 / math.pi * (-1 if motor.inverted else 1)
-        """Of the motor at 1 m/s, in the controller's sign."""
-        self._read = 0
-        """How much of the drive's bytes was checked."""
-        self._target = 0.0
+        self._taps = taps
+        self._motors = _motor_wires(config, taps)
+        self._fresh: list[tuple[int, int, float]] = []
+        """Targets that no rule has seen yet."""
+        self._stops: dict[int, int] = {}
+        """Instant of the first bytes since the fault that stop each shaft, ns."""
         gate = config.gate
+        self._steering = _Steering(config)
+        chassis = self._steering.chassis
+        self._target = [0.0] * len(chassis.shafts)
         self._standstill = _Standstill()
-        self._pulses = _Pulses(config)
+        self._turning = _Turning(self._steering)
         self._battery: _Battery | None = None
-        if (pack := config.devices.steering.driver.battery) is not None:
-            limits = gate.battery.stale_after, 0.0 if gate.battery.critical else gate.battery_low_speed
-            self._battery = _Battery(self._servos, pack.channel, limits)
-        self._rules: tuple[Rule, ...] = (
+        rules: list[Rule] = [
             self._standstill,
-            _Speeds(gate.reverse_speed, gate.speed),
-            _Ramp(gate.acceleration),
+            _Speeds(chassis, gate.reverse_speed, gate.speed),
+            _Ramp(_accelerations(chassis, gate)),
             _HeldShaft(world),
-            self._pulses,
-            _Silence(_indispensable(config, taps)),
-            _Ahead(config, world),
-            _contact,
-            *(() if self._battery is None else (self._battery,)),
-        )
+        ]
+        if (servos := config.devices.steering) is not None:
+            self._maestro = Decoder(crc=servos.driver.use_crc)
+            rules.append(_Pulses(config, self._steering))
+            if (pack := servos.driver.battery) is not None:
+                limits = gate.battery.stale_after, 0.0 if gate.battery.critical else gate.battery_low_speed
+                self._battery = _Battery(taps[DeviceRole.STEERING], pack.channel, limits)
+                rules.append(self._battery)
+        rules += [self._turning, _Silence(_indispensable(config, taps)), _contact]
+        if config.devices.lidar is not None:
+            rules.append(_Ahead(config, world))
+        self._rules = tuple(rules)
         self._violations: dict[str, Violation] = {}
         self.speed = 0.0
         """True speed, m/s."""
+
+    @property
+    def drive(self) -> WireTap:
+        """Wire of the first motor controller."""
+        return self._motors[0].tap
 
     async def run(self) -> None:
         """Observe a hundred times a second until cancelled."""
@@ -498,11 +680,11 @@ class Observer:
         """A fault begins; with ``stops`` the truck must stand soon, with ``disarms`` not set off again by itself."""
         self._observe()
         self._standstill.begin(self._clock.now(), must_stop=stops, disarms=disarms)
-        self._pulses.begin()
+        self._turning.begin()
         self._violations.clear()
-        self._read = 0
-        self.drive.to_device.clear()
-        self.drive.to_host.clear()
+        self._stops.clear()
+        for motors in self._motors:
+            motors.forget()
 
     def end_fault(self) -> None:
         """The fault is over."""
@@ -518,10 +700,11 @@ class Observer:
         return self._standstill.top_speed
 
     def stop_bytes_after(self) -> float | None:
-        """Seconds from the fault to the first bytes that stop the motor."""
-        began = self._standstill.began
-        instant = stop_bytes(self.drive, began)
-        return None if instant is None else (instant - began) / SECOND
+        """Seconds from the fault to the first bytes that stop the last one of the motors."""
+        self._read_motors()
+        if len(self._stops) < len(self._target):
+            return None
+        return (max(self._stops.values()) - self._standstill.began) / SECOND
 
     def standstill_after(self) -> float | None:
         """Seconds from the fault to standstill."""
@@ -542,26 +725,29 @@ class Observer:
         now = self._clock.now()
         truth = self._world.truth(now)
         self.speed = truth.v
-        targets = tuple(self._new_targets())
-        if targets:
-            self._target = targets[-1][1]
-        seen = Observation(now, truth, targets, self._target, tuple(self._new_pulses()))
+        self._read_motors()
+        targets, self._fresh = tuple(self._fresh), []
+        for _, shaft, speed in targets:
+            self._target[shaft] = speed
+        twist = self._world.plant.twist
+        seen = Observation(now, truth, twist, targets, tuple(self._target), tuple(self._new_pulses()))
         for rule in self._rules:
             for name, text in rule(seen):
                 self._violations.setdefault(name, Violation((now - self._standstill.began) / SECOND, name, text))
 
-    def _new_targets(self) -> Iterator[tuple[int, float]]:
-        fresh = self.drive.to_device[self._read :]
-        self._read += len(fresh)
-        for instant, index, value in _writes(fresh):
-            if index == od.TARGET_VELOCITY.index:
-                yield instant, (value - (1 << 32) if value >= 1 << 31 else value) / self._rpm
-            elif index == od.CONTROLWORD.index and value in STOP_CONTROLS:
-                yield instant, 0.0
+    def _read_motors(self) -> None:
+        for motors in self._motors:
+            for instant, shaft, speed in motors.read():
+                self._fresh.append((instant, shaft, speed))
+                if speed == 0 and instant >= self._standstill.began:
+                    self._stops.setdefault(shaft, instant)
 
     def _new_pulses(self) -> Iterator[tuple[int, float]]:
-        received, self._servos.to_device[:] = list(self._servos.to_device), []
-        self._servos.to_host.clear()
+        tap = self._taps.get(DeviceRole.STEERING)
+        if tap is None:
+            return
+        received, tap.to_device[:] = list(tap.to_device), []
+        tap.to_host.clear()
         for instant, data in received:
             for command in self._maestro.feed(data):
                 if not isinstance(command, ServoCommand):
@@ -575,10 +761,15 @@ class Observer:
 def _indispensable(config: SimulatedTruckConfig, taps: Mapping[str, WireTap]) -> Iterator[tuple[str, WireTap, float]]:
     """Wires of what the truck may not drive without: role, wire, and for how long it may be silent, s.
 
-    Without the deadman line nothing stops a drive that cannot be reached.
+    Without the deadman line nothing stops an EPOS that cannot be reached; steppers have a watchdog of their own.
     """
     gate = config.gate
-    limits = dict(zip(map(str, WIRES), (gate.drive, gate.steering, gate.scan, gate.attitude), strict=True))
+    limits = dict.fromkeys(map(str, MOTORS), gate.drive)
+    limits |= {
+        DeviceRole.STEERING.value: gate.steering,
+        DeviceRole.LIDAR.value: gate.scan,
+        DeviceRole.COMPASS.value: gate.attitude,
+    }
     for role, tap in taps.items():
-        if limits[role].critical and (role != DeviceRole.DRIVE or config.sim.deadman_wired):
+        if limits[role].critical and (role not in SHAFTS or config.sim.deadman_wired):
             yield role, tap, limits[role].stale_after

@@ -22,6 +22,7 @@ from typing import Any, Final, TypeVar
 import numpy as np
 from pydantic import TypeAdapter
 
+from monstertruck_drivers.maestro.protocol import CHANNELS
 from monstertruck_planners.steps import TRACKING
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.errors import InputError, NoAnswerError, WorkerError
@@ -29,6 +30,7 @@ from monstertruck_schemas.event import Event, Severity
 from monstertruck_schemas.health import HealthTable
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order
+from monstertruck_schemas.roles import SHAFTS, DeviceRole
 from monstertruck_schemas.state import GateState
 from monstertruck_sim.faults import CatalogFault, FaultCatalog, FaultKind, apply
 from monstertruckd import __version__
@@ -63,11 +65,39 @@ QUIET: Final = frozenset(
 OBSTACLE: Final = frozenset({Reason.OBSTACLE_STOP, Reason.OBSTACLE_SLOW})
 """Reasons of a truck that stands, or creeps, before something."""
 DEADMAN: Final[dict[str, Any]] = {"map": None, **DEADMAN_LINE}
-"""Of every truck: the deadman line, and no map."""
+"""Of a truck: the deadman line, and no map; see ``wired``."""
 TRACKER_IN_WORKER: Final[dict[str, Any]] = {"placement": {"tracker": "worker"}}
 """Of every second truck."""
+KNOWN: Final = {
+    **dict.fromkeys(map(str, SHAFTS), "epos"),
+    DeviceRole.WHEELS.value: "steppers",
+    DeviceRole.STEERING.value: "maestro",
+}
+"""Kinds of devices whose wires the observer reads, by role."""
 STILL_STOPS: Final = 0.05
 """True speed of a truck that may not be armed yet, m/s."""
+
+
+def wired(config: SimulatedTruckConfig) -> SimulatedTruckConfig:
+    """The robot without a map, with the deadman line where a servo controller has an output for it."""
+    plain, steering = with_overlay(config, {"map": None}), config.devices.steering
+    if steering is None or not config.devices.present().keys() & set(SHAFTS):
+        return plain
+    servos = steering.driver
+    used = {servo.channel for servo in servos.servos} | ({servos.battery.channel} if servos.battery else set())
+    asked = DEADMAN_LINE["devices"]["steering"]["driver"]["deadman_channel"]
+    channel = next((c for c in (servos.deadman_channel, asked, *range(CHANNELS)) if c not in {None, *used}), None)
+    line = {"devices": {"steering": {"driver": {"deadman_channel": channel}}}}
+    return plain if channel is None else with_overlay(plain, {**DEADMAN_LINE, **line})
+
+
+def unguarded(config: SimulatedTruckConfig) -> tuple[str, ...]:
+    """Motor controllers that nothing stops while they cannot be reached.
+
+    The EPOS has no watchdog on RS232: without the deadman line it keeps its last speed. Steppers have one.
+    """
+    roles = config.devices.present()
+    return () if config.sim.deadman_wired else tuple(role.value for role in SHAFTS if role in roles)
 
 
 def default_jobs() -> int:
@@ -193,17 +223,20 @@ class Drill:
         leg: faults of one truck.
 
     Raises:
-        InputError: the robot has no motor, servos or tracker: nothing drives it, or the observer cannot judge it.
+        InputError: nothing drives the robot, or the observer does not know its devices.
     """
 
     def __init__(self, seed: int, count: int, config: SimulatedTruckConfig, *, leg: int = LEG) -> None:
-        needed = {"devices.drive": config.devices.drive, "devices.steering": config.devices.steering}
-        for key, there in (needed | {"tracker": config.tracker}).items():
-            if there is None:
+        if (lack := config.missing_actuators()) is not None:
+            raise InputError(f"{config.robot} cannot drive: its body needs {lack}")
+        for role, device in config.devices.present().items():
+            if role in KNOWN and device.driver.kind not in KNOWN[role]:
+                expected = " or ".join(KNOWN[role])
                 raise InputError(
-                    f"{key}: {config.robot} has none: expected a robot that a tracker drives by motor and servos; "
-                    "others have random faults by `sim: { drill: {} }`"
+                    f"devices.{role}: the observer reads the wire of {expected}, not of {device.driver.kind}"
                 )
+        if config.tracker is not None and config.path is None:
+            raise InputError(f"path: {config.robot} has none: expected one that its tracker follows; or no tracker")
         self.seed = seed
         self.count = count
         self._config = config
@@ -381,12 +414,14 @@ class _LegRun:
     def __init__(self, leg: DrillLeg, clock: VirtualClock, folder: str) -> None:
         self._clock = clock
         self._rng = np.random.default_rng([leg.seed, leg.number])
-        base = with_overlay(SimulatedTruckConfig.model_validate(leg.config), DEADMAN)
+        base = wired(SimulatedTruckConfig.model_validate(leg.config))
         workers: tuple[str, ...] = ()
         if base.tracker is not None and leg.number % 2:
             base, workers = with_overlay(base, TRACKER_IN_WORKER), (TRACKING,)
         monitors, records = base.monitors.present(), base.recorder is not None
-        catalog = FaultCatalog(base.devices, monitors, records=records, restarts=True, workers=workers)
+        catalog = FaultCatalog(
+            base.devices, monitors, records=records, restarts=True, workers=workers, unguarded=unguarded(base)
+        )
         self._faults = _draw(catalog, leg.count, self._rng)
         records = any(fault.kind is FaultKind.DISK_FULL for fault in self._faults)
         recorder = base.recorder.model_copy(update={"directory": folder}) if records and base.recorder else None

@@ -16,20 +16,19 @@ from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos.protocol import Control
 from monstertruck_runtime.clock import SECOND, VirtualClock
 from monstertruck_runtime.errors import NoAnswerError
-from monstertruck_runtime.mailbox import fifo, latest
-from monstertruck_schemas import topics
+from monstertruck_runtime.mailbox import fifo
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.event import Event
 from monstertruck_schemas.health import HealthTable, ServiceHealth, ServiceState
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import DriveRequest, Order, Role
+from monstertruck_schemas.req import Order
 from monstertruck_schemas.roles import DeviceRole
 from monstertruck_schemas.state import GateMode, GateState
 from monstertruck_schemas.topics import Topic
 from monstertruck_sim.faults import Fault, SimContext, apply
 from monstertruckd.bus.local import Bus
 from monstertruckd.tools.drill.observer import AT_REST, Violation, stop_bytes, written
-from monstertruckd.tools.drill.truck import DaemonReport, DrillTruck
+from monstertruckd.tools.drill.truck import DaemonReport, DrillTruck, DrivingStation
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
 
 SENSORS: Final[Mapping[str, Topic[Any]]] = {role.name: role.topic for role in (LIDAR, COMPASS, DRIVE, STEERING)}
@@ -56,49 +55,6 @@ GOALS: Final = {
     "back_after_replug_s": 2.0,
 }
 COLUMNS: Final = ("fault", "detected", "stop bytes", "standstill", "metres", "reason", "back")
-
-
-class DrivingStation:
-    """A station that sends drive requests, 20 a second, until it is made silent.
-
-    Args:
-        bus: of the daemon.
-        clock: time.
-        speed: requested, m/s.
-    """
-
-    def __init__(self, bus: Bus, clock: VirtualClock, speed: float = 0.18) -> None:
-        self.silent = True
-        self.speed = speed
-        self._bus = bus
-        self._clock = clock
-        self._seq = 0
-        self._gate = bus.subscribe(topics.GATE, latest())
-
-    async def run(self) -> None:
-        """Send until cancelled."""
-        while True:
-            if not self.silent:
-                self._send()
-            await self._clock.sleep(0.05)
-
-    def _send(self) -> None:
-        now = self._clock.now()
-        self._seq += 1
-        gate = self._gate.latest
-        request = DriveRequest(
-            stamp=now,
-            received=now,
-            seq=self._seq,
-            source="station",
-            role=Role.STATION,
-            lease=0.25,
-            nonce=gate.nonce if gate is not None else "",
-            gate_stamp=gate.stamp if gate is not None else None,
-            speed=self.speed,
-            front=0.0,
-        )
-        self._bus.inject(topics.REQ_DRIVE, request)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

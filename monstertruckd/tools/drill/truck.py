@@ -1,6 +1,7 @@
 """The simulated truck of a drill: rig, operator and observer, and what the daemon reports."""
 
 import asyncio
+import math
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, suppress
 from typing import Final, Self
@@ -12,8 +13,9 @@ from monstertruck_schemas import topics
 from monstertruck_schemas.event import Event
 from monstertruck_schemas.health import HealthTable, ServiceState
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import Order
+from monstertruck_schemas.req import DriveRequest, Order, Role
 from monstertruck_schemas.state import GateMode, GateState
+from monstertruckd.bus.local import Bus
 from monstertruckd.daemon import Daemon
 from monstertruckd.tools.drill.observer import Observer
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
@@ -21,15 +23,68 @@ from monstertruckd.tools.simulation.operator import LocalOperator
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 
 CRUISE: Final = 0.1
-"""True speed of a truck that drives, m/s."""
+"""True speed of a truck that drives, m/s; of a slow one half of what it may."""
+CIRCLE: Final = 0.5
+"""Radius of the circle in which a station drives a robot without a tracker, m."""
+STATION_SPEED: Final = 0.8
+"""Of that station, as a share of the gate's limit."""
+REQUESTS: Final = 0.05
+"""Seconds from one request of a station to the next."""
 OPTIONAL: Final = frozenset({"recorder"})
 """Services that a fault may end for the rest of a run: driving goes on without."""
 
 DaemonReport = Event | GateState | HealthTable
 
 
+class DrivingStation:
+    """A station that sends drive requests, 20 a second, until it is made silent.
+
+    Args:
+        bus: of the daemon.
+        clock: time.
+        speed: requested, m/s.
+        front: angle of the bicycle's front axle that is requested, rad.
+    """
+
+    def __init__(self, bus: Bus, clock: VirtualClock, speed: float = 0.18, front: float = 0.0) -> None:
+        self.silent = True
+        self.speed = speed
+        self.front = front
+        self._bus = bus
+        self._clock = clock
+        self._seq = 0
+        self._gate = bus.subscribe(topics.GATE, latest())
+
+    async def run(self) -> None:
+        """Send until cancelled."""
+        while True:
+            self.send()
+            await self._clock.sleep(REQUESTS)
+
+    def send(self) -> None:
+        """One request, unless it is silent."""
+        if self.silent:
+            return
+        now = self._clock.now()
+        self._seq += 1
+        gate = self._gate.latest
+        request = DriveRequest(
+            stamp=now,
+            received=now,
+            seq=self._seq,
+            source="station",
+            role=Role.STATION,
+            lease=0.25,
+            nonce=gate.nonce if gate is not None else "",
+            gate_stamp=gate.stamp if gate is not None else None,
+            speed=self.speed,
+            front=self.front,
+        )
+        self._bus.inject(topics.REQ_DRIVE, request)
+
+
 class DrillTruck:
-    """One rig with its operator and observer.
+    """One rig with its operator and observer; without a tracker a station drives it, in a circle.
 
     Args:
         rig: not running yet.
@@ -39,6 +94,8 @@ class DrillTruck:
         self.rig = rig
         self.clock = rig.clock
         self.observer = Observer(rig.config, rig.world, rig.ports, rig.clock)
+        self.station: DrivingStation | None = None
+        self._cruise = min(CRUISE, rig.config.gate.speed / 2)
         self._heard: Daemon | None = None
         self.listen()
 
@@ -53,6 +110,9 @@ class DrillTruck:
         self._reports = tuple(queues)
         self._gate = rig.bus.subscribe(topics.GATE, latest())
         self._health = rig.bus.subscribe(topics.HEALTH, latest())
+        if rig.config.tracker is None:
+            angle = min(math.atan(rig.config.geometry.wheelbase / CIRCLE), rig.config.gate.angle)
+            self.station = DrivingStation(rig.bus, rig.clock, STATION_SPEED * rig.config.gate.speed, angle)
 
     @classmethod
     @asynccontextmanager
@@ -66,12 +126,19 @@ class DrillTruck:
         truck = cls(rig)
         async with rig.running():
             observing = asyncio.create_task(truck.observer.run(), name="observer")
+            asking = asyncio.create_task(truck._ask_for_ever(), name="station")
             try:
                 yield truck
             finally:
+                asking.cancel()
                 observing.cancel()
                 with suppress(asyncio.CancelledError):
                     await observing  # an observer that broke has seen nothing
+
+    async def _ask_for_ever(self) -> None:
+        while self.station is not None:
+            self.station.send()
+            await self.clock.sleep(REQUESTS)
 
     @property
     def gate(self) -> GateState | None:
@@ -94,6 +161,8 @@ class DrillTruck:
         while self.clock.now() < end and not self.rig.daemon_ended:
             if condition():
                 return True
+            if order is Order.ARM and self.station is not None:  # arming needs a stick at rest
+                self.station.silent = self.gate is None or not self.gate.mode.active
             if order is not None and self.gate is not None and not self.gate.mode.active:
                 await self.order(order)
             await self.clock.sleep(0.02)
@@ -107,7 +176,7 @@ class DrillTruck:
 
     def drives(self) -> bool:
         """Whether it moves at a speed worth stopping."""
-        return abs(self.observer.speed) > CRUISE
+        return abs(self.observer.speed) > self._cruise
 
     def reports(self) -> list[DaemonReport]:
         """Events, gate states and health tables since the last call, by time."""
