@@ -144,7 +144,7 @@ class MotorWire(Protocol):
         ...
 
 
-class _Taken:
+class _MotorWireReader:
     """Takes every item of a tap once."""
 
     def __init__(self, tap: WireTap) -> None:
@@ -163,7 +163,7 @@ class _Taken:
         self.tap.to_host.clear()
 
 
-class _EposWire(_Taken):
+class _EposWire(_MotorWireReader):
     """One shaft.
 
     Args:
@@ -186,7 +186,7 @@ class _EposWire(_Taken):
                 yield instant, self._shaft, 0.0
 
 
-class _StepperWire(_Taken):
+class _StepperWire(_MotorWireReader):
     """All shafts of a body with steppers.
 
     Args:
@@ -407,7 +407,7 @@ class _HeldShaft:
             yield "held shaft", f"{held[0]:.3f} m/s asked for though the shaft is held"
 
 
-class _Steering:
+class _PulsedSteering:
     """The steering angles that the newest pulses ask for; straight ahead for a body without servos.
 
     Args:
@@ -440,7 +440,7 @@ class _Pulses:
         steering: what the pulses steer.
     """
 
-    def __init__(self, config: SimulatedTruckConfig, steering: _Steering) -> None:
+    def __init__(self, config: SimulatedTruckConfig, steering: _PulsedSteering) -> None:
         assert config.devices.steering is not None
         self._steering = steering
         self._limits = {servo.channel: servo for servo in config.devices.steering.driver.servos}
@@ -464,7 +464,7 @@ class _Turning:
         steering: of the pulses.
     """
 
-    def __init__(self, steering: _Steering) -> None:
+    def __init__(self, steering: _PulsedSteering) -> None:
         self._steering = steering
         self._course: Twist[float] = STILL
         """Of several motors, the newest motion that was asked for."""
@@ -618,7 +618,7 @@ class Observer:
         self._stops: dict[int, int] = {}
         """Instant of the first bytes since the fault that stop each shaft, ns."""
         gate = config.gate
-        self._steering = _Steering(config)
+        self._steering = _PulsedSteering(config)
         chassis = self._steering.chassis
         self._target = [0.0] * len(chassis.shafts)
         self._standstill = _Standstill()
