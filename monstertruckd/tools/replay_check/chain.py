@@ -54,8 +54,11 @@ LINKS: Final = 16
 
 GIVEN: Final = frozenset({topics.PATH.name, topics.GATE.name})
 """Not computed again, but read by the tracker."""
-ASKED: Final = frozenset({topics.GATE.name, topics.REQ_GOAL.name, topics.REQ_GOAL_CONTROL.name, topics.REQ_PATH.name})
-"""The same for goals, whose paths are computed."""
+ASKED: Final = frozenset(
+    topic.name for topic in (topics.GATE, topics.GROUND, topics.REQ_GOAL, topics.REQ_GOAL_CONTROL, topics.REQ_PATH)
+)
+"""The same for goals, whose paths are computed. Ground and goals have their turns at the same instants, in either
+order."""
 
 
 def replayable(config: TruckConfig) -> TruckConfig:
@@ -76,6 +79,8 @@ def replayable(config: TruckConfig) -> TruckConfig:
             "map": None,
             "behaviours": {},
             "explorer": None,
+            "ground": None,
+            "points": None,
             "placement": PlacementConfig(),
         }
     )

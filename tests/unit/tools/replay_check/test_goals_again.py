@@ -1,18 +1,25 @@
 """Goals, routes and their deformation computed again."""
 
+import asyncio
 import json
 from dataclasses import replace
 
 import pytest
 from typer.testing import CliRunner
 
+from monstertruck_estimation.points.config import PointsConfig
 from monstertruck_runtime import wire
+from monstertruck_runtime.clock import VirtualLoop
 from monstertruck_schemas import topics
 from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.roles import ServiceName
 from monstertruckd.recorder.reader import open_log
 from monstertruckd.tools.cli.main import app
 from monstertruckd.tools.replay_check import check_log
+from monstertruckd.tools.replay_check.chain import Chain
 from monstertruckd.tools.replay_check.comparison import Kind
+from monstertruckd.tools.replay_check.pace import PacedClock
+from monstertruckd.tools.replay_check.recorded import RunLog, preamble, recorded_config, survey
 from monstertruckd.tools.replay_check.result import ROUNDING
 from tests.unit.tools.replay_check.log_surgery import (
     BY_NAME,
@@ -49,6 +56,21 @@ def test_the_stored_run_has_all_there_is_to_compute():
     asked = [entry for entry in open_log(GOALS) if entry.topic == "req/goal"]
     assert len(asked) == 1  # and the other one by remote call
     assert GOALS.stat().st_size < 400_000
+
+
+def test_the_ground_is_given_as_recorded_and_nothing_reads_pictures():
+    log = RunLog(GOALS)
+    config = recorded_config(GOALS, preamble(log)[0]).model_copy(update={"points": PointsConfig()})
+    assert config.ground is not None, "it was computed when the log was recorded"
+    found = survey(log)
+
+    async def main(clock):
+        chain = Chain(config, clock, (), found)
+        assert chain.takes(topics.GROUND.name)
+        assert {service.name for service in chain._services}.isdisjoint({ServiceName.GROUND, ServiceName.POINTS})
+
+    with asyncio.Runner(loop_factory=lambda: VirtualLoop(found.start)) as runner:
+        runner.run(main(PacedClock(runner.get_loop())))
 
 
 def test_a_flipped_byte_of_a_request_is_found(tmp_path):
