@@ -227,6 +227,7 @@ class Chain:
         """Whoever wrote ``outputs``, recorded in a row, had its turn then; who reads them did not come in between."""
         await self._catch_up(outputs[0].log_time)
         for output in outputs:
+            await self._take_unseen_turns(output.log_time)
             if (call := self._calls.get(output.sequence)) is not None and output.topic == topics.GOAL.name:
                 await self._call(call, output.stamp)
             elif (service := self._writer_of(output)) in self._paces and not self._is_start(output):
@@ -320,12 +321,16 @@ class Chain:
         self._answers += 1
 
     async def _catch_up(self, instant: int) -> None:
+        await self._take_unseen_turns(instant)
+        await self._clock.reach(instant)
+
+    async def _take_unseen_turns(self, instant: int) -> None:
+        """Those up to ``instant``, ns; at that instant before everything recorded: none of it shows in them."""
         while self._unseen and self._unseen[0][0] <= instant:
             due, service = self._unseen.popleft()
             await self._clock.reach(due)
             await self._paces[service].release(due)
             await asyncio.sleep(0)
-        await self._clock.reach(instant)
 
     def _build(self, config: TruckConfig) -> Iterator[Service]:
         body = Body.of(config)

@@ -13,12 +13,12 @@ from monstertruck_runtime.clock import VirtualLoop
 from monstertruck_schemas import topics
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.roles import ServiceName
-from monstertruckd.recorder.reader import open_log
+from monstertruckd.recorder.reader import LogMessage, open_log
 from monstertruckd.tools.cli.main import app
 from monstertruckd.tools.replay_check import check_log
 from monstertruckd.tools.replay_check.chain import Chain
 from monstertruckd.tools.replay_check.comparison import Kind
-from monstertruckd.tools.replay_check.pace import PacedClock
+from monstertruckd.tools.replay_check.pace import Pace, PacedClock
 from monstertruckd.tools.replay_check.recorded import RunLog, preamble, recorded_config, survey
 from monstertruckd.tools.replay_check.result import ROUNDING
 from tests.unit.tools.replay_check.log_surgery import (
@@ -58,7 +58,16 @@ def test_the_stored_run_has_all_there_is_to_compute():
     assert GOALS.stat().st_size < 400_000
 
 
-def test_the_ground_is_given_as_recorded_and_nothing_reads_pictures():
+class NotedTurns(Pace):
+    def __init__(self, name, turns):
+        super().__init__()
+        self.name, self.turns = name, turns
+
+    async def release(self, instant):
+        self.turns.append(self.name)
+
+
+def test_ground_is_given_as_recorded_no_pictures_are_read_and_silent_ticks_have_their_turn():
     log = RunLog(GOALS)
     config = recorded_config(GOALS, preamble(log)[0]).model_copy(update={"points": PointsConfig()})
     assert config.ground is not None, "it was computed when the log was recorded"
@@ -68,6 +77,14 @@ def test_the_ground_is_given_as_recorded_and_nothing_reads_pictures():
         chain = Chain(config, clock, (), found)
         assert chain.takes(topics.GROUND.name)
         assert {service.name for service in chain._services}.isdisjoint({ServiceName.GROUND, ServiceName.POINTS})
+
+        # Ticks of several services recorded in a row, and between them one that left nothing.
+        chain = Chain(config, clock, [(found.start + 20, "goals")], found)
+        turns = []
+        chain._paces = {name: NotedTurns(name, turns) for name in chain._paces}
+        rows = [(topics.ODOMETRY, 10), (topics.TRACKER, 20), (topics.ODOMETRY, 30)]
+        await chain.tick([LogMessage(t.name, found.start + at, found.start + at, 9, b"", "") for t, at in rows])
+        assert turns == ["odometry", "goals", "tracker", "odometry"]
 
     with asyncio.Runner(loop_factory=lambda: VirtualLoop(found.start)) as runner:
         runner.run(main(PacedClock(runner.get_loop())))
