@@ -15,6 +15,7 @@ import pytest
 from monstertruck_drivers.cable import MemoryPort
 from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos.protocol import write_request
+from monstertruck_drivers.steppers.protocol import run
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.mailbox import fifo
@@ -28,7 +29,16 @@ from monstertruck_sim.world.obstacles import Disc
 from monstertruck_sim.world.world import World
 from monstertruckd.config.load import load_config
 from monstertruckd.tools.drill.observer import Observer, Violation
-from monstertruckd.tools.drill.random_drill import DEADMAN, TRACKER_IN_WORKER, Drill, DrillReport, FaultOutcome, run_leg
+from monstertruckd.tools.drill.random_drill import (
+    DEADMAN,
+    TRACKER_IN_WORKER,
+    Drill,
+    DrillReport,
+    FaultOutcome,
+    run_leg,
+    unguarded,
+    wired,
+)
 from monstertruckd.tools.drill.truck import DrillTruck
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
@@ -46,6 +56,11 @@ def full() -> SimulatedTruckConfig:
 @cache
 def demo() -> SimulatedTruckConfig:
     return load_config(CONFIGS / "demo.yaml", SimulatedTruckConfig)[0]
+
+
+@cache
+def body(name: str) -> SimulatedTruckConfig:
+    return load_config(CONFIGS / "robots" / f"{name}.yaml", SimulatedTruckConfig)[0]
 
 
 def catalog_of(config: SimulatedTruckConfig) -> FaultCatalog:
@@ -159,12 +174,38 @@ def test_every_kind_is_on_the_catalog_of_the_whole_truck_and_what_needs_hubs_is_
     assert missing == {*hubs, FaultKind.RAIL_12V, FaultKind.ECHO, FaultKind.NETWORK, FaultKind.MEMORY}
 
 
-def test_a_robot_that_it_cannot_judge_is_refused_with_the_key():
-    sonar, _ = load_config(CONFIGS / "robots" / "sonar.yaml", SimulatedTruckConfig)
-    with pytest.raises(InputError, match=r"devices\.steering: sonar has none: expected a robot that a tracker drives"):
-        Drill(1, 1, sonar)
-    with pytest.raises(InputError, match="tracker: "):
-        Drill(1, 1, with_overlay(demo(), {"tracker": None}))
+def test_a_robot_that_nothing_drives_is_refused_with_the_key():
+    with pytest.raises(InputError, match="path: truck has none: expected one that its tracker follows"):
+        Drill(1, 1, with_overlay(demo(), {"path": None}))
+    with pytest.raises(InputError, match="cannot drive: its body needs the devices drive and steering"):
+        Drill(1, 1, with_overlay(demo(), {"devices": {"drive": None}, "tracker": None, "path": None}))
+
+
+def test_the_deadman_line_takes_a_free_output_and_without_it_nothing_cuts_a_motor_controller_off():
+    for name, channel in (("truck", 2), ("independent", 4)):
+        config = wired(body(name))
+        assert config.devices.steering is not None
+        assert (config.devices.steering.driver.deadman_channel, unguarded(config)) == (channel, ())
+    assert unguarded(wired(body("skid_stand"))) == (), "steppers have a watchdog"
+    config = wired(body("differential"))
+    assert Drill(1, 1, config).unguarded == unguarded(config) == ("drive", "drive_2")
+    catalog, rng = FaultCatalog(config.devices, records=False, unguarded=unguarded(config)), np.random.default_rng(1)
+    names = {catalog.draw(rng).name for _ in range(600)}
+    assert {"unplug: lidar", "stall: compass", "late answers: drive_2", "blocked shaft: drive_2"} <= names
+    assert {
+        name for name in names if name.startswith(("unplug: dr", "stall: dr")) or "wrong device: dr" in name
+    } == set()
+    assert FaultKind.RAIL_SERVOS not in catalog.kinds
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    "name", ["differential", "skid_steer", "mecanum", "omni", "independent", "skid_stand", "sonar"]
+)
+def test_random_faults_of_other_bodies_end_safely(name: str):
+    report = Drill(7, 4, with_overlay(body(name), {"recorder": None}), leg=4).run()
+    assert [(o.fault, o.violations, o.stuck) for o in report.outcomes if o.violations or o.stuck] == []
+    assert len(report.outcomes) == 4
 
 
 def test_draws_are_the_seeds():
@@ -197,13 +238,16 @@ def watched(
     estopped: bool = False,
     seconds: float = 3.0,
     deadman: bool = True,
+    robot: str | None = None,
 ) -> set[str]:
     """Rules broken by a scene."""
 
     async def main(clock: VirtualClock) -> set[str]:
         config = with_overlay(demo(), DEADMAN) if deadman else demo()
+        if robot is not None:
+            config = body(robot)
         world = World(config.sim.world, seed=1)
-        ports = {role: MemoryPort(role) for role in TAPPED}
+        ports = {role: MemoryPort(role) for role in (*TAPPED, *config.devices.present())}
         bare = Bare(world, ports, clock)
         observer = Observer(config, world, ports, clock)
         watching = asyncio.create_task(observer.run())
@@ -432,6 +476,72 @@ def targets(bare: Bare, *speeds: tuple[float, float]) -> None:
             bare.ports["drive"].device.take(frame.body)
 
     bare.tasks.append(asyncio.get_running_loop().create_task(ask()))
+
+
+# Bodies with several motors
+
+
+def asked(bare: Bare, role: str, speed: float) -> None:
+    """Bytes ask a motor for a speed, m/s."""
+    bare.ports[role].device.take(write_request(od.TARGET_VELOCITY, round(-RPM * speed), 1).body)
+
+
+def turned(bare: Bare, shaft: int, speed: float) -> None:
+    """A motor does turn."""
+    bare.world.motors[shaft].command(bare.clock.now(), -RPM * speed, 1e5)
+
+
+@pytest.mark.parametrize(("right", "rules"), [(0.12, set[str]()), (0.0, {"steering"})])
+def test_a_body_whose_motors_do_not_turn_it_as_their_bytes_ask_is_seen(right: float, rules: set[str]):
+    def scene(bare: Bare) -> None:
+        for shaft, (role, speed) in enumerate({"drive": 0.12, "drive_2": right}.items()):
+            asked(bare, role, 0.12)
+            turned(bare, shaft, speed)
+
+    assert watched(scene, robot="differential", seconds=1.5) == rules
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "rules"), [(0.15, -0.15, set[str]()), (0.1, 0.2, set()), (0.1, 0.215, {"speed bytes"})]
+)
+def test_bytes_to_the_second_motor_are_judged_as_well(left: float, right: float, rules: set[str]):
+    def scene(bare: Bare) -> None:
+        for shaft, (role, speed) in enumerate({"drive": left, "drive_2": right}.items()):
+            asked(bare, role, speed)
+            turned(bare, shaft, speed)
+
+    assert watched(scene, robot="differential", seconds=1.0) == rules
+
+
+def test_a_held_second_shaft_that_is_driven_on_and_motion_back_before_standstill_are_seen():
+    def held(bare: Bare) -> None:
+        bare.world.block_shaft(bare.clock.now(), 1, on=True)
+        asked(bare, "drive_2", 0.1)
+
+    assert watched(held, robot="differential", seconds=1.5) == {"held shaft"}
+
+    def back(bare: Bare) -> None:
+        for shaft, role in enumerate(("drive", "drive_2")):
+            turned(bare, shaft, 0.12)
+            asyncio.get_running_loop().call_later(0.5, asked, bare, role, -0.05)
+
+    assert "reversal bytes" in watched(back, robot="differential", seconds=0.6)
+
+
+@pytest.mark.parametrize(("rate", "rules"), [(150, set[str]()), (190, {"speed bytes"})])
+def test_the_lines_to_steppers_are_read(rate: int, rules: set[str]):
+    def scene(bare: Bare) -> None:
+        bare.ports["wheels"].device.take(bytes(run(1, (1000 * rate,) * 4)))
+
+    assert watched(scene, robot="skid_stand", seconds=0.3) == rules
+    assert watched(scene, robot="skid_stand", seconds=0.3, disarmed=True) == rules, "it was asked before the order"
+
+    def late(bare: Bare) -> None:
+        turn = bare.world.motors[0].command
+        turn(bare.clock.now(), 100.0, 1e5)
+        asyncio.get_running_loop().call_later(0.2, scene, bare)
+
+    assert "stopping bytes" in watched(late, robot="skid_stand", seconds=0.4, disarmed=True)
 
 
 def test_a_truck_before_something_is_distinguished_from_one_in_the_open():

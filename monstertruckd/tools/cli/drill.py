@@ -40,11 +40,17 @@ def drill(
     from monstertruckd.tools.drill.random_drill import Drill, default_jobs
     from monstertruckd.tools.simulation.config import load_simulated
 
-    report = _run(Drill(seed, count, load_simulated(config)), jobs or default_jobs(), cluster, resume)
+    drill = Drill(seed, count, load_simulated(config))
+    report = _run(drill, jobs or default_jobs(), cluster, resume)
     if json_output:
-        print_json(report.as_json())
+        print_json(report.as_json() | {"unguarded": drill.unguarded})
     else:
         _print(report)
+        if drill.unguarded:
+            names = ", ".join(drill.unguarded)
+            console().print(
+                f"no fault cut off {names}: without a deadman line nothing stops a motor that is not reached"
+            )
     if report.unsafe or report.stuck:
         raise typer.Exit(1)
 

@@ -239,6 +239,8 @@ class Drill:
             raise InputError(f"path: {config.robot} has none: expected one that its tracker follows; or no tracker")
         self.seed = seed
         self.count = count
+        self.unguarded = unguarded(wired(config))
+        """Motor controllers that no fault cuts off, for nothing would stop them."""
         self._config = config
         self._leg = leg
 

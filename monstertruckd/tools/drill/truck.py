@@ -161,7 +161,7 @@ class DrillTruck:
         while self.clock.now() < end and not self.rig.daemon_ended:
             if condition():
                 return True
-            if order is Order.ARM and self.station is not None:  # arming needs a stick at rest
+            if order is not None and self.station is not None:  # a stick at rest, until it is armed
                 self.station.silent = self.gate is None or not self.gate.mode.active
             if order is not None and self.gate is not None and not self.gate.mode.active:
                 await self.order(order)
