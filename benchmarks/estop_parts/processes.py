@@ -2,6 +2,7 @@
 
 import asyncio
 import os
+import resource
 import sys
 import time
 from collections.abc import AsyncIterator
@@ -51,3 +52,31 @@ async def order(client: TruckClient, what: Order) -> None:
             await asyncio.sleep(0.05)
         else:
             return
+
+
+class OtherLoad:
+    """Processor time that the cores of this process have given to others, but for its children, since it was made.
+
+    Latencies of milliseconds are those of a quiet computer only: somebody else's turn on a core takes as long.
+    """
+
+    def __init__(self) -> None:
+        self._began, self._busy, self._own = time.monotonic(), _busy(), _own()
+
+    def cores(self) -> float:
+        """How many cores were busy with it, on the average; children count once they have ended."""
+        others = (_busy() - self._busy) - (_own() - self._own)
+        return max(0.0, others) / (time.monotonic() - self._began)
+
+
+def _busy() -> float:
+    """Seconds for which the cores of this process have not been idle (proc(5), ``/proc/stat``)."""
+    cores = {f"cpu{core}" for core in os.sched_getaffinity(0)}
+    rows = (line.split() for line in Path("/proc/stat").read_text().splitlines())
+    ticks = sum(sum(map(int, row[1:4])) + sum(map(int, row[6:9])) for row in rows if row[0] in cores)
+    return ticks / os.sysconf("SC_CLK_TCK")
+
+
+def _own() -> float:
+    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(each.ru_utime + each.ru_stime for each in used)
