@@ -438,7 +438,8 @@ class _LegRun:
         left = self._faults
         while left:
             before = len(self._outcomes)
-            async with DrillTruck.running(self._config, self._clock) as truck:
+            by_station = self._config.tracker is None
+            async with DrillTruck.running(self._config, self._clock, by_station=by_station) as truck:
                 await truck.until(lambda: not truck.blockers(), TIMEOUT)  # called within this turn only
                 for fault in left:
                     order = Order.DISARM if (len(self._outcomes) + 1) % ESTOPS else Order.ESTOP

@@ -84,14 +84,16 @@ class DrivingStation:
 
 
 class DrillTruck:
-    """One rig with its operator and observer; without a tracker a station drives it, in a circle.
+    """One rig with its operator and observer.
 
     Args:
         rig: not running yet.
+        by_station: a station drives it, in a circle.
     """
 
-    def __init__(self, rig: VirtualRig) -> None:
+    def __init__(self, rig: VirtualRig, *, by_station: bool = False) -> None:
         self.rig = rig
+        self._by_station = by_station
         self.clock = rig.clock
         self.observer = Observer(rig.config, rig.world, rig.ports, rig.clock)
         self.station: DrivingStation | None = None
@@ -110,20 +112,22 @@ class DrillTruck:
         self._reports = tuple(queues)
         self._gate = rig.bus.subscribe(topics.GATE, latest())
         self._health = rig.bus.subscribe(topics.HEALTH, latest())
-        if rig.config.tracker is None:
+        if self._by_station:
             angle = min(math.atan(rig.config.geometry.wheelbase / CIRCLE), rig.config.gate.angle)
             self.station = DrivingStation(rig.bus, rig.clock, STATION_SPEED * rig.config.gate.speed, angle)
 
     @classmethod
     @asynccontextmanager
-    async def running(cls, config: SimulatedTruckConfig, clock: VirtualClock) -> AsyncIterator[Self]:
-        """World, daemon and observer run while the context lasts.
+    async def running(
+        cls, config: SimulatedTruckConfig, clock: VirtualClock, *, by_station: bool = False
+    ) -> AsyncIterator[Self]:
+        """World, daemon and observer run while the context lasts; arguments as of the class.
 
         Raises:
             BaseException: what ended the daemon early.
         """
         rig = VirtualRig(config, clock)
-        truck = cls(rig)
+        truck = cls(rig, by_station=by_station)
         async with rig.running():
             observing = asyncio.create_task(truck.observer.run(), name="observer")
             asking = asyncio.create_task(truck._ask_for_ever(), name="station")
