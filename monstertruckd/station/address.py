@@ -4,7 +4,7 @@ import re
 from dataclasses import dataclass
 from typing import Self
 
-from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT, nearest
+from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT, is_endpoint, nearest
 from monstertruck_runtime.errors import InputError
 
 _NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
@@ -22,11 +22,11 @@ class RobotAddress:
         """Read ``NAME@ENDPOINT``; without an endpoint it is a daemon on this machine.
 
         Raises:
-            InputError: the name cannot be part of a key, or the endpoint has no protocol.
+            InputError: the name cannot be part of a key, or the endpoint is none.
         """
         name, at, endpoint = text.partition("@")
         if not _NAME.fullmatch(name):
             raise InputError(f"robot {text!r}: expected NAME@ENDPOINT, the name of letters, digits, _ and -")
-        if at and "/" not in endpoint:
+        if at and not is_endpoint(endpoint):
             raise InputError(f"robot {text!r}: expected an endpoint such as tcp/192.168.1.7:7447 behind the @")
         return cls(name, nearest(endpoint or DEFAULT_ENDPOINT))

@@ -237,8 +237,11 @@ class Station:
                 viewer.show("fetching", frames.text("fetching", name=name, share=round(share, 3)))
 
             await fetch(address, name, user, self._clock, file, progress)
-            self.replays[title] = feed = await in_thread(lambda: ReplayFeed(title, file, open_log, self._clock))
-            file.unlink(missing_ok=True)
+            try:
+                feed = await in_thread(lambda: ReplayFeed(title, file, open_log, self._clock))
+            finally:  # one that cannot be shown would fill the disk
+                file.unlink(missing_ok=True)
+            self.replays[title] = feed
         self._follow(feed)
         for each in self._viewers:
             each.send(frames.text("robots", names=self.names))

@@ -5,6 +5,7 @@ import base64
 import binascii
 import hashlib
 import hmac
+import re
 import secrets
 import stat
 from collections import OrderedDict
@@ -31,6 +32,7 @@ PAUSE: Final = 1.0
 REMEMBERED: Final = 256
 MOST_HASHES: Final = 2
 """Computed at once."""
+HASH: Final = re.compile(rf"[0-9a-f]{{{2 * LENGTH}}}:[0-9a-f]{{{2 * LENGTH}}}")
 NO_HASH: Final = ":".join(("00" * LENGTH,) * 2)
 """Compared with for unknown names, so that they take as long as known ones."""
 
@@ -82,7 +84,7 @@ class StationUsers:
             )
         if file.stat().st_mode & (stat.S_IRWXG | stat.S_IRWXO):
             raise NotPermittedError(f"{file}: others may read it; expected mode 600 (chmod 600 {file})")
-        return cls({name: _row(file, name, value) for name, value in (read_yaml(file) or {}).items()})
+        return cls({name: _row(file, name, value) for name, value in _rows(file).items()})
 
     async def who(self, header: str | None, address: str = "") -> StationUser | None:
         """The user of an ``Authorization`` header of the scheme Basic (RFC 7617); None = nobody.
@@ -132,7 +134,7 @@ def add_user(file: Path, name: str, role: AccessRole, password: str) -> None:
         raise InputError(f"user {name!r}: expected up to 24 letters, digits and . _ - @")
     if len(password) < SHORTEST:
         raise InputError(f"password of {name}: expected at least {SHORTEST} characters")
-    rows: dict[str, Any] = (read_yaml(file) or {}) if file.exists() else {}
+    rows = _rows(file) if file.exists() else {}
     rows[name] = {"role": role.value, "password": hash_of(password, secrets.token_bytes(LENGTH))}
     file.parent.mkdir(parents=True, exist_ok=True)
     if file.exists():
@@ -149,10 +151,23 @@ def _matches(password: str, kept: str) -> bool:
     return hmac.compare_digest(hash_of(password, bytes.fromhex(kept.partition(":")[0])), kept)
 
 
+def _rows(file: Path) -> dict[str, Any]:
+    """Users of a file by name.
+
+    Raises:
+        InputError: it is no such file.
+    """
+    rows = read_yaml(file) or {}
+    if not isinstance(rows, dict) or not all(isinstance(name, str) for name in rows):
+        raise InputError(f"{file}: expected users by name, each with role and password")
+    return rows
+
+
 def _row(file: Path, name: str, value: Any) -> tuple[AccessRole, str]:
     try:
         role, kept = AccessRole(value["role"]), str(value["password"])
-        bytes.fromhex(kept.partition(":")[0])
+        if not HASH.fullmatch(kept):
+            raise ValueError(kept)
     except (ValueError, KeyError, TypeError):
         roles = ", ".join(AccessRole)
         raise InputError(f"{file}: {name}: expected a role ({roles}) and a password hash") from None

@@ -28,7 +28,7 @@ from monstertruck_runtime.errors import (
 from monstertruck_runtime.mailbox import Delivery, Mailbox, latest
 from monstertruck_runtime.requests import Operator
 from monstertruck_runtime.stations import ClientTls, own_source, session_config, tls_for
-from monstertruck_runtime.threads import ThreadHop, in_thread
+from monstertruck_runtime.threads import ThreadHop, in_daemon_thread, in_thread
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.mission import Mission
 from monstertruck_schemas.plan import Path as DrivePath
@@ -538,7 +538,7 @@ class TruckClient(Operator):
     async def _close(self) -> None:
         session, self._session = self._session, None
         if session is not None:
-            await in_thread(session.close)
+            await in_daemon_thread(session.close)  # also at the program's end, when pools take nothing any more
 
     def _open(self) -> None:
         tls = self._tls or tls_for(self.endpoint)

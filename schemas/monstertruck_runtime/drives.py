@@ -9,6 +9,7 @@ from typing import Any, Final, Protocol
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError, TruckError
 from monstertruck_runtime.mailbox import Mailbox, fifo, latest
+from monstertruck_runtime.presence import while_it_runs
 from monstertruck_runtime.requests import Operator
 from monstertruck_schemas.event import Event, Severity
 from monstertruck_schemas.plan import GoalPhase, GoalState, Path, TrackerState
@@ -91,8 +92,8 @@ async def drive_to(
     """Send a goal and wait for its end; cancelled or without an answer, it cancels the goal.
 
     Raises:
-        RequestRefusedError: the goal or the arming was refused.
-        NoAnswerError: the robot does not answer.
+        RequestRefusedError: the goal or the arming was refused, or the robot restarted.
+        NoAnswerError: the robot does not answer, or has been silent for a minute.
     """
     with driver.subscribe(GOAL, fifo(256)) as states, driver.subscribe(GATE, latest()) as gate:
 
@@ -160,8 +161,8 @@ async def follow(driver: Driver, clock: Clock, path: Path, *, arm: bool, report:
     """Send a path and wait for its end; cancelled or without an answer, it stops the truck.
 
     Raises:
-        RequestRefusedError: the path or the arming was refused.
-        NoAnswerError: the robot does not answer.
+        RequestRefusedError: the path or the arming was refused, or the robot restarted.
+        NoAnswerError: the robot does not answer, or has been silent for a minute.
     """
     path = path.model_copy(update={"name": f"{path.name[:96]}-{clock.now():x}"})
     with (
@@ -217,7 +218,7 @@ async def _watched(
 ) -> Arrival:
     """Wait for the end and report why the truck stands meanwhile; ``undo`` if cancelled or refused."""
     watching = asyncio.create_task(_say_why_it_stands(gate, clock, report))
-    ending = asyncio.ensure_future(end)
+    ending = asyncio.ensure_future(while_it_runs(driver, end))
     try:
         if arm and not ((state := gate.latest) is not None and state.mode.active):
             # A truck that is armed already may have set off.
@@ -227,6 +228,10 @@ async def _watched(
             except RequestRefusedError as error:
                 raise RequestRefusedError(error.refusal, f"arm refused: {error}") from None
         return await ending
+    except TruckError:
+        with suppress(TruckError):  # that it failed says more than that it cannot be taken back either
+            await undo()
+        raise
     except BaseException:
         await undo()
         raise

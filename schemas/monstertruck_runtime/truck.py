@@ -8,6 +8,7 @@ import asyncio
 import threading
 import weakref
 from collections.abc import Callable, Coroutine, Iterator, Sequence
+from concurrent.futures import CancelledError
 from contextlib import suppress
 from functools import partial
 from types import TracebackType
@@ -39,7 +40,9 @@ class Truck:
     """Session with one robot, over a ``TruckClient`` on an event loop in a thread of its own.
 
     A context manager; without ``with`` it opens at the first call, and closes with ``close()``, when nothing refers to
-    it any longer, or at the program's end. Calls may come from any thread. Ctrl-C during ``goto`` cancels the goal.
+    it any longer, or at the program's end. Calls may come from any thread; those of others that still wait when it is
+    closed raise ``RuntimeError``, and so does a call in a process that was forked from this one: open another there.
+    Ctrl-C during ``goto`` cancels the goal.
 
     Args:
         robot: name in the keys ``mt/<robot>/...``.
@@ -180,6 +183,7 @@ class MessageStream(Iterator[M]):
     """Messages of one topic; ends with its ``with`` block, or when it is forgotten."""
 
     def __init__(self, truck: Truck, topic: Topic[M], timeout: float, depth: int) -> None:
+        self._truck = truck  # which would close itself if nothing else refers to it
         self._loop = truck._opened()  # noqa: SLF001 - one module
         self._topic = topic
         self._timeout = timeout
@@ -224,11 +228,11 @@ class _LoopThread:
     """
 
     def __init__(self, make: Callable[[], TruckClient]) -> None:
+        self._client = make()
         self._loop = uvloop.new_event_loop()
         self._ending = asyncio.Event()
         self._thread = threading.Thread(target=self._run, name="truck", daemon=True)
         self._thread.start()
-        self._client = make()
         try:
             self._submit(self._client.__aenter__())
         except BaseException:
@@ -257,9 +261,16 @@ class _LoopThread:
         self._ending.set()
 
     def _submit(self, work: Coroutine[Any, Any, T]) -> T:
+        if not self._thread.is_alive():
+            work.close()
+            msg = "the session was closed, or this process was forked from the one that opened it"
+            raise RuntimeError(msg)
         future = asyncio.run_coroutine_threadsafe(work, self._loop)
         try:
             return future.result()
+        except CancelledError:
+            msg = "the session was closed meanwhile"
+            raise RuntimeError(msg) from None
         except BaseException:
             if not future.done():
                 # The coroutine takes its request back, and ends, before the interrupt is passed on.
@@ -274,6 +285,13 @@ class _LoopThread:
 
         asyncio.run_coroutine_threadsafe(others(), self._loop).result()
 
+    async def _give_up(self) -> None:
+        """End the calls of other threads that still wait for something."""
+        tasks = asyncio.all_tasks() - {asyncio.current_task()}
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
     def _end(self) -> None:
         self._loop.call_soon_threadsafe(self._ending.set)
         self._thread.join(WAIT)
@@ -282,6 +300,7 @@ class _LoopThread:
         asyncio.set_event_loop(self._loop)
         try:
             self._loop.run_until_complete(self._ending.wait())
+            self._loop.run_until_complete(self._give_up())
             self._loop.run_until_complete(self._loop.shutdown_default_executor())
         finally:
             self._loop.close()

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from typing import Any, Final, Protocol, TypeVar
 
 from monstertruck_runtime.errors import NoAnswerError, TruckError
-from monstertruck_runtime.mailbox import fifo
+from monstertruck_runtime.mailbox import Mailbox, fifo
+from monstertruck_runtime.presence import while_it_runs
 from monstertruck_runtime.requests import Operator
 from monstertruck_schemas.mission import Mission
 from monstertruck_schemas.plan import BehaviourState, ExplorationState, MissionState
@@ -162,29 +163,33 @@ async def _run(
     """Start a run and wait for its end; cancelled or without an answer, it is stopped.
 
     Raises:
-        RequestRefusedError: the start or the arming was refused.
-        NoAnswerError: the robot does not answer.
+        RequestRefusedError: the start or the arming was refused, or the robot restarted.
+        NoAnswerError: the robot does not answer, or has been silent for a minute.
     """
     with client.subscribe(topic, fifo(256)) as states:
         if arm:
             await client.arm()
         try:
             number = int((await start())["number"])
-            last: dict[str, Any] = {}
-            async for state in states:
-                if state.number > number:
-                    return RunEnd(Reason.CANCELLED, f"{state.source} started another one", last)
-                if state.number == number:
-                    show(state)
-                    last = {name: getattr(state, name) for name in figures}
-                    if not state.running:
-                        return RunEnd(state.outcome, state.text, last)
-            raise NoAnswerError("the link to the robot was closed")
+            return await while_it_runs(client, _followed(states, number, show, figures))
         except BaseException as error:
             if not isinstance(error, TruckError) or isinstance(error, NoAnswerError):
                 with suppress(TruckError):
                     await stop()
             raise
+
+
+async def _followed(states: Mailbox[S], number: int, show: Callable[[S], None], figures: tuple[str, ...]) -> RunEnd:
+    last: dict[str, Any] = {}
+    async for state in states:
+        if state.number > number:
+            return RunEnd(Reason.CANCELLED, f"{state.source} started another one", last)
+        if state.number == number:
+            show(state)
+            last = {name: getattr(state, name) for name in figures}
+            if not state.running:
+                return RunEnd(state.outcome, state.text, last)
+    raise NoAnswerError("the link to the robot was closed")
 
 
 def progress_line(state: ExplorationState) -> str:

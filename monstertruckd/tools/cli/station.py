@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from monstertruck_runtime.clock import WallClock
+from monstertruck_runtime.endpoints import is_endpoint
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.roles import AccessRole
 from monstertruckd.tools.cli.output import needs_extra, remark, until_stopped
@@ -72,6 +73,9 @@ def station(
         password = typer.prompt(f"Password of {add_user}", hide_input=True, confirmation_prompt=True)
         station_users.add_user(users, add_user, role, password)
         return
+    for router in routers or ():
+        if not is_endpoint(router):
+            raise InputError(f"--router {router!r}: expected tcp/HOST:PORT or tls/HOST:PORT")
     addresses = [RobotAddress.parse(text) for text in robots or ([] if routers else ["truck"])]
     known = None if users is None else station_users.StationUsers.load(users)
     place = Place(host, port, _tls(certificate, key), known, tuple(name or ()))

@@ -154,7 +154,7 @@ class Pad:
         actions: list[Action] = []
         for _, _, kind, code, value in EVENT.iter_unpack(data[:whole]):
             if kind == EV_KEY:
-                actions += self._key(code, pressed=value != 0)
+                actions += self._key(code, value)
             elif kind == EV_ABS:
                 actions += self._move(code, value)
             elif kind == EV_SYN and code == SYN_DROPPED:
@@ -165,6 +165,8 @@ class Pad:
     def release(self) -> None:
         """Let go: the deadman button counts again once it was released, sticks once they move."""
         self._trusted = False
+        # What of them was released meanwhile is not known: the next press must not be taken for one that went on.
+        self._pressed &= {BUTTONS[name] for name in self.mapping.deadman}
         triggers = {AXES[name] for name in self.mapping.deadman if name in AXES}
         self._axes = {code: value for code, value in self._axes.items() if code in triggers}
 
@@ -202,15 +204,15 @@ class Pad:
             return 0.0
         return -value if what in self.mapping.inverted else value
 
-    def _key(self, code: int, *, pressed: bool) -> list[Action]:
-        if not pressed:
+    def _key(self, code: int, value: int) -> list[Action]:
+        if value == 0:
             self._pressed.discard(code)
             return []
         before = code in self._pressed
         self._pressed.add(code)
         name = next((name for name, number in BUTTONS.items() if number == code), None)
         action = next((action for button, action in self.mapping.buttons.items() if button == name), None)
-        return [] if before or action is None else [action]
+        return [] if before or value != 1 or action is None else [action]
 
     def _move(self, code: int, value: int) -> list[Action]:
         low, high = self.ranges.get(code, (-1, 1))

@@ -1,16 +1,22 @@
 """The client without asyncio, before a robot of a few lines in this process."""
 
+import asyncio
 import gc
 import json
+import os
+import signal
 import threading
+import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from types import SimpleNamespace
 
 import pytest
 import zenoh
 
 from monstertruck_runtime import wire
-from monstertruck_runtime.errors import NoAnswerError, NotFoundError, RequestRefusedError
+from monstertruck_runtime.errors import InputError, NoAnswerError, NotFoundError, RequestRefusedError
 from monstertruck_runtime.truck import Truck
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import Battery, BatteryLevel
@@ -88,3 +94,49 @@ def test_a_robot_that_is_not_there_is_reported_and_leaves_nothing_behind():
     with pytest.raises(NotFoundError, match="no robot answers"), Truck("truck", "tcp/127.0.0.1:1", timeout=0.3):
         pass
     assert threads() == []
+
+
+def test_a_name_that_no_key_may_hold_leaves_nothing_behind():
+    with pytest.raises(InputError, match="source"):
+        Truck(source="a/b").alive()
+    assert threads() == []
+
+
+def test_a_stream_keeps_the_session_that_nothing_else_refers_to(robot: SimpleNamespace):
+    messages = Truck("truck", robot.endpoint).stream(BATTERY)
+    assert next(messages).voltage == 24.5
+    del messages
+    assert threads() == []
+
+
+def test_it_closes_at_the_programs_end_when_pools_take_no_work(robot: SimpleNamespace, monkeypatch: pytest.MonkeyPatch):
+    truck = Truck("truck", robot.endpoint)
+    assert truck.alive() is False
+    monkeypatch.setattr("concurrent.futures.thread._shutdown", True)
+    truck.close()
+    assert threads() == []
+
+
+def test_another_threads_call_ends_when_it_is_closed(robot: SimpleNamespace):
+    with Truck("truck", robot.endpoint) as truck, ThreadPoolExecutor() as pool:
+        waiting = [pool.submit(truck.get, SCAN, 30.0), pool.submit(truck._do, lambda _: asyncio.sleep(30.0))]
+        while len(asyncio.all_tasks(truck._opened()._loop)) < 3:
+            time.sleep(0.01)
+        truck.close()
+        for each in waiting:
+            with pytest.raises(RuntimeError, match="closed"):
+                each.result(5.0)
+
+
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+def test_a_forked_process_is_refused_instead_of_waiting_for_ever(robot: SimpleNamespace):
+    with Truck("truck", robot.endpoint) as truck:
+        child = os.fork()
+        if child == 0:
+            signal.alarm(10)  # of which it dies where it waits
+            with suppress(BaseException):
+                truck.call("anything")
+                os._exit(1)
+            os._exit(0)
+        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+        assert truck.call("anything") == {"said": {}}

@@ -79,10 +79,20 @@ def test_a_file_of_users_is_private_and_wrong_ones_are_refused(file: Path, tmp_p
     with pytest.raises(NotFoundError, match="--add-user"):
         StationUsers.load(tmp_path / "none.yaml")
     wrong = tmp_path / "wrong.yaml"
-    wrong.write_text("ann: {role: queen, password: x}\n")
-    wrong.chmod(0o600)
-    with pytest.raises(InputError, match="ann: expected a role"):
-        StationUsers.load(wrong)
+    short = f"ann: {{role: pilot, password: '{'0' * 64}:{'é' * 64}'}}\n"
+    for text, fault in (
+        ("ann: {role: queen, password: x}\n", "ann: expected a role"),
+        (short, "ann: expected a role"),
+        ("- ann\n", "expected users by name"),
+        ("7: {role: pilot, password: x}\n", "expected users by name"),
+    ):
+        wrong.write_text(text)
+        wrong.chmod(0o600)
+        with pytest.raises(InputError, match=fault):
+            StationUsers.load(wrong)
+    wrong.write_text("- ann\n")
+    with pytest.raises(InputError, match="expected users by name"):
+        add_user(wrong, "ann", AccessRole.PILOT, "long enough")
     for name, password, fault in (("a/b", "long enough", "letters"), ("ann", "short", "8 characters")):
         with pytest.raises(InputError, match=fault):
             add_user(file, name, AccessRole.PILOT, password)

@@ -49,7 +49,9 @@ def test_a_robot_is_named_with_or_without_its_endpoint():
     )
 
 
-@pytest.mark.parametrize("text", ["", "a/b@tcp/h:1", "*@tcp/h:1", "truck@", "truck@192.168.1.7"])
+@pytest.mark.parametrize(
+    "text", ["", "a/b@tcp/h:1", "*@tcp/h:1", "truck@", "truck@192.168.1.7", "truck@tcp/192.168.1.7"]
+)
 def test_a_wrong_robot_is_refused_with_what_was_expected(text: str):
     with pytest.raises(InputError, match="expected"):
         RobotAddress.parse(text)

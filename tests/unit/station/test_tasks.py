@@ -341,7 +341,15 @@ async def test_a_recording_that_nobody_looks_at_makes_room_for_another(monkeypat
         station.replays[titles[2]].attach(viewer)
         with pytest.raises(InputError, match="looked at"):
             await station.replay(address, "run-3.mcap", "", viewer)
-        assert list(station._folder.iterdir()) == [], "they are in memory"
+        station.replays[titles[2]].detach(viewer)
+
+        def unreadable(file):
+            raise InputError(f"{file.name}: no log")
+
+        station._open_log = unreadable
+        with pytest.raises(InputError, match="no log"):
+            await station.replay(address, "run-4.mcap", "", viewer)
+        assert list(station._folder.iterdir()) == [], "they are in memory, or cannot be shown"
     finally:
         for task in station._following.values():
             task.cancel()

@@ -8,10 +8,12 @@ from typer.testing import CliRunner
 
 from monstertruck_runtime.clock import VirtualClock, run_virtual
 from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError
-from monstertruck_runtime.mailbox import Mailbox, fifo
+from monstertruck_runtime.mailbox import Mailbox
 from monstertruck_schemas.plan import BehaviourState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import BehaviourOrder
+from monstertruck_schemas.state import GateMode, GateState
+from monstertruck_schemas.topics import BEHAVIOUR
 from monstertruckd.tools.cli.main import app
 from monstertruckd.tools.cli.runs import run_behaviour
 
@@ -33,8 +35,19 @@ class Robot:
 
     @contextmanager
     def subscribe(self, topic, delivery):
-        self.box = Mailbox(fifo(16))
-        yield self.box
+        box = Mailbox(delivery)
+        if topic is BEHAVIOUR:
+            self.box = box
+        else:
+            self.tasks.append(asyncio.create_task(self._runs(box)))
+        yield box
+
+    async def _runs(self, gate):
+        """It is started anew after three seconds."""
+        for number in range(40):
+            await self.clock.sleep(0.1)
+            run = f"run {number // 30}"
+            gate.put(GateState(stamp=0, received=0, seq=0, mode=GateMode.DRIVING, nonce=run, speed_limit=0.2))
 
     async def arm(self, *, hold=False):
         self.orders.append("arm")
@@ -81,9 +94,16 @@ def test_reports_of_the_one_before_are_passed_over_and_a_later_one_ends_it():
 
 
 def test_giving_up_stops_the_robot():
-    robot, end = run(state(), seconds=5.0)
+    robot, end = run(state(), seconds=2.0)
     assert isinstance(end, TimeoutError)
     assert robot.orders[-1] is BehaviourOrder.STOP
+
+
+def test_a_robot_that_was_started_anew_is_not_asked_to_stop_what_it_can_go_on_with():
+    robot, end = run(*[state()] * 20)
+    assert isinstance(end, RequestRefusedError)
+    assert "restarted" in str(end)
+    assert robot.orders == [BehaviourOrder.START]
 
 
 @pytest.mark.parametrize(

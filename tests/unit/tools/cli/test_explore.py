@@ -10,6 +10,7 @@ from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.plan import ExplorationPhase, ExplorationState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import ExploreOrder
+from monstertruck_schemas.topics import EXPLORE
 from monstertruckd.tools.cli.explore import seconds_of
 from monstertruckd.tools.cli.runs import progress_line, run_exploration
 
@@ -31,8 +32,7 @@ class Robot:
         self.states, self.refuse = states, refuse
 
     def subscribe(self, topic, delivery):
-        del topic, delivery
-        return self.mailbox
+        return self.mailbox if topic is EXPLORE else Mailbox(delivery)
 
     async def arm(self):
         self.orders.append(("arm",))

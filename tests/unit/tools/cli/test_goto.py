@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from monstertruck_runtime.clock import SECOND, run_virtual
 from monstertruck_runtime.drives import drive_to, follow
-from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError
+from monstertruck_runtime.errors import NoAnswerError, NotFoundError, RequestRefusedError
 from monstertruck_runtime.mailbox import Mailbox, latest
 from monstertruck_schemas.plan import Path
 from monstertruck_schemas.reasons import Reason
@@ -180,8 +180,52 @@ class MovingRobot(SilentRobot):
         self.gate.put(gate_state(GateMode.ARMED))
 
 
-def gate_state(mode):
-    return GateState(stamp=0, received=0, seq=0, mode=mode, nonce="n", speed_limit=0.2)
+def gate_state(mode, nonce="n"):
+    return GateState(stamp=0, received=0, seq=0, mode=mode, nonce=nonce, speed_limit=0.2)
+
+
+class LostRobot(SilentRobot):
+    """Says ten times a second that it drives, for a while; then it is another run, or silent, and knows no goal."""
+
+    def __init__(self, clock, restarts):
+        super().__init__("cancel", NotFoundError("no such call"))
+        self._clock, self._restarts = clock, restarts
+        self._gates = []
+
+    def subscribe(self, topic, delivery):
+        box = super().subscribe(topic, delivery)
+        if topic is GATE:
+            self._gates.append(box)
+        return box
+
+    async def live(self):
+        for _ in range(200):
+            await self._clock.sleep(0.1)
+            self._say("first")
+        if self._restarts:
+            await self._clock.sleep(40.0)
+            self._say("second")
+
+    def _say(self, nonce):
+        for box in self._gates:
+            box.put(gate_state(GateMode.DRIVING, nonce))
+
+
+@pytest.mark.parametrize(
+    ("restarts", "error", "after"), [(True, RequestRefusedError, 60.0), (False, NoAnswerError, 80.0)]
+)
+def test_nobody_waits_for_a_robot_that_was_restarted_or_stays_silent(restarts, error, after):
+    async def main(clock):
+        robot = LostRobot(clock, restarts)
+        living, began = asyncio.create_task(robot.live()), clock.now()
+        with pytest.raises(error) as lost:
+            await to_goal(robot, clock)
+        assert clock.now() - began == pytest.approx(after * SECOND)
+        assert getattr(lost.value, "refusal", Reason.SHUTDOWN) is Reason.SHUTDOWN
+        assert robot.asked == ["goal", "arm", "cancel"]  # which it did not understand
+        await living
+
+    run_virtual(main)
 
 
 def test_a_path_waits_for_a_truck_that_comes_to_rest():

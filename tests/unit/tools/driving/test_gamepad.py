@@ -90,6 +90,14 @@ def test_after_lost_records_and_pauses_the_deadman_button_must_be_pressed_anew()
         assert hand.held
 
 
+def test_an_emergency_stop_counts_whose_last_release_was_among_the_lost_records():
+    hand = pad()
+    assert hand.feed(key("east")) == ["estop"]
+    hand.feed(EVENT.pack(0, 0, 0, 3, 0))
+    assert hand.feed(key("start", 2)) == []
+    assert hand.feed(key("east")) == ["estop"]
+
+
 def test_buttons_and_the_cross_give_each_order_once():
     hand = pad()
     assert hand.feed(key("start") + key("start", 2) + key("start", 0) + key("east")) == ["arm", "estop"]
