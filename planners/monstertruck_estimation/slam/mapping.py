@@ -18,7 +18,7 @@ from monstertruck_estimation.slam.correlation import Submap
 from monstertruck_estimation.slam.grid import NONE, GridBuilder, passed_ends
 from monstertruck_estimation.slam.keyframes import LOOSENED, KeyframeMap, Trajectory
 from monstertruck_estimation.slam.motion import ClockOffsetEstimator, MotionPredictor, ScanOdometry, velocity
-from monstertruck_estimation.slam.relocation import LossDetector, Relocation, contradicts
+from monstertruck_estimation.slam.relocation import LossDetector, Relocation, contradicts, foreseen
 from monstertruck_estimation.slam.scan_matcher import (
     LOW_OVERLAP,
     MIN_PAIRS,
@@ -188,6 +188,8 @@ class Mapper:
         most = PART_CONTRADICTION if suspect else CONTRADICTION
         if (suspect or after_gap) and contradicts(self.map, scan, match.pose, most):
             return rejected(guess, covariance, MatchStatus.CONTRADICTED)
+        if after_gap and not foreseen(covariance) and self._has_moved(match.pose):
+            return rejected(guess, covariance, MatchStatus.UNSURE)
         return match
 
     def finish(self) -> bool:
@@ -225,7 +227,11 @@ class Mapper:
             return True
         if not self._loss.fits and not self._loss.lost:
             return False
-        moved = between(self.map.poses[-1], self._pose)
+        return self._has_moved(self._pose)
+
+    def _has_moved(self, pose: Array) -> bool:
+        """Whether ``pose``, shape (3,), is as far from the newest keyframe as the next one."""
+        moved = between(self.map.poses[-1], pose)
         return math.hypot(moved[0], moved[1]) >= self.config.key_distance or abs(moved[2]) >= self.config.key_turn
 
     def _is_elsewhere(self, scan: Scan) -> bool:

@@ -18,7 +18,7 @@ from monstertruck_estimation.slam.closure import CONTRADICTION, VIEW, LoopCloser
 from monstertruck_estimation.slam.correlation import Peak, Submap, correlate, look_ups
 from monstertruck_estimation.slam.keyframes import KeyframeMap
 from monstertruck_estimation.slam.motion import OVERLAP_DROP, OVERLAP_GAIN
-from monstertruck_estimation.slam.scan_matcher import GATE_LOW_OVERLAP, LOW_OVERLAP, ScanMatch
+from monstertruck_estimation.slam.scan_matcher import GATE_LOW_OVERLAP, LOW_OVERLAP, ScanMatch, deviations
 from monstertruck_estimation.slam.scans import Scan
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND
@@ -37,8 +37,8 @@ class LossDetector:
     """Whether scans fit the map.
 
     After a misfit or a gap the overlap must return to its mean less ``OVERLAP_DROP``, and after a gap the match must
-    constrain all directions: a half fit, or one wall, is found in many places. That it looks through no wall of the map
-    is for the mapper to judge: rooms of one shape overlap wherever they are.
+    constrain all directions: a half fit, or one wall, is found in many places. That it looks through no wall of the map,
+    and that the motion led there, is for the mapper to judge: rooms of one shape overlap wherever they are.
     """
 
     def __init__(self) -> None:
@@ -94,6 +94,19 @@ class LossDetector:
     def restart(self) -> None:
         """The newest scan fits, for it is part of the map."""
         self._misfits, self.after_gap, self.fitted = 0, False, self._stamp or 0
+
+
+FORESEEN: Final = (0.5, 0.25)
+"""Standard deviation of the predicted pose, m and rad, up to which the robot is where a match near it says."""
+
+
+def foreseen(covariance: Array) -> bool:
+    """Whether so little is open about a predicted pose, of ``covariance`` (3, 3), that no other place comes into question.
+
+    A match in a wider window is one place that fits, of how many nobody has looked.
+    """
+    place, turn = deviations(covariance)
+    return place <= FORESEEN[0] and turn <= FORESEEN[1]
 
 
 NEAR: Final = 6

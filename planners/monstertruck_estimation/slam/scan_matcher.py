@@ -53,6 +53,8 @@ class MatchStatus(StrEnum):
     FAR = "far"
     CONTRADICTED = "contradicted"
     """Scan and map look through each other's walls there."""
+    UNSURE = "unsure"
+    """After a gap in the scans: the robot may be anywhere, and one place that fits is no proof."""
 
 
 @dataclass(frozen=True, slots=True)

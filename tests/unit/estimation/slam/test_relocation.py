@@ -80,6 +80,34 @@ def test_after_a_gap_a_room_of_the_same_outline_is_another_if_it_looks_through_t
     assert any(MappingEvent.APART in step.events for step in steps)
 
 
+@pytest.mark.parametrize(
+    ("moved", "odom", "lost"),
+    [
+        pytest.param((0.9, 0.6, 0.4), (9.0, 4.0, 2.0), True, id="wheels begin anew"),
+        pytest.param((0.9, 0.6, 0.4), None, True, id="no wheels"),
+        pytest.param((0.0, 0.0, 0.0), None, False, id="it stood"),
+        pytest.param((0.9, 0.6, 0.4), (0.9, 0.6, 0.4), False, id="wheels say where to"),
+    ],
+)
+def test_after_a_gap_one_place_that_fits_is_no_proof_unless_the_motion_led_there(moved, odom, lost):
+    """In a room of the same shape, for instance: that nothing contradicts it says nothing."""
+    walls, mapper, rng = [*box(-2.5, -2.0, 2.5, 2.0), *box(1.2, -0.5, 1.6, 0.9)], Mapper(), np.random.default_rng(3)
+    for k, pose in enumerate(np.linspace((-1.4, -0.4, 0.0), (-1.0, -0.4, 0.0), 12)):
+        mapper.step(scan(walls, pose, noise=0.01, rng=rng), int(k * 1e8), pose)
+    place = compose(pose, np.array(moved))
+    after = [
+        mapper.step(
+            scan(walls, place, noise=0.01, rng=rng),
+            int((60 + k / 10) * SECOND),
+            None if odom is None else compose(pose, np.array(odom)),
+        )
+        for k in range(5)
+    ]
+    assert after[0].match.accepted is not lost
+    assert mapper.lost is lost
+    assert any(MappingEvent.APART in step.events for step in after) is lost
+
+
 def test_somewhere_else_it_stays_apart_and_is_not_saved():
     way = rounds(120, 0.6, 3.6, 2.2)
     elsewhere = [*box(-2.0, -1.5, 2.4, 1.9), *box(0.6, 0.2, 1.1, 0.5), *box(-1.6, 0.9, -1.1, 1.9)]
