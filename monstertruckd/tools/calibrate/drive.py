@@ -34,6 +34,8 @@ SLIP: Final = 0.003
 """Share that rolling slip may differ by on another floor."""
 BENT: Final = 0.35
 """Turn in one run, rad, beyond which a straight tape measures nothing useful."""
+ASIDE: Final = math.tan(BENT / 2)
+"""How far aside of straight ahead such a run ends, per metre of the tape."""
 APART: Final = 0.03
 """Share by which two runs may differ before one of them must be a slip of the pen."""
 
@@ -42,6 +44,10 @@ _MARK: Final = Confirm("mark", "Mark the floor straight below the middle of the 
 _DISTANCE: Final = Number(
     "distance", "Distance from that mark to below the middle of the front bumper now, m", 0.2, 20.0
 )
+_STRAIGHT: Final = Confirm(
+    "straight", f"Is it less than {100 * ASIDE:.0f} cm per metre aside of straight ahead of the mark?", fact=True
+)
+"""Asked of a truck without a compass."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +69,7 @@ class DriveWizard:
         """Measure."""
         inverted = bool(context.value(INVERTED))
         await context.confirm(CLEAR)
-        await context.move(MoveStep("a hand's breadth, to see where forward is", 0.06, metres=0.15))
+        sign = await context.move(MoveStep("a hand's breadth, to see where forward is", 0.06, metres=0.15))
         if not await context.confirm(_FORWARD):
             return self._reversed(inverted)
         if self.sign_only:
@@ -73,13 +79,20 @@ class DriveWizard:
                 estimates=(_sign(inverted),),
                 partial=True,
             )
+        compass = context.config.devices.compass is not None
+        if compass:
+            sign.turn()  # before anything is taped
+        else:
+            context.say("no compass: how straight the runs are is judged by eye, and the result is less certain")
         runs, tracks = [], []
         for run in range(self.runs):
             await context.confirm(_MARK)
             speed = self.speed if run % 2 == 0 else -min(self.speed, 0.12)
             name = f"run {run + 1} of {self.runs}, {'forward' if speed > 0 else 'back'}"
             track = await context.move(MoveStep(name, speed, metres=self.metres, marked=True))
-            runs.append(TapedRun.of(track, await context.ask(_DISTANCE)))
+            distance = await context.ask(_DISTANCE)
+            straight = None if compass else await context.confirm(_STRAIGHT)
+            runs.append(TapedRun.of(track, distance, straight=straight))
             tracks.append(track)
         delays = context.fit("dead time and lag", lambda: drive_estimates(tracks, float(context.value(RATE))))
         result = context.fit("turns per metre", lambda: self._result(context, inverted, runs))
@@ -104,7 +117,8 @@ class DriveWizard:
                 off = 100 * (value / middle - 1)
                 raise InputError(f"run {number} differs by {off:.1f} % from the others: measure again")
         # A compass disturbed by iron shows that there is a bend, not how much.
-        bend = 0.0 if "compass" in context.known else max(run.bend for run in runs)
+        known = "compass" in context.known and context.config.devices.compass is not None
+        bend = 0.0 if known else max(run.bend for run in runs)
         turns = turns_per_metre(values, self.tape_error, self.metres, bend)
         radius = float(context.value("geometry.wheel_radius"))
         ratio = turns.times(2 * math.pi * radius)
@@ -173,18 +187,33 @@ class TapedRun:
     """Share by which the arc is longer than the tape."""
 
     @classmethod
-    def of(cls, track: MoveRecord, distance: float) -> "TapedRun":
+    def of(cls, track: MoveRecord, distance: float, *, straight: bool | None = None) -> "TapedRun":
         """From the taped chord, m.
+
+        Args:
+            track: the run.
+            distance: the chord, m.
+            straight: whether it looked straight, of a truck without a compass: half the greatest bend that looks so is
+                taken off, and may be too much or too little.
 
         Raises:
             InputError: the truck went too crooked.
         """
-        turn, _ = track.turn()
-        if abs(turn) > BENT:
+        if straight is None:
+            turn, _ = track.turn()
+            if abs(turn) > BENT:
+                raise InputError(
+                    f"the truck turned by {math.degrees(turn):.0f} deg on its way: "
+                    "run `calibrate steering --rough` first"
+                )
+            way = arc(distance, turn)
+        elif not straight:
             raise InputError(
-                f"the truck turned by {math.degrees(turn):.0f} deg on its way: run `calibrate steering --rough` first"
+                f"the truck turned by more than {math.degrees(BENT):.0f} deg on its way: set the middle of its servos "
+                "(devices.steering.driver.front.centre_us and .rear.centre_us), for `calibrate steering` needs a compass"
             )
-        way = arc(distance, turn)
+        else:
+            way = (distance + arc(distance, BENT)) / 2
         return cls(abs(track.turns), way, way / distance - 1)
 
 

@@ -80,7 +80,10 @@ class MoveRecord:
         stamps = np.array([reading.stamp for reading in self.attitude])
         before, after = headings[stamps < self.left], headings[stamps > self.arrived]
         if min(before.size, after.size) < 5:
-            raise InputError(f"only {before.size} and {after.size} headings at rest: expected 5 at each end")
+            raise InputError(
+                f"only {before.size} and {after.size} headings of the compass at rest: expected 5 at each end; "
+                "`monstertruckd status` says whether it is silent"
+            )
         noise = math.hypot(*(float(rest.std(ddof=1)) / math.sqrt(rest.size) for rest in (before, after)))
         return float(before.mean() - after.mean()), noise
 

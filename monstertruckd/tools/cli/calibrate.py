@@ -97,7 +97,7 @@ def drive(
 ) -> "Wizard":
     """Which way is forward, and how far a turn of the motor goes: runs along a tape.
 
-    Asks `clear`, `forward` and, for each run, `mark` and `distance` (m).
+    Asks `clear`, `forward` and, for each run, `mark` and `distance` (m), and without a compass `straight` (yes or no).
     """
     from monstertruckd.tools.calibrate.drive import DriveWizard, drive_wizard
 

@@ -1,13 +1,15 @@
 """Turns per metre of single runs, and how runs are judged."""
 
+import asyncio
 import math
+from types import SimpleNamespace
 
 import pytest
 
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.sensor import Attitude, DriveFeedback, DriveMode
-from monstertruckd.tools.calibrate.drive import TapedRun, arc
+from monstertruckd.tools.calibrate.drive import DriveWizard, TapedRun, arc
 from monstertruckd.tools.calibrate.steps import MoveRecord
 
 
@@ -58,5 +60,60 @@ def test_a_crooked_run_measures_nothing():
 def test_no_headings_at_rest():
     short = track(2732.0)
     short.attitude = short.attitude[:-18]
-    with pytest.raises(InputError, match="20 and 2 headings at rest: expected 5"):
+    with pytest.raises(InputError, match="20 and 2 headings of the compass at rest: expected 5"):
         TapedRun.of(short, 2.0)
+
+
+class Course:
+    """A context in which every run has the same turns of the motor and the same taped distance."""
+
+    known: dict[str, object] = {}
+    values = {"geometry.wheel_radius": 0.075, "devices.drive.driver.inverted": False, "devices.drive.driver.rate": 50}
+
+    def __init__(self, move: MoveRecord, compass: object) -> None:
+        self._move = move
+        self.config = SimpleNamespace(devices=SimpleNamespace(compass=compass, drive=None))
+        self.asked: list[str] = []
+        self.said: list[str] = []
+        self.value = self.values.__getitem__
+        self.say = self.said.append
+
+    async def confirm(self, step):
+        self.asked.append(step.name)
+        return True
+
+    async def ask(self, step):
+        self.asked.append(step.name)
+        return 2.0
+
+    async def move(self, _step):
+        return self._move
+
+    def fit(self, name, function):
+        return [] if name == "dead time and lag" else function()
+
+
+def test_without_a_compass_the_operator_judges_the_bend_and_the_result_says_so():
+    move = track(2732.0)
+    move.attitude.clear()
+    course = Course(move, None)
+    result = asyncio.run(DriveWizard(runs=3)(course))
+    assert course.asked == ["clear", "forward", *["mark", "distance", "straight"] * 3]
+    assert len(course.said) == 1
+    turns = result.estimate("turns_per_metre")
+    assert turns.low < 2732.0 / (2.0 * 1.0051) < 2732.0 / 2.0 < turns.high
+    assert "0.26% of the bends" in turns.meaning
+
+
+def test_without_a_compass_a_run_that_looks_crooked_measures_nothing():
+    with pytest.raises(InputError, match="more than 20 deg on its way: set the middle of its servos"):
+        TapedRun.of(track(2732.0), 2.0, straight=False)
+
+
+def test_a_silent_compass_is_noticed_before_anything_is_taped():
+    move = track(2732.0)
+    move.attitude.clear()
+    course = Course(move, object())
+    with pytest.raises(InputError, match="only 0 and 0 headings of the compass at rest"):
+        asyncio.run(DriveWizard()(course))
+    assert course.asked == ["clear", "forward"]
