@@ -52,6 +52,12 @@ class CompassGate:
     """Readings it was taken from."""
     rejected: int = 0
     """Headings left out since the start."""
+    jump: float = 0.0
+    """By how much the headings jumped while the robot did not turn, rad, when the present disturbance began; 0 = not."""
+    level: float = 0.0
+    """Mean residual since, rad, over about ``LEVEL_WAY``."""
+    level_at: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Pose in odom at the last heading, m and rad."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +81,15 @@ class HeadingInnovation:
     taken_back: bool
     """A disturbance was detected soon after."""
     field: float | None
+    jump: float | None = None
+    """By how much the headings have jumped at this one, rad, 0 if that may have been the robot; None = not known:
+    whether its residual is a jump shows by ``turn_known``."""
+    turn_known: float = 0.0
+    """Greatest residual, rad, that may be the robot's own turn, and not the compass's."""
+
+
+LEVEL_WAY: Final = 1.0
+"""Way, m, and turn, rad, over which reckoning drifts less than a jump."""
 
 
 def gate_heading(
@@ -87,21 +102,47 @@ def gate_heading(
     further than that. Neither locks the compass out:
     ``config.recover`` good ones over ``config.regain`` let it in again (next to a magnet, too, there is a place where
     the heading is right), and so does one that is steadily off for ``config.steady_time``, as a
-    new north, for the odometry is the better judge of a turn, the compass of nothing but the field around it.
+    new north, for the odometry is the better judge of a turn, the compass of nothing but the field around it. A
+    disturbance that began with a jump that the robot did not turn is over when the headings jump back, or as a new north.
     """
     gate, disturbed = _field(gate, innovation, config)
+    gate = _jumped(gate, innovation)
     crept = not gate.disturbed and abs(innovation.local) > config.gate * config.local
     # The first heading stays, or there would be no north to come back to.
     if disturbed or crept or (innovation.taken_back and gate.anchored):
         return HeadingUse.LEFT_OUT, _off(gate, innovation, steady=False)
     if not gate.anchored:
-        return HeadingUse.ANCHORED, replace(gate, anchored=True, disturbed=False, good=0)
-    if abs(innovation.residual) <= config.gate * (innovation.variance + config.noise**2) ** 0.5:
+        return HeadingUse.ANCHORED, replace(gate, anchored=True, disturbed=False, good=0, jump=0.0)
+    near = abs(innovation.residual) <= config.gate * (innovation.variance + config.noise**2) ** 0.5
+    if near and not gate.jump:
         gate, enough = _good(gate, innovation, config) if gate.disturbed else (gate, True)
         if not enough:
             return HeadingUse.LEFT_OUT, replace(gate, rejected=gate.rejected + 1, steady_since=innovation.stamp)
         return HeadingUse.USED, replace(gate, disturbed=False, good=0, home_good=0)
+    if not gate.disturbed and innovation.jump is None and abs(innovation.residual) > innovation.turn_known:
+        gate = replace(gate, jump=innovation.residual, level=innovation.residual, level_at=innovation.place)
     return _far(gate, innovation, config)
+
+
+def _jumped(gate: CompassGate, innovation: HeadingInnovation) -> CompassGate:
+    """The gate with a jump that began or ended at this heading.
+
+    It ends when the headings go back by more than half of it on a way on which reckoning does not. Residuals alone do
+    not tell: without headings the yaw soon is so uncertain that a lasting jump might as well be the robot's.
+    """
+    if innovation.jump is not None:
+        # Where headings were taken back, the disturbance before this one may not have ended yet.
+        jump = gate.jump + innovation.jump
+        jump = 0.0 if abs(jump) < abs(innovation.jump) / 2 else jump
+        return replace(gate, jump=jump, level=innovation.residual, level_at=innovation.place)
+    if not gate.jump:
+        return gate
+    (x, y, yaw), (x0, y0, yaw0) = innovation.place, gate.level_at
+    change = wrap_angle(innovation.residual - gate.level)
+    if change * gate.jump < 0 and abs(change) > abs(gate.jump) / 2:
+        return replace(gate, jump=0.0)
+    share = 1.0 - math.exp(-(math.hypot(x - x0, y - y0) + abs(wrap_angle(yaw - yaw0))) / LEVEL_WAY)
+    return replace(gate, level=wrap_angle(gate.level + share * change), level_at=innovation.place)
 
 
 def _field(gate: CompassGate, innovation: HeadingInnovation, config: HeadingTrust) -> tuple[CompassGate, bool]:
@@ -140,13 +181,13 @@ def _far(gate: CompassGate, innovation: HeadingInnovation, config: HeadingTrust)
         near = abs(off) <= config.gate * (innovation.yaw_variance + variance + config.local**2 + config.noise**2) ** 0.5
         gate = replace(gate, home_good=gate.home_good + 1 if near else 0)
         if gate.home_good >= config.recover:
-            return HeadingUse.HOME, replace(gate, disturbed=False, good=0, home_good=0)
+            return HeadingUse.HOME, replace(gate, disturbed=False, good=0, home_good=0, jump=0.0)
     steady = abs(wrap_angle(innovation.residual - gate.last)) <= config.local
     gate = _off(gate, innovation, steady=steady)
     if innovation.stamp - gate.steady_since < config.steady_time * SECOND:
         return HeadingUse.LEFT_OUT, gate
     home = gate.home or innovation.north
-    return HeadingUse.ANCHORED, replace(gate, disturbed=False, good=0, home=home, home_good=0)
+    return HeadingUse.ANCHORED, replace(gate, disturbed=False, good=0, home=home, home_good=0, jump=0.0)
 
 
 def _off(gate: CompassGate, innovation: HeadingInnovation, *, steady: bool) -> CompassGate:

@@ -178,6 +178,8 @@ class Fusion:
         self._left_out: Counter[str] = Counter()
         self._changes: deque[SlipChange] = deque()
         self._was_disturbed = False
+        self._jump = 0.0
+        """Of the headings when the last disturbance began, rad; 0 = none."""
 
     # What comes in
 
@@ -292,7 +294,11 @@ class Fusion:
     @property
     def _doubt(self) -> str:
         contrary = self._turns.contrary
-        return "its headings or its field are off" if contrary is None else contrary.text
+        if contrary is not None:
+            return contrary.text
+        if self._jump:
+            return f"its headings jumped by {self._jump:+.2f} rad, and the robot did not turn"
+        return "its headings or its field are off"
 
     @property
     def state(self) -> FilterState | None:
@@ -383,7 +389,9 @@ class Fusion:
     def _look_for_disturbance(self) -> None:
         """Mark headings before a detected disturbance as taken back: a magnet approaches before it is detected."""
         if self._disturbed and not self._was_disturbed and self._history is not None:
-            self._history.rewrite(0, _taken_back)
+            gate = self._history.newest.gate
+            self._jump = gate.jump
+            self._history.rewrite(0, partial(_taken_back, jump=gate.jump, at=gate.steady_since))
             self._slip.forget_headings()
         self._was_disturbed = self._disturbed
 
@@ -431,8 +439,11 @@ def _without_turn(measurement: Measurement) -> Measurement:
     return replace(measurement, turn=None) if isinstance(measurement, WheelMeasurement) else measurement
 
 
-def _taken_back(measurement: Measurement) -> Measurement:
-    return replace(measurement, taken_back=True) if isinstance(measurement, HeadingMeasurement) else measurement
+def _taken_back(measurement: Measurement, jump: float, at: int) -> Measurement:
+    """A heading before the disturbance that began ``at``, ns, with a ``jump``, rad, is left out."""
+    if not isinstance(measurement, HeadingMeasurement):
+        return measurement
+    return replace(measurement, taken_back=True, jump=jump if measurement.stamp == at else measurement.jump)
 
 
 def _scan_way(motion: ScanMotion, scale: float) -> ScanMeasurement | None:

@@ -68,6 +68,8 @@ class HeadingMeasurement:
     """Strength of the magnetic field, in the device's unit."""
     tilt: tuple[float, float] | None = None
     """Roll and pitch, rad, if valid."""
+    jump: float | None = None
+    """By how much the headings jumped here, rad, as was found when it came; None before."""
 
 
 Measurement = WheelMeasurement | ScanMeasurement | ScanClone | HeadingMeasurement
@@ -90,6 +92,8 @@ QUANTUM: Final = (1e-5, 1e-5)
 """Standard deviation of a wheel reading that did not move, m and rad: status costs no certainty."""
 MOVED_BY: Final = ("drive", "lidar")
 """Sensors that measure motion."""
+TURNED_BY: Final = ("imu", "lidar")
+"""Sensors that measure turns, and slip with no wheel."""
 STOPPING: Final = 0.1
 """Time constant with which the velocity dies away when all of them are silent, s."""
 FRESH: Final = SECOND // 2
@@ -335,6 +339,8 @@ def _heading(state: FilterState, heading: HeadingMeasurement, config: FusionConf
         flagged=heading.disturbed,
         taken_back=heading.taken_back,
         field=heading.field,
+        jump=heading.jump,
+        turn_known=_own_turn(state, heading.stamp, config),
     )
     before = state.gate
     verdict, gate = gate_heading(before, innovation, config.compass)
@@ -352,6 +358,13 @@ def _heading(state: FilterState, heading: HeadingMeasurement, config: FusionConf
     else:
         state = kalman_update(state, np.array([residual]), by_state, np.array([[noise]]))
     return replace(state, used={**state.used, "compass": heading.stamp})
+
+
+def _own_turn(state: FilterState, stamp: int, config: FusionConfig) -> float:
+    """Greatest turn since the last heading used, rad, that wheels which slip may have missed; 0 where others saw it."""
+    if any(stamp - state.used[name] <= FRESH for name in TURNED_BY if name in state.used):
+        return 0.0
+    return config.max_turn * (stamp - state.used.get("compass", stamp)) / SECOND
 
 
 def _residual(state: FilterState, heading: HeadingMeasurement) -> Array:

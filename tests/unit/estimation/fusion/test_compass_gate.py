@@ -133,6 +133,38 @@ def test_a_lasting_change_becomes_a_new_north_and_the_old_one_is_known_again():
     assert rig.error()[1] < 0.05
 
 
+@pytest.mark.parametrize(("sensors", "magnet"), [(SENSORS, 0.3), ((*SENSORS, "imu"), 0.12)])
+def test_headings_that_jump_for_good_never_draw_the_yaw_along(sensors, magnet):
+    """By wheels alone the yaw soon is so uncertain that the jump might as well be the robot's: it is remembered."""
+    rig = Rig(sensors).drive(0.0, 0.0, 0.0, 1.0).drive(0.3, 0.0, 0.0, 4.0)
+    rig.magnet = magnet
+    rig.drive(0.3, 0.0, 0.0, 8.0)
+    assert "jumped by +0." in rig.fusion.status().doubt
+    assert rig.error()[1] < 0.03
+    rig.drive(0.3, 0.0, 0.0, 5.0)
+    assert not rig.fusion.status().disturbed
+    assert rig.fusion.status().north == pytest.approx(0.7 - magnet, abs=0.05)
+    assert rig.error()[1] < 0.03
+
+
+def test_headings_that_jump_back_are_believed_again():
+    rig = Rig(SENSORS).drive(0.3, 0.0, 0.0, 4.0)
+    disturbed(rig, 3.0, magnet=0.3)
+    assert "jumped" in rig.fusion.status().doubt
+    rig.drive(0.3, 0.0, 0.0, 8.0)
+    assert not rig.fusion.status().disturbed
+    assert rig.fusion.status().north == pytest.approx(0.7, abs=0.03)
+
+
+def test_headings_that_turn_no_faster_than_the_robot_can_are_no_jump():
+    """Its wheels may have slipped."""
+    rig = Rig(SENSORS).drive(0.3, 0.0, 0.0, 4.0)
+    for k in range(10):
+        disturbed(rig, 0.1, magnet=0.03 * k)
+        assert "jumped" not in (rig.fusion.status().doubt or "")
+    assert rig.fusion.status().slipping
+
+
 def test_wild_headings_never_become_a_north():
     rig = Rig(SENSORS).drive(0.3, 0.0, 0.0, 4.0)
     for _ in range(150):
