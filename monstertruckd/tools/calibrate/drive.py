@@ -210,7 +210,7 @@ class TapedRun:
         elif not straight:
             raise InputError(
                 f"the truck turned by more than {math.degrees(BENT):.0f} deg on its way: set the middle of its servos "
-                "(devices.steering.driver.front.centre_us and .rear.centre_us), for `calibrate steering` needs a compass"
+                "(devices.steering.driver.front.centre_us, .rear.centre_us), for `calibrate steering` needs a compass"
             )
         else:
             way = (distance + arc(distance, BENT)) / 2

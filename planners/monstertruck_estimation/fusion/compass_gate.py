@@ -53,7 +53,7 @@ class CompassGate:
     rejected: int = 0
     """Headings left out since the start."""
     jump: float = 0.0
-    """By how much the headings jumped while the robot did not turn, rad, when the present disturbance began; 0 = not."""
+    """By how much the headings jumped, and the robot did not turn, when the present disturbance began, rad; 0 = not."""
     level: float = 0.0
     """Mean residual since, rad, over about ``LEVEL_WAY``."""
     level_at: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -103,7 +103,7 @@ def gate_heading(
     ``config.recover`` good ones over ``config.regain`` let it in again (next to a magnet, too, there is a place where
     the heading is right), and so does one that is steadily off for ``config.steady_time``, as a
     new north, for the odometry is the better judge of a turn, the compass of nothing but the field around it. A
-    disturbance that began with a jump that the robot did not turn is over when the headings jump back, or as a new north.
+    disturbance that began with a jump that was no turn of the robot ends when they jump back, or as a new north.
     """
     gate, disturbed = _field(gate, innovation, config)
     gate = _jumped(gate, innovation)

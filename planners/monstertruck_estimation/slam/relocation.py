@@ -37,8 +37,8 @@ class LossDetector:
     """Whether scans fit the map.
 
     After a misfit or a gap the overlap must return to its mean less ``OVERLAP_DROP``, and after a gap the match must
-    constrain all directions: a half fit, or one wall, is found in many places. That it looks through no wall of the map,
-    and that the motion led there, is for the mapper to judge: rooms of one shape overlap wherever they are.
+    constrain all directions: a half fit, or one wall, is found in many places. That it looks through no wall of the
+    map, and that the motion led there, is for the mapper to judge: rooms of one shape overlap wherever they are.
     """
 
     def __init__(self) -> None:
@@ -101,7 +101,7 @@ FORESEEN: Final = (0.5, 0.25)
 
 
 def foreseen(covariance: Array) -> bool:
-    """Whether so little is open about a predicted pose, of ``covariance`` (3, 3), that no other place comes into question.
+    """Whether a predicted pose, of ``covariance`` (3, 3), is known so well that no other place comes into question.
 
     A match in a wider window is one place that fits, of how many nobody has looked.
     """
