@@ -78,11 +78,6 @@ def test_random_faults_end_safely_and_leave_nothing_behind(count: int):
     assert report.score > 95
 
 
-def test_one_seed_is_one_report():
-    runs = [Drill(7, 2, with_overlay(demo(), {"recorder": None})).run() for _ in range(2)]
-    assert runs[0] == runs[1]
-
-
 @pytest.mark.long
 def test_the_tracker_of_every_second_truck_runs_in_a_worker_that_may_be_killed():
     kinds = {number: {o.kind for o in run_leg(leg)} for number, leg in enumerate(worker_drill().legs())}

@@ -74,7 +74,7 @@ INSTEAD = {
         None, "waits for a hand at a cable; tests/daemon/test_usb_wall.py pulls an emulated one"
     ),
     "monstertruckd drive --mapping pad.yaml": Instead(
-        None, "needs the file; tests/unit/tools/cli/test_gamepad.py reads mappings"
+        None, "needs the file; tests/unit/tools/driving/test_gamepad.py reads mappings"
     ),
     "monstertruckd probe lidar --port /dev/ttyACM0": Instead(
         None, "needs the device; tests/daemon/test_commands_wall.py probes its emulator"
