@@ -1,11 +1,13 @@
 """Compiles kernels ahead of their first use: ``python -m monstertruckd.tools.install.kernels``.
 
 Those of all workers and of the emulated camera. numba keeps them next to the modules, or in ``NUMBA_CACHE_DIR``. Where
-they are up to date this takes seconds.
+they are up to date this takes seconds. ``--background`` leaves the processor to others: beside two busy programs that
+takes ten times as long, which nobody should wait for.
 """
 
 import importlib
 import os
+import sys
 from contextlib import suppress
 from typing import Final
 
@@ -14,6 +16,7 @@ from monstertruck_planners.steps import STEPS
 
 WORKERS: Final = (TARGET, *STEPS.values())
 """``module:factory``; each compiles when it is built."""
+BACKGROUND: Final = "--background"
 CAMERA: Final = "monstertruck_sim.world.camera:compile_kernels"
 
 
@@ -26,5 +29,6 @@ def compile_kernels() -> None:
 
 
 if __name__ == "__main__":
-    os.nice(10)
+    if BACKGROUND in sys.argv[1:]:
+        os.nice(10)
     compile_kernels()
