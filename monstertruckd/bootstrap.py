@@ -72,7 +72,7 @@ def main(arguments: list[str]) -> int:
     sync(EXTRAS[command])
     if command == "demo":
         code = run(VENV / "bin" / "monstertruckd", "demo", *rest)
-        background = [*KERNELS, "--background"]
+        background = (*KERNELS, "--background")
         subprocess.Popen(background, cwd=ROOT, stdin=DEVNULL, stdout=DEVNULL, stderr=DEVNULL, start_new_session=True)
         return code
     if command == "check":

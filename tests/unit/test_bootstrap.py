@@ -128,8 +128,8 @@ def test_kernels_are_compiled_at_installation_and_never_before_the_first_lap(
         done.append("demo" if arguments == ("demo", "--fast") else "compile")
         return 3
 
-    def popen(command: list[str], **settings: object) -> None:
-        assert command == [*bootstrap.KERNELS, "--background"], "with what the computer has left"
+    def popen(command: tuple[str, ...], **settings: object) -> None:
+        assert command == (*bootstrap.KERNELS, "--background"), "with what the computer has left"
         assert settings["start_new_session"]
         done.append("compile in the background")
 
