@@ -193,6 +193,7 @@ def test_a_run_of_the_wall_clock_has_several_stamps_in_a_tick(tmp_path):
     assert all(one.value <= ROUNDING for one in rows[topics.PATH].greatest.values())  # stamps alone
 
 
+@pytest.mark.long
 def test_last_digits_of_a_run_of_the_wall_clock_are_reported_as_such(tmp_path):
     def nudged(one):
         if (one.topic, one.sequence) != ("state/odometry", 100):
