@@ -107,6 +107,8 @@ def exchange(line: int, frame: Frame) -> None:
     length = receive(line, 1)
     answer = decode_body(ANSWER, length + receive(line, 2 * (length[0] + 1) + 2))
     os.write(line, OKAY)
+    if len(answer.words) < 2:
+        raise NotStoppedError("an answer without a result")
     if code := answer.words[0] | answer.words[1] << 16:
         raise NotStoppedError(f"refused with error 0x{code:08X}")
 
@@ -123,7 +125,10 @@ def receive(line: int, count: int) -> bytes:
     while len(data) < count:
         if not select.select([line], [], [], 0.25)[0]:
             raise NotStoppedError("no answer")
-        data += os.read(line, count - len(data))
+        part = os.read(line, count - len(data))
+        if not part:  # hung up: such a port is always readable, and never gives a byte
+            raise NotStoppedError("the port is gone")
+        data += part
     return data
 
 

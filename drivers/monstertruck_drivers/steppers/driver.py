@@ -157,6 +157,8 @@ class StepperDriver:
                 f"{self._port.name}: {identity.motors} motors of {identity.steps_per_turn} steps, configured are "
                 f"{config.motors} of {config.steps_per_turn}"
             )
+        if self._last is not None and len(self._last[0].positions) != identity.motors:
+            self._last = None  # another controller is plugged in
         began = self._clock.now()
         while any((await session.status("Q", identity.motors, attempts=ATTEMPTS)).rates):
             if self._clock.now() - began > SAFE_DEADLINE * SECOND:

@@ -68,6 +68,8 @@ class Controller:
             return
         os.write(self.master, b"O")
         reply = answer(0 if isinstance(step, str) else step)
+        if step == "short answer":
+            reply = reply._replace(words=reply.words[:1])
         os.write(self.master, b"\x11" if step == "not an answer" else reply.head)
         if step == "not an answer":
             return
@@ -156,6 +158,7 @@ def test_a_controller_is_braked_and_switched_off_once_it_had_the_time_to_brake(n
         ("damaged request", "expected b'O', got b'F'"),
         ("not an answer", "expected b'\\x00', got b'\\x11'"),
         ("damaged answer", ""),
+        ("short answer", "an answer without a result"),
         ("silent", "no answer"),
     ],
 )
@@ -169,6 +172,18 @@ def test_whatever_goes_wrong_is_reported_and_tried_again_once_the_controller_has
     reported = capsys.readouterr()
     assert says in reported.err
     assert reported.err.startswith("neutral: /dev/pts/")
+
+
+def test_a_port_that_hangs_up_in_the_middle_is_opened_again(neutral, monkeypatch):
+    controller, lost = Controller("no permission", 0, 0), iter([True])
+
+    def read(*arguments):
+        return b"" if next(lost, False) else os.read(*arguments)
+
+    monkeypatch.setattr(neutral, "os", SimpleNamespace(**vars(os) | {"read": read}))
+    assert neutral.main([f"{controller.path}=3@115200"]) == 0
+    controller.close()
+    assert controller.frames[-2:] == [BRAKE, SWITCH_OFF]
 
 
 def test_a_controller_that_refuses_to_switch_off_is_braked_again(neutral):

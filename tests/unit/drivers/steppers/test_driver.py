@@ -10,7 +10,7 @@ from monstertruck_drivers.cable import MemoryPort
 from monstertruck_drivers.steppers.config import StepperConfig
 from monstertruck_drivers.steppers.driver import setpoint_of
 from monstertruck_drivers.steppers.probe import probe
-from monstertruck_drivers.steppers.protocol import Line, MotorState, Splitter
+from monstertruck_drivers.steppers.protocol import Line, MotorState, Splitter, Status
 from monstertruck_runtime.clock import SECOND, run_virtual
 from monstertruck_runtime.errors import (
     DeviceLostError,
@@ -257,6 +257,18 @@ def test_other_motors_than_configured_are_refused(motors, steps):
             await rig.session()
 
     on_bench(test, motors=motors, steps_per_turn=steps)
+
+
+def test_a_controller_with_more_motors_may_take_the_place_of_another_one():
+    async def test(rig):
+        now = rig.clock.now()
+        rig.driver._last = Status(MotorState.OFF, 0, 0, (7, 7), (0, 0)), now  # powered up at the same time
+        async with rig.driving():
+            rig.run_at(1.0, 1.0, 0.0, 0.0)
+            await rig.settle(1.0)
+            assert rig.outs[1].last.velocity == pytest.approx(1.0, rel=2e-3)
+
+    on_bench(test, StepperConfig(motors=2))
 
 
 def test_another_device_is_refused():
