@@ -47,9 +47,15 @@ class CompassGate:
     home: tuple[float, float] | None = None
     """North, rad, and its variance before the disturbance."""
     field: float = 0.0
-    """Mean strength at the start."""
+    """Mean strength at the start, or the one that has replaced it."""
     fields: int = 0
     """Readings it was taken from."""
+    other_field: float = 0.0
+    """Another strength, which holds at present."""
+    other_since: int = 0
+    """ns."""
+    other_from: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Where that began, m and rad in odom."""
     rejected: int = 0
     """Headings left out since the start."""
     jump: float = 0.0
@@ -146,13 +152,24 @@ def _jumped(gate: CompassGate, innovation: HeadingInnovation) -> CompassGate:
 
 
 def _field(gate: CompassGate, innovation: HeadingInnovation, config: HeadingTrust) -> tuple[CompassGate, bool]:
-    """The gate with the field learned, and whether the reading is disturbed."""
+    """The gate with the field learned, and whether the reading is disturbed.
+
+    A robot may be started beside iron: a strength that holds for ``config.steady_time`` and ``config.regain`` metres is
+    that of the place, and replaces the one of the start.
+    """
     if innovation.flagged:
         return gate, True
     if innovation.field is None:
         return gate, False
     if gate.fields >= REFERENCE:
-        return gate, abs(innovation.field - gate.field) > config.field * gate.field
+        if abs(innovation.field - gate.field) <= config.field * gate.field:
+            return replace(gate, other_field=0.0), False
+        if abs(innovation.field - gate.other_field) > config.field * gate.other_field:
+            began = replace(gate, other_field=innovation.field, other_since=innovation.stamp, other_from=innovation.place)
+            return began, True
+        way = math.hypot(innovation.place[0] - gate.other_from[0], innovation.place[1] - gate.other_from[1])
+        held = innovation.stamp - gate.other_since >= config.steady_time * SECOND and way >= config.regain
+        return (replace(gate, field=gate.other_field, other_field=0.0), False) if held else (gate, True)
     count = gate.fields + 1
     return replace(gate, fields=count, field=gate.field + (innovation.field - gate.field) / count), False
 

@@ -165,6 +165,21 @@ def test_headings_that_turn_no_faster_than_the_robot_can_are_no_jump():
     assert rig.fusion.status().slipping
 
 
+@pytest.mark.parametrize(("speed", "sticks"), [(0.3, False), (0.0, True)])
+def test_started_beside_iron_the_field_of_where_it_drives_replaces_that_of_the_start(speed, sticks):
+    """Its heading there is wrong, too; one that only stands beside iron learns nothing from it."""
+    rig = Rig((*SENSORS, "imu"))
+    rig.field, rig.magnet = 1.5 * FIELD, 0.4
+    rig.drive(0.0, 0.0, 0.0, 2.0)
+    rig.field, rig.magnet = FIELD, 0.0
+    rig.drive(speed, 0.0, 0.0, 12.0)
+    assert rig.fusion.status().disturbed
+    rig.drive(speed, 0.0, 0.0, 10.0)
+    assert rig.fusion.status().disturbed is sticks
+    assert rig.fusion.status().north == pytest.approx(0.3 if sticks else 0.7, abs=0.06)
+    assert rig.error()[1] < 0.04
+
+
 def test_wild_headings_never_become_a_north():
     rig = Rig(SENSORS).drive(0.3, 0.0, 0.0, 4.0)
     for _ in range(150):
