@@ -165,7 +165,9 @@ def _field(gate: CompassGate, innovation: HeadingInnovation, config: HeadingTrus
         if abs(innovation.field - gate.field) <= config.field * gate.field:
             return replace(gate, other_field=0.0), False
         if abs(innovation.field - gate.other_field) > config.field * gate.other_field:
-            began = replace(gate, other_field=innovation.field, other_since=innovation.stamp, other_from=innovation.place)
+            began = replace(
+                gate, other_field=innovation.field, other_since=innovation.stamp, other_from=innovation.place
+            )
             return began, True
         way = math.hypot(innovation.place[0] - gate.other_from[0], innovation.place[1] - gate.other_from[1])
         held = innovation.stamp - gate.other_since >= config.steady_time * SECOND and way >= config.regain

@@ -204,7 +204,7 @@ class Fusion:
             self._left_out["drive: counts from a new origin"] += 1
             return
         way = self._felt(roll, self._way(roll, self._chassis))
-        self._slip.wheels(way)
+        self._apply_slip(self._slip.wheels(way))
         if way.turn is None and self._slip.slipping:
             self._turns.forget()
         else:

@@ -31,6 +31,8 @@ JITTER: Final = 0.01
 """Standard deviation of a compass heading against one a second before, rad."""
 FASTEST: Final = 3.0
 """No robot turns faster than this, rad/s."""
+EXPIRES: Final = 10 * SECOND
+"""Slip that nothing has confirmed for so long, ns, is over: the scans have ended, and the wheels are all there is."""
 BLANK: Final = 1.0
 """A direction in which the standard deviation of a scan is greater is unconstrained, m."""
 SPANS: Final = 2
@@ -68,6 +70,8 @@ class SlipDetector:
         self._suspicious = 0
         self._calm = 0
         self._scanned: int | None = None
+        self._compared_at = 0
+        """Stamp of the last comparison, ns."""
         self._unproven = 0
         """Scans that must agree with the wheels before they are used."""
         self.slipping = False
@@ -76,8 +80,8 @@ class SlipDetector:
         self.distance = 0.0
         """Last distance between the two, in standard deviations."""
 
-    def wheels(self, way: WheelMeasurement) -> None:
-        """Take the motion of the wheels."""
+    def wheels(self, way: WheelMeasurement) -> SlipChange | None:
+        """Take the motion of the wheels; returns the end of a slip that nothing can confirm any longer."""
         if not self._trail or self._trail[-1][0] != way.since:
             self._trail.clear()
             self._trail.append((way.since, np.zeros(3), np.zeros((3, 3))))
@@ -85,6 +89,11 @@ class SlipDetector:
         self._trail.append((way.stamp, compose(pose, way.delta), spread + way.covariance))
         while self._trail[0][0] < way.stamp - SOURCE_TIMEOUT:
             self._trail.popleft()
+        if not self.slipping or way.stamp - self._compared_at < EXPIRES:
+            return None
+        self.slipping = False
+        text = f"nothing to compare the wheels with for {EXPIRES // SECOND} s: they count again"
+        return SlipChange(slipping=False, since=way.stamp, text=text)
 
     def scans(self, way: ScanMeasurement) -> SlipChange | None:
         """Take the motion between two scans; returns a change of the result."""
@@ -101,6 +110,7 @@ class SlipDetector:
         near = self._compared(recent)
         if near is None:
             return None
+        self._compared_at = way.stamp
         if self._unproven and not self.slipping:
             self._prove(near[0])
             return None
@@ -164,6 +174,7 @@ class SlipDetector:
         )
         elsewhere = JITTER**2 + self._deviation**2 * (1 - like)
         distance = abs(off) / math.sqrt(float(noise[2, 2]) + 2 * elsewhere)
+        self._compared_at = stamp
         text = f"wheels and compass differ by {off:+.3f} rad in {(stamp - since) / SECOND:.1f} s"
         return self._judged(distance, since, text)
 

@@ -192,6 +192,20 @@ def test_wheels_that_slip_do_not_count_as_a_source():
     assert "lidar" in rig.estimate.sources
 
 
+def test_slip_that_nothing_can_confirm_any_longer_is_over():
+    """The lidar is gone, and the wheels are all there is."""
+    rig = Rig(("wheels", "scans")).drive(0.3, 0.0, 0.0, 2.0)
+    rig.slip = 1.8
+    rig.drive(0.3, 0.0, 0.0, 1.0)
+    rig.slip, rig.sensors = 1.0, {"wheels"}
+    rig.drive(0.3, 0.0, 0.0, 8.0)
+    assert rig.fusion.status().slipping
+    rig.drive(0.3, 0.0, 0.0, 3.0)
+    assert not rig.fusion.status().slipping
+    assert "drive" in rig.estimate.sources
+    assert "nothing to compare" in rig.changes[-1].text
+
+
 def test_slip_too_slight_for_one_window_is_clear_over_two():
     rig = Rig(("wheels", "scans"), slip=SlipConfig(window=0.2)).drive(0.3, 0.0, 0.0, 4.0)
     rig.slip = 1.6
