@@ -7,6 +7,7 @@ where USB states one) or hangs on another port.
 
 import itertools
 import json
+import logging
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +20,7 @@ from monstertruck_kinematics.truck import DriveTrain
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.mailbox import latest
 from monstertruck_runtime.ports import EventSink, Ready
-from monstertruck_runtime.small_files import text_of
+from monstertruck_runtime.small_files import replace_file, text_of
 from monstertruck_runtime.threads import Offload
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.health import CalibrationHealth, CalibrationState
@@ -42,6 +43,8 @@ from monstertruck_schemas.usb import UsbTree
 from monstertruckd.bus.local import Bus
 from monstertruckd.config.calibration import Estimate, Grade, Result, ValidUntil, WizardName, utc
 from monstertruckd.config.truck import TruckConfig
+
+log = logging.getLogger(__name__)
 
 DAY: Final = 86_400 * SECOND
 """ns."""
@@ -238,12 +241,17 @@ class WayCounter:
     written: float = 0.0
 
     def load(self) -> None:
-        """Read it; a damaged or missing file begins at 0."""
+        """Read it; a missing file begins at 0, and so does a damaged one, which the log says."""
+        self.metres = 0.0
+        text = text_of(self.file) if self.file else None
         try:
-            metres = float(json.loads((text_of(self.file) if self.file else None) or "{}").get("metres", 0.0))
-        except (ValueError, AttributeError, TypeError, OverflowError, RecursionError):
-            metres = 0.0
-        self.metres = metres if 0.0 <= metres < np.inf else 0.0
+            metres = 0.0 if text is None else float(json.loads(text)["metres"])
+        except (ValueError, LookupError, TypeError, OverflowError, RecursionError):
+            metres = np.nan
+        if 0.0 <= metres < np.inf:
+            self.metres = metres
+        else:
+            log.warning("%s: is damaged: the way driven begins at 0, and no calibration ends by it before", self.file)
         self.written = self.metres
 
     def save(self) -> None:
@@ -255,9 +263,7 @@ class WayCounter:
         if self.file is None:
             return
         self.file.parent.mkdir(parents=True, exist_ok=True)
-        draft = self.file.with_suffix(".new")
-        draft.write_text(json.dumps({"metres": round(self.metres, 1)}), encoding="utf-8")
-        draft.replace(self.file)
+        replace_file(self.file, json.dumps({"metres": round(self.metres, 1)}))
         self.written = self.metres
 
 

@@ -10,30 +10,39 @@ from monstertruck_kinematics.description import (
     Size,
     truck_description,
 )
+from monstertruck_kinematics.elementary import KinematicsError
 from monstertruck_kinematics.platform import BallCaster, platform_description
 from monstertruck_kinematics.unsteered import mecanum, omni
 from monstertruck_kinematics.wheels import FixedWheel, Wheel
+from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.body import OmniBody
 from monstertruck_sim.world.config import MechanicsConfig, SimTruckConfig
 
 
 def mechanics(truck: SimTruckConfig, config: MechanicsConfig) -> Mechanics:
-    """What the description is made from."""
-    return Mechanics(
-        mass=truck.mass,
-        wheel_mass=config.wheel_mass,
-        axle_mass=config.axle_mass,
-        mass_height=config.mass_height,
-        wheel_width=config.wheel_width,
-        droop=config.droop,
-        bump=config.bump,
-        damping=config.damping,
-        axle_roll=radians(config.axle_roll_deg),
-        friction=config.friction,
-        rolling_resistance=truck.rolling_resistance,
-        tyre_stiffness=config.tyre_stiffness,
-        relaxation=config.relaxation,
-    )
+    """What the description is made from.
+
+    Raises:
+        InputError: masses no robot can have.
+    """
+    try:
+        return Mechanics(
+            mass=truck.mass,
+            wheel_mass=config.wheel_mass,
+            axle_mass=config.axle_mass,
+            mass_height=config.mass_height,
+            wheel_width=config.wheel_width,
+            droop=config.droop,
+            bump=config.bump,
+            damping=config.damping,
+            axle_roll=radians(config.axle_roll_deg),
+            friction=config.friction,
+            rolling_resistance=truck.rolling_resistance,
+            tyre_stiffness=config.tyre_stiffness,
+            relaxation=config.relaxation,
+        )
+    except KinematicsError as error:
+        raise InputError(f"sim.world.mechanics: {error}") from error
 
 
 def platform_wheels(truck: SimTruckConfig) -> tuple[Wheel, ...]:
@@ -64,8 +73,17 @@ def description(
         head: the lidar on its joints; None = it is fixed.
 
     Raises:
-        KinematicsError: masses or springs no robot can have.
+        InputError: masses or springs no robot can have.
     """
+    try:
+        return _description(truck, parts, sensors, head)
+    except KinematicsError as error:
+        raise InputError(f"sim.world.mechanics: {error}") from error
+
+
+def _description(
+    truck: SimTruckConfig, parts: Mechanics, sensors: tuple[SensorFrame, ...], head: LidarHead | None
+) -> Description:
     size = Size(truck.wheelbase, truck.track, truck.wheel_radius, truck.length, truck.width)
     wheels = platform_wheels(truck)
     if not wheels:

@@ -29,6 +29,8 @@ _SETTLE: Final = 400
 """Steps that a robot which was put down gets to come to rest."""
 _RESTS: Final = 0.5
 """Speed upwards or downwards that one which came to rest cannot have, m/s."""
+_INSIDE: Final = 0.03
+"""Depth to which nothing gives way under it, m."""
 _UNSTABLE: Final = (
     mujoco.mjtWarning.mjWARN_BADQPOS,
     mujoco.mjtWarning.mjWARN_BADQVEL,
@@ -144,8 +146,17 @@ class RigidPlant(GriddedPlant):
         super().integrate(time_ns)
 
     def carry(self, pose: Pose) -> None:
-        """Put the robot down elsewhere, at rest; sensors see no way between the two places."""
-        self._put(pose)
+        """Put the robot down elsewhere, at rest; sensors see no way between the two places.
+
+        Raises:
+            InputError: it cannot stand there, and is where it was.
+        """
+        before = self._pose
+        try:
+            self._put(pose)
+        except InputError:
+            self._put(before)
+            raise
         self._trail.clear()
         self._remember()
 
@@ -173,7 +184,8 @@ class RigidPlant(GriddedPlant):
                 break
             data.qpos[:2] = x, y
             data.qvel[:2] *= 0.5
-        if self._unstable() or not abs(data.qvel[2]) < _RESTS:
+        inside = data.ncon > 0 and data.contact.dist.min() < -_INSIDE
+        if self._unstable() or inside or not abs(data.qvel[2]) < _RESTS:
             raise InputError(f"the robot does not come to rest at ({x:.2f}, {y:.2f}): something is in its place there")
         data.qvel[:] = 0.0
         mujoco.mj_forward(self.model, data)

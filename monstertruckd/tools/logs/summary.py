@@ -1,5 +1,6 @@
 """Summaries: of one log by reading it, of a folder's logs by their indices."""
 
+from contextlib import suppress
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -101,14 +102,19 @@ class LogSummary:
 
 
 def list_logs(folder: Path) -> list[LogSummary]:
-    """All logs in ``folder`` and below, by name.
+    """All logs in ``folder`` and below, by name; one that is removed meanwhile is none.
 
     Raises:
         NotFoundError: no such folder.
     """
     if not folder.is_dir():
         raise NotFoundError(f"{folder}: no such folder")
-    return [_summary_of(path) for path in sorted(folder.rglob("*.mcap")) if path.is_file()]
+    found = []
+    for path in sorted(folder.rglob("*.mcap")):
+        if path.is_file():
+            with suppress(FileNotFoundError, NotFoundError):
+                found.append(_summary_of(path))
+    return found
 
 
 def _summary_of(path: Path) -> LogSummary:

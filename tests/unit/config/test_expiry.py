@@ -91,12 +91,16 @@ def test_what_rests_on_it_is_named():
         *(f'{{"metres": {value}}}' for value in ('"x"', "NaN", "1e999", "-1", "1" + 400 * "0")),
     ],
 )
-def test_a_damaged_odometer_begins_at_nothing(text, tmp_path):
+def test_a_damaged_odometer_begins_at_nothing_and_says_so(text, tmp_path, caplog):
     file = tmp_path / "odometer.json"
-    file.write_text(text)
     odometer = WayCounter(file)
     odometer.load()
+    assert not caplog.messages  # a new robot
+    file.write_text(text)
+    odometer.load()
     assert odometer.metres == 0.0
+    (said,) = caplog.messages
+    assert said.startswith(f"{file}: is damaged")
     replace(odometer, metres=12.34).save()
     odometer.load()
     assert odometer.metres == 12.3

@@ -205,6 +205,15 @@ def test_a_robot_that_begins_inside_of_something_is_refused(tmp_path, place, mon
     assert not (tmp_path / "MUJOCO_LOG.TXT").exists()
 
 
+def test_a_robot_is_not_carried_into_something(tmp_path):
+    file = scene_file(tmp_path, '<geom type="box" size="0.4 0.4 1" pos="1.5 0 0"/>')
+    world = World(configured(map="yard", noise=False, mjcf=file, start={"x": 0.0, "y": 0.0, "yaw": 0.0}), 1)
+    with pytest.raises(InputError, match=r"does not come to rest at \(1\.50, 0\.00\)"):
+        world.carry(0, (1.5, 0.0, 0.0))
+    where = world.truth(1_000_000_000)
+    assert (where.x, where.y) == pytest.approx((0.0, 0.0), abs=0.02)
+
+
 def test_more_people_than_there_are_bodies_for_are_refused():
     with pytest.raises(InputError, match=r"sim\.world\.people: 25: expected at most 24"):
         World(configured(map="yard", noise=False, people=[{"radius": 0.05}] * 25), 1)

@@ -34,6 +34,16 @@ def test_a_body_without_description_is_refused():
     assert "body synchro: has no description" in result.stderr
 
 
+def test_the_small_robot_has_masses_of_its_own_and_those_of_the_truck_are_refused(tmp_path):
+    small = CONFIGS / "robots" / "skid_stand.yaml"
+    assert CliRunner().invoke(app, ["description", str(small)]).exit_code == 0
+    heavy = tmp_path / "heavy.yaml"
+    heavy.write_text(f"version: 2\ninclude: {small}\nsim: {{ world: {{ mechanics: {{ wheel_mass: 0.281 }} }} }}\n")
+    result = CliRunner().invoke(app, ["description", str(heavy)])
+    assert result.exit_code == 3
+    assert result.stderr.startswith("sim.world.mechanics: mass is 0.6: expected more than wheels and axles together")
+
+
 @pytest.mark.parametrize("robot", ["sonar", "omni"])
 def test_a_platform_has_its_wheels_and_sensors(robot):
     result = CliRunner().invoke(app, ["description", str(CONFIGS / "robots" / f"{robot}.yaml")])

@@ -12,6 +12,7 @@ from monstertruck_runtime.errors import NotFoundError
 from monstertruck_schemas.topics import CLOCK, GATE
 from monstertruckd.recorder.reader import LogReader
 from monstertruckd.tools.cli.main import main
+from monstertruckd.tools.logs import summary
 from monstertruckd.tools.logs.messages import real_offset
 from monstertruckd.tools.logs.summary import LogState, LogSummary, list_logs
 from tests.unit.tools.logs.log_kit import MAY_2026, Writer, clock, gate
@@ -70,6 +71,18 @@ def test_what_dates_a_log_may_be_damaged_or_a_name_lead_nowhere(folder: Path):
     undated.write_bytes(undated.read_bytes().replace(number + b"5", number + b"u"))
     (folder / "gone.mcap").symlink_to(folder / "nothing")
     assert [log.state for log in list_logs(folder)] == ["finished", "finished", "unfinished", "unreadable"]
+
+
+def test_a_log_that_goes_meanwhile_does_not_hide_the_others(folder: Path, monkeypatch: pytest.MonkeyPatch):
+    real = summary.is_finished
+
+    def gone(path: Path) -> bool:
+        if path.name == "run-1.mcap":
+            path.unlink()
+        return real(path)
+
+    monkeypatch.setattr(summary, "is_finished", gone)
+    assert [log.path.name for log in list_logs(folder)] == ["run-2.mcap", "run-3.mcap", "run-4.mcap"]
 
 
 def test_no_folder_is_not_no_logs(tmp_path: Path):
