@@ -1,6 +1,7 @@
 """Settings that are changed while the robot runs: which, within which bounds, and what is kept of them."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -100,7 +101,8 @@ def test_who_makes_the_robot_less_safe_than_by_default_is_warned(
 ):
     robot = Robot(config)
     assert robot.set({"gate.tilt.stop": 0.3})["weakened"] == []
-    monkeypatch.setattr(settings, "_call", lambda robot_name, endpoint, name, payload: robot.set(**payload))
+    client = SimpleNamespace(call=lambda name, payload: robot.set(**payload))
+    monkeypatch.setattr(settings, "with_robot", lambda main, *_: main(client, None))
     settings.set_value("gate.tilt.stop", "0.4")
     said = capsys.readouterr()
     assert said.out == "gate.tilt.stop is 0.4 until the daemon ends\n"
