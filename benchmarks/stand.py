@@ -84,7 +84,8 @@ def tracker(stand: Any, kind: str, starts: Any) -> StandTracker:
 
 def readers(stand: Any, kind: str) -> dict[str, StandReader]:
     """By camera, as the stand reads."""
-    return {name: StandReader(stand[1].marks, () if kind == "tags" else LOOK) for name in stand[3]}
+    tags = kind == "tags"
+    return {name: StandReader(stand[1].marks, () if tags else LOOK, tagged=tags) for name in stand[3]}
 
 
 def accuracy(

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from monstertruck_estimation.vision.blobs import Blob, BlobReader
-from monstertruck_estimation.vision.tags import Picture, Sighting, TagReader
+from monstertruck_estimation.vision.tags import EVERYWHERE, Picture, Sighting, TagReader
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import TruckError
 from monstertruck_schemas.board import Colour
@@ -29,16 +29,22 @@ class StandReader:
     Args:
         marks: tags that lie on the table.
         colours: of robots' discs; empty: pictures may be grey.
+        tagged: there are robots with tags; otherwise tags are read in one picture of ``EVERYWHERE``, for the marks.
     """
 
-    def __init__(self, marks: Collection[int], colours: Collection[Colour]) -> None:
+    def __init__(self, marks: Collection[int], colours: Collection[Colour], *, tagged: bool = True) -> None:
         self._tags = TagReader(still=marks)
         self._blobs = BlobReader(colours) if colours else None
+        self._tagged = tagged
+        self._count = 0
 
     def read(self, picture: Picture) -> list[Sighting | Blob]:
         """Tags and discs in a picture, grey or blue, green and red."""
-        grey = picture if picture.ndim == 2 else np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
-        found: list[Sighting | Blob] = list(self._tags.read(grey))
+        found: list[Sighting | Blob] = []
+        if self._tagged or self._count % EVERYWHERE == 0:
+            grey = picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
+            found += self._tags.read(np.asarray(grey, dtype=np.uint8))
+        self._count += 1
         if self._blobs is not None and picture.ndim == 3:
             found += self._blobs.read(picture)
         return found
@@ -91,7 +97,9 @@ class StandRun:
     async def _play(self) -> None:
         """Recorded pictures: the first ones of all cameras are of one instant, and so on."""
         iterators = {name: stream() for name, stream in self._streams.items()}
-        readers = {name: StandReader(self._tracker.marks, self._colours) for name in iterators}
+        readers = {
+            name: StandReader(self._tracker.marks, self._colours, tagged=self._tracker.tagged) for name in iterators
+        }
         began, count = self._clock.now(), 0
         while iterators:
             seen = {}
@@ -108,6 +116,9 @@ class StandRun:
                 for text in self._tracker.complaints(stamp):
                     self._say(text)
             count += 1
+
+    def _reader(self) -> StandReader:
+        return StandReader(self._tracker.marks, self._colours, tagged=self._tracker.tagged)
 
     async def _follow(self) -> None:
         loop = asyncio.get_running_loop()
@@ -136,7 +147,7 @@ class StandRun:
         """One camera, in a thread of its own: OpenCV gives the interpreter free while it works."""
         said = ""
         while not self._ended.is_set():
-            reader = StandReader(self._tracker.marks, self._colours)
+            reader = self._reader()
             try:
                 for picture in stream():
                     at = self._clock.now()

@@ -140,6 +140,11 @@ class StandTracker:
                 poses.append(where)
         return poses
 
+    @property
+    def tagged(self) -> bool:
+        """Whether there are robots with tags."""
+        return bool(self._tagged)
+
     def complaints(self, now: int) -> list[str]:
         """What is newly wrong with cameras, or right again, and robots that are not distinguished."""
         said = self._identities.complaints()

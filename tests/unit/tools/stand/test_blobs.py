@@ -11,6 +11,7 @@ pytest.importorskip("cv2")
 import cv2
 
 from monstertruck_estimation.vision.blobs import Blob, BlobReader
+from monstertruck_estimation.vision.tags import TagReader
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import ConfigError
 from monstertruckd.config.load import load_config
@@ -137,6 +138,18 @@ def test_a_stand_without_colours_reads_grey_pictures_and_one_with_them_colour(tm
     assert next(stream(source, (64, 48), 25.0)).shape == (48, 64)
     assert next(stream(source, (64, 48), 25.0, colour=True)).shape == (48, 64, 3)
     assert StandReader((), ["red"]).read(np.full((48, 64), 90, np.uint8)) == []
+
+
+def test_where_no_robot_has_a_tag_marks_are_looked_for_in_one_picture_of_eight(monkeypatch):
+    read = []
+    monkeypatch.setattr(TagReader, "read", lambda self, picture: read.append(picture.ndim) or [])
+    pictures = [np.full((48, 64, 3), 90, np.uint8)] * 17
+    for tagged, times in ((False, 3), (True, 17)):
+        read.clear()
+        reader = StandReader((100,), ["red"], tagged=tagged)
+        for picture in pictures:
+            reader.read(picture)
+        assert read == [2] * times
 
 
 ROBOT = "{ front: red, rear: blue, apart: 0.1 }"
