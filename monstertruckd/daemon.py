@@ -44,11 +44,11 @@ from monstertruck_schemas.health import ServiceHealth, ServiceState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import GoalRequest
 from monstertruck_schemas.roles import AccessRole
-from monstertruck_schemas.topics import DRIVES, TOPICS, Writer
+from monstertruck_schemas.topics import DRIVES, TOPICS, Topic, Writer
 from monstertruckd.assembly.devices import Cabling, build_drivers, measures_battery, of_duty, sensor_services
 from monstertruckd.assembly.estimation import Body, build_estimation
 from monstertruckd.assembly.planning import build_planners
-from monstertruckd.bus.local import Bus
+from monstertruckd.bus.local import Bus, Tap
 from monstertruckd.bus.peers import PeerService, PeerSubscriber
 from monstertruckd.bus.rpc import Rpc
 from monstertruckd.bus.zenoh_session import ZenohBridge
@@ -165,9 +165,7 @@ class Daemon:
             self.slow = SlowComputer(self.clock, factor_of(slowness))
         async with (
             self._outside(),
-            self._black_box(),
             self._recording(),
-            self._remembering(),
             scope("actuators") as actuators,
             scope("gate") as gate,
             scope("sensors") as sensors,
@@ -253,44 +251,29 @@ class Daemon:
 
     @asynccontextmanager
     async def _recording(self) -> AsyncIterator[None]:
-        if self.recorder is None:
-            yield
-            return
-        async with self.recorder as recorder:
-            self._board.report(ServiceHealth(name=recorder.name, state=ServiceState.READY, since=self.clock.now()))
-            tap = self.bus.tap(
-                lambda topic, message, data, at: recorder.record(topic, message.stamp, data, at),
-                (topic for topic in TOPICS if topic.logged),
-            )
-            try:
-                yield
-            finally:
-                tap.close()
+        """The recording inside the black box: its file is finished before a box that is written at the very end.
 
-    @asynccontextmanager
-    async def _black_box(self) -> AsyncIterator[None]:
-        """Outside the recording, whose file is finished before a box that is written at the very end."""
-        if self.black_box is None:
-            yield
-            return
-        async with self.black_box:
+        The box stops listening before the recording ends, which takes real time: what happens meanwhile is in no box.
+        """
+        recorder, box = self.recorder, self.black_box
+        async with AsyncExitStack() as after:
+            if box is not None:
+                await after.enter_async_context(box)
+            if recorder is not None:
+                await after.enter_async_context(recorder)
+                self._board.report(ServiceHealth(name=recorder.name, state=ServiceState.READY, since=self.clock.now()))
+                after.callback(self._tap(recorder.record).close)
+            if box is not None:
+                after.callback(box.freeze)
+                after.callback(self._tap(box.record).close)
             yield
 
-    @asynccontextmanager
-    async def _remembering(self) -> AsyncIterator[None]:
-        """Inside the recording, whose end takes real time: what happens meanwhile is in no box."""
-        if (box := self.black_box) is None:
-            yield
-            return
-        tap = self.bus.tap(
-            lambda topic, message, data, at: box.record(topic, message.stamp, data, at),
+    def _tap(self, record: Callable[[Topic[Any], int, bytes, int], None]) -> Tap:
+        """Hands everything that is logged to ``record``."""
+        return self.bus.tap(
+            lambda topic, message, data, at: record(topic, message.stamp, data, at),
             (topic for topic in TOPICS if topic.logged),
         )
-        try:
-            yield
-        finally:
-            tap.close()
-            box.freeze()
 
     def _status(self) -> str:
         return status_line(self.gate.mode, self._board.rows())
