@@ -13,15 +13,13 @@ from typing import Annotated, Any, Final, Self
 from pydantic import Field, model_validator
 
 from monstertruck_schemas import topics
-from monstertruck_schemas.base import LIVE, Schema
+from monstertruck_schemas.base import LIVE, NotNegative, Positive, Schema
 from monstertruck_schemas.req import Role
 from monstertruck_schemas.roles import DeviceRole, ServiceName
 from monstertruck_schemas.topics import Topic
 
-Positive = Annotated[float, Field(gt=0)]
-Share = Annotated[float, Field(ge=0)]
 LivePositive = Annotated[Positive, LIVE]
-LiveShare = Annotated[Share, LIVE]
+LiveNotNegative = Annotated[NotNegative, LIVE]
 LiveTilt = Annotated[float, Field(gt=0, lt=math.pi / 2), LIVE]
 
 
@@ -89,9 +87,9 @@ class SteeringCheckConfig(Schema):
 class ObstacleLimits(Schema):
     """Clearance kept along the swept path."""
 
-    ahead: LiveShare = 0.05
+    ahead: LiveNotNegative = 0.05
     """Distance between footprint and obstacle after the stop, m."""
-    side_clearance: LiveShare = 0.02
+    side_clearance: LiveNotNegative = 0.02
     """Clearance to all sides while passing, m, added to the footprint's padding."""
     deceleration: LivePositive = 0.15
     """Comfortable deceleration towards an obstacle, m/s^2: decides how early the truck slows down."""
@@ -103,7 +101,7 @@ class ObstacleLimits(Schema):
     unseen_speed: LivePositive = 0.1
     """Speed limit while a sector of travel is not seen, m/s; one not seen for ``scan.stale_after`` stops the truck.
     Where the lidar does not look it is the limit onto ground that no scan of the last 30 s has seen."""
-    memory_distance: Share = 1.0
+    memory_distance: NotNegative = 1.0
     """Travelled distance for which the points of earlier scans guard the truck where its lidar does not look, m."""
     open_ground: bool = False
     """Whether a scan without any range is believed: otherwise it counts as none, whatever its beams say."""
@@ -153,7 +151,7 @@ class GateConfig(Schema):
     """Least deceleration of its quick stop, m/s^2."""
     steering_rate: Annotated[float, Field(gt=0, le=12), LIVE] = 1.0
     """Greatest change of a steering angle, rad/s; the quickest servos turn by 60 degrees in 0.09 s."""
-    reaction: Share = 0.08
+    reaction: NotNegative = 0.08
     """Seconds from a command leaving the gate to the truck's response."""
     standstill: Positive = 0.01
     """Measured speed below which the truck is at rest, m/s."""
@@ -205,7 +203,7 @@ class GateConfig(Schema):
     """Speed limit with a low battery, or a stale battery voltage, m/s."""
     obstacle: ObstacleLimits = ObstacleLimits()
     sonar: SonarLimits = SonarLimits()
-    event_interval: Share = 1.0
+    event_interval: NotNegative = 1.0
     """Least seconds between two equal events."""
 
     @model_validator(mode="after")

@@ -7,9 +7,7 @@ from typing import Annotated, Final
 from pydantic import Field
 
 from monstertruck_runtime.clock import SECOND
-from monstertruck_schemas.base import Schema
-
-Positive = Annotated[float, Field(gt=0)]
+from monstertruck_schemas.base import Positive, Schema
 
 STILL: Final = 1e-4
 """Way of the fastest shaft between two readings, m, up to which the robot stands."""

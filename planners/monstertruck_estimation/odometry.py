@@ -24,7 +24,7 @@ from monstertruck_runtime.clock import ESTIMATES, SECOND, Clock, Schedule
 from monstertruck_runtime.mailbox import fifo, latest
 from monstertruck_runtime.ports import BusPort, EventSink, Publisher, Ready, Subscription
 from monstertruck_schemas import topics
-from monstertruck_schemas.base import Pose2D, Schema, Twist2D
+from monstertruck_schemas.base import NotNegative, Pose2D, Positive, Schema, Twist2D
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.roles import ServiceName
@@ -33,8 +33,6 @@ from monstertruck_schemas.state import Odometry
 
 Vector = tuple[float, float, float]
 
-Share = Annotated[float, Field(ge=0)]
-Positive = Annotated[float, Field(gt=0)]
 
 STILL: Final = 0.02
 """Distance, m, up to which the truck counts as standing at its start."""
@@ -109,15 +107,15 @@ class OdometryConfig(OdometrySettings):
     kind: Literal["reckoning"] = "reckoning"
     start: Pose2D = Pose2D(x=0.0, y=0.0, yaw=0.0)
     """Pose of base in odom at the start, m and rad."""
-    distance_noise: Share = 0.02
+    distance_noise: NotNegative = 0.02
     """Standard deviation of the way per root metre driven, m."""
-    lateral_noise: Share = 0.01
+    lateral_noise: NotNegative = 0.01
     """Standard deviation of sideways slip per root metre driven, m."""
-    yaw_noise: Share = 0.05
+    yaw_noise: NotNegative = 0.05
     """Standard deviation of the heading per root metre driven, rad."""
-    speed_noise: Share = 0.05
+    speed_noise: NotNegative = 0.05
     """Standard deviation of the speed while it is predicted, m/s."""
-    turn_noise: Share = 0.1
+    turn_noise: NotNegative = 0.1
     """Standard deviation of the yaw rate while it is predicted, rad/s."""
     max_prediction: Positive = 0.3
     """Seconds the last motion is carried on without a drive reading; then the pose waits, its covariance grows on."""

@@ -29,12 +29,11 @@ from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.mailbox import Mailbox, fifo
 from monstertruck_runtime.ports import EventSink
 from monstertruck_schemas import topics
-from monstertruck_schemas.base import Schema
+from monstertruck_schemas.base import Positive, Schema
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import DriveFeedback, WheelEncoders
 
-Positive = Annotated[float, Field(gt=0)]
 Pair = tuple[float, float]
 """Of the left and of the right wheel."""
 

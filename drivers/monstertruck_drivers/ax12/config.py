@@ -5,10 +5,9 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from monstertruck_drivers.ax12.protocol import BAUD, POSITION_MAX, SPEED_UNIT, STEP
-from monstertruck_schemas.base import Schema
+from monstertruck_schemas.base import Positive, Schema
 
 Steps = Annotated[int, Field(ge=0, le=POSITION_MAX)]
-Positive = Annotated[float, Field(gt=0)]
 Seconds = Annotated[float, Field(ge=0)]
 
 TIMEOUT_MIN = 0.005

@@ -5,9 +5,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from monstertruck_drivers.os4000.protocol import RATE_MAX, Fields
-from monstertruck_schemas.base import FrameId, Schema
-
-Positive = Annotated[float, Field(gt=0)]
+from monstertruck_schemas.base import FrameId, Positive, Schema
 
 NEEDED = Fields.HEADING | Fields.PITCH | Fields.ROLL
 """Without these there is no attitude."""

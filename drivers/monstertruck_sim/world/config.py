@@ -14,12 +14,10 @@ from monstertruck_kinematics.chassis import Chassis, Dimensions
 from monstertruck_kinematics.polynomials import AxlePolynomials, SteeringPolynomials
 from monstertruck_kinematics.truck import DriveTrain
 from monstertruck_runtime.bodies import AnyBody, build_chassis
-from monstertruck_schemas.base import FrameId, Pose2D, Schema
+from monstertruck_schemas.base import FrameId, NotNegative, Pose2D, Positive, Schema
 from monstertruck_schemas.board import BoardConfig
 from monstertruck_schemas.body import TruckBody
 
-Positive = Annotated[float, Field(gt=0)]
-NotNegative = Annotated[float, Field(ge=0)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
 
 

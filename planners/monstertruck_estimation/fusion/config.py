@@ -6,10 +6,8 @@ from pydantic import Field
 
 from monstertruck_estimation.gyro import GyroConfig
 from monstertruck_estimation.odometry import OdometrySettings
-from monstertruck_schemas.base import Pose2D, Schema
+from monstertruck_schemas.base import NotNegative, Pose2D, Positive, Schema
 
-Share = Annotated[float, Field(ge=0)]
-Positive = Annotated[float, Field(gt=0)]
 DEVIATION_SCALE: Final = (2.0, 1.0)
 """Way, m, and turn, rad, after which the local deviation of the compass is another: iron is in floors and furniture."""
 
@@ -19,9 +17,9 @@ class WheelTrust(Schema):
 
     shaft_noise: Positive = 0.02
     """Standard deviation of every shaft's way per root metre it rolled, m."""
-    angle_noise: Share = 0.01
+    angle_noise: NotNegative = 0.01
     """Standard deviation of the mean angle of a steered axle over a metre, rad."""
-    slip_noise: tuple[Share, Share, Share] = (0.01, 0.01, 0.03)
+    slip_noise: tuple[NotNegative, NotNegative, NotNegative] = (0.01, 0.01, 0.03)
     """Standard deviations of what no wheel can tell, forward and sideways (m) and in yaw (rad), per root metre."""
     trim: Positive = 0.05
     """Standard deviation of the constant error of the curvature at the start (a servo off its centre), rad/m."""
@@ -55,7 +53,7 @@ class ScanTrust(Schema):
 
     scale: Positive = 1.0
     """Factor on the standard deviation the matching claims."""
-    drift: tuple[Share, Share] = (0.0005, 0.0005)
+    drift: tuple[NotNegative, NotNegative] = (0.0005, 0.0005)
     """Standard deviation by which the map, against which scans are matched, drifts from one to the next, m and rad."""
 
 
@@ -64,7 +62,7 @@ class ImuTrust(GyroConfig):
 
     noise: Positive = 0.005
     """Standard deviation of its turn, its bias included, rad per root second."""
-    scale: Share = 0.01
+    scale: NotNegative = 0.01
     """Standard deviation of its scale."""
 
 

@@ -1,12 +1,6 @@
 """Settings of the ground's grid; light."""
 
-from typing import Annotated
-
-from pydantic import Field
-
-from monstertruck_schemas.base import Schema
-
-Positive = Annotated[float, Field(gt=0)]
+from monstertruck_schemas.base import Positive, Schema
 
 
 class GroundConfig(Schema):

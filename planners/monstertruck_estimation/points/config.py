@@ -5,9 +5,8 @@ from typing import Annotated
 
 from pydantic import Field
 
-from monstertruck_schemas.base import Schema
+from monstertruck_schemas.base import Positive, Schema
 
-Positive = Annotated[float, Field(gt=0)]
 Size = Annotated[float, Field(gt=0.005, le=2)]
 
 

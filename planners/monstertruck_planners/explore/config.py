@@ -5,10 +5,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from monstertruck_schemas.base import Schema
-
-Positive = Annotated[float, Field(gt=0)]
-NotNegative = Annotated[float, Field(ge=0)]
+from monstertruck_schemas.base import NotNegative, Positive, Schema
 
 
 class ExplorerConfig(Schema):

@@ -8,11 +8,8 @@ from pydantic import Field, model_validator
 from monstertruck_planners.local.catalog import AnyLocalPlanner
 from monstertruck_planners.route.catalog import AnyRoutePlanner
 from monstertruck_planners.route.config import HybridConfig
-from monstertruck_schemas.base import Schema
+from monstertruck_schemas.base import NotNegative, Positive, Schema
 from monstertruck_schemas.plan import Steering
-
-Positive = Annotated[float, Field(gt=0)]
-Share = Annotated[float, Field(ge=0)]
 
 Recovery = Literal["clear", "back_out", "wait", "replan"]
 
@@ -35,16 +32,16 @@ class EscapeConfig(Schema):
     """Of the axles, away from a blocked side, rad; less where the servos reach less."""
     crab: bool = True
     """Both axles alike, where the vehicle can; else they turn the truck."""
-    margin: Share = 0.03
+    margin: NotNegative = 0.03
     """Kept to obstacles on the way, m; those that are nearer already may not come nearer."""
 
 
 class LocalConfig(Schema):
     """When routes are deformed, and what is made of it."""
 
-    clearance: Share = 0.02
+    clearance: NotNegative = 0.02
     """A route with an obstacle nearer than this is deformed, m; the gate's side clearance."""
-    rejoin_clearance: Share = 0.03
+    rejoin_clearance: NotNegative = 0.03
     """More than that is needed to go back to the route, m..."""
     rejoin_distance: Positive = 0.06
     """...and the truck may be this far from it, m, counting 0.3 m a radian."""
@@ -107,7 +104,7 @@ class PlannerConfig(Schema):
     """Routes for one goal at most."""
     max_tilt: Annotated[float, Field(gt=0, le=1.5)] = 0.1
     """A scan tilted more than this says nothing about the way, rad: it looks over obstacles, or onto the ground"""
-    scan_tolerance: Share = 0.08
+    scan_tolerance: NotNegative = 0.08
     """Returns this near to an obstacle of the map are taken for it, m; up to twice as much where the pose is uncertain:
     two standard deviations of its position are added"""
     escape: EscapeConfig = EscapeConfig()

@@ -4,10 +4,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from monstertruck_schemas.base import Schema
+from monstertruck_schemas.base import NotNegative, Positive, Schema
 
-Positive = Annotated[float, Field(gt=0)]
-NotNegative = Annotated[float, Field(ge=0)]
 Count = Annotated[int, Field(gt=0)]
 
 Strategy = Literal["start_to_end", "start_to_next", "point_to_point", "skip_failures", "start_to_receding_end"]

@@ -4,10 +4,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from monstertruck_schemas.base import Schema
+from monstertruck_schemas.base import NotNegative, Positive, Schema
 
-Positive = Annotated[float, Field(gt=0)]
-NotNegative = Annotated[float, Field(ge=0)]
 AtLeastOne = Annotated[float, Field(ge=1)]
 
 Unknown = Literal["blocked", "dear", "free"]

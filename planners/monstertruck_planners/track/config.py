@@ -8,10 +8,8 @@ from typing import Annotated, Final, Literal, Self
 
 from pydantic import Field, model_validator
 
-from monstertruck_schemas.base import Schema
+from monstertruck_schemas.base import Positive, Schema
 from monstertruck_schemas.plan import Steering
-
-Positive = Annotated[float, Field(gt=0)]
 
 STEERING_MODES: Final[dict[Steering, tuple[float, float]]] = {
     "front": (0.1, 0.0),
