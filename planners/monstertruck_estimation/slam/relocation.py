@@ -96,7 +96,7 @@ class LossDetector:
         self._misfits, self.after_gap, self.fitted = 0, False, self._stamp or 0
 
 
-FORESEEN: Final = (0.5, 0.25)
+FORESEEN: Final = (0.5, 0.5)
 """Standard deviation of the predicted pose, m and rad, up to which the robot is where a match near it says."""
 
 
