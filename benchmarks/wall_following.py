@@ -237,6 +237,8 @@ def main() -> int:
     parser.add_argument("--model", choices=("beam", "cone"), nargs="+", default=("beam", "cone"))
     parser.add_argument("--figure", help="PNG of the runs of `start`")
     args = parser.parse_args()
+    if args.figure and "start" not in args.only:
+        parser.error("--figure draws the runs of the part start: it needs --only start, or all parts")
     sides, jobs = ("left", "right"), []
     every = range(args.seeds)
     if args.resume is not None:
