@@ -36,7 +36,7 @@ from monstertruckd.tools.calibrate import (
     weave,
 )
 from monstertruckd.tools.calibrate.board_mount import LidarPlace
-from monstertruckd.tools.calibrate.board_views import BoardView
+from monstertruckd.tools.calibrate.board_views import BoardGuide, BoardView
 from monstertruckd.tools.calibrate.response import ResponseFit, Steps
 from monstertruckd.tools.calibrate.statistics import NORMAL, Interval
 from monstertruckd.tools.calibrate.steering import BAND, SPAN
@@ -435,8 +435,12 @@ def camera_fit(rng: np.random.Generator) -> list[Verdict]:
     true = believed + rng.uniform(-1, 1, 6) * (0.03, 0.03, 0.03, 0.06, 0.06, 0.06)
     lidar = LidarPlace.of(Mount(x=0.14, z=0.25, yaw=0.02))
     size, far = 1 + board_mount.PRINT * rng.normal(), board_mount.RANGE * rng.normal()
-    views = held_boards(reader, lens, true, lidar, rng, size, far)
-    found, kept = camera.lens_of(views, reader, lens.size)
+    guide = BoardGuide(
+        reader, lens, lambda v: board_mount.line_on_board(v, reader, lens, true, lidar, known=True) is not None, 60.0
+    )
+    while guide.missing():
+        guide.keep(held_boards(reader, lens, true, lidar, rng, size, far, count=1, steep=0.5)[0])
+    found, kept = camera.lens_of(guide.views, reader, lens.size)
     result = camera.result_of(found, len(kept), camera.mount_of(kept, reader, found, believed, lidar, {}))
     values = dict(zip((*PARAMETERS, *board_mount.NAMES), (*lens.parameters, *true), strict=True))
     return judged(result, {name: float(value) for name, value in values.items()})
@@ -460,6 +464,7 @@ def held_boards(
     size: float = 1.0,
     far: float = 0.0,
     count: int = 28,
+    steep: float = 0.0,
 ) -> list[BoardView]:
     """Views of a board, as a camera with ``lens`` at ``mount`` and a lidar see them.
 
@@ -472,13 +477,17 @@ def held_boards(
         size: of the board, as a share of what is stated.
         far: what the lidar measures too far, m.
         count: views.
+        steep: share of views that lean by 30 to 37 degrees, as the wizard asks for.
     """
     angles = np.linspace(-2.09, 2.09, 682)
     origin = board_mount.in_camera(np.zeros((1, 3)), mount, lidar)[0]
     beams = board_mount.in_camera(board_mount.directions(angles), mount, lidar) - origin
     found: list[BoardView] = []
     while len(found) < count:
-        axes = cv2.Rodrigues(np.array((*rng.uniform(-0.55, 0.55, 2), 0.0)))[0]
+        lean, turn = rng.uniform(-0.55, 0.55, 2)
+        if steep and rng.random() < steep:
+            lean = math.copysign(rng.uniform(0.53, 0.65), lean)
+        axes = cv2.Rodrigues(np.array((lean, turn, 0.0)))[0]
         axes = axes @ cv2.Rodrigues(np.array((0.0, 0.0, rng.uniform(-0.35, 0.35))))[0]
         middle = rng.uniform(0.45, 0.9) * np.array((*(rng.uniform(-1, 1, 2) * (0.31, 0.2)), 1.0))
         wide, high = size * reader.board.width, size * reader.board.height
@@ -550,7 +559,7 @@ HALF_WIDTHS: Final = {
     "camera.centre_x": 4.6,
     "camera.centre_y": 4.6,
     **{f"camera.{name}": 0.015 for name in ("x", "y", "z")},
-    **{f"camera.{name}": math.radians(half) for name, half in (("yaw", 0.5), ("pitch", 1.0), ("roll", 0.5))},
+    **{f"camera.{name}": math.radians(half) for name, half in (("yaw", 0.5), ("pitch", 0.5), ("roll", 0.5))},
 }
 """Median half-widths at most: 0.1 V, 1 % of ways and wheels, 2 degrees by iron in 25 uT, 0.5 degrees of an axle (8.5
 us), 10 ms, 10 mm and 0.5 degrees of the lidar, 2 mm of turning centres, 15 mm and 3 degrees of sonars, 1 % of the

@@ -45,13 +45,14 @@ class BoardHolder:
 
 
 def held(board: HeldBoard, place: CameraPlace, rng: np.random.Generator, field_of_view: float) -> FlatPanel:
-    """The board somewhere in a camera's view, tilted by up to 30 degrees."""
+    """The board somewhere in a camera's view, turned by up to 30 degrees, and leaning by 17 to 40."""
     texture = board_texture(board.columns, board.rows, board.square, board.marker)
     wide, high = (printed * board.printed_scale for printed in (board.width, board.height))
     away = rng.uniform(0.9, 1.7) * max(wide, high) / math.tan(field_of_view / 2)
     aside, below = rng.uniform(-ASIDE, ASIDE), rng.uniform(-BELOW, BELOW)
     aside, below = (part * away * math.tan(field_of_view / 2) for part in (aside, below))
-    spin, tilt, lean = rng.uniform(-UPRIGHT, UPRIGHT), *rng.uniform(-0.55, 0.55, 2)
+    spin, tilt = rng.uniform(-UPRIGHT, UPRIGHT), rng.uniform(-0.55, 0.55)
+    lean = float(rng.choice((-1.0, 1.0))) * rng.uniform(0.3, 0.7)
     # Its axes in the camera's: right and down, turned about the axis, then tilted.
     right = np.array((math.cos(spin) * math.cos(tilt), math.sin(spin) * math.cos(tilt), math.sin(tilt)))
     down = np.array((-math.sin(spin) * math.cos(lean), math.cos(spin) * math.cos(lean), math.sin(lean)))

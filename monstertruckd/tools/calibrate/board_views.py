@@ -36,13 +36,19 @@ COLUMNS: Final = ("left", "middle", "right")
 IN_CELL: Final = 6
 """Corners in each ninth of the picture."""
 VIEWS: Final = 24
-BEAMED: Final = 14
+BEAMED: Final = 16
 """Views in which the lidar sees the board, too."""
 TILT: Final = math.radians(12.0)
 TILTED: Final = 3
 """Views tilted by more, to each of four sides;"""
 TILTED_BEAMED: Final = 3
 """and those of them that the lidar sees."""
+STEEP: Final = math.radians(30.0)
+STEEP_BEAMED: Final = 8
+"""Views that the lidar sees, tilted by more than ``STEEP``, upper and lower edge nearer each: by these alone height and
+pitch of the camera are known, and pitch to 0.5 degrees."""
+APART: Final = 1.5
+"""Distance of the farthest of them over that of the nearest: it tells height from pitch."""
 DEEP: Final = 1.3
 """Distance of the farthest view over that of the nearest."""
 SIDES: Final = ("left edge nearer", "right edge nearer", "upper edge nearer", "lower edge nearer")
@@ -120,13 +126,17 @@ class BoardGuide:
         self._since = stamp if self._since is None else self._since
         view = self._view(stamp, sighting)
         if view is not None:
-            self.views.append(view)
-            if self.beams is not None and self.beams(view):
-                self.seen_by_lidar.append(view)
+            self.keep(view)
             self.attempts, self._since = BoardAttempts(), stamp
         elif stamp - self._since > self.patience * SECOND:
             raise InputError(self.trouble())
         return view
+
+    def keep(self, view: BoardView) -> None:
+        """Keep a view."""
+        self.views.append(view)
+        if self.beams is not None and self.beams(view):
+            self.seen_by_lidar.append(view)
 
     def _view(self, stamp: int, sighting: BoardSighting | None) -> BoardView | None:
         attempts = self.attempts
@@ -168,6 +178,7 @@ class BoardGuide:
         found += _more(VIEWS - len(self.views), "view of it", "views of it")
         if self.beams is not None:
             found += self._tilts(self.seen_by_lidar, TILTED_BEAMED, ", across the lidar's beam")
+            found += self._steep()
             more = BEAMED - len(self.seen_by_lidar)
             found += _more(more, "view across the lidar's beam", "views across the lidar's beam")
         return found
@@ -187,6 +198,19 @@ class BoardGuide:
             for j, column in enumerate(COLUMNS)
             if counts[i, j] < IN_CELL
         ]
+
+    def _steep(self) -> list[str]:
+        poses = [view.pose for view in self.seen_by_lidar]
+        steep = f"by {math.degrees(STEEP):.0f} degrees or more, across the lidar's beam"
+        found = [
+            f"its {side} {steep} ({more} more)"
+            for side, sign in zip(SIDES[2:], (1, -1), strict=True)
+            if (more := STEEP_BEAMED - sum(sign * pose.lean > STEEP for pose in poses)) > 0
+        ]
+        distances = [float(pose.place[2]) for pose in poses if abs(pose.lean) > STEEP]
+        if not found and max(distances) < APART * min(distances):
+            found.append(f"it so nearer and farther than {min(distances):.2f} to {max(distances):.2f} m")
+        return found
 
     @staticmethod
     def _tilts(views: Sequence[BoardView], wanted: int, how: str) -> list[str]:

@@ -97,9 +97,24 @@ def test_what_is_missing_is_said_and_named_at_the_end():
     assert {"upper right", "right", "lower right"} <= set(one.uncovered())
     assert "the board in the right of the picture" in missing
     assert f"{24 - len(held)} more views of it" in missing
-    assert "14 more views across the lidar's beam" in missing
+    assert "16 more views across the lidar's beam" in missing
     with pytest.raises(InputError, match=r"nothing new in 20 s; still missing: the board in the .*right of"):
         shown(one, held[0], 20 * SECOND, 30.0)
+
+
+def test_views_across_the_beam_have_to_lean_steeply_near_and_far():
+    one = guide(beams=lambda view: True)
+    steep = [view for view in boards(5, 120, steep=1.0) if abs(view.pose.lean) > math.radians(30)]
+    near = [view for view in steep if view.pose.place[2] < 0.6]
+    upper, lower = ([view for view in near if sign * view.pose.lean > 0] for sign in (1, -1))
+    for view in upper[:8] + lower[:7]:
+        one.keep(view)
+    said = "its lower edge nearer by 30 degrees or more, across the lidar's beam (1 more)"
+    assert [text for text in one.missing() if "degrees" in text] == [said]
+    one.keep(lower[7])
+    assert any(text.startswith("it so nearer and farther than 0.4") for text in one.missing())
+    one.keep(max(steep, key=lambda view: view.pose.place[2]))
+    assert not any(word in text for text in one.missing() for word in ("degrees", "it so"))
 
 
 @pytest.mark.parametrize(
@@ -222,7 +237,7 @@ def session(monkeypatch):
     config = load_config(CONFIGS / "board.yaml", SimulatedTruckConfig)[0]
     lens = true_lens(np.random.default_rng(8))
     mount = MOUNT + np.array((0.01, -0.02, 0.01, 0.03, 0.02, -0.03))
-    views = held_boards(READER, lens, mount, LIDAR, np.random.default_rng(8), count=70)
+    views = held_boards(READER, lens, mount, LIDAR, np.random.default_rng(8), count=70, steep=0.6)
 
     def decoded(message: CompressedImage) -> Any:
         return np.full((480, 640), message.sequence, np.uint8)
