@@ -138,13 +138,12 @@ GOALS: Final[dict[str, Goal]] = {
     "camera.y": Goal(0.015),
     "camera.z": Goal(0.015),
     "camera.yaw": Goal(0.0087),
-    "camera.pitch": Goal(0.0175),
+    "camera.pitch": Goal(0.0087),
     "camera.roll": Goal(0.0087),
 }
 """Of the intervals, in the estimates' units: 1 % of ways, 0.5 degrees of steering (8.5 us), 2 degrees by iron
 in a horizontal field of 25 uT, 10 mm and 0.5 degrees of the lidar, 15 mm and 3 degrees of any sonar, 1
-degree (3.4 steps) of the stabiliser, 15 mm and 0.5 degrees (4.6 of 522 pixels) of the camera, of its pitch 1 degree,
-0.1 V."""
+degree (3.4 steps) of the stabiliser, 15 mm and 0.5 degrees (4.6 of 522 pixels) of the camera, 0.1 V."""
 
 
 def grade(wizard: WizardName, estimate: Estimate) -> Grade | None:
