@@ -44,8 +44,8 @@ LIKE_OTHERS = {
     "map worker hangs",
     "battery critical before arming",
 }
-"""Left to the long tests: another test or device has the same fault, the same device on its other side, or it takes half
-a minute to show in the whole daemon what the unit tests of the gate show.
+"""Left to the long tests: another test or device has the same fault, or the same device on its other side, or it takes
+half a minute to show in the whole daemon what the unit tests of the gate show.
 """
 COMPARED = {"lidar: clock slewed by -10 %", "drive: answers 40 ms late", "battery critical"}
 """Noticed by what was measured before, for which the truck has to drive some seconds."""
