@@ -48,10 +48,7 @@ would take as long as a thousand tests."""
 THREE = ("-n", "3")
 """Tests at a time on the two cores of a small computer: some wait for a process or a time-out."""
 TWO = ("-n", "2")
-"""Tests on the wall clock at a time: each runs a truck and a daemon, which must not be late. Three where the computer
-has nothing else to do: together they ask for less of it than two beside two busy programs."""
-IDLE = 1.0
-"""Load below which that is so, as the check begins."""
+"""Tests on the wall clock at a time: each runs a truck and a daemon, which must not be late."""
 FAILED_ALONE = ("-n", "0", "--last-failed", "--last-failed-no-failures", "none", "--cov-append", "--assert", "rewrite")
 TESTS_FAILED = 1
 """Exit code of pytest; others mean that it did not run them."""
@@ -178,7 +175,6 @@ def check(arguments: list[str]) -> int:
     """
     tools = VENV / "bin"
     pytest = tools / "pytest"
-    at_a_time = THREE if os.getloadavg()[0] < IDLE else TWO
     run(KERNELS[0], *BYTECODE)
     compiling = subprocess.Popen(KERNELS, cwd=ROOT)  # while what needs none runs: it keeps one core busy for a minute
     try:
@@ -202,7 +198,7 @@ def check(arguments: list[str]) -> int:
         compiling.wait()
     return steps(
         (pytest, [*THREE, *TESTS, "-m", "not wall and not traced and not long", *arguments]),
-        (pytest, [*at_a_time, *TESTS, "-m", "wall and not long", *arguments]),
+        (pytest, [*TWO, *TESTS, "-m", "wall and not long", *arguments]),
     )
 
 

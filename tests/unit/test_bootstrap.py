@@ -198,16 +198,6 @@ def test_a_step_that_ran_no_tests_is_not_tried_again(steps):
     assert len(ran) == 1
 
 
-@pytest.mark.parametrize(("load", "expected"), [(0.2, "3"), (2.0, "2")])
-def test_a_busy_computer_runs_fewer_tests_on_the_wall_clock(
-    load: float, expected: str, steps, monkeypatch: pytest.MonkeyPatch
-):
-    ran, _ = steps
-    monkeypatch.setattr(bootstrap.os, "getloadavg", lambda: (load, 5.0, 5.0))
-    bootstrap.check([])
-    assert [arguments[:2] for arguments in ran] == [("-n", "3"), ("-n", "3"), ("-n", expected)]
-
-
 def test_every_test_but_the_long_ones_belongs_to_one_step(steps):
     ran, _ = steps
     bootstrap.check([])
