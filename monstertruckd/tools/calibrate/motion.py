@@ -40,13 +40,13 @@ SETTLE: Final = 5.0
 """Seconds in which it must come to rest."""
 DEPTH: Final = 4096
 LATE: Final = (
-    "requests came too late: end what else keeps this computer or the link to the truck busy, or run the wizard on the "
-    "truck's own computer, and repeat it; nothing was saved"
+    "requests came too late: end what else keeps this computer or the link to the truck busy, or run the command on "
+    "the truck's own computer, and repeat it; nothing was saved"
 )
 """What to do about a lease that expired."""
 SILENT: Final = (
     "a device was silent (`monstertruckd status` names it), or the truck's computer is too busy: end what keeps it so, "
-    "and repeat the wizard; nothing was saved"
+    "and repeat the command; nothing was saved"
 )
 """What to do about measurements or ticks that came too late."""
 REPEATS: Final = 2

@@ -50,7 +50,7 @@ def test_a_silent_device_says_what_to_do_once():
     assert str(error).startswith(
         "stopped by the gate: no fresh drive feedback, no fresh lidar scan; a device was silent"
     )
-    assert str(error).count("repeat the wizard") == 1
+    assert str(error).count("repeat the command") == 1
     assert ";" not in str(stopped(Reason.OBSTACLE_STOP))
 
 
