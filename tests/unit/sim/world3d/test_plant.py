@@ -383,5 +383,5 @@ def test_people_walk_into_it_and_are_felt():
 
 
 def test_a_heavier_load_is_refused_where_no_body_is_left():
-    with pytest.raises(ValueError, match="expected more than wheels and axles"):
+    with pytest.raises(InputError, match="expected more than wheels and axles"):
         World(WorldConfig(engine="mujoco", mechanics=MechanicsConfig(wheel_mass=2.0)), 1)
