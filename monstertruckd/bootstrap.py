@@ -45,8 +45,9 @@ TESTS = ("--dist", "worksteal", "--hypothesis-profile", "ci", "--assert", "plain
 """Neighbours run in one process, for what they share is cached; property tests have the same examples every time, and
 no time limit. Plain pytest draws new ones. Values of local variables stand for those in assertions, whose rewriting
 would take as long as a thousand tests."""
-THREE = ("-n", "3")
-"""Tests at a time on the two cores of a small computer: some wait for a process or a time-out."""
+FOUR = ("-n", "4")
+"""Tests at a time on the two cores of a small computer: some wait for a process or a time-out, and beside busy programs
+four get more of the cores than two."""
 TWO = ("-n", "2")
 """Tests on the wall clock at a time: each runs a truck and a daemon, which must not be late."""
 FAILED_ALONE = ("-n", "0", "--last-failed", "--last-failed-no-failures", "none", "--cov-append", "--assert", "rewrite")
@@ -184,7 +185,7 @@ def check(arguments: list[str]) -> int:
             (tools / "ruff", ["format", "--check", "."]),
             (tools / "lint-imports", []),
             (tools / "mypy", []),
-            (pytest, [*THREE, *TESTS, "-m", "traced and not wall", "--cov", "--cov-report=", *TRACED]),
+            (pytest, [*FOUR, *TESTS, "-m", "traced and not wall", "--cov", "--cov-report=", *TRACED]),
             (tools / "coverage", ["report"]),
         )
         if code:
@@ -197,7 +198,7 @@ def check(arguments: list[str]) -> int:
         compiling.kill()
         compiling.wait()
     return steps(
-        (pytest, [*THREE, *TESTS, "-m", "not wall and not traced and not long", *arguments]),
+        (pytest, [*FOUR, *TESTS, "-m", "not wall and not traced and not long", *arguments]),
         (pytest, [*TWO, *TESTS, "-m", "wall and not long", *arguments]),
     )
 
