@@ -82,8 +82,9 @@ SLOW: Final = 0.2
 """Share of the speed asked for below which the robot does not move."""
 EQUAL: Final = 12, 0.1
 """Equal echoes in a row, and the way over which they came, m, from which on a sonar counts as stuck."""
-JUDGED: Final = 20
-"""Newest echoes of a sonar that tell whether it agrees with the wall."""
+JUDGED: Final = 20, 1.2
+"""Least number of echoes of a sonar, of so much way along a wall, m, that tell whether it agrees with the wall: the
+diagonal one looks through a door, or past the end of a pillar, before the other one."""
 DISAGREES, AGREES = 0.2, 0.7
 """Share of them on the wall below which a sonar contradicts another one, whose share is above the second figure."""
 FOLLOWED: Final = 0.5
@@ -398,10 +399,13 @@ class WallLine:
 
     def _disagreement(self, state: LineState, wall: WallEstimate, cone: Cone) -> tuple[Reason, str] | None:
         """A sonar that does not hear the wall that the other one hears."""
-        shares = []
+        least, way = JUDGED
+        if state.travelled - state.marks[0] < way:
+            return None
+        recent, shares = state.echoes[state.echoes[:, 5] > state.travelled - way], []
         for number in (SIDE, DIAGONAL):
-            rows = state.echoes[state.echoes[:, 4] == number][-JUDGED:]
-            if len(rows) < JUDGED or not cone.hears(float(rows[-1, 2]), wall.normal):
+            rows = recent[recent[:, 4] == number]
+            if len(rows) < least or not cone.hears(float(rows[-1, 2]), wall.normal):
                 return None
             shares.append(float((np.abs(residuals(rows, wall, cone)) < TIGHT).mean()))
         for number, (share, other) in enumerate((shares, shares[::-1])):

@@ -163,6 +163,33 @@ def test_a_front_sonar_that_hears_nothing_is_made_up_for_by_the_diagonal_one():
     assert clearance > 0.16
 
 
+def along(walls, far, steps):
+    """Outcome beside a wall, and the way driven; ``far`` changes what the sonars measure, by the number of the step."""
+    robot, behaviour = Robot(walls, (0.0, 0.0, 0.1)), follower()
+    state = replace(behaviour.begin(), phase="follow", wall=WallEstimate(math.pi / 2, 0.35), begun=robot.pose)
+    for i in range(steps):
+        robot.stuck = far(i)
+        step = behaviour.step(robot.inputs(), state, i * PERIOD)
+        state, robot.motion = step.state, step.motion or RequestedMotion()
+        if step.outcome is not Reason.DRIVING:
+            break
+        robot.move()
+    return step, robot.pose[0]
+
+
+def test_a_sonar_that_measures_another_wall_than_its_neighbour_ends_it():
+    step, way = along([(-9.0, 0.35, 9.0, 0.35)], lambda i: {"fl": 2.0 + 0.002 * i}, 100)
+    assert step.outcome is Reason.INPUT_CONTRADICTORY
+    assert step.text == "sonar fl does not measure the wall that its neighbour does"
+    assert 1.1 < way < 1.4
+
+
+def test_the_end_of_a_short_wall_is_no_fault_of_the_sonar_that_looks_past_it_first():
+    step, way = along([(-0.1, 0.35, 0.3, 0.35), (-9.0, 1.5, 9.0, 1.5)], lambda _: {}, 45)
+    assert step.outcome is Reason.DRIVING
+    assert way > 0.45
+
+
 def test_it_does_not_turn_away_from_what_is_too_near():
     robot = Robot(HALL, (0.0, 0.0, 0.0))
     robot.stuck = {"fl": 0.15}
