@@ -46,10 +46,9 @@ async def while_it_runs(robot: Subscriber, work: Awaitable[T]) -> T:
 
 
 async def _until_gone(gate: Mailbox[GateState]) -> NoReturn:
-    run = (await gate.next()).nonce
-    while True:
-        state = await gate.next_within(LOST)
-        if state is None:
-            raise NoAnswerError(f"the robot has been silent for {LOST:g} s: it may be driving on")
+    run: str | None = None
+    while (state := await gate.next_within(LOST)) is not None:
+        run = run or state.nonce
         if state.nonce != run:
             raise RequestRefusedError(Reason.SHUTDOWN, "the robot's daemon was restarted meanwhile")
+    raise NoAnswerError(f"the robot has been silent for {LOST:g} s: it may be driving on")

@@ -185,11 +185,11 @@ def gate_state(mode, nonce="n"):
 
 
 class LostRobot(SilentRobot):
-    """Says ten times a second that it drives, for a while; then it is another run, or silent, and knows no goal."""
+    """Says ten times a second that it drives, ``said`` times; then it is another run, or silent, and knows no goal."""
 
-    def __init__(self, clock, restarts):
+    def __init__(self, clock, said, restarts):
         super().__init__("cancel", NotFoundError("no such call"))
-        self._clock, self._restarts = clock, restarts
+        self._clock, self._said, self._restarts = clock, said, restarts
         self._gates = []
 
     def subscribe(self, topic, delivery):
@@ -199,7 +199,7 @@ class LostRobot(SilentRobot):
         return box
 
     async def live(self):
-        for _ in range(200):
+        for _ in range(self._said):
             await self._clock.sleep(0.1)
             self._say("first")
         if self._restarts:
@@ -212,11 +212,12 @@ class LostRobot(SilentRobot):
 
 
 @pytest.mark.parametrize(
-    ("restarts", "error", "after"), [(True, RequestRefusedError, 60.0), (False, NoAnswerError, 80.0)]
+    ("said", "restarts", "error", "after"),
+    [(200, True, RequestRefusedError, 60.0), (200, False, NoAnswerError, 80.0), (0, False, NoAnswerError, 60.0)],
 )
-def test_nobody_waits_for_a_robot_that_was_restarted_or_stays_silent(restarts, error, after):
+def test_nobody_waits_for_a_robot_that_was_restarted_or_stays_silent(said, restarts, error, after):
     async def main(clock):
-        robot = LostRobot(clock, restarts)
+        robot = LostRobot(clock, said, restarts)
         living, began = asyncio.create_task(robot.live()), clock.now()
         with pytest.raises(error) as lost:
             await to_goal(robot, clock)
