@@ -4,29 +4,36 @@
 
 Six cameras of 640 x 480 with hidden lenses and places over a table of 3 m x 3 m, calibrated by the stand's own
 procedure from rendered boards and marks that a ruler measured to 1.5 mm; blur, noise and distortion as in
-``tests/stand_kit.py``. Rendering is not counted in the frames a second. Robots carry a tag, or two coloured discs:
+``tests/stand_kit.py``. Rendering is not counted in the frames a second: JPEGs are decoded, read and tracked, first one
+after the other, which gives a core's time for a picture, then once more as ``stand track`` does, on all cores, which
+gives the pictures a second of each camera that the computer really did. Robots carry a tag, or two coloured discs:
 then all five have the same colours. ``--minutes`` of five of them crossing are not rendered: discs are found to 0.2
 pixels, one in fifty is missed, and one picture in fifty shows a disc too much.
 """
 
 import argparse
+import asyncio
 import json
 import math
 import sys
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
-from time import process_time
-from typing import Any
+from tempfile import TemporaryDirectory
+from time import perf_counter, process_time
+from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 
 from monstertruck_estimation.vision.blobs import Blob
 from monstertruck_kinematics.elementary import Array
-from monstertruck_runtime.clock import SECOND
+from monstertruck_runtime.clock import SECOND, WallClock
 from monstertruckd.tools.stand.camera import PlacedCamera
-from monstertruckd.tools.stand.config import BlobRobot
+from monstertruckd.tools.stand.config import BlobRobot, FileSource
 from monstertruckd.tools.stand.poses import RobotPose
-from monstertruckd.tools.stand.track import StandReader
+from monstertruckd.tools.stand.sources import FLAGS, stream
+from monstertruckd.tools.stand.track import StandReader, StandRun
 from monstertruckd.tools.stand.tracking import StandTracker
 from tests.stand_kit import LOOK as LOOK_OF_PICTURES
 from tests.stand_kit import simulated, turned
@@ -44,6 +51,8 @@ GOALS = {
     "discs_hand_over_jump_mm": 5.0,
     "frames_per_second_of_each_on_2_cores": 25.0,
     "discs_frames_per_second_of_each_on_2_cores": 25.0,
+    "played_frames_per_second_of_each": 25.0,
+    "discs_played_frames_per_second_of_each": 25.0,
     "identities_lost": 0,
     "discs_identities_lost": 0,
     "discs_identities_lost_in_minutes": 0,
@@ -85,7 +94,9 @@ def tracker(stand: Any, kind: str, starts: Any) -> StandTracker:
 def readers(stand: Any, kind: str) -> dict[str, StandReader]:
     """By camera, as the stand reads."""
     tags = kind == "tags"
-    return {name: StandReader(stand[1].marks, () if tags else LOOK, tagged=tags) for name in stand[3]}
+    return {
+        name: StandReader(stand[1].marks, () if tags else LOOK, tagged=tags, phase=k) for k, name in enumerate(stand[3])
+    }
 
 
 def accuracy(
@@ -114,8 +125,10 @@ def hand_over(stand: Any, kind: str) -> float:
     for k, x in enumerate(ways):
         y = 0.4 * math.sin(2 * x)
         placards = [*floor, marker(stand, kind, 0, x, y, 0.2)]
-        seen = {name: reading[name].read(renderer.picture(placards)) for name, renderer in renderers.items()}
-        for pose in track.take(k * SECOND // 25, seen):
+        stamp = k * SECOND // 25
+        expected = track.expected(stamp)
+        seen = {n: reading[n].read(r.picture(placards), expected.get(n, ())) for n, r in renderers.items()}
+        for pose in track.take(stamp, seen):
             error = np.array((pose.x - x, pose.y - y))
             if before is not None:
                 worst = max(worst, float(np.hypot(*(error - before))))
@@ -145,7 +158,22 @@ def _along(way: Array, times: Array) -> Array:
     return np.column_stack((place, np.arctan2(speed[:, 1], speed[:, 0])))
 
 
-def crossing(stand: Any, kind: str, seconds: float, rng: np.random.Generator) -> tuple[int, float, float]:
+class Crossing(NamedTuple):
+    """What robots that cross came to."""
+
+    lost: int
+    """Poses that are another robot's."""
+    unseen: float
+    """Longest time that a robot was not seen, s."""
+    spent: float
+    """Processor seconds of a picture that is decoded, read and tracked."""
+    worst: float
+    """Processor seconds of all pictures of one instant, the first one left aside, in which all are searched."""
+    played: float
+    """Pictures of each camera that are tracked in a second."""
+
+
+def crossing(stand: Any, kind: str, seconds: float, rng: np.random.Generator) -> Crossing:
     """Five robots that cross.
 
     Args:
@@ -153,25 +181,42 @@ def crossing(stand: Any, kind: str, seconds: float, rng: np.random.Generator) ->
         kind: of marker.
         seconds: how long; a minute takes some minutes to render.
         rng: of their ways.
-
-    Returns:
-        Poses that are another robot's, longest time that a robot was not seen, s, and processor seconds of a picture
-        read and tracked.
     """
     _, _, _, renderers, floor = stand
     where = crossing_ways(rng)
-    track, reading = tracker(stand, kind, [(x, y) for x, y, _ in where(0.0)]), readers(stand, kind)
-    watch, spent, pictures = Watch(5), 0.0, 0
-    for k in range(round(25 * seconds)):
-        true = where(k / 25)
-        placards = [*floor, *(marker(stand, kind, i, *place) for i, place in enumerate(true))]
-        shown = {name: renderer.picture(placards) for name, renderer in renderers.items()}
-        began = process_time()
-        poses = track.take(k * SECOND // 25, {name: reading[name].read(picture) for name, picture in shown.items()})
-        spent += process_time() - began
-        pictures += len(shown)
-        watch.take(k / 25, poses, true)
-    return watch.lost, watch.longest, spent / pictures
+    starts = [(x, y) for x, y, _ in where(0.0)]
+    track, reading = tracker(stand, kind, starts), readers(stand, kind)
+    watch, spent, colour = Watch(5), [], kind == "discs"
+    with TemporaryDirectory(prefix="monstertruck-") as folder:
+        for name in renderers:
+            (Path(folder) / name).mkdir()
+        for k in range(round(25 * seconds)):
+            true = where(k / 25)
+            placards = [*floor, *(marker(stand, kind, i, *place) for i, place in enumerate(true))]
+            files = {name: Path(folder) / name / f"{k:06d}.jpg" for name in renderers}
+            for name, renderer in renderers.items():
+                cv2.imwrite(str(files[name]), renderer.picture(placards))
+            began = process_time()
+            expected, seen = track.expected(k * SECOND // 25), {}
+            for name, file in files.items():
+                picture = np.asarray(cv2.imread(str(file), FLAGS[colour]), dtype=np.uint8)
+                seen[name] = reading[name].read(picture, expected.get(name, ()))
+            poses = track.take(k * SECOND // 25, seen)
+            spent.append(process_time() - began)
+            watch.take(k / 25, poses, true)
+        streams = {
+            name: partial(stream, FileSource(path=Path(folder) / name), (640, 480), 25.0, colour=colour)
+            for name in renderers
+        }
+        again: list[RobotPose] = []
+        colours = LOOK if colour else ()
+        run = StandRun(
+            tracker(stand, kind, starts), streams, 25.0, WallClock(), again.append, print, live=False, colours=colours
+        )
+        started = perf_counter()
+        asyncio.run(run.run())
+        played = len(spent) / (perf_counter() - started)
+    return Crossing(watch.lost, watch.longest, sum(spent) / len(spent) / 6, max(spent[1:]), played)
 
 
 class Watch:
@@ -235,11 +280,11 @@ def faults(stand: Any, seed: int) -> tuple[float, float, int]:
         bumped = StandRenderer(turned(hidden["c1"], axis, math.radians(2.0)), LOOK_OF_PICTURES, seed).picture(floor)
         track, reading = StandTracker(found.placed(), config.robots, config.marks), readers(stand, "tags")
         reported: dict[str, float] = {}
+        tags = {name: reading[name].read(picture) for name, picture in good.items()}
         for k in range(350):
-            # Pictures are read once only: nothing moves but c1. A robot keeps marks to one picture of eight.
-            shown = good if k < 50 else {**good, "c1": bumped}
-            if k in (0, 50):
-                tags = {name: reading[name].read(picture) for name, picture in shown.items()}
+            # Pictures are read once only: nothing moves but c1. Marks are looked for in one picture of eight.
+            if k == 50:
+                tags["c1"] = readers(stand, "tags")["c1"].read(bumped)
             now = k * SECOND // 25
             track.take(now, {n: t if k % 8 == 0 else [] for n, t in tags.items() if k < 50 or n != "c2"})
             for text in track.complaints(now):
@@ -287,7 +332,7 @@ def main() -> int:
 
 def measured(stands: Sequence[Any], kind: str, poses: int, seconds: float) -> dict[str, Any]:
     """Figures of one kind of marker."""
-    off, turned_by, dim, jumps, lost, unseen, cost = [], [], [], [], 0, 0.0, []
+    off, turned_by, dim, jumps, crossed = [], [], [], [], []
     for seed, stand in enumerate(stands):
         rng = np.random.default_rng([seed, 9])
         found = accuracy(stand, kind, poses, rng, None)
@@ -295,9 +340,8 @@ def measured(stands: Sequence[Any], kind: str, poses: int, seconds: float) -> di
         turned_by += found[1]
         dim += accuracy(stand, kind, max(poses // 2, 1), rng, HALF)[0]
         jumps.append(hand_over(stand, kind))
-        mistaken, longest, spent = crossing(stand, kind, seconds, np.random.default_rng([seed, 10]))
-        lost, unseen = lost + mistaken, max(unseen, longest)
-        cost.append(spent)
+        crossed.append(crossing(stand, kind, seconds, np.random.default_rng([seed, 10])))
+    cost = float(np.mean([one.spent for one in crossed]))
     return {
         "seen_share": round(len(off) / (len(stands) * poses), 3),
         "position_rms_mm": round(1000 * rms(off), 2),
@@ -305,11 +349,13 @@ def measured(stands: Sequence[Any], kind: str, poses: int, seconds: float) -> di
         "heading_rms_deg": round(math.degrees(rms(turned_by)), 2),
         "half_light_position_rms_mm": round(1000 * rms(dim), 2),
         "hand_over_jump_mm": round(1000 * max(jumps), 2),
-        "read_and_track_ms": round(1000 * float(np.mean(cost)), 2),
-        "frames_per_second_of_each_on_2_cores": round(2 / float(np.mean(cost)) / 6, 1),
+        "decode_read_and_track_ms": round(1000 * cost, 2),
+        "worst_instant_of_six_ms": round(1000 * max(one.worst for one in crossed), 1),
+        "frames_per_second_of_each_on_2_cores": round(2 / cost / 6, 1),
+        "played_frames_per_second_of_each": round(min(one.played for one in crossed), 1),
         "crossing_s": seconds,
-        "identities_lost": lost,
-        "longest_unseen_s": round(unseen, 2),
+        "identities_lost": sum(one.lost for one in crossed),
+        "longest_unseen_s": round(max(one.unseen for one in crossed), 2),
     }
 
 

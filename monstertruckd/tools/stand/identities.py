@@ -182,6 +182,7 @@ def pairs(camera: PlacedCamera, robot: BlobRobot, blobs: Sequence[Blob]) -> Iter
                     weight_of(camera, pixels[[i, j]]),
                     sigma / math.sqrt(2),
                     sigma * math.sqrt(2) / apart,
+                    apart,
                 ),
                 abs(apart - robot.apart),
             )

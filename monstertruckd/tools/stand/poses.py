@@ -29,6 +29,8 @@ class MarkerPose(NamedTuple):
     sigma: float
     """Standard deviation of x and y, m."""
     heading_sigma: float
+    side: float
+    """Of the tag, or distance of the discs, m."""
 
 
 class RobotPose(NamedTuple):
@@ -64,6 +66,7 @@ def tag_pose(camera: PlacedCamera, sighting: Sighting, height: float) -> MarkerP
         weight_of(camera, sighting.corners),
         sigma / 2,
         sigma / side,
+        side,
     )
 
 
@@ -76,13 +79,13 @@ def merged(poses: Sequence[MarkerPose]) -> MarkerPose:
     """Weighted mean of what several cameras see of one marker."""
     weights = np.array([pose.weight for pose in poses])
     weights /= weights.sum()
-    x, y = (float(weights @ [getattr(pose, axis) for pose in poses]) for axis in ("x", "y"))
+    x, y, side = (float(weights @ [getattr(pose, name) for pose in poses]) for name in ("x", "y", "side"))
     yaw = math.atan2(weights @ [math.sin(p.yaw) for p in poses], weights @ [math.cos(p.yaw) for p in poses])
     sigma, turn = (
         math.sqrt(float(weights**2 @ [getattr(pose, name) ** 2 for pose in poses]))
         for name in ("sigma", "heading_sigma")
     )
-    return MarkerPose(x, y, yaw, float(max(pose.weight for pose in poses)), sigma, turn)
+    return MarkerPose(x, y, yaw, float(max(pose.weight for pose in poses)), sigma, turn, side)
 
 
 def robot_pose(

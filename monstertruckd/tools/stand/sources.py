@@ -33,10 +33,14 @@ def pictures_in(folder: Path, *, colour: bool = False) -> list[Picture]:
     Raises:
         InputError: there is none, or one cannot be read.
     """
+    return [_read(path, colour=colour) for path in _files(folder)]
+
+
+def _files(folder: Path) -> list[Path]:
     files = sorted(path for path in folder.glob("*") if path.suffix.lower() in ENDINGS) if folder.is_dir() else []
     if not files:
         raise InputError(f"{folder}: no pictures in it ({', '.join(ENDINGS)}): take some with `stand snap`")
-    return [_read(path, colour=colour) for path in files]
+    return files
 
 
 def stream(
@@ -50,7 +54,8 @@ def stream(
     """
     if isinstance(source, FileSource):
         if source.path.is_dir():
-            yield from pictures_in(source.path, colour=colour)
+            for path in _files(source.path):  # one at a time: a minute of six cameras is 3 GB
+                yield _read(path, colour=colour)
             return
         capture = cv2.VideoCapture(str(source.path))
         yield from _frames(source.path, capture, InputError("cannot be read as a film"), colour=colour)

@@ -2,7 +2,7 @@
 
 import asyncio
 import threading
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from typing import Final
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from monstertruck_estimation.vision.blobs import Blob, BlobReader
 from monstertruck_estimation.vision.tags import EVERYWHERE, Picture, Sighting, TagReader
+from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import TruckError
 from monstertruck_schemas.board import Colour
@@ -30,20 +31,29 @@ class StandReader:
         marks: tags that lie on the table.
         colours: of robots' discs; empty: pictures may be grey.
         tagged: there are robots with tags; otherwise tags are read in one picture of ``EVERYWHERE``, for the marks.
+        phase: number of the camera: in each picture another one looks for tags everywhere.
     """
 
-    def __init__(self, marks: Collection[int], colours: Collection[Colour], *, tagged: bool = True) -> None:
-        self._tags = TagReader(still=marks)
+    def __init__(
+        self, marks: Collection[int], colours: Collection[Colour], *, tagged: bool = True, phase: int = 0
+    ) -> None:
+        self._tags = TagReader(EVERYWHERE, marks, phase=phase) if tagged else TagReader(1, marks)
         self._blobs = BlobReader(colours) if colours else None
         self._tagged = tagged
+        self._phase = phase
         self._count = 0
 
-    def read(self, picture: Picture) -> list[Sighting | Blob]:
-        """Tags and discs in a picture, grey or blue, green and red."""
+    def read(self, picture: Picture, expected: Sequence[Array] = ()) -> list[Sighting | Blob]:
+        """Tags and discs in a picture, grey or blue, green and red.
+
+        Args:
+            picture: next one.
+            expected: corners of robots' tags, (4, 2) each, pixels.
+        """
         found: list[Sighting | Blob] = []
-        if self._tagged or self._count % EVERYWHERE == 0:
+        if self._tagged or self._count == 0 or (self._count - self._phase) % EVERYWHERE == 0:
             grey = picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
-            found += self._tags.read(np.asarray(grey, dtype=np.uint8))
+            found += self._tags.read(np.asarray(grey, dtype=np.uint8), expected)
         self._count += 1
         if self._blobs is not None and picture.ndim == 3:
             found += self._blobs.read(picture)
@@ -85,6 +95,7 @@ class StandRun:
         self._live = live
         self._colours = colours
         self._newest: dict[str, tuple[int, list[Sighting | Blob]]] = {}
+        self._expected: dict[str, list[Array]] = {}
         self._ended = threading.Event()
 
     async def run(self) -> None:
@@ -97,28 +108,29 @@ class StandRun:
     async def _play(self) -> None:
         """Recorded pictures: the first ones of all cameras are of one instant, and so on."""
         iterators = {name: stream() for name, stream in self._streams.items()}
-        readers = {
-            name: StandReader(self._tracker.marks, self._colours, tagged=self._tracker.tagged) for name in iterators
-        }
+        readers = {name: self._reader(name) for name in iterators}
+
+        def read(name: str) -> list[Sighting | Blob] | None:
+            picture = next(iterators[name], None)
+            return None if picture is None else readers[name].read(picture, self._expected.get(name, ()))
+
         began, count = self._clock.now(), 0
         while iterators:
-            seen = {}
-            for name, pictures in list(iterators.items()):
-                picture = await asyncio.to_thread(next, pictures, None)
-                if picture is None:
-                    del iterators[name]
-                    continue
-                seen[name] = await asyncio.to_thread(readers[name].read, picture)
+            stamp = began + round(count * SECOND / self._rate)
+            self._expected = self._tracker.expected(stamp)
+            found = await asyncio.gather(*(asyncio.to_thread(read, name) for name in iterators))
+            seen = {name: tags for name, tags in zip(iterators, found, strict=True) if tags is not None}
+            iterators = {name: iterators[name] for name in seen}
             if seen:
-                stamp = began + round(count * SECOND / self._rate)
                 for pose in self._tracker.take(stamp, seen):
                     self._put(pose)
                 for text in self._tracker.complaints(stamp):
                     self._say(text)
             count += 1
 
-    def _reader(self) -> StandReader:
-        return StandReader(self._tracker.marks, self._colours, tagged=self._tracker.tagged)
+    def _reader(self, name: str) -> StandReader:
+        tracker = self._tracker
+        return StandReader(tracker.marks, self._colours, tagged=tracker.tagged, phase=list(self._streams).index(name))
 
     async def _follow(self) -> None:
         loop = asyncio.get_running_loop()
@@ -138,6 +150,7 @@ class StandRun:
                     stamp = max(at for at, _ in fresh.values())
                     for pose in self._tracker.take(stamp, {name: tags for name, (_, tags) in fresh.items()}):
                         self._put(pose)
+                    self._expected = self._tracker.expected(stamp + round(SECOND / self._rate))
                 for text in self._tracker.complaints(self._clock.now()):
                     self._say(text)
         finally:
@@ -147,11 +160,11 @@ class StandRun:
         """One camera, in a thread of its own: OpenCV gives the interpreter free while it works."""
         said = ""
         while not self._ended.is_set():
-            reader = self._reader()
+            reader = self._reader(name)
             try:
                 for picture in stream():
                     at = self._clock.now()
-                    self._newest[name] = at, reader.read(picture)
+                    self._newest[name] = at, reader.read(picture, self._expected.get(name, ()))
                     if self._ended.is_set():
                         return
                     said = ""

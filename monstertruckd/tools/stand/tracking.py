@@ -26,6 +26,8 @@ FASTEST: Final = 3.0
 """m/s: robots are not faster;"""
 SLACK: Final = 0.05
 """and this much, m, is no jump."""
+EXPECTED: Final = 0.5
+"""Seconds for which a robot is expected where its speed takes it."""
 STUBBORN: Final = 5
 """Pictures after which an impossible pose is believed."""
 BUMPED: Final = 0.005
@@ -43,7 +45,16 @@ SILENT: Final = 1.0
 @dataclass(slots=True)
 class _Known:
     pose: RobotPose
+    side: float
+    """Of its tag, m."""
     doubts: int = 0
+    rate: Array = field(default_factory=lambda: np.zeros(3))
+    """Of x, y and yaw, m/s and rad/s."""
+
+    def at(self, stamp: int) -> Array:
+        """x, y and yaw that are expected, (3,)."""
+        seconds = max((stamp - self.pose.stamp) / SECOND, 0.0)
+        return np.array((self.pose.x, self.pose.y, self.pose.yaw)) + seconds * self.rate
 
 
 @dataclass(slots=True)
@@ -136,9 +147,27 @@ class StandTracker:
                 self._identities.learn(stamp, name, whole)
             robot = self._blobs.get(name) or self._robots[name]
             where = robot_pose(name, robot, stamp, whole, tuple(camera for camera, _ in places))
-            if self._believed(where):
+            if self._believed(where, whole.side):
                 poses.append(where)
         return poses
+
+    def expected(self, stamp: int) -> dict[str, list[Array]]:
+        """Where cameras should see the tags of robots at ``stamp``, ns: corners by camera, (4, 2) each, pixels."""
+        squares = []
+        for name, robot in self._robots.items():
+            known = self._known.get(name)
+            if known is None or stamp - known.pose.stamp > EXPECTED * SECOND:
+                continue
+            x, y, yaw = known.at(stamp)
+            c, s = math.cos(yaw), math.sin(yaw)
+            middle = np.array((x + c * robot.x - s * robot.y, y + s * robot.x + c * robot.y))
+            c, s = (0.5 * known.side * turn(yaw + robot.yaw) for turn in (math.cos, math.sin))
+            arms = np.array(((c - s, s + c), (c + s, s - c), (s - c, -s - c), (-c - s, c - s)))
+            squares.append(np.column_stack((middle + arms, np.full(4, robot.height))))
+        if not squares:
+            return {}
+        corners = np.concatenate(squares)
+        return {name: list(camera.project(corners).reshape(-1, 4, 2)) for name, camera in self._cameras.items()}
 
     @property
     def tagged(self) -> bool:
@@ -171,10 +200,10 @@ class StandTracker:
             state.moved = moved
         return said
 
-    def _believed(self, pose: RobotPose) -> bool:
+    def _believed(self, pose: RobotPose, side: float) -> bool:
         known = self._known.get(pose.robot)
         if known is None:
-            self._known[pose.robot] = _Known(pose)
+            self._known[pose.robot] = _Known(pose, side)
             return True
         seconds = (pose.stamp - known.pose.stamp) / SECOND
         jump = math.hypot(pose.x - known.pose.x, pose.y - known.pose.y)
@@ -182,7 +211,13 @@ class StandTracker:
             known.doubts += 1
             self.left_out += 1
             return False
-        known.pose, known.doubts = pose, 0
+        turn = math.remainder(pose.yaw - known.pose.yaw, math.tau)
+        known.rate = (
+            np.array((pose.x - known.pose.x, pose.y - known.pose.y, turn)) / seconds
+            if 0.0 < seconds < EXPECTED and not known.doubts
+            else np.zeros(3)
+        )
+        known.pose, known.side, known.doubts = pose, side, 0
         return True
 
     def _watch(self, name: str, stamp: int, sightings: Sequence[Sighting]) -> None:

@@ -1,8 +1,8 @@
 """AprilTags in a picture: the one place where tags are read (family 36h11; Olson, "AprilTag", ICRA 2011).
 
 OpenCV's ArUco module finds them; corners are crossings of lines along the edges, to a part of a pixel. A tag that stays
-in view is looked for around its last place only, and everywhere once in a while, which lets one core read several
-cameras.
+in view is looked for around its last place and where it is expected, and everywhere once in a while, which lets one
+core read several cameras.
 """
 
 from collections.abc import Collection, Sequence
@@ -21,8 +21,11 @@ MARGIN: Final = 1.0
 """Of a window around a tag, in its sizes to each side: how far it may move between two pictures."""
 LEAST_MARGIN: Final = 16
 """Pixels."""
+LEAST_PERIMETER: Final = 32
+"""Pixels around a tag, one for each of its cells: what is smaller is noise, of which every speck takes time."""
 EVERYWHERE: Final = 8
-"""Pictures from one look at the whole of it to the next."""
+"""Pictures from one look at the whole of it to the next: a tag that appears is found in the one after so many at the
+latest, also where it was not expected."""
 
 
 class Sighting(NamedTuple):
@@ -35,17 +38,22 @@ class Sighting(NamedTuple):
     @property
     def size(self) -> float:
         """Mean side, pixels."""
-        return float(np.hypot(*(self.corners - np.roll(self.corners, 1, axis=0)).T).mean())
+        return _side(self.corners)
+
+
+def _side(corners: Array) -> float:
+    return float(np.hypot(*(corners - np.roll(corners, 1, axis=0)).T).mean())
 
 
 class TagReader:
     """Reads the tags of one camera's pictures.
 
     Args:
-        everywhere: pictures from one look at the whole picture to the next; 1 = always.
+        everywhere: pictures from one look at the whole picture to the next; 1 = always. The first one is one, too.
         still: tags that do not move: they are read in whole pictures only.
         corners: how they are found: as crossings of lines along the edges, which bears tags of few pixels a cell and
             dirt, or to a tenth of a pixel as crossings of the edges of the picture itself, for tags that are measured.
+        phase: which ones of the pictures are looked at as a whole: cameras that are read side by side take turns.
     """
 
     def __init__(
@@ -53,6 +61,7 @@ class TagReader:
         everywhere: int = EVERYWHERE,
         still: Collection[int] = (),
         corners: Literal["lines", "edges"] = "lines",
+        phase: int = 0,
     ) -> None:
         cv2.setNumThreads(1)  # cameras are read side by side; OpenCV's own threads wait for each other
         self._still = frozenset(still)
@@ -66,28 +75,40 @@ class TagReader:
         parameters.adaptiveThreshWinSizeMax = 21
         parameters.adaptiveThreshWinSizeStep = 8
         self._exact = corners == "edges"
+        self._parameters = parameters
         self._detector = cv2.aruco.ArucoDetector(dictionary(), parameters)
         self._everywhere = everywhere
+        self._phase = phase
         self._count = 0
-        self._last: list[Sighting] = []
+        self._last: dict[int, Sighting] = {}
 
-    def read(self, picture: Picture) -> list[Sighting]:
-        """Tags of the next picture."""
-        whole = self._count % self._everywhere == 0 or not self._last
+    def read(self, picture: Picture, expected: Sequence[Array] = ()) -> list[Sighting]:
+        """Tags of the next picture.
+
+        Args:
+            picture: next one.
+            expected: corners of tags, (4, 2) each, pixels, where others say that they are.
+        """
+        whole = self._count == 0 or (self._count - self._phase) % self._everywhere == 0
         self._count += 1
         if whole:
             found = self._detect(picture, 0, 0)
         else:
             found = []
-            for x0, y0, x1, y1 in _windows(self._last, picture.shape[1], picture.shape[0]):
+            places = [*(sighting.corners for sighting in self._last.values()), *expected]
+            for x0, y0, x1, y1 in _windows(places, picture.shape[1], picture.shape[0]):
                 found += self._detect(np.ascontiguousarray(picture[y0:y1, x0:x1]), x0, y0)
         if self._exact:
             found = [sighting._replace(corners=along_edges(picture, sighting.corners)) for sighting in found]
         by_tag = {sighting.tag: sighting for sighting in found}
-        self._last = [sighting for tag, sighting in by_tag.items() if tag not in self._still]
+        moving = {tag: sighting for tag, sighting in by_tag.items() if tag not in self._still}
+        # One that was missed is looked for where it was until the whole picture is looked at.
+        self._last = moving if whole else self._last | moving
         return list(by_tag.values())
 
     def _detect(self, picture: Picture, x0: int, y0: int) -> list[Sighting]:
+        self._parameters.minMarkerPerimeterRate = LEAST_PERIMETER / max(picture.shape)
+        self._detector.setDetectorParameters(self._parameters)
         corners, ids, _ = self._detector.detectMarkers(picture)
         if ids is None:
             return []
@@ -149,18 +170,20 @@ def drawn(tag: int, pixels: int) -> Picture:
     return np.asarray(cv2.aruco.generateImageMarker(dictionary(), tag, pixels), dtype=np.uint8)
 
 
-def _windows(sightings: Sequence[Sighting], width: int, height: int) -> list[tuple[int, int, int, int]]:
-    """Around each tag, those that overlap joined: x0, y0, x1, y1, pixels."""
+def _windows(places: Sequence[Array], width: int, height: int) -> list[tuple[int, int, int, int]]:
+    """Around the corners of each tag, those that overlap joined: x0, y0, x1, y1, pixels."""
     boxes: list[tuple[int, int, int, int]] = []
-    for sighting in sightings:
-        margin = max(LEAST_MARGIN, round(MARGIN * sighting.size))
-        low, high = sighting.corners.min(axis=0), sighting.corners.max(axis=0)
+    for corners in places:
+        margin = max(LEAST_MARGIN, round(MARGIN * _side(corners)))
+        low, high = corners.min(axis=0), corners.max(axis=0)
         box = (
             max(int(low[0]) - margin, 0),
             max(int(low[1]) - margin, 0),
             min(int(high[0]) + margin, width),
             min(int(high[1]) + margin, height),
         )
+        if box[0] >= box[2] or box[1] >= box[3]:
+            continue  # out of the picture
         while (other := next((b for b in boxes if _overlap(b, box)), None)) is not None:
             boxes.remove(other)
             box = (min(box[0], other[0]), min(box[1], other[1]), max(box[2], other[2]), max(box[3], other[3]))

@@ -142,7 +142,7 @@ def test_a_stand_without_colours_reads_grey_pictures_and_one_with_them_colour(tm
 
 def test_where_no_robot_has_a_tag_marks_are_looked_for_in_one_picture_of_eight(monkeypatch):
     read = []
-    monkeypatch.setattr(TagReader, "read", lambda self, picture: read.append(picture.ndim) or [])
+    monkeypatch.setattr(TagReader, "read", lambda self, picture, expected: read.append(picture.ndim) or [])
     pictures = [np.full((48, 64, 3), 90, np.uint8)] * 17
     for tagged, times in ((False, 3), (True, 17)):
         read.clear()

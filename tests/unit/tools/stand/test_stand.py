@@ -11,6 +11,7 @@ pytest.importorskip("cv2")
 
 import cv2
 
+from monstertruck_estimation.vision import tags
 from monstertruck_estimation.vision.lens import LensFit
 from monstertruck_estimation.vision.tags import Sighting, TagReader
 from monstertruck_runtime.clock import SECOND
@@ -67,7 +68,10 @@ def test_cameras_agree_where_both_see_a_robot(stand):
 
 
 def test_a_robot_near_a_border_counts_less():
-    sure, faint = MarkerPose(0.0, 0.0, 3.1, 1.0, 0.001, 0.01), MarkerPose(0.1, 0.0, -3.1, 0.001, 0.001, 0.01)
+    sure, faint = (
+        MarkerPose(0.0, 0.0, 3.1, 1.0, 0.001, 0.01, 0.08),
+        MarkerPose(0.1, 0.0, -3.1, 0.001, 0.001, 0.01, 0.08),
+    )
     assert merged([sure, faint]).x < 0.001
     assert abs(merged([sure, sure._replace(yaw=-3.1)]).yaw) > 3.1, "headings are averaged across the turn"
 
@@ -78,9 +82,10 @@ def test_a_tag_is_followed_in_a_window(stand):
     whole = TagReader(everywhere=1)
     for k in range(5):
         picture = renderers["c1"].picture([*floor, level_tag(0, 0.08, -1.0 + 0.01 * k, 0.7, 0.1, 0.08)])
-        found = {s.tag: s for s in reader.read(picture)}
-        for sighting in whole.read(picture):
-            assert np.abs(found[sighting.tag].corners - sighting.corners).max() < 1.0
+        found, everywhere = ({s.tag: s.corners for s in one.read(picture)} for one in (reader, whole))
+        assert 0 in found
+        for tag in found.keys() & everywhere.keys():
+            assert np.abs(found[tag] - everywhere[tag]).max() < 1.0
 
 
 def test_tags_that_lie_still_are_read_in_whole_pictures_only(stand):
@@ -90,6 +95,65 @@ def test_tags_that_lie_still_are_read_in_whole_pictures_only(stand):
     seen = [{s.tag for s in reader.read(picture)} for _ in range(4)]
     assert seen[0] == seen[3] > {0}
     assert seen[1] == seen[2] == {0}
+
+
+def test_a_tag_that_appears_is_found_in_eight_pictures_and_at_once_where_it_is_expected(stand):
+    _, config, _, renderers, floor = stand
+    empty = renderers["c1"].picture(floor)
+    there = renderers["c1"].picture([*floor, level_tag(0, 0.08, -1.0, 0.7, 0.1, 0.08)])
+    (corners,) = (s.corners for s in TagReader(1).read(there) if s.tag == 0)
+    unexpected, expected = TagReader(still=config.marks, phase=5), TagReader(still=config.marks, phase=5)
+
+    def found(reader, picture, places=()):
+        return 0 in {s.tag for s in reader.read(picture, places)}
+
+    assert not found(unexpected, empty)
+    assert not found(expected, empty)
+    pictures = next(k for k in range(1, 9) if found(unexpected, there))
+    assert pictures == 5, "the turn of the sixth camera, though it had nothing in view"
+    assert found(expected, there, [corners + 15.0, corners - 1000.0])
+    assert not found(expected, empty)
+    assert found(expected, there), "looked for where it was hidden"
+
+
+def test_cameras_take_turns_to_be_searched_and_specks_take_no_time(stand, monkeypatch):
+    sizes = []
+
+    def detect(self, picture):
+        sizes.append((picture.shape, self.getDetectorParameters().minMarkerPerimeterRate * max(picture.shape)))
+        return (), None, ()
+
+    readers = [TagReader(phase=k) for k in range(6)]
+    empty = np.zeros((480, 640), np.uint8)
+    monkeypatch.setattr(tags.cv2.aruco.ArucoDetector, "detectMarkers", detect, raising=False)
+    searched = []
+    for _ in range(17):
+        sizes.clear()
+        for reader in readers:
+            reader.read(empty, [np.array(((50.0, 50), (70, 50), (70, 70), (50, 70)))])
+        searched.append(sum(shape == (480, 640) for shape, _ in sizes))
+        assert all(least == pytest.approx(32) for _, least in sizes)
+    assert searched == [6, 1, 1, 1, 1, 1, 0, 0, 1, 1, 1, 1, 1, 1, 0, 0, 1]
+
+
+def test_robots_are_expected_in_every_camera_where_their_speed_takes_them(stand):
+    _, _, found, _, _ = stand
+    cameras = found.placed()
+    robot = TaggedRobot(tag=0, height=0.08, x=0.05, y=0.02, yaw=0.3)
+    tracker = StandTracker(cameras, {"r1": robot}, {})
+    square = 0.04 * np.array([(1, 1, 0), (1, -1, 0), (-1, -1, 0), (-1, 1, 0)])
+
+    def corners(camera, k):
+        c, s = math.cos(0.1 * k), math.sin(0.1 * k)
+        turned = square @ np.array(((c, s, 0), (-s, c, 0), (0, 0, 1)))
+        return camera.project(turned + np.array((-0.6 + 0.05 * k, 0.75, 0.08)))
+
+    assert tracker.expected(0) == {}
+    for k in range(2):
+        tracker.take(k * SECOND // 25, {"c1": [Sighting(0, corners(cameras["c1"], k))]})
+    for name, places in tracker.expected(2 * SECOND // 25).items():
+        assert places[0] == pytest.approx(corners(cameras[name], 2), abs=1.0)
+    assert tracker.expected(SECOND) == {}
 
 
 @pytest.mark.parametrize("axis", ["right", "down", "ahead"])
