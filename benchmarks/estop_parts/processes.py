@@ -69,6 +69,12 @@ class OtherLoad:
         return max(0.0, others) / (time.monotonic() - self._began)
 
 
+def processor_seconds(pid: int) -> float:
+    """Processor time of a process of ours so far, s (proc(5))."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
 def _busy() -> float:
     """Seconds for which the cores of this process have not been idle (proc(5), ``/proc/stat``)."""
     cores = {f"cpu{core}" for core in os.sched_getaffinity(0)}

@@ -1,6 +1,6 @@
 """How many remote calls are taken: judged where they arrive, so that a flood does not reach the event loop.
 
-An emergency stop is refused only where as many of the same owner are being carried out.
+An emergency stop is refused only where as many of the same owner, or of all together, are being carried out.
 """
 
 import threading
@@ -25,6 +25,8 @@ ROOM: Final = 4 * MAX_WAITING
 """Calls that wait with emergency stops."""
 MAX_ESTOPS: Final = 8
 """Emergency stops of one owner that wait or are carried out."""
+ALL_ESTOPS: Final = 64
+"""Of all owners together: without certificates names can be invented."""
 CALL_RATE: Final = 100.0
 """Calls a second of one owner that are not orders."""
 TOO_MANY: Final = "too many calls at once"
@@ -57,6 +59,8 @@ class CallLimits:
                 owner = owner_of(source)
                 if self._estops[owner] >= MAX_ESTOPS:
                     return f"{MAX_ESTOPS} emergency stops of {owner} are being carried out"
+                if self._estops.total() >= ALL_ESTOPS:
+                    return f"{ALL_ESTOPS} emergency stops are being carried out"
                 self._estops[owner] += 1
             return ""
         order = name in ORDERS

@@ -2,12 +2,16 @@
 
 Even in another thread a decoder holds the interpreter while it runs, so what may be decoded is bounded by size, by rate
 and by a look at the bytes. Every topic waits in a queue of its own, and every owner has a rate of its own: a flood of
-one delays no other.
+one delays no other. Orders that stop are never refused; those that repeat faster than the truck could notice are taken
+together.
 """
 
+import asyncio
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Final
 
 from monstertruck_runtime import wire
@@ -18,8 +22,9 @@ from monstertruck_schemas.base import Message
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import UNCONDITIONAL, ControlRequest, Order, Request
+from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.sensor import StandPose
-from monstertruck_schemas.topics import REQ_CONTROL, REQ_DRIVE, REQ_PATH, STAND_POSE, Topic, owner_of
+from monstertruck_schemas.topics import ESTOP_WAY, REQ_CONTROL, REQ_DRIVE, REQ_PATH, STAND_POSE, Topic, owner_of
 from monstertruckd.bus.access import Sender, role_needed
 from monstertruckd.bus.local import Bus
 
@@ -56,6 +61,13 @@ fits."""
 
 ORDER_RATE: Final = 5.0
 """Orders a second of one owner, those that stop not counted."""
+
+STOP_RATE: Final = 50.0
+"""Orders a second of one owner that stop and are taken at once; of further ones the newest follows."""
+REPEAT: Final = 0.02
+"""Seconds after which it does."""
+MAX_REPEATS: Final = 8
+"""Owners of whom it does; one more replaces the one heard least recently, for others are stopping the truck then."""
 
 
 @dataclass(slots=True)
@@ -142,6 +154,46 @@ class Refusals:
         self._event(reason, Severity.WARNING, self._reporter, text, by=source, count=count)
 
 
+class Repeats:
+    """Holds the newest order of each owner for a moment, so that however many come, the loop gets few.
+
+    To be made on the loop.
+
+    Args:
+        deliver: called on the loop with each.
+    """
+
+    def __init__(self, deliver: Callable[[Message], None]) -> None:
+        self._deliver = deliver
+        self._loop = asyncio.get_running_loop()
+        self._lock = threading.Lock()
+        self._newest: dict[str, Callable[[], Message]] = {}
+
+    def put(self, source: str, order: Callable[[], Message]) -> None:
+        """Deliver an order in ``REPEAT`` seconds, unless its owner gives a newer one; callable from any thread.
+
+        Args:
+            source: who gives it.
+            order: makes it, on the loop.
+        """
+        owner = owner_of(source)
+        with self._lock:
+            first = not self._newest
+            self._newest.pop(owner, None)
+            if len(self._newest) >= MAX_REPEATS:
+                del self._newest[next(iter(self._newest))]
+            self._newest[owner] = order
+        if first:
+            with suppress(RuntimeError):  # the loop was closed meanwhile
+                self._loop.call_soon_threadsafe(self._loop.call_later, REPEAT, self._deliver_all)
+
+    def _deliver_all(self) -> None:
+        with self._lock:
+            newest, self._newest = self._newest, {}
+        for order in newest.values():
+            self._deliver(order())
+
+
 class Intake:
     """Takes in the requests of one topic; to be made on the loop.
 
@@ -151,15 +203,25 @@ class Intake:
         clock: time.
         guard: runs what happens on the loop, so that a bug does not vanish there.
         reporter: who reports refusals.
+        only: the one order that is taken, on a way of its own; None = all.
     """
 
     def __init__(
-        self, topic: Topic[Any], bus: Bus, clock: Clock, guard: Callable[[Callable[[], object]], None], reporter: str
+        self,
+        topic: Topic[Any],
+        bus: Bus,
+        clock: Clock,
+        guard: Callable[[Callable[[], object]], None],
+        reporter: str,
+        only: Order | None = None,
     ) -> None:
         self.topic = topic
+        self._name = topic.name if only is None else ESTOP_WAY
+        self._only = only
         self._limit = LIMITS.get(topic.name, Limit())
         self._rates = None if self._limit.rate is None else OwnerRates(self._limit.rate, clock)
         self._order_rates = OwnerRates(ORDER_RATE, clock)
+        self._stop_rates = {order: OwnerRates(STOP_RATE, clock) for order in UNCONDITIONAL}
         self._refusals = Refusals(bus, clock, reporter)
 
         def deliver(request: Message) -> None:
@@ -170,6 +232,7 @@ class Intake:
         )
         self._estops: ThreadHop[Message] = ThreadHop(deliver, DEPTH, bus.add_drops)
         """Emergency stops wait for no other order."""
+        self._repeats = {Order.ESTOP: Repeats(self._estops.put), Order.STOP: Repeats(self._requests.put)}
 
     def take(self, sender: Sender, size: int, read: Callable[[], bytes]) -> None:
         """Judge, decode and queue one request; callable from any thread.
@@ -179,7 +242,7 @@ class Intake:
             size: bytes it has.
             read: gets them.
         """
-        name, limit, source = self.topic.name, self._limit, sender.source
+        name, limit, source = self._name, self._limit, sender.source
         if size > limit.size:
             text = f"{name}: request of {size} bytes, at most {limit.size} are taken"
             self._refusals.add(Reason.BAD_INPUT, source, text)
@@ -188,6 +251,9 @@ class Intake:
             self._refusals.add(Reason.MESSAGES_DROPPED, source, f"{name}: more than {limit.rate:g} requests a second")
             return
         data = read()
+        ordinary = self.topic is REQ_CONTROL and not _may_stop(data)
+        if ordinary and not self._may_order(sender):
+            return
         if data.count(b",") > MAX_VALUES or sum(map(data.count, (b"[", b"{", b'"'))) > MAX_MARKS:
             self._refusals.add(Reason.BAD_INPUT, source, f"{name}: request of too many parts")
             return
@@ -197,16 +263,33 @@ class Intake:
             self._refusals.add(Reason.BAD_INPUT, source, str(error))
             return
         assert isinstance(request, Request)
+        order = _order(request)
+        if self._only is not None and order is not self._only:
+            self._refusals.add(Reason.BAD_INPUT, source, f"{name}: expected the order {self._only}, found {order}")
+            return
         if not sender.may(needed := role_needed(request)):
             self._refusals.add(Reason.NOT_PERMITTED, source, f"{name}: {sender.refusal(needed)}")
             return
-        order = _order(request)
-        if order is not None and order not in UNCONDITIONAL and not self._order_rates.spend(source):
-            text = f"{name}: more than {ORDER_RATE:g} orders a second"
-            self._refusals.add(Reason.MESSAGES_DROPPED, source, text)
+        stops = order in UNCONDITIONAL
+        if order is not None and not stops and not ordinary and not self._may_order(sender):
             return
         said = {"source": source, "role": sender.grant.capped(request.role)}
-        (self._estops if order is Order.ESTOP else self._requests).put(request.model_copy(update=said))
+        if order is not None and stops and not self._stop_rates[order].spend(source):
+            self._repeats[order].put(source, partial(request.model_copy, update=said))
+        else:
+            (self._estops if order is Order.ESTOP else self._requests).put(request.model_copy(update=said))
+
+    def _may_order(self, sender: Sender) -> bool:
+        """Whether an order that does not stop is taken; it is counted, and reported if not."""
+        name, needed = self._name, AccessRole.PILOT
+        if not sender.may(needed):
+            self._refusals.add(Reason.NOT_PERMITTED, sender.source, f"{name}: {sender.refusal(needed)}")
+        elif not self._order_rates.spend(sender.source):
+            text = f"{name}: more than {ORDER_RATE:g} orders a second"
+            self._refusals.add(Reason.MESSAGES_DROPPED, sender.source, text)
+        else:
+            return True
+        return False
 
     def charge(self, source: str) -> bool:
         """Count one request of ``source``; False if its owner has sent too many. Callable from any thread."""
@@ -259,6 +342,11 @@ class StandIntake:
     def close(self) -> None:
         """Discard what waits and everything to come."""
         self._poses.close()
+
+
+def _may_stop(data: bytes) -> bool:
+    """Whether an order may be one that stops: cheaper than decoding it. An escaped letter is written by a backslash."""
+    return b"stop" in data or b"\\" in data
 
 
 def _order(request: Message) -> Order | None:

@@ -24,17 +24,21 @@ from monstertruck_runtime.ports import Ready
 from monstertruck_runtime.threads import ThreadHop, in_thread
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import Order
 from monstertruck_schemas.roles import AccessRole, ServiceName
 from monstertruck_schemas.topics import (
     CAMERA,
+    ESTOP_WAY,
     KEY_ROOT,
     MAP,
     MAP_TILES,
+    REQ_CONTROL,
     STAND_POSE,
     TOPICS,
     Topic,
     Writer,
     alive_key,
+    estop_key,
     rpc_key,
     sender_in,
 )
@@ -131,6 +135,9 @@ class ZenohBridge:
                             for topic in TOPICS
                             if topic.writer is Writer.OUTSIDE
                         }
+                        estops = inputs.enter_context(
+                            closing(Intake(REQ_CONTROL, self._bus, self._clock, guard, self.name, only=Order.ESTOP))
+                        )
                         refusals = inputs.enter_context(closing(Refusals(self._bus, self._clock, self.name)))
                         stand_intake = inputs.enter_context(
                             closing(StandIntake(self._bus, self._clock, guard, refusals))
@@ -147,7 +154,7 @@ class ZenohBridge:
                             )
                         )
                         inward = partial(
-                            self._declare_inputs, intakes, refusals, queries, replies, limits, stand_intake
+                            self._declare_inputs, intakes, estops, refusals, queries, replies, limits, stand_intake
                         )
                         for token in await in_thread(inward):
                             inputs.enter_context(token)
@@ -216,6 +223,7 @@ class ZenohBridge:
     def _declare_inputs(
         self,
         intakes: Mapping[str, Intake],
+        estops: Intake,
         refusals: Refusals,
         queries: ThreadHop[Call],
         replies: Replies,
@@ -233,6 +241,10 @@ class ZenohBridge:
                     partial(self._on_request, listener, intakes, refusals),
                     allowed_origin=remote,
                 )
+            # A thread of Zenoh's for each subscriber: what waits for another one delays no emergency stop.
+            session.declare_subscriber(
+                estop_key(self._robot), partial(self._on_estop, listener, estops), allowed_origin=remote
+            )
             if self._stand:
                 session.declare_subscriber(
                     STAND_POSE.key(self._robot), partial(_on_stand_pose, stand_intake), allowed_origin=remote
@@ -255,6 +267,8 @@ class ZenohBridge:
         key, payload = str(sample.key_expr), sample.payload
         found = sender_in(self._robot, key)
         name, source = found if found is not None else ("", None)
+        if name == ESTOP_WAY:
+            return
         if name in intakes:
             intakes[name].take(_sender(listener, source), len(payload), payload.to_bytes)
             return
@@ -264,6 +278,11 @@ class ZenohBridge:
                 intake.charge(source)
         text = f"{key}: expected {KEY_ROOT}/{self._robot}/req/<source>/ and one of {', '.join(map(_last, intakes))}"
         refusals.add(Reason.BAD_INPUT, source, text)
+
+    def _on_estop(self, listener: Listener, estops: Intake, sample: zenoh.Sample) -> None:
+        found = sender_in(self._robot, str(sample.key_expr))
+        if found is not None:  # else a key with wildcards, which the subscriber to all requests reports
+            estops.take(_sender(listener, found[1]), len(sample.payload), sample.payload.to_bytes)
 
     def _send(
         self,

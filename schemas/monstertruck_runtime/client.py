@@ -59,6 +59,7 @@ from monstertruck_schemas.topics import (
     Topic,
     Writer,
     alive_key,
+    estop_key,
     rpc_key,
 )
 
@@ -345,7 +346,8 @@ class TruckClient(Operator):
         """
         if order in UNCONDITIONAL:
             self._overtaking += 1
-            self._put(REQ_CONTROL, ControlRequest(**self._header(1.0), order=order))
+            request = ControlRequest(**self._header(1.0), order=order)
+            self._put(REQ_CONTROL, request, estop_key if order is Order.ESTOP else REQ_CONTROL.key)
         return self._outcome(order, self._overtaking, {"hold": True} if hold else {})
 
     async def ask_to_drive(self) -> GateState:
@@ -476,12 +478,12 @@ class TruckClient(Operator):
         """Request to follow a path computed here. Raises as ``drive`` does."""
         self._put(REQ_PATH, PathRequest(**await self._answered(lease), frame=path.frame, path=path))
 
-    def _put(self, topic: Topic[M], message: M) -> None:
+    def _put(self, topic: Topic[M], message: M, key: Callable[[str, str], str] | None = None) -> None:
         assert topic.writer is Writer.OUTSIDE
         # Requests overtake everything else on the link, and an order is never dropped for lack of room.
         driving = topic.name == REQ_DRIVE.name
         self._open_session().put(
-            topic.key(self.robot, self.source),
+            (key or topic.key)(self.robot, self.source),
             wire.encode(topic, message),
             encoding=wire.encoding(topic),
             congestion_control=zenoh.CongestionControl.DROP if driving else zenoh.CongestionControl.BLOCK,

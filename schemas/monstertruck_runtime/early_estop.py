@@ -14,9 +14,9 @@ ENCODING: Final = "application/json;monstertruck.ControlRequest;v=1"
 LEASE: Final = 1.0
 
 
-def control_key(robot: str, source: str) -> str:
-    """Key of a source's ``req/control``; as that topic's, whose table takes long to load."""
-    return f"mt/{robot}/req/{source}/control"
+def estop_key(robot: str, source: str) -> str:
+    """Key of a source's emergency stops; as that of the topic table, which takes long to load."""
+    return f"mt/{robot}/req/{source}/estop"
 
 
 def estop_payload(source: str) -> bytes:
@@ -41,7 +41,7 @@ def send_estop(robot: str, endpoint: str, timeout: float) -> zenoh.Session:
     source = own_source(None if tls is None else tls.owner())
     session = zenoh.open(zenoh.Config.from_json5(json.dumps(session_config(endpoint, timeout, tls))))
     session.put(
-        control_key(robot, source),
+        estop_key(robot, source),
         estop_payload(source),
         encoding=ENCODING,
         congestion_control=zenoh.CongestionControl.BLOCK,

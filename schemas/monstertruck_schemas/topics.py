@@ -366,6 +366,15 @@ def rpc_key(robot: str, name: str, source: str | None = None) -> str:
     return key if source is None else f"{key}/{source}"
 
 
+ESTOP_WAY: Final = "req/estop"
+"""Name of the emergency stop's own way in; inside the robot it is an order on ``req/control`` like any other."""
+
+
+def estop_key(robot: str, source: str = "*") -> str:
+    """Key of emergency stops, which have one of their own: there they wait behind no other request."""
+    return f"{KEY_ROOT}/{robot}/req/{source}/estop"
+
+
 def sender_in(robot: str, key: str) -> tuple[str, str | None] | None:
     """What is asked for with ``key``, and by whom: the opposite of ``Topic.key`` and ``rpc_key``.
 

@@ -4,6 +4,7 @@ import pytest
 
 from monstertruck_runtime.clock import SECOND, WallClock
 from monstertruckd.bus.call_limits import (
+    ALL_ESTOPS,
     CALL_RATE,
     MAX_CALLS,
     MAX_ESTOPS,
@@ -65,6 +66,14 @@ def test_an_emergency_stop_is_refused_only_while_many_of_its_owner_are_carried_o
 
 def test_programs_of_one_owner_share_what_it_may_stop(limits: CallLimits):
     assert [limits.refusal("estop", f"eve:{number}", 0) for number in range(3 * MAX_ESTOPS)].count("") == MAX_ESTOPS
+
+
+def test_emergency_stops_under_invented_names_are_bounded_together(limits: CallLimits):
+    names = [f"eve{number}" for number in range(3 * ALL_ESTOPS)]
+    assert [limits.refusal("estop", name, 0) for name in names].count("") == ALL_ESTOPS
+    assert f"{ALL_ESTOPS} emergency stops are being carried out" in limits.refusal("estop", "ann", 0)
+    limits.ended("estop", names[0])
+    assert limits.refusal("estop", "ann", 0) == ""
 
 
 def test_orders_wait_and_are_served_where_others_are_refused_and_emergency_stops_always(limits: CallLimits):

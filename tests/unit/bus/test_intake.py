@@ -18,9 +18,9 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import ControlRequest, DriveRequest, GoalRequest, Order, PathRequest, Role
 from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.state import GateMode
-from monstertruck_schemas.topics import EVENT, REQ_CONTROL, REQ_DRIVE, REQ_GOAL, REQ_PATH, Topic
+from monstertruck_schemas.topics import ESTOP_WAY, EVENT, REQ_CONTROL, REQ_DRIVE, REQ_GOAL, REQ_PATH, Topic
 from monstertruckd.bus.access import EVERYTHING, OBSERVING, Grant, Sender
-from monstertruckd.bus.intake import DEPTH, LIMITS, MAX_OWNERS, ORDER_RATE, Intake
+from monstertruckd.bus.intake import DEPTH, LIMITS, MAX_OWNERS, MAX_REPEATS, ORDER_RATE, REPEAT, STOP_RATE, Intake
 from monstertruckd.bus.local import Bus
 from tests.unit.gate.rig import make_gate
 
@@ -81,6 +81,7 @@ class Entrance:
             topic.name: Intake(topic, self.bus, clock, _call, "zenoh")
             for topic in (REQ_CONTROL, REQ_DRIVE, REQ_GOAL, REQ_PATH)
         }
+        self.intakes[ESTOP_WAY] = Intake(REQ_CONTROL, self.bus, clock, _call, "zenoh", only=Order.ESTOP)
 
     def send(self, *requests: tuple[Topic[Any], bytes], sender: Sender = ANN) -> None:
         """All of them arrive before the loop gets a turn."""
@@ -92,6 +93,9 @@ class Entrance:
         thread = threading.Thread(target=run)
         thread.start()
         thread.join()
+
+    def stop_by_its_own_way(self, data: bytes) -> None:
+        self.intakes[ESTOP_WAY].take(ANN, len(data), lambda: data)
 
     async def settle(self) -> None:
         for _ in range(3 * DEPTH):
@@ -129,10 +133,93 @@ async def test_an_emergency_stop_overtakes_the_orders_that_wait():
     entrance = Entrance()
     taken: list[Order] = []
     entrance.bus.listen(REQ_CONTROL, lambda request: taken.append(request.order))
-    entrance.send(*[(REQ_CONTROL, order(Order.STOP))] * (2 * DEPTH), (REQ_CONTROL, order(Order.ESTOP)))
+    stops = [(REQ_CONTROL, order(Order.STOP))] * (2 * DEPTH)
+    for name in ("eve", "bob"):
+        entrance.send(*stops, sender=Sender(name, EVERYTHING))
+    entrance.send((REQ_CONTROL, order(Order.ESTOP)))
     await entrance.settle()
     assert len(taken) == DEPTH + 1
     assert taken.index(Order.ESTOP) <= 1
+
+
+@pytest.mark.parametrize("stopping", [Order.STOP, Order.ESTOP])
+async def test_of_stops_that_repeat_all_the_time_the_loop_gets_few_and_always_the_last(stopping: Order):
+    entrance = Entrance()
+    taken: list[ControlRequest] = []
+    entrance.bus.listen(REQ_CONTROL, taken.append)
+    burst = round(STOP_RATE)
+    entrance.send(*[(REQ_CONTROL, order(stopping, seq)) for seq in range(burst)])
+    await entrance.settle()
+    entrance.send(*[(REQ_CONTROL, order(stopping, seq)) for seq in range(burst, 20 * burst)])
+    for number in range(3 * MAX_REPEATS):
+        entrance.send(*[(REQ_CONTROL, order(stopping))] * (burst + 1), sender=Sender(f"eve{number}", EVERYTHING))
+    await asyncio.sleep(2 * REPEAT)
+    await entrance.settle()
+    assert len(taken) < 6 * burst
+    entrance.send(*[(REQ_CONTROL, order(stopping, seq)) for seq in range(20 * burst, 40 * burst)])
+    await asyncio.sleep(2 * REPEAT)
+    await entrance.settle()
+    assert (taken[-1].source, taken[-1].seq) == ("ann", 40 * burst - 1)
+
+
+async def test_stops_that_repeat_cost_those_of_others_no_time():
+    entrance = Entrance()
+    taken: list[ControlRequest] = []
+    entrance.bus.listen(REQ_CONTROL, taken.append)
+    entrance.send(*[(REQ_CONTROL, order(Order.STOP))] * 500, sender=Sender("eve", EVERYTHING))
+    await entrance.settle()
+    entrance.send((REQ_CONTROL, order(Order.STOP)))
+    await asyncio.sleep(0)
+    await asyncio.sleep(0)
+    assert taken[-1].source == "ann"
+
+
+async def test_an_emergency_stop_has_a_way_of_its_own_which_takes_nothing_else():
+    entrance = Entrance()
+    taken: list[Order] = []
+    entrance.bus.listen(REQ_CONTROL, lambda request: taken.append(request.order))
+    entrance.stop_by_its_own_way(order(Order.ESTOP))
+    await entrance.settle()
+    assert taken == [Order.ESTOP]
+    for wrong, complaint in (
+        (order(Order.STOP), "req/estop: expected the order estop, found stop"),
+        (order(Order.ARM), "req/estop: expected the order estop, found arm"),
+    ):
+        entrance.stop_by_its_own_way(wrong)
+        await entrance.settle()
+        event = await entrance.events.next()
+        assert (event.reason, event.text) == (Reason.BAD_INPUT, complaint)
+        entrance.clock.stamp += SECOND
+    assert taken == [Order.ESTOP]
+
+
+async def test_orders_beyond_the_rate_are_refused_without_decoding_them_but_never_one_that_may_stop(monkeypatch):
+    entrance = Entrance()
+    taken: list[Order] = []
+    decoded: list[bytes] = []
+    decode = wire.decode
+    monkeypatch.setattr(wire, "decode", lambda topic, data: decoded.append(data) or decode(topic, data))
+    entrance.bus.listen(REQ_CONTROL, lambda request: taken.append(request.order))
+    entrance.send(*[(REQ_CONTROL, order(Order.ARM))] * 100)
+    assert len(decoded) == ORDER_RATE
+    for spelling in (b'"stop"', rb'"\u0073top"', b'"estop"', rb'"e\u0073top"'):
+        data = order(Order.STOP).replace(b'"stop"', spelling)
+        assert spelling in data
+        entrance.send((REQ_CONTROL, data))
+    await entrance.settle()
+    assert taken.count(Order.STOP) == 2
+    assert taken.count(Order.ESTOP) == 2
+
+
+async def test_what_one_may_not_order_costs_the_others_no_rate():
+    entrance = Entrance()
+    taken: list[str] = []
+    entrance.bus.listen(REQ_CONTROL, lambda request: taken.append(request.source))
+    for number in range(2 * MAX_OWNERS):
+        entrance.send((REQ_CONTROL, order(Order.ARM)), sender=Sender(f"eve{number}", OBSERVING))
+    entrance.send((REQ_CONTROL, order(Order.ARM)))
+    await entrance.settle()
+    assert taken == ["ann"]
 
 
 @pytest.mark.parametrize("limited", [Order.ARM, Order.DISARM, Order.RESET])

@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from pathlib import Path
+from typing import Any
 from unittest.mock import AsyncMock
 
 import numpy as np
@@ -22,11 +23,24 @@ from monstertruck_runtime.errors import BusyError, ConfigError
 from monstertruck_runtime.mailbox import fifo
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import DriveRequest, GoalRequest, Role
+from monstertruck_schemas.req import ControlRequest, DriveRequest, GoalRequest, Order, Role
 from monstertruck_schemas.sensor import StandPose
 from monstertruck_schemas.state import Grid
-from monstertruck_schemas.topics import GATE, MAP, POSE, REQ_DRIVE, REQ_GOAL, STAND_POSE, TOPICS, Writer
+from monstertruck_schemas.topics import (
+    GATE,
+    MAP,
+    POSE,
+    REQ_CONTROL,
+    REQ_DRIVE,
+    REQ_GOAL,
+    STAND_POSE,
+    TOPICS,
+    Writer,
+    estop_key,
+)
+from monstertruckd.bus.access import Sender
 from monstertruckd.bus.call_limits import CALL_RATE, MAX_WAITING
+from monstertruckd.bus.intake import Intake
 from monstertruckd.bus.local import Bus
 from monstertruckd.bus.rpc import Rpc
 from monstertruckd.bus.zenoh_config import ZenohConfig, listeners, session_config
@@ -214,6 +228,33 @@ async def test_a_put_to_a_wildcard_or_an_unknown_key_is_reported_and_taken_by_no
     assert event.reason is Reason.BAD_INPUT
     assert event.text.startswith(f"mt/truck/{key}: expected mt/truck/req/<source>/ and one of drive, control,")
     assert event.values["by"] == (*key.split("/")[1:2], "")[0]
+
+
+async def test_an_emergency_stop_waits_for_no_other_request(monkeypatch: pytest.MonkeyPatch):
+    held, release = threading.Event(), threading.Event()
+    take = Intake.take
+
+    def slowly(intake: Intake, sender: Sender, *request: Any) -> None:
+        if sender.source == "eve":
+            held.set()
+            release.wait(5)
+        take(intake, sender, *request)
+
+    monkeypatch.setattr(Intake, "take", slowly)
+    async with running_robot() as robot, TruckClient(endpoint=robot.endpoint, source="ann") as client:
+        got: list[ControlRequest] = []
+        robot.bus.listen(REQ_CONTROL, got.append)
+        try:
+            with raw_session(robot.endpoint) as eve:
+                put(eve, "mt/truck/req/eve/control", b"x")
+                assert await asyncio.to_thread(held.wait, 3)
+                for source in ("*", "**"):
+                    put(eve, estop_key("truck", source), b"x")
+                client.order(Order.ESTOP).close()
+                await eventually(lambda: got)
+        finally:
+            release.set()
+    assert [(request.order, request.source) for request in got] == [(Order.ESTOP, "ann")]
 
 
 async def test_wildcard_puts_use_up_what_their_sender_may_send():

@@ -317,7 +317,7 @@ async def test_a_stop_withdraws_an_order_that_still_waits_for_the_nonce(monkeypa
 
     monkeypatch.setattr(client, "_answered", answered)
     monkeypatch.setattr(client, "_call", call)
-    monkeypatch.setattr(client, "_put", lambda _topic, request: put.append(request.order))
+    monkeypatch.setattr(client, "_put", lambda _topic, request, _key: put.append(request.order))
     monkeypatch.setattr(client, "_header", lambda _lease: header())
     reset = asyncio.create_task(client.order(Order.RESET))
     await asyncio.sleep(0)

@@ -133,6 +133,7 @@ def test_a_topic_of_another_distribution_that_the_recorder_could_not_write_is_re
         ("mt/truck/req/ann/drive", ("req/drive", "ann")),
         ("mt/truck/req/ann@laptop:12/control", ("req/control", "ann@laptop:12")),
         ("mt/truck/req/control", ("req/control", None)),
+        (topics.estop_key("truck", "ann"), (topics.ESTOP_WAY, "ann")),
         ("mt/truck/rpc/arm/ann", ("arm", "ann")),
         ("mt/truck/rpc/arm", ("arm", None)),
         ("mt/rover/req/ann/drive", None),

@@ -8,17 +8,17 @@ from pathlib import Path
 
 import pytest
 
-from monstertruck_runtime import wire
-from monstertruck_runtime.early_estop import ENCODING, control_key, estop_payload
+from monstertruck_runtime import early_estop, wire
+from monstertruck_runtime.early_estop import ENCODING, estop_payload
 from monstertruck_runtime.mailbox import fifo
 from monstertruck_schemas.req import ControlRequest, Order
-from monstertruck_schemas.topics import REQ_CONTROL
+from monstertruck_schemas.topics import REQ_CONTROL, estop_key
 from monstertruckd.tools.cli import early_estop as early
 from tests.bus_kit import free_endpoint, running_robot
 
 
 def test_key_encoding_and_order_are_those_of_the_topic():
-    assert control_key("rover", "ann:1") == REQ_CONTROL.key("rover", "ann:1")
+    assert early_estop.estop_key("rover", "ann:1") == estop_key("rover", "ann:1")
     assert wire.encoding(REQ_CONTROL) == ENCODING
     request = wire.decode(REQ_CONTROL, estop_payload("ann:1"))
     assert isinstance(request, ControlRequest)
