@@ -26,7 +26,7 @@ from monstertruck_runtime.endpoints import emulated_ports
 from monstertruck_runtime.errors import ConfigError
 from monstertruck_runtime.plugins import kind_of, models_in
 from monstertruck_runtime.small_files import replace_file, require_file
-from monstertruck_schemas.base import LiveValue, Schema, live_settings
+from monstertruck_schemas.base import LiveValue, Schema, field_docs, live_settings
 from monstertruckd.config.calibration import CalibrationStore, Result, WizardName, in_order, put_values
 from monstertruckd.config.truck import ROBOT, TruckConfig
 
@@ -746,7 +746,6 @@ def _description(model: type[BaseModel], key: Key) -> str | None:
     if not key or isinstance(key[-1], int):
         return None
     for candidate in _reach(model, key[:-1]):
-        info = candidate.model_fields.get(key[-1])
-        if info is not None and info.description:
-            return info.description.split("\n")[0].rstrip(".")
+        if text := field_docs(candidate).get(key[-1]):
+            return text.split("\n")[0].rstrip(".")
     return None

@@ -16,7 +16,7 @@ from monstertruck_drivers.usb.config import UsbConfig
 from monstertruck_runtime.errors import ConfigError, InputError
 from monstertruck_runtime.ports import Publisher, Subscription
 from monstertruck_schemas import topics
-from monstertruck_schemas.base import Schema
+from monstertruck_schemas.base import Schema, field_docs
 from monstertruck_schemas.roles import DeviceRole, ServiceName
 from monstertruckd.config.load import load_truck
 
@@ -27,7 +27,7 @@ def test_every_role_of_the_enum_has_its_row_a_kind_and_a_key():
     assert set(DEVICES.roles) == set(DeviceRole)
     for role in DEVICES.roles.values():
         section = Monitors if role.duty is Duty.MONITOR else Devices
-        assert section.model_fields[role.name].description == role.doc
+        assert field_docs(section)[role.name] == role.doc
         assert DEVICES.of_role(role.name), role.name
 
 
