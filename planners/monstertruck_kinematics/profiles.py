@@ -131,24 +131,25 @@ def shortest_ramp(v0: float, a0: float, v1: float, max_acceleration: float, max_
         require_finite(name, value)
     limit = max(max_acceleration, abs(a0)) * (1.0 + 1e-9)
     change, jerk = v1 - v0, max_jerk * (1.0 + 1e-9)
-
-    def kept(time: Array) -> NDArray[np.bool_]:
-        a1, a2 = (3.0 * change - 2.0 * a0 * time) / time**2, (a0 * time - 2.0 * change) / time**3
-        ends = np.maximum(np.abs(2.0 * a1), np.abs(2.0 * a1 + 6.0 * a2 * time))
-        with np.errstate(divide="ignore", invalid="ignore"):
-            turning = -a1 / (3.0 * a2)
-            peak = np.abs(a0 - a1**2 / (3.0 * a2))
-        inside = (turning > 0.0) & (turning < time)
-        return (ends <= jerk) & (~inside | (peak <= limit))
-
     long = 2.0 * abs(change) / max_acceleration + 8.0 * (limit / max_jerk) + (6.0 * abs(change) / max_jerk) ** 0.5
     times = _SHORTEST * np.exp(_COARSE * math.log(max(long, 1e-2) / _SHORTEST))
-    found = kept(times)
+    found = _kept(times, change, a0, limit, jerk)
     first = int(np.argmax(found))
     if first == 0:
         return CubicRamp(v0, v1, float(times[0] if found[0] else times[-1]), a0)
     between = times[first - 1] + _FINE * (times[first] - times[first - 1])
-    return CubicRamp(v0, v1, float(between[int(np.argmax(kept(between)))]), a0)
+    return CubicRamp(v0, v1, float(between[int(np.argmax(_kept(between, change, a0, limit, jerk)))]), a0)
+
+
+def _kept(time: Array, change: float, a0: float, limit: float, jerk: float) -> NDArray[np.bool_]:
+    """Of which durations a ramp keeps the limits of acceleration and jerk."""
+    a1, a2 = (3.0 * change - 2.0 * a0 * time) / time**2, (a0 * time - 2.0 * change) / time**3
+    ends = np.maximum(np.abs(2.0 * a1), np.abs(2.0 * a1 + 6.0 * a2 * time))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        turning = -a1 / (3.0 * a2)
+        peak = np.abs(a0 - a1**2 / (3.0 * a2))
+    inside = (turning > 0.0) & (turning < time)
+    return (ends <= jerk) & (~inside | (peak <= limit))
 
 
 class MotionProfile(Protocol):

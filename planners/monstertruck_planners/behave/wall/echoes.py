@@ -37,7 +37,7 @@ SAMPLED: Final = 40
 """Echoes to which all guesses are fitted, taken evenly out of more."""
 LONGEST: Final = 0.3
 """Greatest step of a fit, rad and m."""
-SETTLED: Final = 1e-5
+SETTLED: Final = 1e-4
 """A step of all fits below this, rad and m, is the last one."""
 FREE: Final = (math.inf, math.inf)
 """Inertia without an estimate before."""

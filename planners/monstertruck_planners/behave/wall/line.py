@@ -10,6 +10,7 @@ All is written for a wall on the left; a wall on the right is the mirror image.
 import math
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
+from statistics import median
 from typing import Any, ClassVar, Final, Literal, NamedTuple
 
 import numpy as np
@@ -24,6 +25,7 @@ from monstertruck_planners.behave.wall.echoes import (
     Cone,
     EstimateFit,
     WallEstimate,
+    deviation,
     refine,
     residuals,
     search,
@@ -60,8 +62,15 @@ NEARER: Final = 5.0
 """Standard deviations by which an echo of the diagonal sonar is nearer than the wall beside: of something ahead."""
 LEAST: Final = 6
 """Echoes that make a wall."""
+CLEAR: Final = 0.2
+"""Range of every sonar that looks ahead at which the robot stands at the latest, m: what it hears there may not be the
+wall to which it drives."""
+FITS: Final = 2
+"""Lines fitted for a round of echoes: one in a step where there are as many steps: the event loop waits for them."""
 TOUCHING: Final = 0.16
 """A range from which on the robot stops at once, m."""
+OPENING: Final = 0.3
+"""By which the side sonar measures more than the way to the wall where it looks through an opening, m."""
 STARTED: Final = 0.05
 """Angle up to which a turn begins, rad."""
 BEAM_CRITICAL: Final = 1.3
@@ -87,11 +96,15 @@ JUDGED: Final = 20, 1.2
 diagonal one looks through a door, or past the end of a pillar, before the other one."""
 DISAGREES, AGREES = 0.2, 0.7
 """Share of them on the wall below which a sonar contradicts another one, whose share is above the second figure."""
+PLACED: Final = 0.5
+"""Way between two places at which a lap may be complete, m."""
 FOLLOWED: Final = 0.5
 """A lap does not begin where the robot followed a wall for less, m."""
 
 STANDSTILL: Final = TimedRamp(0.0, CubicRamp(0.0, 0.0, 1.0))
 
+Fit = Literal["beside", "left", "right", "turned"]
+"""Lines that are fitted: the wall beside; one ahead by the sonars of either side; the one to which it turns."""
 Phase = Literal["settle", "search", "brake", "turn", "follow", "stop"]
 Pose = tuple[float, float, float]
 
@@ -129,6 +142,10 @@ class LineState:
     """Whether the direction of ``wall`` is known well."""
     ahead: WallEstimate | None = None
     """To which it turns."""
+    faced: tuple[WallEstimate | None, WallEstimate | None] = (None, None)
+    """Walls ahead by front and diagonal sonar, and by front and far one; along a wall the second alone."""
+    fits: tuple[Fit, ...] = ()
+    """Lines to be fitted to the echoes that came in."""
     v: TimedRamp = STANDSTILL
     w: TimedRamp = STANDSTILL
     lag: tuple[float, float] = (0.0, 0.0)
@@ -148,10 +165,8 @@ class LineState:
     """``travelled`` when the wall was heard last."""
     sense: float = -1.0
     """Of the turn: 1 = left."""
-    begun: Pose | None = None
-    """Where the lap began."""
-    since: float = 0.0
-    """``travelled`` then."""
+    places: Array = field(default_factory=lambda: np.empty((0, 4)))
+    """(n, 4) ``travelled`` and pose where the lap began and every ``PLACED`` metres since; empty = no wall yet."""
     laps: int = 0
     strays: tuple[float | None, float | None] = (None, None)
     """Since when yaw rate and speed are not those asked for, s."""
@@ -172,6 +187,7 @@ class WallLine:
         self._config = config
         self._names = NAMES[config.side]
         self._mirror = 1.0 if config.side == "left" else -1.0
+        self._fits = math.ceil(FITS * (SONAR.rate or 0.0) / config.rate)
 
     def begin(self) -> LineState:
         """Before the first step."""
@@ -187,10 +203,11 @@ class WallLine:
             state = replace(state, mounts=mounts)
         state = self._moved(state, odometry, inputs.of(IMU).angular_velocity.z * self._mirror, t)
         cone = self._cone(sonars)
-        if sonars.stamp != state.heard:
-            state = self._hear(state, sonars, t)
-            state = self._estimate(state, cone)
-        fault = self._fault(state, odometry, cone, t)
+        heard = sonars.stamp != state.heard
+        state = self._estimate(self._hear(state, sonars, t) if heard else state, cone, heard=heard)
+        fault = self._fault(state, odometry, t)
+        if fault is None and heard and state.phase == "follow" and state.wall is not None:
+            fault = self._disagreement(state, state.wall, cone)
         if fault is not None:
             return BehaviourStep(None, state, state.phase, *fault)
         due = t + self._config.lead
@@ -250,17 +267,7 @@ class WallLine:
             turned=state.turned + turn,
             lag=(_clip(behind[0], LAG[0]), _clip(behind[1], LAG[1])),
             before=t,
-            strays=self._strays(state, speed, rate - bias, t),
-        )
-
-    def _strays(self, state: LineState, speed: float, rate: float, t: float) -> tuple[float | None, float | None]:
-        """Since when yaw rate and speed are not those asked for."""
-        v, w = _asked(state, t)
-        turns = abs(w - rate) > STRAY[0]
-        stands = (v > 0.05 and speed < SLOW * v) or (abs(w) > 0.2 and abs(rate) < SLOW * abs(w))
-        return (
-            (t if state.strays[0] is None else state.strays[0]) if turns else None,
-            (t if state.strays[1] is None else state.strays[1]) if stands else None,
+            strays=_strays(state.strays, (v, w), (speed, rate - bias), t),
         )
 
     def _hear(self, state: LineState, sonars: SonarRanges, t: float) -> LineState:
@@ -294,28 +301,51 @@ class WallLine:
 
     # Walls
 
-    def _estimate(self, state: LineState, cone: Cone) -> LineState:
-        """Fit the wall beside and the one ahead anew."""
-        echoes, at = state.echoes, state.pose[:2]
+    def _estimate(self, state: LineState, cone: Cone, *, heard: bool) -> LineState:
+        """Fit lines anew after a round of echoes, as many in a step as ``FITS`` says, the longest waiting first."""
+        wanted: tuple[Fit, ...] = ("beside", "right") if state.wall is not None else ("left", "right")
         if state.phase == "turn":
-            fit = self._turned_to(state, cone)
-            return state if fit is None else replace(state, ahead=fit.line)
-        wall = state.wall
-        if wall is not None:
-            beside = echoes[echoes[:, 4] <= DIAGONAL]
-            if len(beside):
-                fit = refine(beside, wall, at, cone)
-                wall, state = fit.line, replace(state, sure=fit.sigma[0] < UNSURE)
-                fresh = beside[beside[:, 6] == state.before]
-                if len(fresh) and (np.abs(residuals(fresh, wall, cone)) < TIGHT).any():
-                    state = replace(state, seen=state.travelled)
-        return replace(state, wall=wall, ahead=self._facing(state, cone))
+            wanted = ("turned",)
+        fits = tuple(fit for fit in state.fits if fit in wanted)
+        if heard:
+            fits += tuple(fit for fit in wanted if fit not in fits)
+        for fit in fits[: self._fits]:
+            match fit:
+                case "turned":
+                    found = self._turned_to(state, cone)
+                    state = state if found is None else replace(state, ahead=found.line)
+                case "beside":
+                    state = self._beside(state, cone)
+                case "left":
+                    state = self._nearer(state, (self._faced(state, cone, (DIAGONAL, FRONT)), state.faced[1]))
+                case "right":
+                    state = self._nearer(state, (state.faced[0], self._faced(state, cone, (FRONT, FAR))))
+        return replace(state, fits=fits[self._fits :])
 
-    def _facing(self, state: LineState, cone: Cone) -> WallEstimate | None:
-        """The wall ahead, once it is near: on free ground the nearer one of those by the sonars of either side."""
-        groups = ((DIAGONAL, FRONT), (FRONT, FAR)) if state.wall is None else ((FRONT, FAR),)
-        found = [line for group in groups if (line := self._faced(state, cone, group)) is not None]
-        return min(found, key=lambda line: self._way_to(state, line), default=None)
+    def _beside(self, state: LineState, cone: Cone) -> LineState:
+        """With the wall beside fitted anew."""
+        wall, echoes = state.wall, state.echoes
+        beside = echoes[echoes[:, 4] <= DIAGONAL]
+        if wall is None or not len(beside):
+            return state
+        if not self._opening(state, wall, cone):
+            fit = refine(beside, wall, state.pose[:2], cone)
+            wall, state = fit.line, replace(state, wall=fit.line, sure=fit.sigma[0] < UNSURE)
+        fresh = beside[beside[:, 6] == echoes[-1, 6]]
+        on_wall = fresh[np.abs(residuals(fresh, wall, cone)) < TIGHT]
+        return replace(state, seen=float(on_wall[-1, 5])) if len(on_wall) else state
+
+    def _opening(self, state: LineState, wall: WallEstimate, cone: Cone) -> bool:
+        """Whether the side sonar looks through an opening: what the diagonal one hears then may be its far post."""
+        if not cone.hears(state.pose[2] + state.mounts[SIDE].yaw, wall.normal):
+            return False
+        fresh = _fresh(state.echoes[state.echoes[:, 4] == SIDE], state)
+        return not len(fresh) or bool((residuals(fresh, wall, cone) * deviation(fresh[:, 3])).min() > OPENING)
+
+    def _nearer(self, state: LineState, faced: tuple[WallEstimate | None, WallEstimate | None]) -> LineState:
+        """With the nearer one of the walls ahead by the sonars of either side."""
+        lines = [line for line in faced if line is not None]
+        return replace(state, faced=faced, ahead=min(lines, key=lambda line: self._way_to(state, line), default=None))
 
     def _faced(self, state: LineState, cone: Cone, group: tuple[int, int]) -> WallEstimate | None:
         """A wall ahead by the sonars from one number to another."""
@@ -327,7 +357,7 @@ class WallLine:
             return None
         fit = search(rows, pose[:2], cone)
         facing = abs(math.remainder(fit.line.normal - pose[2], math.tau)) < FACING
-        present = (np.abs(residuals(fresh, fit.line, cone)) < TIGHT).mean() > 0.5
+        present = np.count_nonzero(np.abs(residuals(fresh, fit.line, cone)) < TIGHT) > 0.5 * len(fresh)
         return fit.line if facing and present and fit.explained >= max(LEAST, 0.5 * len(rows)) else None
 
     def _turned_to(self, state: LineState, cone: Cone) -> EstimateFit | None:
@@ -345,17 +375,18 @@ class WallLine:
 
     def _way_left(self, state: LineState, cone: Cone) -> float:
         """Way until the robot stands before the wall ahead at the distance at which it follows walls, m."""
-        left, fresh = math.inf, _fresh(state.echoes, state)
-        if state.ahead is not None:
-            left = self._way_to(state, state.ahead)
-        else:  # what is ahead makes no line: as if it were right before the sonar
-            for number in (DIAGONAL, FRONT) if state.wall is not None else (DIAGONAL, FRONT, FAR):
-                rows = fresh[fresh[:, 4] == number][-3:]
-                if number == DIAGONAL and state.wall is not None:
-                    rows = rows[residuals(rows, state.wall, cone) < -NEARER]
-                ranges = rows[:, 3]
-                if len(ranges) >= 2:
-                    left = min(left, float(np.median(ranges)) + state.mounts[number].reach - self._keep(state))
+        ahead, fresh = state.ahead, _fresh(state.echoes, state)
+        left = math.inf if ahead is None else self._way_to(state, ahead)
+        for number in (DIAGONAL, FRONT, FAR):  # as if what it hears were right before the sonar
+            rows = fresh[fresh[:, 4] == number][-3:]
+            if number == DIAGONAL and state.wall is not None:
+                rows = rows[residuals(rows, state.wall, cone) < -NEARER]
+            if len(rows) < 2:
+                continue
+            range_now = median((rows[:, 3] - (state.travelled - rows[:, 5])).tolist())
+            left = min(left, range_now - CLEAR)
+            if ahead is None and (number != FAR or state.wall is None):  # what is ahead makes no line
+                left = min(left, range_now + state.mounts[number].reach - self._keep(state))
         near = fresh[fresh[:, 4] >= DIAGONAL][-6:, 3]
         return min(left, 0.0) if np.count_nonzero(near < TOUCHING) >= 2 else left
 
@@ -371,7 +402,7 @@ class WallLine:
 
     # Faults
 
-    def _fault(self, state: LineState, odometry: Odometry, cone: Cone, t: float) -> tuple[Reason, str] | None:
+    def _fault(self, state: LineState, odometry: Odometry, t: float) -> tuple[Reason, str] | None:
         """Why it cannot go on."""
         if (found := state.monitor.fault(state.turned, t)) is not None:
             return found
@@ -393,8 +424,6 @@ class WallLine:
             return Reason.STUCK, "turned once around and found no wall to follow"
         if state.phase == "search" and state.travelled - state.marks[0] > self._config.search:
             return Reason.STUCK, f"no wall within {self._config.search:.0f} m"
-        if state.phase == "follow" and state.wall is not None:
-            return self._disagreement(state, state.wall, cone)
         return None
 
     def _disagreement(self, state: LineState, wall: WallEstimate, cone: Cone) -> tuple[Reason, str] | None:
@@ -407,7 +436,7 @@ class WallLine:
             rows = recent[recent[:, 4] == number]
             if len(rows) < least or not cone.hears(float(rows[-1, 2]), wall.normal):
                 return None
-            shares.append(float((np.abs(residuals(rows, wall, cone)) < TIGHT).mean()))
+            shares.append(np.count_nonzero(np.abs(residuals(rows, wall, cone)) < TIGHT) / len(rows))
         for number, (share, other) in enumerate((shares, shares[::-1])):
             if share < DISAGREES and other > AGREES:
                 name = self._names[number]
@@ -443,7 +472,7 @@ class WallLine:
         state = replace(state, v=self._ramp(state.v, config.creep if slow else config.speed, t))
         if state.phase == "follow":
             if state.travelled - state.seen > config.door:
-                state = self._to(replace(state, wall=None, begun=None), "search")
+                state = self._to(replace(state, wall=None, faced=(None, None), places=state.places[:0]), "search")
             else:
                 state = self._lap(state)
                 if state.laps >= config.laps:
@@ -498,9 +527,11 @@ class WallLine:
             return state
         kept = state.echoes[np.abs(residuals(state.echoes, wall, cone)) < TIGHT].copy()
         kept[:, 4] = np.where(kept[:, 4] <= DIAGONAL, kept[:, 4], OWN)
-        if state.begun is None or state.travelled - state.since < FOLLOWED:
-            state = replace(state, begun=state.pose, since=state.travelled)
-        return replace(self._to(state, "follow"), wall=wall, ahead=None, echoes=kept, seen=state.travelled)
+        if not len(state.places) or state.travelled - state.places[0, 0] < FOLLOWED:
+            state = replace(state, places=np.array([[state.travelled, *state.pose]]))
+        return replace(
+            self._to(state, "follow"), wall=wall, ahead=None, faced=(None, None), echoes=kept, seen=state.travelled
+        )
 
     def _steer(self, state: LineState, t: float) -> LineState:
         """Yaw rate by which the distance error decays; 0 without a wall."""
@@ -528,16 +559,24 @@ class WallLine:
         return math.copysign(1.0, math.remainder(state.ahead.heading - state.pose[2], math.tau))
 
     def _lap(self, state: LineState) -> LineState:
-        """Count laps by odometry."""
-        config, (x, y, yaw) = self._config, state.pose
-        assert state.begun is not None
-        bx, by, byaw = state.begun
-        way = state.travelled - state.since
-        passed = (x - bx) * math.cos(byaw) + (y - by) * math.sin(byaw) >= 0.0
-        near = math.hypot(x - bx, y - by) <= config.lap_radius + 0.01 * way
-        if way < config.lap_length or not passed or not near or math.cos(yaw - byaw) < math.cos(0.6):
+        """Count laps by odometry: one is complete where the robot comes back to any place that it drove past.
+
+        Where it began need not be such a place: a robot that begins along a door post leaves it for the wall.
+        """
+        config, (x, y, yaw), places = self._config, state.pose, state.places
+        if state.travelled - places[-1, 0] >= PLACED:
+            places = np.vstack([places, (state.travelled, x, y, yaw)])
+            state = replace(state, places=places)
+        if state.travelled - places[0, 0] < config.lap_length:
             return state
-        return replace(state, laps=state.laps + 1, since=state.travelled)
+        way, bx, by, byaw = state.travelled - places[:, 0], *places[:, 1:].T
+        passed = (x - bx) * np.cos(byaw) + (y - by) * np.sin(byaw) >= 0.0
+        near = np.hypot(x - bx, y - by) <= config.lap_radius + 0.01 * way
+        back = (way >= config.lap_length) & passed & near & (np.cos(yaw - byaw) >= math.cos(0.6))
+        if back.any():
+            place = state.travelled, *places[int(back.argmax()), 1:]
+            return replace(state, laps=state.laps + 1, places=np.array([place]))
+        return state
 
     def _to(self, state: LineState, phase: Phase) -> LineState:
         return replace(state, phase=phase, marks=(state.travelled, state.turned))
@@ -549,6 +588,16 @@ class WallLine:
             return ramp
         shape = shortest_ramp(ramp.at(t), ramp.acceleration(t), target, config.acceleration, config.jerk)
         return TimedRamp(t, shape)
+
+
+def _strays(
+    before: tuple[float | None, float | None], asked: tuple[float, float], measured: tuple[float, float], t: float
+) -> tuple[float | None, float | None]:
+    """Since when yaw rate and speed are not those asked for."""
+    (v, w), (speed, rate) = asked, measured
+    stray = abs(w - rate) > STRAY[0], (v > 0.05 and speed < SLOW * v) or (abs(w) > 0.2 and abs(rate) < SLOW * abs(w))
+    turns, stands = ((t if since is None else since) if now else None for now, since in zip(stray, before, strict=True))
+    return turns, stands
 
 
 def _asked(state: LineState, t: float) -> tuple[float, float]:

@@ -8,6 +8,7 @@ import pytest
 from pydantic import ValidationError
 
 from monstertruck_planners.behave.api import Inputs, RequestedMotion
+from monstertruck_planners.behave.wall import line
 from monstertruck_planners.behave.wall.config import WallLineConfig
 from monstertruck_planners.behave.wall.echoes import WallEstimate
 from monstertruck_planners.behave.wall.line import STANDSTILL, WallLine
@@ -41,6 +42,57 @@ def test_a_lap_that_began_just_before_a_corner_ends_though_the_odometry_has_drif
     done = drive(follower(lap_length=6.0), robot, 100.0)
     assert done.outcome is Reason.BEHAVIOUR_DONE
     assert done.steps[-1].text.startswith("1 lap, ")
+
+
+def test_a_lap_is_complete_at_any_place_that_it_comes_back_to():
+    robot, behaviour = Robot([(-9.0, 0.35, 9.0, 0.35)], (0.0, 0.0, 0.0)), follower(lap_length=6.0)
+    post, later = (0.0, -0.2, -0.1, 1.2), (0.5, -0.1, 0.0, 0.0)
+    state = replace(behaviour.begin(), phase="follow", wall=WallEstimate(math.pi / 2, 0.35), travelled=9.0, seen=9.0)
+    first = behaviour.step(robot.inputs(), replace(state, places=np.array([post])), 0.0)
+    assert (first.phase, first.state.laps) == ("follow", 0)  # it heads another way than along the post
+    done = behaviour.step(robot.inputs(), replace(state, places=np.array([post, later])), 0.0)
+    assert (done.phase, done.state.laps) == ("stop", 1)
+
+
+@pytest.mark.parametrize("begins", [0.2, -9.0])
+def test_the_line_stays_where_the_side_sonar_looks_through_an_opening(begins):
+    robot, behaviour = Robot([(begins, 0.35, 9.0, 0.35)], (0.0, 0.0, 0.0)), follower()
+    slanting = WallEstimate(math.pi / 2 + 0.1, 0.35)
+    state = replace(behaviour.begin(), phase="follow", wall=slanting, places=np.zeros((1, 4)))
+    step = behaviour.step(robot.inputs(), state, 0.0)
+    assert (step.state.wall == slanting) is (begins > 0.0)
+
+
+def test_at_its_own_rate_no_step_fits_two_lines(monkeypatch):
+    fits = []
+    for name in ("search", "refine"):
+        fit = getattr(line, name)
+        monkeypatch.setattr(line, name, lambda *args, fit=fit: fits.append(fit) or fit(*args))
+    robot, behaviour, counts = Robot(HALL, (0.9, 0.8, 0.7)), WallLine(WallLineConfig(beam=True)), []
+    state = behaviour.begin()
+    for i in range(60):
+        before = len(fits)
+        step = behaviour.step(robot.inputs(), state, i * PERIOD)
+        state, robot.motion = step.state, step.motion or RequestedMotion()
+        counts.append(len(fits) - before)
+        robot.move()
+    assert len(fits) > 20
+    assert max(counts) == 1
+    assert state.phase == "turn"
+
+
+def test_it_stands_clear_of_a_wall_beside_the_one_it_drives_to():
+    walls = [(-5.0, 1.0, 1.0, 1.0), (1.0, 1.0, 1.0, -5.0)]
+    robot, behaviour = Robot(walls, (-0.6, 0.45 - 0.6 * math.tan(0.45), 0.45)), follower()
+    state = behaviour.begin()
+    for i in range(120):
+        step = behaviour.step(robot.inputs(), state, i * PERIOD)
+        state, robot.motion = step.state, step.motion or RequestedMotion()
+        if state.phase == "turn":
+            break
+        robot.move()
+    assert state.phase == "turn"
+    assert robot.clearance > 0.3
 
 
 def test_every_ramp_keeps_acceleration_and_jerk_at_100_hz_and_speeds_do_not_jump():
@@ -151,7 +203,9 @@ def test_a_front_sonar_that_hears_nothing_is_made_up_for_by_the_diagonal_one():
     robot = Robot(corner, (0.5, 0.0, 0.1))
     robot.stuck = {"f": None, "fr": None}
     behaviour, state, clearance = follower(), None, math.inf
-    state = replace(behaviour.begin(), phase="follow", wall=WallEstimate(math.pi / 2, 0.35), begun=robot.pose)
+    state = replace(
+        behaviour.begin(), phase="follow", wall=WallEstimate(math.pi / 2, 0.35), places=np.array([[0.0, *robot.pose]])
+    )
     for i in range(200):
         step = behaviour.step(robot.inputs(), state, i * PERIOD)
         state, robot.motion = step.state, step.motion or RequestedMotion()
@@ -166,7 +220,9 @@ def test_a_front_sonar_that_hears_nothing_is_made_up_for_by_the_diagonal_one():
 def along(walls, far, steps):
     """Outcome beside a wall, and the way driven; ``far`` changes what the sonars measure, by the number of the step."""
     robot, behaviour = Robot(walls, (0.0, 0.0, 0.1)), follower()
-    state = replace(behaviour.begin(), phase="follow", wall=WallEstimate(math.pi / 2, 0.35), begun=robot.pose)
+    state = replace(
+        behaviour.begin(), phase="follow", wall=WallEstimate(math.pi / 2, 0.35), places=np.array([[0.0, *robot.pose]])
+    )
     for i in range(steps):
         robot.stuck = far(i)
         step = behaviour.step(robot.inputs(), state, i * PERIOD)
