@@ -35,6 +35,11 @@ CLEAR: Final = 0.3
 """and share of it that a sensor must have seen."""
 AHEAD: Final = 0.05
 """Least way of a move by which a sign can be judged, m."""
+UNSURE: Final = 0.05
+"""Standard deviation of a way by scans, m, from which on they do not tell it: 0.01 where a wall is ahead, 0.4 along a
+corridor."""
+NOTHING: Final = 1e-3 * np.eye(3)
+"""Information of scans that see nothing."""
 SIGN_ONLY: Final = "calibrate drive --sign-only"
 ROUGH: Final = "calibrate steering --rough"
 
@@ -52,7 +57,7 @@ class Movement:
     seen: Mapping[str, float]
     """Turn by each sensor, rad"""
     way_seen: float | None
-    """By the lidar, m; None = its scans do not match"""
+    """By the lidar, m; None = its scans do not match, or do not tell, as in a corridor"""
 
 
 async def signs(drives: Drives, config: TruckConfig, command: Callable[..., str]) -> list[Finding]:
@@ -104,7 +109,7 @@ def movement(record: MoveRecord, chassis: TruckChassis, lidar: Array | None) -> 
     moved = None if lidar is None else by_lidar(record, (way, turn), lidar)
     if moved is not None:
         seen["lidar"] = float(moved[2])
-    return Movement(way, turn, seen, None if moved is None else float(moved[0]))
+    return Movement(way, turn, seen, None if moved is None or math.isnan(moved[0]) else float(moved[0]))
 
 
 def by_wheels(record: MoveRecord, chassis: TruckChassis) -> tuple[float, float]:
@@ -122,13 +127,15 @@ def by_wheels(record: MoveRecord, chassis: TruckChassis) -> tuple[float, float]:
 def by_lidar(record: MoveRecord, wheels: tuple[float, float], mount: Array) -> Array | None:
     """Motion of the body by the scans at rest before and after, m and rad, (3,); None where they do not match.
 
-    What the wheels say is one guess; that they go the other way, or turn the other way, are others.
+    What the wheels say is one guess; that they go the other way, or turn the other way, are others. Where the scans do
+    not tell the way, as in a corridor that has no end in sight, x and y are not a number.
     """
     try:
         before, after = (resting_scan(found) for found in record.at_rest(topics.SCAN))
     except InputError:
         return None
     cloud, best, moved = Cloud.of(before), LEAST_OVERLAP, None
+    ahead = np.array((math.cos(mount[2]), -math.sin(mount[2]), 0.0))  # of the body, in the lidar's axes
     for along, sense in ((1, 1), (-1, -1), (1, -1), (-1, 1)):
         way, turn = along * wheels[0], sense * wheels[1]
         body = np.array((way * math.cos(turn / 2), way * math.sin(turn / 2), turn))
@@ -136,7 +143,9 @@ def by_lidar(record: MoveRecord, wheels: tuple[float, float], mount: Array) -> A
         found = register(after, cloud, found.pose)
         if found.overlap > best:
             best, moved = found.overlap, compose(compose(mount, found.pose), between(mount, np.zeros(3)))
-    return None if moved is None else np.asarray(moved)
+            if ahead @ np.linalg.solve(found.information + NOTHING, ahead) > UNSURE**2:
+                moved[:2] = math.nan
+    return moved
 
 
 def judged(moves: list[Movement], command: Callable[..., str]) -> Iterator[Finding]:
@@ -159,6 +168,8 @@ def judged(moves: list[Movement], command: Callable[..., str]) -> Iterator[Findi
         yield fail("sign lidar", Reason.BAD_CONFIG, f"{seen} (its mount's yaw is near 3.14), or motor and steering err")
     elif along > 0.0:
         yield fine("sign motor", "the lidar sees it go where the motor counts")
+    elif "lidar" in shares:
+        yield fine("sign motor", "not seen: the walls look alike all along the way; drive where one is ahead")
     if shares and not agree and not against:
         seen = f"{', '.join(shares)} saw nothing of the turn: the direction of one axle is wrong, or a servo is loose"
         yield fail("sign steering", Reason.STEERING_DEAD, seen, command(*ROUGH.split()))

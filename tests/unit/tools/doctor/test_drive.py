@@ -1,6 +1,7 @@
 """The doctor's drive of 20 cm: what has a wrong sign is named, and what the gate refuses is said."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -90,6 +91,39 @@ def test_the_lidar_tells_way_and_turn_by_itself():
         moved = by_lidar(record, guess, np.array((0.14, 0.0, 0.0)))
         assert moved == pytest.approx((0.2, 0.03, 0.3), abs=0.03)
     assert by_lidar(MoveRecord(), (0.2, 0.3), np.zeros(3)) is None
+
+
+def corridor(x, yaw, noise, end=100.0):
+    """Four scans at rest between two walls at 1 m to each side."""
+    angle = 2 * math.pi / 1024
+    angles = np.arange(-340, 342) * angle
+    s, c = np.sin(angles + yaw), np.cos(angles + yaw)
+    ranges = np.minimum(1 / np.maximum(np.abs(s), 1e-9), np.where(c > 0, (end - x) / np.maximum(c, 1e-9), np.inf))
+    scans = []
+    for k in range(4):
+        seen = np.where(ranges < 5.5, ranges + noise.normal(0, 0.01, ranges.size), np.inf)
+        scans.append(
+            LaserScan(
+                stamp=k, received=k, seq=k, start_angle=-340 * angle, end_angle=341 * angle, scan_time=0.1,
+                time_increment=1e-4, range_min=0.02, range_max=5.6, ranges=seen,
+                codes=np.where(np.isinf(seen), 0, VALID_BEAM).astype(np.uint8),
+            )
+        )  # fmt: skip
+    return scans
+
+
+def test_a_corridor_tells_the_turn_and_not_the_way():
+    noise = np.random.default_rng(2)
+    for end, way in ((100.0, math.nan), (3.0, 0.2)):
+        before, after = corridor(0.0, 0.0, noise, end), corridor(0.2, 0.05, noise, end)
+        after = [scan.model_copy(update={"stamp": 100 + scan.stamp}) for scan in after]
+        record = MoveRecord(others={"sensor/scan": before + after}, left=50, arrived=90)
+        moved = by_lidar(record, (0.2, 0.05), np.zeros(3))
+        assert moved[0] == pytest.approx(way, abs=0.02, nan_ok=True)
+        assert moved[2] == pytest.approx(0.05, abs=0.01)
+    rows = [replace(move, way_seen=None) for move in moves()]
+    assert not found(rows)
+    assert "not seen" in next(f.seen for f in judged(rows, str) if f.check == "sign motor")
 
 
 async def test_what_the_gate_refuses_is_said_and_other_bodies_are_not_driven():
