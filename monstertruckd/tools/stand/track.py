@@ -148,7 +148,8 @@ class StandRun:
                 if fresh:
                     taken |= {name: at for name, (at, _) in fresh.items()}
                     stamp = max(at for at, _ in fresh.values())
-                    for pose in self._tracker.take(stamp, {name: tags for name, (_, tags) in fresh.items()}):
+                    seen = {name: tags for name, (_, tags) in fresh.items()}
+                    for pose in self._tracker.take(stamp, seen, {name: at for name, (at, _) in fresh.items()}):
                         self._put(pose)
                     self._expected = self._tracker.expected(stamp + round(SECOND / self._rate))
                 for text in self._tracker.complaints(self._clock.now()):

@@ -9,6 +9,7 @@ that no robot can have reached is left out, until it is seen again and again; so
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Final
 
 import numpy as np
@@ -125,8 +126,19 @@ class StandTracker:
         self.left_out = 0
         """Impossible poses."""
 
-    def take(self, stamp: int, pictures: Mapping[str, Sequence[Sighting | Blob]]) -> list[RobotPose]:
-        """Poses at ``stamp``, ns, from the tags and discs in the cameras' pictures of that instant."""
+    def take(
+        self,
+        stamp: int,
+        pictures: Mapping[str, Sequence[Sighting | Blob]],
+        taken: Mapping[str, int] = MappingProxyType({}),
+    ) -> list[RobotPose]:
+        """Poses at one instant.
+
+        Args:
+            stamp: of it, ns.
+            pictures: tags and discs in the cameras' pictures.
+            taken: stamps of pictures that were taken before, ns: a robot is carried on by its speed.
+        """
         seen: dict[str, list[tuple[str, MarkerPose]]] = {}
         for camera, found in pictures.items():
             sightings = [one for one in found if isinstance(one, Sighting)]
@@ -142,7 +154,7 @@ class StandTracker:
                 seen.setdefault(name, []).append((camera, pose))
         poses = []
         for name, places in seen.items():
-            whole = merged([pose for _, pose in places])
+            whole = merged([self._carried(name, pose, stamp - taken.get(camera, stamp)) for camera, pose in places])
             if name in self._blobs:
                 self._identities.learn(stamp, name, whole)
             robot = self._blobs.get(name) or self._robots[name]
@@ -199,6 +211,14 @@ class StandTracker:
                 said.append(f"camera {name} sees its marks in their places again")
             state.moved = moved
         return said
+
+    def _carried(self, name: str, pose: MarkerPose, late: int) -> MarkerPose:
+        """Where a robot's marker is ``late`` ns after it was seen."""
+        known = self._known.get(name)
+        if known is None or not late:
+            return pose
+        x, y, turn = known.rate * late / SECOND
+        return pose._replace(x=pose.x + x, y=pose.y + y, yaw=pose.yaw + turn)
 
     def _believed(self, pose: RobotPose, side: float) -> bool:
         known = self._known.get(pose.robot)

@@ -146,8 +146,21 @@ def test_robots_are_expected_in_every_camera_where_their_speed_takes_them(stand)
     def corners(camera, k):
         c, s = math.cos(0.1 * k), math.sin(0.1 * k)
         turned = square @ np.array(((c, s, 0), (-s, c, 0), (0, 0, 1)))
-        return camera.project(turned + np.array((-0.6 + 0.05 * k, 0.75, 0.08)))
+        return camera.project(turned + np.array((-0.6 + 0.02 * k, 0.75, 0.08)))
 
+    def where(late):
+        """x at the end, of a robot of which one camera is half a picture behind the other."""
+        tracker = StandTracker(cameras, {"r1": TaggedRobot(tag=0)}, {})
+        for k in range(8):
+            both = {
+                "c1": [Sighting(0, corners(cameras["c1"], k))],
+                "c2": [Sighting(0, corners(cameras["c2"], k - 0.5))],
+            }
+            (pose,) = tracker.take(k * SECOND // 25, both, {"c2": k * SECOND // 25 - late})
+        return pose.x
+
+    assert where(SECOND // 50) == pytest.approx(-0.46, abs=1e-4)
+    assert where(0) < -0.462
     assert tracker.expected(0) == {}
     for k in range(2):
         tracker.take(k * SECOND // 25, {"c1": [Sighting(0, corners(cameras["c1"], k))]})
