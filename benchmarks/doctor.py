@@ -60,7 +60,7 @@ def driven(seed: int, wrong: str | None) -> list[Finding]:
     rng = np.random.default_rng([seed, 27])
     name = WORLDS[seed // 2 % len(WORLDS)]
     built = BUILT_IN[name]().map
-    x, y, yaw = Arena.of(name, built.cells != FREE, built.resolution, built.origin[:2]).start(seed).tolist()
+    x, y, yaw = Arena.of(name, built.cells != FREE, built.resolution, built.origin[:2]).start(seed)
     servos = {
         servo: {
             "channel": channel,

@@ -26,6 +26,8 @@ Numbers = Annotated[tuple[float, ...], Field(strict=False)]
 
 LEAST_MARKS: Final = 5
 """In sight of a camera."""
+MISPLACED: Final = (0.002, 5.0)
+"""A mark is not where it was said to be beyond so many m, and so many standard deviations of the ruler."""
 SEEN: Final = 0.0005
 """Standard deviation of a point on the table by a camera's noise, m: a fifth of a pixel."""
 
@@ -91,6 +93,41 @@ def place(lens: Lens, seen: Mapping[int, Array], marks: Mapping[int, MarkConfig]
     return PlacedCamera(lens, np.ravel(rotation), np.ravel(translation))
 
 
+def check_places(
+    placed: PlacedCamera, seen: Mapping[int, Array], marks: Mapping[int, MarkConfig], ruler: float
+) -> None:
+    """Raise where a mark does not lie where it was said to.
+
+    Args:
+        placed: camera, by all of its marks.
+        seen: middles of its marks, pixels.
+        marks: by tag.
+        ruler: standard deviation of a mark's place, m.
+
+    Raises:
+        InputError: so it is. The mark without which all others fit is named, else the three that fit worst.
+    """
+    limit = MISPLACED[0] + MISPLACED[1] * ruler
+
+    def off(camera: PlacedCamera) -> dict[int, float]:
+        points = {tag: camera.on_plane(px[None])[0] for tag, px in seen.items()}
+        return {tag: float(np.hypot(*(points[tag] - (marks[tag].x, marks[tag].y)))) for tag in seen}
+
+    def text(found: Mapping[int, float]) -> str:
+        return ", ".join(f"marks.{tag} by {1000 * way:.0f} mm" for tag, way in found.items())
+
+    now = off(placed)
+    if max(now.values()) < limit:
+        return
+    if len(seen) > LEAST_MARKS:
+        without = {tag: off(place(placed.lens, {t: px for t, px in seen.items() if t != tag}, marks)) for tag in seen}
+        least, tag = min((max(way for t, way in rest.items() if t != tag), tag) for tag, rest in without.items())
+        if least < limit:
+            raise InputError(f"a mark is not where it should be, {text({tag: without[tag][tag]})}: measure it again")
+    worst = dict(sorted(now.items(), key=lambda item: -item[1])[:3])
+    raise InputError(f"marks are not where they should be, {text(worst)}: measure them all again")
+
+
 def join(
     cameras: Mapping[str, PlacedCamera],
     seen: Mapping[str, Mapping[int, Array]],
@@ -101,7 +138,7 @@ def join(
 
     Args:
         cameras: placed one by one.
-        seen: middles of tags by camera, pixels.
+        seen: middles of marks by camera, pixels.
         marks: by tag.
         ruler: standard deviation of a mark's place, m.
     """
@@ -124,8 +161,7 @@ def join(
         for tag, points in by_tag.items():
             middle = np.mean(points, axis=0)
             off += [(point - middle) / SEEN for point in points] if len(points) > 1 else []
-            if tag in marks:
-                off.append((middle - (marks[tag].x, marks[tag].y)) / ruler)
+            off.append((middle - (marks[tag].x, marks[tag].y)) / ruler)
         return np.concatenate(off)
 
     fit = least_squares(residual, start, start - 1.0, start + 1.0, iterations=30)
@@ -146,16 +182,17 @@ def calibrate(
         floors: pictures of the table by camera.
 
     Raises:
-        InputError: a camera lacks pictures or marks; it is named.
+        InputError: a camera lacks pictures or marks, or a mark lies elsewhere; it is named.
     """
     lenses: dict[str, tuple[LensFit, int]] = {}
     seen, placed = {}, {}
-    robots = {robot.tag for robot in config.robots.values()}  # one that stands there is no mark: it is above the table
     for name in config.cameras:
         try:
             lenses[name] = lens_from_pictures(boards[name], BoardReader(config.board))
-            seen[name] = {tag: px for tag, px in seen_marks(floors[name]).items() if tag not in robots}
+            # What else has a tag, such as a robot that stands there, may be above the table.
+            seen[name] = {tag: px for tag, px in seen_marks(floors[name]).items() if tag in config.marks}
             placed[name] = place(lenses[name][0].lens, seen[name], config.marks)
+            check_places(placed[name], seen[name], config.marks, config.ruler_error)
         except InputError as error:
             raise InputError(f"camera {name}: {error}") from error
     joined = join(placed, seen, config.marks, config.ruler_error)

@@ -18,7 +18,7 @@ from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError
 from monstertruckd.tools.cli.main import app
 from monstertruckd.tools.stand import calibration
-from monstertruckd.tools.stand.calibration import calibrate, place, save
+from monstertruckd.tools.stand.calibration import calibrate, check_places, place, save
 from monstertruckd.tools.stand.config import MarkConfig, OverheadConfig, TaggedRobot
 from monstertruckd.tools.stand.poses import MarkerPose, merged, tag_pose
 from monstertruckd.tools.stand.tracking import StandTracker, shift_of
@@ -255,6 +255,23 @@ def test_too_few_marks_or_boards_are_named(stand):
     lens = found.placed()["c1"].lens
     with pytest.raises(InputError, match="marks"):
         place(lens, {1: np.zeros(2)}, {1: MarkConfig(x=0.0, y=0.0)})
+
+
+def test_a_mark_that_was_measured_wrong_is_named(stand):
+    _, config, found, _, _ = stand
+    camera = found.placed()["c1"]
+    places = {tag: np.array([(m.x, m.y, 0.0)]) for tag, m in config.marks.items()}
+    seen = {tag: camera.project(place)[0] for tag, place in places.items()}
+    seen = {tag: px for tag, px in seen.items() if (px > 10).all() and (px < (630, 470)).all()}
+    check_places(place(camera.lens, seen, config.marks), seen, config.marks, 0.0015)
+    for tag in seen:
+        wrong = {**config.marks, tag: MarkConfig(x=config.marks[tag].x + 0.05, y=config.marks[tag].y)}
+        with pytest.raises(InputError, match=rf"a mark is not where it should be, marks.{tag} by (49|50|51) mm"):
+            check_places(place(camera.lens, seen, wrong), seen, wrong, 0.0015)
+    first, second, *_ = seen
+    swapped = {**config.marks, first: config.marks[second], second: config.marks[first]}
+    with pytest.raises(InputError, match=r"marks are not where they should be, marks\."):
+        check_places(place(camera.lens, seen, swapped), seen, swapped, 0.0015)
 
 
 def test_the_commands_calibrate_and_track_recorded_pictures(stand, tmp_path):
