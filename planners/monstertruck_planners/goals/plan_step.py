@@ -306,7 +306,6 @@ class PlanningStep:
             config.steering, angle=config.angle, geometry=setup.geometry, footprint=setup.footprint
         )
         self._planner = make_planner(self._vehicle, config.route)
-        self._tight = make_planner(self._vehicle, config.route.model_copy(update={"margin": 0.0}))
         wide = max(config.route.margin, setup.cusp_clearance)
         self._wide = make_planner(self._vehicle, config.route.model_copy(update={"margin": wide}))
         if setup.timed:
@@ -372,15 +371,9 @@ class PlanningStep:
             return replan(planner, route_map, self._route, start, goal, self._now, via=via)
 
         result = plan(self._planner)
-        if result.reason is Reason.START_BLOCKED or (
-            result.reason is Reason.ROUTE_TIMEOUT and self._confined(route_map, task.pose)
-        ):
-            result = plan(self._tight)
         if result.reason in HELD:
             self._route_map = route_map = self._standing(static_map, cells, task.pose)
             result = plan(self._planner)
-            if result.reason is Reason.START_BLOCKED:
-                result = plan(self._tight)
         elif (room := self._cusp_clearance(route_map, result)) < self._setup.cusp_clearance:
             wider = plan(self._wide)
             result = wider if self._cusp_clearance(route_map, wider) > room else result
@@ -397,12 +390,6 @@ class PlanningStep:
         poses = moved(result.poses, -self._vehicle.reference)
         length = float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum())
         return PlanAnswer(Reason.OK, "", poses, np.ones(len(poses)), (), length, result.cost, drivable=False)
-
-    def _confined(self, route_map: RouteMap, pose: Pose) -> bool:
-        """Whether the truck stands nearer to an obstacle than routes pass: then any first motion may be too near."""
-        assert self._setup is not None
-        margin = self._setup.config.route.margin
-        return not route_map.field.free(self._setup.footprint, np.array([pose]), margin)[0]
 
     def _map_of(self, cells: Cells, static_map: StaticMap) -> RouteMap:
         assert self._setup is not None

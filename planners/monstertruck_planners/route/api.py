@@ -220,6 +220,9 @@ class Vehicle:
         return ReedsShepp(self.radius, self.crab_angle, *weights, self.steering, self.reference)
 
 
+WARM_UP_CLEARANCE = 0.02
+"""Between the start of the last route of ``warm_up`` and the edge of the map, m: less than the margin."""
+
 WARM_UP_EFFORT = 6000
 """See ``GoalConfig.effort``."""
 
@@ -318,9 +321,21 @@ class Endpoints:
 
 
 def check_endpoints(
-    route_map: RouteMap, vehicle: Vehicle, start: ArrayLike, goal: ArrayLike, position: float, yaw: float, margin: float
-) -> Endpoints | RouteResult:
-    """Free start and goal, the latter within tolerance, or the result that refuses them."""
+    route_map: RouteMap, vehicle: Vehicle, start: ArrayLike, goal: ArrayLike, position: float, yaw: float,
+    margin: float, *, start_margin: float | None = None,
+) -> Endpoints | RouteResult:  # fmt: skip
+    """Free start and goal, the latter within tolerance, or the result that refuses them.
+
+    Args:
+        route_map: obstacles.
+        vehicle: its footprint counts.
+        start: pose of the reference point.
+        goal: the same.
+        position: tolerance of the goal, m.
+        yaw: the same, rad.
+        margin: to be kept at both, m.
+        start_margin: to be kept at the start instead, m.
+    """
     try:
         a, b = (np.array(p, dtype=np.float64).reshape(3) for p in (start, goal))
     except (TypeError, ValueError):
@@ -328,8 +343,8 @@ def check_endpoints(
     if not (np.isfinite(a).all() and np.isfinite(b).all()):
         return RouteResult(Reason.NOT_FINITE, text="start and goal: expected finite numbers")
     field, footprint = route_map.field, vehicle.footprint
-    if not field.free(footprint, a[None], margin)[0]:
-        return RouteResult(Reason.START_BLOCKED, text=f"start {_format_pose(a)}: the footprint overlaps an obstacle")
+    if not field.free(footprint, a[None], margin if start_margin is None else start_margin)[0]:
+        return RouteResult(Reason.START_BLOCKED, text=f"start {_refused(field, footprint, a, margin)}")
     if not field.inside(b[:2]):
         return RouteResult(Reason.GOAL_OUTSIDE, text=f"goal {_format_pose(b)}: off the map")
     if field.free(footprint, b[None], margin)[0]:
@@ -337,8 +352,15 @@ def check_endpoints(
     candidates = np.vstack([b + d for d in _tolerance_offsets(position, yaw)])
     free = field.free(footprint, candidates, margin)
     if not free.any():
-        return RouteResult(Reason.GOAL_BLOCKED, text=f"goal {_format_pose(b)}: the footprint overlaps an obstacle")
+        return RouteResult(Reason.GOAL_BLOCKED, text=f"goal {_refused(field, footprint, b, margin)}")
     return Endpoints(a, candidates[int(np.argmax(free))])
+
+
+def _refused(field: DistanceField, footprint: Footprint | DiscFootprint, pose: Array, margin: float) -> str:
+    """Why a pose that does not keep the margin is refused."""
+    overlaps = not field.free(footprint, pose[None])[0]
+    why = "the footprint overlaps an obstacle" if overlaps else f"an obstacle is nearer than {margin:g} m"
+    return f"{_format_pose(pose)}: {why}"
 
 
 def _tolerance_offsets(position: float, yaw: float) -> list[Array]:
@@ -359,9 +381,10 @@ def _format_pose(pose: Array) -> str:
 def warm_up(planner: RoutePlanner) -> None:
     """Plan on two small maps, so that numba compiles everything (or reads its cache) beforehand.
 
-    The second one is the first with a wall whose gap is too narrow.
+    The second one is the first with a wall whose gap is too narrow. The last route leaves the edge of the map.
     """
-    config = planner.config.model_copy(update={"effort": WARM_UP_EFFORT})
+    margin = max(planner.config.margin, 2 * WARM_UP_CLEARANCE)
+    config = planner.config.model_copy(update={"effort": WARM_UP_EFFORT, "margin": margin})
     planner = make_planner(planner.vehicle, config)
     ends = (2.0, 4.0, 0.0), (6.0, 4.0, 1.0)
     cells = np.zeros((80, 80), np.int8)
@@ -372,6 +395,9 @@ def warm_up(planner: RoutePlanner) -> None:
         path.part(0.1, path.length).base_poses(0.1)
     cells[:60, 40] = cells[63:, 40] = 100
     planner.plan(RouteMap.from_cells(cells, 0.1, previous=route_map), *ends)
+    footprint = planner.vehicle.footprint.data()
+    beside = (footprint.half_width or footprint.radius) + WARM_UP_CLEARANCE
+    planner.plan(route_map, (2.0, beside, 0.0), ends[1])
 
 
 def make_planner(vehicle: Vehicle, config: GoalConfig) -> RoutePlanner:

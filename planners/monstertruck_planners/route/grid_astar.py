@@ -2,7 +2,8 @@
 
 Costs as on the author's robot: neutral 50 for every cell, plus three times the costmap's value; cells from 200 up are
 closed; the value falls with distance beyond the inscribed circle as exp(-10 d), to 0.3 m. Headings point along the way.
-The result is no drivable motion: turning radius and footprint are not regarded.
+The result is no drivable motion: turning radius and footprint are not regarded. So a start need only be free: whoever
+drives along the way has to leave what is too near.
 """
 
 import numpy as np
@@ -34,13 +35,16 @@ class GridAstarPlanner:
         config = self.config
         budget = Budget(config.budget, now, config.effort)
         ends = check_endpoints(
-            route_map, self.vehicle, start, goal, config.position_tolerance, config.yaw_tolerance, config.margin
-        )
+            route_map, self.vehicle, start, goal, config.position_tolerance, config.yaw_tolerance, config.margin,
+            start_margin=0.0,
+        )  # fmt: skip
         if isinstance(ends, RouteResult):
             return ends
         field = route_map.field.data()
         cell_cost = self._cell_costs(field.distance)
         start, goal = (heuristic.cell_at(field, field.resolution, *pose[:2]) for pose in (ends.start, ends.goal))
+        if not cell_cost[start]:
+            cell_cost[start] = int(config.lethal) - 1
         to_go = heuristic.cost_to_go(cell_cost, field.resolution, goal, start, least=int(config.neutral))
         cost = heuristic.cost_at(to_go, *start)
         if cost >= heuristic.UNREACHED:

@@ -22,10 +22,10 @@ from monstertruck_planners.route.api import (
     RouteMap,
     RouteResult,
     Vehicle,
-    check_endpoints,
 )
 from monstertruck_planners.route.config import HybridConfig
 from monstertruck_planners.route.corridors import cheapest_unmarked, close_narrow_gaps, mark_corridor
+from monstertruck_planners.route.departure import plan_between
 from monstertruck_planners.route.hybrid_search import (
     MAX_NODES,
     RESOLUTIONS,
@@ -144,11 +144,14 @@ class HybridPlanner:
         self, budget: Budget, route_map: RouteMap, start: ArrayLike, goal: ArrayLike, attempt: MarginAttempt
     ) -> RouteResult:
         """Route with the margin of this planner's settings, see ``plan``."""
-        position, yaw, margin = self.config.position_tolerance, self.config.yaw_tolerance, self.config.margin
-        ends = check_endpoints(route_map, self.vehicle, start, goal, position, yaw, margin)
-        if isinstance(ends, RouteResult):
-            return ends
-        return _PlanningRun(self, route_map, ends, budget, attempt).route()
+        return plan_between(
+            route_map,
+            self.vehicle,
+            self.config,
+            start,
+            goal,
+            lambda ends: _PlanningRun(self, route_map, ends, budget, attempt).route(),
+        )
 
     def planner_for(self, margin: float) -> "HybridPlanner":
         """The planner of the greatest margin tried that is not above this one; of the narrowest, if all are."""

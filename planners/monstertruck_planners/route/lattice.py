@@ -26,9 +26,9 @@ from monstertruck_planners.route.api import (
     RouteMap,
     RouteResult,
     Vehicle,
-    check_endpoints,
 )
 from monstertruck_planners.route.config import LatticeConfig
+from monstertruck_planners.route.departure import plan_between
 from monstertruck_planners.route.heuristic import (
     UNIT,
     UNREACHED,
@@ -361,13 +361,14 @@ class LatticePlanner:
 
     def plan(self, route_map: RouteMap, start: ArrayLike, goal: ArrayLike, now: Clock | None = None) -> RouteResult:
         """Route of the vehicle's reference point, see ``RoutePlanner``."""
-        config = self.config
-        budget = Budget(config.budget, now, config.effort)
-        ends = check_endpoints(
-            route_map, self.vehicle, start, goal, config.position_tolerance, config.yaw_tolerance, config.margin
+        budget = Budget(self.config.budget, now, self.config.effort)
+        return plan_between(
+            route_map, self.vehicle, self.config, start, goal, lambda ends: self._route(route_map, ends, budget)
         )
-        if isinstance(ends, RouteResult):
-            return ends
+
+    def _route(self, route_map: RouteMap, ends: Endpoints, budget: Budget) -> RouteResult:
+        """Route that keeps the margin from its start on."""
+        config = self.config
         field = route_map.field.data()
         costs = RouteCosts.of(self.vehicle, config)
         layer, cell = route_map.cost_layer(costs), route_map.coarse_cell

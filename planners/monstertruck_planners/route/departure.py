@@ -1,0 +1,310 @@
+"""Leaving a place that is nearer to an obstacle than routes pass: what a route from there begins with. Loads numba.
+
+A search whose margin the start does not keep finds nothing, as all of its motions begin too near. So the route begins
+with few arcs and translations, on which the footprint comes no nearer to anything, up to a pose that keeps the margin;
+from there on it is planned like any other. Where no such motion exists the footprint may come nearer once more, as the
+end of a car that leaves a wall beside it, yet never touches: first by half of what there is.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from heapq import heappop, heappush
+from itertools import count
+from typing import Final
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike
+
+from monstertruck_kinematics.elementary import Array
+from monstertruck_planners.collision_kernels import FieldData, FootprintData, safe_distance, segment_free
+from monstertruck_planners.route import heuristic
+from monstertruck_planners.route.api import Endpoints, RouteCosts, RouteMap, RouteResult, Vehicle, check_endpoints
+from monstertruck_planners.route.config import DriveCosts
+from monstertruck_planners.route.motion import MotionPath, advance
+from monstertruck_planners.route.search import CHECK_MARGIN, CHECK_STEP
+from monstertruck_schemas.reasons import Reason
+
+LEVEL: Final = 0.0005
+"""Clearances are compared in whole steps of this, m."""
+SPARE: Final = 0.002
+"""Kept beyond the margin where a departure ends, m: the first motion of a search may come a little nearer."""
+CONFINED: Final = 0.03
+"""A start with less than this beyond the margin may be left by no motion of a search, m: the end of a body that turns
+comes that much nearer to a wall beside it."""
+CHECK: Final = 0.004
+"""Between two poses checked, m."""
+BRANCH: Final = 0.2
+"""Between two poses of an arc from which others are tried, m."""
+SHORTEST: Final = 0.02
+"""Of one arc, m: less is not driven exactly."""
+LONGEST: Final = 1.0
+"""Of one arc, m."""
+CURVATURES: Final = (0.0, *(0.5**k for k in range(7)))
+"""Of the arcs tried, as shares of the greatest one: the wider a body turns, the less near its end comes to a wall."""
+TRANSLATIONS: Final = (1.0, 0.5)
+"""Angles of the translations tried, as shares of the greatest one."""
+CUSP: Final = 0.1
+"""Cost of a change of direction, m."""
+SET_OFF: Final = 0.15
+"""From the end of a departure one of the arcs has to be free for so far, m: else a search would end there."""
+GAIN: Final = 3.0
+"""Metres to drive for a metre of clearance, about: translations of 0.33 rad."""
+DIPS: Final = (0.0, 0.125, 0.5, 1.0)
+"""Shares of the clearance by which it may fall again on the way, tried in turn."""
+NODES: Final = 200
+"""Poses from which arcs are tried, at most."""
+ENOUGH: Final = 20
+"""Departures that are looked at for the way on from them."""
+DEARER: Final = 0.5
+"""A departure is of no use if it costs so much more than the cheapest, m."""
+TRIES: Final = 3
+"""Departures from which a route is looked for."""
+PLACE: Final = np.array([0.01, 0.01, 0.03])
+"""Poses nearer than this to each other are one, m, m, rad."""
+
+
+@njit(cache=True)
+def _level(
+    field: FieldData, footprint: FootprintData, x: float, y: float, yaw: float, guess: int, least: int, most: int
+) -> int:
+    """Clearance of a pose in steps of LEVEL, up to ``most``, looked for from ``guess`` on; -1: below ``least``."""
+    level = guess
+    if safe_distance(field, footprint, level * LEVEL, x, y, yaw) >= 0.0:
+        while level < most and safe_distance(field, footprint, (level + 1) * LEVEL, x, y, yaw) >= 0.0:
+            level += 1
+        return level
+    while level > least:
+        level -= 1
+        if safe_distance(field, footprint, level * LEVEL, x, y, yaw) >= 0.0:
+            return level
+    return -1
+
+
+@njit(cache=True)
+def _drive_off(
+    field: FieldData, footprint: FootprintData, pose: Array, segment: Array, level: int, best: int, dip: int,
+    wanted: int,
+) -> tuple[float, int, int]:  # fmt: skip
+    """Drive a segment on and on, up to a pose with the wanted clearance.
+
+    Args:
+        field: the grid.
+        footprint: of the vehicle.
+        pose: where it begins, shape (3,).
+        segment: its sign, curvature and sideslip count.
+        level: clearance of the pose, in steps of LEVEL.
+        best: greatest one so far.
+        dip: by how much it may fall below the best one.
+        wanted: clearance that ends the motion.
+
+    Returns:
+        Length that is free (not signed), m, the clearance there, and the greatest one so far.
+    """
+    sign = 1.0 if segment[0] > 0.0 else -1.0
+    free, known = 0.0, level
+    for k in range(1, int(LONGEST / CHECK) + 1):
+        x, y, yaw = advance(pose[0], pose[1], pose[2], sign * k * CHECK, segment[1], segment[2])
+        now = _level(field, footprint, x, y, yaw, known, max(best - dip, 0), wanted)
+        if now < 0:
+            break
+        free, known, best = k * CHECK, now, max(best, now)
+        if now >= wanted and free >= SHORTEST:
+            break
+    return free, known, best
+
+
+@dataclass(frozen=True, slots=True)
+class Departure:
+    """Motions from a start to a pose that keeps the margin."""
+
+    segments: Array
+    """Shape (n, 3), see ``motion``."""
+    end: Array
+    """Pose of the reference point, shape (3,)."""
+    cost: float
+    """m."""
+    turns: bool
+    """A search may turn the vehicle there, or move it sideways; else it can only go straight on."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Node:
+    pose: Array
+    level: int
+    best: int
+    cost: float
+    segments: tuple[tuple[float, float, float], ...]
+
+
+def departures(route_map: RouteMap, vehicle: Vehicle, start: Array, margin: float, reverse: float) -> list[Departure]:
+    """Ways from a start to poses that keep the margin with a little to spare, the cheapest first.
+
+    Args:
+        route_map: obstacles.
+        vehicle: what is driven.
+        start: pose of the reference point, shape (3,).
+        margin: wanted between footprint and obstacles, m.
+        reverse: cost of a metre backward, m.
+
+    Returns:
+        None if the start touches an obstacle, or all its motions do.
+    """
+    field, footprint = route_map.field.data(), vehicle.footprint.data()
+    wanted = _wanted(margin)
+    level = int(_level(field, footprint, start[0], start[1], start[2], 0, 0, wanted))
+    if level < 0:
+        return []
+    straight: list[Departure] = []
+    for dip in dict.fromkeys(math.ceil(level * share) for share in DIPS):
+        found = _search(field, footprint, vehicle, _Node(start, level, level, 0.0, ()), dip, margin, reverse)
+        if found and found[0].turns:
+            return found
+        straight = straight or found
+    return straight
+
+
+def _wanted(margin: float) -> int:
+    """Clearance at the end, in steps of LEVEL."""
+    return int(np.ceil((margin + CHECK_MARGIN + SPARE) / LEVEL))
+
+
+def _arcs(vehicle: Vehicle) -> list[Array]:
+    """Segments of one metre, forward and backward: lines, arcs to both sides, translations to both sides."""
+    shapes = [(share * side / vehicle.radius, 0.0) for share in CURVATURES for side in ((1, -1) if share else (1,))]
+    if vehicle.crab_angle > 0.0:
+        shapes += [(0.0, share * side * vehicle.crab_angle) for share in TRANSLATIONS for side in (1, -1)]
+    return [np.array([sign, *shape]) for shape in shapes for sign in (1.0, -1.0)]
+
+
+def _search(
+    field: FieldData, footprint: FootprintData, vehicle: Vehicle, start: _Node, dip: int, margin: float, reverse: float
+) -> list[Departure]:
+    """Best first over arcs and the places on them."""
+    arcs, wanted, most = _arcs(vehicle), _wanted(margin), np.inf
+    lines = [arc for arc in arcs if not arc[1:].any()]
+    turning = [arc for arc in arcs if arc[2] or abs(arc[1]) * vehicle.radius > 0.49]
+    waiting: list[tuple[float, int, _Node]] = []
+    number = count()
+
+    def wait(node: _Node) -> None:
+        heappush(waiting, (node.cost + GAIN * LEVEL * (wanted - node.level), next(number), node))
+
+    wait(start)
+    seen: set[tuple[int, ...]] = set()
+    found: list[Departure] = []
+    enough = ENOUGH
+    while waiting and len(seen) < NODES and enough > 0:
+        _, _, node = heappop(waiting)
+        place = tuple(np.round(node.pose / PLACE).astype(int).tolist())
+        if node.cost > most or place in seen:
+            continue
+        seen.add(place)
+        for arc in arcs:
+            length, level, best = _drive_off(field, footprint, node.pose, arc, node.level, node.best, dip, wanted)
+            if length < SHORTEST:
+                continue
+            for travelled in np.arange(BRANCH, length - CHECK / 2, BRANCH).tolist():
+                wait(_after(node, arc, travelled, min(node.level, level), best, reverse))
+            after = _after(node, arc, length, level, best, reverse)
+            turns = level >= wanted and _sets_off(field, footprint, turning, after.pose, margin)
+            if turns or (level >= wanted and _sets_off(field, footprint, lines, after.pose, margin)):
+                found.append(Departure(np.array(after.segments), after.pose, after.cost, turns))
+            if turns:
+                enough -= 1
+                most = min(most, after.cost + DEARER)
+            else:
+                wait(after)
+    return sorted(found, key=lambda departure: (not departure.turns, departure.cost))
+
+
+def _sets_off(field: FieldData, footprint: FootprintData, arcs: list[Array], pose: Array, margin: float) -> bool:
+    """Whether a search with that margin may begin with one of some arcs."""
+    x, y, yaw = pose.tolist()
+    keep = margin + CHECK_MARGIN
+    return any(
+        segment_free(field, footprint, keep, CHECK_STEP, x, y, yaw, SET_OFF * sign, curvature, sideslip)
+        for sign, curvature, sideslip in (arc.tolist() for arc in arcs)
+    )
+
+
+def _after(node: _Node, arc: Array, travelled: float, level: int, best: int, reverse: float) -> _Node:
+    """The node at the end of an arc of so many metres."""
+    segment = (float(arc[0]) * travelled, float(arc[1]), float(arc[2]))
+    cusp = bool(node.segments) and node.segments[-1][0] * segment[0] < 0.0
+    cost = node.cost + travelled * (1.0 if arc[0] > 0.0 else reverse) + CUSP * cusp
+    pose = np.array(advance(*node.pose.tolist(), *segment))
+    return _Node(pose, level, best, cost, (*node.segments, segment))
+
+
+def plan_between(
+    route_map: RouteMap, vehicle: Vehicle, config: DriveCosts, start: ArrayLike, goal: ArrayLike,
+    search: Callable[[Endpoints], RouteResult],
+) -> RouteResult:  # fmt: skip
+    """Route between two poses, with a departure first if the start is too near to an obstacle; or why there is none.
+
+    Args:
+        route_map: obstacles and costs.
+        vehicle: what is driven.
+        config: margin, tolerances, costs.
+        start: pose of the reference point.
+        goal: the same.
+        search: route between two poses that keep the margin.
+    """
+    ends = _ends(route_map, vehicle, config, start, goal)
+    if isinstance(ends, Endpoints) and _room(route_map, vehicle, ends.start, config.margin):
+        result = search(ends)
+        if result.reason is not Reason.ROUTE_TIMEOUT or _room(route_map, vehicle, ends.start, config.margin + CONFINED):
+            return result
+    elif isinstance(ends, Endpoints):
+        result = RouteResult(Reason.START_BLOCKED, text=f"start: every motion comes nearer than {config.margin:g} m")
+    elif ends.reason is Reason.START_BLOCKED:
+        result = ends
+    else:
+        return ends
+    begin, end = np.array(start, dtype=np.float64), np.array(goal, dtype=np.float64)
+    for departure in _best_departures(route_map, vehicle, config, begin, end):
+        ends = _ends(route_map, vehicle, config, departure.end, end)
+        result = search(ends) if isinstance(ends, Endpoints) else ends
+        if result.path is not None:
+            first = MotionPath(begin, departure.segments, vehicle.steering, vehicle.reference)
+            return replace(result, path=first.then(result.path), cost=departure.cost + result.cost)
+        if result.reason not in (Reason.ROUTE_TIMEOUT, Reason.GOAL_UNREACHABLE):
+            break
+    return result
+
+
+def _ends(
+    route_map: RouteMap, vehicle: Vehicle, config: DriveCosts, start: ArrayLike, goal: ArrayLike
+) -> Endpoints | RouteResult:
+    position, yaw = config.position_tolerance, config.yaw_tolerance
+    return check_endpoints(route_map, vehicle, start, goal, position, yaw, config.margin)
+
+
+def _room(route_map: RouteMap, vehicle: Vehicle, start: Array, margin: float) -> bool:
+    """Whether a search with that margin has motions to begin with: others begin too near to an obstacle."""
+    return bool(route_map.field.free(vehicle.footprint, start[None], margin + CHECK_MARGIN)[0])
+
+
+def _best_departures(
+    route_map: RouteMap, vehicle: Vehicle, config: DriveCosts, start: Array, goal: Array
+) -> list[Departure]:
+    """The departures to begin with, by the way that is left from their ends; each ends somewhere else."""
+    found = departures(route_map, vehicle, start, config.margin, config.reverse_cost)
+    if not found or not route_map.field.inside(goal[:2]):
+        return found[:1]
+    field, cell = route_map.field.data(), route_map.coarse_cell
+    cells = [heuristic.cell_at(field, cell, pose[0], pose[1]) for pose in (goal, found[0].end)]
+    to_go = heuristic.cost_to_go(route_map.cell_costs(RouteCosts.of(vehicle, config)), cell, cells[0], cells[1])
+    table = heuristic.reeds_shepp_table(vehicle.crab_angle)
+
+    def total(departure: Departure) -> float:
+        x, y, yaw = departure.end.tolist()
+        return departure.cost + heuristic.heuristic_cost(field, to_go, table, vehicle.radius, goal, x, y, yaw)
+
+    chosen: list[Departure] = []
+    for departure in sorted(found, key=lambda departure: (not departure.turns, total(departure))):
+        if all((np.abs(departure.end - other.end) > 2 * PLACE).any() for other in chosen):
+            chosen.append(departure)
+    return chosen[:TRIES]
