@@ -234,7 +234,8 @@ def _after(node: _Node, arc: Array, travelled: float, level: int, best: int, rev
     segment = (float(arc[0]) * travelled, float(arc[1]), float(arc[2]))
     cusp = bool(node.segments) and node.segments[-1][0] * segment[0] < 0.0
     cost = node.cost + travelled * (1.0 if arc[0] > 0.0 else reverse) + CUSP * cusp
-    pose = np.array(advance(*node.pose.tolist(), *segment))
+    x, y, yaw = node.pose.tolist()
+    pose = np.array(advance(x, y, yaw, segment[0], segment[1], segment[2]))
     return _Node(pose, level, best, cost, (*node.segments, segment))
 
 
