@@ -11,7 +11,7 @@ from aiohttp import web
 
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import Clock
-from monstertruck_runtime.errors import NotFoundError, RequestRefusedError, TruckError
+from monstertruck_runtime.errors import NotFoundError, NotPermittedError, RequestRefusedError, TruckError
 from monstertruck_runtime.recordings import fetch_recording
 from monstertruck_runtime.stations import own_source, tls_for
 from monstertruck_schemas.reasons import Reason
@@ -27,11 +27,18 @@ RANGE: Final = re.compile(r"bytes=(\d{1,15})-")
 
 
 async def download(
-    request: web.Request, address: RobotAddress, name: str, user: str, clock: Clock, headers: Mapping[str, str]
+    request: web.Request,
+    address: RobotAddress,
+    name: str,
+    user: str,
+    clock: Clock,
+    headers: Mapping[str, str],
+    may: Callable[[], bool],
 ) -> web.StreamResponse:
     """Answer a request for a recording; the robot says how fast.
 
-    A ``Range`` of the kind ``bytes=N-`` gives what comes behind (RFC 9110, 14.2), others are ignored.
+    A ``Range`` of the kind ``bytes=N-`` gives what comes behind (RFC 9110, 14.2), others are ignored. A user who no
+    longer ``may`` gets no more of it.
 
     Raises:
         web.HTTPException: the robot refuses, is not there, or the range lies behind the end.
@@ -56,7 +63,7 @@ async def download(
             response.headers["Content-Range"] = f"bytes {offset}-{size - 1}/{size}"
         await response.prepare(request)
         if request.method != "HEAD":
-            await _stream(response, truck, name, first, offset, size)
+            await _stream(response, truck, name, first, offset, size, may)
         return response
 
 
@@ -80,7 +87,13 @@ def _session(address: RobotAddress, user: str, clock: Clock) -> TruckClient:
 
 
 async def _stream(
-    response: web.StreamResponse, truck: TruckClient, name: str, answer: dict[str, Any], at: int, size: int
+    response: web.StreamResponse,
+    truck: TruckClient,
+    name: str,
+    answer: dict[str, Any],
+    at: int,
+    size: int,
+    may: Callable[[], bool],
 ) -> None:
     """Pass chunks on until the size that was promised; one that fails breaks the connection, for the browser to see.
 
@@ -95,6 +108,8 @@ async def _stream(
         try:
             if not data:
                 raise NotFoundError("the recording became shorter")
+            if not may():
+                raise NotPermittedError("its user may no longer have it")
             answer = await truck.call("recording_read", {"name": name, "offset": at})
         except TruckError as error:
             log.warning("download of %s broken off at %d of %d bytes: %s", name, at, size, error)

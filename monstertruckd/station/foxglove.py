@@ -28,6 +28,7 @@ from monstertruck_runtime.stations import own_source, tls_for
 from monstertruck_schemas.req import Order
 from monstertruck_schemas.topics import TOPICS, Topic
 from monstertruckd.station.address import RobotAddress
+from monstertruckd.station.remarks import Remarks
 
 log = logging.getLogger(__name__)
 
@@ -99,6 +100,7 @@ class FoxgloveServer:
         self._looks: Counter[str] = Counter()
         self._taps: dict[str, Any] = {}
         self._driving: asyncio.Task[None] | None = None
+        self._remarks = Remarks(log)
 
     async def run(self, ready: Callable[[], object] = lambda: None) -> None:
         """Serve until cancelled; ``ready`` is called once clients are answered.
@@ -132,6 +134,7 @@ class FoxgloveServer:
                 await self._clock.sleep(RETRY)
         finally:
             self._client = None
+            self._remarks.tell()
             await asyncio.to_thread(server.stop)
 
     def _session(self) -> TruckClient:
@@ -188,11 +191,15 @@ class FoxgloveServer:
         try:
             motion = twist(data)
         except InputError as error:
-            log.warning("message of a Foxglove client refused: %s", error)
+            self.refuse(f"message of a Foxglove client refused: {error}")
             self._server.publish_status(str(error), StatusLevel.Warning, TELEOP)
             return
         if self._client is not None and (self._driving is None or self._driving.done()):
             self._driving = asyncio.create_task(self._request(self._client, motion))
+
+    def refuse(self, text: str) -> None:
+        """Log what a client may not do."""
+        self._remarks.add("Foxglove", text)
 
     async def _request(self, client: TruckClient, motion: tuple[float, float, float]) -> None:
         with suppress(TruckError):  # the robot says why on its topics
@@ -247,7 +254,8 @@ class _Listener(ServerListener):
         if channel.topic == TELEOP and channel.encoding == "json":
             self._teleop.add((client.id, channel.id))
         else:
-            log.warning("Foxglove client %s: %s as %s refused", client.id, channel.topic, channel.encoding)
+            text = f"Foxglove client {client.id}: {channel.topic} as {channel.encoding} refused"
+            self._loop.call_soon_threadsafe(self._server.refuse, text)
 
     def on_client_unadvertise(self, client: Client, client_channel_id: int) -> None:
         self._teleop.discard((client.id, client_channel_id))

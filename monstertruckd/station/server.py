@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from aiohttp import WSMessage, WSMsgType, web
+from aiohttp.http_exceptions import HttpProcessingError
 
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.endpoints import LOCAL_HOSTS
@@ -33,6 +34,7 @@ from monstertruckd.station.downloads import download, fetch
 from monstertruckd.station.feed import RobotFeed
 from monstertruckd.station.fleet import FleetBoard
 from monstertruckd.station.pilot import Pilot
+from monstertruckd.station.remarks import Remarks
 from monstertruckd.station.replay import LogOpener, ReplayFeed
 from monstertruckd.station.users import LOCAL, StationUser, StationUsers
 from monstertruckd.station.viewer import Viewer
@@ -148,7 +150,9 @@ class Station:
         self._discoveries = [Discovery(endpoint, clock, self._found) for endpoint in routers]
         self._following: dict[RobotFeed | ReplayFeed, asyncio.Task[None]] = {}
         self._viewers: set[Viewer] = set()
-        self._sockets: set[web.WebSocketResponse] = set()
+        self._sockets: dict[web.WebSocketResponse, StationUser] = {}
+        self._closing: set[asyncio.Task[bool]] = set()
+        self._remarks = Remarks(log)
         self._numbers = itertools.count(1)
         self._browsers: list[_Browser] = []
         self._run = secrets.token_hex(2)
@@ -167,7 +171,9 @@ class Station:
         Raises:
             BusyError: the port is taken.
         """
-        runner = web.AppRunner(self.application(), access_log=None, shutdown_timeout=END)
+        http = logging.getLogger(f"{__name__}.http")
+        http.addFilter(self._refuse_rubbish)
+        runner = web.AppRunner(self.application(), access_log=None, shutdown_timeout=END, logger=http)
         await runner.setup()
         for feed in self.feeds.values():
             self._follow(feed)
@@ -179,21 +185,36 @@ class Station:
             except OSError as error:
                 raise BusyError(f"{self.place.url} cannot be served: {error.strerror or error}") from None
             ready()
-            while True:  # robots may come while others are followed
+            while True:  # robots may come while others are followed, and users go
                 done, _ = await asyncio.wait(
                     [*self._following.values(), *discovering], return_when=asyncio.FIRST_COMPLETED, timeout=LOOK
                 )
                 for task in done:
                     if not task.cancelled():  # of a recording that was dropped
                         task.result()
+                await self._check_users()
         finally:
             tasks = [*self._following.values(), *discovering]
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
             await runner.cleanup()
+            http.removeFilter(self._refuse_rubbish)
+            self._remarks.tell()
             if self._folder is not None:
                 shutil.rmtree(self._folder, ignore_errors=True)
+
+    async def _check_users(self) -> None:
+        """Let those go who may no longer be here, or not as they are."""
+        users = self.place.users
+        if users is not None and await users.refresh():
+            for socket, user in self._sockets.items():
+                if not users.stands(user):
+                    text = "browser of %s is let go: no longer a user, or with another role or password"
+                    log.warning(text, user.name)
+                    task = asyncio.create_task(socket.close(code=1008))  # one that is frozen takes long
+                    self._closing.add(task)
+                    task.add_done_callback(self._closing.discard)
 
     def _follow(self, feed: RobotFeed | ReplayFeed) -> None:
         self._following[feed] = asyncio.create_task(feed.run())
@@ -293,7 +314,7 @@ class Station:
         else:
             user = await self.place.users.who(request.headers.get("Authorization"), request.remote or "")
             if user is None:
-                log.warning("%s %s from %s refused: no valid login", request.method, request.path, request.remote)
+                self._refused(request, "no valid login")
                 challenge = {"WWW-Authenticate": 'Basic realm="monstertruckd", charset="UTF-8"'}
                 raise web.HTTPUnauthorized(headers=HEADERS | challenge)
             request[USER] = user
@@ -303,8 +324,18 @@ class Station:
         return response
 
     def _refused(self, request: web.Request, why: str) -> web.HTTPForbidden:
-        log.warning("%s %s from %s refused: %s", request.method, request.path, request.remote, why)
+        asked = f"{request.method[:20]} {request.raw_path[:100]} from {request.remote}"
+        self._remarks.add(request.remote, f"{asked} refused: {why}")
         return web.HTTPForbidden(text=why, headers=HEADERS)
+
+    def _refuse_rubbish(self, record: logging.LogRecord) -> bool:
+        """Whether a line of aiohttp's is written as it is: what is no request of HTTP gets a short one of ours."""
+        fault = record.exc_info[1] if isinstance(record.exc_info, tuple) else None
+        if not isinstance(fault, HttpProcessingError):
+            return True
+        peer = str(record.args[0]) if isinstance(record.args, tuple) and record.args else "?"
+        self._remarks.add(peer, f"request from {peer} refused: {' '.join(fault.message.split())}")
+        return False
 
     # Files
 
@@ -335,14 +366,16 @@ class Station:
         if not user.may(AccessRole.PILOT):
             raise self._refused(request, f"user {user.name!r} is {user.role.value}: expected pilot")
         if feed is None or not RECORDING.fullmatch(name):
-            log.warning(
-                "GET %s from %s refused: expected a robot's name and that of a recording",
-                request.raw_path[:200],
-                request.remote,
-            )
+            self._refused(request, "expected a robot's name and that of a recording")
             raise web.HTTPNotFound
-        log.info("recording %s of %s goes to %s", name, feed.address.name, request.remote)
-        return await download(request, feed.address, name, user.name, self._clock, HEADERS)
+        told = f"recording {name} of {feed.address.name} goes to {request.remote}"
+        self._remarks.add(request.remote, told, logging.INFO)
+        users = self.place.users
+
+        def may() -> bool:
+            return users is None or users.stands(user)
+
+        return await download(request, feed.address, name, user.name, self._clock, HEADERS, may)
 
     # One browser
 
@@ -350,7 +383,7 @@ class Station:
         user = request[USER]
         count, own = len(self._browsers), sum(each.user.name == user.name for each in self._browsers)
         if count >= MOST_BROWSERS or (user is not LOCAL and own >= MOST_OF_USER):
-            log.warning("browser at %s refused: %d are connected, %d of this user", request.remote, count, own)
+            self._refused(request, f"{count} browsers are connected, {own} of this user")
             raise web.HTTPServiceUnavailable(text="too many browsers", headers=HEADERS)
         name = f"{user.name}{'-' * bool(user.name)}{self._run}.{next(self._numbers)}"
         browser = _Browser(name, user, self, self._board, self._clock)
@@ -361,30 +394,30 @@ class Station:
             self._browsers.remove(browser)
 
     async def _converse(self, request: web.Request, browser: "_Browser") -> web.WebSocketResponse:
-        name = browser.name
+        name, peer = browser.name, request.remote
         socket = web.WebSocketResponse(max_msg_size=commands.MOST_BYTES, heartbeat=BEAT, compress=False)
         await socket.prepare(request)
-        log.info("browser %s connected from %s", name, request.remote)
+        self._remarks.add(peer, f"browser {name} connected from {peer}", logging.INFO)
         self._viewers.add(browser.viewer)
-        self._sockets.add(socket)
+        self._sockets[socket] = browser.user
         sending = asyncio.create_task(_send(socket, browser.viewer))
         try:
             async for received in socket:
                 if received.type is not WSMsgType.TEXT:
-                    log.warning("browser %s at %s refused: %s", name, request.remote, _fault(received))
+                    self._remarks.add(peer, f"browser {name} at {peer} refused: {_fault(received)}")
                     break
                 try:
                     browser.take(received.data)
                 except (InputError, NotPermittedError) as error:
-                    log.warning("browser %s: message refused: %s", name, error)
+                    self._remarks.add(peer, f"browser {name}: message refused: {error}")
                     browser.viewer.send(frames.text("trouble", text=str(error)))
         finally:
             self._viewers.discard(browser.viewer)
-            self._sockets.discard(socket)
+            del self._sockets[socket]
             sending.cancel()
             await asyncio.gather(sending, return_exceptions=True)
             await browser.close()
-            log.info("browser %s is gone", name)
+            self._remarks.add(peer, f"browser {name} is gone", logging.INFO)
         return socket
 
 

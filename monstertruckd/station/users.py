@@ -5,22 +5,26 @@ import base64
 import binascii
 import hashlib
 import hmac
+import ipaddress
+import logging
 import re
 import secrets
 import stat
 from collections import OrderedDict
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
-from dataclasses import dataclass
+from contextlib import asynccontextmanager, suppress
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, Final
 
-from monstertruck_runtime.errors import InputError, NotFoundError, NotPermittedError
+from monstertruck_runtime.errors import InputError, NotFoundError, NotPermittedError, TruckError
 from monstertruck_runtime.small_files import replace_file
 from monstertruck_runtime.threads import in_thread
 from monstertruck_runtime.yaml_files import read_yaml, yaml_text
 from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.topics import SOURCE_NAME
+
+log = logging.getLogger(__name__)
 
 COST: Final = {"n": 2**14, "r": 8, "p": 1}
 """Of scrypt: 16 MB and some 50 ms for each attempt."""
@@ -30,6 +34,8 @@ SHORTEST: Final = 8
 PAUSE: Final = 1.0
 """Seconds that a wrong password costs, one attempt after the other."""
 REMEMBERED: Final = 256
+MOST_WAITING: Final = 16
+"""Attempts of one address that wait for their turn; further ones are wrong at once."""
 MOST_HASHES: Final = 2
 """Computed at once."""
 HASH: Final = re.compile(rf"[0-9a-f]{{{2 * LENGTH}}}:[0-9a-f]{{{2 * LENGTH}}}")
@@ -43,6 +49,8 @@ class StationUser:
 
     name: str
     role: AccessRole
+    proof: str = field(default="", repr=False)
+    """Hash of the password that was given."""
 
     def may(self, needed: AccessRole) -> bool:
         """Whether the user may do what takes ``needed``."""
@@ -54,14 +62,21 @@ LOCAL: Final = StationUser("", AccessRole.ENGINEER)
 
 
 class StationUsers:
-    """Users of a file.
+    """Users of a file, as it is now.
 
     Args:
-        rows: role and hash of the password by name.
+        file: to be read.
+
+    Raises:
+        NotFoundError: there is none.
+        NotPermittedError: others may read it.
+        InputError: it is no such file.
     """
 
-    def __init__(self, rows: dict[str, tuple[AccessRole, str]]) -> None:
-        self._rows = rows
+    def __init__(self, file: Path) -> None:
+        self._file = file
+        self._version = _version(file)
+        self._rows = _read(file)
         self._known: OrderedDict[bytes, StationUser] = OrderedDict()
         """Headers that were right, by their hash: a page asks for a dozen files."""
         self._secret = secrets.token_bytes(LENGTH)
@@ -69,27 +84,37 @@ class StationUsers:
         """Of every address that waits, and how many of its attempts do."""
         self._hashing = asyncio.Semaphore(MOST_HASHES)
 
-    @classmethod
-    def load(cls, file: Path) -> Self:
-        """Read a file of users.
+    async def refresh(self) -> bool:
+        """Read the file again if it has changed; whether the users have.
 
-        Raises:
-            NotFoundError: there is none.
-            NotPermittedError: others may read it.
-            InputError: it is no such file.
+        A file that cannot be read is reported, and the users stay as they are: a slip of an editor takes nobody's
+        emergency stop away.
         """
-        if not file.is_file():
-            raise NotFoundError(
-                f"{file}: not there; expected users (monstertruckd station --add-user NAME --users {file})"
-            )
-        if file.stat().st_mode & (stat.S_IRWXG | stat.S_IRWXO):
-            raise NotPermittedError(f"{file}: others may read it; expected mode 600 (chmod 600 {file})")
-        return cls({name: _row(file, name, value) for name, value in _rows(file).items()})
+        version = await in_thread(lambda: _version(self._file))
+        if version == self._version:
+            return False
+        self._version = version
+        try:
+            rows = await in_thread(lambda: _read(self._file))
+        except (TruckError, OSError) as error:
+            log.error("the users stay as they were: %s", error)
+            return False
+        if rows == self._rows:
+            return False
+        self._rows = rows
+        self._known = OrderedDict((mark, user) for mark, user in self._known.items() if self.stands(user))
+        log.info("%s was read again: %d users", self._file, len(rows))
+        return True
+
+    def stands(self, user: StationUser) -> bool:
+        """Whether a user who has logged in is still one, with the same role and password."""
+        return self._rows.get(user.name) == (user.role, user.proof)
 
     async def who(self, header: str | None, address: str = "") -> StationUser | None:
         """The user of an ``Authorization`` header of the scheme Basic (RFC 7617); None = nobody.
 
-        Attempts of one address are looked at one after the other: whoever guesses holds up nobody elsewhere.
+        Attempts of one address, or network of IPv6, are looked at one after the other: whoever guesses holds up nobody
+        elsewhere.
         """
         credentials = _credentials(header)
         if credentials is None:
@@ -98,15 +123,19 @@ class StationUsers:
         if mark not in self._known:
             name, password = credentials
             role, kept = self._rows.get(name, (AccessRole.OBSERVER, NO_HASH))
-            async with self._turn(address):
+            user, network = StationUser(name, role, kept), _network(address)
+            if self._turns.get(network, (None, 0))[1] >= MOST_WAITING:
+                return None
+            async with self._turn(network):
                 async with self._hashing:
                     right = await in_thread(lambda: _matches(password, kept))
-                if not right or name not in self._rows:
+                if not right or not self.stands(user):
                     await asyncio.sleep(PAUSE)
                     return None
-            self._known[mark] = StationUser(name, role)
+            self._known[mark] = user
             while len(self._known) > REMEMBERED:
                 self._known.popitem(last=False)
+            return user
         return self._known[mark]
 
     @asynccontextmanager
@@ -122,6 +151,39 @@ class StationUsers:
                 self._turns[address] = lock, waiting
             else:
                 del self._turns[address]
+
+
+def _network(address: str) -> str:
+    """What guesses of one origin share: an address, or of IPv6 the network of 64 bits that one site has."""
+    with suppress(ValueError):
+        found = ipaddress.ip_address(address.partition("%")[0])
+        if found.version == 6 and found.ipv4_mapped is None:
+            return str(ipaddress.ip_network((found, 64), strict=False))
+    return address
+
+
+def _version(file: Path) -> tuple[int, ...] | None:
+    """What changes whenever a file is written; None = it is not there."""
+    try:
+        found = file.stat()
+    except OSError:
+        return None
+    return found.st_ino, found.st_mtime_ns, found.st_size, found.st_mode
+
+
+def _read(file: Path) -> dict[str, tuple[AccessRole, str]]:
+    """Role and hash of the password by name.
+
+    Raises:
+        NotFoundError: there is no such file.
+        NotPermittedError: others may read it.
+        InputError: it is no file of users.
+    """
+    if not file.is_file():
+        raise NotFoundError(f"{file}: not there; expected users (monstertruckd station --add-user NAME --users {file})")
+    if file.stat().st_mode & (stat.S_IRWXG | stat.S_IRWXO):
+        raise NotPermittedError(f"{file}: others may read it; expected mode 600 (chmod 600 {file})")
+    return {name: _row(file, name, value) for name, value in _rows(file).items()}
 
 
 def add_user(file: Path, name: str, role: AccessRole, password: str) -> None:

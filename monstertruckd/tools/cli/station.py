@@ -77,7 +77,7 @@ def station(
         if not is_endpoint(router):
             raise InputError(f"--router {router!r}: expected tcp/HOST:PORT or tls/HOST:PORT")
     addresses = [RobotAddress.parse(text) for text in robots or ([] if routers else ["truck"])]
-    known = None if users is None else station_users.StationUsers.load(users)
+    known = None if users is None else station_users.StationUsers(users)
     place = Place(host, port, _tls(certificate, key), known, tuple(name or ()))
     if (foxglove or foxglove_drive or rerun) and not addresses:
         raise typer.BadParameter("a viewer shows one robot: expected --robot NAME@ENDPOINT")

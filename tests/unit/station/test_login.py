@@ -28,6 +28,7 @@ def basic(name: str, password: str) -> str:
 @pytest.fixture
 def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(users, "PAUSE", 0.01)
+    monkeypatch.setattr(users, "COST", users.COST | {"n": 2**8})
     made = tmp_path / "users.yaml"
     add_user(made, "ann", AccessRole.PILOT, "correct horse")
     add_user(made, "olga", AccessRole.OBSERVER, "battery staple")
@@ -35,14 +36,14 @@ def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_a_page_for_other_machines_needs_tls_and_users(file: Path):
-    known = StationUsers.load(file)
+    known = StationUsers(file)
     for tls, who in ((None, None), (None, known), (ssl.create_default_context(ssl.Purpose.CLIENT_AUTH), None)):
         with pytest.raises(NotPermittedError, match=r"0\.0\.0\.0"):
             Place("0.0.0.0", tls=tls, users=who)
 
 
 async def test_who_logs_in_and_who_does_not(file: Path):
-    known = StationUsers.load(file)
+    known = StationUsers(file)
 
     async def who(name: str, password: str) -> AccessRole | None:
         user = await known.who(basic(name, password))
@@ -59,7 +60,7 @@ async def test_who_logs_in_and_who_does_not(file: Path):
 
 async def test_whoever_guesses_holds_up_nobody_at_another_address(file: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(users, "PAUSE", 60.0)
-    known = StationUsers.load(file)
+    known = StationUsers(file)
     guesses = [asyncio.create_task(known.who(basic("ann", str(number)), "10.0.0.9")) for number in range(20)]
     await asyncio.sleep(0.05)
     async with asyncio.timeout(10):
@@ -70,14 +71,51 @@ async def test_whoever_guesses_holds_up_nobody_at_another_address(file: Path, mo
     assert known._turns == {}
 
 
+async def test_guesses_of_one_network_wait_in_one_queue_which_has_an_end(file: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(users, "PAUSE", 60.0)
+    known = StationUsers(file)
+    addresses = [f"2001:db8::{number:x}" for number in range(2 * users.MOST_WAITING)]
+    guesses = [asyncio.create_task(known.who(basic("ann", address), address)) for address in addresses]
+    await asyncio.sleep(0.05)
+    assert list(known._turns) == ["2001:db8::/64"]
+    assert [guess.done() for guess in guesses].count(True) == users.MOST_WAITING
+    for guess in guesses:
+        guess.cancel()
+    await asyncio.gather(*guesses, return_exceptions=True)
+
+
+async def test_the_file_of_users_is_read_again_when_it_changes(file: Path, caplog: pytest.LogCaptureFixture):
+    known = StationUsers(file)
+    ann, olga = [await known.who(basic(*each)) for each in (("ann", "correct horse"), ("olga", "battery staple"))]
+    assert ann is not None
+    assert olga is not None
+    assert not await known.refresh()
+    add_user(file, "bob", AccessRole.PILOT, "long enough")
+    assert await known.refresh()
+    assert await known.who(basic("bob", "long enough")) is not None
+    assert known.stands(ann)
+    add_user(file, "ann", AccessRole.OBSERVER, "correct horse")
+    assert await known.refresh()
+    assert not known.stands(ann), "another role"
+    add_user(file, "olga", AccessRole.OBSERVER, "another staple")
+    assert await known.refresh()
+    assert not known.stands(olga), "another password"
+    assert await known.who(basic("olga", "battery staple")) is None
+    for damage in (lambda: file.write_text("- ann\n"), lambda: file.chmod(0o644), file.unlink):
+        damage()
+        assert not await known.refresh()
+        assert caplog.messages[-1].startswith(f"the users stay as they were: {file}")
+    assert await known.who(basic("bob", "long enough")) is not None
+
+
 def test_a_file_of_users_is_private_and_wrong_ones_are_refused(file: Path, tmp_path: Path):
     assert file.stat().st_mode & 0o777 == 0o600
     assert "correct horse" not in file.read_text()
     file.chmod(0o640)
     with pytest.raises(NotPermittedError, match="chmod 600"):
-        StationUsers.load(file)
+        StationUsers(file)
     with pytest.raises(NotFoundError, match="--add-user"):
-        StationUsers.load(tmp_path / "none.yaml")
+        StationUsers(tmp_path / "none.yaml")
     wrong = tmp_path / "wrong.yaml"
     short = f"ann: {{role: pilot, password: '{'0' * 64}:{'é' * 64}'}}\n"
     for text, fault in (
@@ -89,7 +127,7 @@ def test_a_file_of_users_is_private_and_wrong_ones_are_refused(file: Path, tmp_p
         wrong.write_text(text)
         wrong.chmod(0o600)
         with pytest.raises(InputError, match=fault):
-            StationUsers.load(wrong)
+            StationUsers(wrong)
     wrong.write_text("- ann\n")
     with pytest.raises(InputError, match="expected users by name"):
         add_user(wrong, "ann", AccessRole.PILOT, "long enough")
@@ -111,9 +149,10 @@ def test_users_are_replaced_as_a_whole(file: Path, tmp_path: Path):
 async def test_an_observer_sees_and_may_stop_and_nothing_else_over_tls(
     file: Path, tmp_path: Path, caplog, monkeypatch: pytest.MonkeyPatch
 ):
+    monkeypatch.setattr(server_module, "LOOK", 0.05)
     server, client = self_signed(tmp_path)
     robot = RobotAddress("truck", "tcp/127.0.0.1:1")
-    station = Station([robot], WallClock(), Place(port=free_port(), tls=server, users=StationUsers.load(file)))
+    station = Station([robot], WallClock(), Place(port=free_port(), tls=server, users=StationUsers(file)))
     ready = asyncio.Event()
     running = asyncio.create_task(station.run(ready.set))
     try:
@@ -128,12 +167,23 @@ async def test_an_observer_sees_and_may_stop_and_nothing_else_over_tls(
                         assert "Basic" in reply.headers["WWW-Authenticate"]
             assert "no valid login" in caplog.text
             login = {"Authorization": basic("olga", "battery staple")}
+            ann = {"Authorization": basic("ann", "correct horse")}
             async with session.ws_connect("/socket", origin=url[:-1], headers=login) as socket:
                 hello = await socket.receive_json()
                 assert (hello["user"], hello["role"]) == ("olga", "observer")
                 monkeypatch.setattr(server_module, "MOST_OF_USER", 1)
                 async with session.get("/socket", headers={"Origin": url[:-1], **login}) as reply:
                     assert reply.status == 503, "one user does not take all places"
+                async with session.ws_connect("/socket", origin=url[:-1], headers=ann) as other:
+                    assert (await other.receive_json())["user"] == "ann"
+                    rows = file.read_text()
+                    file.write_text(rows[: rows.index("ann:")] + rows[rows.index("olga:") :])
+                    while (message := await other.receive()).type is aiohttp.WSMsgType.TEXT:
+                        pass
+                    assert message.data == 1008
+                    assert "browser of ann is let go" in caplog.text
+                async with session.get("/", headers=ann) as reply:
+                    assert reply.status == 401
                 await socket.send_json({"do": "watch", "robot": "truck"})
                 wanted = {1: "not_permitted", 2: "not_permitted", 3: "not_found"}
                 await socket.send_json({"do": "order", "id": 1, "order": "arm"})

@@ -1,7 +1,9 @@
 """The station's web server against browsers and against others; no robot is there."""
 
 import asyncio
+import contextlib
 import json
+import logging
 from collections.abc import AsyncIterator, Sequence
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from typing import Any
@@ -13,7 +15,7 @@ from yarl import URL
 
 from monstertruck_runtime.clock import WallClock
 from monstertruck_runtime.errors import BusyError, InputError
-from monstertruckd.station import commands, server
+from monstertruckd.station import commands, remarks, server
 from monstertruckd.station.address import RobotAddress
 from monstertruckd.station.server import Place, Station
 from monstertruckd.tools.demo.runs import free_endpoint
@@ -186,3 +188,58 @@ async def test_browsers_are_bounded_and_one_that_goes_leaves_its_place(monkeypat
                 await asyncio.sleep(0.01)
         async with connected(station, session) as socket:
             assert (await socket.receive_json())["kind"] == "hello"
+
+
+async def test_rubbish_of_a_browser_costs_a_few_lines_and_how_many_more_there_were_is_told(
+    caplog: pytest.LogCaptureFixture,
+):
+    count = 10 * remarks.BURST
+    async with serving() as (station, session), connected(station, session) as socket:
+        for _ in range(count):
+            await socket.send_str('{"do":"\\u001b[2J\\nfaked line"}')
+        answers = 0
+        while answers < count:
+            message = await socket.receive_json()
+            answers += message["kind"] == "trouble"
+        async with session.get("/", headers={"Host": "elsewhere.example"}):
+            pass
+    told = [text for text in caplog.messages if text.endswith("further lines left out")]
+    assert len(told) == 1
+    left_out = int(told[0].removeprefix("127.0.0.1: ").split()[0])
+    assert left_out == count + 3 - remarks.BURST, "with those of who came, went and was refused"
+    assert len(caplog.messages) <= remarks.BURST + 1
+    assert all(text.isprintable() for text in caplog.messages)
+
+
+async def test_lines_are_counted_for_each_address_and_anew_after_a_while(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(remarks, "WINDOW", 0.05)
+    made = remarks.Remarks(logging.getLogger("station"))
+    for number in range(3 * remarks.MOST_PEERS):
+        made.add(f"10.0.0.{number}", f"line of {number}")
+    assert len(caplog.messages) == remarks.MOST_PEERS + remarks.BURST
+    caplog.clear()
+    await asyncio.sleep(0.1)
+    assert caplog.messages == [f"other addresses: {2 * remarks.MOST_PEERS - remarks.BURST} further lines left out"]
+    made.add("10.0.0.95", "again\x1b]0;title\x07\nfaked")
+    assert caplog.messages[-1] == r"again\x1b]0;title\x07\nfaked"
+    made.add("10.0.0.95", "x" * 10_000)
+    assert len(caplog.messages[-1]) < 2 * remarks.LONGEST
+    made.tell()
+
+
+async def test_what_is_no_request_of_http_costs_no_line_each(caplog: pytest.LogCaptureFixture):
+    async with serving() as (station, _):
+        for rubbish in (
+            b"\x00\xff\n\n",
+            b"GET / HTTP/9.9\r\n\r\n",
+            b"GET / HTTP/1.1\r\nA: " + 20_000 * b"a" + b"\r\n\r\n",
+        ):
+            for _ in range(2 * remarks.BURST):
+                reader, writer = await asyncio.open_connection("127.0.0.1", station.place.port)
+                writer.write(rubbish)
+                with contextlib.suppress(ConnectionError):
+                    await reader.read()
+                writer.close()
+    assert len(caplog.messages) <= remarks.BURST + 1

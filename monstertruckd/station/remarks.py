@@ -1,0 +1,55 @@
+"""What the log says of those who ask: a few lines of each, so that whoever sends rubbish cannot fill the disk."""
+
+import asyncio
+import logging
+from collections import Counter
+from typing import Final
+
+WINDOW: Final = 60.0
+"""Seconds over which lines are counted."""
+BURST: Final = 20
+"""Lines of one address in that time; further ones are counted, and their number is told at its end."""
+MOST_PEERS: Final = 32
+"""Addresses that are told apart in that time; all further ones share one count."""
+OTHERS: Final = "other addresses"
+LONGEST: Final = 300
+"""Characters of a line."""
+
+
+def printable(text: str) -> str:
+    """One line that a terminal shows as it is: control characters are written as escapes."""
+    short = text if len(text) <= LONGEST else f"{text[:LONGEST]}..."
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in short)
+
+
+class Remarks:
+    """Writes lines about the addresses that they come from; to be used on the event loop.
+
+    Args:
+        log: where to.
+    """
+
+    def __init__(self, log: logging.Logger) -> None:
+        self._log = log
+        self._counts: Counter[str] = Counter()
+        self._timer: asyncio.TimerHandle | None = None
+
+    def add(self, peer: str | None, text: str, level: int = logging.WARNING) -> None:
+        """Write ``text``, unless ``peer`` has caused many lines already."""
+        known = peer or "?"
+        if known not in self._counts and len(self._counts) >= MOST_PEERS:
+            known = OTHERS
+        self._counts[known] += 1
+        if self._counts[known] <= BURST:
+            self._log.log(level, "%s", printable(text))
+        if self._timer is None:
+            self._timer = asyncio.get_running_loop().call_later(WINDOW, self.tell)
+
+    def tell(self) -> None:
+        """Write how many lines were left out, and count anew."""
+        if self._timer is not None:
+            self._timer.cancel()
+        counts, self._counts, self._timer = self._counts, Counter(), None
+        for peer, count in counts.items():
+            if count > BURST:
+                self._log.warning("%s: %d further lines left out", printable(peer), count - BURST)
