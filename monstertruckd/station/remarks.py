@@ -8,9 +8,9 @@ from typing import Final
 WINDOW: Final = 60.0
 """Seconds over which lines are counted."""
 BURST: Final = 20
-"""Lines of one address in that time; further ones are counted, and their number is told at its end."""
+"""Lines of one address in that time; further ones are counted, and their number is reported at its end."""
 MOST_PEERS: Final = 32
-"""Addresses that are told apart in that time; all further ones share one count."""
+"""Addresses that are distinguished in that time; all further ones share one count."""
 OTHERS: Final = "other addresses"
 LONGEST: Final = 300
 """Characters of a line."""

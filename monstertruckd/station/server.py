@@ -368,8 +368,8 @@ class Station:
         if feed is None or not RECORDING.fullmatch(name):
             self._refused(request, "expected a robot's name and that of a recording")
             raise web.HTTPNotFound
-        told = f"recording {name} of {feed.address.name} goes to {request.remote}"
-        self._remarks.add(request.remote, told, logging.INFO)
+        text = f"recording {name} of {feed.address.name} goes to {request.remote}"
+        self._remarks.add(request.remote, text, logging.INFO)
         users = self.place.users
 
         def may() -> bool:

@@ -190,7 +190,7 @@ async def test_browsers_are_bounded_and_one_that_goes_leaves_its_place(monkeypat
             assert (await socket.receive_json())["kind"] == "hello"
 
 
-async def test_rubbish_of_a_browser_costs_a_few_lines_and_how_many_more_there_were_is_told(
+async def test_rubbish_of_a_browser_costs_a_few_lines_and_how_many_more_there_were_is_reported(
     caplog: pytest.LogCaptureFixture,
 ):
     count = 10 * remarks.BURST
@@ -203,9 +203,9 @@ async def test_rubbish_of_a_browser_costs_a_few_lines_and_how_many_more_there_we
             answers += message["kind"] == "trouble"
         async with session.get("/", headers={"Host": "elsewhere.example"}):
             pass
-    told = [text for text in caplog.messages if text.endswith("further lines left out")]
-    assert len(told) == 1
-    left_out = int(told[0].removeprefix("127.0.0.1: ").split()[0])
+    reported = [text for text in caplog.messages if text.endswith("further lines left out")]
+    assert len(reported) == 1
+    left_out = int(reported[0].removeprefix("127.0.0.1: ").split()[0])
     assert left_out == count + 3 - remarks.BURST, "with those of who came, went and was refused"
     assert len(caplog.messages) <= remarks.BURST + 1
     assert all(text.isprintable() for text in caplog.messages)
