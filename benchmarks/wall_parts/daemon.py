@@ -155,7 +155,6 @@ def tuned(
         async with rig.running():
             operator = LocalOperator(rig.daemon, clock)
             await clock.sleep(SETTLED)
-            await operator.arm()
             found = await tune(operator, "wall_left", 0.3, first, 8.0, lambda: clock.sleep(1.5), keep)
             assert not rig.truth.array()[:, 5].any(), "the robot touched the wall"
             return found

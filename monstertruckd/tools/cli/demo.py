@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.small_files import require_place
 from monstertruckd.tools.cli.options import SimulatedOption
 from monstertruckd.tools.cli.output import (
@@ -41,7 +42,6 @@ def demo(
 ) -> None:
     """The emulated truck drives a lap: real drivers, real bytes, real log."""
     from monstertruck_runtime.clock import run_wall
-    from monstertruck_runtime.errors import InputError
     from monstertruck_schemas.reasons import Reason
     from monstertruckd.tools.demo.runs import run_fast_demo, run_wall_demo
     from monstertruckd.tools.simulation.config import load_simulated
@@ -120,7 +120,10 @@ def simulate(
     if truth is not None:
         require_place(truth)
 
-    files = [config] if robots is None else [Path(name) for name in robots.split(",")]
+    names = [str(config)] if robots is None else robots.split(",")
+    if "" in names:
+        raise InputError(f"--robots {robots}: expected names of files with one comma between each two")
+    files = list(map(Path, names))
     simulated = as_fleet([load_simulated(file) for file in files])
     code = 0
 
@@ -139,7 +142,6 @@ def _film(config: Path, film: Path, seconds: float, *, alone: bool) -> None:
     Raises:
         InputError: of an option that does not go with it.
     """
-    from monstertruck_runtime.errors import InputError
     from monstertruckd.tools.demo.runs import run_film
     from monstertruckd.tools.simulation.config import load_simulated
 

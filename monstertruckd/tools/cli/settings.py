@@ -1,12 +1,14 @@
 """``get`` and ``set``: settings that may be changed while the robot runs."""
 
 import json
+import math
+from contextlib import suppress
 from typing import Annotated, Any
 
 import typer
 
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
-from monstertruck_runtime.errors import NotFoundError
+from monstertruck_runtime.errors import InputError, NotFoundError
 from monstertruckd.tools.cli.connection import with_robot
 from monstertruckd.tools.cli.options import EndpointOption, RobotOption
 from monstertruckd.tools.cli.output import JsonOption, print_json, print_table, remark
@@ -54,7 +56,7 @@ def set_value(
     The whole configuration is checked as at the start: nothing passes the ceilings of the robot's body. Without --save
     it is forgotten when the daemon ends.
     """
-    change = {"values": {key: _parsed(value)}, "save": save}
+    change = {"values": {key: _parsed(key, value)}, "save": save}
     answer = with_robot(lambda client, _: client.call("set", change), robot, endpoint)
     if json_output:
         print_json(answer)
@@ -68,8 +70,15 @@ def _below(key: str, wanted: str | None) -> bool:
     return wanted is None or f"{key}.".startswith(f"{wanted}.")
 
 
-def _parsed(text: str) -> Any:
-    """A number or truth value as such; anything else is text, which the model judges."""
+def _parsed(key: str, text: str) -> Any:
+    """A number or truth value as such; anything else is text, which the model judges.
+
+    Raises:
+        InputError: a number that is not finite, which no setting may be.
+    """
+    with suppress(ValueError):
+        if not math.isfinite(float(text)):
+            raise InputError(f"{key} {text}: expected a finite number")
     try:
         value = json.loads(text)
     except ValueError:

@@ -49,7 +49,6 @@ def wall_command(
             raise NotFoundError(f"no behaviour {name!r}: see `monstertruckd behave list`")
         if config["kind"] != "wall_pd":
             raise InputError(f"{name} is of kind {config['kind']}: expected wall_pd, which has these gains")
-        await client.arm()
         return await tune(client, name, float(config["distance"]), first, seconds, lambda: clock.sleep(1.5), report)
 
     try:

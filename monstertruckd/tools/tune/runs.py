@@ -1,7 +1,7 @@
 """Runs of a wall-following behaviour with gains of the recipe, each from a step of the distance wanted."""
 
 import math
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Generator, Mapping, Sequence
 from contextlib import AbstractContextManager, suppress
 from functools import partial
 from typing import Any, Final, NamedTuple, Protocol
@@ -42,6 +42,14 @@ class TunedRobot(Protocol):
         """Start or stop a behaviour."""
         ...
 
+    async def arm(self) -> Any:
+        """Allow driving."""
+        ...
+
+    async def disarm(self) -> Any:
+        """Forbid driving."""
+        ...
+
 
 Samples = Sequence[tuple[float, float]]
 """Times since following began, s, and measured distances, m."""
@@ -73,7 +81,7 @@ async def tune(
     pause: Callable[[], Awaitable[None]],
     report: Callable[[TuningRun], None],
 ) -> WallGains | None:
-    """Run the recipe; the robot is armed and stands beside a wall.
+    """Run the recipe with a robot that stands beside a wall: it is armed, and disarmed at the end, also after errors.
 
     Before each run the behaviour as configured, with its own gains, brings the robot along the wall.
 
@@ -87,10 +95,26 @@ async def tune(
         report: called with every run.
 
     Raises:
-        RequestRefusedError: a start is refused, or the behaviour ended before the run was complete.
+        RequestRefusedError: arming or a start is refused, or the behaviour ended before the run was complete.
         NoAnswerError: the robot does not answer.
     """
-    trials = recipe(first)
+    await client.arm()
+    try:
+        return await _tuned(client, name, distance, recipe(first), seconds, pause, report)
+    finally:
+        with suppress(TruckError):
+            await client.disarm()
+
+
+async def _tuned(
+    client: TunedRobot,
+    name: str,
+    distance: float,
+    trials: Generator[WallGains, RunVerdict, WallGains | None],
+    seconds: float,
+    pause: Callable[[], Awaitable[None]],
+    report: Callable[[TuningRun], None],
+) -> WallGains | None:
     gains, number = next(trials), 0
     while True:
         before, wanted = (distance + STEP * (n % 2) for n in (number, number + 1))

@@ -207,9 +207,13 @@ def _faces(cells: NDArray[np.int8]) -> tuple[Array, Array]:
         return wall[1 + dy : 1 + dy + rows, 1 + dx : 1 + dx + columns]
 
     touching = neighbour(1, 0) + neighbour(-1, 0) + neighbour(0, 1) + neighbour(0, -1) > 0
+
+    def slope(dx: int, dy: int) -> Array:
+        return neighbour(-dx, -dy) - neighbour(dx, dy)
+
     # Sobel's kernel: the stairs of an oblique wall give its direction roughly.
-    x = 2 * (neighbour(-1, 0) - neighbour(1, 0)) + sum(neighbour(-1, k) - neighbour(1, k) for k in (-1, 1))
-    y = 2 * (neighbour(0, -1) - neighbour(0, 1)) + sum(neighbour(k, -1) - neighbour(k, 1) for k in (-1, 1))
+    x = 2 * slope(1, 0) + slope(1, 1) + slope(1, -1)
+    y = 2 * slope(0, 1) + slope(1, 1) + slope(-1, 1)
     length = np.hypot(x, y)
     # In a gap one cell wide both sides cancel; it is left out.
     at = np.nonzero((cells == FREE) & touching & (length > 0))

@@ -100,6 +100,8 @@ class MoveConfig(BehaviourConfig):
         """
         if (self.length is None) is (self.angle is None):
             raise ValueError("expected either a length or an angle")
+        if 0.0 in (self.length, self.angle):
+            raise ValueError("the length or angle is 0: nothing would move")
         try:
             if self.angle is None:
                 assert self.length is not None

@@ -41,6 +41,10 @@ WRONG = (
         2,
         "configs/truck.yaml: describes a real truck: it has no section `sim`, as conf",
     ),
+    ("simulate --robots configs/demo.yaml,", 3, "--robots configs/demo.yaml,: expected names of files with one comma"),
+    ("set gate.speed nan", 3, "gate.speed nan: expected a finite number"),
+    ("set gate.speed -- -inf", 3, "gate.speed -inf: expected a finite number"),
+    ("set gate.speed 1e999", 3, "gate.speed 1e999: expected a finite number"),
     ("demo --seed x", 2, "Error: Invalid value for '--seed': Input should be a valid integer, unable t"),
     ("demo --seed -1 --fast -c /nonexistent", 2, "/nonexistent: cannot be read: No such file or directory"),
     (

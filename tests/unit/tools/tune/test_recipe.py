@@ -31,7 +31,13 @@ class Client:
     wild = None
 
     def __init__(self, outcome=Reason.DRIVING):
-        self.outcome, self.number, self.running, self.wanted = outcome, 0, "", 0.35
+        self.outcome, self.number, self.running, self.wanted, self.armed = outcome, 0, "", 0.35, None
+
+    async def arm(self):
+        self.armed = True
+
+    async def disarm(self):
+        self.armed = False
 
     @contextmanager
     def subscribe(self, topic, delivery):
@@ -42,6 +48,7 @@ class Client:
         if order is BehaviourOrder.STOP:
             self.running = ""
             return {}
+        assert self.armed
         assert not self.running
         self.number, self.running = self.number + 1, behaviour
         robot = Robot(WALL, (0.0, 0.30 - self.wanted, 0.0), ahead=0.05)
@@ -67,7 +74,9 @@ def tuned(client, runs):
 
 def test_it_raises_p_until_it_overshoots_and_d_until_it_is_calm(tmp_path):
     runs = []
-    best = tuned(Client(), runs)
+    client = Client()
+    best = tuned(client, runs)
+    assert client.armed is False
     overshot = next(i for i, run in enumerate(runs) if run.verdict.overshoot >= OVERSHOOTS)
     assert all(run.gains.k_d == 0.0 for run in runs[: overshot + 1])
     assert best is not None
@@ -94,6 +103,7 @@ def test_a_run_that_ends_early_ends_the_tuning_with_its_reason():
         tuned(client, [])
     assert caught.value.refusal is Reason.STUCK
     assert not client.running
+    assert client.armed is False
 
 
 def test_it_gives_up_after_some_runs_without_calm_gains():
