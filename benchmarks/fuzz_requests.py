@@ -86,14 +86,14 @@ def fuzz(endpoint: str, names: list[str], count: int, seed: int, rate: float) ->
     rng = np.random.default_rng(seed)
     tls = tls_for(endpoint)
     owner = "fuzz{}" if tls is None else tls.owner()
-    inward = [topic for topic in TOPICS if topic.writer is Writer.OUTSIDE]
+    inward = [topic.key for topic in TOPICS if topic.writer is Writer.OUTSIDE] + [topics.estop_key]
     with zenoh.open(zenoh.Config.from_json5(json.dumps(session_config(endpoint, 5.0, tls)))) as session:
         began = time.monotonic()
         for number in range(count):
             source = f"{owner.format(rng.integers(1000))}:{rng.integers(10)}"
             data = payload(rng)
             if number % 2:
-                session.put(inward[number // 2 % len(inward)].key("truck", source), data)
+                session.put(inward[number // 2 % len(inward)]("truck", source), data)
             else:
                 name = names[number // 2 % len(names)]
                 session.get(topics.rpc_key("truck", name, source), lambda _: None, payload=data, timeout=1.0)

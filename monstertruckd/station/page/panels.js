@@ -163,11 +163,9 @@ export class Panels {
 
   addEvent(event) {
     const list = byId("events");
-    const clock = this.link.newest.clock;
     const item = element("li", { className: event.severity },
       element("span", { textContent: event.text || reason(event.reason) }),
       element("small", { textContent: `${event.source} · ${reason(event.reason)}` }));
-    void clock;
     list.prepend(item);
     while (list.children.length > KEPT) list.lastChild.remove();
   }

@@ -9,6 +9,7 @@ import errno
 import json
 import os
 import shutil
+import tempfile
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
@@ -20,7 +21,6 @@ from typing import Any, Final, TypeVar, get_args, get_type_hints
 import numpy as np
 from mcap.records import Attachment, Header, Metadata
 from mcap.writer import Writer
-from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from monstertruck_runtime import wire
@@ -30,6 +30,7 @@ from monstertruck_schemas.state import ClockOffset
 from monstertruck_schemas.topics import BY_NAME
 from monstertruckd.recorder.log_file import TIMES, Channels
 from monstertruckd.recorder.reader import LogReader, open_log
+from monstertruckd.tools.logs.columns import Column, Spool
 from monstertruckd.tools.logs.messages import ALL, Progress, Selection, real_offset
 
 
@@ -98,27 +99,24 @@ def export_npz(
         InputError: not a log, a message in it is invalid, or the folder cannot be written.
     """
     directory = _folder(output)
-    tables: dict[str, dict[str, list[Any]]] = {}
-    for topic, row in _rows(path, directory, selection, progress):
-        table = tables.setdefault(topic, {name: [] for name in row})
-        for name, value in row.items():
-            table[name].append(value)
+    tables: dict[str, dict[str, Column]] = {}
     files: dict[str, Path] = {}
-    with _tables(directory, ".npz", files) as place:
+    with tempfile.TemporaryFile(dir=directory) as file, _tables(directory, ".npz", files) as place:
+        spool = Spool(file)
+        for topic, row in _rows(path, directory, selection, progress):
+            if topic not in tables:
+                tables[topic] = {name: spool.column() for name in row}
+            for name, value in row.items():
+                tables[topic][name].add(value)
         for topic, table in tables.items():
-            arrays: dict[str, NDArray[Any]] = {}
-            for name, values in table.items():
-                arrays |= _column(name, values)
-            _write_npz(place(topic), arrays)
+            _write_npz(place(topic), table)
     return files
 
 
-def _write_npz(file: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write arrays by any names: numpy's own function takes none called ``file``, which journal records have."""
+def _write_npz(file: Path, table: Mapping[str, Column]) -> None:
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, array in arrays.items():
-            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
-                np.lib.format.write_array(member, array, allow_pickle=False)
+        for name, column in table.items():
+            column.write(archive, name, lambda value: "" if value is None else str(_cell(value)))
 
 
 @contextmanager
@@ -206,19 +204,6 @@ def _plain(value: Any) -> Any:
 def _cell(value: Any) -> Any:
     value = [_plain(item) for item in value] if isinstance(value, tuple) else _plain(value)
     return json.dumps(value) if isinstance(value, list | dict) else value
-
-
-def _column(name: str, values: list[Any]) -> dict[str, NDArray[Any]]:
-    if all(isinstance(value, np.ndarray) for value in values):
-        lengths = [len(value) for value in values]
-        if len(set(lengths)) == 1:
-            return {name: np.stack(values)}
-        return {name: np.concatenate(values), f"{name}.lengths": np.array(lengths)}
-    if all(value is None or isinstance(value, int | float) for value in values):
-        if any(value is None for value in values):
-            return {name: np.array([np.nan if value is None else value for value in values], np.float64)}
-        return {name: np.array(values)}
-    return {name: np.array(["" if value is None else str(_cell(value)) for value in values])}
 
 
 S = TypeVar("S", bound=Schema)

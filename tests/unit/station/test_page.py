@@ -7,6 +7,9 @@ from typing import Any
 
 from playwright.async_api import Page
 
+from monstertruck_schemas.event import Cause, Stop
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.state import GateMode
 from tests.daemon.browser_kit import NEEDS_CHROMIUM, chromium
 from tests.unit.station.test_server import serving
 
@@ -145,6 +148,17 @@ async def parts_of_the_map_outlive_the_whole_map_that_they_belong_to(page: Page)
     assert kept == [2, 4]
 
 
+async def a_stop_is_shown_with_its_chain_of_causes(page: Page) -> None:
+    lost = Cause(reason=Reason.DEVICE_LOST, source="lidar", since=9 * 10**8, text="lidar: <b>unplugged</b>")
+    stale = Cause(reason=Reason.SCAN_STALE, source="lidar", since=9 * 10**8, text="no fresh lidar scan", because=1)
+    header = {"stamp": 10**9, "received": 10**9, "seq": 1, "number": 3}
+    stop = Stop(**header, reason=stale.reason, mode=GateMode.STOPPING, causes=(stale, lost), text="")
+    await say(page, {"kind": "stop", "m": json.loads(stop.model_dump_json())})
+    shown = await page.text_content("#causes") or ""
+    assert "no fresh lidar scan" in shown
+    assert "lidar: <b>unplugged</b>" in shown, "as text, whatever a device says"
+
+
 async def test_the_page_drives_as_the_hand_does_and_shows_what_is_true(tmp_path: Path):
     """All in one browser, for it takes seconds to start."""
     async with serving() as (station, _), chromium(tmp_path) as browser:
@@ -161,4 +175,5 @@ async def test_the_page_drives_as_the_hand_does_and_shows_what_is_true(tmp_path:
         await a_gamepad_drives_the_robot_of_the_page_that_has_the_focus(page)
         await an_unknown_way_is_taken_to_be_slow(page)
         await parts_of_the_map_outlive_the_whole_map_that_they_belong_to(page)
+        await a_stop_is_shown_with_its_chain_of_causes(page)
         assert errors == []

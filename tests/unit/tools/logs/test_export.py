@@ -3,6 +3,11 @@
 import csv
 import json
 import math
+import tempfile
+import tracemalloc
+import zipfile
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,6 +26,7 @@ from monstertruck_schemas.plan import Path as TruckPath
 from monstertruck_schemas.sensor import Battery, BatteryLevel, CompressedImage
 from monstertruck_schemas.state import ClockOffset, Grid, Peer, Peers, Transform, Transforms
 from monstertruckd.recorder.reader import open_log
+from monstertruckd.tools.logs import columns
 from monstertruckd.tools.logs.export import export_csv, export_mcap, export_npz, in_unix_time
 from monstertruckd.tools.logs.messages import Selection, real_offset, utc
 from monstertruckd.tools.logs.ros2 import export_ros2
@@ -269,3 +275,68 @@ def test_dated_log_is_a_log_like_any_other(log, tmp_path):
     assert row.since == SECOND - 3 + MAY_2026
     with pytest.raises(InputError, match=r"dated\.mcap: is there already"):
         export_mcap(log, dated)
+
+
+def columns_of(values: list[Any], folder: Path) -> dict[str, Any]:
+    with tempfile.TemporaryFile() as file, zipfile.ZipFile(folder / "table.npz", "w") as archive:
+        column = columns.Spool(file).column()
+        for value in values:
+            column.add(value)
+        column.write(archive, "file", lambda value: "" if value is None else str(value))
+    with np.load(folder / "table.npz", allow_pickle=False) as table:
+        return dict(table)
+
+
+@pytest.mark.parametrize(
+    ("values", "dtype"),
+    [
+        ([True, False] * 50, "bool"),
+        ([True] * 90 + [7] * 10, "int64"),
+        ([2**62] * 90 + [0.5], "float64"),
+        ([None] * 50 + [3] * 50, "float64"),
+        ([1.5] * 90 + ["much later a text"], "<U17"),
+        ([None] * 50 + ["a"], "<U1"),
+    ],
+)
+def test_a_column_has_the_type_of_all_its_values_however_late_they_come(values, dtype, tmp_path, monkeypatch):
+    monkeypatch.setattr(columns, "KEPT", 10 * columns.PLAIN)
+    found = columns_of(values, tmp_path)["file"]
+    assert found.dtype == dtype
+    if dtype.startswith("<U"):
+        assert found.tolist() == ["" if value is None else str(value) for value in values]
+    else:
+        np.testing.assert_array_equal(found, np.array([np.nan if v is None else v for v in values], dtype))
+
+
+def test_arrays_of_equal_and_of_different_lengths(tmp_path, monkeypatch):
+    monkeypatch.setattr(columns, "KEPT", 1000)
+    same = [np.full((3, 2), i, np.uint8 if i else np.int16) for i in range(30)]
+    found = columns_of(same, tmp_path)
+    assert found.keys() == {"file"}
+    assert found["file"].dtype == np.int16
+    np.testing.assert_array_equal(found["file"], np.stack(same))
+    different = [np.arange(i % 4, dtype=float) for i in range(30)]
+    found = columns_of(different, tmp_path)
+    np.testing.assert_array_equal(found["file"], np.concatenate(different))
+    assert found["file.lengths"].tolist() == [i % 4 for i in range(30)]
+
+
+def test_a_table_of_any_length_takes_little_memory(tmp_path, monkeypatch):
+    monkeypatch.setattr(columns, "KEPT", 400_000)
+    tracemalloc.start()
+    try:
+        with tempfile.TemporaryFile() as file, zipfile.ZipFile(tmp_path / "table.npz", "w") as archive:
+            spool = columns.Spool(file)
+            arrays, texts = spool.column(), spool.column()
+            for number in range(800):
+                arrays.add(np.full(1000, float(number)))
+                texts.add("x" * 1000)
+            arrays.write(archive, "arrays", str)
+            texts.write(archive, "texts", str)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < 4_000_000, "the values are 7 MB, as array of text 10 MB"
+    with np.load(tmp_path / "table.npz", allow_pickle=False) as table:
+        assert table["arrays"][799, 999] == 799.0
+        assert table["texts"].shape == (800,)

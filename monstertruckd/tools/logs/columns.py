@@ -1,0 +1,148 @@
+"""Columns of a table of any length: values wait in one file without a name, and become arrays chunk by chunk."""
+
+import pickle
+import zipfile
+from array import array
+from collections.abc import Callable, Iterable, Iterator
+from itertools import chain
+from typing import IO, Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+KEPT: Final = 16_000_000
+"""Bytes of values in memory, about."""
+PLAIN: Final = 64
+"""Bytes of a value that is no array and no text."""
+
+
+class Spool:
+    """Values of many columns.
+
+    Args:
+        file: open for reading and writing, that nobody else can open: what is read from it is trusted.
+    """
+
+    def __init__(self, file: IO[bytes]) -> None:
+        self._file = file
+        self._columns: list[Column] = []
+        self._size = 0
+
+    def column(self) -> "Column":
+        """A new column."""
+        made = Column(self)
+        self._columns.append(made)
+        return made
+
+    def grow(self, size: int) -> None:
+        """A column has so many bytes more in memory; beyond ``KEPT`` all go to the file."""
+        self._size += size
+        if self._size > KEPT:
+            for column in self._columns:
+                column.flush()
+            self._size = 0
+
+    def write(self, values: list[Any]) -> int:
+        """Keep a chunk; returns where."""
+        place = self._file.seek(0, 2)
+        pickle.dump(values, self._file, pickle.HIGHEST_PROTOCOL)
+        return place
+
+    def read(self, place: int) -> list[Any]:
+        """A chunk."""
+        self._file.seek(place)
+        values: list[Any] = pickle.load(self._file)  # noqa: S301  # of this process alone
+        return values
+
+
+class Column:
+    """Values of one column.
+
+    Args:
+        spool: keeps them.
+    """
+
+    def __init__(self, spool: Spool) -> None:
+        self._spool = spool
+        self._places: list[int] = []
+        self._waiting: list[Any] = []
+        self._arrays = self._numbers = True
+        self._gaps = False
+        self._dtypes: set[np.dtype[Any]] = set()
+        self._lengths = array("q")
+        self._rest: tuple[int, ...] = ()
+        self._count = 0
+
+    def add(self, value: Any) -> None:
+        """Add one: an array, a number, None, or what ``text`` of ``write`` makes text of."""
+        self._count += 1
+        size = PLAIN
+        if isinstance(value, np.ndarray):
+            self._numbers = False
+            self._dtypes.add(value.dtype)
+            self._lengths.append(len(value))
+            self._rest = value.shape[1:]
+            size += value.nbytes
+        else:
+            self._arrays = False
+            self._gaps |= value is None
+            self._numbers &= value is None or isinstance(value, int | float)
+            size += len(value) if isinstance(value, str) else 0
+        self._waiting.append(value)
+        self._spool.grow(size)
+
+    def flush(self) -> None:
+        """Move what waits to the file."""
+        if self._waiting:
+            self._places.append(self._spool.write(self._waiting))
+            self._waiting = []
+
+    def _chunks(self) -> Iterator[list[Any]]:
+        self.flush()
+        return map(self._spool.read, self._places)
+
+    def write(self, archive: zipfile.ZipFile, name: str, text: Callable[[Any], str]) -> None:
+        """Write it as array ``name``, and, of arrays that differ in length, ``name.lengths``."""
+        if self._arrays:
+            self._write_arrays(archive, name)
+        elif self._numbers:
+            self._write_numbers(archive, name)
+        else:
+            width = max(chain((1,), (len(text(value)) for values in self._chunks() for value in values)))
+            parts = (np.array([text(value) for value in values], f"<U{width}") for values in self._chunks())
+            _write(archive, name, np.dtype(f"<U{width}"), (self._count,), parts)
+
+    def _write_arrays(self, archive: zipfile.ZipFile, name: str) -> None:
+        dtype, lengths = np.result_type(*self._dtypes), np.array(self._lengths)
+        equal = bool((lengths == lengths[0]).all())
+        shape = (len(lengths), int(lengths[0])) if equal else (int(lengths.sum()),)
+        parts = (np.concatenate(values).astype(dtype, copy=False) for values in self._chunks())
+        _write(archive, name, dtype, (*shape, *self._rest), parts)
+        if not equal:
+            _write(archive, f"{name}.lengths", lengths.dtype, lengths.shape, (lengths,))
+
+    def _write_numbers(self, archive: zipfile.ZipFile, name: str) -> None:
+        if self._gaps:
+            dtype = np.dtype(np.float64)
+        else:
+            dtype = np.result_type(*(np.array(values).dtype for values in self._chunks()))
+        parts = (np.array([np.nan if v is None else v for v in values]).astype(dtype) for values in self._chunks())
+        _write(archive, name, dtype, (self._count,), parts)
+
+
+def _write(
+    archive: zipfile.ZipFile,
+    name: str,
+    dtype: np.dtype[Any],
+    shape: tuple[int, ...],
+    parts: Iterable[NDArray[Any]],
+) -> None:
+    """Write an array of the form that ``numpy.load`` reads, part by part.
+
+    numpy's own function takes no array called ``file``, which journal records have, and the whole of it at once.
+    """
+    head = {"descr": np.lib.format.dtype_to_descr(dtype), "fortran_order": False, "shape": shape}
+    with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+        np.lib.format.write_array_header_1_0(member, head)
+        for part in parts:
+            member.write(np.ascontiguousarray(part).tobytes())
