@@ -8,6 +8,7 @@ from PIL import Image
 
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.moving_picture import MovingPicture
 from monstertruck_sim.world.world import World
 from monstertruck_sim.world3d.picture import WorldRenderer, looking_at
 from monstertruck_sim.world3d.plant import RigidPlant
@@ -30,7 +31,7 @@ class Film:
     Args:
         world: with the robot.
         clock: its time.
-        file: GIF, written by ``save``.
+        file: GIF, written as it is filmed.
 
     Raises:
         InputError: the engine has nothing to draw, or the file is no GIF.
@@ -42,13 +43,17 @@ class Film:
             raise InputError(f"{file}: expected a name that ends with .gif")
         if not isinstance(world.plant, RigidPlant):
             raise InputError(f"{file}: only sim.world.engine mujoco can be filmed")
-        self._world, self._clock, self._file, self._plant = world, clock, file, world.plant
+        self._world, self._clock, self._plant = world, clock, world.plant
         self._renderer = WorldRenderer(world.plant.model, *SIZE)
         self._heading = world.plant.pose[2]
-        self.frames: list[Image.Image] = []
+        self._pictures = MovingPicture(file, 1 / RATE)
 
     async def run(self) -> None:
-        """Take frames until cancelled."""
+        """Take frames until cancelled.
+
+        Raises:
+            OSError: the file cannot be written.
+        """
         due = self._clock.now()
         while True:
             self.take()
@@ -64,11 +69,13 @@ class Film:
         c, s = cos(self._heading), sin(self._heading)
         camera = x - _BEHIND * c + _ASIDE * s, y - _BEHIND * s - _ASIDE * c, z + _ABOVE
         picture = self._renderer.draw(self._plant.data, looking_at(camera, (x + 0.3 * c, y + 0.3 * s, z + 0.1)))
-        self.frames.append(Image.fromarray(picture).quantize(_COLOURS, Image.Quantize.MAXCOVERAGE, dither=_PLAIN))
+        self._pictures.add(Image.fromarray(picture).quantize(_COLOURS, Image.Quantize.MAXCOVERAGE, dither=_PLAIN))
 
-    def save(self) -> None:
-        """Write the file."""
+    def close(self) -> None:
+        """End the file.
+
+        Raises:
+            OSError: it cannot be written.
+        """
         self._renderer.close()
-        if self.frames:
-            first, *others = self.frames
-            first.save(self._file, save_all=True, append_images=others, duration=1000 // RATE, loop=0, optimize=False)
+        self._pictures.close()

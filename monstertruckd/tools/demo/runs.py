@@ -9,7 +9,7 @@ import gc
 import os
 import socket
 from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -126,8 +126,11 @@ async def _filmed(rig: VirtualRig, clock: VirtualClock, file: Path | None) -> As
         yield
     finally:
         task.cancel()
-        await asyncio.wait([task])
-        film.save()
+        try:
+            with suppress(asyncio.CancelledError):
+                await task
+        finally:
+            film.close()
 
 
 async def run_wall_demo(clock: Clock, config: Path, folder: Path, seed: int | None, *, screen: bool) -> Summary:

@@ -12,6 +12,7 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.collision import placed
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import CommandFailedError, InputError, TruckError
+from monstertruck_runtime.moving_picture import MovingPicture
 from monstertruck_schemas.plan import Path as DrivePath
 from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.state import Odometry, Transforms
@@ -124,21 +125,14 @@ def animate(
         needed = speed * len(scenes) / MOST_FRAMES
         raise InputError(f"{len(scenes)} pictures, at most {MOST_FRAMES}: expected --speed {math.ceil(needed)} or more")
     canvas = _AnimationCanvas(scenes, width, recorded_geometry(reader.path, reader.config()))
-    frames = [canvas.frame(scene) for scene in scenes]
-    shown = round(1000 / FRAMES_PER_SECOND)
     try:
-        frames[0].save(
-            output,
-            save_all=True,
-            append_images=frames[1:],
-            duration=[*[shown] * (len(frames) - 1), round(REST * 1000)],
-            loop=0,
-            optimize=True,
-        )
+        with MovingPicture(output, 1 / FRAMES_PER_SECOND, REST) as pictures:
+            for scene in scenes:
+                pictures.add(canvas.frame(scene))
     except OSError as error:
         raise CommandFailedError(f"{output}: {error.strerror or error}") from error
-    seconds = (len(frames) - 1) / FRAMES_PER_SECOND + REST
-    return {"frames": len(frames), "seconds": round(seconds, 2), "bytes": output.stat().st_size}
+    seconds = (len(scenes) - 1) / FRAMES_PER_SECOND + REST
+    return {"frames": len(scenes), "seconds": round(seconds, 2), "bytes": output.stat().st_size}
 
 
 def _scenes(reader: LogReader, period: int, report: Progress) -> list[AnimationFrame]:

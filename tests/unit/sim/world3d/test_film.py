@@ -53,7 +53,7 @@ def test_a_film_has_a_frame_an_eighth_of_a_second(world, renderer, tmp_path):
         for _ in range(3):
             film.take()
             await clock.sleep(1 / RATE)
-        film.save()
+        film.close()
 
     run_virtual(main)
     with Image.open(tmp_path / "a.gif") as image:
