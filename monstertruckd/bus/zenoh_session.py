@@ -238,7 +238,7 @@ class ZenohBridge:
                 # One for all requests, so that a put to many keys comes once.
                 session.declare_subscriber(
                     f"{KEY_ROOT}/{self._robot}/{group}/**",
-                    partial(self._on_request, listener, intakes, refusals),
+                    partial(self._on_request, listener, intakes, estops, refusals),
                     allowed_origin=remote,
                 )
             # A thread of Zenoh's for each subscriber: what waits for another one delays no emergency stop.
@@ -262,12 +262,19 @@ class ZenohBridge:
         return tokens
 
     def _on_request(
-        self, listener: Listener, intakes: Mapping[str, Intake], refusals: Refusals, sample: zenoh.Sample
+        self,
+        listener: Listener,
+        intakes: Mapping[str, Intake],
+        estops: Intake,
+        refusals: Refusals,
+        sample: zenoh.Sample,
     ) -> None:
         key, payload = str(sample.key_expr), sample.payload
         found = sender_in(self._robot, key)
         name, source = found if found is not None else ("", None)
         if name == ESTOP_WAY:
+            if source is None:  # else the subscriber to emergency stops has it
+                self._on_estop(listener, estops, sample)
             return
         if name in intakes:
             intakes[name].take(_sender(listener, source), len(payload), payload.to_bytes)

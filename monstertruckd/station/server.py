@@ -58,6 +58,10 @@ MOST_BROWSERS: Final = 32
 """At once: each holds a session with a robot, of which that has a number of places..."""
 MOST_OF_USER: Final = 8
 """...and this many of one user who logs in, so that nobody takes them all."""
+MOST_CONNECTIONS: Final = 256
+"""Of one address: a browser keeps some six. Of those beyond, the newest are closed."""
+MESSAGES: Final = 200.0
+"""Messages a second of one browser, in bursts of as many; what comes faster waits, and others are heard meanwhile."""
 USUAL_PORTS: Final = {"http": 80, "https": 443}
 """Browsers leave these out of a name."""
 
@@ -193,6 +197,8 @@ class Station:
                     if not task.cancelled():  # of a recording that was dropped
                         task.result()
                 await self._check_users()
+                if runner.server is not None:
+                    self._close_crowds(runner.server)
         finally:
             tasks = [*self._following.values(), *discovering]
             for task in tasks:
@@ -215,6 +221,18 @@ class Station:
                     task = asyncio.create_task(socket.close(code=1008))  # one that is frozen takes long
                     self._closing.add(task)
                     task.add_done_callback(self._closing.discard)
+
+    def _close_crowds(self, server: web.Server) -> None:
+        """Close what one address has too many of, so that nobody takes all file descriptors, before a login too."""
+        of_peer: dict[str, int] = {}
+        for connection in server.connections:  # the oldest first
+            peer = _peer(connection)
+            of_peer[peer] = of_peer.get(peer, 0) + 1
+            if of_peer[peer] > MOST_CONNECTIONS:
+                connection.force_close()
+        for peer, count in of_peer.items():
+            if count > MOST_CONNECTIONS:
+                self._remarks.add(peer, f"{count} connections of {peer}, {count - MOST_CONNECTIONS} are closed")
 
     def _follow(self, feed: RobotFeed | ReplayFeed) -> None:
         self._following[feed] = asyncio.create_task(feed.run())
@@ -401,6 +419,7 @@ class Station:
         self._viewers.add(browser.viewer)
         self._sockets[socket] = browser.user
         sending = asyncio.create_task(_send(socket, browser.viewer))
+        pace = _Pace()
         try:
             async for received in socket:
                 if received.type is not WSMsgType.TEXT:
@@ -411,6 +430,7 @@ class Station:
                 except (InputError, NotPermittedError) as error:
                     self._remarks.add(peer, f"browser {name}: message refused: {error}")
                     browser.viewer.send(frames.text("trouble", text=str(error)))
+                await pace.keep()
         finally:
             self._viewers.discard(browser.viewer)
             del self._sockets[socket]
@@ -419,6 +439,21 @@ class Station:
             await browser.close()
             self._remarks.add(peer, f"browser {name} is gone", logging.INFO)
         return socket
+
+
+class _Pace:
+    """Holds up a browser that sends more than ``MESSAGES`` a second."""
+
+    def __init__(self) -> None:
+        self._clock = asyncio.get_running_loop().time
+        self._left, self._at = MESSAGES, self._clock()
+
+    async def keep(self) -> None:
+        """After each message: wait, if there were too many."""
+        now = self._clock()
+        self._left, self._at = min(self._left + (now - self._at) * MESSAGES, MESSAGES) - 1.0, now
+        if self._left < 0.0:
+            await asyncio.sleep(-self._left / MESSAGES)
 
 
 class _Browser:
@@ -547,6 +582,13 @@ class _Browser:
         for task in self._ending:
             task.cancel()
         await asyncio.gather(*self._ending, return_exceptions=True)
+
+
+def _peer(connection: web.RequestHandler) -> str:
+    """Address of the other end."""
+    transport = connection.transport
+    name = None if transport is None else transport.get_extra_info("peername")
+    return str(name[0]) if name else "?"
 
 
 def _while_replaying(command: commands.AnyCommand) -> bool:

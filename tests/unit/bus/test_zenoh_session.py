@@ -19,6 +19,7 @@ import zenoh
 from monstertruck_runtime import client, wire
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import WallClock
+from monstertruck_runtime.early_estop import estop_payload
 from monstertruck_runtime.errors import BusyError, ConfigError
 from monstertruck_runtime.mailbox import fifo
 from monstertruck_schemas.base import Pose2D
@@ -38,7 +39,7 @@ from monstertruck_schemas.topics import (
     Writer,
     estop_key,
 )
-from monstertruckd.bus.access import Sender
+from monstertruckd.bus.access import ANONYMOUS, Sender
 from monstertruckd.bus.call_limits import CALL_RATE, MAX_WAITING
 from monstertruckd.bus.intake import Intake
 from monstertruckd.bus.local import Bus
@@ -252,9 +253,12 @@ async def test_an_emergency_stop_waits_for_no_other_request(monkeypatch: pytest.
                     put(eve, estop_key("truck", source), b"x")
                 client.order(Order.ESTOP).close()
                 await eventually(lambda: got)
+                release.set()
+                put(eve, "mt/truck/req/estop", estop_payload("eve"))
+                await eventually(lambda: len(got) == 2)
         finally:
             release.set()
-    assert [(request.order, request.source) for request in got] == [(Order.ESTOP, "ann")]
+    assert [(request.order, request.source) for request in got] == [(Order.ESTOP, "ann"), (Order.ESTOP, ANONYMOUS)]
 
 
 async def test_wildcard_puts_use_up_what_their_sender_may_send():

@@ -243,3 +243,46 @@ async def test_what_is_no_request_of_http_costs_no_line_each(caplog: pytest.LogC
                     await reader.read()
                 writer.close()
     assert len(caplog.messages) <= remarks.BURST + 1
+
+
+async def test_a_browser_that_sends_too_much_waits_and_others_do_not(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(server, "MESSAGES", 40.0)
+    async with (
+        serving() as (station, session),
+        connected(station, session) as flooding,
+        connected(station, session) as other,
+    ):
+        for number in range(100):
+            await flooding.send_json({"do": "ping", "at": number})
+        await other.send_json({"do": "ping", "at": 1000})
+        answered = 0
+
+        async def answers() -> None:
+            nonlocal answered
+            while True:
+                answered += (await flooding.receive_json())["kind"] == "pong"
+
+        async with asyncio.timeout(5):
+            while (await other.receive_json()).get("at") != 1000:
+                pass
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(0.3):
+                await answers()
+        assert 40 <= answered < 90, "the rest waits, and is lost no more than slowed down"
+
+
+async def test_connections_of_one_address_have_an_end_and_those_that_were_there_stay(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+):
+    monkeypatch.setattr(server, "MOST_CONNECTIONS", 5)
+    monkeypatch.setattr(server, "LOOK", 0.05)
+    async with serving() as (station, session), connected(station, session) as socket:
+        crowd = [await asyncio.open_connection("127.0.0.1", station.place.port) for _ in range(20)]
+        async with asyncio.timeout(5):
+            await asyncio.gather(*(reader.read() for reader, _ in crowd[5:]))
+        await socket.send_json({"do": "ping", "at": 7})
+        while (await socket.receive_json()).get("at") != 7:
+            pass
+        for _, writer in crowd:
+            writer.close()
+    assert "connections of 127.0.0.1" in caplog.text
