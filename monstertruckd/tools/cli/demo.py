@@ -107,6 +107,7 @@ def simulate(
 
     Faults are read from standard input as with `emulate`, each line beginning with the device's role, the monitor's
     name, or `usb` (an unknown word lists what it knows); with several robots the robot's name stands before it.
+    `tape mark` and `tape` measure how far the robot really is from a mark, as who calibrates it is asked.
     With `--film` nothing is served: robot and daemon run for some seconds on the virtual clock, the robot drives its
     path or explores, and a moving picture of it is written.
     """

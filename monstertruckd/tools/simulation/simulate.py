@@ -35,6 +35,7 @@ from monstertruckd.tools.simulation.config import SimulatedTruckConfig, needs_co
 from monstertruckd.tools.simulation.fleet import shared_scene
 from monstertruckd.tools.simulation.ports import claimed
 from monstertruckd.tools.simulation.program import program
+from monstertruckd.tools.simulation.tape import EmulatedTape
 
 TRUTH_PERIOD = SECOND // 20
 STAND_RETRY = 1.0
@@ -71,8 +72,8 @@ async def serve(
 ) -> int:
     """Serve the devices of robots in one world behind ptys at their configured ports until SIGTERM or SIGINT.
 
-    Faults are read from standard input, each line beginning with the device's role, the monitor's name, or ``usb``;
-    with several robots the robot's name stands before it.
+    Faults are read from standard input, each line beginning with the device's role, the monitor's name, or ``usb``, and
+    ``tape`` measures; with several robots the robot's name stands before it.
 
     Args:
         clock: time.
@@ -162,7 +163,8 @@ class ServedRobot:
             role: Emulated(self._robot.emulators[role], self._robot.ports[role]) for role in devices
         }
         emulated |= {name: EmulatedFiles(files) for name, files in self._robot.monitored.items()}
-        emulated["usb"] = self._computer
+        body = config.sim.world.truck.length, config.sim.world.truck.width
+        emulated |= {"usb": self._computer, "tape": EmulatedTape(self._robot.world, clock, body, _say)}
         self.console = CommandedGroup("device", emulated)
 
     def tasks(self, say: Callable[[str], None]) -> Iterator[asyncio.Task[Any]]:

@@ -1,0 +1,68 @@
+"""Tape, string and meter beside an emulated robot, for whoever calibrates it by hand."""
+
+import math
+from collections.abc import Callable
+from typing import Final
+
+from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.errors import InputError
+from monstertruck_sim.world.plant import TruthState
+from monstertruck_sim.world.world import World
+
+WORDS: Final = "tape mark (a mark on the floor below the front bumper, and a string along the robot), tape (measure)"
+
+
+class EmulatedTape:
+    """Measures what is really the case, for a person: nothing of the robot hears it.
+
+    Args:
+        world: with the robot.
+        clock: time.
+        body: length and width of the robot, m.
+        say: gets what was measured, a line.
+    """
+
+    def __init__(self, world: World, clock: Clock, body: tuple[float, float], say: Callable[[str], None]) -> None:
+        self._world, self._clock, self._body, self._say = world, clock, body, say
+        self._mark: TruthState | None = None
+
+    def command(self, words: list[str]) -> None:
+        """``mark``, or nothing: measure from there.
+
+        Raises:
+            InputError: another word, or there is no mark.
+        """
+        now = self._world.truth(self._clock.now())
+        if words == ["mark"]:
+            self._mark = now
+        elif words or self._mark is None:
+            raise InputError(f"expected {WORDS}" if words else f"there is no mark yet: {WORDS}")
+        else:
+            self._say(measured(self._mark, now, *self._body))
+
+
+def measured(mark: TruthState, now: TruthState, length: float, width: float) -> str:
+    """What tape, string and meter show.
+
+    Args:
+        mark: when mark and string were laid.
+        now: when it is measured.
+        length: of the body, m.
+        width: of the body, m.
+    """
+    (ahead, left), (_, side) = (_moved(mark, now, *place) for place in ((length / 2, 0.0), (0.0, width / 2)))
+    turn = math.degrees(math.remainder(now.yaw - mark.yaw, math.tau))
+    return (
+        f"front bumper {math.hypot(ahead, left):.3f} m from its mark: {100 * ahead:.1f} cm ahead, {100 * left:.1f} cm "
+        f"left; middle of the left side {100 * side:.1f} cm left of the string; turned {turn:.1f} deg to the left; "
+        f"pack {now.supply_v:.2f} V"
+    )
+
+
+def _moved(mark: TruthState, now: TruthState, x: float, y: float) -> tuple[float, float]:
+    """By how much a place of the body has moved, ahead and left, m; x and y from the body's middle, m."""
+    dx, dy = now.x - mark.x, now.y - mark.y
+    c, s = math.cos(mark.yaw), math.sin(mark.yaw)
+    turned = now.yaw - mark.yaw
+    cos, sin = math.cos(turned), math.sin(turned)
+    return c * dx + s * dy + cos * x - sin * y - x, c * dy - s * dx + sin * x + cos * y - y
