@@ -2,6 +2,8 @@
 
 Every trial runs the whole daemon on the virtual clock: the drive wizard measures, something happens, the truck has
 to be at rest with its gate closed and the calibration as it was; then the cause is removed and the wizard is run again.
+After what passes by itself, a cable or a link that is out for a second, a wizard may also go on: then the truck has to
+have stood with its gate closed meanwhile, and the wizard has to save its result.
 
 A daemon that is killed takes its cables with it; the stop script's commands (``systemd/neutral.py``) reach the drive
 afterwards, and a new daemon starts, as systemd has it.
@@ -40,6 +42,12 @@ FIRST, LAST = 2.0, 35.0
 """Seconds after the wizard's start between which it is interrupted: it takes 80 s."""
 ENDED = 40.0
 """Seconds in which the wizard ends after that: a low battery is judged for ten."""
+PASSES = ("unplug", "lease_lost")
+"""What a wizard may outlast,"""
+STOPPED = 8.0
+"""seconds in which the truck has stood by then,"""
+WHOLE = 300.0
+"""and in which the wizard is done."""
 REST = 2.0
 """Seconds from then in which the truck is at rest."""
 READY = 20.0
@@ -48,6 +56,8 @@ FORGOTTEN, BRAKING = 0.55, 0.4
 """Seconds after which the controller has dropped half a frame, and in which it brakes: those of the stop script."""
 STILL = 0.005
 """m/s."""
+STEP = 0.05
+"""Seconds between two looks."""
 OLD = Result(
     wizard="drive",
     measured="long ago",
@@ -211,8 +221,12 @@ async def _interrupt(bench: Interrupted, found: Trial) -> None:
     if bench.wizard.done():
         found.wrong.append("the wizard had ended before")
         return
+    standing = asyncio.create_task(_stands(bench))
     await happens(bench)
     await asyncio.wait([bench.wizard], timeout=ENDED)
+    if found.kind in PASSES and await _outlasted(bench, await standing, found):
+        return
+    standing.cancel()
     if not bench.wizard.done():
         found.wrong.append("the wizard goes on")
         bench.wizard.cancel()
@@ -239,6 +253,28 @@ async def _interrupt(bench: Interrupted, found: Trial) -> None:
     else:
         if len(bench.files()) != len(before) + 1:
             found.wrong.append("the second run was not saved")
+
+
+async def _outlasted(bench: Interrupted, stood: bool, found: Trial) -> bool:
+    """Whether the wizard goes on to its end after what passed."""
+    before = bench.files()
+    if not bench.wizard.done():
+        if not stood:
+            found.wrong.append("it was not stopped")
+        await asyncio.wait([bench.wizard], timeout=WHOLE)
+        if bench.wizard.done() and bench.wizard.exception() is None and len(bench.files()) != len(before) + 1:
+            found.wrong.append("it went on, and saved nothing")
+    return bench.wizard.done() and bench.wizard.exception() is None
+
+
+async def _stands(bench: Interrupted) -> bool:
+    """Whether the truck comes to stand with its gate closed soon."""
+    async with _mode(bench) as gate:
+        for _ in range(round(STOPPED / STEP)):
+            await bench.clock.sleep(STEP)
+            if bench.speed <= STILL and gate.latest is not None and not gate.latest.mode.active:
+                return True
+    return False
 
 
 @asynccontextmanager
