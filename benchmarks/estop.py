@@ -40,7 +40,14 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.estop_parts.processes import ORDER_TIMEOUT, OtherLoad, order, process, processor_seconds
+from benchmarks.estop_parts.processes import (
+    ORDER_TIMEOUT,
+    OtherLoad,
+    order,
+    process,
+    processor_seconds,
+    set_scheduler,
+)
 from monstertruck_drivers.cable import PtyPort
 from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos.protocol import Control, FrameError, Opcode, decode_body, join
@@ -121,8 +128,6 @@ def flood(kind: str, endpoint: str, nonce: str, yields: bool) -> None:
 
     import zenoh  # noqa: PLC0415
 
-    if yields:
-        os.nice(19)
     config = zenoh.Config()
     config.insert_json5("mode", '"client"')
     config.insert_json5("connect/endpoints", json.dumps([endpoint]))
@@ -140,7 +145,7 @@ def flood(kind: str, endpoint: str, nonce: str, yields: bool) -> None:
                     break
                 flooding, count, began = not flooding, 0, time.monotonic()
                 if yields and flooding:
-                    os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+                    set_scheduler(os.getpid(), os.SCHED_IDLE)
                 continue
             send(count)
             count += 1
@@ -200,7 +205,7 @@ class Flooder:
 
     def _hurry(self) -> None:
         """Have it read what it shall do: on a computer that others keep busy, one that yields gets no turn."""
-        os.sched_setscheduler(self._running.pid, os.SCHED_OTHER, os.sched_param(0))
+        set_scheduler(self._running.pid, os.SCHED_OTHER)
 
     async def end(self) -> float:
         """End; returns how many were sent a second while it flooded."""

@@ -6,7 +6,7 @@ import resource
 import sys
 import time
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 
 from monstertruck_runtime.client import TruckClient
@@ -73,6 +73,13 @@ def processor_seconds(pid: int) -> float:
     """Processor time of a process of ours so far, s (proc(5))."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def set_scheduler(pid: int, policy: int) -> None:
+    """Give all threads of a process of ours a scheduling policy (sched(7)); those that have ended are left out."""
+    for task in Path(f"/proc/{pid}/task").iterdir():
+        with suppress(ProcessLookupError):
+            os.sched_setscheduler(int(task.name), policy, os.sched_param(0))
 
 
 def _busy() -> float:
