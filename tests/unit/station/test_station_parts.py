@@ -327,11 +327,13 @@ async def test_a_stop_goes_by_any_session_and_other_commands_of_one_browser_are_
         task.cancel()
 
 
-def test_the_page_is_asked_for_by_the_names_and_the_scheme_that_browsers_use():
+def test_the_page_is_asked_for_by_the_names_and_the_scheme_that_browsers_use(tmp_path: Path):
+    file = tmp_path / "users.yaml"
+    file.touch(0o600)
     local = Place(port=80)
     assert {"localhost", "localhost:80", "[::1]"} <= local.names
     assert "localhost" not in Place(port=8470).names
-    users, tls = StationUsers({}), ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
+    users, tls = StationUsers(file), ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
     wide = Place("fd00::7", 443, tls, users, ("Robots.Example",))
     assert {"[fd00::7]", "[fd00::7]:443", "robots.example"} <= wide.names
     assert "https://robots.example" in wide.origins
