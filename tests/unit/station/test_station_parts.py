@@ -5,6 +5,7 @@ import json
 import re
 import ssl
 import struct
+from pathlib import Path
 
 import numpy as np
 import pytest
