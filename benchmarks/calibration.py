@@ -1,13 +1,15 @@
 """Wizards against hidden truth: 20 trucks, all values of each off, calibrated in the order of docs/calibration.md.
 
     python benchmarks/calibration.py [--seeds 20] [--jobs 1] [--light 200]
+    python benchmarks/calibration.py --only camera --light 200
     python benchmarks/calibration.py --part swapped|interruptions|square [--count 20]
 
 Every session runs the whole daemon on a virtual clock: real drivers, emulated devices, the safety gate; the operator
 has a tape, a string and a meter with errors of their own. Judged is whether the true value lies in the stated interval,
 and, against the truck's own linkage, the curvature that the calibrated truck believes, to its full lock.
 Before that the fits of every wizard are judged alone on drawn measurements, ``--light``
-each: how often the truth lies inside, how wide the intervals are. ``--seeds 0`` leaves it at these.
+each: how often the truth lies inside, how wide the intervals are. ``--seeds 0`` leaves it at these, ``--only WIZARD``
+at those of one.
 
 ``--part swapped``: a swapped cable or a wrong sign, drawn for every wizard, that it has to name in every case.
 ``--part interruptions``: Ctrl-C, a cable, the emergency stop, a low battery, a lost lease, and kill -9 of wizard and
@@ -123,10 +125,10 @@ def figures(trucks: Iterable[Truck]) -> dict[str, dict[str, float]]:
     return out
 
 
-def light(fits: int) -> tuple[dict[str, Any], bool]:
+def light(fits: int, wizards: Iterable[str]) -> tuple[dict[str, Any], bool]:
     """Fits on drawn measurements: coverage by wizard, half-widths by estimate, and whether both are as meant."""
     inside, halves, fine = {}, {}, True
-    for wizard in LIGHT:
+    for wizard in wizards:
         found = coverage(wizard, fits)
         inside[wizard] = round(float(np.mean([share for share, _ in found.values()])), 4)
         fine &= COVERAGE[0] <= inside[wizard] <= COVERAGE[1]
@@ -159,6 +161,7 @@ def main() -> int:
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--light", type=int, default=200)
+    parser.add_argument("--only", choices=tuple(LIGHT), help="this wizard's light fits alone")
     parser.add_argument("--part", choices=("trucks", *PARTS), default="trucks")
     parser.add_argument("--count", type=int, default=20, help="of faults or interruptions of each kind")
     arguments = parser.parse_args()
@@ -166,9 +169,9 @@ def main() -> int:
         found, goals, met = PARTS[arguments.part](arguments.count)
         print(json.dumps({"bench": f"calibration.{arguments.part}", "figures": found, "goals": goals, "met": met}))
         return 0 if met else 1
-    by_light, fine = light(arguments.light)
+    by_light, fine = light(arguments.light, LIGHT if arguments.only is None else (arguments.only,))
     light_goals = {"coverage": COVERAGE, "half_widths": HALF_WIDTHS}
-    if not arguments.seeds:
+    if not arguments.seeds or arguments.only is not None:
         print(json.dumps({"bench": "calibration", "figures": by_light, "goals": light_goals, "met": fine}))
         return 0 if fine else 1
     trucks = []
