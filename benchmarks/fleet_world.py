@@ -3,8 +3,9 @@
     python benchmarks/fleet_world.py              one simulator process, a daemon process for each robot, real time
     python benchmarks/fleet_world.py --virtual    the same daemons on one virtual clock, as fast as it computes
 
-Robots do not know each other's plans: each stops before what it sees, waits a time drawn by its seed, backs off where
-no other robot says that it is near (a lidar of 240 degrees sees nobody who comes from behind), and tries again.
+Robots do not know each other's plans. Each hears where the others say that they are (``peers``), which counts behind
+it, where its lidar of 240 degrees sees nobody; it stops before what it sees and hears, waits a time drawn by its seed,
+backs off, and tries again.
 Contacts in which a robot moves count against the goal; people who walk into a standing one are counted apart.
 """
 
@@ -59,8 +60,6 @@ HALF = 2.2
 """Places are drawn within this of the yard's middle, m."""
 REACHED = 0.15
 """A place nearer than this is reached, m."""
-APART = 0.65
-"""Between the middles of two robots of which one may turn or go backwards, m."""
 TASKS = 8
 GOALS = {"contacts_by_moving_robots": 0, "tasks_of_each": TASKS}
 CONTACT = re.compile(r"contact: (.+) at ([\d.]+) m/s with (.+) at ([\d.]+) m/s")
@@ -79,6 +78,7 @@ class Score:
 def configurations(folder: Path) -> list[Path]:
     """A file for every robot, with its name, place and folders."""
     files = []
+    endpoints = {kind: free_endpoint() for kind in ROBOTS}
     for i, (kind, (x, y, yaw)) in enumerate(ROBOTS.items()):
         start = {"x": x, "y": y, "yaw": yaw}
         world: dict[str, Any] = {"map": "yard", "start": start}
@@ -92,7 +92,8 @@ def configurations(folder: Path) -> list[Path]:
             "recorder": None,
             "odometry": {"start": start},
             "state_directory": str(folder / "{robot}" / "state"),
-            "zenoh": {"listen": [free_endpoint()]},
+            "zenoh": {"listen": [endpoints[kind]]},
+            "peers": {other: {"endpoint": end} for other, end in endpoints.items() if other != kind},
             "sim": {"world": world | ({"people": list(PEOPLE)} if i == 0 else {})},
         }
         file = folder / f"{kind}.yaml"
@@ -110,16 +111,14 @@ class Pilot:
         clock: time.
         seed: of places and pauses.
         score: what it does.
-        everybody: newest pose that each robot says of itself, by name.
-        name: of the robot.
+        pose: newest pose of the robot.
     """
 
     driver: BehaviourClient
     clock: Clock
     seed: int
     score: Score
-    everybody: dict[str, Mailbox[Odometry]]
-    name: str
+    pose: Mailbox[Odometry]
     rng: np.random.Generator = field(init=False)
     gate: Mailbox[GateState] = field(init=False)
 
@@ -136,7 +135,7 @@ class Pilot:
     async def go_to(self, x: float, y: float, until: int) -> None:
         """Turn to a place and drive there; after a stop back off and try again."""
         while self.clock.now() < until:
-            if (newest := self.everybody[self.name].latest) is None:
+            if (newest := self.pose.latest) is None:
                 await self.clock.sleep(0.2)
                 continue
             pose = newest.pose
@@ -149,21 +148,14 @@ class Pilot:
             if turned and await self.move(length=way, speed=0.18):
                 continue
             await self.clock.sleep(float(self.rng.uniform(0.3, 3.0)))
-            if self.rng.random() < 0.8 and self.alone(back=0.25):
+            if self.rng.random() < 0.8:
                 await self.move(length=-float(self.rng.uniform(0.1, 0.2)), speed=0.1)
             if self.rng.random() < 0.5 and await self.turn(float(self.rng.uniform(-1.5, 1.5))):
                 await self.move(length=float(self.rng.uniform(0.2, 0.8)), speed=0.15)
 
-    def alone(self, back: float = 0.0) -> bool:
-        """Whether no other robot says that it is near, here or so many metres behind."""
-        poses = {name: box.latest.pose for name, box in self.everybody.items() if box.latest is not None}
-        me = poses.pop(self.name)
-        place = me.x - back * math.cos(me.yaw), me.y - back * math.sin(me.yaw)
-        return all(math.dist(place, (other.x, other.y)) > APART for other in poses.values())
-
     async def turn(self, angle: float) -> bool:
         """Whether it turned on the spot."""
-        return self.alone() and await self.move(radius=0.0, angle=angle)
+        return await self.move(radius=0.0, angle=angle)
 
     async def move(self, **settings: float) -> bool:
         """Whether a move came to its end."""
@@ -206,11 +198,10 @@ def on_virtual_clock(seconds: float, seed: int) -> Run:
         async with virtual_fleet(configs, clock) as (rigs, scene):
             await clock.sleep(2.0)
             began, used, until = perf_counter(), process_time(), clock.now() + round(seconds * SECOND)
-            everybody = {rig.config.robot: rig.bus.subscribe(POSE, latest()) for rig in rigs}
             async with asyncio.TaskGroup() as group:
                 for i, rig in enumerate(rigs):
                     name, driver = rig.config.robot, LocalOperator(rig.daemon, clock)
-                    pilot = Pilot(driver, clock, seed + i, scores[name], everybody, name)
+                    pilot = Pilot(driver, clock, seed + i, scores[name], rig.bus.subscribe(POSE, latest()))
                     group.create_task(pilot.patrol(until))
             return scene.contacts, perf_counter() - began, process_time() - used
 
@@ -231,13 +222,13 @@ def in_processes(seconds: float, seed: int) -> Run:
             endpoints = {c.robot: c.zenoh.listen[0] for c in map(load_simulated, files)}
             async with simulator(files, folder / "truth.npz", lines) as process:
                 clients = [await connected(clock, robot, end) for robot, end in endpoints.items()]
-                everybody = {client.robot: client.subscribe(POSE, latest()) for client in clients}
                 until = clock.now() + round(seconds * SECOND)
                 began = perf_counter()
                 try:
                     async with asyncio.TaskGroup() as group:
                         for i, client in enumerate(clients):
-                            pilot = Pilot(client, clock, seed + i, scores[client.robot], everybody, client.robot)
+                            pose = client.subscribe(POSE, latest())
+                            pilot = Pilot(client, clock, seed + i, scores[client.robot], pose)
                             group.create_task(pilot.patrol(until))
                 finally:
                     taken = perf_counter() - began

@@ -359,6 +359,7 @@ class Daemon:
             battery_measured=measures_battery(config),
             latched=latch.engaged(),
             sonars=self._body.sonars,
+            peers=self._body.peers,
         )
         shafts = len(self._body.chassis.shafts)
         drives, steering = bus.actuators(shafts)
@@ -373,6 +374,8 @@ class Daemon:
                 steering=bus.subscribe(topics.STEERING, latest()),
                 battery=bus.subscribe(topics.BATTERY, latest()),
                 sonar=bus.subscribe(topics.SONAR, latest()) if self._body.sonars else None,
+                peers=bus.subscribe(topics.PEERS, latest()) if config.peers else None,
+                pose=bus.subscribe(topics.POSE, latest()) if config.peers else None,
             ),
             GateOutputs(
                 drives, steering, bus.publisher(topics.GATE, Writer.GATE), bus.publisher(topics.STOP, Writer.GATE)

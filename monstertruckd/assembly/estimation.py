@@ -49,6 +49,8 @@ class Body:
     """Of the newest scan."""
     sonars: Mapping[str, tuple[float, float, float]]
     """Pose of every sonar in base that guards the robot, m, m, rad: of one without a lidar."""
+    peers: Mapping[str, Footprint]
+    """Outlines of the robots that it hears, by name."""
 
     @classmethod
     def of(cls, config: TruckConfig) -> Self:
@@ -57,7 +59,9 @@ class Body:
         points = ScanPoints(lidar.mount.planar if lidar is not None else (0.0, 0.0, 0.0))
         sonar = config.devices.sonar if lidar is None else None
         mounts = {} if sonar is None else {name: one.mount.planar for name, one in sonar.driver.sonars.items()}
-        return cls(config.chassis(), Footprint(config.geometry.length, config.geometry.width), points, mounts)
+        length, width = config.geometry.length, config.geometry.width
+        peers = {name: Footprint(peer.length or length, peer.width or width) for name, peer in config.peers.items()}
+        return cls(config.chassis(), Footprint(length, width), points, mounts, peers)
 
 
 def sensor_mounts(config: TruckConfig) -> dict[str, Mount]:

@@ -137,6 +137,10 @@ class PeerConfig(Schema):
 
     endpoint: str
     """Where it listens, e.g. tcp/192.168.1.8:7447"""
+    length: Annotated[float, Field(gt=0, le=10)] | None = None
+    """Of its outline, m; null = that of this robot"""
+    width: Annotated[float, Field(gt=0, le=10)] | None = None
+    """Of its outline, m; null = that of this robot"""
 
 
 @dataclass(frozen=True, slots=True)

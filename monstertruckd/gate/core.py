@@ -27,10 +27,11 @@ from monstertruck_schemas.health import HealthTable
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import UNCONDITIONAL, ControlRequest, DriveForm, DriveRequest, Order, Role
 from monstertruck_schemas.sensor import Attitude, Battery, DriveFeedback, LaserScan, SonarRanges, SteeringFeedback
-from monstertruck_schemas.state import GateMode
+from monstertruck_schemas.state import GateMode, Odometry, Peers
 from monstertruckd.gate.arbitration import EventLog, GateEvent, GateStateMachine, Source, Sources
 from monstertruckd.gate.config import GateConfig
 from monstertruckd.gate.limiter import CommandLimiter, Motion, ObstacleGuard
+from monstertruckd.gate.peers import PeerGuard
 from monstertruckd.gate.sensors import DRIVE_LOSSES, STALE_SENSORS, Assessment, SensorMonitor, ShaftCheck, SteeringCheck
 from monstertruckd.gate.sonars import SonarGuard
 from monstertruckd.gate.stops import CauseBuilder, Outages, StopLog, Trip
@@ -119,6 +120,7 @@ class Gate:
         battery_measured: something is there to measure the battery.
         latched: whether the emergency stop was latched when the daemon last ran.
         sonars: pose (x, y, yaw) of every sonar in base by name, of a robot that has no lidar; m, m, rad.
+        peers: outlines of other robots that say where they are, by name.
     """
 
     def __init__(
@@ -133,6 +135,7 @@ class Gate:
         battery_measured: bool,
         latched: bool,
         sonars: Mapping[str, tuple[float, float, float]] | None = None,
+        peers: Mapping[str, Footprint] | None = None,
     ) -> None:
         self._config = config
         self._chassis = chassis
@@ -141,8 +144,9 @@ class Gate:
         self._outages = Outages(services)
         self._obstacles = ObstacleGuard(config, footprint, points)
         self._sonars = SonarGuard(config, footprint, sonars) if sonars else None
+        self._peers = PeerGuard(config, footprint, peers, self._obstacles.looks_at) if peers else None
         self._motion = Motion(config, chassis)
-        self._limiter = CommandLimiter(config, self._motion, self._obstacles, self._sensors, self._sonars)
+        self._limiter = CommandLimiter(config, self._motion, self._obstacles, self._sensors, self._sonars, self._peers)
         self._steering_check = SteeringCheck(config.turning) if config.turning is not None else None
         self._shaft_check = ShaftCheck(config.blocked) if config.blocked is not None else None
         self._causes = CauseBuilder(config, self._sensors, self._limiter, self._steering_check, self._shaft_check)
@@ -187,6 +191,16 @@ class Gate:
         """Take the newest round of the sonars."""
         if self._sonars is not None:
             self._sonars.observe(ranges)
+
+    def observe_peers(self, peers: Peers) -> None:
+        """Take what was heard of other robots."""
+        if self._peers is not None:
+            self._peers.observe(peers)
+
+    def observe_pose(self, pose: Odometry) -> None:
+        """Take the newest pose in the map, in which other robots say where they are."""
+        if self._peers is not None:
+            self._peers.observe_pose(pose)
 
     def observe_attitude(self, attitude: Attitude) -> None:
         """Take the newest attitude."""

@@ -36,6 +36,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import DriveRequest, RequestedTwist
 from monstertruck_schemas.sensor import NO_ECHO, VALID_BEAM, LaserScan
 from monstertruckd.gate.config import GateConfig
+from monstertruckd.gate.peers import PeerGuard
 from monstertruckd.gate.sensors import SensorMonitor
 from monstertruckd.gate.sonars import SonarGuard
 
@@ -151,6 +152,10 @@ class Visibility:
         """Sector of every point (n, 2) in base, m."""
         x, y, yaw = self._mount
         return _sector(np.arctan2(points[:, 1] - y, points[:, 0] - x) - yaw)
+
+    def covers(self, points: Array) -> NDArray[np.bool_]:
+        """Which of the points (n, 2) in base, m, lie in the lidar's field."""
+        return self._field[self.sectors_of(points)]
 
     def travelled(self, ground: Array) -> Sectors:
         """Sectors of the points (n, 2) in base, m, that the body does not stand on."""
@@ -397,6 +402,15 @@ class ObstacleGuard:
             self._memory.forget()
         self._sweep = lru_cache(SWEEPS)(self._swept)
         self._checked = None
+
+    @property
+    def reach(self) -> float:
+        """Distance swept, m."""
+        return self._reach
+
+    def looks_at(self, points: Array) -> NDArray[np.bool_]:
+        """Which of the points (n, 2) in base, m, lie in the lidar's field."""
+        return self._visibility.covers(points)
 
     def move(self, now: int, twist: Twist[float] | None, dt: float) -> None:
         """The body moved with ``twist`` for the ``dt`` s until ``now``, ns; None = it is not known how."""
@@ -715,6 +729,7 @@ class CommandLimiter:
         obstacles: swept footprint against the newest scan.
         sensors: newest samples.
         sonars: swept footprint against the newest echoes; None = the robot has a lidar, or no range sensor at all.
+        peers: swept footprint against other robots; None = none is heard.
     """
 
     def __init__(
@@ -724,12 +739,14 @@ class CommandLimiter:
         obstacles: ObstacleGuard,
         sensors: SensorMonitor,
         sonars: SonarGuard | None = None,
+        peers: PeerGuard | None = None,
     ) -> None:
         self._config = config
         self._motion = motion
         self._obstacles = obstacles
         self._sensors = sensors
         self._sonars = sonars
+        self._peers = peers
         self.blocked = False
         """An obstacle ahead allows no motion."""
         self.blind = False
@@ -747,6 +764,8 @@ class CommandLimiter:
         self._sensors.configure(config)
         if self._sonars is not None:
             self._sonars.configure(config)
+        if self._peers is not None:
+            self._peers.configure(config)
 
     @property
     def unseen(self) -> float | None:
@@ -811,6 +830,8 @@ class CommandLimiter:
         reach = config.obstacle.ahead + config.speed * (delay + config.speed / (2 * config.obstacle.deceleration))
         views = [sonars.look(way, reach, now) for way in ways]
         free = min((view.free for view in views), default=math.inf)
+        if self._peers is not None:
+            free = min(free, self._peers.free_distance(ways, reach, now))
         self.free = free if math.isfinite(free) else None
         allowed = comfortable_speed(free - config.obstacle.ahead, delay, config.obstacle.deceleration)
         self.blocked = allowed < (2 * config.obstacle.crawl if self.blocked else config.obstacle.crawl)
@@ -837,6 +858,8 @@ class CommandLimiter:
         if self._sensors.steering_fresh(now):
             ways.append(motion.along(ways[0], self._sensors.angles))
         free = self._obstacles.free_distance(tuple(ways))
+        if self._peers is not None:
+            free = min(free, self._peers.free_distance(ways, self._obstacles.reach, now))
         self.free = free if math.isfinite(free) else None
         allowed = self._obstacles.allowed_speed(free, now)
         crawl = self._config.obstacle.crawl

@@ -21,7 +21,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import STARTING, ControlRequest, DriveRequest
 from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.sensor import Attitude, Battery, DriveFeedback, LaserScan, SonarRanges, SteeringFeedback
-from monstertruck_schemas.state import GateMode, GateState
+from monstertruck_schemas.state import GateMode, GateState, Odometry, Peers
 from monstertruckd.gate.config import GateConfig
 from monstertruckd.gate.core import Decision, Gate, GateOutput
 from monstertruckd.gate.latch import Latch
@@ -88,6 +88,10 @@ class GateInputs:
     battery: Subscription[Battery]
     sonar: Subscription[SonarRanges] | None = None
     """Of a robot that has sonars."""
+    peers: Subscription[Peers] | None = None
+    """Of a robot that hears others."""
+    pose: Subscription[Odometry] | None = None
+    """Of one that hears others."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,6 +165,8 @@ class GateService:
             _Feed(inputs.steering, gate.observe_steering),
             _Feed(inputs.battery, gate.observe_battery),
             *(() if inputs.sonar is None else (_Feed(inputs.sonar, gate.observe_sonar),)),
+            *(() if inputs.peers is None else (_Feed(inputs.peers, gate.observe_peers),)),
+            *(() if inputs.pose is None else (_Feed(inputs.pose, gate.observe_pose),)),
         ]
 
     def configure(self, config: GateConfig, weakened: tuple[str, ...]) -> None:

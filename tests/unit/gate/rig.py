@@ -53,7 +53,9 @@ ANY_GROUND = {"unseen_speed": 1.0}
 """Settings for obstacles that take ground no scan has seen for seen."""
 
 
-def make_gate(latched=False, nonce=NONCE, chassis=CHASSIS, services=SERVICES, battery_measured=False, **config):
+def make_gate(
+    latched=False, nonce=NONCE, chassis=CHASSIS, services=SERVICES, battery_measured=False, peers=None, **config
+):
     return Gate(
         GateConfig(**config),
         chassis=chassis,
@@ -63,6 +65,7 @@ def make_gate(latched=False, nonce=NONCE, chassis=CHASSIS, services=SERVICES, ba
         nonce=nonce,
         battery_measured=battery_measured,
         latched=latched,
+        peers=peers,
     )
 
 
