@@ -561,7 +561,7 @@ def on_cluster(address: str, step: Callable[[T], U], inputs: Sequence[T]) -> Ite
     except ImportError as error:
         raise InputError("--cluster needs dask.distributed: install monstertruckd[cluster]") from error
     try:
-        client = Client(address, timeout=CONNECT)  # type: ignore[no-untyped-call]
+        client = Client(address, timeout=CONNECT)
     except (OSError, ValueError) as error:
         raise NoAnswerError(f"{address}: no dask scheduler answers: {error}") from error
     with client:
