@@ -47,12 +47,16 @@ class DrivingStation:
     """
 
     def __init__(self, bus: Bus, clock: VirtualClock, speed: float = 0.18, front: float = 0.0) -> None:
-        self.silent = True
         self.speed = speed
         self.front = front
-        self._bus = bus
         self._clock = clock
         self._seq = 0
+        self.attach(bus)
+
+    def attach(self, bus: Bus) -> None:
+        """Send to a daemon, silent at first."""
+        self.silent = True
+        self._bus = bus
         self._gate = bus.subscribe(topics.GATE, latest())
 
     async def run(self) -> None:
@@ -93,13 +97,15 @@ class DrillTruck:
 
     def __init__(self, rig: VirtualRig, *, by_station: bool = False) -> None:
         self.rig = rig
-        self._by_station = by_station
         self.clock = rig.clock
         self.observer = Observer(rig.config, rig.world, rig.ports, rig.clock)
         self.station: DrivingStation | None = None
         self._cruise = min(CRUISE, rig.config.gate.speed / 2)
         self._heard: Daemon | None = None
         self.listen()
+        if by_station:
+            angle = min(math.atan(rig.config.geometry.wheelbase / CIRCLE), rig.config.gate.angle)
+            self.station = DrivingStation(rig.bus, rig.clock, STATION_SPEED * rig.config.gate.speed, angle)
 
     def listen(self) -> None:
         """Listen to the rig's daemon where it is another one than before."""
@@ -112,9 +118,8 @@ class DrillTruck:
         self._reports = tuple(queues)
         self._gate = rig.bus.subscribe(topics.GATE, latest())
         self._health = rig.bus.subscribe(topics.HEALTH, latest())
-        if self._by_station:
-            angle = min(math.atan(rig.config.geometry.wheelbase / CIRCLE), rig.config.gate.angle)
-            self.station = DrivingStation(rig.bus, rig.clock, STATION_SPEED * rig.config.gate.speed, angle)
+        if self.station is not None:
+            self.station.attach(rig.bus)
 
     @classmethod
     @asynccontextmanager
@@ -130,19 +135,15 @@ class DrillTruck:
         truck = cls(rig, by_station=by_station)
         async with rig.running():
             observing = asyncio.create_task(truck.observer.run(), name="observer")
-            asking = asyncio.create_task(truck._ask_for_ever(), name="station")
+            asking = None if truck.station is None else asyncio.create_task(truck.station.run(), name="station")
             try:
                 yield truck
             finally:
-                asking.cancel()
+                if asking is not None:
+                    asking.cancel()
                 observing.cancel()
                 with suppress(asyncio.CancelledError):
                     await observing  # an observer that broke has seen nothing
-
-    async def _ask_for_ever(self) -> None:
-        while self.station is not None:
-            self.station.send()
-            await self.clock.sleep(REQUESTS)
 
     @property
     def gate(self) -> GateState | None:
