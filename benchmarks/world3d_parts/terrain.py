@@ -80,7 +80,7 @@ def hills() -> list[dict[str, Any]]:
     """Hills with the RMS slope over the demo's world, and a ramp."""
     feature = {"kind": "hills", "height": 0.05, "wavelength": WAVE, "seed": 5}
     config = WorldConfig.model_validate({"engine": "mujoco", "map": "loop", "ground": [feature]})
-    heights = ground_heights(config, None, (-3.0, 3.0, -3.0, 3.0), (9.0, 9.0, 0.0))
+    heights = ground_heights(config, None, (-3.0, 3.0, -3.0, 3.0), [(9.0, 9.0, 0.0)])
     assert heights is not None
     rows, columns = np.gradient(heights.z, heights.resolution)
     slope = degrees(float(np.sqrt((np.arctan(np.hypot(rows, columns)) ** 2).mean())))

@@ -6,7 +6,7 @@ from typing import Final, NamedTuple
 from PIL import Image
 
 from monstertruck_sim.world.world import World, make_scene
-from monstertruck_sim.world3d.picture import WorldRenderer, looking_at
+from monstertruck_sim.world3d.picture import WorldRenderer, looking_at, standing
 from monstertruck_sim.world3d.plant import RigidPlant
 from monstertruckd.tools.shipped import shipped
 from monstertruckd.tools.simulation.config import load_simulated
@@ -43,7 +43,7 @@ def main() -> None:
     for name in sorted(files.keys() - {other for others in WITH.values() for other in others}):
         configs = [load_simulated(files[each]).sim for each in (name, *WITH.get(name, ()))]
         seed = configs[0].seed
-        scene = make_scene(configs[0].world, seed)
+        scene = make_scene(configs[0].world, seed, [config.world for config in configs[1:]])
         worlds = [World(config.world, seed, scene, f"robot_{i}") for i, config in enumerate(configs)]
         for world in worlds:
             world.truth(SETTLED)
@@ -54,7 +54,8 @@ def main() -> None:
         view = VIEWS.get(name, View())
         eye = tuple(a + b for a, b in zip(view.at, view.aside, strict=True))
         renderer = WorldRenderer(plant.model, *SIZE)
-        picture = renderer.draw(plant.data, looking_at((eye[0], eye[1], eye[2]), view.at))
+        people = standing(scene.people_at(2 * SETTLED), plant.ground)
+        picture = renderer.draw(plant.data, looking_at((eye[0], eye[1], eye[2]), view.at), people=people)
         renderer.close()
         image = Image.fromarray(picture).quantize(COLOURS, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
         image.save(PICTURES / f"{name}.png", optimize=True)

@@ -591,7 +591,7 @@ class Hills(Schema):
     """Shortest wave, m."""
     seed: Annotated[int, Field(ge=0)] = 1
     flat: NotNegative = 0.5
-    """Radius of level ground around the robot's start, m."""
+    """Radius of level ground around the start of every robot of the world, m."""
 
 
 class Slope(Schema):

@@ -19,6 +19,7 @@ from monstertruck_sim.world.built_in import BuiltIn
 from monstertruck_sim.world.config import PersonConfig
 from monstertruck_sim.world.obstacles import Box, Disc, Obstacle, discs_and_segments, penetration
 from monstertruck_sim.world.people import STEP_S, Person
+from monstertruck_sim.world.plant import Pose
 from monstertruck_sim.world.raycast import cast_rays, clearance, grid_penetration
 from monstertruck_sim.world.truck_plant import STEP_NS
 
@@ -78,13 +79,14 @@ class Surroundings:
         place: map and ground.
         people: who walks through it.
         seed: of the people.
+        starts: where its robots begin; hills are level there, for all of them.
 
     Raises:
         InputError: a person's way is not free.
     """
 
-    def __init__(self, place: BuiltIn, people: Sequence[PersonConfig] = (), seed: int = 0) -> None:
-        self.place, self.map = place, place.map
+    def __init__(self, place: BuiltIn, people: Sequence[PersonConfig], seed: int, starts: Sequence[Pose]) -> None:
+        self.place, self.map, self.starts = place, place.map, tuple(starts)
         self.solid = place.map.cells != FREE
         """Cells in which nobody may begin."""
         self._occupied = place.map.cells == OCCUPIED

@@ -1,5 +1,6 @@
 """One robot in a simulated world, and the physics of its devices."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -58,7 +59,7 @@ class World:
         self.scene = scene if scene is not None else make_scene(config, seed)
         self.name = name
         place = self.scene.place
-        start = (config.start.x, config.start.y, config.start.yaw) if config.start else place.start
+        start = _start(config, place)
         noise_seed = seed if config.noise else None
         self.map = place.map
         self._footprint = PlanOutline(self.scene, config.truck, name)
@@ -240,13 +241,24 @@ def make_view(config: WorldConfig, plant: Plant, cast: Caster, scene: Surroundin
     return RenderedView(drawn)
 
 
-def make_scene(config: WorldConfig, seed: int) -> Surroundings:
+def make_scene(config: WorldConfig, seed: int, others: Sequence[WorldConfig] = ()) -> Surroundings:
     """Surroundings for the robots of one world.
+
+    Args:
+        config: the first robot's; map and people are its.
+        seed: of the people.
+        others: the further robots' worlds, for the places where they begin.
 
     Raises:
         InputError: unknown map name, a bad map or profile file, or a person's way that is not free.
     """
-    return Surroundings(_find(config.map), config.people, seed)
+    place = _find(config.map)
+    return Surroundings(place, config.people, seed, [_start(each, place) for each in (config, *others)])
+
+
+def _start(config: WorldConfig, place: BuiltIn) -> Pose:
+    start = config.start
+    return (start.x, start.y, start.yaw) if start else place.start
 
 
 def _find(name: str) -> BuiltIn:

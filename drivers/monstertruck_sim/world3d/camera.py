@@ -10,7 +10,7 @@ import numpy as np
 from monstertruck_runtime.errors import InputError
 from monstertruck_sim.world.camera import CameraPlace, Drawing, Painter, Picture, SimulatedView, mounted
 from monstertruck_sim.world3d.model import Group
-from monstertruck_sim.world3d.picture import CameraPose, WorldRenderer
+from monstertruck_sim.world3d.picture import CameraPose, WorldRenderer, standing
 from monstertruck_sim.world3d.plant import RigidPlant
 
 FULL_SIZE: Final = (640, 480)
@@ -53,9 +53,8 @@ class RenderedView(SimulatedView):
         upright = 2 * atan(height / width * tan(self.config.field_of_view / 2) * wider)
         pose = CameraPose(tuple(place.centre.tolist()), tuple(ahead), (-down[0], -down[1], -down[2]), upright)
         people = [] if self.crowd is None else self.crowd.people_at(time_ns)
-        floor = self._rigid.height
-        standing = [(x, y, floor, radius) for x, y, radius in people]
-        renderer.arrange(self._rigid.data, pose, people=standing, hidden=self.HIDDEN)
+        there = standing(people, self._rigid.ground)
+        renderer.arrange(self._rigid.data, pose, people=there, hidden=self.HIDDEN)
         grain = self.grain(time_ns)
         board = self.board_at(time_ns)
 

@@ -29,6 +29,7 @@ from monstertruck_sim.world3d.model import (
     PARKED,
     SPARE,
     TALL,
+    UPRIGHT,
     DriveLine,
     Group,
     StaticScene,
@@ -37,6 +38,8 @@ from monstertruck_sim.world3d.model import (
 )
 from monstertruck_sim.world3d.plant import RigidPlant, Steering
 
+_Shown = tuple[Obstacle, bool] | None
+"""What a spare body stands for, and whether pictures show it: people are drawn as such; None = nothing."""
 _RAYS: Final = 64
 """Beams that are cast at blocks from one origin; each is corrected for its own."""
 
@@ -70,8 +73,11 @@ class RigidSpace:
             footprint, footprint.scene, plant, ground, name,
         )  # fmt: skip
         self.contact, self.cast = footprint.overlap, footprint.cast
-        self._shown: dict[str, list[Obstacle | None]] = {"disc": [None] * SPARE, "box": [None] * SPARE}
+        self._shown: dict[str, list[_Shown]] = {"disc": [None] * SPARE, "box": [None] * SPARE}
         self._known: tuple[Obstacle, ...] = ()
+        for kind, spare in self._shown.items():
+            for i in range(len(spare)):
+                self._show(f"{kind}_{i}", None)
 
     @property
     def obstacles(self) -> tuple[Obstacle, ...]:
@@ -84,8 +90,8 @@ class RigidSpace:
         Raises:
             InputError: no spare body of its kind is left.
         """
-        kind = type(obstacle)
-        if sum(isinstance(other, kind) for other in (*self.obstacles, *self._moving())) >= SPARE:
+        kind, people = type(obstacle), [person.disc for person in self._scene.people]
+        if sum(isinstance(other, kind) for other in (*self.obstacles, *self._robots(), *people)) >= SPARE:
             raise InputError(f"obstacle: {SPARE} of kind {kind.__name__.lower()} are in the world: no room for more")
         self._scene.set_obstacles((*self.obstacles, obstacle))
 
@@ -108,30 +114,36 @@ class RigidSpace:
 
     def follow(self) -> None:
         """Bring the bodies to where everything is now."""
-        moving = self._moving()
-        if not moving and self._known is self.obstacles:
+        robots, people = self._robots(), [person.disc for person in self._scene.people]
+        if not robots and not people and self._known is self.obstacles:
             return
         self._known = self.obstacles
+        there = [(shape, True) for shape in (*self._known, *robots)] + [(disc, False) for disc in people]
         for kind, cls in (("disc", Disc), ("box", Box)):
-            shapes = [shape for shape in (*self._known, *moving) if isinstance(shape, cls)][:SPARE]
             shown = self._shown[kind]
-            for i, shape in enumerate([*shapes, *[None] * (SPARE - len(shapes))]):
-                if shape != shown[i]:
-                    self._show(f"{kind}_{i}", shape)
-                    shown[i] = shape
+            wanted: list[_Shown] = [each for each in there if isinstance(each[0], cls)]
+            wanted += [None] * (SPARE - len(wanted))
+            for i, each in enumerate(wanted[:SPARE]):
+                if each != shown[i]:
+                    self._show(f"{kind}_{i}", each)
+                    shown[i] = each
 
-    def _moving(self) -> list[Obstacle]:
-        scene = self._scene
-        others: list[Obstacle] = [body.outline for body in scene.bodies if body.name != self._name]
-        return [*others, *(person.disc for person in scene.people)]
+    def _robots(self) -> list[Obstacle]:
+        return [body.outline for body in self._scene.bodies if body.name != self._name]
 
-    def _show(self, name: str, shape: Obstacle | None) -> None:
+    def _show(self, name: str, shown: _Shown) -> None:
+        """Put a spare body to where something is; one that is not used costs neither steps nor pictures anything."""
         model, data = self._plant.model, self._plant.data
         body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name)
         mocap, geom = model.body_mocapid[body], model.body_geomadr[body]
-        if shape is None:
+        kind, affinity = (0, 0) if shown is None else UPRIGHT
+        model.geom_contype[geom] = model.body_contype[body] = kind
+        model.geom_conaffinity[geom] = model.body_conaffinity[body] = affinity
+        model.geom_rgba[geom, 3] = shown is not None and shown[1]
+        if shown is None:
             data.mocap_pos[mocap] = 0.0, 0.0, PARKED
             return
+        shape = shown[0]
         foot = float(self._ground.height(np.array(shape.x), np.array(shape.y)))
         data.mocap_pos[mocap] = shape.x, shape.y, foot + TALL / 2
         if isinstance(shape, Disc):
@@ -298,7 +310,7 @@ def rigid(config: WorldConfig, footprint: PlanOutline, start: Pose) -> Engine:
     resolution, (x0, y0) = place.map.resolution, place.map.origin
     rows, columns = place.map.cells.shape
     bounds = x0, x0 + columns * resolution, y0, y0 + rows * resolution
-    heights = ground_heights(config, place.profile, bounds, start)
+    heights = ground_heights(config, place.profile, bounds, scene.starts)
     ground: UnevenGround = heights if heights is not None else LevelGround()
     parts = mechanics(truck, config.mechanics)
     robot = description(truck, parts, head=LidarHead((config.lidar.x, config.lidar.y, config.lidar.height)))

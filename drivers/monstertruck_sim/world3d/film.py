@@ -10,7 +10,7 @@ from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.moving_picture import MovingPicture
 from monstertruck_sim.world.world import World
-from monstertruck_sim.world3d.picture import WorldRenderer, looking_at
+from monstertruck_sim.world3d.picture import WorldRenderer, looking_at, standing
 from monstertruck_sim.world3d.plant import RigidPlant
 
 RATE: Final = 8
@@ -62,13 +62,16 @@ class Film:
 
     def take(self) -> None:
         """One frame, of this moment."""
-        self._world.truth(self._clock.now())
+        now = self._clock.now()
+        self._world.truth(now)
         x, y, yaw = self._plant.pose
         z = self._plant.height
         self._heading += _SWING * (yaw - self._heading)
         c, s = cos(self._heading), sin(self._heading)
         camera = x - _BEHIND * c + _ASIDE * s, y - _BEHIND * s - _ASIDE * c, z + _ABOVE
-        picture = self._renderer.draw(self._plant.data, looking_at(camera, (x + 0.3 * c, y + 0.3 * s, z + 0.1)))
+        view = looking_at(camera, (x + 0.3 * c, y + 0.3 * s, z + 0.1))
+        people = standing(self._world.scene.people_at(now), self._plant.ground)
+        picture = self._renderer.draw(self._plant.data, view, people=people)
         self._pictures.add(Image.fromarray(picture).quantize(_COLOURS, Image.Quantize.MAXCOVERAGE, dither=_PLAIN))
 
     def close(self) -> None:

@@ -38,8 +38,16 @@ Bounds = tuple[float, float, float, float]
 """Least and greatest x, then y, m."""
 
 
-def ground_heights(config: WorldConfig, profile: Profile | None, bounds: Bounds, start: Pose) -> HeightGrid | None:
+def ground_heights(
+    config: WorldConfig, profile: Profile | None, bounds: Bounds, starts: Sequence[Pose]
+) -> HeightGrid | None:
     """Sum of the map's profile, rough patches, features and picture; None: level.
+
+    Args:
+        config: of the world.
+        profile: of the map.
+        bounds: of the map.
+        starts: of all robots of the world, for they stand on the same ground.
 
     Raises:
         InputError: no such picture.
@@ -52,15 +60,15 @@ def ground_heights(config: WorldConfig, profile: Profile | None, bounds: Bounds,
     x, y = np.meshgrid(x0 + np.arange(columns) * HEIGHT_STEP, y0 + np.arange(rows) * HEIGHT_STEP)
     z = Terrain(profile or LEVEL, config.rough).height(x, y)
     for feature in config.ground:
-        z = z + _height(feature, x, y, start)
+        z = z + _height(feature, x, y, starts)
     if config.height_image is not None:
         z = z + _pictured(config.height_image).height(x, y)
     return HeightGrid(np.ascontiguousarray(z), HEIGHT_STEP, (x0, y0))
 
 
-def _height(feature: GroundFeature, x: Array, y: Array, start: Pose) -> Array:
+def _height(feature: GroundFeature, x: Array, y: Array, starts: Sequence[Pose]) -> Array:
     if isinstance(feature, Hills):
-        return _hills(feature, x, y, start)
+        return _hills(feature, x, y, starts)
     if isinstance(feature, Slope):
         along = (x - feature.x) * cos(feature.direction) + (y - feature.y) * sin(feature.direction)
         return np.asarray(np.clip(along, 0.0, feature.length) * tan(radians(feature.angle_deg)))
@@ -73,15 +81,16 @@ def _height(feature: GroundFeature, x: Array, y: Array, start: Pose) -> Array:
     return np.zeros_like(x)
 
 
-def _hills(feature: Hills, x: Array, y: Array, start: Pose) -> Array:
-    """White noise without waves shorter than ``wavelength``, level around the start."""
+def _hills(feature: Hills, x: Array, y: Array, starts: Sequence[Pose]) -> Array:
+    """White noise without waves shorter than ``wavelength``, level around the starts."""
     noise = generator(feature.seed, GROUND).standard_normal(x.shape)
     spectrum = np.fft.rfft2(noise)
     fy, fx = np.fft.fftfreq(x.shape[0], HEIGHT_STEP), np.fft.rfftfreq(x.shape[1], HEIGHT_STEP)
     short = np.hypot(fy[:, None], fx) * feature.wavelength
     z = np.fft.irfft2(spectrum * np.exp(-(short**4)), s=x.shape)
     z *= feature.height / max(float(z.std()), 1e-12)
-    rise = np.clip((np.hypot(x - start[0], y - start[1]) - feature.flat) / feature.wavelength, 0.0, 1.0)
+    away = np.min([np.hypot(x - start[0], y - start[1]) for start in starts], axis=0)
+    rise = np.clip((away - feature.flat) / feature.wavelength, 0.0, 1.0)
     return np.asarray(z * rise * rise * (3.0 - 2.0 * rise))
 
 

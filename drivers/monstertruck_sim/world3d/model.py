@@ -49,7 +49,9 @@ class Warnings:
 
 # Two geometries touch where a bit of the type of one is in the affinity of the other.
 _GROUND: Final = {"contype": "5", "conaffinity": "2"}
-_UPRIGHT: Final = {"contype": "9", "conaffinity": "2"}
+UPRIGHT: Final = (9, 2)
+"""Type and affinity of walls and of what stands in a world."""
+_UPRIGHT: Final = {"contype": f"{UPRIGHT[0]}", "conaffinity": f"{UPRIGHT[1]}"}
 _TOUCHES: Final = {
     "all": {"contype": "2", "conaffinity": "1"},
     "ground": {"contype": "0", "conaffinity": "4"},
@@ -194,7 +196,8 @@ def mjcf(description: Description, drive: DriveLine, friction: float, scene: Sta
     visual = SubElement(root, "visual")
     SubElement(visual, "global", offwidth="1280", offheight="960", fovy="60")
     SubElement(visual, "map", znear="0.005", zfar="100")
-    SubElement(visual, "quality", shadowsize="1024", offsamples="0")
+    # Only a lamp near by would need sides of boxes in several parts: software draws each of them three times.
+    SubElement(visual, "quality", shadowsize="1024", offsamples="0", numquads="1")
     SubElement(visual, "headlight", ambient="0.35 0.35 0.35", diffuse="0.25 0.25 0.25", specular="0 0 0")
     default = SubElement(root, "default")
     SubElement(default, "geom", _GROUND, friction=f"{friction} 0.005 0.0001")
@@ -356,7 +359,7 @@ def _spare(world: Element) -> None:
             body = SubElement(world, "body", name=f"{kind}_{i}", mocap="true", pos=_text(0.0, 0.0, PARKED))
             shape = "cylinder" if kind == "disc" else "box"
             group = f"{Group.MOVING.value}"
-            look = {**_UPRIGHT, "type": shape, "size": size, "group": group, "rgba": "0.8 0.45 0.15 1"}
+            look = {**_UPRIGHT, "type": shape, "size": size, "group": group, "rgba": "0.8 0.45 0.15 0"}
             SubElement(body, "geom", look, name=f"{kind}_{i}")
 
 

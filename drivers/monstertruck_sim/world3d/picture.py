@@ -1,6 +1,6 @@
 """Pictures of the world, rendered by software without a screen (EGL)."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 
 import mujoco
@@ -44,6 +44,11 @@ def looking_at(
     return CameraPose(place, _triple(ahead), _triple(up), field_of_view)
 
 
+def standing(people: Iterable[tuple[float, float, float]], ground: Callable[[float, float], float]) -> list[Somebody]:
+    """People, x, y and radius, on the ground whose height is given at a place; m."""
+    return [(x, y, ground(x, y), radius) for x, y, radius in people]
+
+
 class WorldRenderer:
     """Draws a model; to be used in one thread.
 
@@ -79,9 +84,9 @@ class WorldRenderer:
         self._option = mujoco.MjvOption()
         self._pixels = np.empty((height, width, 3), np.uint8)
 
-    def draw(self, data: mujoco.MjData, camera_pose: CameraPose, *, shadows: bool = True) -> Picture:
-        """The world at the state of ``data``."""
-        self.arrange(data, camera_pose, shadows=shadows)
+    def draw(self, data: mujoco.MjData, camera_pose: CameraPose, *, people: Sequence[Somebody] = ()) -> Picture:
+        """The world at the state of ``data``, and who is there."""
+        self.arrange(data, camera_pose, people=people)
         return self.render()
 
     def arrange(
@@ -89,7 +94,6 @@ class WorldRenderer:
         data: mujoco.MjData,
         camera_pose: CameraPose,
         *,
-        shadows: bool = True,
         people: Sequence[Somebody] = (),
         hidden: Collection[Group] = (),
     ) -> None:
@@ -98,7 +102,6 @@ class WorldRenderer:
         Args:
             data: state of the world.
             camera_pose: from where.
-            shadows: are drawn.
             people: who is there.
             hidden: groups that are left out.
         """
@@ -116,7 +119,7 @@ class WorldRenderer:
             part.frustum_near, part.frustum_far = near, 100.0
             part.frustum_bottom, part.frustum_top = -half, half
             part.frustum_center, part.frustum_width = 0.0, half * self._view.width / self._view.height
-        self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = True
 
     def render(self) -> Picture:
         """What was arranged; in the thread that made the renderer."""

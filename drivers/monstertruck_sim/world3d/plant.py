@@ -10,10 +10,8 @@ from typing import ClassVar, Final, NamedTuple
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from monstertruck_kinematics.description import HEAD_JOINTS, Mechanics
-from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.errors import CommandFailedError, InputError
 from monstertruck_sim.world.actuators import RPM
 from monstertruck_sim.world.config import BatteryModelConfig, SimTruckConfig
@@ -45,11 +43,10 @@ Steering = Callable[[Sequence[float]], Sequence[float]]
 
 
 class _Tyres(NamedTuple):
-    """The give of all tyres: places and speeds of their joints, and speeds of their wheels."""
+    """The give of all tyres."""
 
-    places: NDArray[np.intp]
-    slips: NDArray[np.intp]
-    spins: NDArray[np.intp]
+    joints: tuple[tuple[int, int, int], ...]
+    """Of each its place and its speed among those of all joints, and the speed of its wheel."""
     spring: float
     """N/m."""
     share: float
@@ -65,8 +62,7 @@ def _tyres(model: mujoco.MjModel, parts: Mechanics, radius: float) -> _Tyres | N
             found.append((joint.qposadr[0], joint.dofadr[0], model.joint(f"{wheel}_spin").dofadr[0]))
     if not found:
         return None
-    places, slips, spins = np.array(found).T
-    return _Tyres(places, slips, spins, parts.tyre_spring, radius * TIMESTEP / parts.relaxation)
+    return _Tyres(tuple(found), parts.tyre_spring, radius * TIMESTEP / parts.relaxation)
 
 
 class RigidPlant(GriddedPlant):
@@ -100,7 +96,7 @@ class RigidPlant(GriddedPlant):
         super().__init__(config, battery, start, (0.0, 0.0))
         self.model = model
         self.data = mujoco.MjData(model)
-        self._drive, self._steers, self._ground = drive, steering, ground
+        self._drive, self._steers, self.ground = drive, steering, ground
         self.before_steps: Callable[[], None] = lambda: None
         """Brings what moves around the robot to where it is now."""
         count = len(self.shafts)
@@ -113,12 +109,12 @@ class RigidPlant(GriddedPlant):
         self._rolling = [model.jnt_qposadr[i] for i in range(model.njnt) if model.joint(i).name.endswith("_rollers")]
         """Of balls that stand for wheels with rollers: whose axis across the rollers' stays level."""
         self._tyres = _tyres(model, parts, config.wheel_radius)
-        self._deflection = np.zeros(0 if self._tyres is None else len(self._tyres.places))
+        self._deflection = [0.0] * (0 if self._tyres is None else len(self._tyres.joints))
         """Of the tyres along and across, m."""
         self._steered: list[float] = []
         """Servo angles that the steered wheels follow."""
-        self._felt = self._turning = (0.0, 0.0, 0.0)
-        self._solid = np.isin(model.geom_group, (Group.WALLS, Group.MOVING))
+        self._felt = self._turning = self._velocity = (0.0, 0.0, 0.0)
+        self._solid = np.isin(model.geom_group, (Group.WALLS, Group.MOVING)).tolist()
         self._put(start)
 
     @property
@@ -172,10 +168,10 @@ class RigidPlant(GriddedPlant):
         data.mocap_pos[:], data.mocap_quat[:] = around
         x, y, yaw = pose
         self._wound = [0.0] * len(self.shafts)
-        data.qpos[:3] = x, y, self._ground(x, y) + 0.002
+        data.qpos[:3] = x, y, self.ground(x, y) + 0.002
         data.qpos[3:7] = cos(yaw / 2), 0.0, 0.0, sin(yaw / 2)
         self._steered = []
-        self._deflection[:] = 0.0
+        self._deflection = [0.0] * len(self._deflection)
         self._command(0.0, [servo.angle for servo in self._servos])
         self._warned = Warnings.count
         for _ in range(_SETTLE):
@@ -193,7 +189,7 @@ class RigidPlant(GriddedPlant):
         self._felt = self._turning = (0.0, 0.0, 0.0)
         self._wound = data.actuator_length[self._first_shaft :].tolist()
         self._pose = x, y, yaw
-        self._read(None)
+        self._read(data.qpos[:7].tolist(), data.qvel[:6].tolist())
 
     def _steering_angles(self) -> tuple[float, ...]:
         return self._chassis.steering(*(servo.angle for servo in self._servos))
@@ -202,12 +198,14 @@ class RigidPlant(GriddedPlant):
         servos = self._turn_servos(dt)
         self._turn_motors(dt)
         self._command(dt, servos)
-        before = self.data.qvel[:3].copy()
         mujoco.mj_step(self.model, self.data)
         if Warnings.count != self._warned:
             self._require_stable()
-        self._roll()
-        self._read(before)
+        places, speeds = self.data.qpos.tolist(), self.data.qvel.tolist()  # far faster than to pick from the arrays
+        self._roll(places, speeds)
+        before = self._velocity
+        self._read(places, speeds)
+        self._feel(before)
         self._draw(dt, self._slip())
         self._touch()
 
@@ -225,7 +223,7 @@ class RigidPlant(GriddedPlant):
             x, y, _ = self._pose
             raise CommandFailedError(f"the simulation of the robot at ({x:.2f}, {y:.2f}) became unstable")
 
-    def _roll(self) -> None:
+    def _roll(self, places: list[float], speeds: list[float]) -> None:
         """Tyres give way where they touch the ground; rolling on brings a fresh piece of them there.
 
         Their deflection d follows d' = u' - |v| d / relaxation, u' being the slip of the rolling wheel: the force
@@ -237,10 +235,11 @@ class RigidPlant(GriddedPlant):
             data.qpos[self._rolling] = 0.0
         if tyres is None:
             return
-        rolled = abs(data.qvel[tyres.spins]) * tyres.share
-        self._deflection = (self._deflection + data.qpos[tyres.places]) * np.exp(-rolled)
-        data.qpos[tyres.places] = 0.0
-        data.qfrc_applied[tyres.slips] = -tyres.spring * self._deflection
+        moved, forces, deflection = data.qpos, data.qfrc_applied, self._deflection
+        for i, (place, slip, spin) in enumerate(tyres.joints):
+            given = deflection[i] = (deflection[i] + places[place]) * exp(-abs(speeds[spin]) * tyres.share)
+            moved[place] = 0.0
+            forces[slip] = -tyres.spring * given
 
     def _command(self, dt: float, servos: list[float]) -> None:
         controls, drive = self.data.ctrl, self._drive
@@ -272,9 +271,9 @@ class RigidPlant(GriddedPlant):
             pulls.append(torque / self.config.wheel_radius)
         return pulls
 
-    def _read(self, before: Array | None) -> None:
-        """Pose, twist, acceleration and rates of the base."""
-        x, y, z, qw, qx, qy, qz = self.data.qpos[:7].tolist()
+    def _read(self, places: list[float], speeds: list[float]) -> None:
+        """Pose, twist and rates of the base, whose numbers are the first."""
+        x, y, z, qw, qx, qy, qz = places[:7]
         forward_x, forward_y = 1.0 - 2.0 * (qy * qy + qz * qz), 2.0 * (qx * qy + qw * qz)
         down = 2.0 * (qx * qz - qw * qy)
         left_up, up_up = 2.0 * (qy * qz + qw * qx), 1.0 - 2.0 * (qx * qx + qy * qy)
@@ -282,27 +281,32 @@ class RigidPlant(GriddedPlant):
         turned = self._pose[2]
         yaw = turned + (heading - turned + tau / 2) % tau - tau / 2
         pitch, roll = asin(max(-1.0, min(1.0, -down))), atan2(left_up, up_up)
-        vx, vy, vz, wx, wy, wz = self.data.qvel[:6].tolist()
+        vx, vy, vz, wx, wy, wz = speeds[:6]
         c, s = cos(yaw), sin(yaw)
         # Of the body's own axes to those of its level frame, by pitch and roll.
-        ahead = cos(roll) * wy - sin(roll) * wz, sin(roll) * wy + cos(roll) * wz
-        self._turning = cos(pitch) * wx + sin(pitch) * ahead[1], ahead[0], cos(pitch) * ahead[1] - sin(pitch) * wx
+        cr, sr, cp, sp = cos(roll), sin(roll), cos(pitch), sin(pitch)
+        up = sr * wy + cr * wz
+        self._turning = cp * wx + sp * up, cr * wy - sr * wz, cp * up - sp * wx
         self._pose, self._attitude, self._height = (x, y, yaw), (pitch, roll), z
         self._twist = c * vx + s * vy, c * vy - s * vx, self._turning[2]
-        if before is None:
-            return
-        ax, ay, az = ((now - then) / TIMESTEP for now, then in zip((vx, vy, vz), before.tolist(), strict=True))
+        self._velocity = vx, vy, vz
+
+    def _feel(self, before: Vector) -> None:
+        """The acceleration of a step, from the velocity before it, through the sensor's filter."""
+        ax, ay, az = ((now - then) / TIMESTEP for now, then in zip(self._velocity, before, strict=True))
+        c, s = cos(self._pose[2]), sin(self._pose[2])
         share = 1.0 - exp(-TIMESTEP / _FELT)
-        true = c * ax + s * ay, c * ay - s * ax, az
-        a, b, u = (felt + share * (value - felt) for felt, value in zip(self._felt, true, strict=True))
-        self._felt = a, b, u
+        forward, left, up = self._felt
+        self._felt = (
+            forward + share * (c * ax + s * ay - forward),
+            left + share * (c * ay - s * ax - left),
+            up + share * (az - up),
+        )
 
     def _touch(self) -> None:
         """Walls and what stands or moves around stop the robot; ground and blocks carry it."""
-        touching = False
-        if self.data.ncon:
-            touching = bool(self._solid[self.data.contact.geom].any())
-        if touching:
+        solid = self._solid
+        if self.data.ncon and any(solid[a] or solid[b] for a, b in self.data.contact.geom.tolist()):
             if self._stuck_at is None and hypot(*self._twist[:2]) > _STANDING:
                 self.on_blocked(self._pose, self._twist)
             self._stuck_at = self._pose

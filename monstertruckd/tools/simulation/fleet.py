@@ -45,7 +45,8 @@ def as_fleet(configs: Sequence[SimulatedTruckConfig]) -> list[SimulatedTruckConf
 
 def shared_scene(configs: Sequence[SimulatedTruckConfig]) -> Surroundings:
     """The world of a fleet, without its robots."""
-    return make_scene(configs[0].sim.world, configs[0].sim.seed)
+    first, *others = (config.sim for config in configs)
+    return make_scene(first.world, first.seed, [other.world for other in others])
 
 
 def _ports(config: SimulatedTruckConfig) -> Iterator[Path]:

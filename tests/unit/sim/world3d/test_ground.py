@@ -24,7 +24,7 @@ def configured(*features, **config):
 
 
 def heights(*features, profile=None, **config):
-    return ground_heights(configured(*features, **config), profile, BOUNDS, ORIGIN)
+    return ground_heights(configured(*features, **config), profile, BOUNDS, [ORIGIN])
 
 
 def at(grid, *places):
@@ -98,7 +98,7 @@ def test_steps_stand_on_the_ground_with_their_height():
         {"kind": "slope", "x": 0.0, "angle_deg": 10.0, "length": 2.0},
         {"kind": "step", "x": 1.0, "y": 0.5, "yaw": 0.3, "length": 0.2, "width": 0.8, "height": 0.03},
     )
-    grid = ground_heights(config, None, BOUNDS, ORIGIN)
+    grid = ground_heights(config, None, BOUNDS, [ORIGIN])
     (step,) = blocks(config.ground, grid)
     assert step.z + step.height / 2 == pytest.approx(tan(radians(10)) + 0.03, abs=1e-6)
     assert (step.x, step.y, step.yaw, step.length, step.width) == (1.0, 0.5, 0.3, 0.2, 0.8)
