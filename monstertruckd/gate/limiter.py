@@ -52,6 +52,10 @@ GROUND_STEP: Final = 2
 SWEEPS: Final = 256
 """Sweeps cached."""
 
+LEAVING: Final = 0.1
+"""Who stands nearer to something than the side clearance may drive if that takes him so much further away on every
+metre, m/m: a translation of 0.33 rad away from a wall does, 0.34 m/m; a straight line along it does not."""
+
 AHEAD: Final = 0.5
 """A motion whose forward speed is a lesser share of its pace than this has the limit of reverse: part of the footprint
 goes where the lidar does not look."""
@@ -466,7 +470,9 @@ class ObstacleGuard:
 
     def _free_distance(self, x: int, y: int, turn: int, remembered: Array | None) -> float:
         sweep = self._sweep(x, y, turn)
-        contacts = [first_contact(self._footprint, sweep.poses, self._points, self._config.obstacle.side_clearance)]
+        clearance = self._config.obstacle.side_clearance
+        leaving = LEAVING * sweep.distances
+        contacts = [first_contact(self._footprint, sweep.poses, self._points, clearance, leaving)]
         if remembered is not None:
             contacts.append(first_contact(self._footprint, sweep.poses, remembered, -DRIFT))
         return min(

@@ -200,17 +200,22 @@ def points_near(points: Array, poses: Array, reach: float) -> Array:
     return near
 
 
-def first_contact(footprint: Footprint, poses: Array, points: Array, margin: float = 0.0) -> int | None:
+def first_contact(
+    footprint: Footprint, poses: Array, points: Array, margin: float = 0.0, leaving: Array | None = None
+) -> int | None:
     """Index of the first pose at which the moving footprint comes within ``margin`` of a point.
 
     A point that is no nearer than it was at the first pose is no obstacle to this motion: a truck that stands at a
-    wall may leave it.
+    wall may leave it. Sideways it still comes nearer to points of the wall that it had ahead: with ``leaving`` these
+    may be as near as the nearest one was at the first pose (half of the padding is kept at least), and so much further
+    away at each pose.
 
     Args:
         footprint: the rectangle.
         poses: shape (m, 3), in the order driven, the first one being the present pose.
         points: shape (n, 2), same frame.
         margin: m.
+        leaving: shape (m,), m; None: the margin counts for all points that come nearer.
 
     Returns:
         The index, at least 1, or None when all poses are free.
@@ -225,7 +230,10 @@ def first_contact(footprint: Footprint, poses: Array, points: Array, margin: flo
     if not points_touched.any():
         return None
     distance = _distance(beyond_x[:, points_touched], beyond_y[:, points_touched])
-    hits = ((distance < margin) & (distance < distance[0] - 1e-9)).any(axis=1)
+    kept: float | Array = margin
+    if leaving is not None:
+        kept = np.minimum(margin, max(float(distance[0].min()), -footprint.padding / 2) + leaving)[:, None]
+    hits = ((distance < kept) & (distance < distance[0] - 1e-9)).any(axis=1)
     return int(np.argmax(hits)) if hits.any() else None
 
 

@@ -46,6 +46,15 @@ def test_before_the_first_scan_there_is_no_obstacle():
     assert checked.free_distance(AHEAD) == math.inf
 
 
+@pytest.mark.parametrize("gap", [0.0, 0.005, 0.015])
+def test_beside_a_wall_nearer_than_the_side_clearance_it_may_drive_away_but_not_along_it(gap):
+    wall = [(x, -FOOTPRINT.half_width - gap - 1e-4) for x in np.arange(0.04, 0.9, 0.01)]
+    away, along = ((math.cos(0.33), math.sin(0.33), 0.0),), AHEAD
+    assert looked(guard(), *wall, ways=away) == math.inf
+    assert looked(guard(), *wall, ways=along) < 0.05
+    assert looked(guard(), *wall, (0.5, 0.05), ways=away) < 0.3
+
+
 def test_a_corner_that_moves_ahead_of_the_body_is_checked_to_the_end_of_its_reach():
     corner = math.atan2(FOOTPRINT.half_width, FOOTPRINT.half_length)
     way = (math.cos(corner), math.sin(corner), 0.0)

@@ -123,6 +123,37 @@ def test_a_truck_at_a_wall_may_leave_it_but_not_push_on():
     assert first_contact(BARE, straight(0.5), wall, margin=0.03) == 1
 
 
+def sideways(angle, length=0.3, count=61):
+    return swept_poses((math.cos(angle), math.sin(angle), 0.0), np.linspace(0, length, count))
+
+
+@pytest.mark.parametrize("gap", [0.001, 0.005, 0.015])
+def test_a_truck_beside_a_wall_may_leave_it_sideways_but_not_drive_along_it(gap):
+    wall = np.column_stack((np.linspace(-0.4, 1.0, 141), np.full(141, -0.17 - gap)))
+    leaving = 0.1 * np.linspace(0, 0.3, 61)
+    assert first_contact(BARE, sideways(0.33), wall, 0.02) is not None
+    assert first_contact(BARE, sideways(0.33), wall, 0.02, leaving) is None
+    for angle in (0.0, 0.05, -0.33):
+        assert first_contact(BARE, sideways(angle), wall, 0.02, leaving) is not None
+    ahead = np.vstack((wall, points((0.5, 0.0))))
+    assert first_contact(BARE, sideways(0.33), ahead, 0.02, leaving) is not None
+
+
+def test_what_is_further_than_the_margin_keeps_it_when_leaving_too():
+    wall = np.column_stack((np.linspace(-0.4, 1.0, 141), np.full(141, -0.17 - 0.021)))
+    leaving = np.zeros(61)
+    assert first_contact(BARE, sideways(-0.1), wall, 0.02, leaving) == first_contact(BARE, sideways(-0.1), wall, 0.02)
+    assert first_contact(BARE, sideways(-0.1), wall, 0.02) is not None
+
+
+def test_half_of_the_padding_is_kept_when_leaving():
+    padded = Footprint(padding=0.01)
+    inside = np.column_stack((np.linspace(-0.2, 1.0, 121), np.full(121, -0.18 + 0.004)))
+    leaving = 0.1 * np.linspace(0, 0.3, 61)
+    assert first_contact(padded, sideways(0.33), inside, 0.02, leaving) is None
+    assert first_contact(padded, sideways(0.33), inside + np.array([0.0, 0.004]), 0.02, leaving) is not None
+
+
 def test_a_turn_sweeps_its_outer_rear_corner():
     steering = FourWheelSteering()
     poses = swept_poses(steering.body_twist(1.0, 0.4, -0.4), np.linspace(0, 0.3, 31))
