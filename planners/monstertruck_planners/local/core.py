@@ -140,7 +140,9 @@ class LocalPlannerCore:
         self.cover = cover_footprint(vehicle.footprint)
         search = search or HybridConfig(effort=config.effort)
         margins = dict.fromkeys((config.margin, 0.0))
-        self._planners = [HybridPlanner(vehicle, search.model_copy(update={"margin": m})) for m in margins]
+        self._planners = [
+            HybridPlanner(vehicle, search.model_copy(update={"margin": m}), departs=False) for m in margins
+        ]
         self._primitives = self._planners[0].motion_model(RESOLUTIONS[0], vehicle.crab_angle).primitives
 
     def begin(

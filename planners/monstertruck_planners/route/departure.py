@@ -149,7 +149,7 @@ def departures(route_map: RouteMap, vehicle: Vehicle, start: Array, margin: floa
         reverse: cost of a metre backward, m.
 
     Returns:
-        None if the start touches an obstacle, or all its motions do.
+        None, an empty list, if the start touches an obstacle, or all its motions do.
     """
     field, footprint = route_map.field.data(), vehicle.footprint.data()
     wanted = _wanted(margin)
@@ -241,7 +241,7 @@ def _after(node: _Node, arc: Array, travelled: float, level: int, best: int, rev
 
 def plan_between(
     route_map: RouteMap, vehicle: Vehicle, config: DriveCosts, start: ArrayLike, goal: ArrayLike,
-    search: Callable[[Endpoints], RouteResult],
+    search: Callable[[Endpoints], RouteResult], *, departs: bool = True,
 ) -> RouteResult:  # fmt: skip
     """Route between two poses, with a departure first if the start is too near to an obstacle; or why there is none.
 
@@ -251,12 +251,17 @@ def plan_between(
         config: margin, tolerances, costs.
         start: pose of the reference point.
         goal: the same.
-        search: route between two poses that keep the margin.
+        search: route between two poses that keep the margin; ``statistics["exhausted"]`` is not 0 if no budget would
+            help it.
+        departs: else there are no departures, and the start has to keep the margin.
     """
     ends = _ends(route_map, vehicle, config, start, goal)
+    if not departs:
+        return search(ends) if isinstance(ends, Endpoints) else ends
     if isinstance(ends, Endpoints) and _room(route_map, vehicle, ends.start, config.margin):
         result = search(ends)
-        if result.reason is not Reason.ROUTE_TIMEOUT or _room(route_map, vehicle, ends.start, config.margin + CONFINED):
+        room = _room(route_map, vehicle, ends.start, config.margin + CONFINED)
+        if result.ok or room or not result.statistics.get("exhausted"):
             return result
     elif isinstance(ends, Endpoints):
         result = RouteResult(Reason.START_BLOCKED, text=f"start: every motion comes nearer than {config.margin:g} m")

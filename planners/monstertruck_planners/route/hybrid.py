@@ -117,16 +117,17 @@ class HybridPlanner:
     Args:
         vehicle: what is driven.
         config: costs, tolerances, budget.
+        departs: a start nearer to an obstacle than the margin is left first; else it is refused.
     """
 
-    def __init__(self, vehicle: Vehicle, config: HybridConfig | None = None) -> None:
-        self.vehicle = vehicle
+    def __init__(self, vehicle: Vehicle, config: HybridConfig | None = None, *, departs: bool = True) -> None:
+        self.vehicle, self._departs = vehicle, departs
         self.config = config or HybridConfig()
         self.reeds_shepp = vehicle.reeds_shepp(self.config)
         self.footprint = vehicle.footprint.data()
         self.costs = RouteCosts.of(vehicle, self.config)
         self._models: dict[tuple[Resolution, float], search.VehicleMotions] = {}
-        self._narrower = [HybridPlanner(vehicle, narrow) for narrow in narrower_configs(self.config)]
+        self._narrower = [HybridPlanner(vehicle, narrow, departs=departs) for narrow in narrower_configs(self.config)]
 
     def plan(self, route_map: RouteMap, start: ArrayLike, goal: ArrayLike, now: Clock | None = None) -> RouteResult:
         """Route of the vehicle's reference point, see ``RoutePlanner``; ``statistics["margin"]`` is the margin kept."""
@@ -151,6 +152,7 @@ class HybridPlanner:
             start,
             goal,
             lambda ends: _PlanningRun(self, route_map, ends, budget, attempt).route(),
+            departs=self._departs,
         )
 
     def planner_for(self, margin: float) -> "HybridPlanner":
@@ -318,6 +320,7 @@ class _PlanningRun:
         if segments is not None:
             return segments, Reason.OK, ""
         # A search that is exhausted proves nothing: between its cells and headings there may be a way.
+        self.statistics["exhausted"] = float(fine[-1].exhausted)
         return (
             None,
             Reason.ROUTE_TIMEOUT,

@@ -386,6 +386,7 @@ class LatticePlanner:
             best, cost = segments, found
         statistics["elapsed_s"] = budget.elapsed
         if best is None:
+            statistics["exhausted"] = float(budget.remaining() > 0.0)
             return RouteResult(reason, text="no drivable way found", statistics=statistics)
         path = MotionPath(ends.start, best, self.vehicle.steering, self.vehicle.reference)
         statistics.setdefault("first_length", path.length)
