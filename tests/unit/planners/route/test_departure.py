@@ -13,7 +13,7 @@ from monstertruck_planners.route.departure import SPARE, departures
 from monstertruck_planners.route.grid_astar import GridAstarPlanner
 from monstertruck_planners.route.hybrid import HybridPlanner
 from monstertruck_planners.route.lattice import LatticePlanner
-from monstertruck_planners.route.motion import moved
+from monstertruck_planners.route.motion import MotionPath
 from monstertruck_schemas.reasons import Reason
 from tests.unit.planners.route.route_kit import CAR, TRUCK, assert_drivable, ground, room
 
@@ -146,11 +146,15 @@ def test_a_body_shut_in_on_all_sides_is_soon_refused():
 
 def test_a_departure_ends_where_a_search_can_set_off_and_is_short():
     where = ground()
-    for gap in (0.0005, 0.02):
-        start = base_beside("facing", gap)
+    for way, gap in (("facing", 0.0005), ("aslant", 0.02), ("parallel", 0.035)):
+        start = base_beside(way, gap)
         found = departures(where, TRUCK, start, MARGIN, 2.0)
+        for departure in found:
+            poses = MotionPath(start, departure.segments).sample(0.002).poses
+            clear = where.field.clearance(TRUCK.footprint, poses, 0.04, 0.0005)
+            assert np.diff(clear).min() >= -0.0011
         assert [d.cost for d in found] == sorted(d.cost for d in found)
         ends = np.array([d.end for d in found])
         assert where.field.free(Footprint(), ends, MARGIN + SPARE).all()
-        assert moved(start, 0.0)[1] < found[0].end[1] < start[1] + MARGIN - gap + 0.02
+        assert start[1] < found[0].end[1] < start[1] + MARGIN - gap + 0.02
         assert np.abs(found[0].segments[:, 0]).min() >= 0.02
