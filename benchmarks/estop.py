@@ -222,7 +222,14 @@ async def flooder(
     """A connected flooder that does not flood yet; without a core of its own it yields to nobody."""
     state = await client.get_retained(topics.GATE)
     assert state is not None
-    words = (str(Path(__file__).resolve()), "--flooder", kind, endpoint, state.nonce, "yields" if core else "")
+    words = (
+        str(Path(__file__).resolve()),
+        "--flooder",
+        kind,
+        endpoint,
+        state.nonce,
+        "yields" if core is not None else "",
+    )
     async with process(core, folder / "flood.txt", *words) as running:
         assert running.stdout is not None
         await running.stdout.readline()

@@ -76,9 +76,12 @@ def processor_seconds(pid: int) -> float:
 
 
 def set_scheduler(pid: int, policy: int) -> None:
-    """Give all threads of a process of ours a scheduling policy (sched(7)); those that have ended are left out."""
+    """Give all threads of a process of ours a scheduling policy (sched(7)); those that have ended are left out.
+
+    Only root may take ``SCHED_IDLE`` back; others' processes keep it.
+    """
     for task in Path(f"/proc/{pid}/task").iterdir():
-        with suppress(ProcessLookupError):
+        with suppress(ProcessLookupError, PermissionError):
             os.sched_setscheduler(int(task.name), policy, os.sched_param(0))
 
 

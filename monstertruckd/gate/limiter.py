@@ -26,6 +26,7 @@ from monstertruck_planners.collision import (
     ScanPoints,
     beyond,
     first_contact,
+    on_body,
     placed,
     points_relative,
     relative,
@@ -177,14 +178,6 @@ class Visibility:
 
 def _sector(bearings: Array) -> Sectors:
     return ((bearings + math.pi) // SECTOR).astype(np.intp) % SECTORS
-
-
-def on_body(body: Footprint, points: Array, margin: float) -> NDArray[np.bool_]:
-    """Which points (n, 2) in base lie on the body, or nearer to it than ``margin``, m."""
-    on: NDArray[np.bool_] = (np.abs(points[:, 0] - body.offset) < body.half_length + margin) & (
-        np.abs(points[:, 1]) < body.half_width + margin
-    )
-    return on
 
 
 def outline(body: Footprint) -> Array:

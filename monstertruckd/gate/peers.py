@@ -1,7 +1,7 @@
 """Other robots by what they say of themselves: the swept footprint against their outlines.
 
 A lidar does not look behind the robot, and what it saw there is old: another robot may have come since. Of robots that
-are heard (section ``peers``) the outline counts where the lidar does not look, all around for robots without one: where
+are heard (section ``peers``) the outline counts where the lidar does not look, all around for robots with sonars: where
 it was heard, and where its own motion takes it within ``HORIZON``. Silent ones stay where they were for ``KEPT``.
 """
 
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_kinematics.elementary import Array, integrate
-from monstertruck_planners.collision import Footprint, first_contact, placed, points_relative, swept_poses
+from monstertruck_planners.collision import Footprint, first_contact, on_body, placed, points_relative, swept_poses
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.state import Odometry, Peers
 from monstertruckd.gate.config import GateConfig
@@ -103,7 +103,10 @@ class PeerGuard:
             for later in HORIZON:
                 at = integrate((pose.x, pose.y, pose.yaw), twist.vx, twist.vy, twist.wz, later)
                 outline = placed(np.column_stack((edges, np.zeros(len(edges)))), at)[:, :2]
-                found.append(points_relative(outline, self._pose))
+                outline = points_relative(outline, self._pose)
+                if later and on_body(self._footprint, outline, self._config.obstacle.side_clearance).any():
+                    break  # it comes to this robot, which may have left by then
+                found.append(outline)
         points = np.concatenate(found)
         return points[~self._seen(points)] if len(points) else points
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from aiohttp import WSMessage, WSMsgType, web
+from aiohttp import WSCloseCode, WSMessage, WSMsgType, web
 from aiohttp.http_exceptions import HttpProcessingError
 
 from monstertruck_runtime.clock import Clock
@@ -50,7 +50,7 @@ TYPES: Final = {".js": "text/javascript", ".css": "text/css", ".svg": "image/svg
 BEAT: Final = 10.0
 """Seconds between two pings of the WebSocket itself; a browser that does not answer for half of it is let go."""
 LOOK: Final = 1.0
-"""Seconds between two looks at robots that appeared."""
+"""Seconds between two looks at robots that appeared, users that were revoked, and the number of connections."""
 END: Final = 5.0
 """Seconds that sessions with robots may take to close at the end."""
 LANGUAGE: Final = "en"
@@ -154,8 +154,8 @@ class Station:
         self._discoveries = [Discovery(endpoint, clock, self._found) for endpoint in routers]
         self._following: dict[RobotFeed | ReplayFeed, asyncio.Task[None]] = {}
         self._viewers: set[Viewer] = set()
-        self._sockets: dict[web.WebSocketResponse, StationUser] = {}
-        self._closing: set[asyncio.Task[bool]] = set()
+        self._sockets: dict[web.WebSocketResponse, tuple[StationUser, asyncio.Transport | None]] = {}
+        self._closing: set[asyncio.Task[None]] = set()
         self._remarks = Remarks(log)
         self._numbers = itertools.count(1)
         self._browsers: list[_Browser] = []
@@ -214,22 +214,25 @@ class Station:
         """Let those go who may no longer be here, or not as they are."""
         users = self.place.users
         if users is not None and await users.refresh():
-            for socket, user in self._sockets.items():
+            for socket, (user, transport) in self._sockets.items():
                 if not users.stands(user):
                     text = "browser of %s is let go: no longer a user, or with another role or password"
                     log.warning(text, user.name)
-                    task = asyncio.create_task(socket.close(code=1008))  # one that is frozen takes long
+                    task = asyncio.create_task(_let_go(socket, transport, WSCloseCode.POLICY_VIOLATION))
                     self._closing.add(task)
                     task.add_done_callback(self._closing.discard)
 
     def _close_crowds(self, server: web.Server) -> None:
-        """Close what one address has too many of, so that nobody takes all file descriptors, before a login too."""
+        """Close what one address has too many of, before a login too, so that it does not take all file descriptors.
+
+        Connections whose TLS handshake is under way are not among them; asyncio ends that after a minute.
+        """
         of_peer: dict[str, int] = {}
         for connection in server.connections:  # the oldest first
             peer = _peer(connection)
             of_peer[peer] = of_peer.get(peer, 0) + 1
-            if of_peer[peer] > MOST_CONNECTIONS:
-                connection.force_close()
+            if of_peer[peer] > MOST_CONNECTIONS and connection.transport is not None:
+                connection.transport.abort()
         for peer, count in of_peer.items():
             if count > MOST_CONNECTIONS:
                 self._remarks.add(peer, f"{count} connections of {peer}, {count - MOST_CONNECTIONS} are closed")
@@ -313,7 +316,8 @@ class Station:
         return application
 
     async def _hang_up(self, _: web.Application) -> None:
-        await asyncio.gather(*(socket.close(code=1001) for socket in list(self._sockets)), return_exceptions=True)
+        leaving = [_let_go(each, transport, WSCloseCode.GOING_AWAY) for each, (_, transport) in self._sockets.items()]
+        await asyncio.gather(*leaving, return_exceptions=True)
 
     @web.middleware
     async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
@@ -417,11 +421,13 @@ class Station:
         await socket.prepare(request)
         self._remarks.add(peer, f"browser {name} connected from {peer}", logging.INFO)
         self._viewers.add(browser.viewer)
-        self._sockets[socket] = browser.user
+        self._sockets[socket] = browser.user, request.transport
         sending = asyncio.create_task(_send(socket, browser.viewer))
         pace = _Pace()
         try:
             async for received in socket:
+                if self.place.users is not None and not self.place.users.stands(browser.user):
+                    break  # let go, or about to be
                 if received.type is not WSMsgType.TEXT:
                     self._remarks.add(peer, f"browser {name} at {peer} refused: {_fault(received)}")
                     break
@@ -439,6 +445,16 @@ class Station:
             await browser.close()
             self._remarks.add(peer, f"browser {name} is gone", logging.INFO)
         return socket
+
+
+async def _let_go(socket: web.WebSocketResponse, transport: asyncio.Transport | None, code: int) -> None:
+    """Close a browser's WebSocket; one that reads nothing is cut off, as it would hold up its closing for ever."""
+    try:
+        async with asyncio.timeout(END):
+            await socket.close(code=code)
+    except TimeoutError:
+        if transport is not None:
+            transport.abort()
 
 
 class _Pace:

@@ -76,6 +76,8 @@ class StationUsers:
     def __init__(self, file: Path) -> None:
         self._file = file
         self._version = _version(file)
+        self._reported: object = self._version
+        """Version that was found damaged, and reported."""
         self._rows = _read(file)
         self._known: OrderedDict[bytes, StationUser] = OrderedDict()
         """Headers that were right, by their hash: a page asks for a dozen files."""
@@ -87,18 +89,20 @@ class StationUsers:
     async def refresh(self) -> bool:
         """Read the file again if it has changed; whether the users have.
 
-        A file that cannot be read is reported, and the users stay as they are: a slip of an editor takes nobody's
-        emergency stop away.
+        A file that cannot be read, or names nobody, is reported and tried again, and the users stay as they are: a slip
+        of an editor takes nobody's emergency stop away.
         """
         version = await in_thread(lambda: _version(self._file))
         if version == self._version:
             return False
-        self._version = version
         try:
             rows = await in_thread(lambda: _read(self._file))
         except (TruckError, OSError) as error:
-            log.error("the users stay as they were: %s", error)
+            if version != self._reported:
+                log.error("the users stay as they were: %s", error)
+            self._reported = version
             return False
+        self._version = self._reported = version
         if rows == self._rows:
             return False
         self._rows = rows
@@ -183,7 +187,9 @@ def _read(file: Path) -> dict[str, tuple[AccessRole, str]]:
         raise NotFoundError(f"{file}: not there; expected users (monstertruckd station --add-user NAME --users {file})")
     if file.stat().st_mode & (stat.S_IRWXG | stat.S_IRWXO):
         raise NotPermittedError(f"{file}: others may read it; expected mode 600 (chmod 600 {file})")
-    return {name: _row(file, name, value) for name, value in _rows(file).items()}
+    if not (rows := _rows(file)):
+        raise InputError(f"{file}: expected at least one user")
+    return {name: _row(file, name, value) for name, value in rows.items()}
 
 
 def add_user(file: Path, name: str, role: AccessRole, password: str) -> None:

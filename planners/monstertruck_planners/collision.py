@@ -200,6 +200,14 @@ def points_near(points: Array, poses: Array, reach: float) -> Array:
     return near
 
 
+def on_body(body: Footprint, points: Array, margin: float) -> NDArray[np.bool_]:
+    """Which points (n, 2) in base lie on the body, or nearer to it than ``margin``, m."""
+    on: NDArray[np.bool_] = (np.abs(points[:, 0] - body.offset) < body.half_length + margin) & (
+        np.abs(points[:, 1]) < body.half_width + margin
+    )
+    return on
+
+
 def first_contact(
     footprint: Footprint, poses: Array, points: Array, margin: float = 0.0, leaving: Array | None = None
 ) -> int | None:
@@ -232,7 +240,9 @@ def first_contact(
     distance = _distance(beyond_x[:, points_touched], beyond_y[:, points_touched])
     kept: float | Array = margin
     if leaving is not None:
-        kept = np.minimum(margin, max(float(distance[0].min()), -footprint.padding / 2) + leaving)[:, None]
+        outside = distance[0][distance[0] >= -footprint.padding]  # deeper ones are parts of the robot itself
+        nearest = max(float(outside.min(initial=margin)), -footprint.padding / 2)
+        kept = np.minimum(margin, nearest + leaving)[:, None]
     hits = ((distance < kept) & (distance < distance[0] - 1e-9)).any(axis=1)
     return int(np.argmax(hits)) if hits.any() else None
 

@@ -10,10 +10,14 @@ from typing import IO, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from monstertruck_runtime.errors import InputError
+
 KEPT: Final = 16_000_000
 """Bytes of values in memory, about."""
 PLAIN: Final = 64
 """Bytes of a value that is no array and no text."""
+ROWS: Final = 256
+"""Texts that are an array at a time: each is as wide as the longest one."""
 
 
 class Spool:
@@ -28,9 +32,9 @@ class Spool:
         self._columns: list[Column] = []
         self._size = 0
 
-    def column(self) -> "Column":
-        """A new column."""
-        made = Column(self)
+    def column(self, text: Callable[[Any], str]) -> "Column":
+        """A new column; ``text`` makes text of what is no array and no number."""
+        made = Column(self, text)
         self._columns.append(made)
         return made
 
@@ -60,10 +64,12 @@ class Column:
 
     Args:
         spool: keeps them.
+        text: of what is no array and no number.
     """
 
-    def __init__(self, spool: Spool) -> None:
+    def __init__(self, spool: Spool, text: Callable[[Any], str]) -> None:
         self._spool = spool
+        self._text = text
         self._places: list[int] = []
         self._waiting: list[Any] = []
         self._arrays = self._numbers = True
@@ -74,7 +80,7 @@ class Column:
         self._count = 0
 
     def add(self, value: Any) -> None:
-        """Add one: an array, a number, None, or what ``text`` of ``write`` makes text of."""
+        """Add one: an array, a number, None, or what text is made of."""
         self._count += 1
         size = PLAIN
         if isinstance(value, np.ndarray):
@@ -86,8 +92,10 @@ class Column:
         else:
             self._arrays = False
             self._gaps |= value is None
-            self._numbers &= value is None or isinstance(value, int | float)
-            size += len(value) if isinstance(value, str) else 0
+            if not (value is None or isinstance(value, int | float)):
+                self._numbers = False
+                value = self._text(value)
+                size += len(value)
         self._waiting.append(value)
         self._spool.grow(size)
 
@@ -101,16 +109,25 @@ class Column:
         self.flush()
         return map(self._spool.read, self._places)
 
-    def write(self, archive: zipfile.ZipFile, name: str, text: Callable[[Any], str]) -> None:
-        """Write it as array ``name``, and, of arrays that differ in length, ``name.lengths``."""
+    def write(self, archive: zipfile.ZipFile, name: str) -> None:
+        """Write it as array ``name``, and, of arrays that differ in length, ``name.lengths``.
+
+        Raises:
+            InputError: a number has more than 64 bits.
+        """
         if self._arrays:
             self._write_arrays(archive, name)
         elif self._numbers:
             self._write_numbers(archive, name)
         else:
-            width = max(chain((1,), (len(text(value)) for values in self._chunks() for value in values)))
-            parts = (np.array([text(value) for value in values], f"<U{width}") for values in self._chunks())
+            width = max(chain((1,), map(len, chain.from_iterable(self._texts()))))
+            parts = (np.array(texts, f"<U{width}") for texts in self._texts())
             _write(archive, name, np.dtype(f"<U{width}"), (self._count,), parts)
+
+    def _texts(self) -> Iterator[list[str]]:
+        for values in self._chunks():
+            for first in range(0, len(values), ROWS):
+                yield [v if isinstance(v, str) else self._text(v) for v in values[first : first + ROWS]]
 
     def _write_arrays(self, archive: zipfile.ZipFile, name: str) -> None:
         dtype, lengths = np.result_type(*self._dtypes), np.array(self._lengths)
@@ -141,6 +158,8 @@ def _write(
 
     numpy's own function takes no array called ``file``, which journal records have, and the whole of it at once.
     """
+    if dtype.hasobject:
+        raise InputError(f"{name}: expected numbers of at most 64 bits")
     head = {"descr": np.lib.format.dtype_to_descr(dtype), "fortran_order": False, "shape": shape}
     with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
         np.lib.format.write_array_header_1_0(member, head)

@@ -105,7 +105,7 @@ def export_npz(
         spool = Spool(file)
         for topic, row in _rows(path, directory, selection, progress):
             if topic not in tables:
-                tables[topic] = {name: spool.column() for name in row}
+                tables[topic] = {name: spool.column(_text) for name in row}
             for name, value in row.items():
                 tables[topic][name].add(value)
         for topic, table in tables.items():
@@ -116,7 +116,7 @@ def export_npz(
 def _write_npz(file: Path, table: Mapping[str, Column]) -> None:
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, column in table.items():
-            column.write(archive, name, lambda value: "" if value is None else str(_cell(value)))
+            column.write(archive, name)
 
 
 @contextmanager
@@ -199,6 +199,10 @@ def _plain(value: Any) -> Any:
     if isinstance(value, np.ndarray):
         return value.tolist()
     return value.value if isinstance(value, Enum) else value
+
+
+def _text(value: Any) -> str:
+    return "" if value is None else str(_cell(value))
 
 
 def _cell(value: Any) -> Any:

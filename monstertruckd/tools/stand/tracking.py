@@ -27,6 +27,8 @@ FASTEST: Final = 3.0
 """m/s: robots are not faster;"""
 SLACK: Final = 0.05
 """and this much, m, is no jump."""
+RATE_TIME: Final = 0.1
+"""Seconds over which a robot's speed is a mean."""
 EXPECTED: Final = 0.5
 """Seconds for which a robot is expected where its speed takes it."""
 STUBBORN: Final = 5
@@ -232,11 +234,12 @@ class StandTracker:
             self.left_out += 1
             return False
         turn = math.remainder(pose.yaw - known.pose.yaw, math.tau)
-        known.rate = (
-            np.array((pose.x - known.pose.x, pose.y - known.pose.y, turn)) / seconds
-            if 0.0 < seconds < EXPECTED and not known.doubts
-            else np.zeros(3)
-        )
+        if seconds >= EXPECTED or known.doubts:
+            known.rate = np.zeros(3)
+        elif seconds > 0.0:
+            moved = np.array((pose.x - known.pose.x, pose.y - known.pose.y, turn))
+            # A mean over time: two cameras place a robot at rest some 1 mm apart, at instants of 1 ms between.
+            known.rate = known.rate - math.expm1(-seconds / RATE_TIME) * (moved / seconds - known.rate)
         known.pose, known.side, known.doubts = pose, side, 0
         return True
 

@@ -98,7 +98,12 @@ async def tune(
         RequestRefusedError: arming or a start is refused, or the behaviour ended before the run was complete.
         NoAnswerError: the robot does not answer.
     """
-    await client.arm()
+    try:
+        await client.arm()
+    except NoAnswerError:  # it may have armed all the same
+        with suppress(TruckError):
+            await client.disarm()
+        raise
     try:
         return await _tuned(client, name, distance, recipe(first), seconds, pause, report)
     finally:

@@ -139,7 +139,9 @@ class _Node:
 
 
 def departures(route_map: RouteMap, vehicle: Vehicle, start: Array, margin: float, reverse: float) -> list[Departure]:
-    """Ways from a start to poses that keep the margin with a little to spare, the cheapest first.
+    """Ways from a start to poses that keep the margin with a little to spare.
+
+    Those from whose end a search can turn come first, then the cheapest.
 
     Args:
         route_map: obstacles.
@@ -149,7 +151,7 @@ def departures(route_map: RouteMap, vehicle: Vehicle, start: Array, margin: floa
         reverse: cost of a metre backward, m.
 
     Returns:
-        None, an empty list, if the start touches an obstacle, or all its motions do.
+        Empty if the start touches an obstacle, or all its motions do.
     """
     field, footprint = route_map.field.data(), vehicle.footprint.data()
     wanted = _wanted(margin)
@@ -269,6 +271,10 @@ def plan_between(
         result = ends
     else:
         return ends
+    position, yaw = config.position_tolerance, config.yaw_tolerance
+    reachable = check_endpoints(route_map, vehicle, start, goal, position, yaw, config.margin, start_margin=0.0)
+    if isinstance(reachable, RouteResult):
+        return reachable
     begin, end = np.array(start, dtype=np.float64), np.array(goal, dtype=np.float64)
     for departure in _best_departures(route_map, vehicle, config, begin, end):
         ends = _ends(route_map, vehicle, config, departure.end, end)

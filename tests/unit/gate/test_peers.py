@@ -54,6 +54,12 @@ def test_a_robot_aside_ends_a_turn_that_it_has_no_room_for():
     assert free(SPOT, heard(0.0, 0.5)) == inf
 
 
+def test_one_that_comes_from_behind_stops_nobody_who_drives_on():
+    for way in (AHEAD, (1.0, 0.0, 1.25), (0.95, 0.31, 0.0)):
+        assert free(way, heard(-0.69, 0.0, vx=0.3)) == inf
+    assert free(BACK, heard(-0.69, 0.0, vx=0.3)) < 0.25
+
+
 def test_places_are_those_in_the_map():
     assert free(BACK, heard(1.0, 2.8), own=pose(1.0, 2.0, -pi / 2)) == pytest.approx(0.37, abs=0.03)
 

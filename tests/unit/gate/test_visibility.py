@@ -5,12 +5,12 @@ import math
 import numpy as np
 import pytest
 
-from monstertruck_planners.collision import Footprint, scan_points, swept_poses
+from monstertruck_planners.collision import Footprint, on_body, scan_points, swept_poses
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order
 from monstertruck_schemas.state import GateMode
-from monstertruckd.gate.limiter import SECTOR, SECTORS, Visibility, ground_ahead, on_body, outline
+from monstertruckd.gate.limiter import SECTOR, SECTORS, Visibility, ground_ahead, outline
 from tests.unit.gate.rig import Rig, scan
 
 FOOTPRINT = Footprint()

@@ -146,6 +146,15 @@ def test_what_is_further_than_the_margin_keeps_it_when_leaving_too():
     assert first_contact(BARE, sideways(-0.1), wall, 0.02) is not None
 
 
+def test_a_part_of_the_robot_itself_lets_it_pass_nothing_nearer():
+    post = points((0.4, -0.17 - 0.014))
+    leaving = 0.1 * np.linspace(0, 0.5, 61)
+    alone = first_contact(BARE, straight(0.5, 61), post, 0.02, leaving)
+    assert alone is not None
+    both = np.vstack((post, points((0.1, 0.1))))
+    assert first_contact(BARE, straight(0.5, 61), both, 0.02, leaving) == alone
+
+
 def test_half_of_the_padding_is_kept_when_leaving():
     padded = Footprint(padding=0.01)
     inside = np.column_stack((np.linspace(-0.2, 1.0, 121), np.full(121, -0.18 + 0.004)))

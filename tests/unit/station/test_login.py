@@ -4,6 +4,7 @@ import asyncio
 import base64
 import json
 import ssl
+from functools import partial
 from pathlib import Path
 
 import aiohttp
@@ -101,7 +102,8 @@ async def test_the_file_of_users_is_read_again_when_it_changes(file: Path, caplo
     assert await known.refresh()
     assert not known.stands(olga), "another password"
     assert await known.who(basic("olga", "battery staple")) is None
-    for damage in (lambda: file.write_text("- ann\n"), lambda: file.chmod(0o644), file.unlink):
+    texts = (partial(file.write_text, text) for text in ("- ann\n", ""))
+    for damage in (*texts, lambda: file.chmod(0o644), file.unlink):
         damage()
         assert not await known.refresh()
         assert caplog.messages[-1].startswith(f"the users stay as they were: {file}")

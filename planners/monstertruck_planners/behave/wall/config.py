@@ -33,7 +33,7 @@ class WallConfig(BehaviourConfig):
     lap_length: Annotated[float, Field(gt=0, le=1000)] = 4.0
     """Least way of a lap, m"""
     lap_radius: Metres = 0.6
-    """So near to where following began, by odometry, a lap is complete, m; grows with the odometry's drift"""
+    """So near to a place that it passed, by odometry, a lap is complete, m; grows with the odometry's drift"""
     laps: Annotated[int, Field(ge=1, le=100)] = 1
     """After which it stops"""
 
@@ -120,6 +120,6 @@ class WallLineConfig(BehaviourConfig):
     lap_length: Annotated[float, Field(gt=0, le=1000)] = 4.0
     """Least way of a lap, m"""
     lap_radius: Metres = 0.6
-    """So near to where following began, by odometry, a lap is complete, m, and 1 % of the lap's way more"""
+    """So near to a place that it passed, by odometry, a lap is complete, m, and 1 % of the lap's way more"""
     laps: Annotated[int, Field(ge=1, le=100)] = 1
     """After which it stops"""

@@ -279,10 +279,10 @@ def test_dated_log_is_a_log_like_any_other(log, tmp_path):
 
 def columns_of(values: list[Any], folder: Path) -> dict[str, Any]:
     with tempfile.TemporaryFile() as file, zipfile.ZipFile(folder / "table.npz", "w") as archive:
-        column = columns.Spool(file).column()
+        column = columns.Spool(file).column(lambda value: "" if value is None else str(value))
         for value in values:
             column.add(value)
-        column.write(archive, "file", lambda value: "" if value is None else str(value))
+        column.write(archive, "file")
     with np.load(folder / "table.npz", allow_pickle=False) as table:
         return dict(table)
 
@@ -327,12 +327,12 @@ def test_a_table_of_any_length_takes_little_memory(tmp_path, monkeypatch):
     try:
         with tempfile.TemporaryFile() as file, zipfile.ZipFile(tmp_path / "table.npz", "w") as archive:
             spool = columns.Spool(file)
-            arrays, texts = spool.column(), spool.column()
+            arrays, texts = spool.column(str), spool.column(str)
             for number in range(800):
                 arrays.add(np.full(1000, float(number)))
                 texts.add("x" * 1000)
-            arrays.write(archive, "arrays", str)
-            texts.write(archive, "texts", str)
+            arrays.write(archive, "arrays")
+            texts.write(archive, "texts")
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
