@@ -18,6 +18,7 @@ from monstertruck_runtime.mailbox import Mailbox
 from monstertruck_runtime.stations import own_source
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.req import Order, Role
+from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.state import GateMode, GateState, Grid
 from monstertruck_schemas.topics import SOURCE_NAME
@@ -28,7 +29,7 @@ from monstertruckd.station.commands import GiveOrder, Heartbeat
 from monstertruckd.station.feed import KEPT_EVENTS, MapStore, RobotFeed
 from monstertruckd.station.pilot import LATEST, MEMORY, MOST_ASKED, OLDEST, DelayWatch, Pilot
 from monstertruckd.station.server import PAGE, Place
-from monstertruckd.station.users import StationUsers
+from monstertruckd.station.users import StationUsers, add_user
 from monstertruckd.station.viewer import MOST_TILES, MOST_WAITING, Viewer
 
 
@@ -330,7 +331,7 @@ async def test_a_stop_goes_by_any_session_and_other_commands_of_one_browser_are_
 
 def test_the_page_is_asked_for_by_the_names_and_the_scheme_that_browsers_use(tmp_path: Path):
     file = tmp_path / "users.yaml"
-    file.touch(0o600)
+    add_user(file, "ann", AccessRole.PILOT, "long enough")
     local = Place(port=80)
     assert {"localhost", "localhost:80", "[::1]"} <= local.names
     assert "localhost" not in Place(port=8470).names
