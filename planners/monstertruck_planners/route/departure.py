@@ -271,10 +271,9 @@ def plan_between(
         result = ends
     else:
         return ends
-    position, yaw = config.position_tolerance, config.yaw_tolerance
-    reachable = check_endpoints(route_map, vehicle, start, goal, position, yaw, config.margin, start_margin=0.0)
-    if isinstance(reachable, RouteResult):
-        return reachable
+    free = _ends(route_map, vehicle, config, start, goal, start_margin=0.0)
+    if isinstance(free, RouteResult):
+        return free
     begin, end = np.array(start, dtype=np.float64), np.array(goal, dtype=np.float64)
     for departure in _best_departures(route_map, vehicle, config, begin, end):
         ends = _ends(route_map, vehicle, config, departure.end, end)
@@ -288,10 +287,13 @@ def plan_between(
 
 
 def _ends(
-    route_map: RouteMap, vehicle: Vehicle, config: DriveCosts, start: ArrayLike, goal: ArrayLike
-) -> Endpoints | RouteResult:
+    route_map: RouteMap, vehicle: Vehicle, config: DriveCosts, start: ArrayLike, goal: ArrayLike,
+    *, start_margin: float | None = None,
+) -> Endpoints | RouteResult:  # fmt: skip
     position, yaw = config.position_tolerance, config.yaw_tolerance
-    return check_endpoints(route_map, vehicle, start, goal, position, yaw, config.margin)
+    return check_endpoints(
+        route_map, vehicle, start, goal, position, yaw, config.margin, start_margin=start_margin
+    )  # fmt: skip
 
 
 def _room(route_map: RouteMap, vehicle: Vehicle, start: Array, margin: float) -> bool:
