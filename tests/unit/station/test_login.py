@@ -6,6 +6,7 @@ import json
 import ssl
 from functools import partial
 from pathlib import Path
+from unittest.mock import Mock
 
 import aiohttp
 import pytest
@@ -107,6 +108,16 @@ async def test_the_file_of_users_is_read_again_when_it_changes(file: Path, caplo
         damage()
         assert not await known.refresh()
         assert caplog.messages[-1].startswith(f"the users stay as they were: {file}")
+    assert await known.who(basic("bob", "long enough")) is not None
+
+
+async def test_a_file_of_users_that_could_not_be_read_is_read_again(file: Path, monkeypatch: pytest.MonkeyPatch):
+    known = StationUsers(file)
+    add_user(file, "bob", AccessRole.PILOT, "long enough")
+    with monkeypatch.context() as broken:
+        broken.setattr(users, "_rows", Mock(side_effect=OSError("too many open files")))
+        assert not await known.refresh()
+    assert await known.refresh()
     assert await known.who(basic("bob", "long enough")) is not None
 
 

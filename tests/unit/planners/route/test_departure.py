@@ -7,6 +7,7 @@ import pytest
 
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.collision import Footprint
+from monstertruck_planners.route import departure as departure_module
 from monstertruck_planners.route.api import RouteMap, Vehicle
 from monstertruck_planners.route.config import GridAstarConfig, HybridConfig, LatticeConfig
 from monstertruck_planners.route.departure import SPARE, departures
@@ -125,6 +126,12 @@ def test_what_touches_and_goals_within_the_margin_are_refused(planner):
         assert "nearer than" in result.text
     outside = planner.plan(where, base_beside("parallel", 0.02), np.array([50.0, 2.0, 0.0]))
     assert outside.reason is Reason.GOAL_OUTSIDE
+
+
+def test_a_refused_goal_costs_no_search_for_departures(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(departure_module, "departures", lambda *_: pytest.fail("searched"))
+    touching = np.array([5.0, WALL - 0.05 + SIDE, 0.0])
+    assert hybrid().plan(ground(), base_beside("parallel", 0.02), touching).reason is Reason.GOAL_BLOCKED
 
 
 def test_the_other_planners_leave_a_wall_too():

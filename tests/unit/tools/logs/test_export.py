@@ -308,6 +308,11 @@ def test_a_column_has_the_type_of_all_its_values_however_late_they_come(values, 
         np.testing.assert_array_equal(found, np.array([np.nan if v is None else v for v in values], dtype))
 
 
+def test_numbers_that_no_array_holds_are_refused(tmp_path):
+    with pytest.raises(InputError, match="at most 64 bits"):
+        columns_of([2**70, 1], tmp_path)
+
+
 def test_arrays_of_equal_and_of_different_lengths(tmp_path, monkeypatch):
     monkeypatch.setattr(columns, "KEPT", 1000)
     same = [np.full((3, 2), i, np.uint8 if i else np.int16) for i in range(30)]
