@@ -144,7 +144,7 @@ class Gate:
         self._outages = Outages(services)
         self._obstacles = ObstacleGuard(config, footprint, points)
         self._sonars = SonarGuard(config, footprint, sonars) if sonars else None
-        self._peers = PeerGuard(config, footprint, peers, self._obstacles.looks_at) if peers else None
+        self._peers = PeerGuard(config, footprint, peers) if peers else None
         self._motion = Motion(config, chassis)
         self._limiter = CommandLimiter(config, self._motion, self._obstacles, self._sensors, self._sonars, self._peers)
         self._steering_check = SteeringCheck(config.turning) if config.turning is not None else None

@@ -37,7 +37,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import DriveRequest, RequestedTwist
 from monstertruck_schemas.sensor import NO_ECHO, VALID_BEAM, LaserScan
 from monstertruckd.gate.config import GateConfig
-from monstertruckd.gate.peers import PeerGuard
+from monstertruckd.gate.peers import PeerGuard, Seen
 from monstertruckd.gate.sensors import SensorMonitor
 from monstertruckd.gate.sonars import SonarGuard
 
@@ -75,6 +75,9 @@ LEAST: Final = 1e-6
 
 Way = tuple[float, float, float]
 """Motion of the base per metre of pace: m/m, m/m, rad/m."""
+
+Course = tuple[Way, float]
+"""A way, and the pace along it, m/s."""
 
 SECTORS: Final = 36
 """Of a turn about the lidar: 0.1 m at the end of the distance the gate checks, less than the width of the body."""
@@ -796,8 +799,12 @@ class CommandLimiter:
         if target.clipped or pace > max_pace * (1 + ROUNDING):
             limits[Reason.CLIPPED] = max_pace
         if pace > 0 or not motion.standing:
-            self._check_obstacles(now, wanted, shafts, limits)
-            self._check_sonars(now, wanted, shafts, limits)
+            if self._sonars is not None:
+                self._check_sonars(now, self._sonars, wanted, shafts, limits)
+            elif self._sensors.scan_fresh(now):
+                self._check_obstacles(now, wanted, shafts, limits)
+            else:
+                self._check_peers(now, wanted, shafts, limits)
         allowed = min((*limits.values(), max_pace))
         factor = 1.0 if pace <= allowed else allowed / pace
         if allowed == 0:
@@ -815,29 +822,79 @@ class CommandLimiter:
         speed = min(speed, FASTEST)
         return speed * self._config.reaction + speed**2 / (2 * self._config.deceleration)
 
-    def _check_sonars(self, now: int, wanted: Twist[float], shafts: Speeds | None, limits: dict[Reason, float]) -> None:
-        """Sweep the footprint along the commanded motion and along ``wanted`` against the sonars' echoes."""
-        sonars, motion, config = self._sonars, self._motion, self._config
-        if sonars is None:
+    def _courses(self, wanted: Twist[float], shafts: Speeds | None) -> list[Course]:
+        """The motions to be swept: ``wanted`` and the commanded one, without those that stand still."""
+        motion = self._motion
+        courses = ((wanted, motion.pace(wanted, shafts)), (motion.twist, motion.present_pace))
+        return [(_scaled(twist, 1.0 / pace), pace) for twist, pace in courses if twist != STILL and pace >= LEAST]
+
+    def _stop_before(self, free: float, allowed: float, fastest: float, limits: dict[Reason, float]) -> None:
+        """Limit the pace where ``free`` metres are free and ``allowed`` m/s therefore."""
+        crawl = self._config.obstacle.crawl
+        self.free = free if math.isfinite(free) else None
+        self.blocked = allowed < (2 * crawl if self.blocked else crawl)
+        if self.blocked:
+            limits[Reason.OBSTACLE_STOP] = 0.0
+        elif allowed < fastest:
+            limits[Reason.OBSTACLE_SLOW] = allowed
+
+    def _comfortable(self, free: float, delay: float) -> float:
+        """Pace allowed by what is ``free`` metres ahead, known ``delay`` s late, m/s."""
+        obstacle = self._config.obstacle
+        return comfortable_speed(free - obstacle.ahead, delay, obstacle.deceleration)
+
+    def _reach(self, delay: float) -> float:
+        """Distance to be swept against what is known ``delay`` s late, m."""
+        config = self._config
+        return config.obstacle.ahead + config.speed * (delay + config.speed / (2 * config.obstacle.deceleration))
+
+    def _beside_peers(
+        self, now: int, courses: list[Course], reach: float, limits: dict[Reason, float], seen: Seen | None
+    ) -> float:
+        """Sweep the footprint against other robots.
+
+        Args:
+            now: ns.
+            courses: to be swept.
+            reach: so far, m.
+            limits: gets that of robots whose place is not known.
+            seen: which points in base a lidar sees; None = there is none, and all are looked at.
+
+        Returns:
+            The free distance, m.
+        """
+        peers, slow = self._peers, self._config.obstacle.unseen_speed
+        if peers is None:
+            return math.inf
+        looked = self._sonars is not None or seen is not None
+        if peers.unknown(now) and any(pace > slow and not (looked and way[0] >= AHEAD) for way, pace in courses):
+            limits[Reason.PEER_UNKNOWN] = slow
+        return peers.free_distance([way for way, _ in courses], reach, now, seen)
+
+    def _check_peers(self, now: int, wanted: Twist[float], shafts: Speeds | None, limits: dict[Reason, float]) -> None:
+        """Sweep the footprint of a robot without range sensors along both motions: against other robots alone."""
+        courses = self._courses(wanted, shafts)
+        if self._peers is None or not courses:
             return
+        delay = self._config.reaction
+        free = self._beside_peers(now, courses, self._reach(delay), limits, None)
+        self._stop_before(free, self._comfortable(free, delay), max(pace for _, pace in courses), limits)
+
+    def _check_sonars(
+        self, now: int, sonars: SonarGuard, wanted: Twist[float], shafts: Speeds | None, limits: dict[Reason, float]
+    ) -> None:
+        """Sweep the footprint along both motions against the sonars' echoes."""
+        config, courses = self._config, self._courses(wanted, shafts)
         if not sonars.fresh(now):
             limits[Reason.SONAR_STALE] = 0.0
             return
-        courses = ((wanted, motion.pace(wanted, shafts)), (motion.twist, motion.present_pace))
-        ways = [_scaled(twist, 1.0 / pace) for twist, pace in courses if twist != STILL and pace >= LEAST]
         delay = sonars.delay(now) + config.reaction
-        reach = config.obstacle.ahead + config.speed * (delay + config.speed / (2 * config.obstacle.deceleration))
-        views = [sonars.look(way, reach, now) for way in ways]
+        reach = self._reach(delay)
+        views = [sonars.look(way, reach, now) for way, _ in courses]
         free = min((view.free for view in views), default=math.inf)
-        if self._peers is not None:
-            free = min(free, self._peers.free_distance(ways, reach, now))
-        self.free = free if math.isfinite(free) else None
-        allowed = comfortable_speed(free - config.obstacle.ahead, delay, config.obstacle.deceleration)
-        self.blocked = allowed < (2 * config.obstacle.crawl if self.blocked else config.obstacle.crawl)
-        if self.blocked:
-            limits[Reason.OBSTACLE_STOP] = 0.0
-        elif allowed < max(pace for _, pace in courses):
-            limits[Reason.OBSTACLE_SLOW] = allowed
+        free = min(free, self._beside_peers(now, courses, reach, limits, None))
+        fastest = max((pace for _, pace in courses), default=0.0)
+        self._stop_before(free, self._comfortable(free, delay), fastest, limits)
         if any(view.dead for view in views):
             limits[Reason.SONAR_BLIND] = 0.0
         elif any(view.unknown for view in views):
@@ -846,27 +903,17 @@ class CommandLimiter:
     def _check_obstacles(
         self, now: int, wanted: Twist[float], shafts: Speeds | None, limits: dict[Reason, float]
     ) -> None:
-        """Sweep the footprint along the commanded motion, along ``wanted``, and as the wheels are seen to stand."""
-        motion = self._motion
-        courses = ((wanted, motion.pace(wanted, shafts)), (motion.twist, motion.present_pace))
-        moving = [(twist, pace) for twist, pace in courses if twist != STILL and pace >= LEAST]
-        if not moving or not self._sensors.scan_fresh(now):
+        """Sweep the footprint along both motions, and as the wheels are seen to stand, against the scan."""
+        motion, courses = self._motion, self._courses(wanted, shafts)
+        if not courses:
             return
-        ways = [_scaled(twist, 1.0 / pace) for twist, pace in moving]
-        fastest = max(pace for _, pace in moving)
+        fastest = max(pace for _, pace in courses)
         if self._sensors.steering_fresh(now):
-            ways.append(motion.along(ways[0], self._sensors.angles))
-        free = self._obstacles.free_distance(tuple(ways))
-        if self._peers is not None:
-            free = min(free, self._peers.free_distance(ways, self._obstacles.reach, now))
-        self.free = free if math.isfinite(free) else None
-        allowed = self._obstacles.allowed_speed(free, now)
-        crawl = self._config.obstacle.crawl
-        self.blocked = allowed < (2 * crawl if self.blocked else crawl)
-        if self.blocked:
-            limits[Reason.OBSTACLE_STOP] = 0.0
-        elif allowed < fastest:
-            limits[Reason.OBSTACLE_SLOW] = allowed
+            courses.append((motion.along(courses[0][0], self._sensors.angles), 0.0))
+        ways = tuple(way for way, _ in courses)
+        free = self._obstacles.free_distance(ways)
+        free = min(free, self._beside_peers(now, courses, self._obstacles.reach, limits, self._obstacles.looks_at))
+        self._stop_before(free, self._obstacles.allowed_speed(free, now), fastest, limits)
         unseen = self._obstacles.unseen
         self.blind = unseen is None or unseen > self._config.scan.stale_after
         if self.blind:

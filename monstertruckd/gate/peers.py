@@ -1,8 +1,9 @@
 """Other robots by what they say of themselves: the swept footprint against their outlines.
 
 A lidar does not look behind the robot, and what it saw there is old: another robot may have come since. Of robots that
-are heard (section ``peers``) the outline counts where the lidar does not look, all around for robots with sonars: where
-it was heard, and where its own motion takes it within ``HORIZON``. Silent ones stay where they were for ``KEPT``.
+are heard (section ``peers``) the outline counts where the lidar does not look, all around for robots without one: where
+its own motion has taken it since it was heard, and takes it within ``HORIZON``. A pose older than ``FRESH`` tells where
+a robot was, not where it is: the outline stays there for ``KEPT``, and the robot may be anywhere (``unknown``).
 """
 
 import math
@@ -15,11 +16,15 @@ from numpy.typing import NDArray
 from monstertruck_kinematics.elementary import Array, integrate
 from monstertruck_planners.collision import Footprint, first_contact, on_body, placed, points_relative, swept_poses
 from monstertruck_runtime.clock import SECOND
-from monstertruck_schemas.state import Odometry, Peers
+from monstertruck_schemas.base import Pose2D, Twist2D
+from monstertruck_schemas.state import Odometry, Peer, Peers
 from monstertruckd.gate.config import GateConfig
 
 HORIZON: Final = (0.0, 0.5, 1.0)
 """Seconds for which another robot goes on as it was heard to."""
+FRESH: Final = 0.5
+"""Age up to which a pose tells where a robot is, s: further on, at 0.2 m/s, it may be 0.1 m from where it is looked
+for."""
 KEPT: Final = 30.0
 """Seconds for which the place of a silent one counts, as remembered points do."""
 SPACING: Final = 0.03
@@ -28,6 +33,9 @@ STEP: Final = 0.02
 """Between the poses of a sweep, m."""
 
 Way = tuple[float, float, float]
+Place = tuple[float, float, float]
+Seen = Callable[[Array], NDArray[np.bool_]]
+"""Which of the points (n, 2) in base, m, a sensor sees."""
 
 
 class PeerGuard:
@@ -37,22 +45,14 @@ class PeerGuard:
         config: the gate's limits.
         footprint: the body's outline.
         outlines: of the others by name.
-        seen: which of the points (n, 2) in base, m, lie where the lidar looks.
     """
 
-    def __init__(
-        self,
-        config: GateConfig,
-        footprint: Footprint,
-        outlines: Mapping[str, Footprint],
-        seen: Callable[[Array], NDArray[np.bool_]],
-    ) -> None:
+    def __init__(self, config: GateConfig, footprint: Footprint, outlines: Mapping[str, Footprint]) -> None:
         self._config = config
         self._footprint = footprint
         self._edges = {name: _edges(body) for name, body in outlines.items()}
-        self._seen = seen
-        self._pose: tuple[float, float, float] | None = None
-        self._peers: Peers | None = None
+        self._own: Odometry | None = None
+        self._heard: dict[str, Peer] = {}
 
     def configure(self, config: GateConfig) -> None:
         """Take other limits, between two ticks."""
@@ -60,21 +60,30 @@ class PeerGuard:
 
     def observe_pose(self, pose: Odometry) -> None:
         """Take the robot's own newest pose in the map."""
-        self._pose = (pose.pose.x, pose.pose.y, pose.pose.yaw)
+        self._own = pose
 
     def observe(self, peers: Peers) -> None:
         """Take what was heard of the others."""
-        self._peers = peers
+        self._heard = {peer.robot: peer for peer in peers.peers if peer.robot in self._edges}
 
-    def free_distance(self, ways: Iterable[Way], reach: float, now: int) -> float:
-        """Distance the footprint can travel, m; +inf if nobody is within reach.
+    def unknown(self, now: int) -> bool:
+        """Whether another robot may be anywhere: it is silent, was never heard, or this one does not know its place."""
+        if self._pose(now) is None:
+            return True
+        return any((peer := self._heard.get(name)) is None or _age(peer.heard, now) > FRESH for name in self._edges)
+
+    def free_distance(self, ways: Iterable[Way], reach: float, now: int, seen: Seen | None) -> float:
+        """Distance the footprint can travel, m; +inf if nobody is known to be within reach.
 
         Args:
             ways: twists per metre of pace, m/m, m/m, rad/m; the shortest distance of all counts.
             reach: distance swept, m.
             now: ns.
+            seen: what the lidar sees, where nobody counts; None = nothing.
         """
         points = self._points(now, reach)
+        if seen is not None:
+            points = points[~seen(points)]
         if not len(points):
             return math.inf
         return min((self._swept(way, reach, points) for way in ways), default=math.inf)
@@ -86,29 +95,43 @@ class PeerGuard:
         contact = first_contact(self._footprint, swept_poses(way, distances), points, clearance)
         return math.inf if contact is None else float(distances[contact - 1])
 
+    def _pose(self, now: int) -> Place | None:
+        """Of this robot in the map, m, m, rad; None = not known."""
+        if self._own is None or (age := _age(self._own.stamp, now)) > FRESH:
+            return None
+        return _moved(self._own.pose, self._own.twist, age)
+
     def _points(self, now: int, reach: float) -> Array:
         """Points of the outlines that are near, in base, shape (n, 2), m."""
-        found = [np.empty((0, 2))]
-        if self._pose is None or self._peers is None:
+        found, own = [np.empty((0, 2))], self._pose(now)
+        if own is None:
             return found[0]
         near = reach + self._footprint.circumscribed_radius
-        for peer in self._peers.peers:
-            edges, age = self._edges.get(peer.robot), (now - peer.heard) / SECOND
-            if edges is None or age > KEPT:
-                continue
+        for name, peer in self._heard.items():
+            edges, age = self._edges[name], _age(peer.heard, now)
             pose, twist = peer.pose, peer.twist
-            largest = near + float(np.hypot(edges[:, 0], edges[:, 1]).max())
-            if math.dist((pose.x, pose.y), self._pose[:2]) > largest + math.hypot(twist.vx, twist.vy) * HORIZON[-1]:
+            times = (0.0,) if age > FRESH else tuple(age + later for later in HORIZON)
+            radius, way = float(np.hypot(edges[:, 0], edges[:, 1]).max()), math.hypot(twist.vx, twist.vy) * times[-1]
+            if age > KEPT or math.dist((pose.x, pose.y), own[:2]) > near + radius + way:
                 continue
-            for later in HORIZON:
-                at = integrate((pose.x, pose.y, pose.yaw), twist.vx, twist.vy, twist.wz, later)
+            for number, time in enumerate(times):
+                at = _moved(pose, twist, time)
                 outline = placed(np.column_stack((edges, np.zeros(len(edges)))), at)[:, :2]
-                outline = points_relative(outline, self._pose)
-                if later and on_body(self._footprint, outline, self._config.obstacle.side_clearance).any():
+                outline = points_relative(outline, own)
+                if number and on_body(self._footprint, outline, self._config.obstacle.side_clearance).any():
                     break  # it comes to this robot, which may have left by then
                 found.append(outline)
-        points = np.concatenate(found)
-        return points[~self._seen(points)] if len(points) else points
+        return np.concatenate(found)
+
+
+def _age(stamp: int, now: int) -> float:
+    """S; 0 for what is stamped ahead."""
+    return max(now - stamp, 0) / SECOND
+
+
+def _moved(pose: Pose2D, twist: Twist2D, seconds: float) -> Place:
+    """Where a steady motion leads from a pose, m, m, rad."""
+    return integrate((pose.x, pose.y, pose.yaw), twist.vx, twist.vy, twist.wz, seconds)
 
 
 def _edges(body: Footprint) -> Array:

@@ -74,9 +74,18 @@ def test_in_three_dimensions_each_has_its_daemon_and_stops_before_the_other():
     assert abs(speed) < 0.02, "before it stands the first one, 1.7 m before its goal"
 
 
+def test_a_robot_without_eyes_stops_before_another_that_it_hears():
+    rigs, contacts, outcome = drive(*fleet(second=BLIND), seconds=9.0)
+    assert outcome is Reason.OBSTACLE_STOP
+    assert contacts == []
+    gap = rigs[0].truth.array()[-1, 1] - rigs[1].truth.array()[-1, 1] - 0.47
+    assert 0.02 < gap < 0.3
+
+
 @pytest.mark.long
-def test_a_robot_without_eyes_runs_into_it_and_the_world_says_so():
-    rigs, contacts, outcome = drive(*fleet(second=BLIND))
+def test_a_robot_without_eyes_and_ears_runs_into_it_and_the_world_says_so():
+    leader, second = fleet(second=BLIND)
+    rigs, contacts, outcome = drive(leader, second.model_copy(update={"peers": {}}))
     assert outcome is not Reason.BEHAVIOUR_DONE
     assert [(contact.mover, contact.other) for contact in contacts] == [("second", "leader")]
     assert contacts[0].speed == pytest.approx(0.15, abs=0.03)

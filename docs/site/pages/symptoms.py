@@ -50,6 +50,7 @@ SYMPTOMS: Final = (
             "lidar_blind": "As above; something hangs before it?",
             "unseen_slow": "It drives where no sensor looks: turn it round.",
             "sonar_slow": "",
+            "peer_unknown": "A robot of `peers` is silent, or this one has no pose: see `echo state/peers`.",
             "sonar_blind": "A sonar does not answer: check its plug.",
             "tilt_slow": "",
             "tilt_stop": "Drive it down by hand, or carry it; `gate.tilt` says from where.",

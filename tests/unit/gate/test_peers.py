@@ -1,4 +1,4 @@
-"""Other robots by what they say of themselves: behind the robot they stop it, before the lidar they do not count."""
+"""Other robots by what they say of themselves: they stop the robot where no lidar looks, silent ones slow it."""
 
 from math import inf, pi
 
@@ -12,34 +12,32 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.state import Odometry, Peer, Peers
 from monstertruckd.gate.config import GateConfig
 from monstertruckd.gate.peers import PeerGuard
-from tests.unit.gate.rig import ANY_GROUND, Rig, make_gate
+from tests.unit.gate.rig import ANY_GROUND, TICK, Rig, make_gate
 
 AHEAD, BACK, SPOT = (1.0, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 4.0)
 BODY = Footprint(0.48, 0.34, padding=0.0)
 HEARD = 100 * SECOND
+SILENT = (Reason.PEER_UNKNOWN,)
 
 
-def blind(points):
-    return np.zeros(len(points), bool)
-
-
-def pose(x=0.0, y=0.0, yaw=0.0):
+def pose(x=0.0, y=0.0, yaw=0.0, vx=0.0, now=HEARD):
     return Odometry(
-        stamp=0, received=0, seq=0, frame="map", pose=Pose2D(x=x, y=y, yaw=yaw), twist=Twist2D(vx=0.0, vy=0.0, wz=0.0),
-        pose_covariance=np.zeros(9), twist_covariance=np.zeros(9), age=0.0,
+        stamp=now, received=now, seq=0, frame="map", pose=Pose2D(x=x, y=y, yaw=yaw),
+        twist=Twist2D(vx=vx, vy=0.0, wz=0.0), pose_covariance=np.zeros(9), twist_covariance=np.zeros(9), age=0.0,
     )  # fmt: skip
 
 
-def heard(x, y, yaw=0.0, vx=0.0, robot="ann"):
-    peer = Peer(robot=robot, pose=Pose2D(x=x, y=y, yaw=yaw), twist=Twist2D(vx=vx, vy=0.0, wz=0.0), heard=HEARD)
-    return Peers(stamp=HEARD, received=HEARD, seq=0, frame="map", peers=(peer,))
+def heard(x, y, yaw=0.0, vx=0.0, robot="ann", now=HEARD):
+    peer = Peer(robot=robot, pose=Pose2D(x=x, y=y, yaw=yaw), twist=Twist2D(vx=vx, vy=0.0, wz=0.0), heard=now)
+    return Peers(stamp=now, received=now, seq=0, frame="map", peers=(peer,))
 
 
-def free(way, peers, *, own=None, after=0.0, seen=blind):
-    guard = PeerGuard(GateConfig(), BODY, {"ann": BODY}, seen)
-    guard.observe_pose(pose() if own is None else own)
+def free(way, peers, *, own=None, after=0.0, seen=None):
+    now = HEARD + round(after * SECOND)
+    guard = PeerGuard(GateConfig(), BODY, {"ann": BODY})
+    guard.observe_pose(pose(now=now) if own is None else own)
     guard.observe(peers)
-    return guard.free_distance([way], 0.5, HEARD + round(after * SECOND))
+    return guard.free_distance([way], 0.5, now, seen)
 
 
 def test_a_robot_behind_ends_the_way_back_and_no_other():
@@ -78,22 +76,78 @@ def test_a_robot_where_the_lidar_looks_and_one_that_is_not_configured_do_not_cou
     assert free(BACK, heard(-0.8, 0.0, robot="bob")) == inf
 
 
-def test_without_a_pose_of_its_own_nobody_has_a_place():
-    guard = PeerGuard(GateConfig(), BODY, {"ann": BODY}, blind)
+def test_both_robots_are_where_their_motion_has_taken_them_since():
+    near = 0.8 - 0.48 - 0.02
+    assert free(BACK, heard(-1.1, 0.0, vx=0.2), after=0.4) == pytest.approx(near + 0.02, abs=0.021)
+    assert free(BACK, heard(-0.4, 0.0, vx=-1.0), after=0.4) == pytest.approx(near, abs=0.021)
+    assert free(BACK, heard(-0.9, 0.0), own=pose(vx=-0.25), after=0.4) == pytest.approx(near, abs=0.021)
+
+
+def test_without_a_fresh_pose_of_its_own_nobody_has_a_place_and_may_be_anywhere():
+    guard = PeerGuard(GateConfig(), BODY, {"ann": BODY})
     guard.observe(heard(-0.8, 0.0))
-    assert guard.free_distance([BACK], 0.5, HEARD) == inf
+    for own, known in ((None, False), (pose(now=HEARD - 6 * SECOND // 10), False), (pose(), True)):
+        if own is not None:
+            guard.observe_pose(own)
+        assert (guard.free_distance([BACK], 0.5, HEARD, None) < 0.5) is known
+        assert guard.unknown(HEARD) is not known
+
+
+@pytest.mark.parametrize(("after", "unknown"), [(0.4, False), (0.6, True), (100.0, True)])
+def test_one_that_is_silent_may_be_anywhere_until_it_is_heard_again(after, unknown):
+    now = HEARD + round(after * SECOND)
+    guard = PeerGuard(GateConfig(), BODY, {"ann": BODY})
+    guard.observe_pose(pose(now=now))
+    assert guard.unknown(now), "never heard"
+    guard.observe(heard(-9.0, 0.0))
+    assert guard.unknown(now) is unknown
+    guard.observe(heard(-9.0, 0.0, now=now))
+    assert not guard.unknown(now)
+
+
+def peer_rig(**config):
+    rig = Rig(**config)
+    rig.gate = make_gate(peers={"ann": Footprint()}, **config)
+    return rig
+
+
+def beside(rig, x=None, ticks=40):
+    """Drive for some ticks, hearing another robot ahead or behind; None = nobody."""
+    for _ in range(ticks):
+        rig.gate.observe_pose(pose(now=rig.now + TICK))
+        if x is not None:
+            rig.gate.observe_peers(heard(x, 0.0, now=rig.now + TICK))
+        rig.tick()
 
 
 def test_the_gate_stops_before_a_robot_behind_that_no_scan_has_seen():
-    rig = Rig(obstacle=ANY_GROUND)
-    rig.gate = make_gate(obstacle=ANY_GROUND, peers={"ann": Footprint()})
-    rig.gate.observe_pose(pose())
-    rig.driving(ticks=40, speed=-0.1)
+    rig = peer_rig(obstacle=ANY_GROUND)
+    rig.driving(ticks=1, speed=-0.1)
+    beside(rig, 5.0)
     assert rig.out.reasons == ()
-    rig.gate.observe_peers(heard(-0.55, 0.0))
-    rig.tick(40)
+    beside(rig, -0.55)
     assert rig.out.reasons == (Reason.OBSTACLE_STOP,)
     assert rig.speed == 0.0
-    rig.gate.observe_peers(heard(0.55, 0.0))  # before the lidar, which sees nobody
-    rig.tick(40)
+    beside(rig, 0.55)  # before the lidar, which sees nobody
     assert rig.out.reasons == ()
+
+
+@pytest.mark.parametrize(("speed", "slow"), [(-0.14, 0.1), (-0.09, None), (0.2, None)])
+def test_the_gate_is_slow_where_the_lidar_does_not_look_while_another_robot_is_silent(speed, slow):
+    rig = peer_rig()
+    rig.driving(ticks=1, speed=speed)
+    beside(rig)
+    assert (Reason.PEER_UNKNOWN in rig.out.reasons) is (slow is not None)
+    assert rig.speed == pytest.approx(speed if slow is None else -slow)
+
+
+@pytest.mark.parametrize(
+    ("place", "reasons", "speed"), [(5.0, (), 0.2), (0.55, (Reason.OBSTACLE_STOP,), 0.0), (None, SILENT, 0.1)]
+)
+def test_a_robot_without_range_sensors_goes_by_what_it_hears_all_around(place, reasons, speed):
+    rig = peer_rig(scan={"stale_after": 0.25, "critical": False})
+    rig.silent.add("scan")
+    rig.driving(ticks=1, speed=0.2)
+    beside(rig, place)
+    assert rig.out.reasons == reasons
+    assert rig.speed == pytest.approx(speed)
