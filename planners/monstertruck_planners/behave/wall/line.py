@@ -67,6 +67,8 @@ CLEAR: Final = 0.2
 wall to which it drives."""
 FITS: Final = 2
 """Lines fitted for a round of echoes: one in a step where there are as many steps: the event loop waits for them."""
+GONE: Final = 0.1
+"""Way left at standstill beside a wall, m, from which on what the robot braked for has gone: it was no corner."""
 TOUCHING: Final = 0.16
 """A range from which on the robot stops at once, m."""
 OPENING: Final = 0.3
@@ -457,6 +459,8 @@ class WallLine:
                 state = self._steer(state, t) if state.wall is not None else state
                 if not state.v.over(t):
                     return replace(state, v=self._stopping(state.v, self._left(state, cone, t), t))
+                if state.wall is not None and self._left(state, cone, t) > GONE:
+                    return self._to(state, "follow")
                 state = self._to(state, "turn")
                 sense = self._sense(state)
                 return replace(state, sense=sense, w=self._ramp(state.w, sense * config.turn_rate, t))

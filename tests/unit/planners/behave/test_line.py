@@ -198,6 +198,27 @@ def test_it_stops_by_its_ramp_where_the_wall_ahead_is_heard_no_longer_while_it_b
     assert abs(step.motion.vx) < 0.02
 
 
+@pytest.mark.parametrize("goes", [True, False])
+def test_it_follows_its_wall_on_after_braking_for_what_has_gone_from_the_far_side(goes):
+    wall, person = (-9.0, 0.35, 9.0, 0.35), (1.5, -0.2, 1.5, -0.6)
+    robot, behaviour, phases = Robot([wall, person], (0.0, 0.0, 0.1)), follower(), []
+    state = replace(
+        behaviour.begin(), phase="follow", wall=WallEstimate(math.pi / 2, 0.35), places=np.array([[0.0, *robot.pose]])
+    )
+    for i in range(200):
+        if goes and state.phase == "brake":
+            robot.walls = [wall]
+        step = behaviour.step(robot.inputs(), state, i * PERIOD)
+        state, robot.motion = step.state, step.motion or RequestedMotion()
+        phases.append(state.phase)
+        if state.phase == "turn":
+            break
+        robot.move()
+    assert "brake" in phases
+    assert ("turn" in phases) is not goes
+    assert (robot.pose[0] > 3.0) is goes
+
+
 def test_a_front_sonar_that_hears_nothing_is_made_up_for_by_the_diagonal_one():
     corner = [(-9.0, 0.35, 2.0, 0.35), (2.0, 0.35, 3.5, -3.0)]
     robot = Robot(corner, (0.5, 0.0, 0.1))
