@@ -29,6 +29,7 @@ from monstertruck_planners.goals.escape import escape
 from monstertruck_planners.goals.exchange import PlanAnswer, PlanTask, Pose, Setup, explained_within
 from monstertruck_planners.route.api import Clock, RouteMap, RoutePlanner, RouteResult, Vehicle, make_planner, warm_up
 from monstertruck_planners.route.config import GoalConfig, GridAstarConfig, HybridConfig, LatticeConfig
+from monstertruck_planners.route.departure import leaving
 from monstertruck_planners.route.motion import MotionPath, moved
 from monstertruck_planners.route.replan import ViaPoint, replan, with_headings
 from monstertruck_planners.track.segments import stops
@@ -510,6 +511,8 @@ class PlanningWorker(PlanningStep):
         for config in configs:
             warm_up(make_planner(Vehicle.truck(), config))
         Vehicle.truck("2ws").reeds_shepp().distance(np.zeros(3), np.ones(3))
+        ahead = MotionPath(np.ones(3), np.array([[0.1, 0.0, 0.0]]))
+        leaving(RouteMap.from_cells(np.zeros((20, 20), np.int8), 0.1), Vehicle.truck(), ahead, 0.0, lambda _: True)
 
 
 def hybrid_worker() -> PlanningWorker:

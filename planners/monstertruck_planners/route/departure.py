@@ -20,7 +20,15 @@ from numpy.typing import ArrayLike
 from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.collision_kernels import FieldData, FootprintData, safe_distance, segment_free
 from monstertruck_planners.route import heuristic
-from monstertruck_planners.route.api import Endpoints, RouteCosts, RouteMap, RouteResult, Vehicle, check_endpoints
+from monstertruck_planners.route.api import (
+    Budget,
+    Endpoints,
+    RouteCosts,
+    RouteMap,
+    RouteResult,
+    Vehicle,
+    check_endpoints,
+)
 from monstertruck_planners.route.config import DriveCosts
 from monstertruck_planners.route.motion import MotionPath, advance
 from monstertruck_planners.route.search import CHECK_MARGIN, CHECK_STEP
@@ -41,6 +49,8 @@ SHORTEST: Final = 0.02
 """Of one arc, m: less is not driven exactly."""
 LONGEST: Final = 1.0
 """Of one arc, m."""
+FURTHEST: Final = 3.0
+"""Of a departure that a path begins with, m."""
 CURVATURES: Final = (0.0, *(0.5**k for k in range(7)))
 """Of the arcs tried, as shares of the greatest one: the wider a body turns, the less near its end comes to a wall."""
 TRANSLATIONS: Final = (1.0, 0.5)
@@ -52,9 +62,11 @@ SET_OFF: Final = 0.15
 GAIN: Final = 3.0
 """Metres to drive for a metre of clearance, about: translations of 0.33 rad."""
 DIPS: Final = (0.0, 0.125, 0.5, 1.0)
-"""Shares of the clearance by which it may fall again on the way, tried in turn."""
-NODES: Final = 200
-"""Poses from which arcs are tried, at most."""
+"""Shares of the clearance by which it may fall again on the way, tried in turn, each with half of the budget left."""
+ARC: Final = 8
+"""Poses checked that take as long as what else there is to do for an arc..."""
+NODE: Final = 60
+"""...and at least as long as a node of a search: these are what a planner's budget counts."""
 ENOUGH: Final = 20
 """Departures that are looked at for the way on from them."""
 DEARER: Final = 0.5
@@ -115,6 +127,45 @@ def _drive_off(
     return free, known, best
 
 
+@njit(cache=True)
+def _to_room(
+    field: FieldData, footprint: FootprintData, start: Array, segments: Array, after: float, wanted: int
+) -> tuple[float, int]:
+    """Where a path first has the wanted clearance again, and how far the clearance fell until then.
+
+    Args:
+        field: the grid.
+        footprint: of the vehicle.
+        start: pose of the path, shape (3,).
+        segments: of the path, shape (n, 3).
+        after: nearer to the start than this it may have it and fall again, m.
+        wanted: clearance, in steps of LEVEL.
+
+    Returns:
+        Metres from the start, -1 if the path touches something before or never has it; greatest fall of the clearance
+        below the best one so far, in steps of LEVEL.
+    """
+    x, y, yaw = start[0], start[1], start[2]
+    level = _level(field, footprint, x, y, yaw, 0, 0, wanted)
+    best, fall, before = level, 0, 0.0
+    for i in range(len(segments)):
+        length, curvature, sideslip = segments[i, 0], segments[i, 1], segments[i, 2]
+        pieces = max(math.ceil(abs(length) / CHECK), 1)
+        for k in range(pieces + 1):
+            travelled = before + abs(length) * k / pieces
+            px, py, pyaw = advance(x, y, yaw, length * k / pieces, curvature, sideslip)
+            level = _level(field, footprint, px, py, pyaw, max(level, 0), 0, wanted)
+            if level < 0:
+                return -1.0, fall
+            best = max(best, level)
+            fall = max(fall, best - level)
+            if level >= wanted and travelled >= after:
+                return travelled, fall
+        x, y, yaw = advance(x, y, yaw, length, curvature, sideslip)
+        before += abs(length)
+    return -1.0, fall
+
+
 @dataclass(frozen=True, slots=True)
 class Departure:
     """Motions from a start to a pose that keeps the margin."""
@@ -138,33 +189,46 @@ class _Node:
     segments: tuple[tuple[float, float, float], ...]
 
 
-def departures(route_map: RouteMap, vehicle: Vehicle, start: Array, margin: float, reverse: float) -> list[Departure]:
-    """Ways from a start to poses that keep the margin with a little to spare.
+@dataclass(frozen=True, slots=True)
+class Departures:
+    """Ways from a start to poses that keep the margin with a little to spare."""
 
-    Those from whose end a search can turn come first, then the cheapest.
+    found: list[Departure]
+    """Those from whose end a search can turn come first, then the cheapest."""
+    exhausted: bool
+    """There are no others than these; else the budget ended the search for them."""
+
+
+def departures(
+    route_map: RouteMap, vehicle: Vehicle, start: Array, config: DriveCosts, budget: Budget, reserve: float = 0.0
+) -> Departures:
+    """Ways from a start to poses that keep the margin.
 
     Args:
         route_map: obstacles.
         vehicle: what is driven.
         start: pose of the reference point, shape (3,).
-        margin: wanted between footprint and obstacles, m.
-        reverse: cost of a metre backward, m.
+        config: margin, and cost of a metre backward.
+        budget: of the route; what is done here is counted.
+        reserve: share of it that is kept; of the rest half is kept for the route.
 
     Returns:
-        Empty if the start touches an obstacle, or all its motions do.
+        None found if the start touches an obstacle, or all its motions do.
     """
     field, footprint = route_map.field.data(), vehicle.footprint.data()
-    wanted = _wanted(margin)
+    wanted = _wanted(config.margin)
     level = int(_level(field, footprint, start[0], start[1], start[2], 0, 0, wanted))
     if level < 0:
-        return []
-    straight: list[Departure] = []
-    for dip in dict.fromkeys(math.ceil(level * share) for share in DIPS):
-        found = _search(field, footprint, vehicle, _Node(start, level, level, 0.0, ()), dip, margin, reverse)
-        if found and found[0].turns:
-            return found
-        straight = straight or found
-    return straight
+        return Departures([], exhausted=True)
+    straight, exhausted, end = list[Departure](), True, 0.5 * (budget.remaining() + reserve)
+    dips = list(dict.fromkeys(math.ceil(level * share) for share in DIPS))
+    for dip in dips:
+        until = end if dip == dips[-1] else 0.5 * (budget.remaining() + end)
+        result = _search(field, footprint, vehicle, _Node(start, level, level, 0.0, ()), dip, config, budget, until)
+        if result.found and result.found[0].turns:
+            return result
+        straight, exhausted = straight or result.found, exhausted and result.exhausted
+    return Departures(straight, exhausted=exhausted)
 
 
 def _wanted(margin: float) -> int:
@@ -181,9 +245,11 @@ def _arcs(vehicle: Vehicle) -> list[Array]:
 
 
 def _search(
-    field: FieldData, footprint: FootprintData, vehicle: Vehicle, start: _Node, dip: int, margin: float, reverse: float
-) -> list[Departure]:
-    """Best first over arcs and the places on them."""
+    field: FieldData, footprint: FootprintData, vehicle: Vehicle, start: _Node, dip: int, config: DriveCosts,
+    budget: Budget, until: float,
+) -> Departures:  # fmt: skip
+    """Best first over arcs and the places on them, while more than ``until`` of the budget remains."""
+    margin, reverse = config.margin, config.reverse_cost
     arcs, wanted, most = _arcs(vehicle), _wanted(margin), np.inf
     lines = [arc for arc in arcs if not arc[1:].any()]
     turning = [arc for arc in arcs if arc[2] or abs(arc[1]) * vehicle.radius > 0.49]
@@ -196,15 +262,20 @@ def _search(
     wait(start)
     seen: set[tuple[int, ...]] = set()
     found: list[Departure] = []
-    enough = ENOUGH
-    while waiting and len(seen) < NODES and enough > 0:
+    enough, exhausted = ENOUGH, True
+    while waiting and enough > 0:
         _, _, node = heappop(waiting)
         place = tuple(np.round(node.pose / PLACE).astype(int).tolist())
         if node.cost > most or place in seen:
             continue
+        if budget.remaining() <= until:
+            exhausted = False
+            break
         seen.add(place)
+        checked = 0
         for arc in arcs:
             length, level, best = _drive_off(field, footprint, node.pose, arc, node.level, node.best, dip, wanted)
+            checked += ARC + round(length / CHECK)
             if length < SHORTEST:
                 continue
             for travelled in np.arange(BRANCH, length - CHECK / 2, BRANCH).tolist():
@@ -218,7 +289,9 @@ def _search(
                 most = min(most, after.cost + DEARER)
             else:
                 wait(after)
-    return sorted(found, key=lambda departure: (not departure.turns, departure.cost))
+        budget.work += checked // NODE
+    order = sorted(found, key=lambda departure: (not departure.turns, departure.cost))
+    return Departures(order, exhausted=exhausted)
 
 
 def _sets_off(field: FieldData, footprint: FootprintData, arcs: list[Array], pose: Array, margin: float) -> bool:
@@ -243,7 +316,7 @@ def _after(node: _Node, arc: Array, travelled: float, level: int, best: int, rev
 
 def plan_between(
     route_map: RouteMap, vehicle: Vehicle, config: DriveCosts, start: ArrayLike, goal: ArrayLike,
-    search: Callable[[Endpoints], RouteResult], *, departs: bool = True,
+    search: Callable[[Endpoints], RouteResult], budget: Budget, *, reserve: float = 0.0, departs: bool = True,
 ) -> RouteResult:  # fmt: skip
     """Route between two poses, with a departure first if the start is too near to an obstacle; or why there is none.
 
@@ -255,6 +328,8 @@ def plan_between(
         goal: the same.
         search: route between two poses that keep the margin; ``statistics["exhausted"]`` is not 0 if no budget would
             help it.
+        budget: that of the search, for the departure too.
+        reserve: share of it that is kept, see ``departures``.
         departs: else there are no departures, and the start has to keep the margin.
     """
     ends = _ends(route_map, vehicle, config, start, goal)
@@ -262,8 +337,8 @@ def plan_between(
         return search(ends) if isinstance(ends, Endpoints) else ends
     if isinstance(ends, Endpoints) and _room(route_map, vehicle, ends.start, config.margin):
         result = search(ends)
-        room = _room(route_map, vehicle, ends.start, config.margin + CONFINED)
-        if result.ok or room or not result.statistics.get("exhausted"):
+        confined = needs_departure(route_map, vehicle, ends.start, config.margin)
+        if result.ok or not confined or not result.statistics.get("exhausted"):
             return result
     elif isinstance(ends, Endpoints):
         result = RouteResult(Reason.START_BLOCKED, text=f"start: every motion comes nearer than {config.margin:g} m")
@@ -275,7 +350,11 @@ def plan_between(
     if isinstance(free, RouteResult):
         return free
     begin, end = np.array(start, dtype=np.float64), np.array(goal, dtype=np.float64)
-    for departure in _best_departures(route_map, vehicle, config, begin, end):
+    ways = departures(route_map, vehicle, begin, config, budget, reserve)
+    if not ways.found and not ways.exhausted:
+        away = f"no way found in time to where {config.margin:g} m to obstacles can be kept"
+        return RouteResult(Reason.ROUTE_TIMEOUT, text=f"start: {away}")
+    for departure in _best(ways.found, route_map, vehicle, config, end):
         ends = _ends(route_map, vehicle, config, departure.end, end)
         result = search(ends) if isinstance(ends, Endpoints) else ends
         if result.path is not None:
@@ -296,16 +375,55 @@ def _ends(
     )  # fmt: skip
 
 
+def needs_departure(route_map: RouteMap, vehicle: Vehicle, start: Array, margin: float) -> bool:
+    """Whether routes from a start may begin with a departure: elsewhere they keep the margin all the way."""
+    return not _room(route_map, vehicle, start, margin + CONFINED)
+
+
+@dataclass(frozen=True, slots=True)
+class Leaving:
+    """How a path leaves a place that is nearer to an obstacle than the margin."""
+
+    length: float
+    """From here on to its end it keeps the margin, m from its start."""
+    fall: float
+    """Of the clearance below the greatest one before, m."""
+
+
+def leaving(
+    route_map: RouteMap, vehicle: Vehicle, path: MotionPath, margin: float, free: Callable[[MotionPath], bool]
+) -> Leaving | None:
+    """How a path gets from its start to where it keeps the margin up to its end; None if it touches or never does.
+
+    Args:
+        route_map: obstacles.
+        vehicle: what is driven.
+        path: of the reference point.
+        margin: to obstacles, m.
+        free: whether a path keeps the margin.
+    """
+    field, footprint = route_map.field.data(), vehicle.footprint.data()
+    start, segments = path.copied()
+    kept, length = math.ceil((margin + CHECK_MARGIN) / LEVEL), 0.0
+    while length < FURTHEST:
+        length, fall = _to_room(field, footprint, start, segments, length, kept)
+        if length < 0.0:
+            break
+        if free(path.part(length, math.inf)):
+            return Leaving(length, fall * LEVEL)
+        length += BRANCH
+    return None
+
+
 def _room(route_map: RouteMap, vehicle: Vehicle, start: Array, margin: float) -> bool:
     """Whether a search with that margin has motions to begin with: others begin too near to an obstacle."""
     return bool(route_map.field.free(vehicle.footprint, start[None], margin + CHECK_MARGIN)[0])
 
 
-def _best_departures(
-    route_map: RouteMap, vehicle: Vehicle, config: DriveCosts, start: Array, goal: Array
+def _best(
+    found: list[Departure], route_map: RouteMap, vehicle: Vehicle, config: DriveCosts, goal: Array
 ) -> list[Departure]:
     """The departures to begin with, by the way that is left from their ends; each ends somewhere else."""
-    found = departures(route_map, vehicle, start, config.margin, config.reverse_cost)
     if not found or not route_map.field.inside(goal[:2]):
         return found[:1]
     field, cell = route_map.field.data(), route_map.coarse_cell

@@ -25,7 +25,7 @@ from monstertruck_planners.route.api import (
 )
 from monstertruck_planners.route.config import HybridConfig
 from monstertruck_planners.route.corridors import cheapest_unmarked, close_narrow_gaps, mark_corridor
-from monstertruck_planners.route.departure import plan_between
+from monstertruck_planners.route.departure import Leaving, leaving, plan_between
 from monstertruck_planners.route.hybrid_search import (
     MAX_NODES,
     RESOLUTIONS,
@@ -152,6 +152,8 @@ class HybridPlanner:
             start,
             goal,
             lambda ends: _PlanningRun(self, route_map, ends, budget, attempt).route(),
+            budget,
+            reserve=attempt.reserve,
             departs=self._departs,
         )
 
@@ -170,6 +172,10 @@ class HybridPlanner:
         start, segments = path.copied()
         model, field = self.motion_model(RESOLUTIONS[0], 0.0), route_map.field.data()
         return bool(search.segments_free(field, self.footprint, model, start, segments, len(segments)))
+
+    def leaving(self, route_map: RouteMap, path: MotionPath) -> Leaving | None:
+        """How a path of the reference point gets to where it keeps the margin up to its end; None: it does not."""
+        return leaving(route_map, self.vehicle, path, self.config.margin, lambda rest: self.free(route_map, rest))
 
     def cost(self, route_map: RouteMap, path: MotionPath) -> float:
         """Cost of a path, m."""

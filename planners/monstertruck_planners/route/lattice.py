@@ -363,7 +363,7 @@ class LatticePlanner:
         """Route of the vehicle's reference point, see ``RoutePlanner``."""
         budget = Budget(self.config.budget, now, self.config.effort)
         return plan_between(
-            route_map, self.vehicle, self.config, start, goal, lambda ends: self._route(route_map, ends, budget)
+            route_map, self.vehicle, self.config, start, goal, lambda ends: self._route(route_map, ends, budget), budget
         )
 
     def _route(self, route_map: RouteMap, ends: Endpoints, budget: Budget) -> RouteResult:

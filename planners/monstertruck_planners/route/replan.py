@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.route.api import Clock, RouteMap, RoutePlanner, RouteResult, make_planner
 from monstertruck_planners.route.config import HybridConfig
+from monstertruck_planners.route.departure import needs_departure
 from monstertruck_planners.route.hybrid import HybridPlanner
 from monstertruck_planners.route.motion import MotionPath, joined
 from monstertruck_runtime.errors import InputError
@@ -98,6 +99,8 @@ class KeepPolicy:
     """The truck may be this far from the route, m."""
     gain: float = 0.1
     """A new route has to cost less than the old one by this share of it."""
+    fall: float = 0.005
+    """A kept route may come nearer to an obstacle than a new one by this much before it keeps the margin, m."""
 
 
 def replan(
@@ -130,7 +133,10 @@ def replan(
     fresh = plan_through(planner, route_map, pose, stops, now) if stops else planner.plan(route_map, pose, goal, now)
     judge = _judge(planner)
     keeper = judge.planner_for(fresh.statistics.get("margin", judge.config.margin))
-    kept = None if previous is None else remaining_route(keeper, route_map, previous, pose, goal, policy.reach)
+    kept = None
+    if previous is not None:
+        fall = _fall_allowed(keeper, route_map, fresh, pose, policy)
+        kept = remaining_route(keeper, route_map, previous, pose, goal, policy.reach, fall)
     if kept is not None and not all(_passes(kept, place) for place in via):
         kept = None
     cost = fresh.cost if judge is planner or fresh.path is None else keeper.cost(route_map, fresh.path)
@@ -139,6 +145,18 @@ def replan(
     return RouteResult(
         Reason.OK, kept, cost=keeper.cost(route_map, kept), statistics={**fresh.statistics, "kept_route": 1.0}
     )
+
+
+def _fall_allowed(
+    keeper: HybridPlanner, route_map: RouteMap, fresh: RouteResult, pose: ArrayLike, policy: KeepPolicy
+) -> float | None:
+    """See ``remaining_route``: about as much as that of a new route, if that begins with a departure."""
+    if not needs_departure(route_map, keeper.vehicle, np.asarray(pose, dtype=np.float64), keeper.config.margin):
+        return None
+    if fresh.path is None:
+        return math.inf
+    left = None if keeper.free(route_map, fresh.path) else keeper.leaving(route_map, fresh.path)
+    return None if left is None else left.fall + policy.fall
 
 
 def _judge(planner: RoutePlanner) -> HybridPlanner:
@@ -150,9 +168,13 @@ def _judge(planner: RoutePlanner) -> HybridPlanner:
 
 
 def remaining_route(
-    planner: HybridPlanner, route_map: RouteMap, path: MotionPath, pose: ArrayLike, goal: ArrayLike, reach: float
-) -> MotionPath | None:
+    planner: HybridPlanner, route_map: RouteMap, path: MotionPath, pose: ArrayLike, goal: ArrayLike, reach: float,
+    fall: float | None = None,
+) -> MotionPath | None:  # fmt: skip
     """A free path from the pose back onto the route and along it to its end, or None.
+
+    Where the pose is nearer to an obstacle than the margin, the rest of the route's departure is driven as it is, or
+    left for the route beyond it: the path touches nothing, and keeps the margin from where it first has it.
 
     Args:
         planner: of the path.
@@ -161,11 +183,12 @@ def remaining_route(
         pose: of the reference point.
         goal: where the path has to end.
         reach: greatest distance of the pose from the path, m.
+        fall: by which the clearance may fall on a departure, m; None: the path has to keep the margin all the way.
     """
     here, there = np.asarray(pose, dtype=np.float64), np.asarray(goal, dtype=np.float64)
     if not np.isfinite(here).all() or not len(path.segments) or _apart(path.end, there) > planner.tolerance + SAME_GOAL:
         return None
-    samples = path.sample(0.05)
+    samples = path.sample(0.01)
     away = np.hypot(samples.poses[:, 0] - here[0], samples.poses[:, 1] - here[1])
     turned = np.abs(np.remainder(samples.poses[:, 2] - here[2] + math.pi, math.tau) - math.pi)
     nearest = int(np.argmin(away + planner.vehicle.radius * turned))
@@ -173,9 +196,20 @@ def remaining_route(
         return None
     begin = float(samples.travelled[nearest])
     reeds_shepp = planner.vehicle.reeds_shepp(planner.config)
-    rests = [path.part(begin + ahead * planner.vehicle.radius, math.inf) for ahead in (0.0, 0.5, 1.0, 2.0, 4.0)]
-    ways = [reeds_shepp.path(here, rest.start).then(rest) for rest in rests]
-    ways = [way for way in ways if planner.free(route_map, way)]
+
+    def joined_at(first: MotionPath, begin: float) -> list[MotionPath]:
+        rests = [path.part(begin + ahead * planner.vehicle.radius, math.inf) for ahead in (0.0, 0.5, 1.0, 2.0, 4.0)]
+        return [first.then(reeds_shepp.path(first.end, rest.start)).then(rest) for rest in rests]
+
+    ways = joined_at(replace(path, start=here, segments=np.empty((0, 3)), steering=()), begin)
+    if fall is None:
+        ways = [way for way in ways if planner.free(route_map, way)]
+    else:
+        left = planner.leaving(route_map, path.part(begin, math.inf))
+        if left is not None:
+            rest = path.part(begin, begin + left.length)
+            ways += joined_at(replace(rest, start=here), begin + left.length)
+        ways = [way for way in ways if (left := planner.leaving(route_map, way)) is not None and left.fall <= fall]
     return min(ways, key=lambda way: planner.cost(route_map, way), default=None)
 
 

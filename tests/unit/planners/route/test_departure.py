@@ -8,13 +8,14 @@ import pytest
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.collision import Footprint
 from monstertruck_planners.route import departure as departure_module
-from monstertruck_planners.route.api import RouteMap, Vehicle
+from monstertruck_planners.route.api import Budget, RouteMap, Vehicle
 from monstertruck_planners.route.config import GridAstarConfig, HybridConfig, LatticeConfig
 from monstertruck_planners.route.departure import SPARE, departures
 from monstertruck_planners.route.grid_astar import GridAstarPlanner
 from monstertruck_planners.route.hybrid import HybridPlanner
 from monstertruck_planners.route.lattice import LatticePlanner
 from monstertruck_planners.route.motion import MotionPath
+from monstertruck_planners.route.replan import remaining_route, replan
 from monstertruck_schemas.reasons import Reason
 from tests.unit.planners.route.route_kit import CAR, TRUCK, assert_drivable, ground, room
 
@@ -26,7 +27,7 @@ GOAL = np.array([4.0, 2.5, 0.0])
 
 
 def hybrid(vehicle=TRUCK, **config):
-    return HybridPlanner(vehicle, HybridConfig(**{"effort": 6000, "improve": False, "margin": MARGIN} | config))
+    return HybridPlanner(vehicle, HybridConfig(**{"effort": 60_000, "improve": False, "margin": MARGIN} | config))
 
 
 def base_beside(way: str, gap: float) -> np.ndarray:
@@ -147,15 +148,37 @@ def test_the_other_planners_leave_a_wall_too():
 def test_a_body_shut_in_on_all_sides_is_soon_refused():
     start = np.array([3.0, 2.0, 0.0])
     boxed = ground((2.6, 1.7, 3.4, 1.8), (2.6, 2.2, 3.4, 2.3), (2.6, 1.7, 2.75, 2.3), (3.25, 1.7, 3.4, 2.3))
-    assert not departures(boxed, TRUCK, start, MARGIN, 1.0)
+    ways = departures(boxed, TRUCK, start, HybridConfig(margin=MARGIN), Budget(1.0, None, 60_000))
+    assert (ways.found, ways.exhausted) == ([], True)
     assert hybrid().plan(boxed, start, GOAL).reason is Reason.START_BLOCKED
+
+
+@pytest.mark.parametrize(
+    "planner", [hybrid(effort=2000), LatticePlanner(TRUCK, LatticeConfig(margin=MARGIN, effort=2000))]
+)
+def test_departures_are_part_of_the_budget_and_say_when_it_ends(planner):
+    # 2 cm on either side all the way: there is much to be tried, and nowhere is the margin kept.
+    shut_in = ground((1.0, 0.8, 5.0, 0.9), (1.0, 1.3, 5.0, 1.4), (1.0, 0.8, 1.1, 1.4), (4.9, 0.8, 5.0, 1.4))
+    start, config = np.array([3.0, 1.1, 0.0]), HybridConfig(margin=MARGIN)
+    result = planner.plan(shut_in, start, GOAL)
+    assert result.reason is Reason.ROUTE_TIMEOUT
+    assert "no way found in time" in result.text
+    for reserve, share in ((0.0, 0.5), (0.5, 0.25)):
+        budget = Budget(1.0, None, 2000)
+        assert not departures(shut_in, TRUCK, start, config, budget, reserve).exhausted
+        assert share < 1.0 - budget.remaining() < share + 0.1  # the rest is kept for the route and for other margins
+    ticks = iter(np.arange(0.0, 9.0, 0.1).tolist())
+    timed = Budget(1.0, ticks.__next__, 2000)
+    assert not departures(shut_in, TRUCK, start, config, timed).exhausted
+    assert next(ticks) < 1.5
 
 
 def test_a_departure_ends_where_a_search_can_set_off_and_is_short():
     where = ground()
     for way, gap in (("facing", 0.0005), ("aslant", 0.02), ("parallel", 0.035)):
         start = base_beside(way, gap)
-        found = departures(where, TRUCK, start, MARGIN, 2.0)
+        config = HybridConfig(margin=MARGIN, reverse_cost=2.0)
+        found = departures(where, TRUCK, start, config, Budget(1.0, None, 60_000)).found
         for departure in found:
             poses = MotionPath(start, departure.segments).sample(0.002).poses
             clear = where.field.clearance(TRUCK.footprint, poses, 0.04, 0.0005)
@@ -166,3 +189,41 @@ def test_a_departure_ends_where_a_search_can_set_off_and_is_short():
         assert where.field.free(Footprint(), ends, MARGIN + SPARE).all()
         assert start[1] < found[0].end[1] < start[1] + MARGIN - gap + 0.02
         assert np.abs(found[0].segments[:, 0]).min() >= 0.02
+
+
+def off_the_wall(planner, where, start):
+    """Route, and the pose in the middle of its departure a little off it."""
+    route = planner.plan(where, start, GOAL).path
+    left = planner.leaving(where, route)
+    pose = route.sample(left.length / 2).poses[1] + (0.0007, 0.0005, 0.002)
+    assert not where.field.free(planner.vehicle.footprint, pose[None], MARGIN)[0]
+    return route, pose
+
+
+@pytest.mark.parametrize(
+    ("body", "way"), [("4ws", "parallel"), ("4ws", "aslant"), ("2ws", "facing"), ("2ws", "parallel")]
+)
+def test_a_route_is_kept_on_its_departure_too(body, way):
+    vehicle, where, planner = BODIES[body], ground(), hybrid(BODIES[body])
+    route, pose = off_the_wall(planner, where, vehicle.reference_pose(base_beside(way, 0.01)))
+    again = replan(planner, where, route, pose, GOAL)
+    assert again.statistics["kept_route"] == 1.0
+    assert again.path.length < route.length
+    assert_drivable(again.path, where, vehicle, pose, GOAL)
+    assert_leaves(where, vehicle, again.path, dip=0.01)
+
+
+def test_a_departure_that_would_touch_or_comes_nearer_than_a_new_one_is_not_kept():
+    where, planner, start = ground(), hybrid(effort=3000), base_beside("facing", 0.03)
+    nearer = MotionPath(start, np.array([[0.02, 0.0, 0.0]]))
+    route = nearer.then(planner.plan(where, nearer.end, GOAL).path)
+    assert planner.leaving(where, route).fall == pytest.approx(0.02, abs=0.001)
+    assert remaining_route(planner, where, route, start, GOAL, 0.5, 0.025) is not None
+    assert remaining_route(planner, where, route, start, GOAL, 0.5) is None
+    assert planner.leaving(where, replan(planner, where, route, start, GOAL).path).fall <= 0.005
+    route, pose = off_the_wall(planner, where, base_beside("facing", 0.005))
+    x, y = planner.leaving(where, route).length * np.array([0.0, 1.0]) + pose[:2]
+    shut = ground((x - 0.2, y + END + 0.05, x + 0.2, y + END + 0.1))
+    assert replan(planner, shut, route, pose, GOAL).statistics.get("kept_route", 0.0) == 0.0
+    touching = MotionPath(start, np.array([[0.05, 0.0, 0.0], [-0.5, 0.0, 0.0]]))
+    assert planner.leaving(where, touching) is None
