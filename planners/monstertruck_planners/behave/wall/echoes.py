@@ -86,10 +86,15 @@ class Cone:
         """
         off = normal - axis
         off -= math.tau * np.rint(off * (1.0 / math.tau))
-        beyond = np.maximum(np.abs(off) - self.half, 0.0)
-        heard = beyond <= self.critical + SPARE
-        slope = np.tan(beyond * heard)
-        return np.sqrt(1.0 + slope * slope), np.copysign(slope, off), heard
+        slope = np.abs(off)
+        slope -= self.half
+        np.maximum(slope, 0.0, out=slope)
+        heard = slope <= self.critical + SPARE
+        slope *= heard
+        np.tan(slope, out=slope)
+        share = slope * slope
+        share += 1.0
+        return np.sqrt(share, out=share), np.copysign(slope, off, out=slope), heard
 
     def hears(self, axis: float, normal: float) -> bool:
         """Whether a sonar hears a wall of that direction."""
@@ -184,24 +189,43 @@ def _fitted(
     damping = weight / ROBUST**2
     first = np.stack([normals, distances])
     lines = first
-    held = 1.0 / np.array(inertia)[:, None] ** 2
+    held_a, held_d = 1.0 / inertia[0] ** 2, 1.0 / inertia[1] ** 2
     terms = np.empty((len(normals), 3, len(echoes)))
     """Of every fit and echo: derivatives of the range by direction and distance, and what is missing of it."""
+    across, step = np.empty((len(normals), len(echoes))), np.empty_like(first)
+    # Arrays are small: what costs time is the number of calls, so most of them write where there is room already.
     for _ in range(steps):
-        c, s = np.cos(lines[0])[:, None], np.sin(lines[0])[:, None]
-        share, slope, heard = cone.shares(axis, lines[0][:, None])
-        far = lines[1][:, None] - c * x - s * y
-        terms[:, 0] = (s * x - c * y + far * slope) * share
+        angle = lines[0][:, None]
+        c, s = np.cos(angle), np.sin(angle)
+        share, slope, heard = cone.shares(axis, angle)
+        far = lines[1][:, None] - c * x
+        far -= s * y
+        slope *= far
+        np.multiply(s, x, out=across)
+        across -= c * y
+        across += slope
+        np.multiply(across, share, out=terms[:, 0])
         terms[:, 1] = share
-        missing = np.where(heard, ranges - far * share, UNHEARD)
+        far *= share
+        missing = np.where(heard, ranges - far, UNHEARD)
         terms[:, 2] = missing
-        kept = heard * weight / (1.0 + missing * missing * damping)
+        doubt = missing * missing
+        doubt *= damping
+        doubt += 1.0
+        kept = heard * weight
+        kept /= doubt
         sums = (terms * kept[:, None]) @ terms.transpose(0, 2, 1)
-        aa, ad, dd = sums[:, 0, 0] + held[0], sums[:, 0, 1], sums[:, 1, 1] + held[1]
-        ga, gd = sums[:, :2, 2].T + held * (first - lines)
-        determinant = np.maximum(aa * dd - ad * ad, 1e-12 * (1.0 + aa * dd))
-        step = np.stack([dd * ga - ad * gd, aa * gd - ad * ga]) / determinant
-        step = np.minimum(np.maximum(step, -LONGEST), LONGEST)
+        aa, ad, dd, ga, gd = sums[:, 0, 0], sums[:, 0, 1], sums[:, 1, 1], sums[:, 0, 2], sums[:, 1, 2]
+        if inertia != FREE:
+            aa, dd = aa + held_a, dd + held_d
+            ga, gd = ga + held_a * (first[0] - lines[0]), gd + held_d * (first[1] - lines[1])
+        product = aa * dd
+        determinant = np.maximum(product - ad * ad, 1e-12 * (1.0 + product))
+        np.subtract(dd * ga, ad * gd, out=step[0])
+        np.subtract(aa * gd, ad * ga, out=step[1])
+        step /= determinant
+        np.maximum(step, -LONGEST, out=step)
+        np.minimum(step, LONGEST, out=step)
         lines = lines + step
         if np.abs(step).max() < SETTLED:
             break

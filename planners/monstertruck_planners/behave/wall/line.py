@@ -8,7 +8,6 @@ All is written for a wall on the left; a wall on the right is the mirror image.
 """
 
 import math
-from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from statistics import median
 from typing import Any, ClassVar, Final, Literal, NamedTuple
@@ -124,8 +123,7 @@ class SonarMount(NamedTuple):
         return self.x * math.cos(self.yaw) + self.y * math.sin(self.yaw)
 
 
-@dataclass(frozen=True, slots=True)
-class LineState:
+class LineState(NamedTuple):
     """Between two steps; poses with the wall on the left."""
 
     phase: Phase = "settle"
@@ -136,8 +134,8 @@ class LineState:
     """Where the body is."""
     heard: int = -1
     """Stamp of the newest echoes taken in."""
-    echoes: Array = field(default_factory=lambda: np.empty((0, len(ECHO))))
-    monitor: SonarMonitor = field(default_factory=SonarMonitor)
+    echoes: Array = np.empty((0, len(ECHO)))
+    monitor: SonarMonitor = SonarMonitor()
     wall: WallEstimate | None = None
     """Along which it drives."""
     sure: bool = False
@@ -167,7 +165,7 @@ class LineState:
     """``travelled`` when the wall was heard last."""
     sense: float = -1.0
     """Of the turn: 1 = left."""
-    places: Array = field(default_factory=lambda: np.empty((0, 4)))
+    places: Array = np.empty((0, 4))
     """(n, 4) ``travelled`` and pose where the lap began and every ``PLACED`` metres since; empty = no wall yet."""
     laps: int = 0
     strays: tuple[float | None, float | None] = (None, None)
@@ -202,7 +200,7 @@ class WallLine:
             mounts = self._mounts(inputs.of(TRANSFORMS))
             if isinstance(mounts, str):
                 return BehaviourStep(None, state, state.phase, Reason.INPUT_CONTRADICTORY, mounts)
-            state = replace(state, mounts=mounts)
+            state = state._replace(mounts=mounts)
         state = self._moved(state, odometry, inputs.of(IMU).angular_velocity.z * self._mirror, t)
         cone = self._cone(sonars)
         heard = sonars.stamp != state.heard
@@ -218,7 +216,7 @@ class WallLine:
             text = f"{state.laps} lap{'s' if state.laps > 1 else ''}, {state.travelled:.1f} m"
             return BehaviourStep(None, state, state.phase, Reason.BEHAVIOUR_DONE, text)
         v, w = state.v.at(due), state.w.at(due)
-        state = replace(state, sent=(*(entry for entry in state.sent if entry[0] > t - KEPT), (due, v, w)))
+        state = state._replace(sent=(*(entry for entry in state.sent if entry[0] > t - KEPT), (due, v, w)))
         v, w = v + CATCH_UP * state.lag[0], w + CATCH_UP * state.lag[1]
         motion = RequestedMotion(min(max(v, 0.0), FASTEST), w * self._mirror)
         error = None if state.wall is None else self.error(state)
@@ -260,8 +258,7 @@ class WallLine:
         dt = 0.0 if state.before is None else t - state.before
         v, w = _asked(state, t)
         behind = state.lag[0] + (v - speed) * dt, state.lag[1] + (w - (rate - bias)) * dt
-        return replace(
-            state,
+        return state._replace(
             bias=(bias, count),
             poses=poses,
             pose=pose,
@@ -293,8 +290,7 @@ class WallLine:
         echoes = state.echoes[state.echoes[:, 5] > state.travelled - self._config.window]
         if rows:
             echoes = np.vstack([echoes, np.array(rows)])
-        return replace(
-            state,
+        return state._replace(
             heard=sonars.stamp,
             echoes=echoes[-600:],
             equal=tuple(equal),
@@ -315,14 +311,14 @@ class WallLine:
             match fit:
                 case "turned":
                     found = self._turned_to(state, cone)
-                    state = state if found is None else replace(state, ahead=found.line)
+                    state = state if found is None else state._replace(ahead=found.line)
                 case "beside":
                     state = self._beside(state, cone)
                 case "left":
                     state = self._nearer(state, (self._faced(state, cone, (DIAGONAL, FRONT)), state.faced[1]))
                 case "right":
                     state = self._nearer(state, (state.faced[0], self._faced(state, cone, (FRONT, FAR))))
-        return replace(state, fits=fits[self._fits :])
+        return state._replace(fits=fits[self._fits :])
 
     def _beside(self, state: LineState, cone: Cone) -> LineState:
         """With the wall beside fitted anew."""
@@ -332,10 +328,10 @@ class WallLine:
             return state
         if not self._opening(state, wall, cone):
             fit = refine(beside, wall, state.pose[:2], cone)
-            wall, state = fit.line, replace(state, wall=fit.line, sure=fit.sigma[0] < UNSURE)
+            wall, state = fit.line, state._replace(wall=fit.line, sure=fit.sigma[0] < UNSURE)
         fresh = beside[beside[:, 6] == echoes[-1, 6]]
         on_wall = fresh[np.abs(residuals(fresh, wall, cone)) < TIGHT]
-        return replace(state, seen=float(on_wall[-1, 5])) if len(on_wall) else state
+        return state._replace(seen=float(on_wall[-1, 5])) if len(on_wall) else state
 
     def _opening(self, state: LineState, wall: WallEstimate, cone: Cone) -> bool:
         """Whether the side sonar looks through an opening: what the diagonal one hears then may be its far post."""
@@ -347,7 +343,7 @@ class WallLine:
     def _nearer(self, state: LineState, faced: tuple[WallEstimate | None, WallEstimate | None]) -> LineState:
         """With the nearer one of the walls ahead by the sonars of either side."""
         lines = [line for line in faced if line is not None]
-        return replace(state, faced=faced, ahead=min(lines, key=lambda line: self._way_to(state, line), default=None))
+        return state._replace(faced=faced, ahead=min(lines, key=lambda line: self._way_to(state, line), default=None))
 
     def _faced(self, state: LineState, cone: Cone, group: tuple[int, int]) -> WallEstimate | None:
         """A wall ahead by the sonars from one number to another."""
@@ -458,12 +454,12 @@ class WallLine:
             case "brake":
                 state = self._steer(state, t) if state.wall is not None else state
                 if not state.v.over(t):
-                    return replace(state, v=self._stopping(state.v, self._left(state, cone, t), t))
+                    return state._replace(v=self._stopping(state.v, self._left(state, cone, t), t))
                 if state.wall is not None and self._left(state, cone, t) > GONE:
                     return self._to(state, "follow")
                 state = self._to(state, "turn")
                 sense = self._sense(state)
-                return replace(state, sense=sense, w=self._ramp(state.w, sense * config.turn_rate, t))
+                return state._replace(sense=sense, w=self._ramp(state.w, sense * config.turn_rate, t))
             case "turn":
                 return self._turn(state, cone, t)
             case "stop":
@@ -473,14 +469,14 @@ class WallLine:
         """Along the wall, or straight on until there is one."""
         config = self._config
         slow = state.phase == "follow" and not state.sure
-        state = replace(state, v=self._ramp(state.v, config.creep if slow else config.speed, t))
+        state = state._replace(v=self._ramp(state.v, config.creep if slow else config.speed, t))
         if state.phase == "follow":
             if state.travelled - state.seen > config.door:
-                state = self._to(replace(state, wall=None, faced=(None, None), places=state.places[:0]), "search")
+                state = self._to(state._replace(wall=None, faced=(None, None), places=state.places[:0]), "search")
             else:
                 state = self._lap(state)
                 if state.laps >= config.laps:
-                    return self._steer(self._to(replace(state, v=self._ramp(state.v, 0.0, t)), "stop"), t)
+                    return self._steer(self._to(state._replace(v=self._ramp(state.v, 0.0, t)), "stop"), t)
         state = self._steer(state, t)
         left, speed = self._left(state, cone, t), state.v.at(t)
         if left == math.inf:
@@ -490,7 +486,7 @@ class WallLine:
             return state
         if left < LATE * brake.distance:
             brake = shortest_ramp(speed, state.v.acceleration(t), 0.0, config.acceleration, config.jerk)
-        return self._to(replace(state, v=self._stopping(TimedRamp(t, brake), left, t)), "brake")
+        return self._to(state._replace(v=self._stopping(TimedRamp(t, brake), left, t)), "brake")
 
     def _left(self, state: LineState, cone: Cone, t: float) -> float:
         """``_way_left`` of where the robot is at ``t`` by its ramp, m."""
@@ -518,11 +514,11 @@ class WallLine:
         left = (sense * (state.ahead.heading - yaw) + 0.5) % math.tau - 0.5
         left -= sense * (state.lag[1] + rate * config.lead)
         if state.w.shape.v1 == 0.0:
-            return replace(state, w=self._stopping(state.w, sense * left, t))
+            return state._replace(w=self._stopping(state.w, sense * left, t))
         brake = shortest_ramp(rate, change, 0.0, config.acceleration, config.jerk)
         if left - abs(rate) / config.rate > abs(brake.distance):
             return state
-        return replace(state, w=self._stopping(TimedRamp(t, brake), sense * left, t))
+        return state._replace(w=self._stopping(TimedRamp(t, brake), sense * left, t))
 
     def _follow(self, state: LineState, cone: Cone) -> LineState:
         """Go on along the wall that the robot has turned to."""
@@ -532,9 +528,9 @@ class WallLine:
         kept = state.echoes[np.abs(residuals(state.echoes, wall, cone)) < TIGHT].copy()
         kept[:, 4] = np.where(kept[:, 4] <= DIAGONAL, kept[:, 4], OWN)
         if not len(state.places) or state.travelled - state.places[0, 0] < FOLLOWED:
-            state = replace(state, places=np.array([[state.travelled, *state.pose]]))
-        return replace(
-            self._to(state, "follow"), wall=wall, ahead=None, faced=(None, None), echoes=kept, seen=state.travelled
+            state = state._replace(places=np.array([[state.travelled, *state.pose]]))
+        return self._to(state, "follow")._replace(
+            wall=wall, ahead=None, faced=(None, None), echoes=kept, seen=state.travelled
         )
 
     def _steer(self, state: LineState, t: float) -> LineState:
@@ -546,7 +542,7 @@ class WallLine:
             away = math.remainder(state.pose[2] - wall.heading, math.tau)
             stiff = config.stiffness
             target = state.v.at(t) * (max(min(error, stiff), -stiff) / stiff**2 - 2.0 * away / stiff)
-        return replace(state, w=self._ramp(state.w, _clip(target, TURNS), t))
+        return state._replace(w=self._ramp(state.w, _clip(target, TURNS), t))
 
     def error(self, state: LineState) -> float:
         """Distance of the side sonar from the wall less the one wanted, m; of a state with a wall."""
@@ -570,7 +566,7 @@ class WallLine:
         config, (x, y, yaw), places = self._config, state.pose, state.places
         if state.travelled - places[-1, 0] >= PLACED:
             places = np.vstack([places, (state.travelled, x, y, yaw)])
-            state = replace(state, places=places)
+            state = state._replace(places=places)
         if state.travelled - places[0, 0] < config.lap_length:
             return state
         way, bx, by, byaw = state.travelled - places[:, 0], *places[:, 1:].T
@@ -579,11 +575,11 @@ class WallLine:
         back = (way >= config.lap_length) & passed & near & (np.cos(yaw - byaw) >= math.cos(0.6))
         if back.any():
             place = state.travelled, *places[int(back.argmax()), 1:]
-            return replace(state, laps=state.laps + 1, places=np.array([place]))
+            return state._replace(laps=state.laps + 1, places=np.array([place]))
         return state
 
     def _to(self, state: LineState, phase: Phase) -> LineState:
-        return replace(state, phase=phase, marks=(state.travelled, state.turned))
+        return state._replace(phase=phase, marks=(state.travelled, state.turned))
 
     def _ramp(self, ramp: TimedRamp, target: float, t: float) -> TimedRamp:
         """The ramp that runs if it ends at ``target``, else a new one from the present speed and acceleration."""

@@ -1,7 +1,6 @@
 """Method 3: laps of a hall, gaps, ramps, and bad inputs."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -47,10 +46,10 @@ def test_a_lap_that_began_just_before_a_corner_ends_though_the_odometry_has_drif
 def test_a_lap_is_complete_at_any_place_that_it_comes_back_to():
     robot, behaviour = Robot([(-9.0, 0.35, 9.0, 0.35)], (0.0, 0.0, 0.0)), follower(lap_length=6.0)
     post, later = (0.0, -0.2, -0.1, 1.2), (0.5, -0.1, 0.0, 0.0)
-    state = replace(behaviour.begin(), phase="follow", wall=WallEstimate(math.pi / 2, 0.35), travelled=9.0, seen=9.0)
-    first = behaviour.step(robot.inputs(), replace(state, places=np.array([post])), 0.0)
+    state = behaviour.begin()._replace(phase="follow", wall=WallEstimate(math.pi / 2, 0.35), travelled=9.0, seen=9.0)
+    first = behaviour.step(robot.inputs(), state._replace(places=np.array([post])), 0.0)
     assert (first.phase, first.state.laps) == ("follow", 0)  # it heads another way than along the post
-    done = behaviour.step(robot.inputs(), replace(state, places=np.array([post, later])), 0.0)
+    done = behaviour.step(robot.inputs(), state._replace(places=np.array([post, later])), 0.0)
     assert (done.phase, done.state.laps) == ("stop", 1)
 
 
@@ -58,7 +57,7 @@ def test_a_lap_is_complete_at_any_place_that_it_comes_back_to():
 def test_the_line_stays_where_the_side_sonar_looks_through_an_opening(begins):
     robot, behaviour = Robot([(begins, 0.35, 9.0, 0.35)], (0.0, 0.0, 0.0)), follower()
     slanting = WallEstimate(math.pi / 2 + 0.1, 0.35)
-    state = replace(behaviour.begin(), phase="follow", wall=slanting, places=np.zeros((1, 4)))
+    state = behaviour.begin()._replace(phase="follow", wall=slanting, places=np.zeros((1, 4)))
     step = behaviour.step(robot.inputs(), state, 0.0)
     assert (step.state.wall == slanting) is (begins > 0.0)
 
@@ -202,8 +201,8 @@ def test_it_stops_by_its_ramp_where_the_wall_ahead_is_heard_no_longer_while_it_b
 def test_it_follows_its_wall_on_after_braking_for_what_has_gone_from_the_far_side(goes):
     wall, person = (-9.0, 0.35, 9.0, 0.35), (1.5, -0.2, 1.5, -0.6)
     robot, behaviour, phases = Robot([wall, person], (0.0, 0.0, 0.1)), follower(), []
-    state = replace(
-        behaviour.begin(), phase="follow", wall=WallEstimate(math.pi / 2, 0.35), places=np.array([[0.0, *robot.pose]])
+    state = behaviour.begin()._replace(
+        phase="follow", wall=WallEstimate(math.pi / 2, 0.35), places=np.array([[0.0, *robot.pose]])
     )
     for i in range(200):
         if goes and state.phase == "brake":
@@ -224,8 +223,8 @@ def test_a_front_sonar_that_hears_nothing_is_made_up_for_by_the_diagonal_one():
     robot = Robot(corner, (0.5, 0.0, 0.1))
     robot.stuck = {"f": None, "fr": None}
     behaviour, state, clearance = follower(), None, math.inf
-    state = replace(
-        behaviour.begin(), phase="follow", wall=WallEstimate(math.pi / 2, 0.35), places=np.array([[0.0, *robot.pose]])
+    state = behaviour.begin()._replace(
+        phase="follow", wall=WallEstimate(math.pi / 2, 0.35), places=np.array([[0.0, *robot.pose]])
     )
     for i in range(200):
         step = behaviour.step(robot.inputs(), state, i * PERIOD)
@@ -241,8 +240,8 @@ def test_a_front_sonar_that_hears_nothing_is_made_up_for_by_the_diagonal_one():
 def along(walls, far, steps):
     """Outcome beside a wall, and the way driven; ``far`` changes what the sonars measure, by the number of the step."""
     robot, behaviour = Robot(walls, (0.0, 0.0, 0.1)), follower()
-    state = replace(
-        behaviour.begin(), phase="follow", wall=WallEstimate(math.pi / 2, 0.35), places=np.array([[0.0, *robot.pose]])
+    state = behaviour.begin()._replace(
+        phase="follow", wall=WallEstimate(math.pi / 2, 0.35), places=np.array([[0.0, *robot.pose]])
     )
     for i in range(steps):
         robot.stuck = far(i)
@@ -272,6 +271,6 @@ def test_it_does_not_turn_away_from_what_is_too_near():
     robot.stuck = {"fl": 0.15}
     behaviour = follower()
     state = behaviour.step(robot.inputs(), behaviour.begin(), 0.0).state
-    step = behaviour.step(robot.inputs(), replace(state, phase="turn", w=STANDSTILL), PERIOD)
+    step = behaviour.step(robot.inputs(), state._replace(phase="turn", w=STANDSTILL), PERIOD)
     assert step.outcome is Reason.STUCK
     assert step.text == "sonar fl measures 0.15 m: too near to turn away"
