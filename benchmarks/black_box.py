@@ -143,7 +143,7 @@ def main(rounds: int) -> None:
                 begin = perf_counter()
                 box._hurry = pauses = Pauses()  # noqa: SLF001
                 name = f"blackbox-{number:06d}-scan_stale.mcap"
-                writing = asyncio.ensure_future(asyncio.to_thread(box._write, name, entries, {}))  # noqa: SLF001
+                writing = asyncio.ensure_future(asyncio.to_thread(box._write, name, entries, {}, 0))  # noqa: SLF001
                 busy.append(await waits(writing, 0.0))
                 await writing
                 took.append(perf_counter() - begin)

@@ -82,7 +82,7 @@ class Pair:
     def _answer(self) -> bytes:
         assert self._ping.stdout is not None
         if not select.select([self._ping.stdout], [], [], 60)[0]:
-            raise RuntimeError(f"{self._ping.args} does not answer")
+            raise RuntimeError(f"{self._ping.args!r} does not answer")
         return self._ping.stdout.readline()
 
 

@@ -29,7 +29,7 @@ from monstertruck_schemas.sensor import VALID_BEAM, LaserScan
 from monstertruck_schemas.topics import SCAN, Writer
 from monstertruckd.bus.local import Bus
 from monstertruckd.bus.rpc import Rpc
-from monstertruckd.bus.zenoh_config import ZenohConfig, doors, session_config
+from monstertruckd.bus.zenoh_config import ZenohConfig, listeners, session_config
 from monstertruckd.bus.zenoh_session import ZenohBridge
 from monstertruckd.tools.demo.runs import connect
 
@@ -113,8 +113,8 @@ async def raw(
     Sessions are configured as the product's are, for the comparison is of what lies between them and the reader.
     """
     server, client = ZenohConfig(listen=(here,)), ZenohConfig(connect=(there,))
-    listening = zenoh.open(zenoh.Config.from_json5(session_config(me, server, doors(server)[0])))
-    dial = json.loads(session_config(me, client, doors(client)[0], probe=True))
+    listening = zenoh.open(zenoh.Config.from_json5(session_config(me, server, listeners(server)[0])))
+    dial = json.loads(session_config(me, client, listeners(client)[0], probe=True))
     while True:
         try:
             dialled = zenoh.open(zenoh.Config.from_json5(json.dumps(dial)))

@@ -106,7 +106,7 @@ class TappedPort(PtyPort):
 
 def serve(config: Path) -> None:
     """``monstertruckd simulate`` with a tap on the drive's wire."""
-    simulate.PtyPort = TappedPort  # type: ignore[misc]
+    simulate.PtyPort = TappedPort  # type: ignore[attr-defined, misc]
     run_wall(lambda clock: simulate.serve(clock, (load_simulated(config),), None))
 
 

@@ -152,7 +152,7 @@ def run_of(arena: Arena, kind: str, reach: float, seed: int) -> Run:
     """One exploration."""
     if kind == "offline":
         return offline_tour(arena, reach, seed)
-    return Rover(arena, EXPLORERS[kind].settings_class()(reach=reach), seed).explore()
+    return Rover(arena, EXPLORERS[kind].settings_class().model_validate({"reach": reach}), seed).explore()
 
 
 def row_of(run: Run) -> dict[str, Any]:

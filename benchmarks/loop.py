@@ -36,8 +36,9 @@ from monstertruck_runtime.mailbox import fifo, latest
 from monstertruck_schemas import topics
 from monstertruck_schemas.plan import GoalPhase
 from monstertruck_schemas.state import GateMode
-from monstertruckd.tools.demo.runs import connect, free_endpoint, program, write_overlay
+from monstertruckd.tools.demo.runs import connect, free_endpoint, write_overlay
 from monstertruckd.tools.simulation.operator import drive_lap
+from monstertruckd.tools.simulation.program import program
 
 HERE = Path(__file__).resolve().parent
 FULL = HERE.parent / "configs" / "full.yaml"
@@ -105,7 +106,7 @@ async def drive(client: TruckClient, clock: Clock, drives: "Drives", *, laps: bo
     """Keep the truck driving: one lap after the other, or as the goals have it; armed again after every stop."""
     while laps:
         lap = await drive_lap(client, clock)
-        drives.stops += [reason.value for reason in lap.interruptions]
+        drives.stops += [reason.value for reason in lap.stops]
     with client.subscribe(topics.GATE, latest()) as gate, client.subscribe(topics.STOP, latest()) as stop:
         while True:
             if gate.latest is not None and not gate.latest.mode.active:

@@ -47,7 +47,7 @@ from monstertruckd.recorder.recorder import Recorder
 from monstertruckd.recorder.repair import recover
 
 GOALS = {"cpu_over_rosbag": 1.0, "cpu_s_per_1000": 0.018, "stall_ms": 1.0, "unreadable": 0, "worst_loss_s": 1.0}
-RATES = {POSE: 100, SCAN: 10, CAMERA: 2}
+RATES: dict[Topic[Any], int] = {POSE: 100, SCAN: 10, CAMERA: 2}
 SECONDS = 20
 """Of the mix, in one round of the cost."""
 WATCHED = 5.0
@@ -83,7 +83,7 @@ def mix() -> Mix:
         codes=np.full(682, 255, np.uint8),
     )
     picture = CompressedImage(**header, data=rng.bytes(100_000), sequence=1)
-    messages = {POSE: pose, SCAN: scan, CAMERA: picture}
+    messages: dict[Topic[Any], Any] = {POSE: pose, SCAN: scan, CAMERA: picture}
     times = sorted((i / rate, topic.name) for topic, rate in RATES.items() for i in range(rate))
     encoded = {topic.name: (topic, wire.encode(topic, message)) for topic, message in messages.items()}
     return [encoded[name] for _, name in times]

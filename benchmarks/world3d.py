@@ -274,7 +274,7 @@ def step() -> dict[str, float]:
     ends = []
     for share in (1, 2):
         seconds = 0.002 / share
-        rigid_model.TIMESTEP = rigid_plant.TIMESTEP = seconds  # type: ignore[misc]
+        rigid_model.TIMESTEP = rigid_plant.TIMESTEP = seconds  # type: ignore[attr-defined, misc]
         RigidPlant.STEP_NS = round(seconds * 1e9)
         it = hands()
         it.drive(0.2)
@@ -282,7 +282,7 @@ def step() -> dict[str, float]:
             it.steer(front, rear)
             truth = it.wait(10.0)
         ends.append((truth.x, truth.y))
-    rigid_model.TIMESTEP = rigid_plant.TIMESTEP = 0.002  # type: ignore[misc]
+    rigid_model.TIMESTEP = rigid_plant.TIMESTEP = 0.002  # type: ignore[attr-defined, misc]
     RigidPlant.STEP_NS = 2_000_000
     return {"half_step_moves_end": hypot(ends[0][0] - ends[1][0], ends[0][1] - ends[1][1])}
 

@@ -100,7 +100,7 @@ class WirePort(PtyPort):
 
 def serve(config: Path) -> None:
     """``monstertruckd simulate`` with taps on both wires."""
-    simulate.PtyPort = WirePort  # type: ignore[misc]
+    simulate.PtyPort = WirePort  # type: ignore[attr-defined, misc]
     run_wall(lambda clock: simulate.serve(clock, (load_simulated(config),), None))
 
 

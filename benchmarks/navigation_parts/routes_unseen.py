@@ -6,6 +6,7 @@ the circle of both axles, so that only translations tell them apart.
 
 import math
 import time
+from typing import Any
 
 import numpy as np
 
@@ -27,7 +28,7 @@ CUSPS = 8
 def run(options: Options) -> Part:
     part = Part()
     front, tight = (Vehicle(FOOTPRINT, radius, 0.0, "front") for radius in (FRONT.radius, TRUCK.radius))
-    planners = {
+    planners: dict[str, Any] = {
         "2ws": HybridPlanner(front),
         "tight": HybridPlanner(tight),
         "4ws": HybridPlanner(Vehicle(FOOTPRINT, TRUCK.radius, TRUCK.crab_angle, "counter")),

@@ -14,6 +14,7 @@ from typing import TextIO
 
 from monstertruck_drivers.cable import PtyPort
 from monstertruck_runtime.clock import SECOND, Clock, run_wall
+from monstertruck_sim.world.world import World
 from monstertruckd.tools.simulation import simulate
 from monstertruckd.tools.simulation.config import load_simulated
 
@@ -23,7 +24,7 @@ def main(config: Path, lines: Path) -> None:
     with lines.open("a", buffering=1) as out:
 
         async def serve(clock: Clock) -> None:
-            simulate.PtyPort = lambda path: tapped(path, clock, out)
+            simulate.PtyPort = lambda path: tapped(path, clock, out)  # type: ignore[attr-defined]
             simulate.TruthLog = lambda world, _: Speeds(world, clock, out)
             await simulate.serve(clock, (load_simulated(config),), lines.with_suffix(".npz"))
 
@@ -53,7 +54,7 @@ def tapped(path: Path, clock: Clock, out: TextIO) -> PtyPort:
 class Speeds(simulate.TruthLog):
     """Writes the true speed down."""
 
-    def __init__(self, world: simulate.World, clock: Clock, out: TextIO) -> None:
+    def __init__(self, world: World, clock: Clock, out: TextIO) -> None:
         super().__init__(world, clock)
         self.out = out
 

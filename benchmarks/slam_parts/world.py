@@ -158,8 +158,9 @@ def run_drive(drive: Drive, subset: str, saved: Path | None = None, keep: Path |
                 matching.heed(message)
         elif isinstance(message, tuple) and matching is not None:
             history = [(t, *pose) for t, pose in zip(run.stamps[-32:], run.poses[-32:], strict=True)]
-            moved = matching.match(*message, history if "drive" in sensors else None)
-            _judge_match(run, matching, drive, message[0], truth)
+            stamp, ranges = message
+            moved = matching.match(stamp, ranges, history if "drive" in sensors else None)
+            _judge_match(run, matching, drive, stamp, truth)
             if moved is not None:
                 waiting.append((now + LATENCY, _message(message[0], moved)))
     if keep is not None and matching is not None:

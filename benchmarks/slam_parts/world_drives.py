@@ -160,9 +160,9 @@ def _leg(
             drive.reported.append((now, _steering(now, pilot.servos)))
             drive.reported.append((now, _drive(now, angle, reading.rpm * math.pi / 30)))
         if count % 5 == 2:
-            reading = world.compass.compass(now)
-            north = pose[2] + math.radians(reading.heading_deg)
-            drive.reported.append((now, _attitude(now, reading, _magnet(scenario.magnet, pose, north))))
+            compass = world.compass.compass(now)
+            north = pose[2] + math.radians(compass.heading_deg)
+            drive.reported.append((now, _attitude(now, compass, _magnet(scenario.magnet, pose, north))))
         if now >= swept + SWEEP:
             ranges = world.lidar.scan(swept).astype(np.float64) / 1000
             ranges[ranges < 0.02] = np.inf

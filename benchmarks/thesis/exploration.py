@@ -45,7 +45,7 @@ def run(options: Options) -> Part:
 
 
 def one(arena: Arena, kind: str, car: str, seed: int) -> tuple[dict[str, float], np.ndarray]:
-    rover = Rover(arena, EXPLORERS[kind].settings_class()(reach=REACH), seed, steering=car)
+    rover = Rover(arena, EXPLORERS[kind].settings_class().model_validate({"reach": REACH}), seed, steering=car)
     done = rover.explore()
     patch = rover.grid.patch()
     error = scoring.map_error(patch.cells, tuple(patch.origin), patch.resolution, arena.truth)

@@ -102,14 +102,12 @@ def drive(legs: list[tuple[float, float, float]]) -> dict[str, Any]:
     config = with_overlay(config, overlay | {"odometry": {"start": START}})
     seen: list[tuple[float, ...]] = []
 
+    def note(_topic: object, message: Any, *_: object) -> None:
+        seen.append((message.stamp / SECOND, message.pose.x, message.pose.y, message.pose.yaw))
+
     async def main(clock: VirtualClock) -> np.ndarray:
         rig = VirtualRig(config, clock)
-        rig.bus.tap(
-            lambda topic, message, data, at: seen.append(
-                (message.stamp / SECOND, message.pose.x, message.pose.y, message.pose.yaw)
-            ),
-            [topics.ODOMETRY],
-        )
+        rig.bus.tap(note, [topics.ODOMETRY])
         async with rig.running():
             await clock.sleep(2.0)
             operator = LocalOperator(rig.daemon, clock)

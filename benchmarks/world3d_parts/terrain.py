@@ -154,7 +154,7 @@ def _over(ground: list[dict[str, Any]], metres: float, path: Path, *, stabilised
         await clock.sleep(2.0)
         grid = grids.latest
         walls = np.zeros(0) if grid is None else to_walls(grid, world)
-        return Driven(*(np.array(each) for each in (lidar, body, poses, true, ways)), walls)
+        return Driven(np.array(lidar), np.array(body), np.array(poses), np.array(true), np.array(ways), walls)
 
     return run(with_overlay(base, overlay), drive)
 
