@@ -306,7 +306,8 @@ class _PlanningRun:
             crabs: greatest angles of translations that are searched with, in this order.
             reserve: share of the budget that is kept.
         """
-        too_narrow = None, Reason.GOAL_UNREACHABLE, "no way is wide enough"
+        width = 2 * (self.planner.costs.side + self._gap_margin)
+        too_narrow = None, Reason.GOAL_UNREACHABLE, f"no way {width:.2f} m wide leads there"
         if not self._reachable(to_go):
             return too_narrow
         coarse = [self._search_run(to_go, RESOLUTIONS[0], crab) for crab in crabs]
@@ -362,17 +363,20 @@ class _PlanningRun:
     def _reachable(self, to_go: heuristic.CostToGo) -> bool:
         return heuristic.cost_at(to_go, *self._cell_of(self.start)) < heuristic.UNREACHED
 
+    @property
+    def _gap_margin(self) -> float:
+        """Needed on both sides of a gap, m; without a margin, gaps that may be just wide enough are left to the search."""
+        return self.config.margin + (GAP_PLAY if self.config.margin >= GAP_ERROR else -GAP_ERROR)
+
     def _close_narrow_gaps(self, to_go: heuristic.CostToGo) -> bool:
         """Close the narrow gaps on the shortest way, on the next one around these, and so on; False: there are none."""
         checked = np.zeros(self.cell_cost.shape, np.bool_)
-        # Without a margin to spare, gaps that may be just wide enough are left to the search.
-        margin = self.config.margin + (GAP_PLAY if self.config.margin >= GAP_ERROR else -GAP_ERROR)
         wide = self.planner.costs.side + self.config.margin + NARROW
         any_closed = False
         for _ in range(GAP_ROUNDS):
             for width in (0.0, GAP_CORRIDOR / self.cell):
                 closed = close_narrow_gaps(
-                    self.field, self.footprint, margin, self.cell_cost, self.factor, wide, to_go.step,
+                    self.field, self.footprint, self._gap_margin, self.cell_cost, self.factor, wide, to_go.step,
                     *self._cell_of(self.start), width, checked,
                 )  # fmt: skip
                 if not closed and not width:

@@ -375,7 +375,7 @@ class LatticePlanner:
         start, goal = (cell_at(field, cell, pose[0], pose[1]) for pose in (ends.start, ends.goal))
         to_go = cost_to_go(route_map.cell_costs(costs), cell, goal, start, overrun=inf)
         if cost_at(to_go, *start) >= UNREACHED:
-            return RouteResult(Reason.GOAL_UNREACHABLE, text="no way is wide enough")
+            return RouteResult(Reason.GOAL_UNREACHABLE, text=f"no way {2 * costs.closed:.2f} m wide leads there")
         best, cost, statistics = None, np.inf, {"expanded": 0.0}
         for weight in (config.heuristic_weight, 0.5 * (1 + config.heuristic_weight), 1.0):
             segments, found, reason = self._search(field, layer, to_go, ends, budget, weight, cost, statistics)
