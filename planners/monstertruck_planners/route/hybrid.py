@@ -365,7 +365,7 @@ class _PlanningRun:
 
     @property
     def _gap_margin(self) -> float:
-        """Needed on both sides of a gap, m; without a margin, gaps that may be just wide enough are left to the search."""
+        """Needed on both sides of a gap, m; without a margin, those just wide enough are left to the search."""
         return self.config.margin + (GAP_PLAY if self.config.margin >= GAP_ERROR else -GAP_ERROR)
 
     def _close_narrow_gaps(self, to_go: heuristic.CostToGo) -> bool:
