@@ -10,7 +10,7 @@ import shutil
 import ssl
 import tempfile
 from collections.abc import Awaitable, Callable, Coroutine, Sequence
-from contextlib import suppress
+from contextlib import AsyncExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -33,10 +33,11 @@ from monstertruckd.station.discovery import Discovery
 from monstertruckd.station.downloads import download, fetch
 from monstertruckd.station.feed import RobotFeed
 from monstertruckd.station.fleet import FleetBoard
+from monstertruckd.station.listener import Listener
 from monstertruckd.station.pilot import Pilot
 from monstertruckd.station.remarks import Remarks
 from monstertruckd.station.replay import LogOpener, ReplayFeed
-from monstertruckd.station.users import LOCAL, StationUser, StationUsers
+from monstertruckd.station.users import LOCAL, StationUser, StationUsers, network_of
 from monstertruckd.station.viewer import Viewer
 
 log = logging.getLogger(__name__)
@@ -59,7 +60,7 @@ MOST_BROWSERS: Final = 32
 MOST_OF_USER: Final = 8
 """...and this many of one user who logs in, so that nobody takes them all."""
 MOST_CONNECTIONS: Final = 256
-"""Of one address: a browser keeps some six. Of those beyond, the newest are closed."""
+"""Of one network: a browser keeps some six. Of those beyond, the newest are closed."""
 MESSAGES: Final = 200.0
 """Messages a second of one browser, in bursts of as many; what comes faster waits, and others are heard meanwhile."""
 USUAL_PORTS: Final = {"http": 80, "https": 443}
@@ -183,11 +184,14 @@ class Station:
             self._follow(feed)
         runs = (self._board.run(), *(each.run() for each in self._discoveries))
         discovering = [asyncio.create_task(run) for run in runs]
+        assert runner.server is not None
+        place, doors = self.place, AsyncExitStack()
+        listener = Listener(place.host, place.port, place.tls, runner.server, self._remarks.add)
         try:
             try:
-                await web.TCPSite(runner, self.place.host, self.place.port, ssl_context=self.place.tls).start()
+                await doors.enter_async_context(listener)
             except OSError as error:
-                raise BusyError(f"{self.place.url} cannot be served: {error.strerror or error}") from None
+                raise BusyError(f"{place.url} cannot be served: {error.strerror or error}") from None
             ready()
             while True:  # robots may come while others are followed, and users go
                 done, _ = await asyncio.wait(
@@ -197,9 +201,9 @@ class Station:
                     if not task.cancelled():  # of a recording that was dropped
                         task.result()
                 await self._check_users()
-                if runner.server is not None:
-                    self._close_crowds(runner.server)
+                self._close_crowds(runner.server)
         finally:
+            await doors.aclose()
             tasks = [*self._following.values(), *discovering]
             for task in tasks:
                 task.cancel()
@@ -223,10 +227,7 @@ class Station:
                     task.add_done_callback(self._closing.discard)
 
     def _close_crowds(self, server: web.Server) -> None:
-        """Close what one address has too many of, before a login too, so that it does not take all file descriptors.
-
-        Connections whose TLS handshake is under way are not among them; asyncio ends that after a minute.
-        """
+        """Close what one network has too many of, before a login too, so that it does not take all file descriptors."""
         of_peer: dict[str, int] = {}
         for connection in server.connections:  # the oldest first
             peer = _peer(connection)
@@ -601,10 +602,10 @@ class _Browser:
 
 
 def _peer(connection: web.RequestHandler) -> str:
-    """Address of the other end."""
+    """Address of the other end, or of IPv6 its network."""
     transport = connection.transport
     name = None if transport is None else transport.get_extra_info("peername")
-    return str(name[0]) if name else "?"
+    return network_of(str(name[0])) if name else "?"
 
 
 def _while_replaying(command: commands.AnyCommand) -> bool:

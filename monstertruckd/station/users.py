@@ -127,7 +127,7 @@ class StationUsers:
         if mark not in self._known:
             name, password = credentials
             role, kept = self._rows.get(name, (AccessRole.OBSERVER, NO_HASH))
-            user, network = StationUser(name, role, kept), _network(address)
+            user, network = StationUser(name, role, kept), network_of(address)
             if self._turns.get(network, (None, 0))[1] >= MOST_WAITING:
                 return None
             async with self._turn(network):
@@ -157,7 +157,7 @@ class StationUsers:
                 del self._turns[address]
 
 
-def _network(address: str) -> str:
+def network_of(address: str) -> str:
     """What guesses of one origin share: an address, or of IPv6 the network of 64 bits that one site has."""
     with suppress(ValueError):
         found = ipaddress.ip_address(address.partition("%")[0])

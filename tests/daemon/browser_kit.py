@@ -30,7 +30,7 @@ PATIENCE = 20_000
 
 
 @asynccontextmanager
-async def station(made: Robot, *options: str) -> AsyncIterator[str]:
+async def station(made: Robot, *options: str, scheme: str = "http") -> AsyncIterator[str]:
     """URL of a station before a robot; its process is ended at the end."""
     port = free_endpoint().rpartition(":")[2]
     process = await made.spawn("station", "--robot", f"truck@{made.endpoint}", "--port", port, *options)
@@ -38,7 +38,7 @@ async def station(made: Robot, *options: str) -> AsyncIterator[str]:
         async with asyncio.timeout(40):
             while "station:" not in (made.folder / "station.txt").read_text():
                 await asyncio.sleep(0.05)
-        yield f"http://127.0.0.1:{port}/"
+        yield f"{scheme}://127.0.0.1:{port}/"
     finally:
         await end(process)
 

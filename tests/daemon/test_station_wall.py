@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 import pytest
-from playwright.async_api import Page, expect
+from playwright.async_api import Browser, Page, expect
 
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.mailbox import Mailbox, fifo, latest
@@ -19,10 +19,13 @@ from monstertruck_schemas import topics
 from monstertruck_schemas.cmd import DriveAction, DriveCommand
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Role
+from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.state import GateMode, GateState
 from monstertruckd.station.pilot import LEASE
+from monstertruckd.station.users import add_user
 from tests.daemon.browser_kit import NEEDS_CHROMIUM, PATIENCE, chromium, opened, shows, station
 from tests.daemon.wall_kit import ROOT, Robot, end, kept_armed, planner_ready, robot
+from tests.unit.station.certificate import self_signed
 
 pytestmark = [pytest.mark.wall, pytest.mark.timeout(240), NEEDS_CHROMIUM]
 
@@ -146,21 +149,38 @@ async def reset(page: Page) -> None:
             await asyncio.sleep(0.5)
 
 
-async def test_emergency_stop_by_button_and_space_bar_and_two_tabs_are_two_sources(tmp_path: Path):
+async def test_emergency_stop_by_button_and_space_bar_and_two_users_are_two_sources(tmp_path: Path):
+    users = tmp_path / "users.yaml"
+    self_signed(tmp_path)
+    options = ("--certificate", tmp_path / "station.pem", "--key", tmp_path / "station.key", "--users", users)
+    for name in ("ann", "bob"):
+        add_user(users, name, AccessRole.PILOT, f"the password of {name}")
+
+    async def logged_in(browser: Browser, url: str, name: str) -> Page:
+        login = {"username": name, "password": f"the password of {name}"}
+        return await opened(browser, url, http_credentials=login, ignore_https_errors=True)
+
     async with robot(tmp_path, FREE) as made:
         await started(made)
-        async with made.client() as client, station(made) as url, chromium(tmp_path) as browser:
+        async with (
+            made.client() as client,
+            station(made, *map(str, options), scheme="https") as url,
+            chromium(tmp_path) as browser,
+        ):
             gate = client.subscribe(topics.GATE, latest())
             stops = client.subscribe(topics.STOP, latest())
-            page, other = await opened(browser, url), await opened(browser, url)
+            page, other = await logged_in(browser, url, "ann"), await logged_in(browser, url, "bob")
 
             await arm_and_hold(page, gate)
             assert gate.latest is not None
             driver = gate.latest.holder
+            assert driver is not None
+            assert "ann-" in driver
             assert gate.latest.role is Role.STATION
             await expect(page.locator("#holder-name")).to_have_text("You drive", timeout=PATIENCE)
             await expect(other.locator("#holder-name")).to_contain_text(f"{driver} drives", timeout=PATIENCE)
             await hand_over(page, other, gate)
+            assert "bob-" in str(gate.latest.holder)
             await page.mouse.up()
             await arm_and_hold(page, gate)
             driver = gate.latest.holder

@@ -2,6 +2,7 @@
 
 import asyncio
 import base64
+import contextlib
 import json
 import ssl
 from functools import partial
@@ -14,8 +15,8 @@ import pytest
 from monstertruck_runtime.clock import WallClock
 from monstertruck_runtime.errors import InputError, NotFoundError, NotPermittedError
 from monstertruck_schemas.roles import AccessRole
+from monstertruckd.station import listener, users
 from monstertruckd.station import server as server_module
-from monstertruckd.station import users
 from monstertruckd.station.address import RobotAddress
 from monstertruckd.station.server import Place, Station
 from monstertruckd.station.users import StationUsers, add_user
@@ -159,6 +160,39 @@ def test_users_are_replaced_as_a_whole(file: Path, tmp_path: Path):
     assert "bob" in file.read_text()
 
 
+async def test_a_revoked_user_whose_browser_reads_nothing_is_cut_off(file: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(server_module, "LOOK", 0.05)
+    monkeypatch.setattr(server_module, "END", 0.2)
+    place = Place(port=free_port(), users=StationUsers(file))
+    station = Station([RobotAddress("truck", "tcp/127.0.0.1:1")], WallClock(), place)
+    ready = asyncio.Event()
+    running = asyncio.create_task(station.run(ready.set))
+    await ready.wait()
+    reader, writer = await asyncio.open_connection("127.0.0.1", place.port, limit=1024)
+    try:
+        request = (
+            f"GET /socket HTTP/1.1\r\nHost: 127.0.0.1:{place.port}\r\nOrigin: {place.url[:-1]}\r\n"
+            f"Authorization: {basic('ann', 'correct horse')}\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"
+            "Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
+        )
+        writer.write(request.encode())
+        assert b"101" in await reader.readline()
+        (browser,) = station._browsers
+        for _ in range(100):
+            browser.viewer.send(bytes(1 << 17))
+        (transport,) = [transport for _, transport in station._sockets.values()]
+        async with asyncio.timeout(10):
+            while not transport.get_write_buffer_size():
+                await asyncio.sleep(0.01)
+            add_user(file, "ann", AccessRole.OBSERVER, "correct horse")
+            while station._browsers:
+                await asyncio.sleep(0.01)
+    finally:
+        writer.close()
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
+
+
 async def test_an_observer_sees_and_may_stop_and_nothing_else_over_tls(
     file: Path, tmp_path: Path, caplog, monkeypatch: pytest.MonkeyPatch
 ):
@@ -211,3 +245,46 @@ async def test_an_observer_sees_and_may_stop_and_nothing_else_over_tls(
     finally:
         running.cancel()
         await asyncio.gather(running, return_exceptions=True)
+
+
+async def test_handshakes_that_never_end_are_few_and_short_and_who_comes_later_is_served(
+    file: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(listener, "LONGEST", 0.5)
+    monkeypatch.setattr(listener, "MOST_OF_NETWORK", 4)
+    server, client = self_signed(tmp_path)
+    place = Place(port=free_port(), tls=server, users=StationUsers(file))
+    station = Station([RobotAddress("truck", "tcp/127.0.0.1:1")], WallClock(), place)
+    ready = asyncio.Event()
+    running = asyncio.create_task(station.run(ready.set))
+    try:
+        await ready.wait()
+        begun = asyncio.get_running_loop().time()
+        crowd = [await asyncio.open_connection("127.0.0.1", place.port) for _ in range(12)]
+        crowd[0][1].write(b"\x16\x03\x01\x02\x00\x01")  # the begin of a hello
+        crowd[1][1].write(b"GET / HTTP/1.1\r\n\r\n")
+
+        async def ended(number: int) -> float:
+            with contextlib.suppress(ConnectionError):
+                await crowd[number][0].read()
+            return asyncio.get_running_loop().time() - begun
+
+        async with asyncio.timeout(5):
+            times = await asyncio.gather(*map(ended, range(12)))
+        assert max(times[4:]) < 0.4, "those beyond are closed at once"
+        assert 0.4 < times[0] < 2.0
+        assert times[1] < 0.4, "no TLS at all"
+        assert "4 TLS handshakes of 127.0.0.1 are under way" in caplog.text
+        assert "TLS handshake of 127.0.0.1 failed" in caplog.text
+        async with (
+            aiohttp.ClientSession(place.url, connector=aiohttp.TCPConnector(ssl=client)) as session,
+            session.get("/", headers={"Authorization": basic("ann", "correct horse")}) as reply,
+        ):
+            assert reply.status == 200
+        crowd.append(await asyncio.open_connection("127.0.0.1", place.port))
+    finally:
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
+        for _, writer in crowd:
+            writer.close()
+    assert await crowd[-1][0].read() == b"", "one that is under way does not hold up the end"

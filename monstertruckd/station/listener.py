@@ -1,0 +1,108 @@
+"""Connections to the page's server, with bounds for TLS handshakes: no connections yet, but they cost as much."""
+
+import asyncio
+import socket
+import ssl
+from collections import Counter
+from collections.abc import Callable, Coroutine
+from contextlib import ExitStack
+from typing import Any, Final
+
+from monstertruckd.station.users import network_of
+
+LONGEST: Final = 5.0
+"""Seconds that a handshake may take."""
+MOST_OF_NETWORK: Final = 32
+"""Handshakes under way from one network; further connections are closed at once."""
+BACKLOG: Final = 128
+"""Connections that wait to be taken."""
+PAUSE: Final = 0.2
+"""Seconds before connections are taken again after there was no file descriptor for one."""
+
+
+class Listener:
+    """Takes connections to an address while its context lasts.
+
+    Args:
+        host: name or address to listen on.
+        port: of it.
+        tls: certificate and key; None = connections are plain.
+        inside: makes the protocol that gets a connection, once its handshake is done.
+        refused: called with the other end's address and what is wrong, for each that is closed.
+    """
+
+    def __init__(
+        self,
+        host: str,
+        port: int,
+        tls: ssl.SSLContext | None,
+        inside: Callable[[], asyncio.Protocol],
+        refused: Callable[[str, str], None],
+    ) -> None:
+        self._host, self._port, self._tls = host, port, tls
+        self._inside = inside
+        self._refused = refused
+        self._under_way: Counter[str] = Counter()
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._sockets = ExitStack()
+
+    async def __aenter__(self) -> None:
+        """Listen.
+
+        Raises:
+            OSError: the port is taken, or this machine has no such address.
+        """
+        loop = asyncio.get_running_loop()
+        found = await loop.getaddrinfo(self._host, self._port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+        with ExitStack() as made:
+            sockets = [
+                made.enter_context(socket.create_server(address[:2], family=family, backlog=BACKLOG))
+                for family, address in dict.fromkeys((row[0], row[4]) for row in found)
+            ]
+            self._sockets = made.pop_all()
+        for sock in sockets:
+            sock.setblocking(False)
+            self._begin(self._accept(sock))
+
+    async def __aexit__(self, *_: object) -> None:
+        """Take no more; what was under way is cut off."""
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        self._sockets.close()
+
+    def _begin(self, job: Coroutine[Any, Any, None]) -> None:
+        task = asyncio.create_task(job)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    async def _accept(self, sock: socket.socket) -> None:
+        loop = asyncio.get_running_loop()
+        while True:
+            try:
+                taken, name = await loop.sock_accept(sock)
+            except OSError as error:  # too many open files, or the other end is gone already
+                self._refused("?", f"a connection cannot be taken: {error.strerror or error}")
+                await asyncio.sleep(PAUSE)
+                continue
+            address = str(name[0])
+            network = network_of(address)
+            if self._under_way[network] < MOST_OF_NETWORK:
+                self._under_way[network] += 1
+                self._begin(self._greet(taken, address, network))
+            else:
+                taken.close()
+                self._refused(address, f"{MOST_OF_NETWORK} TLS handshakes of {network} are under way: no further one")
+
+    async def _greet(self, taken: socket.socket, address: str, network: str) -> None:
+        longest = None if self._tls is None else LONGEST
+        try:
+            await asyncio.get_running_loop().connect_accepted_socket(
+                self._inside, taken, ssl=self._tls, ssl_handshake_timeout=longest
+            )
+        except OSError as error:
+            self._refused(address, f"TLS handshake of {address} failed: {error.strerror or error}")
+        finally:
+            self._under_way[network] -= 1
+            if not self._under_way[network]:
+                del self._under_way[network]
