@@ -1,5 +1,6 @@
 """Runs of a wall-following behaviour with gains of the recipe, each from a step of the distance wanted."""
 
+import asyncio
 import math
 from collections.abc import Awaitable, Callable, Generator, Mapping, Sequence
 from contextlib import AbstractContextManager, suppress
@@ -100,7 +101,7 @@ async def tune(
     """
     try:
         await client.arm()
-    except NoAnswerError:  # it may have armed all the same
+    except (NoAnswerError, asyncio.CancelledError):  # it may have armed all the same
         with suppress(TruckError):
             await client.disarm()
         raise

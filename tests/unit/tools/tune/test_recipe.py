@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from monstertruck_planners.behave.wall.config import WallPdConfig
 from monstertruck_planners.behave.wall.published import WallPd
 from monstertruck_runtime import client
-from monstertruck_runtime.errors import RequestRefusedError
+from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError
 from monstertruck_runtime.mailbox import Mailbox
 from monstertruck_schemas.plan import BehaviourState
 from monstertruck_schemas.reasons import Reason
@@ -104,6 +104,32 @@ def test_a_run_that_ends_early_ends_the_tuning_with_its_reason():
     assert caught.value.refusal is Reason.STUCK
     assert not client.running
     assert client.armed is False
+
+
+@pytest.mark.parametrize("lost", [NoAnswerError("no answer within 2.5 s"), asyncio.CancelledError()])
+def test_a_robot_that_was_armed_without_saying_so_is_disarmed(lost):
+    client = Client()
+
+    async def arm():
+        client.armed = True
+        raise lost
+
+    client.arm = arm
+    with pytest.raises(type(lost)):
+        tuned(client, [])
+    assert client.armed is False
+
+
+def test_a_robot_that_refuses_to_be_armed_may_be_driven_by_somebody_else_and_is_left_alone():
+    client = Client()
+
+    async def arm():
+        raise RequestRefusedError(Reason.BUSY, "bob drives")
+
+    client.arm = arm
+    with pytest.raises(RequestRefusedError):
+        tuned(client, [])
+    assert client.armed is None
 
 
 def test_it_gives_up_after_some_runs_without_calm_gains():
