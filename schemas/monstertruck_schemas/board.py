@@ -1,8 +1,8 @@
 """What is printed for cameras: the board by which they are calibrated, and colours of discs that robots carry."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from monstertruck_schemas.base import Schema
 
@@ -20,6 +20,12 @@ class BoardConfig(Schema):
     """m, as measured on the print"""
     marker: Annotated[float, Field(gt=0, le=1)] = 0.03
     """m"""
+
+    @model_validator(mode="after")
+    def _markers_lie_in_squares(self) -> Self:
+        if not self.marker < self.square:
+            raise ValueError(f"marker {self.marker}: expected less than the square's {self.square}")
+        return self
 
     @property
     def width(self) -> float:

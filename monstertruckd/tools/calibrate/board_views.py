@@ -87,6 +87,7 @@ class BoardAttempts:
     blur: float = 0.0
     """Of the last blurred one, pixels"""
     moved: int = 0
+    damaged: int = 0
 
 
 @dataclass
@@ -111,18 +112,22 @@ class BoardGuide:
     _scans: deque[LaserScan] = field(default_factory=lambda: deque(maxlen=64))
     _since: int | None = None
 
-    def take(self, stamp: int, sighting: BoardSighting | None, scans: Iterable[LaserScan] = ()) -> BoardView | None:
+    def take(
+        self, stamp: int, sighting: BoardSighting | None, scans: Iterable[LaserScan] = (), *, damaged: bool = False
+    ) -> BoardView | None:
         """Take the next picture in; returns a view that has come of it.
 
         Args:
             stamp: of the picture, ns.
-            sighting: of the board in it; None = it is not seen.
+            sighting: of the board in it; None = it is not seen, or the picture is ``damaged``.
             scans: that have come since the last call.
+            damaged: the picture cannot be decoded.
 
         Raises:
             InputError: nothing new for too long: says what is wrong, or missing.
         """
         self._scans.extend(scans)
+        self.attempts.damaged += damaged
         self._since = stamp if self._since is None else self._since
         view = self._view(stamp, sighting)
         if view is not None:
@@ -179,6 +184,8 @@ class BoardGuide:
         if self.beams is not None:
             found += self._tilts(self.seen_by_lidar, TILTED_BEAMED, ", across the lidar's beam")
             found += self._steep()
+            if self.views and not any(view.ranges.size for view in self.views):
+                found.insert(0, f"scans of the lidar: {LEAST_SCANS} or more in {HOLD / SECOND:g} s")
             more = BEAMED - len(self.seen_by_lidar)
             found += _more(more, "view across the lidar's beam", "views across the lidar's beam")
         return found
@@ -228,6 +235,8 @@ class BoardGuide:
         a, board = self.attempts, self.reader.board
         shape = f"{board.columns} x {board.rows} squares"
         within = f"in {self.patience:g} s"
+        if a.damaged > 0.5 * a.pictures:
+            return f"{a.damaged} of {a.pictures} pictures cannot be decoded: look at the camera's cable and hub"
         if a.unseen > 0.8 * a.pictures:
             strangers = sorted(self.reader.strangers)
             if strangers:

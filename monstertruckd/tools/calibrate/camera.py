@@ -14,6 +14,7 @@ import numpy as np
 
 from monstertruck_estimation.vision.board import BoardReader
 from monstertruck_estimation.vision.lens import PARAMETERS, Lens, LensFit, fit_lens
+from monstertruck_estimation.vision.tags import Picture
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.errors import InputError, RequestRefusedError
 from monstertruck_schemas import topics
@@ -24,6 +25,7 @@ from monstertruck_schemas.sensor import CompressedImage
 from monstertruckd.config.calibration import CAMERA_LENS, CAMERA_MOUNT, Estimate, Result
 from monstertruckd.tools.calibrate.board_mount import NAMES, LidarPlace, fit_mount, line_on_board
 from monstertruckd.tools.calibrate.board_views import BoardGuide, BoardView
+from monstertruckd.tools.calibrate.lidar import joint_angles
 from monstertruckd.tools.calibrate.statistics import NORMAL, Interval, estimated, known_errors
 from monstertruckd.tools.calibrate.steps import Collect, Confirm, WatchStep
 from monstertruckd.tools.calibrate.wizard import Wizard, WizardContext
@@ -31,6 +33,10 @@ from monstertruckd.tools.calibrate.wizard import Wizard, WizardContext
 ROOM: Final = "a printed board on something flat (`stand print`), 0.4 to 1 m before the camera; light; nothing drives"
 WORST: Final = 1.0
 """Pixels: root mean square by which corners may be off."""
+FIRST: Final = 3
+"""Pictures that are looked at for their size."""
+KEPT: Final = math.radians(0.7)
+"""By which the lidar's joints may have turned meanwhile: two steps of their servos."""
 STRAY: Final = 3.0
 """Times the median by which the corners of a view may be off."""
 UNITS: Final = {"focal_x": "px", "focal_y": "px", "centre_x": "px", "centre_y": "px"}
@@ -55,8 +61,11 @@ class CameraWizard:
         device = context.config.devices.camera
         if device is None or not isinstance(believed := getattr(device.driver, "lens", None), LensConfig):
             raise RequestRefusedError(Reason.NOT_SUPPORTED, "this robot has no camera whose lens it states")
-        (first,) = await context.collect(Collect("a picture", topics.CAMERA, 1))
-        height, width = decoded(first).shape
+        first = await context.collect(Collect("a picture", topics.CAMERA, FIRST))
+        shapes = [picture.shape for message in first if (picture := decoded(message)) is not None]
+        if not shapes:
+            raise InputError(f"none of {FIRST} pictures of the camera can be decoded: look at its cable and hub")
+        height, width = shape = shapes[0]
         reader, lens = BoardReader(self.board), Lens.of(believed, width, height)
         mount = np.array([getattr(device.mount, name) for name in NAMES])
         lidar = await self._lidar(context) if self.lidar else None
@@ -68,8 +77,12 @@ class CameraWizard:
         await context.confirm(_BOARD)
 
         def take(message: CompressedImage, others: dict[str, list[Any]]) -> tuple[float, float]:
-            scans = others.get(topics.SCAN.name, [])
-            if guide.take(message.stamp, reader.read(decoded(message)), scans) is not None:
+            scans, picture = others.get(topics.SCAN.name, []), decoded(message)
+            if picture is not None and picture.shape != shape:
+                now = " x ".join(map(str, picture.shape[::-1]))
+                raise InputError(f"the camera's pictures were {width} x {height} pixels and are {now} now: begin anew")
+            sighting = None if picture is None else reader.read(picture)
+            if guide.take(message.stamp, sighting, scans, damaged=picture is None) is not None:
                 missing = guide.missing()
                 if missing:
                     context.say(f"view {len(guide.views)}; still missing: {'; '.join(missing[:2])}")
@@ -80,6 +93,7 @@ class CameraWizard:
         found, views = context.fit("lens", lambda: lens_of(guide.views, reader, (width, height)))
         if lidar is None:
             return result_of(found, len(views))
+        check_kept(lidar, await self._lidar(context))
         halves = lidar_halves(context)
         placed = context.fit("mount", lambda: mount_of(views, reader, found, mount, lidar, halves))
         return result_of(found, len(views), placed)
@@ -89,14 +103,7 @@ class CameraWizard:
         devices = context.config.devices
         if devices.lidar is None:
             return None
-        pitch = roll = 0.0
-        if devices.stabiliser is not None:
-            joints = await context.collect(Collect("joints of the lidar's mount", topics.STABILISER, 20))
-            read = [(j.pitch, j.roll) for j in joints if j.pitch is not None and j.roll is not None]
-            if not read:
-                raise InputError("a servo of the stabiliser does not answer: where the lidar looks is not known")
-            pitch, roll = np.mean(np.array(read), axis=0).tolist()
-        return LidarPlace.of(devices.lidar.mount, pitch, roll)
+        return LidarPlace.of(devices.lidar.mount, *await joint_angles(context))
 
 
 def camera_wizard(settings: CameraWizard | None = None) -> Wizard:
@@ -105,16 +112,26 @@ def camera_wizard(settings: CameraWizard | None = None) -> Wizard:
     return Wizard("camera", doc, ROOM, settings or CameraWizard())
 
 
-def decoded(message: CompressedImage) -> Any:
-    """A picture, grey, (height, width).
+def decoded(message: CompressedImage) -> Picture | None:
+    """A picture, grey, (height, width); None = it is damaged, as some of a webcam's are."""
+    if not message.data:
+        return None
+    grey: Picture | None = cv2.imdecode(np.frombuffer(message.data, np.uint8), cv2.IMREAD_GRAYSCALE)
+    return grey
+
+
+def check_kept(before: LidarPlace, after: LidarPlace | None) -> None:
+    """Refuse views of a lidar whose joints have turned meanwhile: the truck was leant on, or its ground gave way.
 
     Raises:
-        InputError: it is none.
+        InputError: so they have.
     """
-    grey = cv2.imdecode(np.frombuffer(message.data, np.uint8), cv2.IMREAD_GRAYSCALE)
-    if grey is None:
-        raise InputError(f"picture {message.sequence} of the camera cannot be decoded")
-    return grey
+    turn = 0.0 if after is None else float(np.linalg.norm(cv2.Rodrigues(before.axes.T @ after.axes)[0]))
+    if turn > KEPT:
+        raise InputError(
+            f"the lidar has turned by {math.degrees(turn):.1f} degrees on its stabiliser meanwhile: stand the truck "
+            "firmly, lean on nothing of it, and begin anew"
+        )
 
 
 def lens_of(views: Sequence[BoardView], reader: BoardReader, size: tuple[int, int]) -> tuple[LensFit, list[BoardView]]:

@@ -16,6 +16,7 @@ from monstertruck_drivers.os4000.config import IronConfig
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.fitting import FitResult, least_squares
 from monstertruck_runtime.errors import InputError
+from monstertruck_schemas import topics
 from monstertruckd.config.calibration import COMPASS, Estimate, Result
 from monstertruckd.tools.calibrate.statistics import NORMAL, correlation_factor
 from monstertruckd.tools.calibrate.steps import MoveRecord, MoveStep
@@ -31,6 +32,10 @@ TILT: Final = math.radians(0.5)
 """Greatest error of the unit's own tilt, rad (its data sheet): through it the vertical field looks like hard iron."""
 LINEARITY: Final = 0.001
 """Share by which a magnetoresistive sensor's output bends over the earth's field, and with it the ellipse."""
+FEWEST: Final = 24
+"""Readings: one in 30 degrees of both circles."""
+DISTURBED: Final = 0.03
+"""Residual, as a share of the circle's radius, from which on it is no ellipse: headings would err by 2 degrees."""
 GAP: Final = math.radians(30)
 """Greatest gap between directions of the field that still is a circle."""
 
@@ -52,15 +57,17 @@ class FieldCircle:
 
     @classmethod
     def of(cls, tracks: list[MoveRecord]) -> "FieldCircle":
-        """What was read while the truck moved.
+        """What was read while the truck moved; also what the driver calls disturbed, for that is what is looked for.
 
         Raises:
-            InputError: the compass sends no field.
+            InputError: the compass sends no field, or too few readings.
         """
         rows = []
         for track in tracks:
             moving = [
-                a for a in track.attitude if track.left < a.stamp < track.arrived and a.magnetic_field is not None
+                a
+                for a in track.of(topics.COMPASS)
+                if track.left < a.stamp < track.arrived and a.magnetic_field is not None
             ]
             currents = track.currents_at(np.array([a.stamp for a in moving], dtype=np.float64))
             for a, current in zip(moving, currents, strict=True):
@@ -71,6 +78,8 @@ class FieldCircle:
             raise InputError(
                 "the compass sends no magnetic field: its field mask needs 64 (devices.compass.driver.fields)"
             )
+        if len(rows) < FEWEST:
+            raise InputError(f"{len(rows)} readings of the compass while the truck moved: expected {FEWEST} or more")
         return cls(*np.array(rows).T)
 
 
@@ -100,6 +109,7 @@ class CompassWizard:
                     -ANGLE,
                     metres=1.8 * length,
                     done=lambda track: abs(track.turned()) > full,
+                    also=(topics.COMPASS,),
                 )
             )
             for name, speed in (("a circle to the left", self.speed), ("the same circle back", -self.speed))
@@ -117,8 +127,10 @@ def result_of(circle: FieldCircle) -> Result:
     """Fit and judge.
 
     Raises:
-        InputError: no full circle was driven, or the field turns the wrong way round.
+        InputError: no full circle was driven, the field turns the wrong way round, or is no ellipse.
     """
+    if np.ptp(circle.heading) == 0.0:
+        raise InputError("the unit's heading stays the same while the truck turns: unplug the compass, and plug it in")
     fit = fit_ellipse(circle)
     iron = IronConfig(**dict(zip(_NAMES, _iron(fit.parameters), strict=True)))
     angle = _angles(circle, iron)
@@ -127,6 +139,12 @@ def result_of(circle: FieldCircle) -> Result:
         raise InputError(
             "the field turns against the unit's own heading: its axes are not x forward, y left; mount it otherwise "
             "(setting E of the unit)"
+        )
+    radius = float(fit.parameters[4])
+    if not np.isfinite(fit.standard_errors[:5]).all() or fit.rms > DISTURBED * radius:
+        raise InputError(
+            f"the field is {fit.rms:.1f} uT off the ellipse of {radius:.0f} uT that the truck's own iron can make of "
+            "it: a magnet is near the compass, or iron in the ground or passing by; go elsewhere, or move the compass"
         )
     errors = NORMAL * correlation_factor(fit.residuals) * _iron_errors(fit)
     vertical = float(np.abs(circle.z).mean()) * math.sin(TILT)

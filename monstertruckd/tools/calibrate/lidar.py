@@ -25,8 +25,9 @@ from monstertruck_kinematics.chassis import Chassis
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.fitting import FitResult, least_squares
 from monstertruck_runtime.clock import SECOND
-from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.errors import InputError, RequestRefusedError
 from monstertruck_schemas import topics
+from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import VALID_BEAM, LaserScan
 from monstertruckd.config.calibration import LIDAR, Estimate, Result
 from monstertruckd.tools.calibrate.statistics import NORMAL, Interval, correlation_factor, estimated, known_errors
@@ -35,7 +36,8 @@ from monstertruckd.tools.calibrate.steps import Collect, MoveRecord, MoveStep, N
 from monstertruckd.tools.calibrate.weave import weaves
 from monstertruckd.tools.calibrate.wizard import CLEAR, Wizard, WizardContext
 
-ROOM: Final = "3 m x 3 m, with walls in sight to several sides; with heights, a wall ahead and one to the left"
+ROOM: Final = "3 m x 3 m, with walls in sight to several sides"
+LEVEL_ROOM: Final = f"{ROOM}; a level floor, a wall straight ahead and one straight to the left; a tape"
 SPEED: Final = 0.12
 ANGLE: Final = 0.35
 """Of both axles, against each other, rad."""
@@ -141,6 +143,8 @@ class LidarWizard:
 
     async def __call__(self, context: WizardContext) -> Result:
         """Measure."""
+        if context.config.devices.compass is None:
+            raise RequestRefusedError(Reason.NOT_SUPPORTED, "the lidar's mount is measured with a compass")
         believed = tuple(float(context.value(f"{LIDAR}.{name}")) for name in ("x", "y", "yaw"))
         mount = (believed[0], believed[1], believed[2])
         # First, so that a wrong number is refused before anything is driven, and nobody walks there afterwards.
@@ -177,14 +181,15 @@ class LidarWizard:
     async def _level(self, context: WizardContext) -> tuple[Estimate, ...]:
         scans = await context.collect(Collect("distances of the walls", topics.SCAN, 10))
         tilt = await context.collect(Collect("the truck's tilt", topics.COMPASS, 20))
+        joints = await joint_angles(context)
         ahead, left = (beam_distance(scans, angle) for angle in (0.0, QUARTER))
         heights = [(await context.ask(step)) / 100 for step in HEIGHTS]
         pitch, roll = beam_tilt(heights, (ahead, left))
         body = tuple(float(np.mean([getattr(a, name) for a in tilt])) for name in ("pitch", "roll"))
         error = math.hypot(self.tape_error * math.sqrt(2), FLAT * self.tape_error)
         found = (
-            ("pitch", pitch - body[0], ahead, "nose down positive"),
-            ("roll", roll - body[1], left, "right side down positive"),
+            ("pitch", pitch - body[0] - joints[0], ahead, "nose down positive"),
+            ("roll", roll - body[1] - joints[1], left, "right side down positive"),
         )
         return tuple(
             estimated(
@@ -202,7 +207,24 @@ class LidarWizard:
 def lidar_wizard(settings: LidarWizard | None = None) -> Wizard:
     """Mount and clock of the lidar."""
     doc = "where the lidar sits on the body, and the offset of its clock, from scans between rests"
-    return Wizard("lidar", doc, ROOM, settings or LidarWizard())
+    settings = settings or LidarWizard()
+    return Wizard("lidar", doc, LEVEL_ROOM if settings.heights else ROOM, settings)
+
+
+async def joint_angles(context: WizardContext) -> tuple[float, float]:
+    """Pitch and roll of the joints below the lidar as they are now, rad; 0 where it has none.
+
+    Raises:
+        InputError: a servo does not answer.
+    """
+    if context.config.devices.stabiliser is None:
+        return 0.0, 0.0
+    joints = await context.collect(Collect("joints of the lidar's mount", topics.STABILISER, 20))
+    read = [(j.pitch, j.roll) for j in joints if j.pitch is not None and j.roll is not None]
+    if not read:
+        raise InputError("a servo of the stabiliser does not answer: where the lidar looks is not known")
+    pitch, roll = np.mean(np.array(read), axis=0).tolist()
+    return pitch, roll
 
 
 def crab_error(context: WizardContext) -> float:

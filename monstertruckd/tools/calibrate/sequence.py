@@ -19,6 +19,8 @@ class SequenceStep:
     """Estimate that its result has once this step is done"""
     rough: bool = False
     """A first measurement, on which the others rest: skipped once there is any result of this wizard"""
+    heights: bool = False
+    """How level the lidar is, too: for one that no stabiliser levels, whose zeros are that"""
 
 
 ORDER: Final = (
@@ -30,6 +32,7 @@ ORDER: Final = (
     SequenceStep("steering", "front_scale"),
     SequenceStep("odometry", "wheelbase"),
     SequenceStep("stabiliser", "pitch_zero"),
+    SequenceStep("lidar", "pitch", heights=True),
     SequenceStep("lidar", "x"),
     SequenceStep("imu", "rate_scale"),
     SequenceStep("slip", "icr_left"),
@@ -58,7 +61,10 @@ def fits(step: SequenceStep, config: TruckConfig) -> bool:
             return "sonar" in devices.present() and config.body.kind in BODIES
         case "slip":
             return config.body.kind == "skid_steer" and config.stand != "none"
-        case "drive" | "compass" | "lidar" | "imu":
+        case "lidar":
+            lidar = truck and devices.lidar is not None and devices.compass is not None
+            return lidar and step.heights == (devices.stabiliser is None)
+        case "drive" | "compass" | "imu":
             return truck and step.name in devices.present()
 
 

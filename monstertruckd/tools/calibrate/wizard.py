@@ -13,9 +13,6 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, Final, TypeVar
 
-import numpy as np
-from pydantic import ValidationError
-
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import InputError, NoAnswerError, RequestRefusedError
 from monstertruck_runtime.mailbox import fifo, latest
@@ -166,12 +163,12 @@ class WizardContext:
         """Compute a result from what was measured, as a step of its own.
 
         Raises:
-            InputError: there is none, as the measurements do not determine it; and what ``function`` raises.
+            InputError: there is none, as the measurements do not determine it; and what ``function`` raises of its own.
         """
         self._panel.say(f"computing: {name}")
         try:
             return function()
-        except (ValidationError, np.linalg.LinAlgError, ZeroDivisionError) as error:
+        except (ValueError, ArithmeticError) as error:  # of pydantic, numpy and least squares, too
             text = str(error).splitlines()[0]
             raise InputError(f"{name}: cannot be computed from what was measured ({text}): measure again") from error
 

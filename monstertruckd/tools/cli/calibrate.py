@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from monstertruck_runtime.clock import Clock
     from monstertruckd.config.calibration import CalibrationFile, Estimate, Result, WizardName
     from monstertruckd.tools.calibrate.sequence import SequenceStep
+    from monstertruckd.tools.calibrate.steps import Panel
     from monstertruckd.tools.calibrate.wizard import Wizard
 
 app = command_group("Calibrate this truck: guided, step by step; Ctrl-C gives up at any step.")
@@ -60,11 +61,8 @@ class _Call:
 
     robot: str
     endpoint: str
-    config: Path | None
-    answers: list[str]
-    yes: bool
-    undo: bool
-    json_output: bool
+    config: Path | None = None
+    json_output: bool = False
 
 
 def _wizard(make: "Callable[..., Wizard]") -> "Callable[..., Wizard]":
@@ -81,7 +79,14 @@ def _wizard(make: "Callable[..., Wizard]") -> "Callable[..., Wizard]":
         json_output: JsonOption = False,
         **own: Any,
     ) -> None:
-        _run(make(**own), _Call(robot, endpoint, config, answer or [], yes, undo, json_output))
+        from monstertruckd.tools.cli.calibrate_panel import TerminalPanel
+
+        wizard, call = make(**own), _Call(robot, endpoint, config, json_output)
+        if undo:
+            _undo(wizard.name, call)
+            return
+        with TerminalPanel(answer or [], yes=yes) as panel:
+            _run(wizard, call, panel)
 
     WIZARDS[make.__name__] = make
     app.command(make.__name__)(with_parameters(command, make, command))
@@ -246,8 +251,11 @@ def camera(
 
     Nothing drives. Asks `board`; `stand print` makes the board.
     """
+    from monstertruck_runtime.errors import InputError
     from monstertruck_schemas.board import BoardConfig
 
+    if marker >= square:
+        raise InputError(f"--marker {marker:g}: expected less than --square {square:g}, in which it lies")
     with needs_extra("vision"):
         from monstertruckd.tools.calibrate.camera import CameraWizard, camera_wizard
 
@@ -266,24 +274,28 @@ def all_(
 ) -> None:
     """Every wizard that this robot still needs, in order; what is fresh is skipped.
 
+    Without a stabiliser, which has its own wizard, the lidar's asks the heights of the beam, too.
+
     After each, restart the daemon: this command waits for it and goes on. Ended half-way, it begins with what is left.
     """
     from monstertruck_runtime.clock import run_wall
+    from monstertruckd.tools.cli.calibrate_panel import TerminalPanel
 
-    call = _Call(robot, endpoint, None, answer or [], yes=yes, undo=False, json_output=False)
-    while True:
-        steps, waiting = run_wall(lambda clock: _steps_left(call, clock))
-        if dry_run or not steps:
-            names = [f"{step.name}{' (first look)' if step.rough else ''}" for step in steps]
-            print(
-                f"still to be calibrated: {', '.join(names)}" if names else "everything is calibrated, nothing expired"
-            )
-            return
-        if waiting:
-            remark("restart the daemon, so that what was measured counts; this command goes on then (Ctrl-C ends it)")
-            run_wall(lambda clock: _until_restarted(call, clock))
-            continue
-        _run(wizard_of(steps[0]), call)
+    call = _Call(robot, endpoint)
+    with TerminalPanel(answer or [], yes=yes) as panel:
+        while True:
+            steps, waiting = run_wall(lambda clock: _steps_left(call, clock))
+            if dry_run or not steps:
+                names = ", ".join(f"{step.name}{' (first look)' if step.rough else ''}" for step in steps)
+                print(f"still to be calibrated: {names}" if names else "everything is calibrated, nothing expired")
+                return
+            if waiting:
+                remark(
+                    "restart the daemon, so that what was measured counts; this command goes on then (Ctrl-C ends it)"
+                )
+                run_wall(lambda clock: _until_restarted(call, clock))
+                continue
+            _run(wizard_of(steps[0]), call, panel)
 
 
 def wizard_of(step: "SequenceStep") -> "Wizard":
@@ -292,6 +304,8 @@ def wizard_of(step: "SequenceStep") -> "Wizard":
         return drive(sign_only=step.rough)
     if step.name == "steering":
         return steering(rough=step.rough)
+    if step.name == "lidar":
+        return lidar(heights=step.heights)
     return WIZARDS[step.name]()
 
 
@@ -354,13 +368,10 @@ def show(
         remark(f"the daemon still runs on {state['loaded'] or 'no calibration'}: restart it")
 
 
-def _run(wizard: "Wizard", call: _Call) -> None:
+def _run(wizard: "Wizard", call: _Call, panel: "Panel") -> None:
     from monstertruck_runtime.clock import run_wall
 
-    if call.undo:
-        _undo(wizard.name, call)
-        return
-    result, file = run_wall(lambda clock: _run_wizard(wizard, call, clock))
+    result, file = run_wall(lambda clock: _run_wizard(wizard, call, clock, panel))
     if call.json_output:
         print_json({"result": result, "file": file})
     else:
@@ -370,17 +381,15 @@ def _run(wizard: "Wizard", call: _Call) -> None:
         remark(f"not complete: {result.again}")
 
 
-async def _run_wizard(wizard: "Wizard", call: _Call, clock: "Clock") -> "tuple[Result, str]":
+async def _run_wizard(wizard: "Wizard", call: _Call, clock: "Clock", panel: "Panel") -> "tuple[Result, str]":
     from monstertruckd.config.calibration_rpc import SHOW
     from monstertruckd.tools.calibrate.wizard import calibrate
-    from monstertruckd.tools.cli.calibrate_panel import TerminalPanel
 
     async with _client(call.robot, call.endpoint, clock) as client:
         config = await robot_config(client)
         file = _file(await client.call(SHOW))
         known = {} if file is None else file.results
-        with TerminalPanel(call.answers, yes=call.yes) as panel:
-            return await calibrate(wizard, client, panel, clock, config, known)
+        return await calibrate(wizard, client, panel, clock, config, known)
 
 
 def _undo(name: "WizardName", call: _Call) -> None:

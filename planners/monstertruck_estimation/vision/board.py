@@ -53,15 +53,17 @@ class BoardReader:
         """Markers seen so far that are not of this board."""
 
     def read(self, picture: Picture) -> BoardSighting | None:
-        """The board in the next picture; None = it is not seen, or too few of its corners."""
+        """The board in the next picture; None = it is not seen, or too few of its corners, or these in one line."""
         corners, ids, _, markers = self._detector.detectBoard(picture)
         self.strangers |= (
             {int(tag) for tag in np.ravel(markers) if tag >= self._known} if markers is not None else set()
         )
         if ids is None or len(ids) < LEAST_CORNERS:
             return None
-        found = np.asarray(corners, dtype=np.float64).reshape(-1, 2)
-        return BoardSighting(found, np.asarray(ids, dtype=np.int64).ravel(), edge_blur(picture, found))
+        numbers, found = np.asarray(ids, dtype=np.int64).ravel(), np.asarray(corners, dtype=np.float64).reshape(-1, 2)
+        if any(np.unique(places).size < 2 for places in np.divmod(numbers, self.board.columns - 1)):
+            return None
+        return BoardSighting(found, numbers, edge_blur(picture, found))
 
 
 def edge_blur(picture: Picture, corners: Array) -> float:

@@ -127,7 +127,7 @@ INSTEAD = {
     "monstertruckd calibrate compass": Instead(None, MOVES),
     "monstertruckd calibrate all": Instead("monstertruckd calibrate all --dry-run", "asks somebody, and drives"),
     "monstertruckd calibrate odometry": Instead(None, MOVES),
-    "monstertruckd calibrate lidar --heights": Instead(None, MOVES),
+    "monstertruckd calibrate lidar": Instead(None, MOVES),
     "monstertruckd calibrate imu": Instead(None, MOVES),
     "monstertruckd calibrate slip": Instead(None, MOVES),
     "monstertruckd calibrate sonar": Instead(None, MOVES),

@@ -1,6 +1,7 @@
 """The camera's wizard: what it keeps of a board that is held, what it says is missing or wrong, and what it saves."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,6 +12,7 @@ import pytest
 pytest.importorskip("cv2")
 
 import cv2
+from pydantic import ValidationError
 
 from monstertruck_drivers.webcam.emulator import jpeg
 from monstertruck_estimation.vision.board import BoardReader, BoardSighting
@@ -203,6 +205,7 @@ class Session:
     def __init__(self, config, views):
         self.config, self.known, self._views = config, {}, views
         self.said: list[str] = []
+        self.joints: list[float] = []
 
     def say(self, text):
         self.said.append(text)
@@ -211,7 +214,9 @@ class Session:
         return True
 
     async def collect(self, step):
-        return [self._picture(0, 0)]
+        if step.topic is topics.STABILISER:
+            return [SimpleNamespace(pitch=self.joints.pop(0), roll=0.0)]
+        return [self._picture(0, 0)] * step.count
 
     async def watch(self, step):
         for k, view in enumerate(self._views):
@@ -272,3 +277,71 @@ async def test_a_robot_without_a_camera_is_refused(session):
     context.config = load_config(CONFIGS / "yard.yaml", SimulatedTruckConfig)[0]
     with pytest.raises(RequestRefusedError, match="no camera whose lens it states"):
         await CameraWizard()(context)
+
+
+async def test_a_damaged_picture_now_and_then_does_not_end_it_and_a_camera_that_sends_no_others_is_named(
+    session, monkeypatch: pytest.MonkeyPatch
+):
+    context, _, _ = session
+    whole = camera.decoded
+    monkeypatch.setattr(camera, "decoded", lambda m: None if m.stamp % (4 * SECOND) == 0 and m.stamp else whole(m))
+    assert (await CameraWizard(lidar=False)(context)).estimate("k1") is not None
+    assert camera.decoded(SimpleNamespace(stamp=4 * SECOND)) is None
+    monkeypatch.setattr(camera, "decoded", lambda m: whole(m) if m.stamp == 0 else None)
+    with pytest.raises(InputError, match=r"of \d+ pictures cannot be decoded: look at the camera's cable"):
+        await CameraWizard(lidar=False)(context)
+    monkeypatch.setattr(camera, "decoded", lambda _: None)
+    with pytest.raises(InputError, match="none of 3 pictures"):
+        await CameraWizard(lidar=False)(context)
+
+
+@pytest.mark.parametrize("data", [b"", b"\xff\xd8 torn", b"no picture"])
+def test_bytes_that_are_no_picture_are_none(data: bytes):
+    assert camera.decoded(SimpleNamespace(data=data)) is None
+
+
+async def test_pictures_of_another_size_are_another_lens(session, monkeypatch: pytest.MonkeyPatch):
+    context, _, _ = session
+    whole = camera.decoded
+    monkeypatch.setattr(camera, "decoded", lambda m: whole(m)[: 360 if m.stamp > 9 * SECOND else 480])
+    with pytest.raises(InputError, match="were 640 x 480 pixels and are 640 x 360 now"):
+        await CameraWizard(lidar=False)(context)
+
+
+@pytest.mark.parametrize(("after", "refused"), [(0.004, False), (0.03, True)])
+async def test_a_lidar_whose_joints_turn_meanwhile_tells_no_mount(session, after: float, refused: bool):
+    context, _, _ = session
+    stabiliser = load_config(CONFIGS / "full.yaml", SimulatedTruckConfig)[0].devices.stabiliser
+    devices = context.config.devices.model_copy(update={"stabiliser": stabiliser})
+    context.config, context.joints = context.config.model_copy(update={"devices": devices}), [0.0, after]
+    if refused:
+        with pytest.raises(InputError, match=r"turned by 1\.7 degrees .* lean on nothing of it"):
+            await CameraWizard()(context)
+    else:
+        assert (await CameraWizard()(context)).estimate("pitch") is not None
+
+
+def test_a_lidar_that_sends_nothing_is_named_before_everything_else():
+    one = guide(beams=lambda view: False)
+    for number, view in enumerate(boards(5)):
+        one.keep(replace(view, angles=np.empty(0), ranges=np.empty(0)))
+        assert one.missing()[0] == "scans of the lidar: 3 or more in 0.7 s", number
+
+
+def test_corners_in_one_line_tell_no_place_of_the_board(monkeypatch: pytest.MonkeyPatch):
+    long = BoardReader(BoardConfig(columns=12, rows=6))
+    across = np.arange(10)
+    found = np.column_stack((20.0 + 40.0 * across, np.full(10, 200.0))).reshape(-1, 1, 2)
+    reads = {"across": across, "down": 11 * np.arange(5), "both": np.concatenate((across[:8], 11 + across[:2]))}
+    seen = {}
+    for name, ids in reads.items():
+        corners = np.resize(found, (ids.size, 1, 2))
+        detector = SimpleNamespace(detectBoard=lambda _, c=corners, i=ids: (c, i[:, None], None, None))
+        monkeypatch.setattr(long, "_detector", detector)
+        seen[name] = long.read(np.zeros((480, 640), np.uint8)) is not None
+    assert seen == {"across": False, "down": False, "both": True}
+
+
+def test_a_marker_as_large_as_its_square_is_refused():
+    with pytest.raises(ValidationError, match="marker"):
+        BoardConfig(square=0.03, marker=0.03)

@@ -7,7 +7,10 @@ import numpy as np
 import pytest
 
 from monstertruck_runtime.errors import InputError
+from monstertruck_schemas import topics
+from monstertruck_schemas.sensor import Attitude, Vector3
 from monstertruckd.tools.calibrate.compass import LINEARITY, FieldCircle, result_of
+from monstertruckd.tools.calibrate.steps import MoveRecord
 
 HARD = np.array((6.0, -4.0))
 SOFT = np.array(((1.1, 0.06), (0.06, 0.93)))
@@ -41,6 +44,12 @@ def circle(
     flat += noise * rng.standard_normal(flat.shape)
     believed = np.arctan2(flat[1], flat[0])
     return FieldCircle(flat[0], flat[1], z, pitch, roll, current, np.unwrap(believed))
+
+
+def reading(stamp: int, number: int, **more: bool) -> Attitude:
+    field = Vector3(x=20.0 + number, y=0.0, z=-39.0)
+    head = {"stamp": stamp, "received": stamp, "seq": number, "heading": 0.0, "pitch": 0.0, "roll": 0.0}
+    return Attitude(**head, magnetic_field=field, **more)
 
 
 def truth() -> dict[str, float]:
@@ -119,3 +128,30 @@ def test_the_map_of_the_motors_disturbance():
 def test_without_current_there_is_no_map():
     still = circle()
     assert result_of(replace(still, current=0.0 * still.current)).estimate("motor_x") is None
+
+
+def test_iron_in_the_ground_is_told_from_the_trucks_own():
+    clean = circle()
+    beside = 8.0 * np.exp(-(((np.arange(clean.x.size) % 400) - 150) ** 2) / 1800.0)
+    with pytest.raises(InputError, match=r"off the ellipse .* go elsewhere"):
+        result_of(replace(clean, x=clean.x + beside))
+
+
+def test_a_magnet_that_makes_no_circle_of_it_is_refused_and_gets_no_interval_without_an_end():
+    clean = circle()
+    with pytest.raises(InputError, match="a magnet is near the compass"):
+        result_of(replace(clean, y=0.1 * clean.y))
+
+
+def test_a_heading_that_stays_and_too_few_readings_are_named():
+    with pytest.raises(InputError, match="stays the same while the truck turns"):
+        result_of(replace(circle(), heading=np.zeros(800)))
+    record = MoveRecord(others={topics.COMPASS.name: [reading(100 + i, i) for i in range(9)]}, left=99, arrived=200)
+    with pytest.raises(InputError, match="18 readings of the compass while the truck moved: expected 24"):
+        FieldCircle.of([record, record])
+
+
+def test_readings_that_the_driver_calls_disturbed_count_for_they_are_what_is_measured():
+    rows = [reading(100 + i, i, heading_disturbed=True) for i in range(30)]
+    found = FieldCircle.of([MoveRecord(others={topics.COMPASS.name: rows}, left=99, arrived=200)])
+    assert found.x.size == 30

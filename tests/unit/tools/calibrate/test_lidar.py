@@ -2,14 +2,21 @@
 
 import math
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.errors import InputError, RequestRefusedError
+from monstertruck_schemas import topics
+from monstertruck_schemas.sensor import VALID_BEAM
+from monstertruckd.config.load import load_config
+from monstertruckd.config.truck import TruckConfig
 from monstertruckd.tools.calibrate.lidar import (
     HEIGHTS,
     LidarLeg,
+    LidarWizard,
     beam_tilt,
     fit_mount,
     fit_offset,
@@ -17,6 +24,7 @@ from monstertruckd.tools.calibrate.lidar import (
     seen_motion,
 )
 
+CONFIGS = Path(__file__).resolve().parents[4] / "configs"
 TRUE = np.array((0.13, 0.02, 0.04, 1.01, 0.0))
 
 
@@ -72,3 +80,36 @@ def test_heights_that_no_lidar_has_are_refused_by_name(heights, named):
     with pytest.raises(InputError, match=rf"^{named}: a beam 25 cm at .* measure again, in cm"):
         beam_tilt(heights, (2.0, 2.0))
     assert all(step.low == 1.0 for step in HEIGHTS), "metres in place of cm are refused, too"
+
+
+class Level:
+    """A truck on a level floor whose compass says 0.01 and -0.02 rad, and whose joints take that out."""
+
+    def __init__(self, name):
+        self.config = load_config(CONFIGS / name, TruckConfig)[0]
+
+    async def collect(self, step):
+        if step.topic is topics.STABILISER:
+            return [SimpleNamespace(pitch=-0.01, roll=0.02)] * step.count
+        if step.topic is topics.COMPASS:
+            return [SimpleNamespace(pitch=0.01, roll=-0.02)] * step.count
+        ranges, codes = np.full(5, 2.0), np.full(5, VALID_BEAM)
+        return [SimpleNamespace(start_angle=0.0, angle_increment=1.0, ranges=ranges, codes=codes)] * step.count
+
+    async def ask(self, step):
+        return {"centre": 25.0, "ahead": 21.0, "left": 27.0}[step.name]
+
+
+@pytest.mark.parametrize(("name", "found"), [("truck.yaml", (0.02, 0.01)), ("demo.yaml", (0.01, 0.03))])
+async def test_its_mounts_tilt_is_that_of_the_beam_less_the_bodys_and_the_joints(name, found):
+    estimates = await LidarWizard(heights=True)._level(Level(name))
+    assert [e.value for e in estimates] == pytest.approx(found, abs=1e-5)
+
+
+async def test_a_truck_without_a_compass_is_refused_before_it_drives():
+    context = Level("truck.yaml")
+    context.config = context.config.model_copy(
+        update={"devices": context.config.devices.model_copy(update={"compass": None})}
+    )
+    with pytest.raises(RequestRefusedError, match="compass"):
+        await LidarWizard()(context)
