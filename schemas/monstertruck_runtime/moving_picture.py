@@ -1,5 +1,6 @@
 """An animated GIF that is written picture by picture, however long it gets."""
 
+from contextlib import ExitStack
 from io import BufferedWriter
 from pathlib import Path
 from types import TracebackType
@@ -7,15 +8,19 @@ from typing import Final, Self
 
 from PIL import GifImagePlugin, Image, ImageChops
 
+from monstertruck_runtime.small_files import whole_file
+
 LONGEST: Final = 65_535
 """Hundredths of a second for which a picture can stand (GIF89a, 23: 16 bits)."""
 
 
 class MovingPicture:
-    """Writes a GIF; a context manager. Only the newest picture is kept, and of each what differs from the one before.
+    """Writes a GIF, as a whole or not at all; a context manager.
+
+    Only the newest picture is kept, and of each what differs from the one before.
 
     Args:
-        file: made with the first picture.
+        file: takes the place of an older one at the end; without a picture there is none.
         seconds: for which a picture stands.
         rest: for which the last one stands; None = as the others.
     """
@@ -24,6 +29,7 @@ class MovingPicture:
         self._file = file
         self._shown = round(100 * seconds)
         self._rest = self._shown if rest is None else round(100 * rest)
+        self._made = ExitStack()
         self._out: BufferedWriter | None = None
         self._palette = b""
         self._newest: Image.Image | None = None
@@ -38,7 +44,10 @@ class MovingPicture:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.close()
+        if error is None:
+            self.close()
+        else:
+            self._made.__exit__(kind, error, trace)
 
     def add(self, picture: Image.Image) -> None:
         """Add a picture with a palette.
@@ -67,22 +76,20 @@ class MovingPicture:
         Raises:
             OSError: it cannot be written.
         """
-        if self._waiting is not None:
-            part, place, duration = self._waiting
-            self._waiting = part, place, min(duration - self._shown + self._rest, LONGEST)
-            self._write()
-            self._waiting = None
-        if self._out is not None:
-            with self._out:
+        with self._made:
+            if self._waiting is not None:
+                part, place, duration = self._waiting
+                self._waiting = part, place, min(duration - self._shown + self._rest, LONGEST)
+                self._write()
+            if self._out is not None:
                 self._out.write(b";")
-            self._out = None
 
     def _write(self) -> None:
         assert self._waiting is not None
         part, place, duration = self._waiting
         palette = bytes(part.getpalette() or ())
         if self._out is None:
-            self._out = self._file.open("wb")
+            self._out = self._made.enter_context(self._made.enter_context(whole_file(self._file)).open("wb"))
             self._palette = palette
             # Of a copy: it changes its picture.
             self._out.writelines(GifImagePlugin.getheader(part.copy(), info={"loop": 0, "optimize": False})[0])

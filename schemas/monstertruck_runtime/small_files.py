@@ -4,6 +4,8 @@ import errno
 import os
 import stat
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 
@@ -85,4 +87,25 @@ def replace_file(path: Path, content: str | bytes, mode: int = 0o644, *, follow_
         Path(scratch).replace(place)
     except BaseException:
         Path(scratch).unlink(missing_ok=True)
+        raise
+
+
+@contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """Yields where to write a file of any length: ``.part`` behind its name, which it takes once the body ends.
+
+    If the body fails, what it wrote is removed, and a file of that name stays as it was.
+
+    Raises:
+        OSError: ``path`` is a folder, a device or the like, or cannot be replaced.
+    """
+    place = path.resolve()
+    if place.exists():
+        require_file(place)
+    part = place.with_name(place.name + ".part")
+    try:
+        yield part
+        part.replace(place)
+    except BaseException:
+        part.unlink(missing_ok=True)
         raise

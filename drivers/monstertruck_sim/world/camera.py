@@ -85,10 +85,14 @@ class Holder(Protocol):
 
 
 class Crowd(Protocol):
-    """Who walks around, as the camera sees it."""
+    """Who moves around, as the camera sees it."""
 
     def people_at(self, time_ns: int, /) -> Sequence[tuple[float, float, float]]:
         """Place and radius of everybody, m."""
+        ...
+
+    def robots_beside(self, own: Plant, /) -> Sequence[Plant]:
+        """What moves the other robots."""
         ...
 
 

@@ -19,7 +19,7 @@ from monstertruck_sim.world.built_in import BuiltIn
 from monstertruck_sim.world.config import PersonConfig
 from monstertruck_sim.world.obstacles import Box, Disc, Obstacle, discs_and_segments, penetration
 from monstertruck_sim.world.people import STEP_S, Person
-from monstertruck_sim.world.plant import Pose
+from monstertruck_sim.world.plant import Plant, Pose
 from monstertruck_sim.world.raycast import cast_rays, clearance, grid_penetration
 from monstertruck_sim.world.truck_plant import STEP_NS
 
@@ -52,6 +52,11 @@ class Neighbour(Protocol):
     """A robot, as the others see it."""
 
     name: str
+
+    @property
+    def plant(self) -> Plant:
+        """What moves it."""
+        ...
 
     @property
     def outline(self) -> Box:
@@ -136,6 +141,10 @@ class Surroundings:
             if penetration(outline, person.disc) > 0:
                 raise InputError(f"start: the robot {body.name} and {person.name} overlap")
         self.bodies.append(body)
+
+    def robots_beside(self, own: Plant) -> list[Plant]:
+        """What moves the other robots."""
+        return [body.plant for body in self.bodies if body.plant is not own]
 
     def advance(self, time_ns: int) -> None:
         """Bring everything that moves to the last point of the grid before an instant."""

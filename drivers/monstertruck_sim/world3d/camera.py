@@ -52,9 +52,10 @@ class RenderedView(SimulatedView):
         width, height = size
         upright = 2 * atan(height / width * tan(self.config.field_of_view / 2) * wider)
         pose = CameraPose(tuple(place.centre.tolist()), tuple(ahead), (-down[0], -down[1], -down[2]), upright)
-        people = [] if self.crowd is None else self.crowd.people_at(time_ns)
-        there = standing(people, self._rigid.ground)
-        renderer.arrange(self._rigid.data, pose, people=there, hidden=self.HIDDEN)
+        crowd = self.crowd
+        there = [] if crowd is None else standing(crowd.people_at(time_ns), self._rigid.ground)
+        robots = () if crowd is None else crowd.robots_beside(self._rigid)
+        renderer.arrange(self._rigid.data, pose, people=there, robots=robots, hidden=self.HIDDEN)
         grain = self.grain(time_ns)
         board = self.board_at(time_ns)
 

@@ -23,6 +23,7 @@ from monstertruck_sim.world.mechanics import description, mechanics, platform_wh
 from monstertruck_sim.world.obstacles import Box, Disc, Obstacle
 from monstertruck_sim.world.plane import Engine, PlanOutline, without
 from monstertruck_sim.world.plant import Caster, Pose
+from monstertruck_sim.world.scene import Neighbour
 from monstertruck_sim.world.sensors import LEVEL_BEAMS, Beams, UnevenGround, over, turned
 from monstertruck_sim.world3d.ground import blocks, ground_heights, scenery
 from monstertruck_sim.world3d.model import (
@@ -91,7 +92,8 @@ class RigidSpace:
             InputError: no spare body of its kind is left.
         """
         kind, people = type(obstacle), [person.disc for person in self._scene.people]
-        if sum(isinstance(other, kind) for other in (*self.obstacles, *self._robots(), *people)) >= SPARE:
+        robots = [body.outline for body in self._others()]
+        if sum(isinstance(other, kind) for other in (*self.obstacles, *robots, *people)) >= SPARE:
             raise InputError(f"obstacle: {SPARE} of kind {kind.__name__.lower()} are in the world: no room for more")
         self._scene.set_obstacles((*self.obstacles, obstacle))
 
@@ -114,11 +116,15 @@ class RigidSpace:
 
     def follow(self) -> None:
         """Bring the bodies to where everything is now."""
-        robots, people = self._robots(), [person.disc for person in self._scene.people]
+        robots: list[tuple[Obstacle, bool]] = [
+            (body.outline, not isinstance(body.plant, RigidPlant)) for body in self._others()
+        ]
+        people = [person.disc for person in self._scene.people]
         if not robots and not people and self._known is self.obstacles:
             return
         self._known = self.obstacles
-        there = [(shape, True) for shape in (*self._known, *robots)] + [(disc, False) for disc in people]
+        # Robots of rigid bodies and people are drawn as what they are.
+        there = [(shape, True) for shape in self._known] + [(disc, False) for disc in people] + robots
         for kind, cls in (("disc", Disc), ("box", Box)):
             shown = self._shown[kind]
             wanted: list[_Shown] = [each for each in there if isinstance(each[0], cls)]
@@ -128,8 +134,8 @@ class RigidSpace:
                     self._show(f"{kind}_{i}", each)
                     shown[i] = each
 
-    def _robots(self) -> list[Obstacle]:
-        return [body.outline for body in self._scene.bodies if body.name != self._name]
+    def _others(self) -> list[Neighbour]:
+        return [body for body in self._scene.bodies if body.name != self._name]
 
     def _show(self, name: str, shown: _Shown) -> None:
         """Put a spare body to where something is; one that is not used costs neither steps nor pictures anything."""

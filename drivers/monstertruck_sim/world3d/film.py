@@ -2,12 +2,13 @@
 
 from math import cos, sin
 from pathlib import Path
-from typing import Final
+from types import TracebackType
+from typing import Final, Self
 
 from PIL import Image
 
 from monstertruck_runtime.clock import SECOND, Clock
-from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.errors import InputError, TruckError
 from monstertruck_runtime.moving_picture import MovingPicture
 from monstertruck_sim.world.world import World
 from monstertruck_sim.world3d.picture import WorldRenderer, looking_at, standing
@@ -28,10 +29,12 @@ _PLAIN: Final = Image.Dither.NONE
 class Film:
     """Frames of one robot; to be used on the loop of a virtual clock, for a frame takes tens of milliseconds.
 
+    A context manager. A run that ends by an error of the robot's is shown; one that is broken off leaves no file.
+
     Args:
         world: with the robot.
         clock: its time.
-        file: GIF, written as it is filmed.
+        file: GIF, written as it is filmed; it takes its name at the end.
 
     Raises:
         InputError: the engine has nothing to draw, or the file is no GIF.
@@ -71,14 +74,18 @@ class Film:
         camera = x - _BEHIND * c + _ASIDE * s, y - _BEHIND * s - _ASIDE * c, z + _ABOVE
         view = looking_at(camera, (x + 0.3 * c, y + 0.3 * s, z + 0.1))
         people = standing(self._world.scene.people_at(now), self._plant.ground)
-        picture = self._renderer.draw(self._plant.data, view, people=people)
+        robots = self._world.scene.robots_beside(self._plant)
+        picture = self._renderer.draw(self._plant.data, view, people=people, robots=robots)
         self._pictures.add(Image.fromarray(picture).quantize(_COLOURS, Image.Quantize.MAXCOVERAGE, dither=_PLAIN))
 
-    def close(self) -> None:
-        """End the file.
+    def __enter__(self) -> Self:
+        return self
 
-        Raises:
-            OSError: it cannot be written.
-        """
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         self._renderer.close()
-        self._pictures.close()
+        if isinstance(error, TruckError):
+            self._pictures.close()
+        else:
+            self._pictures.__exit__(kind, error, trace)

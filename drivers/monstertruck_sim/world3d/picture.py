@@ -2,13 +2,16 @@
 
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_runtime.errors import NotInstalledError
+from monstertruck_sim.world.plant import Plant
 from monstertruck_sim.world3d.model import Group
+from monstertruck_sim.world3d.plant import RigidPlant
 
 Somebody = tuple[float, float, float, float]
 """Place, height of the ground, and radius, m."""
@@ -84,9 +87,16 @@ class WorldRenderer:
         self._option = mujoco.MjvOption()
         self._pixels = np.empty((height, width, 3), np.uint8)
 
-    def draw(self, data: mujoco.MjData, camera_pose: CameraPose, *, people: Sequence[Somebody] = ()) -> Picture:
+    def draw(
+        self,
+        data: mujoco.MjData,
+        camera_pose: CameraPose,
+        *,
+        people: Sequence[Somebody] = (),
+        robots: Sequence[Plant] = (),
+    ) -> Picture:
         """The world at the state of ``data``, and who is there."""
-        self.arrange(data, camera_pose, people=people)
+        self.arrange(data, camera_pose, people=people, robots=robots)
         return self.render()
 
     def arrange(
@@ -95,6 +105,7 @@ class WorldRenderer:
         camera_pose: CameraPose,
         *,
         people: Sequence[Somebody] = (),
+        robots: Sequence[Plant] = (),
         hidden: Collection[Group] = (),
     ) -> None:
         """Take over what is to be seen; needs no thread of its own.
@@ -103,6 +114,7 @@ class WorldRenderer:
             data: state of the world.
             camera_pose: from where.
             people: who is there.
+            robots: others than the model's own; those of rigid bodies are drawn as they stand and steer.
             hidden: groups that are left out.
         """
         self._option.geomgroup[:] = [group in list(Group) and group not in hidden for group in range(mujoco.mjNGROUP)]
@@ -111,7 +123,10 @@ class WorldRenderer:
             self._model, data, self._option, None, camera, mujoco.mjtCatBit.mjCAT_ALL.value, self._scene
         )
         for somebody in people:
-            self._add(*somebody)
+            self._add_person(*somebody)
+        for robot in robots:
+            if isinstance(robot, RigidPlant):
+                self._add_robot(robot)
         near = 0.01
         half = near * np.tan(camera_pose.field_of_view / 2)
         for part in self._scene.camera:
@@ -128,7 +143,7 @@ class WorldRenderer:
         mujoco.mjr_readPixels(self._pixels, None, self._view, self._context)
         return self._pixels[::-1].copy()
 
-    def _add(self, x: float, y: float, z: float, radius: float) -> None:
+    def _add_person(self, x: float, y: float, z: float, radius: float) -> None:
         """Legs, trunk and head of somebody who stands at a place."""
         parts = (
             (mujoco.mjtGeom.mjGEOM_CYLINDER, (0.8 * radius, 0.4, 0.0), 0.4, (0.2, 0.24, 0.36, 1.0)),
@@ -136,12 +151,21 @@ class WorldRenderer:
             (mujoco.mjtGeom.mjGEOM_SPHERE, (0.12, 0.0, 0.0), 1.57, (0.8, 0.63, 0.5, 1.0)),
         )
         for kind, size, middle, colour in parts:
-            if self._scene.ngeom >= self._scene.maxgeom:
-                return
-            mujoco.mjv_initGeom(
-                self._scene.geoms[self._scene.ngeom], kind, np.array(size), np.array((x, y, z + middle)),
-                np.eye(3).ravel(), np.array(colour, np.float32),
-            )  # fmt: skip
+            self._add(kind, np.array(size), np.array((x, y, z + middle)), np.eye(3).ravel(), np.array(colour))
+
+    def _add_robot(self, robot: RigidPlant) -> None:
+        """Its visible geometries where they are."""
+        model, data = robot.model, robot.data
+        for geom in np.flatnonzero((model.geom_group == Group.ROBOT) & (model.geom_rgba[:, 3] > 0.0)):
+            look = model.geom_type[geom], model.geom_size[geom], data.geom_xpos[geom], data.geom_xmat[geom]
+            self._add(*look, model.geom_rgba[geom])
+
+    def _add(
+        self, kind: int, size: NDArray[Any], place: NDArray[Any], axes: NDArray[Any], colour: NDArray[Any]
+    ) -> None:
+        if self._scene.ngeom < self._scene.maxgeom:
+            geom = self._scene.geoms[self._scene.ngeom]
+            mujoco.mjv_initGeom(geom, kind, size, place, axes, colour.astype(np.float32))
             self._scene.ngeom += 1
 
     def close(self) -> None:

@@ -120,17 +120,14 @@ async def _filmed(rig: VirtualRig, clock: VirtualClock, file: Path | None) -> As
         return
     from monstertruck_sim.world3d.film import Film  # noqa: PLC0415  # the library of an extra
 
-    film = Film(rig.world, clock, file)
-    task = asyncio.create_task(film.run(), name="film")
-    try:
-        yield
-    finally:
-        task.cancel()
+    with Film(rig.world, clock, file) as film:
+        task = asyncio.create_task(film.run(), name="film")
         try:
+            yield
+        finally:
+            task.cancel()
             with suppress(asyncio.CancelledError):
                 await task
-        finally:
-            film.close()
 
 
 async def run_wall_demo(clock: Clock, config: Path, folder: Path, seed: int | None, *, screen: bool) -> Summary:

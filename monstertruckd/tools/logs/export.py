@@ -5,9 +5,7 @@ the stamps inside them needs log times and stamps of one clock.
 """
 
 import csv
-import errno
 import json
-import os
 import shutil
 import tempfile
 import zipfile
@@ -25,6 +23,7 @@ from pydantic import BaseModel
 
 from monstertruck_runtime import wire
 from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.small_files import whole_file
 from monstertruck_schemas.base import Nanoseconds, Schema
 from monstertruck_schemas.state import ClockOffset
 from monstertruck_schemas.topics import BY_NAME
@@ -122,18 +121,13 @@ def _write_npz(file: Path, table: Mapping[str, Column]) -> None:
 @contextmanager
 def _tables(directory: Path, suffix: str, files: dict[str, Path]) -> Iterator[Callable[[str], Path]]:
     """Yields a function from topic to file to write; all get their final names, in ``files``, once all are complete."""
-    with removed_on_failure() as parts:
+    with ExitStack() as whole:
 
         def place(topic: str) -> Path:
             files[topic] = directory / f"{_stem(topic)}{suffix}"
-            if files[topic].is_dir():
-                raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(files[topic]))
-            parts.append(files[topic].with_name(files[topic].name + ".part"))
-            return parts[-1]
+            return whole.enter_context(whole_file(files[topic]))
 
         yield place
-        for part, file in zip(parts, files.values(), strict=True):
-            part.replace(file)
 
 
 def _folder(directory: str | Path) -> Path:

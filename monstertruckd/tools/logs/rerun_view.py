@@ -17,7 +17,7 @@ import rerun.blueprint as rrb
 from monstertruck_planners.collision import scan_points
 from monstertruck_runtime.clock import is_date
 from monstertruck_runtime.errors import CommandFailedError, ConfigError, InputError
-from monstertruck_runtime.small_files import require_file
+from monstertruck_runtime.small_files import whole_file
 from monstertruck_schemas import topics as t
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.event import Event, LogLevel, LogRecord, Severity, Stop
@@ -35,7 +35,6 @@ from monstertruck_schemas.state import (
     Transforms,
 )
 from monstertruckd.recorder.reader import LogReader, open_log, spare_log
-from monstertruckd.tools.logs.export import removed_on_failure
 from monstertruckd.tools.logs.messages import ALL, Progress, Selection, real_offset
 from monstertruckd.tools.logs.report.signals import FIGURES, Curve, DrivenPath, Figure
 
@@ -77,14 +76,10 @@ def convert(
     output = Path(output)
     try:
         spare_log(output)
-        if output.exists():
-            require_file(output)
         output.parent.mkdir(parents=True, exist_ok=True)
-        with removed_on_failure() as made:
-            made.append(output.with_name(output.name + ".part"))
-            made[0].open("wb").close()
-            _record(reader, made[0], offset, selection, progress)
-            made[0].replace(output)
+        with whole_file(output) as part:
+            part.open("wb").close()
+            _record(reader, part, offset, selection, progress)
     except (OSError, RuntimeError) as error:  # rerun raises the latter
         why = error.strerror if isinstance(error, OSError) else error
         msg = f"{output}: cannot be written: {why}"

@@ -4,6 +4,7 @@ import weakref
 from pathlib import Path
 
 import numpy as np
+import pytest
 from PIL import Image
 
 from monstertruck_runtime.moving_picture import MovingPicture
@@ -63,3 +64,23 @@ def test_a_picture_that_stands_for_hours_is_repeated(tmp_path: Path):
     found = frames(tmp_path / "a.gif")
     assert sum(duration for _, duration in found) == 1_500_000
     assert len(found) == 3
+
+
+def test_one_that_is_broken_off_leaves_what_was_there(tmp_path: Path):
+    file = tmp_path / "a.gif"
+    with MovingPicture(file, 0.1) as made:
+        for number in range(3):
+            made.add(picture(number))
+    whole = file.read_bytes()
+
+    def broken_off() -> None:
+        with MovingPicture(file, 0.1) as made:
+            for number in range(3):
+                made.add(picture(number))
+            assert file.read_bytes() == whole, "what a process that is killed leaves"
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        broken_off()
+    assert [path.name for path in tmp_path.iterdir()] == ["a.gif"]
+    assert file.read_bytes() == whole

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from monstertruck_runtime.small_files import number_of, replace_file, require_place, text_of
+from monstertruck_runtime.small_files import number_of, replace_file, require_place, text_of, whole_file
 
 
 @pytest.mark.parametrize(("content", "number"), [("42\n", 42), ("-1", -1), ("", None), ("4.2", None), ("abc", None)])
@@ -64,3 +64,34 @@ def test_a_place_for_a_file_is_known_before_the_work(tmp_path: Path):
     for wrong in (tmp_path, tmp_path / "nowhere" / "x.gif", Path("/proc/x.gif")):
         with pytest.raises(OSError, match=str(wrong)):
             require_place(wrong)
+
+
+def test_a_file_that_is_written_piece_by_piece_is_there_as_a_whole_or_not_at_all(tmp_path: Path):
+    file = tmp_path / "file"
+    for content in ("a", "b"):
+        with whole_file(file) as part:
+            part.write_text(content)
+        assert [(path, path.read_text()) for path in tmp_path.iterdir()] == [(file, content)]
+
+    def broken_off() -> None:
+        with whole_file(file) as part:
+            part.write_text("half of")
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        broken_off()
+    assert [(path, path.read_text()) for path in tmp_path.iterdir()] == [(file, "b")]
+
+
+def test_a_file_takes_the_place_of_no_folder_and_no_pipe_and_a_link_to_one_stays(tmp_path: Path):
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "folder").mkdir()
+    for name in ("pipe", "folder"):
+        with pytest.raises(OSError, match=name), whole_file(tmp_path / name):
+            pytest.fail("begun")
+    link, file = tmp_path / "link", tmp_path / "folder" / "file"
+    link.symlink_to(file)
+    with whole_file(link) as part:
+        part.write_text("a")
+    assert link.is_symlink()
+    assert file.read_text() == "a"

@@ -7,9 +7,10 @@ import pytest
 from PIL import Image
 
 from monstertruck_runtime.clock import VirtualClock, run_virtual
-from monstertruck_runtime.errors import InputError, NotInstalledError
+from monstertruck_runtime.errors import InputError, NoAnswerError, NotInstalledError
+from monstertruck_schemas.base import Pose2D
 from monstertruck_sim.world.config import WorldConfig
-from monstertruck_sim.world.world import World
+from monstertruck_sim.world.world import World, make_scene
 from monstertruck_sim.world3d.film import RATE, SIZE, Film
 from monstertruck_sim.world3d.picture import WorldRenderer, looking_at
 
@@ -49,16 +50,34 @@ def test_the_upper_half_of_a_level_view_is_sky_and_the_lower_half_is_ground(worl
 
 def test_a_film_has_a_frame_an_eighth_of_a_second(world, renderer, tmp_path):
     async def main(clock: VirtualClock) -> None:
-        film = Film(world, clock, tmp_path / "a.gif")
-        for _ in range(3):
-            film.take()
-            await clock.sleep(1 / RATE)
-        film.close()
+        with Film(world, clock, tmp_path / "a.gif") as film:
+            for _ in range(3):
+                film.take()
+                await clock.sleep(1 / RATE)
 
     run_virtual(main)
     with Image.open(tmp_path / "a.gif") as image:
         assert image.size == SIZE
         assert 1 <= image.n_frames <= 3
+
+
+@pytest.mark.parametrize(
+    ("error", "left"), [(NoAnswerError("no lap"), ["a.gif"]), (KeyboardInterrupt(), []), (OSError("disk"), [])]
+)
+def test_a_film_of_a_run_that_failed_is_kept_and_one_that_is_broken_off_is_not(
+    world, renderer, tmp_path, error: BaseException, left: list[str]
+):
+    async def main(clock: VirtualClock) -> None:
+        with Film(world, clock, tmp_path / "a.gif") as film:
+            for _ in range(2):
+                film.take()
+                world.truth(clock.now())
+                await clock.sleep(1 / RATE)
+            raise error
+
+    with pytest.raises(type(error)):
+        run_virtual(main)
+    assert [path.name for path in tmp_path.iterdir()] == left
 
 
 def test_only_rigid_worlds_and_gifs_are_filmed(tmp_path):
@@ -75,3 +94,31 @@ def test_without_egl_a_reason_is_named(world, monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco.egl", None)
     with pytest.raises(NotInstalledError, match="no EGL on this computer"):
         WorldRenderer(world.plant.model)
+
+
+def test_another_robot_is_drawn_as_it_is_and_steers():
+    starts = [Pose2D(x=x, y=0.0, yaw=0.0) for x in (0.0, 1.0)]
+    configs = [WorldConfig(engine="mujoco", map="yard", noise=False, start=start) for start in starts]
+    scene = make_scene(configs[0], 1, configs[1:])
+    own, other = [World(config, 1, scene, f"robot_{i}") for i, config in enumerate(configs)]
+    own.truth(0)
+    try:
+        renderer = WorldRenderer(own.plant.model, 160, 120)
+    except NotInstalledError as error:
+        pytest.skip(str(error))
+    above = looking_at((0.9, 0.0, 1.2), (1.0, 0.0, 0.1))
+
+    def drawn() -> np.ndarray:
+        return renderer.draw(own.plant.data, above, robots=scene.robots_beside(own.plant)).astype(int)
+
+    with_it, without = drawn(), renderer.draw(own.plant.data, above).astype(int)
+    its_own = own.plant
+    renderer.close()
+    renderer = WorldRenderer(other.plant.model, 160, 120)
+    as_itself = renderer.draw(other.plant.data, above).astype(int)
+    renderer.close()
+    assert scene.robots_beside(its_own) == [other.plant]
+    seen = np.abs(with_it - without).max(axis=2) > 20
+    assert seen.sum() > 1000
+    assert np.abs(with_it - as_itself).max(axis=2).mean() < 2.0, "the same robot in both models"
+    assert not (without[..., 0] - without[..., 2] > 80).any(), "no orange box"
