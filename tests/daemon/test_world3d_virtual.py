@@ -7,7 +7,13 @@ import numpy as np
 import pytest
 
 from monstertruck_runtime.clock import VirtualClock, run_virtual
+from monstertruck_runtime.errors import RequestRefusedError
+from monstertruck_runtime.mailbox import fifo
+from monstertruck_schemas import topics
+from monstertruck_schemas.event import Event
+from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order
+from monstertruck_schemas.state import GateMode
 from monstertruck_sim.world.obstacles import Disc
 from monstertruckd.config.load import load_config
 from monstertruckd.tools.drill.truck import DrillTruck
@@ -84,3 +90,36 @@ def test_the_stabilised_truck_runs_as_well():
         assert truck.rig.world.truth(truck.clock.now()).x > 0.3
 
     driving(test, file="full3d.yaml")
+
+
+def ditch(**more: float) -> dict:
+    return {"sim": {"world": {"ground": [{"kind": "ditch", "yaw": 1.5708, "length": 3.0, **more}]}}}
+
+
+def test_a_truck_that_falls_into_a_ditch_is_stopped_by_its_tilt_and_disarmed():
+    async def test(truck: DrillTruck) -> None:
+        assert await truck.until(lambda: truck.gate is not None and truck.gate.mode is GateMode.DISARMED, 8.0)
+        events = [report.reason for report in truck.reports() if isinstance(report, Event)]
+        assert Reason.TILT_STOP in events
+        assert truck.rig.world.plant.height < -0.05
+        driven = truck.rig.bus.subscribe(topics.CMD_DRIVE, fifo(64))
+        await truck.clock.sleep(0.5)
+        assert all(command.speed == 0.0 for command in driven.drain()), "whatever its wheels stand on"
+        with pytest.raises(RequestRefusedError, match="tilt"):
+            await truck.operator.arm()
+
+    driving(test, ditch(x=0.9, y=-1.7, width=0.8, depth=0.4))
+
+
+@pytest.mark.long
+def test_a_truck_that_pushes_against_a_kerb_below_its_lidar_says_that_it_does_not_get_on():
+    """Its wheels go on turning: what the scans see tells that it stands."""
+
+    async def test(truck: DrillTruck) -> None:
+        assert await truck.until(lambda: truck.gate is not None and truck.gate.mode is GateMode.DISARMED, 60.0)
+        events = [report.reason for report in truck.reports() if isinstance(report, Event)]
+        assert Reason.STUCK in events
+        assert truck.rig.world.truth(truck.clock.now()).x < 0.2
+
+    kerb = {"kind": "step", "x": 0.5, "y": -1.7, "length": 0.3, "width": 2.0, "height": 0.06}
+    driving(test, {"sim": {"world": {"ground": [kerb]}}}, "fusion.yaml")

@@ -122,6 +122,11 @@ class WorldRenderer:
         mujoco.mjv_updateScene(
             self._model, data, self._option, None, camera, mujoco.mjtCatBit.mjCAT_ALL.value, self._scene
         )
+        # Hills take shadows and cast none: drawn twice instead of three times, for the slopes are gentle.
+        for geom in self._scene.geoms[: self._scene.ngeom]:
+            if geom.type == mujoco.mjtGeom.mjGEOM_HFIELD:
+                geom.category = mujoco.mjtCatBit.mjCAT_DECOR
+                break
         for somebody in people:
             self._add_person(*somebody)
         for robot in robots:

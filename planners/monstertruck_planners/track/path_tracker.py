@@ -183,7 +183,7 @@ class Command:
     heading_error: float
     """Yaw less the path's, rad."""
     outcome: Reason
-    """DRIVING, GOAL_REACHED, GOAL_MISSED, CUSP_MISSED, PATH_LOST or NOT_FINITE."""
+    """DRIVING, GOAL_REACHED, GOAL_MISSED, CUSP_MISSED, PATH_LOST, NOT_FINITE, or of the service STUCK."""
 
 
 LEAST: Final = 1e-6

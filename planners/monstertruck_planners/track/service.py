@@ -49,6 +49,12 @@ TURNED: Final = 0.02
 """Or turned by more than this, rad."""
 
 
+ASKED: Final = 1.0
+"""Way that the gate lets the truck drive, m, ..."""
+GOT_ON: Final = 0.2
+"""... in which neither its place nor its place on the path moves by more, m, if it pushes against something unseen."""
+
+
 @dataclass(frozen=True, slots=True)
 class TrackSetup:
     """What the step is made for."""
@@ -101,11 +107,36 @@ class TrackOutput:
     events: tuple[StepEvent, ...] = ()
 
 
+@dataclass(slots=True)
+class _Advance:
+    """Whether the truck gets on; by a pose that rests on its wheels alone it always does."""
+
+    place: tuple[float, float] = (math.inf, math.inf)
+    """From where it is counted, m."""
+    along: float = -math.inf
+    """The same on the path, where short moves to and fro add up, m."""
+    asked: float = 0.0
+    """Way that the gate has let it drive since, m."""
+    looked: int = 0
+    """When it was counted last, ns."""
+
+    def stuck(self, now: int, place: tuple[float, float], along: float, gate: GateState | None) -> bool:
+        """Whether it has not got on, then for good; ``gate`` is None while it does not drive as it is asked to."""
+        if self.asked >= ASKED:
+            return True
+        if along - self.along > GOT_ON or math.dist(place, self.place) > GOT_ON:
+            self.place, self.along, self.asked = place, along, 0.0
+        elif gate is not None and gate.twist is not None:
+            self.asked += math.hypot(gate.twist.vx, gate.twist.vy) * (now - self.looked) / SECOND
+        self.looked = now
+        return self.asked >= ASKED
+
+
 class TrackingStep:
     """Follows the newest path by the configured tracker.
 
     Starts the path over whenever the truck is armed anew after the path's end; after a stop on the way it goes on.
-    Once the path has ended or is lost it asks for standstill, then falls silent.
+    Once the path has ended or is lost, or the truck does not get on, it asks for standstill, then falls silent.
 
     Args:
         setup: the tracker and the truck.
@@ -132,6 +163,7 @@ class TrackingStep:
         self._begun: tuple[float, float, float] | None = None
         """Pose the path was begun from; None for one that may have to be begun anew."""
         self._outcome = Reason.DRIVING
+        self._advance = _Advance()
         self._reported = Reason.DRIVING
         """Outcome of the newest event since the path came or the truck was armed."""
         self._active = False
@@ -179,6 +211,10 @@ class TrackingStep:
             text = f"path {path.name!r} cannot be driven from {state.pose}: {error}"
             self._report(Reason.BAD_INPUT, Severity.WARNING, text)
             return TrackOutput(events=self._drain())
+        along = path.along(command.progress)
+        stuck = self._advance.stuck(now, at[:2], along, gate if obeyed else None)
+        if stuck and command.outcome is Reason.DRIVING:
+            command.speed, command.outcome = 0.0, Reason.STUCK
         if active := gate.mode.active:
             self._progress = command.progress
         self._outcome = command.outcome
@@ -188,7 +224,6 @@ class TrackingStep:
             self._report(command.outcome, severity, path=path.name, cross_track=command.cross_track)
         axles = self._axles()
         drive = active and (command.outcome is Reason.DRIVING or abs(pose.twist.vx) > AT_REST)
-        along = path.along(command.progress)
         return TrackOutput(command, drive, path.frame, path.name, along, path.length, axles, self._drain())
 
     def _axles(self) -> AxleResponse:
@@ -228,6 +263,7 @@ class TrackingStep:
         else:
             self._reported = Reason.DRIVING
         self._followed, self._path, self._outcome, self._begun = path, None, Reason.DRIVING, here
+        self._advance = _Advance()
         try:
             if path.frame != pose.frame:
                 msg = f"path {path.name!r} is in frame {path.frame!r}: expected {pose.frame!r}"

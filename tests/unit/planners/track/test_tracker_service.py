@@ -10,7 +10,15 @@ from monstertruck_planners.collision import Footprint
 from monstertruck_planners.track.config import PurePursuitConfig
 from monstertruck_planners.track.pure_pursuit import PurePursuit
 from monstertruck_planners.track.segments import SegmentedPath
-from monstertruck_planners.track.service import Newest, TrackerService, TrackingStep, TrackingWorker, TrackSetup
+from monstertruck_planners.track.service import (
+    ASKED,
+    Newest,
+    TrackerService,
+    TrackingStep,
+    TrackingWorker,
+    TrackOutput,
+    TrackSetup,
+)
 from monstertruck_runtime.clock import SECOND, run_virtual
 from monstertruck_schemas.base import Pose2D, Twist2D
 from monstertruck_schemas.reasons import Reason
@@ -426,3 +434,46 @@ def test_a_narrow_place_ahead_slows_it_down_while_the_scan_is_fresh():
         assert bench.asked[-1].speed == pytest.approx(0.18)
 
     on_bench(scenario, path(straight(4.0)), with_scan=True)
+
+
+def driven(way: float, asked: float, seconds: float, *, again: bool = False) -> tuple[list[TrackOutput], TrackingStep]:
+    """Outputs of a truck that comes ``way`` m/s along a straight where the gate lets it drive ``asked`` m/s."""
+    setup = TrackSetup(PurePursuitConfig(), FourWheelSteering(), Footprint(), (0.14, 0.0, 0.0))
+    step, route, outputs = TrackingStep(setup), path(straight(9.0)), []
+
+    def stand(now: int, mode: GateMode, x: float) -> None:
+        head = {"stamp": now, "received": now, "seq": 0}
+        covariance = {"pose_covariance": np.zeros(9), "twist_covariance": np.zeros(9), "age": 0.0}
+        twist = Twist2D(vx=0.0, vy=0.0, wz=0.0)
+        pose = Odometry(**head, frame="odom", pose=Pose2D(x=x, y=0.0, yaw=0.0), twist=twist, **covariance)
+        gate = GateState(
+            **head, mode=mode, nonce="n1", speed_limit=0.2, holder="tracker", twist=Twist2D(vx=asked, vy=0.0, wz=0.0)
+        )
+        outputs.append(step.step(now, Newest(pose, route, gate)))
+
+    stand(0, GateMode.DISARMED, 0.0)
+    for tick in range(1, round(50 * seconds)):
+        stand(tick * SECOND // 50, GateMode.DRIVING, way * tick / 50)
+    if again:
+        stand(10**11, GateMode.DISARMED, way * seconds)
+        stand(10**11 + SECOND // 50, GateMode.DRIVING, way * seconds)
+    return outputs, step
+
+
+def test_a_truck_that_pushes_against_something_unseen_stops_and_says_so_once_and_begins_anew_when_armed():
+    outputs, _ = driven(0.0, 0.2, 8.0, again=True)
+    outcomes = [output.command.outcome for output in outputs]
+    first = outcomes.index(Reason.STUCK)
+    assert first / 50 == pytest.approx(ASKED / 0.2, abs=0.1)
+    assert set(outcomes[first:-1]) == {Reason.STUCK}
+    assert all(output.command.speed == 0.0 and not output.drive for output in outputs[first:-1])
+    events = [event.reason for output in outputs for event in output.events]
+    assert events.count(Reason.STUCK) == 1
+    assert outcomes[-1] is Reason.DRIVING
+    assert outputs[-1].drive
+
+
+@pytest.mark.parametrize(("way", "asked"), [(0.05, 0.2), (0.0, 0.0), (0.18, 0.18)])
+def test_a_truck_that_slips_waits_or_drives_is_not_stuck(way: float, asked: float):
+    outputs, _ = driven(way, asked, 20.0)
+    assert {output.command.outcome for output in outputs} == {Reason.DRIVING}

@@ -12,6 +12,7 @@ from monstertruck_schemas.base import Pose2D
 from monstertruck_sim.world.config import WorldConfig
 from monstertruck_sim.world.world import World, make_scene
 from monstertruck_sim.world3d.film import RATE, SIZE, Film
+from monstertruck_sim.world3d.model import Group
 from monstertruck_sim.world3d.picture import WorldRenderer, looking_at
 
 
@@ -122,3 +123,23 @@ def test_another_robot_is_drawn_as_it_is_and_steers():
     assert seen.sum() > 1000
     assert np.abs(with_it - as_itself).max(axis=2).mean() < 2.0, "the same robot in both models"
     assert not (without[..., 0] - without[..., 2] > 80).any(), "no orange box"
+
+
+def test_hills_take_the_robots_shadow():
+    hills = {"kind": "hills", "height": 0.03, "wavelength": 2.0}
+    config = WorldConfig.model_validate({"engine": "mujoco", "map": "yard", "noise": False, "ground": [hills]})
+    world = World(config, 1)
+    world.truth(0)
+    try:
+        renderer = WorldRenderer(world.plant.model, 160, 120)
+    except NotInstalledError as error:
+        pytest.skip(str(error))
+    above = looking_at((-0.01, 0.0, 1.6), (0.0, 0.0, 0.0))
+    there = renderer.draw(world.plant.data, above).astype(int)
+    renderer.arrange(world.plant.data, above, hidden=(Group.ROBOT,))
+    empty = renderer.render().astype(int)
+    renderer.close()
+    darker = empty.min(axis=2) - there.min(axis=2)
+    ground = np.ptp(there, axis=2) < 25
+    assert (ground & (darker > 20)).sum() > 40
+    assert (ground & (abs(darker) < 6)).sum() > 5000
