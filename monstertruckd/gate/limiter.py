@@ -103,7 +103,7 @@ VIEW_STEP: Final = 0.3
 what the truck is long and half of what is around it, and ground that none of these few saw only slows the truck."""
 VIEWS: Final = 7
 DRIFT: Final = 0.03
-"""The footprint is so much smaller against remembered points, m: the wheels do not tell better where they are."""
+"""Ground so near to where the body was is known, m: the wheels do not tell better where that is."""
 FIELD_EDGE: Final = 0.1
 """Points so near to the edge of the lidar's field are remembered, rad: turns of the wheels' dead reckoning are off."""
 POSES_KEPT: Final = 64
@@ -470,7 +470,8 @@ class ObstacleGuard:
         leaving = LEAVING * sweep.distances
         contacts = [first_contact(self._footprint, sweep.poses, self._points, clearance, leaving)]
         if remembered is not None:
-            contacts.append(first_contact(self._footprint, sweep.poses, remembered, -DRIFT))
+            # Without a clearance, which the error of their places would fill; but nobody may be grazed who was seen.
+            contacts.append(first_contact(self._footprint, sweep.poses, remembered, -self._footprint.padding))
         return min(
             (float(sweep.distances[contact - 1]) for contact in contacts if contact is not None), default=math.inf
         )

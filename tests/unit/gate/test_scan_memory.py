@@ -288,8 +288,24 @@ def test_sideways_the_nearer_of_what_is_seen_and_what_is_remembered_counts(besid
         now += TICK
         guard.move(now, (0.2, 0.0, 0.0), 0.02)
     guard.observe(scan(now, (0.1, beside)))
-    nearest = min(beside - GateConfig().obstacle.side_clearance, behind + DRIFT)
+    nearest = min(beside - GateConfig().obstacle.side_clearance, behind + FOOTPRINT.padding)
     assert guard.free_distance(((0.0, 1.0, 0.0),)) == pytest.approx(nearest - FOOTPRINT.half_width, abs=0.02)
+
+
+@pytest.mark.parametrize(("aside", "stopped"), [(0.275, True), (0.295, False)])
+def test_a_turn_grazes_nothing_that_the_lidar_has_left_behind(aside, stopped):
+    guard = ObstacleGuard(GateConfig(), FOOTPRINT, ScanPoints(MOUNT))
+    now = SECOND
+    for x in np.arange(0.35, -0.05, -0.004):
+        now += TICK
+        guard.move(now, (0.2, 0.0, 0.0), 0.02)
+        guard.observe(scan(now, *([(x, -aside)] if x > 0.0 else [])))
+    for _ in range(20):
+        now += TICK
+        guard.move(now, (0.0, 0.0, 0.0), 0.02)
+        guard.observe(scan(now))
+    free = guard.free_distance(((0.0, 0.0, 7.0),))
+    assert (free < 0.2) is stopped
 
 
 def surround(rig, *obstacles):
