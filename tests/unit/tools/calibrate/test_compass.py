@@ -137,6 +137,26 @@ def test_iron_in_the_ground_is_told_from_the_trucks_own():
         result_of(replace(clean, x=clean.x + beside))
 
 
+def test_iron_in_the_ground_that_is_not_told_widens_the_intervals():
+    inside = []
+    for seed in range(60):
+        rng, clean = np.random.default_rng(seed), circle(seed=seed, count=200)
+        there = np.arange(200)
+        there = np.where(there < 100, there, 199 - there)
+        bump = rng.uniform(0.3, 4.0) * np.exp(-(((there - rng.uniform(0, 100)) / rng.uniform(2.5, 15.0)) ** 2) / 2)
+        way = rng.uniform(0, math.tau)
+        try:
+            result = result_of(replace(clean, x=clean.x + bump * math.cos(way), y=clean.y + bump * math.sin(way)))
+        except InputError:
+            continue
+        for name, value in truth().items():
+            estimate = result.estimate(name)
+            assert estimate is not None
+            inside.append(estimate.low < value < estimate.high)
+    assert len(inside) > 200
+    assert np.mean(inside) > 0.9
+
+
 def test_a_magnet_that_makes_no_circle_of_it_is_refused_and_gets_no_interval_without_an_end():
     clean = circle()
     with pytest.raises(InputError, match="a magnet is near the compass"):
