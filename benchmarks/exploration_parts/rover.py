@@ -102,7 +102,9 @@ class Rover:
         self.trail: list[Pose] = []
         self.stuck, self.stuck_at = 0, self.pose
         self.blameless = self.attempts, self.unreached
-        self.points = np.empty((0, 2))
+        self.hits = np.empty((0, 2))
+        """Of the newest scan, in the map; taken at this pose:"""
+        self.seen_from: Pose | None = None
         self.scanned: Pose | None = None
         self.sent: list[Grid | None] = [None, None]
 
@@ -117,10 +119,15 @@ class Rover:
         if before is not None and math.dist(before[:2], pose[:2]) < SPACING and abs(pose[2] - before[2]) < TURN:
             return
         self.scanned = pose
-        sensor, hits, passed = self.arena.scan(pose, self.config.reach, self.rng)
-        self.points = points_relative(hits, pose)
+        sensor, hits, passed = self.scan()
         under = placed(np.column_stack((self.body, np.zeros(len(self.body)))), pose)[:, :2]
         self.grid.add(sensor, hits, np.vstack((passed, under)))
+
+    def scan(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The lidar's place, where its beams ended, and those of the beams that met nothing."""
+        sensor, self.hits, passed = self.arena.scan(self.pose, self.config.reach, self.rng)
+        self.seen_from = self.pose
+        return sensor, self.hits, passed
 
     def take_stock(self) -> None:
         """Send the changes to the explorer, and see how much is known."""
@@ -164,21 +171,17 @@ class Rover:
 
     def route(self, goal: Pose, *, clear: bool = True) -> np.ndarray | None:
         """Poses of a route."""
+        if self.seen_from != self.pose:
+            self.scan()
         for k in range(2):
             setup = self.setups[k] if self.fresh[k] else None
             grid = self.map if self.map is not self.sent[k] else None
             self.fresh[k], self.sent[k] = False, self.map
-            answer = self.planning[k].step(
-                PlanTask("route", self.pose, goal, self.points_in_map(), setup, grid, clear=clear)
-            )
+            answer = self.planning[k].step(PlanTask("route", self.pose, goal, self.hits, setup, grid, clear=clear))
             if answer.poses is not None:
                 return answer.poses
         self.why = f"{answer.reason}: {answer.text}"
         return None
-
-    def points_in_map(self) -> np.ndarray:
-        """Returns of the newest scan in map."""
-        return placed(np.column_stack((self.points, np.zeros(len(self.points)))), self.pose)[:, :2]
 
     def drive(self, poses: np.ndarray, most: float) -> bool:
         """Follow a route for so many metres; False if something stands on it."""
@@ -204,10 +207,9 @@ class Rover:
     def blocked(self, ahead: np.ndarray) -> bool:
         """Whether ``SCANS`` scans in a row show something on the way, as the goal service asks for."""
         for _ in range(SCANS):
-            if not path_blocked(BARE, ahead, self.points, self.pose):
+            if not path_blocked(BARE, ahead, points_relative(self.hits, self.pose), self.pose):
                 return False
-            _, hits, _ = self.arena.scan(self.pose, self.config.reach, self.rng)
-            self.points = points_relative(hits, self.pose)
+            self.scan()
         return True
 
     def explore(self) -> Run:
