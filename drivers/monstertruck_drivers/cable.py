@@ -235,7 +235,7 @@ def reserved(*links: Path) -> Iterator[None]:
         links: symlinks that are to be made; their folders must exist.
 
     Raises:
-        BusyError: another program serves one of them.
+        BusyError: another program serves one of them; its process is named.
         InputError: something else than a link has the name.
         OSError: a link cannot be made there.
     """
@@ -245,15 +245,20 @@ def reserved(*links: Path) -> Iterator[None]:
                 raise InputError(f"{link}: is there already, and no link: a pty does not take its place")
             lock = link.with_name(f".{link.name}.lock")
             try:
-                file = stack.enter_context(lock.open("w"))
+                file = stack.enter_context(lock.open("a+"))  # keeps what a holder wrote
             except OSError as error:
                 error.filename = str(link)
                 raise
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
-                raise BusyError(f"{link}: another program serves this port") from None
+                file.seek(0)
+                process = f" (process {number})" if (number := file.read().strip()) else ""
+                raise BusyError(f"{link}: another program{process} serves this port") from None
             stack.callback(lock.unlink, missing_ok=True)
+            file.truncate(0)
+            file.write(str(os.getpid()))
+            file.flush()
         yield
 
 

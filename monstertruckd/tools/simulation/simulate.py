@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AsyncExitStack, ExitStack, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
-from monstertruck_runtime.errors import InputError, NotFoundError
+from monstertruck_runtime.errors import BusyError, InputError, NotFoundError
 from monstertruck_runtime.memory import settle
 from monstertruck_sim.computer import EmulatedComputer
 from monstertruck_sim.config import CeilingCamera
@@ -38,6 +38,11 @@ from monstertruckd.tools.simulation.program import program
 from monstertruckd.tools.simulation.tape import EmulatedTape
 
 TRUTH_PERIOD = SECOND // 20
+ANOTHER: Final = (
+    "probably another `simulate` on this computer; Ctrl-C in its terminal ends it. "
+    "A second robot beside it needs a configuration with a `robot` and `zenoh: listen` of its own"
+)
+"""Of ports that are taken."""
 STAND_RETRY = 1.0
 """Seconds between two looks for a daemon."""
 
@@ -96,7 +101,10 @@ async def serve(
     links = [port.path for port in ports if isinstance(port, PortConfig)]
     links += [camera.port for config in configs for camera in config.sim.stand.cameras.values()]
     with ExitStack() as stack:
-        stack.enter_context(claimed(*links))
+        try:
+            stack.enter_context(claimed(*links))
+        except BusyError as error:
+            raise BusyError(f"{error}: {ANOTHER}") from None
         scene = shared_scene(configs)
         scene.on_contact = lambda contact: _say(str(contact))
         robots = []

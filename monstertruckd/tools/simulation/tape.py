@@ -9,7 +9,10 @@ from monstertruck_runtime.errors import InputError
 from monstertruck_sim.world.plant import TruthState
 from monstertruck_sim.world.world import World
 
-WORDS: Final = "tape mark (a mark on the floor below the front bumper, and a string along the robot), tape (measure)"
+WORDS: Final = (
+    "tape mark (a mark on the floor below the front bumper, and a string along the robot), "
+    "tape (measure from there, and the volts of the pack)"
+)
 
 
 class EmulatedTape:
@@ -27,16 +30,18 @@ class EmulatedTape:
         self._mark: TruthState | None = None
 
     def command(self, words: list[str]) -> None:
-        """``mark``, or nothing: measure from there.
+        """``mark``, or nothing: measure from there; before there is a mark, what needs none.
 
         Raises:
-            InputError: another word, or there is no mark.
+            InputError: another word.
         """
         now = self._world.truth(self._clock.now())
         if words == ["mark"]:
             self._mark = now
-        elif words or self._mark is None:
-            raise InputError(f"expected {WORDS}" if words else f"there is no mark yet: {WORDS}")
+        elif words:
+            raise InputError(f"expected {WORDS}")
+        elif self._mark is None:
+            self._say(f"{_meter(now)}; `tape mark` first, and it measures a way from there, too")
         else:
             self._say(measured(self._mark, now, *self._body))
 
@@ -55,8 +60,12 @@ def measured(mark: TruthState, now: TruthState, length: float, width: float) -> 
     return (
         f"front bumper {math.hypot(ahead, left):.3f} m from its mark: {100 * ahead:.1f} cm ahead, {100 * left:.1f} cm "
         f"left; middle of the left side {100 * side:.1f} cm left of the string; turned {turn:.1f} deg to the left; "
-        f"pack {now.supply_v:.2f} V"
+        f"{_meter(now)}"
     )
+
+
+def _meter(now: TruthState) -> str:
+    return f"pack {now.supply_v:.2f} V"
 
 
 def _moved(mark: TruthState, now: TruthState, x: float, y: float) -> tuple[float, float]:

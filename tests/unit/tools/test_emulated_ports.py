@@ -1,6 +1,7 @@
 """Emulated devices hang in a folder of their user's own, where the configuration names no port."""
 
 import fcntl
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -61,7 +62,10 @@ async def test_a_second_simulator_is_refused_and_leaves_the_first_alone(own: Pat
     config = load_simulated(CONFIGS / "demo.yaml")
     with claimed(*paths(config).values()), pytest.raises(BusyError) as refused:
         await serve(WallClock(), [config])
-    assert str(refused.value) == f"{own}/ports/truck/lidar: another program serves this port"
+    assert str(refused.value).startswith(
+        f"{own}/ports/truck/lidar: another program (process {os.getpid()}) serves this port: probably another `simulate`"
+    )
+    assert "Ctrl-C in its terminal ends it" in str(refused.value)
     assert refused.value.reason.exit_code == 7
     with claimed(*paths(config).values()):
         assert own.stat().st_mode & 0o007 == 0, "nobody else's"
