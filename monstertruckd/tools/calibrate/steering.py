@@ -65,6 +65,9 @@ _STRING: Final = Confirm(
 _OFFSET: Final = Number(
     "offset", "How far has the middle of the left side moved off the string's line, cm, left positive?", -60.0, 60.0
 )
+SIDES: Final = ((1, "left"), (-1, "right"))
+CIRCLED: Final = (("the front", (1, 0)), ("the rear", (0, 1)), ("all", (1, -1)))
+"""Wheels that full circles are driven with, and which way each axle is steered then."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,6 +83,16 @@ class SteeringWizard:
     weaves: int = 3
     """Times the truck weaves ahead and back, for dead time and lag"""
 
+    @property
+    def moves(self) -> int:
+        """How often the truck moves: arcs; then arcs and travel, straights, circles and weaves."""
+        arcs = 2 * len(SIDES) * len(AXLES)
+        return arcs if self.rough else 3 * arcs + 2 * self._lines + len(CIRCLED) * len(SIDES) + 2 * self.weaves
+
+    @property
+    def _lines(self) -> int:
+        return max(self.strings, 2)
+
     async def __call__(self, context: WizardContext) -> Result:
         """Measure."""
         chassis = context.chassis
@@ -87,6 +100,7 @@ class SteeringWizard:
             raise RequestRefusedError(Reason.NOT_SUPPORTED, "only the truck's two steered axles are calibrated so far")
         maps, model = Maps.of(context.config), SteeringModel(chassis)
         await context.confirm(CLEAR)
+        context.expect(self.moves)
         arcs = await self._arcs(context, maps, ROUGH)
         directions = context.fit("directions", lambda: steered_senses(arcs))
         start = Maps(maps.centres, (maps.scales[0] * directions[0], maps.scales[1] * directions[1]), maps.deficit)
@@ -132,7 +146,7 @@ class SteeringWizard:
         speed, angle, metres = arc
         found: tuple[list[SteeringRun], list[SteeringRun]] = ([], [])
         for axle, name in enumerate(AXLES):
-            for sign, side in ((1, "left"), (-1, "right")):
+            for sign, side in SIDES:
                 for direction in (1, -1):
                     what = f"{name} wheels {side}, {'forward' if direction > 0 else 'back'}"
                     front, rear = _steered(axle, sign * angle)
@@ -147,7 +161,7 @@ class SteeringWizard:
         limit = context.config.gate.angle
         reached = []
         for axle, name in enumerate(AXLES):
-            for sign, side in ((1, "left"), (-1, "right")):
+            for sign, side in SIDES:
                 front, rear = _steered(axle, sign * limit)
                 legs = []
                 for direction in (1, -1):
@@ -160,7 +174,7 @@ class SteeringWizard:
         """Straight ahead and back, the wheels set from one side and from the other."""
         speed, metres = STRAIGHT
         legs = []
-        for run in range(max(self.strings, 2)):
+        for run in range(self._lines):
             side = APPROACH if run % 2 == 0 else -APPROACH
             if self.strings:
                 await context.confirm(_STRING)
@@ -183,8 +197,8 @@ class SteeringWizard:
         """
         ends = {(reach.axle, reach.sign): reach.sign * (abs(reach.servo) - SHORT) for reach in travel}
         legs = []
-        for wheels, steered in (("the front", (1, 0)), ("the rear", (0, 1)), ("all", (1, -1))):
-            for sign, side in ((1, "left"), (-1, "right")):
+        for wheels, steered in CIRCLED:
+            for sign, side in SIDES:
                 servos = [ends.get((axle, sign * way), 0.0) for axle, way in enumerate(steered)]
                 front, rear = model.commands(servos, first, maps)
                 move = MoveStep(

@@ -76,6 +76,7 @@ class WizardContext:
         self._clock = clock
         self._mover = Mover(truck, clock, self.chassis)
         self._values: dict[str, Any] = config.model_dump()
+        self._moves, self._moved = 0, 0
 
     def say(self, text: str) -> None:
         """Show a sentence to the operator."""
@@ -115,9 +116,15 @@ class WizardContext:
             raise RequestRefusedError(Reason.CANCELLED, f"cancelled at: {step.question}")
         return yes
 
+    def expect(self, moves: int) -> None:
+        """Say with each of the next ``moves`` moves which of them it is."""
+        self._moves, self._moved = moves, 0
+
     async def move(self, step: MoveStep) -> MoveRecord:
         """Drive; raises as ``Mover.move`` does."""
-        self._panel.say(f"moving: {step.name}")
+        self._moved += 1
+        which = f" ({self._moved} of {self._moves})" if self._moved <= self._moves else ""
+        self._panel.say(f"moving{which}: {step.name}")
 
         def report(way: float) -> None:
             self._panel.progress(step.name, way, step.metres)

@@ -12,6 +12,7 @@ from monstertruck_kinematics.polynomials import F_CORRECTED, G_PRINTED, AxlePoly
 from monstertruck_kinematics.truck import DriveTrain
 from monstertruck_runtime.errors import InputError
 from monstertruckd.config.calibration import KEYS
+from monstertruckd.tools.calibrate import steering
 from monstertruckd.tools.calibrate.steering import AxleTravel, SteeringWizard, _deficits, _rough, steered_senses
 from monstertruckd.tools.calibrate.steering_model import Maps, SteeringModel, SteeringRun, half_widths
 from monstertruckd.tools.calibrate.steps import Confirm, MoveRecord, MoveStep
@@ -121,7 +122,7 @@ def test_where_both_axles_seem_to_steer_the_other_way_the_operator_sees_whether_
     monkeypatch.setattr(SteeringWizard, "_arcs", staticmethod(arcs))
     monkeypatch.setattr(Maps, "of", lambda _: BELIEVED)
     context = SimpleNamespace(
-        chassis=CHASSIS, config=None, confirm=confirm, move=move, fit=lambda _, compute: compute()
+        chassis=CHASSIS, config=None, confirm=confirm, expect=print, move=move, fit=lambda _, compute: compute()
     )
     wizard = SteeringWizard(rough=True)
     if turned_left:
@@ -131,6 +132,41 @@ def test_where_both_axles_seem_to_steer_the_other_way_the_operator_sees_whether_
         result = asyncio.run(wizard(context))  # type: ignore[arg-type]
         assert [result.estimate(f"{name}_direction").value for name in ("front", "rear")] == [1, 1]  # type: ignore[union-attr]
     assert asked[-1] == "turned"
+
+
+@pytest.mark.parametrize(
+    "wizard",
+    [SteeringWizard(), SteeringWizard(rough=True), SteeringWizard(strings=0, weaves=1)],
+    ids=lambda it: it.moves,
+)
+def test_the_moves_that_are_announced_are_those_that_are_made(wizard: SteeringWizard, monkeypatch: pytest.MonkeyPatch):
+    announced, made = [], []
+
+    async def answer(step: object) -> float:
+        return 0.0
+
+    async def move(step: MoveStep) -> MoveRecord:
+        made.append(step.name)
+        return MoveRecord()
+
+    def fit(what: str, _: object) -> object:
+        return (1, 1) if what == "directions" else SimpleNamespace(model_copy=lambda update: None, estimates=())
+
+    def reach(axle: int, sign: int, *_: object) -> SimpleNamespace:
+        return SimpleNamespace(axle=axle, sign=sign, servo=0.4)
+
+    monkeypatch.setattr(Maps, "of", lambda _: BELIEVED)
+    monkeypatch.setattr(Maps, "from_parameters", lambda _: BELIEVED)
+    monkeypatch.setattr(SteeringRun, "of", lambda *_: None)
+    monkeypatch.setattr(SteeringModel, "fit", lambda *_: SimpleNamespace(parameters=None))
+    monkeypatch.setattr(steering.AxleTravel, "of", reach)
+    monkeypatch.setattr(steering, "estimates", lambda _: ())
+    context = SimpleNamespace(
+        chassis=CHASSIS, config=SimpleNamespace(gate=SimpleNamespace(angle=0.4)), confirm=answer, ask=answer,
+        expect=announced.append, move=move, fit=fit,
+    )  # fmt: skip
+    asyncio.run(wizard(context))  # type: ignore[arg-type]
+    assert announced == [len(made)]
 
 
 def test_wheels_that_do_not_steer_are_named():

@@ -16,7 +16,7 @@ from monstertruckd.config.calibration import Estimate, Result, ValidUntil
 from monstertruckd.config.expiry import part_of
 from monstertruckd.config.load import load_config
 from monstertruckd.config.truck import TruckConfig
-from monstertruckd.tools.calibrate.steps import Collect, Confirm, Number
+from monstertruckd.tools.calibrate.steps import Collect, Confirm, MoveRecord, MoveStep, Number
 from monstertruckd.tools.calibrate.wizard import Wizard, WizardContext, calibrate
 
 CONFIG = load_config(Path(__file__).resolve().parents[4] / "configs" / "demo.yaml", TruckConfig)[0]
@@ -176,3 +176,18 @@ def test_values_of_the_running_configuration():
 
     with pytest.raises(InputError, match=r"devices\.camera\.driver\.rate: not in this truck's configuration"):
         run(steps)
+
+
+def test_moves_say_how_many_there_are():
+    async def steps(context: WizardContext):
+        async def moved(*_):
+            return MoveRecord()
+
+        context._mover.move = moved
+        context.expect(2)
+        for name in ("left", "right", "once more"):
+            await context.move(MoveStep(name, 0.1))
+        return RESULT
+
+    run(steps, panel := Panel())
+    assert panel.said[-3:] == ["moving (1 of 2): left", "moving (2 of 2): right", "moving: once more"]
