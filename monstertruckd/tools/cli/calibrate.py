@@ -1,8 +1,6 @@
 """``monstertruckd calibrate``: the wizards, what they found so far, and the way back."""
 
-import shutil
 import sys
-import textwrap
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
@@ -20,6 +18,7 @@ from monstertruckd.tools.cli.output import (
     print_json,
     print_table,
     remark,
+    wrapped,
 )
 
 if TYPE_CHECKING:
@@ -437,15 +436,14 @@ def _file(state: dict[str, Any]) -> "CalibrationFile | None":
 
 
 def _print(result: "Result") -> None:
-    """A table in a pipe; on a terminal two lines for each value, however long what it means is."""
+    """A table in a pipe; on a terminal a line for each value, and what it means below."""
     if on_terminal(sys.stdout):
-        width = shutil.get_terminal_size().columns
         for e in result.estimates:
             grade = f", {e.grade}" if e.grade else ""
             until = "" if e.valid_until is None else f", valid until {e.valid_until.date[:10]}"
             print(f"{result.wizard}.{e.name}: {_number(e)} {e.unit}{grade}".rstrip())
             text = f"{e.meaning}; {e.samples} samples, {e.date.replace('T', ' ')[:16]}{until}"
-            print("  " + textwrap.shorten(text, width - 2, placeholder=" ..."))
+            print(wrapped(text, indent="  "))
     else:
         _print_table(result)
     for missing in result.unobserved:

@@ -83,7 +83,6 @@ def list_command(
             for log in logs
         ],
         right=("seconds", "messages", "MB"),
-        fold=False,
     )
     if any(log.state in {LogState.UNFINISHED, LogState.DAMAGED} for log in logs):
         remark("`monstertruckd log recover FILE` repairs unfinished and damaged logs")

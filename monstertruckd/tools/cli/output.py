@@ -41,6 +41,10 @@ WIDE_CELL: Final = 48
 """Longer cells fold on a terminal, and in a pipe reach beyond their column instead of widening it for all."""
 
 
+NARROW: Final = 24
+"""Least width of a column of words on a terminal; what has less room stands below its row."""
+
+
 def on_terminal(stream: TextIO | None) -> bool:
     """Whether a standard stream is a terminal, which is None if it was closed before the start."""
     return stream is not None and stream.isatty()
@@ -107,19 +111,23 @@ def print_table(
     *,
     right: Sequence[str] = (),
     title: str | None = None,
-    fold: bool = True,
 ) -> None:
     """Print rows under headings: on a terminal as a table that folds, in a pipe one unfolded line for each row.
+
+    Where a terminal has no room for the last column, its cells have lines of their own, broken between words: a path
+    is whole.
 
     Args:
         headings: one per column.
         rows: cells.
         right: headings of the columns set to the right, the numbers.
         title: a line above, on terminals only.
-        fold: False = never: the terminal breaks lines at its edge, so that a path that is copied from it is whole.
     """
-    if not (fold and on_terminal(sys.stdout)):
+    if not on_terminal(sys.stdout):
         print("\n".join(_aligned(headings, rows, right)))
+        return
+    if headings[-1] not in right and not _has_room([headings, *rows]):
+        print("\n".join(_with_last_below(headings, rows, right, title)))
         return
     from rich.table import Table
 
@@ -130,6 +138,25 @@ def print_table(
     for row in rows:
         table.add_row(*row)
     console().print(table)
+
+
+def _has_room(lines: Sequence[Sequence[str]]) -> bool:
+    """Whether the last column of a table fits into a terminal, or folds into something that can be read."""
+    *others, last = zip(*lines, strict=True)
+    room = shutil.get_terminal_size().columns - sum(max(map(len, column)) + 2 for column in others)
+    longest_word = max((len(word) for cell in last for word in cell.split()), default=0)
+    return max(map(len, last)) <= room or (room >= NARROW and longest_word <= room)
+
+
+def _with_last_below(
+    headings: Sequence[str], rows: Sequence[Sequence[str]], right: Sequence[str], title: str | None
+) -> Iterator[str]:
+    if title is not None:
+        yield title
+    others = _aligned(headings[:-1], [row[:-1] for row in rows], right)
+    for line, last in zip(others, [headings[-1], *(row[-1] for row in rows)], strict=True):
+        yield line
+        yield wrapped(last, indent="  ")
 
 
 def _aligned(headings: Sequence[str], rows: Sequence[Sequence[str]], right: Sequence[str]) -> list[str]:
@@ -153,11 +180,16 @@ def remark(text: str) -> None:
         print(text, file=sys.stderr, flush=True)
 
 
-def wrapped(text: str) -> str:
+def wrapped(text: str, indent: str = "") -> str:
     """Text broken between words where the terminal ends; what has no blanks, such as a path, stays whole."""
-    width = shutil.get_terminal_size().columns
-    lines = (textwrap.wrap(line, width, break_long_words=False, break_on_hyphens=False) for line in text.split("\n"))
-    return "\n".join("\n".join(line) for line in lines)
+    wrapper = textwrap.TextWrapper(
+        shutil.get_terminal_size().columns,
+        initial_indent=indent,
+        subsequent_indent=indent,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+    return "\n".join("\n".join(wrapper.wrap(line)) for line in text.split("\n"))
 
 
 @contextmanager

@@ -19,6 +19,8 @@ import typer
 from monstertruck_runtime.errors import ConfigError, NotFoundError, RequestRefusedError, TruckError
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.reasons import Reason
+from monstertruckd.config.calibration import Estimate, Result
+from monstertruckd.tools.cli.calibrate import _print
 from monstertruckd.tools.cli.main import app
 from monstertruckd.tools.cli.output import (
     HELP_STYLE,
@@ -234,12 +236,46 @@ def test_a_piped_table_is_a_line_for_each_row_whatever_its_width(capsys: pytest.
     assert not any(line.endswith(" ") for line in lines)
 
 
-def test_a_path_is_whole_on_a_terminal_too(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):
+@pytest.fixture
+def narrow(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A terminal of 40 columns."""
     monkeypatch.setattr("monstertruckd.tools.cli.output.on_terminal", lambda _: True)
+    monkeypatch.setattr("monstertruckd.tools.cli.calibrate.on_terminal", lambda _: True)
     monkeypatch.setenv("COLUMNS", "40")
+
+
+@pytest.mark.usefixtures("narrow")
+def test_a_path_is_whole_on_a_terminal_too(capsys: pytest.CaptureFixture[str]):
     path = "runs/demo/logs/blackbox/blackbox-000001-drive_stale.mcap"
-    print_table(("MB", "log"), [("0.4", path)], fold=False)
-    assert capsys.readouterr().out.splitlines()[1].endswith(path)
+    print_table(("MB", "log"), [("0.4", path)])
+    assert capsys.readouterr().out.splitlines() == ["MB", "  log", "0.4", f"  {path}"]
+    print_table(("MB", "log"), [("0.4", "runs/a.mcap")])
+    assert len(capsys.readouterr().out.splitlines()) == 2, "a short one stands in its row"
+
+
+@pytest.mark.usefixtures("narrow")
+def test_words_that_have_no_room_beside_the_row_stand_below_it(capsys: pytest.CaptureFixture[str]):
+    meaning = "stopping distance at full speed, counted from the bumper"
+    print_table(("setting", "bounds", "meaning"), [("gate.margin_of_all", "> 0, <= 0.5", meaning)], right=("bounds",))
+    assert capsys.readouterr().out.splitlines()[2:] == [
+        "gate.margin_of_all  > 0, <= 0.5",
+        "  stopping distance at full speed,",
+        "  counted from the bumper",
+    ]
+    print_table(("key", "meaning"), [("gate", meaning)])
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 3, "room enough: a table"
+    assert not set(" ".join(lines[1:]).split()) - {"gate", *meaning.split()}, "no word is broken"
+
+
+@pytest.mark.usefixtures("narrow")
+def test_what_a_calibrated_value_means_is_whole_on_a_terminal(capsys: pytest.CaptureFixture[str]):
+    meaning = "scale of the voltage: what the controller tells times this is what the meter shows"
+    estimate = Estimate(name="gain", value=1.25, unit="1", samples=4, date="2026-11-22T12:00:00Z", meaning=meaning)
+    _print(Result(wizard="battery", measured="test", estimates=(estimate,)))
+    lines = capsys.readouterr().out.splitlines()
+    assert " ".join(map(str.strip, lines[1:])) == f"{meaning}; 4 samples, 2026-11-22 12:00"
+    assert max(map(len, lines)) <= 40
 
 
 def test_progress_is_silent_where_nobody_looks(capsys: pytest.CaptureFixture[str]):
