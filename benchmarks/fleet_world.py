@@ -4,8 +4,9 @@
     python benchmarks/fleet_world.py --virtual    the same daemons on one virtual clock, as fast as it computes
 
 Robots do not know each other's plans. Each hears where the others say that they are (``peers``), which counts behind
-it, where its lidar of 240 degrees sees nobody; it stops before what it sees and hears, waits a time drawn by its seed,
-backs off, and tries again.
+it, where its lidar of 240 degrees sees nobody; it stops before what it sees and hears. Of those that are near to each
+other one has the right of way, for a minute each in turn: it waits, and the others drive away from those near them.
+Before people, and where that fails, a robot waits a time drawn by its seed, backs off, and tries again.
 Contacts in which a robot moves count against the goal; people who walk into a standing one are counted apart.
 """
 
@@ -33,8 +34,8 @@ from monstertruck_runtime.errors import NoAnswerError, NotFoundError, RequestRef
 from monstertruck_runtime.mailbox import Mailbox, latest
 from monstertruck_runtime.yaml_files import yaml_text
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.state import GateState, Odometry
-from monstertruck_schemas.topics import GATE, POSE
+from monstertruck_schemas.state import GateState, Odometry, Peers
+from monstertruck_schemas.topics import GATE, PEERS, POSE
 from monstertruck_sim.world.scene import MOVING, Contact
 from monstertruckd.tools.cli.runs import BehaviourClient, RunEnd, run_behaviour
 from monstertruckd.tools.demo.runs import free_endpoint
@@ -60,6 +61,10 @@ HALF = 2.2
 """Places are drawn within this of the yard's middle, m."""
 REACHED = 0.15
 """A place nearer than this is reached, m."""
+NEAR = 1.1
+"""Robots that stand nearer to each other than this settle which of them goes first, m."""
+TURN_OF_EACH = 60.0
+"""Seconds for which one robot has the right of way before all others."""
 TASKS = 8
 GOALS = {"contacts_by_moving_robots": 0, "tasks_of_each": TASKS}
 CONTACT = re.compile(r"contact: (.+) at ([\d.]+) m/s with (.+) at ([\d.]+) m/s")
@@ -112,6 +117,7 @@ class Pilot:
         seed: of places and pauses.
         score: what it does.
         pose: newest pose of the robot.
+        number: of the robot in ``ROBOTS``.
     """
 
     driver: BehaviourClient
@@ -119,13 +125,18 @@ class Pilot:
     seed: int
     score: Score
     pose: Mailbox[Odometry]
+    number: int
     rng: np.random.Generator = field(init=False)
     gate: Mailbox[GateState] = field(init=False)
+    peers: Mailbox[Peers] = field(init=False)
 
     async def patrol(self, until: int) -> None:
         """Until then, ns."""
         self.rng = np.random.default_rng(self.seed)
-        with self.driver.subscribe(GATE, latest()) as self.gate:
+        with (
+            self.driver.subscribe(GATE, latest()) as self.gate,
+            self.driver.subscribe(PEERS, latest()) as self.peers,
+        ):
             while self.clock.now() < until:
                 x, y = (float(v) for v in self.rng.uniform(-HALF, HALF, 2))
                 with contextlib.suppress(TimeoutError):
@@ -133,7 +144,7 @@ class Pilot:
                         await self.go_to(x, y, until)
 
     async def go_to(self, x: float, y: float, until: int) -> None:
-        """Turn to a place and drive there; after a stop back off and try again."""
+        """Turn to a place and drive there; after a stop make way and try again."""
         while self.clock.now() < until:
             if (newest := self.pose.latest) is None:
                 await self.clock.sleep(0.2)
@@ -147,11 +158,38 @@ class Pilot:
             turned = abs(turn) < 0.05 or await self.turn(turn)
             if turned and await self.move(length=way, speed=0.18):
                 continue
+            if await self.make_way():
+                continue
             await self.clock.sleep(float(self.rng.uniform(0.3, 3.0)))
             if self.rng.random() < 0.8:
                 await self.move(length=-float(self.rng.uniform(0.1, 0.2)), speed=0.1)
             if self.rng.random() < 0.5 and await self.turn(float(self.rng.uniform(-1.5, 1.5))):
                 await self.move(length=float(self.rng.uniform(0.2, 0.8)), speed=0.15)
+
+    async def make_way(self) -> bool:
+        """Whether it left others the way, or waited until they left it; False: no robot is near, or it cannot move."""
+        assert self.pose.latest is not None
+        me, heard = self.pose.latest.pose, self.peers.latest
+        others = {} if heard is None else {peer.robot: (me.x - peer.pose.x, me.y - peer.pose.y) for peer in heard.peers}
+        near = {name: off for name, off in others.items() if math.hypot(*off) < NEAR}
+        if not near:
+            return False
+        if self.rank(self.number) < min(self.rank(list(ROBOTS).index(name)) for name in near):
+            await self.clock.sleep(float(self.rng.uniform(1.0, 2.0)))
+            return True
+        pushes = [(x / (x * x + y * y), y / (x * x + y * y)) for x, y in near.values()]
+        away = math.atan2(sum(y for _, y in pushes), sum(x for x, _ in pushes))
+        turn = math.remainder(away - me.yaw, math.tau)
+        back = abs(turn) > math.pi / 2  # its tail is nearer to that direction
+        turn = math.remainder(turn - math.pi, math.tau) if back else turn
+        if abs(turn) > 0.3 and not await self.turn(turn):
+            return False
+        way = float(self.rng.uniform(0.4, 0.8))
+        return await self.move(length=-way if back else way, speed=0.1 if back else 0.18)
+
+    def rank(self, number: int) -> int:
+        """0 for the robot that has the right of way before all others at present."""
+        return (number - int(self.clock.now() / SECOND / TURN_OF_EACH)) % len(ROBOTS)
 
     async def turn(self, angle: float) -> bool:
         """Whether it turned on the spot."""
@@ -201,7 +239,7 @@ def on_virtual_clock(seconds: float, seed: int) -> Run:
             async with asyncio.TaskGroup() as group:
                 for i, rig in enumerate(rigs):
                     name, driver = rig.config.robot, LocalOperator(rig.daemon, clock)
-                    pilot = Pilot(driver, clock, seed + i, scores[name], rig.bus.subscribe(POSE, latest()))
+                    pilot = Pilot(driver, clock, seed + i, scores[name], rig.bus.subscribe(POSE, latest()), i)
                     group.create_task(pilot.patrol(until))
             return scene.contacts, perf_counter() - began, process_time() - used
 
@@ -228,7 +266,7 @@ def in_processes(seconds: float, seed: int) -> Run:
                     async with asyncio.TaskGroup() as group:
                         for i, client in enumerate(clients):
                             pose = client.subscribe(POSE, latest())
-                            pilot = Pilot(client, clock, seed + i, scores[client.robot], pose)
+                            pilot = Pilot(client, clock, seed + i, scores[client.robot], pose, i)
                             group.create_task(pilot.patrol(until))
                 finally:
                     taken = perf_counter() - began
