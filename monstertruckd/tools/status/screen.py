@@ -18,6 +18,7 @@ from rich.text import Text
 
 from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.collision import scan_points
+from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.stop_text import stop_lines
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.event import Event, Severity, Stop
@@ -90,7 +91,8 @@ class ScreenState:
     loop: LoopHealth | None = None
     recorder: RecorderHealth | None = None
     stop: Stop | None = None
-    events: deque[Event] = field(default_factory=lambda: deque(maxlen=8))
+    events: deque[tuple[int, Event]] = field(default_factory=lambda: deque(maxlen=8))
+    """Each with the UNIX time at which it came, ns."""
     trail: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=2000))
 
     @property
@@ -98,10 +100,21 @@ class ScreenState:
         """The newest stop in a few lines, while it still holds the truck; nothing otherwise."""
         if self.stop is None or self.gate is None or self.gate.speed_limit > 0:
             return []
-        return stop_lines(self.stop, self.gate.stamp)
+        silence = self.silence if self.gone else 0.0
+        return stop_lines(self.stop, self.gate.stamp + round(silence * SECOND))
 
-    def take(self, message: Message) -> None:
-        """Remember ``message`` if the screen shows its kind."""
+    @property
+    def gone(self) -> bool:
+        """Whether the robot has fallen silent, or was never heard."""
+        return self.silence > SILENCE
+
+    def take(self, message: Message, real: int = 0) -> None:
+        """Remember ``message`` if the screen shows its kind.
+
+        Args:
+            message: of the robot.
+            real: when it came, ns of UNIX time: events are shown by the time of day, which is the same on all screens.
+        """
         self.now = message.stamp
         self.began = message.stamp if self.began is None else self.began
         if (name := _NEWEST.get(type(message))) is not None:
@@ -112,7 +125,7 @@ class ScreenState:
                 if not self.trail or math.dist(spot, self.trail[-1]) > 0.03:
                     self.trail.append(spot)
             case Event():
-                self.events.append(message)
+                self.events.append((real, message))
             case _:
                 pass
 
@@ -149,13 +162,14 @@ def draw(state: ScreenState, width: int, events: int = 6) -> RenderableType:
     Args:
         state: what is shown.
         width: columns there are.
-        events: newest events shown.
+        events: lines for the newest events; the newest of all is whole, however long it is.
     """
     layout = Layout()
-    gone = state.silence > SILENCE
+    gone = state.gone
     paint: Callable[[RenderableType], RenderableType] = _Gone if gone else _as_it_is
-    shown = max(1, min(events, len(state.events)))
-    rows = [Layout(name="top", ratio=1), Layout(paint(_events(state, shown)), name="events", size=shown + 2)]
+    lines_of_events = _events(state, max(1, width - 4), events)
+    below = Panel(Group(*lines_of_events), title="events (UTC)", border_style="dim")
+    rows = [Layout(name="top", ratio=1), Layout(paint(below), name="events", size=max(1, len(lines_of_events)) + 2)]
     if lines := state.why_stopped:
         stop = Panel(Text("\n".join(lines), style="yellow", no_wrap=True), title="stopped", border_style="yellow")
         rows.insert(1, Layout(paint(stop), name="stop", size=len(lines) + 2))
@@ -239,7 +253,8 @@ def _truck(state: ScreenState) -> Panel:
         _row(table, "off path", f"{state.tracker.cross_track * 100:+.1f} cm {state.tracker.outcome.value}")
     if state.loop is not None:
         _row(table, "tick late", f"p99 {state.loop.lateness_p99 * 1e3:.1f} ms max {state.loop.lateness_max * 1e3:.1f}")
-    return Panel(table, title=f"mt/{state.robot}", border_style="dim")
+    old = f", {state.silence:.0f} s ago" if state.gone else ""
+    return Panel(table, title=f"mt/{state.robot}{old}", border_style="dim")
 
 
 def _tilt(table: Table, state: ScreenState) -> None:
@@ -280,15 +295,23 @@ def _services(state: ScreenState, shown: Sequence[ServiceHealth] | None = None) 
     return Panel(Group(*parts), title="services", border_style="dim")
 
 
-def _events(state: ScreenState, count: int) -> Panel:
-    lines = Text()
-    for event in list(state.events)[-count:]:
-        seconds = (event.stamp - (state.began or 0)) / 1e9
-        lines.append(f"{seconds:8.2f} s  ", style="dim")
-        lines.append(f"{event.source}: ", style="bold")
-        lines.append(event.text or event.reason.text, style=EVENT_STYLE[event.severity])
-        lines.append(f"  [{event.reason.value}]\n", style="dim")
-    return Panel(lines, title="events", border_style="dim")
+def _events(state: ScreenState, width: int, count: int) -> list[Text]:
+    """Lines of the newest events, of as many as go into ``count`` lines whole; of the newest one in any case."""
+    lines: list[Text] = []
+    for real, event in reversed(state.events):
+        text = Text(f"{str(np.datetime64(real // SECOND, 's'))[-8:]}  ", style="dim")
+        text.append(f"{event.source}: ", style="not dim bold")
+        text.append(event.text or event.reason.text, style=f"not dim {EVENT_STYLE[event.severity]}")
+        text.append(f"  [{event.reason.value}]")
+        above = text.wrap(_WRAPPING, width)
+        if lines and len(lines) + len(above) > count:
+            break
+        lines = [*above, *lines]
+    return lines
+
+
+_WRAPPING: Final = Console()
+"""What breaks lines; nothing is written to it."""
 
 
 class _Braille:

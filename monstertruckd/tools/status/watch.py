@@ -69,7 +69,7 @@ class Follower:
 
     async def _collect(self) -> None:
         async for event in self._events:
-            self.state.take(event)
+            self.state.take(event, self._clock.now() + self._clock.real_offset())
 
 
 def place(endpoint: str) -> str:

@@ -97,7 +97,7 @@ def test_it_shows_what_matters():
         "+1.2 cm",
         "NOT RECORDING: no space left",
         "backoff",
-        "0.00 s  gate: tilted",
+        "  gate: tilted",
         "roll +5.7° pitch +11.5°",
         "2.9° off the level",
         "▲",
@@ -143,6 +143,8 @@ def test_a_stopped_truck_says_why():
     for words in ("stop 3.0 s ago", "no fresh lidar scan (for 100 ms)", "because lidar: unplugged (for 100 ms)"):
         assert words in text
         assert any(line.startswith("stop ") and words in line for line in plain(state))
+    state.silence = 12.0
+    assert state.why_stopped[0].startswith("stop 15.0 s ago"), "it ages after the robot's end, too"
 
 
 def test_the_screen_shows_who_waits_and_what_weakens_the_truck():
@@ -184,6 +186,7 @@ def test_a_robot_that_fell_silent_is_not_shown_as_alive():
     assert "DRIVING" in text
     assert styled.count("\x1b[1;37;41m") == 1, "white on red"
     assert set(re.findall(r"\x1b\[([\d;]+)m", styled)) == {"1;37;41", "90", "0"}, "all else is grey"
+    assert "mt/truck, 12 s ago" in text
     assert text.splitlines()[-1] == alive.splitlines()[-1], "it still fits"
 
 
@@ -203,12 +206,39 @@ def test_ages_are_of_the_robots_clock():
             services=(ServiceHealth(name="lidar", state=ServiceState.BACKOFF, since=30 * 10**9, detail=""),),
         )
     )
-    state.take(
-        Event(stamp=41 * 10**9, received=0, seq=0, reason=Reason.TILT_SLOW, severity=Severity.INFO, source="gate")
+    state.take(event("tilted", 41 * 10**9))
+    assert "11 s" in shown(state).export_text()
+
+
+def event(text: str, stamp: int = 10**9) -> Event:
+    return Event(
+        stamp=stamp, received=0, seq=0, reason=Reason.TILT_SLOW, severity=Severity.INFO, source="gate", text=text
     )
-    text = shown(state).export_text()
-    assert "11 s" in text
-    assert " 1.00 s  gate" in text
+
+
+def test_an_event_has_the_same_time_on_every_screen_whenever_that_began():
+    early, late = ScreenState("truck", heard=0), ScreenState("truck", heard=0)
+    real = 1_790_000_000 * 10**9  # 14:13:20 UTC
+    early.take(event("first", 10**9), real)
+    for state in (early, late):
+        state.take(event("stopped", 60 * 10**9), real + 59 * 10**9)
+    lines = [next(line for line in shown(it).export_text().splitlines() if "stopped" in line) for it in (early, late)]
+    assert lines[0] == lines[1]
+    assert " 14:14:19  gate: stopped" in lines[0]
+
+
+def test_the_newest_events_are_whole():
+    state = ScreenState("truck", heard=0)
+    long = " ".join(f"word{number}" for number in range(40))
+    for text in ("short", long, "and why"):
+        state.take(event(text))
+    text = " ".join(shown(state).export_text().replace("│", " ").split())
+    assert f"gate: {long} [tilt_slow]" in text
+    assert "gate: and why" in text
+    assert "short" in text
+    for _ in range(2):
+        state.take(event(long))
+    assert " ".join(shown(state).export_text().replace("│", " ").split()).count(f"gate: {long} [tilt_slow]") == 1
 
 
 def test_the_title_has_room_for_the_robots_name():
