@@ -1,11 +1,13 @@
 """A command's connection to one robot."""
 
+import asyncio
 import json
 from collections.abc import Callable, Coroutine
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from monstertruck_runtime.clock import Clock, run_wall
 from monstertruck_runtime.errors import NotFoundError
+from monstertruckd.tools.cli.output import remark
 
 if TYPE_CHECKING:
     from monstertruck_runtime.client import TruckClient
@@ -13,11 +15,14 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
+SOON: Final = 0.7
+"""Seconds in which a robot that is there has answered; who waits longer is told for what."""
+
 
 def with_robot(
     main: "Callable[[TruckClient, Clock], Coroutine[Any, Any, T]]", robot: str, endpoint: str, timeout: float = 2.5
 ) -> T:
-    """Connect, run ``main(client, clock)``, and return what it returns.
+    """Connect, run ``main(client, clock)``, and return what it returns; a link that takes long is said to be awaited.
 
     Args:
         main: what is done with the robot.
@@ -31,10 +36,20 @@ def with_robot(
     from monstertruck_runtime.client import TruckClient
 
     async def session(clock: Clock) -> T:
-        async with TruckClient(robot, endpoint, clock=clock, timeout=timeout) as client:
-            return await main(client, clock)
+        waiting = asyncio.create_task(_say_waiting(robot, endpoint, clock))
+        try:
+            async with TruckClient(robot, endpoint, clock=clock, timeout=timeout) as client:
+                waiting.cancel()
+                return await main(client, clock)
+        finally:
+            waiting.cancel()
 
     return run_wall(session)
+
+
+async def _say_waiting(robot: str, endpoint: str, clock: Clock) -> None:
+    await clock.sleep(SOON)
+    remark(f"waiting for robot {robot!r} at {endpoint} ...")
 
 
 async def robot_config(client: "TruckClient") -> "TruckConfig":

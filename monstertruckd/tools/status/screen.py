@@ -174,7 +174,8 @@ def draw(state: ScreenState, width: int, events: int = 6) -> RenderableType:
         stop = Panel(Text("\n".join(lines), style="yellow", no_wrap=True), title="stopped", border_style="yellow")
         rows.insert(1, Layout(paint(stop), name="stop", size=len(lines) + 2))
     if gone:
-        rows.insert(0, Layout(_banner(state), name="gone", size=1))
+        banner = _banner(state).wrap(_WRAPPING, max(1, width))
+        rows.insert(0, Layout(Group(*banner), name="gone", size=len(banner)))
     layout.split_column(*rows)
     scan = Layout(paint(Panel(_Braille(state), title="scan and trail, robot frame", border_style="dim")))
     truck = Layout(paint(_truck(state)), size=40)
@@ -206,7 +207,7 @@ class _Gone:
 def _banner(state: ScreenState) -> Text:
     said = "no robot" if state.began is None else "no word of the robot"
     text = f"{said} for {state.silence:.0f} s" + (f": {state.trouble}" if state.trouble else "")
-    return Text(text, style="bold white on red", no_wrap=True, overflow="ellipsis")
+    return Text(text, style="bold white on red")
 
 
 def _troubled(state: ScreenState) -> list[ServiceHealth]:

@@ -15,6 +15,7 @@ from monstertruck_schemas.plan import Path
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.state import GateMode, GateState
 from monstertruck_schemas.topics import GATE
+from monstertruckd.tools.cli import connection
 from monstertruckd.tools.cli.goto_session import on_the_terminal
 from monstertruckd.tools.cli.main import app
 
@@ -43,6 +44,31 @@ def test_a_robot_without_a_planner_is_reported(monkeypatch: pytest.MonkeyPatch):
     done = CliRunner().invoke(app, ["goto", "1", "0", "0"])
     assert done.exit_code == Reason.NOT_FOUND.exit_code
     assert done.output == "robot 'truck' has no planner: expected a section `planner` in its configuration\n"
+
+
+def test_a_robot_that_is_awaited_is_named_before_the_wait_ends(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    said: list[str] = []
+
+    class Absent(Unplanned):
+        async def __aenter__(self):
+            await asyncio.sleep(0.1)
+            said.append(capsys.readouterr().err)
+            raise NotFoundError("no robot answers")
+
+    monkeypatch.setattr("monstertruck_runtime.client.TruckClient", Absent)
+    monkeypatch.setattr(connection, "SOON", 0.02)
+    with pytest.raises(NotFoundError):
+        connection.with_robot(None, "truck", "tcp/there:1")  # type: ignore[arg-type]
+    assert said == ["waiting for robot 'truck' at tcp/there:1 ...\n"]
+    monkeypatch.setattr("monstertruck_runtime.client.TruckClient", Unplanned)
+
+    async def main(client: object, clock: object) -> None:
+        await asyncio.sleep(0.1)
+
+    connection.with_robot(main, "truck", "tcp/there:1")
+    assert capsys.readouterr().err == "", "one that is there is not awaited"
 
 
 class SilentRobot:

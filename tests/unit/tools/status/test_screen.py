@@ -194,6 +194,10 @@ def test_a_robot_that_was_never_heard_is_waited_for():
     state = ScreenState("truck at tcp/there", heard=0)
     state.silence, state.trouble = 5.0, "no robot answers at tcp/there within 1 s"
     assert shown(state, 120).export_text().startswith("no robot for 5 s: no robot answers at tcp/there within 1 s")
+    state.trouble += ": is its daemon running there (`monstertruckd run`), or is it elsewhere (--endpoint)?"
+    text = shown(state, 80).export_text()
+    assert "elsewhere (--endpoint)?" in text
+    assert len(text.splitlines()) == 24
 
 
 def test_ages_are_of_the_robots_clock():
