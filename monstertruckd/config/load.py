@@ -455,6 +455,15 @@ def _check_directives(text: str, path: Path) -> None:
             raise ConfigError(f"{path}:{number}: {line.strip()}: expected YAML 1.2; leave this line out")
 
 
+def _meant(path: Path) -> Path | None:
+    """A configuration of a similar name, in the same folder or the shipped ones."""
+    for folder in (path.parent, path.parent / "configs"):
+        files = {file.name: file for file in sorted(folder.glob("*.yaml"))}
+        for name in difflib.get_close_matches(path.name, files, 1):
+            return files[name]
+    return None
+
+
 class YamlText:
     """A YAML mapping, or nothing, as text.
 
@@ -482,7 +491,9 @@ class YamlText:
             return cls(path.read_text(encoding="utf-8"), path)
         except (OSError, UnicodeDecodeError) as error:
             reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
-            raise ConfigError(f"{path}: cannot be read: {reason}") from error
+            meant = _meant(path) if isinstance(error, FileNotFoundError) else None
+            hint = f" (did you mean {meant}?)" if meant else ""
+            raise ConfigError(f"{path}: cannot be read: {reason}{hint}") from error
 
     def _set(self, text: str) -> None:
         self.text = text

@@ -106,9 +106,15 @@ def save_map(world: WorldMap, path: Path) -> None:
 
 
 def _read_keys(path: Path) -> dict[str, Any]:
-    keys = read_yaml(path)
-    if not isinstance(keys, dict):
-        raise InputError(f"{path}: expected a mapping with the keys {', '.join(_REQUIRED)}")
+    no_map = f"{path}: no map: expected the folder of a saved map, or a map_server YAML"
+    try:
+        keys = read_yaml(path)
+    except InputError as error:
+        if path.is_file():
+            raise InputError(f"{no_map} ({error})") from error
+        raise
+    if not isinstance(keys, dict) or keys.keys().isdisjoint(_REQUIRED):
+        raise InputError(f"{no_map} with the keys {', '.join(_REQUIRED)}")
     if unknown := sorted(str(key) for key in keys.keys() - {*_REQUIRED, "mode"}):
         raise InputError(f"{path}: {unknown[0]}: unknown key; known are {', '.join(_REQUIRED)}, mode")
     for key in _REQUIRED:

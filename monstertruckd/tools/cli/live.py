@@ -9,7 +9,7 @@ import typer
 
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
-from monstertruck_runtime.errors import NoAnswerError, NotFoundError
+from monstertruck_runtime.errors import NoAnswerError
 from monstertruckd.tools.cli.options import EndpointOption, RobotOption, TopicArgument
 from monstertruckd.tools.cli.output import JsonOption, on_terminal, print_json, remark, until_stopped
 
@@ -53,11 +53,10 @@ def echo(
     from monstertruck_runtime.client import TruckClient
     from monstertruck_runtime.mailbox import fifo
     from monstertruck_schemas.topics import BY_NAME
+    from monstertruckd.tools.logs.messages import require_topics
 
-    row = BY_NAME.get(topic)
-    if row is None:
-        raise NotFoundError(f"no topic {topic!r}; known: {', '.join(BY_NAME)}")
-
+    require_topics(topic)
+    row = BY_NAME[topic]
     short = on_terminal(sys.stdout) and not json_output
 
     async def main(clock: Clock) -> None:

@@ -353,10 +353,17 @@ def _usage_in_one_line() -> Iterator[None]:
     except NoArgsIsHelpError:  # a group without a command: its help is the answer
         raise
     except UsageError as error:
-        complaint = " ".join(error.format_message().split()).removesuffix(".").replace(": Value error, ", ": ")
+        complaint = _in_own_words(" ".join(error.format_message().split()).removesuffix("."))
         command = "monstertruckd" if error.ctx is None else error.ctx.command_path
         remark(f"Error: {complaint}. Try '{command} -h'.")
         raise typer.Exit(error.exit_code) from None
+
+
+def _in_own_words(complaint: str) -> str:
+    """Without the phrases of the library that reads values."""
+    text = complaint.replace(": Value error, ", ": ").replace(": Input should be ", ": expected ")
+    text = text.replace(": expected a valid integer", ": expected a whole number")
+    return text.replace(": expected a valid ", ": expected a ").partition(", unable to parse string")[0]
 
 
 def _interrupt(_: int, frame: FrameType | None) -> None:

@@ -8,6 +8,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from difflib import get_close_matches
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,18 @@ _EVERY = 1000
 
 Progress = Callable[[float], None]
 """Called with the bytes of the log read so far."""
+
+
+def require_topics(*names: str) -> None:
+    """Refuse names that are not in the table of topics.
+
+    Raises:
+        NotFoundError: one is not; names those that are like it.
+    """
+    for name in sorted(set(names) - BY_NAME.keys()):
+        close = [topic for topic in BY_NAME if name in topic.split("/")] or get_close_matches(name, BY_NAME)
+        meant = f" (did you mean {', '.join(close)}?)" if close else ""
+        raise NotFoundError(f"no topic {name}{meant}; `monstertruckd topics` lists all")
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,9 +59,7 @@ class Selection:
     end: float = math.inf
 
     def __post_init__(self) -> None:
-        if unknown := set(self.topics) - BY_NAME.keys():
-            msg = f"no topic {', '.join(sorted(unknown))}; known: {', '.join(BY_NAME)}"
-            raise NotFoundError(msg)
+        require_topics(*self.topics)
         if not self.start < self.end:
             msg = f"from {self.start:g} s to {self.end:g} s: expected an end after the start"
             raise InputError(msg)

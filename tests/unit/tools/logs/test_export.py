@@ -166,7 +166,7 @@ def test_selection_by_topic_and_time(log, tmp_path):
 
 
 def test_selection_that_cannot_be_is_refused():
-    with pytest.raises(NotFoundError, match=r"no topic sensor/nose; known: sensor/scan"):
+    with pytest.raises(NotFoundError, match=r"no topic sensor/nose .did you mean sensor/scan"):
         Selection(("sensor/nose",))
     with pytest.raises(InputError, match="expected an end after the start"):
         Selection(start=3.0, end=3.0)
