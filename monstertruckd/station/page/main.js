@@ -53,6 +53,8 @@ link.on("robots", ({ names }) => {
   select.value = wanted;
   if (wanted !== link.robot) link.watch(wanted);
 });
+link.on("facts", ({ mapping }) => (byId("map-none").hidden = mapping !== false));
+link.on("robot", () => (byId("map-none").hidden = true));
 link.on("hello", ({ role }) => (document.body.dataset.role = role));
 link.on("open", (open) => {
   if (!open) link.robot = null; // what was watched is asked for again

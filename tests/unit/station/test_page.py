@@ -148,6 +148,17 @@ async def parts_of_the_map_outlive_the_whole_map_that_they_belong_to(page: Page)
     assert kept == [2, 4]
 
 
+async def a_robot_without_a_map_is_called_so(page: Page) -> None:
+    assert not await page.is_visible("#map-none")
+    await say(page, FACTS | {"mapping": False})
+    assert await page.is_visible("#map-none")
+    await page.click("#tool-goal")
+    assert not await page.is_visible("#map-none"), "the hint of a tool has its place"
+    await page.click("#tool-goal")
+    await say(page, FACTS | {"mapping": True})
+    assert not await page.is_visible("#map-none")
+
+
 async def a_stop_is_shown_with_its_chain_of_causes(page: Page) -> None:
     lost = Cause(reason=Reason.DEVICE_LOST, source="lidar", since=9 * 10**8, text="lidar: <b>unplugged</b>")
     stale = Cause(reason=Reason.SCAN_STALE, source="lidar", since=9 * 10**8, text="no fresh lidar scan", because=1)
@@ -175,5 +186,6 @@ async def test_the_page_drives_as_the_hand_does_and_shows_what_is_true(tmp_path:
         await a_gamepad_drives_the_robot_of_the_page_that_has_the_focus(page)
         await an_unknown_way_is_taken_to_be_slow(page)
         await parts_of_the_map_outlive_the_whole_map_that_they_belong_to(page)
+        await a_robot_without_a_map_is_called_so(page)
         await a_stop_is_shown_with_its_chain_of_causes(page)
         assert errors == []
