@@ -455,7 +455,7 @@ class WallLine:
                 state = self._steer(state, t) if state.wall is not None else state
                 if not state.v.over(t):
                     return state._replace(v=self._stopping(state.v, self._left(state, cone, t), t))
-                if state.wall is not None and self._left(state, cone, t) > GONE:
+                if state.wall is not None and self._passed_by(state, state.wall, cone, t):
                     return self._to(state, "follow")
                 state = self._to(state, "turn")
                 sense = self._sense(state)
@@ -464,6 +464,18 @@ class WallLine:
                 return self._turn(state, cone, t)
             case "stop":
                 return self._steer(state, t)
+
+    def _passed_by(self, state: LineState, wall: WallEstimate, cone: Cone, t: float) -> bool:
+        """Whether what it braked for was on the far side and has gone: front and diagonal sonar heard nothing of it.
+
+        What those two heard may be the corner, though they hear it no longer where the robot stands.
+        """
+        if self._left(state, cone, t) <= GONE:
+            return False
+        lately = state.echoes[state.echoes[:, 5] > state.travelled - AHEAD[1]]
+        diagonal, front = lately[:, 4] == DIAGONAL, lately[:, 4] == FRONT
+        ahead = (diagonal & (residuals(lately, wall, cone) < -NEARER)) | (front & (lately[:, 3] < NEAR))
+        return np.count_nonzero(ahead) < 2
 
     def _drive(self, state: LineState, cone: Cone, t: float) -> LineState:
         """Along the wall, or straight on until there is one."""

@@ -218,7 +218,8 @@ def test_it_follows_its_wall_on_after_braking_for_what_has_gone_from_the_far_sid
     assert (robot.pose[0] > 3.0) is goes
 
 
-def test_a_front_sonar_that_hears_nothing_is_made_up_for_by_the_diagonal_one():
+@pytest.mark.parametrize("heard", [True, False])
+def test_a_front_sonar_that_hears_nothing_is_made_up_for_by_the_diagonal_one(heard):
     corner = [(-9.0, 0.35, 2.0, 0.35), (2.0, 0.35, 3.5, -3.0)]
     robot = Robot(corner, (0.5, 0.0, 0.1))
     robot.stuck = {"f": None, "fr": None}
@@ -227,6 +228,8 @@ def test_a_front_sonar_that_hears_nothing_is_made_up_for_by_the_diagonal_one():
         phase="follow", wall=WallEstimate(math.pi / 2, 0.35), places=np.array([[0.0, *robot.pose]])
     )
     for i in range(200):
+        if state.phase == "brake" and not heard:  # the corner is beyond the diagonal sonar where the robot stands
+            robot.stuck = {"f": None, "fr": None, "fl": None}
         step = behaviour.step(robot.inputs(), state, i * PERIOD)
         state, robot.motion = step.state, step.motion or RequestedMotion()
         clearance = min(clearance, robot.clearance)
