@@ -475,7 +475,7 @@ class WallLine:
         lately = state.echoes[state.echoes[:, 5] > state.travelled - AHEAD[1]]
         diagonal, front = lately[:, 4] == DIAGONAL, lately[:, 4] == FRONT
         ahead = (diagonal & (residuals(lately, wall, cone) < -NEARER)) | (front & (lately[:, 3] < NEAR))
-        return np.count_nonzero(ahead) < 2
+        return bool(np.count_nonzero(ahead) < 2)
 
     def _drive(self, state: LineState, cone: Cone, t: float) -> LineState:
         """Along the wall, or straight on until there is one."""
