@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 SOON: Final = 0.7
-"""Seconds in which a robot that is there has answered; who waits longer is told for what."""
+"""Seconds in which a robot that is there has answered; later the command says what it waits for."""
 
 
 def with_robot(
