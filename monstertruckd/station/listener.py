@@ -20,7 +20,7 @@ PAUSE: Final = 0.2
 """Seconds before connections are taken again after there was no file descriptor for one."""
 
 
-class Listener:
+class WebListener:
     """Takes connections to an address while its context lasts.
 
     Args:

@@ -33,7 +33,7 @@ from monstertruckd.station.discovery import Discovery
 from monstertruckd.station.downloads import download, fetch
 from monstertruckd.station.feed import RobotFeed
 from monstertruckd.station.fleet import FleetBoard
-from monstertruckd.station.listener import Listener
+from monstertruckd.station.listener import WebListener
 from monstertruckd.station.pilot import Pilot
 from monstertruckd.station.remarks import Remarks
 from monstertruckd.station.replay import LogOpener, ReplayFeed
@@ -186,7 +186,7 @@ class Station:
         discovering = [asyncio.create_task(run) for run in runs]
         assert runner.server is not None
         place, doors = self.place, AsyncExitStack()
-        listener = Listener(place.host, place.port, place.tls, runner.server, self._remarks.add)
+        listener = WebListener(place.host, place.port, place.tls, runner.server, self._remarks.add)
         try:
             try:
                 await doors.enter_async_context(listener)

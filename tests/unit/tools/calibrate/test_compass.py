@@ -130,14 +130,14 @@ def test_without_current_there_is_no_map():
     assert result_of(replace(still, current=0.0 * still.current)).estimate("motor_x") is None
 
 
-def test_iron_in_the_ground_is_told_from_the_trucks_own():
+def test_iron_in_the_ground_is_separated_from_the_trucks_own():
     clean = circle()
     beside = 8.0 * np.exp(-(((np.arange(clean.x.size) % 400) - 150) ** 2) / 1800.0)
     with pytest.raises(InputError, match=r"off the ellipse .* go elsewhere"):
         result_of(replace(clean, x=clean.x + beside))
 
 
-def test_iron_in_the_ground_that_is_not_told_widens_the_intervals():
+def test_iron_in_the_ground_that_is_not_seen_widens_the_intervals():
     inside = []
     for seed in range(60):
         rng, clean = np.random.default_rng(seed), circle(seed=seed, count=200)
