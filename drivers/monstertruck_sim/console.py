@@ -121,7 +121,8 @@ class CommandedGroup:
         elif len(self.members) == 1:
             next(iter(self.members.values())).command(words)
         else:
-            raise InputError(f"name a {self.kind} first: {', '.join(self.members)}")
+            first = next(iter(self.members), "")
+            raise InputError(f"name a {self.kind} first: {', '.join(self.members)}; `{first} help` lists its commands")
 
 
 class FaultConsole:
@@ -153,14 +154,14 @@ class FaultConsole:
         await asyncio.Event().wait()
 
     def execute(self, line: str) -> None:
-        """Carry out one line; answers ``ok`` or an error."""
+        """Carry out one line; answers ``ok`` or an error, or the commands if the last word is ``help``."""
         words = line.split()
         if not words:
             return
         try:
             self._target.command(words)
         except InputError as error:
-            self._say(f"error: {error}")
+            self._say(str(error) if words[-1] == "help" else f"error: {error}")
         else:
             self._say("ok")
 

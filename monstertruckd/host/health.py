@@ -110,22 +110,26 @@ class HealthBoard:
         return row
 
     async def run(self, ready: Ready) -> None:
-        """Publish the table once a second; log once what is not ready after the start."""
+        """Publish the table once a second; log what is not ready after the start, and once that all are."""
         ready()
+        complete = False
         for periods in count(1):
             await self._clock.sleep(PERIOD)
             self._publish()
-            if periods == SUMMARY_AFTER:
-                self._summarise()
+            if periods >= SUMMARY_AFTER and not complete:
+                complete = self._summarise(missing=periods == SUMMARY_AFTER)
 
-    def _summarise(self) -> None:
+    def _summarise(self, *, missing: bool) -> bool:
+        """Log that all services are ready, or, with ``missing``, which are not; whether all are."""
         rows = self.rows()
-        missing = [row for row in rows if row.state is not ServiceState.READY]
-        if not missing:
+        rest = [row for row in rows if row.state is not ServiceState.READY]
+        if not rest:
             log.info("all %d services are ready", len(rows))
-            return
-        names = "; ".join(f"{row.name} ({row.detail or row.state.value})" for row in missing)
-        log.warning("%d of %d services are ready; not ready: %s", len(rows) - len(missing), len(rows), names)
+        elif missing:
+            level = logging.INFO if all(row.state is ServiceState.STARTING for row in rest) else logging.WARNING
+            names = "; ".join(f"{row.name} ({row.detail or row.state.value})" for row in rest)
+            log.log(level, "%d of %d services are ready; not ready: %s", len(rows) - len(rest), len(rows), names)
+        return not rest
 
     def _publish(self) -> None:
         now = self._clock.now()

@@ -106,7 +106,8 @@ class SteeringWizard:
         start = Maps(maps.centres, (maps.scales[0] * directions[0], maps.scales[1] * directions[1]), maps.deficit)
         wrong = [name for name, sign in zip(AXLES, directions, strict=True) if sign < 0]
         if self.rough or wrong:
-            again = f"{' and '.join(wrong)} wheels steer the other way: restart the daemon, and measure the rest"
+            senses = f"the {' and '.join(wrong)} wheels steered the other way than configured, which is corrected then"
+            again = f"restart the daemon and run the wizard again: {senses}"
             if len(wrong) == len(AXLES):
                 await self._check_compass(context)
                 again += "; swapped cables look the same: do the FRONT wheels turn when the front ones are steered?"

@@ -377,7 +377,7 @@ def _run(wizard: "Wizard", call: _Call, panel: "Panel") -> None:
         _print(result)
     remark(f"saved in {file}; it counts from the next start of the daemon")
     if result.again is not None:
-        remark(f"not complete: {result.again}")
+        remark(f"next: {result.again}")
 
 
 async def _run_wizard(wizard: "Wizard", call: _Call, clock: "Clock", panel: "Panel") -> "tuple[Result, str]":

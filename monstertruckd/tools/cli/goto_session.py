@@ -31,7 +31,7 @@ class TerminalReport(DriveReport):
 
     def stands(self, why: str) -> None:
         """Say it."""
-        remark(f"the truck stands: {why}; `monstertruckd arm` lets it drive")
+        remark(f"waiting: {why}; `monstertruckd arm` lets it drive, or --arm of this command")
 
 
 @contextmanager

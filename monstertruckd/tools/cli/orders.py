@@ -22,6 +22,9 @@ if TYPE_CHECKING:
     from monstertruck_schemas.req import Order
     from monstertruck_schemas.state import GateState
 
+HEARD = 0.3
+"""Seconds in which a tracker that has a path is heard."""
+
 
 @dataclass(frozen=True, slots=True)
 class OrderOutcome:
@@ -83,9 +86,23 @@ async def _announce(client: "TruckClient", *, hold: bool) -> None:
     for row in () if calibration is None else calibration.wizards:
         if row.expired:
             remark(f"calibration of {row.wizard} has expired ({row.expired}): monstertruckd calibrate {row.wizard}")
-    state = await client.get_retained(GATE)
-    if state is not None and state.waiting and not hold:
-        print(f"sets off at once: {', '.join(state.waiting)}; --hold arms without", file=sys.stderr)
+    if not hold and (names := await _set_off(client, await client.get_retained(GATE))):
+        print(f"sets off at once: {', '.join(names)}; --hold arms without", file=sys.stderr)
+
+
+async def _set_off(client: "TruckClient", gate: "GateState | None") -> list[str]:
+    """Who drives as soon as the truck is armed: those who ask for it now, and the tracker if it has a path."""
+    from monstertruck_runtime.mailbox import latest
+    from monstertruck_schemas.topics import TRACKER
+
+    names = [] if gate is None else list(gate.waiting)
+    if gate is not None and not gate.mode.active and "tracker" not in names:
+        with client.subscribe(TRACKER, latest()) as tracker, suppress(TimeoutError):
+            async with asyncio.timeout(HEARD):
+                along = await tracker.next()
+            path = f"path {along.path!r}" if along.path else "its path"
+            names.append(f"tracker, along {path} of {along.length:.1f} m")
+    return names
 
 
 def _run(name: str, robot: str, endpoint: str, *, json_output: bool, hold: bool = False) -> None:

@@ -227,6 +227,13 @@ def needs_extra(name: str) -> Iterator[None]:
         raise NotInstalledError(text) from None
 
 
+REMEDIES: Final = {
+    Reason.DISARMED: "`monstertruckd arm` lets it drive",
+    Reason.ESTOPPED: "`monstertruckd reset` clears the emergency stop",
+}
+"""The command that removes the cause of a refusal."""
+
+
 def finish(reason: Reason, text: str = "") -> None:
     """End the command by ``reason``: with its exit code, and a sentence if that is not zero.
 
@@ -234,8 +241,14 @@ def finish(reason: Reason, text: str = "") -> None:
         Exit: the reason is no success.
     """
     if reason.exit_code:
-        remark(text or reason.text)
+        remark(with_remedy(reason, text or reason.text))
         raise typer.Exit(reason.exit_code)
+
+
+def with_remedy(reason: Reason, text: str) -> str:
+    """A refusal in words, and the command that removes its cause if there is one."""
+    remedy = REMEDIES.get(reason)
+    return text if remedy is None or remedy in text else f"{text}; {remedy}"
 
 
 def print_end(reason: Reason, text: str, values: Mapping[str, Any], *, json_output: bool) -> None:
@@ -309,7 +322,7 @@ class CommandGroup(TyperGroup):
             return self._invoke_and_flush(ctx)
         except TruckError as error:
             reason = error.refusal if isinstance(error, RequestRefusedError) else error.reason
-            remark(str(error) or reason.text)
+            remark(with_remedy(reason, str(error) or reason.text))
             raise typer.Exit(reason.exit_code) from None
         except ModuleNotFoundError as error:
             if error.name is None or error.name.startswith("monstertruck"):
@@ -355,7 +368,7 @@ def _usage_in_one_line() -> Iterator[None]:
     except UsageError as error:
         complaint = _in_own_words(" ".join(error.format_message().split()).removesuffix("."))
         command = "monstertruckd" if error.ctx is None else error.ctx.command_path
-        remark(f"Error: {complaint}. Try '{command} -h'.")
+        remark(f"Error: {complaint}{'' if complaint.endswith('?') else '.'} Try '{command} -h'.")
         raise typer.Exit(error.exit_code) from None
 
 

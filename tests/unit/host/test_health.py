@@ -83,3 +83,22 @@ def test_five_seconds_after_the_start_the_log_says_once_what_is_not_ready(
     caplog.set_level(logging.INFO, "monstertruckd")
     run_virtual(main)
     assert caplog.messages == [expected]
+
+
+def test_what_only_starts_is_no_warning_and_the_log_says_when_the_last_one_is_ready(caplog: pytest.LogCaptureFixture):
+    async def main(clock: VirtualClock) -> None:
+        board = HealthBoard(clock, Kept(), Events())
+        board.report(READY)
+        board.report(row(ServiceState.STARTING, "goals"))
+        running = asyncio.create_task(board.run(lambda: None))
+        await clock.sleep(20)
+        board.report(row(ServiceState.READY, "goals"))
+        await clock.sleep(20)
+        running.cancel()
+
+    caplog.set_level(logging.INFO, "monstertruckd")
+    run_virtual(main)
+    assert [(record.levelname, record.message) for record in caplog.records if "services" in record.message] == [
+        ("INFO", "1 of 2 services are ready; not ready: goals (starting)"),
+        ("INFO", "all 2 services are ready"),
+    ]

@@ -3,6 +3,7 @@
 import asyncio
 import os
 import pty
+import sys
 
 import pytest
 
@@ -11,7 +12,7 @@ from monstertruck_drivers.catalog import DEVICES
 from monstertruck_drivers.emulation import EmulatorSetup
 from monstertruck_runtime.clock import VirtualClock, VirtualLoop
 from monstertruck_runtime.errors import InputError
-from monstertruck_sim.console import Emulated, FaultConsole
+from monstertruck_sim.console import CommandedGroup, Emulated, FaultConsole
 from monstertruck_sim.world.config import WorldConfig
 from monstertruck_sim.world.world import World
 
@@ -75,3 +76,23 @@ async def test_the_end_of_the_input_ends_the_last_line_and_nothing_else():
         running.cancel()
         await asyncio.gather(running, return_exceptions=True)
     assert target.commands == [["lidar", "unplug"], ["drive", "stall"]]
+
+
+@pytest.mark.parametrize(
+    ("line", "answer"),
+    [
+        ("help", "name a device first: lidar, drive; `lidar help` lists its commands"),
+        ("lidar help", "known: spin"),
+        ("lidar nonsense", "error: known: spin"),
+        ("nonsense", "error: name a device first: lidar, drive; `lidar help` lists its commands"),
+    ],
+)
+def test_help_is_no_error(line: str, answer: str):
+    class Refusing:
+        def command(self, _: list[str]) -> None:
+            raise InputError("known: spin")
+
+    said: list[str] = []
+    target = CommandedGroup("device", {"lidar": Refusing(), "drive": Refusing()})
+    FaultConsole(target, sys.stdin, said.append).execute(line)
+    assert said == [answer]

@@ -9,11 +9,13 @@ import pytest
 import typer
 
 from monstertruck_runtime.errors import NoAnswerError, NotFoundError, RequestRefusedError, TruckError
+from monstertruck_runtime.mailbox import Delivery, Mailbox, latest
 from monstertruck_schemas.health import CalibrationHealth, CalibrationState
+from monstertruck_schemas.plan import TrackerState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order
 from monstertruck_schemas.state import GateMode, GateState
-from monstertruck_schemas.topics import CALIBRATION, GATE, Topic
+from monstertruck_schemas.topics import CALIBRATION, GATE, TRACKER, Topic
 from monstertruckd.tools.cli import orders
 from monstertruckd.tools.cli.orders import OrderOutcome, give
 
@@ -32,6 +34,11 @@ class Robot:
         self.newest = newest
         self.orders: list[Order] = []
         self.calibration: CalibrationHealth | None = None
+        self.tracker: Mailbox[TrackerState] = Mailbox(latest())
+
+    def subscribe(self, topic: Topic[Any], _: Delivery) -> Mailbox[TrackerState]:
+        assert topic is TRACKER
+        return self.tracker
 
     async def order(self, order: Order, *, hold: bool = False) -> GateState:
         self.orders.append(order)
@@ -155,6 +162,34 @@ def test_who_sets_off_is_said_before_arming(capsys: pytest.CaptureFixture[str]):
     for newest in (state(GateMode.DISARMED), None):
         asyncio.run(orders._announce(Robot(waiting, newest), hold=False))  # type: ignore[arg-type]
     assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize(
+    ("mode", "hold", "name", "words"),
+    [
+        (
+            GateMode.DISARMED,
+            False,
+            "lap",
+            "sets off at once: tracker, along path 'lap' of 14.0 m; --hold arms without\n",
+        ),
+        (GateMode.DISARMED, False, "", "sets off at once: tracker, along its path of 14.0 m; --hold arms without\n"),
+        (GateMode.DISARMED, True, "lap", ""),
+        (GateMode.ARMED, False, "lap", ""),
+    ],
+)
+def test_a_tracker_with_a_path_sets_off_though_it_asks_for_nothing_before(
+    capsys: pytest.CaptureFixture[str], mode: GateMode, hold: bool, name: str, words: str
+):
+    robot = Robot(state(mode), state(mode))
+    robot.tracker.put(
+        TrackerState(
+            stamp=0, received=0, seq=0, path=name, cross_track=0.0, heading_error=0.0, along=0.0, length=14.0,
+            outcome=Reason.DRIVING,
+        )
+    )  # fmt: skip
+    asyncio.run(orders._announce(robot, hold=hold))  # type: ignore[arg-type]
+    assert capsys.readouterr().err == words
 
 
 def test_a_calibration_that_has_expired_is_said_before_arming(capsys: pytest.CaptureFixture[str]):

@@ -219,6 +219,26 @@ def test_finish_is_silent_about_success_only(capsys: pytest.CaptureFixture[str])
     assert capsys.readouterr().err == f"{Reason.PATH_LOST.text}\n"
 
 
+@pytest.mark.parametrize(
+    ("reason", "text", "words"),
+    [
+        (Reason.DISARMED, "", "the truck is disarmed; `monstertruckd arm` lets it drive\n"),
+        (
+            Reason.DISARMED,
+            "it stands: `monstertruckd arm` lets it drive",
+            "it stands: `monstertruckd arm` lets it drive\n",
+        ),
+        (Reason.ESTOPPED, "stopped 2 s ago", "stopped 2 s ago; `monstertruckd reset` clears the emergency stop\n"),
+    ],
+)
+def test_a_refusal_names_the_command_that_removes_its_cause(
+    capsys: pytest.CaptureFixture[str], reason: Reason, text: str, words: str
+):
+    with pytest.raises(typer.Exit):
+        finish(reason, text)
+    assert capsys.readouterr().err == words
+
+
 def test_json_is_strict_whatever_it_is_made_of(capsys: pytest.CaptureFixture[str]):
     print_json({"pose": Pose2D(x=1.0, y=2.0, yaw=0.5), "far": (float("inf"), 1.5), "why": Reason.OK, "at": Path("a/b")})
     shown = json.loads(capsys.readouterr().out)
