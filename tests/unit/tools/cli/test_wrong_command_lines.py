@@ -17,7 +17,7 @@ WRONG = (
     ("track /nonexistent.csv", 3, "/nonexistent.csv: cannot be read: No such file or directory"),
     ("calibrate camera --square 30 --marker 40", 3, "--marker 40: expected less than --square 30, in which it lies"),
     ("track configs/truck.yaml", 3, "configs/truck.yaml:1: "),
-    ("statu", 2, "Error: No such command 'statu'. Did you mean 'status', 'station'? Try 'monstertruckd -h'."),
+    ("statu", 2, "Error: No such command 'statu'. Did you mean 'status', 'station', 'study'? Try '"),
     (
         "arm -e nonsense",
         3,
