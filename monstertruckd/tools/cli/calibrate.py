@@ -441,7 +441,7 @@ def _print(result: "Result") -> None:
         for e in result.estimates:
             grade = f", {e.grade}" if e.grade else ""
             until = "" if e.valid_until is None else f", valid until {e.valid_until.date[:10]}"
-            print(f"{result.wizard}.{e.name}: {_number(e)} {e.unit}{grade}".rstrip())
+            print(f"{result.wizard}.{e.name}: {' '.join(filter(None, (_number(e), e.unit)))}{grade}")
             text = f"{e.meaning}; {e.samples} samples, {e.date.replace('T', ' ')[:16]}{until}"
             print(wrapped(text, indent="  "))
     else:

@@ -317,3 +317,14 @@ def test_a_terminal_breaks_no_word_of_a_remark(monkeypatch: pytest.MonkeyPatch, 
         "why",
         "  indented",
     ]
+
+
+def test_a_value_without_a_unit_is_followed_by_its_grade(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setattr("monstertruckd.tools.cli.calibrate.on_terminal", lambda _: True)
+    estimate = Estimate(
+        name="gain", value=1.25, unit="", samples=4, date="2026-11-22T12:00:00Z", meaning="m", grade="A"
+    )
+    _print(Result(wizard="battery", measured="", estimates=(estimate, estimate.model_copy(update={"unit": "V"}))))
+    assert capsys.readouterr().out.splitlines()[::2] == ["battery.gain: 1.25, A", "battery.gain: 1.25 V, A"]
