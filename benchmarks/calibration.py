@@ -2,7 +2,7 @@
 
     python benchmarks/calibration.py [--seeds 20] [--jobs 1] [--light 200]
     python benchmarks/calibration.py --only camera --light 200
-    python benchmarks/calibration.py --part swapped|interruptions|square [--count 20]
+    python benchmarks/calibration.py --part swapped|interruptions|square|alone [--count 20]
 
 Every session runs the whole daemon on a virtual clock: real drivers, emulated devices, the safety gate; the operator
 has a tape, a string and a meter with errors of their own. Judged is whether the true value lies in the stated interval,
@@ -14,6 +14,7 @@ at those of one.
 ``--part swapped``: a swapped cable or a wrong sign, drawn for every wizard, that it has to name in every case.
 ``--part interruptions``: Ctrl-C, a cable, the emergency stop, a low battery, a lost lease, and kill -9 of wizard and
 daemon at random instants: the old file is intact, the truck neutral, and the wizard runs again (half an hour).
+``--part alone``: the wizards of odometry, lidar, inertial unit, slip, stabiliser, camera and sonars, each alone.
 ``--part square``: closing error of dead reckoning after a square of 10 m, before and after ``calibrate all``.
 """
 
@@ -32,6 +33,7 @@ from time import process_time
 from typing import Any
 
 import numpy as np
+from calibration_parts.alone import alone
 from calibration_parts.interruptions import interruptions
 from calibration_parts.square import square
 
@@ -151,6 +153,7 @@ PARTS: dict[str, Callable[[int], tuple[dict[str, Any], dict[str, Any], bool]]] =
     "swapped": swapped,
     "interruptions": interruptions,
     "square": square,
+    "alone": alone,
 }
 """Besides the trucks."""
 

@@ -305,6 +305,8 @@ class GateService:
         self._mark_latch()
         for event in output.events:
             self._events(event.reason, event.severity, self.name, event.text, **event.values)
+            if event.reason is Reason.FAULTS_REPEAT:
+                log.warning("%s", event.text)
         for trip in output.trips:
             stop = self._stop(trip, now)
             self._outputs.stops.put(stop)

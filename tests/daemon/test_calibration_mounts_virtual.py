@@ -5,8 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from monstertruckd.config.calibration import CalibrationStore, WizardName, with_values
-from monstertruckd.config.load import load_config
+from monstertruckd.config.calibration import CalibrationStore, with_values
 from monstertruckd.tools.calibrate.camera import CameraWizard, camera_wizard
 from monstertruckd.tools.calibrate.imu import ImuWizard, imu_wizard
 from monstertruckd.tools.calibrate.lidar import LidarWizard, lidar_wizard
@@ -15,23 +14,11 @@ from monstertruckd.tools.calibrate.slip import SlipWizard, slip_wizard
 from monstertruckd.tools.calibrate.sonar import SonarWizard, sonar_wizard
 from monstertruckd.tools.calibrate.stabiliser import stabiliser_wizard
 from monstertruckd.tools.calibrate.wizard import Wizard
-from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
-from tests.calibration_kit import hidden, run_session, verdicts
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig
+from tests.calibration_kit import run_session, verdicts
+from tests.calibration_robots import robot_of
 
 pytestmark = [pytest.mark.virtual, pytest.mark.timeout(600)]
-
-CONFIGS = Path(__file__).resolve().parents[2] / "configs"
-
-
-def truck(folder: Path, seed: int, name: WizardName) -> SimulatedTruckConfig:
-    base = load_config(CONFIGS / "yard.yaml", SimulatedTruckConfig)[0]
-    plain = SimulatedTruckConfig.model_validate(
-        base.model_dump() | {"sim": {"world": {"map": "yard"}}, "state_directory": folder, "recorder": None}
-    )
-    if name == "imu":
-        imu = {"port": {"path": Path("/tmp/monstertruck/imu")}, "driver": {"kind": "wt61"}}
-        plain = with_overlay(plain, {"devices": {"imu": imu}})
-    return hidden(plain, np.random.default_rng(seed), seed, (name,))
 
 
 def judged(wizard: Wizard, config: SimulatedTruckConfig, seed: int, outside: int = 0) -> set[str]:
@@ -45,7 +32,7 @@ def judged(wizard: Wizard, config: SimulatedTruckConfig, seed: int, outside: int
 
 @pytest.mark.long
 def test_odometry(tmp_path: Path):
-    config = truck(tmp_path, 1, "odometry")
+    config = robot_of("odometry", tmp_path, 1)
     assert judged(odometry_wizard(), config, 1) >= {"drive_ratio", "wheelbase", "front_centre", "rear_centre"}
     current = CalibrationStore(config.calibration_folder, config.robot).current()
     assert current is not None
@@ -56,41 +43,24 @@ def test_odometry(tmp_path: Path):
 @pytest.mark.long
 def test_lidar(tmp_path: Path):
     wizard = lidar_wizard(LidarWizard(heights=True))
-    assert judged(wizard, truck(tmp_path, 2, "lidar"), 2) == {"x", "y", "yaw", "pitch", "roll"}
+    assert judged(wizard, robot_of("lidar", tmp_path, 2), 2) == {"x", "y", "yaw", "pitch", "roll"}
 
 
 @pytest.mark.long
 def test_imu(tmp_path: Path):
     wizard = imu_wizard(ImuWizard(rounds=1))
-    assert judged(wizard, truck(tmp_path, 3, "imu"), 3) >= {"rate_z", "rate_scale", "force_x"}
+    assert judged(wizard, robot_of("imu", tmp_path, 3), 3) >= {"rate_z", "rate_scale", "force_x"}
 
 
 @pytest.mark.long
 def test_slip(tmp_path: Path):
-    body = {"kind": "skid_steer", "motors": "wheels", "icr_left": 0.08, "icr_right": -0.07, "gain_left": 1.05}
-    base = load_config(CONFIGS / "robots" / "skid_stand.yaml", SimulatedTruckConfig)[0]
-    overlay = {
-        "recorder": None,
-        "blackbox": None,
-        "state_directory": tmp_path,
-        "sim": {"world": {"truck": {"body": body}}},
-    }
-    config = with_overlay(base, overlay)
+    config = robot_of("slip", tmp_path, 4)
     assert judged(slip_wizard(SlipWizard(rounds=1)), config, 4) >= {"icr_left", "icr_right", "gain_left"}
 
 
 @pytest.mark.long
 def test_stabiliser(tmp_path: Path):
-    base = load_config(CONFIGS / "full.yaml", SimulatedTruckConfig)[0]
-    lean = {"devices": {"camera": None}, "monitors": {"link": None, "host": None}, "planner": None, "path": None}
-    overlay = {
-        "recorder": None,
-        "blackbox": None,
-        "state_directory": tmp_path,
-        "sim": {"world": {"map": "yard"}},
-        **lean,
-    }
-    config = hidden(with_overlay(base, overlay), np.random.default_rng(6), 6, ("stabiliser",))
+    config = robot_of("stabiliser", tmp_path, 6)
     found = judged(stabiliser_wizard(), config, 6)
     assert found == {"pitch_zero", "pitch_direction", "roll_zero", "roll_direction"}
     current = CalibrationStore(config.calibration_folder, config.robot).current()
@@ -103,12 +73,7 @@ def test_stabiliser(tmp_path: Path):
 
 @pytest.mark.long
 def test_camera(tmp_path: Path):
-    overlay = {
-        "devices": {"camera": {"mount": {"x": 0.18, "z": 0.25}, "driver": {"kind": "webcam", "rate": 5}}},
-        "sim": {"world": {"camera": {"noise": 3.0}, "board": {}}},
-    }
-    overlay["devices"]["camera"]["port"] = {"path": tmp_path / "camera"}
-    config = hidden(with_overlay(truck(tmp_path, 7, "camera"), overlay), np.random.default_rng(7), 7, ("camera",))
+    config = robot_of("camera", tmp_path, 7)
     found = judged(camera_wizard(CameraWizard(patience=120.0)), config, 7, outside=2)
     assert found >= {"focal_x", "centre_y", "k1", "x", "z", "pitch"}
     current = CalibrationStore(config.calibration_folder, config.robot).current()
@@ -120,10 +85,7 @@ def test_camera(tmp_path: Path):
 
 @pytest.mark.long
 def test_sonar(tmp_path: Path):
-    base = load_config(CONFIGS / "robots" / "sonar.yaml", SimulatedTruckConfig)[0]
-    overlay = {"recorder": None, "blackbox": None, "state_directory": tmp_path}
-    overlay |= {"devices": {"sonar": {"driver": {"speed_of_sound": 340.0}}}}
-    config = hidden(with_overlay(base, overlay), np.random.default_rng(5), 5, ("sonar",))
+    config = robot_of("sonar", tmp_path, 5)
     assert len(judged(sonar_wizard(SonarWizard(turn=3.3, speed=0.25)), config, 5, outside=2)) == 17
     current = CalibrationStore(config.calibration_folder, config.robot).current()
     assert current is not None

@@ -6,15 +6,16 @@ from dataclasses import dataclass
 from typing import Any, Final, Protocol, TypeVar
 
 from monstertruck_runtime.errors import NoAnswerError, TruckError
-from monstertruck_runtime.mailbox import Mailbox, fifo
+from monstertruck_runtime.mailbox import Mailbox, fifo, latest
 from monstertruck_runtime.presence import while_it_runs
 from monstertruck_runtime.requests import Operator
 from monstertruck_schemas.mission import Mission
 from monstertruck_schemas.plan import BehaviourState, ExplorationState, MissionState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import BehaviourOrder, ExploreOrder, MissionOrder
-from monstertruck_schemas.topics import BEHAVIOUR, EXPLORE, MISSION, Topic
-from monstertruckd.tools.cli.output import progress
+from monstertruck_schemas.state import GateState
+from monstertruck_schemas.topics import BEHAVIOUR, EXPLORE, GATE, MISSION, Topic
+from monstertruckd.tools.cli.output import progress, with_remedy
 
 EVERY: Final = 5.0
 """Seconds between two lines on an exploration that does the same all the time."""
@@ -94,24 +95,34 @@ async def run_exploration(
     report: Report | None = None,
 ) -> RunEnd:
     """Start an exploration and wait for its end, see ``_run``; its arguments are those of ``TruckClient.explore``."""
-    shown: ExplorationState | None = None
+    shown: tuple[Any, ...] = ()
+    due = 0.0
 
     def show(state: ExplorationState) -> None:
-        nonlocal shown
-        changed = shown is None or (state.phase, state.goals) != (shown.phase, shown.goals)
-        if report is not None and (changed or shown is None or state.elapsed - shown.elapsed >= EVERY):
-            shown = state
-            report(progress_line(state))
+        nonlocal shown, due
+        now = state.phase, state.goals, _why_it_stands(gate.latest)
+        if report is not None and (now != shown or state.elapsed >= due):
+            shown, due = now, state.elapsed + EVERY
+            report(progress_line(state, now[-1]))
 
-    return await _run(
-        client,
-        EXPLORE,
-        lambda: client.explore(ExploreOrder.START, home=home, budget=budget, find=find),
-        lambda: client.explore(ExploreOrder.STOP),
-        show,
-        ("elapsed", "travelled", "known", "goals"),
-        arm=arm,
-    )
+    with client.subscribe(GATE, latest()) as gate:
+        return await _run(
+            client,
+            EXPLORE,
+            lambda: client.explore(ExploreOrder.START, home=home, budget=budget, find=find),
+            lambda: client.explore(ExploreOrder.STOP),
+            show,
+            ("elapsed", "travelled", "known", "goals"),
+            arm=arm,
+        )
+
+
+def _why_it_stands(gate: GateState | None) -> str:
+    """Why the truck may not move, in words; empty if it may."""
+    if gate is None or gate.mode.active:
+        return ""
+    reason = next(iter(gate.reasons), Reason.DISARMED)
+    return with_remedy(reason, reason.text)
 
 
 async def run_mission(
@@ -192,9 +203,11 @@ async def _followed(states: Mailbox[S], number: int, show: Callable[[S], None], 
     raise NoAnswerError("the link to the robot was closed")
 
 
-def progress_line(state: ExplorationState) -> str:
-    """How far an exploration has come, in less than 80 characters."""
+def progress_line(state: ExplorationState, stands: str = "") -> str:
+    """How far an exploration has come, in less than 80 characters, or why the truck ``stands``."""
     where = "" if state.target is None else f" to ({state.target.x:.1f}, {state.target.y:.1f})"
+    if stands:
+        return f"{state.elapsed:5.0f} s  it stands: {stands}"
     return (
         f"{state.elapsed:5.0f} s {state.travelled:6.1f} m  {state.known:6.1f} m^2 known, "
         f"{state.frontiers:2d} frontiers  {state.phase}{where}"

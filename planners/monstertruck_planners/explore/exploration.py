@@ -45,6 +45,8 @@ TRAIL: Final = 0.5
 """Metres between the poses that are remembered for driving back..."""
 REMEMBERED: Final = 8
 """...and how many."""
+COUNTED: Final = 0.03
+"""Metres from which on a motion counts: a standing robot's pose moves by some millimetres with every scan."""
 LEAST_USED: Final = 0.05
 """Share of the charge after which its use per metre counts as measured."""
 PASSING: Final = frozenset({Reason.PLANNER_STARTING, Reason.NO_MAP, Reason.LEASE_EXPIRED})
@@ -156,6 +158,9 @@ class Exploration:
     """Answers in a row without a place to look at."""
     newest: ExploreAnswer = field(default_factory=ExploreAnswer)
     travelled: float = 0.0
+    """Metres, by poses apart by ``COUNTED``."""
+    counted: Pose | None = None
+    """The last of these."""
     before: Pose | None = None
     trail: tuple[Pose, ...] = ()
     """Where it came from, the newest last."""
@@ -229,12 +234,17 @@ def tick(run: Exploration, seen: Observed, config: ExplorerConfig) -> Step:
 
 
 def _moved(run: Exploration, seen: Observed) -> Exploration:
-    way = 0.0 if run.before is None or seen.pose is None else math.dist(run.before[:2], seen.pose[:2])
+    way = 0.0 if run.counted is None or seen.pose is None else math.dist(run.counted[:2], seen.pose[:2])
+    counted = run.counted
+    if counted is None or seen.pose is None or way >= COUNTED:
+        counted = seen.pose
+    else:
+        way = 0.0
     charge = seen.charge if run.charge is None else run.charge
     trail = run.trail
     if seen.pose is not None and (not trail or math.dist(trail[-1][:2], seen.pose[:2]) >= TRAIL) and not run.backing:
         trail = (*trail, seen.pose)[-REMEMBERED:]
-    return replace(run, before=seen.pose, travelled=run.travelled + way, charge=charge, trail=trail)
+    return replace(run, before=seen.pose, counted=counted, travelled=run.travelled + way, charge=charge, trail=trail)
 
 
 def _merged(before: ExploreAnswer, answer: ExploreAnswer) -> ExploreAnswer:

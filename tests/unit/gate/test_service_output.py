@@ -10,6 +10,7 @@ from monstertruck_schemas.cmd import DriveAction
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order, Role
 from monstertruck_schemas.state import GateMode
+from monstertruckd.gate.config import GateConfig
 from monstertruckd.gate.latch import MemoryLatch
 from monstertruckd.gate.service import METER_DEPTH, GateInputs, GateOutputs, GateService, TickMeter
 from tests.unit.gate.bench import Bench, Inbox, Outbox, on_bench
@@ -244,5 +245,16 @@ def test_ticks_and_mode_are_shown_to_the_watchdog():
         assert bench.service.ticks() - before == 10
         assert bench.service.mode is GateMode.DISARMED
         assert bench.readies == bench.service.ticks()
+
+    on_bench(scenario)
+
+
+def test_that_short_faults_repeat_is_logged_too(caplog):
+    async def scenario(bench):
+        for _ in range(GateConfig().short_faults):
+            bench.service._gate._count_short_fault(bench.clock.now())
+        await bench.clock.sleep(0.05)
+        logged = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+        assert "4 stops for stale sensors within 10 s: disarmed" in logged
 
     on_bench(scenario)

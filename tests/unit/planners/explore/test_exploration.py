@@ -306,3 +306,18 @@ def test_places_are_left_alone_until_their_time_is_over():
     assert again.banned(math.inf) == ()
     assert again.banned(1e9) == ((1.2, 1.0),)
     assert again.released(90.0) is None
+
+
+def test_a_pose_that_trembles_is_no_way():
+    stepped = SteppedExploration()
+    stepped.drive()
+    x, y, yaw = stepped.pose
+    began = stepped.run.travelled
+    for k in range(100):
+        stepped.pose = (x + 0.002 * (-1) ** k, y, yaw)
+        stepped.step()
+    assert stepped.run.travelled == began
+    for k in range(100):
+        stepped.pose = (x + 0.005 * k, y, yaw)
+        stepped.step()
+    assert stepped.run.travelled - began == pytest.approx(0.495, abs=0.03)

@@ -5,12 +5,13 @@ import asyncio
 import pytest
 
 from monstertruck_runtime.errors import InputError, NoAnswerError, RequestRefusedError
-from monstertruck_runtime.mailbox import Mailbox, fifo
+from monstertruck_runtime.mailbox import Mailbox, fifo, latest
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.plan import ExplorationPhase, ExplorationState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import ExploreOrder
-from monstertruck_schemas.topics import EXPLORE
+from monstertruck_schemas.state import GateMode, GateState
+from monstertruck_schemas.topics import EXPLORE, GATE
 from monstertruckd.tools.cli.explore import seconds_of
 from monstertruckd.tools.cli.runs import progress_line, run_exploration
 
@@ -29,10 +30,11 @@ class Robot:
     def __init__(self, *states: ExplorationState, refuse: bool = False) -> None:
         self.orders: list[tuple[str, ...]] = []
         self.mailbox: Mailbox[ExplorationState] = Mailbox(fifo(64), lambda _: None)
+        self.gate: Mailbox[GateState] = Mailbox(latest())
         self.states, self.refuse = states, refuse
 
     def subscribe(self, topic, delivery):
-        return self.mailbox if topic is EXPLORE else Mailbox(delivery)
+        return {EXPLORE: self.mailbox, GATE: self.gate}.get(topic) or Mailbox(delivery)
 
     async def arm(self):
         self.orders.append(("arm",))
@@ -104,3 +106,17 @@ def test_another_exploration_ends_it():
     robot = Robot(state(4, ExplorationPhase.LOOKING, source="bob"))
     end = asyncio.run(run_exploration(robot, home=None, budget=None, arm=False))
     assert (end.reason, end.text) == (Reason.CANCELLED, "bob started another one")
+
+
+def test_a_truck_that_stands_disarmed_is_not_said_to_drive():
+    robot = Robot(*(state(3, ExplorationPhase.DRIVING, elapsed=float(t)) for t in (0, 1, 2)))
+    robot.gate.put(
+        GateState(
+            stamp=1, received=1, seq=0, mode=GateMode.DISARMED, nonce="n", speed_limit=0.0, reasons=(Reason.DISARMED,)
+        )
+    )
+    robot.states += (state(3, ExplorationPhase.IDLE, Reason.EXPLORED),)
+    lines: list[str] = []
+    asyncio.run(run_exploration(robot, home=None, budget=None, arm=False, report=lines.append))
+    assert lines[0] == "    0 s  it stands: the truck is disarmed; `monstertruckd arm` lets it drive"
+    assert len(lines[0]) < 80

@@ -1,0 +1,65 @@
+"""Each of the other wizards alone through the whole daemon: on robots of which only what it measures is hidden.
+
+Judged is, for every wizard, the share of its numbers that lie in their intervals, and that every choice (a sign, a
+direction) is right.
+"""
+
+import logging
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Final
+
+import numpy as np
+
+from monstertruck_runtime.errors import TruckError
+from monstertruckd.config.calibration import WizardName
+from monstertruckd.tools.calibrate.camera import CameraWizard, camera_wizard
+from monstertruckd.tools.calibrate.imu import imu_wizard
+from monstertruckd.tools.calibrate.lidar import LidarWizard, lidar_wizard
+from monstertruckd.tools.calibrate.odometry import odometry_wizard
+from monstertruckd.tools.calibrate.slip import slip_wizard
+from monstertruckd.tools.calibrate.sonar import sonar_wizard
+from monstertruckd.tools.calibrate.stabiliser import stabiliser_wizard
+from monstertruckd.tools.calibrate.wizard import Wizard
+from tests.calibration_kit import Verdict, run_session, verdicts
+from tests.calibration_robots import robot_of
+
+WIZARDS: Final[dict[WizardName, Wizard]] = {
+    "odometry": odometry_wizard(),
+    "lidar": lidar_wizard(LidarWizard(heights=True)),
+    "imu": imu_wizard(),
+    "slip": slip_wizard(),
+    "stabiliser": stabiliser_wizard(),
+    "camera": camera_wizard(CameraWizard(patience=120.0)),
+    "sonar": sonar_wizard(),
+}
+GOAL: Final = 0.9
+"""Share of the numbers inside their intervals."""
+
+
+def alone(count: int) -> tuple[dict[str, Any], dict[str, Any], bool]:
+    """Each wizard on so many robots; goals; whether they are met."""
+    logging.disable(logging.CRITICAL)
+    inside, wrong = {}, {}
+    for name, wizard in WIZARDS.items():
+        found = [verdict for seed in range(count) for verdict in _session(name, wizard, seed)]
+        numbers = [verdict.holds for verdict in found if verdict.low is not None]
+        inside[name] = round(sum(numbers) / max(len(numbers), 1), 4)
+        wrong[name] = sum(not verdict.holds for verdict in found if verdict.low is None)
+        print(f"{name}: {sum(numbers)} of {len(numbers)} numbers inside, {wrong[name]} choices wrong", flush=True)
+    figures = {"count": count, "inside": inside, "wrong_choices": wrong}
+    met = min(inside.values()) >= GOAL and not any(wrong.values())
+    return figures, {"inside": GOAL, "wrong_choices": 0}, met
+
+
+def _session(name: WizardName, wizard: Wizard, seed: int) -> list[Verdict]:
+    with TemporaryDirectory(prefix="monstertruck-") as folder:
+        config = robot_of(name, Path(folder), seed)
+        try:
+            session = run_session(config, wizard, np.random.default_rng([seed, 41]))
+        except TruckError as error:
+            print(f"{name}, robot {seed}: {error}", flush=True)
+            return [Verdict(f"{name}.finished", False, None, None, True)]
+        found = verdicts(session.result, config)
+    print(f"{name}, robot {seed}: outside {[v.name for v in found if not v.holds] or 'none'}", flush=True)
+    return found
