@@ -275,7 +275,7 @@ def _arrived(run: GoalRun, observed: Observations, config: PlannerConfig) -> Ste
     """The end of the route: is it the goal?"""
     assert observed.pose is not None
     away, turned = apart(observed.pose, run.goal)
-    off = f"{away:.3f} m and {math.degrees(turned):.1f} degrees away"
+    off = f"{away:.3f} m and {turned:.3f} rad away"
     error = max(away / config.position_tolerance, turned / config.yaw_tolerance)
     if run.via:
         off = f"{len(run.via)} waypoint{'s' if len(run.via) > 1 else ''} not passed"
