@@ -161,6 +161,8 @@ def result_of(arcs: Sequence[SkidArc], radius: float, half_track: float) -> Resu
     gains = {"gain_left": values["gain"] / tilt, "gain_right": values["gain"] * tilt}
     rows = [(name, values[name], errors[name], "m") for name in ("icr_left", "icr_right", "icr_x")]
     rows += [(name, value, share * value, "") for name, value in gains.items()]
+    # No body turns about a place before its base: beyond it by less than the error is at it.
+    highest = {"icr_x": 0.0} if values["icr_x"] <= errors["icr_x"] else {}
     meanings = {
         "icr_left": "turning centre of the left wheels, left of the middle",
         "icr_right": "turning centre of the right wheels",
@@ -174,9 +176,9 @@ def result_of(arcs: Sequence[SkidArc], radius: float, half_track: float) -> Resu
         estimates=tuple(
             Estimate(
                 name=name,
-                value=value,
+                value=min(value, highest.get(name, value)),
                 low=value - half,
-                high=value + half,
+                high=min(value + half, highest.get(name, value + half)),
                 unit=unit,
                 samples=len(arcs),
                 meaning=f"{meanings[name]}, on this floor; 95 % of poses and skidding",
