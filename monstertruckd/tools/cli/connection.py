@@ -61,6 +61,10 @@ async def robot_config(client: "TruckClient") -> "TruckConfig":
     return TruckConfig.model_validate_json(json.dumps(running))
 
 
+EXAMPLES = {"explorer": "configs/explore.yaml", "planner": "configs/goals.yaml", "points": "configs/points.yaml"}
+"""Shipped configurations that have a section."""
+
+
 async def require_section(client: "TruckClient", section: str, lacks: str) -> Any:
     """Return a section of the robot's configuration, as JSON.
 
@@ -74,5 +78,7 @@ async def require_section(client: "TruckClient", section: str, lacks: str) -> An
     """
     found = (await client.call("config")).get(section)
     if not found:
-        raise NotFoundError(f"robot {client.robot!r} {lacks}: expected a section `{section}` in its configuration")
+        example = f", as {EXAMPLES[section]} has" if section in EXAMPLES else ""
+        text = f"{lacks}: expected a section `{section}` in its configuration{example}"
+        raise NotFoundError(f"robot {client.robot!r} {text}")
     return found

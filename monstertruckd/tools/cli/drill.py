@@ -68,9 +68,9 @@ def _run(drill: "Drill", jobs: int, cluster: str | None, resume: Path | None) ->
 
 
 def _print(report: "DrillReport") -> None:
-    numbers = ("stop bytes s", "standstill s", "metres", "recovered s", "score")
+    numbers = ("stop s", "still s", "metres", "back s", "score")
     rows = [_cells(outcome) for outcome in report.outcomes]
-    print_table(("fault", "reaction", "reason", *numbers), rows, right=numbers)
+    print_table((*numbers, "reaction", "reason", "fault"), rows, right=numbers)
     out = console()
     for outcome in report.outcomes:
         for violation in outcome.violations:
@@ -88,14 +88,14 @@ def _print(report: "DrillReport") -> None:
 
 def _cells(outcome: "FaultOutcome") -> tuple[str, ...]:
     return (
-        outcome.fault,
-        outcome.reaction,
-        outcome.reason or "-",
         _seconds(outcome.stop_bytes_s),
         _seconds(outcome.standstill_s),
         f"{outcome.metres:.3f}",
         _seconds(outcome.recovered_s),
         str(outcome.score),
+        outcome.reaction,
+        outcome.reason or "-",
+        outcome.fault,
     )
 
 
