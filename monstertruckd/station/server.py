@@ -185,11 +185,11 @@ class Station:
         runs = (self._board.run(), *(each.run() for each in self._discoveries))
         discovering = [asyncio.create_task(run) for run in runs]
         assert runner.server is not None
-        place, doors = self.place, AsyncExitStack()
+        place, listening = self.place, AsyncExitStack()
         listener = WebListener(place.host, place.port, place.tls, runner.server, self._remarks.add)
         try:
             try:
-                await doors.enter_async_context(listener)
+                await listening.enter_async_context(listener)
             except OSError as error:
                 raise BusyError(f"{place.url} cannot be served: {error.strerror or error}") from None
             ready()
@@ -203,7 +203,7 @@ class Station:
                 await self._check_users()
                 self._close_crowds(runner.server)
         finally:
-            await doors.aclose()
+            await listening.aclose()
             tasks = [*self._following.values(), *discovering]
             for task in tasks:
                 task.cancel()

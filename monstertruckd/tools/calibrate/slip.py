@@ -159,10 +159,11 @@ def result_of(arcs: Sequence[SkidArc], radius: float, half_track: float) -> Resu
     tilt = math.sqrt(values["slip_ratio"])
     share = math.hypot(errors["gain"] / values["gain"], errors["slip_ratio"] / values["slip_ratio"] / 2)
     gains = {"gain_left": values["gain"] / tilt, "gain_right": values["gain"] * tilt}
-    rows = [(name, values[name], errors[name], "m") for name in ("icr_left", "icr_right", "icr_x")]
-    rows += [(name, value, share * value, "") for name, value in gains.items()]
+    rows = [(name, values[name], errors[name], math.inf, "m") for name in ("icr_left", "icr_right")]
     # No body turns about a place before its base: beyond it by less than the error is at it.
-    highest = {"icr_x": 0.0} if values["icr_x"] <= errors["icr_x"] else {}
+    most = 0.0 if values["icr_x"] <= errors["icr_x"] else math.inf
+    rows.append(("icr_x", values["icr_x"], errors["icr_x"], most, "m"))
+    rows += [(name, value, share * value, math.inf, "") for name, value in gains.items()]
     meanings = {
         "icr_left": "turning centre of the left wheels, left of the middle",
         "icr_right": "turning centre of the right wheels",
@@ -176,15 +177,15 @@ def result_of(arcs: Sequence[SkidArc], radius: float, half_track: float) -> Resu
         estimates=tuple(
             Estimate(
                 name=name,
-                value=min(value, highest.get(name, value)),
+                value=min(value, most),
                 low=value - half,
-                high=min(value + half, highest.get(name, value + half)),
+                high=min(value + half, most),
                 unit=unit,
                 samples=len(arcs),
                 meaning=f"{meanings[name]}, on this floor; 95 % of poses and skidding",
                 key=f"body.{name}",
             )
-            for name, value, half, unit in rows
+            for name, value, half, most, unit in rows
         ),
         unobserved=("another floor, another load", "what a reversal turns the body by, and slow sliding"),
     )

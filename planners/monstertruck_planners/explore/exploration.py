@@ -234,12 +234,11 @@ def tick(run: Exploration, seen: Observed, config: ExplorerConfig) -> Step:
 
 
 def _moved(run: Exploration, seen: Observed) -> Exploration:
-    way = 0.0 if run.counted is None or seen.pose is None else math.dist(run.counted[:2], seen.pose[:2])
-    counted = run.counted
-    if counted is None or seen.pose is None or way >= COUNTED:
+    counted, way = run.counted, 0.0
+    if counted is None or seen.pose is None:
         counted = seen.pose
-    else:
-        way = 0.0
+    elif (moved := math.dist(counted[:2], seen.pose[:2])) >= COUNTED:
+        counted, way = seen.pose, moved
     charge = seen.charge if run.charge is None else run.charge
     trail = run.trail
     if seen.pose is not None and (not trail or math.dist(trail[-1][:2], seen.pose[:2]) >= TRAIL) and not run.backing:
