@@ -26,7 +26,13 @@ class PeerService:
 
     def hear(self, robot: str, pose: Odometry) -> None:
         """Take the newest pose of another robot."""
-        self._heard[robot] = Peer(robot=robot, pose=pose.pose, twist=pose.twist, heard=self._clock.now())
+        self._heard[robot] = Peer(
+            robot=robot,
+            pose=pose.pose,
+            twist=pose.twist,
+            deviation=pose.position_deviation,
+            heard=self._clock.now(),
+        )
 
     async def run(self, ready: Ready) -> None:
         """Publish until cancelled."""

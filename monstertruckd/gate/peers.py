@@ -2,8 +2,9 @@
 
 A lidar does not look behind the robot, and what it saw there is old: another robot may have come since. Of robots that
 are heard (section ``peers``) the outline counts where the lidar does not look, all around for robots without one: where
-its own motion has taken it since it was heard, and takes it within ``HORIZON``. A pose older than ``FRESH`` tells where
-a robot was, not where it is: the outline stays there for ``KEPT``, and the robot may be anywhere (``unknown``).
+its own motion has taken it since it was heard, and takes it within ``HORIZON``. The clearance grows by how unsure both
+poses are. A pose older than ``FRESH`` tells where a robot was, not where it is: the outline stays there for ``KEPT``,
+and the robot may be anywhere (``unknown``), as one may whose place is not known to ``UNSURE``.
 """
 
 import math
@@ -27,6 +28,10 @@ FRESH: Final = 0.5
 for."""
 KEPT: Final = 30.0
 """Seconds for which the place of a silent one counts, as remembered points do."""
+DEVIATIONS: Final = 2.0
+"""Standard deviations of where two robots are to each other that are added to the clearance."""
+UNSURE: Final = 0.3
+"""Standard deviation from which poses tell no place, m; the clearance grows no further."""
 SPACING: Final = 0.03
 """Between the points of an outline, m."""
 STEP: Final = 0.02
@@ -67,10 +72,14 @@ class PeerGuard:
         self._heard = {peer.robot: peer for peer in peers.peers if peer.robot in self._edges}
 
     def unknown(self, now: int) -> bool:
-        """Whether another robot may be anywhere: it is silent, was never heard, or this one does not know its place."""
-        if self._pose(now) is None:
+        """Whether another robot may be anywhere: silent, never heard, or one of both does not know its place."""
+        own = self._own
+        if own is None or _age(own.stamp, now) > FRESH:
             return True
-        return any((peer := self._heard.get(name)) is None or _age(peer.heard, now) > FRESH for name in self._edges)
+        return any(
+            (peer := self._heard.get(name)) is None or _age(peer.heard, now) > FRESH or _deviation(own, peer) > UNSURE
+            for name in self._edges
+        )
 
     def free_distance(self, ways: Iterable[Way], reach: float, now: int, seen: Seen | None) -> float:
         """Distance the footprint can travel, m; +inf if nobody is known to be within reach.
@@ -81,52 +90,54 @@ class PeerGuard:
             now: ns.
             seen: what the lidar sees, where nobody counts; None = nothing.
         """
-        points = self._points(now, reach)
-        if seen is not None:
-            points = points[~seen(points)]
-        if not len(points):
-            return math.inf
-        return min((self._swept(way, reach, points) for way in ways), default=math.inf)
+        own, free = self._own, math.inf
+        if own is None or (age := _age(own.stamp, now)) > FRESH:
+            return free
+        ways, place = tuple(ways), _moved(own.pose, own.twist, age)
+        for peer in self._heard.values():
+            unsure = DEVIATIONS * min(_deviation(own, peer), UNSURE)
+            clearance = self._config.obstacle.side_clearance + unsure
+            points = self._outline(peer, place, now, reach, clearance)
+            if seen is not None:
+                points = points[~seen(points)]
+            if len(points):
+                free = min([free, *(self._swept(way, reach, points, clearance) for way in ways)])
+        return free
 
-    def _swept(self, way: Way, reach: float, points: Array) -> float:
+    def _swept(self, way: Way, reach: float, points: Array, clearance: float) -> float:
         corner = math.hypot(way[0], way[1]) + abs(way[2]) * self._footprint.circumscribed_radius
         distances = np.linspace(0.0, reach, max(2, math.ceil(reach * max(corner, 1.0) / STEP) + 1))
-        clearance = self._config.obstacle.side_clearance
         contact = first_contact(self._footprint, swept_poses(way, distances), points, clearance)
         return math.inf if contact is None else float(distances[contact - 1])
 
-    def _pose(self, now: int) -> Place | None:
-        """Of this robot in the map, m, m, rad; None = not known."""
-        if self._own is None or (age := _age(self._own.stamp, now)) > FRESH:
-            return None
-        return _moved(self._own.pose, self._own.twist, age)
-
-    def _points(self, now: int, reach: float) -> Array:
-        """Points of the outlines that are near, in base, shape (n, 2), m."""
-        found, own = [np.empty((0, 2))], self._pose(now)
-        if own is None:
+    def _outline(self, peer: Peer, own: Place, now: int, reach: float, clearance: float) -> Array:
+        """Points of another robot's outline where it is and goes, in base, shape (n, 2), m; none if it is far away."""
+        edges, age = self._edges[peer.robot], _age(peer.heard, now)
+        pose, twist = peer.pose, peer.twist
+        times = (0.0,) if age > FRESH else tuple(age + later for later in HORIZON)
+        radius, way = float(np.hypot(edges[:, 0], edges[:, 1]).max()), math.hypot(twist.vx, twist.vy) * times[-1]
+        near = reach + self._footprint.circumscribed_radius + clearance
+        found = [np.empty((0, 2))]
+        if age > KEPT or math.dist((pose.x, pose.y), own[:2]) > near + radius + way:
             return found[0]
-        near = reach + self._footprint.circumscribed_radius
-        for name, peer in self._heard.items():
-            edges, age = self._edges[name], _age(peer.heard, now)
-            pose, twist = peer.pose, peer.twist
-            times = (0.0,) if age > FRESH else tuple(age + later for later in HORIZON)
-            radius, way = float(np.hypot(edges[:, 0], edges[:, 1]).max()), math.hypot(twist.vx, twist.vy) * times[-1]
-            if age > KEPT or math.dist((pose.x, pose.y), own[:2]) > near + radius + way:
-                continue
-            for number, time in enumerate(times):
-                at = _moved(pose, twist, time)
-                outline = placed(np.column_stack((edges, np.zeros(len(edges)))), at)[:, :2]
-                outline = points_relative(outline, own)
-                if number and on_body(self._footprint, outline, self._config.obstacle.side_clearance).any():
-                    break  # it comes to this robot, which may have left by then
-                found.append(outline)
+        for number, time in enumerate(times):
+            at = _moved(pose, twist, time)
+            outline = placed(np.column_stack((edges, np.zeros(len(edges)))), at)[:, :2]
+            outline = points_relative(outline, own)
+            if number and on_body(self._footprint, outline, clearance).any():
+                break  # it comes to this robot, which may have left by then
+            found.append(outline)
         return np.concatenate(found)
 
 
 def _age(stamp: int, now: int) -> float:
     """S; 0 for what is stamped ahead."""
     return max(now - stamp, 0) / SECOND
+
+
+def _deviation(own: Odometry, peer: Peer) -> float:
+    """Standard deviation of where another robot is to this one, m: both are unsure of the map alone."""
+    return math.hypot(own.position_deviation, peer.deviation)
 
 
 def _moved(pose: Pose2D, twist: Twist2D, seconds: float) -> Place:

@@ -1,5 +1,6 @@
 """Messages of the ``state`` group: what the robot believes and in which state it is."""
 
+import math
 from enum import StrEnum
 from typing import Annotated, Final
 
@@ -37,6 +38,12 @@ class Odometry(Message):
     degraded: bool = False
     """It rests on a calibration that has expired."""
 
+    @property
+    def position_deviation(self) -> float:
+        """Standard deviation of the position along the axis where it is largest, m."""
+        xx, xy, yy = self.pose_covariance[0], self.pose_covariance[1], self.pose_covariance[4]
+        return math.sqrt(max(0.0, (xx + yy) / 2 + math.hypot((xx - yy) / 2, xy)))
+
 
 class Peer(Schema):
     """What another robot says of itself."""
@@ -47,6 +54,8 @@ class Peer(Schema):
     """In its map: robots that follow each other need one map, or starts measured in one frame."""
     twist: Twist2D
     """In its base."""
+    deviation: Annotated[float, Field(ge=0)] = 0.0
+    """Standard deviation of its position along the axis where it is largest, by itself, m; 0 in older recordings."""
     heard: Nanoseconds
     """When it came in, by this robot's clock: the other one's stamps mean nothing here."""
 

@@ -86,7 +86,8 @@ async def test_an_observer_on_the_network_asks_for_everything_and_gets_nothing_d
         assert called == []
         assert [box.drain() for box in asked] == [[], []]
         refused = robot.events.drain()
-        assert {event.reason for event in refused} == {Reason.BAD_INPUT}
+        assert {event.reason for event in refused} <= {Reason.BAD_INPUT, Reason.NOT_PERMITTED}
+        assert refused
         assert all(str(event.values["by"]).startswith("eve:") for event in refused), "who, beside why"
         async with await asyncio.start_server(lambda *_: None, "127.0.0.1", 0) as server:
             words = (sys.executable, "-c", REFUSED, HERE, str(server.sockets[0].getsockname()[1]))

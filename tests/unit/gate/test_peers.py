@@ -20,15 +20,17 @@ HEARD = 100 * SECOND
 SILENT = (Reason.PEER_UNKNOWN,)
 
 
-def pose(x=0.0, y=0.0, yaw=0.0, vx=0.0, now=HEARD):
+def pose(x=0.0, y=0.0, yaw=0.0, vx=0.0, now=HEARD, deviation=0.0):
     return Odometry(
         stamp=now, received=now, seq=0, frame="map", pose=Pose2D(x=x, y=y, yaw=yaw),
-        twist=Twist2D(vx=vx, vy=0.0, wz=0.0), pose_covariance=np.zeros(9), twist_covariance=np.zeros(9), age=0.0,
+        twist=Twist2D(vx=vx, vy=0.0, wz=0.0), pose_covariance=np.diag([deviation**2, 0.0, 0.0]).ravel(),
+        twist_covariance=np.zeros(9), age=0.0,
     )  # fmt: skip
 
 
-def heard(x, y, yaw=0.0, vx=0.0, robot="ann", now=HEARD):
-    peer = Peer(robot=robot, pose=Pose2D(x=x, y=y, yaw=yaw), twist=Twist2D(vx=vx, vy=0.0, wz=0.0), heard=now)
+def heard(x, y, yaw=0.0, vx=0.0, robot="ann", now=HEARD, deviation=0.0):
+    twist = Twist2D(vx=vx, vy=0.0, wz=0.0)
+    peer = Peer(robot=robot, pose=Pose2D(x=x, y=y, yaw=yaw), twist=twist, deviation=deviation, heard=now)
     return Peers(stamp=now, received=now, seq=0, frame="map", peers=(peer,))
 
 
@@ -50,6 +52,30 @@ def test_a_robot_behind_ends_the_way_back_and_no_other():
 def test_a_robot_aside_ends_a_turn_that_it_has_no_room_for():
     assert free(SPOT, heard(0.0, 0.39)) < 0.1
     assert free(SPOT, heard(0.0, 0.5)) == inf
+
+
+def test_a_turned_ellipse_counts_by_its_longest_axis():
+    turned = pose().model_copy(update={"pose_covariance": (0.05, 0.03, 0.0, 0.03, 0.05, 0.0, 0.0, 0.0, 0.1)})
+    assert turned.position_deviation == pytest.approx(0.08**0.5)
+    assert pose(deviation=0.3).position_deviation == pytest.approx(0.3)
+
+
+def test_poses_that_are_not_sure_keep_robots_further_apart():
+    sure = free(BACK, heard(-0.9, 0.0))
+    assert free(BACK, heard(-0.9, 0.0, deviation=0.06)) == pytest.approx(sure - 0.12, abs=0.021)
+    both = free(BACK, heard(-0.9, 0.0, deviation=0.06), own=pose(deviation=0.08))
+    assert both == pytest.approx(sure - 0.2, abs=0.021)
+    assert free(AHEAD, heard(-0.6, 0.0, deviation=0.2)) == inf, "one may always drive away"
+
+
+def test_poses_that_tell_no_place_make_the_robot_slow_and_close_no_more_ground():
+    guard = PeerGuard(GateConfig(), BODY, {"ann": BODY})
+    guard.observe_pose(pose(deviation=0.2))
+    guard.observe(heard(-9.0, 0.0, deviation=0.2))
+    assert not guard.unknown(HEARD)
+    guard.observe(heard(-9.0, 0.0, deviation=0.25))
+    assert guard.unknown(HEARD)
+    assert free(BACK, heard(-1.5, 0.0, deviation=9.0)) == free(BACK, heard(-1.5, 0.0, deviation=0.3)) > 0.3
 
 
 def test_one_that_comes_from_behind_stops_nobody_who_drives_on():
