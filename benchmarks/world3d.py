@@ -363,6 +363,8 @@ def main() -> None:
         "--keep", type=Path, help="folder for the laps' logs, and for finished drives and legs of the drill"
     )
     arguments = parser.parse_args()
+    if arguments.keep is not None:
+        arguments.keep.mkdir(parents=True, exist_ok=True)
     figures: dict[str, float] = {}
     calls = PARTS | {
         "lap": lambda: lap(arguments.keep),

@@ -159,6 +159,13 @@ def test_a_file_of_something_else_is_refused(tmp_path: Path, text: str, expected
         resumable().run(resume=tmp_path)
 
 
+def test_a_file_that_cannot_be_made_is_refused_before_the_first_leg(tmp_path: Path):
+    drill = resumable()
+    drill._parts = lambda *_: pytest.fail("it began")  # type: ignore[method-assign]
+    with pytest.raises(InputError, match="No such file"):
+        drill.run(resume=tmp_path / "nowhere" / "legs.jsonl")
+
+
 def test_every_kind_is_on_the_catalog_of_the_whole_truck_and_what_needs_hubs_is_not_without():
     others = {FaultKind.BAD_ANSWERS, FaultKind.HELD_WHEEL, FaultKind.WRONG_SIGN}  # of wheels, sonars, IMU
     others |= {FaultKind.DEAD_SONAR, FaultKind.STUCK_SONAR, FaultKind.CROSS_TALK}

@@ -303,11 +303,11 @@ class LegFile:
     """Outcomes of the finished legs of a drill, one JSON object a line, so that an interrupted drill goes on.
 
     Args:
-        path: the file; made with the first leg that is added.
+        path: the file; made where there is none.
         leg: any one of the drill.
 
     Raises:
-        InputError: it cannot be read, or is of another drill or program.
+        InputError: it cannot be read or written, or is of another drill or program.
     """
 
     def __init__(self, path: Path, leg: DrillLeg) -> None:
@@ -317,9 +317,9 @@ class LegFile:
         self._end = 0
         """Bytes of whole lines: an interrupted program leaves part of one."""
         try:
-            data = path.read_bytes()
-        except FileNotFoundError:
-            return
+            with path.open("a+b") as file:  # before the first leg, not after it: it must be possible to write
+                file.seek(0)
+                data = file.read()
         except OSError as error:
             raise InputError(f"{path}: {error.strerror}") from error
         self._end = data.rfind(b"\n") + 1
@@ -352,7 +352,7 @@ class LegFile:
         row = {**self._header, "leg": leg.number, "count": leg.count}
         line = json.dumps(row | {"outcomes": _OUTCOMES.dump_python(outcomes, mode="json")}).encode() + b"\n"
         try:
-            with self._path.open("r+b" if self._path.exists() else "wb") as file:
+            with self._path.open("r+b") as file:
                 file.seek(self._end)
                 file.write(line)
                 file.truncate()
