@@ -96,6 +96,7 @@ def configurations(folder: Path) -> list[Path]:
             "blackbox": None,
             "recorder": None,
             "odometry": {"start": start},
+            "slam": {"mode": "mapping"},
             "state_directory": str(folder / "{robot}" / "state"),
             "zenoh": {"listen": [endpoints[kind]]},
             "peers": {other: {"endpoint": end} for other, end in endpoints.items() if other != kind},

@@ -36,6 +36,9 @@ WIDE_OVERLAP_GAIN: Final = 0.15
 """and how much more than the first match it must overlap."""
 WIDE_FACTOR: Final = 3.0
 """Factor on the standard deviation of the predicted pose in the wide search."""
+SPACING: Final = 0.04
+"""About one point of a scan is matched per square of this edge, m, as keyframes have them: by beams, a person or robot
+beside the lidar would outweigh all walls."""
 COARSE_POINTS: Final = 160
 """Points of a scan used in the correlative search."""
 LEVELS: Final = 4
@@ -107,12 +110,14 @@ class ScanMatcher(Protocol):
 class PlanarMatcher:
     """Correlation in a window given by the guess's covariance, then generalised ICP with the guess as prior.
 
+    Every piece of surface counts by its length, not by the beams that met it (``SPACING``).
     A match that is rejected or overlaps little is repeated in a window ``WIDE_FACTOR`` times as wide, because wheels
     slip further than their covariance; its result must overlap more (``WIDE_MIN_OVERLAP``).
     """
 
     def match(self, scan: Scan, delta: Array, guess: Array, covariance: Array, submap: Submap) -> ScanMatch:
         """See ``ScanMatcher``."""
+        scan = scan.downsampled(SPACING, len(scan))
         if len(scan) < MIN_PAIRS or len(submap.cloud) < MIN_PAIRS:
             return rejected(guess, covariance, MatchStatus.EMPTY)
         match = self._match_in_window(scan, guess, covariance, submap)

@@ -109,7 +109,7 @@ def test_without_wheels_the_motion_so_far_is_the_guess():
 
 
 def test_the_distortion_of_a_swept_scan_is_undone_by_the_motion_it_shows():
-    jerky = np.cumsum(20 + 18 * np.sin(1.2 * np.arange(60))).astype(int)
+    jerky = np.cumsum(20 + 18 * np.sin(0.8 * np.arange(60))).astype(int)
     truth = rounds(1500, 1.0)[jerky]
     swept = dataclasses.replace(LIDAR, time_increment=0.08 / BEAMS)
     share = np.linspace(0.0, 0.8, BEAMS)[:, None]

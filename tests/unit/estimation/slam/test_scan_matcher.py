@@ -9,7 +9,7 @@ from monstertruck_estimation.slam.kiss_matcher import KissMatcher
 from monstertruck_estimation.slam.registration import Cloud, register
 from monstertruck_estimation.slam.scan_matcher import MatchStatus, PlanarMatcher
 from monstertruck_estimation.slam.scans import Scan, ScanGeometry, prepare
-from tests.unit.estimation.slam.kit import CORRIDOR, ROOM, scan
+from tests.unit.estimation.slam.kit import CORRIDOR, ROOM, box, scan
 
 PLACE = np.array((1.8, 0.2, 1.2))
 WIDE = np.diag((0.3**2, 0.3**2, 0.2**2))
@@ -32,6 +32,16 @@ def test_the_fine_fit_finds_the_place_and_knows_how_well():
     assert fit.overlap > 0.9
     assert fit.residual < 0.012
     assert np.linalg.eigvalsh(fit.information)[0] > 100
+
+
+@pytest.mark.parametrize("moved", [0.1, 0.15, 0.2])
+def test_a_thing_that_moves_beside_the_lidar_does_not_take_the_pose_along(moved):
+    hall = [((-3, -3), (3, -3)), ((3, -3), (3, 3)), ((3, 3), (-3, 3)), ((-3, 3), (-3, -3))]
+    submap = seen_from([*hall, *box(0.4, -0.25, 0.6, 0.25)], np.zeros(3))
+    now = scan([*hall, *box(0.4 + moved, -0.2, 0.6 + moved, 0.3)], np.zeros(3))
+    match = PlanarMatcher().match(now, np.zeros(3), np.zeros(3), np.diag((0.05**2, 0.05**2, 0.05**2)), submap)
+    assert match.accepted
+    assert match.pose == pytest.approx(np.zeros(3), abs=0.022)  # by beams, a quarter of them, it took the pose along
 
 
 def test_the_search_returns_the_greatest_score_of_its_window():
