@@ -66,7 +66,7 @@ async def _carry_out(bus: Bus, clock: Clock, order: Order, payload: dict[str, An
                     if CARRIED_OUT[order](state.mode):
                         return state.model_dump(mode="json")
                     if order not in GRADUAL:
-                        raise RequestRefusedError(next(iter(state.reasons), Reason.DISARMED))
+                        raise RequestRefusedError(state.worst)
         except TimeoutError:
             msg = f"{order.value} accepted, but standstill is not confirmed after {STANDSTILL:g} s"
             raise NoAnswerError(msg) from None

@@ -55,8 +55,8 @@ class DriveReport:
     def under_way(self, what: str, share: float) -> None:
         """Driven so far, 0..1."""
 
-    def stands(self, why: str) -> None:
-        """The truck stands, for another reason than before."""
+    def stands(self, gate: GateState) -> None:
+        """The truck stands, for other reasons than before."""
 
 
 SILENT: Final = DriveReport()
@@ -241,14 +241,12 @@ async def _watched(
 
 
 async def _say_why_it_stands(gate: Mailbox[GateState], clock: Clock, report: DriveReport) -> None:
-    said = ""
+    said: str | None = None
     while True:
         await clock.sleep(2 * LOOK)
         state = gate.latest
         if state is None or state.mode.active:
-            said = ""
-            continue
-        why = ", ".join(reason.text for reason in state.reasons) or state.mode.value
-        if why != said:
-            said = why
-            report.stands(why)
+            said = None
+        elif state.why != said:
+            said = state.why
+            report.stands(state)

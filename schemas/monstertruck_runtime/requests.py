@@ -230,3 +230,10 @@ def refusal(request: Request, gate: GateState | None, sequences: Sequences, now:
     if reason is Reason.OK and request.role not in OPERATORS:
         reason = Reason.BAD_ROLE
     return reason
+
+
+def does_not_drive(gate: GateState | None) -> RequestRefusedError:
+    """What to answer who asks a robot for motion that is not armed: what holds it most, and why in words."""
+    if gate is None:
+        return RequestRefusedError(Reason.DISARMED, f"the robot does not drive: {Reason.DISARMED.text}")
+    return RequestRefusedError(gate.worst, f"the robot does not drive: {gate.why}")

@@ -3,6 +3,7 @@
 Members only ever get added; a value or an exit code is never reused.
 """
 
+from collections.abc import Iterable
 from enum import StrEnum
 from typing import Self
 
@@ -205,3 +206,8 @@ class Reason(StrEnum):
     MISSION_DONE = "mission_done", 0, "all steps of the mission are done"
     MISSION_INCOMPLETE = "mission_incomplete", 124, "steps of the mission have failed"
     BUDGET_SPENT = "budget_spent", 0, "the time for exploring is over"
+
+
+def in_words(reasons: Iterable[Reason]) -> str:
+    """Texts of all ``reasons``, in their order."""
+    return ", ".join(reason.text for reason in reasons)

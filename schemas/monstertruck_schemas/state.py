@@ -17,7 +17,7 @@ from monstertruck_schemas.base import (
     Twist2D,
     UInt8Array,
 )
-from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.reasons import Reason, in_words
 from monstertruck_schemas.req import DriveForm, Role
 
 
@@ -198,3 +198,18 @@ class GateState(Message):
     """Operators who have asked the one who drives to hand over, the newest last."""
     handed_to: str | None = None
     """Operator to whom the drive was handed over just now: others of that priority wait a moment."""
+
+    @property
+    def worst(self) -> Reason:
+        """What limits or stops the truck most; ``DISARMED`` if nothing is named."""
+        return next(iter(self.reasons), Reason.DISARMED)
+
+    @property
+    def hindrances(self) -> tuple[Reason, ...]:
+        """``reasons`` without ``DISARMED``, which says no more than that nobody has armed."""
+        return tuple(reason for reason in self.reasons if reason is not Reason.DISARMED)
+
+    @property
+    def why(self) -> str:
+        """Why the truck stands or is slow, in words; its mode where no reason is named."""
+        return in_words(self.reasons) or f"the truck is {self.mode}"

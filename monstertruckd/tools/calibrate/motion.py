@@ -13,7 +13,7 @@ from monstertruck_runtime.mailbox import Mailbox, fifo
 from monstertruck_runtime.requests import Operator
 from monstertruck_schemas import topics
 from monstertruck_schemas.cmd import DriveCommand, SteeringCommand
-from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.reasons import Reason, in_words
 from monstertruck_schemas.sensor import Attitude, DriveFeedback, SteeringFeedback
 from monstertruck_schemas.state import GateMode, GateState
 from monstertruckd.tools.calibrate.steps import MoveRecord, MoveStep
@@ -147,9 +147,8 @@ class Mover:
             if new - way > PROGRESS:
                 way, since = new, self._clock.now()
             elif self._clock.now() - since > STUCK * SECOND:
-                held = run.state.reasons if run.state else ()
-                why = ", ".join(reason.text for reason in held) or "no reason given"
-                text = f"{move.name}: no progress for {STUCK:g} s ({why})"
+                text = f"{move.name}: no progress for {STUCK:g} s ({run.state.why if run.state else 'silent'})"
+                held = run.state is not None and run.state.reasons
                 raise RequestRefusedError(held[0], text) if held else NoAnswerError(text)
 
     @asynccontextmanager
@@ -319,11 +318,11 @@ class _Run:
         state = self.state
         if state is None or self._driving():
             return
-        reasons = [reason for reason in state.reasons if reason is not Reason.DISARMED]
+        reasons = state.hindrances
         if not reasons and state.mode is GateMode.DRIVING:
             raise RequestRefusedError(Reason.BUSY, f"{state.holder} drives the truck")
         if not reasons and state.mode.active:  # armed still, but this wizard's requests hold it no longer
-            reasons = [Reason.LEASE_EXPIRED]
-        text = ", ".join(reason.text for reason in reasons) or f"the truck is {state.mode}"
+            reasons = (Reason.LEASE_EXPIRED,)
+        text = in_words(reasons) or f"the truck is {state.mode}"
         advice = "".join(f"; {text}" for text in dict.fromkeys(ADVICE[r] for r in reasons if r in ADVICE))
         raise RequestRefusedError(reasons[0] if reasons else Reason.DISARMED, f"stopped by the gate: {text}{advice}")

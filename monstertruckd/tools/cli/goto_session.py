@@ -4,7 +4,8 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 
 from monstertruck_runtime.drives import DriveReport
-from monstertruckd.tools.cli.output import progress, remark
+from monstertruck_schemas.state import GateState
+from monstertruckd.tools.cli.output import progress, remark, with_remedy
 
 
 class TerminalReport(DriveReport):
@@ -29,9 +30,9 @@ class TerminalReport(DriveReport):
             self._show = self._shown.enter_context(progress(what, 1.0))
         self._show(share)
 
-    def stands(self, why: str) -> None:
+    def stands(self, gate: GateState) -> None:
         """Say it."""
-        remark(f"waiting: {why}; `monstertruckd arm` lets it drive, or --arm of this command")
+        remark(f"waiting: {with_remedy(gate.worst, gate.why)}")
 
 
 @contextmanager

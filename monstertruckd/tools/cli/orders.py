@@ -12,7 +12,7 @@ import typer
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError, TruckError
-from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.reasons import Reason, in_words
 from monstertruckd.tools.cli.connection import with_robot
 from monstertruckd.tools.cli.options import EndpointOption, RobotOption
 from monstertruckd.tools.cli.output import JsonOption, finish, print_json, remark
@@ -129,8 +129,8 @@ def _state_texts(state: "GateState") -> Iterator[str]:
         yield f"{state.holder} drives"
     elif state.waiting:
         yield f"{', '.join(state.waiting)} waits to drive"
-    if held := [r.text for r in state.reasons if r not in (Reason.DISARMED, Reason.ESTOPPED)]:
-        yield ", ".join(held)
+    if held := in_words(reason for reason in state.hindrances if reason is not Reason.ESTOPPED):
+        yield held
 
 
 def arm(

@@ -13,7 +13,6 @@ from monstertruck_schemas.mission import Mission
 from monstertruck_schemas.plan import BehaviourState, ExplorationState, MissionState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import BehaviourOrder, ExploreOrder, MissionOrder
-from monstertruck_schemas.state import GateState
 from monstertruck_schemas.topics import BEHAVIOUR, EXPLORE, GATE, MISSION, Topic
 from monstertruckd.tools.cli.output import progress, with_remedy
 
@@ -100,10 +99,12 @@ async def run_exploration(
 
     def show(state: ExplorationState) -> None:
         nonlocal shown, due
-        now = state.phase, state.goals, _why_it_stands(gate.latest)
+        held = gate.latest
+        stands = "" if held is None or held.mode.active else with_remedy(held.worst, held.why)
+        now = state.phase, state.goals, stands
         if report is not None and (now != shown or state.elapsed >= due):
             shown, due = now, state.elapsed + EVERY
-            report(progress_line(state, now[-1]))
+            report(progress_line(state, stands))
 
     with client.subscribe(GATE, latest()) as gate:
         return await _run(
@@ -115,14 +116,6 @@ async def run_exploration(
             ("elapsed", "travelled", "known", "goals"),
             arm=arm,
         )
-
-
-def _why_it_stands(gate: GateState | None) -> str:
-    """Why the truck may not move, in words; empty if it may."""
-    if gate is None or gate.mode.active:
-        return ""
-    reason = next(iter(gate.reasons), Reason.DISARMED)
-    return with_remedy(reason, reason.text)
 
 
 async def run_mission(

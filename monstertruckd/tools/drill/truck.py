@@ -12,7 +12,6 @@ from monstertruck_runtime.mailbox import fifo, latest
 from monstertruck_schemas import topics
 from monstertruck_schemas.event import Event
 from monstertruck_schemas.health import HealthTable, ServiceState
-from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import DriveRequest, Order, Role
 from monstertruck_schemas.state import GateMode, GateState
 from monstertruckd.bus.local import Bus
@@ -157,8 +156,7 @@ class DrillTruck:
             return ("daemon",)
         down = [r.name for r in table.services if r.state is not ServiceState.READY and r.name not in OPTIONAL]
         driving = state.mode is GateMode.DRIVING
-        reasons = () if driving else tuple(reason for reason in state.reasons if reason is not Reason.DISARMED)
-        return (*down, *reasons)
+        return (*down, *(() if driving else state.hindrances))
 
     async def until(self, condition: Callable[[], bool], seconds: float, order: Order | None = None) -> bool:
         """Whether the condition becomes true in time; until then the order is repeated while the truck is disarmed."""

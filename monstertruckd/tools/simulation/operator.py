@@ -149,8 +149,8 @@ async def drive_lap(operator: Operator, clock: Clock, *, timeout: float = 30.0, 
                         armed_again += 1
                         await _arm(operator, clock, timeout)
         except TimeoutError:
-            held = ", ".join(reason.text for reason in gate.latest.reasons) if gate.latest else ""
-            raise NoAnswerError(f"path not finished within {limit:g} s ({held or 'nothing held the truck'})") from None
+            why = gate.latest.why if gate.latest else "no state of the gate"
+            raise NoAnswerError(f"path not finished within {limit:g} s ({why})") from None
         finally:
             await operator.disarm()
 

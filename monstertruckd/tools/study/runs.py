@@ -8,7 +8,6 @@ from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import InputError, RequestRefusedError
 from monstertruck_runtime.mailbox import Delivery, Mailbox, latest
 from monstertruck_schemas import topics
-from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.state import GateState
 from monstertruck_schemas.topics import Topic
 from monstertruckd.config.truck import TruckConfig
@@ -151,8 +150,7 @@ async def drive(robot: OpenLoop, clock: Clock, config: TruckConfig, plan: Sequen
                     await clock.sleep_until(min(due, end))
                     state = gate.latest
                     if state is not None and not state.mode.active and state.stamp > began + SECOND:
-                        reason = next(iter(state.reasons), Reason.DISARMED)
-                        raise RequestRefusedError(reason, f"the robot stopped on the way: {reason.text}")
+                        raise RequestRefusedError(state.worst, f"the robot stopped on the way: {state.why}")
         finally:
             await robot.disarm()
     return (clock.now() - began) / SECOND

@@ -220,9 +220,8 @@ class Move:
                 state, Reason.BEHAVIOUR_DONE, f"{state.covered:.3f} {unit}, turned {state.turned:.3f} rad"
             )
         if waited > PATIENCE:
-            held = ", ".join(reason.text for reason in gate.reasons) or "nothing holds it"
             reason = Reason.GOAL_MISSED if state.phase == "arrive" else Reason.STUCK
-            return self._ended(state, reason, f"{left:.3f} left and no progress for {waited:.1f} s: {held}")
+            return self._ended(state, reason, f"{left:.3f} left and no progress for {waited:.1f} s: {gate.why}")
         off = state.target - state.covered
         usual = LAG * abs(state.planned)
         beyond = off - min(max(off, -usual), usual)

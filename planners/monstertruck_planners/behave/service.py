@@ -21,7 +21,7 @@ from monstertruck_runtime.clock import SECOND, Clock, Schedule
 from monstertruck_runtime.errors import InputError, NotFoundError, RequestRefusedError
 from monstertruck_runtime.mailbox import latest
 from monstertruck_runtime.ports import BusPort, EventSink, Publisher, Ready, RpcRegistry, Subscription
-from monstertruck_runtime.requests import Sequences, parse_request, planner_request, refusal
+from monstertruck_runtime.requests import Sequences, does_not_drive, parse_request, planner_request, refusal
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.plan import BehaviourState, GoalPhase, GoalState, TrackerState
@@ -159,8 +159,7 @@ class BehaviourService:
         if (other := self._other_planner(now)) is not None:
             raise RequestRefusedError(Reason.BUSY, other)
         if gate is None or not gate.mode.accepts_motion:
-            held = Reason.DISARMED if gate is None else next(iter(gate.reasons), Reason.DISARMED)
-            raise RequestRefusedError(held, f"the robot does not drive: {held.text}")
+            raise does_not_drive(gate)
         config = _with_settings(self.configs[name], request.settings)
         behaviour = self._made(config)
         if (stale := self._stale(behaviour, now)) is not None:
@@ -231,15 +230,15 @@ class BehaviourService:
         """Why the behaviour cannot go on."""
         gate = self._gate.latest
         if gate is None or not gate.mode.active:
-            reason = Reason.DISARMED if gate is None else next(iter(gate.reasons), Reason.DISARMED)
-            return reason, f"the robot does not drive: {reason.text}"
+            error = does_not_drive(gate)
+            return error.refusal, str(error)
         if (other := self._other_planner(now)) is not None:
             return Reason.BUSY, other
         if (stale := self._stale(run.behaviour, now)) is not None:
             return Reason.INPUT_STALE, stale
         if run.disobeyed is not None and now - run.disobeyed > DISOBEYED * SECOND:
             reason = next(iter(gate.reasons), Reason.NOT_OBEYED)
-            return reason, f"the gate does not let it drive: {reason.text}"
+            return reason, f"the gate does not let it drive: {gate.why}"
         return None
 
     def _stale(self, behaviour: Behaviour, now: int) -> str | None:

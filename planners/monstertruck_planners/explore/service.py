@@ -16,7 +16,7 @@ from monstertruck_runtime.clock import SECOND, Clock, Schedule
 from monstertruck_runtime.errors import RequestRefusedError, WorkerError
 from monstertruck_runtime.mailbox import Mailbox
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, RpcRegistry, Subscription
-from monstertruck_runtime.requests import Sequences, inner_request, parse_request, refusal
+from monstertruck_runtime.requests import Sequences, does_not_drive, inner_request, parse_request, refusal
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.event import Event, Severity
 from monstertruck_schemas.health import LocalisationStatus, SlamHealth
@@ -169,8 +169,7 @@ class ExplorerService:
         if goal is not None and goal.phase is not GoalPhase.IDLE:
             raise RequestRefusedError(Reason.BUSY, f"goal {goal.number} of {goal.source} is pursued, cancel it first")
         if gate is None or not gate.mode.active:
-            held = Reason.DISARMED if gate is None else next(iter(gate.reasons), Reason.DISARMED)
-            raise RequestRefusedError(held, f"the robot does not drive: {held.text}")
+            raise does_not_drive(gate)
         if (pose := self._pose(now)) is None:
             raise RequestRefusedError(Reason.NO_MAP, "no pose in a map yet")
         self._fresh, self._goal, self._refused, self._saves = True, None, None, None

@@ -43,7 +43,7 @@ from monstertruck_runtime.requests import Sequences, parse_request, refusal
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.plan import MAX_COORDINATE, GoalPhase, GoalState
-from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.reasons import Reason, in_words
 from monstertruck_schemas.req import GoalControl, GoalOrder, GoalRequest, Request
 from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.sensor import LaserScan
@@ -263,7 +263,7 @@ class GoalService:
             along=along if followed is None else followed.before + along,
             left=self._left(followed, along),
             blocked=odometry is not None and followed is not None and self._blocked(followed, along, odometry, now),
-            held="" if gate is None else ", ".join(r.text for r in gate.reasons if r is not Reason.DISARMED),
+            held="" if gate is None else in_words(gate.hindrances),
         )
 
     def _left(self, followed: FollowedPath | None, along: float) -> float:

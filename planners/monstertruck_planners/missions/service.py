@@ -24,7 +24,7 @@ from monstertruck_planners.missions.progress import (
 from monstertruck_runtime.clock import SECOND, Clock, Schedule
 from monstertruck_runtime.errors import InputError, NotFoundError, RequestRefusedError, TruckError
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, RpcRegistry, Subscription
-from monstertruck_runtime.requests import Sequences, inner_request, parse_request, refusal
+from monstertruck_runtime.requests import Sequences, does_not_drive, inner_request, parse_request, refusal
 from monstertruck_runtime.small_files import replace_file
 from monstertruck_runtime.threads import Offload
 from monstertruck_schemas.base import Pose2D
@@ -237,8 +237,7 @@ class MissionService:
         if running:
             raise RequestRefusedError(Reason.BUSY, f"the mission of {self._source} is running, stop it first")
         if gate is None or not gate.mode.active:
-            held = Reason.DISARMED if gate is None else next(iter(gate.reasons), Reason.DISARMED)
-            raise RequestRefusedError(held, f"the robot does not drive: {held.text}")
+            raise does_not_drive(gate)
         progress = self._begin(request)
         self._check(progress.mission)
         assert self._tasks is not None

@@ -13,7 +13,7 @@ from monstertruck_schemas.plan import Path
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import DriveForm, DriveRequest, RequestedTwist, Role
 from monstertruck_schemas.sensor import LaserScan, SteeringFeedback
-from monstertruck_schemas.state import Grid, Odometry
+from monstertruck_schemas.state import GateMode, GateState, Grid, Odometry
 
 HEADER = {"stamp": 1, "received": 2, "seq": 3}
 
@@ -216,3 +216,24 @@ def test_arrays_have_one_dimension():
         Path(**HEADER, poses=np.zeros((2, 3)), directions=[])
     with pytest.raises(ValidationError, match="poses"):
         Path(**HEADER, poses=[{}], directions=[])
+
+
+@pytest.mark.parametrize(
+    ("mode", "reasons", "worst", "hindrances", "why"),
+    [
+        (GateMode.ARMED, (), Reason.DISARMED, 0, "the truck is armed"),
+        (GateMode.DISARMED, (Reason.DISARMED,), Reason.DISARMED, 0, "the truck is disarmed"),
+        (
+            GateMode.DISARMED,
+            (Reason.SCAN_STALE, Reason.DISARMED),
+            Reason.SCAN_STALE,
+            1,
+            "no fresh lidar scan, the truck is disarmed",
+        ),
+    ],
+)
+def test_the_gate_says_why_the_truck_stands(
+    mode: GateMode, reasons: tuple[Reason, ...], worst: Reason, hindrances: int, why: str
+):
+    state = GateState(**HEADER, mode=mode, nonce="n", speed_limit=0.0, reasons=reasons)  # type: ignore[arg-type]
+    assert (state.worst, len(state.hindrances), state.why) == (worst, hindrances, why)

@@ -14,16 +14,20 @@ from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError
 from monstertruck_runtime.mailbox import Mailbox
 from monstertruck_schemas import topics
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.state import GateMode
+from monstertruck_schemas.state import GateMode, GateState
 from monstertruckd.tools.calibrate import motion
 from monstertruckd.tools.calibrate.steps import MoveStep
 
 STEP = MoveStep("run", speed=0.2, front=0.0, rear=0.0, metres=1.0)
 
 
+def gate_state(reasons: tuple[Reason, ...], mode: GateMode) -> GateState:
+    return GateState(stamp=0, received=0, seq=0, mode=mode, nonce="n", speed_limit=0.0, reasons=reasons)
+
+
 def stopped(*reasons: Reason, mode: GateMode = GateMode.DISARMED) -> RequestRefusedError:
     run = motion._Run(None, None, (), {})
-    run.state = SimpleNamespace(reasons=reasons, mode=mode, holder=None)
+    run.state = gate_state(reasons, mode)
     run._truck = SimpleNamespace(source="wizard")
     with pytest.raises(RequestRefusedError) as refused:
         run._check()
@@ -62,7 +66,7 @@ def test_a_silent_device_says_what_to_do_once():
             RequestRefusedError,
             "run: no progress for 3 s (obstacle within the stopping distance)",
         ),
-        ((), NoAnswerError, "run: no progress for 3 s (no reason given)"),
+        ((), NoAnswerError, "run: no progress for 3 s (the truck is driving)"),
     ],
 )
 def test_a_run_that_is_held_ends_by_what_holds_it(held: tuple[Reason, ...], kind: type[Exception], said: str):
@@ -73,7 +77,7 @@ def test_a_run_that_is_held_ends_by_what_holds_it(held: tuple[Reason, ...], kind
         async def hold(*_: float) -> None:
             await clock.sleep(motion.PERIOD)
 
-        run = SimpleNamespace(track=record, state=SimpleNamespace(reasons=held), hold=hold)
+        run = SimpleNamespace(track=record, state=gate_state(held, GateMode.DRIVING), hold=hold)
         await mover._drive(run, STEP, lambda _: None)
 
     with pytest.raises(kind) as ended:
@@ -136,7 +140,7 @@ class HinderedTruck:
                 self._mode, self._until = GateMode.DISARMED, self._clock.now() + round(seconds * SECOND)
             now = self._clock.now()
             position = drivetrain.motor_angle(self.x)
-            state = SimpleNamespace(mode=self._mode, reasons=self._reasons(), holder=self.source)
+            state = gate_state(self._reasons(), self._mode).model_copy(update={"holder": self.source})
             for box in self._boxes.get(topics.GATE.name, ()):
                 box.put(state)
             for box in self._boxes.get(topics.DRIVE.name, ()):

@@ -167,6 +167,20 @@ def test_a_goal_waits_while_the_planner_is_starting_and_says_for_what(starts, re
     assert capsys.readouterr().err.splitlines() == ["waiting: the planner compiles"]
 
 
+def test_what_a_goal_waits_for_is_said_with_the_command_that_helps(capsys):
+    with on_the_terminal() as report:
+        for reason in (Reason.DISARMED, Reason.ESTOPPED):
+            report.stands(
+                GateState(
+                    stamp=0, received=0, seq=0, mode=GateMode.DISARMED, nonce="", speed_limit=0.0, reasons=(reason,)
+                )
+            )
+    assert capsys.readouterr().err.splitlines() == [
+        "waiting: the truck is disarmed; `monstertruckd arm` lets it drive",
+        "waiting: emergency stop is latched; `monstertruckd reset` clears the emergency stop",
+    ]
+
+
 def test_a_goal_whose_request_is_interrupted_is_cancelled():
     assert interrupted(SilentRobot("goal"), to_goal) == ["goal", "cancel"]
 
