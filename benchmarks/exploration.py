@@ -135,9 +135,10 @@ def whole(arguments: argparse.Namespace) -> tuple[dict[str, float], dict[str, fl
     """The whole daemon."""
     rows = Rows("daemon", keep=arguments.resume)
     for seed in range(arguments.seeds or 2):
-        for world in [world for world in arguments.worlds or SHIPPED if world in SHIPPED]:
-            if not rows.has(world=world, seed=seed):
-                rows.add(daemon.explored(world, seed))
+        for reach in arguments.reach:
+            for world in [world for world in arguments.worlds or SHIPPED if world in SHIPPED]:
+                if not rows.has(world=world, seed=seed, reach=reach):
+                    rows.add(daemon.explored(world, seed, reach))
     return daemon.summary(rows.all)
 
 

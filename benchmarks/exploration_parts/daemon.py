@@ -126,7 +126,14 @@ class ExploringTruck:
 
 
 def recorded_run(
-    world: str, seed: int, happen: Happen | None = None, *, budget: float = BUDGET, limit: float = LIMIT, **more: Any
+    world: str,
+    seed: int,
+    happen: Happen | None = None,
+    *,
+    reach: float = 5.6,
+    budget: float = BUDGET,
+    limit: float = LIMIT,
+    **more: Any,
 ) -> RunRecord:
     """One exploration of a world of this repository; it starts where the light harness does.
 
@@ -134,6 +141,7 @@ def recorded_run(
         world: name.
         seed: of start and noise.
         happen: what happens meanwhile.
+        reach: of the lidar, m; mapper and explorer count on it.
         budget: seconds of exploring.
         limit: seconds until the end.
         more: of the configuration's `sim.world`.
@@ -148,8 +156,9 @@ def recorded_run(
             "blackbox": None,
             "placement": {"planner": "loop", "explorer": "loop"},
             "odometry": {"start": pose},
-            "slam": {"save": Path(folder) / "map"},
-            "sim": {"seed": seed, "world": {"map": str(file), "start": pose, **more}},
+            "slam": {"save": Path(folder) / "map", "grid": {"passed": reach}},
+            "explorer": {"reach": reach},
+            "sim": {"seed": seed, "world": {"map": str(file), "start": pose, "lidar": {"max_range": reach}, **more}},
         }
         config = with_overlay(load_config(CONFIGS / "explore.yaml", SimulatedTruckConfig)[0], overlay)
         result: dict[str, Any] = {}
@@ -166,13 +175,13 @@ def recorded_run(
     return RunRecord(**result)
 
 
-def explored(world: str, seed: int) -> dict[str, Any]:
+def explored(world: str, seed: int, reach: float) -> dict[str, Any]:
     """One run, judged."""
-    run = recorded_run(world, seed)
+    run = recorded_run(world, seed, reach=reach)
     metres, covered = known(run)
     here = run.true[-1, 1:3]
     return {
-        "world": world, "seed": seed, "outcome": str(run.state.outcome), "text": run.state.text,
+        "world": world, "seed": seed, "reach": reach, "outcome": str(run.state.outcome), "text": run.state.text,
         "metres": {f"{share:.0%}": round(metres[share], 2) for share in SHARES if share in metres},
         "covered": round(covered, 5), "driven": round(driven(run.true)[-1], 1), "seconds": round(run.seconds),
         "collided": bool(run.true[:, 5].any()), "late": run.late, "home": round(math.dist(here, run.start[:2]), 3),
@@ -229,13 +238,13 @@ def off_share(folder: Path, arena: Arena, added: list[Box]) -> float:
 
 
 def summary(rows: list[dict[str, Any]]) -> tuple[dict[str, float], dict[str, float]]:
-    """Means of each world, and what is not to be."""
+    """Means of each world and range, and what is not to be."""
     figures: dict[str, float] = {"daemon_runs": float(len(rows))}
-    for world in sorted({row["world"] for row in rows}):
-        of = [row for row in rows if row["world"] == world]
+    for world, reach in sorted({(row["world"], row["reach"]) for row in rows}):
+        of = [row for row in rows if (row["world"], row["reach"]) == (world, reach)]
         for share in (f"{share:.0%}" for share in SHARES):
             values = [row["metres"].get(share, math.inf) for row in of]
-            figures[f"daemon_{world}_{share}_m"] = round(min(float(np.mean(values)), 1e6), 1)
+            figures[f"daemon_{world}_{reach:g}_{share}_m"] = round(min(float(np.mean(values)), 1e6), 1)
     figures["daemon_not_99"] = float(sum("99%" not in row["metres"] for row in rows))
     figures["daemon_collisions"] = float(sum(row["collided"] for row in rows))
     figures["daemon_late"] = float(sum(row["late"] for row in rows))

@@ -10,6 +10,7 @@ import html
 import importlib
 import json
 import os
+import re
 import sys
 import time
 from pathlib import Path
@@ -29,6 +30,19 @@ EXPERIMENTS = {
     "5.7": "computer",
 }
 OUT = Path(__file__).resolve().parents[2] / "runs" / "thesis"
+HEAD = """<!doctype html>
+<html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>{title}</title>
+<style>
+body {{ font: 15px sans-serif; max-width: 70em; margin: auto; padding: 0 1em }}
+img {{ max-width: 100% }}
+div {{ overflow-x: auto }}
+table {{ border-collapse: collapse; margin: 1em 0 }}
+th, td {{ padding: 0.2em 0.8em; text-align: right; border-bottom: 1px solid #ccc }}
+th {{ vertical-align: bottom }}
+td:first-child {{ text-align: left }}
+</style>
+<h1>{title}</h1>"""
+CODE = re.compile(r"`+(.+?)`+")
 
 
 def main() -> int:
@@ -57,30 +71,68 @@ def main() -> int:
 
 
 def write_report(out: Path) -> None:
-    """One page of all experiments whose figures are in the folder."""
-    lines, page = ["# The thesis's experiments"], ["<!doctype html><title>The thesis's experiments</title>"]
-    page.append("<style>body{font:15px sans-serif;max-width:70em;margin:auto}td{padding:0 1em}</style>")
+    """One page of all experiments whose figures are in the folder, as Markdown and as HTML."""
+    title = "The thesis's experiments"
+    lines, page = [f"# {title}"], [HEAD.format(title=html.escape(title))]
     for number, name in EXPERIMENTS.items():
         file = out / f"{name}.json"
         if not file.exists():
             continue
         saved = json.loads(file.read_text())
-        title, *about = saved["about"].strip().split("\n")
-        lines += [f"\n## {number} {title.removeprefix(number).strip()}\n", "\n".join(about).strip()]
-        page += [f"<h2>{html.escape(title)}</h2><p>{html.escape(' '.join(about))}</p><img src={name}.png>"]
+        about, text = (part.strip() for part in saved["about"].strip().split("\n", 1))
         if saved["quick"]:
-            lines.append("\nA quick look: figures mean nothing.")
-            page.append("<p>A quick look: figures mean nothing.</p>")
-        lines += [f"\n![{name}]({name}.png)\n", "| figure | value | goal |", "|---|---|---|"]
-        page.append("<table><tr><th>figure<th>value<th>goal</tr>")
-        for key, value in saved["figures"].items():
-            goal = saved["goals"].get(key)
-            goal_text = "" if goal is None else f"at most {goal:g}{'' if value <= goal else ' (not met)'}"
-            lines.append(f"| {key} | {value:.4g} | {goal_text} |")
-            page.append(f"<tr><td>{html.escape(key)}<td>{value:.4g}<td>{goal_text}</tr>")
-        page.append("</table>")
-    (out / "index.md").write_text("\n".join(lines) + "\n")
-    (out / "index.html").write_text("\n".join(page))
+            text += "\n\nA quick look: figures mean nothing."
+        lines += [f"\n## {about}\n", text, f"\n![{number}]({name}.png)"]
+        page.append(f"<h2>{marked(about)}</h2>")
+        page += [f"<p>{marked(one)}</p>" for one in text.split("\n\n")]
+        page.append(f'<img src="{name}.png" alt="{number}">')
+        for measures, rows in tables(saved["figures"]):
+            heads = ["", *(measure.replace("_", " ") for measure in measures)]
+            lines += ["", f"| {' | '.join(heads)} |", f"|---|{'---:|' * len(measures)}"]
+            page.append(f"<div><table><tr>{''.join(f'<th>{html.escape(head)}' for head in heads)}</tr>")
+            for row, values in rows.items():
+                cells = [cell(values.get(measure), saved["goals"].get(key_of(row, measure))) for measure in measures]
+                lines.append(f"| {' | '.join([row, *cells])} |")
+                page.append(f"<tr>{''.join(f'<td>{html.escape(text)}' for text in [row, *cells])}</tr>")
+            page.append("</table></div>")
+    (out / "index.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    (out / "index.html").write_text("\n".join(page), encoding="utf-8")
+
+
+def marked(text: str) -> str:
+    """As HTML; what stands between backticks is code."""
+    return CODE.sub(r"<code>\1</code>", html.escape(text))
+
+
+def tables(figures: dict[str, float]) -> list[tuple[list[str], dict[str, dict[str, float]]]]:
+    """Columns and rows of figures named ``row.measure``: rows that have a measure in common are one table."""
+    rows: dict[str, dict[str, float]] = {}
+    for key, value in figures.items():
+        row, _, measure = key.rpartition(".")
+        rows.setdefault(row, {})[measure] = value
+    found: list[tuple[list[str], dict[str, dict[str, float]]]] = []
+    for row, values in rows.items():
+        for measures, own in found:
+            if values.keys() & set(measures):
+                measures += [measure for measure in values if measure not in measures]
+                own[row] = values
+                break
+        else:
+            found.append((list(values), {row: values}))
+    return found
+
+
+def key_of(row: str, measure: str) -> str:
+    """The figure's name."""
+    return f"{row}.{measure}" if row else measure
+
+
+def cell(value: float | None, goal: float | None) -> str:
+    """A figure, and its goal if it has one."""
+    if value is None:
+        return ""
+    text = f"{value:.0f}" if abs(value) >= 1000 else f"{value:.4g}"
+    return text if goal is None else f"{text} (at most {goal:g}{'' if value <= goal else ': not met'})"
 
 
 if __name__ == "__main__":

@@ -8,8 +8,8 @@ from collections.abc import Iterable
 import numpy as np
 import scoring
 from navigation_parts import Options, Part
-from navigation_parts.deformation import CARS, drive
-from navigation_parts.deformation_world import SCENARIOS
+from navigation_parts.deformation import CARS, LIMIT, drive
+from navigation_parts.deformation_world import SCENARIOS, SIZE
 
 from monstertruck_planners.local.config import PublishedConfig, RsbandConfig, TebConfig
 
@@ -56,15 +56,28 @@ def add(part: Part, prefix: str, rows: Iterable[dict]) -> None:
 
 def draw(options: Options, rows: list[dict]) -> None:
     from matplotlib.figure import Figure  # noqa: PLC0415
+    from matplotlib.patches import Rectangle  # noqa: PLC0415
 
-    names = list(dict.fromkeys(row["scenario"] for row in rows))
-    figure = Figure(figsize=(11, 2.6 * len(names)), layout="constrained")
-    for line, name in zip(figure.subplots(len(names), 2, squeeze=False), names, strict=True):
+    scenarios = [scenario for scenario in SCENARIOS if any(row["scenario"] == scenario.name for row in rows)]
+    figure = Figure(figsize=(11, 3.6 * len(scenarios)), layout="constrained")
+    for line, scenario in zip(figure.subplots(len(scenarios), 2, squeeze=False), scenarios, strict=True):
         for axes, car in zip(line, CARS, strict=True):
+            for boxes, colour in ((scenario.known, "0.6"), (scenario.hidden(LIMIT), "tab:red")):
+                for x0, y0, x1, y1 in boxes:
+                    axes.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, color=colour, lw=0))
+            if scenario.person is not None:
+                walk = np.array([scenario.person(t) for t in np.arange(0.0, LIMIT, 0.5)])
+                axes.plot(*walk.T, color="tab:red", ls=":", label="person")
             for row in rows:
-                if (row["scenario"], row["car"]) == (name, car):
-                    axes.plot(*np.array(row["trace"])[:, :2].T, label=row["method"])
-            axes.set_title(f"{name}, {car}", fontsize=9)
-            axes.set_aspect("equal", "datalim")
-    axes.legend(fontsize=7)
+                if (row["scenario"], row["car"]) == (scenario.name, car):
+                    end = f"{row['clearance_m']:.2f} m" if row["reached"] else "not arrived"
+                    axes.plot(*np.array(row["trace"])[:, :2].T, label=f"{row['method']}, {end}")
+            for x, y, yaw in (scenario.start, scenario.goal):
+                axes.annotate(
+                    "", (x + 0.3 * np.cos(yaw), y + 0.3 * np.sin(yaw)), (x, y), arrowprops={"arrowstyle": "->"}
+                )
+            axes.set_title(f"{scenario.name}, {car}", fontsize=9)
+            axes.set(xlim=(0.0, SIZE[0]), ylim=(0.0, SIZE[1]), aspect="equal")
+            axes.legend(fontsize=7, title="least clearance", title_fontsize=7, loc="upper left")
+    figure.suptitle("grey: in the map; red: not in the map", fontsize=9)
     figure.savefig(options.out / "deformation.png", dpi=70)

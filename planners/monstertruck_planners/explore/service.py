@@ -173,6 +173,7 @@ class ExplorerService:
         if (pose := self._pose(now)) is None:
             raise RequestRefusedError(Reason.NO_MAP, "no pose in a map yet")
         self._fresh, self._goal, self._refused, self._saves = True, None, None, None
+        self._deciding = None  # of the exploration before: its answer is not one to this
         self._others = 0 if goal is None else goal.number
         if request.find is not None and self._in.points is None:
             raise RequestRefusedError(Reason.NOT_SUPPORTED, "this robot keeps no points of interest: section `points`")

@@ -1,0 +1,100 @@
+"""The exploring service and its worker."""
+
+import asyncio
+from types import SimpleNamespace
+from typing import Self
+
+import numpy as np
+
+from monstertruck_planners.collision import Footprint
+from monstertruck_planners.explore.config import InformationConfig
+from monstertruck_planners.explore.exchange import ExploreAnswer, ExploreSetup, ExploreTask, Viewpoint
+from monstertruck_planners.explore.service import ExplorerInputs, ExplorerService
+from monstertruck_runtime.clock import VirtualClock, run_virtual
+from monstertruck_runtime.mailbox import Mailbox, fifo
+from monstertruck_runtime.requests import inner_request
+from monstertruck_schemas.base import Message, Pose2D, Twist2D
+from monstertruck_schemas.req import ExploreOrder, ExploreRequest
+from monstertruck_schemas.state import GateMode, GateState, Odometry
+
+DECIDING = 0.3
+"""Seconds."""
+
+
+class Worker:
+    """Answers the nth question with a place at x = n."""
+
+    asked = 0
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        pass
+
+    def __init__(self, clock: VirtualClock) -> None:
+        self._clock = clock
+
+    async def step(self, _: ExploreTask) -> ExploreAnswer:
+        self.asked += 1
+        target = Viewpoint((float(self.asked), 0.0, 0.0), (self.asked + 1.0, 0.0))
+        await self._clock.sleep(DECIDING)
+        return ExploreAnswer(target, frontiers=1, known=1.0)
+
+
+class Live:
+    """A topic whose newest message is always of now."""
+
+    def __init__(self, message: Message, clock: VirtualClock) -> None:
+        self._message, self._clock = message, clock
+
+    @property
+    def latest(self) -> Message:
+        return self._message.model_copy(update={"stamp": self._clock.now(), "received": self._clock.now()})
+
+
+def test_the_answer_to_a_question_of_the_exploration_before_is_none():
+    sent: list[float] = []
+
+    async def main(clock: VirtualClock) -> None:
+        worker, newest, head = Worker(clock), SimpleNamespace, {"stamp": 0, "received": 0, "seq": 0}
+        still, sure = Twist2D(vx=0.0, vy=0.0, wz=0.0), np.zeros(9)
+        here = Pose2D(x=0.0, y=0.0, yaw=0.0)
+        gate = GateState(**head, frame="base", mode=GateMode.ARMED, nonce="n", speed_limit=1.0)
+        pose = Odometry(
+            **head, frame="map", pose=here, twist=still, pose_covariance=sure, twist_covariance=sure, age=0.0
+        )
+        none = newest(latest=None)
+        service = ExplorerService(
+            ExploreSetup(InformationConfig(), Footprint(), 0.5), clock, worker,
+            newest(take=lambda goal: sent.append(goal.goal.x) or len(sent), control=lambda _: None,
+                   hold=lambda *_, **__: None),
+            None, max_age=1.0,
+            inputs=ExplorerInputs(
+                gate=Live(gate, clock), pose=Live(pose, clock), goal=none, grid=none, tiles=Mailbox(fifo(8)),
+                slam=none, battery=none, events=Mailbox(fifo(8)),
+            ),
+            state=newest(next_seq=lambda: 0, put=lambda _: None),
+            events=lambda *_, **__: None,
+        )  # fmt: skip
+
+        def order(what: ExploreOrder, seq: int) -> None:
+            header = inner_request(seq, service._in.gate.latest, clock.now(), "ann")
+            service.take(ExploreRequest(**header, order=what))
+
+        running = asyncio.create_task(service.run(lambda: None))
+        await clock.sleep(0.1)
+        order(ExploreOrder.START, 1)
+        while not worker.asked:
+            await clock.sleep(0.05)
+        order(ExploreOrder.STOP, 2)
+        await clock.sleep(1.0)
+        assert sent == []
+        order(ExploreOrder.START, 3)
+        while not sent:
+            await clock.sleep(0.05)
+        running.cancel()
+        await asyncio.wait([running])
+
+    run_virtual(main)
+    assert sent == [2.0]
