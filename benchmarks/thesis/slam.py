@@ -43,7 +43,7 @@ def run(options: Options) -> Part:
     for key, value in scoring.map_error(cells, *where).items():
         part.add(f"map.{key}", value, 0.05 if key == "wall_mean_m" else None)
     part.add("map.wall_iou", scoring.wall_iou(cells, *where, WALLS))
-    draw(options, found, cells)
+    draw(options, found, cells, arena)
     return part
 
 
@@ -78,7 +78,7 @@ def lap(seconds: float) -> dict[str, Any]:
     return result
 
 
-def draw(options: Options, found: dict[str, Any], cells: np.ndarray) -> None:
+def draw(options: Options, found: dict[str, Any], cells: np.ndarray, arena: Arena) -> None:
     from matplotlib.figure import Figure  # noqa: PLC0415
 
     grid = found["grid"]
@@ -87,8 +87,14 @@ def draw(options: Options, found: dict[str, Any], cells: np.ndarray) -> None:
     x, y, step = grid.origin.x, grid.origin.y, grid.resolution
     box = (x, x + grid.width * step, y, y + grid.height * step)
     axes.imshow(np.where(cells < 0, 50, cells), origin="lower", extent=box, cmap="Greys", alpha=0.7)
+    rows, columns = arena.blocked.shape
+    (x, y), step = arena.origin, arena.resolution
+    walls = (x, x + columns * step, y, y + rows * step)
+    axes.contour(arena.blocked, [0.5], extent=walls, colors="tab:blue", linewidths=0.8)
+    axes.plot([], [], color="tab:blue", lw=0.8, label="true walls")
+    axes.set(xlim=box[:2], ylim=box[2:], aspect="equal", xlabel="x, m", ylabel="y, m")
     axes.plot(*found["true_slam"][:, :2].T, color="0.5", lw=3, label="truth")
     for name, colour in (("reckoning", "tab:orange"), ("slam", "tab:red")):
         axes.plot(*found[name][:, 1:3].T, color=colour, lw=1, label=name)
-    axes.legend()
+    axes.legend(loc="center")
     figure.savefig(options.out / "slam.png", dpi=80)
