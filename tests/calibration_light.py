@@ -344,7 +344,7 @@ def sonar_fit(rng: np.random.Generator) -> list[Verdict]:
     }
     legs = sonar_legs(true, (wall, turned), cone / 2, factor, rng)
     result = sonar.result_of(legs, settings, wall + 0.002 * rng.normal(), 0.002)
-    truth = {"cone": cone, "speed_of_sound": settings.speed_of_sound / factor}
+    truth = {"cone": cone, "speed_of_sound": settings.speed_of_sound * factor}
     truth |= {f"{n}_{what}": float(v) for n, p in true.items() for what, v in zip(("x", "y", "yaw"), p, strict=True)}
     return judged(result, truth)
 
@@ -357,24 +357,38 @@ def sonar_legs(
     rng: np.random.Generator,
     turn: float = math.tau,
 ) -> list[sonar.SonarLeg]:
-    """Arcs ahead and back to both sides, 5 pings a second: ranges with the sonars' noise, over ``factor``; odometry
-    drifts between."""
-    legs = []
+    """Arcs ahead and back to both sides, 5 pings a second: ranges with the sonars' noise, over ``factor``.
+
+    Odometry turns too little by another share on every arc, and drifts between.
+    """
+    legs: list[sonar.SonarLeg] = []
+    aside, turned = 0.0, 0.0
     step = 0.2 * sonar.SonarWizard().speed / ARC
     for side in (1, -1):
         for way in (1, -1):
             angles = np.arange(0.0, turn, step)[::way] * side
             radius = side * ARC
             poses = np.column_stack((radius * np.sin(angles), radius * (1 - np.cos(angles)), angles))
-            nearer, drift = np.array(sonar.DRIFT) * rng.normal(size=2) if legs else (0.0, 0.0)
+            nearer, drift, more = (np.array(sonar.DRIFT) * rng.normal(size=3)).tolist()
+            nearer, drift = (nearer, drift) if legs else (0.0, 0.0)
+            actual = _drifted(poses, aside + nearer, turned + drift, more)
+            aside, turned = (actual[-1] - poses[-1])[1:].tolist()
             ranges = {}
             for name, place in places.items():
-                actual = poses + np.array((0.0, 0.0, drift))
-                due, past = sonar.wall_range(actual, place, (wall[0] - nearer, wall[1]), half)
+                due, past = sonar.wall_range(actual, place, wall, half)
                 heard = due / factor + np.hypot(sonar.NOISE[0], sonar.NOISE[1] * due) * rng.normal(size=due.size)
                 ranges[name] = np.where((past <= 0.45) & (due <= 3.0), heard, np.inf)
             legs.append(sonar.SonarLeg(dict.fromkeys(places, poses), ranges))
     return legs
+
+
+def _drifted(poses: Array, aside: float, turned: float, more: float) -> Array:
+    """Where a robot is that begins an arc off by so many m and rad, and turns by a share more than ``poses`` say."""
+    x, y, yaw = poses.T
+    off = turned + more * (yaw - yaw[0])
+    rolled = np.exp(1j * (off[1:] + off[:-1]) / 2) * (np.diff(x) + 1j * np.diff(y))
+    at = x[0] + 1j * (y[0] + aside) + np.cumsum(np.append(0.0, rolled))
+    return np.column_stack((at.real, at.imag, yaw + off))
 
 
 def stabiliser_fit(rng: np.random.Generator) -> list[Verdict]:

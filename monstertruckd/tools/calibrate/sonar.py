@@ -39,8 +39,9 @@ SHARE: Final = 0.96
 """Of the angle that the gate lets a request have."""
 NOISE: Final = (0.005, 0.01)
 """Standard deviation of a range: m, and share of it, added in quadrature."""
-DRIFT: Final = (0.003, 0.003)
-"""Standard deviation of the robot's distance from the wall (m) and heading (rad) on one arc, by odometry."""
+DRIFT: Final = (0.003, 0.003, 0.01)
+"""Standard deviation of what odometry is off by on an arc: distance from the wall (m) and heading (rad) from where the
+arc before ended, and the share by which it turns more, as gyroscopes and slipping wheels let it."""
 BELIEVED: Final = 0.01
 """Standard deviation of the speed of sound before it is measured, as a share: 6 degrees Celsius."""
 NEAR: Final = 0.2
@@ -190,7 +191,7 @@ def result_of(legs: Sequence[SonarLeg], settings: Srf08Config, wall: float, tape
         raise InputError("the arcs do not tell the sonars' places: one is off by more than a fit may find")
     found = [Interval(float(v), float(h)) for v, h in zip(fit.parameters, halves, strict=True)]
     count, noise = model.kept.ranges.size, "95 % of ranges, odometry and tape"
-    sound = Interval(settings.speed_of_sound / found[3].value, settings.speed_of_sound * found[3].half)
+    sound = found[3].times(settings.speed_of_sound)
     estimates = [
         estimated("cone", found[2].times(2.0), "rad", count, f"full opening angle, hard edges taken; {noise}",
                   f"{SONAR}.field_of_view"),
@@ -227,7 +228,9 @@ def arc(chassis: Chassis, limit: float) -> tuple[float, float, float]:
     return (*angles, 1.0 / float(chassis.bicycle.curvature(*angles)))
 
 
-def wall_range(poses: Array, place: SonarPose, wall: tuple[float, float], half: float) -> tuple[Array, Array]:
+def wall_range(
+    poses: Array, place: SonarPose, wall: tuple[float | Array, float | Array], half: float
+) -> tuple[Array, Array]:
     """Range of a wall, m, and by how much its normal is past the cone's edge, rad; (n,) each.
 
     Args:
@@ -239,20 +242,30 @@ def wall_range(poses: Array, place: SonarPose, wall: tuple[float, float], half: 
     x, y, yaw = poses.T
     turned = yaw + wall[1]
     distance = (
-        wall[0]
-        - (math.sin(wall[1]) * x + math.cos(wall[1]) * y)
-        - (np.sin(turned) * place.x + np.cos(turned) * place.y)
+        wall[0] - (np.sin(wall[1]) * x + np.cos(wall[1]) * y) - (np.sin(turned) * place.x + np.cos(turned) * place.y)
     )
     off = np.abs(_wrapped(turned + place.yaw - math.pi / 2))
     past = np.maximum(off - half, 0.0)
     return np.asarray(distance / np.cos(np.minimum(past, 1.2))), past
 
 
+def swings(poses: Array) -> Array:
+    """What turning by one rad more for each rad by odometry adds to the poses of an arc, to first order; (n, 3).
+
+    Args:
+        poses: x, y (m) and yaw (rad) by odometry; (n, 3).
+    """
+    yaw = poses[:, 2] - poses[0, 2]
+    across = (yaw[1:] + yaw[:-1])[:, None] / 2 * np.diff(poses[:, :2], axis=0)
+    x, y = np.cumsum(np.vstack((np.zeros(2), across)), axis=0).T
+    return np.column_stack((-y, x, yaw))
+
+
 class SonarModel:
     """Ranges of a wall along arcs.
 
-    Parameters: ``COMMON``; for every arc but the first what the robot is nearer to the wall (m) and turned (rad); x, y,
-    yaw of every sonar.
+    Parameters: ``COMMON``; for every arc what the robot is nearer to the wall (m) and turned (rad) against odometry
+    (not for the first one), and by what share it turns more, in turn; x, y, yaw of every sonar.
 
     Args:
         legs: driven.
@@ -263,17 +276,23 @@ class SonarModel:
 
     def __init__(self, legs: Sequence[SonarLeg], settings: Srf08Config, wall: float, tape_error: float) -> None:
         self.order = tuple(settings.sonars)
-        self.first = COMMON + 2 * (len(legs) - 1)
-        rows = [
-            (i, k, *pose, distance)
-            for i, leg in enumerate(legs)
-            for k, name in enumerate(self.order)
-            if name in leg.poses
-            for pose, distance in zip(leg.poses[name].tolist(), leg.ranges[name].tolist(), strict=True)
-            if distance < math.inf
-        ]
-        arcs, sonars, *poses, ranges = np.array(rows).T
-        self._echoes = _Echoes(arcs.astype(np.int64), sonars.astype(np.int64), np.array(poses), ranges)
+        legs = [leg for leg in legs if leg.poses]
+        self.first = COMMON + len(DRIFT) * len(legs) - 2
+        rows = np.concatenate(
+            [
+                np.column_stack((np.full((len(at), 2), (i, k)), leg.ranges[name], at, swings(at)))
+                for i, leg in enumerate(legs)
+                for k, name in enumerate(self.order)
+                if (at := leg.poses.get(name)) is not None
+            ]
+        )
+        arcs, sonars, ranges, *poses = rows[np.isfinite(rows[:, 2])].T
+        self._echoes = _Echoes(
+            arcs.astype(np.int64), sonars.astype(np.int64), np.array(poses[:3]), np.array(poses[3:]), ranges
+        )
+        paths = [next(iter(leg.poses.values())) for leg in legs]
+        self._begins, self._ends = np.array([path[0] for path in paths]), np.array([path[-1] for path in paths])
+        self._swings = np.array([swings(path)[-1] for path in paths])
         self._wall, self._tape_error = wall, tape_error
         mounts = [s.mount.planar for s in settings.sonars.values()]
         self._start = np.concatenate(
@@ -304,7 +323,7 @@ class SonarModel:
         for name in self.order:
             if (count := self.samples(name)) < LEAST:
                 raise InputError(f"sonar {name}: {count} echoes of the wall: expected {LEAST}; drive longer arcs")
-        reach = np.concatenate(((0.3, 0.3, 0.25, 0.1), np.full(self.first - COMMON, 0.1)))
+        reach = np.concatenate(((0.3, 0.3, 0.25, 0.1), np.full(self.first - COMMON, 0.4)))
         reach = np.concatenate((reach, np.tile((0.15, 0.15, 0.4 if edges else 0.0), len(self.order))))
         reach[2] *= edges
         return least_squares(self._residual, start, self._start - reach, self._start + reach)
@@ -312,17 +331,32 @@ class SonarModel:
     def _predicted(self, parameters: Array, echoes: "_Echoes") -> tuple[Array, Array]:
         """Ranges as the sonars measure them, m, and what the normal is past the cone's edge, rad."""
         distance, direction, half, factor = parameters[:COMMON].tolist()
-        drift = np.vstack(((0.0, 0.0), parameters[COMMON : self.first].reshape(-1, 2)))
-        nearer, turned = drift[echoes.arcs].T
+        nearer, turned, swung = self._drift(parameters)[echoes.arcs].T
         x, y, yaw = parameters[self.first :].reshape(-1, 3)[echoes.sonars].T
-        poses = np.column_stack((echoes.poses[0], echoes.poses[1], echoes.poses[2] + turned))
-        due, past = wall_range(poses, SonarPose(x, y, yaw), (distance - nearer, direction), half)
+        poses = (echoes.poses + swung * echoes.swings).T
+        due, past = wall_range(poses, SonarPose(x, y, yaw), (distance - nearer, direction + turned), half)
         return due / factor, past
+
+    def _drift(self, parameters: Array) -> Array:
+        """Of every arc what the robot is nearer (m), turned (rad), and by what share it turns more; (n, 3)."""
+        return np.concatenate((np.zeros(2), parameters[COMMON : self.first])).reshape(-1, len(DRIFT))
+
+    def _drifted(self, drift: Array) -> Array:
+        """As ``DRIFT``: what of nearer and turned has come since the arc before ended, and the share; (n, 3)."""
+        nearer, turned, swung = drift.T
+        ends = self._ends + swung[:, None] * self._swings
+        at_end = nearer + np.sin(turned) * ends[:, 0] + np.cos(turned) * ends[:, 1]
+        at_begin = nearer + np.sin(turned) * self._begins[:, 0] + np.cos(turned) * self._begins[:, 1]
+        moved = self._begins[1:, 1] - self._ends[:-1, 1]
+        came = np.column_stack(
+            (at_begin[1:] - at_end[:-1] - moved, turned[1:] - turned[:-1] - swung[:-1] * self._swings[:-1, 2])
+        )
+        return np.column_stack((np.vstack((np.zeros(2), came)), swung))
 
     def _residual(self, parameters: Array) -> Array:
         kept = self.kept
         off = (kept.ranges - self._predicted(parameters, kept)[0]) / _sigma(kept.ranges)
-        drift = parameters[COMMON : self.first].reshape(-1, 2) / DRIFT
+        drift = self._drifted(self._drift(parameters)) / DRIFT
         believed = ((parameters[0] - self._wall) / self._tape_error, (parameters[3] - 1.0) / BELIEVED)
         return np.concatenate((off, drift.ravel(), believed))
 
@@ -332,7 +366,7 @@ class SonarModel:
         near = np.abs(self._echoes.ranges - due) < bounds
         near &= (past <= beyond) & (due > self._limits[0]) & (due < self._limits[1])
         e = self._echoes
-        return _Echoes(e.arcs[near], e.sonars[near], e.poses[:, near], e.ranges[near])
+        return _Echoes(e.arcs[near], e.sonars[near], e.poses[:, near], e.swings[:, near], e.ranges[near])
 
 
 class _Echoes(NamedTuple):
@@ -342,6 +376,8 @@ class _Echoes(NamedTuple):
     sonars: NDArray[np.int64]
     poses: Array
     """(3, n): x, y (m) and yaw (rad) of the robot"""
+    swings: Array
+    """(3, n): as ``swings``"""
     ranges: Array
     """m."""
 

@@ -14,6 +14,7 @@ from monstertruck_schemas.base import Pose2D, Twist2D
 from monstertruck_schemas.sensor import SonarEcho, SonarRanges
 from monstertruck_schemas.state import Odometry
 from monstertruckd.config.calibration import may_set
+from monstertruckd.tools.calibrate import sonar
 from monstertruckd.tools.calibrate.sonar import SonarLeg, SonarPose, result_of
 from monstertruckd.tools.calibrate.steps import MoveRecord
 from tests.calibration_light import sonar_legs
@@ -101,3 +102,23 @@ def test_short_arcs_and_too_few_echoes_are_refused():
     deaf = [replace(leg, ranges={**leg.ranges, "f": np.full_like(leg.ranges["f"], np.inf)}) for leg in legs()]
     with pytest.raises(InputError, match="sonar f"):
         result_of(deaf, SETTINGS, WALL, 0.002)
+
+
+def test_ranges_that_come_out_short_mean_a_faster_sound():
+    circles = sonar_legs(PLACES, (WALL, 0.02), 0.43, 1.0, np.random.default_rng(1))
+    short = [replace(leg, ranges={n: r / 1.01 for n, r in leg.ranges.items()}) for leg in circles]
+    sound = result_of(short, SETTINGS, WALL, 0.002).estimate("speed_of_sound")
+    assert sound is not None
+    assert sound.value == pytest.approx(1.01 * SETTINGS.speed_of_sound, abs=2.5)
+
+
+def test_a_heading_that_drifts_on_its_arcs_moves_no_sonar(monkeypatch):
+    monkeypatch.setattr(sonar, "DRIFT", (0.0, 0.0, 0.03))
+    drifting = sonar_legs(PLACES, (WALL, 0.02), 0.43, 1.0, np.random.default_rng(3))
+    monkeypatch.undo()
+    result = result_of(drifting, SETTINGS, WALL, 0.002)
+    for name, place in PLACES.items():
+        estimate = result.estimate(f"{name}_x")
+        assert estimate is not None
+        assert estimate.value == pytest.approx(place.x, abs=0.02)
+        assert estimate.high - estimate.low < 0.04
