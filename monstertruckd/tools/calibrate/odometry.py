@@ -9,6 +9,7 @@ here corners are arcs of a truck that steers both axles, a tape tells the first 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -93,17 +94,21 @@ class OdometryWizard:
     async def _square(self, context: WizardContext, maps: Maps, sense: int) -> Square:
         await context.confirm(_MARK)
         corner = math.pi / 2 / context.chassis.bicycle.curvature(ANGLE, -ANGLE)
-        legs, taped = [], 0.0
+        legs, taped, turned = [], 0.0, 0.0
         way = "left" if sense > 0 else "right"
         for number in range(1, 5):
             side = MoveStep(f"square to the {way}, side {number} of 4", SPEED, metres=self.side, marked=True)
-            legs.append(SteeringRun.of(await context.move(side), maps))
+            record = await context.move(side)
+            turned += record.turned()
+            legs.append(SteeringRun.of(record, maps))
             if number == 1:
                 taped = await context.ask(_SIDE)
             name = f"corner {number} of 4"
             angle = sense * ANGLE
-            arc = MoveStep(name, CORNER, angle, -angle, 1.5 * corner, done=_turned_a_quarter, marked=True)
-            legs.append(SteeringRun.of(await context.move(arc), maps))
+            until = partial(_turned, left=sense * number * math.pi / 2 - turned)
+            record = await context.move(MoveStep(name, CORNER, angle, -angle, 1.5 * corner, done=until, marked=True))
+            turned += record.turned()
+            legs.append(SteeringRun.of(record, maps))
         return Square(tuple(legs), taped, (await context.ask(_AHEAD) / 100, await context.ask(_LEFT) / 100))
 
     def judge(self, context: WizardContext, maps: Maps, squares: Sequence[Square]) -> Result:
@@ -178,8 +183,9 @@ def odometry_wizard(settings: OdometryWizard | None = None) -> Wizard:
     return Wizard("odometry", doc, ROOM, settings or OdometryWizard())
 
 
-def _turned_a_quarter(record: MoveRecord) -> bool:
-    return abs(record.turned()) >= math.pi / 2
+def _turned(record: MoveRecord, left: float) -> bool:
+    """Whether it has turned by so many rad, left positive: a corner makes up for what the sides bend."""
+    return record.turned() * math.copysign(1.0, left) >= abs(left)
 
 
 class SquareModel:

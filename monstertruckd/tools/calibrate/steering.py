@@ -11,6 +11,7 @@ from typing import Final
 
 import numpy as np
 
+from monstertruck_drivers.os4000.config import IronConfig, Os4000Config
 from monstertruck_kinematics.chassis import TruckChassis
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.errors import InputError, RequestRefusedError
@@ -118,7 +119,10 @@ class SteeringWizard:
         legs += await self._straights(context, maps)
         legs += await self._circles(context, maps, model, first, travel)
         weaving = [await context.move(move) for move in weaves(self.weaves)]
-        answer = context.fit("dead time and lag", lambda: response(weaving, chassis))
+        compass = context.config.devices.compass
+        settings = None if compass is None else compass.driver
+        iron = settings.iron if isinstance(settings, Os4000Config) else IronConfig()
+        answer = context.fit("dead time and lag", lambda: response(weaving, chassis, iron))
         result = context.fit("pulse maps", lambda: self._result(context, model, legs, first, travel))
         return result.model_copy(update={"estimates": (*result.estimates, *estimates(answer))})
 

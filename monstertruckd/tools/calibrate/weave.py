@@ -2,18 +2,26 @@
 
 The integral of the lagged curvature, times the speed, is the turn that the compass should see. Each weave has its own
 gain (the linkage may turn less than it should) and trim (the axles may be off centre).
+
+The unit's accelerometers take it for tilt that the truck sets off (2 degrees in the first 0.1 s at speed) and that it
+turns (0.1 degrees to either side). A field that is levelled by such a tilt turns the heading by half as much again, by
+where north is, which looks like another delay and less lag. So headings are computed from the field with one tilt for
+the whole weave; the floor is level.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final, Self
 
 import numpy as np
 
+from monstertruck_drivers.os4000.attitude import level_field
+from monstertruck_drivers.os4000.config import IronConfig
 from monstertruck_kinematics.chassis import TruckChassis
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError
+from monstertruck_schemas.sensor import Attitude
 from monstertruckd.config.calibration import STEERING, Estimate
 from monstertruckd.tools.calibrate.response import ResponseFit, Steps, unexplained
 from monstertruckd.tools.calibrate.steps import MoveRecord, MoveStep
@@ -63,7 +71,7 @@ class Weave:
     """Measured between those, rad; (n - stride,)."""
 
     @classmethod
-    def of(cls, record: MoveRecord, chassis: TruckChassis) -> Self | None:
+    def of(cls, record: MoveRecord, chassis: TruckChassis, iron: IronConfig) -> Self | None:
         """From what was read while the truck was at speed; None where that is too little to compare headings."""
         times = np.array([reading.stamp for reading in record.drive]) / SECOND
         speeds = np.abs([reading.velocity for reading in record.drive])
@@ -75,7 +83,7 @@ class Weave:
         stride = max(round(BASE * (at.size - 1) / float(at[-1] - at[0])), 1) if at.size > 1 else 1
         if at.size <= stride:
             return None
-        yaws = -np.unwrap([reading.heading for reading in seen])
+        yaws = -steady_headings(seen, iron)
         rolled = chassis.drivetrain.distance(np.array([reading.position for reading in record.drive]))
         sent = np.array([(command.stamp / SECOND, command.front, command.rear) for command in record.steering_commands])
         curvatures = chassis.bicycle.body_twist(np.ones(len(sent)), sent[:, 1], sent[:, 2])[2]
@@ -96,13 +104,34 @@ class Weave:
         )
 
 
-def response(records: Iterable[MoveRecord], chassis: TruckChassis) -> ResponseFit:
+def steady_headings(readings: Sequence[Attitude], iron: IronConfig) -> Array:
+    """Headings of a body that keeps its tilt, whatever its accelerometers feel: clockwise, rad, unwrapped; (n,).
+
+    Args:
+        readings: in their order; where one has no field, the unit's own headings are taken.
+        iron: magnetic calibration of the unit.
+    """
+    fields = [(field.x, field.y, field.z) for reading in readings if (field := reading.magnetic_field) is not None]
+    if len(fields) < len(readings):
+        return np.unwrap([reading.heading for reading in readings])
+    x, y, z = np.array(fields).T
+    pitch, roll = (np.full_like(x, np.mean([getattr(r, angle) for r in readings])) for angle in ("pitch", "roll"))
+    forward, left = level_field((x, y, z), pitch, roll, iron)
+    return np.unwrap(np.arctan2(left, forward))
+
+
+def response(records: Iterable[MoveRecord], chassis: TruckChassis, iron: IronConfig) -> ResponseFit:
     """Dead time and lag of the axles behind the commands.
+
+    Args:
+        records: of weaves.
+        chassis: for the turns that commands mean.
+        iron: magnetic calibration that the compass runs with.
 
     Raises:
         InputError: too few turns were seen.
     """
-    seen = [weave for record in records if (weave := Weave.of(record, chassis)) is not None]
+    seen = [weave for record in records if (weave := Weave.of(record, chassis, iron)) is not None]
     samples = sum(weave.turns.size for weave in seen)
     if samples < LEAST:
         raise InputError(f"only {samples} turns tell dead time and lag: expected {LEAST}")

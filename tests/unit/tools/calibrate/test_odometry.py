@@ -1,13 +1,19 @@
 """Squares: what each error does to them."""
 
+import asyncio
 import math
 
 import numpy as np
 import pytest
 
-from monstertruckd.tools.calibrate.odometry import Square, SquareModel
+from monstertruck_schemas.sensor import Attitude, DriveFeedback, DriveMode, SteeringFeedback
+from monstertruckd.config.load import load_config
+from monstertruckd.config.truck import TruckConfig
+from monstertruckd.tools.calibrate.odometry import OdometryWizard, Square, SquareModel
 from monstertruckd.tools.calibrate.steering_model import SteeringModel, SteeringRun
+from monstertruckd.tools.calibrate.steps import MoveRecord
 from tests.calibration_light import AHEAD, CHASSIS, MAPS
+from tests.calibration_robots import CONFIGS
 
 MODEL = SquareModel(SteeringModel(CHASSIS), MAPS, AHEAD)
 RIGHT = np.array((1.0, 1.0, 0.0))
@@ -47,3 +53,51 @@ def test_errors_are_found():
     true = np.array((1.03, 0.97, 0.02))
     fit = MODEL.fit([square(1, true), square(-1, true)], 0.002, 0.0035)
     assert fit.parameters == pytest.approx(true, abs=0.002)
+
+
+class Bent:
+    """A truck whose straights bend to the left, by so many rad on a side of the square."""
+
+    def __init__(self, bend):
+        self.chassis, self.config = CHASSIS, load_config(CONFIGS / "truck.yaml", TruckConfig)[0]
+        self.turned, self._bend = [], bend
+
+    async def confirm(self, step):
+        return True
+
+    async def ask(self, step):
+        return 1.5
+
+    def fit(self, name, function):
+        return None
+
+    async def move(self, step):
+        record = MoveRecord(left=10, arrived=1000)
+        turn = 0.0
+        self._read(record, 0, turn)
+        if step.done is None:
+            turn = self._bend
+        else:
+            while not step.done(record):
+                turn += math.copysign(0.01, step.front)
+                self._read(record, 500, turn)
+        self._read(record, 1001, turn)
+        self.turned.append(turn)
+        return record
+
+    @staticmethod
+    def _read(record, stamp, turn):
+        header = {"stamp": stamp, "received": stamp, "seq": 0}
+        for _ in range(5):
+            record.attitude.append(Attitude(**header, heading=-turn % math.tau, roll=0.0, pitch=0.0))
+        record.drive.append(DriveFeedback(**header, position=0.1 * stamp, velocity=1.0, mode=DriveMode.ENABLED))
+        record.steering.append(SteeringFeedback(**header, front=0.0, rear=0.0))
+
+
+@pytest.mark.parametrize("bend", [0.2, -0.2])
+def test_corners_make_up_for_sides_that_bend(bend):
+    truck = Bent(bend)
+    asyncio.run(OdometryWizard()(truck))
+    left, right = truck.turned[:8], truck.turned[8:]
+    for turns, sense in ((left, 1), (right, -1)):
+        assert np.cumsum(turns)[1::2] == pytest.approx(sense * np.arange(1, 5) * math.pi / 2, abs=0.02)
