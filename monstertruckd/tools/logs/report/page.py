@@ -128,11 +128,22 @@ def _head(run: RunSummary) -> str:
     ]
     if run.drops:
         badges.append((f"{run.drops} messages dropped in the daemon", Tone.WARNING))
+    badges += _calibration_badges(run)
     shown = "".join(f'<span class="badge {tone.name.lower()}">{escape(text)}</span>' for text, tone in badges)
     return (
         f'<div class="over">{"Black box" if run.is_black_box else "Run report"}</div><h1>{escape(robot(run))}</h1>'
         f'<div class="under">{escape(when)} · {escape(run.path.name)}</div><div class="badges">{shown}</div>'
     )
+
+
+def _calibration_badges(run: RunSummary) -> Iterable[tuple[str, Tone]]:
+    """Grades of the calibration that the daemon began with, and what of it had expired; none in logs before these."""
+    rows = run.attachments.get("calibration", {}).get("wizards", ())
+    if counting := [f"{row['wizard']} {row['grade']}" for row in rows if not row["expired"]]:
+        yield f"calibration: {', '.join(counting)}", Tone.GOOD
+    for row in rows:
+        if row["expired"]:
+            yield f"calibration of {row['wizard']} expired: {row['expired']}", Tone.WARNING
 
 
 def _badge(count: int, name: str, tone: Tone) -> tuple[str, Tone]:

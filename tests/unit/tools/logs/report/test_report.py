@@ -165,6 +165,22 @@ def test_page_tells_events_states_losses_and_config(log):
     assert "<b>Battery</b>" not in text
 
 
+def test_page_tells_grades_of_the_calibration_and_what_had_expired(tmp_path):
+    file = tmp_path / "run.mcap"
+    common = {"date": "2026-01-01", "until": "2026-06-30"}
+    rows = [
+        common | {"wizard": "drive", "grade": "A", "expired": ""},
+        common | {"wizard": "lidar", "grade": "C", "expired": ""},
+        common | {"wizard": "compass", "grade": "B", "expired": "after <90> days"},
+    ]
+    writer = Writer(file, calibration={"file": "0001.json", "wizards": rows})
+    writer.put(t.GATE, gate(SECOND, 0))
+    writer.log.finish()
+    text = report(file).file.read_text()
+    assert '<span class="badge good">calibration: drive A, lidar C</span>' in text
+    assert '<span class="badge warning">calibration of compass expired: after &lt;90&gt; days</span>' in text
+
+
 def test_stops_are_reported_with_their_chain(tmp_path):
     file = tmp_path / "run.mcap"
     writer = Writer(file)
