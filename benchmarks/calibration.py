@@ -40,10 +40,10 @@ from calibration_parts.square import square
 from monstertruck_runtime.errors import TruckError
 from monstertruckd.config.calibration import CalibrationStore, with_values
 from monstertruckd.config.load import load_config
-from monstertruckd.tools.calibrate.battery import battery_wizard
-from monstertruckd.tools.calibrate.compass import compass_wizard
-from monstertruckd.tools.calibrate.drive import DriveWizard, drive_wizard
-from monstertruckd.tools.calibrate.steering import SteeringWizard, steering_wizard
+from monstertruckd.tools.calibrate.battery import BatteryWizard
+from monstertruckd.tools.calibrate.compass import CompassWizard
+from monstertruckd.tools.calibrate.drive import DriveWizard
+from monstertruckd.tools.calibrate.steering import SteeringWizard
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 from tests.calibration_kit import Verdict, curvature_errors, hidden, run_session, verdicts
 from tests.calibration_light import HALF_WIDTHS, LIGHT, coverage
@@ -85,12 +85,12 @@ def calibrate(seed: int) -> Truck:
         quiet = base.model_copy(update={"recorder": None, "state_directory": Path(folder)})
         truck = hidden(quiet, rng, seed)
         for step in (
-            battery_wizard(),
-            drive_wizard(DriveWizard(sign_only=True)),
-            steering_wizard(SteeringWizard(rough=True)),
-            compass_wizard(),
-            drive_wizard(),
-            steering_wizard(),
+            BatteryWizard(),
+            DriveWizard(sign_only=True),
+            SteeringWizard(rough=True),
+            CompassWizard(),
+            DriveWizard(),
+            SteeringWizard(),
         ):
             try:
                 session = run_session(truck, step, rng, charges=EMPTIER if step.name == "battery" else ())

@@ -13,25 +13,25 @@ import numpy as np
 
 from monstertruck_runtime.errors import TruckError
 from monstertruckd.config.calibration import WizardName
-from monstertruckd.tools.calibrate.camera import CameraWizard, camera_wizard
-from monstertruckd.tools.calibrate.imu import imu_wizard
-from monstertruckd.tools.calibrate.lidar import LidarWizard, lidar_wizard
-from monstertruckd.tools.calibrate.odometry import odometry_wizard
-from monstertruckd.tools.calibrate.slip import slip_wizard
-from monstertruckd.tools.calibrate.sonar import sonar_wizard
-from monstertruckd.tools.calibrate.stabiliser import stabiliser_wizard
+from monstertruckd.tools.calibrate.camera import CameraWizard
+from monstertruckd.tools.calibrate.imu import ImuWizard
+from monstertruckd.tools.calibrate.lidar import LidarWizard
+from monstertruckd.tools.calibrate.odometry import OdometryWizard
+from monstertruckd.tools.calibrate.slip import SlipWizard
+from monstertruckd.tools.calibrate.sonar import SonarWizard
+from monstertruckd.tools.calibrate.stabiliser import StabiliserWizard
 from monstertruckd.tools.calibrate.wizard import Wizard
 from tests.calibration_kit import Verdict, run_session, verdicts
 from tests.calibration_robots import robot_of
 
 WIZARDS: Final[dict[WizardName, Wizard]] = {
-    "odometry": odometry_wizard(),
-    "lidar": lidar_wizard(LidarWizard(heights=True)),
-    "imu": imu_wizard(),
-    "slip": slip_wizard(),
-    "stabiliser": stabiliser_wizard(),
-    "camera": camera_wizard(CameraWizard(patience=120.0)),
-    "sonar": sonar_wizard(),
+    "odometry": OdometryWizard(),
+    "lidar": LidarWizard(heights=True),
+    "imu": ImuWizard(),
+    "slip": SlipWizard(),
+    "stabiliser": StabiliserWizard(),
+    "camera": CameraWizard(patience=120.0),
+    "sonar": SonarWizard(),
 }
 GOAL: Final = 0.9
 """Share of the numbers inside their intervals."""

@@ -30,7 +30,7 @@ from monstertruck_schemas import topics
 from monstertruck_schemas.req import Role
 from monstertruckd.config.calibration import CalibrationStore, Estimate, Result
 from monstertruckd.config.load import load_config
-from monstertruckd.tools.calibrate.drive import DriveWizard, drive_wizard
+from monstertruckd.tools.calibrate.drive import DriveWizard
 from monstertruckd.tools.calibrate.wizard import calibrate
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
 from monstertruckd.tools.simulation.operator import LocalOperator
@@ -91,7 +91,7 @@ class Interrupted:
     async def measure(self, wizard: DriveWizard) -> Result:
         """Run the wizard to its end, or to what ends it."""
         panel = SimulatedOperator(self.rig, np.random.default_rng(1))
-        result, _ = await calibrate(drive_wizard(wizard), self.truck, panel, self.clock, self.rig.config, {})
+        result, _ = await calibrate(wizard, self.truck, panel, self.clock, self.rig.config, {})
         return result
 
     def files(self) -> dict[Path, bytes]:

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from monstertruckd.config.calibration import CalibrationStore, with_values
-from monstertruckd.tools.calibrate.camera import CameraWizard, camera_wizard
-from monstertruckd.tools.calibrate.imu import ImuWizard, imu_wizard
-from monstertruckd.tools.calibrate.lidar import LidarWizard, lidar_wizard
-from monstertruckd.tools.calibrate.odometry import odometry_wizard
-from monstertruckd.tools.calibrate.slip import SlipWizard, slip_wizard
-from monstertruckd.tools.calibrate.sonar import SonarWizard, sonar_wizard
-from monstertruckd.tools.calibrate.stabiliser import stabiliser_wizard
+from monstertruckd.tools.calibrate.camera import CameraWizard
+from monstertruckd.tools.calibrate.imu import ImuWizard
+from monstertruckd.tools.calibrate.lidar import LidarWizard
+from monstertruckd.tools.calibrate.odometry import OdometryWizard
+from monstertruckd.tools.calibrate.slip import SlipWizard
+from monstertruckd.tools.calibrate.sonar import SonarWizard
+from monstertruckd.tools.calibrate.stabiliser import StabiliserWizard
 from monstertruckd.tools.calibrate.wizard import Wizard
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 from tests.calibration_kit import run_session, verdicts
@@ -33,7 +33,7 @@ def judged(wizard: Wizard, config: SimulatedTruckConfig, seed: int, outside: int
 @pytest.mark.long
 def test_odometry(tmp_path: Path):
     config = robot_of("odometry", tmp_path, 1)
-    assert judged(odometry_wizard(), config, 1) >= {"drive_ratio", "wheelbase", "front_centre", "rear_centre"}
+    assert judged(OdometryWizard(), config, 1) >= {"drive_ratio", "wheelbase", "front_centre", "rear_centre"}
     current = CalibrationStore(config.calibration_folder, config.robot).current()
     assert current is not None
     calibrated = with_values(config, current.results.values(), "calibration")
@@ -42,26 +42,26 @@ def test_odometry(tmp_path: Path):
 
 @pytest.mark.long
 def test_lidar(tmp_path: Path):
-    wizard = lidar_wizard(LidarWizard(heights=True))
+    wizard = LidarWizard(heights=True)
     assert judged(wizard, robot_of("lidar", tmp_path, 2), 2) == {"x", "y", "yaw", "pitch", "roll"}
 
 
 @pytest.mark.long
 def test_imu(tmp_path: Path):
-    wizard = imu_wizard(ImuWizard(rounds=1))
+    wizard = ImuWizard(rounds=1)
     assert judged(wizard, robot_of("imu", tmp_path, 3), 3) >= {"rate_z", "rate_scale", "force_x"}
 
 
 @pytest.mark.long
 def test_slip(tmp_path: Path):
     config = robot_of("slip", tmp_path, 4)
-    assert judged(slip_wizard(SlipWizard(rounds=1)), config, 4) >= {"icr_left", "icr_right", "gain_left"}
+    assert judged(SlipWizard(rounds=1), config, 4) >= {"icr_left", "icr_right", "gain_left"}
 
 
 @pytest.mark.long
 def test_stabiliser(tmp_path: Path):
     config = robot_of("stabiliser", tmp_path, 6)
-    found = judged(stabiliser_wizard(), config, 6)
+    found = judged(StabiliserWizard(), config, 6)
     assert found == {"pitch_zero", "pitch_direction", "roll_zero", "roll_direction"}
     current = CalibrationStore(config.calibration_folder, config.robot).current()
     assert current is not None
@@ -74,7 +74,7 @@ def test_stabiliser(tmp_path: Path):
 @pytest.mark.long
 def test_camera(tmp_path: Path):
     config = robot_of("camera", tmp_path, 7)
-    found = judged(camera_wizard(CameraWizard(patience=120.0)), config, 7, outside=2)
+    found = judged(CameraWizard(patience=120.0), config, 7, outside=2)
     assert found >= {"focal_x", "centre_y", "k1", "x", "z", "pitch"}
     current = CalibrationStore(config.calibration_folder, config.robot).current()
     assert current is not None
@@ -86,7 +86,7 @@ def test_camera(tmp_path: Path):
 @pytest.mark.long
 def test_sonar(tmp_path: Path):
     config = robot_of("sonar", tmp_path, 5)
-    assert len(judged(sonar_wizard(SonarWizard(turn=3.3, speed=0.25)), config, 5, outside=2)) == 17
+    assert len(judged(SonarWizard(turn=3.3, speed=0.25), config, 5, outside=2)) == 17
     current = CalibrationStore(config.calibration_folder, config.robot).current()
     assert current is not None
     calibrated = with_values(config, current.results.values(), "calibration")

@@ -20,10 +20,10 @@ from monstertruck_sim.world.obstacles import Box
 from monstertruckd.config.calibration import CalibrationStore, Estimate, Result, WizardName
 from monstertruckd.config.load import load_config
 from monstertruckd.tools.calibrate import steering
-from monstertruckd.tools.calibrate.battery import battery_wizard
-from monstertruckd.tools.calibrate.compass import CompassWizard, compass_wizard
-from monstertruckd.tools.calibrate.drive import DriveWizard, drive_wizard
-from monstertruckd.tools.calibrate.steering import SteeringWizard, steering_wizard
+from monstertruckd.tools.calibrate.battery import BatteryWizard
+from monstertruckd.tools.calibrate.compass import CompassWizard
+from monstertruckd.tools.calibrate.drive import DriveWizard
+from monstertruckd.tools.calibrate.steering import SteeringWizard
 from monstertruckd.tools.calibrate.wizard import calibrate
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
 from monstertruckd.tools.simulation.operator import LocalOperator
@@ -59,9 +59,9 @@ def judged(session: Session, config: SimulatedTruckConfig) -> None:
 
 def test_battery(tmp_path: Path):
     config, rng = yard(tmp_path, 1, "battery")
-    once = run_session(config, battery_wizard(), rng)
+    once = run_session(config, BatteryWizard(), rng)
     judged(once, config)
-    again = run_session(config, battery_wizard(), rng, charges=(0.2,))
+    again = run_session(config, BatteryWizard(), rng, charges=(0.2,))
     judged(again, config)
     assert len(again.result.readings) == 3, "the earlier reading counts too"
     current = CalibrationStore(config.calibration_folder, config.robot).current()
@@ -78,7 +78,7 @@ def test_battery_by_a_converter_of_the_kernel(tmp_path: Path):
             "monitors": {"battery": {"kind": "iio", "channel": 5}},
         },
     )
-    gain, offset = run_session(converter, battery_wizard(), rng).result.estimates
+    gain, offset = run_session(converter, BatteryWizard(), rng).result.estimates
     assert (gain.key, offset.key) == ("monitors.battery.divider", "monitors.battery.offset")
     assert gain.low is not None
     assert gain.high is not None
@@ -89,14 +89,14 @@ def test_battery_by_a_converter_of_the_kernel(tmp_path: Path):
 def test_compass(tmp_path: Path):
     config, rng = yard(tmp_path, 1, "compass")
     blind = with_overlay(config, {"devices": {"lidar": None}, "gate": {"scan": {"critical": False}}})
-    judged(run_session(blind, compass_wizard(CompassWizard(speed=0.14)), rng), config)
+    judged(run_session(blind, CompassWizard(speed=0.14), rng), config)
 
 
 @pytest.mark.long
 def test_drive_whose_sign_is_wrong_and_whose_next_start_is_right(tmp_path: Path):
     config, rng = yard(tmp_path, 3, "drive")
     assert config.sim.world.truck.motor.inverted is False
-    wizard = drive_wizard(DriveWizard(runs=3))
+    wizard = DriveWizard(runs=3)
     sign = run_session(config, wizard, rng)
     assert sign.result.again is not None, "with the sign wrong nothing else is driven"
     assert [e.name for e in sign.result.estimates] == ["inverted"]
@@ -114,7 +114,7 @@ def test_steering(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """A truck one of whose axles turns the wrong way."""
     monkeypatch.setattr(steering, "FULL", 0.24)  # circles take half the time
     config, rng = yard(tmp_path, 6, "steering")
-    wizard = steering_wizard(SteeringWizard(strings=2, weaves=1))
+    wizard = SteeringWizard(strings=2, weaves=1)
     session = run_session(config, wizard, rng)
     world = config.sim.world.truck
     assert world.front_servo.us_per_degree > 0 > world.rear_servo.us_per_degree
@@ -128,10 +128,10 @@ def test_steering(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 @pytest.mark.long
 def test_everything_hidden_at_once_begins_with_what_needs_nothing_else(tmp_path: Path):
     config, rng = yard(tmp_path, 8, "compass", "drive", "steering")
-    for wizard in (drive_wizard(DriveWizard(sign_only=True)), steering_wizard(SteeringWizard(rough=True))):
+    for wizard in (DriveWizard(sign_only=True), SteeringWizard(rough=True)):
         judged(run_session(config, wizard, rng), config)
-    judged(run_session(config, compass_wizard(), rng), config)
-    judged(run_session(config, drive_wizard(DriveWizard(runs=3)), rng), config)
+    judged(run_session(config, CompassWizard(), rng), config)
+    judged(run_session(config, DriveWizard(runs=3), rng), config)
 
 
 # Half-way
@@ -180,7 +180,7 @@ async def driving(config: SimulatedTruckConfig, clock: VirtualClock) -> AsyncIte
         await clock.sleep(3.0)
         bench = Bench(rig, clock)
         panel = SimulatedOperator(rig, np.random.default_rng(1))
-        steps = calibrate(drive_wizard(), bench.truck, panel, clock, config, {})
+        steps = calibrate(DriveWizard(), bench.truck, panel, clock, config, {})
         wizard = asyncio.create_task(steps)
         try:
             await bench.until_it_drives()
@@ -281,7 +281,7 @@ def test_the_end_of_a_move_is_not_taken_for_the_begin_of_the_next(tmp_path: Path
         async with rig.running():
             await clock.sleep(3.0)
             truck, panel = Distant(rig.daemon, clock), SimulatedOperator(rig, np.random.default_rng(1))
-            wizard = drive_wizard(DriveWizard(runs=3, metres=0.5))
+            wizard = DriveWizard(runs=3, metres=0.5)
             result, _ = await calibrate(wizard, truck, panel, clock, config, {})
             return result
 
@@ -299,7 +299,7 @@ def test_a_truck_that_somebody_has_armed_is_left_alone(tmp_path: Path):
             await clock.sleep(0.2)
             truck, panel = LocalTruck(rig.daemon, clock), SimulatedOperator(rig, np.random.default_rng(1))
             with pytest.raises(RequestRefusedError, match="armed already") as refusal:
-                await calibrate(drive_wizard(), truck, panel, clock, config, {})
+                await calibrate(DriveWizard(), truck, panel, clock, config, {})
             assert refusal.value.refusal is Reason.BUSY
             with pytest.raises(RequestRefusedError, match="while it is disarmed"):
                 await truck.call("calibration_undo", {"wizard": "drive"})
@@ -370,4 +370,4 @@ def test_a_wizard_needs_its_device(tmp_path: Path):
     config, rng = yard(tmp_path, 1)
     blind = config.model_copy(update={"devices": config.devices.model_copy(update={"compass": None})})
     with pytest.raises(InputError, match=r"devices\.compass\.driver\.rate: not in this truck's configuration"):
-        run_session(blind, compass_wizard(), rng)
+        run_session(blind, CompassWizard(), rng)

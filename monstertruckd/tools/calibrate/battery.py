@@ -6,7 +6,7 @@ between full and empty, so a second reading usually comes days later: readings a
 
 import math
 from dataclasses import dataclass
-from typing import Final
+from typing import ClassVar, Final
 
 import numpy as np
 
@@ -15,10 +15,10 @@ from monstertruck_runtime.errors import InputError, RequestRefusedError
 from monstertruck_schemas import topics
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import Battery
-from monstertruckd.config.calibration import STEERING, Result
+from monstertruckd.config.calibration import STEERING, Result, WizardName
 from monstertruckd.tools.calibrate.statistics import NORMAL, Interval, estimated
 from monstertruckd.tools.calibrate.steps import Collect, Confirm, Number
-from monstertruckd.tools.calibrate.wizard import Wizard, WizardContext
+from monstertruckd.tools.calibrate.wizard import WizardContext
 
 METER: Final = Number("meter", "Voltage of the pack at its plug by the multimeter, V", 5.0, 70.0)
 ANOTHER: Final = Confirm("another", "Take another reading now, with the pack at another voltage?", fact=True)
@@ -46,6 +46,9 @@ class MeterReading:
 class BatteryWizard:
     """One or more readings of a multimeter."""
 
+    name: ClassVar[WizardName] = "battery"
+    doc: ClassVar[str] = "scale of the battery voltage from a multimeter, and its offset from two readings apart"
+    room: ClassVar[str] = ""
     meter_share: float = 0.005
     """Greatest error of the multimeter as a share of its reading"""
     meter_digits: float = 0.02
@@ -180,9 +183,3 @@ def check_input(reading: MeterReading, gain: float) -> None:
 def volts_near(shown: float, volts: float) -> bool:
     """Whether two voltages may be the same pack's by inputs that are wrong by a factor of two at most."""
     return volts / 2 < shown < 2 * volts
-
-
-def battery_wizard(settings: BatteryWizard | None = None) -> Wizard:
-    """Voltage scale."""
-    doc = "scale of the battery voltage from a multimeter, and its offset from two readings apart"
-    return Wizard("battery", doc, "", settings or BatteryWizard())

@@ -7,7 +7,7 @@ Nothing drives; the board is held still for a moment, again and again another wa
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 import cv2
 import numpy as np
@@ -22,13 +22,13 @@ from monstertruck_schemas.board import BoardConfig
 from monstertruck_schemas.body import LensConfig
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import CompressedImage
-from monstertruckd.config.calibration import CAMERA_LENS, CAMERA_MOUNT, Estimate, Result
+from monstertruckd.config.calibration import CAMERA_LENS, CAMERA_MOUNT, Estimate, Result, WizardName
 from monstertruckd.tools.calibrate.board_mount import NAMES, LidarPlace, fit_mount, line_on_board
 from monstertruckd.tools.calibrate.board_views import BoardGuide, BoardView
 from monstertruckd.tools.calibrate.lidar import joint_angles
 from monstertruckd.tools.calibrate.statistics import NORMAL, Interval, estimated, known_errors
 from monstertruckd.tools.calibrate.steps import Collect, Confirm, WatchStep
-from monstertruckd.tools.calibrate.wizard import Wizard, WizardContext
+from monstertruckd.tools.calibrate.wizard import WizardContext
 
 ROOM: Final = "a printed board on something flat (`stand print`), 0.4 to 1 m before the camera; light; nothing drives"
 WORST: Final = 1.0
@@ -50,6 +50,9 @@ _BOARD: Final = Confirm(
 class CameraWizard:
     """Pictures and scans of a board, until enough was seen."""
 
+    name: ClassVar[WizardName] = "camera"
+    doc: ClassVar[str] = "lens of the camera, and where it sits against the lidar, from a board held before both"
+    room: ClassVar[str] = ROOM
     board: BoardConfig = field(default_factory=BoardConfig)
     lidar: bool = True
     """Fit the mount, too, where the robot has a lidar"""
@@ -104,12 +107,6 @@ class CameraWizard:
         if devices.lidar is None:
             return None
         return LidarPlace.of(devices.lidar.mount, *await joint_angles(context))
-
-
-def camera_wizard(settings: CameraWizard | None = None) -> Wizard:
-    """Lens and mount of the camera."""
-    doc = "lens of the camera, and where it sits against the lidar, from a board held before both"
-    return Wizard("camera", doc, ROOM, settings or CameraWizard())
 
 
 def decoded(message: CompressedImage) -> Picture | None:

@@ -7,7 +7,7 @@ strength of the field, nor a rotation of the whole (the unit's mounting).
 
 import math
 from dataclasses import dataclass
-from typing import Final
+from typing import ClassVar, Final
 
 import numpy as np
 
@@ -17,10 +17,10 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.fitting import FitResult, least_squares
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas import topics
-from monstertruckd.config.calibration import COMPASS, Estimate, Result
+from monstertruckd.config.calibration import COMPASS, Estimate, Result, WizardName
 from monstertruckd.tools.calibrate.statistics import NORMAL, correlation_factor
 from monstertruckd.tools.calibrate.steps import MoveRecord, MoveStep
-from monstertruckd.tools.calibrate.wizard import CLEAR, Wizard, WizardContext
+from monstertruckd.tools.calibrate.wizard import CLEAR, WizardContext
 
 ROOM: Final = "2 m x 2 m, level, outdoors or well away from iron: no car, no reinforced wall, no drain within 3 m"
 
@@ -90,6 +90,9 @@ class FieldCircle:
 class CompassWizard:
     """One circle forward, the same one back: what the motor's current adds changes its sign with the direction."""
 
+    name: ClassVar[WizardName] = "compass"
+    doc: ClassVar[str] = "the truck's own magnetism, from a driven circle"
+    room: ClassVar[str] = ROOM
     speed: float = 0.07
     """m/s: slowly, for a compass with much iron runs ahead and falls behind by turns, which the gate takes for
     wheels that do not steer"""
@@ -118,12 +121,6 @@ class CompassWizard:
             for name, speed in (("a circle to the left", self.speed), ("the same circle back", -self.speed))
         ]
         return context.fit("ellipse", lambda: result_of(FieldCircle.of(tracks)))
-
-
-def compass_wizard(settings: CompassWizard | None = None) -> Wizard:
-    """Hard and soft iron."""
-    doc = "the truck's own magnetism, from a driven circle"
-    return Wizard("compass", doc, ROOM, settings or CompassWizard())
 
 
 def result_of(circle: FieldCircle) -> Result:

@@ -10,18 +10,18 @@ apart: drivers pass on a slower speed at once, a faster one with their next cycl
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Final, Literal, Self
+from typing import ClassVar, Final, Literal, Self
 
 import numpy as np
 
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError
-from monstertruckd.config.calibration import Estimate, Result
+from monstertruckd.config.calibration import Estimate, Result, WizardName
 from monstertruckd.tools.calibrate.response import ResponseFit, Steps, unexplained
 from monstertruckd.tools.calibrate.statistics import Interval, estimated, mean_interval
 from monstertruckd.tools.calibrate.steps import Confirm, MoveRecord, MoveStep, Number
-from monstertruckd.tools.calibrate.wizard import CLEAR, Wizard, WizardContext
+from monstertruckd.tools.calibrate.wizard import CLEAR, WizardContext
 
 RATIO: Final = "geometry.drive_ratio"
 INVERTED: Final = "devices.drive.driver.inverted"
@@ -54,6 +54,9 @@ _STRAIGHT: Final = Confirm(
 class DriveWizard:
     """Sign, then several runs forward and back."""
 
+    name: ClassVar[WizardName] = "drive"
+    doc: ClassVar[str] = "which way is forward, the way of a motor's turn, from taped distances; how late it follows"
+    room: ClassVar[str] = ROOM
     runs: int = 4
     """Taped distances; at least 3"""
     metres: float = 2.0
@@ -167,12 +170,6 @@ def turns_per_metre(values: Sequence[float], tape_error: float, metres: float, b
 def on_any_floor(found: Interval) -> Interval:
     """What was found on one floor, as it counts on others."""
     return found.joined(found.value * SLIP)
-
-
-def drive_wizard(settings: DriveWizard | None = None) -> Wizard:
-    """Sign and ratio."""
-    doc = "which way is forward, how far a turn of the motor goes, from taped distances, and how late it follows"
-    return Wizard("drive", doc, ROOM, settings or DriveWizard())
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import ClassVar, Final
 
 import numpy as np
 
@@ -13,11 +13,11 @@ from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas import topics
 from monstertruck_schemas.sensor import Attitude, Imu
-from monstertruckd.config.calibration import IMU, Result
+from monstertruckd.config.calibration import IMU, Result, WizardName
 from monstertruckd.tools.calibrate.statistics import NORMAL, Interval, correlation_factor, estimated, known_errors
 from monstertruckd.tools.calibrate.steering_model import HEADING
 from monstertruckd.tools.calibrate.steps import Collect, MoveRecord, MoveStep
-from monstertruckd.tools.calibrate.wizard import CLEAR, Wizard, WizardContext
+from monstertruckd.tools.calibrate.wizard import CLEAR, WizardContext
 
 ROOM: Final = "2 m x 2 m, level"
 GRAVITY: Final = 9.80665
@@ -77,6 +77,9 @@ class Turn:
 class ImuWizard:
     """At rest for ten seconds; then full circles to both sides."""
 
+    name: ClassVar[WizardName] = "imu"
+    doc: ClassVar[str] = "biases of the inertial unit at rest, and the scale of its yaw rate from full turns"
+    room: ClassVar[str] = ROOM
     rounds: int = 2
     """Circles to each side"""
     turns: bool = True
@@ -108,12 +111,6 @@ class ImuWizard:
 
 
 _NAMES: Final = ("rate_x", "rate_y", "rate_z", "rate_scale", "force_x", "force_y")
-
-
-def imu_wizard(settings: ImuWizard | None = None) -> Wizard:
-    """Biases and scale."""
-    doc = "biases of the inertial measurement unit at rest, and the scale of its yaw rate from full turns"
-    return Wizard("imu", doc, ROOM, settings or ImuWizard())
 
 
 def result_of(

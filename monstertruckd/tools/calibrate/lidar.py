@@ -13,7 +13,7 @@ left. The beam is infrared: a telephone's camera shows it.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import ClassVar, Final
 
 import numpy as np
 
@@ -29,15 +29,17 @@ from monstertruck_runtime.errors import InputError, RequestRefusedError
 from monstertruck_schemas import topics
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import VALID_BEAM, LaserScan
-from monstertruckd.config.calibration import LIDAR, Estimate, Result
+from monstertruckd.config.calibration import LIDAR, Estimate, Result, WizardName
 from monstertruckd.tools.calibrate.statistics import NORMAL, Interval, correlation_factor, estimated, known_errors
 from monstertruckd.tools.calibrate.steering_model import AXLES, EYE
 from monstertruckd.tools.calibrate.steps import Collect, MoveRecord, MoveStep, Number
 from monstertruckd.tools.calibrate.weave import weaves
-from monstertruckd.tools.calibrate.wizard import CLEAR, Wizard, WizardContext
+from monstertruckd.tools.calibrate.wizard import CLEAR, WizardContext
 
-ROOM: Final = "3 m x 3 m, with walls in sight to several sides"
-LEVEL_ROOM: Final = f"{ROOM}; a level floor, a wall straight ahead and one straight to the left; a tape"
+ROOM: Final = (
+    "3 m x 3 m, with walls in sight to several sides; for heights a tape, a level floor, and a wall straight ahead and "
+    "straight to the left"
+)
 SPEED: Final = 0.12
 ANGLE: Final = 0.35
 """Of both axles, against each other, rad."""
@@ -134,6 +136,9 @@ class Offset:
 class LidarWizard:
     """Quarter circles to both sides and straights; then weaves for the clocks, and heights where asked for."""
 
+    name: ClassVar[WizardName] = "lidar"
+    doc: ClassVar[str] = "where the lidar sits on the body, and the offset of its clock, from scans between rests"
+    room: ClassVar[str] = ROOM
     rounds: int = 1
     """Full circles to each side, in quarters"""
     heights: bool = False
@@ -202,13 +207,6 @@ class LidarWizard:
             )
             for name, angle, distance, sign in found
         )
-
-
-def lidar_wizard(settings: LidarWizard | None = None) -> Wizard:
-    """Mount and clock of the lidar."""
-    doc = "where the lidar sits on the body, and the offset of its clock, from scans between rests"
-    settings = settings or LidarWizard()
-    return Wizard("lidar", doc, LEVEL_ROOM if settings.heights else ROOM, settings)
 
 
 async def joint_angles(context: WizardContext) -> tuple[float, float]:

@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Final
+from typing import ClassVar, Final
 
 import numpy as np
 
@@ -19,11 +19,11 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.fitting import FitResult, least_squares
 from monstertruck_runtime.errors import InputError, RequestRefusedError
 from monstertruck_schemas.reasons import Reason
-from monstertruckd.config.calibration import STEERING, Estimate, Result
+from monstertruckd.config.calibration import STEERING, Estimate, Result, WizardName
 from monstertruckd.tools.calibrate.statistics import Interval, estimated, known_errors
 from monstertruckd.tools.calibrate.steering_model import AXLES, EYE, SLIP, Maps, SteeringModel, SteeringRun
 from monstertruckd.tools.calibrate.steps import Confirm, MoveRecord, MoveStep, Number
-from monstertruckd.tools.calibrate.wizard import CLEAR, Wizard, WizardContext
+from monstertruckd.tools.calibrate.wizard import CLEAR, WizardContext
 
 ROOM: Final = "3.5 m x 3.5 m on either side: squares of 2.4 m to the left and to the right of the truck, level"
 SPEED: Final = 0.15
@@ -70,6 +70,9 @@ class Square:
 class OdometryWizard:
     """A square to the left, the same to the right, as often as asked for."""
 
+    name: ClassVar[WizardName] = "odometry"
+    doc: ClassVar[str] = "way, wheelbase and steering offset of dead reckoning, from squares driven to both sides"
+    room: ClassVar[str] = ROOM
     rounds: int = 1
     """Squares to each side"""
     side: float = 1.5
@@ -175,12 +178,6 @@ class OdometryWizard:
                 "the wheelbase apart from the servos' scale: their product is measured",
             ),
         )
-
-
-def odometry_wizard(settings: OdometryWizard | None = None) -> Wizard:
-    """Way, wheelbase, steering offset."""
-    doc = "way, wheelbase and steering offset of dead reckoning, from squares driven to both sides"
-    return Wizard("odometry", doc, ROOM, settings or OdometryWizard())
 
 
 def _turned(record: MoveRecord, left: float) -> bool:

@@ -8,7 +8,7 @@ delay of anybody's does.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Literal
+from typing import Any, ClassVar, Final, Literal
 
 import numpy as np
 
@@ -21,10 +21,10 @@ from monstertruck_schemas import topics
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.topics import Topic
-from monstertruckd.config.calibration import Estimate, Result
+from monstertruckd.config.calibration import Estimate, Result, WizardName
 from monstertruckd.tools.calibrate.statistics import known_errors
 from monstertruckd.tools.calibrate.steps import MoveRecord, MoveStep
-from monstertruckd.tools.calibrate.wizard import CLEAR, Wizard, WizardContext
+from monstertruckd.tools.calibrate.wizard import CLEAR, WizardContext
 
 Observer = Literal["stand", "pose"]
 OBSERVERS: Final[dict[Observer, Topic[Any]]] = {"stand": topics.STAND_POSE, "pose": topics.POSE}
@@ -83,6 +83,9 @@ class SkidArc:
 class SlipWizard:
     """Arcs to both sides, forward and back."""
 
+    name: ClassVar[WizardName] = "slip"
+    doc: ClassVar[str] = "turning centres and wheels of a skid-steer body, from arcs seen by a stand or in the map"
+    room: ClassVar[str] = ROOM
     by: Observer = "stand"
     """What says where the robot is: a test stand, or its own map"""
     rounds: int = 2
@@ -113,12 +116,6 @@ class SlipWizard:
                     move = MoveStep(name, way * speed, front, 0.0, metres, rest=REST, also=also)
                     arcs.append(SkidArc.of(await context.move(move), self.by, context.chassis))
         return context.fit("turning centres", lambda: result_of(arcs, config.geometry.wheel_radius, track / 2))
-
-
-def slip_wizard(settings: SlipWizard | None = None) -> Wizard:
-    """Turning centres."""
-    doc = "turning centres and effective wheels of a skid-steer body, from arcs seen by a stand or in the map"
-    return Wizard("slip", doc, ROOM, settings or SlipWizard())
 
 
 def result_of(arcs: Sequence[SkidArc], radius: float, half_track: float) -> Result:

@@ -10,7 +10,7 @@ centre look like a wall that is turned.
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final, NamedTuple
+from typing import Any, ClassVar, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,10 +22,10 @@ from monstertruck_kinematics.fitting import FitResult, least_squares
 from monstertruck_runtime.errors import InputError, RequestRefusedError
 from monstertruck_schemas import topics
 from monstertruck_schemas.reasons import Reason
-from monstertruckd.config.calibration import SONAR, Result
+from monstertruckd.config.calibration import SONAR, Result, WizardName
 from monstertruckd.tools.calibrate.statistics import Interval, estimated, known_errors
 from monstertruckd.tools.calibrate.steps import Confirm, MoveRecord, MoveStep, Number
-from monstertruckd.tools.calibrate.wizard import CLEAR, Wizard, WizardContext
+from monstertruckd.tools.calibrate.wizard import CLEAR, WizardContext
 
 ROOM: Final = (
     "a flat wall 5 m long and as high as the sonars see, 1.7 m to the robot's left; nothing else within 2 m before, "
@@ -124,6 +124,9 @@ class SonarLeg:
 class SonarWizard:
     """An arc to each side, driven ahead and back, beside a wall."""
 
+    name: ClassVar[WizardName] = "sonar"
+    doc: ClassVar[str] = "where the sonars sit and look, their cones, and the speed of sound, from arcs beside a wall"
+    room: ClassVar[str] = ROOM
     turn: float = 2 * math.pi
     """Of each arc, rad"""
     tape_error: float = 0.002
@@ -159,12 +162,6 @@ class SonarWizard:
         origin = _start(records[0])
         legs = [SonarLeg.of(record, origin) for record in records]
         return context.fit("places and cones", lambda: result_of(legs, settings, wall, self.tape_error))
-
-
-def sonar_wizard(settings: SonarWizard | None = None) -> Wizard:
-    """Places and cones."""
-    doc = "where every sonar sits and looks, how wide its cone is, and the speed of sound, from arcs beside a wall"
-    return Wizard("sonar", doc, ROOM, settings or SonarWizard())
 
 
 def result_of(legs: Sequence[SonarLeg], settings: Srf08Config, wall: float, tape_error: float) -> Result:

@@ -10,7 +10,7 @@ where two tilts meet it. A joint that does not turn leaves one tilt, and so do t
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import ClassVar, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,11 +22,11 @@ from monstertruck_runtime.errors import InputError, RequestRefusedError
 from monstertruck_schemas import topics
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import VALID_BEAM, Attitude, LaserScan, StabiliserFeedback
-from monstertruckd.config.calibration import STABILISER, Estimate, Result
+from monstertruckd.config.calibration import STABILISER, Estimate, Result, WizardName
 from monstertruckd.tools.calibrate.lidar import FLAT, HEIGHTS, beam_distance, beam_tilt
 from monstertruckd.tools.calibrate.statistics import NORMAL, Interval
 from monstertruckd.tools.calibrate.steps import Collect, Confirm
-from monstertruckd.tools.calibrate.wizard import Wizard, WizardContext
+from monstertruckd.tools.calibrate.wizard import WizardContext
 
 ROOM: Final = (
     "a level floor, a wall 2.5 to 3.5 m ahead of the truck and one to its left, nothing within 2.5 m ahead and to the "
@@ -113,6 +113,9 @@ class Heights:
 class StabiliserWizard:
     """Heights on the level floor; then blocks below the rear wheels, and below the left ones."""
 
+    name: ClassVar[WizardName] = "stabiliser"
+    doc: ClassVar[str] = "zero and direction of both servos, from the height of the beam and blocks under wheels"
+    room: ClassVar[str] = ROOM
     tape_error: float = 0.002
     """Standard deviation of a height, m"""
 
@@ -143,12 +146,6 @@ class StabiliserWizard:
         tilts = await context.collect(Collect("the truck's tilt", topics.COMPASS, 20))
         joints = await context.collect(Collect("positions of the servos", topics.STABILISER, 20))
         return RestMeasurement.of(scans, tilts, joints), scans
-
-
-def stabiliser_wizard(settings: StabiliserWizard | None = None) -> Wizard:
-    """Zeros and directions."""
-    doc = "zero and direction of both servos below the lidar, from the height of its beam and from blocks under wheels"
-    return Wizard("stabiliser", doc, ROOM, settings or StabiliserWizard())
 
 
 def result_of(

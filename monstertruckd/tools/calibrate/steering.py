@@ -7,7 +7,7 @@ and a string on the floor shows what neither sees, the crabbing of two axles tha
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Final
+from typing import ClassVar, Final
 
 import numpy as np
 
@@ -16,12 +16,12 @@ from monstertruck_kinematics.chassis import TruckChassis
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.errors import InputError, RequestRefusedError
 from monstertruck_schemas.reasons import Reason
-from monstertruckd.config.calibration import STEERING, Estimate, Result
+from monstertruckd.config.calibration import STEERING, Estimate, Result, WizardName
 from monstertruckd.tools.calibrate.statistics import NORMAL
 from monstertruckd.tools.calibrate.steering_model import AXLES, SLIP, Maps, SteeringModel, SteeringRun, half_widths
 from monstertruckd.tools.calibrate.steps import Confirm, MoveStep, Number
 from monstertruckd.tools.calibrate.weave import estimates, response, weaves
-from monstertruckd.tools.calibrate.wizard import CLEAR, Wizard, WizardContext
+from monstertruckd.tools.calibrate.wizard import CLEAR, WizardContext
 
 ROOM: Final = "2.5 m x 2.5 m, level, the truck in the middle; with --rough 1.5 m x 1.5 m"
 
@@ -75,6 +75,9 @@ CIRCLED: Final = (("the front", (1, 0)), ("the rear", (0, 1)), ("all", (1, -1)))
 class SteeringWizard:
     """Short arcs for the directions; then travel, straights along a string, full circles and weaves."""
 
+    name: ClassVar[WizardName] = "steering"
+    doc: ClassVar[str] = "centre, direction, travel and pulses of both axles, from the truck's turns and a string"
+    room: ClassVar[str] = ROOM
     rough: bool = False
     """Directions and a first centre only: before the compass is calibrated"""
     strings: int = 3
@@ -268,12 +271,6 @@ class SteeringWizard:
                 *(() if self.strings else ("equal errors of both centres, but by unlike circles: the truck crabs",)),
             ),
         )
-
-
-def steering_wizard(settings: SteeringWizard | None = None) -> Wizard:
-    """Centre, direction, travel, pulse map."""
-    doc = "centre, direction, travel and pulse map of both axles, from the truck's own turns and a string"
-    return Wizard("steering", doc, ROOM, settings or SteeringWizard())
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,11 +7,10 @@ the calibration unchanged; the gate stops the truck as it does for any operator 
 """
 
 import json
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, Final, TypeVar
+from typing import Any, ClassVar, Final, Protocol, TypeVar
 
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import InputError, NoAnswerError, RequestRefusedError
@@ -33,16 +32,18 @@ WATCHED: Final = 64
 CLEAR: Final = Confirm("clear", "The truck is about to move. Is the floor free as described?")
 
 
-@dataclass(frozen=True, slots=True)
-class Wizard:
-    """One calibration procedure."""
+class Wizard(Protocol):
+    """One calibration procedure, with its settings."""
 
-    name: WizardName
-    doc: str
+    name: ClassVar[WizardName]
+    doc: ClassVar[str]
     """What it finds, in a sentence"""
-    room: str
+    room: ClassVar[str]
     """Free space that the truck needs"""
-    run: Callable[["WizardContext"], Awaitable[Result]]
+
+    async def __call__(self, context: "WizardContext") -> Result:
+        """Measure."""
+        ...
 
 
 class WizardContext:
@@ -199,6 +200,6 @@ async def calibrate(
     context = WizardContext(truck, panel, clock, config, known)
     if why := context.expired.get(wizard.name):
         panel.say(f"nothing of the calibration before is used, it has expired: {why}")
-    result = await wizard.run(context)
+    result = await wizard(context)
     saved = await truck.call(SAVE, {"result": result.model_dump(mode="json"), "source": truck.source})
     return Result.model_validate_json(json.dumps(saved["result"])), str(saved["file"])

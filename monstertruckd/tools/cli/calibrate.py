@@ -103,9 +103,9 @@ def drive(
 
     Asks `clear`, `forward` and, for each run, `mark` and `distance` (m), and without a compass `straight` (yes or no).
     """
-    from monstertruckd.tools.calibrate.drive import DriveWizard, drive_wizard
+    from monstertruckd.tools.calibrate.drive import DriveWizard
 
-    return drive_wizard(DriveWizard(runs, metres, tape_error / 1000, sign_only=sign_only))
+    return DriveWizard(runs, metres, tape_error / 1000, sign_only=sign_only)
 
 
 @_wizard
@@ -122,17 +122,17 @@ def steering(
 
     Asks `clear` and, for each string, `string` and `offset` (cm).
     """
-    from monstertruckd.tools.calibrate.steering import SteeringWizard, steering_wizard
+    from monstertruckd.tools.calibrate.steering import SteeringWizard
 
-    return steering_wizard(SteeringWizard(rough, strings, string_error / 1000))
+    return SteeringWizard(rough, strings, string_error / 1000)
 
 
 @_wizard
 def compass() -> "Wizard":
     """The truck's own magnetism, hard and soft iron: a circle forward and back. Asks `clear`."""
-    from monstertruckd.tools.calibrate.compass import compass_wizard
+    from monstertruckd.tools.calibrate.compass import CompassWizard
 
-    return compass_wizard()
+    return CompassWizard()
 
 
 @_wizard
@@ -145,9 +145,9 @@ def battery(
 
     Asks `meter` (V) and `another` (yes or no), until that is no.
     """
-    from monstertruckd.tools.calibrate.battery import BatteryWizard, battery_wizard
+    from monstertruckd.tools.calibrate.battery import BatteryWizard
 
-    return battery_wizard(BatteryWizard(meter_error / 100, meter_digits, fresh=fresh))
+    return BatteryWizard(meter_error / 100, meter_digits, fresh=fresh)
 
 
 @_wizard
@@ -163,9 +163,9 @@ def odometry(
 
     Asks `clear` and, for each square, `mark`, `side` (m), `ahead` and `left` (cm).
     """
-    from monstertruckd.tools.calibrate.odometry import OdometryWizard, odometry_wizard
+    from monstertruckd.tools.calibrate.odometry import OdometryWizard
 
-    return odometry_wizard(OdometryWizard(rounds, side, tape_error / 1000, string_error / 1000))
+    return OdometryWizard(rounds, side, tape_error / 1000, string_error / 1000)
 
 
 @_wizard
@@ -178,9 +178,9 @@ def lidar(
 
     Asks with heights `centre`, `ahead` and `left` (cm), and `clear`.
     """
-    from monstertruckd.tools.calibrate.lidar import LidarWizard, lidar_wizard
+    from monstertruckd.tools.calibrate.lidar import LidarWizard
 
-    return lidar_wizard(LidarWizard(rounds, heights, tape_error / 1000))
+    return LidarWizard(rounds, heights, tape_error / 1000)
 
 
 @_wizard
@@ -189,9 +189,9 @@ def imu(
     still: Annotated[bool, typer.Option("--still", help="Biases only: nothing moves, the scale stays.")] = False,
 ) -> "Wizard":
     """Biases of the inertial unit at rest, and the scale of its yaw rate from full circles. Asks `clear`."""
-    from monstertruckd.tools.calibrate.imu import ImuWizard, imu_wizard
+    from monstertruckd.tools.calibrate.imu import ImuWizard
 
-    return imu_wizard(ImuWizard(rounds, turns=not still))
+    return ImuWizard(rounds, turns=not still)
 
 
 @_wizard
@@ -201,11 +201,11 @@ def slip(
 ) -> "Wizard":
     """Turning centres and wheels of a skid-steer body: arcs seen by a test stand, or in the map. Asks `clear`."""
     from monstertruck_runtime.errors import InputError
-    from monstertruckd.tools.calibrate.slip import OBSERVERS, SlipWizard, slip_wizard
+    from monstertruckd.tools.calibrate.slip import OBSERVERS, SlipWizard
 
     if by not in OBSERVERS:
         raise InputError(f"--by {by}: expected one of {', '.join(OBSERVERS)}")
-    return slip_wizard(SlipWizard("pose" if by == "pose" else "stand", rounds))
+    return SlipWizard("pose" if by == "pose" else "stand", rounds)
 
 
 @_wizard
@@ -219,9 +219,9 @@ def sonar(
     """
     import math
 
-    from monstertruckd.tools.calibrate.sonar import SonarWizard, sonar_wizard
+    from monstertruckd.tools.calibrate.sonar import SonarWizard
 
-    return sonar_wizard(SonarWizard(math.radians(turn), tape_error=tape_error / 1000))
+    return SonarWizard(math.radians(turn), tape_error=tape_error / 1000)
 
 
 @_wizard
@@ -232,9 +232,9 @@ def stabiliser(
 
     Nothing drives. Asks `level`, `centre`, `ahead`, `left` (cm), `nose` and `side`.
     """
-    from monstertruckd.tools.calibrate.stabiliser import StabiliserWizard, stabiliser_wizard
+    from monstertruckd.tools.calibrate.stabiliser import StabiliserWizard
 
-    return stabiliser_wizard(StabiliserWizard(tape_error / 1000))
+    return StabiliserWizard(tape_error / 1000)
 
 
 @_wizard
@@ -256,10 +256,10 @@ def camera(
     if marker >= square:
         raise InputError(f"--marker {marker:g}: expected less than --square {square:g}, in which it lies")
     with needs_extra("vision"):
-        from monstertruckd.tools.calibrate.camera import CameraWizard, camera_wizard
+        from monstertruckd.tools.calibrate.camera import CameraWizard
 
     board = BoardConfig(columns=columns, rows=rows, square=square / 1000, marker=marker / 1000)
-    return camera_wizard(CameraWizard(board, lidar=not lens_only, patience=patience))
+    return CameraWizard(board, lidar=not lens_only, patience=patience)
 
 
 @app.command("all")

@@ -52,12 +52,12 @@ def test_what_is_fresh_is_skipped_and_a_first_look_is_taken_once():
 
 def test_a_lidar_that_no_stabiliser_levels_is_measured_with_the_heights_of_its_beam():
     (levelled,) = [step for step in missing(TRUCK, {}) if step.name == "lidar"]
-    assert not calibrate.wizard_of(levelled).run.heights
+    assert not calibrate.wizard_of(levelled).heights
     plain = TRUCK.model_copy(update={"devices": TRUCK.devices.model_copy(update={"stabiliser": None})})
     for results in ({}, {"lidar": result("lidar", "x")}):
         (step,) = [step for step in missing(plain, results) if step.name == "lidar"]
         wizard = calibrate.wizard_of(step)
-        assert wizard.run.heights
+        assert wizard.heights
         assert "a wall straight ahead" in wizard.room
     assert "lidar" not in names(missing(plain, {"lidar": result("lidar", "x", "pitch", "roll")}))
     blind = plain.model_copy(update={"devices": plain.devices.model_copy(update={"compass": None})})

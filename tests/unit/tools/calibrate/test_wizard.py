@@ -17,7 +17,7 @@ from monstertruckd.config.expiry import part_of
 from monstertruckd.config.load import load_config
 from monstertruckd.config.truck import TruckConfig
 from monstertruckd.tools.calibrate.steps import Collect, Confirm, MoveRecord, MoveStep, Number
-from monstertruckd.tools.calibrate.wizard import Wizard, WizardContext, calibrate
+from monstertruckd.tools.calibrate.wizard import WizardContext, calibrate
 
 CONFIG = load_config(Path(__file__).resolve().parents[4] / "configs" / "demo.yaml", TruckConfig)[0]
 RESULT = Result(
@@ -69,10 +69,15 @@ class Panel:
 
 def run(steps, panel: Panel | None = None, truck: Truck | None = None, known=None):
     """Run a wizard of the given coroutine function; returns what ``calibrate`` does."""
-    wizard = Wizard("battery", "test", "a table", steps)
+
+    class Steps:
+        name, doc, room = "battery", "test", "a table"
+
+        async def __call__(self, context):
+            return await steps(context)
 
     async def main(clock: VirtualClock):
-        return await calibrate(wizard, truck or Truck(), panel or Panel(), clock, CONFIG, known or {})
+        return await calibrate(Steps(), truck or Truck(), panel or Panel(), clock, CONFIG, known or {})
 
     return run_virtual(main)
 
