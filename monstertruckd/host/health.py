@@ -25,6 +25,10 @@ SUMMARY_AFTER: Final = 5
 STEP = SECOND // 20
 """A change of the real-time offset within one period beyond this is a step, not drift (NTP slews < 1 ms/s)."""
 
+LASTS: Final = 3
+"""Seconds with late ticks after which the log says that the computer is busy: a start has some."""
+SAY_BUSY: Final = 60.0
+"""Seconds until it says so again."""
 DEGRADED: Final = frozenset({Reason.SLOW_LINK})
 """Reasons of a service that works, but badly: its warning says so, its information that it is over."""
 
@@ -179,6 +183,9 @@ class MeterService:
         self._bus = bus
         self._loop = bus.publisher(LOOP, Writer.DAEMON)
         self._recording = bus.publisher(RECORDER, Writer.DAEMON)
+        self._late = 0
+        """Seconds with late ticks, less those without."""
+        self._said: int | None = None
 
     async def run(self, ready: Ready) -> None:
         """Publish until cancelled."""
@@ -187,17 +194,28 @@ class MeterService:
             await self._clock.sleep(PERIOD)
             now = self._clock.now()
             late = self._gate.lateness()
-            self._loop.put(
-                LoopHealth(
-                    stamp=now,
-                    received=now,
-                    seq=self._loop.next_seq(),
-                    ticks=late.ticks,
-                    lateness_p50=late.p50,
-                    lateness_p99=late.p99,
-                    lateness_max=late.max,
-                    drops=self._bus.drops,
-                )
+            health = LoopHealth(
+                stamp=now,
+                received=now,
+                seq=self._loop.next_seq(),
+                ticks=late.ticks,
+                lateness_p50=late.p50,
+                lateness_p99=late.p99,
+                lateness_max=late.max,
+                drops=self._bus.drops,
             )
+            self._loop.put(health)
+            self._say_busy(health)
             if self._recorder is not None:
                 self._recording.put(self._recorder.health(self._recording.next_seq()))
+
+    def _say_busy(self, health: LoopHealth) -> None:
+        """Log that the computer is busy once it lasts, at most once in ``SAY_BUSY``."""
+        self._late = self._late + 1 if health.busy else max(0, self._late - 1)
+        if (
+            health.busy
+            and self._late >= LASTS
+            and (self._said is None or health.stamp - self._said > SAY_BUSY * SECOND)
+        ):
+            self._said = health.stamp
+            log.warning("%s", health.busy)

@@ -1,4 +1,4 @@
-"""Connections to the page's server, with bounds for TLS handshakes: no connections yet, but they cost as much."""
+"""Connections to the page's server, with bounds while they are set up (TLS: the handshake): that costs as much."""
 
 import asyncio
 import socket
@@ -13,7 +13,7 @@ from monstertruckd.station.users import network_of
 LONGEST: Final = 5.0
 """Seconds that a handshake may take."""
 MOST_OF_NETWORK: Final = 32
-"""Handshakes under way from one network; further connections are closed at once."""
+"""Connections of one network that are being set up; further connections are closed at once."""
 BACKLOG: Final = 128
 """Connections that wait to be taken."""
 PAUSE: Final = 0.2
@@ -92,7 +92,7 @@ class WebListener:
                 self._begin(self._greet(taken, address, network))
             else:
                 taken.close()
-                self._refused(address, f"{MOST_OF_NETWORK} TLS handshakes of {network} are under way: no further one")
+                self._refused(address, f"{MOST_OF_NETWORK} connections of {network} are being set up: no further one")
 
     async def _greet(self, taken: socket.socket, address: str, network: str) -> None:
         longest = None if self._tls is None else LONGEST
@@ -101,7 +101,7 @@ class WebListener:
                 self._inside, taken, ssl=self._tls, ssl_handshake_timeout=longest
             )
         except OSError as error:
-            self._refused(address, f"TLS handshake of {address} failed: {error.strerror or error}")
+            self._refused(address, f"connection of {address} failed: {error.strerror or error}")
         finally:
             self._under_way[network] -= 1
             if not self._under_way[network]:

@@ -1,7 +1,7 @@
 """Messages of the ``health`` group."""
 
 from enum import StrEnum
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
 from pydantic import Field
 
@@ -61,6 +61,10 @@ class CalibrationHealth(Message):
     """Way that the robot has driven in all, m."""
 
 
+LATE: Final = 0.02
+"""Of the control tick, s: a whole period."""
+
+
 class LoopHealth(Message):
     """Punctuality of the control tick over the last second and since the start."""
 
@@ -71,6 +75,12 @@ class LoopHealth(Message):
     lateness_max: float
     drops: int = 0
     """Messages lost in bounded queues since the start."""
+
+    @property
+    def busy(self) -> str:
+        """That the daemon gets too little processor time, in words; empty while ticks are less than ``LATE`` late."""
+        late = self.lateness_p99
+        return f"the computer is busy: control ticks come {late * 1e3:.0f} ms late; end other programs" * (late > LATE)
 
 
 class RecorderHealth(Message):

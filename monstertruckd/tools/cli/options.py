@@ -83,7 +83,10 @@ SimulatedOption = Annotated[
     typer.Option("--config", "-c", help="Configuration of a simulated truck.", autocompletion=complete_config),
 ]
 ConfigArgument = Annotated[
-    Path, typer.Argument(help="Configuration (YAML).", show_default=False, autocompletion=complete_config)
+    Path,
+    typer.Argument(
+        help="Configuration (YAML), e.g. configs/demo.yaml.", show_default=False, autocompletion=complete_config
+    ),
 ]
 TopicArgument = Annotated[
     str,

@@ -359,7 +359,7 @@ class CommandGroup(TyperGroup):
 @contextmanager
 def _usage_in_one_line() -> Iterator[None]:
     """Say what is wrong with a command line in one line, and which help explains it."""
-    from typer._click.exceptions import NoArgsIsHelpError, UsageError
+    from typer._click.exceptions import MissingParameter, NoArgsIsHelpError, UsageError
 
     try:
         yield
@@ -367,6 +367,8 @@ def _usage_in_one_line() -> Iterator[None]:
         raise
     except UsageError as error:
         complaint = _in_own_words(" ".join(error.format_message().split()).removesuffix("."))
+        if isinstance(error, MissingParameter) and (wanted := getattr(error.param, "help", None)):
+            complaint += f". {wanted.removesuffix('.')}"
         command = "monstertruckd" if error.ctx is None else error.ctx.command_path
         remark(f"Error: {complaint}{'' if complaint.endswith('?') else '.'} Try '{command} -h'.")
         raise typer.Exit(error.exit_code) from None

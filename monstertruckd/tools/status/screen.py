@@ -251,8 +251,12 @@ def _truck(state: ScreenState) -> Panel:
         done = _done(state.tracker)
         bar = "█" * round(done * 16)
         _row(table, "path", f"{bar:░<16} {done:4.0%}")
-        _row(table, "off path", f"{state.tracker.cross_track * 100:+.1f} cm {state.tracker.outcome.value}")
-    if state.loop is not None:
+        waits = state.tracker.outcome is Reason.DRIVING and gate is not None and not gate.mode.active
+        doing = "waits" if waits else state.tracker.outcome.value
+        _row(table, "off path", f"{state.tracker.cross_track * 100:+.1f} cm {doing}")
+    if state.loop is not None and state.loop.busy:
+        _row(table, "busy", Text(state.loop.busy, style="bold yellow"))
+    elif state.loop is not None:
         _row(table, "tick late", f"p99 {state.loop.lateness_p99 * 1e3:.1f} ms max {state.loop.lateness_max * 1e3:.1f}")
     old = f", {state.silence:.0f} s ago" if state.gone else ""
     return Panel(table, title=f"mt/{state.robot}{old}", border_style="dim")

@@ -2,6 +2,7 @@
 
 import asyncio
 import logging
+from types import SimpleNamespace
 
 import pytest
 
@@ -9,7 +10,7 @@ from monstertruck_runtime.clock import VirtualClock, run_virtual
 from monstertruck_schemas.event import Event, Severity
 from monstertruck_schemas.health import ServiceHealth, ServiceState
 from monstertruck_schemas.reasons import Reason
-from monstertruckd.host.health import HealthBoard
+from monstertruckd.host.health import HealthBoard, MeterService
 from tests.unit.drivers.kit import Events, Kept
 
 
@@ -102,3 +103,24 @@ def test_what_only_starts_is_no_warning_and_the_log_says_when_the_last_one_is_re
         ("INFO", "1 of 2 services are ready; not ready: goals (starting)"),
         ("INFO", "all 2 services are ready"),
     ]
+
+
+def test_a_busy_computer_is_said_in_the_log_once_it_lasts(caplog: pytest.LogCaptureFixture):
+    def said(late: list[float]) -> list[str]:
+        caplog.clear()
+        rest = iter(late)
+
+        async def main(clock: VirtualClock) -> None:
+            gate = SimpleNamespace(lateness=lambda: SimpleNamespace(ticks=1, p50=0.0, p99=next(rest), max=1.0))
+            bus = SimpleNamespace(publisher=lambda *_: Kept(), drops=0)
+            job = asyncio.create_task(MeterService(clock, gate, None, bus).run(lambda: None))  # type: ignore[arg-type]
+            await clock.sleep(len(late) + 0.5)
+            job.cancel()
+
+        run_virtual(main)
+        return [record.message for record in caplog.records]
+
+    assert said([0.05, 0.05, 0.001, 0.001, 0.05, 0.05]) == []
+    words = "the computer is busy: control ticks come 50 ms late; end other programs"
+    assert said([0.05] * 50) == [words]
+    assert said([0.05] * 90) == [words] * 2

@@ -146,7 +146,8 @@ def test_help_and_usage_errors_are_bare_lines_in_pipes():
     assert f"  report   {report}\n" in reported
     refused = called("probe", capture_output=True)
     assert refused.returncode == 2
-    assert refused.stderr == "Error: Missing argument 'device'. Try 'python -m monstertruckd probe -h'.\n"
+    assert refused.stderr.startswith("Error: Missing argument 'device'. Kind or role: lidar, drive, ")
+    assert refused.stderr.endswith(" Try 'python -m monstertruckd probe -h'.\n")
 
 
 def test_help_is_framed_on_a_terminal():

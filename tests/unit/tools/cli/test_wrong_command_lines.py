@@ -80,6 +80,7 @@ WRONG = (
         3,
         "configs/goals.yaml: no map: expected the folder of a saved map, or a map_server",
     ),
+    ("config show", 2, "Error: Missing argument 'config'. Configuration (YAML), e.g. configs/demo.yaml. Try '"),
     ("map show", 2, "Error: Missing argument 'place'."),
     ("map localise", 2, "Error: Missing argument 'log'."),
     ("config show configs/truck.yaml extra", 2, "Error: Got unexpected extra argument(s) (extra)"),

@@ -160,6 +160,23 @@ def test_the_screen_shows_who_waits_and_what_weakens_the_truck():
         assert words in text
 
 
+def test_a_busy_computer_is_said_in_words():
+    state = full()
+    assert "busy" not in "\n".join(plain(state))
+    state.take(LoopHealth(**HEADER, ticks=5, lateness_p50=0.0, lateness_p99=0.045, lateness_max=0.05))
+    words = "the computer is busy: control ticks come 45 ms late; end other programs"
+    assert f"busy      {words}" in plain(state)
+    assert "the computer is busy" in shown(state, 140, 40).export_text()
+
+
+def test_a_disarmed_truck_does_not_drive_its_path():
+    state = full()
+    state.take(GateState(**HEADER, mode=GateMode.DISARMED, nonce="n", speed_limit=0.0))
+    text = shown(state, 140, 40).export_text()
+    assert "+1.2 cm waits" in text
+    assert "driving" not in text
+
+
 def shown(state: ScreenState, width: int = 80, height: int = 24) -> Console:
     console = Console(width=width, height=height, record=True, force_terminal=True, color_system="truecolor")
     console.print(draw(state, width), height=height)
