@@ -573,7 +573,7 @@ class Gate:
             asking=self._sources.asking(now),
             handed_to=self._sources.handed_to(now),
             events=self._events.drain(),
-            trips=self._stops.drain(now),
+            trips=self._stops.drain(now, (*blocks, *limits)),
         )
 
 

@@ -1,7 +1,8 @@
 """Why the truck was stopped: causes with measurements, lost devices behind them, and the numbered log of stops."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Final
 
 from monstertruck_runtime.clock import SECOND
@@ -219,13 +220,18 @@ class Outages:
             for role in str(event.values.get("roles", "")).split(","):
                 self._hubs[role] = event
 
-    def explain(self, causes: Sequence[Cause]) -> tuple[Cause, ...]:
-        """The given causes, each linked to what was behind it; a cause shared by several comes once."""
+    def explain(self, causes: Sequence[Cause], over: Mapping[Reason, int] = MappingProxyType({})) -> tuple[Cause, ...]:
+        """The given causes, each linked to what was behind it; a cause shared by several comes once.
+
+        Args:
+            causes: of a stop.
+            over: when a sensor was fresh again, ns: what befell it later was not behind its silence.
+        """
         chain = list(causes)
         found: dict[tuple[Reason, str, int], int] = {}
         for index, cause in enumerate(causes):
             effect = index
-            for deeper in self._behind(cause):
+            for deeper in self._behind(cause, over.get(cause.reason)):
                 key = (deeper.reason, deeper.source, deeper.since)
                 known = key in found
                 if not known:
@@ -237,12 +243,12 @@ class Outages:
                 effect = found[key]
         return tuple(chain)
 
-    def _behind(self, cause: Cause) -> Iterator[Cause]:
+    def _behind(self, cause: Cause, over: int | None) -> Iterator[Cause]:
         """Causes behind ``cause``, each behind the one before it."""
         services = [name for name, stale in self._services.items() if stale is cause.reason] or [cause.source]
         outages = (outage for name in services if (outage := self._outages.get(name)) is not None)
         outage = next((outage for outage in outages if outage.end is None or cause.since <= outage.end), None)
-        if outage is not None:
+        if outage is not None and (over is None or outage.first.since <= over):
             service = outage.first
             detail = service.detail or service.reason.text
             text = detail if service.name in detail else f"{service.name}: {detail}"
@@ -291,6 +297,8 @@ class StopLog:
         self._count = 0
         self._causes: tuple[Cause, ...] = ()
         """Of the newest stop, before ``Outages.explain``."""
+        self._over: dict[Reason, int] = {}
+        """When a sensor whose silence was a cause of it was fresh again, ns."""
         self._newest: Trip | None = None
         self._pending: list[Trip] = []
 
@@ -319,7 +327,7 @@ class StopLog:
             stopping_distance: expected, m.
         """
         self._count += 1
-        self._causes = tuple(causes)
+        self._causes, self._over = tuple(causes), {}
         self._newest = Trip(
             number=self._count,
             at=now,
@@ -341,11 +349,19 @@ class StopLog:
             return ""
         return f"stopped {duration_text((now - newest.at) / SECOND)} ago: {causes_text(newest.causes, newest.at)}"
 
-    def drain(self, now: int) -> tuple[Trip, ...]:
-        """Stops since the last call, or the newest one again if more of its causes are known."""
+    def drain(self, now: int, present: Collection[Reason]) -> tuple[Trip, ...]:
+        """Stops since the last call, or the newest one again if more of its causes are known.
+
+        Args:
+            now: ns.
+            present: what limits or stops the truck now.
+        """
         newest = self._newest
+        for cause in self._causes:
+            if cause.reason in STALE_SENSORS and cause.reason not in present:
+                self._over.setdefault(cause.reason, now)
         if newest is not None and not self._pending and now - newest.at <= EXPLAINED_WITHIN:
-            causes = self._outages.explain(self._causes)
+            causes = self._outages.explain(self._causes, self._over)
             if causes != newest.causes:
                 self._newest = replace(newest, causes=causes)
                 return (self._newest,)

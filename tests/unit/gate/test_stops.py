@@ -161,6 +161,20 @@ def test_an_outage_that_is_over_is_not_behind_a_later_silence():
     assert [cause.reason for cause in stopped(rig).causes] == [Reason.SCAN_STALE]
 
 
+@pytest.mark.parametrize("fresh", [True, False])
+def test_what_befell_a_device_after_it_had_been_heard_again_is_not_behind_its_silence(fresh: bool):
+    rig = Rig().driving()
+    rig.silent = {"scan"}
+    first = stopped(rig)
+    rig.silent = set() if fresh else {"scan"}
+    rig.tick(20)
+    rig.gate.observe_health(health(rig.now, ServiceState.BACKOFF, "lidar", reason=Reason.DEVICE_RESTARTED))
+    rig.tick(5)
+    found = [cause.reason for cause in rig.trips[-1].causes]
+    assert rig.trips[-1].number == first.number
+    assert found == [Reason.SCAN_STALE] if fresh else [Reason.SCAN_STALE, Reason.DEVICE_RESTARTED]
+
+
 def test_only_the_first_failure_of_an_outage_is_behind_it():
     rig = Rig().driving()
     rig.silent = {"scan"}
