@@ -138,6 +138,7 @@ class Reason(StrEnum):
     ODOMETRY_DROPPED = "odometry_dropped", 96, "scans contradict odometry, or it is missing: mapping uses scans alone"
     ODOMETRY_RETURNED = "odometry_returned", 0, "odometry agrees with the scans again: mapping uses it"
     LOOP_CLOSED = "loop_closed", 0, "a place was recognised and the map corrected"
+    JOIN_UNDONE = "join_undone", 0, "two parts of the map were joined wrongly, and are apart again"
     MAP_SAVED = "map_saved", 0, "the map was saved"
 
     # USB

@@ -24,7 +24,9 @@ EDGE: Final = 400.0
 EDGE_OPTIMISED: Final = 4000.0
 """when it is optimised,"""
 VERIFIED: Final = 3e6
-"""and of verifying a match."""
+"""of verifying a match,"""
+CROSSED: Final = 2e5
+"""and of holding a keyframe against those of another submap."""
 
 
 class ScanBudget:

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from monstertruck_estimation.se2 import between, compose, inverse, rotation, transform
 from monstertruck_estimation.slam.budget import (
+    CROSSED,
     EDGE,
     EDGE_OPTIMISED,
     ELEMENT,
@@ -70,12 +71,17 @@ JOIN_OVERLAP: Final = 0.75
 """The same for a submap searched for in the whole map,"""
 JOIN_BASELINE: Final = 2.0
 """and the length of the trajectory between the matches that join it, m."""
-JOIN_CONTRADICTION: Final = 0.1
-"""Share of what both of two submaps saw that they may look through: right joins of recordings had 0.07 at most."""
-CROSSED_KEYS: Final = 40
-"""Keyframes of the smaller of two submaps that are held against the other's,"""
-CROSSED_NEAR: Final = 3
-"""and how many of those each."""
+JOIN_CONTRADICTION: Final = (0.1, 0.14)
+"""Share of what both of two submaps saw that they may look through, of all of it and along a stretch: right joins of
+recordings had 0.05 and 0.12 at most, wrong ones of equal rooms 0.13 and more behind the door."""
+JOIN_STRETCH: Final = 6
+"""Keyframes of a stretch."""
+CROSSED_KEYS: Final = 24
+"""Newest keyframes of one of two submaps that are held against the other's,"""
+CROSSED_NEAR: Final = 12
+"""how many of those each, evenly chosen,"""
+CROSSED_REACH: Final = 5.0
+"""and how near they are at most, m."""
 MIN_RATIO: Final = 0.02
 """Of the eigenvalues of the information on the position: less is a corridor, where a fit proves nothing."""
 MAX_CORRECTION: Final = 0.3
@@ -207,9 +213,11 @@ class LoopCloser:
         poses, count = keyframes.poses, len(keyframes.edges)
         if not self._accepted(keyframes, hit, sure=False, baseline=JOIN_BASELINE):
             return False
-        if crossed(keyframes, own_part, part) > JOIN_CONTRADICTION:
+        robots = int(keyframes.part[-1])
+        submaps = (np.flatnonzero(keyframes.part == one) for one in sorted((own_part, part), key=robots.__ne__))
+        if finished(opposed(keyframes, *submaps)):
             keyframes.poses = poses
-            keyframes.edges.cut(count)
+            keyframes.edges.keep(slice(count))
             self.refused += 1
             return None
         keyframes.join(own_part, part)
@@ -366,7 +374,7 @@ class LoopCloser:
         _, squares = residuals(poses, edges)
         holds = robust_weights(squares, edges.loop) > 0.5
         if not holds[count:].all() or np.count_nonzero(held & ~holds[:count]) > MAX_STRAINED * count:
-            keyframes.edges.cut(count)
+            keyframes.edges.keep(slice(count))
             self.refused += len(hits)
             return False
         keyframes.poses = poses
@@ -437,18 +445,45 @@ def _overlap_in_view(keyframes: KeyframeMap, near: NDArray[np.intp], query: Scan
     return measure(query.chosen(seen), submap.cloud, pose).overlap
 
 
-def crossed(keyframes: KeyframeMap, one: int, other: int) -> float:
-    """Share of the points of submap ``one`` and those near it of ``other`` that the opposite ones looked through."""
-    few, many = sorted((np.flatnonzero(keyframes.part == part) for part in (one, other)), key=len)
-    few = few[np.linspace(0, len(few) - 1, min(len(few), CROSSED_KEYS)).astype(np.intp)]
-    counts = np.zeros(2)
-    for key in few.tolist():
-        far = _distance(keyframes, key)
-        near = many[np.argsort(far[many], kind="stable")][:CROSSED_NEAR]
-        near = near[far[near] < VIEW]
-        seen = [keyframes.frames[k].scan for k in near]
-        counts += _counted([keyframes.frames[key].scan], keyframes.poses[[key]], seen, keyframes.poses[near])
-    return float(counts[0] / max(counts[1], 1))
+def crossings(keyframes: KeyframeMap, own: NDArray[np.intp], others: NDArray[np.intp]) -> Pieces[Array]:
+    """How the newest of ``own`` near ``others`` agree with what those around them saw.
+
+    Returns:
+        Shape (k, 2), a row for each in their order: points that the opposite side looked through, and those in its
+        view. An own point is looked through if more of the others say so than not; of the others' points each counts as
+        its share in them, for they are the same walls many times.
+    """
+    off = keyframes.poses[own, None, :2] - keyframes.poses[others, :2]
+    far = np.hypot(off[..., 0], off[..., 1])
+    met = np.flatnonzero(far.min(axis=1, initial=np.inf) < CROSSED_REACH)[-CROSSED_KEYS:]
+    counts = np.zeros((len(met), 2))
+    for row, k in enumerate(met.tolist()):
+        yield CROSSED
+        near = others[far[k] < CROSSED_REACH]
+        near = near[np.linspace(0, len(near) - 1, min(len(near), CROSSED_NEAR)).astype(np.intp)]
+        points, place = keyframes.frames[int(own[k])].scan.points, keyframes.poses[own[k]]
+        view, votes = _view(points), np.zeros((len(points), 2), np.int64)
+        for j in near.tolist():
+            at, seen = keyframes.poses[j], keyframes.frames[j].scan.points
+            _vote(_view(seen), transform(between(at, place), points), votes)
+            counts[row] += np.array(_looked_through(view, transform(between(place, at), seen))) / len(near)
+        counts[row] += np.count_nonzero(votes[:, 0] > votes[:, 1]), np.count_nonzero(votes.any(axis=1))
+    return counts
+
+
+def opposed(keyframes: KeyframeMap, own: NDArray[np.intp], others: NDArray[np.intp]) -> Pieces[bool]:
+    """Whether the keyframes ``own`` and ``others`` look through too much of each other's walls to be of one map.
+
+    As a whole, or along any stretch of ``own``: the way out of a room that only looks like another one is short.
+    """
+    counts = yield from crossings(keyframes, own, others)
+    through, judged = counts.sum(axis=0)
+    if through > JOIN_CONTRADICTION[0] * judged:
+        return True
+    if len(counts) < JOIN_STRETCH:
+        return False
+    stretches = np.lib.stride_tricks.sliding_window_view(counts, JOIN_STRETCH, axis=0).sum(axis=-1)
+    return bool((stretches[:, 0] > JOIN_CONTRADICTION[1] * stretches[:, 1]).any())
 
 
 def surroundings(keyframes: KeyframeMap, centre: int) -> tuple[NDArray[np.intp], Scan]:
@@ -551,6 +586,17 @@ def _looked_through(view, points):  # type: ignore[no-untyped-def] # noqa: ANN00
             if r < limit - gap:
                 through += 1
     return through, judged
+
+
+@njit(cache=True)
+def _vote(view, points, votes):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+    """Count for every point in view whether it is looked through, or not: columns of ``votes``."""
+    for i in range(points.shape[0]):
+        limit = view[_sector(points[i, 0], points[i, 1])]
+        r = math.hypot(points[i, 0], points[i, 1])
+        gap = VIEW_MARGIN + VIEW_SLACK * r
+        if limit > 0 and r < limit + gap:
+            votes[i, 0 if r < limit - gap else 1] += 1
 
 
 @njit(cache=True)

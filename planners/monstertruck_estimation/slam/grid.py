@@ -359,10 +359,24 @@ class GridBuilder:
         ).all():
             return False
         self._poses = list(now)
+        self._redraw()
+        return True
+
+    def keep_marked(self, stamps: NDArray[np.int64], kept: NDArray[np.bool_]) -> None:
+        """Rebuild the grid of those of its scans that the trajectory marks.
+
+        Args:
+            stamps: shape (n,), ns, rising.
+            kept: shape (n,), the marks.
+        """
+        at = np.minimum(np.searchsorted(stamps, self._stamps), len(stamps) - 1)
+        self._keep(np.flatnonzero(kept[at]).tolist())
+        self._redraw()
+
+    def _redraw(self) -> None:
         self.grid.clear()
         for i in range(len(self._stamps)):
             self._draw(i)
-        return True
 
     def _due(self, stamp: int, pose: Array) -> bool:
         if not self._stamps:
@@ -385,7 +399,9 @@ class GridBuilder:
     def _prune(self) -> None:
         """Drop every other scan but the newest quarter."""
         count = len(self._stamps)
-        kept = [i for i in range(count) if i % 2 == 0 or i >= 3 * count // 4]
+        self._keep([i for i in range(count) if i % 2 == 0 or i >= 3 * count // 4])
+
+    def _keep(self, kept: list[int]) -> None:
         self._stamps = [self._stamps[i] for i in kept]
         self._poses = [self._poses[i] for i in kept]
         self._mounts = [self._mounts[i] for i in kept]

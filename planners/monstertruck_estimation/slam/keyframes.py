@@ -93,10 +93,10 @@ class EdgeList:
         self._loop.append(loop)
         self._odometry.append(odometry)
 
-    def cut(self, count: int) -> None:
-        """Remove all edges after the first ``count``."""
+    def keep(self, kept: NDArray[np.bool_] | slice) -> None:
+        """Remove all edges but the marked ones."""
         for rows in (self._ends, self._measured, self._information, self._spread, self._loop, self._odometry):
-            rows.set(rows.view[:count])
+            rows.set(rows.view[kept])
 
     def loosen(self, kept: NDArray[np.bool_]) -> None:
         """Multiply the standard deviations of the marked edges by ``LOOSENED``."""
@@ -229,6 +229,20 @@ VIEW: Final = 0.7
 """Metres that one radian between two views counts as."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Join:
+    """Two submaps that were joined, maybe wrongly."""
+
+    own: int
+    """Number of the robot's submap, to which later keyframes belong,"""
+    other: int
+    """and that of the other one,"""
+    others: Numbers
+    """with its keyframes, rising."""
+    since: int
+    """Keyframes there were."""
+
+
 class KeyframeMap:
     """Keyframes with their poses in map and the pose graph between them.
 
@@ -243,6 +257,8 @@ class KeyframeMap:
         self.edges = EdgeList()
         self.part: NDArray[np.int64] = np.zeros(0, np.int64)
         """Shape (n,): the submap of every keyframe, by the number of its first one; 0 = the map."""
+        self.doubtful: list[Join] = []
+        """Joins, in their order, that what the robot saw since then has not confirmed yet."""
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -266,8 +282,29 @@ class KeyframeMap:
         self.poses[moved] = compose(target, between(origin, self.poses[moved]))
 
     def join(self, one: int, other: int) -> None:
-        """Submaps ``one`` and ``other`` are related by edges: they are one."""
-        self.part[self.part == max(one, other)] = min(one, other)
+        """Submaps ``one`` and ``other`` are related by edges: they are one, which is to be confirmed."""
+        own, other = (one, other) if one == self.part[-1] else (other, one)
+        self.doubtful.append(Join(own, other, np.flatnonzero(self.part == other), len(self)))
+        self.part[self.part == max(own, other)] = min(own, other)
+
+    def sides(self, join: Join) -> tuple[Numbers, Numbers]:
+        """Keyframes, rising, of the robot's side of a join in doubt, those since then included, and of the other side.
+
+        What later joins brought belongs to neither.
+        """
+        later = self.doubtful[self.doubtful.index(join) :]
+        apart = np.concatenate([each.others for each in later])
+        return np.setdiff1d(np.flatnonzero(self.part == self.part[join.others[0]]), apart), join.others
+
+    def separate(self, join: Join) -> None:
+        """Undo a ``join`` in doubt, and those since then: no edge relates what they joined."""
+        while join in self.doubtful:
+            own, others = self.sides(self.doubtful[-1])
+            last = self.doubtful.pop()
+            self.part[own], self.part[others] = last.own, last.other
+        edges = self.edges.edges()
+        self.edges.keep(self.part[edges.origin] == self.part[edges.target])
+        self.optimise()
 
     def joined(self) -> NDArray[np.bool_]:
         """Which keyframes belong to the map, shape (n,)."""
@@ -376,6 +413,7 @@ class KeyframeMap:
         self.frames = [key for key, left_out in zip(self.frames, gone.tolist(), strict=True) if not left_out]
         self.poses = self.poses[~gone]
         self.part = number[stand_in[self.part]][~gone]
+        self.doubtful.clear()
         return ~gone, number[stand_in], offset
 
     def _closeness(self, numbers: Numbers, pose: Array) -> Array:

@@ -18,7 +18,16 @@ from monstertruck_estimation.slam.correlation import Submap
 from monstertruck_estimation.slam.grid import NONE, GridBuilder, passed_ends
 from monstertruck_estimation.slam.keyframes import LOOSENED, KeyframeMap, Trajectory
 from monstertruck_estimation.slam.motion import ClockOffsetEstimator, MotionPredictor, ScanOdometry, velocity
-from monstertruck_estimation.slam.relocation import LossDetector, Relocation, contradicts, foreseen
+from monstertruck_estimation.slam.relocation import (
+    ASTRAY,
+    ASTRAY_CONTRADICTION,
+    OFF_MOTION,
+    LossDetector,
+    Relocation,
+    contradicts,
+    exceeds,
+    foreseen,
+)
 from monstertruck_estimation.slam.scan_matcher import (
     LOW_OVERLAP,
     MIN_PAIRS,
@@ -52,6 +61,8 @@ class MappingEvent(StrEnum):
     """The robot is lost: a submap that is not joined to the map was begun."""
     JOINED = "joined"
     """Two submaps were joined."""
+    PARTED = "parted"
+    """Their join was wrong, and is undone."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,8 +159,7 @@ class Mapper:
         self._stamp, self._pose, self._covariance = stamp, match.pose, match.covariance
         events: tuple[MappingEvent, ...] = () if match.accepted or not len(self.map) else (MappingEvent.REJECTED,)
         if self._is_elsewhere(scan):
-            events += (MappingEvent.APART,)
-            self._begin_submap(scan, stamp)
+            events += (*self._begin_submap(scan, stamp), MappingEvent.APART)
         elif self._key_is_due(scan):
             if len(self.map):
                 self._append_to_trajectory(stamp)
@@ -186,6 +196,11 @@ class Mapper:
         match = self._front.match(scan, delta, guess, covariance, self._submap)
         suspect, after_gap = self._loss.suspects(match, guess, covariance), self._loss.after_gap and match.accepted
         most = PART_CONTRADICTION if suspect else CONTRADICTION
+        if match.accepted and not after_gap and (off := self._motion.off(between(self._pose, match.pose))):
+            if exceeds(off, OFF_MOTION):
+                return rejected(guess, covariance, MatchStatus.FAR)
+            if exceeds(off, ASTRAY[self._loss.doubts(match)]):
+                suspect, most = True, ASTRAY_CONTRADICTION
         if (suspect or after_gap) and contradicts(self.map, scan, match.pose, most):
             return rejected(guess, covariance, MatchStatus.CONTRADICTED)
         if after_gap and not foreseen(covariance) and self._has_moved(match.pose):
@@ -241,14 +256,19 @@ class Mapper:
         alone = self._motion.use is not OdometryUse.USED
         return alone or self._loss.after_gap or contradicts(self.map, scan, self._pose)
 
-    def _begin_submap(self, scan: Scan, stamp: int) -> None:
-        """Begin a submap of the scans since the first misfit."""
+    def _begin_submap(self, scan: Scan, stamp: int) -> tuple[MappingEvent, ...]:
+        """Begin a submap of the scans since the first misfit; who is lost again soon may have been joined wrongly."""
+        place = between(self.map.poses[-1], self._pose)
+        change = self._relocation.part(self.map, self._closer)
+        if change is not None:
+            self._pose = compose(self.map.poses[-1], place)
         self.map.add(scan, stamp, self._pose, apart=True)
         self._trajectory.reattach(self._loss.fitted + 1, self.map.poses, len(self.map) - 1)
         self._since_key = (np.zeros(3), np.zeros((3, 3)))
         self._covariance = np.zeros((3, 3))
         self._loss.restart()
         self._look_around()
+        return () if change is None else (MappingEvent(change),)
 
     def _searched(self) -> tuple[MappingEvent, ...]:
         """Continue the searches for loops and for the places of submaps, as far as the budget goes."""
@@ -260,8 +280,8 @@ class Mapper:
         # One search at a time: neither must see the other move the poses.
         if not self._relocation.busy and self._closer.step(self.map, budget):
             events += (MappingEvent.CLOSED,)
-        if not self._closer.busy and self._relocation.step(self.map, self._closer, budget):
-            events += (MappingEvent.JOINED,)
+        if not self._closer.busy and (change := self._relocation.step(self.map, self._closer, budget)) is not None:
+            events += (MappingEvent(change),)
         if events or self.map.poses is not poses:
             self._pose = compose(self.map.poses[-1], place)
             self._look_around()
@@ -385,6 +405,9 @@ class MappingEstimator:
         self._redrawn = False
         self._misfits = 0
         self._apart: list[tuple[Scan, int, Vector]] = []
+        """Keyframes that are not on the map: scan, stamp, mount."""
+        self._doubtful: list[tuple[Scan, int, Vector]] = []
+        """Those on it by a join that is in doubt."""
         self._offset = ClockOffsetEstimator()
         self._scan_odometry = ScanOdometry()
 
@@ -410,23 +433,30 @@ class MappingEstimator:
             return None
         accepted = step.match.accepted or (MappingEvent.KEY in step.events and len(self.mapper.map) == 1)
         self._misfits = 0 if accepted else self._misfits + 1
-        lost, joined = self.mapper.lost, MappingEvent.JOINED in step.events
+        lost, joined, parted = self.mapper.lost, MappingEvent.JOINED in step.events, MappingEvent.PARTED in step.events
         self.counts["scans"] += 1
         self.counts["keys"] = len(self.mapper.map)
         self.counts["closures"] += MappingEvent.CLOSED in step.events
         self.counts["rejected"] += MappingEvent.REJECTED in step.events
-        self._moved |= MappingEvent.CLOSED in step.events or joined
-        if lost or joined:
-            if MappingEvent.KEY in step.events or MappingEvent.APART in step.events:
-                self._apart.append((step.scan, step.stamp, inputs.mount))
-        elif accepted:
+        self._moved |= MappingEvent.CLOSED in step.events or joined or parted
+        key, keyframe = {MappingEvent.KEY, MappingEvent.APART}, (step.scan, step.stamp, inputs.mount)
+        if not key.isdisjoint(step.events):
+            if lost or joined:
+                self._apart.append(keyframe)
+            elif self._doubtful:
+                self._doubtful.append(keyframe)
+        if not lost and not joined and accepted:
             passed = NONE if self._passed is None else passed_ends(inputs, self._passed)
             self.builder.add(step.scan, step.stamp, step.pose, inputs.mount, passed)
             if inputs.odom is not None and self.mapper.odometry is OdometryUse.USED:
                 self._offset.add(step.stamp, float(step.pose[2]), inputs.odom[2])
+        if parted:
+            self._withdraw_parted()
         if joined:
             self._draw_joined()
-        closed = MappingEvent.CLOSED in step.events or joined
+        if not self.mapper.map.doubtful:
+            self._doubtful.clear()
+        closed = MappingEvent.CLOSED in step.events or joined or parted
         moved = self._scan_odometry.take(step.stamp, step.match, step.pose, alone=alone, corrected=closed)
         status = (
             LocalisationStatus.LOST
@@ -482,8 +512,15 @@ class MappingEstimator:
             k = np.searchsorted(stamps, stamp)
             if on_map[k]:
                 self.builder.add(scan, stamp, poses[k], mount)
-            else:
-                self._apart.append((scan, stamp, mount))
+            (self._doubtful if on_map[k] else self._apart).append((scan, stamp, mount))
+
+    def _withdraw_parted(self) -> None:
+        """Take what a wrong join had brought to the map out of the grid."""
+        stamps, _ = self.mapper.trajectory()
+        on_map = self.mapper.on_map()
+        self._apart += [row for row in self._doubtful if not on_map[np.searchsorted(stamps, row[1])]]
+        self.builder.keep_marked(stamps, on_map)
+        self._redrawn = True
 
     def _follow(self) -> None:
         if self._moved:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from monstertruck_estimation.se2 import between, compose, rotation
 from monstertruck_estimation.slam.config import MapperConfig
-from monstertruck_estimation.slam.scan_matcher import LOW_OVERLAP, ScanMatch
+from monstertruck_estimation.slam.scan_matcher import LOW_OVERLAP, ScanMatch, deviations
 from monstertruck_estimation.slam.worker_io import ScanIncrement
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND
@@ -25,6 +25,8 @@ CLEAR_MATCH: Final = (0.15, 0.75)
 """Least degeneracy and overlap of a match that is compared with odometry."""
 FIT_NOISE: Final = (0.01, 0.005)
 """Standard deviation of a match itself, m and rad."""
+OFF_NOISE: Final = 2.0
+"""Standard deviations of odometry that explain a difference from it."""
 MISSING_AFTER: Final = 1.0
 """Seconds without finite odometry after which it is missing."""
 
@@ -239,6 +241,19 @@ class MotionPredictor:
         place = self.factors[0] * math.hypot(config.odometry_floor[0], config.odometry_distance * way)
         turn = self.factors[1] * math.hypot(config.odometry_floor[1], math.hypot(by_turn * turned, by_way * way))
         return np.diag((place**2, place**2, turn**2))
+
+    def off(self, moved: Array) -> tuple[float, float] | None:
+        """How far ``moved``, shape (3,), is from the motion by odometry, or as the last one, whichever is nearer.
+
+        Returns:
+            m and rad beyond ``OFF_NOISE`` standard deviations of odometry; None where it is not in use.
+        """
+        if self.use is not OdometryUse.USED or self._by_odometry is None:
+            return None
+        offs = (between(delta, moved) for delta in (self._by_motion[0], self._by_odometry[0]))
+        x, y, turn = min(offs, key=lambda off: math.hypot(*off)).tolist()
+        noise = deviations(self._by_odometry[1])
+        return max(math.hypot(x, y) - OFF_NOISE * noise[0], 0.0), max(abs(turn) - OFF_NOISE * noise[1], 0.0)
 
     def learn(self, dt: float, delta: Array, noise: Array, moved: Array, match: ScanMatch) -> None:
         """Compare the prediction ``delta`` (covariance ``noise``) with ``moved``, the motion by the match."""

@@ -5,18 +5,23 @@ joins to the map. The surroundings of the newest keyframe are searched for in ev
 (branch and bound, a slice of yaws per scan, so that no scan waits for all of them); a place found is verified as every
 loop closure is, and joins both only with the support of matches from other places. So a submap whose place was not
 found while the robot was in it is found when the robot comes back to it, from the map or from a later submap.
+
+A join may be wrong all the same: a room that looks like one of the map fits it as well as that one does. So it is in
+doubt while the robot drives on, and undone if what both sides saw contradicts it then, or if the robot is lost again.
 """
 
 import math
+from enum import StrEnum
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from monstertruck_estimation.se2 import between, compose
 from monstertruck_estimation.slam.budget import ELEMENT, Pieces, PiecewiseSearch, ScanBudget, finished
-from monstertruck_estimation.slam.closure import CONTRADICTION, VIEW, LoopCloser, contradiction, surroundings
+from monstertruck_estimation.slam.closure import CONTRADICTION, VIEW, LoopCloser, contradiction, opposed, surroundings
 from monstertruck_estimation.slam.correlation import Peak, Submap, correlate, look_ups
-from monstertruck_estimation.slam.keyframes import KeyframeMap
+from monstertruck_estimation.slam.keyframes import Join, KeyframeMap
 from monstertruck_estimation.slam.motion import OVERLAP_DROP, OVERLAP_GAIN
 from monstertruck_estimation.slam.scan_matcher import GATE_LOW_OVERLAP, LOW_OVERLAP, ScanMatch, deviations
 from monstertruck_estimation.slam.scans import Scan
@@ -55,6 +60,10 @@ class LossDetector:
     def fits(self) -> bool:
         """Whether the newest scan fits."""
         return not self._misfits and not self.after_gap
+
+    def doubts(self, match: ScanMatch) -> bool:
+        """Whether a match follows a misfit, or overlaps clearly less than usual."""
+        return not self.fits or match.overlap < self._usual - OVERLAP_DROP
 
     def suspects(self, match: ScanMatch, guess: Array, covariance: Array) -> bool:
         """Whether an accepted ``match`` overlaps clearly less than usual, and is far from the predicted pose.
@@ -107,6 +116,23 @@ def foreseen(covariance: Array) -> bool:
     """
     place, turn = deviations(covariance)
     return place <= FORESEEN[0] and turn <= FORESEEN[1]
+
+
+OFF_MOTION: Final = (0.5, 1.0)
+"""Difference of a match from the motion by odometry, or the last one, m or rad, up to which these may be wrong.
+
+With every misfit the window of the next match grows, and that of the last motion is wide: a robot that was carried fits
+somewhere in it sooner or later. Wheels that are late are put right by the last motion.
+"""
+ASTRAY: Final = ((0.25, 0.25), (0.1, 0.1))
+"""Difference from which such a match may be at a place that looks alike, without a doubt and in doubt,"""
+ASTRAY_CONTRADICTION: Final = 0.03
+"""and share of what scan and map see in view of each other that they may look through then."""
+
+
+def exceeds(off: tuple[float, float], limits: tuple[float, float]) -> bool:
+    """Whether a difference is more than ``limits``, m or rad."""
+    return off[0] > limits[0] or off[1] > limits[1]
 
 
 NEAR: Final = 6
@@ -163,13 +189,27 @@ LAST_KEYS: Final = 12
 """Keyframes of every open submap searched for at the end of a run, at most."""
 
 
+CONFIRMING_WAY: Final = 10.0
+"""Way near keyframes of the other side, m, after which a join that nothing contradicts is confirmed."""
+
+
+class Change(StrEnum):
+    """What a search has changed."""
+
+    JOINED = "joined"
+    PARTED = "parted"
+
+
 class Relocation:
-    """Joins submaps: the newest keyframe's to the map, and those left open to the one in which the robot is."""
+    """Joins submaps: the newest keyframe's to the map, and those left open to the one in which the robot is.
+
+    A join is checked at every keyframe until it is confirmed.
+    """
 
     def __init__(self) -> None:
         self._submaps: dict[int, tuple[int, Array, Submap]] = {}
         """Of each part: its keyframes, the pose of its first one, and their surfaces, all when they were merged."""
-        self._progress: PiecewiseSearch[bool] | None = None
+        self._progress: PiecewiseSearch[Join | Change | None] | None = None
         self._last = -1
 
     @property
@@ -177,18 +217,41 @@ class Relocation:
         """Whether a search is on its way."""
         return self._progress is not None
 
-    def step(self, keyframes: KeyframeMap, closer: LoopCloser, budget: ScanBudget) -> bool:
-        """Continue the search; True if submaps were joined, which moves poses. A place found moves a submap."""
+    def step(self, keyframes: KeyframeMap, closer: LoopCloser, budget: ScanBudget) -> Change | None:
+        """Continue the search, or the check of a join; what was joined or parted, which moves poses.
+
+        A place found moves a submap.
+        """
         newest = len(keyframes) - 1
         if self._progress is None:
-            if newest == self._last or not _others(keyframes, newest):
-                return False
+            if newest == self._last or not (keyframes.doubtful or _others(keyframes, newest)):
+                return None
             self._last = newest
-            self._progress = PiecewiseSearch(self._joined(keyframes, closer, newest))
+            self._progress = PiecewiseSearch(self._examined(keyframes, closer, newest))
         if not self._progress.run(budget):
-            return False
-        joined, self._progress = self._progress.result, None
-        return bool(joined)
+            return None
+        found, self._progress = self._progress.result, None
+        return self._part(keyframes, closer, found) if isinstance(found, Join) else found
+
+    def part(self, keyframes: KeyframeMap, closer: LoopCloser) -> Change | None:
+        """Undo all joins that are in doubt, if there are any."""
+        return self._part(keyframes, closer, keyframes.doubtful[0]) if keyframes.doubtful else None
+
+    def _part(self, keyframes: KeyframeMap, closer: LoopCloser, join: Join) -> Change:
+        keyframes.separate(join)
+        closer.forget(np.ones(len(keyframes), bool))
+        self.forget()
+        return Change.PARTED
+
+    def _examined(self, keyframes: KeyframeMap, closer: LoopCloser, at: int) -> Pieces[Join | Change | None]:
+        """Check the joins in doubt, then search for keyframe ``at``; a join that is wrong, or what was changed."""
+        for join in tuple(keyframes.doubtful):
+            own, others = keyframes.sides(join)
+            if (yield from opposed(keyframes, own, others)):
+                return join
+            if _way_along(keyframes, own[own >= join.since], others) >= CONFIRMING_WAY:
+                keyframes.doubtful.remove(join)
+        return (yield from self._joined(keyframes, closer, at))
 
     def finish(self, keyframes: KeyframeMap, closer: LoopCloser) -> bool:
         """Search for every open submap in all others, without a budget; True if submaps were joined."""
@@ -196,14 +259,15 @@ class Relocation:
         joined = False
         while any(finished(self._joined(keyframes, closer, at)) for at in _samples(keyframes)):
             joined = True
+        keyframes.doubtful.clear()
         return joined
 
     def forget(self) -> None:
         """The keyframes have other numbers."""
         self._submaps, self._progress, self._last = {}, None, -1
 
-    def _joined(self, keyframes: KeyframeMap, closer: LoopCloser, at: int) -> Pieces[bool]:
-        """Place the surroundings of keyframe ``at`` in the other submaps, and verify them there; True if joined.
+    def _joined(self, keyframes: KeyframeMap, closer: LoopCloser, at: int) -> Pieces[Change | None]:
+        """Place the surroundings of keyframe ``at`` in the other submaps, and verify them there.
 
         A place is given up when most of the keyframes verified do not fit.
         """
@@ -216,11 +280,11 @@ class Relocation:
             for key in keys:
                 found = yield from closer.join(keyframes, key, other)
                 if found:
-                    return True
+                    return Change.JOINED
                 failed += found is None
                 if failed > MOST_FAILED:
                     break
-        return False
+        return None
 
     def _place(self, keyframes: KeyframeMap, at: int, part: int) -> Pieces[Array | None]:
         """Where in submap ``part`` the surroundings of keyframe ``at`` are; None if nowhere, or at several places."""
@@ -259,6 +323,13 @@ class Relocation:
             yield ELEMENT * sum(len(keyframes.frames[k].scan) for k in kept)
             known = self._submaps[part] = len(numbers), keyframes.poses[part], keyframes.submap(kept)
         return known[1:]
+
+
+def _way_along(keyframes: KeyframeMap, own: NDArray[np.intp], others: NDArray[np.intp]) -> float:
+    """Way, m, along those of ``own`` that are near ``others``."""
+    off = keyframes.poses[own, None, :2] - keyframes.poses[others, :2]
+    met = own[np.hypot(off[..., 0], off[..., 1]).min(axis=1, initial=math.inf) < VIEW]
+    return float(np.hypot(*np.diff(keyframes.poses[met, :2], axis=0).T).sum())
 
 
 def _others(keyframes: KeyframeMap, at: int) -> list[int]:

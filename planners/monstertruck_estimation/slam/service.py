@@ -48,7 +48,11 @@ UNMATCHED: Final = SECOND
 """Without a scan that can be used for so long, ns, the lidar is no source of the pose, which odometry carries on."""
 UNSCANNED: Final = 1.0
 """A map that is asked for is saved without a scan if no usable one comes within so many seconds."""
-CORRECTIONS: Final = {"closed": "closure {}", "joined": "two submaps are joined"}
+CORRECTIONS: Final = {
+    "closed": (Reason.LOOP_CLOSED, Severity.INFO, "closure {}"),
+    "joined": (Reason.LOOP_CLOSED, Severity.INFO, "two submaps are joined"),
+    "parted": (Reason.JOIN_UNDONE, Severity.WARNING, "what was seen since then contradicts it"),
+}
 """What is reported of a step that has corrected the map; {} is the number of closures."""
 PLACELESS: Final = frozenset({LocalisationStatus.SEARCHING, LocalisationStatus.OUTSIDE})
 """The pose in map means nothing."""
@@ -367,8 +371,8 @@ class SlamService:
         if estimate.disagreement is not None:
             text = f"by {estimate.disagreement:.2f} m over the last seconds"
             self._events(Reason.WITNESS_DISAGREES, Severity.WARNING, self.name, text, distance=estimate.disagreement)
-        for text in (CORRECTIONS[event] for event in estimate.events if event in CORRECTIONS):
-            self._events(Reason.LOOP_CLOSED, Severity.INFO, self.name, text.format(outputs.counts["closures"]))
+        for reason, severity, text in (CORRECTIONS[event] for event in estimate.events if event in CORRECTIONS):
+            self._events(reason, severity, self.name, text.format(outputs.counts["closures"]))
         if estimate.offset is not None and not self._offset_reported:
             self._offset_reported = True
             text = f"odometry runs {estimate.offset:+.2f} s ahead of the scans"

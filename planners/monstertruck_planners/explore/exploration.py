@@ -35,8 +35,9 @@ AGAIN: Final = 2.0
 """Seconds from a refused goal to the next one; on the way home twice as many after each failure."""
 STANDS: Final = 5.0
 """Seconds for which a robot that is lost stands before it drives a little."""
-AROUND: Final = ((0.6, 0.0, 0.0), (-0.9, 0.0, 0.0), (0.6, 0.25, 0.8), (0.6, -0.25, -0.8))
-"""Poses in base to which it then drives in turn: who stands still sees nothing new."""
+AROUND: Final = ((0.6, 0.0, 0.0), (0.6, 0.25, 0.8), (0.6, -0.25, -0.8))
+"""Poses in base to which it then drives in turn, and back: who stands still sees nothing new, and behind it is ground
+that no scan has seen where it is now."""
 STUCK: Final = 3
 """Goals in a row that fail without the robot leaving its place, after which the place is to blame..."""
 LEFT: Final = 0.3
@@ -180,7 +181,10 @@ class Exploration:
     blocked: int = 0
     """Of them: at which the robot cannot stand."""
     looks: int = 0
-    """Short drives since it was lost."""
+    """Short drives since it was lost,"""
+    came_from: Pose | None = None
+    """where the newest one began, and whether it is to drive back there."""
+    goes_back: bool = False
 
     @property
     def running(self) -> bool:
@@ -224,7 +228,7 @@ def tick(run: Exploration, seen: Observed, config: ExplorerConfig) -> Step:
     if run.phase is ExplorationPhase.LOST:
         return _lost(run, seen, config)
     if seen.pose is None:
-        lost = replace(_enter(run, ExplorationPhase.LOST), target=None, backing=False, looks=0)
+        lost = replace(_enter(run, ExplorationPhase.LOST), target=None, backing=False, looks=0, goes_back=False)
         return lost, (Cancel(), Notice(Reason.POSE_LOST, Severity.WARNING, "waits where it stands"))
     if run.phase is ExplorationPhase.RETURNING:
         return _returning(run, seen)
@@ -391,13 +395,19 @@ def _lost(run: Exploration, seen: Observed, config: ExplorerConfig) -> Step:
     if run.target is not None:
         if seen.ended is Reason.CANCELLED:
             return _end(run, Reason.CANCELLED, f"its goal was cancelled: {seen.ended_text}", Save())
-        return (run, ()) if seen.ended is None else (replace(run, target=None, not_before=run.now + AGAIN), ())
+        if seen.ended is None:
+            return run, ()
+        back = seen.ended is Reason.GOAL_REACHED and not run.goes_back
+        return replace(run, target=None, goes_back=back, not_before=run.now + AGAIN), ()
     if not config.around or seen.believed is None or run.now < max(run.since + STANDS, run.not_before):
         return run, ()
+    if run.goes_back and run.came_from is not None:
+        return replace(run, target=Viewpoint(run.came_from, run.came_from[:2])), (Go(run.came_from),)
     x, y, yaw = placed(np.array((AROUND[run.looks % len(AROUND)],)), seen.believed)[0].tolist()
     pose = x, y, math.remainder(yaw, math.tau)
     say = () if run.looks else (Notice(Reason.RECOVERING, Severity.INFO, "its place is not known: looks around"),)
-    return replace(run, target=Viewpoint(pose, pose[:2]), looks=run.looks + 1), (Go(pose), *say)
+    run = replace(run, target=Viewpoint(pose, pose[:2]), looks=run.looks + 1, came_from=seen.believed)
+    return run, (Go(pose), *say)
 
 
 def _finish(run: Exploration, outcome: Reason, text: str) -> Step:

@@ -6,8 +6,11 @@ import math
 import numpy as np
 
 from monstertruck_estimation.se2 import between, compose
+from monstertruck_estimation.slam.config import MapperConfig
+from monstertruck_estimation.slam.keyframes import KeyframeMap
 from monstertruck_estimation.slam.mapping import Mapper, Step
 from monstertruck_estimation.slam.scans import Scan, ScanGeometry, prepare
+from monstertruck_runtime.clock import SECOND
 
 BEAMS = 240
 LIDAR = ScanGeometry(-math.radians(120), math.radians(240) / (BEAMS - 1), 0.02, 5.6)
@@ -84,3 +87,44 @@ def errors(poses, truth):
     """Distances, m, between poses reported from the first one."""
     off = between(truth[0], np.asarray(truth)) - between(poses[0], np.asarray(poses))
     return np.hypot(off[:, 0], off[:, 1])
+
+
+POSTS = ((-4.0, 2.6), (-1.2, 3.1), (2.0, 2.4), (4.4, 0.9), (3.6, -2.4), (0.4, -3.0), (-2.6, -2.7), (-4.6, -0.4))
+HALL = [
+    *box(-6.0, -4.2, 6.0, 4.0),
+    *box(-1.5, -0.8, 1.7, 0.6),
+    *(wall for x, y in POSTS for wall in box(x, y, x + 0.3 + 0.07 * abs(x), y + 0.3 + 0.1 * abs(y))),
+]
+WAY = rounds(200, 1.0, 3.6, 2.2)[::4]
+"""Where keyframes are in the hall, 0.4 m apart."""
+SURE = np.diag((0.02**2, 0.02**2, 0.004**2))
+
+
+def extend(keyframes, poses, begin=None):
+    """Add keyframes at ``poses`` in the hall, one by one; the first at ``begin``, in a submap of its own.
+
+    Without ``begin`` the first is that of the newest keyframe.
+    """
+    rng = np.random.default_rng(len(keyframes))
+    for k, pose in enumerate(poses):
+        known, stamp = scan(HALL, pose, noise=0.01, rng=rng), len(keyframes) * SECOND
+        if k == 0 and begin is not None:
+            keyframes.add(known, stamp, np.array(begin), apart=True)
+        elif k:
+            delta = between(poses[k - 1], pose)
+            keyframes.add(known, stamp, compose(keyframes.poses[-1], delta))
+            keyframes.add_odometry_edge(delta, SURE)
+        yield len(keyframes)
+
+
+def consume(steps):
+    for _ in steps:
+        pass
+
+
+def submaps(*stretches):
+    """Keyframes of several stretches of ``WAY``, each in a submap of its own."""
+    keyframes = KeyframeMap(MapperConfig())
+    for k, stretch in enumerate(stretches):
+        consume(extend(keyframes, WAY[stretch], (7.0 * k, 3.0 * k, 0.4 * k)))
+    return keyframes

@@ -29,7 +29,9 @@ class FakeWorker:
     tasks: list[WorkerInput]
     at_once: int
     statuses: ClassVar[list[LocalisationStatus]] = []
-    """Of the scans to come."""
+    """Of the scans to come,"""
+    told: ClassVar[list[tuple[str, ...]]] = []
+    """and their events."""
 
     def __init__(self, name: str, target: str, clock: VirtualClock, **settings: float) -> None:
         FakeWorker.tasks, FakeWorker.at_once = [], 0
@@ -55,7 +57,8 @@ class FakeWorker:
             return WorkerOutput(saved=saved)
         counts = {"scans": 1, "keys": 1, "closures": 0, "rejected": 0}
         status, pose = self.statuses.pop(0), (0.0, 0.0, 0.0)
-        made = SlamEstimate(task.scan.stamp, pose, (0.0,) * 9, None, status, 1.0, 0.0, 0.0, 0.0, "")
+        events = self.told.pop(0) if self.told else ()
+        made = SlamEstimate(task.scan.stamp, pose, (0.0,) * 9, None, status, 1.0, 0.0, 0.0, 0.0, "", events)
         return WorkerOutput(made, saved=saved, counts=counts)
 
 
@@ -122,6 +125,20 @@ def test_along_a_corridor_it_does_not_say_with_every_scan_that_a_direction_is_op
 
     said = [reason for reason, _ in events_of(story, monkeypatch, tmp_path)]
     assert said == [Reason.MATCH_DEGENERATE, Reason.POSE_LOST, Reason.POSE_FOUND]
+
+
+def test_a_join_that_is_undone_is_a_warning_of_its_own(monkeypatch, tmp_path: Path):
+    fits, lost = LocalisationStatus.MAPPING, LocalisationStatus.LOST
+    FakeWorker.statuses[:], FakeWorker.told[:] = [fits, fits, lost], [(), ("key", "joined"), ("key", "parted")]
+
+    async def story(clock, scans, service):
+        while FakeWorker.statuses:
+            scans.put(scan(clock))
+            await clock.sleep(0.2)
+
+    said = events_of(story, monkeypatch, tmp_path)
+    assert [reason for reason, _ in said] == [Reason.LOOP_CLOSED, Reason.JOIN_UNDONE, Reason.POSE_LOST]
+    assert said[1][1] == "what was seen since then contradicts it"
 
 
 def test_with_scans_it_is_saved_once_with_the_next_one(monkeypatch, tmp_path: Path):

@@ -194,9 +194,18 @@ def test_lost_it_drives_to_and_fro_until_it_is_found():
     assert stepped.said() == [Reason.RECOVERING]
     stepped.step(believed=here)
     assert stepped.actions == (), "the goal is pursued"
+    there = (2.0, 1.58, math.pi / 2)
+    stepped.step(believed=there, ended=Reason.GOAL_REACHED)
+    stepped.step(exploration.AGAIN, believed=there)
+    assert stepped.actions == (Go(here),), "over ground that it came over"
+    stepped.step(believed=here, ended=Reason.GOAL_REACHED)
+    stepped.step(exploration.AGAIN, believed=here)
+    assert stepped.actions == (Go(pytest.approx((1.75, 1.6, math.pi / 2 + 0.8))),)
     stepped.step(believed=here, ended=Reason.GOAL_UNREACHABLE)
     stepped.step(exploration.AGAIN, believed=here)
-    assert stepped.actions == (Go(pytest.approx((2.0, 0.1, math.pi / 2))),)
+    assert stepped.actions == (Go(pytest.approx((2.25, 1.6, math.pi / 2 - 0.8))),), (
+        "nothing is known of what is behind it"
+    )
     stepped.pose = (5.0, 5.0, 0.0)
     stepped.step(believed=stepped.pose)
     assert (stepped.run.phase, stepped.actions[0], stepped.said()) == (Phase.LOOKING, Cancel(), [Reason.POSE_FOUND])
