@@ -10,6 +10,7 @@ import errno
 import json
 import math
 import os
+import re
 import shutil
 import signal
 import sys
@@ -254,6 +255,8 @@ def with_remedy(reason: Reason, text: str) -> str:
 def print_end(reason: Reason, text: str, values: Mapping[str, Any], *, json_output: bool) -> None:
     """Print how a drive or another run ended, and end the command by its reason.
 
+    Angles are shown in degrees as well. The robot's own text keeps to rad, as recorded runs are compared word by word.
+
     Args:
         reason: of the end.
         text: the end in words.
@@ -265,9 +268,10 @@ def print_end(reason: Reason, text: str, values: Mapping[str, Any], *, json_outp
     """
     if json_output:
         print_json(values)
-    elif not reason.exit_code:
-        print(f"{reason.text}: {text}")
-    finish(reason, f"{reason.text}: {text}")
+    shown = re.sub(r"([-+]?\d+\.\d+) rad\b(?!/)", lambda rad: f"{rad[0]} ({math.degrees(float(rad[1])):.1f}°)", text)
+    if not json_output and not reason.exit_code:
+        print(f"{reason.text}: {shown}")
+    finish(reason, f"{reason.text}: {shown}")
 
 
 def until_stopped(main: Callable[[WallClock], Coroutine[Any, Any, None]]) -> None:

@@ -10,7 +10,7 @@ from monstertruck_runtime.mailbox import Mailbox, fifo, latest
 from monstertruck_runtime.presence import while_it_runs
 from monstertruck_runtime.requests import Operator
 from monstertruck_schemas.mission import Mission
-from monstertruck_schemas.plan import BehaviourState, ExplorationState, MissionState
+from monstertruck_schemas.plan import BehaviourState, ExplorationPhase, ExplorationState, MissionState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import BehaviourOrder, ExploreOrder, MissionOrder
 from monstertruck_schemas.topics import BEHAVIOUR, EXPLORE, GATE, MISSION, Topic
@@ -201,6 +201,8 @@ def progress_line(state: ExplorationState, stands: str = "") -> str:
     where = "" if state.target is None else f" to ({state.target.x:.1f}, {state.target.y:.1f})"
     if stands:
         return f"{state.elapsed:5.0f} s  it stands: {stands}"
+    if state.phase is ExplorationPhase.LOOKING and not state.known:
+        return f"{state.elapsed:5.0f} s  waits for the first look at the map: its worker starts"
     return (
         f"{state.elapsed:5.0f} s {state.travelled:6.1f} m  {state.known:6.1f} m^2 known, "
         f"{state.frontiers:2d} frontiers  {state.phase}{where}"

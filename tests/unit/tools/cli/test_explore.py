@@ -120,3 +120,9 @@ def test_a_truck_that_stands_disarmed_is_not_said_to_drive():
     asyncio.run(run_exploration(robot, home=None, budget=None, arm=False, report=lines.append))
     assert lines[0] == "    0 s  it stands: the truck is disarmed; `monstertruckd arm` lets it drive"
     assert len(lines[0]) < 80
+
+
+def test_until_the_worker_has_looked_at_the_map_it_says_what_it_waits_for():
+    starts = progress_line(state(3, ExplorationPhase.LOOKING))
+    assert starts.endswith("waits for the first look at the map: its worker starts")
+    assert progress_line(state(3, ExplorationPhase.LOOKING, known=12.0)).endswith("looking")

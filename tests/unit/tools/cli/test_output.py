@@ -26,6 +26,7 @@ from monstertruckd.tools.cli.output import (
     HELP_STYLE,
     CommandGroup,
     finish,
+    print_end,
     print_json,
     print_table,
     progress,
@@ -329,3 +330,12 @@ def test_a_value_without_a_unit_is_followed_by_its_grade(
     )
     _print(Result(wizard="battery", measured="", estimates=(estimate, estimate.model_copy(update={"unit": "V"}))))
     assert capsys.readouterr().out.splitlines()[::2] == ["battery.gain: 1.25, A", "battery.gain: 1.25 V, A"]
+
+
+def test_the_end_of_a_drive_says_angles_in_degrees_too(capsys: pytest.CaptureFixture[str]):
+    text = "0.012 m and 0.031 rad away, at 0.500 rad/s"
+    print_end(Reason.GOAL_REACHED, text, {}, json_output=False)
+    assert capsys.readouterr().out.endswith("0.012 m and 0.031 rad (1.8°) away, at 0.500 rad/s\n")
+    with pytest.raises(typer.Exit):
+        print_end(Reason.GOAL_MISSED, text, {}, json_output=False)
+    assert "0.031 rad (1.8°) away" in capsys.readouterr().err
