@@ -6,7 +6,8 @@
 Robots do not know each other's plans. Each hears where the others say that they are (``peers``), which counts behind
 it, where its lidar of 240 degrees sees nobody; it stops before what it sees and hears. Of those that are near to each
 other one has the right of way, for a minute each in turn: it waits, and the others drive away from those near them.
-Before people, and where that fails, a robot waits a time drawn by its seed, backs off, and tries again.
+Before people, and where that fails, a robot waits a time drawn by its seed, turns or drives elsewhere, and tries again;
+it backs up, where its lidar does not look, only as far as it must to turn.
 Contacts in which a robot moves count against the goal; people who walk into a standing one are counted apart.
 """
 
@@ -162,9 +163,9 @@ class Pilot:
             if await self.make_way():
                 continue
             await self.clock.sleep(float(self.rng.uniform(0.3, 3.0)))
-            if self.rng.random() < 0.8:
+            if not await self.turn(float(self.rng.uniform(-1.5, 1.5))):
                 await self.move(length=-float(self.rng.uniform(0.1, 0.2)), speed=0.1)
-            if self.rng.random() < 0.5 and await self.turn(float(self.rng.uniform(-1.5, 1.5))):
+            elif self.rng.random() < 0.5:
                 await self.move(length=float(self.rng.uniform(0.2, 0.8)), speed=0.15)
 
     async def make_way(self) -> bool:
@@ -181,12 +182,9 @@ class Pilot:
         pushes = [(x / (x * x + y * y), y / (x * x + y * y)) for x, y in near.values()]
         away = math.atan2(sum(y for _, y in pushes), sum(x for x, _ in pushes))
         turn = math.remainder(away - me.yaw, math.tau)
-        back = abs(turn) > math.pi / 2  # its tail is nearer to that direction
-        turn = math.remainder(turn - math.pi, math.tau) if back else turn
         if abs(turn) > 0.3 and not await self.turn(turn):
             return False
-        way = float(self.rng.uniform(0.4, 0.8))
-        return await self.move(length=-way if back else way, speed=0.1 if back else 0.18)
+        return await self.move(length=float(self.rng.uniform(0.4, 0.8)), speed=0.18)
 
     def rank(self, number: int) -> int:
         """0 for the robot that has the right of way before all others at present."""

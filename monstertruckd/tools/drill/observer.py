@@ -34,6 +34,8 @@ from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 PERIOD: Final = SECOND // 100
 AT_REST: Final = 0.01
 """True speed of a truck that stands, m/s."""
+ROCKS: Final = 0.003
+"""Distance from where it came to rest within which a truck still stands, m: braked, it rocks on tyres and springs."""
 STOPS_WITHIN: Final = 0.6
 """Seconds from any fault that must stop the truck, or from a disarm order, to standstill."""
 CLOSEST: Final = 0.03
@@ -278,6 +280,8 @@ class _Standstill:
         self.top_speed = 0.0
         """Greatest true speed since the fault, m/s."""
         self._path: list[tuple[float, float]] = []
+        self._rest: tuple[float, float] | None = None
+        """Where it last was at rest, m."""
 
     def begin(self, now: int, *, must_stop: bool, disarms: bool) -> None:
         """A fault begins."""
@@ -292,12 +296,14 @@ class _Standstill:
     def __call__(self, seen: Observation) -> Broken:
         now, speed = seen.now, seen.truth.v
         self.top_speed = max(self.top_speed, abs(speed))
-        moving = abs(speed) > AT_REST
+        resting, here = abs(speed) <= AT_REST, (seen.truth.x, seen.truth.y)
         if self.stood is None:
-            self._path.append((seen.truth.x, seen.truth.y))
-            if not moving:
+            self._path.append(here)
+            if resting:
                 self.stood = now
-        if not moving:
+        if resting:
+            self._rest = here
+        if self._rest is not None and math.dist(here, self._rest) <= ROCKS:
             return
         ordered = min((at for at in (self.disarmed, self.estopped) if at is not None), default=now)
         asked = max((abs(each) for *_, each in seen.targets), default=0.0)
