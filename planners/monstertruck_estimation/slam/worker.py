@@ -73,7 +73,7 @@ class SlamWorker:
         trajectory = estimator.trajectory() if inputs.trajectory else None
         counts = dict(estimator.counts)
         bases = estimator.poses_at(np.array(inputs.instants, np.int64)) if inputs.instants else None
-        return WorkerOutput(made, refused, tuple(tiles), whole, redrawn, counts, saved, error, trajectory, bases, joint)
+        return WorkerOutput(made, refused, tuple(tiles), whole, counts, saved, error, trajectory, bases, joint)
 
     def _begin(self, start: Start) -> None:
         config = start.config

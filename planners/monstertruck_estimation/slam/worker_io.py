@@ -150,8 +150,6 @@ class WorkerOutput:
     """Why the scan was left out."""
     tiles: tuple[GridPatch, ...] = ()
     whole: GridPatch | None = None
-    redrawn: bool = False
-    """The grid was rebuilt since the last step: tiles received before are obsolete."""
     counts: dict[str, int] = field(default_factory=dict)
     """Scans, keyframes, closures, rejected matches since the start."""
     saved: str | None = None
