@@ -160,7 +160,7 @@ class ExplorationState(Message):
     outcome: Reason = Reason.OK
     """DRIVING while it runs, then EXPLORED, BUDGET_SPENT, CHARGE_SPENT, CANCELLED, or why it was given up."""
     text: str = ""
-    """The outcome in words."""
+    """The outcome in words; while it runs, what it waits for."""
     target: Pose2D | None = None
     """Where it is going."""
     frontiers: Annotated[int, Field(ge=0)] = 0

@@ -101,7 +101,7 @@ async def run_exploration(
         nonlocal shown, due
         held = gate.latest
         stands = "" if held is None or held.mode.active else with_remedy(held.worst, held.why)
-        now = state.phase, state.goals, stands
+        now = state.phase, state.goals, stands, state.text
         if report is not None and (now != shown or state.elapsed >= due):
             shown, due = now, state.elapsed + EVERY
             report(progress_line(state, stands))
@@ -197,10 +197,12 @@ async def _followed(states: Mailbox[S], number: int, show: Callable[[S], None], 
 
 
 def progress_line(state: ExplorationState, stands: str = "") -> str:
-    """How far an exploration has come, in less than 80 characters, or why the truck ``stands``."""
+    """How far an exploration has come, in less than 80 characters, why the truck ``stands``, or what it waits for."""
     where = "" if state.target is None else f" to ({state.target.x:.1f}, {state.target.y:.1f})"
     if stands:
         return f"{state.elapsed:5.0f} s  it stands: {stands}"
+    if state.text and state.running:
+        return f"{state.elapsed:5.0f} s  it waits: {state.text}"
     if state.phase is ExplorationPhase.LOOKING and not state.known:
         return f"{state.elapsed:5.0f} s  waits for the first look at the map: its worker starts"
     return (

@@ -311,7 +311,7 @@ def _driving(run: Exploration, seen: Observed, config: ExplorerConfig) -> Step:
         if seen.ended is Reason.CANCELLED:
             return _end(run, Reason.CANCELLED, f"its goal was cancelled: {seen.ended_text}", Save())
         if seen.ended in PASSING:
-            looking = _enter(run, ExplorationPhase.LOOKING)
+            looking = replace(_enter(run, ExplorationPhase.LOOKING), text=seen.ended.text)
             return replace(looking, target=None, backing=False, not_before=run.now + AGAIN), ()
         reached = seen.ended is Reason.GOAL_REACHED
         if run.backing:
@@ -465,4 +465,4 @@ def _end(run: Exploration, outcome: Reason, text: str, *actions: Action) -> Step
 
 
 def _enter(run: Exploration, phase: ExplorationPhase) -> Exploration:
-    return replace(run, phase=phase, since=run.now)
+    return replace(run, phase=phase, since=run.now, text="")

@@ -171,7 +171,9 @@ class ExplorerService:
         if gate is None or not gate.mode.active:
             raise does_not_drive(gate)
         if (pose := self._pose(now)) is None:
-            raise RequestRefusedError(Reason.NO_MAP, "no pose in a map yet")
+            raise RequestRefusedError(
+                Reason.NO_MAP, "no pose in a map yet; `monstertruckd status` shows if slam is ready"
+            )
         self._fresh, self._goal, self._refused, self._saves = True, None, None, None
         self._deciding = None  # of the exploration before: its answer is not one to this
         self._others = 0 if goal is None else goal.number

@@ -245,6 +245,14 @@ def test_a_planner_that_is_starting_says_nothing_of_the_place():
     assert (stepped.run.phase, stepped.run.attempts.places) == (Phase.LOOKING, ())
 
 
+def test_it_says_what_it_waits_for():
+    stepped = SteppedExploration()
+    stepped.drive()
+    assert stepped.run.text == ""
+    stepped.step(ended=Reason.PLANNER_STARTING)
+    assert stepped.run.text == "the planner is starting"
+
+
 def test_the_way_home_is_tried_again_and_given_up_in_the_end():
     stepped = SteppedExploration()
     stepped.run = replace(stepped.run, now=0.0)

@@ -84,6 +84,19 @@ def test_it_is_followed_to_its_end_and_printed_in_short_lines():
     assert len(progress_line(busy)) < 80
 
 
+def test_what_it_waits_for_is_said():
+    robot = Robot(
+        state(3, ExplorationPhase.LOOKING, text="the planner is starting"),
+        state(3, ExplorationPhase.LOOKING, elapsed=1.0, known=3.0),
+        state(3, ExplorationPhase.IDLE, Reason.EXPLORED, text="12 m^2"),
+    )
+    lines: list[str] = []
+    asyncio.run(run_exploration(robot, home=None, budget=None, arm=False, report=lines.append))
+    assert lines[0] == "    0 s  it waits: the planner is starting"
+    assert "waits" not in lines[1]
+    assert "looking" in lines[1]
+
+
 def test_refused_it_stops_nothing_and_without_the_robot_it_tries_to():
     robot = Robot(refuse=True)
     with pytest.raises(RequestRefusedError):
