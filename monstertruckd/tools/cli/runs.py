@@ -204,7 +204,7 @@ def progress_line(state: ExplorationState, stands: str = "") -> str:
     if state.text and state.running:
         return f"{state.elapsed:5.0f} s  it waits: {state.text}"
     if state.phase is ExplorationPhase.LOOKING and not state.known:
-        return f"{state.elapsed:5.0f} s  waits for the first look at the map: its worker starts"
+        return f"{state.elapsed:5.0f} s  waits for the first look at the map"
     return (
         f"{state.elapsed:5.0f} s {state.travelled:6.1f} m  {state.known:6.1f} m^2 known, "
         f"{state.frontiers:2d} frontiers  {state.phase}{where}"

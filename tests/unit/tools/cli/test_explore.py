@@ -135,7 +135,7 @@ def test_a_truck_that_stands_disarmed_is_not_said_to_drive():
     assert len(lines[0]) < 80
 
 
-def test_until_the_worker_has_looked_at_the_map_it_says_what_it_waits_for():
+def test_before_the_first_look_at_the_map_it_tells_no_zeros():
     starts = progress_line(state(3, ExplorationPhase.LOOKING))
-    assert starts.endswith("waits for the first look at the map: its worker starts")
+    assert starts.endswith("waits for the first look at the map")
     assert progress_line(state(3, ExplorationPhase.LOOKING, known=12.0)).endswith("looking")
