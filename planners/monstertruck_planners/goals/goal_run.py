@@ -138,6 +138,8 @@ class GoalRun:
     partial: bool = False
     """The present route ends before the goal: it is too long for one path."""
     misses: int = 0
+    error: float = math.inf
+    """Least that it was off before a correction, as the greater share of its tolerances."""
     next_recovery: int = 0
     """Index of the recovery behaviour to be tried next."""
     routes: int = 0
@@ -277,13 +279,15 @@ def _arrived(run: GoalRun, observed: Observations, config: PlannerConfig) -> Ste
     away, turned = apart(observed.pose, run.goal)
     off = f"{away:.3f} m and {turned:.3f} rad away"
     error = max(away / config.position_tolerance, turned / config.yaw_tolerance)
+    before = max(config.aim, min(run.error, 1.0))
+    wanted = 1.0 if run.misses >= MISSES else config.aim if run.misses < config.corrections else before
     if run.via:
         off = f"{len(run.via)} waypoint{'s' if len(run.via) > 1 else ''} not passed"
-    elif error <= (config.aim if run.misses < config.corrections else 1.0):
+    elif error <= wanted:
         return _end(run, Reason.GOAL_REACHED, off, Severity.INFO)
     if run.misses >= MISSES:
         return _end(run, Reason.GOAL_MISSED, off)
-    run = replace(run, misses=run.misses + 1)
+    run = replace(run, misses=run.misses + 1, error=min(run.error, error))
     report = Report(Reason.GOAL_MISSED, Severity.WARNING, f"goal {run.number}: {off}; plans anew")
     return _with(_plan(run, config, afresh=True), report)
 

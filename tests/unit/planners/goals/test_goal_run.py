@@ -127,6 +127,22 @@ def test_a_place_within_the_tolerance_is_corrected_once_then_taken():
         assert run.run.outcome is outcome
 
 
+def test_a_correction_that_ends_worse_is_corrected_again():
+    run = SteppedRun()
+    for yaw, outcome in ((0.1, Reason.DRIVING), (0.15, Reason.DRIVING), (0.1, Reason.GOAL_REACHED)):
+        run.step(answer=WAY)
+        run.step(outcome=Reason.GOAL_REACHED, pose=(2.0, 0.0, yaw))
+        assert run.run.outcome is outcome
+
+
+def test_within_the_tolerance_it_has_reached_its_goal_after_the_last_correction_too():
+    run = SteppedRun()
+    for number, yaw in enumerate((0.1, 0.15, 0.15, 0.15, 0.15, 0.15)):
+        run.step(answer=WAY)
+        run.step(outcome=Reason.GOAL_REACHED, pose=(2.0, 0.0, yaw))
+        assert run.run.outcome is (Reason.GOAL_REACHED if number == 5 else Reason.DRIVING)
+
+
 def test_an_obstacle_on_the_way_is_planned_round_while_the_truck_drives_on():
     run = SteppedRun()
     run.step(answer=WAY)
