@@ -79,8 +79,9 @@ class LoopHealth(Message):
     @property
     def busy(self) -> str:
         """That the daemon gets too little processor time, in words; empty while ticks are less than ``LATE`` late."""
-        late = self.lateness_p99
-        return f"the computer is busy: control ticks come {late * 1e3:.0f} ms late; end other programs" * (late > LATE)
+        if self.lateness_p99 <= LATE:
+            return ""
+        return f"the computer is busy: control ticks come {self.lateness_p99 * 1e3:.0f} ms late; end other programs"
 
 
 class RecorderHealth(Message):
