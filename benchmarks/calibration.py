@@ -1,12 +1,13 @@
 """Wizards against hidden truth: 20 trucks, all values of each off, calibrated in the order of docs/calibration.md.
 
-    python benchmarks/calibration.py [--seeds 20] [--jobs 1] [--light 200]
+    python benchmarks/calibration.py [--seeds 20] [--jobs 1] [--light 200] [--engine mujoco]
     python benchmarks/calibration.py --only camera --light 200
     python benchmarks/calibration.py --part swapped|interruptions|square|alone [--count 20]
 
 Every session runs the whole daemon on a virtual clock: real drivers, emulated devices, the safety gate; the operator
 has a tape, a string and a meter with errors of their own. Judged is whether the true value lies in the stated interval,
 and, against the truck's own linkage, the curvature that the calibrated truck believes, to its full lock.
+With ``--engine mujoco`` the truck is one of rigid bodies on springs and tyres.
 Before that the fits of every wizard are judged alone on drawn measurements, ``--light``
 each: how often the truth lies inside, how wide the intervals are. ``--seeds 0`` leaves it at these, ``--only WIZARD``
 at those of one.
@@ -27,6 +28,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import process_time
@@ -44,7 +46,7 @@ from monstertruckd.tools.calibrate.battery import BatteryWizard
 from monstertruckd.tools.calibrate.compass import CompassWizard
 from monstertruckd.tools.calibrate.drive import DriveWizard
 from monstertruckd.tools.calibrate.steering import SteeringWizard
-from monstertruckd.tools.simulation.config import SimulatedTruckConfig
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
 from tests.calibration_kit import Verdict, curvature_errors, hidden, run_session, verdicts
 from tests.calibration_light import HALF_WIDTHS, LIGHT, coverage
 from tests.calibration_wrong import WRONG, noticed
@@ -73,14 +75,15 @@ class Truck:
     """By mode and side, see ``curvature_errors``."""
 
 
-def calibrate(seed: int) -> Truck:
-    """The whole procedure on one truck."""
+def calibrate(seed: int, engine: str) -> Truck:
+    """The whole procedure on one truck, in the world of an engine."""
     logging.disable(logging.CRITICAL)
     began = process_time()
     rng = np.random.default_rng([seed, 4])
     found: list[Verdict] = []
     minutes: dict[str, float] = defaultdict(float)
-    base = load_config(ROOT / "configs" / "yard.yaml", SimulatedTruckConfig)[0]
+    yard = load_config(ROOT / "configs" / "yard.yaml", SimulatedTruckConfig)[0]
+    base = with_overlay(yard, {"sim": {"world": {"engine": engine}}})
     with TemporaryDirectory(prefix="monstertruck-") as folder:
         quiet = base.model_copy(update={"recorder": None, "state_directory": Path(folder)})
         truck = hidden(quiet, rng, seed)
@@ -163,6 +166,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--engine", choices=("plane", "mujoco"), default="plane", help="of the trucks' world")
     parser.add_argument("--light", type=int, default=200)
     parser.add_argument("--only", choices=tuple(LIGHT), help="this wizard's light fits alone")
     parser.add_argument("--part", choices=("trucks", *PARTS), default="trucks")
@@ -182,7 +186,7 @@ def main() -> int:
         return 0 if fine else 1
     trucks = []
     with ProcessPoolExecutor(arguments.jobs) as pool:
-        for truck in pool.map(calibrate, range(arguments.seeds)):
+        for truck in pool.map(partial(calibrate, engine=arguments.engine), range(arguments.seeds)):
             trucks.append(truck)
             missed = [v.name for v in truck.verdicts if not v.holds]
             print(f"truck {truck.seed}: {len(truck.verdicts)} estimates, outside: {missed or 'none'}", flush=True)

@@ -193,7 +193,7 @@ CONFIRMING_WAY: Final = 10.0
 """Way near keyframes of the other side, m, after which a join that nothing contradicts is confirmed."""
 
 
-class Change(StrEnum):
+class JoinChange(StrEnum):
     """What a search has changed."""
 
     JOINED = "joined"
@@ -209,7 +209,7 @@ class Relocation:
     def __init__(self) -> None:
         self._submaps: dict[int, tuple[int, Array, Submap]] = {}
         """Of each part: its keyframes, the pose of its first one, and their surfaces, all when they were merged."""
-        self._progress: PiecewiseSearch[Join | Change | None] | None = None
+        self._progress: PiecewiseSearch[Join | JoinChange | None] | None = None
         self._last = -1
 
     @property
@@ -217,7 +217,7 @@ class Relocation:
         """Whether a search is on its way."""
         return self._progress is not None
 
-    def step(self, keyframes: KeyframeMap, closer: LoopCloser, budget: ScanBudget) -> Change | None:
+    def step(self, keyframes: KeyframeMap, closer: LoopCloser, budget: ScanBudget) -> JoinChange | None:
         """Continue the search, or the check of a join; what was joined or parted, which moves poses.
 
         A place found moves a submap.
@@ -233,17 +233,17 @@ class Relocation:
         found, self._progress = self._progress.result, None
         return self._part(keyframes, closer, found) if isinstance(found, Join) else found
 
-    def part(self, keyframes: KeyframeMap, closer: LoopCloser) -> Change | None:
+    def part(self, keyframes: KeyframeMap, closer: LoopCloser) -> JoinChange | None:
         """Undo all joins that are in doubt, if there are any."""
         return self._part(keyframes, closer, keyframes.doubtful[0]) if keyframes.doubtful else None
 
-    def _part(self, keyframes: KeyframeMap, closer: LoopCloser, join: Join) -> Change:
+    def _part(self, keyframes: KeyframeMap, closer: LoopCloser, join: Join) -> JoinChange:
         keyframes.separate(join)
         closer.forget(np.ones(len(keyframes), bool))
         self.forget()
-        return Change.PARTED
+        return JoinChange.PARTED
 
-    def _examined(self, keyframes: KeyframeMap, closer: LoopCloser, at: int) -> Pieces[Join | Change | None]:
+    def _examined(self, keyframes: KeyframeMap, closer: LoopCloser, at: int) -> Pieces[Join | JoinChange | None]:
         """Check the joins in doubt, then search for keyframe ``at``; a join that is wrong, or what was changed."""
         for join in tuple(keyframes.doubtful):
             own, others = keyframes.sides(join)
@@ -266,7 +266,7 @@ class Relocation:
         """The keyframes have other numbers."""
         self._submaps, self._progress, self._last = {}, None, -1
 
-    def _joined(self, keyframes: KeyframeMap, closer: LoopCloser, at: int) -> Pieces[Change | None]:
+    def _joined(self, keyframes: KeyframeMap, closer: LoopCloser, at: int) -> Pieces[JoinChange | None]:
         """Place the surroundings of keyframe ``at`` in the other submaps, and verify them there.
 
         A place is given up when most of the keyframes verified do not fit.
@@ -280,7 +280,7 @@ class Relocation:
             for key in keys:
                 found = yield from closer.join(keyframes, key, other)
                 if found:
-                    return Change.JOINED
+                    return JoinChange.JOINED
                 failed += found is None
                 if failed > MOST_FAILED:
                     break

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from monstertruck_estimation.slam import storage
-from monstertruck_estimation.slam.closure import contradiction, describe, in_view
+from monstertruck_estimation.slam.budget import finished
+from monstertruck_estimation.slam.closure import contradiction, describe, in_view, opposed
 from monstertruck_estimation.slam.config import GridConfig, MapperConfig
 from monstertruck_estimation.slam.localisation import LocalisationEstimator
 from monstertruck_estimation.slam.map_evidence import EvidenceGrid
@@ -144,7 +145,9 @@ def _warm_up() -> None:
         )
         scans.append(prepare_input(inputs, 30.0))
         estimator.step(scans[-1], inputs)
-    estimator.mapper.map.optimise()
+    keyframes = estimator.mapper.map
+    keyframes.optimise()
+    finished(opposed(keyframes, np.array((0,)), np.array((len(keyframes) - 1,))))
     estimator.changes()
     # What a few scans of a small room do not come to: loops that are closed, and a saved map.
     points = scans[0].points

@@ -12,7 +12,7 @@ from monstertruck_estimation.slam.closure import LoopCloser
 from monstertruck_estimation.slam.config import GridConfig, MapperConfig
 from monstertruck_estimation.slam.keyframes import KeyframeMap
 from monstertruck_estimation.slam.mapping import Mapper, MappingEstimator, MappingEvent
-from monstertruck_estimation.slam.relocation import CONFIRMING_WAY, Change, Relocation
+from monstertruck_estimation.slam.relocation import CONFIRMING_WAY, JoinChange, Relocation
 from monstertruck_estimation.slam.scans import prepare_input
 from monstertruck_estimation.slam.worker_io import ScanInput
 from monstertruck_schemas.health import LocalisationStatus
@@ -127,7 +127,7 @@ def test_what_both_sides_see_through_of_each_other_parts_them_and_no_edge_is_lef
     before = keyframes.poses[:25].copy()
     assert not keyframes.part.any()
     changes = (relocation.step(keyframes, closer, ScanBudget(1e12)) for _ in extend(keyframes, WAY[21:30]))
-    assert Change.PARTED in changes
+    assert JoinChange.PARTED in changes
     assert keyframes.part.tolist() == [0] * 25 + [25] * (len(keyframes) - 25)
     edges = keyframes.edges.edges()
     assert not ((edges.origin < 25) & (edges.target >= 25)).any()
@@ -171,8 +171,8 @@ def test_who_is_lost_again_before_the_join_is_confirmed_has_it_undone():
             odom = odom if k == 0 else compose(odom, between(stretch[k - 1], pose))
             stamp = (len(events) + 1) * SECOND // 10
             events.append(mapper.step(scan(walls, pose, noise=0.01, rng=rng), stamp, odom).events)
-    told = [event for step in events for event in step if event in {"apart", "joined", "parted"}]
-    assert told == [MappingEvent.APART, MappingEvent.JOINED, MappingEvent.PARTED, MappingEvent.APART]
+    reported = [event for step in events for event in step if event in {"apart", "joined", "parted"}]
+    assert reported == [MappingEvent.APART, MappingEvent.JOINED, MappingEvent.PARTED, MappingEvent.APART]
     assert len(np.unique(mapper.map.part)) == 3
     assert mapper.lost
 

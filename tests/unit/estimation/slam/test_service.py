@@ -30,7 +30,7 @@ class FakeWorker:
     at_once: int
     statuses: ClassVar[list[LocalisationStatus]] = []
     """Of the scans to come,"""
-    told: ClassVar[list[tuple[str, ...]]] = []
+    happened: ClassVar[list[tuple[str, ...]]] = []
     """and their events."""
 
     def __init__(self, name: str, target: str, clock: VirtualClock, **settings: float) -> None:
@@ -57,7 +57,7 @@ class FakeWorker:
             return WorkerOutput(saved=saved)
         counts = {"scans": 1, "keys": 1, "closures": 0, "rejected": 0}
         status, pose = self.statuses.pop(0), (0.0, 0.0, 0.0)
-        events = self.told.pop(0) if self.told else ()
+        events = self.happened.pop(0) if self.happened else ()
         made = SlamEstimate(task.scan.stamp, pose, (0.0,) * 9, None, status, 1.0, 0.0, 0.0, 0.0, "", events)
         return WorkerOutput(made, saved=saved, counts=counts)
 
@@ -129,7 +129,7 @@ def test_along_a_corridor_it_does_not_say_with_every_scan_that_a_direction_is_op
 
 def test_a_join_that_is_undone_is_a_warning_of_its_own(monkeypatch, tmp_path: Path):
     fits, lost = LocalisationStatus.MAPPING, LocalisationStatus.LOST
-    FakeWorker.statuses[:], FakeWorker.told[:] = [fits, fits, lost], [(), ("key", "joined"), ("key", "parted")]
+    FakeWorker.statuses[:], FakeWorker.happened[:] = [fits, fits, lost], [(), ("key", "joined"), ("key", "parted")]
 
     async def story(clock, scans, service):
         while FakeWorker.statuses:

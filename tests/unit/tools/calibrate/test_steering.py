@@ -162,8 +162,8 @@ def test_the_moves_that_are_announced_are_those_that_are_made(wizard: SteeringWi
     monkeypatch.setattr(steering.AxleTravel, "of", reach)
     monkeypatch.setattr(steering, "estimates", lambda _: ())
     context = SimpleNamespace(
-        chassis=CHASSIS, config=SimpleNamespace(gate=SimpleNamespace(angle=0.4)), confirm=answer, ask=answer,
-        expect=announced.append, move=move, fit=fit,
+        chassis=CHASSIS, confirm=answer, ask=answer, expect=announced.append, move=move, fit=fit,
+        config=SimpleNamespace(gate=SimpleNamespace(angle=0.4), devices=SimpleNamespace(compass=None)),
     )  # fmt: skip
     asyncio.run(wizard(context))  # type: ignore[arg-type]
     assert announced == [len(made)]
