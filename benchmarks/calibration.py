@@ -7,7 +7,7 @@
 Every session runs the whole daemon on a virtual clock: real drivers, emulated devices, the safety gate; the operator
 has a tape, a string and a meter with errors of their own. Judged is whether the true value lies in the stated interval,
 and, against the truck's own linkage, the curvature that the calibrated truck believes, to its full lock.
-With ``--engine mujoco`` the truck is one of rigid bodies on springs and tyres.
+With ``--engine mujoco`` trucks and the robots of ``alone`` are rigid bodies on springs and tyres.
 Before that the fits of every wizard are judged alone on drawn measurements, ``--light``
 each: how often the truth lies inside, how wide the intervals are. ``--seeds 0`` leaves it at these, ``--only WIZARD``
 at those of one.
@@ -166,14 +166,17 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--jobs", type=int, default=1)
-    parser.add_argument("--engine", choices=("plane", "mujoco"), default="plane", help="of the trucks' world")
+    parser.add_argument(
+        "--engine", choices=("plane", "mujoco"), default="plane", help="of the world of trucks and `alone`"
+    )
     parser.add_argument("--light", type=int, default=200)
     parser.add_argument("--only", choices=tuple(LIGHT), help="this wizard's light fits alone")
     parser.add_argument("--part", choices=("trucks", *PARTS), default="trucks")
     parser.add_argument("--count", type=int, default=20, help="of faults or interruptions of each kind")
     arguments = parser.parse_args()
-    if arguments.part in PARTS:
-        found, goals, met = PARTS[arguments.part](arguments.count)
+    parts = PARTS | {"alone": partial(alone, engine=arguments.engine)}
+    if arguments.part in parts:
+        found, goals, met = parts[arguments.part](arguments.count)
         print(json.dumps({"bench": f"calibration.{arguments.part}", "figures": found, "goals": goals, "met": met}))
         return 0 if met else 1
     by_light: dict[str, Any] = {}

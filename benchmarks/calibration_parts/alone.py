@@ -21,6 +21,7 @@ from monstertruckd.tools.calibrate.slip import SlipWizard
 from monstertruckd.tools.calibrate.sonar import SonarWizard
 from monstertruckd.tools.calibrate.stabiliser import StabiliserWizard
 from monstertruckd.tools.calibrate.wizard import Wizard
+from monstertruckd.tools.simulation.config import with_overlay
 from tests.calibration_kit import Verdict, run_session, verdicts
 from tests.calibration_robots import robot_of
 
@@ -37,12 +38,12 @@ GOAL: Final = 0.9
 """Share of the numbers inside their intervals."""
 
 
-def alone(count: int) -> tuple[dict[str, Any], dict[str, Any], bool]:
-    """Each wizard on so many robots; goals; whether they are met."""
+def alone(count: int, engine: str = "plane") -> tuple[dict[str, Any], dict[str, Any], bool]:
+    """Each wizard on so many robots, in the world of an engine; goals; whether they are met."""
     logging.disable(logging.CRITICAL)
     inside, wrong = {}, {}
     for name, wizard in WIZARDS.items():
-        found = [verdict for seed in range(count) for verdict in _session(name, wizard, seed)]
+        found = [verdict for seed in range(count) for verdict in _session(name, wizard, seed, engine)]
         numbers = [verdict.holds for verdict in found if verdict.low is not None]
         inside[name] = round(sum(numbers) / max(len(numbers), 1), 4)
         wrong[name] = sum(not verdict.holds for verdict in found if verdict.low is None)
@@ -52,9 +53,12 @@ def alone(count: int) -> tuple[dict[str, Any], dict[str, Any], bool]:
     return figures, {"inside": GOAL, "wrong_choices": 0}, met
 
 
-def _session(name: WizardName, wizard: Wizard, seed: int) -> list[Verdict]:
+def _session(name: WizardName, wizard: Wizard, seed: int, engine: str) -> list[Verdict]:
+    world: dict[str, Any] = {"engine": engine}
+    if name == "camera" and engine != "plane":
+        world["camera"] = {"rendered": True}
     with TemporaryDirectory(prefix="monstertruck-") as folder:
-        config = robot_of(name, Path(folder), seed)
+        config = with_overlay(robot_of(name, Path(folder), seed), {"sim": {"world": world}})
         try:
             session = run_session(config, wizard, np.random.default_rng([seed, 41]))
         except TruckError as error:
