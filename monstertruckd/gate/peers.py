@@ -73,8 +73,7 @@ class PeerGuard:
 
     def unknown(self, now: int) -> bool:
         """Whether another robot may be anywhere: silent, never heard, or one of both does not know its place."""
-        own = self._own
-        if own is None or _age(own.stamp, now) > FRESH:
+        if (own := self._fresh(now)) is None:
             return True
         return any(
             (peer := self._heard.get(name)) is None or _age(peer.heard, now) > FRESH or _deviation(own, peer) > UNSURE
@@ -90,10 +89,10 @@ class PeerGuard:
             now: ns.
             seen: what the lidar sees, where nobody counts; None = nothing.
         """
-        own, free = self._own, math.inf
-        if own is None or (age := _age(own.stamp, now)) > FRESH:
+        free = math.inf
+        if (own := self._fresh(now)) is None:
             return free
-        ways, place = tuple(ways), _moved(own.pose, own.twist, age)
+        ways, place = tuple(ways), _moved(own.pose, own.twist, _age(own.stamp, now))
         for peer in self._heard.values():
             unsure = DEVIATIONS * min(_deviation(own, peer), UNSURE)
             clearance = self._config.obstacle.side_clearance + unsure
@@ -103,6 +102,10 @@ class PeerGuard:
             if len(points):
                 free = min([free, *(self._swept(way, reach, points, clearance) for way in ways)])
         return free
+
+    def _fresh(self, now: int) -> Odometry | None:
+        """The robot's own pose, if it tells where the robot is."""
+        return None if self._own is None or _age(self._own.stamp, now) > FRESH else self._own
 
     def _swept(self, way: Way, reach: float, points: Array, clearance: float) -> float:
         corner = math.hypot(way[0], way[1]) + abs(way[2]) * self._footprint.circumscribed_radius

@@ -213,8 +213,8 @@ class LoopCloser:
         poses, count = keyframes.poses, len(keyframes.edges)
         if not self._accepted(keyframes, hit, sure=False, baseline=JOIN_BASELINE):
             return False
-        robots = int(keyframes.part[-1])
-        submaps = (np.flatnonzero(keyframes.part == one) for one in sorted((own_part, part), key=robots.__ne__))
+        robots, other = (part, own_part) if part == keyframes.part[-1] else (own_part, part)
+        submaps = np.flatnonzero(keyframes.part == robots), np.flatnonzero(keyframes.part == other)
         if finished(opposed(keyframes, *submaps)):
             keyframes.poses = poses
             keyframes.edges.keep(slice(count))

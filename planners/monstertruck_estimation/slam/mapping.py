@@ -257,7 +257,7 @@ class Mapper:
         return alone or self._loss.after_gap or contradicts(self.map, scan, self._pose)
 
     def _begin_submap(self, scan: Scan, stamp: int) -> tuple[MappingEvent, ...]:
-        """Begin a submap of the scans since the first misfit; who is lost again soon may have been joined wrongly."""
+        """Begin a submap of the scans since the first misfit; joins in doubt are undone: they may be wrong."""
         place = between(self.map.poses[-1], self._pose)
         change = self._relocation.part(self.map, self._closer)
         if change is not None:
