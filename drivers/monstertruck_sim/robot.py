@@ -21,6 +21,11 @@ from monstertruck_sim.world.scene import Surroundings
 from monstertruck_sim.world.world import World
 
 
+def carries_lidar(devices: Devices) -> bool:
+    """Whether a lidar's weight is on the robot, or at least that of the mount that turns one."""
+    return devices.lidar is not None or devices.stabiliser is not None
+
+
 class SimulatedRobot:
     """World and emulators, wired as on the truck.
 
@@ -48,7 +53,7 @@ class SimulatedRobot:
         scene: Surroundings | None = None,
         name: str = "truck",
     ) -> None:
-        self.world = World(config.world, config.seed, scene, name)
+        self.world = World(config.world, config.seed, scene, name, lidar=carries_lidar(devices))
         self.ports = ports
         self.recorded: RecordedHokuyoEmulator | None = None
 

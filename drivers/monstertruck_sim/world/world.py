@@ -50,12 +50,21 @@ class World:
         seed: of all noise.
         scene: surroundings that it shares with other robots; None = its own, of ``config``.
         name: of the robot.
+        lidar: whether it carries one: a robot of rigid bodies feels the weight.
 
     Raises:
         InputError: unknown map name, a bad map or profile file, or a start pose in a wall, a robot or a person.
     """
 
-    def __init__(self, config: WorldConfig, seed: int, scene: Surroundings | None = None, name: str = "truck") -> None:
+    def __init__(
+        self,
+        config: WorldConfig,
+        seed: int,
+        scene: Surroundings | None = None,
+        name: str = "truck",
+        *,
+        lidar: bool = True,
+    ) -> None:
         self.scene = scene if scene is not None else make_scene(config, seed)
         self.name = name
         place = self.scene.place
@@ -65,7 +74,7 @@ class World:
         self._footprint = PlanOutline(self.scene, config.truck, name)
         if self.scene.overlap(self.scene.solid, self._footprint.box(start)) > 0:
             raise InputError(f"start: the truck at {start} touches what is not free on the map {config.map}")
-        self._plant, self._space, sweep, solids = make_engine(config, self._footprint, start, noise_seed)
+        self._plant, self._space, sweep, solids = make_engine(config, self._footprint, start, noise_seed, lidar=lidar)
         self._plant.together = self.scene.advance
         self._plant.on_blocked = self._footprint.blocked
         self.scene.add_body(self)
@@ -200,7 +209,7 @@ class World:
         self._space.set_tilt(tilt)
 
 
-def make_engine(config: WorldConfig, footprint: PlanOutline, start: Pose, seed: int | None) -> Engine:
+def make_engine(config: WorldConfig, footprint: PlanOutline, start: Pose, seed: int | None, *, lidar: bool) -> Engine:
     """What computes one robot: ``engine`` of the configuration.
 
     Raises:
@@ -214,7 +223,7 @@ def make_engine(config: WorldConfig, footprint: PlanOutline, start: Pose, seed: 
                 f"sim.world.engine mujoco: {error.name} is not installed: it comes with the extra sim3d "
                 "(pip install 'monstertruckd[sim3d]'; in a checkout: python3 -m monstertruckd.bootstrap sync)"
             ) from error
-        return rigid(config, footprint, start)
+        return rigid(config, footprint, start, lidar=lidar)
     return plane(config, footprint, start, seed)
 
 

@@ -302,8 +302,8 @@ def wheel_steering(truck: SimTruckConfig) -> Steering:
     return lambda _: ()
 
 
-def rigid(config: WorldConfig, footprint: PlanOutline, start: Pose) -> Engine:
-    """One robot of rigid bodies.
+def rigid(config: WorldConfig, footprint: PlanOutline, start: Pose, *, lidar: bool) -> Engine:
+    """One robot of rigid bodies, with or without a lidar on its joints.
 
     Raises:
         InputError: a file of the world is not there or does not fit, there are too many people, or the robot cannot
@@ -319,7 +319,8 @@ def rigid(config: WorldConfig, footprint: PlanOutline, start: Pose) -> Engine:
     heights = ground_heights(config, place.profile, bounds, scene.starts)
     ground: UnevenGround = heights if heights is not None else LevelGround()
     parts = mechanics(truck, config.mechanics)
-    robot = description(truck, parts, head=LidarHead((config.lidar.x, config.lidar.y, config.lidar.height)))
+    head = LidarHead((config.lidar.x, config.lidar.y, config.lidar.height)) if lidar else None
+    robot = description(truck, parts, head=head)
     drive = drive_line(truck, parts)
     longest = 80 if heights is None else round(0.25 / resolution)
     walls = rectangles(place.map.cells == OCCUPIED, resolution, place.map.origin, longest)
