@@ -7,7 +7,8 @@
 Every session runs the whole daemon on a virtual clock: real drivers, emulated devices, the safety gate; the operator
 has a tape, a string and a meter with errors of their own. Judged is whether the true value lies in the stated interval,
 and, against the truck's own linkage, the curvature that the calibrated truck believes, to its full lock.
-With ``--engine mujoco`` trucks and the robots of ``alone`` are rigid bodies on springs and tyres.
+With ``--engine mujoco`` trucks and the robots of ``alone`` are rigid bodies on springs and tyres; true is then how they
+move in their world, driven by hand without noise (``tests/calibration_rigid.py``).
 Before that the fits of every wizard are judged alone on drawn measurements, ``--light``
 each: how often the truth lies inside, how wide the intervals are. ``--seeds 0`` leaves it at these, ``--only WIZARD``
 at those of one.

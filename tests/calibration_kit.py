@@ -30,13 +30,12 @@ from monstertruckd.tools.calibrate.wizard import Wizard, calibrate
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
 from monstertruckd.tools.simulation.operator import LocalOperator
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
+from tests.calibration_rigid import CHAIN, HandDriven, rigid_truths
 
 M = TypeVar("M", bound=Message)
 
 STOPPED: Final = 0.2
 """Chance that something stops a servo on its way to one side."""
-CHAIN: Final = 0.012
-"""From a command of the gate to the servo, s: the serial line, and half a frame of pulses."""
 MODES: Final = {
     "front_left": (1, 0),
     "front_right": (-1, 0),
@@ -319,7 +318,8 @@ def _linkage(sign: int, rng: np.random.Generator) -> dict[str, Any]:
 def curvature_errors(calibrated: SimulatedTruckConfig) -> dict[str, float]:
     """Greatest error of the curvature that the calibrated truck believes, by mode, as a share.
 
-    From 0.3 of full lock to where pulses reach and nothing stops a servo.
+    From 0.3 of full lock to where pulses reach and nothing stops a servo. True is that of the linkage in the plane, and
+    that of the path driven by hand among rigid bodies.
     """
     believed, truck = calibrated.chassis(), calibrated.sim.world.truck
     true, steering = truck.chassis(), calibrated.devices.steering
@@ -330,6 +330,7 @@ def curvature_errors(calibrated: SimulatedTruckConfig) -> dict[str, float]:
         [min(max(_arm(ours.quarters(end) / 4, real), -real.right_stop_deg), real.left_stop_deg) for end in reach]
         for (ours, real), reach in zip(servos, believed.linkage.ranges, strict=True)
     ]
+    hands = HandDriven(calibrated) if calibrated.sim.world.engine == "mujoco" else None
     errors = {}
     for mode, sides in MODES.items():
         full = [end[side > 0] if side else 0.0 for end, side in zip(ends, sides, strict=True)]
@@ -338,7 +339,11 @@ def curvature_errors(calibrated: SimulatedTruckConfig) -> dict[str, float]:
             arms = [share * end for end in full]
             pulses = [real.centre_us + real.us_per_degree * arm for (_, real), arm in zip(servos, arms, strict=True)]
             angles = [ours.angle(round(4 * pulse)) for (ours, _), pulse in zip(servos, pulses, strict=True)]
-            expected = true.bicycle.curvature(*true.steering(*np.radians(arms).tolist()))
+            servo_angles = np.radians(arms).tolist()
+            if hands is None:
+                expected = true.bicycle.curvature(*true.steering(*servo_angles))
+            else:
+                expected = hands.curvature(servo_angles)
             shares.append(believed.bicycle.curvature(*believed.steering(*angles)) / expected - 1)
         errors[mode] = float(np.abs(shares).max())
     return errors
@@ -362,7 +367,7 @@ def _servo(channel: int, rng: np.random.Generator) -> dict[str, Any]:
 
 
 def truths(config: SimulatedTruckConfig) -> dict[WizardName, dict[str, Value]]:
-    """True values of what the wizards estimate, by wizard and name."""
+    """True values of what the wizards estimate, by wizard and name, in the plane."""
     world = config.sim.world
     truck, iron = world.truck, world.compass.iron
     rolling = truck.slip_per_newton * truck.rolling_resistance * truck.mass * GRAVITY
@@ -532,6 +537,8 @@ class Verdict:
 def verdicts(result: Result, config: SimulatedTruckConfig) -> list[Verdict]:
     """Every estimate of ``result`` whose truth is known; travel counts where something stopped the wheels."""
     known = truths(config)[result.wizard]
+    if config.sim.world.engine == "mujoco":
+        known |= rigid_truths(result.wizard, config)
     return [
         Verdict(f"{result.wizard}.{e.name}", e.value, e.low, e.high, known[e.name])
         for e in result.estimates
