@@ -14,7 +14,7 @@ from monstertruckd.tools.calibrate.slip import SlipWizard
 from monstertruckd.tools.calibrate.sonar import SonarWizard
 from monstertruckd.tools.calibrate.stabiliser import StabiliserWizard
 from monstertruckd.tools.calibrate.wizard import Wizard
-from monstertruckd.tools.simulation.config import SimulatedTruckConfig
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
 from tests.calibration_kit import run_session, verdicts
 from tests.calibration_robots import robot_of
 
@@ -59,8 +59,9 @@ def test_slip(tmp_path: Path):
 
 
 @pytest.mark.long
-def test_stabiliser(tmp_path: Path):
-    config = robot_of("stabiliser", tmp_path, 6)
+@pytest.mark.parametrize("engine", ["plane", "mujoco"])
+def test_stabiliser(tmp_path: Path, engine: str):
+    config = with_overlay(robot_of("stabiliser", tmp_path, 6), {"sim": {"world": {"engine": engine}}})
     found = judged(StabiliserWizard(), config, 6)
     assert found == {"pitch_zero", "pitch_direction", "roll_zero", "roll_direction"}
     current = CalibrationStore(config.calibration_folder, config.robot).current()

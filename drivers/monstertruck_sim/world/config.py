@@ -731,8 +731,8 @@ class WorldConfig(Schema):
                 raise ValueError(
                     f"engine mujoco: has no body {self.truck.body.kind}; expected one of {', '.join(SOLID_BODIES)}"
                 )
-            if self.tilt.kind != "ground":
-                raise ValueError(f"engine mujoco: tilt {self.tilt.kind}: the ground tilts the robot; expected ground")
+            if self.tilt.kind == "sinusoid":
+                raise ValueError("engine mujoco: tilt sinusoid: nothing rocks the robot; expected ground or steady")
         elif self.roof is not None:
             raise ValueError("engine plane: nothing sees a tag on the robot; roof needs engine mujoco")
         elif self.camera.rendered:

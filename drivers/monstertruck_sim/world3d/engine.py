@@ -5,7 +5,7 @@ heights by the project's own kernels: MuJoCo's rays cost 0.9 ms a scan against 4
 400 x 400 heights. Only what those kernels do not know, blocks on the ground, is seen by MuJoCo's rays.
 """
 
-from math import hypot
+from math import hypot, radians
 from typing import Final
 
 import mujoco
@@ -106,13 +106,15 @@ class RigidSpace:
         self._scene.set_obstacles(without(self.obstacles, obstacle))
 
     def set_tilt(self, tilt: TiltConfig) -> None:
-        """Not here.
+        """Lift the robot onto blocks, or put it back onto the ground.
 
         Raises:
-            InputError: always, unless the ground is to tilt the robot.
+            InputError: it is to rock, or does not stand so.
         """
-        if tilt.kind != "ground":
-            raise InputError(f"tilt {tilt.kind}: the ground tilts the robot of engine mujoco")
+        if tilt.kind == "sinusoid":
+            raise InputError("tilt sinusoid: nothing rocks the robot of engine mujoco; expected ground or steady")
+        pitch, roll = (tilt.pitch_deg, tilt.roll_deg) if tilt.kind == "steady" else (0.0, 0.0)
+        self._plant.stand(radians(pitch), radians(roll))
 
     def follow(self) -> None:
         """Bring the bodies to where everything is now."""
@@ -337,5 +339,7 @@ def rigid(config: WorldConfig, footprint: PlanOutline, start: Pose, *, lidar: bo
     )  # fmt: skip
     space = RigidSpace(footprint, plant, ground, footprint.name)
     plant.before_steps = space.follow
+    if config.tilt.kind == "steady":
+        space.set_tilt(config.tilt)
     sweep = RigidSweep(plant, space.cast, ground, config.lidar)
     return Engine(plant, space, sweep, RigidEchoes(plant, config.sonar.height))

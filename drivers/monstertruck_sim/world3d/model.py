@@ -29,6 +29,10 @@ SPARE: Final = 24
 """Discs, and boxes, that can be put into a world while it runs; people and other robots are among them."""
 PARKED: Final = -50.0
 """Height at which spare ones wait, m."""
+SUPPORTS: Final = 4
+"""Blocks that can be put under wheels."""
+SUPPORT_SIDES: Final = (0.12, 0.12, 0.4)
+"""Of such a block, m: what of its height is not wanted is below the ground."""
 TALL: Final = 0.6
 """Height of what is put into a world, m."""
 
@@ -48,7 +52,9 @@ class Warnings:
 
 
 # Two geometries touch where a bit of the type of one is in the affinity of the other.
-_GROUND: Final = {"contype": "5", "conaffinity": "2"}
+CARRIES: Final = (5, 2)
+"""Type and affinity of what wheels stand on."""
+_GROUND: Final = {"contype": f"{CARRIES[0]}", "conaffinity": f"{CARRIES[1]}"}
 UPRIGHT: Final = (9, 2)
 """Type and affinity of walls and of what stands in a world."""
 _UPRIGHT: Final = {"contype": f"{UPRIGHT[0]}", "conaffinity": f"{UPRIGHT[1]}"}
@@ -361,6 +367,12 @@ def _spare(world: Element) -> None:
             group = f"{Group.MOVING.value}"
             look = {**_UPRIGHT, "type": shape, "size": size, "group": group, "rgba": "0.8 0.45 0.15 0"}
             SubElement(body, "geom", look, name=f"{kind}_{i}")
+    for i in range(SUPPORTS):
+        name = f"support_{i}"
+        body = SubElement(world, "body", name=name, mocap="true", pos=_text(0.0, 0.0, PARKED))
+        size, nothing = _text(*(side / 2 for side in SUPPORT_SIDES)), {"contype": "0", "conaffinity": "0"}
+        look = {"group": f"{Group.GROUND.value}", "rgba": "0.55 0.5 0.42 1"}
+        SubElement(body, "geom", look, **nothing, name=name, type="box", size=size)
 
 
 def _robot(world: Element, description: Description) -> Element:

@@ -5,7 +5,7 @@ for, so what is commanded up to then is in it.
 """
 
 from collections.abc import Callable, Sequence
-from math import asin, atan2, cos, exp, hypot, sin, tau
+from math import asin, atan2, cos, degrees, exp, hypot, sin, tau
 from typing import ClassVar, Final, NamedTuple
 
 import mujoco
@@ -16,7 +16,17 @@ from monstertruck_runtime.errors import CommandFailedError, InputError
 from monstertruck_sim.world.actuators import RPM
 from monstertruck_sim.world.config import BatteryModelConfig, SimTruckConfig
 from monstertruck_sim.world.plant import GriddedPlant, Pose, Vector
-from monstertruck_sim.world3d.model import HEAD_LAG, TIMESTEP, DriveLine, Group, Warnings
+from monstertruck_sim.world3d.model import (
+    CARRIES,
+    HEAD_LAG,
+    PARKED,
+    SUPPORT_SIDES,
+    SUPPORTS,
+    TIMESTEP,
+    DriveLine,
+    Group,
+    Warnings,
+)
 
 _FREED: Final = 0.005
 _STANDING: Final = 0.01
@@ -27,6 +37,10 @@ _SETTLE: Final = 400
 """Steps that a robot which was put down gets to come to rest."""
 _RESTS: Final = 0.5
 """Speed upwards or downwards that one which came to rest cannot have, m/s."""
+_LOW: Final = 0.002
+"""A wheel that has to be lifted by less stands on the ground, m."""
+_LEANS: Final = 0.1
+"""Further from what its blocks give it a robot does not lean on its springs, rad."""
 _INSIDE: Final = 0.03
 """Depth to which nothing gives way under it, m."""
 _UNSTABLE: Final = (
@@ -114,6 +128,8 @@ class RigidPlant(GriddedPlant):
         self._steered: list[float] = []
         """Servo angles that the steered wheels follow."""
         self._felt = self._turning = self._velocity = (0.0, 0.0, 0.0)
+        self._on_blocks = 0.0, 0.0
+        """Pitch and roll that blocks under its wheels give it, rad."""
         self._solid = np.isin(model.geom_group, (Group.WALLS, Group.MOVING)).tolist()
         self._put(start)
 
@@ -156,6 +172,52 @@ class RigidPlant(GriddedPlant):
         self._trail.clear()
         self._remember()
 
+    def stand(self, pitch: float, roll: float) -> None:
+        """Lift it onto blocks that tilt it so, rad, or off them (0, 0); it keeps its place, and comes to rest there.
+
+        Raises:
+            InputError: it does not stand so, and is as it was.
+        """
+        before, self._on_blocks = self._on_blocks, (pitch, roll)
+        try:
+            self.carry(self._pose)
+            if hypot(self._attitude[0] - pitch, self._attitude[1] - roll) > _LEANS:
+                wanted = f"pitch {degrees(pitch):.0f} deg and roll {degrees(roll):.0f} deg"
+                raise InputError(f"tilt: the robot falls off blocks that give it {wanted}")
+        except InputError:
+            self._on_blocks = before
+            self.carry(self._pose)
+            raise
+
+    def _support(self, pose: Pose) -> float:
+        """Turn the robot as it is to stand, and put blocks below its wheels; height of its base then, m."""
+        model, data = self.model, self.data
+        x, y, yaw = pose
+        (cy, sy), (cp, sp), (cr, sr) = ((cos(angle / 2), sin(angle / 2)) for angle in (yaw, *self._on_blocks))
+        turned = (
+            cr * cp * cy + sr * sp * sy,
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+        )
+        data.qpos[:7] = 0.0, 0.0, 0.0, *turned
+        mujoco.mj_kinematics(model, data)
+        wheels = np.flatnonzero((model.geom_type == mujoco.mjtGeom.mjGEOM_SPHERE) & (model.geom_group == Group.ROBOT))
+        feet = data.geom_xpos[wheels] - np.outer(model.geom_size[wheels, 0], (0.0, 0.0, 1.0))
+        base = -float(feet[:, 2].min())
+        ground = self.ground(x, y)
+        for i in range(SUPPORTS):
+            body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, f"support_{i}")
+            geom, mocap = model.body_geomadr[body], model.body_mocapid[body]
+            ahead, aside, rise = (x, y, base) + feet[i] if i < len(feet) else np.zeros(3)
+            used = rise > _LOW
+            kind, affinity = CARRIES if used else (0, 0)
+            model.geom_contype[geom] = model.body_contype[body] = kind
+            model.geom_conaffinity[geom] = model.body_conaffinity[body] = affinity
+            data.mocap_pos[mocap] = ahead, aside, (ground + rise if used else PARKED) - SUPPORT_SIDES[2] / 2
+            data.mocap_quat[mocap] = cy, 0.0, 0.0, sy
+        return ground + base
+
     def _put(self, pose: Pose) -> None:
         """Let it settle on its springs at a pose, held in its place.
 
@@ -168,8 +230,7 @@ class RigidPlant(GriddedPlant):
         data.mocap_pos[:], data.mocap_quat[:] = around
         x, y, yaw = pose
         self._wound = [0.0] * len(self.shafts)
-        data.qpos[:3] = x, y, self.ground(x, y) + 0.002
-        data.qpos[3:7] = cos(yaw / 2), 0.0, 0.0, sin(yaw / 2)
+        data.qpos[:3] = x, y, self._support(pose) + 0.002
         self._steered = []
         self._deflection = [0.0] * len(self._deflection)
         self._command(0.0, [servo.angle for servo in self._servos])

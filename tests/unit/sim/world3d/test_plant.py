@@ -11,7 +11,15 @@ from monstertruck_kinematics.polynomials import SteeringPolynomials
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.base import Pose2D
-from monstertruck_sim.world.config import MechanicsConfig, RoughPatch, SimTruckConfig, SinusoidTilt, WorldConfig
+from monstertruck_sim.world.config import (
+    GroundTilt,
+    MechanicsConfig,
+    RoughPatch,
+    SimTruckConfig,
+    SinusoidTilt,
+    SteadyTilt,
+    WorldConfig,
+)
 from monstertruck_sim.world.obstacles import Box, Disc
 from monstertruck_sim.world.world import World
 
@@ -350,7 +358,7 @@ def test_the_mount_of_the_plane_feels_nothing(field):
             {"truck": {"body": {"kind": "synchro"}}},
             "has no body synchro; expected one of truck, ackermann, skid_steer, differential, omni, mecanum",
         ),
-        ({"tilt": {"kind": "sinusoid"}}, "the ground tilts the robot"),
+        ({"tilt": {"kind": "sinusoid"}}, "nothing rocks the robot"),
     ],
 )
 def test_what_the_engine_cannot_do_is_refused(config, text):
@@ -358,10 +366,41 @@ def test_what_the_engine_cannot_do_is_refused(config, text):
         WorldConfig.model_validate({"engine": "mujoco", **config})
 
 
-def test_a_commanded_tilt_is_refused(solid):
+def test_nothing_rocks_it(solid):
     driver = solid()
-    with pytest.raises(InputError, match="the ground tilts the robot"):
+    with pytest.raises(InputError, match="nothing rocks the robot"):
         driver.world.set_tilt(driver.now, SinusoidTilt(kind="sinusoid"))
+
+
+@pytest.mark.parametrize(("pitch", "roll"), [(9.0, 0.0), (0.0, 11.0), (-6.0, -6.0)])
+def test_on_blocks_it_leans_as_high_as_they_are_and_stands(solid, pitch, roll):
+    driver = solid(start=(1.0, 0.5, 0.7))
+    driver.world.set_tilt(driver.now, SteadyTilt(kind="steady", pitch_deg=pitch, roll_deg=roll))
+    before = driver.wait(1.0)
+    truth = driver.wait(1.0)
+    assert (degrees(truth.pitch), degrees(truth.roll)) == pytest.approx((pitch, roll), abs=0.8), "its springs give"
+    assert (truth.x, truth.y, truth.yaw) == pytest.approx((before.x, before.y, before.yaw), abs=1e-4)
+    assert (truth.x, truth.y) == pytest.approx((1.0, 0.5), abs=0.02), "let go it settles on its springs"
+    driver.world.set_tilt(driver.now, GroundTilt())
+    truth = driver.wait(1.0)
+    assert (truth.pitch, truth.roll) == pytest.approx((0.0, 0.0), abs=1e-3)
+
+
+def test_it_drives_off_the_blocks_that_it_began_on(solid):
+    driver = solid(tilt=SteadyTilt(kind="steady", pitch_deg=9.0))
+    assert degrees(driver.wait(0.5).pitch) > 8.0
+    driver.drive(0.3)
+    truth = driver.wait(3.0)
+    assert abs(degrees(truth.pitch)) < 0.5
+    assert truth.x > 0.5
+
+
+def test_blocks_on_which_it_cannot_stand_are_refused_and_it_stays_where_it_was(solid):
+    driver = solid()
+    with pytest.raises(InputError, match="falls off blocks that give it pitch 0 deg and roll 80 deg"):
+        driver.world.set_tilt(driver.now, SteadyTilt(kind="steady", roll_deg=80.0))
+    truth = driver.wait(0.5)
+    assert (truth.x, truth.y, truth.pitch, truth.roll) == pytest.approx((0.0, 0.0, 0.0, 0.0), abs=1e-3)
 
 
 def test_people_walk_into_it_and_are_felt():
