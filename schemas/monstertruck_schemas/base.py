@@ -6,6 +6,7 @@ Units are SI and radians everywhere; frames follow REP 103 (x forward, y left, z
 
 import ast
 import inspect
+import math
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -203,6 +204,17 @@ Covariance = Annotated[NDArray[np.float64], *_array_type(np.float64, "number", 9
 """Shape (9,): that of three values, row-major."""
 UInt8Array = Annotated[NDArray[np.uint8], *_array_type(np.uint8, "integer")]
 Int8Array = Annotated[NDArray[np.int8], *_array_type(np.int8, "integer")]
+
+
+def position_deviation(covariance: NDArray[np.float64]) -> float:
+    """Standard deviation of a position along the axis where it is largest, m.
+
+    Args:
+        covariance: of (x, y, yaw), shape (9,) or (3, 3).
+    """
+    xx, xy, _, _, yy, *_ = np.ravel(covariance).tolist()
+    return math.sqrt(max((xx + yy) / 2 + math.hypot((xx - yy) / 2, xy), 0.0))
+
 
 Nanoseconds = Annotated[int, Field(ge=-(2**63), lt=2**63)]
 """Nanoseconds of CLOCK_MONOTONIC (of the daemon's clock: wall, virtual or replay)."""

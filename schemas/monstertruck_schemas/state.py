@@ -1,6 +1,5 @@
 """Messages of the ``state`` group: what the robot believes and in which state it is."""
 
-import math
 from enum import StrEnum
 from typing import Annotated, Final
 
@@ -16,6 +15,7 @@ from monstertruck_schemas.base import (
     Schema,
     Twist2D,
     UInt8Array,
+    position_deviation,
 )
 from monstertruck_schemas.reasons import Reason, in_words
 from monstertruck_schemas.req import DriveForm, Role
@@ -41,8 +41,7 @@ class Odometry(Message):
     @property
     def position_deviation(self) -> float:
         """Standard deviation of the position along the axis where it is largest, m."""
-        xx, xy, yy = self.pose_covariance[0], self.pose_covariance[1], self.pose_covariance[4]
-        return math.sqrt(max(0.0, (xx + yy) / 2 + math.hypot((xx - yy) / 2, xy)))
+        return position_deviation(self.pose_covariance)
 
 
 class Peer(Schema):

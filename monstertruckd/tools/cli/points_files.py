@@ -8,30 +8,23 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 from monstertruck_runtime.yaml_files import yaml_text
+from monstertruck_schemas.base import position_deviation
 from monstertruck_schemas.points import PointOfInterest
 
 FORMATS: Final = (".csv", ".geojson", ".yaml")
 COLUMNS: Final = ("name", "kind", "tag", "x_m", "y_m", "z_m", "yaw_rad", "sigma_m", "sigma_yaw_rad", "sightings")
 
 
-def sigma(point: PointOfInterest) -> float:
-    """Standard deviation of its position, m: the root of the greater variance of its ellipse."""
-    a, b, c = float(point.covariance[0]), float(point.covariance[1]), float(point.covariance[4])
-    return math.sqrt((a + c) / 2 + math.hypot((a - c) / 2, b))
-
-
 def row_of(point: PointOfInterest) -> tuple[str, ...]:
     """Name and numbers for a table."""
-    return (
-        point.name, f"{point.x:.2f}", f"{point.y:.2f}", f"{point.yaw:.2f}", f"{100 * sigma(point):.1f}",
-        str(point.sightings),
-    )  # fmt: skip
+    place = (f"{value:.2f}" for value in (point.x, point.y, point.yaw))
+    return point.name, *place, f"{100 * position_deviation(point.covariance):.1f}", str(point.sightings)
 
 
 def values_of(point: PointOfInterest) -> dict[str, Any]:
     """What is exported, by ``COLUMNS``."""
     yaw_sigma = math.sqrt(float(point.covariance[8]))
-    numbers = (point.x, point.y, point.z, point.yaw, sigma(point), yaw_sigma)
+    numbers = (point.x, point.y, point.z, point.yaw, position_deviation(point.covariance), yaw_sigma)
     values = (point.name, point.kind.value, point.tag, *(round(number, 4) for number in numbers), point.sightings)
     return dict(zip(COLUMNS, values, strict=True))
 

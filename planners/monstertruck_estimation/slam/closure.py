@@ -575,36 +575,40 @@ def _view(points):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
 
 
 @njit(cache=True)
+def _sight(view, x, y):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+    """Of a point: 0 if it is not in view, 1 if it was seen, 2 if it is in view and was looked through."""
+    limit = view[_sector(x, y)]
+    r = math.hypot(x, y)
+    gap = VIEW_MARGIN + VIEW_SLACK * r
+    if limit <= 0 or r >= limit + gap:
+        return 0
+    return 2 if r < limit - gap else 1
+
+
+@njit(cache=True)
 def _looked_through(view, points):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+    """How many points were looked through, and how many are in view."""
     through, judged = 0, 0
     for i in range(points.shape[0]):
-        limit = view[_sector(points[i, 0], points[i, 1])]
-        r = math.hypot(points[i, 0], points[i, 1])
-        gap = VIEW_MARGIN + VIEW_SLACK * r
-        if limit > 0 and r < limit + gap:
-            judged += 1
-            if r < limit - gap:
-                through += 1
+        sight = _sight(view, points[i, 0], points[i, 1])
+        judged += sight > 0
+        through += sight == 2
     return through, judged
 
 
 @njit(cache=True)
 def _vote(view, points, votes):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
-    """Count for every point in view whether it is looked through, or not: columns of ``votes``."""
+    """Count for every point in view whether it was looked through (column 0 of ``votes``) or seen (column 1)."""
     for i in range(points.shape[0]):
-        limit = view[_sector(points[i, 0], points[i, 1])]
-        r = math.hypot(points[i, 0], points[i, 1])
-        gap = VIEW_MARGIN + VIEW_SLACK * r
-        if limit > 0 and r < limit + gap:
-            votes[i, 0 if r < limit - gap else 1] += 1
+        sight = _sight(view, points[i, 0], points[i, 1])
+        if sight > 0:
+            votes[i, 2 - sight] += 1
 
 
 @njit(cache=True)
 def _mark_seen(view, points, seen):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
     for i in range(points.shape[0]):
-        limit = view[_sector(points[i, 0], points[i, 1])]
-        r = math.hypot(points[i, 0], points[i, 1])
-        if limit > 0 and r < limit + VIEW_MARGIN + VIEW_SLACK * r:
+        if _sight(view, points[i, 0], points[i, 1]) > 0:
             seen[i] = True
 
 

@@ -11,6 +11,7 @@ from monstertruck_estimation.slam.correlation import Submap, correlate
 from monstertruck_estimation.slam.registration import Fit, register
 from monstertruck_estimation.slam.scans import Scan
 from monstertruck_kinematics.elementary import Array
+from monstertruck_schemas.base import position_deviation
 
 MIN_PAIRS: Final = 12
 """Fewest corresponding pairs of an accepted match."""
@@ -170,9 +171,7 @@ def rejected(guess: Array, covariance: Array, verdict: MatchStatus) -> ScanMatch
 
 def deviations(covariance: Array) -> tuple[float, float]:
     """Greatest standard deviation of the position (m) and that of the yaw (rad)."""
-    (a, b), (_, d) = covariance[:2, :2].tolist()
-    greatest = (a + d) / 2 + math.hypot((a - d) / 2, b)
-    return math.sqrt(max(greatest, 0.0)), math.sqrt(max(float(covariance[2, 2]), 0.0))
+    return position_deviation(covariance), math.sqrt(max(float(covariance[2, 2]), 0.0))
 
 
 def degeneracy(information: Array) -> tuple[float, float]:

@@ -13,7 +13,6 @@ from monstertruck_planners.goals.exchange import (
     LocalRoute,
     PlanAnswer,
     Setup,
-    deviation_of,
     level,
     pose_of,
     twist_of,
@@ -200,7 +199,7 @@ class RouteDeformation:
             setup=self._setup if self._fresh else None,
             grid=grid if self._fresh or grid is not self._sent_grid else None,
             way=way,
-            deviation=deviation_of(odometry),
+            deviation=odometry.position_deviation,
             stamp=odometry.stamp,
             twist=twist_of(odometry),
         )

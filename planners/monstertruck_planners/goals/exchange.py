@@ -1,6 +1,5 @@
 """Inputs and outputs of the planning step and the deforming step; light, as the daemon's loop imports them."""
 
-import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -154,12 +153,6 @@ class DeformAnswer:
 def level(scan: LaserScan, config: PlannerConfig) -> bool:
     """Whether a scan lay flat enough to tell of the way, as far as it is known."""
     return scan.tilt is None or scan.tilt <= config.max_tilt
-
-
-def deviation_of(odometry: Odometry) -> float:
-    """Standard deviation of the position in the direction in which it is known worst, m."""
-    (xx, xy, _), (_, yy, _), _ = odometry.pose_covariance.reshape(3, 3).tolist()
-    return math.sqrt(max((xx + yy) / 2 + math.hypot((xx - yy) / 2, xy), 0.0))
 
 
 def explained_within(config: PlannerConfig, deviation: float) -> float:

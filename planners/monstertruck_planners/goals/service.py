@@ -20,7 +20,6 @@ from monstertruck_planners.goals.exchange import (
     Pose,
     SeenScan,
     Setup,
-    deviation_of,
     level,
     pose_of,
     twist_of,
@@ -358,7 +357,7 @@ class GoalService:
             clear=plan.clear,
             afresh=plan.afresh,
             via=run.via,
-            deviation=deviation_of(odometry),
+            deviation=odometry.position_deviation,
             seen=seen,
         )
         self._fresh, self._sent_grid, self._sent_ground = False, grid, ground
