@@ -270,7 +270,7 @@ def lidar_fit(rng: np.random.Generator) -> list[Verdict]:
             seen = lidar.seen_motion(actual, np.array((way,)), np.array((turn,)), np.zeros(1))[0]
             seen[:2] += sigma * rng.normal(size=2)
             legs.append(lidar.LidarLeg(way, (float(seen[0]), float(seen[1]), float(seen[2])), sigma))
-    offset = lidar.Offset(Interval(0.0, 0.01), 100, None)
+    offset = lidar.Offset(Interval(0.0, 0.01), 100)
     result = lidar.result_of(legs, (0.14, 0.0, 0.0), error, offset)
     return judged(result, {"x": float(x), "y": float(y), "yaw": float(yaw)})
 

@@ -509,11 +509,6 @@ class YamlText:
         node = self.node(*key)
         return node.value if isinstance(node, ScalarNode) else None
 
-    def names(self, *key: str) -> list[str]:
-        """Keys of the mapping at ``key``; none if there is no mapping."""
-        node = self.node(*key) if key else self.root
-        return [name.value for name, _ in node.value] if isinstance(node, MappingNode) else []
-
     def replace(self, key: tuple[str, ...], text: str) -> bool:
         """Write ``text`` where the value at ``key`` stands; False if there is none."""
         node = self.node(*key)

@@ -17,13 +17,11 @@ class FitResult:
         standard_errors: (n,) of the parameters, from the curvature at the optimum and the residuals' spread; infinite
             for a parameter on its bound or not determined by the data.
         residuals: (m,) unweighted residuals at the optimum.
-        iterations: steps taken.
     """
 
     parameters: Array
     standard_errors: Array
     residuals: Array
-    iterations: int
 
     @property
     def rms(self) -> float:
@@ -58,14 +56,14 @@ def least_squares(
     Raises:
         KinematicsError: start outside the bounds, fewer residuals than parameters, or residuals that are not finite.
     """
-    point, value, taken = _solve(residual, start, lower, upper, huber, iterations)
-    return FitResult(point, _standard_errors(residual, point, lower, upper, value, huber), value, taken)
+    point, value = _solve(residual, start, lower, upper, huber, iterations)
+    return FitResult(point, _standard_errors(residual, point, lower, upper, value, huber), value)
 
 
 def _solve(
     residual: Callable[[Array], Array], start: Array, lower: Array, upper: Array, huber: float | None, iterations: int
-) -> tuple[Array, Array, int]:
-    """Optimum, its residuals and the steps taken."""
+) -> tuple[Array, Array]:
+    """Optimum and its residuals."""
     point = np.array(start, dtype=np.float64)
     if ((point < lower) | (point > upper)).any():
         raise KinematicsError(f"start {point.tolist()} is outside the bounds")
@@ -74,9 +72,9 @@ def _solve(
         raise KinematicsError(f"{value.size} residuals cannot determine {point.size} parameters")
     if not np.isfinite(value).all():
         raise KinematicsError("residuals are not finite at the start")
-    damping, taken = 1e-3, 0
+    damping = 1e-3
     cost = _cost(value, huber)
-    while taken < iterations:
+    for _ in range(iterations):
         jacobian = _slopes(residual, point, lower, upper)
         weights = _weights(value, huber)
         gradient = jacobian.T @ (weights * value)
@@ -98,13 +96,12 @@ def _solve(
             damping = max(damping / 5.0, 1e-9) if improved else damping * 4.0
         if not improved:
             break
-        taken += 1
         settled = cost - trial_cost <= 1e-15 * cost
         point, value, cost = trial, moved, trial_cost
         damping = min(damping, 1.0)
         if settled:
             break
-    return point, value, taken
+    return point, value
 
 
 def minimax(
@@ -115,7 +112,7 @@ def minimax(
     The largest residual found exceeds the true optimum by less than m^(1/2^rounds). Standard errors have no meaning
     here and are infinite. Arguments and errors as ``least_squares``.
     """
-    point, _, steps = _solve(residual, start, lower, upper, None, 200)
+    point, _ = _solve(residual, start, lower, upper, None, 200)
     for power in range(1, rounds):
         height = np.abs(residual(point)).max()
         if height < 1e-9:
@@ -127,11 +124,10 @@ def minimax(
             exponent = half * np.log(np.maximum(np.abs(relative), 1e-300))
             return np.asarray(np.sign(relative) * np.exp(np.minimum(exponent, 300.0)))
 
-        sharper, _, taken = _solve(raised, point, lower, upper, None, 60)
-        steps += taken
+        sharper, _ = _solve(raised, point, lower, upper, None, 60)
         if np.abs(residual(sharper)).max() <= height:
             point = sharper
-    return FitResult(point, np.full(point.size, np.inf), residual(point), steps)
+    return FitResult(point, np.full(point.size, np.inf), residual(point))
 
 
 def _cost(value: Array, huber: float | None) -> float:

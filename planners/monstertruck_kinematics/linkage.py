@@ -17,7 +17,6 @@ from monstertruck_kinematics.elementary import (
     asin,
     atan,
     atan2,
-    clip,
     cos,
     require_finite,
     require_positive,
@@ -26,8 +25,6 @@ from monstertruck_kinematics.elementary import (
     sqrt,
 )
 from monstertruck_kinematics.truck import FourWheelSteering, least_squares_motion
-
-_NEWTON_STEPS = 50
 
 
 @dataclass(frozen=True)
@@ -122,26 +119,6 @@ class SteeringLinkage:
         """Left and right wheel angles at a servo angle."""
         left = self.left_from_servo(servo)
         return left, self.right_from_left(left)
-
-    def servo_from_left(self, left: Real) -> Real:
-        """Servo angle that puts the left wheel at ``left``: exact inverse within +-90 deg of servo angle.
-
-        Raises:
-            KinematicsError: no servo angle does, or NaN.
-        """
-        require_finite("left", left)
-        target = self.arm * (sin(self._side * left - self.arm_angle) + math.sin(self.arm_angle))
-        servo = asin(clip(target / self.pitman, -1.0, 1.0))
-        edge = 0.5 * math.pi
-        for _ in range(_NEWTON_STEPS):
-            lift = self.pitman * (1.0 - cos(servo))
-            root = sqrt(self.drag_link * self.drag_link - lift * lift)
-            error = root + self.pitman * sin(servo) - self.drag_link - target
-            slope = self.pitman * (cos(servo) - lift * sin(servo) / root)
-            servo = clip(servo - error / clip(slope, 1e-3 * self.pitman, math.inf), -edge, edge)
-        miss = abs(error) / self.arm
-        require_within("left: wheel angle out of the servo's reach, miss", miss, 0.0, 1e-9)
-        return self._side * servo
 
 
 def common_motion(

@@ -57,8 +57,6 @@ class AxlePolynomials:
     servo_limit: float = SERVO_LIMIT
     axle_limits: tuple[float, float] = field(init=False)
     """Axle angles at the servo's two ends, (right, left) = (negative, positive)."""
-    left_limits: tuple[float, float] = field(init=False)
-    """Left wheel angles at the servo's two ends."""
     _slopes: tuple[Coefficients, Coefficients] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -69,7 +67,6 @@ class AxlePolynomials:
         axle = self.axle_from_left(left)
         if not (np.diff(left) > 0.0).all() or not (np.diff(axle) > 0.0).all():
             raise KinematicsError("left_from_servo, right_from_left: expected angles that grow with the servo angle")
-        object.__setattr__(self, "left_limits", (float(left[0]), float(left[-1])))
         object.__setattr__(self, "axle_limits", (float(axle[0]), float(axle[-1])))
 
     def left_of(self, servo: Real) -> Real:
@@ -119,25 +116,6 @@ class AxlePolynomials:
             error = 0.5 * (left_tangent + right_tangent) - target
             slope = 1.0 + left_tangent * left_tangent + (1.0 + right_tangent * right_tangent) * polynomial(dg, left)
             moved = clip(servo - 2.0 * error / (slope * polynomial(df, servo)), -self.servo_limit, self.servo_limit)
-            done = _converged(moved, servo)
-            servo = moved
-            if done:
-                break
-        return servo
-
-    def servo_from_left(self, left: Real) -> Real:
-        """Exact inverse of f: servo angle that puts the left wheel at ``left``.
-
-        Raises:
-            KinematicsError: outside ``left_limits``, or NaN.
-        """
-        require_within("left", left, *self.left_limits)
-        f, df = self.left_from_servo, self._slopes[0]
-        servo = clip(left / f[-2], -self.servo_limit, self.servo_limit)
-        for _ in range(_NEWTON_STEPS):
-            moved = clip(
-                servo - (polynomial(f, servo) - left) / polynomial(df, servo), -self.servo_limit, self.servo_limit
-            )
             done = _converged(moved, servo)
             servo = moved
             if done:

@@ -92,13 +92,13 @@ class EmulatedUsb:
 
     # What there is
 
-    def add_hub(self, name: str, *, ports: int = 4, usb_id: str = "05e3:0608", title: str = "USB2.0 Hub") -> None:
+    def add_hub(self, name: str, *, ports: int = 4) -> None:
         """Create a hub and plug it in; root hubs come by themselves."""
         hub = parent_of(name)
         if hub is not None and hub.startswith("usb") and hub not in self._devices:
             self._devices[hub] = _HubOrDevice(hub, "1d6b:0002", "xHCI Host Controller", None, ports=8)
             self.plug(hub)
-        self._devices[name] = _HubOrDevice(name, usb_id, title, None, ports=ports)
+        self._devices[name] = _HubOrDevice(name, "05e3:0608", "USB2.0 Hub", None, ports=ports)
         self.plug(name)
 
     def add_device(

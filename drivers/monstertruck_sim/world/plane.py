@@ -99,7 +99,7 @@ class PlaneSpace:
     """
 
     def __init__(self, footprint: PlanOutline, config: WorldConfig) -> None:
-        self._footprint, self._scene, self._truck = footprint, footprint.scene, config.truck
+        self._scene, self._truck = footprint.scene, config.truck
         self.contact, self.cast = footprint.overlap, footprint.cast
         profile = self._scene.place.profile
         uneven = profile is not None or bool(config.rough)

@@ -128,8 +128,6 @@ class Offset:
     value: Interval
     """s."""
     samples: int
-    coarse: float | None
-    """By the correlation that the map uses, s; None = none that it would report."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -465,7 +463,7 @@ def fit_offset(series: Sequence[tuple[Array, Array, Array, Array]], coarse: floa
 
     fit = least_squares(residual, np.array((coarse or 0.0,)), np.array((-0.65,)), np.array((0.65,)))
     half = NORMAL * correlation_factor(fit.residuals) * float(fit.standard_errors[0])
-    return Offset(Interval(float(fit.parameters[0]), half), fit.residuals.size, coarse)
+    return Offset(Interval(float(fit.parameters[0]), half), fit.residuals.size)
 
 
 def _yaws(record: MoveRecord) -> tuple[Array, Array, Array, Array, Array] | None:

@@ -274,9 +274,6 @@ class _ScenarioRun:
             return False
         return True
 
-    def _armed(self) -> bool:
-        return self.truck.gate is not None and self.truck.gate.mode.active
-
     def _drivable(self) -> bool:
         return not self.truck.blockers()
 

@@ -27,13 +27,13 @@ FLAGS: Final = {False: cv2.IMREAD_GRAYSCALE, True: cv2.IMREAD_COLOR}
 """Of OpenCV's readers, by whether there is colour."""
 
 
-def pictures_in(folder: Path, *, colour: bool = False) -> list[Picture]:
-    """All pictures of a folder in the order of their names, grey or blue, green and red.
+def pictures_in(folder: Path) -> list[Picture]:
+    """All pictures of a folder in the order of their names, grey.
 
     Raises:
         InputError: there is none, or one cannot be read.
     """
-    return [_read(path, colour=colour) for path in _files(folder)]
+    return [_read(path, colour=False) for path in _files(folder)]
 
 
 def _files(folder: Path) -> list[Path]:

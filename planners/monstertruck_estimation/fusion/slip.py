@@ -77,8 +77,6 @@ class SlipDetector:
         self.slipping = False
         self.doubted = False
         """The last scan is rejected."""
-        self.distance = 0.0
-        """Last distance between the two, in standard deviations."""
 
     def wheels(self, way: WheelMeasurement) -> SlipChange | None:
         """Take the motion of the wheels; returns the end of a slip that nothing can confirm any longer."""
@@ -209,7 +207,6 @@ class SlipDetector:
         )
 
     def _prove(self, distance: float) -> None:
-        self.distance = distance
         self.doubted = distance > self._config.gate
         if distance < self._config.release:
             self._unproven -= 1
@@ -219,7 +216,6 @@ class SlipDetector:
             self._unproven = self._config.calm
 
     def _judged(self, distance: float, since: int, text: str) -> SlipChange | None:
-        self.distance = distance
         config = self._config
         if not self.slipping:
             self._suspicious = self._suspicious + 1 if distance > config.gate else 0

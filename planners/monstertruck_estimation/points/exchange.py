@@ -58,7 +58,5 @@ class ReadAnswer:
     """What a picture shows."""
 
     readings: tuple[TagReading, ...] = ()
-    refused: int = 0
-    """Tags too far away, too oblique or not clear enough."""
     unreadable: bool = False
     """The picture is none."""

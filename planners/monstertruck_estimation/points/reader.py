@@ -42,17 +42,15 @@ class ReadingStep:
         if colour is None:
             return ReadAnswer(unreadable=True)
         grey: Picture = np.asarray(cv2.cvtColor(colour, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
-        found, refused = [], 0
+        found = []
         lens = Lens.of(task.lens, grey.shape[1], grey.shape[0])
         for sighting in self._reader.read(grey):
             margin = decode_margin(grey, sighting)
             reading = placed(sighting, task.sizes.get(sighting.tag, task.size), lens, margin)
             near = reading is not None and float(np.linalg.norm(reading.middle)) <= task.reach
-            if reading is None or margin < task.margin or not near or reading.angle > task.angle:
-                refused += 1
-                continue
-            found.append(_with_picture(reading, colour, sighting))
-        return ReadAnswer(tuple(found), refused)
+            if reading is not None and near and margin >= task.margin and reading.angle <= task.angle:
+                found.append(_with_picture(reading, colour, sighting))
+        return ReadAnswer(tuple(found))
 
 
 def decode_margin(grey: Picture, sighting: Sighting) -> float:

@@ -134,7 +134,7 @@ class PointService:
         self._config, self._clock, self._actor, self._in = config, clock, actor, inputs
         mount, self._lens = (Mount(), LensConfig()) if camera is None else camera
         self._ask, self._out, self._events, self._folders = ask, out, events, folders
-        self._offload, self._max_age = offload, max_age
+        self._offload = offload
         self._map = PointMap(config, mount)
         self._sequences = Sequences(max_age)
         self._history: deque[_Placed] = deque(maxlen=HISTORY)

@@ -64,8 +64,6 @@ class PointSighting:
     """Direction it faces, in base, rad."""
     spread: tuple[float, ...]
     """Row-major (3, 3), covariance of x, y, yaw in base."""
-    pixels: float = 0.0
-    """Side of the tag."""
     worth: int = 1
     """Sightings that it stands for."""
 
@@ -249,7 +247,7 @@ def sighting(
     spread += by_turn @ into @ covariance @ into.T @ by_turn.T
     yaw = math.atan2(normal[1], normal[0])
     x, y, z = (float(v) for v in place)
-    return PointSighting(stamp, base, (x, y, z), yaw, tuple(spread.ravel().tolist()), reading.pixels)
+    return PointSighting(stamp, base, (x, y, z), yaw, tuple(spread.ravel().tolist()))
 
 
 def fused(sightings: Sequence[PointSighting], bases: Bases, config: PointsConfig) -> tuple[Array, float, Array]:

@@ -173,7 +173,7 @@ class Move:
     reads: ClassVar[tuple[Topic[Any], ...]] = (ODOMETRY, GATE)
 
     def __init__(self, config: MoveConfig, body: BehaviourBody) -> None:
-        self._config, self._move, self._amounts = config, config.move(), config.amounts
+        self._move, self._amounts = config.move(), config.amounts
         self._direction = self._move.direction
         self._twist = require_possible(self._move, body)
         """Of base, at unit pace."""

@@ -101,11 +101,6 @@ class LocalPlan:
     """Detail of the reason."""
     statistics: dict[str, float] = field(default_factory=dict)
 
-    @property
-    def ok(self) -> bool:
-        """Whether there is a path."""
-        return self.path is not None
-
 
 class LocalPlanner(Protocol):
     """Pure: equal arguments give equal results."""

@@ -197,7 +197,6 @@ def test_the_configuration_in_a_log_of_0_1_0_is_read(release_0_1_0: Path):
 
 def test_edits_touch_nothing_else():
     text = YamlText('a:   # one\n  - b: 1\n  - c\n\n# two\nd: "x" # three\n', Path("x.yaml"))
-    assert text.names() == ["a", "d"]
     assert (text.value("d"), text.value("a"), text.value("d", "e")) == ("x", None, None)
     assert text.replace(("a",), "[]")
     assert text.text == 'a:   # one\n  []\n\n# two\nd: "x" # three\n'

@@ -79,7 +79,6 @@ def test_inverse_is_exact_everywhere(name):
     for axle in (SteeringPolynomials.named(name).front, SteeringPolynomials.named(name).rear):
         servo = np.linspace(-axle.servo_limit, axle.servo_limit, 4001)
         np.testing.assert_allclose(axle.servo_from_axle(axle.axle_from_servo(servo)), servo, atol=1e-14)
-        np.testing.assert_allclose(axle.servo_from_left(axle.left_of(servo)), servo, atol=1e-14)
         angle = np.linspace(*axle.axle_limits, 4001)
         np.testing.assert_allclose(axle.axle_from_servo(axle.servo_from_axle(angle)), angle, atol=1e-14)
 
@@ -141,8 +140,6 @@ def test_bad_input_is_named():
         axle.servo_from_axle(math.nan)
     with pytest.raises(KinematicsError, match=r"axle\[1\] is 0\.6"):
         axle.servo_from_axle(np.array([0.1, 0.6]))
-    with pytest.raises(KinematicsError, match="left is 1"):
-        axle.servo_from_left(1.0)
     with pytest.raises(KinematicsError, match="2017"):
         SteeringPolynomials.named("2017")
     with pytest.raises(KinematicsError, match="left_from_servo"):
