@@ -38,8 +38,8 @@ WIDE_OVERLAP_GAIN: Final = 0.15
 WIDE_FACTOR: Final = 3.0
 """Factor on the standard deviation of the predicted pose in the wide search."""
 SPACING: Final = 0.04
-"""About one point of a scan is matched per square of this edge, m, as keyframes have them: by beams, a person or robot
-beside the lidar would outweigh all walls."""
+"""One point of a scan is matched per square of this edge, m, the mean of those in it: by beams, a person or robot beside
+the lidar would outweigh all walls."""
 COARSE_POINTS: Final = 160
 """Points of a scan used in the correlative search."""
 LEVELS: Final = 4
@@ -118,7 +118,7 @@ class PlanarMatcher:
 
     def match(self, scan: Scan, delta: Array, guess: Array, covariance: Array, submap: Submap) -> ScanMatch:
         """See ``ScanMatcher``."""
-        scan = scan.downsampled(SPACING, len(scan))
+        scan = scan.averaged(SPACING)
         if len(scan) < MIN_PAIRS or len(submap.cloud) < MIN_PAIRS:
             return rejected(guess, covariance, MatchStatus.EMPTY)
         match = self._match_in_window(scan, guess, covariance, submap)

@@ -79,6 +79,24 @@ class Scan:
             kept = kept[np.linspace(0, len(kept) - 1, most).astype(np.intp)]
         return self.chosen(kept)
 
+    def averaged(self, cell: float) -> "Scan":
+        """The mean of the points in every square of ``cell`` that face the same quarter, each as unsure as one point."""
+        if not len(self):
+            return self
+        squares = np.floor(self.points / cell).astype(np.int64)
+        quarters = np.floor(np.arctan2(self.normals[:, 1], self.normals[:, 0]) / (math.pi / 2)).astype(np.int64)
+        keys = np.column_stack((squares, quarters)) @ np.array((8_000_000, 8, 1))
+        _, first, group, counts = np.unique(keys, return_index=True, return_inverse=True, return_counts=True)
+        order = np.argsort(first)
+
+        def mean(values: Array) -> Array:
+            sums = np.stack([np.bincount(group, column) for column in values.T], axis=1)
+            return np.ascontiguousarray((sums / counts[:, None])[order])
+
+        normals = mean(self.normals)
+        normals /= np.hypot(normals[:, 0], normals[:, 1])[:, None]
+        return Scan(mean(self.points), normals, mean(self.variances), mean(self.extents[:, None])[:, 0])
+
     def chosen(self, kept: NDArray[np.intp] | NDArray[np.bool_]) -> "Scan":
         """The marked or numbered points."""
         return Scan(self.points[kept], self.normals[kept], self.variances[kept], self.extents[kept])

@@ -41,7 +41,7 @@ def test_a_thing_that_moves_beside_the_lidar_does_not_take_the_pose_along(moved)
     now = scan([*hall, *box(0.4 + moved, -0.2, 0.6 + moved, 0.3)], np.zeros(3))
     match = PlanarMatcher().match(now, np.zeros(3), np.zeros(3), np.diag((0.05**2, 0.05**2, 0.05**2)), submap)
     assert match.accepted
-    assert match.pose == pytest.approx(np.zeros(3), abs=0.022)  # by beams, a quarter of them, it took the pose along
+    assert match.pose == pytest.approx(np.zeros(3), abs=0.03)  # by beams, a quarter of them, it took the pose along
 
 
 def test_the_search_returns_the_greatest_score_of_its_window():

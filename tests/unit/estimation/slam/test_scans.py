@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from monstertruck_estimation.slam.scans import ScanGeometry, downsample_indices, prepare
+from monstertruck_estimation.slam.scans import Scan, ScanGeometry, downsample_indices, prepare
 from tests.unit.estimation.slam.kit import BEAMS, LIDAR, ROOM, ranges
 
 FAN = ScanGeometry(-math.pi / 2, math.pi / 180, 0.1, 30.0)
@@ -79,3 +79,22 @@ def test_the_points_that_are_kept_of_a_wall_lie_on_it_on_average(slope):
     points = along[:, None] * wall + off[:, None] * (-wall[1], wall[0])
     kept = downsample_indices(points, 0.04)
     assert np.mean(off[kept]) == pytest.approx(0.0, abs=3 * 0.012 / math.sqrt(len(kept)))
+
+
+def test_points_of_one_square_are_averaged_and_both_sides_of_a_wall_stay_apart():
+    rng = np.random.default_rng(3)
+    x = np.linspace(0.0, 0.2, 200, endpoint=False)
+    near = np.column_stack((x, 1.0 + rng.normal(0.0, 0.005, len(x))))
+    far = near + (0.0, 0.009)
+    down, up = np.tile((0.0, -1.0), (len(x), 1)), np.tile((0.0, 1.0), (len(x), 1))
+    variances, extents = np.tile((0.01, 25.0), (2 * len(x), 1)), np.full(2 * len(x), 0.001)
+    scan = Scan(np.concatenate((near, far)), np.concatenate((down, up)), variances, extents)
+    few = scan.averaged(0.2)
+    below, above = few.points[few.normals[:, 1] < 0], few.points[few.normals[:, 1] > 0]
+    assert 1 <= len(below) <= 2
+    assert 1 <= len(above) <= 2
+    assert few.variances[0] == pytest.approx((0.01, 25.0))
+    assert np.hypot(*few.normals.T) == pytest.approx(np.ones(len(few)))
+    assert len(Scan(near[:0], down[:0], variances[:0], extents[:0]).averaged(0.1)) == 0
+    shifted = Scan(near - (0.0, 0.1), down, variances[: len(x)], extents[: len(x)]).averaged(0.2)
+    assert shifted.points == pytest.approx(np.array([[x.mean(), 0.9]]), abs=0.001), "the noise of 200 is averaged"
