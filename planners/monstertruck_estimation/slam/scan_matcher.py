@@ -38,8 +38,8 @@ WIDE_OVERLAP_GAIN: Final = 0.15
 WIDE_FACTOR: Final = 3.0
 """Factor on the standard deviation of the predicted pose in the wide search."""
 SPACING: Final = 0.04
-"""One point of a scan is matched per square of this edge, m, the mean of those in it: by beams, a person or robot beside
-the lidar would outweigh all walls."""
+"""The mean of a scan's points in a square of this edge, m, is matched: by beams, a person or robot beside the lidar
+would outweigh all walls."""
 COARSE_POINTS: Final = 160
 """Points of a scan used in the correlative search."""
 LEVELS: Final = 4

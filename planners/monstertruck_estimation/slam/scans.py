@@ -80,12 +80,12 @@ class Scan:
         return self.chosen(kept)
 
     def averaged(self, cell: float) -> "Scan":
-        """The mean of the points in every square of ``cell`` that face the same quarter, each as unsure as one point."""
-        if not len(self):
-            return self
-        squares = np.floor(self.points / cell).astype(np.int64)
+        """The mean of the points in every square of ``cell`` that face the same quarter; it is as unsure as one point.
+
+        Every piece of surface counts by its length then, however many beams met it.
+        """
         quarters = np.floor(np.arctan2(self.normals[:, 1], self.normals[:, 0]) / (math.pi / 2)).astype(np.int64)
-        keys = np.column_stack((squares, quarters)) @ np.array((8_000_000, 8, 1))
+        keys = _cells(self.points, cell) * 4 + quarters % 4
         _, first, group, counts = np.unique(keys, return_index=True, return_inverse=True, return_counts=True)
         order = np.argsort(first)
 
