@@ -522,6 +522,14 @@ def test_a_held_second_shaft_that_is_driven_on_and_motion_back_before_standstill
 
     assert watched(held, robot="differential", seconds=1.5) == {"held shaft"}
 
+    def turning(bare: Bare) -> None:
+        bare.world.block_shaft(bare.clock.now(), 1, on=True)
+        for shaft, role in enumerate(("drive", "drive_2")):
+            asked(bare, role, 0.2)
+            turned(bare, shaft, 0.2)
+
+    assert watched(turning, robot="differential", seconds=0.95) == set(), "a held shaft turns it, not its bytes"
+
     def back(bare: Bare) -> None:
         for shaft, role in enumerate(("drive", "drive_2")):
             turned(bare, shaft, 0.12)

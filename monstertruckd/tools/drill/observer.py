@@ -466,12 +466,17 @@ class _Pulses:
 class _Turning:
     """The robot turns as the bytes ask: pulses, and the motors where it has several.
 
+    A held shaft turns a robot with several motors, whatever its bytes ask: for how long they may is the rule of
+    ``_HeldShaft``.
+
     Args:
         steering: of the pulses.
+        world: of the shafts.
     """
 
-    def __init__(self, steering: _PulsedSteering) -> None:
+    def __init__(self, steering: _PulsedSteering, world: World) -> None:
         self._steering = steering
+        self._world = world
         self._course: Twist[float] = STILL
         """Of several motors, the newest motion that was asked for."""
         self._turn_errors: deque[tuple[int, float]] = deque()
@@ -482,11 +487,15 @@ class _Turning:
 
     def __call__(self, seen: Observation) -> Broken:
         now = seen.now
-        self._turn_errors.append((now, (seen.truth.wz - self._asked(seen)) * PERIOD / SECOND))
+        turned = 0.0 if self._held(seen) else (seen.truth.wz - self._asked(seen)) * PERIOD / SECOND
+        self._turn_errors.append((now, turned))
         while now - self._turn_errors[0][0] > TURN_WINDOW * SECOND:
             self._turn_errors.popleft()
         if abs(error := sum(turn for _, turn in self._turn_errors)) > TURN_ERROR:
             yield "steering", f"turned {error:+.2f} rad off within {TURN_WINDOW:g} s"
+
+    def _held(self, seen: Observation) -> bool:
+        return len(seen.target) > 1 and any(map(self._world.shaft_blocked, range(len(seen.target))))
 
     def _asked(self, seen: Observation) -> float:
         """Rate of turn that is asked for at the true pace, rad/s."""
@@ -628,7 +637,7 @@ class Observer:
         chassis = self._steering.chassis
         self._target = [0.0] * len(chassis.shafts)
         self._standstill = _Standstill()
-        self._turning = _Turning(self._steering)
+        self._turning = _Turning(self._steering, world)
         self._battery: _Battery | None = None
         rules: list[Rule] = [
             self._standstill,
