@@ -16,10 +16,9 @@ from monstertruck_estimation.slam.grid import OccupancyGrid, outline
 from monstertruck_estimation.slam.service import grid_message
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.collision import placed, points_relative
-from monstertruck_planners.explore.attempts import Attempts
 from monstertruck_planners.explore.config import AuthorConfig, ExplorerConfig
 from monstertruck_planners.explore.exchange import ExploreSetup, ExploreTask, Viewpoint
-from monstertruck_planners.explore.exploration import LEFT, REMEMBERED, STUCK, TRAIL
+from monstertruck_planners.explore.exploration import LEFT, REMEMBERED, STUCK, TRAIL, Attempts
 from monstertruck_planners.explore.explore_step import ExploringStep
 from monstertruck_planners.goals.config import PlannerConfig
 from monstertruck_planners.goals.exchange import PlanTask, Pose, Setup

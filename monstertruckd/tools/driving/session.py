@@ -4,7 +4,9 @@ import asyncio
 import math
 import os
 import signal
-from contextlib import suppress
+import termios
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from typing import IO, Any, Final
@@ -28,7 +30,6 @@ from monstertruckd.tools.driving.gamepad import Action, PadMapping, key_for
 from monstertruckd.tools.driving.gamepad_device import PadLink
 from monstertruckd.tools.driving.modes import SteeringMode
 from monstertruckd.tools.driving.teleop import MODE_KEYS, STEPS, Command, KeyReader, Teleop, TeleopRequest
-from monstertruckd.tools.driving.terminal import every_key, forget_input
 from monstertruckd.tools.status import screen
 from monstertruckd.tools.status.screen import ScreenState
 from monstertruckd.tools.status.watch import PERIOD, Follower
@@ -56,6 +57,11 @@ HINTS = {
     GateMode.DISARMED: "disarmed: Enter arms",
     GateMode.ESTOPPED: "emergency stop: r resets, then Enter arms",
 }
+REPORT_ON: Final = b"\x1b[?1004h\x1b[?2004h"
+"""Report focus, mark what is pasted (xterm; terminals that cannot do it ignore it)."""
+REPORT_OFF: Final = b"\x1b[?1004l\x1b[?2004l"
+
+_LOCAL, _INPUT, _CHARACTERS = 3, 0, 6
 
 
 @dataclass(slots=True)
@@ -343,3 +349,38 @@ def _modes(teleop: Teleop) -> Text:
     if teleop.mode is SteeringMode.TWIST:
         text.append("a/d turn z/c left, right", style="bold")
     return text
+
+
+@contextmanager
+def every_key(keyboard: IO[Any], screen: IO[Any]) -> Iterator[None]:
+    """Keys come one by one and unechoed; Ctrl-C still interrupts, Ctrl-Z and Ctrl-S neither suspend nor freeze.
+
+    Args:
+        keyboard: terminal to read from.
+        screen: terminal to write to.
+    """
+    before = termios.tcgetattr(keyboard)
+    changed = termios.tcgetattr(keyboard)
+    changed[_LOCAL] &= ~(termios.ICANON | termios.ECHO)
+    changed[_INPUT] &= ~termios.IXON
+    changed[_CHARACTERS][termios.VSUSP] = b"\x00"
+    termios.tcsetattr(keyboard, termios.TCSADRAIN, changed)
+    try:
+        os.write(screen.fileno(), REPORT_ON)
+        yield
+    finally:
+        _restore(keyboard, screen, before)
+
+
+def _restore(keyboard: IO[Any], screen: IO[Any], before: list[Any]) -> None:
+    with suppress(OSError):  # a terminal that is gone took its settings along
+        os.write(screen.fileno(), REPORT_OFF)
+    with suppress(termios.error):
+        # Keys that were held are not for the shell.
+        termios.tcsetattr(keyboard, termios.TCSAFLUSH, before)
+
+
+def forget_input(keyboard: IO[Any]) -> None:
+    """Throw away what was typed but not read yet."""
+    with suppress(termios.error):
+        termios.tcflush(keyboard, termios.TCIFLUSH)

@@ -11,9 +11,8 @@ from typing import Final
 import numpy as np
 
 from monstertruck_planners.collision import placed
-from monstertruck_planners.explore.attempts import Attempts
 from monstertruck_planners.explore.config import ExplorerConfig
-from monstertruck_planners.explore.exchange import ExploreAnswer, Viewpoint
+from monstertruck_planners.explore.exchange import ExploreAnswer, Point, Viewpoint
 from monstertruck_planners.goals.exchange import Pose
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.plan import ExplorationPhase
@@ -54,6 +53,52 @@ PASSING: Final = frozenset({Reason.PLANNER_STARTING, Reason.NO_MAP, Reason.LEASE
 """Ends of a goal that say nothing of the place."""
 HOPELESS: Final = frozenset({Reason.DISARMED, Reason.ESTOPPED, Reason.BUSY})
 """Ends of a goal after which no other place helps."""
+SAME: Final = 0.5
+"""Places this near to each other count as one, m."""
+
+
+@dataclass(frozen=True, slots=True)
+class Attempt:
+    """A place that could not be reached, or from which nothing new was seen."""
+
+    place: Point
+    count: int
+    until: float
+    """On the blacklist until then, s; +inf: to the end of the exploration."""
+
+
+@dataclass(frozen=True, slots=True)
+class Attempts:
+    """The blacklist of an exploration.
+
+    Args:
+        period: seconds on the blacklist after a failed attempt.
+        most: failed attempts after which a place stays on it.
+    """
+
+    period: float
+    most: int
+    places: tuple[Attempt, ...] = ()
+
+    def failed(self, place: Point, now: float, *, ignore_first: bool = False) -> "Attempts":
+        """With one more failed attempt at a place; ``ignore_first``: the first has no effect yet."""
+        before = next((attempt for attempt in self.places if math.dist(attempt.place, place) < SAME), None)
+        count = 1 if before is None else before.count + 1
+        until = math.inf if count >= self.most else now if ignore_first and count == 1 else now + self.period
+        others = tuple(attempt for attempt in self.places if attempt is not before)
+        return replace(self, places=(*others, Attempt(place, count, until)))
+
+    def banned(self, now: float) -> tuple[Point, ...]:
+        """Places on the blacklist at ``now``, s."""
+        return tuple(attempt.place for attempt in self.places if now < attempt.until)
+
+    def released(self, now: float) -> "Attempts | None":
+        """With all temporary entries expired; None = there are none. For a robot that has no other place to go."""
+        if not any(now < attempt.until < math.inf for attempt in self.places):
+            return None
+        return replace(
+            self, places=tuple(replace(a, until=min(a.until, now)) if a.until < math.inf else a for a in self.places)
+        )
 
 
 @dataclass(frozen=True, slots=True)

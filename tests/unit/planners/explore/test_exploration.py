@@ -6,10 +6,9 @@ from dataclasses import replace
 import pytest
 
 from monstertruck_planners.explore import exploration
-from monstertruck_planners.explore.attempts import Attempts
 from monstertruck_planners.explore.config import TourConfig
 from monstertruck_planners.explore.exchange import ExploreAnswer, Viewpoint
-from monstertruck_planners.explore.exploration import Cancel, Choose, Exploration, Go, Notice, Observed, Save
+from monstertruck_planners.explore.exploration import Attempts, Cancel, Choose, Exploration, Go, Notice, Observed, Save
 from monstertruck_schemas.plan import ExplorationPhase as Phase
 from monstertruck_schemas.reasons import Reason
 

@@ -13,7 +13,7 @@ from typing import IO
 import pytest
 
 from monstertruck_runtime.readable import when_readable
-from monstertruckd.tools.driving.terminal import REPORT_OFF, REPORT_ON, every_key, forget_input
+from monstertruckd.tools.driving.session import REPORT_OFF, REPORT_ON, every_key, forget_input
 
 
 @pytest.fixture
