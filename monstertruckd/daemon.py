@@ -54,7 +54,7 @@ from monstertruckd.bus.rpc import Rpc
 from monstertruckd.bus.zenoh_session import ZenohBridge
 from monstertruckd.config import calibration_rpc
 from monstertruckd.config.calibration import CalibrationStore
-from monstertruckd.config.expiry import CalibrationWatch, WayCounter
+from monstertruckd.config.expiry import CalibrationWatch, DistanceCounter
 from monstertruckd.config.live import LiveConfig
 from monstertruckd.config.load import Tree, resolved
 from monstertruckd.config.truck import TruckConfig
@@ -79,11 +79,11 @@ class Daemon:
     """One robot; ``run`` it once.
 
     Args:
-        config: what it is.
-        clock: its time.
-        ports: where devices hang, by role, instead of the configured ports.
-        computer: whose USB tree, kernel files and disk it uses; default: the configured one's.
-        tree: origins of the configuration's values, kept with the log.
+        config: of the robot.
+        clock: wall or virtual time.
+        ports: serial ports by device role, instead of the configured ones.
+        computer: its USB tree, kernel files and disk; default: those under ``config.machine``.
+        tree: file and line of every configured value, kept with the log.
         seed: None for a real run. Otherwise everything random comes from it, nothing arrives from outside and
             nothing but the log is left: no Zenoh, no latch file. For the virtual clock.
         environment: what systemd gives a service: socket and watchdog period (``NOTIFY_SOCKET``, ``WATCHDOG_USEC``),
@@ -131,14 +131,14 @@ class Daemon:
         if config.planner is None:
             self.bus.listen(topics.REQ_GOAL, self._refuse_goal)
         self.peers = PeerService(clock, self.bus.publisher(topics.PEERS, Writer.ESTIMATION)) if config.peers else None
-        """Where poses of other robots come in."""
+        """Publishes the poses received from other robots."""
         self._remote_steps = RemoteWorkQueue(CODEC)
         if config.placement.slowness is not None and not isinstance(clock, VirtualClock):
             raise ConfigError(
                 "placement.slowness: for studies on the virtual clock only, not for a daemon in real time"
             )
         self.slow: SlowComputer | None = None
-        """The computer that a study puts in the place of this one."""
+        """Delays all computations in a study (``placement.slowness``)."""
         self._actors = ActorFactory(clock, self._remote_steps)
         self._calibration = self._build_calibration()
         self.rpc = self._build_rpc()
@@ -180,7 +180,7 @@ class Daemon:
                 self._start(gate, StallWatch(self.clock, self.gate.ticks, self.config.state_directory / "stalls"))
             self._start_drivers(sensors, OnBug.FAIL, Duty.SENSOR, Duty.MONITOR)
             save_map = self._start_estimation(estimation)
-            for service in self._hearing():
+            for service in self._peer_services():
                 self._start(estimation, service)
             for service in build_planners(self.config, self.bus, self.clock, self._body, self._actors, save_map):
                 self._start(planners, service)
@@ -202,7 +202,7 @@ class Daemon:
     # The scopes' contents
 
     def _start_estimation(self, estimation: Scope) -> Callable[[], bool] | None:
-        """Returns what has the map saved; None = there is none."""
+        """Start estimation; returns the function that saves the map, None if no map is made."""
         save_map: Callable[[], bool] | None = None
         for service in build_estimation(self.config, self.bus, self.clock, self._body):
             self._start(estimation, service)
@@ -212,8 +212,8 @@ class Daemon:
                 register_point_calls(self.rpc, service)
         return save_map
 
-    def _hearing(self) -> Iterator[Service]:
-        """What hears other robots; on the virtual clock nothing comes over Zenoh."""
+    def _peer_services(self) -> Iterator[Service]:
+        """Services that receive the poses of other robots; on the virtual clock nothing comes over Zenoh."""
         if self.peers is None:
             return
         yield self.peers
@@ -251,9 +251,9 @@ class Daemon:
 
     @asynccontextmanager
     async def _recording(self) -> AsyncIterator[None]:
-        """The recording inside the black box: its file is finished before a box that is written at the very end.
+        """Recorder and black box; the log file is closed before a black box that is written at shutdown.
 
-        The box stops listening before the recording ends, which takes real time: what happens meanwhile is in no box.
+        The black box stops first, as closing the log file takes real time: it holds nothing of that time.
         """
         recorder, box = self.recorder, self.black_box
         async with AsyncExitStack() as after:
@@ -392,7 +392,7 @@ class Daemon:
         results = {} if loaded is None else CalibrationStore(loaded.parent, self.config.robot).load(loaded).results
         file = self.config.state_directory / "odometer.json" if self._seed is None else None
         return CalibrationWatch(
-            self.config, results, self.bus, self.clock, self._events, self._offload, WayCounter(file)
+            self.config, results, self.bus, self.clock, self._events, self._offload, DistanceCounter(file)
         )
 
     def _build_latch(self, environment: Mapping[str, str]) -> Latch:
@@ -460,7 +460,7 @@ def _attachments(config: TruckConfig, body: Body, tree: Tree | None) -> dict[str
 
 
 def _calibration(config: TruckConfig, chassis: Chassis, tree: Tree | None) -> dict[str, Any]:
-    """Everything that was measured on this very truck, and the file it comes from, for the log."""
+    """All calibrated values of this robot and the file they come from, for the log."""
     devices = config.devices
     values: dict[str, Any] = {
         "file": None if tree is None or tree.calibration is None else str(tree.calibration),

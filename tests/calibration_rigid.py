@@ -151,7 +151,7 @@ def drive_truth(config: SimulatedTruckConfig) -> dict[str, Value]:
 def steering_truth(config: SimulatedTruckConfig) -> dict[str, Value]:
     """Delay of the turns behind the gate's commands.
 
-    The angles change as fast as the gate lets them. Tyres and body swing into a turn: told are the dead time and the
+    The angles change as fast as the gate lets them. Tyres and body swing into a turn: given are the dead time and the
     lag of first order that come nearest to the true turns of the wizard's weaves, by its own measure, turns in 0.3 s.
     """
     chassis, step = config.sim.world.truck.chassis(), config.gate.steering_rate * PERIOD

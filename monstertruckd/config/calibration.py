@@ -137,7 +137,7 @@ class ValidUntil(Schema):
     date: str
     """UTC"""
     odometer: float | None = None
-    """Way of the robot in all, m; None: the way does not count"""
+    """Total distance driven, m; None: distance does not count"""
     part: str = ""
     """Device that was measured, and its port; another device, or one that was plugged elsewhere, is another part"""
     serial: str = ""

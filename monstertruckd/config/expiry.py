@@ -64,7 +64,7 @@ class Lifetime(NamedTuple):
 
     days: int
     metres: float | None
-    """Way; None: it does not wear with the way."""
+    """Distance driven, m; None: not limited."""
     role: DeviceRole
     """Device that was measured."""
     topics: tuple[Topic[Any], ...]
@@ -228,8 +228,8 @@ def _later(date: str, days: int) -> str:
 
 
 @dataclass
-class WayCounter:
-    """Way of the robot in all, m, kept over restarts.
+class DistanceCounter:
+    """Total distance driven, m, kept over restarts.
 
     Args:
         file: where; None: nowhere.
@@ -267,7 +267,7 @@ class WayCounter:
 
 
 class CalibrationWatch:
-    """Counts the way, says how well the robot is calibrated, and marks what rests on an expired calibration.
+    """Counts the distance driven, publishes the state of every calibration, and marks values of expired ones.
 
     Args:
         config: the running one.
@@ -276,7 +276,7 @@ class CalibrationWatch:
         clock: time.
         events: gets an event when one ends.
         offload: where files are written.
-        odometer: way in all.
+        odometer: total distance driven.
     """
 
     name = ServiceName.CALIBRATION.value
@@ -289,7 +289,7 @@ class CalibrationWatch:
         clock: Clock,
         events: EventSink,
         offload: Offload,
-        odometer: WayCounter,
+        odometer: DistanceCounter,
     ) -> None:
         self._config = config
         self._results = dict(results)
@@ -313,7 +313,7 @@ class CalibrationWatch:
         return [state_of(r, self._config, now, way, self._serials) for r in self._results.values()]
 
     async def run(self, ready: Ready) -> None:
-        """Watch until cancelled; the way is written at the end."""
+        """Run until cancelled; the distance is saved at the end."""
         await self._offload(self.odometer.load)
         self._expired = frozenset()
         self._look()

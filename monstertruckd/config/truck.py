@@ -99,7 +99,7 @@ class PlacementConfig(Schema):
     """Where planners and tracker run: in the daemon's loop, in a worker, or on another machine (`plan-server`)."""
 
     planner: Literal["loop", "worker", "remote"] = "worker"
-    """In the loop only for studies: it stands still meanwhile"""
+    """`loop` is for studies only: planning blocks the control tick"""
     local_planner: Literal["loop", "worker", "remote"] = "worker"
     """Likewise"""
     tracker: Literal["loop", "worker", "remote"] = "loop"
@@ -110,10 +110,10 @@ class PlacementConfig(Schema):
 
 
 class TruckConfig(Schema):
-    """Everything the daemon needs to know."""
+    """The configuration of one robot: the root of the YAML file."""
 
     FILE_KEYS: ClassVar[tuple[tuple[str, ...], ...]] = (("path", "file"), ("planner", "map"))
-    """Keys that name files which must exist; they are relative to the file that says them."""
+    """Keys that name files which must exist; relative to the configuration file that names them."""
 
     version: Literal[2]
     robot: RobotName = ROBOT
@@ -125,7 +125,7 @@ class TruckConfig(Schema):
     monitors: Monitors = Monitors()
     usb: UsbConfig = UsbConfig()
     machine: Path = Path("/")
-    """Folder with the computer's proc, sys and dev; the simulated one's is elsewhere"""
+    """Folder that holds proc, sys and dev of the computer; another one of a simulated computer"""
     levelling: AnyLevelling = StabiliserConfig()
     """How the stabiliser follows the compass, where there are both"""
     gate: GateConfig = GateConfig()
@@ -139,11 +139,11 @@ class TruckConfig(Schema):
     behaviours: dict[Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,31}$")], AnyBehaviour] = Field(
         default_factory=dict, validate_default=True
     )
-    """What reacts to sensors without a path, by name; started by `behave start`. `move` is always there"""
+    """Reactive behaviours (without a path) by name; started by `behave start`. `move` is always there"""
     lidar_sonars: LidarSonarsConfig | None = None
     """Sonars computed from the lidar, for behaviours of a robot that has none; null = none"""
     peers: dict[Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,31}$")], PeerConfig] = Field(default_factory=dict)
-    """Other robots whose poses are heard, by name, for behaviours such as `follow`"""
+    """Other robots whose poses are received, by name, for behaviours such as `follow`"""
     placement: PlacementConfig = PlacementConfig()
     path: PathConfig | None = None
     map: MapRender | None = None
@@ -155,7 +155,7 @@ class TruckConfig(Schema):
     """Points of interest in the map: tags that the camera sees (extra vision), and marked places; null = none"""
     recorder: RecorderConfig | None = None
     blackbox: BlackBoxConfig | None = BlackBoxConfig()
-    """The minute before every trip of the gate; null = not kept"""
+    """Saves the minute before every stop by the gate; null = off"""
     zenoh: ZenohConfig = ZenohConfig()
     state_directory: Path = Path("runs/state")
     """Where the e-stop latch is kept"""
@@ -165,7 +165,7 @@ class TruckConfig(Schema):
     calibration: Path | None = None
     """Folder of the calibration files; null = `calibration` in the state directory"""
     stand: Literal["none", "simulator", "overhead"] = "none"
-    """Who says where the robot is, on `mt/stand/sensor/pose_<robot>`: recorded, and read by nothing in the robot"""
+    """Source of the true pose on `mt/stand/sensor/pose_<robot>`: recorded only, nothing in the robot reads it"""
     sim: Any = None
     """The simulated side; `simulate` and `config show` check it, the daemon does not read it"""
 
@@ -207,7 +207,7 @@ class TruckConfig(Schema):
 
     @property
     def body_limits(self) -> BodyLimits:
-        """What bounds the motion of this body."""
+        """Physical limits of this body, which the gate's settings must respect."""
         geometry, lidar = self.geometry, self.devices.lidar
         train = DriveTrain(geometry.drive_ratio, geometry.wheel_radius)
         limits = [motor_limits(device.driver) for device in self.devices.shafts().values()]

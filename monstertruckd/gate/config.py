@@ -96,33 +96,33 @@ class ObstacleLimits(Schema):
     crawl: Positive = 0.02
     """An allowed speed below this is a stop; driving on needs twice as much, m/s."""
     seen: Annotated[float, Field(gt=0, le=1)] = 0.5
-    """Share of the beams in each sector of travel (10 degrees) that must see: measure a range, or meet nothing within
-    the lidar's range. A recorded URG-04LX has 0.95 to 1.0 of them, and less than half in one of 800 sectors."""
+    """Share of the beams in each sector of travel (10 degrees) that must measure a range, or meet nothing within the
+    lidar's range. A recorded URG-04LX has 0.95 to 1.0, and less than half in one of 800 sectors."""
     unseen_speed: LivePositive = 0.1
     """Speed limit while a sector of travel is not seen, m/s; one not seen for ``scan.stale_after`` stops the truck.
     Where the lidar does not look it is the limit onto ground that no scan of the last 30 s has seen."""
     memory_distance: NotNegative = 1.0
     """Travelled distance for which the points of earlier scans guard the truck where its lidar does not look, m."""
     open_ground: bool = False
-    """Whether a scan without any range is believed: otherwise it counts as none, whatever its beams say."""
+    """Whether a scan without any range counts as free ground; otherwise it is not valid."""
 
 
 class SonarLimits(Schema):
-    """What counts of the echoes of a robot without a lidar."""
+    """Limits for the sonars of a robot without a lidar."""
 
     stale_after: Annotated[float, Field(gt=0, le=1)] = topics.SONAR.fresh_for()
-    """Age of the newest round of pings, and of a sonar's newest answer, s, from which on it does not count."""
+    """Age from which on the newest round of pings, or the newest answer of a sonar, is stale, s."""
     core: Annotated[float, Field(gt=0, le=1)] = 0.2
-    """Angle from the axis of a sonar that does not look where the robot goes, within which its echo may be, rad."""
+    """Half angle of the cone of a sonar that does not look in the direction of travel, rad: where its echoes may be."""
     unseen_speed: Positive = 0.1
-    """Speed limit where a sonar does not answer or none looks, m/s."""
+    """Speed limit where a sonar does not answer, or no sonar looks in the direction of travel, m/s."""
 
 
 class ShaftCheckConfig(Schema):
     """When a driven shaft does not turn although it is commanded to."""
 
     within: Positive = 0.6
-    """Seconds of it after which the truck stops."""
+    """Seconds after which the truck stops."""
     speed: Positive = 0.03
     """Slower commands are not compared, m/s."""
     share: Annotated[float, Field(gt=0, lt=1)] = 0.1
@@ -162,8 +162,7 @@ class GateConfig(Schema):
     remote_trackers: Annotated[tuple[str, ...], Field(strict=False)] = ()
     """Sources outside the robot that may drive as trackers."""
     disarm_after: Annotated[float, Field(gt=0, le=10)] = 1.5
-    """Seconds without a driver whose requests can be carried out, after which the truck disarms: somebody may come up
-    to it."""
+    """Seconds without executable drive requests after which the truck disarms: people may come near it."""
 
     scan: SensorLimit = _limit(topics.SCAN)
     scan_tilt: Annotated[float, Field(gt=0, le=math.pi / 4)] = 0.35
@@ -196,9 +195,9 @@ class GateConfig(Schema):
     blocked: ShaftCheckConfig | None = ShaftCheckConfig()
     """Commanded against measured speed of each driven shaft, finds blocked ones; null = off."""
     short_faults: Annotated[int, Field(ge=2, le=10)] = 4
-    """So many stops for stale sensors within ``short_faults_within`` disarm: the fault is no short one."""
+    """Stops for stale sensors within ``short_faults_within`` after which the truck disarms."""
     short_faults_within: Positive = 10.0
-    """Seconds; at least a second for each of them, as the truck stands in between."""
+    """Seconds; at least one for each of ``short_faults``."""
     battery_low_speed: LivePositive = 0.1
     """Speed limit with a low battery, or a stale battery voltage, m/s."""
     obstacle: ObstacleLimits = ObstacleLimits()
@@ -271,7 +270,7 @@ def beyond(config: GateConfig, body: BodyLimits, times: Iterable[tuple[str, floa
     Args:
         config: the gate's.
         body: which.
-        times: names and seconds of other settings that are times in which the truck drives on whatever happens.
+        times: names and values (s) of other settings during which the truck may drive on unattended.
     """
     for name in ("acceleration", "deceleration", "quick_deceleration"):
         if getattr(config, name) > body.acceleration + ROUNDING:
@@ -299,7 +298,7 @@ def beyond(config: GateConfig, body: BodyLimits, times: Iterable[tuple[str, floa
 
 
 def _beyond_checks(config: GateConfig) -> Iterator[str]:
-    """Checks that could never stop a truck."""
+    """Settings of checks that could never stop a truck."""
     if config.obstacle.deceleration > config.deceleration:
         yield (
             f"gate.obstacle.deceleration {config.obstacle.deceleration:g} m/s^2: at most gate.deceleration, "
@@ -327,7 +326,7 @@ def required_sensors(config: GateConfig) -> dict[str, SensorLimit]:
 
 
 def _times(config: GateConfig) -> Iterator[tuple[str, float]]:
-    """Times in which the truck drives on whatever happens, s."""
+    """Settings during which the truck may drive on unattended, s."""
     for name, limit in required_sensors(config).items():
         yield f"gate.{name}.stale_after", limit.stale_after
     for name in ("max_latency", "reaction", "tick_stall", "max_request_age"):

@@ -2,8 +2,8 @@
 
 States: disarmed > armed > driving > stopping > (armed | disarmed); an emergency stop from any state latches.
 A stop is one command, speed 0 or quick stop: the ramp is the drive controller's own, so it completes even if nothing is
-sent afterwards. ``sources`` holds the rules of who drives, ``states`` the transitions, ``sensors`` what stops or slows
-the truck, ``limiter`` the way from a request to the commanded motion, ``stops`` the causes reported.
+sent afterwards. ``arbitration`` holds who may drive and the transitions, ``sensors`` what stops or slows the truck,
+``limiter`` how a request becomes the commanded motion, ``stops`` the causes reported.
 
 Every stop ends with standstill confirmed by the drive. After a short fault (a late scan, an expired lease) the same
 source may continue; a fault longer than ``disarm_after``, or one of ``DISARMING``, disarms.
@@ -51,10 +51,10 @@ DISARMING: Final = frozenset(
         Reason.SHAFT_BLOCKED,
     }
 )
-"""After these the truck must be armed again, however short they were."""
+"""After these the truck must be armed again, even if they were short."""
 
 HALTS: Final = frozenset({Reason.OBSTACLE_STOP, Reason.LIDAR_BLIND, Reason.SONAR_STALE, Reason.SONAR_BLIND})
-"""Limits of the pace that allow none: the truck stands, and its driver keeps it."""
+"""Speed limits of zero: the truck stands, and its driver stays in control."""
 
 
 class Decision(NamedTuple):
@@ -100,9 +100,9 @@ class GateOutput(NamedTuple):
     waiting: tuple[str, ...]
     """Planners that request motion while nobody drives."""
     asking: tuple[str, ...]
-    """Operators who ask for the drive."""
+    """Operators who ask to drive."""
     handed_to: str | None
-    """Operator to whom it was handed over just now."""
+    """Operator to whom the drive was handed over in this tick."""
     events: tuple[GateEvent, ...]
     trips: tuple[Trip, ...]
 
@@ -120,7 +120,7 @@ class Gate:
         battery_measured: something is there to measure the battery.
         latched: whether the emergency stop was latched when the daemon last ran.
         sonars: pose (x, y, yaw) of every sonar in base by name, of a robot that has no lidar; m, m, rad.
-        peers: outlines of other robots that say where they are, by name.
+        peers: outlines of other robots whose poses are received, by name.
     """
 
     def __init__(
@@ -193,12 +193,12 @@ class Gate:
             self._sonars.observe(ranges)
 
     def observe_peers(self, peers: Peers) -> None:
-        """Take what was heard of other robots."""
+        """Take the newest poses of other robots."""
         if self._peers is not None:
             self._peers.observe(peers)
 
     def observe_pose(self, pose: Odometry) -> None:
-        """Take the newest pose in the map, in which other robots say where they are."""
+        """Take the newest pose in map, the frame of the other robots' poses."""
         if self._peers is not None:
             self._peers.observe_pose(pose)
 
@@ -234,7 +234,7 @@ class Gate:
         self._outages.observe_health(table)
 
     def observe_event(self, event: Event) -> None:
-        """Take any service's event: it may explain a stop."""
+        """Take any service's event: it may be the cause of a stop."""
         self._outages.observe_event(event)
 
     # Requests
@@ -266,13 +266,13 @@ class Gate:
             return self._refuse(now, Reason.DISARMED, request)
         reason = self._sources.priority(source, now, self._states.holder_key)
         if reason is Reason.BUSY and inside and source.neutral:
-            return reason  # It holds the truck at rest once the driving planner ends.
+            return reason  # Its turn comes when the driving planner ends.
         if reason is not Reason.OK:
             return self._refuse(now, reason, request)
         return next(iter(self._blocks(self._sensors.assess(now), now)), Reason.OK)
 
     def _impossible(self, request: DriveRequest) -> str | None:
-        """Why the body cannot move like that; None if it can, or nearly."""
+        """Why the body cannot do this motion; None if it can, or nearly."""
         forms = self._chassis.forms
         if request.form not in forms:
             return f"a request by {request.form}: this body takes {' or '.join(sorted(forms))}"
@@ -287,8 +287,8 @@ class Gate:
 
         ESTOP and STOP are accepted from every source, authenticated or not: stopping is always safe. ARM and RESET need
         an operator's role, a truck at rest and no operator requesting motion. An authenticated ESTOP or STOP uses its
-        sequence number, so that an earlier order of its source that arrives later, by another way, is refused. So is
-        an ARM or RESET whose sender did not know yet of another's ESTOP, STOP or DISARM.
+        sequence number, so that an earlier order of its source that arrives later, over another channel, is refused.
+        So is an ARM or RESET whose sender did not know yet of another's ESTOP, STOP or DISARM.
         """
         reason = self._sources.accept_order(request, now)
         if request.order in UNCONDITIONAL:
@@ -493,7 +493,7 @@ class Gate:
         self._states.stop(now, (cause.reason for cause in causes))
 
     def _count_short_fault(self, now: int) -> None:
-        """Short faults let the driver go on; but not again and again."""
+        """Disarm at rest if there were too many short faults, after each of which the driver may go on."""
         faults, config = self._short_faults, self._config
         faults.append(now)
         while now - faults[0] > config.short_faults_within * SECOND:
@@ -504,7 +504,7 @@ class Gate:
             self._states.disarm_at_rest = True
 
     def _trip(self, now: int, mode: GateMode, causes: list[Cause], *, ordered: bool = False) -> None:
-        """Log a stop; to be called before the state changes."""
+        """Log a stop; called before the state changes."""
         holder = self._states.holder
         reasons = tuple(cause.reason for cause in causes)
         self._stops.add(
@@ -542,7 +542,7 @@ class Gate:
         if self.mode is GateMode.ESTOPPED or self._limiter.emergency or not URGENT.isdisjoint(reasons):
             return DriveAction.QUICK_STOP
         if self.mode is GateMode.DISARMED:
-            # A motor that still turns (a drive that outlived its daemon) must not coast.
+            # A motor that still turns, as after a daemon that died, must not coast.
             return DriveAction.DISABLE if self._sensors.at_rest(now) else DriveAction.QUICK_STOP
         return DriveAction.RUN
 

@@ -24,6 +24,7 @@ from monstertruck_kinematics.elementary import Array, KinematicsError, integrate
 from monstertruck_planners.collision import (
     Footprint,
     ScanPoints,
+    UnitTwist,
     beyond,
     first_contact,
     on_body,
@@ -45,39 +46,36 @@ POSES: Final = 20
 """Poses checked along the swept path, at least: a corner that turns faster than the base travels has more of them."""
 
 TWIST_STEP: Final = 0.005
-"""Ways are rounded to this before the sweep, m/m and rad/m: an error of 2 mm at its end, and most sweeps are cached."""
+"""Rounding of unit twists before the sweep, m/m and rad/m: most sweeps are cached, with an error of 2 mm at the end."""
 
 GROUND_STEP: Final = 2
-"""Poses from one to the next of which the ground is looked at."""
+"""The ground is checked at every second pose."""
 
 SWEEPS: Final = 256
 """Sweeps cached."""
 
 LEAVING: Final = 0.1
-"""Who stands nearer to something than the side clearance may drive if that takes him so much further away on every
-metre, m/m: a translation of 0.33 rad away from a wall does, 0.34 m/m; a straight line along it does not."""
+"""A body nearer to an obstacle than the side clearance may only drive motions that take it this much further away per
+metre, m/m: a translation of 0.33 rad away from a wall does (0.34 m/m), a straight line along it does not."""
 
 AHEAD: Final = 0.5
-"""A motion whose forward speed is a lesser share of its pace than this has the limit of reverse: part of the footprint
-goes where the lidar does not look."""
+"""A motion whose forward speed is a smaller share of its pace has the speed limit of reverse: part of the footprint
+moves to where the lidar does not look."""
 
 MAX_SPEED: Final = 1e3
 """Requests are scaled down to this in every component before anything else, m/s and rad/s: sums of them stay finite."""
 
 FASTEST: Final = 1e6
-"""What a motor says beyond this counts as this, m/s: its square is still a number."""
+"""Measured speeds are clamped to this, m/s, so that their squares stay finite."""
 
 ROUNDING: Final = 1e-6
 """Relative difference up to which two motions are the same."""
 
 LEAST: Final = 1e-6
-"""A motion of less pace is none, m/s: what is left of one that ends has the direction of its rounding errors."""
+"""A smaller pace counts as standstill, m/s: the direction of such a twist is rounding error."""
 
-Way = tuple[float, float, float]
-"""Motion of the base per metre of pace: m/m, m/m, rad/m."""
-
-Course = tuple[Way, float]
-"""A way, and the pace along it, m/s."""
+Course = tuple[UnitTwist, float]
+"""A motion of the base: its twist per metre of pace, and its pace, m/s."""
 
 SECTORS: Final = 36
 """Of a turn about the lidar: 0.1 m at the end of the distance the gate checks, less than the width of the body."""
@@ -87,27 +85,27 @@ PRESENT: Final = 0.5
 OUTLINE: Final = 12
 """Points on each edge of the footprint from which the directions of travel are found."""
 MARGIN: Final = 0.005
-"""Ground this near to the body is not travelled, m."""
+"""Ground this near to the body counts as under it, m."""
 TOUCH: Final = 1e-6
 """A point that enters the footprint by less is on its edge, m."""
 
 MEMORY: Final = 30 * SECOND
-"""Scans are remembered for so long, ns: somebody may step onto ground that was free, or take an obstacle away."""
+"""Age up to which scans are kept, ns: people may step onto ground that was free, or take an obstacle away."""
 MEMORY_STEP: Final = 0.1
 """Travelled distance between two remembered scans, m."""
 MEMORY_SCANS: Final = 20
 SPACING: Final = 0.02
-"""Of remembered points along an outline, less than their drift, m."""
+"""Of remembered points along the line of the beams, m: less than their drift."""
 VIEW_STEP: Final = 0.3
-"""Distance (m) and turn (rad) together between two of the scans that tell which ground is free: each sees more than
-what the truck is long and half of what is around it, and ground that none of these few saw only slows the truck."""
+"""Distance (m) plus turn (rad) between two of the scans that are kept to know which ground is free: each sees further
+than a truck's length in half of all directions, and ground that none of them saw only slows the truck."""
 VIEWS: Final = 7
 DRIFT: Final = 0.03
-"""Ground so near to where the body was is known, m: the wheels do not tell better where that is."""
+"""Ground this near to where the body stood counts as free, m: the error of dead reckoning."""
 FIELD_EDGE: Final = 0.1
-"""Points so near to the edge of the lidar's field are remembered, rad: turns of the wheels' dead reckoning are off."""
+"""Remembered points this near to the edge of the lidar's field are kept, rad: the error of the dead-reckoned yaw."""
 POSES_KEPT: Final = 64
-"""Ticks whose pose is known: a scan is placed where it was taken."""
+"""Ticks whose pose is kept, to place a scan where it was taken."""
 
 Sectors = NDArray[np.intp]
 Pose = tuple[float, float, float]
@@ -183,21 +181,12 @@ def _sector(bearings: Array) -> Sectors:
     return ((bearings + math.pi) // SECTOR).astype(np.intp) % SECTORS
 
 
-def outline(body: Footprint) -> Array:
-    """Points on the edges of the footprint in base, shape (n, 2), m."""
-    half_length, half_width = body.half_length, body.half_width
-    along, across = np.linspace(-half_length, half_length, OUTLINE), np.linspace(-half_width, half_width, OUTLINE)
-    ends, sides = np.full(OUTLINE, half_length), np.full(OUTLINE, half_width)
-    x = np.concatenate((along, along, ends, -ends)) + body.offset
-    return np.column_stack((x, np.concatenate((sides, -sides, across, across))))
-
-
 def ground_ahead(body: Footprint, edges: Array, poses: Array) -> Array:
     """Points of the ground that a motion covers and that its pose before did not cover.
 
     Args:
         body: the footprint.
-        edges: its ``outline``.
+        edges: points on its edges, shape (k, 2), m.
         poses: of base at equal steps of one twist, the present one first, shape (m, 3), m, m, rad.
 
     Returns:
@@ -227,11 +216,11 @@ class _Taken(NamedTuple):
     points: Array
     """Its returns near the body in the frame of the memory, shape (n, 2), m."""
     free: Array
-    """How far the beams saw free ground, m; 0 is added before the first and after the last."""
+    """Free distance of every beam, m; padded with a 0 before the first and after the last."""
 
 
 class ScanMemory:
-    """What earlier scans saw of the ground around the body, in a frame that dead reckoning by the wheels moves it in.
+    """What earlier scans saw around the body, in a frame in which the wheels' dead reckoning gives its pose.
 
     Args:
         footprint: the body's outline.
@@ -246,7 +235,7 @@ class ScanMemory:
         self.forget()
 
     def forget(self) -> None:
-        """It is not known how the body has moved."""
+        """Start again: it is not known how the body has moved."""
         self._pose: Pose = (0.0, 0.0, 0.0)
         self._travelled = 0.0
         self._ticks: deque[tuple[int, Pose, float]] = deque(maxlen=POSES_KEPT)
@@ -258,9 +247,7 @@ class ScanMemory:
         """The body moved with ``twist``, m/s and rad/s, for the ``dt`` s until ``now``, ns."""
         if twist != STILL:
             self._pose = integrate(self._pose, *twist, dt)
-            self._travelled += (
-                math.hypot(twist[0], twist[1]) + abs(twist[2]) * self._footprint.circumscribed_radius
-            ) * dt
+            self._travelled += self._footprint.corner_speed(twist) * dt
         self._ticks.append((now, self._pose, self._travelled))
 
     def observe(self, scan: LaserScan, points: Array) -> None:
@@ -345,7 +332,7 @@ def _beams(scans: Sequence[_Taken], points: Array) -> tuple[NDArray[np.intp], Ar
 
 
 class _Sweep(NamedTuple):
-    """What a way covers."""
+    """The poses and the ground that a motion covers."""
 
     distances: Array
     """Of its poses, shape (m,), m."""
@@ -362,7 +349,7 @@ class _Sweep(NamedTuple):
 class ObstacleGuard:
     """Swept footprint against the newest scan.
 
-    The scan's age is covered by distance: the truck may have moved since.
+    The truck may have moved since the scan was taken: its age becomes a part of the stopping distance.
 
     Args:
         config: limits.
@@ -379,17 +366,17 @@ class ObstacleGuard:
         self._points = np.empty((0, 2))
         self._stamp = 0
         self.unseen: float | None = 0.0
-        """Seconds from the newest scan back to the one that saw the sectors of the newest ways; None = none did."""
+        """Age of the oldest view of a sector of travel at the newest scan, s; None = one was never seen."""
         self.known = math.inf
-        """Distance along the newest ways to ground that no scan has seen, m; +inf if none is within reach."""
+        """Distance along the newest motions to ground that no scan has seen, m; +inf if none is within reach."""
         self._checked: frozenset[tuple[int, int, int]] | None = None
         self._free = math.inf
-        self._outline = outline(footprint)
+        self._outline = footprint.edge_points(OUTLINE, OUTLINE)
         self._near = 0.0
         self.configure(config)
 
     def configure(self, config: GateConfig) -> None:
-        """Take other limits, between two ticks; what earlier scans left out as too far away counts as not seen."""
+        """Take other limits, between two ticks; points beyond the range kept so far count as not seen."""
         self._config = config
         self._keep = round(config.scan.stale_after * SECOND)
         delay = config.scan.stale_after + config.max_latency + config.reaction
@@ -431,34 +418,33 @@ class ObstacleGuard:
         self._stamp = min(scan.stamp, scan.received)  # a sensor's clock may run ahead; nothing arrives before it is
         self._checked = None
 
-    def free_distance(self, ways: tuple[Way, ...]) -> float:
+    def free_distance(self, twists: tuple[UnitTwist, ...]) -> float:
         """Distance the footprint can travel from where the scan was taken, m; +inf if no obstacle is within reach.
 
         Args:
-            ways: the shortest distance of all of them counts.
+            twists: the shortest distance of all of them counts.
         """
-        rounded = frozenset((round(x / TWIST_STEP), round(y / TWIST_STEP), round(a / TWIST_STEP)) for x, y, a in ways)
+        rounded = frozenset((round(x / TWIST_STEP), round(y / TWIST_STEP), round(a / TWIST_STEP)) for x, y, a in twists)
         if self._checked != rounded:
             self._checked = rounded
-            self._look(rounded)
-            hidden = [way for way in rounded if way[0] * TWIST_STEP < AHEAD]
+            self._update_unseen(rounded)
+            hidden = [twist for twist in rounded if twist[0] * TWIST_STEP < AHEAD]
             behind = self._memory.points() if hidden else None
-            self._free = min(self._free_distance(*way, behind) for way in rounded)
+            self._free = min(self._free_distance(*twist, behind) for twist in rounded)
             self.known = self._known_distance(hidden)
         return self._free
 
-    def _look(self, ways: frozenset[tuple[int, int, int]]) -> None:
-        """Find how long ago all sectors of the ways were seen; those outside the lidar's field do not count."""
-        seen = np.concatenate([self._visibility.last_seen(self._sweep(*way).sectors) for way in ways])
+    def _update_unseen(self, twists: frozenset[tuple[int, int, int]]) -> None:
+        """Update ``unseen`` from the sectors of travel within the lidar's field."""
+        seen = np.concatenate([self._visibility.last_seen(self._sweep(*twist).sectors) for twist in twists])
         oldest = int(seen.min(initial=self._stamp))
         self.unseen = (self._stamp - oldest) / SECOND if oldest > 0 else None
 
     def _swept(self, x: int, y: int, turn: int) -> _Sweep:
-        """A way in steps of ``TWIST_STEP``; no corner moves further than the base."""
-        vx, vy, wz = way = (x * TWIST_STEP, y * TWIST_STEP, turn * TWIST_STEP)
-        corner = math.hypot(vx, vy) + abs(wz) * self._footprint.circumscribed_radius
-        distances = np.linspace(0.0, self._reach, math.ceil(POSES * max(corner, 1.0)))
-        poses = swept_poses(way, distances)
+        """Sweep of a twist in steps of ``TWIST_STEP``; between two poses corners move no further than the base."""
+        twist = (x * TWIST_STEP, y * TWIST_STEP, turn * TWIST_STEP)
+        distances = np.linspace(0.0, self._reach, math.ceil(POSES * max(self._footprint.corner_speed(twist), 1.0)))
+        poses = swept_poses(twist, distances)
         ground = ground_ahead(self._footprint, self._outline, poses[::GROUND_STEP])
         before = np.repeat(distances[::GROUND_STEP][:-1], ground.shape[1])
         ground = ground.reshape(-1, 2)
@@ -470,14 +456,14 @@ class ObstacleGuard:
         leaving = LEAVING * sweep.distances
         contacts = [first_contact(self._footprint, sweep.poses, self._points, clearance, leaving)]
         if remembered is not None:
-            # Without a clearance, which the error of their places would fill; but nobody may be grazed who was seen.
+            # Without a clearance, as their places may be off by as much.
             contacts.append(first_contact(self._footprint, sweep.poses, remembered, -self._footprint.padding))
         return min(
             (float(sweep.distances[contact - 1]) for contact in contacts if contact is not None), default=math.inf
         )
 
-    def _known_distance(self, ways: list[tuple[int, int, int]]) -> float:
-        sweeps = [self._sweep(*way) for way in ways]
+    def _known_distance(self, twists: list[tuple[int, int, int]]) -> float:
+        sweeps = [self._sweep(*twist) for twist in twists]
         if not sweeps:
             return math.inf
         seen = self._memory.seen(np.concatenate([sweep.ground for sweep in sweeps]))
@@ -506,20 +492,20 @@ def comfortable_speed(room: float, delay: float, deceleration: float) -> float:
 
 
 SATURATED: Final = 1e-4
-"""Steering angle, rad, that a servo has to lack before the gate says so."""
+"""Difference between wanted and reachable steering angle from which on the gate reports it, rad."""
 
 
 class Target(NamedTuple):
-    """What a request asks of the body."""
+    """The motion that a request means for this body."""
 
     twist: Twist[float]
     """Of the base."""
     angles: Angles
     """Steering angles it needs."""
     clipped: bool
-    """It is not what was asked, but the nearest that the body can do."""
+    """It differs from the request: the nearest motion that the body can do."""
     saturated: bool
-    """The servos' range makes it so."""
+    """It differs because of the servos' range."""
     shafts: Speeds | None = None
     """Open loop: the shaft speeds themselves, of which the twist is only the prediction, m/s."""
 
@@ -639,7 +625,7 @@ class Motion:
 
     @property
     def present_pace(self) -> float:
-        """That of the commanded motion, m/s."""
+        """Pace of the commanded motion, m/s."""
         return self.pace(self.twist, self._open)
 
     def max_pace(self, twist: Twist[float], shafts: Speeds | None = None) -> float:
@@ -647,13 +633,13 @@ class Motion:
         ahead = twist[0] >= AHEAD * self.pace(twist, shafts)
         return self._config.speed if ahead else self._config.reverse_speed
 
-    def progress(self, measured: Speeds, way: Way) -> float:
-        """Measured pace along a way, m/s; the way's shaft speeds fitted to the measured ones by least squares."""
-        shafts = self._chassis.shafts_along(way, *self.angles)
+    def progress(self, measured: Speeds, twist: UnitTwist) -> float:
+        """Measured pace along a unit twist, m/s: a least-squares fit of its shaft speeds to the measured ones."""
+        shafts = self._chassis.shafts_along(twist, *self.angles)
         return _dot(measured, shafts) / (_dot(shafts, shafts) or 1.0)
 
     def steer(self, target: Angles, dt: float) -> None:
-        """Turn all steered wheels towards ``target``, rad, within the steering rate; all complete the same share."""
+        """Turn all steered wheels towards ``target``, rad, within the steering rate, all by the same share."""
         step = max(abs(to - at) for at, to in zip(self.angles, target, strict=True))
         if step > 0:
             share = min(self._config.steering_rate * dt / step, 1.0)
@@ -696,7 +682,7 @@ class Motion:
             self.turn_shafts((0.0,) * len(self._open), dt)
 
     def _forecast(self, shafts: Speeds) -> Twist[float]:
-        """Twist of the base that shaft speeds make, even if they push against each other while they change."""
+        """Twist of the base at shaft speeds, even if they contradict each other while they change."""
         return self._chassis.twist(self._chassis.input_speeds(shafts, *self.angles), *self.angles)
 
     def accelerate(self, target: Twist[float], dt: float) -> None:
@@ -718,7 +704,7 @@ class Motion:
         self.twist = target if share == 1.0 else (x, y, turn)
 
     def halt(self) -> None:
-        """Command standstill at once: the drive controllers' own deceleration profile is the ramp."""
+        """Command standstill without a ramp: the drive controllers decelerate by their own profile."""
         self.twist = STILL
         self._open = None
 
@@ -732,7 +718,7 @@ class CommandLimiter:
         obstacles: swept footprint against the newest scan.
         sensors: newest samples.
         sonars: swept footprint against the newest echoes; None = the robot has a lidar, or no range sensor at all.
-        peers: swept footprint against other robots; None = none is heard.
+        peers: swept footprint against other robots; None = no peers.
     """
 
     def __init__(
@@ -753,11 +739,11 @@ class CommandLimiter:
         self.blocked = False
         """An obstacle ahead allows no motion."""
         self.blind = False
-        """The lidar has not seen for too long where the truck is to go."""
+        """A sector of travel was not seen for too long."""
         self.emergency = False
-        """The obstacle is so near that only the quick stop avoids contact."""
+        """An obstacle is so near that only the quick stop avoids contact."""
         self.free: float | None = None
-        """Distance the footprint can travel, m; None = no obstacle within the checked distance."""
+        """Distance the footprint can travel, m; None = no obstacle within the distance checked."""
 
     def configure(self, config: GateConfig) -> None:
         """Take other limits, between two ticks."""
@@ -830,7 +816,7 @@ class CommandLimiter:
         return [(_scaled(twist, 1.0 / pace), pace) for twist, pace in courses if twist != STILL and pace >= LEAST]
 
     def _stop_before(self, free: float, allowed: float, fastest: float, limits: dict[Reason, float]) -> None:
-        """Limit the pace where ``free`` metres are free and ``allowed`` m/s therefore."""
+        """Add the limit for ``free`` metres ahead, which allow a pace of ``allowed`` m/s."""
         crawl = self._config.obstacle.crawl
         self.free = free if math.isfinite(free) else None
         self.blocked = allowed < (2 * crawl if self.blocked else crawl)
@@ -840,26 +826,26 @@ class CommandLimiter:
             limits[Reason.OBSTACLE_SLOW] = allowed
 
     def _comfortable(self, free: float, delay: float) -> float:
-        """Pace allowed by what is ``free`` metres ahead, known ``delay`` s late, m/s."""
+        """Pace allowed by an obstacle ``free`` metres ahead, seen ``delay`` s ago, m/s."""
         obstacle = self._config.obstacle
         return comfortable_speed(free - obstacle.ahead, delay, obstacle.deceleration)
 
     def _reach(self, delay: float) -> float:
-        """Distance to be swept against what is known ``delay`` s late, m."""
+        """Distance to be swept against obstacles seen ``delay`` s ago, m."""
         config = self._config
         return config.obstacle.ahead + config.speed * (delay + config.speed / (2 * config.obstacle.deceleration))
 
-    def _beside_peers(
+    def _free_of_peers(
         self, now: int, courses: list[Course], reach: float, limits: dict[Reason, float], seen: Seen | None
     ) -> float:
         """Sweep the footprint against other robots.
 
         Args:
             now: ns.
-            courses: to be swept.
-            reach: so far, m.
-            limits: gets that of robots whose place is not known.
-            seen: which points in base a lidar sees; None = there is none, and all are looked at.
+            courses: motions to be swept.
+            reach: distance swept, m.
+            limits: gets the limit for robots whose place is not known.
+            seen: the lidar's field of view in base; None = no lidar.
 
         Returns:
             The free distance, m.
@@ -868,9 +854,9 @@ class CommandLimiter:
         if peers is None:
             return math.inf
         looked = self._sonars is not None or seen is not None
-        if peers.unknown(now) and any(pace > slow and not (looked and way[0] >= AHEAD) for way, pace in courses):
+        if peers.unknown(now) and any(pace > slow and not (looked and twist[0] >= AHEAD) for twist, pace in courses):
             limits[Reason.PEER_UNKNOWN] = slow
-        return peers.free_distance([way for way, _ in courses], reach, now, seen)
+        return peers.free_distance([twist for twist, _ in courses], reach, now, seen)
 
     def _check_peers(self, now: int, wanted: Twist[float], shafts: Speeds | None, limits: dict[Reason, float]) -> None:
         """Sweep the footprint of a robot without range sensors along both motions: against other robots alone."""
@@ -878,7 +864,7 @@ class CommandLimiter:
         if self._peers is None or not courses:
             return
         delay = self._config.reaction
-        free = self._beside_peers(now, courses, self._reach(delay), limits, None)
+        free = self._free_of_peers(now, courses, self._reach(delay), limits, None)
         self._stop_before(free, self._comfortable(free, delay), max(pace for _, pace in courses), limits)
 
     def _check_sonars(
@@ -891,9 +877,9 @@ class CommandLimiter:
             return
         delay = sonars.delay(now) + config.reaction
         reach = self._reach(delay)
-        views = [sonars.look(way, reach, now) for way, _ in courses]
+        views = [sonars.look(twist, reach, now) for twist, _ in courses]
         free = min((view.free for view in views), default=math.inf)
-        free = min(free, self._beside_peers(now, courses, reach, limits, None))
+        free = min(free, self._free_of_peers(now, courses, reach, limits, None))
         fastest = max((pace for _, pace in courses), default=0.0)
         self._stop_before(free, self._comfortable(free, delay), fastest, limits)
         if any(view.dead for view in views):
@@ -904,16 +890,16 @@ class CommandLimiter:
     def _check_obstacles(
         self, now: int, wanted: Twist[float], shafts: Speeds | None, limits: dict[Reason, float]
     ) -> None:
-        """Sweep the footprint along both motions, and as the wheels are seen to stand, against the scan."""
+        """Sweep the footprint against the scan: along both motions, and along that of the measured steering angles."""
         motion, courses = self._motion, self._courses(wanted, shafts)
         if not courses:
             return
         fastest = max(pace for _, pace in courses)
         if self._sensors.steering_fresh(now):
             courses.append((motion.along(courses[0][0], self._sensors.angles), 0.0))
-        ways = tuple(way for way, _ in courses)
-        free = self._obstacles.free_distance(ways)
-        free = min(free, self._beside_peers(now, courses, self._obstacles.reach, limits, self._obstacles.looks_at))
+        twists = tuple(twist for twist, _ in courses)
+        free = self._obstacles.free_distance(twists)
+        free = min(free, self._free_of_peers(now, courses, self._obstacles.reach, limits, self._obstacles.looks_at))
         self._stop_before(free, self._obstacles.allowed_speed(free, now), fastest, limits)
         unseen = self._obstacles.unseen
         self.blind = unseen is None or unseen > self._config.scan.stale_after
@@ -925,7 +911,7 @@ class CommandLimiter:
         if allowed < fastest:
             limits[Reason.UNSEEN_SLOW] = allowed
         measured = self._sensors.shaft_speeds(now)
-        speed = max(motion.progress(measured, way) for way in ways) if measured else 0.0
+        speed = max(motion.progress(measured, twist) for twist in twists) if measured else 0.0
         approaching = speed > self._config.standstill
         near = self.blocked and self._obstacles.too_near(free, speed, now)
         self.emergency = approaching and (self.emergency or near)

@@ -78,7 +78,7 @@ class TickMeter:
 
 @dataclass(frozen=True, slots=True)
 class GateInputs:
-    """Topics of which the gate reads the newest message. All others are passed to it as they arrive."""
+    """Topics whose newest message is read at every tick; requests, events and health are passed on as they arrive."""
 
     scan: Subscription[LaserScan]
     attitude: Subscription[Attitude]
@@ -89,9 +89,9 @@ class GateInputs:
     sonar: Subscription[SonarRanges] | None = None
     """Of a robot that has sonars."""
     peers: Subscription[Peers] | None = None
-    """Of a robot that hears others."""
+    """Of a robot with peers."""
     pose: Subscription[Odometry] | None = None
-    """Of one that hears others."""
+    """Of a robot with peers, in map."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -222,7 +222,7 @@ class GateService:
         self._guarded(None, self._gate.observe_health, table)
 
     def shut_down(self) -> None:
-        """Command neutral now and for good; the ticks go on until ``run`` is cancelled."""
+        """Command neutral from now on; the ticks go on until ``run`` is cancelled."""
         self._publish(self._gate.neutral(self._clock.now()), self._clock.now())
 
     def _guarded(self, default: T, take: Callable[..., T], *arguments: object) -> T:
@@ -253,7 +253,7 @@ class GateService:
                 group.create_task(self._keep_latch(), name="gate latch")
                 group.create_task(self._fail(), name="gate bug")
                 try:
-                    await self._tick_for_ever(ready)
+                    await self._tick_forever(ready)
                 finally:
                     self.shut_down()  # before waiting for the disk
         finally:
@@ -264,7 +264,7 @@ class GateService:
         if await self._store_latch():
             self._latch.close()
 
-    async def _tick_for_ever(self, ready: Ready) -> None:
+    async def _tick_forever(self, ready: Ready) -> None:
         schedule = Schedule(self._clock, self._rate, ahead=0)
         while True:
             due = await schedule.next()
@@ -364,10 +364,10 @@ class GateService:
         )
 
     def _mark_latch(self) -> None:
-        """Mark an emergency stop before it is reported, and clear the mark once the disk agrees.
+        """Mark an emergency stop before it is reported; clear the mark once the file on the disk agrees.
 
-        The thread that stores the latch never touches the mark: a stop that is ordered while the one before is being
-        removed from the disk keeps its own.
+        The thread that writes the file never touches the mark: a stop that is ordered while the file of the one before
+        is removed keeps its mark.
         """
         marked = self.mode is GateMode.ESTOPPED and self._latched is not True
         now = self._clock.now()
@@ -390,7 +390,7 @@ class GateService:
                 self._latch_differs.set()
 
     async def _store_latch(self) -> bool:
-        """Store the latch if it differs from the gate's mode; completes even if cancelled; False if that failed."""
+        """Write the latch file if it differs from the gate's mode, even if cancelled; False if writing failed."""
         wanted = self._gate.mode is GateMode.ESTOPPED
         if wanted == self._latched:
             return True
@@ -411,7 +411,7 @@ class GateService:
 
 
 class _Feed:
-    """Passes each newest message of a subscription on once."""
+    """Passes each message of a latest-only subscription on once."""
 
     def __init__(self, subscription: Subscription[Any], observe: Callable[[Any], None]) -> None:
         self._subscription = subscription

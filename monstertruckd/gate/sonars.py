@@ -2,13 +2,13 @@
 
 An echo is somewhere on the arc of its range across the sonar's cone. The rule for the unknown bearing:
 
-- Of a sonar that looks where the robot goes, to within ``ALIGNED``, the whole arc counts.
-- Of every other one the part within ``gate.sonar.core`` of its axis counts: the rest of the arc would put a wall that
-  the robot drives along into its way. What stands there is in the cone of the sonar ahead before it is reached.
-- The newest two rounds count, for sound that is reflected away leaves a round without its echo.
+- A sonar whose axis is within ``ALIGNED`` of the direction of travel: the whole arc is an obstacle.
+- Any other sonar: the part within ``gate.sonar.core`` of its axis. The whole arc would block a robot that drives along
+  a wall; an obstacle in the rest of the arc is in the cone of the sonar ahead before the robot reaches it.
+- The newest two rounds of pings are used, as a single echo may be reflected away.
 
-A sonar that does not answer leaves its cone unknown: one that looks where the robot goes stops it, any other one slows
-it, and so does a direction into which none looks.
+A sonar that does not answer leaves its cone unknown. One in the direction of travel stops the robot, any other one
+slows it, and so does a direction of travel without a sonar.
 """
 
 import math
@@ -19,23 +19,22 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from monstertruck_kinematics.elementary import Array
-from monstertruck_planners.collision import Footprint, first_contact, swept_poses
+from monstertruck_planners.collision import Footprint, UnitTwist, free_distance
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.sensor import SonarRanges
 from monstertruckd.gate.config import GateConfig
 
 ALIGNED: Final = 0.3
-"""Greatest angle between axis and direction of travel, rad, for a sonar to look where the robot goes."""
+"""Greatest angle between the axis of a sonar and the direction of travel for it to look ahead, rad."""
 SPACING: Final = 0.02
 """Between the points of an arc, m."""
 STEP: Final = 0.02
 """Between the poses of a sweep, m."""
 ROUNDS: Final = 2
 TURNING: Final = 0.3
-"""A motion whose base travels less than this per metre of pace turns on the spot: no sonar looks where it goes."""
+"""A motion whose base travels less than this per metre of pace counts as a turn on the spot: no sonar looks ahead."""
 
 Place = tuple[float, float, float]
-Way = tuple[float, float, float]
 
 
 class SonarView(NamedTuple):
@@ -83,26 +82,21 @@ class SonarGuard:
         """Whether there is a round that is not too old."""
         return bool(self._rounds) and now - self._rounds[-1].received <= self._config.sonar.stale_after * SECOND
 
-    def look(self, way: Way, reach: float, now: int) -> SonarView:
+    def look(self, twist: UnitTwist, reach: float, now: int) -> SonarView:
         """Sweep a motion.
 
         Args:
-            way: twist per metre of pace, m/m, m/m, rad/m.
+            twist: of the base.
             reach: distance swept, m.
             now: ns.
         """
-        ahead = self._ahead(way)
+        ahead = self._ahead(twist)
         oldest = now - round(self._config.sonar.stale_after * SECOND)
         silent = [name for name in self._mounts if self._answered.get(name, -1) < oldest]
         points = self._points(ahead, now)
-        corner = math.hypot(way[0], way[1]) + abs(way[2]) * self._footprint.circumscribed_radius
-        distances = np.linspace(0.0, reach, max(2, math.ceil(reach * max(corner, 1.0) / STEP) + 1))
-        contact = first_contact(
-            self._footprint, swept_poses(way, distances), points, self._config.obstacle.side_clearance
-        )
-        free = math.inf if contact is None else float(distances[contact - 1])
+        free = free_distance(self._footprint, twist, points, reach, STEP, self._config.obstacle.side_clearance)
         dead = tuple(name for name in silent if name in ahead)
-        unknown = len(silent) > len(dead) or (not ahead and math.hypot(way[0], way[1]) >= TURNING)
+        unknown = len(silent) > len(dead) or (not ahead and math.hypot(twist[0], twist[1]) >= TURNING)
         self.view = SonarView(free, dead, unknown)
         return self.view
 
@@ -110,11 +104,11 @@ class SonarGuard:
         """Age of the newest round, s."""
         return max(now - self._rounds[-1].stamp, 0) / SECOND if self._rounds else 0.0
 
-    def _ahead(self, way: Way) -> frozenset[str]:
-        """Sonars that look where the base goes."""
-        if math.hypot(way[0], way[1]) < TURNING:
+    def _ahead(self, twist: UnitTwist) -> frozenset[str]:
+        """Sonars that look in the direction of travel."""
+        if math.hypot(twist[0], twist[1]) < TURNING:
             return frozenset()
-        travel = math.atan2(way[1], way[0])
+        travel = math.atan2(twist[1], twist[0])
         return frozenset(
             name for name, (_, _, yaw) in self._mounts.items() if abs(math.remainder(yaw - travel, math.tau)) <= ALIGNED
         )

@@ -73,14 +73,14 @@ class Gyro:
         """Take a yaw rate, rad/s, at ``stamp``, ns."""
         self._rates.append((stamp, rate))
 
-    def turned(self, since: int, stamp: int, wheels: float | None, way: float) -> float | None:
+    def turned(self, since: int, stamp: int, wheels: float | None, distance: float) -> float | None:
         """Mean yaw rate between two readings of the wheels, rad/s; None = leave it to the wheels.
 
         Args:
             since: ns.
             stamp: ns.
             wheels: mean yaw rate by the wheels, rad/s; None = they slip, and judge nobody.
-            way: of the fastest shaft, m.
+            distance: of the fastest shaft, m.
         """
         found = [rate for at, rate in self._rates if since < at <= stamp]
         if not found and self._rates and stamp - self._rates[-1][0] <= LATE:
@@ -89,7 +89,7 @@ class Gyro:
             self._forget()
             return None
         mean, dt = math.fsum(found) / len(found), (stamp - since) / SECOND
-        if way <= STILL:
+        if distance <= STILL:
             self._stand(mean, dt, stamp)
             return 0.0 if self.trusted else None
         self._rest, self._rested = [], 0.0
@@ -100,15 +100,15 @@ class Gyro:
             self._forget()
         else:
             self._judge(stamp, wheels * dt, rate * dt)
-            self._judge_long(stamp, wheels * dt, rate * dt, way)
+            self._judge_long(stamp, wheels * dt, rate * dt, distance)
         return rate if self.trusted else None
 
-    def variance(self, stamp: int, dt: float, way: float) -> float:
+    def variance(self, stamp: int, dt: float, distance: float) -> float:
         """What the drift of the bias adds in ``dt`` seconds to the variance of the turn since the last rest, rad^2.
 
         A bias that has changed at a rate d for the time T has turned the heading by d T^2 / 2.
         """
-        if way <= STILL or self.bias is None:
+        if distance <= STILL or self.bias is None:
             return 0.0
         rested = (stamp - self._known) / SECOND
         return self._config.drift**2 * rested**3 * dt
@@ -148,14 +148,14 @@ class Gyro:
         if self.trusted or abs(by_wheels) >= config.proof:
             self.trusted = agrees
 
-    def _judge_long(self, stamp: int, wheels: float, gyro: float, way: float) -> None:
+    def _judge_long(self, stamp: int, wheels: float, gyro: float, distance: float) -> None:
         """Give the bias up, until the robot rests, where it has crept away: too slowly for the short window."""
         config, rows = self._config, self._long
         if not self.trusted:
             rows.clear()
             self._sums = (0.0, 0.0)
             return
-        rows.append((stamp, wheels, gyro, config.share * abs(wheels) + TRIM * way))
+        rows.append((stamp, wheels, gyro, config.share * abs(wheels) + TRIM * distance))
         off, allowed = self._sums[0] + gyro - wheels, self._sums[1] + rows[-1][3]
         while stamp - rows[0][0] > LONG:
             _, by_wheels, by_gyro, may = rows.popleft()

@@ -1,8 +1,8 @@
 """Whether the headings of a compass turn with the robot or against it.
 
-A heading of the wrong sign is no outlier: near the heading at which north was found it is right, and a gate by its
-error lets it draw the yaw along as the robot turns slowly. Its turns tell: they are opposite to those of the wheels or
-of an inertial measurement unit.
+A heading of the wrong sign is no outlier: it is right near the heading at which north was found, and while the robot
+turns slowly it pulls the yaw with it, within any outlier gate. Only its turns show the fault: they are opposite to
+those of the wheels or of an inertial measurement unit.
 """
 
 from collections import deque
@@ -12,16 +12,16 @@ from typing import Final, NamedTuple
 from monstertruck_estimation.transforms import wrap_angle
 
 PROOF: Final = 0.25
-"""Turn of the robot over which the headings are compared, rad: several times what iron near by makes of it."""
+"""Turn of the robot over which the headings are compared, rad: several times the error that iron nearby causes."""
 LONGEST: Final = 3.0
-"""Way within which it has to turn so far, m: a drift of the wheels over a long way is no turn."""
+"""Distance within which it has to turn that much, m: a drift of the wheels over a long distance is no turn."""
 ALIKE: Final = 0.5
-"""Share of the turn that the headings have to show, with its sign or with the other, to prove anything."""
+"""Least share of the turn that the headings must show, with the same or the opposite sign, for a decision."""
 
 
 class _Row(NamedTuple):
     turn: float
-    way: float
+    distance: float
     heading: float
     correction: float
 
@@ -34,14 +34,14 @@ class ContraryTurn:
     """Turn of the robot, rad."""
     headings: float
     """Turn by the headings, rad."""
-    way: float
-    """In which, m."""
+    distance: float
+    """Distance travelled meanwhile, m."""
     correction: float
-    """By how much they have drawn the yaw along meanwhile, rad."""
+    """Correction of the yaw by these headings, rad."""
 
     @property
     def text(self) -> str:
-        """What is seen, in words."""
+        """For a log."""
         return f"the compass turned {self.headings:+.2f} rad while the robot turned {self.robot:+.2f}: a wrong sign?"
 
 
@@ -50,22 +50,22 @@ class HeadingTurns:
 
     def __init__(self) -> None:
         self._rows: deque[_Row] = deque()
-        self._turn = self._way = self._heading = self._correction = 0.0
+        self._turn = self._distance = self._heading = self._correction = 0.0
         self._last: float | None = None
         self.contrary: ContraryTurn | None = None
-        """What showed that they turn against it; None while they do not."""
+        """The turn that showed it; None while headings turn with the robot."""
 
-    def moved(self, turn: float, way: float) -> None:
-        """The robot turned by ``turn``, rad, by something else than the compass, on ``way``, m."""
+    def moved(self, turn: float, distance: float) -> None:
+        """The robot turned by ``turn``, rad, without the compass, over ``distance``, m."""
         self._turn += turn
-        self._way += way
+        self._distance += distance
 
     def corrected(self, by: float) -> None:
         """A heading corrected the yaw by so much, rad."""
         self._correction += by
 
     def forget(self) -> None:
-        """What comes next is not to be compared with what was: the field or the wheels are disturbed."""
+        """Start a new comparison: the field or the wheels were disturbed."""
         self._rows.clear()
 
     def observe(self, yaw: float) -> bool:
@@ -74,8 +74,10 @@ class HeadingTurns:
             self._heading += wrap_angle(yaw - self._last)
         self._last = yaw
         rows = self._rows
-        rows.append(_Row(self._turn, self._way, self._heading, self._correction))
-        while self._way - rows[0].way > LONGEST or (len(rows) > 2 and abs(self._turn - rows[1].turn) >= PROOF):
+        rows.append(_Row(self._turn, self._distance, self._heading, self._correction))
+        while self._distance - rows[0].distance > LONGEST or (
+            len(rows) > 2 and abs(self._turn - rows[1].turn) >= PROOF
+        ):
             rows.popleft()
         first, before = rows[0], self.contrary
         turn, heading = self._turn - first.turn, self._heading - first.heading
@@ -84,7 +86,7 @@ class HeadingTurns:
         share = heading / turn
         if share <= -ALIKE:
             self.contrary = before or ContraryTurn(
-                turn, heading, self._way - first.way, self._correction - first.correction
+                turn, heading, self._distance - first.distance, self._correction - first.correction
             )
         elif share >= ALIKE:
             self.contrary = None

@@ -35,13 +35,13 @@ Vector = tuple[float, float, float]
 
 
 STILL: Final = 0.02
-"""Distance, m, up to which the truck counts as standing at its start."""
+"""Distance from the start up to which the truck counts as standing there, m."""
 
 RATES: Final = 32
-"""Measurements of an IMU that may wait."""
+"""Measurements of an IMU queued at most."""
 
 SOURCE_TIMEOUT: Final = SECOND
-"""A sensor is listed as a source for this long after a reading, ns."""
+"""Time after a reading for which a sensor is listed as a source, ns."""
 
 
 _NINE: Final = Struct("9d")
@@ -86,9 +86,9 @@ class CompassConfig(Schema):
     """How the compass holds the heading."""
 
     noise: Positive = 0.05
-    """Standard deviation of a heading, rad; larger than the sensor's own, because its errors last."""
+    """Standard deviation of a heading, rad; larger than the sensor's own, because its errors are correlated in time."""
     gate: Positive = 3.0
-    """A heading further off than this many standard deviations is left out."""
+    """Outlier gate: a heading further off than this many standard deviations is rejected."""
     alignment: Annotated[int, Field(ge=1)] = 10
     """Headings averaged at the start to find north in the odom frame, unless the truck drives off earlier."""
 
@@ -102,13 +102,13 @@ class OdometrySettings(Schema):
 
 
 class OdometryConfig(OdometrySettings):
-    """Dead reckoning: start and trust."""
+    """Dead reckoning: start pose and noise."""
 
     kind: Literal["reckoning"] = "reckoning"
     start: Pose2D = Pose2D(x=0.0, y=0.0, yaw=0.0)
     """Pose of base in odom at the start, m and rad."""
     distance_noise: NotNegative = 0.02
-    """Standard deviation of the way per root metre driven, m."""
+    """Standard deviation of the distance per root metre driven, m."""
     lateral_noise: NotNegative = 0.01
     """Standard deviation of sideways slip per root metre driven, m."""
     yaw_noise: NotNegative = 0.05
@@ -118,11 +118,11 @@ class OdometryConfig(OdometrySettings):
     turn_noise: NotNegative = 0.1
     """Standard deviation of the yaw rate while it is predicted, rad/s."""
     max_prediction: Positive = 0.3
-    """Seconds the last motion is carried on without a drive reading; then the pose waits, its covariance grows on."""
+    """Seconds of prediction without a drive reading; then the pose stays, and its covariance goes on growing."""
     max_speed: Positive = 0.6
-    """A drive position that would need more than this, m/s, is a new origin (the drive restarted), not a way."""
+    """A drive position that would need more than this, m/s, is a new origin (the drive restarted), not a motion."""
     compass: CompassConfig | None = CompassConfig()
-    """None leaves the heading to the wheels."""
+    """Null: the heading is that of the wheels."""
     gyro: GyroConfig | None = GyroConfig()
     """Yaw rate of an inertial measurement unit, where there is one; null leaves it out"""
 
@@ -145,13 +145,13 @@ class OdometryEstimate:
 
 
 class SensorInput(Protocol):
-    """Messages of one more sensor, which an estimator does not have to know."""
+    """Messages of an additional sensor, passed to the estimator by its own adapter."""
 
     def take(self) -> None:
-        """Pass new ones on, before those of the wheels."""
+        """Pass new messages to the estimator, before those of the wheels."""
 
     def report(self) -> None:
-        """Report what changed."""
+        """Emit events about changes."""
 
 
 class OdometryEstimator(Protocol):
@@ -171,7 +171,7 @@ class OdometryEstimator(Protocol):
 
 
 class DeadReckoning:
-    """Extended Kalman filter of (x, y, yaw): the drive moves it, the compass corrects its yaw.
+    """Extended Kalman filter of (x, y, yaw): predicted by the drive, corrected in yaw by the compass.
 
     Args:
         config: start and noise.
@@ -196,11 +196,11 @@ class DeadReckoning:
         self._gyro_used: int | None = None
         self._turns = HeadingTurns()
         self._otherwise = 0
-        """Headings in a row that were too far off while they are used, or right while they are left out."""
+        """Headings in a row that contradict ``doubt``: outliers while they are used, or inliers while they are not."""
         self.rejected_headings = 0
-        """Headings left out because they were too far off."""
+        """Headings rejected by the outlier gate."""
         self.doubt: str | None = None
-        """Why headings are left out, in words; None while they are used."""
+        """Why headings are rejected, for a log; None while they are used."""
 
     def observe_steering(self, feedback: SteeringFeedback) -> None:
         """Take the servo angles being sent, unless the servo controller marks them untrusted."""
@@ -219,28 +219,28 @@ class DeadReckoning:
 
     @property
     def _twist(self) -> Vector:
-        """With which the pose is carried on."""
+        """With which the pose is predicted."""
         return self._wheels.twist
 
     @property
     def _carriers(self) -> tuple[str, ...]:
-        """What moves the pose now."""
+        """Sensors that move the pose now."""
         return ("drive",)
 
     def _move(self, roll: WheelIncrement) -> None:
-        """Along the arc that wheels rolled."""
+        """Predict along the arc of the wheels."""
         dt = roll.dt
         if roll.lost:
             self._lose(dt)
             return
-        self._driven += roll.way
+        self._driven += roll.distance
         vx, vy, wz = roll.twist
         trusted = self._gyro is not None and self._gyro.trusted
-        rate = None if self._gyro is None else self._gyro.turned(roll.since, roll.stamp, wz, roll.way)
+        rate = None if self._gyro is None else self._gyro.turned(roll.since, roll.stamp, wz, roll.distance)
         drifted = 0.0
         if rate is not None and self._gyro is not None:
             wz, self._gyro_used = rate, roll.stamp
-            drifted = self._gyro.variance(roll.stamp, dt, roll.way)
+            drifted = self._gyro.variance(roll.stamp, dt, roll.distance)
         pose = integrate(self._pose, vx, vy, wz, dt)
         moved = self._covariance.moved(pose[0] - self._pose[0], pose[1] - self._pose[1])
         self._covariance = moved.plus(self._slipped(roll))
@@ -248,10 +248,10 @@ class DeadReckoning:
             drifted = self._gyro.difference**2
         self._covariance = self._covariance.plus(PlanarCovariance(ww=drifted))
         self._pose = pose
-        self._turns.moved(wz * dt, roll.way)
+        self._turns.moved(wz * dt, roll.distance)
 
     def observe_attitude(self, attitude: Attitude) -> None:
-        """Take a heading: the first ones find north, the others correct the yaw."""
+        """Take a heading: the first ones determine north in odom, the others correct the yaw."""
         config = self._config.compass
         if config is None or not self._wheels.known:
             return
@@ -294,12 +294,12 @@ class DeadReckoning:
         twist = self._twist
         ahead = min(age, self._config.max_prediction)
         x, y, yaw = integrate(self._pose, *twist, ahead)
-        # The predicted way turns with the uncertain yaw; an uncertain speed, alike in all directions, adds to it.
+        # The predicted motion turns with the uncertain yaw; the uncertain speed, alike in all directions, is added.
         moved = self._covariance.moved(x - self._pose[0], y - self._pose[1])
         covariance = moved.plus(term * age**2 for term in self._drift)
         twist_covariance = self._twist_covariance
         if (waited := age - ahead) > 0.0:
-            # Nobody knows whether it still drives: the pose waits, at no speed, as uncertain as if it did.
+            # It may still drive: the pose stays, at speed 0, with the uncertainty of such a motion.
             pace, turn = twist[0] ** 2 + twist[1] ** 2, twist[2] ** 2
             lost = PlanarCovariance(xx=pace, yy=pace, ww=turn)
             covariance = covariance.plus(term * waited**2 for term in lost)
@@ -322,7 +322,7 @@ class DeadReckoning:
         )
 
     def _contradict(self) -> None:
-        """Headings turn against the robot, or no longer do: take back what they did; north is found anew afterwards."""
+        """Headings turn against the robot, or no longer do: undo their corrections, and determine north again."""
         self._north, self._otherwise, self.doubt = None, 0, None
         self._aligning.clear()
         contrary = self._turns.contrary
@@ -331,19 +331,19 @@ class DeadReckoning:
         self.doubt, by = contrary.text, contrary.correction
         x, y, yaw = self._pose
         self._pose = (x, y, yaw - by)
-        aside = (by * contrary.way) ** 2
+        aside = (by * contrary.distance) ** 2
         self._covariance = self._covariance.plus(PlanarCovariance(xx=aside, yy=aside, ww=by**2))
 
     def _lose(self, dt: float) -> None:
-        """The drive counts from a new origin: what it did in between is not known."""
+        """The drive's counter has a new origin: add the uncertainty of an unknown motion."""
         lost = (self._config.max_speed * dt) ** 2
         turned = lost * self._chassis.bicycle.curvature(0.4, -0.4) ** 2
         self._covariance = self._covariance.plus(PlanarCovariance(xx=lost, yy=lost, ww=turned))
 
     def _slipped(self, roll: WheelIncrement) -> PlanarCovariance:
-        """What slip adds along the arc."""
+        """Covariance that slip adds along the arc."""
         (a, b, c), (d, e, f), (_, _, g) = integration_jacobians(self._pose, *roll.twist, roll.dt)[1].tolist()
-        along, aside, turned = (share * roll.way / roll.dt**2 for share in self._slip)
+        along, aside, turned = (share * roll.distance / roll.dt**2 for share in self._slip)
         return PlanarCovariance(
             xx=a * a * along + b * b * aside + c * c * turned,
             xy=a * d * along + b * e * aside + c * f * turned,
@@ -361,8 +361,8 @@ class DeadReckoning:
             )
 
 
-def _untold(*_: Any, **__: Any) -> None:
-    """Sink of the events of an odometry that is given none."""
+def _no_events(*_: Any, **__: Any) -> None:
+    """Event sink that discards all."""
 
 
 class OdometryService:
@@ -377,8 +377,8 @@ class OdometryService:
         odometry: ``state/odometry``.
         pose: ``state/pose``; None = published by localisation.
         imu: measurements of an inertial measurement unit, if there is one.
-        encoders: those of wheels that roll along, if the estimator takes them.
-        events: where it is reported that headings are left out.
+        encoders: of wheels that are not driven, if the estimator takes them.
+        events: about rejected headings.
         rate: poses per second.
     """
 
@@ -396,7 +396,7 @@ class OdometryService:
         pose: Publisher[Odometry] | None,
         imu: InertialInput | None = None,
         encoders: SensorInput | None = None,
-        events: EventSink = _untold,
+        events: EventSink = _no_events,
         rate: float = 50.0,
     ) -> None:
         self._reckoning = reckoning
@@ -486,7 +486,7 @@ def _message(estimate: OdometryEstimate, now: int, seq: int) -> Odometry:
 
 @dataclass(frozen=True, slots=True)
 class OdometryContext:
-    """What an odometry is made for."""
+    """The robot and the bus that an odometry is built for."""
 
     chassis: Chassis
     clock: Clock
@@ -501,7 +501,7 @@ class OdometryContext:
     """Its rear wheels have encoders."""
 
     def inertial(self, config: GyroConfig | None) -> InertialInput | None:
-        """Its IMU, if there is one that counts."""
+        """Its IMU, if there is one and the configuration uses it."""
         if self.imu is None or config is None:
             return None
         measured, events = self.bus.subscribe(topics.IMU, fifo(RATES)), self.bus.event_sink()

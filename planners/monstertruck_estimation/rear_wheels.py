@@ -1,9 +1,9 @@
 """Odometry of a tricycle by the encoders of its rear wheels, judged by its driven wheel.
 
-The rear wheels are not driven, so they do not slip, and tell speed and turn without the steering angle. The front wheel
-tells the same by its rate and angle: thdot = (v_s/d) sin(alpha). Over a stretch both have to agree. An encoder that is
-stuck, mirrored or loose is left out, what it measured since the first sign of it is taken back, and the other wheel
-goes on with the turn of the steering; without both, or while nothing is heard of them, the front wheel goes on alone.
+The rear wheels are not driven, so they do not slip, and give speed and yaw rate without the steering angle. The driven
+front wheel gives both as well, by its rate and angle: thdot = (v_s/d) sin(alpha). Over some distance both must agree.
+An encoder that is stuck, mirrored or loose is rejected, and its measurements since the first sign of it are undone. The
+other wheel is then used with the yaw rate of the steering; without both encoders the front wheel is used alone.
 """
 
 import math
@@ -39,34 +39,34 @@ Pair = tuple[float, float]
 
 SIDES: Final = ("left", "right")
 WAITING: Final = 32
-"""Readings that may wait."""
+"""Readings queued at most."""
 LATE: Final = SECOND // 5
-"""Readings this far apart have something missing between them, ns."""
+"""Interval between two readings from which on one is missing, ns."""
 KEPT: Final = 256
 """Readings, and poses, that are kept."""
 STANDS: Final = 0.2
-"""Share of the expected way below which a wheel stands."""
+"""Share of the expected distance below which a wheel stands still."""
 RUNS: Final = 1.5
-"""Share of the driven wheel's way beyond which both rear wheels cannot have rolled."""
+"""Share of the driven wheel's distance that both rear wheels cannot exceed."""
 NARROW: Final = 0.3
-"""Share of the axle's speed below which a wheel says nothing about it: the robot turns about it."""
+"""Share of the axle's speed below which a wheel does not determine it: the robot turns about that wheel."""
 
 
 class EncoderConfig(Schema):
-    """When encoders are believed."""
+    """When encoders are used."""
 
     stretch: Positive = 0.1
-    """Newest way over which rear wheels and driven wheel are compared, m,"""
+    """Newest distance over which rear wheels and driven wheel are compared, m"""
     proof: Positive = 0.3
-    """and the way after a difference over which it has to last; until then the driven wheel carries the pose"""
+    """Distance over which a difference must last, m; until then the driven wheel moves the pose"""
     tolerance: Positive = 0.02
-    """Tolerated difference, m,"""
+    """Tolerated difference, m"""
     share: Annotated[float, Field(ge=0, lt=1)] = 0.12
-    """and as a share of the greater way: the driven wheel slips a little, the steering lags"""
+    """Tolerated difference as a share of the greater distance: the driven wheel slips a little, the steering lags"""
 
 
 class RearWheelConfig(OdometryConfig):
-    """Encoders of the rear wheels; start, trust and compass as of dead reckoning."""
+    """Encoders of the rear wheels; other settings as of dead reckoning."""
 
     kind: Literal["encoders"] = "encoders"  # type: ignore[assignment]  # each kind has its own word
     encoders: EncoderConfig = EncoderConfig()
@@ -88,16 +88,16 @@ class EncoderVerdict(NamedTuple):
 
 
 def judged(expected: Pair, counted: Pair, turned: float, least: float, config: EncoderConfig) -> EncoderVerdict | None:
-    """Which of two encoders can be right; None = too little of a way.
+    """Which of two encoders can be right; None = the distance is too short.
 
     Two that agree with each other and with the steering are right, and the driven wheel slips; two that roll as far as
     it on average are right too, and the steering is not where it is said to be.
 
     Args:
-        expected: ways of the wheels by rate and angle of the front wheel, m.
-        counted: ways by the encoders, m.
+        expected: distances of the wheels by rate and angle of the front wheel, m.
+        counted: distances by the encoders, m.
         turned: how much further the right wheel rolls than the left one, by the counted mean and the steering alone, m.
-        least: way of some wheel for a verdict, m.
+        least: distance of some wheel for a verdict, m.
         config: limits.
     """
     if max(map(abs, (*expected, *counted))) < least:
@@ -135,13 +135,13 @@ def _fault(want: float, have: float, *, agrees: bool) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class EncoderWay:
+class EncoderIncrement:
     """Ways of both wheels between two readings, m."""
 
     since: int
     """ns."""
     stamp: int
-    ways: Pair
+    distances: Pair
     front: float
     """Mean steering angle, rad."""
 
@@ -151,7 +151,7 @@ class Compared(NamedTuple):
 
     since: int
     """ns."""
-    way: float
+    distance: float
     """Of the wheel that rolled furthest, m, positive."""
     expected: Pair
     """By the driven wheel, m."""
@@ -191,7 +191,7 @@ class Encoders:
         """Of the newest reading, ns."""
         return self._rolled[-1][0] if self._rolled else None
 
-    def observe(self, reading: WheelEncoders, front: float) -> EncoderWay | None:
+    def observe(self, reading: WheelEncoders, front: float) -> EncoderIncrement | None:
         """What was rolled since the last reading; None = not known, or the reading is not later."""
         radius = self._chassis.drivetrain.wheel_radius
         now = (reading.left * radius, reading.right * radius)
@@ -205,8 +205,8 @@ class Encoders:
         self._rolled.append((reading.stamp, now))
         if before is None:
             return None
-        ways = now[0] - before[1][0], now[1] - before[1][1]
-        return EncoderWay(before[0], reading.stamp, ways, front)
+        distances = now[0] - before[1][0], now[1] - before[1][1]
+        return EncoderIncrement(before[0], reading.stamp, distances, front)
 
     def compare(self, roll: WheelIncrement) -> int | None:
         """Judge by what the driven wheel did.
@@ -221,26 +221,26 @@ class Encoders:
             return None
         left, right = self._chassis.rear_of_twist(roll.twist)
         expected, counted = (left * roll.dt, right * roll.dt), (end[0] - start[0], end[1] - start[1])
-        way = max(map(abs, (*expected, *counted)))
-        if way == 0.0:
+        distance = max(map(abs, (*expected, *counted)))
+        if distance == 0.0:
             return None
         turned = sum(counted) * self._chassis.lean(roll.angles[0])
-        self._compared.append(Compared(roll.since, way, expected, counted, turned))
+        self._compared.append(Compared(roll.since, distance, expected, counted, turned))
         return self._judge()
 
     def _judge(self) -> int | None:
         """Of the newest stretch; a verdict that is another one has to be confirmed by a longer one after it."""
-        ways, doubted, since = self._compared, self._doubted, self._since
+        compared, doubted, since = self._compared, self._doubted, self._since
         stretch = self.config.stretch if since is None else self.config.proof
-        total = math.fsum(one.way for one in ways)
-        while total - ways[0].way >= stretch:
-            total -= ways.popleft().way
+        total = math.fsum(one.distance for one in compared)
+        while total - compared[0].distance >= stretch:
+            total -= compared.popleft().distance
         if since is not None and total < stretch:
             return None
         verdict = judged(
-            (math.fsum(one.expected[0] for one in ways), math.fsum(one.expected[1] for one in ways)),
-            (math.fsum(one.counted[0] for one in ways), math.fsum(one.counted[1] for one in ways)),
-            math.fsum(one.turned for one in ways),
+            (math.fsum(one.expected[0] for one in compared), math.fsum(one.expected[1] for one in compared)),
+            (math.fsum(one.counted[0] for one in compared), math.fsum(one.counted[1] for one in compared)),
+            math.fsum(one.turned for one in compared),
             stretch / 2,
             self.config,
         )
@@ -251,11 +251,11 @@ class Encoders:
             self._since, self._doubted = None, False
             return None
         if since is None:
-            self._since, self._doubted = ways[0].since, wrong
+            self._since, self._doubted = compared[0].since, wrong
         else:
             self._since, self._doubted, self.verdict = None, False, verdict
-        begun = ways[0].since if since is None else since
-        ways.clear()
+        begun = compared[0].since if since is None else since
+        compared.clear()
         return begun if wrong and not doubted else None
 
     def _at(self, stamp: int) -> Pair | None:
@@ -283,7 +283,7 @@ class RearWheelReckoning(DeadReckoning):
         self.encoders = Encoders(config.encoders, chassis)
         self._tricycle = chassis
         self._front = 0.0
-        self._ways: deque[EncoderWay] = deque(maxlen=KEPT)
+        self._increments: deque[EncoderIncrement] = deque(maxlen=KEPT)
         self._rolls: deque[WheelIncrement] = deque(maxlen=KEPT)
         self._kept: deque[tuple[int, Vector, PlanarCovariance]] = deque(maxlen=KEPT)
         """(ns, pose, covariance) before each motion."""
@@ -295,10 +295,10 @@ class RearWheelReckoning(DeadReckoning):
     def observe_encoders(self, reading: WheelEncoders) -> None:
         """Take the angles of both rear wheels and move the pose along the arc they rolled."""
         front = self._wheels.front
-        way = self.encoders.observe(reading, (self._front + front) / 2)
+        increment = self.encoders.observe(reading, (self._front + front) / 2)
         self._front = front
-        if way is not None:
-            self._ways.append(way)
+        if increment is not None:
+            self._increments.append(increment)
         self._go_on()
 
     def observe_drive(self, *shafts: DriveFeedback) -> None:
@@ -339,14 +339,14 @@ class RearWheelReckoning(DeadReckoning):
         """The next motion from ``at`` on, and whether it is the encoders'; None = nothing more is known."""
         until: int | None = None
         if self._heard() and any(self.encoders.believed):
-            way = next((way for way in self._ways if way.stamp > at), None)
-            if way is None:
+            increment = next((increment for increment in self._increments if increment.stamp > at), None)
+            if increment is None:
                 return None
-            if way.since <= at:
-                roll = self._by_encoders(way)
+            if increment.since <= at:
+                roll = self._by_encoders(increment)
                 if roll is not None:
-                    return _part(roll, at, way.stamp), True
-            until = way.stamp if way.since <= at else way.since
+                    return _part(roll, at, increment.stamp), True
+            until = increment.stamp if increment.since <= at else increment.since
         driven = next((roll for roll in self._rolls if roll.stamp > at), None)
         if driven is None:
             return None
@@ -357,10 +357,10 @@ class RearWheelReckoning(DeadReckoning):
         newest = self.encoders.stamp
         return newest is not None and self._wheels.stamp - newest <= LATE
 
-    def _by_encoders(self, way: EncoderWay) -> WheelIncrement | None:
+    def _by_encoders(self, increment: EncoderIncrement) -> WheelIncrement | None:
         """Motion by the wheels that are believed; None = the one that is says nothing here."""
-        dt, lean = (way.stamp - way.since) / SECOND, self._tricycle.lean(way.front)
-        left, right = way.ways[0] / dt, way.ways[1] / dt
+        dt, lean = (increment.stamp - increment.since) / SECOND, self._tricycle.lean(increment.front)
+        left, right = increment.distances[0] / dt, increment.distances[1] / dt
         trusted = self.encoders.believed
         if not all(trusted):
             speed, share = (left, 1.0 - lean) if trusted[0] else (right, 1.0 + lean)
@@ -369,7 +369,7 @@ class RearWheelReckoning(DeadReckoning):
             left, right = speed / share * (1.0 - lean), speed / share * (1.0 + lean)
         rolled = max(abs(left), abs(right)) * dt
         twist = self._tricycle.twist_of_rear(left, right)
-        return WheelIncrement(way.since, way.stamp, twist, rolled, (twist[0],), (way.front, 0.0))
+        return WheelIncrement(increment.since, increment.stamp, twist, rolled, (twist[0],), (increment.front, 0.0))
 
     def _take_back(self, since: int) -> None:
         """Return to the pose at that instant, ns, or to the oldest one that is kept."""
@@ -387,7 +387,7 @@ def _part(roll: WheelIncrement, since: int, stamp: int) -> WheelIncrement:
     """The part of a motion from ``since`` (or its beginning) to ``stamp``; one that is not known stays whole."""
     since = max(since, roll.since)
     share = (stamp - since) / (roll.stamp - roll.since)
-    return replace(roll, since=since, stamp=stamp, way=roll.way * share)
+    return replace(roll, since=since, stamp=stamp, distance=roll.distance * share)
 
 
 class EncoderInput:

@@ -29,14 +29,14 @@ class WheelIncrement:
     """ns."""
     twist: Vector
     """Mean vx, vy (m/s) and wz (rad/s) in between."""
-    way: float
-    """Of the fastest shaft, m, not negative."""
+    distance: float
+    """Travelled by the fastest shaft, m, not negative."""
     pace: Speeds
-    """What the family makes of its shafts, see ``Chassis.input_speeds``."""
+    """Speeds of the family's inputs, see ``Chassis.input_speeds``."""
     angles: Angles
     """Mean steering angles, rad."""
     lost: bool = False
-    """The drive counts from a new origin: what it did is not known, and the twist is 0."""
+    """The drive's counter has a new origin: the motion is not known, and the twist is 0."""
 
     @property
     def dt(self) -> float:
@@ -49,7 +49,7 @@ class WheelMotion:
 
     Args:
         chassis: from motors and servos to the body's motion.
-        max_speed: a position that would need more than this, m/s, is a new origin, not a way.
+        max_speed: a position that would need more than this, m/s, is a new origin, not a motion.
     """
 
     def __init__(self, chassis: Chassis, max_speed: float) -> None:
@@ -107,36 +107,36 @@ class WheelMotion:
         if max(map(abs, rolled)) > self._max_speed * dt:
             self._pace = (0.0,) * len(self._pace)
             return WheelIncrement(since, stamp, (0.0, 0.0, 0.0), 0.0, self._pace, angles, lost=True)
-        self._pace = self._chassis.input_speeds(tuple(way / dt for way in rolled), *angles)
-        way = max(map(abs, self._pace)) * dt
-        return WheelIncrement(since, stamp, self._chassis.twist(self._pace, *angles), way, self._pace, angles)
+        self._pace = self._chassis.input_speeds(tuple(distance / dt for distance in rolled), *angles)
+        distance = max(map(abs, self._pace)) * dt
+        return WheelIncrement(since, stamp, self._chassis.twist(self._pace, *angles), distance, self._pace, angles)
 
 
-def way_covariance(chassis: Chassis, roll: WheelIncrement, shaft: float, angle: float, slip: Vector) -> Array:
-    """Covariance, shape (3, 3), of the way (dx, dy, dyaw) that ``roll`` stands for, in base; m and rad.
+def increment_covariance(chassis: Chassis, roll: WheelIncrement, shaft: float, angle: float, slip: Vector) -> Array:
+    """Covariance of the motion (dx, dy, dyaw) of ``roll`` in base, shape (3, 3); m and rad.
 
-    It grows with the way, not with the number of readings the way is cut into.
+    It grows with the distance, not with the number of readings.
 
     Args:
         chassis: the body.
-        roll: what the wheels did.
-        shaft: standard deviation of every shaft's way per root metre it rolled, m.
+        roll: motion of the wheels.
+        shaft: standard deviation of every shaft's distance per root metre it rolled, m.
         angle: standard deviation of the mean of every steering angle over one metre, rad.
-        slip: standard deviations of what the wheels cannot tell, forward and sideways (m) and in yaw (rad), per root
-            metre.
+        slip: standard deviations of motion that the wheels do not measure, forward and sideways (m) and in yaw (rad),
+            per root metre.
     """
     dt = roll.dt
-    result = np.diag(np.square(slip) * roll.way)
+    result = np.diag(np.square(slip) * roll.distance)
     for k, pace in enumerate(roll.pace):
         unit = tuple(float(k == i) for i in range(len(roll.pace)))
         by_shaft = np.array(chassis.twist(unit, *roll.angles))
         result += np.outer(by_shaft, by_shaft) * (shaft**2 * abs(pace) * dt)
-    if roll.way <= 0:
+    if roll.distance <= 0:
         return result
     for error in chassis.steering_errors:
         step = _ANGLE_STEP * np.array(error)
         ahead = np.array(chassis.twist(roll.pace, *(np.array(roll.angles) + step).tolist()))
         behind = np.array(chassis.twist(roll.pace, *(np.array(roll.angles) - step).tolist()))
         by_angle = (ahead - behind) * (dt / (2 * _ANGLE_STEP))
-        result += np.outer(by_angle, by_angle) * (angle**2 / roll.way)
+        result += np.outer(by_angle, by_angle) * (angle**2 / roll.distance)
     return result

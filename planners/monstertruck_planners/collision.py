@@ -25,6 +25,10 @@ OCCUPIED = 50
 """Occupancy, percent, from which a grid cell is an obstacle."""
 
 
+UnitTwist = tuple[float, float, float]
+"""Twist of the base (vx, vy, wz) per metre of distance travelled: m/m, m/m, rad/m."""
+
+
 @dataclass(frozen=True, slots=True)
 class Footprint:
     """Rectangle around the point that poses refer to (the base), grown by ``padding`` on every side.
@@ -71,6 +75,19 @@ class Footprint:
     def inscribed_radius(self) -> float:
         """Radius of the largest circle around the poses' point inside the padded rectangle, m."""
         return max(min(self.half_length - abs(self.offset), self.half_width), 0.0)
+
+    def corner_speed(self, twist: UnitTwist) -> float:
+        """Upper bound of the speed of its points at a twist of the base, m/s; of a unit twist m/m."""
+        return math.hypot(twist[0], twist[1]) + abs(twist[2]) * self.circumscribed_radius
+
+    def edge_points(self, along: int, across: int) -> Array:
+        """Points on its edges in base, shape (n, 2), m: ``along`` on each side, ``across`` on each end."""
+        half_length, half_width = self.half_length, self.half_width
+        x, y = np.linspace(-half_length, half_length, along), np.linspace(-half_width, half_width, across)
+        ends, sides = np.full(across, half_length), np.full(along, half_width)
+        return np.column_stack(
+            (np.concatenate((x, x, ends, -ends)) + self.offset, np.concatenate((sides, -sides, y, y)))
+        )
 
     def covering_discs(self, count: int = 3) -> tuple[Array, float]:
         """``count`` discs along x that together cover the rectangle.
@@ -247,12 +264,30 @@ def first_contact(
     return int(np.argmax(hits)) if hits.any() else None
 
 
-def swept_poses(twist: tuple[float, float, float], distances: Array) -> Array:
+def free_distance(
+    footprint: Footprint, twist: UnitTwist, points: Array, reach: float, step: float, margin: float
+) -> float:
+    """Distance that a footprint can travel with a constant twist before it touches a point, m; +inf beyond ``reach``.
+
+    Args:
+        footprint: outline.
+        twist: of the base.
+        points: obstacles in base, shape (n, 2), m.
+        reach: distance checked, m.
+        step: greatest motion of the outline between two poses checked, m.
+        margin: see ``first_contact``, m.
+    """
+    distances = np.linspace(0.0, reach, max(2, math.ceil(reach * max(footprint.corner_speed(twist), 1.0) / step) + 1))
+    contact = first_contact(footprint, swept_poses(twist, distances), points, margin)
+    return math.inf if contact is None else float(distances[contact - 1])
+
+
+def swept_poses(twist: UnitTwist, distances: Array) -> Array:
     """Poses of the base, starting at the origin, on the arc of a constant twist.
 
     Args:
-        twist: vx, vy, wz of the base per metre of way: m/m, m/m, rad/m.
-        distances: shape (m,), ways, m; negative backwards.
+        twist: of the base.
+        distances: travelled, shape (m,), m; negative backwards.
 
     Returns:
         Shape (m, 3).

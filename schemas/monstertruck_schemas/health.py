@@ -48,7 +48,7 @@ class CalibrationState(Schema):
     until: str
     """Day until which it counts, UTC."""
     metres_left: float | None = None
-    """Way that may be driven until it expires, m; None: the way does not count."""
+    """Distance that may be driven until it expires, m; None: not limited."""
     expired: str = ""
     """Why it no longer counts; empty while it does."""
 
@@ -58,7 +58,7 @@ class CalibrationHealth(Message):
 
     wizards: tuple[CalibrationState, ...] = ()
     odometer: float = 0.0
-    """Way that the robot has driven in all, m."""
+    """Total distance driven, m."""
 
 
 LATE: Final = 0.02

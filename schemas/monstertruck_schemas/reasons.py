@@ -175,7 +175,7 @@ class Reason(StrEnum):
     # Goals
     GOAL_MISSED = "goal_missed", 36, "the truck stands, but not where it was to go"
     GOAL_TIMEOUT = "goal_timeout", 37, "goal not reached in the time allowed"
-    STUCK = "stuck", 38, "the truck does not get on"
+    STUCK = "stuck", 38, "the truck makes no progress"
     NO_MAP = "no_map", 39, "no map or no pose to plan with yet"
     GOAL_ACCEPTED = "goal_accepted", 0, "a goal was taken on"
     ROUTE_FOUND = "route_found", 0, "a route was planned"

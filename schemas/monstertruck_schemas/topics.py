@@ -262,7 +262,7 @@ CALIBRATION: Final = Topic(
     "health/calibration",
     CalibrationHealth,
     W.DAEMON,
-    "What was calibrated, how well, until when; way driven in all",
+    "What was calibrated, how well, until when; total distance driven",
     retained=True,
 )
 LOOP: Final = Topic("health/loop", LoopHealth, W.DAEMON, "Lateness of the control tick", 1, stale_after=3.0)

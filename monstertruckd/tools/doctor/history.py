@@ -14,7 +14,7 @@ from monstertruck_runtime.errors import ConfigError, TruckError
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.topics import CMD_STEERING, COMPASS, EVENT, IMU, ODOMETRY
 from monstertruckd.config.calibration import CalibrationStore
-from monstertruckd.config.expiry import WayCounter, state_of
+from monstertruckd.config.expiry import DistanceCounter, state_of
 from monstertruckd.recorder.reader import open_log
 from monstertruckd.tools.doctor.context import Finding, HostContext, fail, fine, warn
 
@@ -50,7 +50,7 @@ def calibration(context: HostContext) -> Iterator[Finding]:
     if file is None:
         yield warn("calibration", Reason.CALIBRATION_EXPIRED, f"none in {place}", everything)
         return
-    counter = WayCounter(place.parent / "odometer.json")
+    counter = DistanceCounter(place.parent / "odometer.json")
     counter.load()
     clock = context.computer.machine.clock
     now = clock.now() + clock.real_offset()

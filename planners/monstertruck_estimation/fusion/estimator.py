@@ -31,7 +31,7 @@ from monstertruck_estimation.heading_turns import HeadingTurns
 from monstertruck_estimation.inertial import Inertial
 from monstertruck_estimation.odometry import SOURCE_TIMEOUT, OdometryEstimate
 from monstertruck_estimation.se2 import SmoothedCorrection, compose, inverse
-from monstertruck_estimation.wheel_motion import WheelIncrement, WheelMotion, way_covariance
+from monstertruck_estimation.wheel_motion import WheelIncrement, WheelMotion, increment_covariance
 from monstertruck_kinematics.chassis import Chassis
 from monstertruck_kinematics.elementary import Array, integrate
 from monstertruck_runtime.clock import SECOND
@@ -203,13 +203,13 @@ class Fusion:
         if roll.lost:
             self._left_out["drive: counts from a new origin"] += 1
             return
-        way = self._felt(roll, self._way(roll, self._chassis))
-        self._apply_slip(self._slip.wheels(way))
-        if way.turn is None and self._slip.slipping:
+        measured = self._felt(roll, self._wheel_measurement(roll, self._chassis))
+        self._apply_slip(self._slip.wheels(measured))
+        if measured.turn is None and self._slip.slipping:
             self._turns.forget()
         else:
-            self._turns.moved(float(way.delta[2]) if way.turn is None else way.turn[0], roll.way)
-        if not self._insert(replace(way, slipping=self._slip.slipping)):
+            self._turns.moved(float(measured.delta[2]) if measured.turn is None else measured.turn[0], roll.distance)
+        if not self._insert(replace(measured, slipping=self._slip.slipping)):
             self._left_out["drive: too late"] += 1
 
     def observe_attitude(self, attitude: Attitude) -> None:
@@ -249,26 +249,26 @@ class Fusion:
         """Take the motion between two scans, some time after the later of them."""
         if self._config.scans is None:
             return
-        way = _scan_way(motion, self._config.scans.scale)
-        if way is None:
+        measured = _scan_measurement(motion, self._config.scans.scale)
+        if measured is None:
             self._left_out["lidar: no motion with a covariance"] += 1
             return
-        if not self._later("lidar", way.stamp):
+        if not self._later("lidar", measured.stamp):
             return
-        dt = (way.stamp - way.since) / SECOND
-        x, y, yaw = np.abs(way.delta).tolist()
+        dt = (measured.stamp - measured.since) / SECOND
+        x, y, yaw = np.abs(measured.delta).tolist()
         if max(x, y) > self._config.max_speed * dt + MARGIN[0] or yaw > self._config.max_turn * dt + MARGIN[1]:
             self._left_out["lidar: faster than the truck can be"] += 1
             return
-        self._apply_slip(self._slip.scans(way))
+        self._apply_slip(self._slip.scans(measured))
         if self._slip.doubted:
             self._left_out["lidar: against the wheels when it has just been blind"] += 1
             return
-        history = self._begin(way.since)
-        if history.scan_before(way.stamp) != way.since:
+        history = self._begin(measured.since)
+        if history.scan_before(measured.stamp) != measured.since:
             # The clone of the earlier pose has to be made where it was.
-            self._insert(ScanClone(way.since, way.covariance))
-        if not self._insert(way):
+            self._insert(ScanClone(measured.since, measured.covariance))
+        if not self._insert(measured):
             self._left_out["lidar: too late"] += 1
 
     # What comes out
@@ -404,21 +404,21 @@ class Fusion:
         if change.slipping and self._inertial is not None:
             self._inertial.gyro.wheels_slipped(change.since)
 
-    def _way(self, roll: WheelIncrement, chassis: Chassis) -> WheelMeasurement:
+    def _wheel_measurement(self, roll: WheelIncrement, chassis: Chassis) -> WheelMeasurement:
         assert self._config.wheels is not None
         trust = self._config.wheels
         delta = np.array(integrate((0.0, 0.0, 0.0), *roll.twist, roll.dt))
-        noise = way_covariance(chassis, roll, trust.shaft_noise, trust.angle_noise, trust.slip_noise)
+        noise = increment_covariance(chassis, roll, trust.shaft_noise, trust.angle_noise, trust.slip_noise)
         return WheelMeasurement(roll.since, roll.stamp, delta, noise)
 
-    def _felt(self, roll: WheelIncrement, way: WheelMeasurement) -> WheelMeasurement:
+    def _felt(self, roll: WheelIncrement, measured: WheelMeasurement) -> WheelMeasurement:
         """The motion of the wheels with turn and tilt by the IMU."""
         inertial, trust = self._inertial, self._config.imu
         if inertial is None or trust is None:
-            return way
+            return measured
         wheels = None if self._slip.slipping else roll.twist[2]
         trusted = inertial.gyro.trusted
-        rate = inertial.gyro.turned(roll.since, roll.stamp, wheels, roll.way)
+        rate = inertial.gyro.turned(roll.since, roll.stamp, wheels, roll.distance)
         if trusted and not inertial.gyro.trusted and self._history is not None:
             crept = inertial.gyro.bias is None
             seconds = self._config.horizon if crept else trust.window
@@ -426,9 +426,11 @@ class Fusion:
         turn = None if rate is None else rate * roll.dt
         variance = 0.0
         if turn is not None:
-            drifted = inertial.gyro.variance(roll.stamp, roll.dt, roll.way)
+            drifted = inertial.gyro.variance(roll.stamp, roll.dt, roll.distance)
             variance = trust.noise**2 * roll.dt + (trust.scale * turn) ** 2 + drifted
-        return replace(way, turn=None if turn is None else (turn, variance), tilt=inertial.vertical.tilt(roll.stamp))
+        return replace(
+            measured, turn=None if turn is None else (turn, variance), tilt=inertial.vertical.tilt(roll.stamp)
+        )
 
 
 def _slipping(measurement: Measurement) -> Measurement:
@@ -446,7 +448,7 @@ def _taken_back(measurement: Measurement, jump: float, at: int) -> Measurement:
     return replace(measurement, taken_back=True, jump=jump if measurement.stamp == at else measurement.jump)
 
 
-def _scan_way(motion: ScanMotion, scale: float) -> ScanMeasurement | None:
+def _scan_measurement(motion: ScanMotion, scale: float) -> ScanMeasurement | None:
     delta = np.array((motion.motion.x, motion.motion.y, motion.motion.yaw))
     covariance = np.array(motion.covariance).reshape(3, 3) * scale**2
     covariance = (covariance + covariance.T) / 2

@@ -218,7 +218,7 @@ def kalman_update(state: FilterState, residual: Array, by_state: Array, noise: A
     return state.estimated(state.mean + gain @ residual, (covariance + covariance.T) / 2, nis=nis)
 
 
-def _way(state: FilterState, clone: slice, delta: Array) -> tuple[Array, Array]:
+def _wheel_measurement(state: FilterState, clone: slice, delta: Array) -> tuple[Array, Array]:
     """Residual, shape (3,), and derivative, (3, 15), of a motion since a clone."""
     then, now = state.mean[clone], state.mean[POSE]
     residual = delta - between(then, now)
@@ -228,32 +228,32 @@ def _way(state: FilterState, clone: slice, delta: Array) -> tuple[Array, Array]:
     return residual, by_state
 
 
-def _wheels(state: FilterState, way: WheelMeasurement, config: FusionConfig) -> FilterState:
+def _wheels(state: FilterState, measured: WheelMeasurement, config: FusionConfig) -> FilterState:
     slip, used = config.slip, state.used
-    if state.wheels == way.since:
-        if way.tilt is not None:
-            used = {**used, "tilt": way.stamp}
-        level = np.array((*_level(state, way.tilt), 1.0))
-        delta, dt = way.delta * level, (way.stamp - way.since) / SECOND
-        residual, by_state = _way(state, WHEELS, delta)
-        noise = way.covariance + np.diag((QUANTUM[0] ** 2, QUANTUM[0] ** 2, QUANTUM[1] ** 2))
-        if way.slipping:
+    if state.wheels == measured.since:
+        if measured.tilt is not None:
+            used = {**used, "tilt": measured.stamp}
+        level = np.array((*_level(state, measured.tilt), 1.0))
+        delta, dt = measured.delta * level, (measured.stamp - measured.since) / SECOND
+        residual, by_state = _wheel_measurement(state, WHEELS, delta)
+        noise = measured.covariance + np.diag((QUANTUM[0] ** 2, QUANTUM[0] ** 2, QUANTUM[1] ** 2))
+        if measured.slipping:
             noise = noise + np.diag(np.square((slip.speed * dt, slip.speed * dt, slip.turn * dt)))
-        if way.turn is not None:
-            turn, variance = way.turn
+        if measured.turn is not None:
+            turn, variance = measured.turn
             residual = np.append(residual, wrap_angle(turn - float(delta[2] - residual[2])))
             by_state = np.vstack((by_state, by_state[2]))
             wheels, noise = noise, np.zeros((4, 4))
             noise[:3, :3], noise[3, 3] = wheels, variance
-            used = {**used, "imu": way.stamp}
+            used = {**used, "imu": measured.stamp}
         signed = math.copysign(math.hypot(delta[0], delta[1]), delta[0])
         residual[2] -= state.mean[TRIM] * signed
         by_state[2, TRIM] = signed
         state = kalman_update(state, residual, by_state, noise)
-        if not way.slipping:
-            used = {**used, "drive": way.stamp}
+        if not measured.slipping:
+            used = {**used, "drive": measured.stamp}
     mean, covariance = _cloned(state, WHEELS)
-    return replace(state, mean=mean, covariance=covariance, wheels=way.stamp, used=used)
+    return replace(state, mean=mean, covariance=covariance, wheels=measured.stamp, used=used)
 
 
 def _level(state: FilterState, felt: tuple[float, float] | None) -> tuple[float, float]:
@@ -266,17 +266,17 @@ def _level(state: FilterState, felt: tuple[float, float] | None) -> tuple[float,
     return math.cos(pitch), math.cos(roll)
 
 
-def _scan(state: FilterState, way: ScanMeasurement, config: FusionConfig) -> FilterState:
+def _scan(state: FilterState, measured: ScanMeasurement, config: FusionConfig) -> FilterState:
     """Augment with the later scan's pose, update with the motion since the earlier one, then replace that clone."""
-    if state.scan != way.since or config.scans is None:
-        return _marked(state, way.stamp, way.covariance)
+    if state.scan != measured.since or config.scans is None:
+        return _marked(state, measured.stamp, measured.covariance)
     by_place = np.vstack((np.eye(SIZE), np.zeros((3, SIZE))))
     by_place[LATER, POSE] = np.eye(3)
     mean = by_place @ state.mean
     covariance = by_place @ state.covariance @ by_place.T
-    covariance[LATER, LATER] += _turned(way.covariance, float(state.mean[YAW]))
+    covariance[LATER, LATER] += _turned(measured.covariance, float(state.mean[YAW]))
     earlier, later = mean[SCAN], mean[LATER]
-    residual = way.delta - between(earlier, later)
+    residual = measured.delta - between(earlier, later)
     residual[2] = wrap_angle(float(residual[2]))
     by_state = np.zeros((3, SIZE + 3))
     by_state[:, SCAN], by_state[:, LATER] = between_jacobians(earlier, later)
@@ -289,8 +289,8 @@ def _scan(state: FilterState, way: ScanMeasurement, config: FusionConfig) -> Fil
         joint,
         mean=joint.mean[kept],
         covariance=joint.covariance[np.ix_(kept, kept)],
-        scan=way.stamp,
-        used={**state.used, "lidar": way.stamp},
+        scan=measured.stamp,
+        used={**state.used, "lidar": measured.stamp},
     )
 
 

@@ -64,8 +64,8 @@ class SlipDetector:
         self._config = config
         self._deviation = deviation
         self._trail: deque[tuple[int, Array, Array]] = deque()
-        """Stamp, pose, and the sum of the ways' covariances: over a window too short to turn them into each other."""
-        self._ways: deque[ScanMeasurement] = deque()
+        """Stamp, pose, and the sum of the motions' covariances: the window is too short for their rotation to count."""
+        self._motions: deque[ScanMeasurement] = deque()
         self._headings: deque[tuple[int, float]] = deque()
         self._suspicious = 0
         self._calm = 0
@@ -78,42 +78,42 @@ class SlipDetector:
         self.doubted = False
         """The last scan is rejected."""
 
-    def wheels(self, way: WheelMeasurement) -> SlipChange | None:
+    def wheels(self, measured: WheelMeasurement) -> SlipChange | None:
         """Take the motion of the wheels; returns the end of a slip that nothing can confirm any longer."""
-        if not self._trail or self._trail[-1][0] != way.since:
+        if not self._trail or self._trail[-1][0] != measured.since:
             self._trail.clear()
-            self._trail.append((way.since, np.zeros(3), np.zeros((3, 3))))
+            self._trail.append((measured.since, np.zeros(3), np.zeros((3, 3))))
         _, pose, spread = self._trail[-1]
-        self._trail.append((way.stamp, compose(pose, way.delta), spread + way.covariance))
-        while self._trail[0][0] < way.stamp - SOURCE_TIMEOUT:
+        self._trail.append((measured.stamp, compose(pose, measured.delta), spread + measured.covariance))
+        while self._trail[0][0] < measured.stamp - SOURCE_TIMEOUT:
             self._trail.popleft()
-        if not self.slipping or way.stamp - self._compared_at < EXPIRES:
+        if not self.slipping or measured.stamp - self._compared_at < EXPIRES:
             return None
         self.slipping = False
         text = f"nothing to compare the wheels with for {EXPIRES // SECOND} s: they count again"
-        return SlipChange(slipping=False, since=way.stamp, text=text)
+        return SlipChange(slipping=False, since=measured.stamp, text=text)
 
-    def scans(self, way: ScanMeasurement) -> SlipChange | None:
+    def scans(self, measured: ScanMeasurement) -> SlipChange | None:
         """Take the motion between two scans; returns a change of the result."""
-        self._scanned, self.doubted = way.stamp, False
-        if self._ways and self._ways[-1].stamp != way.since:
-            self._ways.clear()
+        self._scanned, self.doubted = measured.stamp, False
+        if self._motions and self._motions[-1].stamp != measured.since:
+            self._motions.clear()
             self._unproven = self._config.calm
-        if float(np.linalg.eigvalsh(way.covariance[:2, :2])[-1]) > BLANK**2:
+        if float(np.linalg.eigvalsh(measured.covariance[:2, :2])[-1]) > BLANK**2:
             self._unproven = self._config.calm
-        self._ways.append(way)
-        while len(self._ways) > 1 and way.stamp - self._ways[1].since >= SPANS * self._window:
-            self._ways.popleft()
-        recent = sum(1 for one in self._ways if way.stamp - one.stamp < self._window)
+        self._motions.append(measured)
+        while len(self._motions) > 1 and measured.stamp - self._motions[1].since >= SPANS * self._window:
+            self._motions.popleft()
+        recent = sum(1 for one in self._motions if measured.stamp - one.stamp < self._window)
         near = self._compared(recent)
         if near is None:
             return None
-        self._compared_at = way.stamp
+        self._compared_at = measured.stamp
         if self._unproven and not self.slipping:
             self._prove(near[0])
             return None
         # Slip adds up, noise evens out: what is doubtful over one window is clear over two.
-        far = None if self.slipping else self._compared(len(self._ways))
+        far = None if self.slipping else self._compared(len(self._motions))
         change = self._judged(*(near if far is None or far[0] < near[0] else far))
         if change is not None and not change.slipping:
             self._agreed()
@@ -125,22 +125,22 @@ class SlipDetector:
 
     def _agreed(self) -> None:
         """Drop the older windows."""
-        while len(self._ways) > 1:
-            self._ways.popleft()
+        while len(self._motions) > 1:
+            self._motions.popleft()
 
     def _compared(self, count: int) -> tuple[float, int, str] | None:
         """Wheels against the last ``count`` motions: distance in deviations, since when (ns), and in words."""
-        ways = list(self._ways)[-count:]
-        since, stamp = ways[0].since, ways[-1].stamp
+        motions = list(self._motions)[-count:]
+        since, stamp = motions[0].since, motions[-1].stamp
         wheels_moved = self._wheel_motion(since, stamp)
         if wheels_moved is None:
             return None
         moved = np.zeros(3)
-        for one in ways:
+        for one in motions:
             moved = compose(moved, one.delta)
         _, by_later = compose_jacobians(moved, np.zeros(3))
         # The places of the first and the last scan err; what was in between has cancelled.
-        spread = ways[0].covariance + by_later @ ways[-1].covariance @ by_later.T
+        spread = motions[0].covariance + by_later @ motions[-1].covariance @ by_later.T
         delta, noise = wheels_moved
         off = delta - moved
         off[2] = wrap_angle(float(off[2]))

@@ -1,4 +1,4 @@
-"""Goals as a service: requests and observations to the state machine, its decisions to planner, tracker and events."""
+"""The goal service: passes requests and observations to the state machine, and carries out its decisions."""
 
 import asyncio
 import math
@@ -50,11 +50,11 @@ from monstertruck_schemas.state import Grid, Ground, Odometry
 from monstertruck_schemas.topics import ODOMETRY, SCAN
 
 REPORT: Final = SECOND // 2
-"""Between two reports without a change, ns."""
+"""Period of reports without a change, ns."""
 CHANGES: Final = ("phase", "outcome", "number", "routes", "recoveries")
 """Fields of the report whose change is reported at once."""
 FIRST_ROUTE: Final = 4.0
-"""Seconds a remote call waits for the first route; the goal is pursued further."""
+"""Seconds a remote call waits for the first route; the goal goes on after that."""
 SEEN: Final = 40
 """Scans kept for the next plan, the newest."""
 SEEN_STEP: Final = 0.25
@@ -62,25 +62,25 @@ SEEN_STEP: Final = 0.25
 SEEN_TURN: Final = 0.4
 """...or radians."""
 JUMP: Final = 0.5
-"""Metres between the poses of two ticks after which the kept scans are not where they were taken."""
+"""Distance between the poses of two ticks that counts as a jump, m: the kept scans are dropped."""
 
 R = TypeVar("R", bound=Request)
 
 
 class GoalService:
-    """Drives to goals, one at a time; a new one takes the place of the old.
+    """Drives to goals, one at a time; a new one replaces the present one.
 
-    While a way is planned and nothing is followed, it asks the gate for standstill, so that the truck stays armed.
+    While a route is planned and none is followed, it requests standstill of the gate, so that the truck stays armed.
 
     Args:
-        setup: how, and the truck.
+        setup: configuration and truck.
         clock: time.
-        actor: where it is planned.
-        deceleration: with which the tracker brakes, m/s^2.
+        actor: computes the routes.
+        deceleration: of the tracker, m/s^2.
         max_age: see ``GateConfig.max_request_age``.
         inputs: topics read.
         outputs: topics written.
-        deformation: of the routes; None = they are driven as they are.
+        deformation: local planning around obstacles; None = routes are followed as planned.
     """
 
     name = ServiceName.GOALS.value
@@ -147,17 +147,17 @@ class GoalService:
             self._answer(self.control, control, control.order)
 
     def _answer(self, handler: Callable[[R], object], request: R, name: str) -> None:
-        """What comes by topic is refused by an event."""
+        """Handle a request that came by topic: a refusal becomes an event."""
         try:
             handler(request)
         except RequestRefusedError as error:
             self._out.events(error.refusal, Severity.WARNING, request.source, f"{name} refused: {error}")
 
     def take(self, request: GoalRequest) -> int:
-        """Take on a goal; returns its number. Whether a way leads there shows later.
+        """Accept a goal; returns its number. Its route is planned afterwards.
 
         Raises:
-            RequestRefusedError: the sender may not, or the goal is none.
+            RequestRefusedError: the sender is not permitted, or the goal is not valid.
         """
         self._examine(request, "goal", moves=True)
         if self._actor is None:
@@ -186,7 +186,7 @@ class GoalService:
         """Pause, resume or cancel the present goal.
 
         Raises:
-            RequestRefusedError: the sender may not, or there is no goal.
+            RequestRefusedError: the sender is not permitted, or there is no goal.
         """
         self._examine(request, "goal_control", moves=request.order is GoalOrder.RESUME)
         if self._goal is None or not self._goal.active:
@@ -194,16 +194,16 @@ class GoalService:
         self._do(goal_run.order(self._goal, request.order, request.source, self._seconds()))
 
     def hold(self, who: str, *, on: bool) -> None:
-        """Keep the truck armed between goals too, by asking for standstill: for what sends one goal after the other.
+        """Keep the truck armed between goals, by requests for standstill; for services that send several goals.
 
         Args:
-            who: sends them.
+            who: the service.
             on: until it is called with False.
         """
         (self._held.add if on else self._held.discard)(who)
 
     async def settled(self, number: int) -> GoalState:
-        """State of a goal once it is known whether a way leads there.
+        """State of a goal once its first route was found, or not.
 
         Raises:
             RequestRefusedError: none does, or another goal has taken its place.
@@ -266,7 +266,7 @@ class GoalService:
         )
 
     def _left(self, followed: FollowedPath | None, along: float) -> float:
-        """Metres of the route ahead; of none, infinitely many."""
+        """Length of the route ahead, m; +inf without a route."""
         if self._deformation is not None and self._deformation.active:
             return self._deformation.left
         return math.inf if followed is None else max(float(followed.travelled[-1]) - along, 0.0)
@@ -276,7 +276,7 @@ class GoalService:
         return odometry if odometry is not None and now - odometry.received <= ODOMETRY.fresh_for() * SECOND else None
 
     def _outcome(self, outcome: Reason) -> Reason:
-        """The end of a deformed path is not that of the route."""
+        """The tracker's outcome; a deformed path that ends before its route is still driven."""
         on_the_way = self._deformation is not None and not self._deformation.complete
         return Reason.DRIVING if on_the_way and outcome in goal_run.ENDED else outcome
 
@@ -291,7 +291,7 @@ class GoalService:
         return path_blocked(self._setup.footprint, ahead, points, pose)
 
     def _keep_scan(self, now: int) -> None:
-        """Keep a scan every few steps for the next plan: what is behind by then has been seen."""
+        """Keep scans along the motion for the next plan, which then knows what is behind the truck."""
         odometry = self._odometry(now)
         pose = None if odometry is None else pose_of(odometry)
         if pose is None or self._before is None or math.dist(pose[:2], self._before[:2]) > JUMP:
@@ -364,7 +364,7 @@ class GoalService:
         self._planning = self._tasks.create_task(self._ask(task))
 
     async def _ask(self, task: PlanTask) -> PlanAnswer:
-        """The planner's answer; of one that failed and begins anew: that it did."""
+        """The planner's answer; if it failed and is restarted, an answer that says so."""
         assert self._actor is not None
         try:
             answer: PlanAnswer = await self._actor.step(task)
@@ -384,7 +384,7 @@ class GoalService:
         self._paths.follow(answer, f"goal-{self._number}")
 
     def _on_deformed(self, was: Finding, answer: DeformAnswer) -> None:
-        """Drive what became of the route."""
+        """Follow the deformed route."""
         followed, run, deformation = self._paths.followed, self._goal, self._deformation
         assert deformation is not None
         if followed is None or run is None or run.phase is GoalPhase.BACKING_OUT:
@@ -442,7 +442,7 @@ def _undecided(state: GoalState) -> bool:
 def goal_state(
     run: GoalRun | None, now: int, followed: FollowedPath | None, inputs: GoalInputs, left: float = 0.0
 ) -> GoalState:
-    """The report on a goal, its sequence number still 0; ``left`` metres of the route are ahead at least."""
+    """The report on a goal, with sequence number 0; at least ``left`` metres of the route are ahead."""
     odometry = inputs.pose.latest
     frame = "map" if odometry is None else odometry.frame
     if run is None:

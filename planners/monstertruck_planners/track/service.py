@@ -38,26 +38,25 @@ LOOKS: Final = 8
 """Poses ahead whose clearance counts."""
 
 LONG: Final = 3 * 500
-"""Numbers of a path (x, y, yaw) from which on it is prepared within several turns of the loop."""
+"""Length of a path's array (3 numbers a pose) from which on it is prepared in several iterations of the event loop."""
 
 AT_REST: Final = 0.01
 """Speed of a truck at rest, m/s."""
 
 MOVED: Final = 0.01
-"""A truck not armed and moved by more than this may begin its path elsewhere, m."""
+"""A disarmed truck that was moved by more than this joins its path again, m."""
 TURNED: Final = 0.02
-"""Or turned by more than this, rad."""
+"""The same for a turn, rad."""
 
-
-ASKED: Final = 1.0
-"""Way that the gate lets the truck drive, m, ..."""
-GOT_ON: Final = 0.2
-"""... in which neither its place nor its place on the path moves by more, m, if it pushes against something unseen."""
+STUCK_AFTER: Final = 1.0
+"""Distance commanded without progress after which the truck is stuck, m."""
+PROGRESS: Final = 0.2
+"""Motion, in space or along the path, that counts as progress, m."""
 
 
 @dataclass(frozen=True, slots=True)
 class TrackSetup:
-    """What the step is made for."""
+    """Settings of the tracking step."""
 
     config: AnyTracker
     steering: FourWheelSteering
@@ -94,9 +93,9 @@ class TrackOutput:
     """What one step decided."""
 
     command: Command | None = None
-    """None = the tracker is silent."""
+    """None = no request is sent."""
     drive: bool = False
-    """Whether the gate is asked for the command."""
+    """Whether the command is sent to the gate."""
     frame: str = ""
     path: str = ""
     along: float = 0.0
@@ -108,35 +107,35 @@ class TrackOutput:
 
 
 @dataclass(slots=True)
-class _Advance:
-    """Whether the truck gets on; by a pose that rests on its wheels alone it always does."""
+class _ProgressChecker:
+    """Detects a truck that does not move although it is commanded to; needs a pose from more than its wheels."""
 
     place: tuple[float, float] = (math.inf, math.inf)
-    """From where it is counted, m."""
+    """Position at the last progress, m."""
     along: float = -math.inf
-    """The same on the path, where short moves to and fro add up, m."""
+    """Position along the path at the last progress, m; short moves to and fro add up there."""
     asked: float = 0.0
-    """Way that the gate has let it drive since, m."""
+    """Distance commanded by the gate since, m."""
     looked: int = 0
-    """When it was counted last, ns."""
+    """Time of the last check, ns."""
 
     def stuck(self, now: int, place: tuple[float, float], along: float, gate: GateState | None) -> bool:
-        """Whether it has not got on, then for good; ``gate`` is None while it does not drive as it is asked to."""
-        if self.asked >= ASKED:
+        """Whether it is stuck, from then on always; ``gate`` is None while the tracker does not drive."""
+        if self.asked >= STUCK_AFTER:
             return True
-        if along - self.along > GOT_ON or math.dist(place, self.place) > GOT_ON:
+        if along - self.along > PROGRESS or math.dist(place, self.place) > PROGRESS:
             self.place, self.along, self.asked = place, along, 0.0
         elif gate is not None and gate.twist is not None:
             self.asked += math.hypot(gate.twist.vx, gate.twist.vy) * (now - self.looked) / SECOND
         self.looked = now
-        return self.asked >= ASKED
+        return self.asked >= STUCK_AFTER
 
 
 class TrackingStep:
-    """Follows the newest path by the configured tracker.
+    """Follows the newest path with the configured tracker.
 
-    Starts the path over whenever the truck is armed anew after the path's end; after a stop on the way it goes on.
-    Once the path has ended or is lost, or the truck does not get on, it asks for standstill, then falls silent.
+    Arming after the end of a path starts it again; after a stop before its end the truck continues. Once the path has
+    ended or is lost, or the truck is stuck, the step requests standstill, then nothing.
 
     Args:
         setup: the tracker and the truck.
@@ -156,19 +155,19 @@ class TrackingStep:
         self._acceleration = BodyAcceleration()
         self._seen: tuple[LaserScan, SegmentedPath] | None = None
         self._clearance_ahead = math.inf
-        """Clearance ahead on that path, in that scan."""
+        """Clearance ahead on that path in that scan, m."""
         self._followed: Path | None = None
         self._path: SegmentedPath | None = None
         self._progress = PathProgress()
         self._begun: tuple[float, float, float] | None = None
-        """Pose the path was begun from; None for one that may have to be begun anew."""
+        """Pose from which the path was joined; None if it has to be joined again."""
         self._outcome = Reason.DRIVING
-        self._advance = _Advance()
+        self._progress_checker = _ProgressChecker()
         self._reported = Reason.DRIVING
         """Outcome of the newest event since the path came or the truck was armed."""
         self._active = False
         self._contradicted = False
-        """The truck answered otherwise than configured at the step before."""
+        """The response differed from the configured one at the last step."""
         self._events: list[StepEvent] = []
 
     def step(self, now: int, newest: Newest) -> TrackOutput:
@@ -178,9 +177,9 @@ class TrackingStep:
         return output
 
     def parts(self, now: int, newest: Newest) -> Iterator[TrackOutput | None]:
-        """The same in parts, for a loop that has to turn in between: None after each but the last, the output then.
+        """The same in parts, between which the event loop can run: None after each but the last, then the output.
 
-        Only a long path, when it comes, makes more than one part.
+        There is more than one part only when a long path arrives.
         """
         pose, path, gate = newest.pose, newest.path, newest.gate
         if pose is None or path is None or gate is None or now - pose.received > ODOMETRY.fresh_for() * SECOND:
@@ -212,7 +211,7 @@ class TrackingStep:
             self._report(Reason.BAD_INPUT, Severity.WARNING, text)
             return TrackOutput(events=self._drain())
         along = path.along(command.progress)
-        stuck = self._advance.stuck(now, at[:2], along, gate if obeyed else None)
+        stuck = self._progress_checker.stuck(now, at[:2], along, gate if obeyed else None)
         if stuck and command.outcome is Reason.DRIVING:
             command.speed, command.outcome = 0.0, Reason.STUCK
         if active := gate.mode.active:
@@ -227,7 +226,7 @@ class TrackingStep:
         return TrackOutput(command, drive, path.frame, path.name, along, path.length, axles, self._drain())
 
     def _axles(self) -> AxleResponse:
-        """How the axles answer; reports where that differs from the configuration."""
+        """Measured response of the axles; reports a difference from the configured one."""
         tracker = self._path_tracker
         estimate, configured = tracker.estimator.estimate, tracker.configured
         axles = AxleResponse(
@@ -248,7 +247,7 @@ class TrackingStep:
         return axles
 
     def _choose_path(self, path: Path, pose: Odometry, *, armed: bool) -> bool:
-        """Take a new path, or start the present one over: until armed it may still begin anywhere; whether it did."""
+        """Join a new path, or the present one again; returns whether it did. Until armed the truck may be moved."""
         idle, self._active = not self._active, armed
         if armed and idle:
             self._path_tracker.reset()
@@ -263,7 +262,7 @@ class TrackingStep:
         else:
             self._reported = Reason.DRIVING
         self._followed, self._path, self._outcome, self._begun = path, None, Reason.DRIVING, here
-        self._advance = _Advance()
+        self._progress_checker = _ProgressChecker()
         try:
             if path.frame != pose.frame:
                 msg = f"path {path.name!r} is in frame {path.frame!r}: expected {pose.frame!r}"
@@ -275,11 +274,11 @@ class TrackingStep:
         return True
 
     def _to_begin(self) -> bool:
-        """Whether the path has ended or not yet begun."""
+        """Whether the path has ended or has not begun yet."""
         return self._outcome is not Reason.DRIVING or (self._path is not None and self._progress == self._path.start)
 
     def _moved(self, here: tuple[float, float, float]) -> bool:
-        """Whether the truck stands elsewhere than where the path was begun, so far as it matters."""
+        """Whether the truck was moved since it joined the path."""
         if self._begun is None:
             return True
         x, y, yaw = self._begun
@@ -318,7 +317,7 @@ class TrackingStep:
 
 
 def _heading(attitude: Attitude | None, now: int) -> tuple[float, float] | None:
-    """When (s) and how (rad, counter-clockwise) the compass saw the truck headed."""
+    """Time (s) and heading (rad, counter-clockwise) of the newest compass reading, if it is valid and fresh."""
     if attitude is None or attitude.heading_disturbed or now - attitude.received > COMPASS.fresh_for() * SECOND:
         return None
     return attitude.stamp / SECOND, -attitude.heading
@@ -326,16 +325,16 @@ def _heading(attitude: Attitude | None, now: int) -> tuple[float, float] | None:
 
 @dataclass(frozen=True, slots=True)
 class TrackInput:
-    """One control step at ``now``, ns, with the messages that are newer than at the step before, by input."""
+    """Input of one control step at ``now``, ns: the messages that are new since the last step, by input."""
 
     now: int
     news: dict[str, Any]
     setup: TrackSetup | None = None
-    """Comes first, and again after every restart."""
+    """In the first step, also after a restart."""
 
 
 class TrackingWorker:
-    """The tracking step behind an actor: keeps the messages that came before."""
+    """The tracking step in an actor: keeps the newest messages."""
 
     def __init__(self) -> None:
         self._step: TrackingStep | None = None
@@ -365,8 +364,8 @@ class TrackerService:
         drive: ``plan/drive``.
         tracker: ``plan/tracker``.
         events: where events go.
-        actor: where the steps are taken; None = in the loop, which turns while a long path is prepared.
-        points: of scans, in base, shared by what runs in the loop.
+        actor: computes the steps; None = the event loop does.
+        points: converter of scans to points in base, shared within the event loop.
 
     Raises:
         InputError: the tracker cannot be built.
@@ -392,13 +391,13 @@ class TrackerService:
         self._actor = actor
         self._step = TrackingStep(setup, points) if actor is None else None
         self._sent: Newest | None = None
-        """Messages the actor has; None before its first step."""
+        """Messages sent to the actor; None before its first step."""
 
     async def run(self, ready: Ready) -> None:
         """Track until cancelled.
 
         Raises:
-            WorkerError: the actor failed or was late; the next session begins without its memory.
+            WorkerError: the actor failed or was late; the next session starts with a new one.
         """
         if self._actor is None:
             await self._serve(ready, self._step_here)

@@ -22,7 +22,7 @@ from monstertruckd.config.expiry import (
     GOALS,
     LIFETIMES,
     CalibrationWatch,
-    WayCounter,
+    DistanceCounter,
     degraded_topics,
     grade,
     stamped,
@@ -93,7 +93,7 @@ def test_what_rests_on_it_is_named():
 )
 def test_a_damaged_odometer_begins_at_nothing_and_says_so(text, tmp_path, caplog):
     file = tmp_path / "odometer.json"
-    odometer = WayCounter(file)
+    odometer = DistanceCounter(file)
     odometer.load()
     assert not caplog.messages  # a new robot
     file.write_text(text)
@@ -124,7 +124,7 @@ def test_the_watch_marks_messages_tells_once_and_counts_the_way(tmp_path):
             clock,
             lambda *args, **_: events.append(args[0]),
             inline,
-            WayCounter(tmp_path / "odometer.json"),
+            DistanceCounter(tmp_path / "odometer.json"),
         )
         task = asyncio.create_task(watch.run(lambda: None))
         await clock.sleep(0.1)
@@ -152,7 +152,7 @@ def test_the_watch_marks_messages_tells_once_and_counts_the_way(tmp_path):
     assert newest.wizards[0].expired
     way = 1000.0 * TRUCK.geometry.wheel_radius / TRUCK.geometry.drive_ratio
     assert newest.odometer == pytest.approx(119 * way, abs=2 * way)
-    kept = WayCounter(tmp_path / "odometer.json")
+    kept = DistanceCounter(tmp_path / "odometer.json")
     kept.load()
     assert kept.metres == pytest.approx(128 * way, abs=2 * way)
 
@@ -170,7 +170,7 @@ def test_another_device_on_the_same_port_is_reported_and_the_old_one_counts_agai
             clock,
             lambda *args, **_: events.append(args),
             inline,
-            WayCounter(tmp_path / "odometer.json"),
+            DistanceCounter(tmp_path / "odometer.json"),
         )
         tree = bus.publisher(topics.USB, Writer.DAEMON)
         task = asyncio.create_task(watch.run(lambda: None))

@@ -7,20 +7,20 @@ from monstertruck_estimation.gyro import Gyro, GyroConfig
 STEP = 20_000_000
 
 
-def run(gyro, seconds, *, wheels, rate, way=0.004, start=0):
+def run(gyro, seconds, *, wheels, rate, distance=0.004, start=0):
     """Feed both at 50 Hz; returns the last answer and the time."""
     answer, now = None, start
     for _ in range(round(seconds * 50)):
         now += STEP
         if rate is not None:
             gyro.observe(now, rate)
-        answer = gyro.turned(now - STEP, now, wheels, way)
+        answer = gyro.turned(now - STEP, now, wheels, distance)
     return answer, now
 
 
 def at_rest(bias=0.02):
     gyro = Gyro(GyroConfig())
-    return gyro, run(gyro, 1.0, wheels=0.0, rate=bias, way=0.0)[1]
+    return gyro, run(gyro, 1.0, wheels=0.0, rate=bias, distance=0.0)[1]
 
 
 def test_the_bias_is_what_it_says_at_rest():
@@ -68,7 +68,7 @@ def test_a_bias_that_creeps_away_is_given_up_until_the_robot_rests():
     assert answers[20] is not None
     assert abs(gyro.difference) < 0.5, "it has not turned the heading by more than that in 20 s"
     assert (answers[-1], gyro.bias, gyro.trusted) == (None, None, False)
-    now = run(gyro, 1.0, wheels=0.0, rate=0.025, way=0.0, start=now)[1]
+    now = run(gyro, 1.0, wheels=0.0, rate=0.025, distance=0.0, start=now)[1]
     answer, _ = run(gyro, 2.0, wheels=0.4, rate=0.425, start=now)
     assert answer == pytest.approx(0.4), "it rested, and turns with the wheels"
 

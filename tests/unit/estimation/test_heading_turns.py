@@ -7,12 +7,12 @@ import pytest
 from monstertruck_estimation.heading_turns import LONGEST, HeadingTurns
 
 
-def contradicted(share, turn=1.0, way=1.0, start=3.0, steps=40):
-    """Whether headings that show ``share`` of a turn, rad, on a way, m, turn against it."""
+def contradicted(share, turn=1.0, distance=1.0, start=3.0, steps=40):
+    """Whether headings that show ``share`` of a turn, rad, over a distance, m, turn against it."""
     turns = HeadingTurns()
     for k in range(steps + 1):
         turns.observe(math.remainder(start + share * turn * k / steps, math.tau))
-        turns.moved(turn / steps, way / steps)
+        turns.moved(turn / steps, distance / steps)
     return turns.contrary is not None
 
 
@@ -25,8 +25,8 @@ def test_headings_that_turn_the_other_way_are_contrary(turn):
 
 
 def test_a_slow_drift_is_no_turn_and_a_spot_turn_is_one():
-    assert not contradicted(-1.0, turn=0.5, way=3 * LONGEST)
-    assert contradicted(-1.0, turn=0.5, way=0.0)
+    assert not contradicted(-1.0, turn=0.5, distance=3 * LONGEST)
+    assert contradicted(-1.0, turn=0.5, distance=0.0)
     assert not contradicted(-1.0, turn=0.2)
 
 

@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from monstertruck_estimation.wheel_motion import WheelMotion, way_covariance
+from monstertruck_estimation.wheel_motion import WheelMotion, increment_covariance
 from monstertruck_kinematics.chassis import Dimensions, truck_chassis
 from monstertruck_runtime.bodies import BODIES
 from monstertruck_runtime.clock import SECOND
@@ -32,7 +32,7 @@ def rolls(chassis, speeds, angle, count, cuts=1):
 
 
 def total(chassis, made):
-    return sum(way_covariance(chassis, roll, SHAFT, 0.01, (0.005, 0.005, 0.01)) for roll in made)
+    return sum(increment_covariance(chassis, roll, SHAFT, 0.01, (0.005, 0.005, 0.01)) for roll in made)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -52,7 +52,7 @@ def test_the_noise_of_the_shafts_gives_the_covariance_that_is_reported(kind):
     chassis = BODIES[kind].implementation_class()(Dimensions(DRIVETRAIN))
     rng, speeds = np.random.default_rng(1), np.full(len(chassis.shafts), 0.2)
     made = rolls(chassis, speeds, 0.05, 20)
-    reported = sum(way_covariance(chassis, roll, SHAFT, 0.0, (0.0, 0.0, 0.0)) for roll in made)
+    reported = sum(increment_covariance(chassis, roll, SHAFT, 0.0, (0.0, 0.0, 0.0)) for roll in made)
     ends = []
     for _ in range(300):
         end = np.zeros(3)
@@ -74,7 +74,10 @@ def test_the_covariance_of_a_truck_that_stands_is_none():
 def test_an_uncertain_axle_turns_the_truck():
     chassis = truck_chassis(Dimensions(DRIVETRAIN))
     sure, unsure = (
-        sum(way_covariance(chassis, roll, SHAFT, angle, (0.0, 0.0, 0.0)) for roll in rolls(chassis, (0.2,), 0.0, 20))
+        sum(
+            increment_covariance(chassis, roll, SHAFT, angle, (0.0, 0.0, 0.0))
+            for roll in rolls(chassis, (0.2,), 0.0, 20)
+        )
         for angle in (0.0, 0.05)
     )
     assert sure[2, 2] == pytest.approx(0.0, abs=1e-9)
@@ -89,4 +92,4 @@ def test_positions_that_are_no_numbers_or_not_later_are_left_out():
     assert wheels.observe_drive(bad) is None
     assert wheels.stamp == SECOND
     assert wheels.observe_drive(drive_feedback(SECOND, 5.0)) is None
-    assert wheels.observe_drive(drive_feedback(2 * SECOND, 0.0)).way == 0.0
+    assert wheels.observe_drive(drive_feedback(2 * SECOND, 0.0)).distance == 0.0

@@ -10,7 +10,7 @@ from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order
 from monstertruck_schemas.state import GateMode
-from monstertruckd.gate.limiter import SECTOR, SECTORS, Visibility, ground_ahead, outline
+from monstertruckd.gate.limiter import OUTLINE, SECTOR, SECTORS, Visibility, ground_ahead
 from tests.unit.gate.rig import Rig, scan
 
 FOOTPRINT = Footprint()
@@ -22,7 +22,7 @@ LEFT = swept_poses((1.0, 0.0, 2.0), np.linspace(0.0, 0.4, 40))
 
 def travelled_by(visibility, poses, body=FOOTPRINT):
     """Sectors of the ground that the body newly covers at poses."""
-    return visibility.travelled(ground_ahead(body, outline(body), poses).reshape(-1, 2))
+    return visibility.travelled(ground_ahead(body, body.edge_points(OUTLINE, OUTLINE), poses).reshape(-1, 2))
 
 
 def seen(message):
@@ -209,7 +209,9 @@ def test_ground_within_half_a_centimetre_of_the_body_is_not_travelled(way, trave
 def test_a_step_covers_the_ground_that_its_leading_edge_reaches(body):
     front, back = body.offset + body.half_length, body.offset - body.half_length
     for sign, edge in ((1.0, front), (-1.0, back)):
-        ground = ground_ahead(body, outline(body), swept_poses((sign, 0.0, 0.0), np.linspace(0.0, 0.2, 5)))
+        ground = ground_ahead(
+            body, body.edge_points(OUTLINE, OUTLINE), swept_poses((sign, 0.0, 0.0), np.linspace(0.0, 0.2, 5))
+        )
         for points, distance in zip(ground, (0.05, 0.1, 0.15, 0.2), strict=True):
             assert points[:, 0].min() >= min(edge, edge + sign * distance) - 1e-9
             assert points[:, 0].max() <= max(edge, edge + sign * distance) + 1e-9
@@ -221,10 +223,10 @@ def test_a_step_covers_the_ground_that_its_leading_edge_reaches(body):
 
 def test_a_tail_that_swings_out_by_a_millimetre_a_step_covers_ground():
     poses = swept_poses((1.0, 0.0, 0.5), np.linspace(0.0, 0.2, 41))
-    ground = ground_ahead(FOOTPRINT, outline(FOOTPRINT), poses)
+    ground = ground_ahead(FOOTPRINT, FOOTPRINT.edge_points(OUTLINE, OUTLINE), poses)
     tail = ground[..., 0] < -LENGTH + 0.1
     assert ground[tail][:, 1].min() < -WIDTH - 0.008
-    assert len(ground_ahead(FOOTPRINT, outline(FOOTPRINT), np.zeros((5, 3))).reshape(-1, 2)) == 0
+    assert len(ground_ahead(FOOTPRINT, FOOTPRINT.edge_points(OUTLINE, OUTLINE), np.zeros((5, 3))).reshape(-1, 2)) == 0
 
 
 def test_a_turn_on_the_spot_travels_over_the_ground_of_all_corners():

@@ -11,7 +11,7 @@ from monstertruck_planners.track.config import PurePursuitConfig
 from monstertruck_planners.track.pure_pursuit import PurePursuit
 from monstertruck_planners.track.segments import SegmentedPath
 from monstertruck_planners.track.service import (
-    ASKED,
+    STUCK_AFTER,
     Newest,
     TrackerService,
     TrackingStep,
@@ -464,7 +464,7 @@ def test_a_truck_that_pushes_against_something_unseen_stops_and_says_so_once_and
     outputs, _ = driven(0.0, 0.2, 8.0, again=True)
     outcomes = [output.command.outcome for output in outputs]
     first = outcomes.index(Reason.STUCK)
-    assert first / 50 == pytest.approx(ASKED / 0.2, abs=0.1)
+    assert first / 50 == pytest.approx(STUCK_AFTER / 0.2, abs=0.1)
     assert set(outcomes[first:-1]) == {Reason.STUCK}
     assert all(output.command.speed == 0.0 and not output.drive for output in outputs[first:-1])
     events = [event.reason for output in outputs for event in output.events]
