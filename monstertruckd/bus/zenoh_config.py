@@ -18,11 +18,11 @@ from monstertruck_schemas.topics import owner_of
 from monstertruckd.bus.access import EVERYTHING, OBSERVING, Grant, access_rules
 
 HANG_UP_US: Final = 2_000_000
-"""A station to which an answer, or another one's message that must not be lost, does not get through in this time is
-hung up on. Zenoh's own 5 s are long for those whose requests wait behind it; a large map takes its time, too."""
+"""Seconds after which a station is disconnected that does not take an answer, or a message that must not be dropped.
+Zenoh's own 5 s are too long for requests that wait behind it; a large map needs some time as well."""
 
 LOCAL_SESSIONS: Final = 16
-"""Places of the robot's own command line."""
+"""Sessions of the robot's own command line."""
 
 OWNER_NAME: Final = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.@-]{0,31}")
 """Common names of certificates: one part of a key, without the colon that begins the name of one of its programs, and
@@ -35,23 +35,23 @@ class TlsConfig(Schema):
     """Mutual TLS for ``tls/...`` endpoints; identities are the common names of the clients' certificates."""
 
     ca: Path
-    """Certificates of the authorities, or of the single stations, that are let in."""
+    """Certificates of the authorities, or of the single stations, that may connect."""
     certificate: Path
     """The robot's own certificate; must name every address a client dials."""
     key: Path
     """Its private key."""
     pilots: Owners = ()
-    """Common names that may see, ask and drive."""
+    """Common names that may observe, call and drive."""
     observers: Owners = ()
-    """Common names that may see, and order an emergency stop."""
+    """Common names that may observe, and order an emergency stop."""
     engineers: Owners = ()
-    """Common names that may save and undo calibrations, besides all a pilot may."""
+    """Common names that may do all a pilot may, and save and undo calibrations."""
     routers: Owners = ()
-    """Common names of a fleet's routers: they bind names to certificates, and pass on what others ask."""
+    """Common names of a fleet's routers, which bind names to certificates and forward requests of others."""
     ranks: dict[OwnerName, Literal[Role.GAMEPAD, Role.KEYBOARD, Role.STATION]] = {}
-    """Highest priority a name may claim; station where it is not given."""
+    """Highest role a name may claim; by default station."""
     pilots_ca: Path | None = None
-    """Like ``ca``, of pilots and engineers only: who is let in at ``listen_pilots``."""
+    """Like ``ca``, of pilots and engineers only, for ``listen_pilots``."""
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -82,17 +82,17 @@ class ZenohConfig(Schema):
     listen: tuple[str, ...] = (DEFAULT_ENDPOINT,)
     """Endpoints stations connect to."""
     listen_pilots: tuple[str, ...] = ()
-    """``tls/...`` endpoints of a session of its own, whose places observers cannot take from pilots and engineers."""
+    """``tls/...`` endpoints of a separate session, so that observers do not use up the connections of pilots."""
     local_socket: bool = True
-    """A session of its own on a Unix socket for the robot's own command line; nobody on a network takes its places."""
+    """A separate session on a Unix socket for the robot's own command line, which no station can use up."""
     connect: tuple[str, ...] = ()
-    """Routers of a fleet to connect to; tried again for ever."""
+    """Routers of a fleet to connect to; retried until connected."""
     tls: TlsConfig | None = None
     insecure: bool = False
     """Allow endpoints on a network without TLS, to listen at or to connect to: anybody there may drive the truck."""
     access_control: bool = False
-    """Refuse forged state from everybody who can connect; always on with ``tls``. Subscribers must then ask for
-    one group (``mt/truck/state/**``): wider expressions get nothing."""
+    """Refuse state published by others in this robot's name; always on with ``tls``. Subscribers must then subscribe to
+    one group (``mt/truck/state/**``): wider expressions receive nothing."""
     max_sessions: int = Field(default=64, ge=1)
     """Stations that may be connected at once; the same number again at ``listen_pilots``."""
     gather_seconds: float = Field(default=0.04, ge=0, le=0.1)
@@ -109,12 +109,12 @@ class ZenohConfig(Schema):
 
     @property
     def open_endpoints(self) -> tuple[str, ...]:
-        """Endpoints by which anybody on a network may ask for everything: own ones, and routers dialled."""
+        """Endpoints without TLS on a network, to listen at or to connect to."""
         return tuple(endpoint for endpoint in (*self.listen, *self.connect) if _open_to_network(endpoint))
 
     @property
     def certified_endpoints(self) -> tuple[str, ...]:
-        """Endpoints that ask for a certificate."""
+        """Endpoints that require a certificate."""
         return tuple(end for end in (*self.listen, *self.listen_pilots, *self.connect) if protocol_of(end) == "tls")
 
     @model_validator(mode="after")
@@ -133,7 +133,7 @@ class ZenohConfig(Schema):
 
 
 class PeerConfig(Schema):
-    """Another robot that this one hears."""
+    """Another robot whose poses are received."""
 
     endpoint: str
     """Where it listens, e.g. tcp/192.168.1.8:7447"""
@@ -145,23 +145,23 @@ class PeerConfig(Schema):
 
 @dataclass(frozen=True, slots=True)
 class Listener:
-    """One Zenoh session of the robot: its own endpoints and places; what a source may do that comes in by it."""
+    """One Zenoh session of the robot: its endpoints, its number of connections, and the rights of its sources."""
 
     listen: tuple[str, ...]
     places: int
     """Sessions of others that may be open at once."""
     connect: tuple[str, ...] = ()
     ca: Path | None = None
-    """Who is let in; None = everybody who reaches it."""
+    """Who may connect; None = everybody."""
     grants: dict[str, Grant] | None = None
-    """By name on the certificate; None = everything to everybody."""
+    """Rights by name on the certificate; None = all rights to everybody."""
     routers: tuple[str, ...] = ()
     """Names on the certificates of a fleet's routers."""
     guarded: bool = False
     """Whether forged state is refused."""
 
     def grant(self, source: str) -> Grant:
-        """What a source may do that comes in here."""
+        """Rights of a source on this session."""
         return EVERYTHING if self.grants is None else self.grants.get(owner_of(source), OBSERVING)
 
 
@@ -181,7 +181,7 @@ def listeners(config: ZenohConfig) -> list[Listener]:
 
 
 def session_config(robot: str, config: ZenohConfig, listener: Listener, *, probe: bool = False) -> str:
-    """Zenoh's own JSON configuration of one of the robot's sessions, or of a client that looks whom it would meet.
+    """Zenoh's own JSON configuration of one of the robot's sessions, or of a client that probes its endpoints.
 
     No discovery at all, for fixed endpoints connect in milliseconds. A full transmit queue drops at once
     (``wait_before_drop`` 0) because a put happens on the event loop; each is deep enough for the largest message.
@@ -228,7 +228,7 @@ def session_config(robot: str, config: ZenohConfig, listener: Listener, *, probe
 
 
 def _open_to_network(endpoint: str) -> bool:
-    """Whether an endpoint asks for no certificate and is reached from other machines."""
+    """Whether an endpoint requires no certificate and is reachable from other machines."""
     if protocol_of(endpoint) in ("tls", "unixsock-stream", "serial"):
         return False
     host = host_of(endpoint)

@@ -58,7 +58,7 @@ MAX_CALL = 16_384
 """Bytes of the largest payload of a call."""
 Put = Callable[[bytes], None]
 Call = tuple[zenoh.Query, Listener]
-"""A question, and where it came in."""
+"""A query, and the session it came in by."""
 
 _SCHEMA_PREFIX = "schema/"
 _SOURCE_PLACE = re.compile(r" at /\S+:\d+\.?")
@@ -77,7 +77,7 @@ class ZenohBridge:
         config: endpoints and access.
         clock: time.
         rpc: handlers behind ``rpc/<name>``; ``rpc/topics`` is added.
-        stand: take in what a test stand sees of the robot.
+        stand: accept poses of the robot from a test stand.
     """
 
     name = ServiceName.ZENOH.value
@@ -95,7 +95,7 @@ class ZenohBridge:
         rpc.register("topics", self._topics, AccessRole.OBSERVER)
 
     async def open(self) -> None:
-        """Claim endpoints and name; ``run`` does it too, a daemon may do it first to fail early.
+        """Open the sessions and claim the robot's name; ``run`` does so as well, a daemon calls it first to fail early.
 
         Raises:
             BusyError: an endpoint is in use, or another daemon already runs this robot.
@@ -105,7 +105,7 @@ class ZenohBridge:
             await in_thread(self._open)
 
     async def close(self) -> None:
-        """Give endpoints and name back; ``run`` does it too."""
+        """Close the sessions; ``run`` does so as well."""
         await in_thread(self._close)
 
     async def run(self, ready: Ready) -> None:
@@ -213,7 +213,7 @@ class ZenohBridge:
             return False
 
     def _declare_publishers(self) -> dict[str, tuple[Put, ...]]:
-        """Put functions of all sessions, by topic name."""
+        """Functions that publish to all sessions, by topic name."""
         return {
             topic.name: tuple(_publisher(session, topic, topic.key(self._robot)) for _, session in self._sessions)
             for topic in TOPICS
@@ -230,7 +230,7 @@ class ZenohBridge:
         limits: CallLimits,
         stand_intake: StandIntake,
     ) -> list[zenoh.LivelinessToken]:
-        """Subscribers and queryables; last the tokens that say so, which live as long as their objects."""
+        """Subscribers and queryables, and last the liveliness tokens; each lives as long as its object."""
         remote = zenoh.Locality.REMOTE
         tokens = []
         for listener, session in self._sessions:
@@ -241,7 +241,7 @@ class ZenohBridge:
                     partial(self._on_request, listener, intakes, estops, refusals),
                     allowed_origin=remote,
                 )
-            # A thread of Zenoh's for each subscriber: what waits for another one delays no emergency stop.
+            # Zenoh has a thread for each subscriber: a blocked one does not delay an emergency stop.
             session.declare_subscriber(
                 estop_key(self._robot), partial(self._on_estop, listener, estops), allowed_origin=remote
             )
@@ -430,7 +430,7 @@ def _on_stand_pose(stand_intake: StandIntake, sample: zenoh.Sample) -> None:
 
 
 def _guarded(failed: "asyncio.Future[None]", job: Callable[[], object]) -> None:
-    """Run ``job``; a bug in it ends the service instead of vanishing in the loop's exception handler."""
+    """Run ``job``; a bug in it ends the service, and not only in the loop's exception handler."""
     try:
         job()
     except Exception as bug:  # noqa: BLE001  # handed to the service's own coroutine

@@ -35,23 +35,23 @@ S = TypeVar("S", bound=Schema)
 T = TypeVar("T", bound=TruckConfig)
 
 PLACEHOLDER = "{robot}"
-"""In texts, for the robot's name."""
+"""Placeholder in values for the robot's name."""
 HEAD: Final = (
     "Settings changed while the robot ran (monstertruckd set --save); they replace those of the configuration."
 )
 MOST_BYTES: Final = 1_000_000
 """Of one file."""
 DEEPEST: Final = 50
-"""Sections and lists within each other."""
+"""Nesting of sections and lists, at most."""
 MOST_NODES: Final = 5_000
-"""Keys and values of one file as they are written: read in a quarter of a second; a full configuration has some
+"""Keys and values in the text of one file, at most: read in a quarter of a second; a full configuration has some
 hundreds."""
 MOST_VALUES = 20_000
 """Of one file; a full configuration has a few hundred."""
 MOST_MISTAKES = 50
 """Named at once."""
 ALIEN = 0.75
-"""Share of unknown sections from which on a file is of another kind."""
+"""Share of unknown sections from which on the file is taken to be no configuration."""
 YAML_1_1 = ("yes", "no", "on", "off")
 """Booleans of YAML 1.1 in lower case: text since 1.2."""
 
@@ -183,7 +183,7 @@ class SavedSettings:
         return {".".join(key): (value, origins[key].line) for key, value in _leaves(content, ())}
 
     def put(self, values: Mapping[str, tuple[LiveValue, int]], config: TruckConfig, data: dict[str, Any]) -> None:
-        """Put saved values into a configuration's plain data, which is not validated.
+        """Merge saved values into a configuration's data before validation.
 
         Raises:
             ConfigError: one is no live setting of the configuration; names the line.
@@ -195,7 +195,7 @@ class SavedSettings:
         put_settings(data, {key: value for key, (value, _) in values.items()})
 
     def save(self, values: Mapping[str, LiveValue]) -> None:
-        """Add settings, or replace them; whatever else is in the file stays, comments too.
+        """Add or replace settings; the rest of the file stays, comments too.
 
         Raises:
             ConfigError: the file is damaged, or cannot be written; nothing has changed then.
@@ -234,7 +234,7 @@ def _leaves(value: Any, key: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...],
 
 
 def put_settings(data: dict[str, Any], values: Mapping[str, Any]) -> None:
-    """Put live settings, by dotted key, into a configuration's plain data, which is not validated."""
+    """Merge live settings, by dotted key, into a configuration's data before validation."""
     for key, value in values.items():
         section = data
         *way, last = key.split(".")
@@ -264,7 +264,7 @@ def load_tree(path: Path) -> Tree:
 
 
 def _named(value: Any, robot: str) -> Any:
-    """The value with the robot's name in its texts."""
+    """The value with the placeholder replaced by the robot's name."""
     match value:
         case str():
             return value.replace(PLACEHOLDER, robot)
@@ -287,7 +287,7 @@ def _load(path: Path, including: tuple[Path, ...], inherited: int | None) -> Tre
 
 
 def included(path: Path, name: str) -> Path:
-    """File that ``name`` means in the file ``path``: relative to its folder, behind a link where that leads.
+    """Path of the file ``name`` named in the file ``path``: relative to its folder, with links resolved.
 
     Without ``..`` in it, where that means the same: not behind a link to a folder.
     """
@@ -316,7 +316,7 @@ def _with_includes(own: Tree, path: Path, including: tuple[Path, ...], version: 
 
 
 def _merge(base: Tree, top: Tree) -> None:
-    """Lay ``top`` over ``base``, values and origins."""
+    """Merge ``top`` over ``base``, values and origins."""
     replaced: set[Key] = set()
     _merge_values(base.data, top.data, (), replaced)
     kept = (
@@ -339,7 +339,7 @@ def _merge_values(below: dict[str, Any], above: dict[str, Any], prefix: Key, rep
 
 
 def _other_kind(below: dict[str, Any], above: dict[str, Any]) -> bool:
-    """Whether ``above`` chooses another ``kind``, so that the keys of the one ``below`` mean nothing to it."""
+    """Whether ``above`` chooses another ``kind``, so that the keys ``below`` do not apply."""
     return "kind" in above and above["kind"] != below.get("kind", above["kind"])
 
 
@@ -350,9 +350,9 @@ class _Builder:
     path: Path
     origins: dict[Key, Origin]
     scalar: Callable[[Node], Any] = field(default_factory=lambda: reader().constructor.construct_object)
-    """Gives the value of a scalar node."""
+    """Constructs the value of a scalar node."""
     around: list[Node] = field(default_factory=list)
-    """Nodes in which the present one lies."""
+    """Nodes that contain the present one."""
     count: int = 0
     """Values built."""
 
@@ -420,7 +420,7 @@ def reader() -> YAML:
 
 
 def node_kind(node: Node) -> str:
-    """What stands there, for complaints."""
+    """Description of a node for error messages."""
     kinds = ((MappingNode, "a mapping"), (SequenceNode, "a list"))
     return next((name for kind, name in kinds if isinstance(node, kind)), "a plain value")
 
@@ -469,7 +469,7 @@ class YamlText:
 
     Args:
         text: content.
-        path: its file, for complaints.
+        path: its file, for error messages.
 
     Raises:
         ConfigError: it is not YAML 1.2, is nested too deeply, or is something else than a mapping.
@@ -500,7 +500,7 @@ class YamlText:
         self.root = _compose(text, self.path)
 
     def node(self, *key: str) -> Node | None:
-        """What stands at ``key``; None if nothing does."""
+        """The node at ``key``; None if there is none."""
         pair = self._pair(key)
         return None if pair is None else pair[1]
 
@@ -518,7 +518,7 @@ class YamlText:
         return True
 
     def rename(self, key: tuple[str, ...], name: str) -> bool:
-        """Call the last part of ``key`` by another name; False if it is not there."""
+        """Rename the last part of ``key``; False if it is not there."""
         pair = self._pair(key)
         if pair is None:
             return False
@@ -541,7 +541,7 @@ class YamlText:
 
 
 def _end(node: Node) -> int:
-    """Index behind the node's last character; a block's own mark lies behind the blanks and comments after it."""
+    """Index after the node's last character; the end mark of a block is after the blanks and comments behind it."""
     if isinstance(node, CollectionNode) and not node.flow_style and node.value:
         last = node.value[-1]
         return _end(last[1] if isinstance(last, tuple) else last)
@@ -553,7 +553,7 @@ def _end(node: Node) -> int:
 
 
 Step = Callable[[YamlText], None]
-"""Edits one file from its version to the next; must do nothing to what is already so."""
+"""Edits one file from its version to the next; must be idempotent."""
 
 RENAMED: Final = (
     (("gate", "obstacle", "beside"), "side_clearance"),
@@ -599,7 +599,7 @@ def run_steps(text: YamlText, version: int, steps: Mapping[int, Step], target: i
 
 
 def bring_up_to_date(text: YamlText, inherited: int | None) -> int | None:
-    """Give the keys of a file of an older version their present names, in memory only.
+    """Rename the keys of a file of an older version to the present ones, in memory only.
 
     Args:
         text: content of the file.
@@ -643,7 +643,7 @@ def validated(tree: Tree, path: Path, model: type[S]) -> tuple[S, Tree]:
 
 
 def _require_kind(data: dict[str, Any], path: Path, model: type[Schema]) -> None:
-    """Tell a mission from a robot's configuration in one line, instead of by every key that it has."""
+    """Report a mission file in one line, instead of an error for each of its keys."""
     found = [str(key) for key in data if key != "version"]
     strange = set(found) - set(model.model_fields)
     if len(strange) > 1 and len(strange) >= ALIEN * len(found):
@@ -652,7 +652,7 @@ def _require_kind(data: dict[str, Any], path: Path, model: type[Schema]) -> None
 
 
 def _locate_files(tree: Tree, keys: tuple[tuple[str, ...], ...]) -> None:
-    """Make the values at ``keys`` absolute, relative to the file that says them."""
+    """Make the paths at ``keys`` absolute: they are relative to the file that names them."""
     for key in keys:
         section: Any = tree.data
         for part in key[:-1]:
@@ -673,7 +673,7 @@ def _locate_files(tree: Tree, keys: tuple[tuple[str, ...], ...]) -> None:
 
 
 def _give_ports(data: dict[str, Any]) -> None:
-    """Hang the devices of an emulated robot that name no port where `simulate` makes them: in a folder of the user."""
+    """Set the ports of an emulated robot's devices that name none to those that `simulate` makes."""
     devices = data.get("devices")
     if data.get("sim") is None or not isinstance(devices, dict):
         return
@@ -716,7 +716,7 @@ def _sentence(detail: ErrorDetails, model: type[Schema], key: Key) -> str:
 
 
 def _data_key(data: Any, loc: tuple[int | str, ...]) -> Key:
-    """Pydantic's location without the parts that name union members instead of keys of the data."""
+    """Pydantic's location without the names of union members, which are no keys of the data."""
     key: list[str | int] = []
     for index, part in enumerate(loc):
         last = index == len(loc) - 1

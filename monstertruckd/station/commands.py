@@ -49,9 +49,9 @@ class Heartbeat(_Command):
 
     do: Literal["drive"]
     heard: Number
-    """The station's time in the newest answer to a ``ping``, ms..."""
+    """The station's time in the newest answer to a ``ping``, ms."""
     since: Number
-    """...and how long before the input was read that came, by the browser's clock, ms."""
+    """Time from that answer to reading the input, by the browser's clock, ms."""
     input: Literal["stick", "keys", "gamepad"]
     speed: Number = 0.0
     front: Number = 0.0

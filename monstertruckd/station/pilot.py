@@ -52,11 +52,11 @@ from monstertruckd.station.viewer import Viewer
 LEASE: Final = 0.25
 """Seconds for which a heartbeat stands."""
 LATEST: Final = 0.2
-"""A heartbeat that took so much longer than the quickest ones, s, is dropped..."""
+"""A heartbeat that took this much longer than the quickest ones is dropped, s."""
 OLDEST: Final = 1.5
-"""...and one that took so long altogether, with the way of what it was measured by, however slow the others were."""
+"""A heartbeat whose round trip took this long is dropped, however slow the others were, s."""
 MEMORY: Final = 200
-"""Heartbeats among which the quickest is looked for."""
+"""Newest heartbeats among which the quickest is found."""
 MOST_ASKED: Final = 16
 """Commands of one browser whose outcome is waited for at once."""
 RETRY: Final = 1.0
@@ -68,9 +68,9 @@ SPACING: Final = 0.05
 SMOOTHING: Final = 0.12
 """Standard deviation of the weights with which a drawn line is smoothed, m: hands tremble."""
 SHORTEST: Final = 0.3
-"""Of a drawn path, m..."""
+"""Least length of a drawn path, m."""
 LONGEST: Final = 200.0
-"""...and the longest: it is computed at once, in about 2 ms."""
+"""Greatest length of a drawn path, m: it is computed in one piece, in about 2 ms."""
 
 
 class DelayWatch:

@@ -56,9 +56,9 @@ END: Final = 5.0
 """Seconds that sessions with robots may take to close at the end."""
 LANGUAGE: Final = "en"
 MOST_BROWSERS: Final = 32
-"""At once: each holds a session with a robot, of which that has a number of places..."""
+"""Browsers at one time: each holds a session with a robot, which accepts a limited number."""
 MOST_OF_USER: Final = 8
-"""...and this many of one user who logs in, so that nobody takes them all."""
+"""Browsers of one user who logs in, so that nobody uses up all of them."""
 MOST_CONNECTIONS: Final = 256
 """Of one network: a browser keeps some six. Of those beyond, the newest are closed."""
 MESSAGES: Final = 200.0

@@ -31,9 +31,9 @@ class GyroConfig(Schema):
     window: Positive = 1.5
     """Seconds over which turns by the gyroscope and by the wheels are compared"""
     tolerance: Positive = 0.12
-    """Tolerated difference, rad,"""
+    """Tolerated difference, rad"""
     share: Annotated[float, Field(ge=0, lt=1)] = 0.35
-    """and as a share of the greater turn: wheels slip"""
+    """Tolerated difference as a share of the greater turn: wheels slip"""
     proof: Positive = 0.3
     """Turn of the wheels in the window with which an IMU that was left out has to agree to count again, rad"""
     drift: Annotated[float, Field(ge=0)] = 5e-5

@@ -164,9 +164,9 @@ class ExplorationState(Message):
     target: Pose2D | None = None
     """Where it is going."""
     frontiers: Annotated[int, Field(ge=0)] = 0
-    """Frontiers that can be reached..."""
+    """Frontiers that can be reached."""
     left_alone: Annotated[int, Field(ge=0)] = 0
-    """...and those that are not tried for now."""
+    """Frontiers on the blacklist."""
     known: Annotated[float, Field(ge=0)] = 0.0
     """Area of the free ground in the map, m^2."""
     travelled: Annotated[float, Field(ge=0)] = 0.0

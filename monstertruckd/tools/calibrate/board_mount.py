@@ -43,7 +43,7 @@ STRAIGHT: Final = 0.02
 FLAT: Final = 0.001
 """Standard deviation of a board's middle off its plane, m;"""
 WARPED: Final = 0.003
-"""and of the turn of a line on it, rad."""
+"""Standard deviation of the direction of a line on it, rad."""
 RANGE: Final = 0.004
 """Standard deviation of what the lidar measures too far on such a surface, m."""
 PRINT: Final = 0.003

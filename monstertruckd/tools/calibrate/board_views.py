@@ -42,7 +42,7 @@ TILT: Final = math.radians(12.0)
 TILTED: Final = 3
 """Views tilted by more, to each of four sides;"""
 TILTED_BEAMED: Final = 3
-"""and those of them that the lidar sees."""
+"""Views needed that the lidar sees as well."""
 STEEP: Final = math.radians(30.0)
 STEEP_BEAMED: Final = 8
 """Views that the lidar sees, tilted by more than ``STEEP``, upper and lower edge nearer each: by these alone height and

@@ -38,9 +38,9 @@ LEAST: Final = 5
 SLIDING: Final = 0.004
 """Share of the way by which a body that skids differs from its model, along and across; and of its turn."""
 FLOOR: Final = 0.0005
-"""Least standard deviation of a position at rest, m,"""
+"""Least standard deviation of a position at rest, m."""
 AIM: Final = 0.001
-"""and of a heading, rad."""
+"""Least standard deviation of a heading at rest, rad."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,11 +20,11 @@ from monstertruckd.tools.stand.config import BlobRobot
 from monstertruckd.tools.stand.poses import MarkerPose, weight_of
 
 APART: Final = 0.012
-"""m by which the distance of two discs may be off."""
+"""Tolerated error of the distance of two discs, m."""
 NEAR: Final = 0.06
-"""m from where a robot is expected,"""
+"""Distance from the expected position within which a robot is found again, m."""
 SWERVE: Final = 1.0
-"""and this much more for each second since it was seen, m/s."""
+"""Growth of that distance with the time since the robot was seen, m/s."""
 AT_START: Final = 0.15
 """m from its start at which a robot is known that cannot be distinguished from others."""
 UNSURE: Final = 0.5

@@ -26,7 +26,7 @@ from monstertruckd.tools.stand.poses import MarkerPose, RobotPose, merged, robot
 FASTEST: Final = 3.0
 """m/s: robots are not faster;"""
 SLACK: Final = 0.05
-"""and this much, m, is no jump."""
+"""Distance up to which a change is no jump, m."""
 RATE_TIME: Final = 0.1
 """Seconds over which a robot's speed is a mean."""
 EXPECTED: Final = 0.5

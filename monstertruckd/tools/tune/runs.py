@@ -23,9 +23,9 @@ LIMIT: Final = 120.0
 LOST: Final = 0.12
 """Distance error at which a run is broken off before the robot loses the wall, m; it counts as overshooting."""
 CALM_WITHIN: Final = 0.02
-"""Distance error of a robot that is ready for a run, m, ..."""
+"""Distance error below which a robot is ready for a run, m."""
 CALM_FOR: Final = 2.0
-"""... for so many seconds."""
+"""Seconds for which the error must be below ``CALM_WITHIN``."""
 
 
 class TunedRobot(Protocol):

@@ -41,9 +41,9 @@ class HeadingTrust(Schema):
     field: Positive = 0.05
     """Share by which the strength of the magnetic field may differ from what it was at the start."""
     recover: Annotated[int, Field(ge=1)] = 10
-    """Good headings in a row until a compass that was disturbed counts again,"""
+    """Good headings in a row after which a compass that was disturbed is used again."""
     regain: Positive = 2.0
-    """over at least so many metres, or radians, or else over the steady time."""
+    """Motion over which these headings must be good, m or rad; alternatively the steady time."""
     steady_time: Positive = 10.0
     """Seconds after which a heading that is steadily off, its field undisturbed, is taken for a new north."""
 
@@ -67,22 +67,22 @@ class ImuTrust(GyroConfig):
 
 
 class SlipConfig(Schema):
-    """When the wheels are held to slip."""
+    """Detection of wheel slip."""
 
     window: Positive = 0.4
     """Seconds over which wheels and scans are compared."""
     gate: Positive = 4.5
-    """They slip when they are apart by more than this many standard deviations twice in a row, and"""
+    """The wheels slip when they differ from the scans by more than this many standard deviations twice in a row"""
     release: Positive = 2.5
-    """no longer when they are closer than this"""
+    """Slip ends when they differ by less than this many standard deviations ``calm`` times in a row"""
     calm: Annotated[int, Field(ge=1)] = 5
-    """so many times in a row."""
+    """Comparisons in a row that end slip"""
     timing: Positive = 0.01
     """Standard deviation of the offset between the stamps of both, s."""
     speed: Positive = 0.5
-    """Standard deviation of the speed at which wheels that slip are wrong, m/s,"""
+    """Standard deviation of the speed of wheels that slip, m/s."""
     turn: Positive = 1.0
-    """and rad/s."""
+    """Standard deviation of the yaw rate of wheels that slip, rad/s."""
 
 
 class FusionConfig(OdometrySettings):
@@ -104,9 +104,9 @@ class FusionConfig(OdometrySettings):
     horizon: Positive = 5.0
     """Measurements may come this late, s, and headings of so long before a disturbance was noticed are taken back."""
     slew: tuple[Positive, Positive] = (0.5, 1.0)
-    """The published pose follows corrections no faster than this, m/s and rad/s: it never jumps,"""
+    """Rate at which the published pose follows corrections at most, m/s and rad/s: it never jumps."""
     settle: Positive = 0.4
-    """and with this time constant, s."""
+    """Time constant with which the published pose follows corrections, s."""
     wheels: WheelTrust | None = WheelTrust()
     """Null leaves the wheels out"""
     compass: HeadingTrust | None = HeadingTrust()

@@ -179,7 +179,7 @@ class Fusion:
         self._changes: deque[SlipChange] = deque()
         self._was_disturbed = False
         self._jump = 0.0
-        """Of the headings when the last disturbance began, rad; 0 = none."""
+        """Jump of the headings at the onset of the last disturbance, rad; 0 = none."""
 
     # What comes in
 
@@ -266,7 +266,7 @@ class Fusion:
             return
         history = self._begin(measured.since)
         if history.scan_before(measured.stamp) != measured.since:
-            # The clone of the earlier pose has to be made where it was.
+            # The clone of the earlier pose must be inserted at its own stamp.
             self._insert(ScanClone(measured.since, measured.covariance))
         if not self._insert(measured):
             self._left_out["lidar: too late"] += 1
@@ -387,7 +387,7 @@ class Fusion:
         return self._history is not None and self._history.newest.gate.disturbed
 
     def _look_for_disturbance(self) -> None:
-        """Mark headings before a detected disturbance as taken back: a magnet approaches before it is detected."""
+        """Undo headings shortly before a detected disturbance: a magnet has an effect before it is detected."""
         if self._disturbed and not self._was_disturbed and self._history is not None:
             gate = self._history.newest.gate
             self._jump = gate.jump
@@ -442,7 +442,7 @@ def _without_turn(measurement: Measurement) -> Measurement:
 
 
 def _taken_back(measurement: Measurement, jump: float, at: int) -> Measurement:
-    """A heading before the disturbance that began ``at``, ns, with a ``jump``, rad, is left out."""
+    """Whether a heading before the disturbance that began ``at``, ns, with a ``jump``, rad, is rejected."""
     if not isinstance(measurement, HeadingMeasurement):
         return measurement
     return replace(measurement, taken_back=True, jump=jump if measurement.stamp == at else measurement.jump)

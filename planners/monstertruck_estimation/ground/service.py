@@ -32,9 +32,9 @@ WINDOW: Final = 0.7
 RATE: Final = 10.0
 """Hz."""
 MOVED: Final = 0.05
-"""Metres between two observations of the ground under the robot..."""
+"""Distance between two observations of the ground under the robot, m."""
 TURNED: Final = 0.2
-"""...or radians."""
+"""Turn between two observations of the ground under the robot, rad."""
 NEAR_GROUND: Final = 0.10
 """Beams that go down and end this near to the robot's own level hit the ground, m."""
 POINTS: Final = 60

@@ -23,27 +23,27 @@ from monstertruck_schemas.points import PointKind, PointOfInterest
 KEPT: Final = 24
 """Sightings of a point at most."""
 SAME_PLACE: Final = 0.08
-"""Sightings from this near to each other, m..."""
+"""Distance within which sightings count as one, m: their errors are the same."""
 SAME_TURN: Final = 0.08
-"""...and headings, rad, are one: what they have wrong is the same."""
+"""Difference in heading within which sightings count as one, rad."""
 APART: Final = 100_000_000
 """Least time between two pictures that count, ns."""
 RANGE_ERROR: Final = 0.4
 """Standard deviation of a tag's side in a picture, pixels."""
 SIDE_ERROR: Final = 0.006
-"""And across the line of sight, m..."""
+"""Standard deviation across the line of sight, m."""
 BEARING_ERROR: Final = 0.004
-"""...and rad: mount and lens."""
+"""Standard deviation of the direction of the line of sight, rad: mount and lens."""
 LATENESS: Final = 0.015
-"""Seconds by which the picture's stamp may be off."""
+"""Error of the picture's stamp, s."""
 HEADING_ERROR: Final = 0.06
-"""Of a tag's normal, rad..."""
+"""Standard deviation of the normal of an unambiguous tag, rad."""
 DOUBTED: Final = 0.6
-"""...where the second pose of its square fits less well than this share."""
+"""Ratio of the fits of the best and the second pose of a square up to which the tag is unambiguous."""
 UNKNOWN_HEADING: Final = 2.0
-"""Else, rad."""
+"""Standard deviation of the normal of an ambiguous tag, rad."""
 MARK_ERROR: Final = 0.01
-"""Of where an operator marks, m and rad."""
+"""Standard deviation of a place marked by an operator, m and rad."""
 LOADED: Final = 2
 """Sightings that a point of a saved map is worth: one that disagrees changes nothing yet."""
 FAR: Final = 3.5

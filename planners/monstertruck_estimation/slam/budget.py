@@ -14,19 +14,19 @@ Pieces = Generator[float, None, T]
 BUDGET: Final = 9e6
 """Work on searches at one scan, 20 to 25 ms."""
 ELEMENT: Final = 100.0
-"""Work of merging one element into a submap,"""
+"""Work of merging one element into a submap."""
 DRAWN: Final = 1000.0
-"""of drawing it into a likelihood grid,"""
+"""Work of drawing an element into a likelihood grid."""
 CELL: Final = 0.2
-"""of a cell of one level of that,"""
+"""Work per cell of one level of a likelihood grid."""
 EDGE: Final = 400.0
-"""of an edge of the pose graph when its drift is bounded,"""
+"""Work per edge of the pose graph of bounding its drift."""
 EDGE_OPTIMISED: Final = 4000.0
-"""when it is optimised,"""
+"""Work per edge of optimising the pose graph."""
 VERIFIED: Final = 3e6
-"""of verifying a match,"""
+"""Work of verifying a match."""
 CROSSED: Final = 2e5
-"""and of holding a keyframe against those of another submap."""
+"""Work of comparing a keyframe with those of another submap."""
 
 
 class ScanBudget:

@@ -40,78 +40,79 @@ from monstertruck_estimation.slam.scans import Scan
 from monstertruck_kinematics.elementary import Array
 
 VIEW: Final = 2.5
-"""Two keyframes this near see enough of the same, m."""
+"""Distance within which two keyframes see enough of the same surroundings, m."""
 WINDOW: Final = 3.0
 """Half width of a search in standard deviations of the drift."""
 MARGIN: Final = (0.3, 0.05)
-"""What is added to that, m and rad."""
+"""Added to the half width, m and rad."""
 MAX_WINDOW: Final = (12.0, 1.0)
 """Half width of a search at most, m and rad."""
 SMALL_WINDOW: Final = (1.5, 0.3)
 """Matches in windows up to this need no support, m and rad."""
 LEVELS: Final = 7
-"""Levels of the pyramid."""
+"""Levels of the correlation pyramid."""
 QUERY_KEYS: Final = 12
 """Keyframes of the query at most."""
 QUERY_REACH: Final = 3.0
-"""They are this near to the newest, m."""
+"""Their distance from the newest keyframe at most, m."""
 QUERY_CELL: Final = 0.1
 """About one of their points is used per square of this edge, m."""
 QUERY_POINTS: Final = 320
 """Points of the query at most."""
 WORK: Final = 40_000
-"""Blocks looked at in one search below the coarsest level, at most."""
+"""Blocks evaluated in one search below the coarsest level, at most."""
 PLACE_KEYS: Final = 60
-"""Keyframes of the place it is searched in, at most."""
+"""Keyframes of the place that is searched, at most."""
 MIN_SCORE: Final = 0.45
-"""Mean likelihood of surroundings found again."""
+"""Least mean likelihood of a match."""
 MIN_OVERLAP: Final = 0.55
-"""Share of their points that must fit."""
+"""Share of the query's points that must fit."""
 JOIN_OVERLAP: Final = 0.75
-"""The same for a submap searched for in the whole map,"""
+"""Share of the points that must fit, of a submap that is searched for in the whole map."""
 JOIN_BASELINE: Final = 2.0
-"""and the length of the trajectory between the matches that join it, m."""
+"""Least length of the trajectory between the matches that join two submaps, m."""
 JOIN_CONTRADICTION: Final = (0.1, 0.18)
-"""Share of what both of two submaps saw that they may look through, of all of it and along a stretch: right joins of
-recordings had 0.05 and 0.15 at most, wrong ones in six of seven drives through equal rooms 0.18 and more."""
+"""Greatest contradiction of two submaps (share of the points in view of both that one looked through), as a whole and
+along a stretch: right joins of recordings had at most 0.05 and 0.15, wrong ones in six of seven drives through equal
+rooms 0.18 and more."""
 JOIN_STRETCH: Final = 6
 """Keyframes of a stretch."""
 CROSSED_KEYS: Final = 24
-"""Newest keyframes of one of two submaps that are held against the other's,"""
+"""Newest keyframes of a submap that are compared with another submap."""
 CROSSED_NEAR: Final = 12
-"""how many of those each, evenly chosen,"""
+"""Keyframes of the other submap that each is compared with, evenly chosen, at most."""
 CROSSED_REACH: Final = 5.0
-"""and how near they are at most, m."""
+"""Distance of these at most, m."""
 MIN_RATIO: Final = 0.02
-"""Of the eigenvalues of the information on the position: less is a corridor, where a fit proves nothing."""
+"""Least ratio of the eigenvalues of the position's information: below it is a corridor, where a fit proves nothing."""
 MAX_CORRECTION: Final = 0.3
-"""The fine fit ends this near to the coarse one, m."""
+"""Distance between the fine and the coarse fit at most, m."""
 CONTRADICTION: Final = 0.15
-"""Share of the points looked through by scans of the other side, from which a place is another one."""
+"""Share of the points looked through by the scans of the other side from which on a match is wrong."""
 PART_SCORE: Final = 0.1
-"""Mean likelihood of surroundings of which only a part was seen before,"""
+"""Partial match (only a part of the surroundings was seen before): least mean likelihood."""
 PART_OVERLAP: Final = 0.7
-"""share of their points in view of the place that must fit,"""
+"""Partial match: share of the points in view of the place that must fit."""
 PART_POINTS: Final = 20
-"""least number of those,"""
+"""Partial match: least number of points in view."""
 PART_CONTRADICTION: Final = 0.05
-"""share that may be looked through,"""
+"""Partial match: share of the points that may be looked through."""
 PART_WIDER: Final = (1.0, 2.0)
-"""and how much wider the search is: scans alone drift further than any covariance says."""
+"""Partial match: added to the half width of the search, m and rad: scans drift more than their covariance says."""
 REVIEWED: Final = 250
-"""Keyframes from which it begins, at most."""
+"""Keyframes from which the review searches, at most."""
 MAX_RIVAL: Final = 0.9
 """A match is ambiguous if another place scores more than this share of it."""
 MIN_SEPARATION: Final = 1.0
 """Distance at which places are different, m."""
 MIN_LIKENESS: Final = 0.8
-"""Of a candidate by descriptor."""
+"""Least similarity of the descriptors of a candidate."""
 FLOOR: Final = (0.03, 0.03, 0.01)
 """Standard deviation of a closure, m and rad: its submaps are not rigid."""
 MIN_SUPPORT: Final = 3
 """Matches that must agree before one of a wide search is accepted, and as many more for each that contradicts."""
 BASELINE: Final = 1.0
-"""Length of the trajectory between the first and the last of them, m."""
+"""Least length of the trajectory between the first and the last of these, m."""
 CONSISTENT: Final = 11.3
 """Squared Mahalanobis distance of agreeing hits (99 % of chi-square with three degrees of freedom)."""
 STRETCH: Final = 3.0
@@ -137,7 +138,7 @@ class LoopMatch:
     measured: Array
     information: Array
     made: int
-    """The newest keyframe when it was found."""
+    """Number of the newest keyframe when it was found."""
 
 
 class LoopCloser:
@@ -156,11 +157,11 @@ class LoopCloser:
 
     @property
     def busy(self) -> bool:
-        """Whether a search is on its way."""
+        """Whether a search is running."""
         return self._progress is not None
 
     def watch(self, at: int) -> None:
-        """Search from keyframe ``at`` in its turn; beyond ``MOST_WAITING`` the oldest are dropped."""
+        """Queue a search from keyframe ``at``; beyond ``MOST_WAITING`` the oldest are dropped."""
         self._waiting = [*self._waiting, at][-MOST_WAITING:]
 
     def step(self, keyframes: KeyframeMap, budget: ScanBudget) -> bool:
@@ -240,7 +241,7 @@ class LoopCloser:
         return closed
 
     def forget(self, kept: NDArray[np.bool_]) -> None:
-        """Only the marked keyframes are kept, with new numbers."""
+        """Renumber after pruning: only the marked keyframes are kept."""
         self._hits.clear()
         self._tried.clear()
         self._waiting.clear()
@@ -249,7 +250,7 @@ class LoopCloser:
         self._fingerprints = {int(number[k]): one for k, one in self._fingerprints.items() if kept[k]}
 
     def _partial_match(self, keyframes: KeyframeMap, at: int) -> LoopMatch | None:
-        """Keyframe ``at`` found near the likeliest place before it, if little else is possible."""
+        """Match of keyframe ``at`` with the likeliest earlier place, if few others are possible."""
         covariances, far = keyframes.drift(at)
         numbers = self._possible(keyframes, at, covariances, far)
         if not len(numbers):
@@ -265,7 +266,7 @@ class LoopCloser:
         return next((hit for hit in tries if hit is not None), None)
 
     def _candidates(self, keyframes: KeyframeMap, newest: int, covariances: Array, far: Array) -> list[int]:
-        """At most two keyframes: the likeliest by place, and one elsewhere that looks most alike."""
+        """At most two candidates: the likeliest by position, and the most similar one elsewhere."""
         numbers = self._possible(keyframes, newest, covariances, far)
         if not len(numbers):
             return []
@@ -306,9 +307,9 @@ class LoopCloser:
         """Match ``query``, the surroundings of keyframe ``at``, or a part of it, to those of ``candidate``."""
         self.searches += 1
         window = min(window[0], MAX_WINDOW[0]), min(window[1], MAX_WINDOW[1])
-        # All of the window, not only what is round the candidate: a place that looks alike must not win by default.
+        # The whole window, not only around the candidate: a similar place must not win for lack of rivals.
         numbers = keyframes.well_known(candidate)
-        # Nor what is known from the query itself: it would be matched to its own neighbours, which closes no loop.
+        # Without the query's own neighbours: a match to them closes no loop.
         numbers = np.setdiff1d(numbers, np.union1d(own, keyframes.well_known(at)))
         numbers = numbers[_distance(keyframes, at)[numbers] < window[0] + keyframes.config.local_reach]
         if not len(numbers):
@@ -393,7 +394,7 @@ def _split_by_consistency(
     at_target, _ = keyframes.drift(hit.target)
     at_origin, _ = keyframes.drift(hit.origin)
     for other in others:
-        # Origin to target to the other's target to its origin, against the graph's own way from origin to origin.
+        # Origin, target, the other's target and its origin, against the graph's own relation of both origins.
         step = between(keyframes.poses[hit.target], keyframes.poses[other.target])
         there = compose(compose(hit.measured, step), inverse(other.measured))
         off = between(between(keyframes.poses[hit.origin], keyframes.poses[other.origin]), there)
@@ -446,7 +447,7 @@ def _overlap_in_view(keyframes: KeyframeMap, near: NDArray[np.intp], query: Scan
 
 
 def crossings(keyframes: KeyframeMap, own: NDArray[np.intp], others: NDArray[np.intp]) -> Pieces[Array]:
-    """How the newest of ``own`` near ``others`` agree with what those around them saw.
+    """Compare the newest of ``own`` with the keyframes ``others`` around them.
 
     Returns:
         Shape (k, 2), a row for each in their order: points that the opposite side looked through, and those in its
@@ -509,9 +510,9 @@ def _way(keyframes: KeyframeMap, hits: list[LoopMatch]) -> float:
 VIEW_SECTORS: Final = 180
 """Sectors of a scan's view all round."""
 VIEW_MARGIN: Final = 0.25
-"""Points this much in front of what was seen behind them were looked through, m."""
+"""Distance in front of what was seen behind a point from which on the point was looked through, m."""
 VIEW_SLACK: Final = 0.04
-"""And this share of their range: for the yaw's error."""
+"""Added to that, as a share of the range, for the error of the yaw."""
 
 
 def contradiction(one: list[Scan], poses: Array, others: list[Scan], other_poses: Array) -> float:
@@ -520,7 +521,7 @@ def contradiction(one: list[Scan], poses: Array, others: list[Scan], other_poses
     Args:
         one: scans, points in base.
         poses: shape (n, 3), of ``one``.
-        others: the scans they are held against.
+        others: the scans that they are compared with.
         other_poses: shape (m, 3), in the same frame.
     """
     through, judged = _counted(one, poses, others, other_poses)
@@ -613,7 +614,7 @@ def _mark_seen(view, points, seen):  # type: ignore[no-untyped-def] # noqa: ANN0
 
 
 DESCRIPTOR_REACH: Final = 5.0
-"""Points up to this far from the robot take part, m."""
+"""Distance from the robot up to which points are in the descriptor, m."""
 DESCRIPTOR_BINS: Final = 20
 
 

@@ -18,9 +18,9 @@ class MapperConfig(Schema):
     """
 
     key_distance: Positive = 0.3
-    """Distance after which a scan becomes a keyframe, m."""
+    """Distance after which a scan is integrated into the grid, m."""
     key_turn: Positive = 0.35
-    """Turn after which a scan becomes a keyframe, rad."""
+    """Turn after which a scan is integrated into the grid, rad."""
     key_points: Count = 360
     """Most points of a keyframe."""
     key_cell: Positive = 0.04
@@ -74,11 +74,11 @@ class GridConfig(Schema):
     free_footprint: bool = False
     """The ground under the robot is free, although its sensor does not see it"""
     spacing: Positive = 0.1
-    """A scan is integrated after so much distance, m,"""
+    """Distance after which a scan is integrated into the grid, m."""
     turn: Positive = 0.1
-    """or turn, rad,"""
+    """Turn after which a scan is integrated into the grid, rad."""
     pause: Positive = 1.0
-    """or seconds."""
+    """Time after which a scan is integrated into the grid, s."""
     remembered: Annotated[int, Field(ge=16)] = 6000
     """Scans stored to rebuild the grid after a loop closure; beyond, every other old one is dropped."""
 
@@ -107,9 +107,9 @@ class SlamConfig(Schema):
     map_period: Positive = 10.0
     """Seconds after which a changed map is published whole, at the latest"""
     slew: tuple[Positive, Positive] = (0.3, 0.5)
-    """The pose in map follows corrections no faster than this, m/s and rad/s, so that it does not jump,"""
+    """Rate at which the pose in map follows corrections at most, m/s and rad/s, so that it does not jump."""
     jump: Positive = 1.0
-    """unless they are greater than this, m: then at once"""
+    """Corrections greater than this are applied immediately, m"""
     latency: Annotated[float, Field(gt=0, le=1)] = 0.03
     """Seconds after which a step of the worker counts on the virtual clock"""
     deadline: Annotated[float, Field(gt=0, le=60)] = 20.0

@@ -234,11 +234,11 @@ class Join:
     """Two submaps that were joined, maybe wrongly."""
 
     own: int
-    """Number of the robot's submap, to which later keyframes belong,"""
+    """Number of the robot's submap, to which later keyframes belong."""
     other: int
-    """and that of the other one,"""
+    """Number of the other submap."""
     others: Numbers
-    """with its keyframes, rising."""
+    """Keyframes of the other submap, in rising order."""
     since: int
     """Keyframes there were."""
 
@@ -571,9 +571,9 @@ def partners(poses: Array) -> NDArray[np.int64]:
 
 
 WITNESS_PAUSE: Final = 60.0
-"""Seconds between two views of a place that judge the joint registration,"""
+"""Seconds between two views of a place that are used to check the joint registration."""
 WITNESS_SHARE: Final = 0.25
-"""or this share of a shorter run."""
+"""The same as a share of a shorter run."""
 WITNESSES: Final = 1500
 """Most pairs that judge it, evenly chosen."""
 WITNESS_REACH: Final = 0.05

@@ -44,13 +44,13 @@ LOST_DEVIATION: Final = (1.0, 0.5)
 MAX_CONTRADICTION: Final = 0.3
 """Greatest share of beams that contradict the saved grid of a match that counts: people and new furniture do, too."""
 MIN_MAPPED: Final = 0.65
-"""Least share of a scan's beams that end on mapped ground,"""
+"""Least share of a scan's beams that end on mapped ground."""
 ALL_MAPPED: Final = 0.95
-"""and that with which all of them are matched."""
+"""Share of beams on mapped ground from which on all beams are matched."""
 PARTIAL_OVERLAP: Final = 0.8
-"""Least overlap of the beams that end on mapped ground where others do not, and of a match far from the motion,"""
+"""Least overlap of the beams on mapped ground where others do not end there, and of a match far from the motion."""
 PARTIAL_CONTRADICTION: Final = 0.15
-"""and greatest share of them that contradict the saved grid: few walls fit in many places."""
+"""Greatest share of these beams that contradict the saved grid: few walls fit in many places."""
 FAR: Final = 3.0
 """Standard deviations of the predicted pose from which a match is far from the motion."""
 CHECKED_WAY: Final = (3.0, 9.0)

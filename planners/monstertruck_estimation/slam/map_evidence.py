@@ -19,9 +19,9 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.map_files import FREE, OCCUPIED, WorldMap
 
 TOLERANCE: Final = 0.15
-"""Distance of a beam's end from a wall within which both agree, m,"""
+"""Distance of a beam's end from a wall within which both agree, m."""
 SLACK: Final = 0.03
-"""and what a metre of range adds to it: the error of the yaw."""
+"""Added to that per metre of range, for the error of the yaw."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,9 +16,9 @@ from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.health import OdometryUse
 
 NOISE_MEMORY: Final = 40
-"""Scans over which the noise of odometry is learned."""
+"""Scans over which the noise of odometry is estimated."""
 MAX_INNOVATION: Final = 4.0
-"""Normalised innovations count as this at most."""
+"""Limit to which normalised innovations are clamped."""
 NOISE_LIMITS: Final = (1.0, 3.0)
 """Limits of the factors on the standard deviations of odometry."""
 CLEAR_MATCH: Final = (0.15, 0.75)
@@ -40,26 +40,26 @@ def velocity(delta: Array, dt: float) -> tuple[float, float, float]:
 
 
 COMPARED: Final = (5.0, 2.0)
-"""Odometry is compared with the scans over so many seconds, and over so much motion (m or rad)."""
+"""Time (s) and motion (m or rad) over which odometry is compared with the scans."""
 SAMPLE: Final = (0.25, 0.1)
 """Least length of a step of the comparison, s and motion: the noise of single matches would add up to a way."""
 FEWEST_SAMPLES: Final = 3
 TOLERANCE: Final = 0.3
-"""Share of the way, or of the turn, by which they may differ,"""
+"""Tolerated difference of odometry and scans as a share of the distance, or of the turn."""
 SLACK: Final = (0.1, 0.2)
-"""what clocks that disagree may add, and at most with what follows, m and rad,"""
+"""Tolerated difference for an offset of the clocks, and at most with ``CROSSED``, m and rad."""
 CROSSED: Final = 0.1
-"""and what a radian may add to the way, m, and a metre to the turn, rad: levers, and wheels of unequal size."""
+"""Tolerated difference of the distance per radian, m, and of the turn per metre, rad: levers, unequal wheels."""
 CONTRADICTIONS: Final = 2
 """Comparisons in a row that contradict odometry before it is dropped."""
 AGREEMENT: Final = 0.4
-"""Mean error of a step, as share of the motion, with which odometry is used again"""
+"""Mean error of a step, as a share of the motion, below which odometry is used again."""
 AGREED: Final = (2.0, 2.0)
-"""after as much motion, m and rad."""
+"""Motion with that agreement after which odometry is used again, m and rad."""
 
 
 class OdometryCheck:
-    """Compares ways and turns by odometry with those by the scans, which know nothing of the wheels.
+    """Compares distances and turns by odometry with those by the scans, which are independent of the wheels.
 
     The differences of their motions are summed over some seconds: clocks that disagree shift both a little and change
     no sum. A slow robot's are compared over as much motion as a fast one's: within seconds alone its error would not

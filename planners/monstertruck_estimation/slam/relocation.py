@@ -29,9 +29,9 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND
 
 LOST_AFTER: Final = 1.5
-"""Seconds of misfits after which the robot is lost,"""
+"""Seconds of scans that do not fit after which the robot is lost."""
 LOST_SCANS: Final = 3
-"""and fewest scans."""
+"""Number of scans that do not fit after which the robot is lost."""
 GAP: Final = (5.0, 3.0)
 """A longer pause, s, that is also so many times the usual one, is a gap: the robot may be elsewhere after it."""
 PERIOD_GAIN: Final = 0.1
@@ -125,9 +125,9 @@ With every misfit the window of the next match grows, and that of the last motio
 somewhere in it sooner or later. Wheels that are late are put right by the last motion.
 """
 ASTRAY: Final = ((0.25, 0.25), (0.1, 0.1))
-"""Difference from which such a match may be at a place that looks alike, without a doubt and in doubt,"""
+"""Difference from which on such a match may be at a similar place, without a doubt and in doubt."""
 ASTRAY_CONTRADICTION: Final = 0.03
-"""and share of what scan and map see in view of each other that they may look through then."""
+"""Greatest contradiction of scan and map of such a match."""
 
 
 def exceeds(off: tuple[float, float], limits: tuple[float, float]) -> bool:
@@ -162,11 +162,11 @@ PART_KEYS: Final = 300
 POINTS: Final = 160
 """Points of the surroundings searched for, at most."""
 SLICE: Final = 2e6
-"""Look-ups of the first level in one slice of the search,"""
+"""Look-ups of the first level in one slice of the search."""
 WORK: Final = 15_000
-"""blocks looked at below it, at most,"""
+"""Blocks evaluated below the first level in one slice, at most."""
 FEWEST_SLICES: Final = 4
-"""and slices at least."""
+"""Slices of a search, at least."""
 ANYWHERE: Final = (1e6, 1e6)
 """Standard deviation of the predicted pose, m and rad: nothing is known of it."""
 MIN_SCORE: Final = 0.5
@@ -178,11 +178,11 @@ APART: Final = (1.0, 0.5)
 RIVAL_TURN: Final = 0.1
 """Half width of the search for a rival that looks the same way, rad."""
 CHECKS: Final = 10
-"""Keyframes verified at a place found, at most,"""
+"""Keyframes verified at a place found, at most."""
 CHECK_SPACING: Final = 2
-"""every second one,"""
+"""Step between these keyframes."""
 MOST_FAILED: Final = 3
-"""and failures after which it is given up."""
+"""Failed verifications after which a place is rejected."""
 FEWEST_KEYS: Final = 2
 """Keyframes of a submap before it is searched for, or in."""
 LAST_KEYS: Final = 12

@@ -45,32 +45,32 @@ HISTORY: Final = 128
 STALE: Final = SECOND // 5
 """Odometry older than the scan by more than this is not used, ns."""
 UNMATCHED: Final = SECOND
-"""Without a scan that can be used for so long, ns, the lidar is no source of the pose, which odometry carries on."""
+"""Time without a usable scan after which the pose is predicted by odometry alone and the lidar is no source, ns."""
 UNSCANNED: Final = 1.0
-"""A map that is asked for is saved without a scan if no usable one comes within so many seconds."""
+"""Seconds to wait for a usable scan with which a requested map is saved; then it is saved without one."""
 CORRECTIONS: Final = {
     "closed": (Reason.LOOP_CLOSED, Severity.INFO, "closure {}"),
     "joined": (Reason.LOOP_CLOSED, Severity.INFO, "two submaps are joined"),
     "parted": (Reason.JOIN_UNDONE, Severity.WARNING, "what was seen since then contradicts it"),
 }
-"""What is reported of a step that has corrected the map; {} is the number of closures."""
+"""Event text of a step that has corrected the map; {} is the number of closures."""
 PLACELESS: Final = frozenset({LocalisationStatus.SEARCHING, LocalisationStatus.OUTSIDE})
-"""The pose in map means nothing."""
+"""States in which the pose in map is not valid."""
 MATCHED: Final = frozenset({LocalisationStatus.MAPPING, LocalisationStatus.LOCALISED, LocalisationStatus.DEGENERATE})
 QUIET: Final = 30 * SECOND
-"""It is said once in this time that scans leave a direction open: along a corridor they do and do not in turn, ns."""
+"""Least time between two events about scans that leave a direction undetermined, ns: in a corridor they alternate."""
 
 
 class SlamService:
     """Sends every scan to the worker with odometry at its stamp; between scans the pose follows odometry.
 
     Args:
-        config: what is mapped, how, and where it is saved.
+        config: mapping, and where the map is saved.
         mount: of the lidar.
         body: length and width of the robot, m.
         clock: time.
         scan: lidar, bounded and counted.
-        odometry: pose in odom; None = the robot has none, the pose is then published once a scan.
+        odometry: pose in odom; None = no odometry: the pose is published once per scan.
         angles: of body and mount at the time of scans, to discard hits of the ground; None = no compass.
         pose: ``state/pose``.
         whole: ``state/map``.
@@ -108,7 +108,7 @@ class SlamService:
         self._newest: SlamEstimate | None = None
         self._latest: Odometry | None = None
         self._matched_at: Odometry | None = None
-        """Odometry when the newest estimate came."""
+        """Odometry at the newest estimate."""
         self._status: LocalisationStatus | None = None
         self._degenerate_said: int | None = None
         self._use = OdometryUse.NONE
@@ -138,7 +138,7 @@ class SlamService:
         return planar("map", "odom", stamp, self._newest.pose), planar("odom", "base", stamp, (0.0, 0.0, 0.0))
 
     def bases_at(self, instants: tuple[int, ...]) -> Mapping[int, Vector]:
-        """Where the base was at instants, ns, by the graph as it is now; brought up to date every ``tiles_period``.
+        """Poses of base at instants, ns, by the present graph; updated every ``tiles_period``.
 
         Those asked for now are answered later, those the map does not know never.
         """
@@ -146,13 +146,13 @@ class SlamService:
         return self._bases
 
     def save_soon(self) -> bool:
-        """Have the map saved, with the next scan if one comes; returns whether there is one, and a place for it."""
+        """Save the map with the next scan; returns whether there is a map and a folder for it."""
         self._due["save"] = 0
         self._asked.set()
         return self._config.save is not None and self._config.mode == "mapping"
 
     async def run(self, ready: Ready) -> None:
-        """Feed the worker until cancelled, then save.
+        """Send scans to the worker until cancelled, then save the map.
 
         Raises:
             WorkerError: the worker failed, hung or died; the next session begins a new map where the robot is now.
@@ -208,7 +208,7 @@ class SlamService:
             self._pose.put(message.model_copy(update=update))
 
     def _publish_pose(self, estimate: SlamEstimate, scan: LaserScan) -> None:
-        """Of a robot without odometry."""
+        """Publish the pose of a robot without odometry."""
         x, y, yaw = estimate.pose
         self._pose.put(
             Odometry(
@@ -241,7 +241,7 @@ class SlamService:
             self._take(outputs, scan)
 
     async def _save_unscanned(self, worker: WorkerActor) -> None:
-        """Save a map that is asked for while the lidar is silent, or the robot lies on its side."""
+        """Save a requested map although there is no usable scan."""
         while True:
             await self._asked.wait()
             self._asked.clear()
@@ -308,7 +308,7 @@ class SlamService:
         return None if angles is None else plane_slopes(*angles, yaw=self._mount.yaw)
 
     def _start(self, odom: Vector | None) -> Vector:
-        """Where a new map begins: the present pose in map."""
+        """Start pose of a new map: the present pose in map."""
         if odom is not None:
             return self._correction.pose(odom, 0.0)
         return (0.0, 0.0, 0.0) if self._newest is None else self._newest.pose
@@ -415,13 +415,13 @@ class SlamService:
 
 
 def carried_on(covariance: Array, before: Odometry, now: Odometry, turn: float) -> Array:
-    """Covariance of a pose in map, (9,), that was known at ``before`` and that odometry has carried on until ``now``.
+    """Covariance, (9,), of a pose in map that was estimated at ``before`` and predicted by odometry until ``now``.
 
     Args:
-        covariance: (9,), then.
-        before: odometry then.
-        now: and now.
-        turn: of odom in map, rad.
+        covariance: (9,), at ``before``.
+        before: odometry at the estimate.
+        now: present odometry.
+        turn: yaw of odom in map, rad.
     """
     way = np.array((now.pose.x - before.pose.x, now.pose.y - before.pose.y))
     swung, swing, turned = np.eye(3), np.eye(3), np.eye(3)
@@ -471,7 +471,7 @@ def scan_motion(stamp: int, moved: ScanIncrement, now: int, seq: int) -> ScanMot
 def slam_health(
     estimate: SlamEstimate, counts: Mapping[str, int], lost: tuple[int, int], now: int, seq: int
 ) -> SlamHealth:
-    """How the newest scan fitted; ``lost`` are the scans left out and those dropped."""
+    """Match of the newest scan, for health; ``lost`` counts scans not used and dropped."""
     return SlamHealth(
         stamp=estimate.stamp,
         received=now,

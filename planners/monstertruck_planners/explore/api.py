@@ -35,17 +35,17 @@ LONGEST: Final = 2.5
 AROUND: Final = 3.0
 """A frontier is looked at from this near, m."""
 COMPARED: Final = 160
-"""Places that are compared for each frontier by how much of it is in sight..."""
+"""Viewpoints compared for each frontier by how much of it is visible."""
 PLACES: Final = 32
-"""...and of the good ones so many by how much new area is seen."""
+"""The best of these that are compared by the new area seen."""
 MARGIN: Final = 1.0
-"""What is found is of use until something changes within this of such places, m."""
+"""A result is valid until something changes within this distance of such places, m."""
 SAMPLES: Final = 12
-"""Cells of a frontier that are to be seen from there."""
+"""Cells of a frontier whose visibility is tested."""
 SEEN: Final = 0.6
-"""Least share of them..."""
+"""Least share of a frontier that must be visible."""
 SHORT: Final = 0.5
-"""...within the sensor's range less this, m."""
+"""Margin on the sensor's range for visibility, m."""
 BEAMS: Final = 96
 DEPTH: Final = 1.0
 """See ``new_area``, m."""

@@ -20,9 +20,9 @@ class CameraView:
     view: float = 0.95
     """Angle of view that is counted on, rad."""
     reach: float = 1.4
-    """Farthest, m..."""
+    """Greatest distance, m."""
     nearest: float = 0.25
-    """...and nearest wall, m."""
+    """Distance of the nearest wall, m."""
     oblique: float = 0.75
     """Greatest angle from a wall's normal, rad."""
 
@@ -49,9 +49,9 @@ class ExploreTask:
     pose: Pose
     """Of the base, in map."""
     whole: Grid | None = None
-    """A whole map, which takes the place of all before..."""
+    """A whole map, which replaces the last one."""
     tiles: tuple[Grid, ...] = ()
-    """...and tiles that are newer."""
+    """Tiles that are newer than the whole map."""
     setup: ExploreSetup | None = None
     choose: bool = False
     """Say where to look next."""

@@ -1,7 +1,7 @@
 """One exploration: a pure state machine. Equal observations give equal decisions.
 
-It asks where to look next, again and again while the robot drives, sends goals, leaves places alone that it cannot come
-to, drives home, and has the map saved. Every decision is reported with its reason.
+It asks for the next viewpoint, again while the robot drives, sends goals, keeps a blacklist of places that cannot be
+reached, drives home, and has the map saved. Every decision is reported with its reason.
 """
 
 import math
@@ -19,40 +19,40 @@ from monstertruck_schemas.plan import ExplorationPhase
 from monstertruck_schemas.reasons import Reason
 
 SETTLE: Final = 1.5
-"""Seconds after a goal in which the map takes in what is seen there."""
+"""Seconds after a goal until the map contains what is seen there."""
 CONFIRM: Final = 2
-"""Looks in a row that have to show nothing left."""
+"""Evaluations in a row without a frontier after which the exploration ends."""
 PATIENCE: Final = 30.0
 """Seconds to wait for a first map."""
 RETURNS: Final = 6
-"""Goals for the way home."""
+"""Attempts to drive home."""
 BESIDE: Final = 1.0
-"""Metres from the start at which it counts as back, where the start itself is blocked, as beside a wall."""
+"""Distance from a blocked start, as at a wall, within which the robot counts as back, m."""
 SAVE: Final = 30.0
 """Seconds to wait for the map to be saved."""
 AGAIN: Final = 2.0
 """Seconds from a refused goal to the next one; on the way home twice as many after each failure."""
 STANDS: Final = 5.0
-"""Seconds for which a robot that is lost stands before it drives a little."""
+"""Seconds that a lost robot waits before it drives a little."""
 AROUND: Final = ((0.6, 0.0, 0.0), (0.6, 0.25, 0.8), (0.6, -0.25, -0.8))
-"""Poses in base to which it then drives in turn, and back: who stands still sees nothing new, and behind it is ground
-that no scan has seen where it is now."""
+"""Poses in base to which a lost robot drives in turn, and back, to see more; not backward, where no scan has seen the
+ground."""
 STUCK: Final = 3
-"""Goals in a row that fail without the robot leaving its place, after which the place is to blame..."""
+"""Goals in a row that fail at one place after which the robot drives back out of it."""
 LEFT: Final = 0.3
-"""...which it has left this far from there, m."""
+"""Distance from there from which on the robot has left that place, m."""
 TRAIL: Final = 0.5
-"""Metres between the poses that are remembered for driving back..."""
+"""Distance between the poses kept for driving back, m."""
 REMEMBERED: Final = 8
-"""...and how many."""
+"""Poses kept for driving back."""
 COUNTED: Final = 0.03
-"""Metres from which on a motion counts: a standing robot's pose moves by some millimetres with every scan."""
+"""Motion that counts, m: the pose of a standing robot moves by some millimetres with every scan."""
 LEAST_USED: Final = 0.05
-"""Share of the charge after which its use per metre counts as measured."""
+"""Share of the charge used from which on the use per metre counts as measured."""
 PASSING: Final = frozenset({Reason.PLANNER_STARTING, Reason.NO_MAP, Reason.LEASE_EXPIRED})
-"""Ends of a goal that say nothing of the place."""
+"""Outcomes of a goal that do not depend on its place."""
 HOPELESS: Final = frozenset({Reason.DISARMED, Reason.ESTOPPED, Reason.BUSY})
-"""Ends of a goal after which no other place helps."""
+"""Outcomes of a goal that would be the same at any other place."""
 SAME: Final = 0.5
 """Places this near to each other count as one, m."""
 
@@ -103,7 +103,7 @@ class Attempts:
 
 @dataclass(frozen=True, slots=True)
 class Choose:
-    """Ask where to look next."""
+    """Ask for the next viewpoint."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,9 +211,9 @@ class Exploration:
     trail: tuple[Pose, ...] = ()
     """Where it came from, the newest last."""
     stuck: int = 0
-    """Goals in a row that failed where it stands..."""
+    """Goals in a row that failed where the robot stands."""
     stuck_at: Pose | None = None
-    """...and where that is."""
+    """Where the robot stands then."""
     blameless: tuple[Attempts, Attempts] | None = None
     """At frontiers and at places to look from, before these goals."""
     backing: bool = False
@@ -226,9 +226,9 @@ class Exploration:
     blocked: int = 0
     """Of them: at which the robot cannot stand."""
     looks: int = 0
-    """Short drives since it was lost,"""
+    """Short drives since the robot was lost."""
     came_from: Pose | None = None
-    """where the newest one began, and whether it is to drive back there."""
+    """Where the newest of these began, and whether the robot has to drive back there."""
     goes_back: bool = False
 
     @property

@@ -19,9 +19,9 @@ Cells = NDArray[np.int8]
 
 UNKNOWN: Final = -1
 BLOCK: Final = 64
-"""The area grows by whole blocks of so many cells..."""
+"""The area grows by whole blocks of this many cells."""
 SPARE: Final = 2
-"""...and by so many more than are needed."""
+"""Cells by which the area grows beyond what is needed."""
 
 
 class FrontierMap:

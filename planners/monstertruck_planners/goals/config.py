@@ -42,9 +42,9 @@ class LocalConfig(Schema):
     clearance: NotNegative = 0.02
     """A route with an obstacle nearer than this is deformed, m; the gate's side clearance."""
     rejoin_clearance: NotNegative = 0.03
-    """More than that is needed to go back to the route, m..."""
+    """Clearance needed to return to the route, m."""
     rejoin_distance: Positive = 0.06
-    """...and the truck may be this far from it, m, counting 0.3 m a radian."""
+    """Distance from the route within which the truck may return to it, m, counting 0.3 m per radian."""
     blocked_timeout: Positive = 2.0
     """Seconds without a way round something after which the route counts as blocked."""
     detour: Positive = 45.0
@@ -73,9 +73,9 @@ class PlannerConfig(Schema):
     rate: Annotated[float, Field(ge=1, le=20)] = 10.0
     """Decisions per second."""
     position_tolerance: Positive = 0.2
-    """The goal is reached if the truck stands this near, m..."""
+    """The goal is reached if the truck stops within this distance, m."""
     yaw_tolerance: Positive = 0.2
-    """...and is turned away from it by no more than this, rad."""
+    """The goal is reached if the heading differs by no more than this, rad."""
     waypoint_radius: Positive = 0.3
     """A waypoint has been passed if the truck was this near, m."""
     aim: Annotated[float, Field(gt=0, le=1)] = 0.4

@@ -50,9 +50,9 @@ class Plan:
 
     what: Literal["route", "escape"] = "route"
     clear: bool = False
-    """Forget older obstacles and the route so far..."""
+    """Forget older obstacles and the route so far."""
     afresh: bool = False
-    """...or only the latter."""
+    """Forget only the route so far."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,9 +132,9 @@ class GoalRun:
     """Looks in a row that showed the way blocked."""
     blocks: int = 0
     nearest: float = math.inf
-    """Least that was left of any route, m..."""
+    """Least remaining length of any route so far, m."""
     recovery_distance: float = math.inf
-    """...and when the last recovery behaviour began."""
+    """That length when the last recovery behaviour began, m."""
     partial: bool = False
     """The present route ends before the goal: it is too long for one path."""
     misses: int = 0

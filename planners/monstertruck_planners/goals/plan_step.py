@@ -45,24 +45,24 @@ Cells = NDArray[np.int8]
 SAMPLE: Final = 0.05
 """Metres between two poses of an answer."""
 SQUARE: Final = 0.05
-"""Obstacles the map does not hold are remembered by squares of this size, m."""
+"""Side of the squares by which obstacles that are not in the map are remembered, m."""
 NEARBY: Final = 1.5
-"""Obstacles this near count when backing out, and are not forgotten, m."""
+"""Distance within which obstacles count when backing out, and are kept, m."""
 
 
 HELD: Final = frozenset({Reason.START_BLOCKED, Reason.GOAL_UNREACHABLE})
-"""Why there is no route if the truck is held by what it stands on."""
+"""Why there is no route for a truck that overlaps an obstacle where it stands."""
 BESIDE: Final = 0.15
-"""Unknown ground this near to where it stands does not hold it, m."""
+"""Unknown ground within this distance of the truck counts as free, m."""
 RIM: Final = 1.5
 """Cells by which the truck may overlap an obstacle of the map where it stands."""
 CLEARANCE: Final = 0.2
-"""Clearance of the poses of an answer is looked for up to this, m."""
+"""Clearance of the poses of an answer is measured up to this, m."""
 
 BEAM_WIDTH: Final = 0.012
-"""Beams this near in bearing show a place, rad: two steps of a URG-04LX."""
+"""Difference in bearing up to which a beam shows a place, rad: two steps of a URG-04LX."""
 THROUGH: Final = 0.10
-"""Metres by which all of them must reach beyond it."""
+"""Distance by which all these beams must reach beyond it, m."""
 
 
 class ObstacleMemory:
@@ -77,10 +77,10 @@ class ObstacleMemory:
         self.places: Array = np.empty((0, 2))
         """Shape (n, 2), m."""
         self.doubted: Array = np.empty((0, 2))
-        """Shape (k, 2), m: cleared, but seen through by no scan. They still count where the truck drives blind."""
+        """Shape (k, 2), m: cleared by the map, not seen free by a scan. They count where the lidar does not look."""
 
     def look(self, points: Array, sensor: Array) -> None:
-        """Forget what a scan saw through. A bearing without a return says nothing.
+        """Remove places that a scan shows to be free; a bearing without a return does not.
 
         Args:
             points: shape (n, 2), the scan's returns.
@@ -94,12 +94,12 @@ class ObstacleMemory:
         self.places = _one_per_square(np.vstack((self.places, points)), self._square)
 
     def doubt(self, where: NDArray[np.bool_]) -> None:
-        """Those places, shape (n,), count no longer where the lidar looks."""
+        """Mark places, shape (n,), as doubted: they no longer count where the lidar looks."""
         self.doubted = _one_per_square(np.vstack((self.doubted, self.places[where])), self._square)
         self.places = self.places[~where]
 
     def trust(self, where: NDArray[np.bool_]) -> None:
-        """Those doubted places, shape (k,), count again."""
+        """Count doubted places, shape (k,), again."""
         self.keep(self.doubted[where])
         self.doubted = self.doubted[~where]
 
@@ -145,13 +145,13 @@ def _one_per_square(points: Array, square: float) -> Array:
 
 
 class StaticMap:
-    """The map the robot was given or has made.
+    """The configured or built map.
 
     Args:
         cells: shape (rows, columns), percent, -1 unknown; row 0 at the lowest y.
         resolution: m.
         origin: pose of the outer corner of cell (0, 0).
-        previous: the map before: only what differs is computed again.
+        previous: the last map: only differences are computed again.
     """
 
     def __init__(self, cells: Cells, resolution: float, origin: Pose, previous: "StaticMap | None" = None) -> None:
@@ -164,12 +164,12 @@ class StaticMap:
 
     @classmethod
     def of(cls, grid: Grid, previous: "StaticMap | None" = None) -> "StaticMap":
-        """Of a message."""
+        """From a message."""
         cells = grid.cells.reshape(grid.height, grid.width)
         return cls(cells, grid.resolution, (grid.origin.x, grid.origin.y, grid.origin.yaw), previous)
 
     def unexplained(self, points: Array, tolerance: float) -> NDArray[np.bool_]:
-        """Whether no obstacle of the map explains each point (n, 2): it is further than ``tolerance`` from all, m."""
+        """Which points (n, 2) are further than ``tolerance`` from all obstacles of the map, m."""
         return np.asarray(self.walls.lookup(points) > tolerance + self.resolution / 2)
 
     def with_points(self, points: Array) -> Cells:
@@ -193,7 +193,7 @@ class StaticMap:
 def standing_free(
     cells: Cells, resolution: float, origin: Pose, footprint: Footprint, pose: Pose, beside: float = 0.0
 ) -> Cells:
-    """Cells with those free on which the truck stands: unknown ones, and obstacles that only its rim touches.
+    """Cells with those under the truck set free: unknown ones, and obstacles that it overlaps by its edge only.
 
     A map is as exact as its cells: a truck beside a wall overlaps one by up to a cell. What it overlaps by more stays,
     for then map or pose is wrong.
@@ -317,7 +317,7 @@ class PlanningStep:
             self._map = StaticMap(world.cells, world.resolution, (*world.origin, 0.0))
 
     def _observe(self, setup: Setup, static_map: StaticMap, task: PlanTask) -> None:
-        """Take in a scan, and what has become of the map."""
+        """Update the remembered obstacles by a scan and by the newest map."""
         memory = self._memory
         for scan in task.seen:
             memory.look(scan.points, scan.sensor)
@@ -330,7 +330,7 @@ class PlanningStep:
         memory.drop_explained(lambda places: static_map.unexplained(places, tolerance))
 
     def _plan(self, static_map: StaticMap, task: PlanTask) -> PlanAnswer:
-        """A route that does not back into doubted places: those near it count again, then all."""
+        """A route that does not reverse into doubted places: those near it count again, then all."""
         answer = self._plan_once(static_map, task)
         for nearby in (NEARBY, math.inf):
             doubted = self._memory.doubted
@@ -358,7 +358,7 @@ class PlanningStep:
         assert self._setup is not None
         points = self._memory.places
         if len(points):
-            # What touches the truck where it stands would only keep it there; the gate watches that.
+            # An obstacle that touches the standing truck would make every route impossible; the gate checks it.
             pose = np.array([task.pose])
             touching = rectangle_distance(self._setup.footprint, pose, points)[0] < 1.5 * static_map.resolution
             points = points[~touching]
@@ -408,7 +408,7 @@ class PlanningStep:
         )
 
     def _standing(self, static_map: StaticMap, cells: Cells, pose: Pose) -> RouteMap:
-        """The map with the ground free on which the truck stands, and a margin where it stands at the map's edge."""
+        """The map with the ground under the truck free, and with a margin if the truck is at its edge."""
         assert self._setup is not None
         footprint = self._setup.footprint
         margin = math.ceil(2 * footprint.circumscribed_radius / static_map.resolution)
@@ -473,13 +473,13 @@ def answer_of(path: MotionPath, cost: float, *, kept: bool = False) -> PlanAnswe
 
 
 def stop_poses(answer: PlanAnswer) -> NDArray[np.intp]:
-    """Indices of the poses at which a path that is driven comes to rest on its way."""
+    """Indices of the poses at which a path stops before its end."""
     assert answer.directions is not None
     return np.flatnonzero(stops(answer.directions[1:], answer.steering[1:])) + 1
 
 
 def shortened(answer: PlanAnswer) -> PlanAnswer:
-    """As much of a path as is driven in one piece: ``MAX_RUNS`` runs, ``MAX_POSES`` poses."""
+    """The part of a path that fits one message: ``MAX_RUNS`` runs, ``MAX_POSES`` poses."""
     poses, directions = answer.poses, answer.directions
     assert poses is not None
     assert directions is not None
@@ -500,10 +500,10 @@ def shortened(answer: PlanAnswer) -> PlanAnswer:
 
 
 class PlanningWorker(PlanningStep):
-    """The step as a worker's: its code is compiled when it is built.
+    """The step in a worker, with its numba code compiled.
 
     Args:
-        configs: route planners whose code that is; all of ours, if not said.
+        configs: route planners whose code is compiled; default: all.
     """
 
     def __init__(self, configs: Sequence[GoalConfig] = (HybridConfig(), LatticeConfig(), GridAstarConfig())) -> None:
@@ -516,5 +516,5 @@ class PlanningWorker(PlanningStep):
 
 
 def hybrid_worker() -> PlanningWorker:
-    """A worker of a robot whose routes are planned by hybrid A*: the others' code is not waited for."""
+    """A worker that compiles the code of hybrid A* only, for robots that plan by it."""
     return PlanningWorker((HybridConfig(),))

@@ -58,9 +58,9 @@ FIRST_ROUTE: Final = 4.0
 SEEN: Final = 40
 """Scans kept for the next plan, the newest."""
 SEEN_STEP: Final = 0.25
-"""Metres between two of them..."""
+"""Distance between two of them, m."""
 SEEN_TURN: Final = 0.4
-"""...or radians."""
+"""Turn between two of them, rad."""
 JUMP: Final = 0.5
 """Distance between the poses of two ticks that counts as a jump, m: the kept scans are dropped."""
 

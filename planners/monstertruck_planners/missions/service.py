@@ -76,11 +76,11 @@ MOVED: Final = 1.0
 MOST_BYTES: Final = 1_000_000
 """Of the saved progress."""
 PASSING: Final = frozenset({Reason.PLANNER_STARTING, Reason.NO_MAP, Reason.LEASE_EXPIRED})
-"""Refusals of a goal that say nothing of its place: asked again..."""
+"""Refusals of a goal that do not depend on its place: it is sent again."""
 AGAIN: Final = 1.0
-"""...after so many seconds..."""
+"""Seconds until it is sent again."""
 PATIENCE: Final = 180.0
-"""...for so many; a planner compiles for a minute or two after an installation."""
+"""Seconds for which it is sent again; a planner compiles for a minute or two after an installation."""
 
 SILENT: Final = 10.0
 """Seconds without a report of what does a step, which comes twice a second, after which it has failed."""

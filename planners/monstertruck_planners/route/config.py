@@ -38,9 +38,9 @@ class DriveCosts(GoalConfig):
     cusp_cost: NotNegative = 0.1
     """Of a change of direction, m."""
     free_cusps: Annotated[int, Field(ge=0)] = 4
-    """Changes of direction that cost no more than that..."""
+    """Changes of direction without an extra cost."""
     many_cusps_cost: NotNegative = 0.4
-    """...and what each of the others costs besides, m: at each the truck stops and its errors add up."""
+    """Extra cost of each further change of direction, m: at each the truck stops and its errors add up."""
     swing_cost: NotNegative = 0.01
     """Of a change of curvature, m: few long arcs instead of many short ones."""
     crab_cost: AtLeastOne = 1.0

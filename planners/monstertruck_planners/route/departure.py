@@ -62,13 +62,13 @@ SET_OFF: Final = 0.15
 GAIN: Final = 3.0
 """Metres to drive for a metre of clearance, about: translations of 0.33 rad."""
 DIPS: Final = (0.0, 0.125, 0.5, 1.0)
-"""Shares of the clearance by which it may fall again on the way, tried in turn, each with half of the budget left."""
+"""Shares by which the clearance may fall again during a departure, tried in turn, each with half of the budget left."""
 ARC: Final = 8
-"""Poses checked that take as long as what else there is to do for an arc..."""
+"""Work per arc of a departure, in checked poses."""
 NODE: Final = 60
-"""...and at least as long as a node of a search: these are what a planner's budget counts."""
+"""Checked poses that take as long as a node of a search, the unit of a planner's budget."""
 ENOUGH: Final = 20
-"""Departures that are looked at for the way on from them."""
+"""Departures from whose ends a route is searched, at most."""
 DEARER: Final = 0.5
 """A departure is of no use if it costs so much more than the cheapest, m."""
 TRIES: Final = 3

@@ -46,10 +46,10 @@ TABLE_HEADINGS = 36
 
 
 OVERRUN = 1.3
-"""The cost to go is known where the way from start to goal over a cell costs up to this factor on the shortest..."""
+"""The cost to go is computed where the path from start to goal over a cell costs at most this times the shortest."""
 
 OVERRUN_CELLS = 80
-"""...and the cost of that many cells more."""
+"""Added to that, in cells."""
 
 USED, WAITING, LEVEL, LIMIT = 0, 1, 2, 3
 """Fields of a spread's state: entries used, entries waiting, estimate it has come to, greatest estimate regarded."""

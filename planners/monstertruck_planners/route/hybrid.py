@@ -42,10 +42,10 @@ BATCH = 1000
 """Smoothing trials between two checks of the budget."""
 
 PROMISING = 1.1
-"""Up to this factor on the cost of the best route another one is looked at more closely."""
+"""Factor on the cost of the best route up to which another route is smoothed further."""
 
 MAX_IDLE_ROUNDS = 12
-"""Rounds of improvement without gain after which the route is taken to be the best."""
+"""Rounds of improvement without gain after which smoothing ends."""
 
 FINE_SHIFTS = (0.25, 0.1, 0.03, 0.01)
 """Shares of a stretch by which poses move in the final smoothing."""
@@ -60,31 +60,31 @@ PLAIN_SHARE = 0.5
 """Of the budget, kept when a route without translations is looked for and one with them is known."""
 
 ALTERNATIVE_DISTANCE = 2.5
-"""Alternatives are this far from all known ways somewhere, turning radii."""
+"""Least distance of an alternative from all known routes, at one place at least, turning radii."""
 
 ALTERNATIVE_LENGTH = 1.15
-"""Alternatives are tried up to this factor on the shortest way."""
+"""Factor on the length of the shortest path up to which alternatives are tried."""
 
 FIRST_NODES = 512
-"""Nodes expanded coarsely before gaps are measured and the fine search takes turns."""
+"""Nodes of the coarse search before gaps are measured and the fine search alternates with it."""
 
 GROWTH = 2
-"""Of the nodes expanded in a turn, from one round to the next."""
+"""Growth of the nodes expanded per turn, from one round to the next."""
 
 NARROW = 0.06
-"""Nearer than this and half the footprint's width to obstacles a cell may belong to a narrow gap, m."""
+"""A cell nearer to obstacles than this plus half the footprint's width may belong to a narrow gap, m."""
 
 GAP_ERROR = 0.01
-"""The positions and headings checked may be off the best ones by that much, m."""
+"""Error of the positions and headings checked against the best ones, m."""
 
 GAP_PLAY = 0.005
-"""Needed in a gap beyond the margin on both sides: with less no search finds the way through, m."""
+"""Width needed in a gap beyond the margin on both sides, m: with less no search finds a path through it."""
 
 GAP_ROUNDS = 30
-"""Ways checked for narrow gaps."""
+"""Paths checked for narrow gaps, at most."""
 
 GAP_CORRIDOR = 0.15
-"""Checked on both sides of a way on which there is a narrow gap, m."""
+"""Width checked on both sides of a path with a narrow gap, m."""
 
 NO_SEGMENTS = np.empty((0, 3))
 
@@ -115,9 +115,9 @@ class HybridPlanner:
     """Routes for one vehicle.
 
     Args:
-        vehicle: what is driven.
+        vehicle: kinematics and footprint.
         config: costs, tolerances, budget.
-        departs: a start nearer to an obstacle than the margin is left first; else it is refused.
+        departs: begin with a departure where the start is nearer to an obstacle than the margin; else refuse it.
     """
 
     def __init__(self, vehicle: Vehicle, config: HybridConfig | None = None, *, departs: bool = True) -> None:
@@ -158,7 +158,7 @@ class HybridPlanner:
         )
 
     def planner_for(self, margin: float) -> "HybridPlanner":
-        """The planner of the greatest margin tried that is not above this one; of the narrowest, if all are."""
+        """The planner of the greatest margin that is not above this one, or of the narrowest."""
         planners = [self, *self._narrower]
         return next((planner for planner in planners if planner.config.margin <= margin), planners[-1])
 
@@ -174,7 +174,7 @@ class HybridPlanner:
         return bool(search.segments_free(field, self.footprint, model, start, segments, len(segments)))
 
     def leaving(self, route_map: RouteMap, path: MotionPath) -> Leaving | None:
-        """How a path of the reference point gets to where it keeps the margin up to its end; None: it does not."""
+        """The part of a path before it keeps the margin up to its end; None: it never does."""
         return leaving(route_map, self.vehicle, path, self.config.margin, lambda rest: self.free(route_map, rest))
 
     def cost(self, route_map: RouteMap, path: MotionPath) -> float:
@@ -349,7 +349,7 @@ class _PlanningRun:
         return SearchRun(self.problem, model, to_go, resolution, goal_range)
 
     def _run_in_turns(self, fine: list[SearchRun], coarse: list[SearchRun], reserve: float) -> Array | None:
-        """What the first of some searches finds, each of which is a fine and a coarse one."""
+        """Result of the first of several searches that finds a route; each is a fine and a coarse one."""
         count = FIRST_NODES
         while self.budget.remaining() > reserve and not fine[-1].exhausted:
             for pair in zip(fine, coarse, strict=True):
@@ -369,7 +369,7 @@ class _PlanningRun:
         return self.config.margin + (GAP_PLAY if self.config.margin >= GAP_ERROR else -GAP_ERROR)
 
     def _close_narrow_gaps(self, to_go: heuristic.CostToGo) -> bool:
-        """Close the narrow gaps on the shortest way, on the next one around these, and so on; False: there are none."""
+        """Close the narrow gaps on the shortest path, then on the next one around them, and so on; False: none."""
         checked = np.zeros(self.cell_cost.shape, np.bool_)
         wide = self.planner.costs.side + self.config.margin + NARROW
         any_closed = False
@@ -416,7 +416,7 @@ class _PlanningRun:
         return max(cusps_of(segments) - self.config.free_cusps, 0), float(metres.sum())
 
     def _with_fewer_cusps(self, segments: Array) -> Array:
-        """The route, or one with fewer cusps if there are so many that each costs extra."""
+        """The route, or one with fewer cusps if it has so many that each costs extra."""
         crabs = (0.0, self.crab) if holds_translations(segments) else (0.0,)
         while (cusps := cusps_of(segments)) > self.config.free_cusps:
             to_go = self._cost_to_go()
@@ -431,7 +431,7 @@ class _PlanningRun:
         return segments
 
     def _improve_in_rounds(self, segments: Array) -> Array:
-        """Smooth the best route and others in turn until nothing gains or only the last share is left."""
+        """Smooth the best route and alternatives in turn until nothing improves or only the last share is left."""
         others = self._starts(segments)
         cheapest = next(others)  # along the cheapest way, while the first route may lead straight ahead
         if len(cheapest) and self._cost(cheapest) < self._cost(segments):
@@ -450,7 +450,7 @@ class _PlanningRun:
         return best
 
     def _starts(self, first: Array) -> Iterator[Array]:
-        """Where smoothing begins: alternatives; then by turns the best route (none here) and each of these again."""
+        """Routes to smooth: the alternatives; then by turns the best route (None) and each of these again."""
         found = [first]
         for segments in self._alternatives():
             if len(segments):
@@ -462,7 +462,7 @@ class _PlanningRun:
                 yield segments
 
     def _polished(self, segments: Array) -> Array:
-        """Smoothed in ever smaller steps."""
+        """The route smoothed in ever smaller steps."""
         path = editable(self.start, segments)
         for shift in FINE_SHIFTS:
             self._shortcut(path, 1e-4, shift)
@@ -496,7 +496,7 @@ class _PlanningRun:
         return float(search.route_cost(self.field, self.layer, self.model, self.start, segments))
 
     def _best_chain(self, routes: list[Array]) -> Array:
-        """Motions over places of some routes, ordered by their share of the way, with the best heading at each."""
+        """Motions over places of several routes, ordered by their share of the length, with the best headings."""
         paths = [MotionPath(self.start, route) for route in routes if len(route)]
         length = paths[0].length
         spacing = max(1.5 * self.vehicle.radius, length / 60) * self.random.uniform(0.7, 1.3)
@@ -514,7 +514,7 @@ class _PlanningRun:
         )
 
     def _alternatives(self) -> Iterator[Array]:
-        """First routes along all alternatives to the shortest way, the shortest first."""
+        """First routes along all alternatives to the shortest path, the shortest first."""
         to_go = self._cost_to_go()
         columns = self.cell_cost.shape[1]
         start, goal = self._cell_of(self.start), self._cell_of(self.goal)

@@ -73,9 +73,9 @@ class CostLayer(NamedTuple):
     terrain: NDArray[np.float32]
     """Of the ground in each cell; an empty array: none."""
     contact: float
-    """Distance to an obstacle's centre at which the footprint's side touches it, m..."""
+    """Distance to an obstacle's centre at which the footprint's side touches it, m."""
     clearance: float
-    """...and beyond that the distance at which it costs nothing more, above 0 m."""
+    """Distance beyond that at which it costs nothing more, above 0 m."""
     clearance_cost: float
     """Of a metre in contact."""
 

@@ -46,9 +46,9 @@ class TrackerConfig(Schema):
     lateral_acceleration: Positive = 0.5
     """Greatest speed squared times curvature, m/s^2."""
     goal_tolerance: Positive = 0.02
-    """A path is driven to its end if the truck comes to rest this near to it, m..."""
+    """A path is completed if the truck stops within this distance of its end, m."""
     goal_yaw_tolerance: Annotated[float, Field(gt=0, le=math.pi)] = 0.2
-    """...and is turned away from it by no more than this, rad."""
+    """A path is completed if the heading differs from its end by no more than this, rad."""
     lost_distance: Positive = 0.5
     """Further away than this from the path the tracker gives up, m."""
     slow_clearance: Positive = 0.12

@@ -28,9 +28,9 @@ SPARE: Final = 0.05
 INERTIA: Final = (0.05, 0.03)
 """Standard deviations of the estimate before: rad, m."""
 GUESSES: Final = 24, 5
-"""Directions from which a line is fitted without an estimate before, and the best ones that are fitted to the end,"""
+"""Start directions of a line fit without an earlier estimate, and the best of these that are fitted to the end."""
 DISTINCT: Final = 0.05
-"""which differ by so much, rad or m."""
+"""Least difference between these, rad or m."""
 STEPS: Final = 4, 4, 6
 """Of Gauss and Newton: from an estimate, from all guesses, and further from the best ones."""
 SAMPLED: Final = 40
