@@ -359,10 +359,10 @@ def sonar_legs(
 ) -> list[sonar.SonarLeg]:
     """Arcs ahead and back to both sides, 5 pings a second: ranges with the sonars' noise, over ``factor``.
 
-    Odometry turns too little by another share on every arc, and drifts between.
+    Odometry turns too little by another share on every arc, drifts between, and errs in the way.
     """
     legs: list[sonar.SonarLeg] = []
-    aside, turned = 0.0, 0.0
+    aside, turned, further = 0.0, 0.0, 1.0 + sonar.BELIEVED[1] * rng.normal()
     step = 0.2 * sonar.SonarWizard().speed / ARC
     for side in (1, -1):
         for way in (1, -1):
@@ -371,7 +371,7 @@ def sonar_legs(
             poses = np.column_stack((radius * np.sin(angles), radius * (1 - np.cos(angles)), angles))
             nearer, drift, more = (np.array(sonar.DRIFT) * rng.normal(size=3)).tolist()
             nearer, drift = (nearer, drift) if legs else (0.0, 0.0)
-            actual = _drifted(poses, aside + nearer, turned + drift, more)
+            actual = _drifted(poses, aside + nearer, turned + drift, more, further)
             aside, turned = (actual[-1] - poses[-1])[1:].tolist()
             ranges = {}
             for name, place in places.items():
@@ -382,11 +382,12 @@ def sonar_legs(
     return legs
 
 
-def _drifted(poses: Array, aside: float, turned: float, more: float) -> Array:
-    """Where a robot is that begins an arc off by so many m and rad, and turns by a share more than ``poses`` say."""
+def _drifted(poses: Array, aside: float, turned: float, more: float, further: float) -> Array:
+    """Where a robot is that begins an arc off by so many m and rad, turns by a share more than ``poses`` say, and comes
+    ``further`` times as far."""
     x, y, yaw = poses.T
     off = turned + more * (yaw - yaw[0])
-    rolled = np.exp(1j * (off[1:] + off[:-1]) / 2) * (np.diff(x) + 1j * np.diff(y))
+    rolled = further * np.exp(1j * (off[1:] + off[:-1]) / 2) * (np.diff(x) + 1j * np.diff(y))
     at = x[0] + 1j * (y[0] + aside) + np.cumsum(np.append(0.0, rolled))
     return np.column_stack((at.real, at.imag, yaw + off))
 

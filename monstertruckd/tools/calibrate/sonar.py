@@ -42,8 +42,9 @@ NOISE: Final = (0.005, 0.01)
 DRIFT: Final = (0.003, 0.003, 0.01)
 """Standard deviation of what odometry is off by on an arc: distance from the wall (m) and heading (rad) from where the
 arc before ended, and the share by which it turns more, as gyroscopes and slipping wheels let it."""
-BELIEVED: Final = 0.01
-"""Standard deviation of the speed of sound before it is measured, as a share: 6 degrees Celsius."""
+BELIEVED: Final = 0.01, 0.003
+"""Standard deviations before anything is measured, as shares: of the speed of sound (6 degrees Celsius), and of the way
+by odometry, which on another floor or under another load the wheels roll a little further or less far."""
 NEAR: Final = 0.2
 """Greatest error of a range that still may be the wall, m, before anything is fitted;"""
 SIGMAS: Final = 4.0
@@ -60,8 +61,9 @@ ASTRAY: Final = 0.4
 """Angle between the middle of the echoes and that of those that are due, rad, that no mount is off by."""
 BODIES: Final = ("differential", "skid_steer", "truck")
 """That turn within a metre."""
-COMMON: Final = 4
-"""Parameters before those of the arcs: distance and direction of the wall, half the cone, factor of the ranges."""
+COMMON: Final = 5
+"""Parameters before those of the arcs: distance and direction of the wall, half the cone, factors of the ranges and of
+the way by odometry."""
 
 _PARK: Final = Confirm(
     "park", "Stand the robot along the wall, the wall 1.7 m to its left, the middle of the wall beside it. Done?"
@@ -293,7 +295,7 @@ class SonarModel:
         self._wall, self._tape_error = wall, tape_error
         mounts = [s.mount.planar for s in settings.sonars.values()]
         self._start = np.concatenate(
-            ((wall, 0.0, settings.field_of_view / 2, 1.0), np.zeros(self.first - COMMON), np.ravel(mounts))
+            ((wall, 0.0, settings.field_of_view / 2, 1.0, 1.0), np.zeros(self.first - COMMON), np.ravel(mounts))
         )
         self._limits = 1.2 * settings.range_min, 0.95 * settings.range_max
         self.kept = self._chosen(self._start, NEAR, 0.0)
@@ -320,17 +322,17 @@ class SonarModel:
         for name in self.order:
             if (count := self.samples(name)) < LEAST:
                 raise InputError(f"sonar {name}: {count} echoes of the wall: expected {LEAST}; drive longer arcs")
-        reach = np.concatenate(((0.3, 0.3, 0.25, 0.1), np.full(self.first - COMMON, 0.4)))
+        reach = np.concatenate(((0.3, 0.3, 0.25, 0.1, 0.05), np.full(self.first - COMMON, 0.4)))
         reach = np.concatenate((reach, np.tile((0.15, 0.15, 0.4 if edges else 0.0), len(self.order))))
         reach[2] *= edges
         return least_squares(self._residual, start, self._start - reach, self._start + reach)
 
     def _predicted(self, parameters: Array, echoes: "_Echoes") -> tuple[Array, Array]:
         """Ranges as the sonars measure them, m, and what the normal is past the cone's edge, rad."""
-        distance, direction, half, factor = parameters[:COMMON].tolist()
+        distance, direction, half, factor, way = parameters[:COMMON].tolist()
         nearer, turned, swung = self._drift(parameters)[echoes.arcs].T
         x, y, yaw = parameters[self.first :].reshape(-1, 3)[echoes.sonars].T
-        poses = (echoes.poses + swung * echoes.swings).T
+        poses = (echoes.poses + swung * echoes.swings).T * (way, way, 1.0)
         due, past = wall_range(poses, SonarPose(x, y, yaw), (distance - nearer, direction + turned), half)
         return due / factor, past
 
@@ -354,8 +356,8 @@ class SonarModel:
         kept = self.kept
         off = (kept.ranges - self._predicted(parameters, kept)[0]) / _sigma(kept.ranges)
         drift = self._drifted(self._drift(parameters)) / DRIFT
-        believed = ((parameters[0] - self._wall) / self._tape_error, (parameters[3] - 1.0) / BELIEVED)
-        return np.concatenate((off, drift.ravel(), believed))
+        taped, believed = (parameters[0] - self._wall) / self._tape_error, (parameters[3:COMMON] - 1.0) / BELIEVED
+        return np.concatenate((off, drift.ravel(), believed, [taped]))
 
     def _chosen(self, parameters: Array, bounds: Array | float, beyond: float) -> "_Echoes":
         """The wall's echoes: as near to what is due as ``bounds``, m, ``beyond`` the cone's edge at most, rad."""

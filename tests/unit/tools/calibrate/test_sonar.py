@@ -122,3 +122,17 @@ def test_a_heading_that_drifts_on_its_arcs_moves_no_sonar(monkeypatch):
         assert estimate is not None
         assert estimate.value == pytest.approx(place.x, abs=0.02)
         assert estimate.high - estimate.low < 0.04
+
+
+def test_the_interval_of_the_sound_holds_wheels_that_roll_less_far_than_odometry_says(monkeypatch):
+    """Loaded tyres: on circles of 0.8 m 0.5 % less look like ranges that come out too short."""
+    monkeypatch.setattr(sonar, "BELIEVED", (0.01, 0.0))
+    circles = sonar_legs(PLACES, (WALL, 0.02), 0.43, 1.0, np.random.default_rng(3))
+    monkeypatch.undo()
+    longer = [replace(leg, poses={n: p * (1.005, 1.005, 1.0) for n, p in leg.poses.items()}) for leg in circles]
+    first, second = (result_of(each, SETTINGS, WALL, 0.002).estimate("speed_of_sound") for each in (circles, longer))
+    assert first is not None
+    assert second is not None
+    half = (second.high - second.low) / 2
+    assert second.value - first.value < 0.6 * half, "0.9 of it if the way were taken for right"
+    assert half < 3.4
