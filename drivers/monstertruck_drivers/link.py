@@ -183,7 +183,7 @@ class Link:
         self.close()
 
     def begin_wait(self, waiting: "LinkWaiter", due: float | None) -> None:
-        """Tell ``waiting`` of the next bytes or the loss; or at ``due``, loop time, that it has waited too long.
+        """Wake ``waiting`` by the next bytes or the loss, or at ``due``, loop time, by a time-out.
 
         A time limit is one timer for many waits, set anew only when it rings.
 

@@ -458,7 +458,7 @@ def _noise(rng: np.random.Generator) -> str:
 
 
 def _held_wheel(rng: np.random.Generator, motors: int) -> CatalogFault:
-    """A stepper that is held loses steps, and nothing tells it."""
+    """A stepper that is held loses steps, and nothing reports it."""
     motor = int(rng.integers(motors)) + 1
     return _cable(rng, FaultKind.HELD_WHEEL, "wheels", *_switch(f"overload {motor}"))
 

@@ -164,7 +164,7 @@ def _publisher(
 
 
 def scan_publisher(config: TruckConfig, bus: Bus) -> Publisher[LaserScan]:
-    """Where scans go: with the tilt of their plane, as far as compass and stabiliser tell it."""
+    """Where scans go: with the tilt of their plane, as far as compass and stabiliser measure it."""
     out = bus.publisher(topics.SCAN, Writer.DRIVER)
     angles = scan_angles(config, bus, RECENT)
     return out if angles is None else TiltStamper(out, angles)

@@ -50,7 +50,7 @@ class Body:
     sonars: Mapping[str, tuple[float, float, float]]
     """Pose of every sonar in base that guards the robot, m, m, rad: of one without a lidar."""
     peers: Mapping[str, Footprint]
-    """Outlines of the robots that it hears, by name."""
+    """Outlines of the robots whose poses it receives, by name."""
 
     @classmethod
     def of(cls, config: TruckConfig) -> Self:

@@ -2,7 +2,7 @@
 
 Zenoh's access rules bind a name to a certificate: under ``req/<name>/...`` and ``rpc/.../<name>`` only that
 certificate's requests arrive. What the name may ask for is its grant, which the daemon looks up. So a source that asks
-for too much is answered, while one that uses another's name is not heard.
+for too much is answered, while one that uses another's name is dropped.
 
 Groups out of the robot may only leave it and requests may only enter it, so that no other peer can forge the robot's
 state to the others. A rule covers a declaration only if it contains the whole declared key expression.
@@ -118,7 +118,7 @@ def access_rules(robot: str, owners: Iterable[str] | None = None, routers: Itera
 def router_rules(fleet: Mapping[str, Iterable[str]]) -> dict[str, Any]:
     """Zenoh ``access_control`` section of a router between robots and stations.
 
-    A robot says its own state and nobody else's, and hears requests to itself only. A station sees and asks the robots
+    A robot publishes its own state only, and receives requests to itself only. A station observes and calls the robots
     that know it, under its own name; it may watch for all robots, and finds those.
 
     Args:

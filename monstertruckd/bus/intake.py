@@ -36,7 +36,7 @@ MAX_MARKS: Final = 512
 """Commas, and brackets, braces and quotes, of one request: many small objects would take tens of milliseconds."""
 
 MAX_OWNERS: Final = 64
-"""Owners whose rates are known; the one heard least recently is dropped for a new one."""
+"""Owners whose rates are known; the least recent one is dropped for a new one."""
 TOGETHER: Final = 5.0
 """All together may send so many times what one owner may: without certificates names can be invented."""
 

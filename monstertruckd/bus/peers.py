@@ -1,4 +1,4 @@
-"""Other robots: each is heard over its own Zenoh endpoint; what it says of itself is on ``state/peers``."""
+"""Other robots: their poses are received over their own Zenoh endpoints, and published on ``state/peers``."""
 
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import Clock, Schedule
@@ -11,7 +11,7 @@ from monstertruckd.bus.zenoh_config import PeerConfig
 
 
 class PeerService:
-    """Publishes what was heard of others at a steady rate, with the time of receipt.
+    """Publishes the newest poses of other robots at a steady rate, with the time of receipt.
 
     Args:
         clock: time.
@@ -49,7 +49,7 @@ class PeerService:
 
 
 class PeerSubscriber:
-    """Hears one other robot; its session reconnects by itself once there was one.
+    """Receives the poses of one other robot; an open session reconnects by itself.
 
     Args:
         robot: its name.

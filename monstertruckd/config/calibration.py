@@ -156,7 +156,7 @@ class Result(Schema):
     """Of the intervals"""
     estimates: Annotated[tuple[Estimate, ...], Field(min_length=1)]
     unobserved: tuple[str, ...] = ()
-    """What this measurement cannot tell"""
+    """What this measurement cannot determine"""
     readings: tuple[tuple[float, ...], ...] = ()
     """Raw readings that a later run may use again; their meaning is the wizard's"""
     partial: bool = False

@@ -13,7 +13,7 @@ Rules:
   ordered a stop, lower roles are refused until the truck is armed again. So a tracker never continues by itself after
   an operator has released the stick.
 - After a STOP order every source must send a neutral request before it may drive again, until the truck is armed again;
-  for one that was driving, none for its lease is as good. A source that is first heard after the stop is no exception.
+  for one that was driving, none for its lease is as good. A source that is new after the stop is no exception.
 - An ARM order with ``hold`` keeps planners out until one without.
 - An operator who drives may hand over to one who has asked. For a moment nobody else of their priority may drive, and
   the former driver not before a neutral request.

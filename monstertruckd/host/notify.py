@@ -94,7 +94,7 @@ class NotifyService:
         self._send("STOPPING=1", "STATUS=stopping")
 
     async def run(self, ready: Ready) -> None:
-        """Tell until cancelled."""
+        """Notify systemd until cancelled."""
         ready()
         while not (self._up and self._ticks() and self._notify("READY=1")):
             await self._clock.sleep(POLL)

@@ -1,4 +1,4 @@
-"""One browser's hand on one robot: its own source of requests, so that the robot tells two tabs apart.
+"""One browser's control of one robot: its own source of requests, so that the robot distinguishes two tabs.
 
 Nothing here repeats a request. Each heartbeat of the browser becomes one request with a short lease, or none if it was
 held up on its way: what the hand did then says nothing of what it does now.
@@ -74,7 +74,7 @@ LONGEST: Final = 200.0
 
 
 class DelayWatch:
-    """Which heartbeats were held up on their way, by what the browser heard last of the station; s.
+    """Finds heartbeats that were delayed, by the newest message of the station that the browser received; s.
 
     The browser says which of the station's times it heard, and how long before it read its input: what has passed
     since, without that, are the ways of both messages. So no clock is compared with another one's.

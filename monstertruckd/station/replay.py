@@ -20,7 +20,7 @@ log = logging.getLogger(__name__)
 MOST_BYTES: Final = 400_000_000
 """Payload of a recording that is kept in memory."""
 AGAIN: Final = 0.4
-"""Seconds after which what stands still is shown once more: pages tell a silent robot by it."""
+"""Seconds after which what stands still is shown once more: pages detect a silent robot by it."""
 AGAIN_KINDS: Final = ("gate", "pose", "scan")
 EVENTS: Final = 50
 """Events shown of the time before the place that was chosen."""

@@ -62,7 +62,7 @@ MOST_OF_USER: Final = 8
 MOST_CONNECTIONS: Final = 256
 """Of one network: a browser keeps some six. Of those beyond, the newest are closed."""
 MESSAGES: Final = 200.0
-"""Messages a second of one browser, in bursts of as many; what comes faster waits, and others are heard meanwhile."""
+"""Messages a second of one browser, in bursts of as many; what comes faster waits, without a delay for others."""
 USUAL_PORTS: Final = {"http": 80, "https": 443}
 """Browsers leave these out of a name."""
 
@@ -161,7 +161,7 @@ class Station:
         self._numbers = itertools.count(1)
         self._browsers: list[_Browser] = []
         self._run = secrets.token_hex(2)
-        """Tells this run's browsers from those of another, whose sequence numbers the robot remembers."""
+        """Distinguishes this run's browsers from those of another, whose sequence numbers the robot remembers."""
         self._strings = _strings()
         self._open_log = open_log
         self.replays: dict[str, ReplayFeed] = {}

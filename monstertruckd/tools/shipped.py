@@ -1,4 +1,4 @@
-"""Files that come with the program beside its modules: configurations, and what the service needs."""
+"""Files that are installed with the modules: configurations, and what the service needs."""
 
 from pathlib import Path
 from typing import Final

@@ -46,7 +46,7 @@ class BodyAcceleration:
             self._speeds.append((odometry.stamp, odometry.twist.vx, odometry.twist.wz))
 
     def at(self, stamp: int) -> tuple[float, float]:
-        """Forward and left, m/s^2, over the time before ``stamp``, ns; 0 where the odometry does not tell it."""
+        """Forward and left, m/s^2, over the time before ``stamp``, ns; 0 where the odometry does not give it."""
         spell = [speed for speed in self._speeds if stamp - 2 * self._felt <= speed[0] <= stamp]
         old = next((speed for speed in reversed(spell) if speed[0] <= stamp - self._felt), None)
         if old is None or old is spell[-1]:

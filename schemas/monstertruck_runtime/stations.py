@@ -97,7 +97,8 @@ def own_source(owner: str | None = None, program: str = "") -> str:
 
     Args:
         owner: common name of the certificate, which is kept whole.
-        program: tells several of one process apart. The host's name gives way to it, and to its end its beginning.
+        program: distinguishes several of one process. If the name is too long, the host is cut first, then the beginning
+            of the program.
     """
     end = f"{os.getpid()}{'-' * bool(program)}{program}"
     host = _plain(socket.gethostname())

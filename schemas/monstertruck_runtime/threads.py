@@ -123,7 +123,7 @@ async def in_thread(function: Callable[[], T]) -> T:
     try:
         return await asyncio.shield(work)
     except asyncio.CancelledError:
-        await asyncio.gather(work, return_exceptions=True)  # nobody is left to hear of an error
+        await asyncio.gather(work, return_exceptions=True)  # nobody is left to report an error to
         raise
 
 

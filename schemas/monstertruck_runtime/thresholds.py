@@ -45,7 +45,7 @@ class ThresholdAlarm:
         self.active = False
 
     def update(self, time_ns: int, value: float | None) -> bool:
-        """Tell the value at ``time_ns``; without a value nothing changes. Returns whether the alarm changed."""
+        """Take the value at ``time_ns``; without a value nothing changes. Returns whether the alarm changed."""
         if value is None:
             return False
         limits = self._threshold

@@ -191,7 +191,7 @@ class LinkLevel(StrEnum):
     UNUSABLE = "unusable"
     DOWN = "down"
     UNKNOWN = "unknown"
-    """Connected by Wi-Fi, but the kernel does not tell the signal."""
+    """Connected by Wi-Fi, but the kernel does not report the signal."""
 
 
 class LinkHealth(Message):
@@ -218,7 +218,7 @@ class LinkHealth(Message):
 
 
 class HostHealth(Message):
-    """State of the computer the daemon runs on; None = the computer does not tell."""
+    """State of the computer the daemon runs on; None = not available."""
 
     load: float
     """Mean number of runnable processes over the last minute."""

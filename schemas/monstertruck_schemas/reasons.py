@@ -123,11 +123,11 @@ class Reason(StrEnum):
     WHEEL_SLIP = (
         "wheel_slip",
         94,
-        "the driven wheels do not hold the ground: other sensors tell another motion",
+        "the driven wheels slip: other sensors measure another motion",
     )
     HEADING_DISTURBED = "heading_disturbed", 95, "the compass is disturbed: its headings are left out"
     WITNESS_DISAGREES = "witness_disagrees", 98, "another scan odometry measures another motion than the map's"
-    IMU_DISAGREES = "imu_disagrees", 99, "the IMU and the wheels tell another turn"
+    IMU_DISAGREES = "imu_disagrees", 99, "the IMU and the wheels measure different turns"
     ENCODERS_DISAGREE = "encoders_disagree", 89, "an encoder of the rear wheels counts what the wheel cannot have done"
     OUTSIDE_MAP = "outside_map", 97, "what the scans see is nowhere on the saved map"
     WHEEL_GRIP = "wheel_grip", 0, "the wheels hold the ground again"

@@ -60,7 +60,7 @@ class Peer(Schema):
 
 
 class Peers(Message):
-    """The newest pose of every other robot that was heard since the start."""
+    """The newest pose of every other robot received since the start."""
 
     peers: tuple[Peer, ...] = ()
 

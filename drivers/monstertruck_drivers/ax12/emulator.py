@@ -48,7 +48,7 @@ class Ax12Bus:
         seed: of what a collision makes of the answers.
         echo: the adapter gives back every byte it is sent.
         latency_s: what the adapter adds to everything it passes to the host.
-        host_baud: rate the host opens the port with; units set to another one hear nothing.
+        host_baud: rate the host opens the port with; units set to another one receive nothing.
         answers_damage: whether a request with a wrong sum is answered (checksum error bit) or ignored.
         positions: of the shafts at the start, steps per unit number; 512 where not named.
         load: what pushes the shafts.

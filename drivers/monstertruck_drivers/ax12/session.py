@@ -39,7 +39,7 @@ class Ax12Session:
     def __init__(self, link: Link, clock: Clock, timeout: Callable[[int, int], float]) -> None:
         self.echo = False
         self.strange = 0
-        """Bytes heard that were no part of a correct packet."""
+        """Bytes received that were no part of a correct packet."""
         self._link = link
         self._clock = clock
         self._timeout = timeout

@@ -515,7 +515,7 @@ class _DriveSession:
         try:
             await self._line.write(od.CONTROLWORD, control)
         except ObjectError as error:
-            if error.code != od.WRONG_STATE:  # the statusword will tell
+            if error.code != od.WRONG_STATE:  # the statusword will show it
                 raise
 
     async def _prepare(self) -> None:

@@ -164,7 +164,7 @@ class ClockMap:
         self._take(self._elapsed, arrival - self._elapsed)
 
     def _find_latency(self, reference: int, samples: Iterable[tuple[int, int]], drift: float) -> None:
-        """The least time from the counter to the arrival, as the comparison at the start tells it."""
+        """The least time from the counter to the arrival, by the comparison at the start."""
         found = round(min(sample - reference - drift * elapsed for elapsed, sample in samples))
         self._latency = max(found, self._least_latency)
 

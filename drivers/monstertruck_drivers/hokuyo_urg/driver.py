@@ -49,7 +49,7 @@ from monstertruck_schemas.sensor import LaserScan
 TRANSFER = 0.002
 """Seconds assumed from the last beam to the arrival where it cannot be measured."""
 GREATEST_2CHAR = 4.095
-"""Metres; the most a two-character range can tell."""
+"""Greatest range in two characters, m."""
 TOO_LATE = 0.3
 """Seconds by which scans arrive later than at the start, from which on they are worth little."""
 LATE_FOR = 3.0
@@ -426,7 +426,7 @@ class HokuyoDriver:
     # SCIP 1.1
 
     async def _poll(self, session: ScipSession, sensor: Sensor, ready: Ready) -> None:
-        """Units that know SCIP 1.1 only: ask for every scan; they tell no time, so the arrival must do."""
+        """Units that know SCIP 1.1 only: ask for every scan; they send no time, so the time of arrival is used."""
         config, geometry = self._config, sensor.parameters
         shape = (geometry.first_step, geometry.last_step, config.cluster)
         await session.demand("L1")

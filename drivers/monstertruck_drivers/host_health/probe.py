@@ -1,4 +1,4 @@
-"""What does the computer tell of itself."""
+"""Which readings of its own health a computer offers."""
 
 from dataclasses import asdict
 from pathlib import Path

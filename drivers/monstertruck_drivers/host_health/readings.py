@@ -1,4 +1,4 @@
-"""What /proc and /sys tell of the computer; blocks for as long as reading small files takes.
+"""Readings of the computer's health in /proc and /sys; blocks for as long as reading small files takes.
 
 Source: kernel documentation, proc(5), ABI/testing/sysfs-class-thermal, admin-guide/pm/cpufreq, and for the throttle
 counters of x86 ABI/testing/sysfs-devices-system-cpu. ``get_throttled`` is the Raspberry Pi firmware's word: bits 0
@@ -18,7 +18,7 @@ from monstertruck_runtime.small_files import number_of, text_of
 FIRMWARE_THROTTLED: Final = "sys/devices/platform/soc/soc:firmware/get_throttled"
 THROTTLED_NOW: Final = 0xF
 PLAUSIBLE_CELSIUS: Final = (-40.0, 150.0)
-"""Zones without a sensor tell nonsense."""
+"""Zones without a sensor report values outside of this."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +31,7 @@ class Times:
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """The computer at one instant; None = it does not tell."""
+    """The computer at one instant; None = not available."""
 
     load: float
     cores: int

@@ -11,13 +11,13 @@ from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import DeviceTimeoutError, WrongDeviceError
 
 LISTEN: Final = 1.2
-"""Seconds to hear a streaming unit; also longer than it pauses after a setting."""
+"""Seconds to receive a sentence of a streaming unit; also longer than it pauses after a setting."""
 PROMPT: Final = 0.3
 """Seconds to wait for the prompt of a command."""
 LEAVE: Final = b"\x1b\r"
 """ESC leaves a command; where there was none it begins one, which CR, being no key, leaves again."""
 SAMPLES: Final = 6
-"""Sentences that tell rate and fields."""
+"""Sentences from which rate and fields are determined."""
 
 
 class Os4000Session:

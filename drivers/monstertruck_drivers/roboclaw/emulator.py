@@ -31,7 +31,7 @@ class RoboclawEmulator:
     """A unit with its encoders wired as the settings say.
 
     Faults (``inject``): ``stuck left|right on|off`` (an encoder's disc slips on its shaft), ``mirrored left|right
-    on|off`` (its channels are exchanged: it counts the other way), ``silent on|off`` (hears, says nothing), ``noise
+    on|off`` (its channels are exchanged: it counts the other way), ``silent on|off`` (gives no answers), ``noise
     COUNT`` (so many answers have a wrong byte), ``reset`` (the supply drops: counters at 0).
 
     Args:

@@ -46,7 +46,7 @@ COASTING: Final = 1e6
 class StepperEmulator:
     """The controller with its motors.
 
-    Faults (``inject``): ``overload MOTOR on|off`` (the rotor stands), ``silent on|off`` (hears, says nothing), ``late
+    Faults (``inject``): ``overload MOTOR on|off`` (the rotor stands), ``silent on|off`` (gives no answers), ``late
     SECONDS [COUNT]`` (answers), ``reset`` (the processor restarts in the middle of whatever it does), ``noise COUNT``
     (so many answers have a wrong byte).
 

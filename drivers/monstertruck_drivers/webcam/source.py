@@ -33,7 +33,7 @@ class CameraFrame:
     """One picture as the camera gave it: not checked yet."""
 
     stamp: int | None
-    """Nanoseconds of CLOCK_MONOTONIC at the exposure; None = the camera does not tell."""
+    """Nanoseconds of CLOCK_MONOTONIC at the exposure; None = not known."""
     sequence: int
     """The camera's own count."""
     data: bytes

@@ -11,7 +11,7 @@ from monstertruck_runtime.ports import EventSink, Publisher, Ready
 from monstertruck_schemas.sensor import Imu, Vector3
 
 LISTEN: Final = 0.6
-"""Seconds to hear a unit that streams; it needs half of one after power-up."""
+"""Seconds to receive a packet of a streaming unit; it needs half of one after power-up."""
 
 
 class ImuSample(NamedTuple):
@@ -70,7 +70,7 @@ class Wt61Session:
         return samples
 
     async def start(self) -> list[ImuSample]:
-        """Hear a unit, which may have been left in standby.
+        """Wait for packets of a unit, which may be in standby.
 
         Raises:
             DeviceLostError: unplugged.

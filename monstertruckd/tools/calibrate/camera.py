@@ -181,14 +181,14 @@ def mount_of(
         lidar_mount: half-widths of its own mount's intervals, by name.
 
     Raises:
-        InputError: see ``fit_mount``; or the views do not tell the mount.
+        InputError: see ``fit_mount``; or the views do not determine the mount.
     """
     fx, fy = found.lens.parameters[:2]
     focal = float(np.hypot(*found.sigmas[:2] / (fx, fy)) / math.sqrt(2))
     fit, lines = fit_mount(views, reader, found.lens, mount, lidar, focal)
     halves = known_errors(fit, 2 * len(lines) - len(NAMES))
     if not np.isfinite(halves).all():
-        raise InputError("the views do not tell the camera's mount: it is more than half a metre off, or never tilted")
+        raise InputError("mount not determined by the views: it is more than half a metre off, or never tilted")
     # The axis of the lens is known as well as its centre in the picture.
     axis = {"yaw": NORMAL * found.sigmas[2] / fx, "pitch": NORMAL * found.sigmas[3] / fy}
     values = {

@@ -30,7 +30,7 @@ ANGLE: Final = 0.35
 RESTING: Final = 500
 """Readings at rest."""
 LEAST: Final = 2
-"""Turns that tell the scale, at least."""
+"""Turns that determine the scale, at least."""
 MOVED: Final = 0.02
 """Greatest standard deviation of a resting yaw rate, rad/s: more is a unit that is being moved."""
 SILENT: Final = 0.5
@@ -161,7 +161,7 @@ def result_of(
         estimates=tuple(estimates),
         unobserved=(
             "scales of pitch and roll rate",
-            "bias and scale of the vertical force, which only other positions of the unit tell apart",
+            "bias and scale of the vertical force, which only other orientations of the unit separate",
             "what the temperature changes: bias drifts, and is followed at every rest",
         ),
         partial=not turns,

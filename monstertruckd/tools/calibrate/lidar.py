@@ -262,7 +262,7 @@ def result_of(
     fit = fit_mount(legs, mount, crab)
     halves = known_errors(fit, 2 * len(legs) - 4)
     if not np.isfinite(halves[:3]).all():
-        raise InputError("the legs do not tell the mount: it is more than half a metre off, or the scans do not fit")
+        raise InputError("the mount is not determined by the legs: more than half a metre off, or the scans do not fit")
     x, y, yaw = (Interval(float(v), float(h)) for v, h in zip(fit.parameters[:3], halves[:3], strict=True))
     noise = "95 % of scans and slip"
     estimates = [

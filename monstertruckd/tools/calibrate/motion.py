@@ -92,7 +92,7 @@ class Mover:
         """Drive ``move`` and return what was measured; ``report`` is called with the metres driven.
 
         However it ends, the truck is stopped and disarmed. After a stop that passed, such as a late request, it drives
-        back to where the move began and once more, ``REPEATS`` times at most, and tells ``say``.
+        back to where the move began and once more, ``REPEATS`` times at most, and reports by ``say``.
 
         Raises:
             RequestRefusedError: the gate refused, stopped the truck, or holds it; with its reason.

@@ -3,7 +3,7 @@
 After the test of Borenstein and Feng ("Measurement and Correction of Systematic Odometry Errors in Mobile Robots", IEEE
 Transactions on Robotics and Automation, 1996): errors of the offset turn a square driven to the left and one driven to
 the right in the same sense, errors of the wheelbase in opposite ones. Theirs is for two wheels that are driven apart;
-here corners are arcs of a truck that steers both axles, a tape tells the first side, and the compass every leg's turn.
+here corners are arcs of a truck that steers both axles, a tape gives the first side, and the compass every leg's turn.
 """
 
 import math

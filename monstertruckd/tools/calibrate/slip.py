@@ -150,7 +150,7 @@ def result_of(arcs: Sequence[SkidArc], radius: float, half_track: float) -> Resu
     fit = least_squares(residual, model.start, model.lower, model.upper)
     halves = known_errors(fit, fit.residuals.size - fit.parameters.size)
     if not np.isfinite(halves).all():
-        raise InputError("the arcs do not tell all turning centres: drive more of them, of several radii")
+        raise InputError("the arcs do not determine all turning centres: drive more of them, of several radii")
     values = dict(zip(model.parameters, fit.parameters.tolist(), strict=True))
     errors = dict(zip(model.parameters, halves.tolist(), strict=True))
     tilt = math.sqrt(values["slip_ratio"])

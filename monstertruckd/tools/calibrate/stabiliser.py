@@ -1,10 +1,10 @@
 """Zero and direction of the two servos below the lidar, by the height of its beam and by what it sees of the floor.
 
 The levelling runs as always: it turns the joints against the tilt that the compass measures. On a level floor the
-height of the beam at its window, on a wall ahead and on one to the left tells how the lidar lies; less the body's tilt
-that is what the joints really are, so the positions of their servos tell the zeros. On blocks a joint that turns the
-right way keeps the lidar level, and one that turns the wrong way doubles the body's tilt: then the beam meets the floor
-where two tilts meet it. A joint that does not turn leaves one tilt, and so do two that are swapped.
+height of the beam at its window, on a wall ahead and on one to the left gives the tilt of the lidar; minus the tilt of
+the body it is the true angle of the joints, so the positions of their servos give the zeros. On blocks a joint that
+turns the right way keeps the lidar level, and one that turns the wrong way doubles the body's tilt: then the beam meets
+the floor at the distance of twice the tilt. A joint that does not turn leaves it single, as do two that are swapped.
 """
 
 import math

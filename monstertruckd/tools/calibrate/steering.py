@@ -294,7 +294,7 @@ class AxleTravel:
 
     @classmethod
     def of(cls, axle: int, sign: int, legs: Sequence[SteeringRun], model: SteeringModel, maps: Maps) -> "AxleTravel":
-        """From arcs with the wheels far over, as far as ``maps`` tell where the other axle stood."""
+        """From arcs with the wheels far over, as far as ``maps`` give the angle of the other axle."""
         reached, meant = np.array([model.reached(leg, maps, axle) for leg in legs]).mean(axis=0).tolist()
         stopped = sign * (meant - reached) > SHORT
         servo = reached if stopped else meant

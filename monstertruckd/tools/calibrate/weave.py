@@ -27,7 +27,7 @@ from monstertruckd.tools.calibrate.response import ResponseFit, Steps, unexplain
 from monstertruckd.tools.calibrate.steps import MoveRecord, MoveStep
 
 WEAVE: Final = (0.3, 0.3, 0.3, 0.3, 1.2)
-"""Seconds between changes of side: many changes tell the lag, and a long arc tells the gain, which a lag resembles
+"""Seconds between changes of side: many changes determine the lag, and a long arc the gain, which has a similar effect
 where changes follow each other evenly."""
 SPEED: Final = 0.15
 ANGLE: Final = 0.12
@@ -134,7 +134,7 @@ def response(records: Iterable[MoveRecord], chassis: TruckChassis, iron: IronCon
     seen = [weave for record in records if (weave := Weave.of(record, chassis, iron)) is not None]
     samples = sum(weave.turns.size for weave in seen)
     if samples < LEAST:
-        raise InputError(f"only {samples} turns tell dead time and lag: expected {LEAST}")
+        raise InputError(f"only {samples} turns determine dead time and lag: expected {LEAST}")
 
     def residuals(delay: float, squared: float) -> Array:
         return np.concatenate([weave.residuals(delay, squared) for weave in seen])

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from monstertruck_schemas.state import GateState
 
 HEARD = 0.3
-"""Seconds in which a tracker that has a path is heard."""
+"""Seconds within which a tracker with a path sends its requests."""
 
 
 @dataclass(frozen=True, slots=True)

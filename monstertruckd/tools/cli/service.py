@@ -88,7 +88,7 @@ def uninstall_service(
 
 
 def _as_root(action: Callable[[], T]) -> T:
-    """Do it, or tell the command that may."""
+    """Do it, or print the command for a user with the rights."""
     try:
         return action()
     except NotPermittedError as error:

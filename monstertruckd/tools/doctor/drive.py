@@ -36,7 +36,7 @@ CLEAR: Final = 0.3
 AHEAD: Final = 0.05
 """Least way of a move by which a sign can be judged, m."""
 UNSURE: Final = 0.05
-"""Standard deviation of a way by scans, m, from which on they do not tell it: 0.01 where a wall is ahead, 0.4 along a
+"""Standard deviation of a motion by scans, m, above which it is not determined: 0.01 where a wall is ahead, 0.4 along a
 corridor."""
 NOTHING: Final = 1e-3 * np.eye(3)
 """Information of scans that see nothing."""
@@ -57,7 +57,7 @@ class Movement:
     seen: Mapping[str, float]
     """Turn by each sensor, rad"""
     way_seen: float | None
-    """By the lidar, m; None = its scans do not match, or do not tell, as in a corridor"""
+    """By the lidar, m; None = its scans do not match, or do not determine it, as in a corridor"""
 
 
 async def signs(drives: Drives, config: TruckConfig, command: Callable[..., str]) -> list[Finding]:
@@ -128,7 +128,7 @@ def by_lidar(record: MoveRecord, wheels: tuple[float, float], mount: Array) -> A
     """Motion of the body by the scans at rest before and after, m and rad, (3,); None where they do not match.
 
     What the wheels say is one guess; that they go the other way, or turn the other way, are others. Where the scans do
-    not tell the way, as in a corridor that has no end in sight, x and y are not a number.
+    not determine the motion, as in a corridor that has no end in sight, x and y are not a number.
     """
     try:
         before, after = (resting_scan(found) for found in record.at_rest(topics.SCAN))
@@ -152,7 +152,7 @@ def judged(moves: list[Movement], command: Callable[..., str]) -> Iterator[Findi
     """Findings of all moves together: turns and ways of a move back count with their signs."""
     turn = sum(abs(move.turn) for move in moves)
     if turn < LEAST_TURN:
-        text = f"motor and steering turned it by {math.degrees(turn):.0f} degrees in all: too little to tell a sign"
+        text = f"motor and steering turned it by {math.degrees(turn):.0f} degrees in all: too little for a sign"
         yield warn("signs", Reason.STEERING_DEAD, text)
         return
     shares = shares_of_turn(moves)

@@ -21,7 +21,7 @@ from monstertruckd.tools.doctor.context import Finding, HostContext, fail, fine,
 MOST_BYTES: Final = 200_000_000
 """Longer logs are left to `log report`."""
 LEAST_TURN: Final = 1.0
-"""Rad in all that tell a sign."""
+"""Least turn in all to determine a sign, rad."""
 SATURATED: Final = 0.2
 """Share of the commands at a limit of an axle."""
 AT_LIMIT: Final = math.radians(0.5)

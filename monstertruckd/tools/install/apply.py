@@ -90,7 +90,7 @@ def runs_here(root: Path) -> bool:
 
 
 def install(plan: InstallPlan, root: Path, *, dry: bool = False, run: Run = run_command) -> InstallReport:
-    """Write what differs, then tell the running system; one that does not run is only written.
+    """Write what differs, then notify the running system; an image that does not run is only written.
 
     Raises:
         InputError: a file is masked, is none, or is behind a link out of ``root``; nothing has been written then.

@@ -1,4 +1,4 @@
-"""What an installation consists of: files, and programs to tell about them."""
+"""The contents of an installation: files, and programs to notify about them."""
 
 import os
 import re

@@ -139,9 +139,9 @@ def unseen_ticks(config: TruckConfig, log: Survey) -> list[tuple[int, str]]:
 
 
 def _early_ticks(config: TruckConfig, log: Survey) -> Iterable[int]:
-    """Of odometry, which reads already but has nothing to tell yet: its grid, continued back from its first output.
+    """Ticks of odometry before its first output: its schedule, continued back from there.
 
-    It tells something from its first tick after the first reading of every shaft, however late a busy computer came to
+    It publishes from its first tick after the first reading of every shaft, however late a busy computer came to
     that tick: there was none in between.
     """
     first = log.first.get(topics.ODOMETRY.name)

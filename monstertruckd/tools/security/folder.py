@@ -172,7 +172,7 @@ class Folder:
             new = not (self.path / "register.yaml").exists()
             if new and (names := sorted(file.stem for file in self.path.glob("issuers/*.pem"))):
                 raise InputError(
-                    f"{self.path}: register.yaml is missing beside certificates of {', '.join(names)}: restore it, "
+                    f"{self.path}: register.yaml is missing among certificates of {', '.join(names)}: restore it, "
                     "or remove the folder issuers to begin anew, without them"
                 )
             before = FIRST if new else self.register().model_dump()

@@ -1,4 +1,4 @@
-"""Tape, string and meter beside an emulated robot, for whoever calibrates it by hand."""
+"""Tape, string and meter for an emulated robot, for its calibration by hand."""
 
 import math
 from collections.abc import Callable
@@ -16,7 +16,7 @@ WORDS: Final = (
 
 
 class EmulatedTape:
-    """Measures what is really the case, for a person: nothing of the robot hears it.
+    """Measures the simulated truth, for a person only: nothing is passed to the robot.
 
     Args:
         world: with the robot.

@@ -136,7 +136,7 @@ class VirtualRig:
         await asyncio.wait([self._daemon_task])
 
     def give(self) -> None:
-        """A new daemon on the same robot; what subscribed to the one before hears nothing of it."""
+        """A new daemon on the same robot; subscriptions to the one before receive nothing of it."""
         self.daemon = self._new_daemon()
         self._start_daemon()
 

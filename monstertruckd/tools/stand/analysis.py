@@ -23,7 +23,7 @@ from monstertruckd.recorder.reader import open_log
 LEAST: Final = 40
 """Poses in common."""
 LEAST_TURN: Final = 0.5
-"""Rad: less tells no latency."""
+"""Least turn to determine the latency, rad."""
 REACH: Final = 0.5
 """Greatest latency, s."""
 
@@ -41,7 +41,7 @@ class EstimateError:
     heading_rms: float
     """rad"""
     latency: float | None
-    """Seconds by which the stand's stamps are late against the estimate's; None: too little turn to tell"""
+    """Seconds by which the stand's stamps are late against the estimate's; None: too little turn to determine it"""
 
 
 def errors_of(path: Path) -> list[EstimateError]:

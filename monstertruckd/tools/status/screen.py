@@ -105,7 +105,7 @@ class ScreenState:
 
     @property
     def gone(self) -> bool:
-        """Whether the robot has fallen silent, or was never heard."""
+        """Whether no message of the robot came lately, or ever."""
         return self.silence > SILENCE
 
     def take(self, message: Message, real: int = 0) -> None:

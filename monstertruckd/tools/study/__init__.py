@@ -1,1 +1,1 @@
-"""The skid-steer study: open-loop runs, their analysis from a log, and the published figures beside them."""
+"""The skid-steer study: open-loop runs, their analysis from a log, and the published figures for comparison."""

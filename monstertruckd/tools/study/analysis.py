@@ -14,7 +14,7 @@ from monstertruck_runtime.errors import InputError
 LEAST: Final = 40
 """Poses of a run, at least."""
 LEAST_TURN: Final = 1.0
-"""Radians that a circle must turn: less does not tell its centre from its radius."""
+"""Radians that a circle must turn: less does not separate its centre from its radius."""
 LEAST_WAY: Final = 0.01
 """Metres that a pass must cover: less has no direction."""
 SETTLED: Final = 1.0

@@ -1,4 +1,4 @@
-"""The study's table: what was measured beside what the ideal robot does and what the paper prints."""
+"""The study's table: measured values next to those of the ideal robot and of the paper."""
 
 import math
 from collections.abc import Iterator, Sequence

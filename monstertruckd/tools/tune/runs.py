@@ -82,7 +82,7 @@ async def tune(
     pause: Callable[[], Awaitable[None]],
     report: Callable[[TuningRun], None],
 ) -> WallGains | None:
-    """Run the recipe with a robot that stands beside a wall: it is armed, and disarmed at the end, also after errors.
+    """Run the recipe with a robot that stands along a wall: it is armed, and disarmed at the end, also after errors.
 
     Before each run the behaviour as configured, with its own gains, brings the robot along the wall.
 

@@ -154,7 +154,7 @@ def _jumped(gate: CompassGate, innovation: HeadingInnovation) -> CompassGate:
 def _field(gate: CompassGate, innovation: HeadingInnovation, config: HeadingTrust) -> tuple[CompassGate, bool]:
     """The gate with the field learned, and whether the reading is disturbed.
 
-    A robot may be started beside iron: a strength that holds for ``config.steady_time`` and ``config.regain`` metres is
+    A robot may be started near iron: a strength that holds for ``config.steady_time`` and ``config.regain`` metres is
     that of the place, and replaces the one of the start.
     """
     if innovation.flagged:

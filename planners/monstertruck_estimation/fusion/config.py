@@ -20,7 +20,7 @@ class WheelTrust(Schema):
     angle_noise: NotNegative = 0.01
     """Standard deviation of the mean angle of a steered axle over a metre, rad."""
     slip_noise: tuple[NotNegative, NotNegative, NotNegative] = (0.01, 0.01, 0.03)
-    """Standard deviations of what no wheel can tell, forward and sideways (m) and in yaw (rad), per root metre."""
+    """Standard deviations of slip of the wheels, forward and sideways (m) and in yaw (rad), per root metre."""
     trim: Positive = 0.05
     """Standard deviation of the constant error of the curvature at the start (a servo off its centre), rad/m."""
     trim_drift: Positive = 0.002

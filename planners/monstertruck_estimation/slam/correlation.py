@@ -365,7 +365,7 @@ def merged(scans: Sequence[Scan], poses: Array) -> Scan:
         variances.append(scan.variances)
         extents.append(scan.extents)
     every = np.concatenate(points), np.concatenate(normals), np.concatenate(variances), np.concatenate(extents)
-    # Cell and octant of the normal tell the piece of surface.
+    # Cell and octant of the normal identify the piece of surface.
     cells = np.floor(every[0] / MERGE_CELL).astype(np.int64)
     facing = np.floor(np.arctan2(every[1][:, 1], every[1][:, 0]) / (np.pi / 4) + 0.5).astype(np.int64) % 8
     lone = (every[2][:, 0] == every[2][:, 1]).astype(np.int64)

@@ -95,7 +95,7 @@ def fit_lens(views: Sequence[BoardSighting], reader: BoardReader, size: tuple[in
             objects, images, size, np.eye(3), np.zeros(5), flags=cv2.CALIB_FIX_K3
         )
     except cv2.error as error:
-        raise InputError(f"the pictures of the board tell no lens: {error.err}: hold it tilted") from error
+        raise InputError(f"the pictures of the board determine no lens: {error.err}: hold it tilted") from error
     count = sum(len(view.ids) for view in views)
     lens = Lens(np.asarray(matrix), np.ravel(distortion)[:5], size)
     poses = zip(views, turns, places, strict=True)

@@ -1,8 +1,8 @@
 """Leader and follower: a robot drives along the way of another one, at a distance.
 
-The leader knows nothing of it: the follower hears the pose that the leader publishes, keeps its trail, and steers
+The leader is not involved: the follower receives the poses that the leader publishes, keeps its trail, and steers
 towards a point on the trail (pure pursuit, Coulter 1992) at the leader's speed plus a share of the gap's error. A
-leader is trusted as long as it is heard, by the follower's own clock.
+leader is trusted as long as its poses arrive, by the follower's own clock.
 """
 
 import itertools

@@ -1,6 +1,6 @@
 """Frontiers of a map that grows: kept cell by cell, so that a changed tile costs only its own surroundings.
 
-A frontier cell is a free cell beside an unknown one (B. Yamauchi, "A frontier-based approach for autonomous
+A frontier cell is a free cell next to an unknown one (B. Yamauchi, "A frontier-based approach for autonomous
 exploration", 1997); only around what differs from before is looked again (compare M. Keidar, G. A. Kaminka, "Efficient
 frontier detection for robot exploration", 2014).
 """

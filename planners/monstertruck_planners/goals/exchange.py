@@ -151,7 +151,7 @@ class DeformAnswer:
 
 
 def level(scan: LaserScan, config: PlannerConfig) -> bool:
-    """Whether a scan lay flat enough to tell of the way, as far as it is known."""
+    """Whether the plane of a scan was level enough to show obstacles; true where its tilt is not known."""
     return scan.tilt is None or scan.tilt <= config.max_tilt
 
 

@@ -195,7 +195,7 @@ def standing_free(
 ) -> Cells:
     """Cells with those under the truck set free: unknown ones, and obstacles that it overlaps by its edge only.
 
-    A map is as exact as its cells: a truck beside a wall overlaps one by up to a cell. What it overlaps by more stays,
+    A map is as exact as its cells: a truck next to a wall overlaps it by up to a cell. What it overlaps by more stays,
     for then map or pose is wrong.
 
     Args:

@@ -3,7 +3,7 @@
 A search whose margin the start does not keep finds nothing, as all of its motions begin too near. So the route begins
 with few arcs and translations, on which the footprint comes no nearer to anything, up to a pose that keeps the margin;
 from there on it is planned like any other. Where no such motion exists the footprint may come nearer once more, as the
-end of a car that leaves a wall beside it, yet never touches: first by half of what there is.
+end of a car that leaves a wall at its side, yet never touches: first by half of what there is.
 """
 
 import math
@@ -40,7 +40,7 @@ SPARE: Final = 0.002
 """Kept beyond the margin where a departure ends, m: the first motion of a search may come a little nearer."""
 CONFINED: Final = 0.03
 """A start with less than this beyond the margin may be left by no motion of a search, m: the end of a body that turns
-comes that much nearer to a wall beside it."""
+comes that much nearer to a wall at its side."""
 CHECK: Final = 0.004
 """Between two poses checked, m."""
 BRANCH: Final = 0.2

@@ -230,7 +230,7 @@ def timeline(run: RunSummary) -> str:
 
 
 def _always_ready(track: StateTrack) -> bool:
-    """Began, was ready, and ended with the daemon: nothing to tell."""
+    """Services that started, were ready, and ended with the daemon: not shown."""
     return track.worst is not Tone.NONE and [s.text for s in track.spans if s.text not in {"starting", "stopped"}] in (
         ["ready"],
         [],

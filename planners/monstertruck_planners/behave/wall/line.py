@@ -162,7 +162,7 @@ class LineState(NamedTuple):
     marks: tuple[float, float] = (0.0, 0.0)
     """``travelled`` and ``turned`` when the phase began."""
     seen: float = 0.0
-    """``travelled`` when the wall was heard last."""
+    """``travelled`` at the last echo of the wall."""
     sense: float = -1.0
     """Of the turn: 1 = left."""
     places: Array = np.empty((0, 4))
@@ -321,7 +321,7 @@ class WallLine:
         return state._replace(fits=fits[self._fits :])
 
     def _beside(self, state: LineState, cone: Cone) -> LineState:
-        """With the wall beside fitted anew."""
+        """With a new fit of the wall at its side."""
         wall, echoes = state.wall, state.echoes
         beside = echoes[echoes[:, 4] <= DIAGONAL]
         if wall is None or not len(beside):
@@ -468,7 +468,7 @@ class WallLine:
     def _passed_by(self, state: LineState, wall: WallEstimate, cone: Cone, t: float) -> bool:
         """Whether what it braked for was on the far side and has gone: front and diagonal sonar heard nothing of it.
 
-        What those two heard may be the corner, though they hear it no longer where the robot stands.
+        The echoes of those two may be the corner, although there are none from where the robot stands.
         """
         if self._left(state, cone, t) <= GONE:
             return False
