@@ -83,7 +83,7 @@ def sync(extras: tuple[str, ...]) -> None:
     """Create or update ``.venv`` with the locked packages of ``extras``; leaves other extras in place.
 
     Bytecode is compiled here, once: where Python may not write it (PYTHONDONTWRITEBYTECODE, another user's
-    environment), every process would compile the libraries anew, two seconds of each start that plans a route.
+    environment), every process would compile the libraries again, two seconds of each start that plans a route.
     """
     flags = [flag for extra in extras for flag in ("--extra", extra)]
     command = [

@@ -78,7 +78,7 @@ def stop(port: str, node: int, baud: int) -> None:
         NotStoppedError: the controller did not accept a command.
         FrameError: an answer was damaged.
     """
-    # An adapter that was plugged in anew waits for a carrier, which no controller gives, before it opens.
+    # An adapter that was plugged in again waits for a carrier, which no controller gives, before it opens.
     line = os.open(port, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
     try:
         tty.setraw(line)

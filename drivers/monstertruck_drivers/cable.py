@@ -40,7 +40,7 @@ class DeviceEnd:
         self._deliver = deliver
 
     async def read(self, within: float | None = None) -> bytes:
-        """Bytes from the host, at least one; waits for ever while nothing is plugged in or open.
+        """Bytes from the host, at least one; waits forever while nothing is plugged in or open.
 
         Raises:
             TimeoutError: nothing came ``within`` that many seconds.

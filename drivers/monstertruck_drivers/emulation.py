@@ -66,7 +66,7 @@ class Emulator(Protocol):
     name: str
 
     async def run(self, end: DeviceEnd) -> None:
-        """Serve for ever; survives hosts that come, go and die."""
+        """Serve until cancelled; survives hosts that come, go and die."""
         ...
 
     def power_cycle(self) -> None:

@@ -98,7 +98,7 @@ class Link:
         """Everything received so far.
 
         Args:
-            within: seconds to wait for it; None = for ever.
+            within: seconds to wait for it; None = no limit.
             least: bytes worth waking for.
 
         Raises:
@@ -118,7 +118,7 @@ class Link:
 
         Args:
             count: how many.
-            within: seconds to wait for the last one; None = for ever.
+            within: seconds to wait for the last one; None = no limit.
 
         Raises:
             DeviceLostError: the link went down before they came.
@@ -185,7 +185,7 @@ class Link:
     def begin_wait(self, waiting: "LinkWaiter", due: float | None) -> None:
         """Wake ``waiting`` by the next bytes or the loss, or at ``due``, loop time, by a time-out.
 
-        A time limit is one timer for many waits, set anew only when it rings.
+        A time limit is one timer for many waits, set again only when it rings.
 
         Raises:
             RuntimeError: a task waits already.
@@ -288,7 +288,7 @@ class SerialPort:
     """A tty by its path (``/dev/truck/lidar``, ``/dev/serial/by-path/...``, a pty).
 
     Args:
-        path: device node or a symlink to it; resolved anew at every open.
+        path: device node or a symlink to it; resolved again at every open.
         baud: bits per second; meaningless on USB-CDC and ptys.
     """
 

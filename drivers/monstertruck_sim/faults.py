@@ -123,7 +123,7 @@ class SimContext:
         clock: time.
         disk: None where nothing records.
         power: None where the computer is this one.
-        workers: None where they are left alone.
+        workers: None where they are skipped.
     """
 
     config: SimConfig

@@ -16,7 +16,7 @@ OFTEN: Final = 1.0
 BEHIND: Final = MILLISECOND
 """Nanoseconds after the multiples at which batches leave: what the gate publishes there leaves with them."""
 BATCH: Final = 10
-"""Messages delivered in one turn of the loop: a fraction of a millisecond."""
+"""Messages delivered in one iteration of the event loop: a fraction of a millisecond."""
 
 Sent = tuple[Topic[Any], Message, int]
 """Topic, message and the time it was sent, ns."""
@@ -60,7 +60,7 @@ class Outgoing:
                 self._timer = asyncio.get_running_loop().call_soon(self._due)
 
     def _due(self) -> None:
-        """Deliver all that waits, one batch per turn of the loop."""
+        """Deliver all that waits, one batch per iteration of the event loop."""
         try:
             if self._waiting:
                 self._next_batch()

@@ -88,7 +88,7 @@ def recover(source: str | Path, target: str | Path, stop: threading.Event | None
 
 
 def recover_directory(directory: Path, stop: threading.Event | None = None) -> list[Recovery]:
-    """Repair every unfinished log of a folder in place; files in use and other files are left alone."""
+    """Repair every unfinished log of a folder in place; files in use and other files are skipped."""
     done = []
     for path in sorted(directory.glob("*.mcap")):
         try:

@@ -110,7 +110,7 @@ class Explore(_Command):
 
 
 class DoMission(_Command):
-    """Start a mission, go on with one, or end it."""
+    """Start a mission, resume one, or end it."""
 
     do: Literal["mission"]
     id: Id

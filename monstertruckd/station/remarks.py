@@ -46,7 +46,7 @@ class Remarks:
             self._timer = asyncio.get_running_loop().call_later(WINDOW, self.tell)
 
     def tell(self) -> None:
-        """Write how many lines were left out, and count anew."""
+        """Write how many lines were left out, and count again."""
         if self._timer is not None:
             self._timer.cancel()
         counts, self._counts, self._timer = self._counts, Counter(), None

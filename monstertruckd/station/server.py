@@ -449,7 +449,7 @@ class Station:
 
 
 async def _let_go(socket: web.WebSocketResponse, transport: asyncio.Transport | None, code: int) -> None:
-    """Close a browser's WebSocket; one that reads nothing is cut off, as it would hold up its closing for ever."""
+    """Close a browser's WebSocket; one that reads nothing is cut off, as it would hold up its closing forever."""
     try:
         async with asyncio.timeout(END):
             await socket.close(code=code)

@@ -50,7 +50,7 @@ class Viewer:
         self._ordered.clear()
 
     def forget_states(self) -> None:
-        """Drop what waits of a robot's state: it began anew."""
+        """Drop what waits of a robot's state: it started again."""
         self._newest.clear()
         self._tiles.clear()
 

@@ -24,7 +24,7 @@ PLAUSIBLE: Final = 1.0
 UNSURE: Final = 5.0
 """Seconds without a plausible force after which the tilt is not known."""
 GAP: Final = 0.5
-"""Seconds without a measurement after which it begins anew."""
+"""Seconds without a measurement after which it starts again."""
 STEEPEST: Final = 0.7
 """Share of the vertical along the body's z axis below which it is no tilt of a robot that drives."""
 

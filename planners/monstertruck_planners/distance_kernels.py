@@ -142,7 +142,7 @@ def update_distances(
         changed: the box.
 
     Returns:
-        The box in which distances were computed anew.
+        The box in which distances were computed again.
     """
     rows, columns = occupied.shape
     reach = 8

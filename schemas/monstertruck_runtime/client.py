@@ -79,7 +79,7 @@ def in_network_thread(take: Callable[[zenoh.Sample], object]) -> "handlers.Callb
     """Handler that calls ``take`` in the thread that reads the network; zenoh-python's own way is one thread further.
 
     While it runs nothing else is read from that link: it must be quick, and must not use the session. The interpreter's
-    state of that thread is kept; made anew for every message, it costs more than the way to another thread.
+    state of that thread is kept; made again for every message, it costs more than the way to another thread.
     """
     kept = threading.local()
 
@@ -458,12 +458,12 @@ class TruckClient(Operator):
     async def mission(
         self, order: MissionOrder, mission: Mission | None = None, *, moved: bool = False
     ) -> dict[str, Any]:
-        """Start a mission, go on with one, or end it; answers with its ``number``. Progress is on ``plan/mission``.
+        """Start a mission, resume one, or end it; answers with its ``number``. Progress is on ``plan/mission``.
 
         Args:
             order: what.
             mission: to be started.
-            moved: go on with it although the robot is not where it was interrupted.
+            moved: resume it although the robot is not where it was interrupted.
 
         Raises:
             RequestRefusedError: why it does not start, or none runs.

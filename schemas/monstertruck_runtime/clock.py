@@ -93,7 +93,7 @@ class WallClock(_LoopClock):
     """CLOCK_MONOTONIC and uvloop, whose timers count its whole milliseconds."""
 
     async def sleep(self, seconds: float) -> None:
-        """Wait at least ``seconds``, and one turn of the loop."""
+        """Wait at least ``seconds``, and one iteration of the event loop."""
         until = self.now() + round(seconds * SECOND)
         if until <= self.now():
             await asyncio.sleep(0)
@@ -182,7 +182,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
             time.sleep(max(0, due - time.monotonic_ns()) / SECOND)
 
     def fire(self) -> None:
-        """Hand the timers that are due to this turn of the loop."""
+        """Hand the timers that are due to this iteration of the event loop."""
         end = self.time() + 1 / SECOND
         while self._timers and self._timers[0].when < end:
             timer = heapq.heappop(self._timers)
@@ -206,7 +206,7 @@ class _Timer(NamedTuple):
 
 
 class _VirtualSelector(selectors.DefaultSelector):
-    """Where asyncio waits, once each turn of a loop: it knows of no timers, so for ever if nothing is ready.
+    """Where asyncio waits, once each iteration of the loop: it has no timers, so without limit if nothing is ready.
 
     The kernel is asked only when another thread has woken the loop, when files other than its wake-up pipe are watched,
     or when there is no timer to jump to.

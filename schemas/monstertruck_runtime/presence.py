@@ -1,4 +1,4 @@
-"""A client that waits for what a robot says later: the robot may restart, or fall silent for ever, meanwhile."""
+"""A client that waits for what a robot says later: the robot may restart, or fall silent forever, meanwhile."""
 
 import asyncio
 from collections.abc import Awaitable

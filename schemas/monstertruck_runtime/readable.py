@@ -8,7 +8,7 @@ from collections.abc import Callable
 def when_readable(fd: int, callback: Callable[[], object]) -> None:
     """Have the loop call back, and leave the mode of ``fd`` alone.
 
-    uvloop makes it non-blocking, for ever, and with it the screen and whatever else shares the open terminal.
+    uvloop makes it non-blocking, forever, and with it the screen and whatever else shares the open terminal.
 
     Raises:
         PermissionError: it is a file.

@@ -27,7 +27,7 @@ def number_of(file: Path) -> int | None:
 
 
 def require_file(path: Path, most: int | None = None) -> None:
-    """Refuse what would take for ever, or too much memory, to read.
+    """Refuse what would take forever, or too much memory, to read.
 
     Args:
         path: to be read.

@@ -97,7 +97,7 @@ def own_source(owner: str | None = None, program: str = "") -> str:
 
     Args:
         owner: common name of the certificate, which is kept whole.
-        program: distinguishes several of one process. If the name is too long, the host is cut first, then the beginning
+        program: distinguishes several of one process. A long name loses the end of the host first, then the beginning
             of the program.
     """
     end = f"{os.getpid()}{'-' * bool(program)}{program}"

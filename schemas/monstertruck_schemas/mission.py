@@ -11,7 +11,7 @@ Seconds = Annotated[float, Field(gt=0, le=86_400)]
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,31}$")]
 
 Policy = Literal["abort", "continue", "return"]
-"""After a step that failed: end the mission; go on with the next step; drive back to where it began, and end."""
+"""After a step that failed: end the mission; continue with the next step; drive back to where it began, and end."""
 
 
 class MissionStep(Schema):

@@ -196,7 +196,7 @@ class MissionState(Message):
     """Who asked for it."""
     running: bool = False
     resumable: bool = False
-    """It was interrupted, and can be gone on with."""
+    """It was interrupted, and can be resumed."""
     step: Annotated[int, Field(ge=0)] = 0
     """The present one, counted from 1; 0 = none."""
     steps: Annotated[int, Field(ge=0)] = 0
@@ -211,7 +211,7 @@ class MissionState(Message):
     text: str = ""
     """The outcome in words."""
     elapsed: Annotated[float, Field(ge=0)] = 0.0
-    """Seconds since it was started or gone on with."""
+    """Seconds since it was started or resumed."""
 
 
 class StabiliserCommand(Message):

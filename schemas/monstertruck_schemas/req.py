@@ -195,7 +195,7 @@ class GoalOrder(StrEnum):
 
 
 class GoalControl(Request):
-    """Interrupt, go on with or give up the present goal."""
+    """Interrupt, resume or give up the present goal."""
 
     order: GoalOrder
 
@@ -245,13 +245,13 @@ class MissionOrder(StrEnum):
 
 
 class MissionRequest(Request):
-    """Start a mission, go on with one that was interrupted, or end the one that runs."""
+    """Start a mission, resume one that was interrupted, or end the one that runs."""
 
     order: MissionOrder
     mission: Mission | None = None
     """Of a start."""
     moved: bool = False
-    """It is gone on with although the robot is not where it was interrupted: its pose is right"""
+    """It is resumed although the robot is not where it was interrupted: its pose is right"""
 
 
 class PathRequest(Request):

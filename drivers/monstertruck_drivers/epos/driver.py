@@ -280,7 +280,7 @@ class _DriveSession:
             raise
 
     async def _check_mark(self, attempts: int = 1) -> None:
-        """Notice a controller that restarted, by the mark that it lost, and mark it anew.
+        """Notice a controller that restarted, by the mark that it lost, and mark it again.
 
         Args:
             attempts: of each exchange.

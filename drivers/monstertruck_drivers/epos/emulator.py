@@ -197,7 +197,7 @@ class EposEmulator:
     # The line
 
     async def run(self, end: DeviceEnd) -> None:
-        """Serve for ever."""
+        """Serve until cancelled."""
         watch = asyncio.create_task(self._watch())
         try:
             while True:

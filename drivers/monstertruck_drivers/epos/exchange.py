@@ -245,7 +245,7 @@ class Exchanger:
         return self._clock.now() + int(silence * SECOND)
 
     def _is_quick(self) -> bool:
-        """Whether an answer that was waited for in vain is lost, not late as on a slow link."""
+        """Whether an answer that did not come in time is lost, not late as on a slow link."""
         return len(self.durations) == RECENT and max(self.durations) <= QUICK_ANSWER * SECOND
 
     def _run_row(self, entries: Sequence[ObjectEntry], take: Callable[[int], bool]) -> Steps[None]:

@@ -155,7 +155,7 @@ class ClockMap:
         return min(sample + self.drift * (self._elapsed - elapsed) for elapsed, sample in samples)
 
     def _restart(self, waited: int, arrival: int) -> None:
-        """The counter began anew: by the latency found so far."""
+        """The counter started again: by the latency found so far."""
         self._keep_latency()
         self._elapsed += waited
         self._newest.clear()
@@ -206,7 +206,7 @@ class Drift:
         self.rate = min(max(rate, -GREATEST_DRIFT), GREATEST_DRIFT)
 
     def forget(self) -> None:
-        """The samples begin anew; the rate stays."""
+        """The samples start again; the rate stays."""
         self._blocks.clear()
         self._block = []
 

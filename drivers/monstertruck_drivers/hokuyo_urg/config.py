@@ -22,9 +22,9 @@ class HokuyoConfig(Schema):
     skip: Annotated[int, Field(ge=0, le=9)] = 0
     """Revolutions left out between two scans."""
     max_bad_scans: Annotated[int, Field(ge=0)] = 5
-    """Damaged scans in a row that are tolerated before the session starts anew."""
+    """Damaged scans in a row that are tolerated before the session restarts."""
     stale_periods: Annotated[float, Field(gt=1)] = 5.0
-    """Scan intervals without a good scan before the session starts anew."""
+    """Scan intervals without a good scan before the session restarts."""
     first_scan_periods: Annotated[float, Field(gt=1)] = 16.0
     """Scan intervals allowed for the first scan after starting."""
     line_timeout: Annotated[float, Field(gt=0)] = 0.14

@@ -53,7 +53,7 @@ GREATEST_2CHAR = 4.095
 TOO_LATE = 0.3
 """Seconds by which scans arrive later than at the start, from which on they are worth little."""
 LATE_FOR = 3.0
-"""Seconds of such scans after which the session starts anew, and with it the comparison of the clocks."""
+"""Seconds of such scans after which the session restarts, and with it the comparison of the clocks."""
 SLEW_PERIOD = 60.0
 """Least seconds between two reports of clocks that run apart."""
 LISTEN = 0.05

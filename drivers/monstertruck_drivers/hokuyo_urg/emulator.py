@@ -1,6 +1,6 @@
 """The device side of a URG-04LX, byte for byte: power-up state, both dialects, streaming, time, faults.
 
-Three tasks run for ever: one reads request lines, one answers them a little later, and one is the rotor,
+Three tasks run forever: one reads request lines, one answers them a little later, and one is the rotor,
 which turns on a 100 ms grid of the sensor's own clock whether or not anybody listens. A stream, once asked
 for, goes on until QT, RS, its count or the supply ends it; a host that dies changes nothing.
 
@@ -212,7 +212,7 @@ class HokuyoEmulator:
     # Emulator protocol
 
     async def run(self, end: DeviceEnd) -> None:
-        """Serve for ever."""
+        """Serve until cancelled."""
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(self._listen(end), name=f"{self.name} requests")
             tasks.create_task(self._serve(end), name=f"{self.name} answers")

@@ -112,7 +112,7 @@ class LinkQualityDriver:
         self._before: tuple[int, Sample] | None = None
 
     async def run(self, ready: Ready) -> None:
-        """Look for ever; nothing the kernel says or leaves unsaid ends the session."""
+        """Look until cancelled; nothing the kernel says or leaves unsaid ends the session."""
         schedule = Schedule(self._clock, self._config.rate, IN_THREADS)
         while True:
             await schedule.next()
@@ -160,6 +160,6 @@ class LinkQualityDriver:
             return None, None
         then, before = self._before
         if before.name != sample.name or sample.received < before.received or sample.sent < before.sent:
-            return None, None  # another interface, or its counters began anew
+            return None, None  # another interface, or its counters started again
         seconds = (stamp - then) / SECOND
         return (sample.received - before.received) / seconds, (sample.sent - before.sent) / seconds

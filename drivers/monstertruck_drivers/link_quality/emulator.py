@@ -24,7 +24,7 @@ class NetworkEmulator:
 
     Faults (``inject``): ``signal DBM`` (instead of the source), ``style normal|no_dot|unsigned|header|missing`` (how
     /proc/net/wireless is printed), ``wifi on|off``, ``cable on|off``, ``remove`` (the Wi-Fi stick is unplugged),
-    ``plug``, ``reset`` (counters begin anew).
+    ``plug``, ``reset`` (counters start again).
 
     Args:
         root: folder that stands for /.

@@ -38,7 +38,7 @@ class Os4000Session:
         """Sentences that became complete with the next bytes.
 
         Args:
-            within: seconds to wait for the bytes; None = for ever.
+            within: seconds to wait for the bytes; None = no limit.
 
         Raises:
             DeviceLostError: unplugged.

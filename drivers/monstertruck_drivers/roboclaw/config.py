@@ -28,7 +28,7 @@ class RoboclawConfig(Schema):
     answer_timeout: Annotated[float, Field(gt=0, le=0.2)] = 0.03
     """Seconds in which an answer must come"""
     max_rate: Annotated[float, Field(gt=0, le=1000)] = 10.0
-    """Of a wheel, rad/s; counts that would need more mean that the unit counts anew"""
+    """Of a wheel, rad/s; counts that would need more mean that the unit restarts at 0"""
 
     @property
     def count(self) -> float:

@@ -52,7 +52,7 @@ class RoboclawDriver:
 
         Raises:
             DeviceLostError: unplugged.
-            DeviceRestartedError: the unit counts anew.
+            DeviceRestartedError: the unit restarts at 0.
             DeviceTimeoutError, ProtocolError: no usable answers.
             WrongDeviceError: something else answers.
             PortBusyError: another process holds the port.

@@ -86,7 +86,7 @@ class RoboclawEmulator:
                 )
 
     async def run(self, end: DeviceEnd) -> None:
-        """Answer for ever."""
+        """Answer until cancelled."""
         end.on_plug = self._plugged
         buffer, last = b"", 0
         while True:

@@ -65,7 +65,7 @@ class Srf08Emulator:
     """A USB-ISS with one SRF08 for each sonar of the settings.
 
     Faults (`inject`): ``silent on|off`` (the USB-ISS), ``dead NAME on|off`` (off the bus), ``stuck NAME on|off`` (the
-    same flight time for ever), ``ghost NAME METRES|off`` (an echo that is not there), ``brownout NAME`` (loses gain and
+    same flight time forever), ``ghost NAME METRES|off`` (an echo that is not there), ``brownout NAME`` (loses gain and
     range), ``extra`` (a byte that nobody asked for).
 
     Args:
@@ -90,7 +90,7 @@ class Srf08Emulator:
         self._end: DeviceEnd | None = None
 
     async def run(self, end: DeviceEnd) -> None:
-        """Answer for ever."""
+        """Answer until cancelled."""
         self._end = end
         end.on_plug = self._plugged
         buffer, last = b"", 0

@@ -126,7 +126,7 @@ class StepperEmulator:
             ) from error
 
     async def run(self, end: DeviceEnd) -> None:
-        """Serve for ever."""
+        """Serve until cancelled."""
         async with asyncio.TaskGroup() as group:
             group.create_task(self._watch())
             while True:

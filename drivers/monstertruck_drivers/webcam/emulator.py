@@ -100,7 +100,7 @@ class WebcamEmulator:
         self._wanted.clear()
 
     async def run(self, end: DeviceEnd) -> None:
-        """Serve for ever."""
+        """Serve until cancelled."""
         end.on_plug = lambda _: self.power_cycle()
         async with asyncio.TaskGroup() as group:
             group.create_task(self._listen(end))

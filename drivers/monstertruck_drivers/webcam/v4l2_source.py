@@ -165,7 +165,7 @@ class V4l2Stream:
         try:
             frame = self._camera.take()
         except DeviceError as error:
-            # The node stays readable for ever now.
+            # The node stays readable forever now.
             self._loop.remove_reader(self._camera.fd)
             self._error = error
             self._news.set()

@@ -126,8 +126,8 @@ class BatteryWizard:
     def scale(self, readings: list[MeterReading]) -> tuple[Interval, Interval]:
         """Gain and offset, by least squares.
 
-        The meter's share errs the same way at every reading, its digits anew. Errors of which only the greatest is
-        known are taken as even up to it.
+        The meter's proportional error has the same sign at every reading, that of its digits is independent. Errors of
+        which only the bound is known are taken as uniform within it.
 
         Raises:
             InputError: no line passes every reading within its bounds.

@@ -50,7 +50,7 @@ SILENT: Final = (
 )
 """What to do about measurements or ticks that came too late."""
 REPEATS: Final = 2
-"""Times that a move begins anew after a stop that passed."""
+"""Times that a move starts again after a stop that passed."""
 UNMOVED: Final = 0.01
 """Way, m, up to which a truck still stands where its move began."""
 ADVICE: Final = {

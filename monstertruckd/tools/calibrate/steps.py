@@ -160,7 +160,7 @@ class MoveStep:
     also: tuple[Topic[Any], ...] = ()
     """Topics that are recorded besides"""
     marked: bool = False
-    """The operator measures from where it begins, so that it cannot begin anew once the truck has moved"""
+    """The operator measures from where it begins, so that it cannot start again once the truck has moved"""
 
     def back(self, way: float) -> "MoveStep":
         """Back over the first ``way`` m of it, m; of a weaving move straight back."""

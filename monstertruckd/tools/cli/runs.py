@@ -50,7 +50,7 @@ class MissionClient(Operator, Protocol):
     async def mission(
         self, order: MissionOrder, mission: Mission | None = None, *, moved: bool = False
     ) -> dict[str, Any]:
-        """Start, go on with or end one."""
+        """Start, resume or end one."""
         ...
 
 
@@ -125,7 +125,7 @@ async def run_mission(
 
     Args:
         client: of the robot.
-        mission: None = go on with the interrupted one.
+        mission: None = resume the interrupted one.
         arm: arm the robot first.
         moved: see ``TruckClient.mission``.
         report: gets a line for each step.

@@ -366,7 +366,7 @@ class _Ramp:
     def __init__(self, accelerations: Iterable[float]) -> None:
         self._accelerations = tuple(accelerations)
         self._newest: list[tuple[float, int] | None] = [None] * len(self._accelerations)
-        """Greatest speed that the ramp allows the bytes to ask for, m/s, and when it did, ns; None = it begins anew."""
+        """Greatest speed that the ramp allows the bytes to command, m/s, and its time, ns; None = it starts again."""
 
     def __call__(self, seen: Observation) -> Broken:
         for instant, shaft, speed in seen.targets:

@@ -1,4 +1,4 @@
-"""Puts a plan into a system, or takes it out; what is already so is left alone."""
+"""Puts a plan into a system, or takes it out; what is already so is skipped."""
 
 import os
 import shlex

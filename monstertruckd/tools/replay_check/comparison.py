@@ -191,7 +191,7 @@ class _TopicOutput:
 
 @dataclass(slots=True)
 class TopicComparison:
-    """Of one topic. The n-th recorded output is held against the n-th of the replay.
+    """Of one topic. The n-th recorded output is compared with the n-th of the replay.
 
     Args:
         topic: its row of the table.

@@ -5,7 +5,7 @@
     authority.pem authority.key     certifies the router and nothing else; the key stays here
     router/                         to the router: zenoh.json5, its certificate and key, whom it lets in
 
-Robots and stations trust the router's authority from then on: their folders are written anew.
+Robots and stations trust the router's authority from then on: their folders are written again.
 """
 
 import json

@@ -65,7 +65,7 @@ class StandRun:
 
     Args:
         tracker: of robots and cameras.
-        streams: pictures by camera; each call begins anew.
+        streams: pictures by camera; each call starts again.
         rate: pictures a second.
         clock: stamps a picture when it was read.
         put: gets every pose.

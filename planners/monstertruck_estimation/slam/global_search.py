@@ -48,7 +48,7 @@ CONFIRM_TOLERANCE: Final = (0.3, 0.1)
 BASELINE: Final = (0.8, 3.0)
 """Way between two looks that makes a place certain, m: if both found it unique, and if not."""
 BROKEN: Final = frozenset({MappingEvent.APART, MappingEvent.PRUNED})
-"""After these events keyframes of the local map are elsewhere, or have other numbers: it begins anew."""
+"""After these events keyframes of the local map are elsewhere, or have other numbers: it starts again."""
 OUTSIDE_AFTER: Final = 10 * SECOND
 """Time after which a robot that no search has found on the map is outside it, ns."""
 

@@ -131,7 +131,7 @@ def _cost(squares: Array, loop: NDArray[np.bool_], switch: float) -> float:
 
 
 class _Pattern:
-    """The sparse normal equations of one set of edges: ordered once for little fill, assembled anew for every step."""
+    """The sparse normal equations of one set of edges: ordered once for little fill, assembled again for every step."""
 
     def __init__(self, edges: Edges, count: int, fixed: Index) -> None:
         self._count = count

@@ -334,7 +334,7 @@ class ScanOdometry:
         return ScanIncrement(since, (x, y, yaw), tuple(covariance.ravel().tolist()))
 
     def forget(self) -> None:
-        """Start anew: the next match has no predecessor."""
+        """Start again: the next match has no predecessor."""
         self._last, self._least = None, LOW_OVERLAP
 
 

@@ -136,7 +136,7 @@ def exceeds(off: tuple[float, float], limits: tuple[float, float]) -> bool:
 
 
 NEAR: Final = 6
-"""Keyframes that a scan is held against."""
+"""Keyframes that a scan is compared with."""
 
 
 def contradicts(keyframes: KeyframeMap, scan: Scan, pose: Array, most: float = CONTRADICTION) -> bool:
@@ -315,7 +315,7 @@ class Relocation:
         return compose(keyframes.poses[part], between(origin, peak.pose))
 
     def _submap(self, keyframes: KeyframeMap, part: int) -> Pieces[tuple[Array, Submap]]:
-        """The keyframes of ``part``, merged anew when there are more of them, and where its first one was then."""
+        """The keyframes of ``part``, merged again when there are more of them, and where its first one was then."""
         numbers = np.flatnonzero(keyframes.part == part)
         known = self._submaps.get(part)
         if known is None or known[0] != len(numbers):

@@ -6,8 +6,8 @@ car the middle of its rear axle.
 
 Before it sets off the robot creeps, so that its wheels are steered to the move. Then the profile says how far it should
 be, by a clock that stands while the robot is further behind than it drives in 0.3 s: because the gate slows it, or the
-motors do. ``ramp`` has no clock: its cubic ramps are computed anew from the present speed and acceleration, and the one
-to standstill covers the way that is left.
+motors do. ``ramp`` has no clock: its cubic ramps are computed from the present speed and acceleration, and the one to
+standstill covers the remaining distance.
 """
 
 import math

@@ -11,8 +11,8 @@ u = R^T z = (-sin p, sin r cos p, cos r cos p). With M z = (sin a cos b, -sin b,
 For tilt about one axis the joint is the opposite angle. For both, a heading of second order remains (4 degrees at
 15 and 15): who uses the scan takes it from the joint angles.
 
-**Prediction.** A compass reading is old when it comes, and a joint is late on its goal. Held against a body that
-rocks by 15 degrees at 0.5 Hz, each 10 ms of that cost up to half a degree. So the tilt is followed by a filter of
+**Prediction.** A compass reading is old when it comes, and a joint reaches its goal late. While the body rocks by 15
+degrees at 0.5 Hz, each 10 ms of that costs up to half a degree. So the tilt is followed by a filter of
 constant acceleration (the fading-memory polynomial filter of second degree, also called critically damped g-h-k; see
 Brookner, "Tracking and Kalman Filtering Made Easy") and predicted to the instant when the joints will be there.
 
@@ -139,7 +139,7 @@ class TiltFilter:
         """Mean squares of what the filters predicted over that many readings, rad^2."""
 
     def observe(self, attitude: Attitude, body: BodyAcceleration | None = None) -> None:
-        """Take a reading; invalid and older ones are passed over, after a gap it starts anew.
+        """Take a reading; invalid and older ones are passed over, after a gap it starts again.
 
         Args:
             attitude: reading.

@@ -54,7 +54,7 @@ WORTH: Final = 0.6
 LEAST: Final = 0.06
 """New area that makes a place worth going to, m^2."""
 BANNED: Final = 0.5
-"""Frontiers whose centre is this near to a banned place are left alone, m."""
+"""Frontiers whose centre is this near to a banned place are skipped, m."""
 AVOIDED: Final = 0.25
 """Metres round an avoided place from where nothing is looked at."""
 NEARBY: Final = 0.6

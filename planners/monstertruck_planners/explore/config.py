@@ -25,7 +25,7 @@ class ExplorerConfig(Schema):
     rate: Annotated[float, Field(gt=0, le=5)] = 1.0
     """Decisions a second"""
     blacklist: Positive = 60.0
-    """Seconds for which a place is left alone that could not be reached, or from which nothing new was seen"""
+    """Seconds for which a place is skipped that could not be reached, or from which nothing new was seen"""
     attempts: Annotated[int, Field(ge=1)] = 3
     """How often a place is tried before it is given up for good"""
     lost: Positive = 60.0

@@ -60,7 +60,7 @@ class ExploreTask:
     pursued: float = 0.0
     """For how long, s."""
     banned: tuple[Point, ...] = ()
-    """Frontiers here are left alone."""
+    """Frontiers here are skipped."""
     avoided: tuple[Point, ...] = ()
     """Nothing is looked at from here: these places could not be reached."""
     home: Pose | None = None
@@ -94,7 +94,7 @@ class ExploreAnswer:
     frontiers: int = 0
     """Frontiers that can be reached."""
     banned: int = 0
-    """Others that are left alone for now."""
+    """Others that are skipped for now."""
     known: float = 0.0
     """Area of the free ground in the map, m^2."""
     home: float | None = None

@@ -30,7 +30,7 @@ WORTH: Final = 1.5
 COMPARED: Final = 60
 """Faces for which a place is looked for, spread over all."""
 NEAR_BANNED: Final = 0.3
-"""A face this near to a banned place is left alone, m."""
+"""A face this near to a banned place is skipped, m."""
 
 
 @dataclass(frozen=True)

@@ -322,7 +322,7 @@ class ExplorerService:
         self._deciding = self._tasks.create_task(self._ask(task))
 
     async def _ask(self, task: ExploreTask) -> ExploreAnswer:
-        """The worker's answer; of one that failed and begins anew: none."""
+        """The worker's answer; of one that failed and starts again: none."""
         assert self._actor is not None
         try:
             answer: ExploreAnswer = await self._actor.step(task)

@@ -68,7 +68,7 @@ class PlannerConfig(Schema):
     map: Path | None = None
     """map_server YAML file to plan on where there is no slam"""
     local_planner: AnyLocalPlanner | None = None
-    """What leads the truck round things that stand on its route; null = the route is planned anew"""
+    """What leads the truck round things that stand on its route; null = the route is planned again"""
     local: LocalConfig = LocalConfig()
     rate: Annotated[float, Field(ge=1, le=20)] = 10.0
     """Decisions per second."""
@@ -99,7 +99,7 @@ class PlannerConfig(Schema):
     wait: Positive = 5.0
     """Seconds of the behaviour "wait"."""
     recovered: Positive = 0.5
-    """Metres nearer to the goal along the route than ever before, after which the recovery behaviours begin anew"""
+    """Metres nearer to the goal along the route than ever before, after which the recovery behaviours start again"""
     routes: Annotated[int, Field(ge=1)] = 30
     """Routes for one goal at most."""
     max_tilt: Annotated[float, Field(gt=0, le=1.5)] = 0.1

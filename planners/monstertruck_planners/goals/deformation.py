@@ -101,7 +101,7 @@ class RouteDeformation:
                     report(was, answer)
 
     async def _started(self, actor: Actor) -> None:
-        """Start what deforms; meanwhile routes are driven as they were planned, and planned anew where blocked."""
+        """Start what deforms; meanwhile routes are driven as they were planned, and planned again where blocked."""
         while True:
             try:
                 await actor.start()

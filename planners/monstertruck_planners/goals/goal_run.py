@@ -1,6 +1,6 @@
 """The pursuit of one goal: a pure state machine. Equal observations give equal decisions.
 
-It plans, has the route followed, plans anew when something stands on it or the truck left it, and tries the recovery
+It plans, has the route followed, plans again when something stands on it or the truck left it, and tries the recovery
 behaviours in turn when that does not help. Every decision is reported with its reason.
 """
 
@@ -32,7 +32,7 @@ ENDED: Final = frozenset({Reason.GOAL_REACHED, Reason.GOAL_MISSED})
 """What the tracker says at the end of a path."""
 
 LEFT: Final = frozenset({Reason.PATH_LOST, Reason.CUSP_MISSED})
-"""What it says where it leaves a path, to be planned anew from there."""
+"""What it says where it leaves a path, to be planned again from there."""
 
 SHORTEST: Final = 0.01
 """A route shorter than this is none, m: the truck stands at the goal."""
@@ -258,7 +258,7 @@ def _drive(run: GoalRun, observed: Observations, config: PlannerConfig) -> Step:
 
 
 def _progressed(run: GoalRun, left: float, config: PlannerConfig) -> GoalRun:
-    """What begins anew as the truck makes progress.
+    """What starts again as the truck makes progress.
 
     The recovery behaviours do so only nearer to the goal than when the last one began: driving to and fro between two
     routes that are both blocked is no progress.

@@ -47,7 +47,7 @@ class MissionProgress:
     index: int = 0
     """Of the present step."""
     attempt: int = 0
-    """Times that the present step was tried in vain."""
+    """Times that the present step was tried without success."""
     failures: int = 0
     why: StepEnd = StepEnd(Reason.OK)
     """The last failure."""

@@ -70,9 +70,9 @@ REPORT: Final = SECOND // 2
 CHANGES: Final = ("number", "running", "step", "attempt", "outcome", "resumable")
 """Fields of the report whose change is reported at once."""
 STEP: Final = 0.5
-"""Metres after which it is noted anew where the robot is."""
+"""Metres after which it is noted again where the robot is."""
 MOVED: Final = 1.0
-"""Metres from where it was interrupted at which a robot counts as moved, or its odometry as begun anew."""
+"""Metres from where it was interrupted at which a robot counts as moved, or its odometry as begun again."""
 MOST_BYTES: Final = 1_000_000
 """Of the saved progress."""
 PASSING: Final = frozenset({Reason.PLANNER_STARTING, Reason.NO_MAP, Reason.LEASE_EXPIRED})
@@ -193,7 +193,7 @@ class MissionService:
         self._reported: MissionState | None = None
 
     async def run(self, ready: Ready) -> None:
-        """Serve until cancelled; what runs then can be gone on with after a restart."""
+        """Serve until cancelled; what runs then can be resumed after a restart."""
         self._interrupted = await self._offload(self._load)
         if self._interrupted is not None:
             text = f"{self._interrupted.mission.name} was interrupted at step {self._interrupted.index + 1}"
@@ -251,7 +251,7 @@ class MissionService:
         return self._number
 
     def _drop(self, interrupted: SavedProgress, source: str) -> None:
-        """Forget a mission that nobody wants to go on with."""
+        """Forget a mission that nobody wants to resume."""
         assert self._tasks is not None
         self._interrupted = None
         self._events(Reason.CANCELLED, Severity.INFO, SOURCE, f"{interrupted.mission.name}: given up by {source}")

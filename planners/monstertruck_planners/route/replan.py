@@ -116,7 +116,7 @@ def replan(
     """The rest of the previous route while it is free and leads to the goal, unless a new one is much better.
 
     This hysteresis keeps a truck before an obstacle from changing sides.
-    ``statistics["kept_route"]`` is 1 if it is kept. Only paths are kept; routes that are mere poses are planned anew.
+    ``statistics["kept_route"]`` is 1 if it is kept. Only paths are kept; routes that are mere poses are planned again.
 
     Args:
         planner: of both.

@@ -300,7 +300,7 @@ class WallLine:
     # Walls
 
     def _estimate(self, state: LineState, cone: Cone, *, heard: bool) -> LineState:
-        """Fit lines anew after a round of echoes, as many in a step as ``FITS`` says, the longest waiting first."""
+        """Fit lines again after a round of echoes, as many in a step as ``FITS`` says, the longest waiting first."""
         wanted: tuple[Fit, ...] = ("beside", "right") if state.wall is not None else ("left", "right")
         if state.phase == "turn":
             wanted = ("turned",)
@@ -505,7 +505,7 @@ class WallLine:
         return self._way_left(state, cone) - state.lag[0] - state.v.at(t) * self._config.lead
 
     def _stopping(self, ramp: TimedRamp, left: float, t: float) -> TimedRamp:
-        """A ramp to standstill, computed anew so that it covers what is left, if that is within the limits."""
+        """A ramp to standstill, computed again so that it covers what is left, if that is within the limits."""
         config, speed, change = self._config, ramp.at(t), ramp.acceleration(t)
         if not 0.0 < speed * left < math.inf:  # nothing is heard ahead any more: the ramp that runs stands
             return ramp
