@@ -1,8 +1,8 @@
 """How well a calibration was measured, and until when it counts: grades, validity, and the service that watches both.
 
 What rests on an expired calibration says so (``degraded``): the truck drives on, as nothing has failed. A calibration
-expires by time, by the way driven since, or when the device that was measured is another one (by its serial number,
-where USB states one) or hangs on another port.
+expires by time, by the distance driven since, or when the device that was measured is another one (by its serial
+number, where USB states one) or is on another port.
 """
 
 import itertools

@@ -10,7 +10,7 @@ from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.base import Positive, Schema
 
 STILL: Final = 1e-4
-"""Way of the fastest shaft between two readings, m, up to which the robot stands."""
+"""Distance of the fastest shaft between two readings, m, up to which the robot stands."""
 KEPT: Final = 100
 """Rates that are kept."""
 LONG: Final = 20 * SECOND

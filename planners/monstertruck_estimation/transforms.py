@@ -148,7 +148,7 @@ class FrameTree:
         self._by_child[child] = transform
 
     def lookup(self, parent: str, child: str) -> Transform:
-        """Pose of ``child`` in ``parent``, whatever the way between them.
+        """Pose of ``child`` in ``parent``, over any chain of frames between them.
 
         Raises:
             NotFoundError: no such frame, or nothing connects the two.

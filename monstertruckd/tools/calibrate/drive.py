@@ -232,12 +232,13 @@ def _sign(inverted: bool) -> Estimate:
 
 Part = Literal["start", "stop"]
 LEAST: Final = 8
-"""Positions of a motor from rest to half the way, or from there to rest, that dead time and lag have to rest on."""
+"""Positions of a motor from rest to half the distance, or from there to rest, that dead time and lag have to rest
+on."""
 
 
 @dataclass(frozen=True, slots=True)
 class HalfRun:
-    """A run from rest to the middle of its way, or from there to rest."""
+    """A run from rest to the middle of its distance, or from there to rest."""
 
     speed: Steps
     """Commanded, rad/s of the motor."""

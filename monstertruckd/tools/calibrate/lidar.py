@@ -4,7 +4,7 @@ At two rests the lidar sees the same surroundings; how it moved between them fol
 body moved from wheels and steering. The mount is what makes one of the other: X in A X = X B (Tsai and Lenz, "A New
 Technique for Fully Autonomous and Efficient 3D Robotics Hand/Eye Calibration", IEEE Transactions on Robotics and
 Automation, 1989), here in the plane. The turn is taken from the scans, which measure it best; so neither the compass
-nor an error of the steering counts, only the way, whose scale is fitted too, and the direction of travel.
+nor an error of the steering counts, only the distance, whose scale is fitted too, and the direction of travel.
 
 How level it is follows from the height of its beam over the floor: near the lidar, on a wall ahead and on one to the
 left. The beam is infrared: a telephone's camera shows it.
@@ -57,7 +57,7 @@ SCAN: Final = 0.002
 CRAB: Final = 0.005
 """Standard deviation of the direction of travel on one leg, by tyres, rad."""
 DRIFT: Final = 0.006
-"""Standard deviation of the way of one leg, by slip, as a share."""
+"""Standard deviation of the distance of one leg, by slip, as a share."""
 SCALE: Final = 0.02
 """Standard deviation of the scale of all ways before it is measured."""
 CENTRE: Final = 0.002
@@ -94,7 +94,7 @@ class LidarLeg:
 
         Args:
             record: with scans.
-            chassis: for way and direction.
+            chassis: for distance and direction.
             mount: as believed, for the first guess.
 
         Raises:
@@ -339,7 +339,7 @@ def check_way_round(before: Scan, after: Scan, moved: tuple[float, float], mount
     Args:
         before: scan at the first rest.
         after: and at the second one.
-        moved: way (m) and turn (rad) of the body.
+        moved: distance (m) and turn (rad) of the body.
         mount: as believed.
         overlap: of the scans as they are.
 

@@ -52,7 +52,7 @@ SILENT: Final = (
 REPEATS: Final = 2
 """Times that a move starts again after a stop that passed."""
 UNMOVED: Final = 0.01
-"""Way, m, up to which a truck still stands where its move began."""
+"""Distance, m, up to which a truck still stands where its move began."""
 ADVICE: Final = {
     Reason.LEASE_EXPIRED: LATE,
     Reason.SCAN_STALE: SILENT,
@@ -78,7 +78,7 @@ class Mover:
     Args:
         truck: link to it.
         clock: time.
-        chassis: for the way.
+        chassis: for the distance.
     """
 
     def __init__(self, truck: MovedTruck, clock: Clock, chassis: Chassis) -> None:

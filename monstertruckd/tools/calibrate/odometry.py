@@ -1,4 +1,4 @@
-"""Way, wheelbase and steering offset of dead reckoning, from squares driven both ways.
+"""Distance scale, wheelbase and steering offset of dead reckoning, from squares driven both ways.
 
 After the test of Borenstein and Feng ("Measurement and Correction of Systematic Odometry Errors in Mobile Robots", IEEE
 Transactions on Robotics and Automation, 1996): errors of the offset turn a square driven to the left and one driven to
@@ -34,7 +34,7 @@ ANGLE: Final = 0.35
 PLACE: Final = 0.03
 """Standard deviation of the way back to the mark by what slips on 10 m, m."""
 FLOOR: Final = 0.003
-"""Share by which the way differs on another floor, half a 95 % interval."""
+"""Share by which the distance differs on another floor, half a 95 % interval."""
 LINKAGE: Final = 0.004
 """Share of a turn by which a linkage is off its polynomials, half a 95 % interval."""
 SAME: Final = 0.5
@@ -188,8 +188,8 @@ def _turned(record: MoveRecord, left: float) -> bool:
 class SquareModel:
     """Squares as dead reckoning sees them.
 
-    Parameters: way and wheelbase as shares of the configured ones, offset of the servos (rad), in front to the left and
-    at the rear to the right.
+    Parameters: distance and wheelbase as shares of the configured ones, offset of the servos (rad), in front to the
+    left and at the rear to the right.
 
     Args:
         model: of the truck.
@@ -288,7 +288,7 @@ def check_senses(model: "SquareModel", squares: Sequence[Square]) -> None:
 
 
 def intervals(fit: FitResult, measured: int) -> tuple[Interval, Interval, Interval]:
-    """Of way and wheelbase (shares) and offset (rad), from so many measurements.
+    """Of distance and wheelbase (shares) and offset (rad), from so many measurements.
 
     Raises:
         InputError: they are off by more than a fit may find.

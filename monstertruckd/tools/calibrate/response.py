@@ -1,7 +1,7 @@
 """Dead time and lag of what follows commands that are piecewise constant, from what they brought about.
 
 ``s`` seconds after the dead time a change of the command by ``k`` has added ``k (s - lag (1 - exp(-s / lag)))`` to its
-integral over time, which a sensor sees: turns of the truck by the steering, way by the drive. Fitted are the delay
+integral over time, which a sensor sees: turns of the truck by the steering, distance by the drive. Fitted are the delay
 (dead time and lag together) and the square of the lag: the delay is all that slow commands show, and the lag shows by
 its square in how they are rounded off.
 """

@@ -36,7 +36,7 @@ REST: Final = 1.5
 LEAST: Final = 5
 """Poses at each end, at least."""
 SLIDING: Final = 0.004
-"""Share of the way by which a body that skids differs from its model, along and across; and of its turn."""
+"""Share of the distance by which a body that skids differs from its model, along and across; and of its turn."""
 FLOOR: Final = 0.0005
 """Least standard deviation of a position at rest, m."""
 AIM: Final = 0.001

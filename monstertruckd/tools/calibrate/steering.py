@@ -1,7 +1,7 @@
 """Centre, direction, travel and pulse map of both steering servos.
 
-Hobby servos report nothing, so the truck itself is the instrument: the compass sees it turn, the drive counts its way,
-and a string on the floor shows what neither sees, the crabbing of two axles that are off by the same angle.
+Hobby servos report nothing, so the truck itself is the instrument: the compass sees it turn, the drive measures its
+distance, and a string on the floor shows what neither sees, the crabbing of two axles that are off by the same angle.
 """
 
 import math
@@ -26,13 +26,13 @@ from monstertruckd.tools.calibrate.wizard import CLEAR, WizardContext
 ROOM: Final = "2.5 m x 2.5 m, level, the truck in the middle; with --rough 1.5 m x 1.5 m"
 
 ROUGH: Final = (0.06, 0.1, 0.4)
-"""Speed (m/s), axle angle (rad) and way (m) of the first arcs: too little turn for the gate to call the steering dead,
-should it go the wrong way."""
+"""Speed (m/s), axle angle (rad) and distance (m) of the first arcs: too little turn for the gate to call the steering
+dead, should it go the wrong way."""
 ARC: Final = (0.12, 0.18, 1.0)
 FULL: Final = 0.12
 """Speed of full circles."""
 TRAVEL: Final = (0.1, 0.6)
-"""Speed and way of arcs with the wheels as far over as the gate lets them."""
+"""Speed and length of arcs with the wheels as far over as the gate lets them."""
 STRAIGHT: Final = (0.12, 2.0)
 APPROACH: Final = 0.2
 
@@ -47,7 +47,7 @@ UNSCALED: Final = 0.5
 WHEELBASE: Final = 0.003
 """Share by which a taped wheelbase may be wrong."""
 WAY: Final = 0.02
-"""Share by which the way may be wrong while the drive is not calibrated."""
+"""Share by which the distance may be wrong while the drive is not calibrated."""
 SHORT: Final = math.radians(2.0)
 """Servo angle, rad, that has to be missing before a stop is assumed; circles keep as far from the ends."""
 MARGIN: Final = 1.0
@@ -438,7 +438,7 @@ def _deficits(maps: Maps, halves: Array, samples: int, band: str) -> list[Estima
 
 
 def _way_error(context: WizardContext) -> float:
-    """Share by which the counted way may be wrong."""
+    """Share by which the counted distance may be wrong."""
     drive = context.known.get("drive")
     ratio = None if drive is None else drive.estimate("turns_per_metre")
     if ratio is None or ratio.low is None or ratio.high is None:

@@ -168,7 +168,7 @@ class SteeringModel:
         return turns, np.add.reduceat(forward * np.sin(heading) + sideways * np.cos(heading), starts)
 
     def way(self, leg: SteeringRun) -> float:
-        """Way rolled on a leg, m."""
+        """Distance rolled on a leg, m."""
         return float(np.abs(self.chassis.drivetrain.distance(leg.motor)).sum())
 
     def fit(self, legs: Sequence[SteeringRun], start: Maps, gain: float = GAIN) -> FitResult:

@@ -52,7 +52,7 @@ class MoveRecord:
         return [m for m in found if m.stamp < self.left], [m for m in found if m.stamp > self.arrived]
 
     def way(self, drivetrain: DriveTrain) -> float:
-        """Way rolled by the wheels, m, by the drive's count; negative backwards."""
+        """Distance rolled by the wheels, m, by the drive's count; negative backwards."""
         if len(self.drive) < 2:
             return 0.0
         return float(drivetrain.distance(self.drive[-1].position - self.drive[0].position))
@@ -148,7 +148,7 @@ class MoveStep:
     rear: float = 0.0
     """Axle angles, rad, left positive"""
     metres: float = 1.0
-    """Way by the drive's own count, at most"""
+    """Distance by the drive's own count, at most"""
     rest: float = 1.0
     """Seconds of standing still at each end"""
     approach: float = 0.0
@@ -156,7 +156,7 @@ class MoveStep:
     weave: tuple[float, ...] = ()
     """Seconds after which the axle angles change their sign while it drives, in turn, again and again; none: never"""
     done: Callable[[MoveRecord], bool] | None = None
-    """Ends the way earlier"""
+    """Ends the move earlier"""
     also: tuple[Topic[Any], ...] = ()
     """Topics that are recorded besides"""
     marked: bool = False

@@ -159,7 +159,7 @@ def odometry(
         float, typer.Option(min=0.5, max=50, help="Standard error of the string's direction, mm per m.")
     ] = 3.5,
 ) -> "Wizard":
-    """Way, wheelbase and steering offset of dead reckoning: squares driven to both sides.
+    """Distance scale, wheelbase and steering offset of dead reckoning: squares driven to both sides.
 
     Asks `clear` and, for each square, `mark`, `side` (m), `ahead` and `left` (cm).
     """

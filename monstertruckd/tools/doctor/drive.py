@@ -113,7 +113,7 @@ def movement(record: MoveRecord, chassis: TruckChassis, lidar: Array | None) -> 
 
 
 def by_wheels(record: MoveRecord, chassis: TruckChassis) -> tuple[float, float]:
-    """Way, m, and turn, rad, by motor and steering."""
+    """Distance, m, and turn, rad, by motor and steering."""
     motor, front, rear = record.steps()
     way = turn = 0.0
     for step, servos in zip(motor.tolist(), zip(front.tolist(), rear.tolist(), strict=True), strict=True):

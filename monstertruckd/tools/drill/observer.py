@@ -594,7 +594,7 @@ class _Ahead:
             yield "braking", f"{truth.v:.3f} m/s with something on its way in {room:.3f} m"
 
     def _room(self, curvature: float, ahead: Array, aside: Array) -> float:
-        """Way along the present arc to the first of these points, m."""
+        """Distance along the present arc to the first of these points, m."""
         turn = ROOM * curvature
         at_x, at_y = ROOM * np.sinc(turn / math.pi), ROOM * np.sinc(turn / 2 / math.pi) * np.sin(turn / 2)
         dx, dy = ahead - at_x[:, None], aside - at_y[:, None]

@@ -95,7 +95,7 @@ class HeadingInnovation:
 
 
 LEVEL_WAY: Final = 1.0
-"""Way, m, and turn, rad, over which reckoning drifts less than a jump."""
+"""Distance, m, and turn, rad, over which reckoning drifts less than a jump."""
 
 
 def gate_heading(
@@ -133,8 +133,8 @@ def gate_heading(
 def _jumped(gate: CompassGate, innovation: HeadingInnovation) -> CompassGate:
     """The gate with a jump that began or ended at this heading.
 
-    It ends when the headings go back by more than half of it on a way on which reckoning does not. Residuals alone do
-    not tell: without headings the yaw soon is so uncertain that a lasting jump might as well be the robot's.
+    It ends when the headings go back by more than half of it over a distance on which reckoning does not. Residuals
+    alone do not tell: without headings the yaw soon is so uncertain that a lasting jump might as well be the robot's.
     """
     if innovation.jump is not None:
         # Where headings were taken back, the disturbance before this one may not have ended yet.

@@ -9,14 +9,15 @@ from monstertruck_estimation.odometry import OdometrySettings
 from monstertruck_schemas.base import NotNegative, Pose2D, Positive, Schema
 
 DEVIATION_SCALE: Final = (2.0, 1.0)
-"""Way, m, and turn, rad, after which the local deviation of the compass is another: iron is in floors and furniture."""
+"""Distance, m, and turn, rad, after which the local deviation of the compass is another: iron is in floors and
+furniture."""
 
 
 class WheelTrust(Schema):
     """What the wheels are worth."""
 
     shaft_noise: Positive = 0.02
-    """Standard deviation of every shaft's way per root metre it rolled, m."""
+    """Standard deviation of every shaft's distance per root metre it rolled, m."""
     angle_noise: NotNegative = 0.01
     """Standard deviation of the mean angle of a steered axle over a metre, rad."""
     slip_noise: tuple[NotNegative, NotNegative, NotNegative] = (0.01, 0.01, 0.03)
@@ -92,7 +93,7 @@ class FusionConfig(OdometrySettings):
     start: Pose2D = Pose2D(x=0.0, y=0.0, yaw=0.0)
     """Pose of base in odom at the start, m and rad."""
     max_speed: Positive = 0.6
-    """A drive position that would need more than this, m/s, is a new origin (the drive restarted), not a way."""
+    """A drive position that would need more than this, m/s, is a new origin (the drive restarted), not a motion."""
     max_turn: Positive = 3.0
     """Scans that would need a greater yaw rate than this, rad/s, or a greater speed, are mismatched"""
     max_prediction: Positive = 0.3

@@ -181,7 +181,7 @@ class SlipDetector:
         self._headings.clear()
 
     def _wheel_motion(self, since: int, stamp: int) -> tuple[Array, Array] | None:
-        """Way of the wheels between two instants and its covariance, (3,) and (3, 3); None if they are not known."""
+        """Motion of the wheels between two instants and its covariance, (3,) and (3, 3); None if it is not known."""
         trail = self._trail
         if len(trail) < 2 or since < trail[0][0] or stamp > trail[-1][0] + AHEAD:
             return None

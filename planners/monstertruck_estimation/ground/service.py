@@ -28,7 +28,7 @@ from monstertruck_schemas.state import Ground, Odometry
 from monstertruck_schemas.topics import FUSION, ODOMETRY
 
 WINDOW: Final = 0.7
-"""Time constant of the roughness, s: about 0.15 m of way."""
+"""Time constant of the roughness, s: about 0.15 m of travel."""
 RATE: Final = 10.0
 """Hz."""
 MOVED: Final = 0.05

@@ -46,7 +46,7 @@ MIN_SEPARATION: Final = 1.0
 CONFIRM_TOLERANCE: Final = (0.3, 0.1)
 """Two searches found the same place if they differ by less, m and rad."""
 BASELINE: Final = (0.8, 3.0)
-"""Way between two looks that makes a place certain, m: if both found it unique, and if not."""
+"""Distance between two looks that makes a place certain, m: if both found it unique, and if not."""
 BROKEN: Final = frozenset({MappingEvent.APART, MappingEvent.PRUNED})
 """After these events keyframes of the local map are elsewhere, or have other numbers: it starts again."""
 OUTSIDE_AFTER: Final = 10 * SECOND
@@ -124,7 +124,7 @@ class GlobalLocaliser:
     def _begin_local_map(self) -> None:
         self._mapper = Mapper(self._config)
         self._ways: list[float] = []
-        """Way driven at every keyframe, m."""
+        """Distance driven at every keyframe, m."""
         self._hypotheses: list[Hypothesis] = []
 
     def _search(self) -> SearchResult | None:

@@ -54,7 +54,8 @@ PARTIAL_CONTRADICTION: Final = 0.15
 FAR: Final = 3.0
 """Standard deviations of the predicted pose from which a match is far from the motion."""
 CHECKED_WAY: Final = (3.0, 9.0)
-"""Way after which the search that confirms a place found ends, and after which it ends without having done so, m."""
+"""Distance after which the search that confirms a place found ends, and after which it ends without having done so,
+m."""
 SAME_PLACE: Final = (0.5, 0.2)
 """Two poses are of the same place if they differ by less, m and rad."""
 
@@ -97,7 +98,7 @@ class LocalisationEstimator:
         self._tracking = start is not None
         """Whether the place is known; with a search under way it is being checked."""
         self._checked = 0.0
-        """Way since the place was found, m."""
+        """Distance since the place was found, m."""
         self._pose = np.array(start or (0.0, 0.0, 0.0))
         self._covariance = np.diag((0.2**2, 0.2**2, 0.1**2))
         """Of the pose as the matches have it: of the window of the next one."""

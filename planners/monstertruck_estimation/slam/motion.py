@@ -32,7 +32,7 @@ MISSING_AFTER: Final = 1.0
 
 
 def velocity(delta: Array, dt: float) -> tuple[float, float, float]:
-    """Velocity in base (vx, vy, wz; m/s, rad/s) that makes the way ``delta``, shape (3,), in ``dt`` s; 0 if dt is."""
+    """Velocity in base (vx, vy, wz; m/s, rad/s) of the motion ``delta``, shape (3,), in ``dt`` s; 0 if dt is."""
     if dt <= 0:
         return 0.0, 0.0, 0.0
     vx, vy, wz = (delta / dt).tolist()
@@ -42,7 +42,7 @@ def velocity(delta: Array, dt: float) -> tuple[float, float, float]:
 COMPARED: Final = (5.0, 2.0)
 """Time (s) and motion (m or rad) over which odometry is compared with the scans."""
 SAMPLE: Final = (0.25, 0.1)
-"""Least length of a step of the comparison, s and motion: the noise of single matches would add up to a way."""
+"""Least length of a step of the comparison, s and motion: the noise of single matches would add up to a distance."""
 FEWEST_SAMPLES: Final = 3
 TOLERANCE: Final = 0.3
 """Tolerated difference of odometry and scans as a share of the distance, or of the turn."""
@@ -146,7 +146,7 @@ def _lengths(motions: Array) -> Array:
 
 
 def _motion(step: Array) -> float:
-    """Way or turn, m or rad, of a step by odometry or the scans: what is most."""
+    """Distance or turn, m or rad, of a step by odometry or the scans: what is most."""
     return float(max(_lengths(step[1:4]).max(), _lengths(step[4:]).max()))
 
 
@@ -175,7 +175,7 @@ class MotionPredictor:
 
     @property
     def factors(self) -> tuple[float, float]:
-        """Factors on the standard deviations of way and turn."""
+        """Factors on the standard deviations of distance and turn."""
         place, turn = np.clip(np.sqrt(self._squares), *NOISE_LIMITS).tolist()
         return place, turn
 
@@ -264,7 +264,7 @@ class MotionPredictor:
             self.check.interrupt(dt)
             return
         by_odometry = self._by_odometry[0]
-        # Along a corridor the match has the way from the prediction: it says nothing of it, but it measures the turn.
+        # Along a corridor the match takes the distance from the prediction; only its turn is measured.
         compared = (*by_odometry[:2], moved[2]) if match.degenerate else moved
         self.check.add(dt, by_odometry, np.array(compared))
         clear = match.degeneracy >= CLEAR_MATCH[0] and match.overlap >= CLEAR_MATCH[1]

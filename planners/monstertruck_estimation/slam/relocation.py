@@ -190,7 +190,7 @@ LAST_KEYS: Final = 12
 
 
 CONFIRMING_WAY: Final = 10.0
-"""Way near keyframes of the other side, m, after which a join that nothing contradicts is confirmed."""
+"""Distance near keyframes of the other side, m, after which a join that nothing contradicts is confirmed."""
 
 
 class JoinChange(StrEnum):
@@ -326,7 +326,7 @@ class Relocation:
 
 
 def _way_along(keyframes: KeyframeMap, own: NDArray[np.intp], others: NDArray[np.intp]) -> float:
-    """Way, m, along those of ``own`` that are near ``others``."""
+    """Distance, m, along those of ``own`` that are near ``others``."""
     off = keyframes.poses[own, None, :2] - keyframes.poses[others, :2]
     met = own[np.hypot(off[..., 0], off[..., 1]).min(axis=1, initial=math.inf) < VIEW]
     return float(np.hypot(*np.diff(keyframes.poses[met, :2], axis=0).T).sum())

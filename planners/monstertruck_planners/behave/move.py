@@ -66,7 +66,7 @@ class MoveConfig(BehaviourConfig):
     radius: float | None = None
     """Of the arc, m, centre on the left positive; 0 = on the spot, null = straight"""
     length: float | None = None
-    """Way, m, backwards negative; null = the angle says it"""
+    """Distance, m, backwards negative; null = the angle says it"""
     angle: float | None = None
     """Turn, rad, counter-clockwise positive; null = the length says it"""
     bearing: Annotated[float, Field(ge=-math.pi, le=math.pi)] = 0.0

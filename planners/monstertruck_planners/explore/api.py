@@ -58,9 +58,9 @@ BANNED: Final = 0.5
 AVOIDED: Final = 0.25
 """Metres round an avoided place from where nothing is looked at."""
 NEARBY: Final = 0.6
-"""A way begins at an open cell this near to the robot, m."""
+"""A path begins at an open cell this near to the robot, m."""
 BEHIND: Final = 4
-"""Coarse cells over which the direction of a way is measured."""
+"""Coarse cells over which the direction of a path is measured."""
 SIDEWARD: Final = 0.4
 """A frontier has to lie this far inside the angle of view, rad."""
 ASIDE: Final = tuple(math.radians(angle) for angle in (0.0, 45.0, -45.0, 90.0, -90.0))
@@ -108,7 +108,7 @@ class Option:
     gain: float
     """New area that may be seen, m^2."""
     turn: float
-    """Angle between the robot's heading and the way's first part, rad, 0 to pi."""
+    """Angle between the robot's heading and the path's first part, rad, 0 to pi."""
 
     @property
     def target(self) -> Viewpoint:
@@ -186,7 +186,7 @@ class ExplorationView:
     # Ways
 
     def way_to(self, place: Point) -> float | None:
-        """Metres from the robot to a place, dearer where it is narrow; None = no way is known."""
+        """Metres from the robot to a place, dearer where it is narrow; None = no path is known."""
         if self._ways is None:
             return None
         at = self._open_cell(self._cell_cost, self._cell, place)
@@ -198,7 +198,7 @@ class ExplorationView:
         return np.asarray(self._route_map.field.free(self.setup.footprint, poses, self.setup.margin), np.bool_)
 
     def ways_between(self, options: list[Option]) -> Array:
-        """Metres from each option's place to each other's, shape (n, n); inf where no way is known."""
+        """Metres from each option's place to each other's, shape (n, n); inf where no path is known."""
         if self._rough is None:
             self._rough = joined_cells(self._cell_cost)
         cell = 2 * self._cell
@@ -374,7 +374,7 @@ class ExplorationView:
         return area
 
     def _heading(self, ways: CostToGo, at: tuple[int, int], bearing: float) -> float:
-        """That of the way to a coarse cell, if a frontier in that direction is in view then; else towards it."""
+        """That of the path to a coarse cell, if a frontier in that direction is in view then; else towards it."""
         before = cell_ahead(ways.step, *at, float(BEHIND))
         if before == at:
             return bearing
@@ -383,7 +383,7 @@ class ExplorationView:
         return arriving if in_view else bearing
 
     def _turn(self, ways: CostToGo, at: tuple[int, int]) -> float:
-        """Angle between the robot's heading and the beginning of the way to a coarse cell, rad."""
+        """Angle between the robot's heading and the beginning of the path to a coarse cell, rad."""
         trail = cells_to_goal(ways.step, *at)
         if len(trail) < 2:
             return 0.0

@@ -33,7 +33,7 @@ class ExplorerConfig(Schema):
     around: bool = True
     """Meanwhile it drives half a metre to and fro, for who stands still sees nothing new"""
     reserve: Annotated[float, Field(ge=1)] = 1.5
-    """It drives home when the charge falls below that of the way back times this"""
+    """The robot drives home when the charge falls below the charge for the path home times this"""
     full_range: Positive = 2000.0
     """Metres that a full battery drives, until that has been measured"""
     latency: Positive = 0.2
@@ -67,7 +67,7 @@ class AuthorConfig(ExplorerConfig):
 
 
 class InformationConfig(ExplorerConfig):
-    """The most new area per second of way."""
+    """The most new area per second of driving."""
 
     kind: Literal["information"] = "information"
     depth: Positive = 1.5
@@ -81,16 +81,16 @@ class InformationConfig(ExplorerConfig):
 
 
 class TourConfig(ExplorerConfig):
-    """The way to a frontier against what it shows, and the short tour over the others after it."""
+    """The path to a frontier against what it shows, and the short tour over the others after it."""
 
     kind: Literal["tour"] = "tour"
     worth: NotNegative = 1.0
-    """Metres of way that are driven for a metre of what is seen: the square root of the new area"""
+    """Metres driven for a metre of new ground, the square root of the new area"""
     turning: NotNegative = 1.0
     """Metres that half a turn at the start of the tour costs"""
     keep: NotNegative = 3.0
     """Metres by which another tour has to be better than one that begins with the present goal"""
     rest: NotNegative = 0.0
-    """Weight of the short tour over the other frontiers, against the way to the first one"""
+    """Weight of the short tour over the other frontiers, against the path to the first one"""
     most: Annotated[int, Field(ge=3, le=60)] = 16
     """Frontiers of a tour at most, the best ones"""

@@ -64,7 +64,7 @@ class ExploreTask:
     avoided: tuple[Point, ...] = ()
     """Nothing is looked at from here: these places could not be reached."""
     home: Pose | None = None
-    """Way there is wanted."""
+    """The path there is wanted."""
     find: bool = False
     """Walls are looked at, too, once no frontier is left."""
 
@@ -98,6 +98,6 @@ class ExploreAnswer:
     known: float = 0.0
     """Area of the free ground in the map, m^2."""
     home: float | None = None
-    """Metres of the way home; None = not asked for, or none is known."""
+    """Metres of the path home; None = not asked for, or none is known."""
     changed: int = 0
     """Cells looked at again for frontiers."""

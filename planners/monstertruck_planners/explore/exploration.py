@@ -31,7 +31,7 @@ BESIDE: Final = 1.0
 SAVE: Final = 30.0
 """Seconds to wait for the map to be saved."""
 AGAIN: Final = 2.0
-"""Seconds from a refused goal to the next one; on the way home twice as many after each failure."""
+"""Seconds from a refused goal to the next one; while driving home twice as many after each failure."""
 STANDS: Final = 5.0
 """Seconds that a lost robot waits before it drives a little."""
 AROUND: Final = ((0.6, 0.0, 0.0), (0.6, 0.25, 0.8), (0.6, -0.25, -0.8))
@@ -189,7 +189,7 @@ class Exploration:
     outcome: Reason = Reason.DRIVING
     text: str = ""
     final: Reason = Reason.DRIVING
-    """The outcome that it comes to after the way home."""
+    """The outcome after driving home."""
     final_text: str = ""
     target: Viewpoint | None = None
     pursued: float = 0.0
@@ -199,7 +199,7 @@ class Exploration:
     waiting: bool = False
     """For its answer."""
     not_before: float = 0.0
-    """No decision, and no goal for the way home, is asked for before, s."""
+    """Time before which no decision and no goal for driving home is requested, s."""
     nothing: int = 0
     """Answers in a row without a place to look at."""
     newest: ExploreAnswer = field(default_factory=ExploreAnswer)
@@ -296,7 +296,7 @@ def _moved(run: Exploration, seen: Observed) -> Exploration:
 
 
 def _merged(before: ExploreAnswer, answer: ExploreAnswer) -> ExploreAnswer:
-    """The newest answer; the way home is remembered where none is found at the moment."""
+    """The newest answer; the path home is kept from before if none is found now."""
     return answer if answer.home is not None else replace(answer, home=before.home)
 
 

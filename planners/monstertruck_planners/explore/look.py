@@ -26,7 +26,7 @@ AWAY: Final = (0.8, 1.0, 0.65)
 ASIDE: Final = (0.0, 0.5, -0.5)
 """And from so far aside, rad."""
 WORTH: Final = 1.5
-"""Metres that a look costs besides its way."""
+"""Metres that a look costs besides its path."""
 COMPARED: Final = 60
 """Faces for which a place is looked for, spread over all."""
 NEAR_BANNED: Final = 0.3

@@ -28,9 +28,9 @@ class Nearest:
 
 
 class Information:
-    """The most new area per second of way.
+    """The most new area per second of driving.
 
-    A goal that is pursued is kept unless another one is much better: what is new there becomes less on the way, as it
+    A goal that is pursued is kept unless another one is much better: what is new there becomes less on the path, as it
     comes into sight, and a robot that turns to whatever is best at each instant leaves a bit of everything behind.
 
     Args:

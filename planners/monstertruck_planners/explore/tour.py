@@ -1,4 +1,4 @@
-"""The explorer that weighs the way to a frontier against what it shows, and the short tour over the others after it."""
+"""The explorer that weighs the path to a frontier against its new area, and the short tour over the others after it."""
 
 import math
 
@@ -11,7 +11,7 @@ from monstertruck_planners.explore.exchange import Viewpoint
 from monstertruck_planners.explore.kernels import short_tour, tour_length
 
 FAR = 1e4
-"""Stands for a way that is not known, m."""
+"""Stands for a path that is not known, m."""
 BEGINNINGS = 6
 """Frontiers that are compared as the first one."""
 

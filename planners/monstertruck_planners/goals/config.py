@@ -91,7 +91,7 @@ class PlannerConfig(Schema):
     progress: Positive = 0.03
     """Metres along the path that are progress."""
     look_ahead: Positive = 1.5
-    """Way ahead that is compared with the newest scan, m."""
+    """Distance ahead that is compared with the newest scan, m."""
     blocked_scans: Annotated[int, Field(ge=1)] = 3
     """Consecutive scans that have to show the path blocked."""
     recovery: Annotated[tuple[Recovery, ...], Field(strict=False)] = ("clear", "back_out", "wait", "replan")

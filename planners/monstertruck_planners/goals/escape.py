@@ -1,9 +1,9 @@
 """Backing out of a tight place, as by car_maneuver_recovery (G. Kouros), with its slips put right.
 
 The rule is its own: of the footprint's four sides those are found that are not free. With both ends blocked there is no
-way out; else the truck drives forward if it can, backward otherwise, steering away from the side that is blocked. Three
-things differ. Speeds follow from the axle angles by the truck's kinematics, where the package's forward speed had
-sqrt(1 / (1 + tan b)) for cos b. A side is the whole side, not three points of it. And the way is checked as a whole.
+path out; else the truck drives forward if it can, backward otherwise, steering away from the side that is blocked.
+Three things differ. Speeds follow from the axle angles by the truck's kinematics, where the package's forward speed had
+sqrt(1 / (1 + tan b)) for cos b. A side is the whole side, not three points of it. And the path is checked as a whole.
 """
 
 from dataclasses import dataclass
@@ -17,9 +17,9 @@ from monstertruck_planners.goals.config import EscapeConfig
 from monstertruck_schemas.plan import Steering
 
 STEP = 0.02
-"""Metres between two poses of the way."""
+"""Metres between two poses of the path."""
 SHORTEST = 0.04
-"""Less than this is no way, m."""
+"""Least length of an escape motion, m."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +39,7 @@ class Sides:
 
 @dataclass(frozen=True)
 class Escape:
-    """A way out."""
+    """An escape motion."""
 
     poses: Array
     """Shape (n, 3): of the base, in the frame of the truck at its start."""
@@ -64,7 +64,7 @@ def blocked_sides(footprint: Footprint, points: Array, room: float) -> Sides:
 def escape(
     config: EscapeConfig, geometry: FourWheelSteering, footprint: Footprint, points: Array, *, crab: bool, rear: bool
 ) -> Escape | None:
-    """A way out, or None if both ends are blocked or the way is too short.
+    """The escape motion, or None if both ends are blocked or it is too short.
 
     Args:
         config: distances and angle.

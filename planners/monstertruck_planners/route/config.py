@@ -62,7 +62,7 @@ class HybridConfig(DriveCosts):
     heuristic_weight: AtLeastOne = 2.0
     """Heuristic weight: a greater one finds a first route sooner."""
     narrow_margin: NotNegative = 0.03
-    """Least margin, used where the configured one leaves no way, m."""
+    """Least margin, used where the configured one leaves no path, m."""
     improve: bool = True
     """Smooth the route and try alternatives while there is time."""
 

@@ -4,8 +4,8 @@ The cost to go treats the vehicle as a point with a radius, so it leads the sear
 footprint passes but the footprint does not. Checking every cell and heading of a map would take longer than the
 search: only cells on the ways in question are checked.
 
-Alternatives to the shortest way (other homotopy classes) come from the sum of the cost to the goal and from the start,
-which is the cost of the shortest way over a cell: the cheapest cell far from all known ways leads to a new one.
+Alternatives to the shortest path (other homotopy classes) come from the sum of the cost to the goal and from the start,
+which is the cost of the shortest path over a cell: the cheapest cell far from all known paths leads to a new one.
 """
 
 from math import ceil, pi
@@ -71,7 +71,7 @@ def close_narrow_gaps(
     field: FieldData, footprint: FootprintData, margin: float, cell_cost: NDArray[np.int16], factor: int, wide: float,
     step: NDArray[np.int8], row: int, column: int, radius: float, checked: NDArray[np.bool_],
 ) -> int:  # fmt: skip
-    """Close the coarse cells round a way in which the footprint fits nowhere.
+    """Close the coarse cells round a path in which the footprint fits nowhere.
 
     Args:
         field: the fine grid.
@@ -81,9 +81,9 @@ def close_narrow_gaps(
         factor: fine cells per coarse one, each way.
         wide: cells further than this from obstacles are taken to be open, m.
         step: see ``CostToGo``.
-        row: of the cell where the way begins.
+        row: of the cell where the path begins.
         column: the same.
-        radius: cells this near to the way are checked, cells.
+        radius: cells this near to the path are checked, cells.
         checked: those that have been; changed in place.
 
     Returns:
@@ -121,7 +121,7 @@ def _mark_disc(mask: NDArray[np.bool_], row: int, column: int, radius: float) ->
 
 @njit(cache=True)
 def mark_corridor(mask: NDArray[np.bool_], step: NDArray[np.int8], row: int, column: int, radius: float) -> None:
-    """Mark the cells within ``radius`` cells of the way from one cell to where ``step`` ends."""
+    """Mark the cells within ``radius`` cells of the path from one cell to where ``step`` ends."""
     while True:
         _mark_disc(mask, row, column, radius)
         k = step[row, column]
@@ -135,7 +135,7 @@ def mark_corridor(mask: NDArray[np.bool_], step: NDArray[np.int8], row: int, col
 def cheapest_unmarked(
     to_goal: NDArray[np.int32], from_start: NDArray[np.int32], marked: NDArray[np.bool_], limit: int
 ) -> int:
-    """Flat index of the unmarked cell with the cheapest way over it; -1 if none costs at most ``limit``."""
+    """Flat index of the unmarked cell with the cheapest path over it; -1 if none costs at most ``limit``."""
     best, where = limit + 1, -1
     rows, columns = marked.shape
     for row in range(rows):

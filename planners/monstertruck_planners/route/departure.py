@@ -191,7 +191,7 @@ class _Node:
 
 @dataclass(frozen=True, slots=True)
 class Departures:
-    """Ways from a start to poses that keep the margin with a little to spare."""
+    """Paths from a start to poses that keep the margin with a little to spare."""
 
     found: list[Departure]
     """Those from whose end a search can turn come first, then the cheapest."""
@@ -202,7 +202,7 @@ class Departures:
 def departures(
     route_map: RouteMap, vehicle: Vehicle, start: Array, config: DriveCosts, budget: Budget, reserve: float = 0.0
 ) -> Departures:
-    """Ways from a start to poses that keep the margin.
+    """Paths from a start to poses that keep the margin.
 
     Args:
         route_map: obstacles.
@@ -423,7 +423,7 @@ def _room(route_map: RouteMap, vehicle: Vehicle, start: Array, margin: float) ->
 def _best(
     found: list[Departure], route_map: RouteMap, vehicle: Vehicle, config: DriveCosts, goal: Array
 ) -> list[Departure]:
-    """The departures to begin with, by the way that is left from their ends; each ends somewhere else."""
+    """The departures to begin with, ordered by the remaining path from their ends; no two end at one place."""
     if not found or not route_map.field.inside(goal[:2]):
         return found[:1]
     field, cell = route_map.field.data(), route_map.coarse_cell

@@ -1,9 +1,9 @@
-"""The author's first planner: the cheapest way over a grid with inflated obstacles, for a point. Loads numba.
+"""The author's first planner: the cheapest path over a grid with inflated obstacles, for a point. Loads numba.
 
 Costs as on the author's robot: neutral 50 for every cell, plus three times the costmap's value; cells from 200 up are
-closed; the value falls with distance beyond the inscribed circle as exp(-10 d), to 0.3 m. Headings point along the way.
-The result is no drivable motion: turning radius and footprint are not regarded. So a start need only be free: whoever
-drives along the way has to leave what is too near.
+closed; the value falls with distance beyond the inscribed circle as exp(-10 d), to 0.3 m. Headings point along the
+path. The result is no drivable motion: turning radius and footprint are not regarded. So a start need only be free:
+whoever drives along the path has to leave what is too near.
 """
 
 import numpy as np
@@ -31,7 +31,7 @@ class GridAstarPlanner:
         self.config = config or GridAstarConfig()
 
     def plan(self, route_map: RouteMap, start: ArrayLike, goal: ArrayLike, now: Clock | None = None) -> RouteResult:
-        """Way between two poses; ``poses`` of the result, one for each cell."""
+        """Shortest path between two poses; ``poses`` of the result, one for each cell."""
         config = self.config
         budget = Budget(config.budget, now, config.effort)
         ends = check_endpoints(

@@ -59,14 +59,14 @@ class CostToGo(NamedTuple):
     """Shortest ways to the goal over the ringed grid of a field.
 
     A* from the goal to the start, which goes on whenever the cost of a cell is asked for that it has not come to: in
-    the open few cells round the shortest way are visited. Its open list is one of buckets (Dial). Source: D. Silver,
+    the open few cells round the shortest path are visited. Its open list is one of buckets (Dial). Source: D. Silver,
     "Cooperative pathfinding", 2005 (reverse resumable A*).
     """
 
     cost: NDArray[np.int32]
-    """In 1/UNIT cells, see ``cost_at``; UNREACHED where no way is known."""
+    """In 1/UNIT cells, see ``cost_at``; UNREACHED where no path is known."""
     step: NDArray[np.int8]
-    """Index of the next neighbour on the way, -1 at the goal."""
+    """Index of the next neighbour on the path, -1 at the goal."""
     cell_cost: NDArray[np.int16]
     """Cost of a straight step into the cell, 0 = closed."""
     cell: float
@@ -136,7 +136,7 @@ def cost_to_go(
     cell_cost: NDArray[np.int16], cell: float, goal: tuple[int, int], start: tuple[int, int],
     least: int = UNIT, overrun: float = OVERRUN,
 ) -> CostToGo:  # fmt: skip
-    """Ways from the start, and from cells round the way, to the goal; both are cells of the grid.
+    """Paths from the start, and from cells round the path, to the goal; both are cells of the grid.
 
     Args:
         cell_cost: see ``CostToGo``.
@@ -173,7 +173,7 @@ def _estimate(to_go: CostToGo, row: int, column: int) -> int:
 
 @njit(cache=True)
 def cost_at(to_go: CostToGo, row: int, column: int) -> int:
-    """Cost from a cell of the grid to the goal, in 1/UNIT cells; UNREACHED where no way is known."""
+    """Cost from a cell of the grid to the goal, in 1/UNIT cells; UNREACHED where no path is known."""
     if to_go.cell_cost[row, column] == 0 and to_go.cost[row, column] > 0:
         return UNREACHED
     while to_go.cost[row, column] + _estimate(to_go, row, column) > to_go.state[LEVEL]:
@@ -243,7 +243,7 @@ def cell_at(field: FieldData, cell: float, x: float, y: float) -> tuple[int, int
 
 @njit(cache=True)
 def cell_ahead(step: NDArray[np.int8], row: int, column: int, length: float) -> tuple[int, int]:
-    """Cell reached after ``length`` cells along the way to the goal, or the goal's."""
+    """Cell reached after ``length`` cells along the path to the goal, or the goal's."""
     while length > 0.0:
         k = step[row, column]
         if k < 0:
@@ -301,7 +301,7 @@ def _reeds_shepp_length(
 ) -> float:
     """Length in metres from a pose to the goal, at the nearest entry; the straight distance beyond the table."""
     dx, dy = (x - goal[0]) / radius, (y - goal[1]) / radius
-    # The way back is as long: seen from the goal.
+    # The path back is as long: seen from the goal.
     c, s = cos(goal[2]), sin(goal[2])
     px, py, turn = dx * c + dy * s, dy * c - dx * s, yaw - goal[2]
     if abs(px) > TABLE_REACH or abs(py) > TABLE_REACH:
@@ -317,7 +317,7 @@ def heuristic_cost(
     field: FieldData, to_go: CostToGo, table: NDArray[np.float32], radius: float, goal: Array,
     x: float, y: float, yaw: float,
 ) -> float:  # fmt: skip
-    """The greater of both heuristics, m; inf where no way to the goal is known."""
+    """The greater of both heuristics, m; inf where no path to the goal is known."""
     row, column = cell_at(field, to_go.cell, x, y)
     rows, columns = to_go.cost.shape
     if not (0 <= row < rows and 0 <= column < columns):

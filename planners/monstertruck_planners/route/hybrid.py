@@ -326,7 +326,7 @@ class _PlanningRun:
             segments = fine[0].run(MAX_NODES, reserve)
         if segments is not None:
             return segments, Reason.OK, ""
-        # A search that is exhausted proves nothing: between its cells and headings there may be a way.
+        # A search that is exhausted proves nothing: between its cells and headings there may be a path.
         self.statistics["exhausted"] = float(fine[-1].exhausted)
         return (
             None,
@@ -433,7 +433,7 @@ class _PlanningRun:
     def _improve_in_rounds(self, segments: Array) -> Array:
         """Smooth the best route and alternatives in turn until nothing improves or only the last share is left."""
         others = self._starts(segments)
-        cheapest = next(others)  # along the cheapest way, while the first route may lead straight ahead
+        cheapest = next(others)  # along the cheapest path, while the first route may lead straight ahead
         if len(cheapest) and self._cost(cheapest) < self._cost(segments):
             segments = cheapest
         else:

@@ -25,7 +25,7 @@ PASSING = 0.1
 
 @dataclass(frozen=True, slots=True)
 class ViaPoint:
-    """A waypoint; without a heading that of the way there and on is taken."""
+    """A waypoint; without a heading it gets that of the path through it."""
 
     x: float
     y: float

@@ -66,7 +66,7 @@ class TrackerConfig(Schema):
     """Greatest turning rate of the axles, rad/s."""
 
     steering_distance: Positive = 0.05
-    """Way in which the axles can turn as the path asks at the speed chosen, m."""
+    """Distance in which the axles can turn as the path asks at the speed chosen, m."""
 
     @property
     def reach(self) -> float:

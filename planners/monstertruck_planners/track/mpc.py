@@ -31,7 +31,7 @@ MOST_PERIODS: Final = 30
 FINE: Final = 0.05
 """Longest step the errors are integrated with, s."""
 APPROACH: Final = 0.3
-"""Distance from the path that counts, as a share of the way to be driven."""
+"""Distance from the path that counts, as a share of the distance to be driven."""
 GENTLE: Final = 1e-6
 """Weight that keeps inputs without effect where they are."""
 OPTIMAL: Final = 1

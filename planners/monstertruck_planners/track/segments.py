@@ -70,16 +70,16 @@ class PathSteps(NamedTuple):
 
 
 class Segment:
-    """Part of a path driven without a stop, with a straight or given way on beyond its end.
+    """Part of a path driven without a stop, with a straight or given extension behind its end.
 
     Args:
-        points: shape (n, 2), n >= 2, m; from index ``last`` on they are the way beyond.
+        points: shape (n, 2), n >= 2, m; from index ``last`` on they are the extension.
         last: index of the segment's own last point.
         direction: +1 forward, -1 backward.
         before: metres of the segments before this one.
         yaws: of the own points, shape (last + 1,), rad.
         steering: of each own step, or empty.
-        lap: the way beyond is the path's own beginning.
+        lap: the extension is the path's own beginning.
         clearance: between footprint and obstacles at its end, m.
     """
 
@@ -104,7 +104,7 @@ class Segment:
         self.before = before
         self.length = float(self._s[last])
         self.end = float(self._s[-1]) if lap else self.length
-        """Up to here the way is part of the path, m."""
+        """Length that is part of the path, m."""
         self.yaws = np.zeros(last + 1) if yaws is None else yaws
         self.steering = steering
         self.clearance = clearance
@@ -162,7 +162,7 @@ class SegmentedPath:
     Args:
         path: poses and directions.
         start: pose (x, y, yaw) of the truck in the path's frame.
-        beyond: metres the way goes on behind each end, at least the look-ahead.
+        beyond: metres by which each end is extended, at least the look-ahead.
 
     Raises:
         InputError: see ``check_path``.
@@ -422,7 +422,7 @@ class Reference:
 
     @property
     def places(self) -> Array:
-        """Metres from the segment's beginning where the reference was computed: from 0 to the end of the way."""
+        """Metres from the segment's beginning where the reference was computed: from 0 to the end of the extension."""
         return self._s
 
     def steering(self, s: float) -> Steering:
@@ -457,7 +457,7 @@ class Reference:
         return np.asarray(np.maximum(*change))
 
     def section_end(self, s: float) -> float:
-        """Where the steering changes next, m; the end of the way if it does not."""
+        """Where the steering changes next, m; the end of the extension if it does not."""
         i = int(self._changes.searchsorted(s, "right"))
         return float(self._changes[i]) if i < len(self._changes) else self._segment.end
 

@@ -31,7 +31,7 @@ class WallConfig(BehaviourConfig):
     approach_turn: Annotated[float, Field(ge=0, le=math.tau)] = 0.0
     """Angle of the arc at the beginning, towards the wall's side, rad; the coursework set a time by hand"""
     lap_length: Annotated[float, Field(gt=0, le=1000)] = 4.0
-    """Least way of a lap, m"""
+    """Least length of a lap, m"""
     lap_radius: Metres = 0.6
     """So near to a place that it passed, by odometry, a lap is complete, m; grows with the odometry's drift"""
     laps: Annotated[int, Field(ge=1, le=100)] = 1
@@ -57,8 +57,8 @@ class WallPdConfig(WallConfig):
     seen: Metres = 0.45
     """Side ranges below which the wall is seen, m; our figure"""
     gap: Annotated[float, Field(ge=0, le=5)] = 0.0
-    """Way over which a side sonar whose range jumped up looks into a gap and does not count, m; 0 as published: the
-    robot turns into gaps"""
+    """Distance over which a side sonar whose range jumped up looks into a gap and does not count, m; 0 as published:
+    the robot turns into gaps"""
     aligned: Annotated[float, Field(ge=-1.5, le=0.5)] | None = None
     """Heading away from the wall by side and diagonal sonar from which on turning away ends, rad; as published none:
     the robot drives on while it still faces the wall"""
@@ -110,16 +110,16 @@ class WallLineConfig(BehaviourConfig):
     critical_angle: Annotated[float, Field(gt=0, le=1.4)] = 0.45
     """Greatest angle from a wall's normal at which sound comes back, rad; without ``beam``"""
     window: Metres = 3.0
-    """Way over which echoes count for the line, m: longer is steadier, and trusts the odometry longer"""
+    """Distance over which echoes count for the line, m: longer is steadier, and trusts the odometry longer"""
     stiffness: Annotated[float, Field(gt=0, le=2)] = 0.3
-    """Way in which a distance error decays by the control, m; critically damped"""
+    """Distance in which a distance error decays by the control, m; critically damped"""
     door: Metres = 1.3
-    """Way without a wall that is driven straight on along the line before another wall is searched for, m"""
+    """Distance without a wall that is driven straight on along the line before another wall is searched for, m"""
     search: Annotated[float, Field(gt=0, le=100)] = 25.0
-    """Way without a wall after which it gives up, m"""
+    """Distance without a wall after which it gives up, m"""
     lap_length: Annotated[float, Field(gt=0, le=1000)] = 4.0
-    """Least way of a lap, m"""
+    """Least length of a lap, m"""
     lap_radius: Metres = 0.6
-    """So near to a place that it passed, by odometry, a lap is complete, m, and 1 % of the lap's way more"""
+    """So near to a place that it passed, by odometry, a lap is complete, m, and 1 % of the lap's length more"""
     laps: Annotated[int, Field(ge=1, le=100)] = 1
     """After which it stops"""

@@ -102,8 +102,8 @@ class Cone:
 
 
 ECHO: Final = ("x", "y", "axis", "range", "sonar", "way", "time")
-"""Columns of the echoes: place (m) and axis (rad) of the sonar in odom, range (m), its number; way driven (m) and time
-(s) when it came."""
+"""Columns of the echoes: place (m) and axis (rad) of the sonar in odom, range (m), its number; distance driven (m) and
+time (s) when it came."""
 
 
 class EstimateFit(NamedTuple):

@@ -47,8 +47,8 @@ KEPT: Final = 1.0
 NEAR: Final = 1.2
 """Front range from which on a wall ahead is estimated, m."""
 AHEAD: Final = 1.5, 0.8
-"""Way over which echoes count for the wall ahead, m: on free ground, and along a wall, behind which the foot of the
-perpendicular on the next one may lie."""
+"""Distance over which echoes count for the wall ahead, m: on free ground, and along a wall, behind which the foot of
+the perpendicular on the next one may lie."""
 UNSURE: Final = 0.008
 """Standard deviation of the wall's direction above which the robot drives along it slowly, rad."""
 FRESH: Final = 0.35
@@ -56,7 +56,7 @@ FRESH: Final = 0.35
 FACING: Final = 1.1
 """Greatest angle between the direction of travel and the normal of a wall that is ahead, rad."""
 LATE: Final = 0.6
-"""Share of the way of gentle braking that is left, below which it brakes as hard as a ramp may."""
+"""Share of the distance of gentle braking that is left, below which it brakes as hard as a ramp may."""
 NEARER: Final = 5.0
 """Standard deviations by which an echo of the diagonal sonar is nearer than the wall beside: of something ahead."""
 LEAST: Final = 6
@@ -67,11 +67,11 @@ wall to which it drives."""
 FITS: Final = 2
 """Lines fitted for a round of echoes: one in a step where there are as many steps: the event loop waits for them."""
 GONE: Final = 0.1
-"""Way left at standstill beside a wall, m, from which on what the robot braked for has gone: it was no corner."""
+"""Distance left at standstill beside a wall, m, from which on what the robot braked for has gone: it was no corner."""
 TOUCHING: Final = 0.16
 """A range from which on the robot stops at once, m."""
 OPENING: Final = 0.3
-"""By which the side sonar measures more than the way to the wall where it looks through an opening, m."""
+"""By which the side sonar measures more than the distance to the wall where it looks through an opening, m."""
 STARTED: Final = 0.05
 """Angle up to which a turn begins, rad."""
 BEAM_CRITICAL: Final = 1.3
@@ -79,7 +79,7 @@ BEAM_CRITICAL: Final = 1.3
 CATCH_UP: Final = 1.5
 """Speed by which a lag is made up for, of the lag, 1/s."""
 LAG: Final = (0.05, 0.15)
-"""Greatest lag that is made up for: way, m, and angle, rad."""
+"""Greatest lag that is made up for: distance, m, and angle, rad."""
 TURNS: Final = 0.5
 """Greatest yaw rate along the wall, rad/s."""
 FASTEST: Final = 0.3
@@ -91,14 +91,14 @@ STALL: Final = 1.0
 SLOW: Final = 0.2
 """Share of the speed asked for below which the robot does not move."""
 EQUAL: Final = 12, 0.1
-"""Equal echoes in a row, and the way over which they came, m, from which on a sonar counts as stuck."""
+"""Equal echoes in a row, and the distance over which they came, m, from which on a sonar counts as stuck."""
 JUDGED: Final = 20, 1.2
-"""Least number of echoes of a sonar, of so much way along a wall, m, that tell whether it agrees with the wall: the
+"""Least number of echoes of a sonar, over this distance along a wall, m, that tell whether it agrees with the wall: the
 diagonal one looks through a door, or past the end of a pillar, before the other one."""
 DISAGREES, AGREES = 0.2, 0.7
 """Share of them on the wall below which a sonar contradicts another one, whose share is above the second figure."""
 PLACED: Final = 0.5
-"""Way between two places at which a lap may be complete, m."""
+"""Distance between two places at which a lap may be complete, m."""
 FOLLOWED: Final = 0.5
 """A lap does not begin where the robot followed a wall for less, m."""
 
@@ -149,7 +149,7 @@ class LineState(NamedTuple):
     v: TimedRamp = STANDSTILL
     w: TimedRamp = STANDSTILL
     lag: tuple[float, float] = (0.0, 0.0)
-    """Way, m, and angle, rad, that the robot is behind its ramps."""
+    """Distance, m, and angle, rad, that the robot is behind its ramps."""
     bias: tuple[float, int] = (0.0, 0)
     """Of the gyroscope, rad/s, and the samples it is the mean of."""
     before: float | None = None
@@ -372,7 +372,7 @@ class WallLine:
         return fit if fit.explained >= max(LEAST, 0.3 * len(rows)) else None
 
     def _way_left(self, state: LineState, cone: Cone) -> float:
-        """Way until the robot stands before the wall ahead at the distance at which it follows walls, m."""
+        """Distance until the robot stands before the wall ahead at the distance at which it follows walls, m."""
         ahead, fresh = state.ahead, _fresh(state.echoes, state)
         left = math.inf if ahead is None else self._way_to(state, ahead)
         for number in (DIAGONAL, FRONT, FAR):  # as if what it hears were right before the sonar
@@ -389,7 +389,7 @@ class WallLine:
         return min(left, 0.0) if np.count_nonzero(near < TOUCHING) >= 2 else left
 
     def _way_to(self, state: LineState, line: WallEstimate) -> float:
-        """Way until the robot stands at the distance at which it follows walls before one, m."""
+        """Distance until the robot stands at the distance at which it follows walls before one, m."""
         x, y, yaw = state.pose
         return (line.distance(x, y) - self._keep(state)) / max(math.cos(line.normal - yaw), 0.4)
 
@@ -621,7 +621,7 @@ def _asked(state: LineState, t: float) -> tuple[float, float]:
 
 
 def _reach(state: LineState) -> float:
-    """Way over which echoes count for the wall ahead, m."""
+    """Distance over which echoes count for the wall ahead, m."""
     return AHEAD[0] if state.wall is None else AHEAD[1]
 
 

@@ -33,11 +33,11 @@ JUMP: Final = 0.06, 0.15
 """Growth of the range of the side sonar over two steps, and of the diagonal one over one, by which it begins to look
 into a gap, m."""
 EDGE: Final = 0.1
-"""Way behind the edge of a gap over which the side sonar may measure the gap's own side wall, m."""
+"""Distance behind the edge of a gap over which the side sonar may measure the gap's own side wall, m."""
 BACK: Final = 0.05
 """Diagonal range times cos 45 degrees less side range below which it ends, m."""
 WALL_WAY: Final = 0.8
-"""Way over which echoes make the line of a wall past whose gap it drives, m."""
+"""Distance over which echoes make the line of a wall past whose gap it drives, m."""
 LEAST_ECHOES: Final = 4
 """Of such a line."""
 LINE_GAINS: Final = 5.0, 2.0
@@ -116,7 +116,7 @@ class WallState:
     begun: tuple[float, float, float] | None = None
     """Pose where following began."""
     since: float = 0.0
-    """Way since then or since the last lap, m."""
+    """Distance since then or since the last lap, m."""
     laps: int = 0
     turned_before: float = 0.0
     """``turned`` when the present phase began, rad."""
