@@ -22,10 +22,12 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from benchmarks.fault_parts.scenario import COLUMNS, GOALS, Expect, Reaction, Scenario, cells, measure, shortcomings
+from benchmarks.fault_parts.scenarios import SCENARIOS
 from monstertruck_runtime.clock import run_virtual
 from monstertruckd.config.load import load_config
-from monstertruckd.tools.drill.scenario import COLUMNS, GOALS, Expect, Reaction, Scenario, cells, measure, shortcomings
-from monstertruckd.tools.drill.scenarios import SCENARIOS
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.fault_parts.scenario import Expect, Reaction, Scenario, measure, shortcomings
+from benchmarks.fault_parts.scenarios import SCENARIOS
 from monstertruck_runtime.clock import run_virtual
 from monstertruck_runtime.yaml_files import yaml_text
 from monstertruck_schemas.reasons import Reason
@@ -13,8 +15,6 @@ from monstertruckd.config.load import load_config
 from monstertruckd.tools.demo.runs import run_fast_demo
 from monstertruckd.tools.demo.summary import GOAL_CLOSING
 from monstertruckd.tools.drill.observer import Violation
-from monstertruckd.tools.drill.scenario import Expect, Reaction, Scenario, measure, shortcomings
-from monstertruckd.tools.drill.scenarios import SCENARIOS
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 from tests.long_kit import mostly_long
 

@@ -1,1 +1,1 @@
-"""Drills: faults injected into the simulated truck while it drives, scripted or random, and judged."""
+"""Drills: random faults injected into the simulated truck while it drives, and judged."""

@@ -7,6 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from benchmarks.fault_parts.scenario import SENSORS, Expect, Scenario, ScenarioContext
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas import topics
 from monstertruck_schemas.reasons import Reason
@@ -25,7 +26,6 @@ from monstertruck_sim.faults import (
     place_obstacle,
 )
 from monstertruck_sim.world.config import GroundTilt, SinusoidTilt
-from monstertruckd.tools.drill.scenario import SENSORS, Expect, Scenario, ScenarioContext
 from monstertruckd.tools.simulation.config import DEADMAN_LINE
 
 STALE: Final[Mapping[str, Reason]] = {
