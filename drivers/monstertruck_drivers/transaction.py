@@ -5,12 +5,34 @@ A handshake byte by byte costs a coroutine a wake-up of its task per byte; here 
 
 import asyncio
 from collections.abc import Generator
-from typing import Generic, NamedTuple, TypeVar
+from types import TracebackType
+from typing import Final, Generic, NamedTuple, TypeVar
 
 from monstertruck_drivers.link import Link
-from monstertruck_runtime.errors import DeviceLostError
+from monstertruck_runtime.errors import DeviceLostError, DeviceTimeoutError, ProtocolError
 
 T = TypeVar("T")
+
+MISSES: Final = 3
+"""Exchanges in a row without a usable answer that end a session."""
+
+
+class Misses:
+    """Context of one exchange after the other: suppresses errors of the answer, but not of the last of ``MISSES``."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        """Failed exchanges in a row; 0 after one that succeeded."""
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> bool:
+        failed = isinstance(error, (DeviceTimeoutError, ProtocolError))
+        self.count = self.count + 1 if failed else 0
+        return failed and self.count < MISSES
 
 
 class WaitFor(NamedTuple):

@@ -1,18 +1,13 @@
 """Battery driver on a Linux IIO converter."""
 
-from typing import Final
-
 from monstertruck_drivers.battery import iio
 from monstertruck_drivers.battery.config import IioConfig
 from monstertruck_drivers.battery.monitor import BatteryMonitor
 from monstertruck_drivers.computer import Computer
+from monstertruck_drivers.transaction import Misses
 from monstertruck_runtime.clock import IN_THREADS, Clock, Schedule
-from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
 from monstertruck_schemas.sensor import Battery, DriveFeedback
-
-MISSES: Final = 3
-"""Readings in a row that may fail before the session ends."""
 
 
 class IioBatteryDriver:
@@ -59,18 +54,14 @@ class IioBatteryDriver:
         await self._offload(channel.read)
         ready()
         schedule = Schedule(self._clock, self._config.rate, IN_THREADS)
-        misses = 0
+        misses = Misses()
         while True:
             await schedule.next()
             stamp = self._clock.now()
-            try:
+            with misses:
                 raw = await self._offload(channel.read)
-            except (DeviceTimeoutError, ProtocolError):
-                misses += 1
-                if misses >= MISSES:
-                    raise
+            if misses.count:
                 continue
-            misses = 0
             volts = channel.volts(raw) * self._config.divider + self._config.offset
             self._monitor.take(stamp, self._clock.now(), volts, at_limit=channel.at_limit(raw))
 

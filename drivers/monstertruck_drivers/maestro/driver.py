@@ -8,8 +8,9 @@ from monstertruck_drivers.link import Port
 from monstertruck_drivers.maestro.config import BatteryInputConfig, MaestroConfig
 from monstertruck_drivers.maestro.protocol import ADC_MAX, Encoder, error_names
 from monstertruck_drivers.maestro.session import MaestroSession
+from monstertruck_drivers.transaction import Misses
 from monstertruck_runtime.clock import QUESTIONS, SECOND, Clock, Schedule
-from monstertruck_runtime.errors import DeviceLostError, DeviceTimeoutError, ProtocolError
+from monstertruck_runtime.errors import DeviceLostError
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
 from monstertruck_schemas.base import servo_fields
 from monstertruck_schemas.cmd import SteeringCommand
@@ -17,8 +18,6 @@ from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import Battery, DriveFeedback, SteeringFeedback
 
-MISSES: Final = 3
-"""Polls in a row without a usable answer that end the session."""
 LINE_HIGH: Final = 8000
 LINE_LOW: Final = 4000
 """Targets of a digital output, quarter microseconds: on either side of the device's threshold."""
@@ -80,7 +79,7 @@ class MaestroDriver:
         self._fresh: SteeringCommand | None = None
         """The same, until it is stale."""
         self._failing = False
-        self._misses = 0
+        self._misses = Misses()
 
     async def run(self, ready: Ready) -> None:
         """Serve one session.
@@ -165,19 +164,15 @@ class MaestroDriver:
         config = self._config
         channels = [servo.channel for servo in config.servos] + ([battery.channel] if battery else [])
         asked = self._clock.now()
-        try:
+        with self._misses:
             *positions, errors = await session.ask(
                 *(session.encode.get_position(channel) for channel in channels), session.encode.get_errors()
             )
             session.check(positions, errors)
-        except (DeviceTimeoutError, ProtocolError):
-            self._misses += 1
-            if self._misses >= MISSES:
-                raise
+        if self._misses.count:
             # The lost answer may have held the only report of an error.
             self._restore(session)
             return
-        self._misses = 0
         received = self._clock.now()
         stamp = (asked + received) // 2
         self._report(session, stamp, received, positions, errors)

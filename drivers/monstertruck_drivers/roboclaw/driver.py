@@ -1,20 +1,16 @@
 """Encoder service: counters of two wheels become ``sensor/encoders``."""
 
-from typing import Final
-
 from monstertruck_drivers.link import Port
 from monstertruck_drivers.roboclaw.config import RoboclawConfig
 from monstertruck_drivers.roboclaw.protocol import step
 from monstertruck_drivers.roboclaw.session import RoboclawSession
+from monstertruck_drivers.transaction import Misses
 from monstertruck_runtime.clock import QUESTIONS, SECOND, Clock, Schedule
-from monstertruck_runtime.errors import DeviceRestartedError, DeviceTimeoutError, ProtocolError
+from monstertruck_runtime.errors import DeviceRestartedError
 from monstertruck_runtime.ports import EventSink, Publisher, Ready
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import WheelEncoders
-
-MISSES: Final = 3
-"""Readings in a row without a usable answer that end the session."""
 
 
 class RoboclawDriver:
@@ -63,18 +59,14 @@ class RoboclawDriver:
             self._events(Reason.DEVICE_READY, Severity.INFO, self.name, await session.identify())
             schedule = Schedule(self._clock, config.rate, QUESTIONS)
             last: tuple[tuple[int, int], int] | None = None
-            misses = 0
+            misses = Misses()
             while True:
                 await schedule.next()
                 asked = self._clock.now()
-                try:
+                with misses:
                     counts = await session.counts()
-                except (DeviceTimeoutError, ProtocolError):
-                    misses += 1
-                    if misses >= MISSES:
-                        raise
+                if misses.count:
                     continue
-                misses = 0
                 stamp = (asked + self._clock.now()) // 2
                 if last is None:
                     ready()

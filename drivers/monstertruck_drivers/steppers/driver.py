@@ -15,6 +15,7 @@ from monstertruck_drivers.link import Port
 from monstertruck_drivers.steppers.config import StepperConfig
 from monstertruck_drivers.steppers.protocol import Identity, MotorState, RefusalCode, Status, step_of
 from monstertruck_drivers.steppers.session import ATTEMPTS, RequestRefusedByDeviceError, StepperSession
+from monstertruck_drivers.transaction import Misses
 from monstertruck_runtime.clock import QUESTIONS, SECOND, Clock, Schedule
 from monstertruck_runtime.errors import (
     DeviceError,
@@ -22,7 +23,6 @@ from monstertruck_runtime.errors import (
     DeviceMismatchError,
     DeviceRestartedError,
     DeviceStoppedError,
-    DeviceTimeoutError,
     ProtocolError,
 )
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
@@ -31,8 +31,6 @@ from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import DriveFeedback, DriveMode
 
-MISSES: Final = 3
-"""Exchanges in a row without a usable answer that end the session."""
 SAFE_DEADLINE: Final = 0.4
 """Seconds a session may take at its end to stop the motors and switch them off."""
 UPTIME_SLACK: Final = 200
@@ -174,7 +172,7 @@ class StepperDriver:
 
     async def _serve(self, session: StepperSession, motors: int, ready: Ready) -> None:
         schedule = Schedule(self._clock, self._config.rate, QUESTIONS)
-        misses, reported = 0, False
+        misses, reported = Misses(), False
         noise, noted = session.splitter.bad, self._clock.now()
         due = 0
         while True:
@@ -182,14 +180,10 @@ class StepperDriver:
                 due = schedule.step()
             await self._until(due)
             setpoint = self._setpoint()
-            try:
+            with misses:
                 status = await self._exchange(session, motors, setpoint)
-            except (DeviceTimeoutError, ProtocolError):
-                misses += 1
-                if misses >= MISSES:
-                    raise
+            if misses.count:
                 continue
-            misses = 0
             self._publish(status, session)
             if not reported:
                 reported = True
