@@ -72,7 +72,7 @@ class Watcher(Protocol):
 
 
 class NoWatcher:
-    """For machines that announce nothing: the tree is only looked at now and then."""
+    """For machines that announce nothing: the tree is only read now and then."""
 
     def start(self, hint: Callable[[], None]) -> None:
         """Nothing will come."""

@@ -49,7 +49,7 @@ log = logging.getLogger(__name__)
 DAY: Final = 86_400 * SECOND
 """ns."""
 PERIOD: Final = 1.0
-"""Seconds between two looks at the drive's position: half of it at most is missing of every reversal."""
+"""Seconds between two checks of the drive's position: half of it at most is missing of every reversal."""
 PUBLISH: Final = 60
 """Periods between two messages, and between two writings of the odometer."""
 WORTH_WRITING: Final = 1.0

@@ -30,7 +30,7 @@ log = logging.getLogger(__name__)
 M = TypeVar("M", bound=Message)
 
 TICK: Final = 0.05
-"""Seconds between two looks at what is new."""
+"""Seconds between two checks of what is new."""
 PING: Final = 1.0
 """Seconds between two measurements of the round trip to the robot."""
 RETRY: Final = 1.0

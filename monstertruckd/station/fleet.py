@@ -15,7 +15,7 @@ from monstertruckd.station.feed import RobotFeed
 from monstertruckd.station.viewer import Viewer
 
 PERIOD: Final = 0.5
-"""Seconds between two looks at all robots."""
+"""Seconds between two checks of all robots."""
 OLD: Final = 2.0
 """Seconds after which a pose that did not change in time is shown as old."""
 

@@ -51,7 +51,7 @@ TYPES: Final = {".js": "text/javascript", ".css": "text/css", ".svg": "image/svg
 BEAT: Final = 10.0
 """Seconds between two pings of the WebSocket itself; a browser that does not answer for half of it is let go."""
 LOOK: Final = 1.0
-"""Seconds between two looks at robots that appeared, users that were revoked, and the number of connections."""
+"""Seconds between two checks of robots that appeared, users that were revoked, and the number of connections."""
 END: Final = 5.0
 """Seconds that sessions with robots may take to close at the end."""
 LANGUAGE: Final = "en"

@@ -17,7 +17,7 @@ GRAVITY: Final = 9.81
 KEPT: Final = 64
 """Readings of the odometry."""
 GREATEST: Final = 2.0
-"""Acceleration of the body that is believed at most, m/s^2: beyond it the wheels spin, and nothing is taken out."""
+"""Acceleration of the body that is trusted at most, m/s^2: beyond it the wheels spin, and nothing is taken out."""
 FELT: Final = 0.06
 """Seconds over which the odometry's acceleration is averaged, as the compass's accelerometer feels it."""
 

@@ -1,4 +1,4 @@
-"""Yaw rate of an inertial measurement unit: without its bias, and judged against the wheels before it is believed."""
+"""Yaw rate of an inertial measurement unit: without its bias, and checked against the wheels before it is used."""
 
 import math
 from collections import deque
@@ -79,7 +79,7 @@ class Gyro:
         Args:
             since: ns.
             stamp: ns.
-            wheels: mean yaw rate by the wheels, rad/s; None = they slip, and judge nobody.
+            wheels: mean yaw rate by the wheels, rad/s; None = they slip, and are not compared.
             distance: of the fastest shaft, m.
         """
         found = [rate for at, rate in self._rates if since < at <= stamp]

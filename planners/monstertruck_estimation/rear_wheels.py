@@ -1,4 +1,4 @@
-"""Odometry of a tricycle by the encoders of its rear wheels, judged by its driven wheel.
+"""Odometry of a tricycle by the encoders of its rear wheels, checked by its driven wheel.
 
 The rear wheels are not driven, so they do not slip, and give speed and yaw rate without the steering angle. The driven
 front wheel gives both as well, by its rate and angle: thdot = (v_s/d) sin(alpha). Over some distance both must agree.
@@ -70,7 +70,7 @@ class RearWheelConfig(OdometryConfig):
 
     kind: Literal["encoders"] = "encoders"  # type: ignore[assignment]  # each kind has its own word
     encoders: EncoderConfig = EncoderConfig()
-    """How they are judged"""
+    """How they are checked"""
 
 
 class EncoderVerdict(NamedTuple):
@@ -209,10 +209,10 @@ class Encoders:
         return EncoderIncrement(before[0], reading.stamp, distances, front)
 
     def compare(self, roll: WheelIncrement) -> int | None:
-        """Judge by what the driven wheel did.
+        """Compare with the driven wheel.
 
         Returns:
-            Since when an encoder is not believed that was until now, ns; None = there is none.
+            Since when an encoder is no longer trusted, ns; None = there is none.
         """
         start, end = self._at(roll.since), self._at(roll.stamp)
         if roll.lost or start is None or end is None:
@@ -270,10 +270,10 @@ class Encoders:
 
 
 class RearWheelReckoning(DeadReckoning):
-    """Dead reckoning whose pose the rear wheels carry while they are believed, else the driven wheel.
+    """Dead reckoning whose pose the rear wheels carry while they are trusted, else the driven wheel.
 
     Args:
-        config: start, noise, judgement.
+        config: start, noise, checks.
         chassis: the body.
         inertial: an inertial measurement unit whose yaw rate replaces that of the wheels.
     """
@@ -302,7 +302,7 @@ class RearWheelReckoning(DeadReckoning):
         self._go_on()
 
     def observe_drive(self, *shafts: DriveFeedback) -> None:
-        """Take the position of the motor: it judges the encoders, and stands in for them."""
+        """Take the position of the motor: it checks the encoders, and replaces them."""
         roll = self._wheels.observe_drive(*shafts)
         if self._at is None and self._wheels.known:
             self._at = self._wheels.stamp
@@ -358,7 +358,7 @@ class RearWheelReckoning(DeadReckoning):
         return newest is not None and self._wheels.stamp - newest <= LATE
 
     def _by_encoders(self, increment: EncoderIncrement) -> WheelIncrement | None:
-        """Motion by the wheels that are believed; None = the one that is says nothing here."""
+        """Motion by the wheels that are trusted; None = the one that is says nothing here."""
         dt, lean = (increment.stamp - increment.since) / SECOND, self._tricycle.lean(increment.front)
         left, right = increment.distances[0] / dt, increment.distances[1] / dt
         trusted = self.encoders.believed

@@ -1,4 +1,4 @@
-"""Messages of the ``state`` group: what the robot believes and in which state it is."""
+"""Messages of the ``state`` group: estimates and state of the robot."""
 
 from enum import StrEnum
 from typing import Annotated, Final

@@ -17,10 +17,12 @@ TESTS = [
 """All but this one, and the one of the keys that were renamed."""
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 PRIVATE = re.compile(
-    r"(?<![a-z])(told|wish(es)?|hunt(s|ed)?|lookout|rungs?|ladder|mishaps?|patients?|thinning|nobody waits)(?![a-z])",
+    r"(?<![a-z])(told|wish(es)?|hunt(s|ed)?|lookout|rungs?|ladder|mishaps?|patients?|thinning|nobody waits"
+    r"|in vain|gone on with|turns? of the loop)(?![a-z])",
     re.IGNORECASE,
 )
-"""reported, request, search, path check, recovery behaviour, fault, host context, pruning, without waiting"""
+"""reported, request, search, path check, recovery behaviour, fault, host context, pruning, without waiting, failed,
+resumed, iteration of the event loop"""
 OLD_KEY = re.compile(r'^    \(\("\w+", .*"\),$')
 """A row of the table of keys that were renamed."""
 

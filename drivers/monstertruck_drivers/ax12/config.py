@@ -78,7 +78,7 @@ class Ax12Config(Schema):
     rate: Annotated[float, Field(gt=0, le=100)] = 25.0
     """Times a second both joints are read; an adapter at its usual latency of 16 ms allows 31."""
     check_interval: Positive = 1.0
-    """Seconds between two looks at a joint's torque settings."""
+    """Seconds between two checks of a joint's torque settings."""
     absent_interval: Annotated[float, Field(ge=1)] = 1.0
     """Seconds between two questions to a joint that does not answer: each costs a whole time-out."""
     return_delay: Annotated[float, Field(ge=0, le=508e-6)] = 500e-6

@@ -230,7 +230,7 @@ class Ax12Parser:
     their sum; after a failure the search goes on one byte further.
 
     Args:
-        longest: greatest length byte to believe.
+        longest: greatest valid length byte.
     """
 
     def __init__(self, longest: int = LONGEST) -> None:

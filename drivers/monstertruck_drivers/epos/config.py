@@ -33,7 +33,7 @@ class EposConfig(Schema):
     """From full speed to rest in 0.08 s."""
 
     encoder_pulses_per_turn: Annotated[int, Field(gt=0, le=65_535)] | None = 500
-    """Encoder pulses per motor turn (counts / 4); None = believe the controller's own setting."""
+    """Encoder pulses per motor turn (counts / 4); None = use the controller's own setting."""
     motor_type: Literal[1, 10, 11] | None = None
     """1 brushed DC, 10 sinusoidal EC, 11 block commutated EC; None = do not check."""
 

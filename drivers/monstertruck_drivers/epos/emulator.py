@@ -40,7 +40,7 @@ TURN_AROUND = 0.001
 """Seconds from the last byte received to the first one sent; most of it is the host's USB converter."""
 BOOT_TIME = 0.4
 WATCH_PERIOD = 0.05
-"""Seconds between looks at the supply while no host asks anything."""
+"""Seconds between checks of the supply while no host asks anything."""
 SEGMENT_BYTES = 4
 STRAY = 0xA5
 FOR_EVER = 1 << 62

@@ -1,4 +1,4 @@
-"""Look at a controller without moving or changing anything."""
+"""Read a controller without moving or changing anything."""
 
 from typing import Any
 

@@ -20,7 +20,7 @@ class HostHealthConfig(Schema):
 
     kind: Literal["host_health"] = "host_health"
     rate: Annotated[float, Field(gt=0, le=10)] = 1.0
-    """Looks a second"""
+    """Checks per second"""
     after: Seconds = 3.0
     """Seconds beyond a limit before it is reported"""
     hot: Celsius = 80.0

@@ -17,7 +17,7 @@ class LinkQualityConfig(Schema):
     interface: Annotated[str, Field(pattern=r"^[^/\s]{1,15}$")] | None = None
     """Name of the interface; None = the connected Wi-Fi, else the connected cable"""
     rate: Annotated[float, Field(gt=0, le=10)] = 1.0
-    """Looks a second"""
+    """Checks per second"""
     smoothing: Annotated[float, Field(ge=0, le=60)] = 4.0
     """Seconds, time constant of the signal's mean"""
     excellent: Dbm = -50.0

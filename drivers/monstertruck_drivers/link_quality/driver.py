@@ -1,4 +1,4 @@
-"""Link monitor: looks at the interface once a second."""
+"""Link monitor: reads the interface once a second."""
 
 import math
 from typing import Final
@@ -155,7 +155,7 @@ class LinkQualityDriver:
         self._events(*concern, self.name, f"{name}: link is {level.value}", signal=self._judge.signal)
 
     def _rates(self, stamp: int, sample: Sample | None) -> tuple[float | None, float | None]:
-        """Bytes a second received and sent since the last look at the same interface."""
+        """Bytes a second received and sent since the last reading of the same interface."""
         if self._before is None or sample is None:
             return None, None
         then, before = self._before

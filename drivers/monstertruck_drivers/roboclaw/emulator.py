@@ -52,7 +52,7 @@ class RoboclawEmulator:
         self._silent = False
         self._noise = 0
         self._angles: tuple[float, float] | None = None
-        """Of the wheels when they were last looked at, rad."""
+        """Of the wheels at the last reading, rad."""
         self._counted = [0.0, 0.0]
         """Left and right, since power-up."""
 

@@ -68,7 +68,7 @@ class UsbConfig(Schema):
     """How the USB tree is watched."""
 
     rescan: Annotated[float, Field(ge=0.2, le=60)] = 5.0
-    """Seconds between two looks at the tree when nothing is announced"""
+    """Seconds between two checks of the tree when nothing is announced"""
     together: Seconds = 0.2
     """Seconds without a further loss after which losses are judged: those behind one hub are one loss of the hub"""
     settle: Seconds = 0.5

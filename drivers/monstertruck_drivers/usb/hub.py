@@ -120,7 +120,7 @@ class HubCoordinator:
     # Called by the watching service
 
     def update(self, snapshot: TreeSnapshot) -> None:
-        """Take a new look at the tree into account, and whatever has come due since the last one."""
+        """Take a new snapshot of the tree into account, and whatever has come due since the last one."""
         now = self._clock.now()
         for name in sorted(self._slots.keys() | snapshot.devices.keys(), key=sort_key):
             slot = self._slots.setdefault(name, _Slot())
@@ -374,7 +374,7 @@ PERIOD: Final = SECOND
 
 
 class UsbService:
-    """Looks at the tree when something is announced, missed or due, and every few seconds anyway.
+    """Reads the tree when something is announced, missed or due, and every few seconds anyway.
 
     Without this service no device waits for a hub.
 

@@ -119,7 +119,7 @@ def sort_key(name: str) -> tuple[int, ...]:
 
 
 def read_tree(sysfs: Sysfs) -> TreeSnapshot:
-    """Look at every hub and device. Devices that vanish while being read are left out."""
+    """Read every hub and device. Devices that vanish while being read are left out."""
     entries = sysfs.names(DEVICES)
     interfaces: dict[str, list[Node]] = {}
     for entry in entries:
@@ -138,7 +138,7 @@ def read_tree(sysfs: Sysfs) -> TreeSnapshot:
 
 
 def read_device(sysfs: Sysfs, name: str) -> UsbDevice | None:
-    """Look at one device; None if nothing hangs there."""
+    """Read one device; None if there is none."""
     nodes: list[Node] = []
     for entry in sysfs.names(f"{DEVICES}/{name}"):
         if match := _INTERFACE.fullmatch(entry):

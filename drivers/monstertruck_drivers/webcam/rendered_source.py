@@ -89,7 +89,7 @@ PTYS: Final = Path("/dev/pts")
 
 
 class PathSource:
-    """Looks at every opening whether the path leads to a pty, behind which only an emulator can be.
+    """Checks at every opening whether the path leads to a pty, behind which only an emulator can be.
 
     Args:
         path: node, symlink or glob pattern, see ``V4l2Source``.

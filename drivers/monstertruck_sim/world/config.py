@@ -1,6 +1,6 @@
 """Everything that can be chosen about the simulated world; the defaults are the truck's.
 
-These are the *true* values of the plant. What the daemon believes stands in its own calibration, so a hidden error
+These are the *true* values of the plant. The daemon has its own calibration, so a hidden error
 is made by changing a value here and not there. ``noise: false`` leaves the physics and drops every random part.
 """
 

@@ -12,7 +12,7 @@ from monstertruck_sim.world.noise import PEOPLE, generator
 from monstertruck_sim.world.obstacles import Disc
 
 STEP_S = 0.02
-"""Between two looks at what is ahead, s."""
+"""Between two checks of what is ahead, s."""
 ARRIVED = 0.05
 """A way-point nearer than this is reached, m."""
 PATIENCE = 3.0

@@ -49,7 +49,7 @@ RANGE: Final = 0.004
 PRINT: Final = 0.003
 """Of the board's size, as a share: a ruler, and paper."""
 UNKNOWN: Final = 0.3
-"""And before the lidar is believed."""
+"""And before the lidar is used."""
 WRONG_SIZE: Final = 0.01
 """Share by which the board's size must be wrong at least, to be named."""
 STRAY: Final = 5.0

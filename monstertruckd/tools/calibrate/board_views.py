@@ -61,7 +61,7 @@ class BoardView:
     sighting: BoardSighting
     """Corners averaged over its pictures"""
     pose: BoardPose
-    """By the lens that was believed then"""
+    """By the lens that was configured then"""
     angles: Array
     """Of the lidar's beams, rad, left positive; (n,); empty: it sent too few scans"""
     ranges: Array
@@ -96,7 +96,7 @@ class BoardGuide:
 
     Args:
         reader: of the board.
-        lens: as believed: only tilts and distances are judged by it.
+        lens: as configured: only tilts and distances are judged by it.
         beams: whether a view is one that the lidar sees, too; None = there is no lidar.
         patience: s without a new view that end it.
     """

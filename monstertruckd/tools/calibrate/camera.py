@@ -34,7 +34,7 @@ ROOM: Final = "a printed board on something flat (`stand print`), 0.4 to 1 m bef
 WORST: Final = 1.0
 """Pixels: root mean square by which corners may be off."""
 FIRST: Final = 3
-"""Pictures that are looked at for their size."""
+"""Pictures from which the size is taken."""
 KEPT: Final = math.radians(0.7)
 """By which the lidar's joints may have turned meanwhile: two steps of their servos."""
 STRAY: Final = 3.0

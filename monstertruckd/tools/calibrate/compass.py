@@ -124,7 +124,7 @@ class CompassWizard:
 
 
 def result_of(circle: FieldCircle) -> Result:
-    """Fit and judge.
+    """Fit and evaluate.
 
     Raises:
         InputError: no full circle was driven, the field turns the wrong way round, or is no ellipse.

@@ -116,7 +116,7 @@ _NAMES: Final = ("rate_x", "rate_y", "rate_z", "rate_scale", "force_x", "force_y
 def result_of(
     resting: Sequence[Imu], tilt: Sequence[Attitude], turns: Sequence[Turn], before: dict[str, float]
 ) -> Result:
-    """Fit and judge.
+    """Fit and evaluate.
 
     Args:
         resting: readings of the unit while the truck stands.

@@ -95,7 +95,7 @@ class LidarLeg:
         Args:
             record: with scans.
             chassis: for distance and direction.
-            mount: as believed, for the first guess.
+            mount: as configured, for the first guess.
 
         Raises:
             InputError: too few scans at rest, or scans that do not fit together.
@@ -244,11 +244,11 @@ def result_of(
     offset: Offset | None,
     level: tuple[Estimate, ...] = (),
 ) -> Result:
-    """Fit and judge.
+    """Fit and evaluate.
 
     Args:
         legs: driven.
-        mount: as believed, m and rad.
+        mount: as configured, m and rad.
         crab: standard deviation of the direction of travel, rad.
         offset: of the clocks; None = not measured.
         level: pitch and roll, where measured.
@@ -340,7 +340,7 @@ def check_way_round(before: Scan, after: Scan, moved: tuple[float, float], mount
         before: scan at the first rest.
         after: and at the second one.
         moved: distance (m) and turn (rad) of the body.
-        mount: as believed.
+        mount: as configured.
         overlap: of the scans as they are.
 
     Raises:

@@ -115,7 +115,7 @@ class OdometryWizard:
         return Square(tuple(legs), taped, (await context.ask(_AHEAD) / 100, await context.ask(_LEFT) / 100))
 
     def judge(self, context: WizardContext, maps: Maps, squares: Sequence[Square]) -> Result:
-        """Fit and judge."""
+        """Fit and evaluate."""
         chassis, geometry = context.chassis, context.config.geometry
         assert isinstance(chassis, TruckChassis)
         model = SquareModel(SteeringModel(chassis), maps, geometry.length / 2)
@@ -244,7 +244,7 @@ class SquareModel:
         return x + self._ahead * (math.cos(yaw) - 1.0), y + self._ahead * math.sin(yaw)
 
     def fit(self, squares: Sequence[Square], tape: float, string: float) -> FitResult:
-        """Least squares; residuals in standard deviations, the beliefs last."""
+        """Least squares; residuals in standard deviations, the priors last."""
         legs = [leg for square in squares for leg in square.legs]
         turned = np.array([leg.turn for leg in legs])
         sigmas = np.array([math.hypot(leg.sigma, SLIP * math.sqrt(self._model.way(leg))) for leg in legs])

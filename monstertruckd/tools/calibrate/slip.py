@@ -119,7 +119,7 @@ class SlipWizard:
 
 
 def result_of(arcs: Sequence[SkidArc], radius: float, half_track: float) -> Result:
-    """Fit and judge.
+    """Fit and evaluate.
 
     Args:
         arcs: driven.

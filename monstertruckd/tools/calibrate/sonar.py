@@ -167,7 +167,7 @@ class SonarWizard:
 
 
 def result_of(legs: Sequence[SonarLeg], settings: Srf08Config, wall: float, tape_error: float) -> Result:
-    """Fit and judge.
+    """Fit and evaluate.
 
     Args:
         legs: driven, the first from where the robot was parked.

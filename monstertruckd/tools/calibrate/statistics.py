@@ -118,7 +118,7 @@ def known_errors(fit: FitResult, freedom: int) -> Array:
 
     Args:
         fit: of residuals over their standard deviations.
-        freedom: measurements, beliefs left aside, less parameters.
+        freedom: measurements, without priors, less parameters.
     """
     power = float(np.sum(fit.residuals**2))
     unit = math.sqrt(power / max(1, fit.residuals.size - fit.parameters.size))

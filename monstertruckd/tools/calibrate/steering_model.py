@@ -229,7 +229,7 @@ def half_widths(fit: FitResult, priors: int = 9) -> Array:
 
     Args:
         fit: of ``SteeringModel.fit``.
-        priors: residuals that are beliefs, not measurements.
+        priors: residuals of priors, not of measurements.
     """
     freedom = fit.residuals.size - priors - fit.parameters.size
     spread = math.sqrt(float(np.sum(fit.residuals**2)) / max(1, fit.residuals.size - fit.parameters.size))

@@ -24,7 +24,7 @@ from monstertruckd.tools.logs.report.signals import FIGURES
 from monstertruckd.tools.logs.rerun_view import APPLICATION, Scene, blueprint
 
 PERIOD: Final = 0.1
-"""Seconds between two looks at what came."""
+"""Seconds between two checks of what came."""
 RETRY: Final = 1.0
 """Seconds between two attempts to reach the robot, and in which it answers."""
 WAITING: Final = 200

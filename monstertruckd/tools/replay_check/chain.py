@@ -50,7 +50,7 @@ WORKER: Final = (topics.SLAM.name, topics.SCAN_MOTION.name, topics.MAP.name, top
 """Outputs of the estimation worker, which come when it is done."""
 
 LINKS: Final = 16
-"""Turns of the loop after which a worker's answer has certainly been delivered."""
+"""Iterations of the event loop after which a worker's answer has certainly been delivered."""
 
 GIVEN: Final = frozenset({topics.PATH.name, topics.GATE.name})
 """Not computed again, but read by the tracker."""

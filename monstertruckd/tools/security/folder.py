@@ -348,7 +348,7 @@ class Folder:
         return file.read_bytes() if file.exists() else b""
 
     def _trusted(self) -> bytes:
-        """Whom a station believes: the robot's authority, and the router's."""
+        """Whom a station trusts: the robot's authority, and the router's."""
         return (self.path / "authority.pem").read_bytes() + self._router()
 
     def _files(self, name: str) -> tuple[Path, Path]:

@@ -32,7 +32,7 @@ def model_text(config: TruckConfig) -> str:
 
 
 def _parts(config: TruckConfig) -> tuple[SimTruckConfig, Mechanics]:
-    """Body and dimensions as the daemon believes them; masses and springs as simulated."""
+    """Body and dimensions as the daemon has them; masses and springs as simulated."""
     if config.body.kind not in SOLID_BODIES:
         raise InputError(f"body {config.body.kind}: has no description; expected one of {', '.join(SOLID_BODIES)}")
     world = config.sim.world if isinstance(config, SimulatedTruckConfig) else WorldConfig()

@@ -32,7 +32,7 @@ RATE_TIME: Final = 0.1
 EXPECTED: Final = 0.5
 """Seconds for which a robot is expected where its speed takes it."""
 STUBBORN: Final = 5
-"""Pictures after which an impossible pose is believed."""
+"""Pictures after which an impossible pose is accepted."""
 BUMPED: Final = 0.005
 """m: marks of a camera that are shifted, turned or scaled by this much, rms over the marks: the camera has moved."""
 BUMP_TIME: Final = 3.0

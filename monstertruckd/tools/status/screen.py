@@ -1,4 +1,4 @@
-"""The live screen: what the truck believes, what limits it, how its services are. Pure: messages in, picture out."""
+"""The live screen: the estimates of the truck, its limits, its services. Pure: messages in, picture out."""
 
 import math
 from collections import deque

@@ -49,7 +49,7 @@ STANDING: Final = (0.02, 0.02)
 LOOKS: Final = 2
 """Pictures read at one place."""
 KEEP_RATE: Final = 2.0
-"""Looks a second at what has changed."""
+"""Checks per second at what has changed."""
 PERIOD: Final = SECOND
 """Between two messages, ns."""
 SAVE_PERIOD: Final = 10 * SECOND

@@ -118,7 +118,7 @@ CONSISTENT: Final = 11.3
 STRETCH: Final = 3.0
 """Length of trajectory within which the drift is small, so that of two contradicting matches one is false, m."""
 MAX_DRIFT: Final = 1.0
-"""Consistency is not judged where the drift between two matches is greater, m."""
+"""Consistency is not tested where the drift between two matches is greater, m."""
 MAX_AGE: Final = 60
 """Keyframes after which a match without support is dropped."""
 SEARCH_INTERVAL: Final = 4

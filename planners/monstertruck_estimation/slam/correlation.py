@@ -31,7 +31,7 @@ SMEAR: Final = 0.08
 DOUBT: Final = 0.002
 """Penalty of a squared standard deviation from the guess, as share of the score."""
 WORK: Final = 400_000
-"""Blocks looked at, unless the caller says otherwise."""
+"""Blocks evaluated, unless the caller says otherwise."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +103,7 @@ def correlate(
         deviation: standard deviation of the guess (m, rad), which breaks ties (``DOUBT``).
         least: poses scoring less are no result.
         apart: a rival is at least this far (m; or that arc at the typical range) from the best; 0: do not look.
-        work: blocks looked at before the search ends with what it has.
+        work: blocks evaluated before the search ends with what it has.
     """
     if not len(points):
         return None
@@ -250,10 +250,10 @@ def _search(  # type: ignore[no-untyped-def] # noqa: ANN202
     shut_cells,  # noqa: ANN001
     shut_turns,  # noqa: ANN001
 ):
-    """Best-first branch and bound: score, turn index, x cells, y cells, and what a pose not looked at may score.
+    """Best-first branch and bound: score, turn index, x cells, y cells, and what a pose not evaluated may score.
 
     The turn index is -1 if nothing reached ``least``. The search begins with the sorted ``blocks`` of the coarsest
-    level, and ends early when more than ``most`` below it were looked at. The block of the greatest bound is next,
+    level, and ends early when more than ``most`` below it were evaluated. The block of the greatest bound is next,
     whatever its size: depth first, a search that ends early would have seen one corner of a great window, and not the
     place that fits.
     Poses within ``shut_cells`` and ``shut_turns`` of (shut_x, shut_y, shut_k) do not count.

@@ -575,7 +575,7 @@ WITNESS_PAUSE: Final = 60.0
 WITNESS_SHARE: Final = 0.25
 """The same as a share of a shorter run."""
 WITNESSES: Final = 1500
-"""Most pairs that judge it, evenly chosen."""
+"""Pairs that are used to check it, at most, evenly chosen."""
 WITNESS_REACH: Final = 0.05
 """Distance within which a point agrees with the other scan, m."""
 
@@ -583,7 +583,7 @@ WITNESS_REACH: Final = 0.05
 def witnesses(keys: list[Keyframe], poses: Array, part: NDArray[np.int64]) -> NDArray[np.int64]:
     """Pairs (earlier, later), shape (n, 2), that see the same place at times far apart, but are not ``partners``.
 
-    The joint registration has no term of theirs, so that they can judge it.
+    The joint registration has no term of theirs, so that they can check it.
     """
     stamps = np.array([key.stamp for key in keys])
     pause = min(WITNESS_PAUSE * SECOND, WITNESS_SHARE * float(stamps[-1] - stamps[0]))

@@ -40,7 +40,7 @@ class Evidence:
 
     @property
     def contradiction(self) -> float:
-        """Share of the beams that the map can judge which speak against the pose, 0..1; 0 if it can judge none."""
+        """Share of the beams that the map can check which contradict the pose, 0..1; 0 if it can check none."""
         judged = self.agreeing + self.against
         return self.against / judged if judged else 0.0
 
@@ -70,7 +70,7 @@ class EvidenceGrid:
         return Evidence(*np.bincount(kinds, minlength=3).tolist())
 
     def judged(self, pose: Array, points: Array, mount: Array) -> NDArray[np.bool_]:
-        """Which beams the map can judge, shape (n,): all but those that end where it knows nothing.
+        """Which beams the map can check, shape (n,): all but those that end where it knows nothing.
 
         Arguments are those of ``judge``.
         """

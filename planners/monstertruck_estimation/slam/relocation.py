@@ -122,7 +122,7 @@ OFF_MOTION: Final = (0.5, 1.0)
 """Difference of a match from the motion by odometry, or the last one, m or rad, up to which these may be wrong.
 
 With every misfit the window of the next match grows, and that of the last motion is wide: a robot that was carried fits
-somewhere in it sooner or later. Wheels that are late are put right by the last motion.
+somewhere in it sooner or later. The last motion corrects wheels that are late.
 """
 ASTRAY: Final = ((0.25, 0.25), (0.1, 0.1))
 """Difference from which on such a match may be at a similar place, without a doubt and in doubt."""

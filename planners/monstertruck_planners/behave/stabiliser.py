@@ -47,7 +47,7 @@ FILTERS: Final = 5
 CALMER: Final = 0.6
 """Each next filter forgets this much of what the one before it forgets."""
 JUDGED: Final = 2
-"""Readings over which a prediction is judged: about as far ahead as it is used."""
+"""Readings over which a prediction is checked: about as far ahead as it is used."""
 JUDGEMENT: Final = 0.1
 """Share that the newest reading has in a filter's errors."""
 DECIDED: Final = 4

@@ -1,4 +1,4 @@
-"""What explorers choose from: the frontiers of a map, a place to look at each, and the ways there. Loads numba."""
+"""What explorers choose from: the frontiers of a map, a viewpoint for each, and the paths there. Loads numba."""
 
 import math
 from dataclasses import dataclass
@@ -33,7 +33,7 @@ from monstertruck_planners.route.heuristic import (
 LONGEST: Final = 2.5
 """Frontiers longer than this are divided, m."""
 AROUND: Final = 3.0
-"""A frontier is looked at from this near, m."""
+"""Distance of a viewpoint from its frontier at most, m."""
 COMPARED: Final = 160
 """Viewpoints compared for each frontier by how much of it is visible."""
 PLACES: Final = 32
@@ -56,7 +56,7 @@ LEAST: Final = 0.06
 BANNED: Final = 0.5
 """Frontiers whose centre is this near to a banned place are skipped, m."""
 AVOIDED: Final = 0.25
-"""Metres round an avoided place from where nothing is looked at."""
+"""Metres round an avoided place without viewpoints."""
 NEARBY: Final = 0.6
 """A path begins at an open cell this near to the robot, m."""
 BEHIND: Final = 4
@@ -81,7 +81,7 @@ class Frontier:
 
 @dataclass(frozen=True)
 class Viewpoints:
-    """Places from where a frontier is looked at; they hold as long as nothing changes around it."""
+    """Viewpoints of a frontier; they are valid as long as nothing changes around it."""
 
     change: int
     """The newest one of the map."""
@@ -99,7 +99,7 @@ class Viewpoints:
 
 @dataclass(frozen=True)
 class Option:
-    """A frontier, and where to look at it from."""
+    """A frontier and its viewpoint."""
 
     frontier: Frontier
     pose: Pose
@@ -117,12 +117,12 @@ class Option:
 
 
 class Explorer(Protocol):
-    """Chooses what to look at next; asked again and again while the robot drives."""
+    """Chooses the next viewpoint; asked repeatedly while the robot drives."""
 
     def choose(
         self, view: "ExplorationView", pursued: Viewpoint | None, still: Option | None, seconds: float
     ) -> Viewpoint | None:
-        """What to look at; ``pursued`` itself to go on.
+        """The next viewpoint; ``pursued`` itself to go on.
 
         Args:
             view: the map, and its options.
@@ -342,7 +342,7 @@ class ExplorationView:
         return places[room], bearings[room], headings[room, first]
 
     def _option(self, frontier: Frontier, look: Viewpoints, ways: CostToGo) -> Option | None:
-        """The nearest place to look at a frontier from."""
+        """The nearest viewpoint of a frontier."""
         if not len(look.places):
             return None
         rows, columns = np.floor((look.places - (self._field.x, self._field.y)) / self._cell).astype(int).T[::-1]

@@ -1,4 +1,4 @@
-"""Exploration by ``kind``: which frontier is looked at next."""
+"""Exploration by ``kind``: which frontier is visited next."""
 
 from typing import Annotated, Final
 

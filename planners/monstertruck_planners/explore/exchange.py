@@ -62,7 +62,7 @@ class ExploreTask:
     banned: tuple[Point, ...] = ()
     """Frontiers here are skipped."""
     avoided: tuple[Point, ...] = ()
-    """Nothing is looked at from here: these places could not be reached."""
+    """No viewpoints here: these places could not be reached."""
     home: Pose | None = None
     """The path there is wanted."""
     find: bool = False
@@ -76,7 +76,7 @@ class Viewpoint:
     pose: Pose
     """Of the base, in map."""
     frontier: Point
-    """Centre of what is looked at."""
+    """Centre of the frontier or wall that is viewed."""
     way: float = 0.0
     """Metres there, for a point."""
     gain: float = 0.0
@@ -100,4 +100,4 @@ class ExploreAnswer:
     home: float | None = None
     """Metres of the path home; None = not asked for, or none is known."""
     changed: int = 0
-    """Cells looked at again for frontiers."""
+    """Cells checked again for frontiers."""

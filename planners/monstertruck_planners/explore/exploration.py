@@ -201,7 +201,7 @@ class Exploration:
     not_before: float = 0.0
     """Time before which no decision and no goal for driving home is requested, s."""
     nothing: int = 0
-    """Answers in a row without a place to look at."""
+    """Answers in a row without a viewpoint."""
     newest: ExploreAnswer = field(default_factory=ExploreAnswer)
     travelled: float = 0.0
     """Metres, by poses apart by ``COUNTED``."""
@@ -258,7 +258,7 @@ def stop(run: Exploration, source: str, now: float) -> Step:
 
 
 def tick(run: Exploration, seen: Observed, config: ExplorerConfig) -> Step:
-    """One look at the observed."""
+    """One step with new observations."""
     run = _moved(replace(run, now=seen.now), seen)
     if seen.answer is not None:
         run = replace(run, newest=_merged(run.newest, seen.answer), waiting=False)
@@ -456,7 +456,7 @@ def _lost(run: Exploration, seen: Observed, config: ExplorerConfig) -> Step:
 
 
 def _finish(run: Exploration, outcome: Reason, text: str) -> Step:
-    """Nothing more is looked at: home, or the end."""
+    """No more viewpoints: drive home, or end."""
     run = replace(run, final=outcome, final_text=text, target=None)
     if not run.returns:
         return _end(run, outcome, text, Cancel(), Save())

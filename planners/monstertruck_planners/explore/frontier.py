@@ -53,7 +53,7 @@ class FrontierMap:
         return x, y, 0.0
 
     def put(self, grid: Grid, *, whole: bool) -> int:
-        """Take in a tile, or a whole map in place of all before; returns the number of cells looked at again.
+        """Take a tile, or a whole map that replaces the last one; returns the number of cells checked again.
 
         Raises:
             InputError: another resolution, or cells that do not lie on those before.

@@ -1,7 +1,7 @@
 """Where to look for tags on walls: faces of walls that the camera has not had before it, near enough and not obliquely.
 
 A layer over exploration: once no frontier is left, the robot is sent past the walls until as much was found as was
-asked for, or every wall has been looked at.
+asked for, or every wall was viewed.
 """
 
 import math
@@ -22,7 +22,7 @@ from monstertruck_planners.goals.exchange import Pose
 FACE: Final = 0.2
 """Faces of walls are counted by squares of this side, m, and eight directions."""
 AWAY: Final = (0.8, 1.0, 0.65)
-"""A face is looked at from so far before it, m, the first that is free."""
+"""Distances from which a face is viewed, m; the first that is free is used."""
 ASIDE: Final = (0.0, 0.5, -0.5)
 """And from so far aside, rad."""
 WORTH: Final = 1.5
@@ -46,7 +46,7 @@ class Faces:
 
 
 class WallLooks:
-    """What the camera has looked at.
+    """What the camera has viewed.
 
     Args:
         camera: of the robot.
@@ -57,13 +57,13 @@ class WallLooks:
         self._looked: set[int] = set()
 
     def take(self, known: FrontierMap, pose: Pose) -> None:
-        """The robot is here: what is before its camera has been looked at."""
+        """The robot is here: what is before its camera was viewed."""
         faces = faces_of(known)
         if len(faces.keys):
             self._looked.update(faces.keys[self._sees(known, faces, pose)].tolist())
 
     def choose(self, view: ExplorationView, current: Viewpoint | None) -> Viewpoint | None:
-        """A place to look at a wall from; the one that is pursued while its wall has not been looked at."""
+        """A viewpoint of a wall; the pursued one until its wall was viewed."""
         faces = faces_of(view.known)
         open_ = ~np.isin(faces.keys, np.fromiter(self._looked, np.int64, len(self._looked)))
         for place in view.banned:

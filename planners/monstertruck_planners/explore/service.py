@@ -32,7 +32,7 @@ from monstertruck_schemas.topics import BATTERY, POSE, SLAM
 SOURCE: Final = ServiceName.EXPLORER.value
 """Of the goals."""
 RATE: Final = 5.0
-"""Looks a second."""
+"""Checks per second."""
 REPORT: Final = SECOND // 2
 """Between two reports without a change, ns."""
 CHANGES: Final = ("number", "phase", "outcome", "goals", "failures")

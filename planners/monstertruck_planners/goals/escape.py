@@ -1,4 +1,4 @@
-"""Backing out of a tight place, as by car_maneuver_recovery (G. Kouros), with its slips put right.
+"""Backing out of a tight place, as by car_maneuver_recovery (G. Kouros), with its errors corrected.
 
 The rule is its own: of the footprint's four sides those are found that are not free. With both ends blocked there is no
 path out; else the truck drives forward if it can, backward otherwise, steering away from the side that is blocked.

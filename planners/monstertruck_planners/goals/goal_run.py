@@ -184,7 +184,7 @@ def displaced(run: GoalRun, text: str) -> Step:
 
 
 def tick(run: GoalRun, observed: Observations, config: PlannerConfig) -> Step:
-    """One look at the observed."""
+    """One step with new observations."""
     passed, run = observed.now - run.now, replace(run, now=observed.now)
     if run.phase in (GoalPhase.IDLE, GoalPhase.PAUSED):
         return run, ()

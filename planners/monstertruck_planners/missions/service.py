@@ -64,7 +64,7 @@ from monstertruck_schemas.topics import ODOMETRY
 SOURCE: Final = ServiceName.MISSIONS.value
 """Of its goals, behaviours and explorations."""
 RATE: Final = 5.0
-"""Looks a second."""
+"""Checks per second."""
 REPORT: Final = SECOND // 2
 """Between two reports without a change, ns."""
 CHANGES: Final = ("number", "running", "step", "attempt", "outcome", "resumable")
@@ -197,7 +197,7 @@ class MissionService:
         self._interrupted = await self._offload(self._load)
         if self._interrupted is not None:
             text = f"{self._interrupted.mission.name} was interrupted at step {self._interrupted.index + 1}"
-            self._events(Reason.MISSION_INCOMPLETE, Severity.WARNING, SOURCE, f"{text}; it can be gone on with")
+            self._events(Reason.MISSION_INCOMPLETE, Severity.WARNING, SOURCE, f"{text}; it can be resumed")
         async with asyncio.TaskGroup() as tasks:
             self._tasks = tasks
             self._report(self._clock.now())

@@ -214,7 +214,7 @@ async def test_a_full_hop_loses_the_oldest_and_says_how_many():
     hop: ThreadHop[int] = ThreadHop(got.append, 3, lost.append)
     for i in range(5):
         hop.put(i)
-    for taken in ([2], [2, 3], [2, 3, 4], [2, 3, 4]):  # one in each turn of the loop
+    for taken in ([2], [2, 3], [2, 3, 4], [2, 3, 4]):  # one in each iteration of the event loop
         await asyncio.sleep(0)
         assert got == taken
     assert lost == [2]

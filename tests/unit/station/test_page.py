@@ -113,7 +113,7 @@ async def an_unknown_way_is_taken_to_be_slow(page: Page) -> None:
     assert beat["heard"] > 5000
     assert beat["since"] >= 0.0
     await page.evaluate("void (window.answers = false)")
-    assert (await beats(page, 0.9))[-1]["speed"] < 0.16, "what is waited for in vain is no quick answer"
+    assert (await beats(page, 0.9))[-1]["speed"] < 0.16, "an answer that does not come is no quick one"
     await page.evaluate("void (window.answers = true)")
     assert max(beat["speed"] for beat in await beats(page, 0.8)) > 0.18
     await say(page, {"kind": "link", "alive": False, "round_trip": None, "text": "gone"})
