@@ -26,7 +26,7 @@ ROOM: Final = 4 * MAX_WAITING
 MAX_ESTOPS: Final = 8
 """Emergency stops of one owner that wait or are carried out."""
 ALL_ESTOPS: Final = 64
-"""Of all owners together: without certificates names can be invented."""
+"""Limit of all owners together: without certificates names can be invented."""
 CALL_RATE: Final = 100.0
 """Calls a second of one owner that are not orders."""
 TOO_MANY: Final = "too many calls at once"

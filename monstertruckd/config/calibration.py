@@ -27,10 +27,10 @@ from monstertruckd.config.truck import TruckConfig
 C = TypeVar("C", bound=TruckConfig)
 
 CONFIDENCE: Final = 0.95
-"""Of every interval: of a hundred trucks measured like this, so many have their true value inside."""
+"""Confidence of every interval: the share of trucks measured like this whose true value is inside."""
 
 MOST_BYTES: Final = 1_000_000
-"""Of one file."""
+"""Size of one file at most."""
 
 Value = bool | int | float
 Grade = Literal["A", "B", "C"]

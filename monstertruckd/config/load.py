@@ -40,14 +40,14 @@ HEAD: Final = (
     "Settings changed while the robot ran (monstertruckd set --save); they replace those of the configuration."
 )
 MOST_BYTES: Final = 1_000_000
-"""Of one file."""
+"""Size of one file at most."""
 DEEPEST: Final = 50
 """Nesting of sections and lists, at most."""
 MOST_NODES: Final = 5_000
 """Keys and values in the text of one file, at most: read in a quarter of a second; a full configuration has some
 hundreds."""
 MOST_VALUES = 20_000
-"""Of one file; a full configuration has a few hundred."""
+"""Values of one file at most; a full configuration has a few hundred."""
 MOST_MISTAKES = 50
 """Named at once."""
 ALIEN = 0.75
@@ -345,7 +345,7 @@ def _other_kind(below: dict[str, Any], above: dict[str, Any]) -> bool:
 
 @dataclass(slots=True)
 class _Builder:
-    """Of one file."""
+    """Size of one file at most."""
 
     path: Path
     origins: dict[Key, Origin]
@@ -579,9 +579,9 @@ def _rename_keys(text: YamlText) -> None:
 
 
 VERSION: Final = 2
-"""Of the configuration files that this program writes."""
+"""Version of the configuration files that this program writes."""
 STEPS: Final[dict[int, Step]] = {1: _rename_keys}
-"""By the version they start from."""
+"""Migration steps by the version they start from."""
 OLDEST: Final = min(STEPS)
 
 

@@ -78,7 +78,7 @@ Course = tuple[UnitTwist, float]
 """A motion of the base: its twist per metre of pace, and its pace, m/s."""
 
 SECTORS: Final = 36
-"""Of a turn about the lidar: 0.1 m at the end of the distance the gate checks, less than the width of the body."""
+"""Sectors around the lidar: 0.1 m wide at the end of the distance the gate checks, less than the width of the body."""
 SECTOR: Final = 2 * math.pi / SECTORS
 PRESENT: Final = 0.5
 """Share of a sector's beams that a scan must have for the sector to be in the lidar's field."""
@@ -95,7 +95,7 @@ MEMORY_STEP: Final = 0.1
 """Travelled distance between two remembered scans, m."""
 MEMORY_SCANS: Final = 20
 SPACING: Final = 0.02
-"""Of remembered points along the line of the beams, m: less than their drift."""
+"""Distance between remembered points along the line of the beams, m: less than their drift."""
 VIEW_STEP: Final = 0.3
 """Distance (m) plus turn (rad) between two of the scans that are kept to know which ground is free: each sees further
 than a truck's length in half of all directions, and ground that none of them saw only slows the truck."""

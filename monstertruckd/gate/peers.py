@@ -32,9 +32,9 @@ DEVIATIONS: Final = 2.0
 UNSURE: Final = 0.3
 """Standard deviation above which a relative position is not used, m; the clearance grows no further."""
 SPACING: Final = 0.03
-"""Between the points of an outline, m."""
+"""Distance between the points of an outline, m."""
 STEP: Final = 0.02
-"""Between the poses of a sweep, m."""
+"""Distance between the poses of a sweep, m."""
 
 Place = tuple[float, float, float]
 Seen = Callable[[Array], NDArray[np.bool_]]

@@ -27,9 +27,9 @@ from monstertruckd.gate.config import GateConfig
 ALIGNED: Final = 0.3
 """Greatest angle between the axis of a sonar and the direction of travel for it to look ahead, rad."""
 SPACING: Final = 0.02
-"""Between the points of an arc, m."""
+"""Distance between the points of an arc, m."""
 STEP: Final = 0.02
-"""Between the poses of a sweep, m."""
+"""Distance between the poses of a sweep, m."""
 ROUNDS: Final = 2
 TURNING: Final = 0.3
 """A motion whose base travels less than this per metre of pace counts as a turn on the spot: no sonar looks ahead."""

@@ -49,7 +49,7 @@ class Channels:
 
 
 NAME: Final = re.compile(r"run-(\d{6,})-(\d{3,})\.mcap")
-"""Of a log: run and part."""
+"""Name of a log: run and part."""
 
 _COMPRESSION: Final = {
     Compression.NONE: CompressionType.NONE,

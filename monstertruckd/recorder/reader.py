@@ -48,7 +48,7 @@ _END: Final = struct.Struct("<BQQQI8s")
 _FOOTER_LENGTH: Final = struct.calcsize("<QQI")
 _UNSUMMED: Final = struct.calcsize("<I8s")
 _HEAD: Final = struct.Struct("<BQ")
-"""Of a record: opcode, length of the content."""
+"""Head of a record: opcode, length of the content."""
 CHECKSUM: Final = struct.Struct("<I")
 _PIECE: Final = 1 << 20
 

@@ -22,7 +22,7 @@ log = logging.getLogger(__name__)
 WAIT: Final = 5.0
 """Seconds in which the robot answers."""
 MOST_BYTES: Final = 2_000_000_000
-"""Of a recording that is fetched to be shown, which fills the station's temporary folder."""
+"""Size of a recording that is fetched to be shown at most: it is kept in the station's temporary folder."""
 RANGE: Final = re.compile(r"bytes=(\d{1,15})-")
 
 

@@ -64,7 +64,7 @@ RETRY: Final = 1.0
 TELL_LATE: Final = 1.0
 """Seconds between two remarks on late heartbeats."""
 SPACING: Final = 0.05
-"""Between two poses of a drawn path, m."""
+"""Distance between two poses of a drawn path, m."""
 SMOOTHING: Final = 0.12
 """Standard deviation of the weights with which a drawn line is smoothed, m: hands tremble."""
 SHORTEST: Final = 0.3

@@ -60,7 +60,7 @@ MOST_BROWSERS: Final = 32
 MOST_OF_USER: Final = 8
 """Browsers of one user who logs in, so that nobody uses up all of them."""
 MOST_CONNECTIONS: Final = 256
-"""Of one network: a browser keeps some six. Of those beyond, the newest are closed."""
+"""Connections of one network at most: a browser keeps some six. The newest beyond that are closed."""
 MESSAGES: Final = 200.0
 """Messages a second of one browser, in bursts of as many; what comes faster waits, without a delay for others."""
 USUAL_PORTS: Final = {"http": 80, "https": 443}

@@ -27,7 +27,7 @@ from monstertruck_schemas.topics import SOURCE_NAME
 log = logging.getLogger(__name__)
 
 COST: Final = {"n": 2**14, "r": 8, "p": 1}
-"""Of scrypt: 16 MB and some 50 ms for each attempt."""
+"""Parameters of scrypt: 16 MB and some 50 ms for each attempt."""
 LENGTH: Final = 32
 SHORTEST: Final = 8
 """Characters of a password."""

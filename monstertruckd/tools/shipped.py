@@ -5,7 +5,7 @@ from typing import Final
 
 _PACKAGE: Final = Path(__file__).resolve().parents[1]
 PLACES: Final = (_PACKAGE, _PACKAGE.parent)
-"""Of an installed wheel, and of a checkout."""
+"""Folders of an installed wheel, and of a checkout."""
 
 
 def shipped(name: str) -> Path:

@@ -35,7 +35,7 @@ from monstertruck_kinematics.wheels import SwedishWheel, Wheel
 _CASTER: Final = 0.05
 """Mass of a caster, kg."""
 _CASTER_SHARE: Final = 0.1
-"""Of the weight, on every caster."""
+"""Share of the weight on every caster."""
 
 
 @dataclass(frozen=True, slots=True)

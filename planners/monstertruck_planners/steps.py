@@ -24,7 +24,7 @@ STEPS: Final = {
 """``module:factory`` by name."""
 
 PLANNING_BY_KIND: Final = {"hybrid": "monstertruck_planners.goals.plan_step:hybrid_worker"}
-"""Of workers that compile what one kind of route planner needs."""
+"""Planning steps that compile only the code of one kind of route planner, by kind."""
 
 CODEC: Final = StepCodec(
     *(PlanTask, PlanAnswer, DeformTask, DeformAnswer, TrackInput, TrackOutput, ExploreTask, ExploreAnswer),

@@ -60,7 +60,7 @@ SEGMENT_LIMIT = 16
 STRAY_LIMIT = 3
 """Unknown bytes skipped before an acknowledge."""
 ATTEMPTS = 3
-"""Of an exchange outside the schedule."""
+"""Attempts at an exchange outside the schedule."""
 
 _ANSWER_LENGTHS: dict[int, frozenset[int]] = {Opcode.READ: frozenset((1, 3)), Opcode.WRITE: frozenset((1,))}
 

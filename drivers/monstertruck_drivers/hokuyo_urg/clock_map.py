@@ -28,7 +28,7 @@ RECENT: Final = 6
 BREAK: Final = 3e-3
 """Difference of the drifts by recent and by all blocks that only a slew explains."""
 GREATEST_DRIFT: Final = 0.12
-"""Of a clock that is slewed: chrony and the kernel slew by a tenth at most."""
+"""Greatest relative drift of a clock that is slewed: chrony and the kernel slew by a tenth at most."""
 PROMPT: Final = 8
 """Scans of which one at least is prompt: all above the envelope means that the clocks run apart."""
 APART: Final = 30 * MILLISECOND

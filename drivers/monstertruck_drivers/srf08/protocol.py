@@ -22,7 +22,7 @@ I2C_AD1: Final = 0x55
 ACK: Final = 0xFF
 
 ADDRESSES: Final = tuple(range(0xE0, 0x100, 2))
-"""That a module may be set to; with their lowest bit they are for reading."""
+"""Addresses that a module may be set to; with the lowest bit set they are for reading."""
 RANGE_IN_MICROSECONDS: Final = 0x52
 ABSENT: Final = 0xFF
 """Software revision that nobody drives onto the bus."""

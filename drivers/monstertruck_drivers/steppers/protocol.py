@@ -45,7 +45,7 @@ class MotorState(IntEnum):
     OFF = 0
     """Coils off: they turn freely. So after power-up."""
     RUN = 1
-    """They follow the rates of the last ``R``."""
+    """The motors follow the rates of the last ``R``."""
     STOPPED = 2
     """Quick stop, then hold."""
     WATCHDOG = 3

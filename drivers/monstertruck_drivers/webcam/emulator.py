@@ -21,7 +21,7 @@ from monstertruck_runtime.threads import Offload, in_thread
 
 FONT_SIZE: Final = 20
 QUALITY: Final = 75
-"""Of the JPEG, 1..95."""
+"""JPEG quality, 1..95."""
 
 
 def jpeg(picture: NDArray[np.uint8], counter: int) -> bytes:

@@ -42,9 +42,9 @@ BEHIND: Final = 0.08
 FINEST: Final = 4
 """Rays of a pixel along and across, at most."""
 RAYS: Final = 80_000
-"""Of a panel at most: fewer rays a pixel where it fills the picture."""
+"""Rays of a panel at most: fewer rays a pixel where it fills the picture."""
 _ROUNDS: Final = 6
-"""Of the fixed-point iteration that undoes the lens's distortion."""
+"""Iterations that undo the lens's distortion."""
 _GRAIN: Final = 64
 """The grain of the sensor is moved by up to so many pixels from picture to picture."""
 

@@ -12,11 +12,11 @@ from monstertruck_sim.world.noise import PEOPLE, generator
 from monstertruck_sim.world.obstacles import Disc
 
 STEP_S = 0.02
-"""Between two checks of what is ahead, s."""
+"""Seconds between two checks of the path ahead."""
 ARRIVED = 0.05
 """A way-point nearer than this is reached, m."""
 PATIENCE = 3.0
-"""After so many seconds of standing before somebody the next way-point is walked to instead."""
+"""Seconds of waiting for somebody else after which the next way-point is chosen."""
 SIDE = 0.25
 """What is further than this from the way somebody sweeps is passed, m."""
 LEG = (1.0, 4.0)

@@ -26,7 +26,7 @@ from monstertruck_sim.world.sensors import turned
 SPEED_OF_SOUND: Final = 343.0
 """m/s, in air of 20 degrees Celsius."""
 _STEP: Final = 0.015
-"""Between the rays of a cone, rad."""
+"""Angle between the rays of a cone, rad."""
 _WINDOW: Final = 0.08
 """Points this near on both sides tell the direction of a wall, m: some cells of a map."""
 _EDGE: Final = 0.25

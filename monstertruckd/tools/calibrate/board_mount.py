@@ -27,7 +27,7 @@ from monstertruck_schemas.body import Mount
 from monstertruckd.tools.calibrate.board_views import BoardView
 
 NAMES: Final = ("x", "y", "z", "yaw", "pitch", "roll")
-"""Of a mount, as parameters."""
+"""Parameters of a mount."""
 LEAST: Final = 10
 """Beams on the board."""
 GAP: Final = 0.05
@@ -47,16 +47,16 @@ WARPED: Final = 0.003
 RANGE: Final = 0.004
 """Standard deviation of what the lidar measures too far on such a surface, m."""
 PRINT: Final = 0.003
-"""Of the board's size, as a share: a ruler, and paper."""
+"""Relative error of the board's size: a ruler, and paper."""
 UNKNOWN: Final = 0.3
-"""And before the lidar is used."""
+"""Standard deviation before the lidar is used."""
 WRONG_SIZE: Final = 0.01
 """Share by which the board's size must be wrong at least, to be named."""
 STRAY: Final = 5.0
 """Residual of a view that does not belong to the others, in standard deviations."""
 LEAST_VIEWS: Final = 6
 REACH: Final = np.array((0.5, 0.5, 0.5, 0.8, 0.8, 0.8))
-"""By which the mount may be off, m and rad."""
+"""Greatest error of the configured mount, m and rad."""
 
 
 class LidarPlace(NamedTuple):

@@ -20,17 +20,17 @@ from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.sensor import VALID_BEAM, LaserScan
 
 HOLD: Final = round(0.7 * SECOND)
-"""For which the board is held still, ns."""
+"""Time for which the board is held still, ns."""
 STILL: Final = 1.0
 """Pixels that four corners of five move meanwhile, at most: a single one may be found wrong."""
 LEAST_PICTURES: Final = 3
-"""Of a view."""
+"""Pictures of a view, at least."""
 ANOTHER: Final = 12.0
 """Pixels by which corners differ from those of every other view, on average."""
 BLURRED: Final = 2.0
 """Pixels: standard deviation of the step of an edge."""
 LEAST_SCANS: Final = 3
-"""Of a view."""
+"""Scans of a view, at least."""
 ROWS: Final = ("upper", "middle", "lower")
 COLUMNS: Final = ("left", "middle", "right")
 IN_CELL: Final = 6

@@ -36,7 +36,7 @@ WORST: Final = 1.0
 FIRST: Final = 3
 """Pictures from which the size is taken."""
 KEPT: Final = math.radians(0.7)
-"""By which the lidar's joints may have turned meanwhile: two steps of their servos."""
+"""Turn of the lidar's joints that is tolerated meanwhile, rad: two steps of their servos."""
 STRAY: Final = 3.0
 """Times the median by which the corners of a view may be off."""
 UNITS: Final = {"focal_x": "px", "focal_y": "px", "centre_x": "px", "centre_y": "px"}

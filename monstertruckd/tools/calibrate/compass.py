@@ -25,7 +25,7 @@ from monstertruckd.tools.calibrate.wizard import CLEAR, WizardContext
 ROOM: Final = "2 m x 2 m, level, outdoors or well away from iron: no car, no reinforced wall, no drain within 3 m"
 
 ANGLE: Final = 0.35
-"""Of both axles, against each other, rad: a circle of 0.44 m."""
+"""Angle of both axles, in opposite directions, rad: a circle of 0.44 m."""
 OVERLAP: Final = 1.05
 """Turns to be driven."""
 TILT: Final = math.radians(0.5)

@@ -26,7 +26,7 @@ TILT: Final = math.radians(0.2)
 """Standard deviation of the compass's own tilt, rad (its data sheet: 0.5 degrees at most), and with it of where gravity
 points."""
 ANGLE: Final = 0.35
-"""Of both axles, against each other, rad."""
+"""Angle of both axles, in opposite directions, rad."""
 RESTING: Final = 500
 """Readings at rest."""
 LEAST: Final = 2

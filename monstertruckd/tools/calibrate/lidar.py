@@ -42,12 +42,12 @@ ROOM: Final = (
 )
 SPEED: Final = 0.12
 ANGLE: Final = 0.35
-"""Of both axles, against each other, rad."""
+"""Angle of both axles, in opposite directions, rad."""
 QUARTER: Final = math.pi / 2
 STRAIGHT: Final = 1.0
 """m."""
 LEAST_OVERLAP: Final = 0.5
-"""Of two scans that are registered."""
+"""Least overlap of two scans that are registered."""
 BETTER: Final = 0.2
 """Overlap by which another way round has to be better, to be named."""
 LEAST_SCANS: Final = 3

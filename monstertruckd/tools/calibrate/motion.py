@@ -61,7 +61,7 @@ ADVICE: Final = {
     Reason.ATTITUDE_STALE: SILENT,
     Reason.TICK_STALLED: SILENT,
 }
-"""By the reasons that may pass: a move that one of them stopped is driven again."""
+"""Advice by transient reason: a move that one of them stopped is driven again."""
 
 
 class MovedTruck(Operator, Protocol):

@@ -30,7 +30,7 @@ SPEED: Final = 0.15
 CORNER: Final = 0.08
 """Speed in the corners, m/s: fast ones are wider, as tyres slip outward."""
 ANGLE: Final = 0.35
-"""Of both axles, against each other, in the corners, rad."""
+"""Angle of both axles in the corners, in opposite directions, rad."""
 PLACE: Final = 0.03
 """Standard deviation of the way back to the mark by what slips on 10 m, m."""
 FLOOR: Final = 0.003

@@ -30,7 +30,7 @@ Observer = Literal["stand", "pose"]
 OBSERVERS: Final[dict[Observer, Topic[Any]]] = {"stand": topics.STAND_POSE, "pose": topics.POSE}
 ROOM: Final = "ten lengths of the robot around it"
 RADII: Final = (4.0, 2.0, 0.0)
-"""Of the arcs, in tracks; 0 = straight."""
+"""Radii of the arcs, in tracks; 0 = straight."""
 REST: Final = 1.5
 """Seconds at each end: 30 poses of a stand."""
 LEAST: Final = 5

@@ -32,11 +32,11 @@ ROOM: Final = (
     "behind and to the right of the robot"
 )
 RADIUS: Final = 0.4
-"""Of the arcs at least, m."""
+"""Least radius of the arcs, m."""
 ANGLE: Final = 0.35
-"""Of both axles of a truck, against each other, rad."""
+"""Angle of both axles of a truck, in opposite directions, rad."""
 SHARE: Final = 0.96
-"""Of the angle that the gate lets a request have."""
+"""Share of the greatest angle that the gate allows."""
 NOISE: Final = (0.005, 0.01)
 """Standard deviation of a range: m, and share of it, added in quadrature."""
 DRIFT: Final = (0.003, 0.003, 0.01)
@@ -60,7 +60,7 @@ BODY: Final = 0.3
 ASTRAY: Final = 0.4
 """Angle between the middle of the echoes and that of those that are due, rad, that no mount is off by."""
 BODIES: Final = ("differential", "skid_steer", "truck")
-"""That turn within a metre."""
+"""Bodies that turn within a metre."""
 COMMON: Final = 5
 """Parameters before those of the arcs: distance and direction of the wall, half the cone, factors of the ranges and of
 the way by odometry."""

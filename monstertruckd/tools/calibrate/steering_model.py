@@ -31,7 +31,7 @@ AXLES: Final[tuple[Axle, Axle]] = ("front", "rear")
 HEADING: Final = 0.002
 """Standard deviation of a turn between two rests, rad: rounding and noise of averaged headings."""
 CURVE: Final = 0.006
-"""And by the compass's own slow error over the heading, rad; a full turn is free of it."""
+"""Standard deviation of a turn by the compass's own slow error over the heading, rad; none for a full turn."""
 SLIP: Final = 0.004
 """Standard deviation of a turn per root metre by tyres that never roll quite along their plane, rad."""
 LINKAGE: Final = 0.005

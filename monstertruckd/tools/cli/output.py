@@ -52,13 +52,14 @@ def on_terminal(stream: TextIO | None) -> bool:
 
 
 HELP_STYLE: Final = "markdown" if on_terminal(sys.stdout) and on_terminal(sys.stderr) else None
-"""Of help and usage errors: framed on terminals, bare text (None) as soon as one of the two streams is a pipe."""
+"""Style of help and usage errors: framed on terminals, plain text (None) as soon as one of the two streams is a
+pipe."""
 
 HELP_SETTINGS: Final[dict[str, Any]] = {
     "max_content_width" if on_terminal(sys.stdout) else "terminal_width": PIPE_WIDTH,
     "help_option_names": ["-h", "--help"],
 }
-"""Of the command line: the terminal's own width, or lines that are not folded; ``-h`` is ``--help`` everywhere."""
+"""Settings of the command line: the terminal's own width, or unfolded lines; ``-h`` is ``--help`` everywhere."""
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Machine-readable output.")]
 

@@ -28,7 +28,7 @@ from monstertruckd.tools.doctor.context import Finding, fail, fine, warn
 METRES: Final = 0.2
 SPEED: Final = 0.06
 ANGLE: Final = 0.045
-"""Of both axles, against each other, rad: so little that the gate tolerates a turn to the wrong side."""
+"""Angle of both axles, in opposite directions, rad: so small that the gate tolerates a turn to the wrong side."""
 LEAST_TURN: Final = 0.1
 """Least turn of all moves together, rad, by which a sign can be judged;"""
 CLEAR: Final = 0.3

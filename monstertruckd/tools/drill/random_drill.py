@@ -65,9 +65,9 @@ QUIET: Final = frozenset(
 OBSTACLE: Final = frozenset({Reason.OBSTACLE_STOP, Reason.OBSTACLE_SLOW})
 """Reasons of a truck that stands, or creeps, before something."""
 DEADMAN: Final[dict[str, Any]] = {"map": None, **DEADMAN_LINE}
-"""Of a truck: the deadman line, and no map; see ``wired``."""
+"""Overlay of a truck: the deadman line, and no map; see ``wired``."""
 TRACKER_IN_WORKER: Final[dict[str, Any]] = {"placement": {"tracker": "worker"}}
-"""Of every second truck."""
+"""Overlay of every second truck."""
 KNOWN: Final = {
     **dict.fromkeys(map(str, SHAFTS), "epos"),
     DeviceRole.WHEELS.value: "steppers",

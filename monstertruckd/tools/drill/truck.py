@@ -26,7 +26,7 @@ CRUISE: Final = 0.1
 CIRCLE: Final = 0.5
 """Radius of the circle in which a station drives a robot without a tracker, m."""
 STATION_SPEED: Final = 0.8
-"""Of that station, as a share of the gate's limit."""
+"""Speed that the station requests, as a share of the gate's limit."""
 REQUESTS: Final = 0.05
 """Seconds from one request of a station to the next."""
 OPTIONAL: Final = frozenset({"recorder"})

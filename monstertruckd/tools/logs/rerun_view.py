@@ -47,7 +47,7 @@ _FIRST: Final = ("Speed", "Steering commanded", "Cross-track error", "Battery", 
 """Figures that are in view when the recording opens."""
 _SCAN, _PATH, _WAY, _TRUCK = (39, 104, 211), (120, 130, 145), (217, 83, 44), (28, 154, 104)
 _HEIGHT: Final = 0.15
-"""Of the truck's box, m; not configured."""
+"""Height of the truck's box, m; not configured."""
 _ROUGH: Final = 0.03
 """Roughness that is shown in full, m."""
 _STEEP: Final = 0.35

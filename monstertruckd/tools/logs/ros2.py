@@ -32,7 +32,7 @@ from monstertruckd.tools.logs.messages import ALL, Progress, Selection, real_off
 
 _STORE: Final = get_typestore(Stores.ROS2_JAZZY)
 _VERSION: Final = 8
-"""Of the bag's metadata: the older one that the writer knows."""
+"""Version of the bag's metadata: the older one that the writer supports."""
 _PLANE: Final = (0, 1, 5)
 """Rows of (x, y, yaw) in ROS's covariances over (x, y, z, roll, pitch, yaw)."""
 _NEVER: Final = QosTime(9_223_372_036, 854_775_807)

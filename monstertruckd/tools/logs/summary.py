@@ -81,7 +81,7 @@ class LogState(StrEnum):
     UNFINISHED = "unfinished"
     """Not finished and not being written: for ``recover``."""
     DAMAGED = "damaged"
-    """Its index is damaged: for ``recover``."""
+    """The index of the log is damaged: for ``recover``."""
     UNREADABLE = "unreadable"
     """Not a log, or not readable."""
 

@@ -56,7 +56,7 @@ PLACE: Final = Path("/etc/monstertruckd/security")
 
 WRITTEN: Final = "# Written by `monstertruckd security`; include it in the robot's configuration.\n"
 FIRST: Final[dict[str, Any]] = {"robot": ROBOT, "addresses": ("localhost", "127.0.0.1")}
-"""Of an authority for which nothing else is given."""
+"""Defaults of an authority."""
 HOST_NAME: Final = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,251}[A-Za-z0-9])?")
 
 S = TypeVar("S", bound=Schema)

@@ -42,7 +42,7 @@ ANOTHER: Final = (
     "probably another `simulate` on this computer; Ctrl-C in its terminal ends it. "
     "A second robot beside it needs a configuration with a `robot` and `zenoh: listen` of its own"
 )
-"""Of ports that are taken."""
+"""Advice for ports that are in use."""
 STAND_RETRY = 1.0
 """Seconds between two looks for a daemon."""
 

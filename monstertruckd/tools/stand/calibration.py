@@ -25,7 +25,7 @@ from monstertruckd.tools.stand.config import MarkConfig, OverheadConfig
 Numbers = Annotated[tuple[float, ...], Field(strict=False)]
 
 LEAST_MARKS: Final = 5
-"""In sight of a camera."""
+"""Marks that a camera must see, at least."""
 MISPLACED: Final = (0.002, 5.0)
 """A mark is not where it was said to be beyond so many m, and so many standard deviations of the ruler."""
 SEEN: Final = 0.0005

@@ -12,7 +12,7 @@ from monstertruckd.tools.stand.camera import PlacedCamera
 from monstertruckd.tools.stand.config import BlobRobot, TaggedRobot
 
 FADE: Final = 0.12
-"""Of a picture's height: nearer to its border a sighting counts less."""
+"""Share of a picture's height: nearer to its border a sighting has less weight."""
 LEAST_WEIGHT: Final = 1e-3
 PIXEL: Final = 0.2
 """Standard deviation of a corner, pixels."""

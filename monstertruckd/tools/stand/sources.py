@@ -24,7 +24,7 @@ ENDINGS: Final = (".png", ".jpg", ".jpeg", ".pgm")
 
 
 FLAGS: Final = {False: cv2.IMREAD_GRAYSCALE, True: cv2.IMREAD_COLOR}
-"""Of OpenCV's readers, by whether there is colour."""
+"""Flags of OpenCV's readers, by whether there is colour."""
 
 
 def pictures_in(folder: Path) -> list[Picture]:

@@ -62,7 +62,7 @@ HORIZON = 0.72
 SILENCE: Final = 2.0
 """Seconds without any message after which a robot counts as gone: it speaks several times a second."""
 GONE: Final = Style(color="bright_black")
-"""Of everything that a robot said before it fell silent."""
+"""Style of all values of a robot that is silent."""
 
 
 @dataclass(slots=True)

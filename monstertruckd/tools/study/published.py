@@ -48,11 +48,11 @@ _ROWS: Final = (
 CIRCLES: Final = tuple(PublishedCircle(circle, *row) for circle, row in zip(PUBLISHED_CIRCLES, _ROWS, strict=True))
 
 SPREAD: Final = 0.1569
-"""Of the tracks of 12 passes, share of the segment."""
+"""Spread of the tracks of 12 passes, as a share of the segment."""
 BEND: Final = 0.0002
 """Within one pass, share of the segment."""
 LINE_DEVIATION: Final = 0.06
-"""Of the line's speed from 3.24 cm/s."""
+"""Relative deviation of the line's speed from 3.24 cm/s."""
 SEGMENT: Final = 0.682
 """m."""
 PASSES: Final = 12

@@ -16,7 +16,7 @@ from monstertruck_schemas.topics import BEHAVIOUR, Topic
 from monstertruckd.tools.tune.recipe import RunVerdict, WallGains, judged, recipe
 
 STEP: Final = 0.05
-"""Between the distances wanted of one run and the next, m."""
+"""Change of the wanted distance from one run to the next, m."""
 FOLLOWING: Final = "follow"
 LIMIT: Final = 120.0
 """Seconds in which a run must have been complete."""

@@ -15,7 +15,7 @@ from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.state import GROUND_UNKNOWN, ROUGHNESS_STEP, TILT_STEP, Ground
 
 FILE: Final = "ground.npz"
-"""In the folder of a saved map."""
+"""Name of the file in the folder of a saved map."""
 RESOLUTION: Final = 0.1
 """m."""
 MARGIN: Final = 20

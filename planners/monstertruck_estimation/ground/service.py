@@ -38,13 +38,13 @@ TURNED: Final = 0.2
 NEAR_GROUND: Final = 0.10
 """Beams that go down and end this near to the robot's own level hit the ground, m."""
 POINTS: Final = 60
-"""Of one scan at most: the fit of planes stays well below a millisecond."""
+"""Points of one scan at most: the fit of planes stays well below a millisecond."""
 DESCENT: Final = 0.03
 """Metres a metre they have to fall."""
 KEPT: Final = 3 * SECOND
 """Such points are put together for so long, ns: the robot's own height is integrated from its pitch and drifts."""
 FIT_EVERY: Final = SECOND
-"""Between two fits of planes to them, ns."""
+"""Time between two fits of planes to the points, ns."""
 
 
 class GroundService:

@@ -16,13 +16,13 @@ from monstertruck_estimation.vision.tags import Picture, Sighting, TagReader, dr
 from monstertruck_kinematics.elementary import Array
 
 CELLS: Final = 8
-"""Of a tag's black square, along a side."""
+"""Cells of a tag's black square, along a side."""
 SAMPLES: Final = 6
 """Pixels of a cell that is looked at."""
 CONTRAST: Final = 25.0
 """Least difference of white and black, of 255."""
 AROUND: Final = 0.6
-"""Of a tag's picture, in its sides to each side."""
+"""Margin of a tag's picture on each side, in sides of the tag."""
 WIDEST: Final = 160
 """Pixels of a tag's picture at most."""
 PIXEL: Final = 0.25

@@ -51,9 +51,9 @@ LOOKS: Final = 2
 KEEP_RATE: Final = 2.0
 """Checks per second at what has changed."""
 PERIOD: Final = SECOND
-"""Between two messages, ns."""
+"""Time between two messages, ns."""
 SAVE_PERIOD: Final = 10 * SECOND
-"""Between two writes of the file, ns."""
+"""Time between two writes of the file, ns."""
 AT_ONCE: Final = 4
 """Points that are computed without letting others run."""
 PAUSE: Final = 0.02

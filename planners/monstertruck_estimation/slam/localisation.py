@@ -36,9 +36,9 @@ from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.health import LocalisationStatus, OdometryUse
 
 FOUND_COVARIANCE: Final = np.diag(np.square((0.05, 0.05, 0.02)))
-"""Of a pose found by global localisation, m and rad."""
+"""Covariance of a pose found by global localisation, m^2 and rad^2."""
 MATCH_COVARIANCE: Final = np.diag(np.square((0.02, 0.02, 0.01)))
-"""Of a match itself, m and rad."""
+"""Covariance of a match itself, m^2 and rad^2."""
 LOST_DEVIATION: Final = (1.0, 0.5)
 """Standard deviation from which the robot is searched for on the whole map, m and rad."""
 MAX_CONTRADICTION: Final = 0.3

@@ -172,7 +172,7 @@ ANYWHERE: Final = (1e6, 1e6)
 MIN_SCORE: Final = 0.5
 """Mean likelihood of a place found."""
 MAX_RIVAL: Final = 0.9
-"""It is ambiguous if another place scores more than this share of it."""
+"""A place is ambiguous if another one scores more than this share of its score."""
 APART: Final = (1.0, 0.5)
 """Two places differ by more, m or rad."""
 RIVAL_TURN: Final = 0.1

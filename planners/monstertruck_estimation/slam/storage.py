@@ -175,7 +175,7 @@ def _read_graph(path: Path) -> SavedGraph:
 NORMAL_REACH: Final = 0.2
 """Faces up to this far away make the normal, m; at least ``NORMAL_CELLS``."""
 NORMAL_CELLS: Final = 4.0
-"""The same in cells: the stairs of an oblique wall must come out even."""
+"""Least reach in cells: the steps of an oblique wall must be averaged."""
 NORMAL_AGREEMENT: Final = 0.5
 """Cosine between first guesses of normals that may belong to one side of one wall."""
 STRAIGHTNESS: Final = 0.1

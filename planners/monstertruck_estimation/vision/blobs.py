@@ -25,9 +25,9 @@ HUES: Final[dict[Colour, tuple[int, int]]] = {
 }
 """First and last hue of each, in OpenCV's half degrees; red passes 180."""
 SATURATED: Final = 90
-"""Of 255, at least: tables and floors are less."""
+"""Least saturation, of 255: tables and floors have less."""
 BRIGHT: Final = 30
-"""Of 255, at least: in the dark every hue is noise."""
+"""Least brightness, of 255: in the dark every hue is noise."""
 LEAST: Final = 12
 """Pixels of a disc."""
 MOST: Final = 0.02

@@ -17,7 +17,7 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_schemas.board import BoardConfig
 
 LEAST_CORNERS: Final = 8
-"""Of a board in a picture."""
+"""Least number of corners of a board in a picture."""
 PROFILE: Final = 6
 """Pixels to both sides of an edge, over which its width is measured."""
 

@@ -22,7 +22,7 @@ from monstertruck_schemas.body import LensConfig
 LEAST_BOARDS: Final = 6
 """Pictures of the board."""
 PARAMETERS: Final = ("focal_x", "focal_y", "centre_x", "centre_y", "k1", "k2", "p1", "p2")
-"""Of a lens, that are fitted, in OpenCV's order."""
+"""Parameters of a lens that are fitted, in OpenCV's order."""
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ Picture = NDArray[np.uint8]
 """Grey, (height, width)."""
 
 MARGIN: Final = 1.0
-"""Of a window around a tag, in its sizes to each side: how far it may move between two pictures."""
+"""Margin of the window around a tag on each side, in sizes of the tag: how far it may move between two pictures."""
 LEAST_MARGIN: Final = 16
 """Pixels."""
 LEAST_PERIMETER: Final = 32

@@ -21,7 +21,7 @@ from monstertruck_schemas.state import Peer
 from monstertruck_schemas.topics import PEERS, POSE, Topic
 
 SPACING: Final = 0.05
-"""Of the points of the trail, m."""
+"""Distance between the points of the trail, m."""
 LONGEST: Final = 400
 """Points."""
 CLOSE_UP: Final = 0.8

@@ -32,11 +32,11 @@ from monstertruck_schemas.state import GateMode, GateState, Odometry
 from monstertruck_schemas.topics import BEHAVIOUR, GATE, GOAL, ODOMETRY, TRACKER, Writer
 
 SOURCE: Final = ServiceName.BEHAVIOURS.value
-"""Of the drive requests."""
+"""Source of the drive requests."""
 LEASE: Final = 0.3
-"""Of each, s."""
+"""Lease of each drive request, s."""
 REPORT: Final = SECOND // 5
-"""Between two reports without a change, ns."""
+"""Period of reports without a change, ns."""
 DISOBEYED: Final = 2.0
 """Seconds of motion asked for and not carried out after which a behaviour gives up."""
 SETTLE: Final = 1.0

@@ -24,7 +24,7 @@ FACE: Final = 0.2
 AWAY: Final = (0.8, 1.0, 0.65)
 """Distances from which a face is viewed, m; the first that is free is used."""
 ASIDE: Final = (0.0, 0.5, -0.5)
-"""And from so far aside, rad."""
+"""Angles off the normal of a face from which it is viewed, rad."""
 WORTH: Final = 1.5
 """Metres that a look costs besides its path."""
 COMPARED: Final = 60

@@ -30,11 +30,11 @@ from monstertruck_schemas.state import GateState, Grid, Odometry
 from monstertruck_schemas.topics import BATTERY, POSE, SLAM
 
 SOURCE: Final = ServiceName.EXPLORER.value
-"""Of the goals."""
+"""Source of the goals."""
 RATE: Final = 5.0
 """Checks per second."""
 REPORT: Final = SECOND // 2
-"""Between two reports without a change, ns."""
+"""Period of reports without a change, ns."""
 CHANGES: Final = ("number", "phase", "outcome", "goals", "failures")
 """Fields of the report whose change is reported at once."""
 LOST_FOR: Final = 1.0

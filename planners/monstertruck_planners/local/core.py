@@ -34,7 +34,7 @@ from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.reasons import Reason
 
 ESCAPE_STEP = 0.01
-"""Between two checks of an escape motion, m."""
+"""Distance between two checks of an escape motion, m."""
 
 MAX_ESCAPE = 0.3
 """Longest escape motion, m."""

@@ -62,11 +62,11 @@ from monstertruck_schemas.state import GateState, Odometry
 from monstertruck_schemas.topics import ODOMETRY
 
 SOURCE: Final = ServiceName.MISSIONS.value
-"""Of its goals, behaviours and explorations."""
+"""Source of the goals, behaviours and explorations of a mission."""
 RATE: Final = 5.0
 """Checks per second."""
 REPORT: Final = SECOND // 2
-"""Between two reports without a change, ns."""
+"""Period of reports without a change, ns."""
 CHANGES: Final = ("number", "running", "step", "attempt", "outcome", "resumable")
 """Fields of the report whose change is reported at once."""
 STEP: Final = 0.5
@@ -74,7 +74,7 @@ STEP: Final = 0.5
 MOVED: Final = 1.0
 """Metres from where it was interrupted at which a robot counts as moved, or its odometry as begun again."""
 MOST_BYTES: Final = 1_000_000
-"""Of the saved progress."""
+"""Size of the saved progress at most."""
 PASSING: Final = frozenset({Reason.PLANNER_STARTING, Reason.NO_MAP, Reason.LEASE_EXPIRED})
 """Refusals of a goal that do not depend on its place: it is sent again."""
 AGAIN: Final = 1.0

@@ -221,7 +221,7 @@ class Vehicle:
 
 
 WARM_UP_CLEARANCE = 0.02
-"""Between the start of the last route of ``warm_up`` and the edge of the map, m: less than the margin."""
+"""Distance from the start of the last route of ``warm_up`` to the edge of the map, m: less than the margin."""
 
 WARM_UP_EFFORT = 6000
 """See ``GoalConfig.effort``."""

@@ -21,10 +21,10 @@ HEADINGS = 72
 """Checked in half a turn."""
 
 STRIDE = 29
-"""Between two headings tried in turn: neighbouring headings fit or do not fit alike."""
+"""Step between two headings tried in turn: neighbouring headings fit or do not fit alike."""
 
 SAMPLE = 0.0125
-"""Between two positions checked, m; middles and borders of the grid's cells are among them."""
+"""Distance between two positions checked, m; middles and borders of the grid's cells are among them."""
 
 
 @njit(cache=True)

@@ -42,15 +42,15 @@ CONFINED: Final = 0.03
 """A start with less than this beyond the margin may be left by no motion of a search, m: the end of a body that turns
 comes that much nearer to a wall at its side."""
 CHECK: Final = 0.004
-"""Between two poses checked, m."""
+"""Distance between two poses checked, m."""
 BRANCH: Final = 0.2
-"""Between two poses of an arc from which others are tried, m."""
+"""Distance between two poses of an arc from which further arcs are tried, m."""
 SHORTEST: Final = 0.02
-"""Of one arc, m: less is not driven exactly."""
+"""Least length of an arc, m: less is not driven exactly."""
 LONGEST: Final = 1.0
-"""Of one arc, m."""
+"""Greatest length of an arc, m."""
 FURTHEST: Final = 3.0
-"""Of a departure that a path begins with, m."""
+"""Greatest length of a departure, m."""
 CURVATURES: Final = (0.0, *(0.5**k for k in range(7)))
 """Of the arcs tried, as shares of the greatest one: the wider a body turns, the less near its end comes to a wall."""
 TRANSLATIONS: Final = (1.0, 0.5)
@@ -58,7 +58,7 @@ TRANSLATIONS: Final = (1.0, 0.5)
 CUSP: Final = 0.1
 """Cost of a change of direction, m."""
 SET_OFF: Final = 0.15
-"""From the end of a departure one of the arcs has to be free for so far, m: else a search would end there."""
+"""Length for which one of the arcs from the end of a departure must be free, m: else a search would end there."""
 GAIN: Final = 3.0
 """Metres to drive for a metre of clearance, about: translations of 0.33 rad."""
 DIPS: Final = (0.0, 0.125, 0.5, 1.0)

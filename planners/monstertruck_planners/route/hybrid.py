@@ -51,13 +51,13 @@ FINE_SHIFTS = (0.25, 0.1, 0.03, 0.01)
 """Shares of a stretch by which poses move in the final smoothing."""
 
 FINAL_SHARE = 0.2
-"""Of the budget, for the final smoothing without and then with translations."""
+"""Share of the budget for the final smoothing without and then with translations."""
 
 CUSPS_SHARE = 0.3
-"""Of the budget, kept when routes with fewer cusps are looked for."""
+"""Share of the budget kept when routes with fewer cusps are searched."""
 
 PLAIN_SHARE = 0.5
-"""Of the budget, kept when a route without translations is looked for and one with them is known."""
+"""Share of the budget kept when a route without translations is searched and one with them is known."""
 
 ALTERNATIVE_DISTANCE = 2.5
 """Least distance of an alternative from all known routes, at one place at least, turning radii."""
@@ -91,10 +91,10 @@ NO_SEGMENTS = np.empty((0, 3))
 NO_COSTS = search.CostLayer(np.zeros((0, 0), np.float32), 0.0, 1.0, 0.0)
 
 MARGIN_STEP = 0.005
-"""From one margin tried to the next, m."""
+"""Step from one margin tried to the next, m."""
 
 MARGIN_SHARE = 0.5
-"""Of the rest of the budget: for the searches with narrower margins."""
+"""Share of the remaining budget for the searches with narrower margins."""
 
 NARROW_COST = 1.0
 """Clearance cost of routes with a narrower margin: they use it only where they have to, m."""

@@ -45,7 +45,7 @@ LONGEST_STROKE = 1.0
 """See ``VehicleMotions.strokes``, turning radii."""
 
 MAX_NODES = 400_000
-"""In one search."""
+"""Nodes of one search at most."""
 
 MAX_TABLE_CELLS = 1 << 26
 """Cells of one search: a table of 256 MB, of which only what is visited takes memory."""

@@ -27,7 +27,7 @@ SLACK = 1e-10
 """Rounding allowed where a formula asks for a sign."""
 
 MAX_SEGMENTS = 5
-"""Of a motion."""
+"""Segments of a motion at most."""
 
 LSL, LSR, LRL, LRLR_SAME, LRLR_CUSP, LRSL, LRSR, LRSLR = range(8)
 

@@ -20,13 +20,13 @@ CHUNK = 256
 """Nodes expanded between two checks of the budget."""
 
 CHECK_STEP = 0.01
-"""Between two collision checks close to obstacles, m."""
+"""Distance between two collision checks close to obstacles, m."""
 
 CHECK_MARGIN = 1e-3
 """Added to the margin, as the footprint may come nearer between two checks, m."""
 
 SPACING = 0.1
-"""Between two samples of the cost layer, m."""
+"""Distance between two samples of the cost layer, m."""
 
 
 @njit(cache=True)

@@ -30,7 +30,7 @@ from monstertruck_schemas.state import GateMode, GateState, Odometry
 from monstertruck_schemas.topics import COMPASS, ODOMETRY, SCAN
 
 SOURCE: Final = ServiceName.TRACKER.value
-"""Of the drive requests."""
+"""Source of the drive requests."""
 
 ROUGHNESS_WINDOW: Final = 2.0
 """Time constant of the roughness that slows the truck down, s."""

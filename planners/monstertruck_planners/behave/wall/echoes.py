@@ -24,7 +24,7 @@ ROBUST: Final = 2.0
 TIGHT: Final = 3.0
 """Residual, in standard deviations, up to which a line explains an echo."""
 SPARE: Final = 0.05
-"""By which the critical angle of a wall may be greater than stated, rad."""
+"""Error of the critical angle of a wall, rad."""
 INERTIA: Final = (0.05, 0.03)
 """Standard deviations of the estimate before: rad, m."""
 GUESSES: Final = 24, 5
@@ -32,7 +32,7 @@ GUESSES: Final = 24, 5
 DISTINCT: Final = 0.05
 """Least difference between these, rad or m."""
 STEPS: Final = 4, 4, 6
-"""Of Gauss and Newton: from an estimate, from all guesses, and further from the best ones."""
+"""Gauss-Newton steps: from an estimate, from all guesses, and further from the best ones."""
 SAMPLED: Final = 40
 """Echoes to which all guesses are fitted, taken evenly out of more."""
 LONGEST: Final = 0.3

@@ -71,7 +71,7 @@ GONE: Final = 0.1
 TOUCHING: Final = 0.16
 """A range from which on the robot stops at once, m."""
 OPENING: Final = 0.3
-"""By which the side sonar measures more than the distance to the wall where it looks through an opening, m."""
+"""Range of the side sonar beyond the wall from which on it looks through an opening, m."""
 STARTED: Final = 0.05
 """Angle up to which a turn begins, rad."""
 BEAM_CRITICAL: Final = 1.3

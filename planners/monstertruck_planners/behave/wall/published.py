@@ -39,7 +39,7 @@ BACK: Final = 0.05
 WALL_WAY: Final = 0.8
 """Distance over which echoes make the line of a wall past whose gap it drives, m."""
 LEAST_ECHOES: Final = 4
-"""Of such a line."""
+"""Least number of echoes of such a line."""
 LINE_GAINS: Final = 5.0, 2.0
 """Yaw rate per distance error from it, rad/s/m, and per heading error, 1/s: critically damped at 0.2 m/s."""
 TIGHT: Final = 4.0
