@@ -110,7 +110,7 @@ class Sources:
         self._stop = "", 0
         """Source and time (ns) of the newest order that stops."""
         self._stop_of_others = "", 0
-        """The same of the newest one of another source than that."""
+        """Source and time (ns) of the newest such order of another source."""
         self._asking: dict[str, int] = {}
         """Operators who ask for the drive, and until when that counts, ns."""
         self._handed: tuple[str, int, int] | None = None

@@ -210,7 +210,7 @@ class _Taken(NamedTuple):
     pose: Pose
     """Of base, in the frame of the memory."""
     lidar: Pose
-    """In the frame of the memory."""
+    """Of the lidar, in the frame of the memory."""
     travelled: float
     """m."""
     points: Array

@@ -116,9 +116,9 @@ class SensorMonitor:
         self.battery: Battery | None = None
         self._failed: tuple[str, ...] = ()
         self._drive_losses: set[Reason] = set()
-        """Those of ``DRIVE_LOSSES`` that a drive's service gives for its end."""
+        """Losses of ``DRIVE_LOSSES`` for which a drive's service is down."""
         self._unjudged_losses: set[Reason] = set()
-        """Those that one gave since the last tick."""
+        """Losses of ``DRIVE_LOSSES`` reported since the last tick."""
         self._lost: dict[Reason, int] = {}
         self._refused: dict[Reason, Measurement] = {}
         self._critical = _critical(config, steered=chassis.steered)

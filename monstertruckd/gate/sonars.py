@@ -65,7 +65,7 @@ class SonarGuard:
         self._answered: dict[str, int] = {}
         """When every sonar answered last, ns."""
         self.view = SonarView(math.inf, (), False)
-        """Of the newest motion that was looked at."""
+        """View of the newest motion that was checked."""
 
     def configure(self, config: GateConfig) -> None:
         """Take other limits, between two ticks."""

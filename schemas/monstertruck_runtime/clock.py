@@ -32,7 +32,7 @@ _FIRST_DATE: Final = 946_684_800 * SECOND
 """2000-01-01: earlier dates are from a virtual clock, or a computer whose clock was never set."""
 
 MANY_TIMERS: Final = 100
-"""From so many on, cancelled timers are cleared away."""
+"""Number of timers from which on cancelled ones are removed."""
 
 
 def is_date(real: int) -> bool:
@@ -311,10 +311,11 @@ AHEAD: Final = 4 * MILLISECOND
 """So long before the gate's ticks the instants of the others lie: its newest input is fresh then, and the loop free."""
 
 ESTIMATES: Final = AHEAD + MILLISECOND
-"""The same of those whose estimates the others use."""
+"""Lead of services whose estimates the others use, ns."""
 
 QUESTIONS: Final = ESTIMATES + 3 * MILLISECOND
-"""The same of those who ask a device: unless its line is slow, the answer is there when the estimates are made."""
+"""Lead of services that query a device, ns: unless its line is slow, the answer is there when the estimates are
+made."""
 
 IN_THREADS: Final = -2 * MILLISECOND
 """The same of those that work in threads: behind the tick, which a thread that holds the interpreter would delay."""

@@ -20,7 +20,7 @@ from monstertruck_runtime.yaml_files import read_yaml, yaml_text
 FREE, OCCUPIED, UNKNOWN = 0, 100, -1
 """Cell values, as in an occupancy grid message."""
 YAML = "map.yaml"
-"""In the folder of a saved map."""
+"""Name of the file in the folder of a saved map."""
 
 _REQUIRED = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh")
 _MODES = ("trinary", "scale", "raw")

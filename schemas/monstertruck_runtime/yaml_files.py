@@ -11,7 +11,7 @@ from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.small_files import require_file
 
 MOST_BYTES: Final = 1_000_000
-"""Of one file: they are written by hand, or say of a map where it is."""
+"""Size of one file at most: they are written by hand, or give the origin of a map."""
 
 
 def read_yaml(path: Path) -> Any:

@@ -43,7 +43,7 @@ class LensConfig(Schema):
     """What a camera makes of directions: a pinhole with the distortion of Brown; as nominal, or as calibrated."""
 
     width: Annotated[int, Field(ge=16, le=8192)] = 640
-    """Of the pictures it holds for, pixels; of others it is scaled"""
+    """Width of the pictures it is calibrated for, pixels; it is scaled for others"""
     height: Annotated[int, Field(ge=16, le=8192)] = 480
     """Pixels"""
     focal_x: Annotated[float, Field(gt=10, le=20_000)] = 522.2
@@ -93,7 +93,7 @@ class TruckBody(BodyConfig):
 
     kind: Literal["truck"] = "truck"
     turn_deficit: TurnDeficitConfig = TurnDeficitConfig()
-    """By circles to both sides, with each axle alone and with both"""
+    """Measured by circles to both sides, with each axle alone and with both"""
 
 
 class AckermannBody(BodyConfig):

@@ -69,13 +69,13 @@ class Stop(Message):
     number: Annotated[int, Field(ge=1)]
     """Counts the stops since the daemon started."""
     reason: Reason
-    """That of the first cause."""
+    """Reason of the first cause."""
     mode: GateMode
     """State of the gate after it."""
     ordered: bool = False
     """An operator ordered an ordinary end of driving."""
     quick: bool = False
-    """By the drive's quick stop instead of its ordinary ramp."""
+    """Whether it was the drive's quick stop instead of its ordinary ramp."""
     holder: str | None = None
     """Source that was driving."""
     role: Role | None = None

@@ -42,9 +42,9 @@ class CalibrationState(Schema):
 
     wizard: str
     grade: Literal["A", "B", "C"]
-    """By the width of its intervals: A as narrow as meant, B twice as wide at most, C wider."""
+    """Grade by the width of its intervals: A within the goal, B at most twice as wide, C wider."""
     date: str
-    """Of the newest measurement, UTC."""
+    """Date of the newest measurement, UTC."""
     until: str
     """Day until which it counts, UTC."""
     metres_left: float | None = None
@@ -62,7 +62,7 @@ class CalibrationHealth(Message):
 
 
 LATE: Final = 0.02
-"""Of the control tick, s: a whole period."""
+"""Lateness of the control tick that counts as late, s: a whole period."""
 
 
 class LoopHealth(Message):
@@ -103,9 +103,9 @@ class LocalisationStatus(StrEnum):
     LOCALISED = "localised"
     """The scans fit the saved map."""
     DEGENERATE = "degenerate"
-    """They fit, but say nothing along one direction, in which the pose is odometry."""
+    """Scans fit, but do not determine one direction, in which the pose is odometry."""
     LOST = "lost"
-    """They have not fitted for a while: the pose is odometry."""
+    """Scans have not fitted for a while: the pose is odometry."""
     SEARCHING = "searching"
     """Where on the saved map this is, is being searched for; the pose means nothing."""
     OUTSIDE = "outside"

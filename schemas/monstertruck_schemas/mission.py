@@ -45,7 +45,7 @@ class PointStep(MissionStep):
 
     do: Literal["goto_point"]
     point: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,31}$")]
-    """Its name"""
+    """Name of the point of interest"""
     distance: Annotated[float, Field(ge=0, le=5)] = 0.7
     """M before a tag"""
 
@@ -84,9 +84,9 @@ class BehaviourStepOfMission(MissionStep):
 
     do: Literal["behaviour"]
     name: Name
-    """In the robot's configuration"""
+    """Name of the behaviour in the robot's configuration"""
     settings: dict[str, float | str | bool] = Field(default_factory=dict)
-    """That replace the configured ones"""
+    """Settings that replace the configured ones"""
 
 
 class FollowWallStep(MissionStep):

@@ -178,7 +178,7 @@ class ExplorationState(Message):
     goals: Annotated[int, Field(ge=0)] = 0
     """Places it set off for."""
     failures: Annotated[int, Field(ge=0)] = 0
-    """Of these, places it did not come to."""
+    """Number of these whose place was not reached."""
 
     @property
     def running(self) -> bool:
@@ -196,14 +196,14 @@ class MissionState(Message):
     """Who asked for it."""
     running: bool = False
     resumable: bool = False
-    """It was interrupted, and can be resumed."""
+    """Whether an interrupted mission can be resumed."""
     step: Annotated[int, Field(ge=0)] = 0
     """The present one, counted from 1; 0 = none."""
     steps: Annotated[int, Field(ge=0)] = 0
     doing: str = ""
     """The present step in words."""
     attempt: Annotated[int, Field(ge=0)] = 0
-    """Of the present step, counted from 1."""
+    """Attempt at the present step, counted from 1."""
     failures: Annotated[int, Field(ge=0)] = 0
     """Steps that have failed so far."""
     outcome: Reason = Reason.OK

@@ -45,7 +45,7 @@ class PointOfInterest(Schema):
     first: Nanoseconds
     """When it was seen, or marked, first."""
     last: Nanoseconds
-    """And last."""
+    """When it was seen, or marked, last."""
     picture: bool = False
     """There is one: remote call ``point_picture``."""
 
@@ -76,7 +76,7 @@ class PointRequest(Request):
     order: PointOrder
     name: PointName
     x: Coordinate | None = None
-    """Of a mark, in map, m; None = where the robot is."""
+    """Place of a mark in map, m; None = where the robot is."""
     y: Coordinate | None = None
     yaw: Coordinate | None = None
     """Rad; None = the robot's."""

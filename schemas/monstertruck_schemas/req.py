@@ -147,7 +147,7 @@ class Order(StrEnum):
     ASK = "ask"
     """Ask the operator who drives to hand over; changes nothing by itself."""
     HAND_OVER = "hand_over"
-    """Of the operator who drives: let another one drive, who has asked for it."""
+    """The operator who drives lets another one drive, who has asked for it."""
 
 
 STARTING: Final = frozenset({Order.ARM, Order.RESET})
@@ -214,7 +214,7 @@ class BehaviourRequest(Request):
     behaviour: Annotated[str, Field(max_length=64)] = ""
     """Name of the behaviour to start; of a stop: only that one, empty = whichever runs."""
     settings: Annotated[dict[str, float | str | bool | None], Field(max_length=32)] = Field(default_factory=dict)
-    """Of a start: settings that replace the configured ones for this run."""
+    """For a start: settings that replace the configured ones for this run."""
 
 
 class ExploreOrder(StrEnum):
@@ -249,9 +249,9 @@ class MissionRequest(Request):
 
     order: MissionOrder
     mission: Mission | None = None
-    """Of a start."""
+    """For a start."""
     moved: bool = False
-    """It is resumed although the robot is not where it was interrupted: its pose is right"""
+    """For a resume: the robot is not where the mission was interrupted, and its pose is right"""
 
 
 class PathRequest(Request):

@@ -74,7 +74,7 @@ class Attitude(Message):
     tilt_valid: bool = True
     """False while the acceleration is not near 1 g: roll and pitch are then not tilt."""
     degraded: bool = False
-    """It rests on a calibration that has expired."""
+    """Whether it rests on a calibration that has expired."""
 
 
 class DriveMode(StrEnum):
@@ -153,7 +153,7 @@ class Battery(Message):
     capacity_ah: float | None = None
     """Capacity of the pack as configured, Ah."""
     degraded: bool = False
-    """It rests on a calibration that has expired."""
+    """Whether it rests on a calibration that has expired."""
 
 
 class SonarEcho(Schema):
@@ -174,7 +174,7 @@ class SonarRanges(Message):
     """All sonars of the robot, each pinged once; ``stamp`` is that of the oldest of them."""
 
     sonars: tuple[SonarEcho, ...]
-    """In the order of the configuration."""
+    """Echoes in the order of the configuration."""
     field_of_view: Annotated[float, Field(gt=0, le=3.1416)]
     """Full opening angle of the cones, rad."""
     range_min: Annotated[float, Field(ge=0)]
@@ -182,7 +182,7 @@ class SonarRanges(Message):
     range_max: Annotated[float, Field(gt=0)]
     """Greatest range, m."""
     degraded: bool = False
-    """It rests on a calibration that has expired."""
+    """Whether it rests on a calibration that has expired."""
 
     def echo(self, name: str) -> SonarEcho | None:
         """The sonar of that name; None = the array has none."""
@@ -197,7 +197,7 @@ class Imu(Message):
     linear_acceleration: Vector3
     """Specific force, m/s^2: at rest and level, z is +9.81."""
     temperature: float | None = None
-    """Of the unit, degree Celsius."""
+    """Temperature of the unit, degree Celsius."""
 
 
 class WheelEncoders(Message):

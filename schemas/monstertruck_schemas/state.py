@@ -36,7 +36,7 @@ class Odometry(Message):
     sources: tuple[str, ...] = ()
     """Sensors used in this estimate, e.g. ("drive", "steering", "compass")."""
     degraded: bool = False
-    """It rests on a calibration that has expired."""
+    """Whether it rests on a calibration that has expired."""
 
     @property
     def position_deviation(self) -> float:
@@ -48,11 +48,11 @@ class Peer(Schema):
     """What another robot says of itself."""
 
     robot: str
-    """Its name."""
+    """Name of the robot."""
     pose: Pose2D
-    """In its map: robots that follow each other need one map, or starts measured in one frame."""
+    """Pose in its map: robots that follow each other need one map, or starts measured in one frame."""
     twist: Twist2D
-    """In its base."""
+    """Twist in its base."""
     deviation: Annotated[float, Field(ge=0)] = 0.0
     """Standard deviation of its position along the axis where it is largest, by itself, m; 0 in older recordings."""
     heard: Nanoseconds

@@ -25,9 +25,9 @@ class Setup:
     geometry: FourWheelSteering
     footprint: Footprint
     lidar: Pose = (0.0, 0.0, 0.0)
-    """In base."""
+    """Pose of the lidar in base."""
     cusp_clearance: float = 0.0
-    """That the gate asks for where the truck stops before it drives the other way, m."""
+    """Clearance that the gate demands at a cusp, m."""
     timed: bool = False
     """Whether the route planner works for its time or for its effort: only the latter is reproducible."""
 
@@ -89,11 +89,11 @@ class PlanAnswer:
     clearance: Array | None = None
     """Shape (n,): see ``Path``; None = not known."""
     kept: bool = False
-    """It is the rest of the route before."""
+    """Whether it is the rest of the previous route."""
     drivable: bool = True
-    """Its poses follow from motions of the truck; else they only show where to go."""
+    """Whether the truck can drive it; else its poses only show where to go."""
     complete: bool = True
-    """It leads to the goal; else it is the beginning of a route too long for one path."""
+    """Whether it leads to the goal; else it is the beginning of a route too long for one path."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,13 +101,13 @@ class LocalRoute:
     """A route to be deformed."""
 
     number: int
-    """Of its own."""
+    """Number of this route."""
     poses: Array
     """Shape (n, 3): of the base."""
     directions: Array
     """Shape (n,): +1 or -1."""
     drivable: bool = True
-    """Else it only shows where to go: what is driven is a local path along it, always."""
+    """Whether the truck can drive it; else a local path along it is always driven."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -36,9 +36,9 @@ Angles = tuple[float, float]
 Pose = tuple[float, float, float]
 
 LONGEST: Final = 0.05
-"""Of the steps the future is computed in, s."""
+"""Greatest time step of the prediction, s."""
 FORGET: Final = 1.0
-"""After a pause of this length nothing is known of the axles, s; requests older than this no longer act."""
+"""Pause after which the state of the axles is not known, s; older requests no longer act."""
 
 
 class AxleModel:
@@ -60,10 +60,10 @@ class AxleModel:
         """Forget all requests."""
         self.angles: Angles = (0.0, 0.0)
         self.requested: Angles = (0.0, 0.0)
-        """By the newest request."""
+        """Axle angles of the newest request."""
         self._due: deque[tuple[float, Angles]] = deque()
         self._requests: deque[tuple[float, Angles]] = deque()
-        """Of the last second."""
+        """Requests of the last second."""
         self._target: Angles = (0.0, 0.0)
         self._t: float | None = None
 
@@ -240,7 +240,7 @@ C = TypeVar("C", bound=TrackerConfig)
 REST: Final = 0.01
 """Speed of a truck at rest, m/s."""
 CUSP_SHARE: Final = 0.5
-"""Of the clearance at a cusp that the truck may be off there: the rest is for the way on."""
+"""Share of the clearance at a cusp that the truck may be off there: the rest is for the motion after it."""
 LEAST_CUSP_TOLERANCE: Final = 0.01
 """However narrow it is, m."""
 STEEPEST: Final = 1.4
@@ -259,7 +259,7 @@ class TrackingState(NamedTuple):
     speed: float
     """Forward, m/s; at least ``min_speed`` in size."""
     target_speed: float
-    """That will be requested, m/s."""
+    """Speed that will be requested, m/s."""
     acceleration: float
     """With which it is reached, m/s^2."""
     segment: Segment

@@ -21,7 +21,7 @@ from monstertruck_schemas.state import GateState
 
 HEADER = ["x", "y", "yaw", "direction"]
 MOST_BYTES: Final = 10_000_000
-"""Of a file of poses: a hundred thousand and more."""
+"""Size of a file of poses at most: a hundred thousand and more."""
 
 """Modes in which the path stays as it is."""
 

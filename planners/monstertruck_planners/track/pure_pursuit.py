@@ -7,7 +7,7 @@ from monstertruck_planners.track.path_tracker import Angles, PathTracker, Tracki
 from monstertruck_planners.track.segments import Projection
 
 LEAST_WAY = 1e-6
-"""Before a change of steering the path is that of the old one, m."""
+"""Distance before a change of the steering mode at which the path still has the old one, m."""
 LEAST_SQUARE = 1e-6
 """Goals nearer than the root of this are not divided by, m^2."""
 

@@ -89,7 +89,7 @@ class ResponseEstimator:
         self._prior = 0.5 * ((totals - EXPECTED[0]) / EXPECTED[1]) ** 2
         self._keep = [math.exp(-CELL / lag) if lag else 0.0 for lag in LAGS.tolist()]
         self._powers = np.stack((np.ones(len(totals)), dead_times, by_lag, dead_times**2, totals**2))
-        """Of the candidates; weighted and summed up they are the estimate's moments."""
+        """Powers of the candidates; their weighted sums are the moments of the estimate."""
         self._by_x: Array = np.zeros((3, len(totals)))
         """Sums of the predicted turns' products with themselves, the measured turns and the ways, by candidate."""
         self._products = np.empty_like(self._by_x)
@@ -106,7 +106,7 @@ class ResponseEstimator:
         self._bend = 0.0
         """Turn per metre that is requested, rad/m."""
         self._most = math.inf
-        """By which it can change in one cell, rad/m."""
+        """Greatest change within one cell, rad/m."""
         self._curvatures = [0.0] * len(self._keep)
         self._turns = [0.0] * len(self._keep)
         self._history = np.zeros((len(self._keep), 4 * KEPT))
@@ -218,9 +218,9 @@ SURE: Final = 3.0
 SURE_AGAIN: Final = 1.0
 """Standard deviations within which it must come back for the configured response to count again."""
 DIFFERENT: Final = 0.03
-"""And this, s: what is not modelled looks like a delay of this size."""
+"""Least difference from the configured delay, s: effects that are not modelled look like a delay of this size."""
 DIVIDED: Final = 0.05
-"""Likewise of the dead time alone, s."""
+"""Least difference from the configured dead time alone, s."""
 
 
 def rounded(estimate: ResponseEstimate) -> Response:

@@ -353,7 +353,7 @@ STEP: Final = 0.025
 MOST: Final = 5000
 """Greatest number of reference points of a segment."""
 QUANTILES: Final = -np.log1p(-(np.arange(16) + 0.5) / 16)
-"""Of the exponential distribution: a mean over them is a first-order lag."""
+"""Quantiles of the exponential distribution: a mean over them is a first-order lag."""
 
 
 class ReferenceStates(NamedTuple):

@@ -62,7 +62,7 @@ class TrackSetup:
     steering: FourWheelSteering
     footprint: Footprint
     lidar: Pose
-    """In base."""
+    """Pose of the lidar in base."""
 
 
 class Newest(NamedTuple):
