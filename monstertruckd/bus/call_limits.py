@@ -1,4 +1,4 @@
-"""How many remote calls are taken: judged where they arrive, so that a flood does not reach the event loop.
+"""Limits of remote calls, checked in the thread in which they arrive, so that a flood does not reach the event loop.
 
 An emergency stop is refused only where as many of the same owner, or of all together, are being carried out.
 """

@@ -1,4 +1,4 @@
-"""The way in for requests: judged in the sender's thread, then one at a time onto the loop.
+"""Intake of requests: checked in Zenoh's thread, then passed to the event loop one at a time.
 
 Even in another thread a decoder holds the interpreter while it runs, so what may be decoded is bounded by size, by rate
 and by a look at the bytes. Every topic waits in a queue of its own, and every owner has a rate of its own: a flood of

@@ -1,7 +1,7 @@
 """One browser's control of one robot: its own source of requests, so that the robot distinguishes two tabs.
 
 Nothing here repeats a request. Each heartbeat of the browser becomes one request with a short lease, or none if it was
-held up on its way: what the hand did then says nothing of what it does now.
+delayed: an old input says nothing about the present one.
 """
 
 import asyncio

@@ -1,4 +1,4 @@
-"""From readings to points of interest: pure; what is seen hangs on where the robot was, so it moves with the map.
+"""From readings to points of interest: pure; a point is stored relative to a pose, so it moves with the map.
 
 Every sighting keeps its place in the robot's base and the instant of its picture. Where the robot was then is asked of
 the mapper again after every correction, so sightings from before and after a loop agree once it is closed.

@@ -1,4 +1,4 @@
-"""Global localisation: where on a saved map the robot is, and that it is on none of it.
+"""Global localisation: where on a saved map the robot is, or that it is not on it.
 
 A local map is built of the first scans (one scan of a 4 m lidar looks alike in many rooms); at every keyframe its
 surroundings are matched to the whole saved map by branch and bound (Hess et al. 2016, section V). What one search finds

@@ -1,4 +1,4 @@
-"""When scans stop fitting the map, and where the submap begun then belongs in the map before it.
+"""Relocalisation: finds that scans no longer fit the map, and where the submap started then belongs in that map.
 
 A robot that was carried fits nowhere near its predicted pose. Its scans begin a submap of their own, which no odometry
 joins to the map. The surroundings of the newest keyframe are searched for in every submap but its own, the map first

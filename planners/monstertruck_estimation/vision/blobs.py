@@ -1,6 +1,6 @@
 """Coloured discs in a picture: pixels of a hue, those that touch each other joined, and their middle.
 
-So SwisTrack finds robots (Lochmatter et al., "SwisTrack", IROS 2008).
+The method of SwisTrack (Lochmatter et al., "SwisTrack", IROS 2008).
 """
 
 from collections.abc import Collection

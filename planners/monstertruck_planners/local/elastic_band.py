@@ -1,8 +1,8 @@
 """Elastic band: poses of a path move away from obstacles and towards each other. Loads numba.
 
 A bubble is a pose and how far every part of the footprint may move from there. Forces and refinement after S. Quinlan
-and O. Khatib, "Elastic bands: connecting path planning and control", 1993, with the parameters and parameters of the
-published planner; differences are named at ``BandParameters``.
+and O. Khatib, "Elastic bands: connecting path planning and control", 1993, with the parameters of the published
+planner; differences are named at ``BandParameters``.
 """
 
 import math

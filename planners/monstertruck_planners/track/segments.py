@@ -1,6 +1,6 @@
 """A path prepared for tracking: segments of one direction, all crab or none of it, measured by arc length.
 
-Progress along it only grows and is looked for near the present one, so a path may cross or repeat itself.
+Progress along it only grows and is searched near the present one, so a path may cross or repeat itself.
 """
 
 import math

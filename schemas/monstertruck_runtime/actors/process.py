@@ -1,4 +1,4 @@
-"""A worker process: the parent's blocking hold on it, and its main program.
+"""A worker process: the parent's blocking connection to it, and its main program.
 
 ``python -m monstertruck_runtime.actors.process FD MODULE:FACTORY`` builds the worker and answers steps until the parent
 is gone, however busy it is then. Signals meant for the daemon's whole group are ignored: the parent decides when its
