@@ -52,7 +52,7 @@ class RoleSpec:
     reads: Mapping[str, Topic[Any]] = field(default_factory=dict)
     """Topics of which the driver gets the newest message, by its parameter."""
     frame: bool = False
-    """Its mount is in the tree of frames."""
+    """Whether its mount is in the tree of frames."""
     elements: str | None = None
     """Field of the driver's settings with several sensing elements by name: their mounts are in the tree of frames, as
     ``<role>_<name>``."""
@@ -61,7 +61,7 @@ class RoleSpec:
     shafts: tuple[int, ...] = ()
     """Driven shafts it may control, of those as many as its settings have (``shafts``); else the first one."""
     loads_hub: bool = False
-    """It draws current (a motor, a sensor of pictures) or bandwidth as soon as its driver starts it."""
+    """Whether it draws current (a motor, an image sensor) or bandwidth as soon as its driver starts it."""
 
     @property
     def topic(self) -> Topic[Any]:
@@ -226,7 +226,7 @@ class DeviceKind(Plugin):
     opens: Literal["serial", "video", "computer"] = "serial"
     """What driver and probe get: a serial ``Port``, a ``FrameSource`` (the probe: a path), or the ``Computer``."""
     baud: int | None = None
-    """Of its serial line; None = USB from end to end, any will do."""
+    """Baud rate of its serial line; None = USB from end to end, any rate works."""
     usb: UsbIdentity | None = None
 
     @property

@@ -21,7 +21,7 @@ class PackConfig(Schema):
 
     cells: Annotated[int, Field(ge=1, le=14)] = 6
     capacity_ah: Annotated[float, Field(gt=0, le=100)] = 5.0
-    """Of the pack that is in the truck: 3.7, 4.0 or 5.0"""
+    """Capacity of the pack in the truck, Ah: 3.7, 4.0 or 5.0"""
     resistance: Annotated[float, Field(ge=0, le=1)] = 0.06
     """Ohm of cells and wiring, for the sag; 5 to 15 milliohm per cell are usual. Fit it from a start of the motor: with
     half the true value the charge reads up to 0.2 too low at 100 W"""

@@ -52,7 +52,7 @@ class EposConfig(Schema):
     """Fault resets tried within ``fault_reset_window`` before the drive is given up."""
     fault_reset_window: Seconds = 10.0
     fault_reset_pause: Seconds = 0.3
-    """Between two fault resets."""
+    """Pause between two fault resets."""
 
     @property
     def motor_limits(self) -> MotorLimits:

@@ -14,7 +14,7 @@ class RoboclawConfig(Schema):
 
     kind: Literal["roboclaw"] = "roboclaw"
     address: Annotated[int, Field(ge=ADDRESSES[0], le=ADDRESSES[1])] = ADDRESSES[0]
-    """Of packet serial, 128 to 135"""
+    """Address of packet serial, 128 to 135"""
     counts_per_turn: Annotated[int, Field(ge=8, le=1_000_000)] = 4096
     """Edges of both channels in one turn of the WHEEL"""
     left: Literal[1, 2] = 1
@@ -22,13 +22,13 @@ class RoboclawConfig(Schema):
     left_inverted: bool = False
     """Driving forward counts down"""
     right_inverted: bool = False
-    """Likewise"""
+    """The right encoder counts backwards when the robot drives forward"""
     rate: Annotated[float, Field(ge=5, le=50)] = 25.0
     """Readings a second"""
     answer_timeout: Annotated[float, Field(gt=0, le=0.2)] = 0.03
     """Seconds in which an answer must come"""
     max_rate: Annotated[float, Field(gt=0, le=1000)] = 10.0
-    """Of a wheel, rad/s; counts that would need more mean that the unit restarts at 0"""
+    """Greatest rate of a wheel, rad/s; counts that would need more mean that the unit has restarted at 0"""
 
     @property
     def count(self) -> float:

@@ -49,7 +49,7 @@ class Srf08Config(Schema):
 
     kind: Literal["srf08"] = "srf08"
     sonars: dict[FrameId, SonarConfig] = Field(default_factory=five_sonars, min_length=1)
-    """By name"""
+    """Sonars by name"""
     groups: Annotated[tuple[tuple[str, ...], ...], Field(strict=False)] = (("l", "f", "r"), ("fl", "fr"))
     """Names in the order in which they fire"""
     rate: Annotated[float, Field(gt=0, le=20)] = 10.0

@@ -44,7 +44,7 @@ class Srf08Reading(NamedTuple):
     revision: int
     light: int
     microseconds: int
-    """From the ping to the first echo; 0 = none."""
+    """Time from the ping to the first echo; 0 = none."""
 
     @property
     def present(self) -> bool:

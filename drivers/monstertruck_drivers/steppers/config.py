@@ -25,13 +25,13 @@ class StepperConfig(Schema):
     steps_per_turn: Annotated[int, Field(ge=4, le=51_200)] = 400
     """Steps per motor turn, half or micro steps counted; must be what the controller says"""
     inverted: Annotated[tuple[bool, ...], Field(strict=False)] = (False,) * MOTORS
-    """Of each motor: driving forward takes negative rates"""
+    """For each motor: driving forward takes negative rates"""
     max_rate: Annotated[float, Field(gt=0, le=MAX_RATE / 1000)] = 250.0
     """Steps per second: requests are limited to this; less than what makes a motor lose steps"""
     acceleration: Annotated[int, Field(gt=0, le=1_000_000)] = 4000
-    """Of the controller's ramps, steps/s^2"""
+    """Acceleration of the controller's ramps, steps/s^2"""
     quick_deceleration: Annotated[int, Field(gt=0, le=1_000_000)] = 8000
-    """Of its quick stop and of its watchdog, steps/s^2"""
+    """Deceleration of its quick stop and of its watchdog, steps/s^2"""
     rate: Annotated[float, Field(ge=5, le=50)] = 20.0
     """Exchanges per second"""
     answer_timeout: Annotated[float, Field(gt=0, le=0.2)] = 0.05

@@ -25,4 +25,4 @@ class WebcamConfig(Schema):
     frame: FrameId = "camera"
     """Frame of the pictures"""
     lens: LensConfig = LensConfig()
-    """For what measures by its pictures"""
+    """Lens, for measurements by its pictures"""

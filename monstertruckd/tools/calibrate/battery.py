@@ -52,7 +52,7 @@ class BatteryWizard:
     meter_share: float = 0.005
     """Greatest error of the multimeter as a share of its reading"""
     meter_digits: float = 0.02
-    """And the rest of it, V"""
+    """Greatest constant error of the meter, V"""
     samples: int = 50
     fresh: bool = False
     """Forget the readings of earlier runs"""

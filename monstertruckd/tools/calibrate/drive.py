@@ -177,7 +177,7 @@ class TapedRun:
     """One taped run."""
 
     turns: float
-    """Of the motor."""
+    """Turns of the motor."""
     way: float
     """Along the arc, m."""
     bend: float

@@ -45,7 +45,7 @@ class Turn:
     """Of the raw yaw rate from rest to rest, rad."""
     seconds: float
     turned: float
-    """By the compass, rad, left positive."""
+    """Turn by the compass, rad, left positive."""
     sigma: float
     """Of ``turned``, rad."""
 

@@ -30,11 +30,11 @@ class Steps:
     """A piecewise constant command."""
 
     first: float
-    """Before its first change."""
+    """Value before the first change."""
     times: Array
-    """Of its changes, s; (k,)."""
+    """Times of the changes, s; (k,)."""
     changes: Array
-    """By how much; (k,)."""
+    """Size of the changes; (k,)."""
 
     @classmethod
     def of(cls, stamps: Array, values: Array) -> "Steps":

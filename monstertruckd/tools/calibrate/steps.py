@@ -31,7 +31,7 @@ class MoveRecord:
     steering_commands: list[SteeringCommand] = field(default_factory=list)
     """What the gate sent to the servos"""
     drive_commands: list[DriveCommand] = field(default_factory=list)
-    """And to the drive"""
+    """Commands to the drive"""
     attitude: list[Attitude] = field(default_factory=list)
     others: dict[str, list[Any]] = field(default_factory=dict)
     """What was asked for besides (``MoveStep.also``), by name of the topic"""

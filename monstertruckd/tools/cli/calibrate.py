@@ -137,8 +137,8 @@ def compass() -> "Wizard":
 
 @_wizard
 def battery(
-    meter_error: Annotated[float, typer.Option(min=0, max=10, help="Greatest error of the meter, percent...")] = 0.5,
-    meter_digits: Annotated[float, typer.Option(min=0, max=1, help="...plus a constant part, V.")] = 0.02,
+    meter_error: Annotated[float, typer.Option(min=0, max=10, help="Proportional error of the meter, percent.")] = 0.5,
+    meter_digits: Annotated[float, typer.Option(min=0, max=1, help="Constant error of the meter, V.")] = 0.02,
     fresh: Annotated[bool, typer.Option("--fresh", help="Forget the readings of earlier runs.")] = False,
 ) -> "Wizard":
     """Scale of the battery voltage from a multimeter; nothing moves.

@@ -95,7 +95,7 @@ def simulate(
             show_default=False,
         ),
     ] = None,
-    truth: Annotated[Path | None, typer.Option("--truth", help="Write what really happened (npz) at the end.")] = None,
+    truth: Annotated[Path | None, typer.Option("--truth", help="Write the simulated truth (npz) at the end.")] = None,
     run: Annotated[bool, typer.Option("--run", help="Run the daemons of the same configurations, too.")] = False,
     film: Annotated[
         Path | None,

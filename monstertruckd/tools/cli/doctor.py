@@ -32,7 +32,7 @@ def doctor(
             autocompletion=complete_config,
         ),
     ] = None,
-    root: Annotated[Path, typer.Option("--root", help="Look at the system in this folder instead.")] = Path("/"),
+    root: Annotated[Path, typer.Option("--root", help="Check the system in this folder instead.")] = Path("/"),
     fix: Annotated[
         bool, typer.Option("--fix", help="Run the safe ones of the commands that fix something, each after asking.")
     ] = False,

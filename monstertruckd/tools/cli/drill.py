@@ -28,7 +28,7 @@ def drill(
     ] = None,
     resume: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Outcomes of an interrupted drill, which goes on; new ones are added."),
+        typer.Option(metavar="FILE", help="Resume the drill whose outcomes are in this file; new ones are added."),
     ] = None,
     json_output: JsonOption = False,
 ) -> None:

@@ -341,7 +341,7 @@ def fit(
     radius: Annotated[float, typer.Option(help="Nominal wheel radius, m.")] = 0.021,
     half_track: Annotated[float, typer.Option(help="Half the left-right wheel distance, m.")] = 0.0525,
     window: Annotated[int, typer.Option(help="Samples over which motion is compared.")] = 10,
-    bounded: Annotated[bool, typer.Option(help="Believable parameters only.")] = True,
+    bounded: Annotated[bool, typer.Option(help="Plausible parameters only.")] = True,
     png: Annotated[Path | None, typer.Option("--png", help="Also draw a picture into this file.")] = None,
     json_output: JsonOption = False,
 ) -> None:

@@ -26,9 +26,9 @@ FileArgument = Annotated[Path, typer.Argument(help="Mission (YAML).", show_defau
 @app.command("run")
 def run_command(
     file: Annotated[Path | None, typer.Argument(help="Mission (YAML).", show_default=False)] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with the one that a restart interrupted.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Resume the mission that a restart interrupted.")] = False,
     moved: Annotated[
-        bool, typer.Option("--moved", help="Go on though the robot is not where it was: its pose is right.")
+        bool, typer.Option("--moved", help="Resume although the robot is not where it was: its pose is right.")
     ] = False,
     arm: Annotated[bool, typer.Option("--arm", help="Arm the robot first; it drives off at once.")] = False,
     robot: RobotOption = "truck",

@@ -30,7 +30,7 @@ def move(
         float | None,
         typer.Option(help="Radius of the arc, m; centre on the left positive, 0 = on the spot, left out = straight."),
     ] = None,
-    length: Annotated[float | None, typer.Option(help="Way, m; backwards negative.")] = None,
+    length: Annotated[float | None, typer.Option(help="Distance, m; backwards negative.")] = None,
     angle: Annotated[float | None, typer.Option(help="Turn, rad; counter-clockwise positive.")] = None,
     bearing: Annotated[
         float | None, typer.Option(help="Direction of travel, rad; 0 = ahead, 1.5708 = sideways to the left.")

@@ -25,7 +25,7 @@ class SteeringChoice(StrEnum):
 
 
 class UnknownChoice(StrEnum):
-    """How unknown cells are regarded."""
+    """How unknown cells count."""
 
     BLOCKED = "blocked"
     DEAR = "dear"
@@ -50,7 +50,7 @@ def plan(
         SteeringChoice, typer.Option(help="Front axle only, both axles opposite, or both in all modes.")
     ] = SteeringChoice.BOTH,
     via: ViaOption = None,
-    unknown: Annotated[UnknownChoice, typer.Option(help="How unknown cells are regarded.")] = UnknownChoice.BLOCKED,
+    unknown: Annotated[UnknownChoice, typer.Option(help="How unknown cells count.")] = UnknownChoice.BLOCKED,
     budget: Annotated[float, typer.Option(min=0.01, help="Processor time for the route and its improvement, s.")] = 1.0,
     reproducible: Annotated[
         bool, typer.Option("--reproducible", help="Limit the work instead of the time: equal inputs give equal routes.")

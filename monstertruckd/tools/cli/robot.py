@@ -10,7 +10,7 @@ from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruckd.tools.cli.options import ConfigOption, EndpointOption, RobotOption
 from monstertruckd.tools.cli.output import JsonOption, needs_extra, print_json, print_table, until_stopped
 
-VerboseOption = Annotated[bool, typer.Option("--verbose", "-v", help="Log what is of use to developers only, too.")]
+VerboseOption = Annotated[bool, typer.Option("--verbose", "-v", help="Log debug messages, too.")]
 
 
 @needs_extra("robot")

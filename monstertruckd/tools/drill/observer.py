@@ -266,7 +266,7 @@ class _Standstill:
 
     def __init__(self) -> None:
         self.began = 0
-        """Of the fault, ns."""
+        """Start of the fault, ns."""
         self.must_stop = False
         """The fault must stop the truck."""
         self.disarms = False

@@ -105,7 +105,7 @@ class PadMapping(Schema):
     inverted: Annotated[tuple[Literal["speed", "steer", "side"], ...], Field(strict=False)] = ()
     """Axes that count the other way; without this, up is ahead and left is left"""
     deadman: Annotated[tuple[Button, ...], Field(strict=False, min_length=1)] = ("right_shoulder", "right_trigger")
-    """Of these one has to be held for the truck to move"""
+    """Buttons of which one has to be held for the truck to move"""
     buttons: dict[Button, Action] = Field(default_factory=lambda: dict(USUAL))
 
     def fits(self, name: str) -> bool:

@@ -179,7 +179,7 @@ class FirstDifference:
     at: float
     """Seconds after the log's begin."""
     fields: tuple[str, ...]
-    """That are off by more than the tolerance; none = the header alone."""
+    """Fields that differ by more than the tolerance; none = the header alone."""
 
 
 @dataclass(frozen=True, slots=True)

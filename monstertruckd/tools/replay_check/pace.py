@@ -23,7 +23,7 @@ class Pace:
 
     def __init__(self) -> None:
         self.instant: int | None = None
-        """Of the newest tick, ns; None before the first."""
+        """Time of the newest tick, ns; None before the first."""
         self._held: asyncio.Future[None] | None = None
 
     def adopt(self) -> None:

@@ -159,7 +159,7 @@ class Survey:
     start: int
     """Log time of the first message, ns."""
     end: int
-    """And of the last, ns."""
+    """Time of the last one, ns."""
     first: dict[str, LogMessage] = field(default_factory=dict)
     """First message of every topic."""
     newest: dict[str, LogMessage] = field(default_factory=dict)

@@ -32,7 +32,7 @@ class RenderedCamera(Schema):
 
     kind: Literal["rendered"] = "rendered"
     port: Path
-    """That of `sim.stand.cameras`"""
+    """Port of `sim.stand.cameras`"""
 
 
 class StandCamera(Schema):
@@ -56,13 +56,13 @@ class MarkedRobot(Schema):
     """A robot that carries a marker."""
 
     x: float = 0.0
-    """Of the marker's middle before the robot's, m"""
+    """Centre of the marker ahead of the robot's, m"""
     y: float = 0.0
-    """And left of it, m"""
+    """Centre of the marker to the left of the robot's, m"""
     yaw: float = 0.0
-    """Of the marker against the robot, left positive, rad"""
+    """Yaw of the marker relative to the robot, left positive, rad"""
     height: Annotated[float, Field(ge=0, le=2)] = 0.08
-    """Of the marker over the table, m"""
+    """Height of the marker over the table, m"""
 
 
 class TaggedRobot(MarkedRobot):
