@@ -58,10 +58,9 @@ from monstertruckd.config.expiry import CalibrationWatch, DistanceCounter
 from monstertruckd.config.live import LiveConfig
 from monstertruckd.config.load import Tree, resolved
 from monstertruckd.config.truck import TruckConfig
-from monstertruckd.gate import rpc as gate_rpc
 from monstertruckd.gate.core import Gate
 from monstertruckd.gate.latch import EstopLatch, Latch, MemoryLatch, marks_folder
-from monstertruckd.gate.service import GateInputs, GateOutputs, GateService
+from monstertruckd.gate.service import GateInputs, GateOutputs, GateService, register_gate_calls
 from monstertruckd.host.health import ClockService, HealthBoard, MeterService
 from monstertruckd.host.journal import published
 from monstertruckd.host.notify import notify_from, status_line
@@ -314,7 +313,7 @@ class Daemon:
         rpc.register("acknowledge", acknowledging(self._events))
         self._recordings().register(rpc)
         rpc.register(REMOTE_STEP, self._remote_steps.serve)
-        gate_rpc.register(rpc, self.bus, self.clock)
+        register_gate_calls(rpc, self.bus, self.clock)
         loaded = self._tree.calibration if self._tree is not None else None
         calibration_rpc.register(
             rpc,

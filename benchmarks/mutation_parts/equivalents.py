@@ -14,7 +14,7 @@ EQUIVALENTS: Final[dict[str, str]] = {
     f"{GATE}arbitration.py::Sources.__init__: 0 -> (1)": "nobody drives before an ARM order, which sets it",
     f"{GATE}config.py::weakened: 1 -> (2)": "a sign: only whether it is positive counts",
     f"{GATE}limiter.py::ObstacleGuard.__init__: 0 -> (1)": NANOSECOND,
-    f"{GATE}limiter.py::ObstacleGuard._look: 0 -> (1)": NANOSECOND,
+    f"{GATE}limiter.py::ObstacleGuard._update_unseen: 0 -> (1)": NANOSECOND,
     f"{GATE}limiter.py::ObstacleGuard._delay: 0 -> (1)": NANOSECOND,
     f"{GATE}limiter.py::ObstacleGuard.free_distance: self._checked != rounded -> True": CACHE,
     f"{GATE}limiter.py::ObstacleGuard.free_distance: self._checked = rounded -> pass": CACHE,
@@ -32,7 +32,7 @@ EQUIVALENTS: Final[dict[str, str]] = {
     f"{GATE}limiter.py::Motion.shaft_speeds: self._shafts[0] != command -> True": CACHE,
     f"{GATE}limiter.py::Motion.shaft_speeds: 0 -> (1)": CACHE,
     f"{GATE}limiter.py::Motion.servos: 0 -> (1)": CACHE,
-    f"{GATE}limiter.py::Motion.progress: 1.0 -> (2.0)": "divides zero: no shaft turns for the way",
+    f"{GATE}limiter.py::Motion.progress: 1.0 -> (2.0)": "divides zero: no shaft turns for the motion",
     f"{GATE}limiter.py::CommandLimiter.update: pace <= allowed -> (pace < allowed)": "scaled by 1",
     f"{GATE}limiter.py::CommandLimiter._check_obstacles: allowed < (2 * crawl if self.blocked else crawl) -> "
     "(allowed <= (2 * crawl if self.blocked else crawl))": "a rounded speed",

@@ -2,7 +2,7 @@
 
 import asyncio
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final, TypeVar
@@ -10,7 +10,10 @@ from typing import Any, Final, TypeVar
 import numpy as np
 
 from monstertruck_runtime.clock import SECOND, Clock, Schedule
-from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
+from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError
+from monstertruck_runtime.mailbox import fifo
+from monstertruck_runtime.ports import EventSink, Publisher, Ready, RpcRegistry, Subscription
+from monstertruck_runtime.requests import parse_request
 from monstertruck_runtime.stop_text import causes_text
 from monstertruck_runtime.threads import Offload, in_thread
 from monstertruck_schemas.base import Twist2D, servo_fields
@@ -18,10 +21,12 @@ from monstertruck_schemas.cmd import DriveCommand, SteeringCommand
 from monstertruck_schemas.event import Event, Severity, Stop
 from monstertruck_schemas.health import HealthTable
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import STARTING, ControlRequest, DriveRequest
-from monstertruck_schemas.roles import ServiceName
+from monstertruck_schemas.req import STARTING, ControlRequest, DriveRequest, Order
+from monstertruck_schemas.roles import AccessRole, ServiceName
 from monstertruck_schemas.sensor import Attitude, Battery, DriveFeedback, LaserScan, SonarRanges, SteeringFeedback
 from monstertruck_schemas.state import GateMode, GateState, Odometry, Peers
+from monstertruck_schemas.topics import GATE, REQ_CONTROL
+from monstertruckd.bus.local import Bus
 from monstertruckd.gate.config import GateConfig
 from monstertruckd.gate.core import Decision, Gate, GateOutput
 from monstertruckd.gate.latch import Latch
@@ -423,3 +428,58 @@ class _Feed:
         if message is not self._seen:
             self._seen = message
             self._observe(message)
+
+
+CARRIED_OUT: Final[Mapping[Order, Callable[[GateMode], bool]]] = {
+    Order.ARM: lambda mode: mode.active,
+    Order.DISARM: lambda mode: not mode.active,
+    Order.ESTOP: lambda mode: mode is GateMode.ESTOPPED,
+    Order.RESET: lambda mode: mode is not GateMode.ESTOPPED,
+    Order.STOP: lambda mode: not mode.moving,
+    Order.ASK: lambda _: True,
+    Order.HAND_OVER: lambda _: True,
+}
+"""Modes that show an order as carried out."""
+
+STANDSTILL: Final = 4.0
+"""Seconds for the truck to come to rest."""
+
+GRADUAL: Final = frozenset({Order.DISARM, Order.STOP})
+"""Orders that end with the truck at rest; the others take effect at once."""
+
+
+def register_gate_calls(rpc: RpcRegistry, bus: Bus, clock: Clock) -> None:
+    """Serve every ``Order`` under its name; the payload is a ``ControlRequest``, the answer a ``GateState``.
+
+    An order is injected on ``req/control``, so that it is recorded and checked like any other; it is answered once it
+    is carried out, or refused with the reason.
+
+    Args:
+        rpc: gets the calls.
+        bus: carries the orders to the gate.
+        clock: time.
+    """
+    for order in Order:
+        role = AccessRole.OBSERVER if order is Order.ESTOP else AccessRole.PILOT
+        rpc.register(order.value, partial(_carry_out, bus, clock, order), role)
+
+
+async def _carry_out(bus: Bus, clock: Clock, order: Order, payload: dict[str, Any]) -> dict[str, Any]:
+    request = parse_request(ControlRequest, {**payload, "order": order.value})
+    with bus.subscribe(GATE, fifo(64)) as states:
+        states.drain()
+        (decision,) = bus.inject(REQ_CONTROL, request)
+        assert isinstance(decision, Decision)
+        if decision.reason is not Reason.OK:
+            raise RequestRefusedError(decision.reason, decision.text)
+        try:
+            async with clock.deadline(STANDSTILL):
+                while True:
+                    state = await states.next()
+                    if CARRIED_OUT[order](state.mode):
+                        return state.model_dump(mode="json")
+                    if order not in GRADUAL:
+                        raise RequestRefusedError(state.worst)
+        except TimeoutError:
+            msg = f"{order.value} accepted, but standstill is not confirmed after {STANDSTILL:g} s"
+            raise NoAnswerError(msg) from None

@@ -55,7 +55,7 @@ class DriveWizard:
     """Sign, then several runs forward and back."""
 
     name: ClassVar[WizardName] = "drive"
-    doc: ClassVar[str] = "which way is forward, the way of a motor's turn, from taped distances; how late it follows"
+    doc: ClassVar[str] = "which way is forward, the distance per motor turn, from taped distances; how late it follows"
     room: ClassVar[str] = ROOM
     runs: int = 4
     """Taped distances; at least 3"""

@@ -250,7 +250,7 @@ class SteeringWizard:
                     high=abs(scale) * (1 + share) + math.hypot(scale_half, BAND / SPAN),
                     unit="us/deg",
                     samples=len(legs),
-                    meaning=f"pulse per degree of the servo; {band}, and {share:.1%} of way and wheelbase",
+                    meaning=f"pulse per degree of the servo; {band}, and {share:.1%} of distance and wheelbase",
                     key=f"{STEERING}.{name}.scale_us_per_deg",
                 ),
             ]

@@ -13,7 +13,7 @@ from monstertruckd.bus.call_limits import (
     CallLimits,
     may_be_served,
 )
-from monstertruckd.gate.rpc import STANDSTILL
+from monstertruckd.gate.service import STANDSTILL
 
 
 class FixedClock(WallClock):

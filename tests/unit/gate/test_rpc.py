@@ -19,7 +19,7 @@ from monstertruck_schemas.state import GateMode
 from monstertruck_schemas.topics import GATE, REQ_CONTROL, Writer
 from monstertruckd.bus.local import Bus
 from monstertruckd.bus.rpc import Rpc
-from monstertruckd.gate import rpc as gate_rpc
+from monstertruckd.gate.service import register_gate_calls
 from tests.unit.gate.bench import Bench
 from tests.unit.gate.rig import NONCE
 
@@ -32,7 +32,7 @@ class CalledBench(Bench):
         super().__init__(clock, state=self.bus.publisher(GATE, Writer.GATE))
         self.bus.listen(REQ_CONTROL, self.service.control)
         self.rpc = Rpc(clock)
-        gate_rpc.register(self.rpc, self.bus, clock)
+        register_gate_calls(self.rpc, self.bus, clock)
         self.seq = 0
 
     def payload(self, **changes):
@@ -107,7 +107,7 @@ def test_a_gate_that_does_not_tick_gives_no_answer():
 
 def test_an_observer_may_order_an_emergency_stop_and_nothing_else():
     roles = {}
-    gate_rpc.register(SimpleNamespace(register=lambda name, _, role: roles.update({name: role})), None, None)
+    register_gate_calls(SimpleNamespace(register=lambda name, _, role: roles.update({name: role})), None, None)
     assert roles == {order.value: AccessRole.OBSERVER if order is Order.ESTOP else AccessRole.PILOT for order in Order}
 
 
