@@ -63,7 +63,7 @@ class Gyro:
         self.bias: float | None = None
         """rad/s; None = the robot has not stood long enough."""
         self.trusted = True
-        """It agrees with the wheels."""
+        """Whether it agrees with the wheels."""
         self.difference = 0.0
         """Turn by the gyroscope less turn by the wheels in the window, rad."""
         self._left_out: int | None = None

@@ -496,9 +496,9 @@ class OdometryContext:
     slam: bool
     """SLAM publishes the pose in map and the motion between scans."""
     imu: Quaternion | None = None
-    """From the axes of its IMU to those of base; None = it has none."""
+    """Rotation from the axes of its IMU to those of base; None = it has none."""
     encoders: bool = False
-    """Its rear wheels have encoders."""
+    """Whether its rear wheels have encoders."""
 
     def inertial(self, config: GyroConfig | None) -> InertialInput | None:
         """Its IMU, if there is one and the configuration uses it."""

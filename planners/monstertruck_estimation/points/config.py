@@ -16,7 +16,7 @@ class PointsConfig(Schema):
     size: Size = 0.1
     """Side of the tags' black square, m"""
     sizes: dict[Annotated[int, Field(ge=0, le=586)], Size] = Field(default_factory=dict)
-    """Of tags that have another one, by number, m"""
+    """Sizes of other tags by number, m"""
     rate: Annotated[float, Field(gt=0, le=30)] = 5.0
     """Pictures read a second, at most; of a robot that stands two at a place"""
     reach: Positive = 2.0
@@ -24,7 +24,7 @@ class PointsConfig(Schema):
     angle: Annotated[float, Field(gt=0, lt=1.57)] = radians(60.0)
     """Nor are those seen more obliquely, from their normal, rad"""
     margin: Annotated[float, Field(ge=0, lt=1)] = 0.15
-    """Of every cell from grey to what it should be, as a share; less is no tag"""
+    """Least contrast of every cell, as a share of the difference from grey to its colour; less is no tag"""
     sightings: Annotated[int, Field(ge=1, le=20)] = 2
     """Pictures that have to agree before a tag is an object of the map"""
     agree: Positive = 0.15

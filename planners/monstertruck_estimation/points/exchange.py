@@ -17,7 +17,7 @@ class ReadTask:
     size: float
     """Side of tags, m."""
     sizes: dict[int, float] = field(default_factory=dict)
-    """Of others, by number."""
+    """Sizes of other tags, by number."""
     reach: float = 2.0
     """m."""
     angle: float = 1.0
@@ -40,17 +40,17 @@ class TagReading:
     normal: Triple
     """Unit vector, out of its front."""
     other_normal: Triple
-    """That of the second pose that fits its outline."""
+    """Normal by the second pose that fits the outline."""
     doubt: float
     """How well the second one fits, 0 (not at all) to 1 (as well): the heading means nothing then."""
     pixels: float
     """Mean side of its black square."""
     margin: float
-    """Of the worst cell."""
+    """Contrast of the worst cell."""
     angle: float
-    """From its normal, rad."""
+    """Angle from its normal to the camera, rad."""
     picture: bytes = b""
-    """It and what is around it, JPEG."""
+    """Picture of the tag and its surroundings, JPEG."""
 
 
 @dataclass(frozen=True, slots=True)

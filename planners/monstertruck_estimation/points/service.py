@@ -74,7 +74,7 @@ class PointInputs:
     camera: Mailbox[CompressedImage] | None
     """None = places are marked only."""
     pose: Mailbox[Odometry]
-    """In map; all of them."""
+    """Poses in map; all of them."""
     slam: Subscription[SlamHealth] | None
     attitude: Subscription[Attitude] | None
     gate: Subscription[GateState]
@@ -85,7 +85,7 @@ class PointFolders:
     """Where points are kept."""
 
     load: Path | None = None
-    """Of the map that is known at the start."""
+    """Folder of the map that is known at the start."""
     save: Path | None = None
 
 

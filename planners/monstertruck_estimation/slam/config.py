@@ -38,7 +38,7 @@ class MapperConfig(Schema):
     drift_distance: tuple[Positive, Positive] = (0.01, 0.01)
     """Standard deviation of the position of a matched keyframe against its neighbour, m and per metre between them."""
     drift_turn: tuple[Positive, Positive] = (0.003, 0.005)
-    """The same of its yaw, rad and per radian between them."""
+    """Standard deviation of its yaw, rad and per radian between them."""
     local_spread: Positive = 0.15
     """Keyframes whose drift against each other is less than this, m, belong to one submap."""
     local_reach: Positive = 5.0

@@ -52,9 +52,9 @@ class ScanInput:
     slopes: tuple[float, float] | None = None
     """Rise per metre along the sensor's x and y axis; None = not known, assumed level."""
     height: float | None = None
-    """Of the sensor over the ground, m; None = not known, hits of the ground are not removed."""
+    """Height of the sensor over the ground, m; None = not known, hits of the ground are not removed."""
     ceiling: float | None = None
-    """Of the ceiling over the ground, m."""
+    """Height of the ceiling over the ground, m."""
 
     @classmethod
     def of(cls, scan: LaserScan, mount: Vector) -> Self:

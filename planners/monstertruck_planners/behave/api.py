@@ -59,7 +59,7 @@ class BehaviourBody(NamedTuple):
 
     chassis: Chassis
     max_angle: float
-    """Of its axles, rad: that of the gate."""
+    """Greatest angle of its axles, rad: that of the gate."""
 
 
 class Inputs:

@@ -54,7 +54,7 @@ class Amounts(NamedTuple):
     behind: float
     """Distance that is never a lag."""
     tolerance: float
-    """Of the end."""
+    """Tolerance at the end."""
 
 
 class MoveConfig(BehaviourConfig):
@@ -64,7 +64,7 @@ class MoveConfig(BehaviourConfig):
     rate: Annotated[float, Field(gt=0, le=50)] = 20.0
     """Steps a second"""
     radius: float | None = None
-    """Of the arc, m, centre on the left positive; 0 = on the spot, null = straight"""
+    """Radius of the arc, m, centre on the left positive; 0 = on the spot, null = straight"""
     length: float | None = None
     """Distance, m, backwards negative; null = the angle says it"""
     angle: float | None = None
@@ -138,11 +138,11 @@ class Progress:
     turned: float = 0.0
     """Rad, counting turns."""
     time: float = 0.0
-    """Of the step before, s."""
+    """Time of the last step, s."""
     steered: float | None = None
     """Since when the wheels are steered to the move, s."""
     clock: float = 0.0
-    """Of the profile, s."""
+    """Time of the profile, s."""
     target: float = 0.0
     """How far the robot should be."""
     planned: float = 0.0

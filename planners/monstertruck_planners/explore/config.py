@@ -19,7 +19,7 @@ class ExplorerConfig(Schema):
     reach: Positive = 5.6
     """Range of the lidar that is counted on, m"""
     view: Annotated[float, Field(gt=0, le=6.2831853072)] = radians(240.0)
-    """Its angle of view, rad"""
+    """Angle of view of the sensor, rad"""
     smallest: Positive = 0.3
     """Shorter frontiers are passed over, m"""
     rate: Annotated[float, Field(gt=0, le=5)] = 1.0
@@ -73,7 +73,7 @@ class InformationConfig(ExplorerConfig):
     depth: Positive = 1.5
     """Unknown ground is taken to go on for this far behind a frontier, m"""
     speed: Positive = 0.2
-    """Of driving, m/s"""
+    """Driving speed, m/s"""
     turning: NotNegative = 4.0
     """Seconds that half a turn at the start costs"""
     better: Annotated[float, Field(ge=1)] = 4.0

@@ -58,7 +58,7 @@ class ExploreTask:
     current: "Viewpoint | None" = None
     """Where the robot is going."""
     pursued: float = 0.0
-    """For how long, s."""
+    """Time for which it has been pursued, s."""
     banned: tuple[Point, ...] = ()
     """Frontiers here are skipped."""
     avoided: tuple[Point, ...] = ()
@@ -90,7 +90,7 @@ class ExploreAnswer:
     target: Viewpoint | None = None
     """None = nothing is left that can be reached, or none was asked for."""
     kept: bool = False
-    """It is the one that is pursued."""
+    """Whether it is the pursued one."""
     frontiers: int = 0
     """Frontiers that can be reached."""
     banned: int = 0

@@ -153,11 +153,11 @@ class Observed:
     answer: ExploreAnswer | None = None
     """To the last question, once."""
     charge: float | None = None
-    """Of the battery, 0 to 1; None = not measured."""
+    """Charge of the battery, 0 to 1; None = not measured."""
     low: bool = False
     """The battery's voltage is low."""
     critical: bool = False
-    """It is too low to drive: the gate stops, and what is not saved may be lost."""
+    """Whether the charge is too low to drive: the gate stops, and an unsaved map may be lost."""
     saved: str | None = None
     """Where the map was saved after that was asked for; empty = nowhere."""
     found: int = 0
@@ -172,7 +172,7 @@ class Exploration:
     source: str
     home: Pose
     returns: bool
-    """It drives home at the end."""
+    """Whether the robot drives home at the end."""
     budget: float
     """Seconds."""
     begun: float
@@ -182,7 +182,7 @@ class Exploration:
     unreached: Attempts
     """At places to look from."""
     find: int | None = None
-    """It ends when so many points of interest are known; None = they do not matter."""
+    """Number of points of interest at which it ends; None = not limited."""
     phase: ExplorationPhase = ExplorationPhase.LOOKING
     since: float = 0.0
     """Begin of the phase, s."""
@@ -197,7 +197,7 @@ class Exploration:
     asked: float = -math.inf
     """When a decision was asked for last, s."""
     waiting: bool = False
-    """For its answer."""
+    """Whether an answer is awaited."""
     not_before: float = 0.0
     """Time before which no decision and no goal for driving home is requested, s."""
     nothing: int = 0

@@ -82,7 +82,7 @@ class LocalPlannerState:
     failed: int = 0
     """Local searches in sequence without a result; after some another heading is tried at the goal."""
     turning: tuple[float, ...] = ()
-    """Of an emergency turn: start x, y, yaw and wanted yaw."""
+    """Emergency turn: start x, y, yaw and wanted yaw."""
 
 
 @dataclass(frozen=True)

@@ -17,9 +17,9 @@ class BandConfig(Schema):
     overlap: Annotated[float, Field(gt=0, le=1)] = 0.7
     """Neighbouring bubbles touch if they are nearer than this share of the sum of their radii."""
     internal_gain: NotNegative = 1.0
-    """Of the attraction of both neighbours."""
+    """Gain of the attraction of both neighbours."""
     external_gain: NotNegative = 2.0
-    """Of the repulsion of obstacles."""
+    """Gain of the repulsion of obstacles."""
     iterations: Count = 5
     """Sweeps over the band and back."""
     depth: Count = 5
@@ -47,11 +47,11 @@ class LocalPlannerConfig(Schema):
     effort: Count = 1100
     """Nodes expanded and smoothing trials of a local search: bounds the time of a cycle."""
     reverse_cost: Annotated[float, Field(ge=1)] = 3.0
-    """Of a metre backward, where the lidar does not look, m."""
+    """Cost of a metre backward, where the lidar does not look, m."""
     cusp_cost: NotNegative = 0.3
-    """Of a change of direction, m."""
+    """Cost of a change of direction, m."""
     crab_cost: Annotated[float, Field(ge=1)] = 1.05
-    """Of a metre of translation, m."""
+    """Cost of a metre of translation, m."""
     clearance_cost: NotNegative = 0.5
     """Extra cost of a metre in contact, falling to 0 where obstacles are 0.1 m away, m."""
     shortest: Positive = 0.15
@@ -66,7 +66,7 @@ class RsbandConfig(LocalPlannerConfig):
     sub_goal: Positive = 0.6
     """Length of band to the goal of ``start_to_next``, m."""
     spacing: Positive = 0.4
-    """Of the band poses that are joined one by one, m."""
+    """Distance between the band poses that are joined one by one, m."""
     renew: Positive = 0.5
     """A path is replaced when less than this share of its length is left."""
     off_path: Positive = 0.1
@@ -92,22 +92,22 @@ class TebConfig(LocalPlannerConfig):
 
     kind: Literal["teb"] = "teb"
     spacing: Positive = 0.1
-    """Of the poses, m."""
+    """Distance between the poses, m."""
     iterations: Count = 8
     """Gauss-Newton steps in one cycle."""
     clearance: Positive = 0.1
     """Preferred between footprint and obstacles, m."""
     obstacle_weight: Positive = 30.0
     steering_weight: Positive = 200.0
-    """Of axle angles beyond their limits."""
+    """Weight of axle angles beyond their limits."""
     rate_weight: Positive = 1.0
-    """Of steering, speeds and accelerations beyond their limits."""
+    """Weight of steering rates, speeds and accelerations beyond their limits."""
     smooth_weight: NotNegative = 0.02
-    """Of changes of the axle angles."""
+    """Weight of changes of the axle angles."""
     crab_weight: NotNegative = 0.05
-    """Of translation."""
+    """Weight of translation."""
     time_weight: Positive = 0.3
-    """Of the time."""
+    """Weight of the time."""
     speed: Positive = 0.2
     """Forward, m/s."""
     reverse_speed: Positive = 0.15
@@ -115,4 +115,4 @@ class TebConfig(LocalPlannerConfig):
     acceleration: Positive = 0.5
     """m/s^2."""
     steering_rate: Positive = 1.0
-    """Of an axle, rad/s."""
+    """Greatest steering rate of an axle, rad/s."""

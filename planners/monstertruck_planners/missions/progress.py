@@ -45,14 +45,14 @@ class MissionProgress:
     start: Pose
     """Where it began, in map."""
     index: int = 0
-    """Of the present step."""
+    """Index of the present step."""
     attempt: int = 0
     """Times that the present step was tried without success."""
     failures: int = 0
     why: StepEnd = StepEnd(Reason.OK)
     """The last failure."""
     returning: bool = False
-    """It drives back to where it began, and ends there."""
+    """Whether the robot drives back to where it began, and ends there."""
 
     @property
     def step(self) -> AnyStep:

@@ -141,7 +141,7 @@ class MissionParts:
     behaviours: BehavioursOfMission | None
     explorer: ExplorerOfMission | None
     names: frozenset[str]
-    """Of the configured behaviours."""
+    """Names of the configured behaviours."""
 
 
 class MissionService:

@@ -21,7 +21,7 @@ class GoalConfig(Schema):
     position_tolerance: NotNegative = 0.05
     """If the goal itself is not free, a free pose this near is accepted, m."""
     yaw_tolerance: NotNegative = 0.09
-    """The same for the heading, rad."""
+    """Tolerance of the heading at the goal, rad."""
     margin: NotNegative = 0.0
     """Kept between footprint and obstacles, m."""
     unknown: Unknown = "blocked"
@@ -34,17 +34,17 @@ class DriveCosts(GoalConfig):
     """Costs of drivable motions. With the defaults routes are nearly the shortest ones."""
 
     reverse_cost: AtLeastOne = 1.0
-    """Of a metre backward, m; above 1 for a truck whose sensors look ahead."""
+    """Cost of a metre backward, m; above 1 for a truck whose sensors look ahead."""
     cusp_cost: NotNegative = 0.1
-    """Of a change of direction, m."""
+    """Cost of a change of direction, m."""
     free_cusps: Annotated[int, Field(ge=0)] = 4
     """Changes of direction without an extra cost."""
     many_cusps_cost: NotNegative = 0.4
     """Extra cost of each further change of direction, m: at each the truck stops and its errors add up."""
     swing_cost: NotNegative = 0.01
-    """Of a change of curvature, m: few long arcs instead of many short ones."""
+    """Cost of a change of curvature, m: few long arcs instead of many short ones."""
     crab_cost: AtLeastOne = 1.0
-    """Of a metre of translation, m."""
+    """Cost of a metre of translation, m."""
     clearance: NotNegative = 0.1
     """Distance to obstacles below which a metre costs more, m."""
     clearance_cost: NotNegative = 0.1
@@ -92,8 +92,8 @@ class GridAstarConfig(GoalConfig):
     cost_factor: NotNegative = 3.0
     """On the costmap's value of a cell, 0 to 252."""
     lethal: Positive = 200.0
-    """From this value on a cell is closed."""
+    """Costmap value from which on a cell is closed."""
     inflation: NotNegative = 0.3
     """Distance beyond the inscribed circle at which the costs of obstacles end, m."""
     decay: Positive = 10.0
-    """Of the costs with distance, 1/m."""
+    """Decay of the costs with distance, 1/m."""

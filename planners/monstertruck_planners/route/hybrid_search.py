@@ -62,7 +62,7 @@ class Nodes(NamedTuple):
     direction: Array
     """+1 or -1: direction at the end; 0 at the start."""
     cusps: IntArray
-    """From the start on."""
+    """Cusps from the start on."""
     closed: NDArray[np.bool_]
     keys: Array
     items: IntArray
@@ -251,9 +251,9 @@ class Resolution:
     """Size of the search's cells, and length of its primitives."""
 
     cell: float
-    """In turning radii."""
+    """Size of a cell, in turning radii."""
     primitive: float
-    """The same."""
+    """Length of a primitive, in turning radii."""
     headings: int = 36
 
     def fitted(self, field: FieldData, radius: float) -> "Resolution":

@@ -71,13 +71,13 @@ class CostLayer(NamedTuple):
     """Extra cost per metre in the cells of a field's ringed grid."""
 
     terrain: NDArray[np.float32]
-    """Of the ground in each cell; an empty array: none."""
+    """Cost of the ground in each cell; an empty array: none."""
     contact: float
     """Distance to an obstacle's centre at which the footprint's side touches it, m."""
     clearance: float
     """Distance beyond that at which it costs nothing more, above 0 m."""
     clearance_cost: float
-    """Of a metre in contact."""
+    """Cost of a metre in contact."""
 
 
 @njit(cache=True)
@@ -132,7 +132,7 @@ class VehicleMotions(NamedTuple):
     expansion_lengths: Array
     """Distances along the cost-to-go path of the targets of analytic expansions, m, longest first."""
     check_step: float
-    """Of the collision check, m."""
+    """Step of the collision check, m."""
     margin: float
     """Kept on all sides of the footprint, m."""
     free_cusps: int

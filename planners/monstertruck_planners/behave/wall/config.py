@@ -19,7 +19,7 @@ class WallConfig(BehaviourConfig):
     side: Literal["left", "right"] = "left"
     """Where the wall is: left is a clockwise lap"""
     distance: Metres = 0.30
-    """From the side sonar to the wall, m"""
+    """Distance from the side sonar to the wall, m"""
     speed: Annotated[float, Field(gt=0, le=0.5)] = 0.2
     """Linear speed, m/s"""
     turn_rate: Annotated[float, Field(gt=0, le=1)] = 0.2
@@ -35,7 +35,7 @@ class WallConfig(BehaviourConfig):
     lap_radius: Metres = 0.6
     """So near to a place that it passed, by odometry, a lap is complete, m; grows with the odometry's drift"""
     laps: Annotated[int, Field(ge=1, le=100)] = 1
-    """After which it stops"""
+    """Laps after which it stops"""
 
 
 class WallPdConfig(WallConfig):
@@ -88,7 +88,7 @@ class WallLineConfig(BehaviourConfig):
     side: Literal["left", "right"] = "left"
     """Where the wall is: left is a clockwise lap"""
     distance: Metres = 0.30
-    """From the side sonar to the wall, m"""
+    """Distance from the side sonar to the wall, m"""
     speed: Annotated[float, Field(gt=0, le=0.3)] = 0.29
     """Along the wall, m/s"""
     creep: Annotated[float, Field(gt=0, le=0.3)] = 0.12
@@ -122,4 +122,4 @@ class WallLineConfig(BehaviourConfig):
     lap_radius: Metres = 0.6
     """So near to a place that it passed, by odometry, a lap is complete, m, and 1 % of the lap's length more"""
     laps: Annotated[int, Field(ge=1, le=100)] = 1
-    """After which it stops"""
+    """Laps after which it stops"""

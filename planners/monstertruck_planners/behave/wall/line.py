@@ -129,7 +129,7 @@ class LineState(NamedTuple):
     phase: Phase = "settle"
     mounts: tuple[SonarMount, ...] = ()
     poses: tuple[tuple[int, Pose, float], ...] = ()
-    """Of the last second by the odometry, with their stamps and speeds, m/s."""
+    """Poses of the last second by the odometry, with their stamps and speeds, m/s."""
     pose: Pose = (0.0, 0.0, 0.0)
     """Where the body is."""
     heard: int = -1
@@ -151,7 +151,7 @@ class LineState(NamedTuple):
     lag: tuple[float, float] = (0.0, 0.0)
     """Distance, m, and angle, rad, that the robot is behind its ramps."""
     bias: tuple[float, int] = (0.0, 0)
-    """Of the gyroscope, rad/s, and the samples it is the mean of."""
+    """Bias of the gyroscope, rad/s, and the number of samples of which it is the mean."""
     before: float | None = None
     """Time of the newest step, s."""
     sent: tuple[tuple[float, float, float], ...] = ()
@@ -164,7 +164,7 @@ class LineState(NamedTuple):
     seen: float = 0.0
     """``travelled`` at the last echo of the wall."""
     sense: float = -1.0
-    """Of the turn: 1 = left."""
+    """Sense of the turn: 1 = left."""
     places: Array = np.empty((0, 4))
     """(n, 4) ``travelled`` and pose where the lap began and every ``PLACED`` metres since; empty = no wall yet."""
     laps: int = 0

@@ -107,7 +107,7 @@ class WallState:
     v: TimedRamp | None = None
     w: TimedRamp | None = None
     error: float | None = None
-    """Of the sample before, m."""
+    """Distance error of the last sample, m."""
     sonars: SonarMonitor = field(default_factory=SonarMonitor)
     pose: tuple[float, float, float] | None = None
     turned: float = 0.0
@@ -121,7 +121,7 @@ class WallState:
     turned_before: float = 0.0
     """``turned`` when the present phase began, rad."""
     before: tuple[Ranges, ...] = ()
-    """Of the two steps before."""
+    """Ranges of the last two steps."""
     gaps: tuple[float | None, float | None] = (None, None)
     """``travelled`` when side and diagonal sonar began to look into a gap."""
     echoes: tuple[tuple[float, float, float], ...] = ()
