@@ -128,7 +128,7 @@ class MotorPlant(Protocol):
         ...
 
     def reading(self, time_ns: int) -> MotorReading:
-        """State at ``time_ns`` (never earlier than a time already asked for)."""
+        """State at ``time_ns`` (never earlier than a time already requested)."""
         ...
 
 

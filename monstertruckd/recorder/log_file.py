@@ -22,7 +22,7 @@ from monstertruckd.recorder.config import Compression
 
 
 class Channels:
-    """Registers each topic with its schema when it is first asked for.
+    """Registers each topic with its schema when it is first requested.
 
     Args:
         writer: of the file, started.

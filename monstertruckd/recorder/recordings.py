@@ -58,7 +58,7 @@ class Recordings:
         folders: where they are, by kind.
         current: file that is being written; None = none is.
         clock: time.
-        events: gets an event for every deletion, with who asked for it.
+        events: gets an event for every deletion, with who requested it.
         offload: where files are read.
     """
 

@@ -135,7 +135,7 @@ class AskToDrive(_Command):
 
 
 class HandOver(_Command):
-    """Let somebody drive who has asked for it."""
+    """Let somebody drive who has asked to."""
 
     do: Literal["hand_over"]
     id: Id

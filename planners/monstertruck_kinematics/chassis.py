@@ -1,6 +1,6 @@
 """A robot body with its actuators: what gate, odometry and simulation need of any drive family.
 
-A motion is asked for in one of three forms, and ``forms`` says which of them a body takes:
+A motion is requested in one of three forms, and ``forms`` says which of them a body takes:
 
 - ``axles``: the motion of an equivalent bicycle about the base point, by its speed along the direction of travel and
   the angles of its two axles, whatever angles the wheels of a real linkage have (``truck.LinkedAxles``). ``freedom`` is
@@ -149,7 +149,7 @@ class Chassis(ABC):
     def possible(self, twist: Twist[float]) -> Twist[float]:
         """The twist, with the sideways speed that follows from turning where the body cannot choose it.
 
-        A ``vy`` of 0 is understood as none asked for: a car whose base is not on its rear axle has one as it turns.
+        A ``vy`` of 0 is understood as none requested: a car whose base is not on its rear axle has one as it turns.
 
         Raises:
             KinematicsError: the body cannot move like that, nor nearly; the reason is named.

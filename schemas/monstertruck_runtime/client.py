@@ -241,7 +241,7 @@ class TruckClient(Operator):
         return ext.declare_advanced_subscriber(self._open_session(), key, receive, history=history)
 
     def watch(self, topic: Topic[M]) -> "Watched[M]":
-        """Follow the newest message of ``topic``, which is decoded only when it is asked for.
+        """Follow the newest message of ``topic``, which is decoded only when it is requested.
 
         For looking at a topic less often than it is published: messages in between cost next to nothing.
         """
@@ -355,7 +355,7 @@ class TruckClient(Operator):
         return await self._outcome(Order.ASK, self._overtaking, {})
 
     async def hand_over(self, to: str) -> GateState:
-        """Let another operator drive, who has asked for it; only who drives can. Raises as ``order`` does."""
+        """Let another operator drive, who has requested it; only who drives can. Raises as ``order`` does."""
         return await self._outcome(Order.HAND_OVER, self._overtaking, {"to": to})
 
     async def _outcome(self, order: Order, overtaking: int, more: dict[str, Any]) -> GateState:

@@ -40,7 +40,7 @@ class Mount(Schema):
 
 
 class LensConfig(Schema):
-    """What a camera makes of directions: a pinhole with the distortion of Brown; as nominal, or as calibrated."""
+    """Projection of a camera: a pinhole with the distortion of Brown; as nominal, or as calibrated."""
 
     width: Annotated[int, Field(ge=16, le=8192)] = 640
     """Width of the pictures it is calibrated for, pixels; it is scaled for others"""

@@ -89,7 +89,7 @@ class GoalState(Message):
     number: Annotated[int, Field(ge=0)] = 0
     """Counts the goals taken on since the start; 0 = none yet."""
     source: str = ""
-    """Who asked for it."""
+    """Who requested it."""
     goal: Pose2D | None = None
     phase: GoalPhase = GoalPhase.IDLE
     outcome: Reason = Reason.OK
@@ -155,7 +155,7 @@ class ExplorationState(Message):
     """Counts the explorations since the start of the daemon; 0 = none yet."""
     kind: str = ""
     source: str = ""
-    """Who asked for it."""
+    """Who requested it."""
     phase: ExplorationPhase = ExplorationPhase.IDLE
     outcome: Reason = Reason.OK
     """DRIVING while it runs, then EXPLORED, BUDGET_SPENT, CHARGE_SPENT, CANCELLED, or why it was given up."""
@@ -193,7 +193,7 @@ class MissionState(Message):
     """Counts the missions since the start of the daemon; 0 = none yet."""
     name: str = ""
     source: str = ""
-    """Who asked for it."""
+    """Who requested it."""
     running: bool = False
     resumable: bool = False
     """Whether an interrupted mission can be resumed."""

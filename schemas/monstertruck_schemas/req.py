@@ -61,7 +61,7 @@ class DriveForm(StrEnum):
 
 
 class RequestedTwist(Schema):
-    """Velocity asked for, of the base in its own frame."""
+    """Requested velocity of the base in its own frame."""
 
     vx: AnyNumber = 0.0
     """Forward, m/s."""
@@ -76,7 +76,7 @@ MAX_SHAFTS: Final = 8
 
 
 class DriveRequest(Request):
-    """A motion asked for, in one form: speed and axle angles, ``twist``, or ``shafts``.
+    """A requested motion, in one form: speed and axle angles, ``twist``, or ``shafts``.
 
     Non-finite numbers reach the gate, which refuses them by name. A reader that does not know the form sees a request
     for standstill.
@@ -147,7 +147,7 @@ class Order(StrEnum):
     ASK = "ask"
     """Ask the operator who drives to hand over; changes nothing by itself."""
     HAND_OVER = "hand_over"
-    """The operator who drives lets another one drive, who has asked for it."""
+    """The operator who drives lets another one drive, who has asked to."""
 
 
 STARTING: Final = frozenset({Order.ARM, Order.RESET})

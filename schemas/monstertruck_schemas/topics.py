@@ -376,7 +376,7 @@ def estop_key(robot: str, source: str = "*") -> str:
 
 
 def sender_in(robot: str, key: str) -> tuple[str, str | None] | None:
-    """What is asked for with ``key``, and by whom: the opposite of ``Topic.key`` and ``rpc_key``.
+    """What is requested with ``key``, and by whom: the opposite of ``Topic.key`` and ``rpc_key``.
 
     Returns:
         Name of a request's topic or of a call, and the source, None where the key has none. None for other keys: those

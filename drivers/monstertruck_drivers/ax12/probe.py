@@ -9,7 +9,7 @@ from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError, WrongDeviceError
 
 IDS = range(1, 7)
-"""Numbers asked for: those of the robot's bus."""
+"""Numbers requested: those of the robot's bus."""
 STORED = 19
 
 

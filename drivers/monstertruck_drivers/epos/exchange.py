@@ -69,7 +69,7 @@ class ObjectError(ProtocolError):
     """The controller answered with a communication error.
 
     Args:
-        subject: what was asked for.
+        subject: what was requested.
         code: 32-bit error code.
     """
 

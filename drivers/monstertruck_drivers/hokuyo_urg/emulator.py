@@ -91,7 +91,7 @@ def scan_lines(order: ScanOrder, counter: int, revolution: NDArray[np.int32]) ->
     """Lines of a scan after its status: time line (not in SCIP 1.1) and data.
 
     Args:
-        order: what was asked for.
+        order: what was requested.
         counter: milliseconds at step 0, 24 bits.
         revolution: shape (769,), mm or error codes.
     """

@@ -348,7 +348,7 @@ def decode_scan(reply: Reply, start: int, end: int, cluster: int = 1) -> ScanBlo
     A partial last cluster may be there or not: the specification leaves it open.
 
     Raises:
-        ProtocolError: wrong sums, or another number of ranges than was asked for.
+        ProtocolError: wrong sums, or another number of ranges than was requested.
     """
     name = reply.echo[:1] if reply.scip1 else reply.echo[:2]
     if name not in RANGE_WIDTH or (not reply.scip1 and len(reply.lines) < 2):

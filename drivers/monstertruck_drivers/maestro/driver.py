@@ -29,7 +29,7 @@ class MaestroDriver:
     **Deadman.** The Maestro's serial time-out (set once in the unit, about 0.5 s) sends its channels home when
     no valid command comes, whichever it is: polling feeds it as well as targets do. Commands are stale
     ``command_timeout`` after their stamp. Then the servos hold, the deadman line (if configured) is released by
-    an explicit target, and with ``deadman_feed: fresh`` the driver falls silent until the next command, so that
+    an explicit target, and with ``deadman_feed: fresh`` the driver sends nothing until the next command, so that
     the time-out trips too although the driver still lives; feedback and battery pause meanwhile. With ``always``
     polling goes on, and the time-out guards only against a hung or dead process. Before the first command of a
     session there is nothing to guard: the line is low and polling runs. Channels that go home are the unit's own

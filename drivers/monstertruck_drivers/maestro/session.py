@@ -124,7 +124,7 @@ class MaestroSession:
             return False
 
     def check(self, positions: list[int], errors: int) -> None:
-        """Refuse words that cannot be what was asked for.
+        """Refuse words that cannot be what was requested.
 
         Raises:
             ProtocolError: out of form, as when a byte was lost.

@@ -66,7 +66,7 @@ class Srf08Emulator:
 
     Faults (`inject`): ``silent on|off`` (the USB-ISS), ``dead NAME on|off`` (off the bus), ``stuck NAME on|off`` (the
     same flight time forever), ``ghost NAME METRES|off`` (an echo that is not there), ``brownout NAME`` (loses gain and
-    range), ``extra`` (a byte that nobody asked for).
+    range), ``extra`` (a byte that nobody requested).
 
     Args:
         clock: time.

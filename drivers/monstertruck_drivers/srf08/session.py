@@ -29,7 +29,7 @@ class Srf08Session:
         Raises:
             DeviceLostError: unplugged.
             DeviceTimeoutError: the answer did not come in time.
-            ProtocolError: bytes that nobody asked for.
+            ProtocolError: bytes that nobody requested.
         """
         if count := self._link.discard():
             raise ProtocolError(f"{self._link.name}: {count} bytes too many: answers are out of step")

@@ -17,7 +17,7 @@ from monstertruck_runtime.errors import (
 
 @dataclass(frozen=True, slots=True)
 class Mode:
-    """What a camera is asked for, or what it granted."""
+    """The settings requested of a camera, or those that it granted."""
 
     width: int
     height: int
@@ -45,7 +45,7 @@ class FrameStream(Protocol):
     """A camera that is sending."""
 
     mode: Mode
-    """What it granted, not always what was asked for."""
+    """What it granted, not always what was requested."""
 
     async def next(self) -> CameraFrame:
         """Wait for a picture newer than the last one; those in between are dropped.

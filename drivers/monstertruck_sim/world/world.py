@@ -40,7 +40,7 @@ from monstertruck_sim.world.terrain import load_profile, profile_path
 
 
 class World:
-    """One robot in its surroundings, with its sensors; it advances when a later instant is asked for.
+    """One robot in its surroundings, with its sensors; it advances when a later instant is requested.
 
     Everything is a function of configuration, seed, commands and their instants. The start of time is the first
     instant anybody names.
@@ -137,7 +137,7 @@ class World:
         return [self._footprint.box((x, y, yaw)) for x, y, yaw in self._plant.poses(times_ns)[:3].T.tolist()]
 
     def truth(self, time_ns: int) -> TruthState:
-        """What is really the case at ``time_ns`` (or at the newest instant asked for, if that is later)."""
+        """What is really the case at ``time_ns`` (or at the newest instant requested, if that is later)."""
         self._plant.advance(time_ns)
         return self._plant.truth()
 

@@ -132,7 +132,7 @@ class Offset:
 
 @dataclass(frozen=True, slots=True)
 class LidarWizard:
-    """Quarter circles to both sides and straights; then weaves for the clocks, and heights where asked for."""
+    """Quarter circles to both sides and straights; then weaves for the clocks, and heights where requested."""
 
     name: ClassVar[WizardName] = "lidar"
     doc: ClassVar[str] = "where the lidar sits on the body, and the offset of its clock, from scans between rests"

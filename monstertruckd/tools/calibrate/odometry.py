@@ -68,7 +68,7 @@ class Square:
 
 @dataclass(frozen=True, slots=True)
 class OdometryWizard:
-    """A square to the left, the same to the right, as often as asked for."""
+    """A square to the left, the same to the right, as often as requested."""
 
     name: ClassVar[WizardName] = "odometry"
     doc: ClassVar[str] = "way, wheelbase and steering offset of dead reckoning, from squares driven to both sides"

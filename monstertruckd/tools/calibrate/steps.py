@@ -34,7 +34,7 @@ class MoveRecord:
     """Commands to the drive"""
     attitude: list[Attitude] = field(default_factory=list)
     others: dict[str, list[Any]] = field(default_factory=dict)
-    """What was asked for besides (``MoveStep.also``), by name of the topic"""
+    """What was requested in addition (``MoveStep.also``), by name of the topic"""
     left: int = 0
     """When the command to set off was given, ns"""
     arrived: int = 0
@@ -43,7 +43,7 @@ class MoveRecord:
     # Time series
 
     def of(self, topic: Topic[M]) -> list[M]:
-        """Messages of a topic that was asked for besides, in their order."""
+        """Messages of a topic that was requested in addition, in their order."""
         return list(self.others.get(topic.name, ()))
 
     def at_rest(self, topic: Topic[M]) -> tuple[list[M], list[M]]:

@@ -321,7 +321,7 @@ class _Standstill:
 
 
 class _Speeds:
-    """Speeds, true and asked for, stay within the limits; nobody asks for the other direction before standstill.
+    """Speeds, true and requested, stay within the limits; nobody asks for the other direction before standstill.
 
     Args:
         chassis: of the body.
@@ -428,7 +428,7 @@ class _PulsedSteering:
         """Servo angles, rad."""
 
     def take(self, channel: int, pulse_us: float) -> None:
-        """A pulse is asked for."""
+        """A pulse is requested."""
         if (model := self._models.get(channel)) is not None:
             self._arms[channel] = math.radians((pulse_us - model.centre_us) / model.us_per_degree)
 
@@ -439,7 +439,7 @@ class _PulsedSteering:
 
 
 class _Pulses:
-    """Servos are asked for angles within their limits and those of the axles.
+    """Requested servo angles are within their limits and those of the axles.
 
     Args:
         config: of the truck, with a steering device.
@@ -478,7 +478,7 @@ class _Turning:
         self._steering = steering
         self._world = world
         self._course: Twist[float] = STILL
-        """Of several motors, the newest motion that was asked for."""
+        """Of several motors, the newest motion that was requested."""
         self._turn_errors: deque[tuple[int, float]] = deque()
 
     def begin(self) -> None:
@@ -498,7 +498,7 @@ class _Turning:
         return len(seen.target) > 1 and any(map(self._world.shaft_blocked, range(len(seen.target))))
 
     def _asked(self, seen: Observation) -> float:
-        """Rate of turn that is asked for at the true pace, rad/s."""
+        """Rate of turn that is requested at the true pace, rad/s."""
         chassis, angles = self._steering.chassis, self._steering.angles
         if len(seen.target) == 1:
             return chassis.bicycle.body_twist(seen.truth.v, *angles)[2]

@@ -241,7 +241,7 @@ class Folder:
             for file in self._files(f"issuers/{name}"):
                 file.unlink(missing_ok=True)
             shutil.rmtree(self.path / "stations" / name, ignore_errors=True)
-            self._write(kept)  # last: what was broken off before can be asked for again
+            self._write(kept)  # last: what was broken off before can be requested again
 
     def join(self, name: str, endpoint: str, authority: bytes) -> None:
         """Let the robot dial a router and its stations trust it.

@@ -141,7 +141,7 @@ class ServedRobot:
         clock: time.
         folder: of its emulated computer.
         scene: world.
-        keeps_truth: whether what really happens is asked for at the end; a day of it is 80 MB.
+        keeps_truth: whether what really happens is requested at the end; a day of it is 80 MB.
     """
 
     def __init__(

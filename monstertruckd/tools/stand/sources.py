@@ -76,7 +76,7 @@ def stream(
 
 
 def _rendered(port: Path, mode: Mode, *, colour: bool) -> Iterator[Picture]:
-    """Pictures of an emulated camera, the newest one whenever one is asked for."""
+    """Pictures of an emulated camera, the newest one whenever one is requested."""
     box: queue.Queue[bytes | BaseException] = queue.Queue(1)
     ended = threading.Event()
     # A thread of its own takes what comes: a pty keeps 4 kB.

@@ -66,7 +66,7 @@ class StraightPasses:
 def circle(times: Array, poses: Array) -> Circle:
     """Fit a circle with an evenly moving centre.
 
-    The heading is measured, so that the position is linear in all that is asked for: centre, drift, and the arm from
+    The heading is measured, so that the position is linear in all that is requested: centre, drift, and the arm from
     the centre to the robot, which turns with it.
 
     Args:

@@ -25,7 +25,7 @@ EQUAL: Final = 1e-6
 
 @dataclass(frozen=True)
 class Run:
-    """One run: what was asked for, and where the robot was."""
+    """One run: what was requested, and where the robot was."""
 
     left: float
     """Rate of the left wheels, rad/s; of a line that of the first pass."""
@@ -35,7 +35,7 @@ class Run:
     poses: Array
     """(3, n): x, y (m), heading (rad)."""
     directions: Array
-    """(n,): sign of the rates asked for at each pose."""
+    """(n,): sign of the rates requested at each pose."""
 
     @property
     def straight(self) -> bool:

@@ -335,7 +335,7 @@ MERGE_CELL: Final = 0.05
 
 @dataclass
 class Submap:
-    """A cloud and, when asked for, its likelihood pyramids."""
+    """A cloud and, when requested, its likelihood pyramids."""
 
     cloud: Cloud
     _grids: dict[int, LikelihoodGrid] = field(default_factory=dict)

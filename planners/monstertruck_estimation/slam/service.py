@@ -140,7 +140,7 @@ class SlamService:
     def bases_at(self, instants: tuple[int, ...]) -> Mapping[int, Vector]:
         """Poses of base at instants, ns, by the present graph; updated every ``tiles_period``.
 
-        Those asked for now are answered later, those the map does not know never.
+        Those requested now are answered later, those the map does not know never.
         """
         self._instants = instants
         return self._bases

@@ -158,6 +158,6 @@ class WorkerOutput:
     trajectory: tuple[NDArray[np.int64], Array] | None = None
     """Stamps (n,), ns, and poses (n, 3) of base in map at the first beam of every scan; None in a saved map."""
     bases: Array | None = None
-    """Shape (n, 3): base in map at the instants asked for; NaN where it is not known; None in a saved map."""
+    """Shape (n, 3): base in map at the instants requested; NaN where it is not known; None in a saved map."""
     joint: bool | None = None
     """After ``finish``: whether the joint registration was kept, for it agreed better than the graph."""

@@ -27,7 +27,7 @@ PARAMETERS: Final = ("focal_x", "focal_y", "centre_x", "centre_y", "k1", "k2", "
 
 @dataclass(frozen=True)
 class Lens:
-    """What a camera makes of directions."""
+    """Projection of a camera."""
 
     matrix: Array
     """(3, 3), pixels."""

@@ -1,4 +1,4 @@
-"""What a behaviour is: a pure step from inputs to a motion asked for, which its service runs at a fixed rate."""
+"""What a behaviour is: a pure step from inputs to a requested motion, which its service runs at a fixed rate."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -23,7 +23,7 @@ class BehaviourConfig(Schema):
 
 
 class RequestedMotion(NamedTuple):
-    """A twist asked for, of base."""
+    """A requested twist of base."""
 
     vx: float = 0.0
     """Forward, m/s."""
@@ -38,7 +38,7 @@ class BehaviourStep:
     """Result of one step.
 
     Attributes:
-        motion: asked for; None = standstill.
+        motion: the requested one; None = standstill.
         state: for the next step.
         phase: what it is doing.
         outcome: DRIVING, or why it has ended; it is not stepped again then.

@@ -43,7 +43,7 @@ HEADING: Final = 1.5
 PATIENCE: Final = 3.0
 """Seconds without progress after which it gives up, and after which an end that is not reached is missed."""
 REACH: Final = 0.01
-"""Difference of an axle angle from the one asked for that is none, rad."""
+"""Difference of an axle angle from the one requested that is none, rad."""
 
 
 class Amounts(NamedTuple):

@@ -1,4 +1,4 @@
-"""Behaviours as a service: started and stopped by remote call, one at a time, motion asked for through the gate."""
+"""Behaviours as a service: started and stopped by remote call, one at a time; their motion is requested from the gate."""
 
 import math
 from collections.abc import Mapping
@@ -38,9 +38,9 @@ LEASE: Final = 0.3
 REPORT: Final = SECOND // 5
 """Period of reports without a change, ns."""
 DISOBEYED: Final = 2.0
-"""Seconds of motion asked for and not carried out after which a behaviour gives up."""
+"""Seconds of requested but not executed motion after which a behaviour gives up."""
 SETTLE: Final = 1.0
-"""Seconds for which standstill is asked for after the end."""
+"""Seconds for which standstill is requested after the end."""
 AT_REST: Final = 0.01
 """m/s, rad/s."""
 IDLE_RATE: Final = 10.0
@@ -65,7 +65,7 @@ class BehaviourRun:
     values: Mapping[str, float] | None = None
     travelled: float = 0.0
     disobeyed: int | None = None
-    """Since when the gate does not carry out the motion asked for, ns."""
+    """Since when the gate does not carry out the requested motion, ns."""
 
     @property
     def running(self) -> bool:
@@ -251,7 +251,7 @@ class BehaviourService:
         return None
 
     def _judged(self, run: BehaviourRun, motion: RequestedMotion, now: int) -> BehaviourRun:
-        """Note since when the gate does not carry out motion that was asked for."""
+        """Note since when the gate does not carry out motion that was requested."""
         gate = self._gate.latest
         obeyed = gate is not None and gate.mode is GateMode.DRIVING and gate.holder == SOURCE
         if obeyed and gate is not None and gate.twist is not None:
@@ -276,7 +276,7 @@ class BehaviourService:
         self._ask(RequestedMotion(), now)
 
     def _settle(self, now: int) -> None:
-        """Ask for standstill until the robot is at rest, then fall silent."""
+        """Ask for standstill until the robot is at rest, then send nothing."""
         run, odometry = self._run, self._odometry.latest
         if run is None or run.ended is None or now - run.ended > SETTLE * SECOND:
             return

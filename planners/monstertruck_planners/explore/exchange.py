@@ -44,7 +44,7 @@ class ExploreSetup:
 
 @dataclass(frozen=True, slots=True)
 class ExploreTask:
-    """What is newer than at the task before, and whether a decision is asked for."""
+    """What is newer than at the task before, and whether a decision is requested."""
 
     pose: Pose
     """Of the base, in map."""
@@ -88,7 +88,7 @@ class ExploreAnswer:
     """What is known, and the decision."""
 
     target: Viewpoint | None = None
-    """None = nothing is left that can be reached, or none was asked for."""
+    """None = nothing is left that can be reached, or none was requested."""
     kept: bool = False
     """Whether it is the pursued one."""
     frontiers: int = 0
@@ -98,6 +98,6 @@ class ExploreAnswer:
     known: float = 0.0
     """Area of the free ground in the map, m^2."""
     home: float | None = None
-    """Metres of the path home; None = not asked for, or none is known."""
+    """Metres of the path home; None = not requested, or none is known."""
     changed: int = 0
     """Cells checked again for frontiers."""

@@ -159,7 +159,7 @@ class Observed:
     critical: bool = False
     """Whether the charge is too low to drive: the gate stops, and an unsaved map may be lost."""
     saved: str | None = None
-    """Where the map was saved after that was asked for; empty = nowhere."""
+    """Where the map was saved after that was requested; empty = nowhere."""
     found: int = 0
     """Points of interest that are known."""
 
@@ -195,7 +195,7 @@ class Exploration:
     pursued: float = 0.0
     """Since when, s."""
     asked: float = -math.inf
-    """When a decision was asked for last, s."""
+    """When a decision was requested last, s."""
     waiting: bool = False
     """Whether an answer is awaited."""
     not_before: float = 0.0

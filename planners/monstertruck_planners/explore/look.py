@@ -1,7 +1,7 @@
 """Where to look for tags on walls: faces of walls that the camera has not had before it, near enough and not obliquely.
 
 A layer over exploration: once no frontier is left, the robot is sent past the walls until as much was found as was
-asked for, or every wall was viewed.
+requested, or every wall was viewed.
 """
 
 import math

@@ -216,7 +216,7 @@ class ExplorerService:
                 self._tiles.append(tile)
 
     def _saved(self) -> str | None:
-        """Where the map was saved since that was asked for."""
+        """Where the map was saved since that was requested."""
         saved = None
         for event in self._in.events.drain():
             if self._saves is not None and event.reason is Reason.MAP_SAVED and event.received >= self._saves:

@@ -398,7 +398,7 @@ class MissionService:
         return await self._until(end, stop, self._in.goal)
 
     async def _taken(self, request: Callable[[], GoalRequest]) -> int:
-        """Number of a goal, which is asked for again while what refuses it passes.
+        """Number of a goal, which is requested again while what refuses it passes.
 
         Raises:
             RequestRefusedError: something else does, or it has not passed.

@@ -59,7 +59,7 @@ class RouteCosts(NamedTuple):
 
 @dataclass(frozen=True)
 class RouteMap:
-    """Map to plan on. Costs of its cells are computed when they are first asked for, and kept.
+    """Map to plan on. Costs of its cells are computed when they are first requested, and kept.
 
     Args:
         field: obstacles.

@@ -58,7 +58,7 @@ USED, WAITING, LEVEL, LIMIT = 0, 1, 2, 3
 class CostToGo(NamedTuple):
     """Shortest ways to the goal over the ringed grid of a field.
 
-    A* from the goal to the start, which goes on whenever the cost of a cell is asked for that it has not come to: in
+    A* from the goal to the start, which goes on whenever the cost of a cell is requested that it has not come to: in
     the open few cells round the shortest path are visited. Its open list is one of buckets (Dial). Source: D. Silver,
     "Cooperative pathfinding", 2005 (reverse resumable A*).
     """

@@ -106,7 +106,7 @@ class AxleModel:
         self._t = t
 
     def ahead(self, pose: Pose, speed: float, geometry: FourWheelSteering, seconds: float) -> tuple[Pose, Angles]:
-        """Pose and angles in ``seconds``, at a constant speed and if nothing else is asked for."""
+        """Pose and angles in ``seconds``, at a constant speed and if nothing else is requested."""
         angles = self.angles
         begin = self._t or 0.0
         for _, duration, target in self._pieces(begin, begin + seconds):

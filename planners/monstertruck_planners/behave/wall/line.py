@@ -85,11 +85,11 @@ TURNS: Final = 0.5
 FASTEST: Final = 0.3
 """m/s."""
 STRAY: Final = (0.3, 0.4)
-"""Yaw rate that is not the one asked for, rad/s, and the seconds after which a motor counts as stalled."""
+"""Yaw rate that is not the one requested, rad/s, and the seconds after which a motor counts as stalled."""
 STALL: Final = 1.0
-"""Seconds without the motion asked for, after which the robot counts as stuck."""
+"""Seconds without the requested motion, after which the robot counts as stuck."""
 SLOW: Final = 0.2
-"""Share of the speed asked for below which the robot does not move."""
+"""Share of the requested speed below which the robot does not move."""
 EQUAL: Final = 12, 0.1
 """Equal echoes in a row, and the distance over which they came, m, from which on a sonar counts as stuck."""
 JUDGED: Final = 20, 1.2
@@ -155,7 +155,7 @@ class LineState(NamedTuple):
     before: float | None = None
     """Time of the newest step, s."""
     sent: tuple[tuple[float, float, float], ...] = ()
-    """Speed and yaw rate that the ramps had, and the time for which they were asked for: of the last second."""
+    """Speed and yaw rate that the ramps had, and the time for which they were requested: of the last second."""
     travelled: float = 0.0
     turned: float = 0.0
     """Rad, both ways counted."""
@@ -169,7 +169,7 @@ class LineState(NamedTuple):
     """(n, 4) ``travelled`` and pose where the lap began and every ``PLACED`` metres since; empty = no wall yet."""
     laps: int = 0
     strays: tuple[float | None, float | None] = (None, None)
-    """Since when yaw rate and speed are not those asked for, s."""
+    """Since when yaw rate and speed are not those requested, s."""
     equal: tuple[tuple[float, int, float], ...] = ((0.0, 0, 0.0),) * 4
     """Newest range of every sonar, how often it came in a row, and ``travelled`` when it came first."""
 
@@ -444,7 +444,7 @@ class WallLine:
     # Phases
 
     def _advance(self, state: LineState, cone: Cone, t: float) -> LineState:
-        """Ramps and phases at ``t``, the time for which motion is asked for now."""
+        """Ramps and phases at ``t``, the time for which motion is requested now."""
         config = self._config
         match state.phase:
             case "settle":
@@ -605,7 +605,7 @@ class WallLine:
 def _strays(
     before: tuple[float | None, float | None], asked: tuple[float, float], measured: tuple[float, float], t: float
 ) -> tuple[float | None, float | None]:
-    """Since when yaw rate and speed are not those asked for."""
+    """Since when yaw rate and speed are not those requested."""
     (v, w), (speed, rate) = asked, measured
     stray = abs(w - rate) > STRAY[0], (v > 0.05 and speed < SLOW * v) or (abs(w) > 0.2 and abs(rate) < SLOW * abs(w))
     turns, stands = ((t if since is None else since) if now else None for now, since in zip(stray, before, strict=True))
@@ -613,7 +613,7 @@ def _strays(
 
 
 def _asked(state: LineState, t: float) -> tuple[float, float]:
-    """Speed and yaw rate that were asked for a time."""
+    """Speed and yaw rate requested over a time."""
     if not state.sent:
         return 0.0, 0.0
     times, speeds, rates = zip(*state.sent, strict=True)

@@ -24,7 +24,7 @@ from monstertruck_schemas.topics import ODOMETRY, SONAR, Topic
 DIAGONAL: Final = math.radians(45)
 """Angle between the side sonar and the diagonal one."""
 STALL: Final = 1.0
-"""Seconds of motion asked for without any after which a motor counts as stalled."""
+"""Seconds of requested but not measured motion after which a motor counts as stalled."""
 SAME_WAY: Final = 1.2
 """Greatest difference of the heading from that at the lap's beginning, rad: the robot weaves."""
 FOLLOWING: Final = ("follow", "free")
@@ -127,9 +127,9 @@ class WallState:
     echoes: tuple[tuple[float, float, float], ...] = ()
     """Newest ones on the wall: x and y by odometry, with the wall on the left, and ``travelled`` when they came, m."""
     asked: float = 0.0
-    """Speed asked for at the step before, m/s."""
+    """Requested speed at the step before, m/s."""
     moving_since: float | None = None
-    """Since when motion is asked for without any, s."""
+    """Since when motion is requested but none is measured, s."""
 
 
 class _Wall(ABC):
