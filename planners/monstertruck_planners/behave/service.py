@@ -1,4 +1,4 @@
-"""Behaviours as a service: started and stopped by remote call, one at a time; their motion is requested from the gate."""
+"""Behaviours as a service: started and stopped by remote call, one at a time; the gate is asked for their motion."""
 
 import math
 from collections.abc import Mapping

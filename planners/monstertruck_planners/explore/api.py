@@ -305,7 +305,8 @@ class ExplorationView:
     def _look(self, frontier: Frontier, near: NDArray[np.int64]) -> Viewpoints:
         """Places with room, from which enough of a frontier is in sight, and nearly as much new area as from the best.
 
-        Free space is checked first: the places that show most are often those at the edge of unknown ground, which blocks.
+        Free space is checked first: the places that show most are often those at the edge of unknown ground, which
+        blocks.
         """
         config, resolution, corner = self.setup.config, self.known.resolution, self.known.origin[:2]
         change, reached = self.known.changes, len(near)
