@@ -211,12 +211,13 @@ def odometry_fit(rng: np.random.Generator) -> list[Verdict]:
     assert isinstance(CHASSIS, TruckChassis)
     model = odometry.SquareModel(SteeringModel(CHASSIS), MAPS, AHEAD)
     true = np.array((rng.uniform(0.95, 1.05), rng.uniform(0.95, 1.05), rng.uniform(-0.04, 0.04)))
-    # What the interval's bounds cover besides: linkage and floor.
-    actual = true * (1 + odometry.FLOOR * rng.normal() / NORMAL, 1 + odometry.LINKAGE * rng.normal() / NORMAL, 1.0)
+    # What the interval's bounds cover besides: floor, linkage and wheels that are steered while the truck stands.
+    besides = odometry.FLOOR, math.hypot(odometry.LINKAGE, odometry.ON_THE_SPOT), 0.0
+    actual = true * (1 + np.array(besides) * rng.normal(size=3) / NORMAL)
     squares = square_legs(model, actual, rng)
     fit = model.fit(squares, 0.002, 0.0035)
     way, base, offset = odometry.intervals(fit, 16 + 6)
-    found = {"way": way.joined(odometry.FLOOR), "wheelbase": base.joined(odometry.LINKAGE), "offset": offset}
+    found = {"way": way.joined(besides[0]), "wheelbase": base.joined(besides[1]), "offset": offset}
     return [
         Verdict(f"odometry.{name}", i.value, i.low, i.high, float(t))
         for (name, i), t in zip(found.items(), true, strict=True)

@@ -13,6 +13,7 @@ import numpy as np
 
 from monstertruck_kinematics.chassis import TruckChassis
 from monstertruck_kinematics.elementary import Array, to_body
+from monstertruck_kinematics.polynomials import SERVO_LIMIT
 from monstertruck_kinematics.truck import LinkedAxles
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.map_files import FREE, WorldMap
@@ -149,7 +150,7 @@ def drive_truth(config: SimulatedTruckConfig) -> dict[str, Value]:
 
 
 def steering_truth(config: SimulatedTruckConfig) -> dict[str, Value]:
-    """Delay of the turns behind the gate's commands.
+    """Delay of the turns behind the gate's commands, and the axles' angles where something stops the servos.
 
     The angles change as fast as the gate lets them. Tyres and body swing into a turn: given are the dead time and the
     lag of first order that come nearest to the true turns of the wizard's weaves, by its own measure, turns in 0.3 s.
@@ -179,7 +180,21 @@ def steering_truth(config: SimulatedTruckConfig) -> dict[str, Value]:
 
     found = ResponseFit.of(residuals, 0.0)
     delay, lag = found.delay.value + CHAIN, math.sqrt(max(found.squared.value, 0.0))
-    return {"dead_time": delay - lag, "lag": lag, "delay": delay}
+    return {"dead_time": delay - lag, "lag": lag, "delay": delay, **_travels(config, chassis)}
+
+
+def _travels(config: SimulatedTruckConfig, chassis: TruckChassis) -> dict[str, Value]:
+    """Angles of one axle, deg, that mean the curvature of the path with its servo at a stop, the other one straight."""
+    truck, bicycle, hands = config.sim.world.truck, chassis.bicycle, HandDriven(config)
+    found: dict[str, Value] = {}
+    for axle, (name, servo) in enumerate((("front", truck.front_servo), ("rear", truck.rear_servo))):
+        for side, stop in (("left", servo.left_stop_deg), ("right", -servo.right_stop_deg)):
+            if math.radians(abs(stop)) < SERVO_LIMIT:
+                curvature = hands.curvature(np.roll((math.radians(stop), 0.0), axle).tolist())
+                # The middle of the turn lies on the axle that is straight.
+                sideslip = math.asin(curvature * (bicycle.l_r if axle == 0 else -bicycle.l_f))
+                found[f"{name}_{side}_travel"] = math.degrees(bicycle.steer_for(curvature, sideslip)[axle])
+    return found
 
 
 def odometry_truth(config: SimulatedTruckConfig) -> dict[str, Value]:

@@ -37,6 +37,9 @@ FLOOR: Final = 0.003
 """Share by which the distance differs on another floor, half a 95 % interval."""
 LINKAGE: Final = 0.004
 """Share of a turn by which a linkage is off its polynomials, half a 95 % interval."""
+ON_THE_SPOT: Final = 0.004
+"""Share of a corner by which wheels turn the body as they are steered at its ends, where it stands, half a 95 %
+interval: 0.005 rad among rigid bodies."""
 SAME: Final = 0.5
 """Share of the turn by the steering that the compass must see."""
 BELIEVED: Final = (0.05, 0.05, math.radians(6.0))
@@ -124,7 +127,7 @@ class OdometryWizard:
         legs = sum(len(square.legs) for square in squares)
         way, base, offset = intervals(fit, legs + 3 * len(squares))
         way = way.joined(FLOOR)
-        base = base.joined(LINKAGE)
+        base = base.joined(LINKAGE).joined(ON_THE_SPOT)
         ratio = geometry.drive_ratio / way.value
         steering = context.known.get("steering")
         estimates = [
@@ -146,7 +149,8 @@ class OdometryWizard:
                 base.times(geometry.wheelbase),
                 "m",
                 legs,
-                f"that the turns show; 95 % of the legs' noise, and {LINKAGE:.1%} of the linkage",
+                f"that the turns show; 95 % of the legs' noise, {LINKAGE:.1%} of the linkage, and {ON_THE_SPOT:.1%} of "
+                "wheels that are steered while it stands",
                 "geometry.wheelbase",
             ),
             estimated(

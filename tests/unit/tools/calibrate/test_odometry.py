@@ -9,7 +9,7 @@ import pytest
 from monstertruck_schemas.sensor import Attitude, DriveFeedback, DriveMode, SteeringFeedback
 from monstertruckd.config.load import load_config
 from monstertruckd.config.truck import TruckConfig
-from monstertruckd.tools.calibrate.odometry import OdometryWizard, Square, SquareModel
+from monstertruckd.tools.calibrate.odometry import OdometryWizard, Square, SquareModel, intervals
 from monstertruckd.tools.calibrate.steering_model import SteeringModel, SteeringRun
 from monstertruckd.tools.calibrate.steps import MoveRecord
 from tests.calibration_light import AHEAD, CHASSIS, MAPS
@@ -55,12 +55,21 @@ def test_errors_are_found():
     assert fit.parameters == pytest.approx(true, abs=0.002)
 
 
+def test_the_wheelbase_is_no_surer_than_wheels_that_are_steered_on_the_spot_let_it_be():
+    squares = [square(1, RIGHT), square(-1, RIGHT)]
+    _, base, _ = intervals(MODEL.fit(squares, 0.002, 0.0035), 16 + 6)
+    context = Bent(0.0)
+    row = OdometryWizard().judge(context, MAPS, squares).estimate("wheelbase")
+    half = (row.high - row.low) / 2 / context.config.geometry.wheelbase
+    assert half == pytest.approx(math.hypot(base.half, 0.004, 0.004), rel=0.05), "and than another linkage"
+
+
 class Bent:
     """A truck whose straights bend to the left, by so many rad on a side of the square."""
 
     def __init__(self, bend):
         self.chassis, self.config = CHASSIS, load_config(CONFIGS / "truck.yaml", TruckConfig)[0]
-        self.turned, self._bend = [], bend
+        self.turned, self.known, self._bend = [], {}, bend
 
     async def confirm(self, step):
         return True
