@@ -57,6 +57,12 @@ def scaled_to(values: Sequence[Real], limit: float) -> Real:
     return 1.0 / larger(largest / limit, 1.0)
 
 
+def scaled_alike(values: Sequence[Real], limit: float) -> tuple[Real, ...]:
+    """All values scaled by one factor, at most 1, so that they are within +-limit: same path, slower."""
+    factor = scaled_to(values, limit)
+    return tuple(value * factor for value in values)
+
+
 def refuse(name: str, value: Real, scale: Real, why: str) -> None:
     """Refuse a twist component that a family cannot produce.
 

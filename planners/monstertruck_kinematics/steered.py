@@ -7,7 +7,16 @@ from typing import Literal
 
 import numpy as np
 
-from monstertruck_kinematics.drive import TWIST, Twist, refuse, require_limit, scaled_to, stacked, unpacked
+from monstertruck_kinematics.drive import (
+    TWIST,
+    Twist,
+    refuse,
+    require_limit,
+    scaled_alike,
+    scaled_to,
+    stacked,
+    unpacked,
+)
 from monstertruck_kinematics.elementary import (
     Array,
     KinematicsError,
@@ -378,10 +387,8 @@ class IndependentSteer:
 
     def limited(self, command: Sequence[Real]) -> tuple[Real, ...]:
         """All speeds scaled alike: same path, slower."""
-        values = list(unpacked(command, self.inputs))
-        angles, speeds = values[: len(self.positions)], values[len(self.positions) :]
-        factor = scaled_to(speeds, self.max_speed)
-        return tuple(angles + [speed * factor for speed in speeds])
+        values, count = unpacked(command, self.inputs), len(self.positions)
+        return (*values[:count], *scaled_alike(values[count:], self.max_speed))
 
     def jacobian(self, command: Sequence[Real]) -> Array:
         """By all angles, then all speeds."""

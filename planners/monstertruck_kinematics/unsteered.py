@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from monstertruck_kinematics.drive import TWIST, Twist, refuse, require_limit, scaled_to, stacked, unpacked
+from monstertruck_kinematics.drive import TWIST, Twist, refuse, require_limit, scaled_alike, stacked, unpacked
 from monstertruck_kinematics.elementary import Array, KinematicsError, Real, require_finite, require_positive
 from monstertruck_kinematics.wheels import CasterWheel, FixedWheel, SwedishWheel, Wheel, rolling_matrix
 
@@ -53,9 +53,7 @@ class Differential:
 
     def limited(self, command: Sequence[Real]) -> tuple[Real, ...]:
         """Both rates scaled alike: same path, slower."""
-        left, right = unpacked(command, self.inputs)
-        factor = scaled_to((left, right), self.max_rate)
-        return left * factor, right * factor
+        return scaled_alike(unpacked(command, self.inputs), self.max_rate)
 
     def jacobian(self, command: Sequence[Real]) -> Array:
         """Constant."""
@@ -151,9 +149,7 @@ class SkidSteer:
 
     def limited(self, command: Sequence[Real]) -> tuple[Real, ...]:
         """Both rates scaled alike: same path, slower."""
-        left, right = unpacked(command, self.inputs)
-        factor = scaled_to((left, right), self.max_rate)
-        return left * factor, right * factor
+        return scaled_alike(unpacked(command, self.inputs), self.max_rate)
 
     def jacobian(self, command: Sequence[Real]) -> Array:
         """Constant."""
@@ -232,9 +228,7 @@ class SwedishDrive:
 
     def limited(self, command: Sequence[Real]) -> tuple[Real, ...]:
         """All rates scaled alike: same path, slower."""
-        rates = unpacked(command, self.inputs)
-        factor = scaled_to(rates, self.max_rate)
-        return tuple(rate * factor for rate in rates)
+        return scaled_alike(unpacked(command, self.inputs), self.max_rate)
 
     def jacobian(self, command: Sequence[Real]) -> Array:
         """Constant."""
