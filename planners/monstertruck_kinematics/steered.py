@@ -387,8 +387,9 @@ class IndependentSteer:
 
     def limited(self, command: Sequence[Real]) -> tuple[Real, ...]:
         """All speeds scaled alike: same path, slower."""
-        values, count = unpacked(command, self.inputs), len(self.positions)
-        return (*values[:count], *scaled_alike(values[count:], self.max_speed))
+        values = unpacked(command, self.inputs)
+        count = len(self.positions)
+        return values[:count] + scaled_alike(values[count:], self.max_speed)
 
     def jacobian(self, command: Sequence[Real]) -> Array:
         """By all angles, then all speeds."""
