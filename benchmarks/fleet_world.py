@@ -28,6 +28,7 @@ from time import perf_counter, process_time
 from typing import Any
 
 import numpy as np
+from scoring import rms
 
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import SECOND, Clock, VirtualClock, run_virtual, run_wall
@@ -42,7 +43,7 @@ from monstertruckd.tools.cli.runs import BehaviourClient, RunEnd, run_behaviour
 from monstertruckd.tools.demo.runs import free_endpoint
 from monstertruckd.tools.simulation.config import load_simulated
 from monstertruckd.tools.simulation.operator import LocalOperator
-from monstertruckd.tools.simulation.virtual_rig import virtual_fleet
+from monstertruckd.tools.simulation.virtual_rig import VirtualRig, virtual_fleet
 
 ROOT = Path(__file__).resolve().parents[1]
 ROBOTS = {
@@ -79,6 +80,8 @@ class Score:
     moves: int = 0
     held: Counter[str] = field(default_factory=Counter)
     """Why moves were refused or ended early."""
+    pose_errors: list[float] = field(default_factory=list)
+    """Of its pose against the world's truth, once a second, m; on the virtual clock only."""
 
 
 def configurations(folder: Path) -> list[Path]:
@@ -237,14 +240,24 @@ def on_virtual_clock(seconds: float, seed: int) -> Run:
             began, used, until = perf_counter(), process_time(), clock.now() + round(seconds * SECOND)
             async with asyncio.TaskGroup() as group:
                 for i, rig in enumerate(rigs):
-                    name, driver = rig.config.robot, LocalOperator(rig.daemon, clock)
-                    pilot = Pilot(driver, clock, seed + i, scores[name], rig.bus.subscribe(POSE, latest()), i)
+                    score, pose = scores[rig.config.robot], rig.bus.subscribe(POSE, latest())
+                    pilot = Pilot(LocalOperator(rig.daemon, clock), clock, seed + i, score, pose, i)
                     group.create_task(pilot.patrol(until))
+                    group.create_task(compare_poses(rig, pose, until, score))
             return scene.contacts, perf_counter() - began, process_time() - used
 
     contacts, taken, processor = run_virtual(main, start=SECOND)
     found = [(it.mover, it.speed, it.other, it.other_speed) for it in contacts]
     return Run(scores, found, seconds, taken, processor)
+
+
+async def compare_poses(rig: VirtualRig, pose: Mailbox[Odometry], until: int, score: Score) -> None:
+    """Compare a robot's pose with the world's truth once a second until then, ns."""
+    while rig.clock.now() < until:
+        await rig.clock.sleep(1.0)
+        if (newest := pose.latest) is not None:
+            true = rig.world.truth(rig.clock.now())
+            score.pose_errors.append(math.dist((newest.pose.x, newest.pose.y), (true.x, true.y)))
 
 
 def in_processes(seconds: float, seed: int) -> Run:
@@ -347,6 +360,9 @@ def main() -> None:
     if run.processor is not None:
         idle = run.simulated / run.processor
         print(f"{run.processor:.0f} s of processor time: {idle:.2f} times as fast as real time on an idle core")
+    poses = {name: rms(np.array(score.pose_errors)) for name, score in run.scores.items() if score.pose_errors}
+    for name, error in poses.items():
+        print(f"{name:13} pose {error * 100:.1f} cm RMS, {max(run.scores[name].pose_errors) * 100:.1f} at most")
     found = {
         "daemons": "one process" if options.virtual else "a process each",
         "minutes": options.minutes,
@@ -354,6 +370,7 @@ def main() -> None:
         "people_into_standing_robots": len(people),
         "least_tasks": min(score.tasks for score in run.scores.values()),
         "tasks": {name: score.tasks for name, score in run.scores.items()},
+        "pose_rms_m": {name: round(error, 4) for name, error in poses.items()},
         "rate": round(rate, 2),
         "rate_on_idle_core": None if run.processor is None else round(run.simulated / run.processor, 2),
     }
