@@ -20,6 +20,11 @@ Index = NDArray[np.int32]
 
 CELL: Final = 0.3
 """Edge of the cells that find neighbours, m; also the greatest distance of a pair."""
+EDGE: Final = 0.03
+"""A scan point that lies further along the surface from its map point than this and half the length that the map point
+stands for is beyond the edge of what is known, m: how the surface goes on there is not, and its pair must not count."""
+COARSE: Final = (1e-3, 5e-4)
+"""Pairs beyond the edge do count, for they lead to the place from far off, until a step is shorter, m and rad."""
 KERNEL: Final = 3.0
 """Mahalanobis distance at which a pair's influence is a quarter."""
 CORRELATION: Final = 0.2
@@ -103,6 +108,7 @@ def register(
         cloud.points,
         cloud.normals,
         cloud.variances,
+        cloud.extents,
         cloud.starts,
         cloud.order,
         np.ascontiguousarray(guess if start is None else start, dtype=np.float64),
@@ -131,9 +137,11 @@ def normal_equations(scan: Scan, cloud: Cloud, pose: Array, reach: float = CELL)
         cloud.points,
         cloud.normals,
         cloud.variances,
+        cloud.extents,
         cloud.starts,
         cloud.order,
         min(reach, CELL),
+        EDGE,
     )
     return h, g, int(stats[0])
 
@@ -196,9 +204,11 @@ def accumulate(  # type: ignore[no-untyped-def] # noqa: ANN201
     map_points,  # noqa: ANN001
     map_normals,  # noqa: ANN001
     map_variances,  # noqa: ANN001
+    map_extents,  # noqa: ANN001
     starts,  # noqa: ANN001
     order,  # noqa: ANN001
     reach,  # noqa: ANN001
+    edge,  # noqa: ANN001
 ):
     """Normal equations at ``pose``: information H (3, 3), gradient g (3,), (pairs, sum of squares across, cost)."""
     h = np.zeros((3, 3))
@@ -228,7 +238,8 @@ def accumulate(  # type: ignore[no-untyped-def] # noqa: ANN201
         m = ex * vx + ey * vy
         w = KERNEL * KERNEL / (KERNEL * KERNEL + m)
         stats[2] += w * m
-        w = w * w
+        half = map_extents[j] if map_extents[j] > 0 else math.sqrt(3 * along_m)
+        w = 0.0 if abs(ey * mx - ex * my) > edge + half else w * w
         jx, jy = -ry, rx
         qx, qy = ixx * jx + ixy * jy, ixy * jx + iyy * jy
         h[0, 0] += w * ixx
@@ -283,6 +294,7 @@ def _register(  # type: ignore[no-untyped-def] # noqa: ANN202
     map_points,  # noqa: ANN001
     map_normals,  # noqa: ANN001
     map_variances,  # noqa: ANN001
+    map_extents,  # noqa: ANN001
     starts,  # noqa: ANN001
     order,  # noqa: ANN001
     start,  # noqa: ANN001
@@ -292,8 +304,20 @@ def _register(  # type: ignore[no-untyped-def] # noqa: ANN202
     reach,  # noqa: ANN001
 ):
     pose = start.copy()
+    edge = reach if iterations > 0 else EDGE
     h, g, stats = accumulate(
-        pose, points, normals, variances, map_points, map_normals, map_variances, starts, order, reach
+        pose,
+        points,
+        normals,
+        variances,
+        map_points,
+        map_normals,
+        map_variances,
+        map_extents,
+        starts,
+        order,
+        reach,
+        edge,
     )
     for _ in range(iterations):
         off = pose - guess
@@ -305,10 +329,25 @@ def _register(  # type: ignore[no-untyped-def] # noqa: ANN202
             total[k, k] += 1e-6 + 1e-9 * total[k, k]
         step = solve3(total, -(g + w * (prior @ off)))
         pose = pose + step
+        way, turn = math.hypot(step[0], step[1]), abs(step[2])
+        done = edge == EDGE and way < 1e-4 and turn < 2e-5
+        if way < COARSE[0] and turn < COARSE[1]:
+            edge = EDGE
         h, g, stats = accumulate(
-            pose, points, normals, variances, map_points, map_normals, map_variances, starts, order, reach
+            pose,
+            points,
+            normals,
+            variances,
+            map_points,
+            map_normals,
+            map_variances,
+            map_extents,
+            starts,
+            order,
+            reach,
+            edge,
         )
-        if math.hypot(step[0], step[1]) < 1e-4 and abs(step[2]) < 2e-5:
+        if done:
             break
     off = pose - guess
     off[2] = (off[2] + math.pi) % (2 * math.pi) - math.pi

@@ -44,6 +44,16 @@ def test_a_thing_that_moves_beside_the_lidar_does_not_take_the_pose_along(moved)
     assert match.pose == pytest.approx(np.zeros(3), abs=0.03)  # by beams, a quarter of them, it took the pose along
 
 
+@pytest.mark.parametrize("bend", [-0.05, -0.1, -0.15])
+def test_how_a_wall_goes_on_beyond_what_is_known_does_not_turn_the_scan(bend):
+    known = [((-2, 0.6), (1.2, 0.6)), ((-2, -0.6), (1.2, -0.6))]
+    new = [((1.2, 0.6), (1.5, 0.6 + bend)), ((1.2, -0.6), (1.5, -0.6))]
+    place = np.array((0.8, 0.0, 0.0))
+    fit = register(scan([*known, *new], place), seen_from(known, np.zeros(3)).cloud, place)
+    assert fit.overlap > 0.95
+    assert fit.pose[1:] == pytest.approx(place[1:], abs=0.005)  # 0.012 to 0.032 rad with pairs of what is new
+
+
 def test_the_search_returns_the_greatest_score_of_its_window():
     rng = np.random.default_rng(3)
     grid = LikelihoodGrid.of(dots(rng.uniform(-2, 2, (60, 2))), 5)
