@@ -30,7 +30,7 @@ ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "tests" / "data" / "replay"
 RUNS = {"level": ("ramp.yaml", 0.2), "slam": ("slam.yaml", 0.8), "fusion": ("fusion.yaml", 0.6)}
 """Logs by name: configuration, and metres of the path: a rocking truck with a level lidar, and two that map."""
-GOALS = ((0.22, -1.7), (0.4, -1.72))
+GOALS = ((0.25, -1.7), (0.43, -1.71))
 """Places (x, y) that the run ``goals`` drives to: asked for by topic, and by remote call."""
 PLANNER = {
     "route": {"kind": "hybrid", "effort": 3000, "unknown": "free"},
