@@ -196,7 +196,7 @@ class Mapper:
         match = self._front.match(scan, delta, guess, covariance, self._submap)
         suspect, after_gap = self._loss.suspects(match, guess, covariance), self._loss.after_gap and match.accepted
         most = PART_CONTRADICTION if suspect else CONTRADICTION
-        if match.accepted and not after_gap and (off := self._motion.off(between(self._pose, match.pose))):
+        if match.accepted and (off := self._motion.off(between(self._pose, match.pose))):
             if exceeds(off, OFF_MOTION):
                 return rejected(guess, covariance, MatchStatus.FAR)
             if exceeds(off, ASTRAY[self._loss.doubts(match)]):
