@@ -81,6 +81,7 @@ def test_after_a_gap_a_room_of_the_same_outline_is_another_if_it_looks_through_t
         pytest.param((0.9, 0.6, 0.4), None, True, id="no wheels"),
         pytest.param((0.0, 0.0, 0.0), None, False, id="it stood"),
         pytest.param((0.9, 0.6, 0.4), (0.9, 0.6, 0.4), False, id="wheels say where to"),
+        pytest.param((0.9, 0.6, 0.4), (0.9, -0.1, 0.4), True, id="wheels say another place"),
     ],
 )
 def test_after_a_gap_one_place_that_fits_is_no_proof_unless_the_motion_led_there(moved, odom, lost):
