@@ -3,11 +3,12 @@
     python benchmarks/fleet_world.py              one simulator process, a daemon process for each robot, real time
     python benchmarks/fleet_world.py --virtual    the same daemons on one virtual clock, as fast as it computes
 
-Robots do not know each other's plans. Each hears where the others say that they are (``peers``), which counts behind
-it, where its lidar of 240 degrees sees nobody; it stops before what it sees and hears. Of those that are near to each
-other one has the right of way, for a minute each in turn: it waits, and the others drive away from those near them.
-Before people, and where that fails, a robot waits a time drawn by its seed, turns or drives elsewhere, and tries again;
-it backs up, where its lidar does not look, only as far as it must to turn.
+Robots do not know each other's plans. Of the places that are drawn for it a robot takes the first of the next few to
+which the straight line leads past nobody it hears. Each hears where the others say that they are (``peers``), which
+counts behind it, where its lidar of 240 degrees sees nobody; it stops before what it sees and hears. Of those that are
+near to each other one has the right of way, for a minute each in turn: it waits, and the others drive away from those
+near them. Before people, and where that fails, a robot waits a time drawn by its seed, turns or drives elsewhere, and
+tries again; it backs up, where its lidar does not look, only as far as it must to turn.
 Contacts in which a robot moves count against the goal; people who walk into a standing one are counted apart.
 """
 
@@ -63,6 +64,10 @@ HALF = 2.2
 """Places are drawn within this of the yard's middle, m."""
 REACHED = 0.15
 """A place nearer than this is reached, m."""
+PENDING = 6
+"""Places among which a robot chooses."""
+PASSES = 0.7
+"""A straight line leads past another robot at least so far from it, m."""
 NEAR = 1.1
 """Robots that stand nearer to each other than this settle which of them goes first, m."""
 TURN_OF_EACH = 60.0
@@ -138,15 +143,34 @@ class Pilot:
     async def patrol(self, until: int) -> None:
         """Until then, ns."""
         self.rng = np.random.default_rng(self.seed)
+        places = [self.draw() for _ in range(PENDING)]
         with (
             self.driver.subscribe(GATE, latest()) as self.gate,
             self.driver.subscribe(PEERS, latest()) as self.peers,
         ):
             while self.clock.now() < until:
-                x, y = (float(v) for v in self.rng.uniform(-HALF, HALF, 2))
-                with contextlib.suppress(TimeoutError):
-                    async with self.clock.deadline(60.0):  # somebody may stand there: another place
-                        await self.go_to(x, y, until)
+                place = next(filter(self.passes, places), places[0])
+                places.remove(place)
+                try:
+                    async with self.clock.deadline(60.0):
+                        await self.go_to(*place, until)
+                    places.append(self.draw())
+                except TimeoutError:
+                    places.append(place)  # somebody may stand there: later
+
+    def draw(self) -> tuple[float, float]:
+        """A place in the yard, m."""
+        x, y = self.rng.uniform(-HALF, HALF, 2).tolist()
+        return x, y
+
+    def passes(self, place: tuple[float, float]) -> bool:
+        """Whether the straight line to a place leads past the others, as far as they are heard."""
+        if self.pose.latest is None or self.peers.latest is None:
+            return True
+        start = np.array((self.pose.latest.pose.x, self.pose.latest.pose.y))
+        line = np.linspace(start, place, 20)
+        others = np.array([(peer.pose.x, peer.pose.y) for peer in self.peers.latest.peers]).reshape(-1, 2)
+        return bool((np.hypot(*(line[:, None] - others[None]).T) > PASSES).all())
 
     async def go_to(self, x: float, y: float, until: int) -> None:
         """Turn to a place and drive there; after a stop make way and try again."""

@@ -99,11 +99,7 @@ def laps(metres: float, folder: Path) -> Path:
 
 
 def over(ground: list[dict[str, Any]], metres: float, *, stabilised: bool) -> Driven:
-    """Laps of the demo with a map that grows.
-
-    Raises:
-        RuntimeError: the truck came to a stand before that way.
-    """
+    """Laps of the demo with a map that grows; shorter where the truck comes to a stand."""
     with TemporaryDirectory() as folder:
         return _over(ground, metres, laps(metres, Path(folder)), stabilised=stabilised)
 
@@ -136,7 +132,9 @@ def _over(ground: list[dict[str, Any]], metres: float, path: Path, *, stabilised
             if truck.drives():
                 moved = clock.now()
             elif clock.now() - moved > STANDS * SECOND:
-                raise RuntimeError(f"the truck stands after {way:.1f} m")
+                why = "no state of the gate" if truck.gate is None else truck.gate.why
+                print(f"the truck stands after {way:.1f} m: {why}", flush=True)
+                break
             up = plant.data.body("lidar_head").xmat[8]
             lidar.append(degrees(acos(min(1.0, float(up)))))
             body.append(degrees(hypot(now.pitch, now.roll)))
@@ -206,6 +204,7 @@ def rough(metres: float, keep: Path | None = None) -> dict[str, float]:
         settled = it.lidar[min(SETTLED, len(it.lidar) - 1) :]
         figures |= {
             f"{name}_way": float(it.way[-1]) if len(it.way) else 0.0,
+            f"{name}_way_share": float(it.way[-1]) / metres if len(it.way) else 0.0,
             f"{name}_body_deg_rms": rms(it.body),
             f"{name}_lidar_deg_rms": rms(it.lidar),
             f"{name}_lidar_deg_max": float(it.lidar.max()),
