@@ -166,7 +166,7 @@ def test_the_authority_of_stations_is_not_made_anew_when_its_register_is_lost(fo
     add(folder, "ann")
     key = (folder.path / "authority.key").read_bytes()
     (folder.path / "register.yaml").unlink()
-    with pytest.raises(InputError, match=r"register\.yaml is missing beside certificates of ann"):
+    with pytest.raises(InputError, match=r"register\.yaml is missing among certificates of ann"):
         folder.init("truck", ("localhost",), folder.robot, NOW)
     assert (folder.path / "authority.key").read_bytes() == key
 
