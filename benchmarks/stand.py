@@ -168,9 +168,9 @@ class Crossing(NamedTuple):
     worst: float
     """Processor seconds of all pictures of one instant, the first one left aside, in which all are searched."""
     played: float
-    """Pictures of each camera that are tracked in a second,"""
+    """Pictures of each camera that are tracked in a second."""
     cores: float
-    """by so many processors, which others may use, too."""
+    """Processors that track them, which others may use, too."""
 
 
 def crossing(stand: Any, kind: str, seconds: float, rng: np.random.Generator) -> Crossing:

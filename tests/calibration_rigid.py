@@ -28,17 +28,17 @@ from monstertruckd.tools.calibrate.response import ResponseFit, Steps
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 
 PERIOD: Final = 0.02
-"""Between two looks at the world, s: that of the servos' pulses."""
+"""Step in which the world is advanced and read, s: the period of the servos' pulses."""
 ACCELERATION: Final = 20_000.0
-"""Of the motors, rpm/s."""
+"""Acceleration of the motors, rpm/s."""
 SETTLED: Final = 1.0
 """Seconds after which a motion is steady."""
 SPEED: Final = 0.15
-"""Straight ahead and in circles, m/s."""
+"""Speed straight ahead and in circles, m/s."""
 ROUNDS: Final = 5
-"""Of a weave: its 1.8 m."""
+"""Repetitions of ``weave.WEAVE``: the wizard's 1.8 m."""
 CHAIN: Final = 0.012
-"""From a command of the gate to the servo, s: the serial line, and half a frame of pulses."""
+"""Delay from a command of the gate to the servo, s: the serial line, and half a frame of pulses."""
 
 
 class Motion(NamedTuple):
@@ -53,8 +53,8 @@ class Motion(NamedTuple):
     """Rad."""
 
     @property
-    def way(self) -> float:
-        """Along the arc, m."""
+    def length(self) -> float:
+        """Length of the arc, m."""
         half = self.turn / 2
         return math.hypot(self.ahead, self.left) * (half / math.sin(half) if half else 1.0)
 
@@ -82,7 +82,7 @@ class HandDriven:
         world = config.sim.world.model_copy(update=bare)
         self._world = World(world, 0, scene, lidar=carries_lidar(config.devices))
         self.now = SECOND
-        """Of its world's clock, ns."""
+        """Time of its world, ns."""
         self._pulses = {servo.channel: servo.centre_us for servo in self._truck.servos}
         self._world.truth(self.now)
         self._world.servos.attach(self)
@@ -125,7 +125,7 @@ class HandDriven:
         """Of the path of its middle at angles of the servos, 1/m, left positive."""
         self.steer(servos)
         motion = self.moved(SPEED, seconds=1.0)
-        return motion.turn / motion.way
+        return motion.turn / motion.length
 
     def _turns(self) -> Array:
         motor = self._truck.motor
@@ -143,7 +143,7 @@ def drive_truth(config: SimulatedTruckConfig) -> dict[str, Value]:
     """Turns of the motor on a metre straight ahead, and what follows from them."""
     drive, geometry = config.devices.drive, config.geometry
     motion = HandDriven(config).moved(SPEED, seconds=2.0)
-    turns = float(motion.turns[0]) / math.tau * config.sim.world.truck.motor.ratio / motion.way
+    turns = float(motion.turns[0]) / math.tau * config.sim.world.truck.motor.ratio / motion.length
     pulses = 0 if drive is None else drive.driver.encoder_pulses_per_turn or 0
     ratio = turns * math.tau * geometry.wheel_radius
     return {"turns_per_metre": turns, "drive_ratio": ratio, "ticks_per_metre": 4 * pulses * turns}
@@ -198,7 +198,7 @@ def _travels(config: SimulatedTruckConfig, chassis: TruckChassis) -> dict[str, V
 
 
 def odometry_truth(config: SimulatedTruckConfig) -> dict[str, Value]:
-    """The way of the wheels, and the wheelbase by which the linkage turns as the truck does in the wizard's corners."""
+    """Distance scale, and the wheelbase by which the linkage turns as the truck in the wizard's corners."""
     truck, geometry = config.sim.world.truck, config.geometry
     chassis, straight, hands = truck.chassis(), drive_truth(config), HandDriven(config)
     assert isinstance(chassis, TruckChassis)

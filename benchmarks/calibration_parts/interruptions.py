@@ -43,11 +43,11 @@ FIRST, LAST = 2.0, 35.0
 ENDED = 40.0
 """Seconds in which the wizard ends after that: a low battery is judged for ten."""
 PASSES = ("unplug", "lease_lost")
-"""What a wizard may outlast,"""
+"""Interruptions that a wizard may outlast."""
 STOPPED = 8.0
-"""seconds in which the truck has stood by then,"""
+"""Seconds within which the truck has stood after such an interruption."""
 WHOLE = 300.0
-"""and in which the wizard is done."""
+"""Seconds within which the wizard is done after it."""
 REST = 2.0
 """Seconds from then in which the truck is at rest."""
 READY = 20.0

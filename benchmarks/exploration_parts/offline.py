@@ -51,8 +51,8 @@ def offline_tour(arena: Arena, reach: float, seed: int) -> Run:
     )
     chosen = _cover(seen)
     options = [Option(Frontier(places[:1], (0.0, 0.0), 0.0), (*places[i], 0.0), 0.0, 0.0, 0.0) for i in chosen]
-    distance = np.minimum(view.ways_between(options), 1e4)
-    first = np.array([view.way_to((x, y)) or 1e4 for x, y in places[chosen]])
+    distance = np.minimum(view.path_lengths_between(options), 1e4)
+    first = np.array([view.path_length_to((x, y)) or 1e4 for x, y in places[chosen]])
     order = [chosen[k] for k in short_tour(distance, first)] if len(chosen) > 1 else list(chosen)
     shown = {i: points[seen[i]] for i in chosen}
     rover.map = grid
@@ -89,7 +89,9 @@ def _places(arena: Arena, view: ExplorationView) -> np.ndarray:
     x, y = (np.arange(o + SPACING / 2, o + s, SPACING) for o, s in zip(arena.origin, size, strict=True))
     places = np.column_stack([v.ravel() for v in np.meshgrid(x, y)])
     room = arena.truth.lookup(places) > BODY.circumscribed_radius + 0.06
-    return np.array([place for place in places[room] if view.way_to((float(place[0]), float(place[1]))) is not None])
+    return np.array(
+        [place for place in places[room] if view.path_length_to((float(place[0]), float(place[1]))) is not None]
+    )
 
 
 def _cover(seen: np.ndarray) -> list[int]:

@@ -18,7 +18,7 @@ HUB_PORTS = 7
 OTHER = UsbIdentity("1a86:7523", "USB Serial", "ttyUSB")
 """A device whose kind says nothing of USB hangs on an adapter."""
 DISK = Disk(total=64_000_000_000, free=32_000_000_000)
-"""Of an emulated computer; on the real one, every run would record something else."""
+"""Disk of an emulated computer; on the real one, every run would record something else."""
 HELP = "known: lose HUB, return HUB, over-current PLACE, suspend PLACE; places as in 1-1.2"
 
 
@@ -71,7 +71,7 @@ class EmulatedComputer:
         self._returning: asyncio.Task[None] | None = None
         self.usb = EmulatedUsb(folder)
         self.ports: dict[str, EmulatedPort] = dict(cables)
-        """By role: where cables are plugged and pulled."""
+        """Cables that are plugged and pulled, by role."""
         places = {
             role: (device.port, device.kind)
             for role, device in devices.present().items()

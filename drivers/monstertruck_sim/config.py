@@ -24,7 +24,7 @@ class CeilingCamera(CameraConfig):
     port: Path
     """Link that is made to it; the stand's camera of kind `rendered` names the same"""
     x: float = 0.0
-    """In the map, m"""
+    """Position in the map, m"""
     y: float = 0.0
     """m"""
     height: Annotated[float, Field(gt=0)] = 2.2
@@ -44,9 +44,9 @@ class StandConfig(Schema):
     heading_noise: Annotated[float, Field(ge=0)] = 0.01
     """Rad"""
     cameras: dict[Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,31}$")], CeilingCamera] = Field(default_factory=dict)
-    """That `stand run` looks through, by name"""
+    """Cameras of `stand run`, by name"""
     board: HeldBoard | None = None
-    """For the pictures by which `stand calibrate` finds their lenses"""
+    """Board in the pictures by which `stand calibrate` finds their lenses"""
 
 
 class SimConfig(Schema):

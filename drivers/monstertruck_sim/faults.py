@@ -123,7 +123,7 @@ class SimContext:
         clock: time.
         disk: None where nothing records.
         power: None where the computer is this one.
-        workers: None where they are skipped.
+        workers: None where no fault acts on them.
     """
 
     config: SimConfig

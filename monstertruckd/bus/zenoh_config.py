@@ -18,8 +18,8 @@ from monstertruck_schemas.topics import owner_of
 from monstertruckd.bus.access import EVERYTHING, OBSERVING, Grant, access_rules
 
 HANG_UP_US: Final = 2_000_000
-"""Seconds after which a station is disconnected that does not take an answer, or a message that must not be dropped.
-Zenoh's own 5 s are too long for requests that wait behind it; a large map needs some time as well."""
+"""Microseconds after which a station is disconnected that does not take an answer, or a message that must not be
+dropped. Zenoh's own 5 s are too long for requests that wait behind it; a large map needs some time as well."""
 
 LOCAL_SESSIONS: Final = 16
 """Sessions of the robot's own command line."""

@@ -345,7 +345,7 @@ def _other_kind(below: dict[str, Any], above: dict[str, Any]) -> bool:
 
 @dataclass(slots=True)
 class _Builder:
-    """Size of one file at most."""
+    """Builds the values of one file, with their origins."""
 
     path: Path
     origins: dict[Key, Origin]

@@ -101,7 +101,7 @@ class PlacementConfig(Schema):
     planner: Literal["loop", "worker", "remote"] = "worker"
     """`loop` is for studies only: planning blocks the control tick"""
     local_planner: Literal["loop", "worker", "remote"] = "worker"
-    """Likewise"""
+    """As `planner`"""
     tracker: Literal["loop", "worker", "remote"] = "loop"
     explorer: Literal["loop", "worker", "remote"] = "worker"
     slowness: Annotated[float, Field(gt=0, le=1000)] | Board | None = None

@@ -55,9 +55,9 @@ class Gyro:
         self._turns: deque[tuple[int, float, float]] = deque()
         """(ns, turn by the wheels, turn by the gyroscope), rad."""
         self._long: deque[tuple[int, float, float, float]] = deque()
-        """The same, with what the wheels may be off, rad."""
+        """(ns, turn by the wheels, turn by the gyroscope, tolerated difference), rad."""
         self._sums = (0.0, 0.0)
-        """Of what it holds: difference of the turns, and what the wheels may be off, rad."""
+        """Sums over ``_long``: difference of the turns, and tolerated difference, rad."""
         self._known = 0
         """When the bias was last known, ns."""
         self.bias: float | None = None

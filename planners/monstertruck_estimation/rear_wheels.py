@@ -136,7 +136,7 @@ def _fault(want: float, have: float, *, agrees: bool) -> str:
 
 @dataclass(frozen=True, slots=True)
 class EncoderIncrement:
-    """Ways of both wheels between two readings, m."""
+    """Distances of both wheels between two readings, m."""
 
     since: int
     """ns."""

@@ -318,7 +318,7 @@ QUESTIONS: Final = ESTIMATES + 3 * MILLISECOND
 made."""
 
 IN_THREADS: Final = -2 * MILLISECOND
-"""The same of those that work in threads: behind the tick, which a thread that holds the interpreter would delay."""
+"""Lead of services that work in threads, ns: behind the tick, which a thread that holds the interpreter would delay."""
 
 
 class Schedule:

@@ -17,10 +17,10 @@ pytestmark = [pytest.mark.virtual, pytest.mark.timeout(300)]
 
 START = (1.0, 3.95, 0.0)
 OUT = ((1.0, 3.95), (5.9, 3.95), (6.85, 4.5), (6.85, 5.6))
-"""Along the hall and into a room; then the truck is carried back..."""
+"""Along the hall and into a room, from where the truck is carried to ``CARRIED``."""
 CARRIED = (8.6, 3.9, math.pi)
 AGAIN = ((8.6, 3.9), (3.0, 3.95))
-"""...and drives along the hall in the other direction."""
+"""Along the hall in the other direction."""
 
 
 async def pursue(rig: VirtualRig, truck: LocalTruck, corners: tuple[tuple[float, float], ...]) -> None:

@@ -20,7 +20,7 @@ Voltage = Callable[[int], float]
 TICK: Final = 2_000_000
 """Nanoseconds of one step of the motion."""
 IDLE_TICK: Final = 100_000_000
-"""The same where the shaft stalls."""
+"""Nanoseconds of one step of a motion without speed, as where the shaft stalls."""
 RATED_VOLTAGE: Final = 12.0
 NO_LOAD_SPEED: Final = 59 * tau / 60 / p.STEP
 """Steps a second at rated voltage and full drive."""

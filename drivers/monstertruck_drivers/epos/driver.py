@@ -18,6 +18,7 @@ from monstertruck_drivers.epos.exchange import ATTEMPTS, RECENT, Exchanger, Obje
 from monstertruck_drivers.epos.objects import ObjectEntry
 from monstertruck_drivers.epos.protocol import FAULTED, OFF, POWERED, Control, State, next_control, state_of
 from monstertruck_drivers.link import Port
+from monstertruck_drivers.transaction import Misses
 from monstertruck_runtime.clock import QUESTIONS, SECOND, Clock, Schedule
 from monstertruck_runtime.errors import (
     DeviceError,
@@ -124,12 +125,10 @@ class Odometer:
 
 HANDSHAKE_ATTEMPTS = 2
 """Quick retries: a motor that kept its speed behind a lost link must rest <= 1.2 s after the link is back."""
-FAILURE_LIMIT = 3
-"""Failed exchanges in a row that end the session."""
 SAFE_DEADLINE = 0.3
 """Seconds a session may take to leave the motor stopped and disabled, from when the controller listens."""
 SAFE_ATTEMPTS = 2
-"""Of that: the first one may meet the rest of what was damaged."""
+"""Attempts with such a time each: the first one may meet the rest of what was damaged."""
 DISABLE_TIME = 0.04
 """Seconds of ``SAFE_DEADLINE`` kept for the last exchange."""
 REENABLE_LIMIT = 0.3
@@ -137,7 +136,7 @@ REENABLE_LIMIT = 0.3
 SLOW_EXCHANGE = 0.03
 """Median duration of exchanges, s, from which on the link is slow: at 38400 baud they take 10 to 13 ms."""
 QUICK_EXCHANGE = 0.02
-"""And from which on it is not."""
+"""Median duration, s, up to which it is no longer slow."""
 GOAL_LIMIT = 2.0
 """Seconds after which a controller that does not follow its commands is reported."""
 
@@ -335,23 +334,18 @@ class _DriveSession:
     async def serve(self, ready: Ready) -> None:
         """Cycle after cycle until cancelled; a failed exchange is followed by the most urgent one."""
         schedule = Schedule(self._clock, self._config.rate, QUESTIONS)
-        failures, reported_ready = 0, False
+        misses, reported_ready = Misses(), False
         while True:
-            try:
+            with misses:
                 await self._cycle()
                 self._judge_link()
                 if not reported_ready and self._state not in FAULTED:
                     reported_ready = True
                     ready()
                 await self._idle(schedule.step())
-            except (DeviceTimeoutError, ProtocolError):
-                failures += 1
-                if failures >= FAILURE_LIMIT:
-                    raise
+            if misses.count:
                 self._doubtful = True
                 await self._line.settle()
-            else:
-                failures = 0
 
     async def _cycle(self) -> None:
         await self._act(also_faster=not self._doubtful)

@@ -28,7 +28,7 @@ class RoboclawConfig(Schema):
     answer_timeout: Annotated[float, Field(gt=0, le=0.2)] = 0.03
     """Seconds in which an answer must come"""
     max_rate: Annotated[float, Field(gt=0, le=1000)] = 10.0
-    """Greatest rate of a wheel, rad/s; counts that would need more mean that the unit has restarted at 0"""
+    """Greatest rate of a wheel, rad/s; counts that would need more mean that the unit has restarted"""
 
     @property
     def count(self) -> float:

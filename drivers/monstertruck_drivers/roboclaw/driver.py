@@ -48,7 +48,7 @@ class RoboclawDriver:
 
         Raises:
             DeviceLostError: unplugged.
-            DeviceRestartedError: the unit restarts at 0.
+            DeviceRestartedError: the unit has restarted, and counts from 0.
             DeviceTimeoutError, ProtocolError: no usable answers.
             WrongDeviceError: something else answers.
             PortBusyError: another process holds the port.

@@ -21,7 +21,7 @@ class StepperConfig(Schema):
 
     kind: Literal["steppers"] = "steppers"
     motors: Annotated[int, Field(ge=1, le=MOTORS)] = MOTORS
-    """Motors that turn shafts; the controller's others are skipped"""
+    """Motors that turn shafts; the controller's others are not used"""
     steps_per_turn: Annotated[int, Field(ge=4, le=51_200)] = 400
     """Steps per motor turn, half or micro steps counted; must be what the controller says"""
     inverted: Annotated[tuple[bool, ...], Field(strict=False)] = (False,) * MOTORS

@@ -75,7 +75,7 @@ class Servo:
         self._due: deque[tuple[float, float]] = deque()
         """When (s) the angles (rad) of newer pulses become the target."""
         self.angle = 0.0
-        """Of the arm, rad."""
+        """Angle of the arm, rad."""
 
     def latch(self, pulse_us: float | None) -> None:
         """Take over one pulse; None (no pulses) leaves the arm where it is."""

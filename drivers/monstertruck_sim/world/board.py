@@ -15,9 +15,9 @@ from monstertruck_sim.world.noise import BOARD, generator
 CELL: int = 40
 """Pixels of a board's square in its texture."""
 ASIDE: float = 0.5
-"""Of the board's middle from the camera's axis, of half the picture's width, at most."""
+"""Greatest distance of the board's middle from the camera's axis, as a share of half the picture's width."""
 BELOW: float = 0.4
-"""And above or below it."""
+"""Greatest distance above or below the axis, as a share of half the picture's width."""
 UPRIGHT: float = 0.35
 """Turn about the camera's axis, rad, at most."""
 

@@ -247,7 +247,7 @@ class Painter:
             self._along = np.cos(fan).astype(np.float32)
         self._fan = fan
         self.azimuths: Array = fan + config.yaw
-        """Of the directions in which it wants to know ranges, from the robot's axis, rad; falling."""
+        """Directions in which ranges are needed, from the robot's axis, rad; falling."""
         depth = np.minimum(np.abs(slope) * self._focal / (height / 2), 1.0) * 63
         ground = (np.where(slope > 0, FLOOR, SKY) + depth).astype(np.uint8)
         self._column, self._slope, self._ground = (

@@ -33,7 +33,7 @@ class ServoModelConfig(Schema):
     rate: Positive = 6.0
     """Greatest servo speed, rad/s (0.17 s for 60 degrees)."""
     dead_time: NotNegative = 0.0
-    """From a new pulse to the first movement, s."""
+    """Delay from a new pulse to the first movement, s."""
     lag: NotNegative = 0.0
     """Time constant with which the arm then turns, s; 0: at its greatest speed"""
     dead_band_us: NotNegative = 2.0
@@ -63,7 +63,7 @@ class MotorConfig(Schema):
     torque_constant: Positive = 0.0127
     """Nm/A (24 V at 18000 rpm)."""
     efficiency: Annotated[float, Field(gt=0, le=1)] = 0.5
-    """Of all gear stages together."""
+    """Efficiency of all gear stages together."""
     idle_current: NotNegative = 0.08
     """Current of the unloaded turning motor, A."""
     peak_current: NotNegative = 2.0
@@ -131,9 +131,9 @@ class SimTruckConfig(Schema):
     yaw_inertia: Positive = 0.20
     """kg m^2; of the single-track model"""
     front_stiffness: Positive = 120.0
-    """Of the front axle's tyres, N/rad; of the single-track model"""
+    """Cornering stiffness of the front axle's tyres, N/rad; of the single-track model"""
     rear_stiffness: Positive = 120.0
-    """Of the rear axle's tyres, N/rad; of the single-track model"""
+    """Cornering stiffness of the rear axle's tyres, N/rad; of the single-track model"""
     wheelbase: Positive = 0.32
     """m."""
     track: Positive = 0.26
@@ -141,13 +141,13 @@ class SimTruckConfig(Schema):
     wheel_radius: Positive = 0.075
     """m."""
     length: Positive = 0.47
-    """Of the footprint, centred on the geometric centre, m."""
+    """Length of the footprint, centred on the geometric centre, m."""
     width: Positive = 0.34
-    """Of the footprint, m."""
+    """Width of the footprint, m."""
     mass: Positive = 7.25
     """kg."""
     rolling_resistance: NotNegative = 0.05
-    """Of the weight."""
+    """Rolling resistance as a share of the weight."""
     front_slip_angle: NotNegative = 0.06
     """rad per m/s^2."""
     rear_slip_angle: NotNegative = 0.04
@@ -169,7 +169,7 @@ class SimTruckConfig(Schema):
     motor: MotorConfig = MotorConfig()
     """Each of the motors"""
     skid: SkidModelConfig = SkidModelConfig()
-    """Of a skid-steer body"""
+    """Slip of a skid-steer body"""
 
     def chassis(self) -> Chassis:
         """True kinematics.
@@ -215,11 +215,11 @@ class MechanicsConfig(Schema):
     """Masses, springs and friction of the truck, for engine ``mujoco``; the whole mass is ``truck.mass``."""
 
     wheel_mass: Positive = 0.281
-    """Of one wheel, kg."""
+    """Mass of one wheel, kg."""
     axle_mass: Positive = 0.45
-    """Of one axle without its wheels, kg."""
+    """Mass of one axle without its wheels, kg."""
     mass_height: Positive = 0.12
-    """Of the centre of the mass on the springs, over the ground, m."""
+    """Height of the centre of the mass on the springs over the ground, m."""
     wheel_width: Positive = 0.08
     """m."""
     droop: Positive = 0.010
@@ -227,11 +227,11 @@ class MechanicsConfig(Schema):
     bump: Positive = 0.030
     """How far it rises before its stop, m."""
     damping: Positive = 0.35
-    """Of the suspension, share of the critical one."""
+    """Damping of the suspension as a share of the critical one."""
     axle_roll_deg: Annotated[float, Field(gt=0, le=45)] = 10.0
     """Greatest roll of an axle against the chassis."""
     friction: Positive = 0.5
-    """Between tyres and ground."""
+    """Coefficient of friction between tyres and ground."""
     tyre_stiffness: NotNegative = 60.0
     """Force of one rolling tyre by a small slip angle, N/rad (half an axle's of the single-track model), and by a small
     slip ratio, N; 0: rigid wheels"""
@@ -244,9 +244,9 @@ class BatteryModelConfig(Schema):
 
     capacity_ah: Positive = 5.0
     charge: Fraction = 0.95
-    """At the start, of the capacity."""
+    """Charge at the start, as a share of the capacity."""
     resistance: NotNegative = 0.08
-    """Of cells and wiring, acts at once, ohm."""
+    """Resistance of cells and wiring, acts at once, ohm."""
     recovery_resistance: NotNegative = 0.04
     """Additional sag that builds up and recovers with ``recovery_time``, ohm."""
     recovery_time: Positive = 20.0
@@ -271,7 +271,7 @@ class LidarConfig(Schema):
     x: float = 0.14
     """Mount before the geometric centre, m."""
     y: float = 0.0
-    """And left of it, m."""
+    """Distance to the left of the geometric centre, m."""
     yaw: float = 0.0
     """Direction of its middle beam, left positive, rad."""
     pitch: float = 0.0
@@ -279,7 +279,7 @@ class LidarConfig(Schema):
     roll: float = 0.0
     """Right side down positive, rad."""
     height: Positive = 0.25
-    """Of the scanning plane over the ground, m."""
+    """Height of the scanning plane over the ground, m."""
     first_step: Annotated[int, Field(ge=0, le=768)] = 44
     last_step: Annotated[int, Field(ge=0, le=768)] = 725
     min_range: NotNegative = 0.02
@@ -291,7 +291,7 @@ class LidarConfig(Schema):
     dropout: Fraction = 0.002
     """Chance of a single beam to fail."""
     wall_height: Positive = 0.6
-    """Of everything in the map: beams tilted upwards pass over it, m."""
+    """Height of everything in the map, m: beams tilted upwards pass over it."""
 
     @model_validator(mode="after")
     def _check_order(self) -> Self:
@@ -308,7 +308,7 @@ class CameraConfig(Schema):
     x: float = 0.18
     """Mount before the geometric centre, m."""
     y: float = 0.0
-    """And left of it, m."""
+    """Distance to the left of the geometric centre, m."""
     height: Positive = 0.25
     """Over the ground, m."""
     yaw: float = 0.0
@@ -337,7 +337,7 @@ class TagConfig(Schema):
     tag: Annotated[int, Field(ge=0, le=586)]
     """Its number."""
     x: float
-    """Of its middle in the map, m."""
+    """Position of its middle in the map, m."""
     y: float
     """m."""
     z: float = 0.25
@@ -356,7 +356,7 @@ class HeldBoard(BoardConfig):
     hold: Annotated[float, Field(ge=0.05, le=60)] = 1.5
     """Seconds for which it is held still"""
     printed_scale: Annotated[float, Field(gt=0.1, lt=10)] = 1.0
-    """Of the true board, against the sizes above"""
+    """Size of the true board as a share of the sizes above"""
 
 
 class RoofTag(Schema):
@@ -364,9 +364,9 @@ class RoofTag(Schema):
 
     tag: Annotated[int, Field(ge=0, le=586)]
     x: float = 0.0
-    """Of its middle before the geometric centre, m."""
+    """Distance of its middle ahead of the geometric centre, m."""
     y: float = 0.0
-    """And left of it, m."""
+    """Distance to the left of the geometric centre, m."""
     z: float = 0.3
     """Over the ground, m."""
     size: Annotated[float, Field(gt=0.01, le=1)] = 0.08
@@ -473,9 +473,9 @@ class SonarModelConfig(Schema):
     audible: Positive = 6.0
     """Farthest wall whose echo is heard, m: what comes back from beyond ``range_max`` may meet the next ping."""
     sonars: dict[FrameId, SonarPlace] = FIVE_SONARS
-    """By name."""
+    """Mounts by name."""
     height: NotNegative = 0.12
-    """Of all of them over the ground, m: on a body that leans some look over the walls."""
+    """Height of all sonars over the ground, m: on a body that leans some look over the walls."""
 
     @model_validator(mode="after")
     def _check_order(self) -> Self:
@@ -495,7 +495,7 @@ class ImuModelConfig(Schema):
     rate_bias: NotNegative = 0.01
     """Greatest fixed error of each angular velocity, rad/s."""
     rate_scale: Positive = 1.0
-    """Of what is measured of a turn about z."""
+    """Scale factor of the measured rate about z."""
     acceleration_noise: NotNegative = 0.05
     """Standard deviation of each axis, m/s^2."""
     acceleration_bias: NotNegative = 0.1
@@ -513,7 +513,7 @@ class RoughPatch(Schema):
     """A rectangle of rough ground: waves along x and along y, added to the ground's height."""
 
     x: float
-    """Of its middle, m."""
+    """Position of its middle, m."""
     y: float
     """m."""
     length: Positive = 1.0
@@ -603,10 +603,10 @@ class Slope(Schema):
     y: float = 0.0
     """m."""
     direction: float = 0.0
-    """In which it rises, rad."""
+    """Direction in which it rises, rad."""
     angle_deg: Annotated[float, Field(ge=-40, le=40)] = 10.0
     length: Positive = 2.0
-    """Of it seen from above, m."""
+    """Length seen from above, m."""
 
 
 class UprightStep(Schema):
@@ -614,7 +614,7 @@ class UprightStep(Schema):
 
     kind: Literal["step"]
     x: float
-    """Of its middle, m."""
+    """Position of its middle, m."""
     y: float
     """m."""
     yaw: float = 0.0
@@ -632,7 +632,7 @@ class Ditch(Schema):
 
     kind: Literal["ditch"]
     x: float
-    """Of its middle, m."""
+    """Position of its middle, m."""
     y: float
     """m."""
     yaw: float = 0.0
@@ -640,7 +640,7 @@ class Ditch(Schema):
     length: Positive = 2.0
     """m."""
     width: Positive = 0.3
-    """At the top, m."""
+    """Width at the top, m."""
     depth: Positive = 0.05
     """m."""
 
@@ -650,7 +650,7 @@ class Rubble(Schema):
 
     kind: Literal["rubble"]
     x: float = 0.0
-    """Of its middle, m."""
+    """Position of its middle, m."""
     y: float = 0.0
     """m."""
     length: Positive = 2.0
@@ -659,7 +659,7 @@ class Rubble(Schema):
     """Along y, m."""
     count: Annotated[int, Field(ge=1, le=200)] = 40
     height: Positive = 0.04
-    """Of the highest one, m."""
+    """Height of the highest one, m."""
     size: Positive = 0.25
     """Longest side, m."""
     seed: Annotated[int, Field(ge=0)] = 1
@@ -671,11 +671,11 @@ class HeightImage(Schema):
     file: Path
     """PNG, 8 or 16 bit"""
     resolution: Positive = 0.05
-    """Of a pixel, m."""
+    """Side of a pixel, m."""
     height: float = 1.0
     """m."""
     x: float = 0.0
-    """Of its lower left corner, m."""
+    """Position of its lower left corner, m."""
     y: float = 0.0
     """m."""
 
@@ -684,7 +684,7 @@ GroundFeature = Annotated[Hills | Slope | UprightStep | Ditch | Rubble, Field(di
 
 
 SOLID_BODIES: Final = ("truck", "ackermann", "skid_steer", "differential", "omni", "mecanum")
-"""That have rigid parts: the first three on the truck's axles, the others on wheels with springs of their own."""
+"""Bodies with rigid parts: the first three on the truck's axles, the others on wheels with springs of their own."""
 
 
 class WorldConfig(Schema):

@@ -33,7 +33,7 @@ class TruthState(NamedTuple):
     x: float
     y: float
     yaw: float
-    """In (-pi, pi]."""
+    """Yaw in (-pi, pi]."""
     v: float
     """Along the direction of travel, negative backwards."""
     wz: float
@@ -48,7 +48,7 @@ class TruthState(NamedTuple):
     """Ran into something and has not got 5 mm away since."""
     clutch_slipping: bool
     charge: float
-    """Of the battery, 0..1."""
+    """Charge of the battery, 0..1."""
     supply_v: float
     motor_current: float
     """A, forwards positive."""
@@ -61,9 +61,9 @@ class Plant(Protocol):
     shafts: tuple[Shaft, ...]
     """Driven ones."""
     currents: list[float]
-    """Of their motors, A."""
+    """Currents of their motors, A."""
     pulses: PulseSource | None
-    """Of the controller that moves the steering servos."""
+    """Pulses of the controller that moves the steering servos."""
     servo_supply: bool
     """The steering servos have their 5 V."""
     together: Callable[[int], None]
@@ -114,7 +114,7 @@ class Plant(Protocol):
         ...
 
     joints: JointSource | None
-    """Of the lidar's mount; None: it is fixed."""
+    """Joints of the lidar's mount; None: it is fixed."""
 
     def mount_torque(self, joint: int, /) -> float:
         """With which the lidar pushes its pitch (0) or roll (1) joint at the newest instant, Nm; 0 in the plane."""
@@ -204,7 +204,7 @@ class GriddedPlant(ABC):
 
     STEP_NS: ClassVar[int]
     WHOLE_STEPS: ClassVar[bool]
-    """Between two points of the grid nothing is integrated; else a step ends early at the requested instant."""
+    """Whether nothing is integrated between two points of the grid; else a step ends early at the requested instant."""
 
     def __init__(
         self, config: SimTruckConfig, battery: BatteryModelConfig, start: Pose, attitude: tuple[float, float]
@@ -224,7 +224,7 @@ class GriddedPlant(ABC):
         self._twist: Twist = (0.0, 0.0, 0.0)
         self._attitude = attitude
         self._height = 0.0
-        """Of the base, m."""
+        """Height of the base, m."""
         self._stuck_at: Pose | None = None
         self._slipping = [False] * count
         self._trail: deque[tuple[float, ...]] = deque(maxlen=_KEPT_NS // self.STEP_NS)

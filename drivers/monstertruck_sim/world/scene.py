@@ -41,7 +41,7 @@ class Contact:
     """Who moved into the other; a robot's name, or ``person N``."""
     other: str
     speed: float
-    """Of the mover, m/s."""
+    """Speed of the mover, m/s."""
     other_speed: float
 
     def __str__(self) -> str:

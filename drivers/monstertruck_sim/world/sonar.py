@@ -59,10 +59,10 @@ class Surface(NamedTuple):
 
     ping: Ping
     x: Array
-    """Of the points, m, map frame."""
+    """Coordinate of the points in the map frame, m."""
     y: Array
     ranges: Array
-    """From the sonar, m; inf = nothing within ``audible``."""
+    """Distances from the sonar, m; inf = nothing within ``audible``."""
     normals: Array
     """Direction of the wall's normal, rad (either of both)."""
     scatters: NDArray[np.bool_]

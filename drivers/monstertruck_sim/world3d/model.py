@@ -32,7 +32,7 @@ PARKED: Final = -50.0
 SUPPORTS: Final = 4
 """Blocks that can be put under wheels."""
 SUPPORT_SIDES: Final = (0.12, 0.12, 0.4)
-"""Of such a block, m: what of its height is not wanted is below the ground."""
+"""Sides of such a block, m: the part of its height that is not needed is below the ground."""
 TALL: Final = 0.6
 """Height of what is put into a world, m."""
 
@@ -64,7 +64,7 @@ _TOUCHES: Final = {
     "walls": {"contype": "0", "conaffinity": "8"},
 }
 _TAG_PIXELS: Final = 16
-"""Of a tag's cell in its texture."""
+"""Pixels of a tag's cell in its texture."""
 _TYRE: Final = "0.01 1"
 """Time constant, s, and damping ratio of its contact: under the weight it gives 0.3 mm."""
 _FLAT: Final = 1e-3
@@ -451,9 +451,9 @@ def _shape(body: Element, shape: Shape, name: str) -> None:
 
 
 _STEERING_ARMATURE: Final = 0.002
-"""Of a steering servo behind its linkage, as each wheel feels it, kg m^2."""
+"""Armature of a steering servo behind its linkage, as each wheel feels it, kg m^2."""
 _HEAD_STIFFNESS: Final = 15.0
-"""Between a stabiliser's shaft and what it turns, Nm/rad."""
+"""Stiffness between a stabiliser's shaft and what it turns, Nm/rad."""
 _HEAD_DAMPING: Final = 0.15
 """Nm s/rad."""
 HEAD_LAG: Final = _HEAD_DAMPING / _HEAD_STIFFNESS

@@ -38,9 +38,9 @@ _SETTLE: Final = 400
 _RESTS: Final = 0.5
 """Speed upwards or downwards that one which came to rest cannot have, m/s."""
 _LOW: Final = 0.002
-"""A wheel that has to be lifted by less stands on the ground, m."""
+"""Height below which a wheel gets no block, m."""
 _LEANS: Final = 0.1
-"""Further from what its blocks give it a robot does not lean on its springs, rad."""
+"""Greatest difference between the tilt of a robot and that of its blocks that its springs explain, rad."""
 _INSIDE: Final = 0.03
 """Depth to which nothing gives way under it, m."""
 _UNSTABLE: Final = (
@@ -124,7 +124,7 @@ class RigidPlant(GriddedPlant):
         """Of balls that stand for wheels with rollers: whose axis across the rollers' stays level."""
         self._tyres = _tyres(model, parts, config.wheel_radius)
         self._deflection = [0.0] * (0 if self._tyres is None else len(self._tyres.joints))
-        """Of the tyres along and across, m."""
+        """Deflection of the tyres along and across, m."""
         self._steered: list[float] = []
         """Servo angles that the steered wheels follow."""
         self._felt = self._turning = self._velocity = (0.0, 0.0, 0.0)

@@ -41,7 +41,7 @@ MARGIN: Final = (0.12, 0.0)
 STRAIGHT: Final = 0.02
 """m: root mean square by which the points of a line may be off it."""
 FLAT: Final = 0.001
-"""Standard deviation of a board's middle off its plane, m;"""
+"""Standard deviation of a board's middle off its plane, m."""
 WARPED: Final = 0.003
 """Standard deviation of the direction of a line on it, rad."""
 RANGE: Final = 0.004
@@ -79,7 +79,7 @@ class BoardLine:
     """A board seen by both."""
 
     pose: BoardPose
-    """Of the board before the camera"""
+    """Pose of the board before the camera"""
     ends: Array
     """(2, 3): of the lidar's line on it, in the lidar's axes, m"""
     sigmas: tuple[float, float]

@@ -40,7 +40,7 @@ BEAMED: Final = 16
 """Views in which the lidar sees the board, too."""
 TILT: Final = math.radians(12.0)
 TILTED: Final = 3
-"""Views tilted by more, to each of four sides;"""
+"""Views needed that are tilted by more, to each of four sides."""
 TILTED_BEAMED: Final = 3
 """Views needed that the lidar sees as well."""
 STEEP: Final = math.radians(30.0)
@@ -61,9 +61,9 @@ class BoardView:
     sighting: BoardSighting
     """Corners averaged over its pictures"""
     pose: BoardPose
-    """By the lens that was configured then"""
+    """Pose by the lens that was configured then"""
     angles: Array
-    """Of the lidar's beams, rad, left positive; (n,); empty: it sent too few scans"""
+    """Angles of the lidar's beams, rad, left positive; (n,); empty: it sent too few scans"""
     ranges: Array
     """Medians over the same time, m; inf = nothing; (n,)"""
 
@@ -85,7 +85,7 @@ class BoardAttempts:
     unseen: int = 0
     blurred: int = 0
     blur: float = 0.0
-    """Of the last blurred one, pixels"""
+    """Blur of the last blurred view, pixels"""
     moved: int = 0
     damaged: int = 0
 

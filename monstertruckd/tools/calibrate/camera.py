@@ -156,9 +156,9 @@ class PlacedMount:
     """The camera's mount as measured."""
 
     values: dict[str, Interval]
-    """By ``NAMES``."""
+    """Mount by ``NAMES``."""
     size: Interval
-    """Of the board, as a share of what is stated."""
+    """Size of the board as a share of the stated one."""
     lines: int
 
 

@@ -113,7 +113,7 @@ class DriveWizard:
         )
 
     def _result(self, context: WizardContext, inverted: bool, runs: list["TapedRun"]) -> Result:
-        values = [run.turns / run.way for run in runs]
+        values = [run.turns / run.length for run in runs]
         middle = float(np.median(values))
         for number, value in enumerate(values, start=1):
             if abs(value / middle - 1) > APART:
@@ -178,8 +178,8 @@ class TapedRun:
 
     turns: float
     """Turns of the motor."""
-    way: float
-    """Along the arc, m."""
+    length: float
+    """Length of the arc, m."""
     bend: float
     """Share by which the arc is longer than the tape."""
 
@@ -203,15 +203,15 @@ class TapedRun:
                     f"the truck turned by {math.degrees(turn):.0f} deg on its way: "
                     "run `calibrate steering --rough` first"
                 )
-            way = arc(distance, turn)
+            length = arc(distance, turn)
         elif not straight:
             raise InputError(
                 f"the truck turned by more than {math.degrees(BENT):.0f} deg on its way: set the middle of its servos "
                 "(devices.steering.driver.front.centre_us, .rear.centre_us), for `calibrate steering` needs a compass"
             )
         else:
-            way = (distance + arc(distance, BENT)) / 2
-        return cls(abs(track.turns), way, way / distance - 1)
+            length = (distance + arc(distance, BENT)) / 2
+        return cls(abs(track.turns), length, length / distance - 1)
 
 
 def arc(chord: float, turn: float) -> float:
@@ -243,9 +243,9 @@ class HalfRun:
     speed: Steps
     """Commanded, rad/s of the motor."""
     times: Array
-    """Of the positions, s; (n,)."""
+    """Times of the positions, s; (n,)."""
     positions: Array
-    """Of the motor, rad; (n,)."""
+    """Positions of the motor, rad; (n,)."""
 
     @classmethod
     def of(cls, record: MoveRecord, part: Part) -> Self | None:

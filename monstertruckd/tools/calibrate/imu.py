@@ -42,12 +42,12 @@ class Turn:
     """One turn between two rests."""
 
     integral: float
-    """Of the raw yaw rate from rest to rest, rad."""
+    """Integral of the raw yaw rate from rest to rest, rad."""
     seconds: float
     turned: float
     """Turn by the compass, rad, left positive."""
     sigma: float
-    """Of ``turned``, rad."""
+    """Standard deviation of ``turned``, rad."""
 
     @classmethod
     def of(cls, record: MoveRecord, bias: float, scale: float) -> "Turn":

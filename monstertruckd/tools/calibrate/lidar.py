@@ -51,7 +51,7 @@ LEAST_OVERLAP: Final = 0.5
 BETTER: Final = 0.2
 """Overlap by which another way round has to be better, to be named."""
 LEAST_SCANS: Final = 3
-"""At each rest."""
+"""Scans at each rest, at least."""
 SCAN: Final = 0.002
 """Least standard deviation of a registered position, m: walls are not straight to less."""
 CRAB: Final = 0.005
@@ -59,7 +59,7 @@ CRAB: Final = 0.005
 DRIFT: Final = 0.006
 """Standard deviation of the distance of one leg, by slip, as a share."""
 SCALE: Final = 0.02
-"""Standard deviation of the scale of all ways before it is measured."""
+"""Standard deviation of the scale of all distances before it is measured."""
 CENTRE: Final = 0.002
 """m: how far the turning centre of all arcs may be ahead or behind by tyres that slip outward."""
 TILT: Final = math.radians(0.2)
@@ -79,8 +79,8 @@ HEIGHTS: Final = (
 class LidarLeg:
     """One move between two rests."""
 
-    way: float
-    """Of the body by the drive's count, m, negative backwards."""
+    distance: float
+    """Distance of the body by the drive's count, m, negative backwards."""
     seen: tuple[float, float, float]
     """Motion of the lidar in its own first frame, m and rad."""
     sigma: float
@@ -103,22 +103,22 @@ class LidarLeg:
         scans, after = (resting_scan(found) for found in record.at_rest(topics.SCAN))
         _, front, rear = record.steps()
         axles = chassis.steering(float(np.median(front)), float(np.median(rear)))
-        way = record.way(chassis.drivetrain) / chassis.bicycle.drive_speed(1.0, *axles)
+        distance = record.distance(chassis.drivetrain) / chassis.bicycle.drive_speed(1.0, *axles)
         ahead, aside, _ = chassis.bicycle.body_twist(1.0, *axles)
         turn = record.turned()
         believed = np.array(mount)
-        body = _arc(way, 0.0, turn)
+        body = _arc(distance, 0.0, turn)
         guess = between(believed, compose(body, believed))
         fit = register(after, Cloud.of(scans), guess, reach=0.3)
         fit = register(after, Cloud.of(scans), fit.pose)
-        check_way_round(scans, after, (way, turn), believed, fit.overlap)
+        check_way_round(scans, after, (distance, turn), believed, fit.overlap)
         if fit.overlap < LEAST_OVERLAP:
             raise InputError(
                 f"the scans before and after a leg overlap by {fit.overlap:.0%}: expected {LEAST_OVERLAP:.0%}"
             )
         errors = np.sqrt(np.diag(np.linalg.inv(fit.information)))
         x, y, yaw = fit.pose.tolist()
-        return cls(way, (x, y, yaw), math.hypot(SCAN, float(np.max(errors[:2]))), math.atan2(aside, ahead))
+        return cls(distance, (x, y, yaw), math.hypot(SCAN, float(np.max(errors[:2]))), math.atan2(aside, ahead))
 
 
 @dataclass(frozen=True, slots=True)
@@ -290,42 +290,42 @@ def result_of(
 
 
 def fit_mount(legs: Sequence[LidarLeg], mount: tuple[float, float, float], crab: float) -> FitResult:
-    """Least squares of the lidar's translations; parameters x, y (m), yaw (rad), scale of the ways, crab (rad)."""
-    ways, seen = np.array([leg.way for leg in legs]), np.array([leg.seen for leg in legs])
+    """Least squares of the lidar's translations; parameters x, y (m), yaw (rad), scale of the distances, crab (rad)."""
+    distances, seen = np.array([leg.distance for leg in legs]), np.array([leg.seen for leg in legs])
     travels = np.array([leg.travel for leg in legs])
-    sigmas = np.array([math.hypot(leg.sigma, DRIFT * leg.way, CRAB * leg.way) for leg in legs])
+    sigmas = np.array([math.hypot(leg.sigma, DRIFT * leg.distance, CRAB * leg.distance) for leg in legs])
     start = np.array((*mount, 1.0, 0.0))
     reach = np.array((0.5, 0.5, math.pi, 0.3, 0.3))
 
     def residual(parameters: Array) -> Array:
-        found = seen_motion(parameters, ways, seen[:, 2], travels)
+        found = seen_motion(parameters, distances, seen[:, 2], travels)
         off = (found[:, :2] - seen[:, :2]) / sigmas[:, None]
         return np.append(off.ravel(), ((parameters[3] - 1.0) / SCALE, parameters[4] / max(crab, 1e-6)))
 
     return least_squares(residual, start, start - reach, start + reach)
 
 
-def seen_motion(parameters: Array, ways: Array, turns: Array, travels: Array) -> Array:
-    """Motion of the lidar on legs, (n, 3): parameters as of ``fit_mount``; ways (m), turns and directions (rad)."""
+def seen_motion(parameters: Array, distances: Array, turns: Array, travels: Array) -> Array:
+    """Motion of the lidar on legs, (n, 3): parameters as of ``fit_mount``; distances, m, turns and directions, rad."""
     x, y, yaw, scale, crab = parameters.tolist()
     mount = np.array((x, y, yaw))
     return np.array(
         [
-            between(mount, compose(_arc(scale * way, crab + travel, turn), mount))
-            for way, turn, travel in zip(ways, turns, travels, strict=True)
+            between(mount, compose(_arc(scale * distance, crab + travel, turn), mount))
+            for distance, turn, travel in zip(distances, turns, travels, strict=True)
         ]
     )
 
 
-def _arc(way: float, crab: float, turn: float) -> Array:
+def _arc(distance: float, crab: float, turn: float) -> Array:
     """Motion of the body on an arc that it travels at an angle to its axis."""
     half = turn / 2
-    chord = way * (math.sin(half) / half if abs(half) > 1e-9 else 1.0)
+    chord = distance * (math.sin(half) / half if abs(half) > 1e-9 else 1.0)
     return np.array((chord * math.cos(half + crab), chord * math.sin(half + crab), turn))
 
 
 def _unexplained(fit: FitResult, legs: Sequence[LidarLeg]) -> float:
-    sigmas = np.array([math.hypot(leg.sigma, DRIFT * leg.way, CRAB * leg.way) for leg in legs])
+    sigmas = np.array([math.hypot(leg.sigma, DRIFT * leg.distance, CRAB * leg.distance) for leg in legs])
     off = fit.residuals[: 2 * len(legs)].reshape(-1, 2) * sigmas[:, None]
     return float(np.sqrt((off**2).sum(axis=1).mean()))
 
@@ -347,11 +347,11 @@ def check_way_round(before: Scan, after: Scan, moved: tuple[float, float], mount
         InputError: so it is.
     """
     body = _arc(moved[0], 0.0, moved[1])
-    ways = (
+    mountings = (
         ("is upside down", _mirrored, mount),
         ("looks backwards: its mount's yaw is near 3.14", _as_seen, mount + np.array((0.0, 0.0, math.pi))),
     )
-    for what, seen, turned in ways:
+    for what, seen, turned in mountings:
         guess = between(turned, compose(body, turned))
         found = register(seen(after), Cloud.of(seen(before)), guess, reach=0.3)
         found = register(seen(after), Cloud.of(seen(before)), found.pose)

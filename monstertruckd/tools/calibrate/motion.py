@@ -115,12 +115,12 @@ class Mover:
                     await self._once(run, move, report)
                     break
                 except RequestRefusedError as error:
-                    way = await run.coasted(self._drivetrain) if left and error.refusal in ADVICE else None
-                    if way is None or (move.marked and way > UNMOVED):
+                    covered = await run.coasted(self._drivetrain) if left and error.refusal in ADVICE else None
+                    if covered is None or (move.marked and covered > UNMOVED):
                         raise
                     say(f"{move.name}: {error.refusal.text}; back to where it began, and once more")
-                if way > UNMOVED:
-                    await self._once(_Run(self._truck, self._clock, feeds, also), move.back(way), report)
+                if covered > UNMOVED:
+                    await self._once(_Run(self._truck, self._clock, feeds, also), move.back(covered), report)
             return run.track
 
     async def _once(self, run: "_Run", move: MoveStep, report: Callable[[float], None]) -> None:
@@ -136,16 +136,16 @@ class Mover:
 
     async def _drive(self, run: "_Run", move: MoveStep, report: Callable[[float], None]) -> None:
         run.track.left = self._clock.now()
-        way, since = 0.0, self._clock.now()
+        distance, since = 0.0, self._clock.now()
         while True:
             side = move.side((self._clock.now() - run.track.left) / SECOND)
             await run.hold(move.speed, side * move.front, side * move.rear, PERIOD)
-            new = abs(run.track.way(self._drivetrain))
+            new = abs(run.track.distance(self._drivetrain))
             report(new)
             if new >= move.metres or (move.done is not None and move.done(run.track)):
                 return
-            if new - way > PROGRESS:
-                way, since = new, self._clock.now()
+            if new - distance > PROGRESS:
+                distance, since = new, self._clock.now()
             elif self._clock.now() - since > STUCK * SECOND:
                 text = f"{move.name}: no progress for {STUCK:g} s ({run.state.why if run.state else 'silent'})"
                 held = run.state is not None and run.state.reasons
@@ -296,7 +296,7 @@ class _Run:
             if since is None or newest is None or abs(newest.position - since.position) > STILL:
                 since = newest
             elif newest.stamp - since.stamp > AT_REST * SECOND and not self._lasting():
-                return abs(self.track.way(drivetrain))
+                return abs(self.track.distance(drivetrain))
         return None
 
     def _lasting(self) -> bool:

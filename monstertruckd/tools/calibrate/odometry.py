@@ -32,7 +32,7 @@ CORNER: Final = 0.08
 ANGLE: Final = 0.35
 """Angle of both axles in the corners, in opposite directions, rad."""
 PLACE: Final = 0.03
-"""Standard deviation of the way back to the mark by what slips on 10 m, m."""
+"""Standard deviation of the position back at the mark by what slips on 10 m, m."""
 FLOOR: Final = 0.003
 """Share by which the distance differs on another floor, half a 95 % interval."""
 LINKAGE: Final = 0.004
@@ -43,7 +43,7 @@ interval: 0.005 rad among rigid bodies."""
 SAME: Final = 0.5
 """Share of the turn by the steering that the compass must see."""
 BELIEVED: Final = (0.05, 0.05, math.radians(6.0))
-"""Standard deviations before anything is measured: share of way and of wheelbase, servo angle, rad."""
+"""Standard deviations before anything is measured: share of distance and of wheelbase, servo angle, rad."""
 
 _MARK: Final = Confirm(
     "mark",
@@ -74,7 +74,9 @@ class OdometryWizard:
     """A square to the left, the same to the right, as often as requested."""
 
     name: ClassVar[WizardName] = "odometry"
-    doc: ClassVar[str] = "way, wheelbase and steering offset of dead reckoning, from squares driven to both sides"
+    doc: ClassVar[str] = (
+        "distance scale, wheelbase and steering offset of dead reckoning, from squares driven to both sides"
+    )
     room: ClassVar[str] = ROOM
     rounds: int = 1
     """Squares to each side"""
@@ -95,15 +97,15 @@ class OdometryWizard:
         maps = Maps.of(context.config)
         await context.confirm(CLEAR)
         squares = [await self._square(context, maps, side) for _ in range(self.rounds) for side in (1, -1)]
-        return context.fit("way, wheelbase and steering offset", lambda: self.judge(context, maps, squares))
+        return context.fit("distance scale, wheelbase and steering offset", lambda: self.judge(context, maps, squares))
 
     async def _square(self, context: WizardContext, maps: Maps, sense: int) -> Square:
         await context.confirm(_MARK)
         corner = math.pi / 2 / context.chassis.bicycle.curvature(ANGLE, -ANGLE)
         legs, taped, turned = [], 0.0, 0.0
-        way = "left" if sense > 0 else "right"
+        towards = "left" if sense > 0 else "right"
         for number in range(1, 5):
-            side = MoveStep(f"square to the {way}, side {number} of 4", SPEED, metres=self.side, marked=True)
+            side = MoveStep(f"square to the {towards}, side {number} of 4", SPEED, metres=self.side, marked=True)
             record = await context.move(side)
             turned += record.turned()
             legs.append(SteeringRun.of(record, maps))
@@ -125,24 +127,25 @@ class OdometryWizard:
         check_senses(model, squares)
         fit = model.fit(squares, self.tape_error, self.string_error)
         legs = sum(len(square.legs) for square in squares)
-        way, base, offset = intervals(fit, legs + 3 * len(squares))
-        way = way.joined(FLOOR)
+        distance, base, offset = intervals(fit, legs + 3 * len(squares))
+        distance = distance.joined(FLOOR)
         base = base.joined(LINKAGE).joined(ON_THE_SPOT)
-        ratio = geometry.drive_ratio / way.value
+        ratio = geometry.drive_ratio / distance.value
         steering = context.known.get("steering")
         estimates = [
             Estimate(
                 name="drive_ratio",
                 value=ratio,
-                low=geometry.drive_ratio / way.high,
-                high=geometry.drive_ratio / way.low,
+                low=geometry.drive_ratio / distance.high,
+                high=geometry.drive_ratio / distance.low,
                 samples=len(squares),
                 meaning=f"motor turns per turn of wheels of {geometry.wheel_radius:g} m; 95 % of tape and slip, and "
                 f"{FLOOR:.1%} of other floors",
                 key="geometry.drive_ratio",
             ),
             estimated(
-                "wheel_radius", way.times(geometry.wheel_radius), "m", len(squares), "wheels, by the configured ratio"
+                "wheel_radius", distance.times(geometry.wheel_radius), "m", len(squares),
+                "wheels, by the configured ratio",
             ),
             estimated(
                 "wheelbase",
@@ -216,13 +219,13 @@ class SquareModel:
 
     def turns(self, legs: Sequence[SteeringRun], parameters: Array) -> Array:
         """Turns of legs, rad; (n,)."""
-        way, base, offset = parameters
+        distance, base, offset = parameters
         turns, _ = self._model.predict(legs, self.maps(float(offset)))
-        return np.asarray(turns * way / base)
+        return np.asarray(turns * distance / base)
 
     def end(self, square: Square, parameters: Array) -> tuple[float, float]:
         """Front bumper from its mark at the end of a square, ahead and left, m: headings as measured."""
-        way, base, offset = parameters.tolist()
+        distance, base, offset = parameters.tolist()
         maps = self.maps(offset)
         chassis = self._model.chassis
         x = y = yaw = 0.0
@@ -230,7 +233,7 @@ class SquareModel:
             servos = [maps.servo(axle, leg.pulses[axle]) for axle in (0, 1)]
             front, rear = self._model.axles(maps).angles(*servos)
             rolled = (
-                way
+                distance
                 * chassis.drivetrain.distance(leg.motor)
                 / chassis.bicycle.drive_speed(np.ones_like(front), front, rear)
             )
@@ -251,9 +254,9 @@ class SquareModel:
         """Least squares; residuals in standard deviations, the priors last."""
         legs = [leg for square in squares for leg in square.legs]
         turned = np.array([leg.turn for leg in legs])
-        sigmas = np.array([math.hypot(leg.sigma, SLIP * math.sqrt(self._model.way(leg))) for leg in legs])
+        sigmas = np.array([math.hypot(leg.sigma, SLIP * math.sqrt(self._model.distance(leg))) for leg in legs])
         sides = np.array([square.side for square in squares])
-        ways = np.array([self._model.way(square.legs[0]) for square in squares])
+        rolled = np.array([self._model.distance(square.legs[0]) for square in squares])
         chords = np.array([_chord(square.legs[0].turn) for square in squares])
         tapes = np.hypot(tape * math.sqrt(2), 0.002 * sides)
         ends = np.array([square.off for square in squares])
@@ -266,7 +269,7 @@ class SquareModel:
             return np.concatenate(
                 (
                     (self.turns(legs, parameters) - turned) / sigmas,
-                    (ways * parameters[0] * chords - sides) / tapes,
+                    (rolled * parameters[0] * chords - sides) / tapes,
                     ((back - ends) / place).ravel(),
                     (parameters - start) / believed,
                 )
@@ -300,8 +303,8 @@ def intervals(fit: FitResult, measured: int) -> tuple[Interval, Interval, Interv
     halves = known_errors(fit, measured - fit.parameters.size)
     if not np.isfinite(halves).all():
         raise InputError("the squares are off by more than 30 %: calibrate drive and steering first")
-    way, base, offset = (Interval(float(x), float(h)) for x, h in zip(fit.parameters, halves, strict=True))
-    return way, base, offset
+    distance, base, offset = (Interval(float(x), float(h)) for x, h in zip(fit.parameters, halves, strict=True))
+    return distance, base, offset
 
 
 def _chord(turn: float) -> float:

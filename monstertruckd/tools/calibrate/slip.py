@@ -51,7 +51,7 @@ class SkidArc:
     """Turned by the left wheels themselves, rad, forward positive."""
     right: float
     motion: tuple[float, float, float]
-    """Of the body in its own first frame, m and rad."""
+    """Motion of the body in its own first frame, m and rad."""
     sigma: tuple[float, float]
     """Standard deviations of the motion's position (m) and heading (rad)."""
 
@@ -72,8 +72,8 @@ class SkidArc:
         turn += math.tau * round((turned - turn) / math.tau)
         ahead, aside = to_body(yaw0, x1 - x0, y1 - y0)
         train = chassis.drivetrain
-        ways = [train.distance(_turned(record, i)) / train.wheel_radius for i in range(len(chassis.shafts))]
-        sides = [float(np.mean(ways[side::2])) for side in (0, 1)]
+        rolled = [train.distance(_turned(record, i)) / train.wheel_radius for i in range(len(chassis.shafts))]
+        sides = [float(np.mean(rolled[side::2])) for side in (0, 1)]
         spreads = [_spread([m.pose for m in poses]) for poses in (before, after)]
         place, heading = (math.hypot(*column) for column in zip(*spreads, strict=True))
         return cls(sides[0], sides[1], (float(ahead), float(aside), turn), (place, heading))
@@ -91,7 +91,7 @@ class SlipWizard:
     rounds: int = 2
     """Times that each arc is driven"""
     turn: float = 2.0
-    """Of each arc, rad"""
+    """Turn of each arc, rad"""
 
     async def __call__(self, context: WizardContext) -> Result:
         """Measure."""
@@ -110,10 +110,10 @@ class SlipWizard:
                 front = math.atan(curvature * (bicycle.l_f + bicycle.l_r))
                 metres = self.turn * share * track if side else 6.0 * track
                 for number in range(2 * self.rounds):
-                    way = 1 if number % 2 == 0 else -1
+                    direction = 1 if number % 2 == 0 else -1
                     side_name = {1: "left", -1: "right", 0: "straight"}[side]
-                    name = f"{side_name}, {share:g} tracks, {'ahead' if way > 0 else 'back'}"
-                    move = MoveStep(name, way * speed, front, 0.0, metres, rest=REST, also=also)
+                    name = f"{side_name}, {share:g} tracks, {'ahead' if direction > 0 else 'back'}"
+                    move = MoveStep(name, direction * speed, front, 0.0, metres, rest=REST, also=also)
                     arcs.append(SkidArc.of(await context.move(move), self.by, context.chassis))
         return context.fit("turning centres", lambda: result_of(arcs, config.geometry.wheel_radius, track / 2))
 
@@ -134,8 +134,8 @@ def result_of(arcs: Sequence[SkidArc], radius: float, half_track: float) -> Resu
         raise InputError(f"{len(arcs)} arcs: expected at least 4, to both sides")
     model = skid_model("icr and slip", radius, half_track, bounded=False, with_icr_x=True)
     seen = np.array([arc.motion for arc in arcs]).T
-    ways = np.array([radius * max(abs(arc.left), abs(arc.right)) for arc in arcs])
-    place = np.hypot([max(arc.sigma[0], FLOOR) for arc in arcs], SLIDING * ways)
+    distances = np.array([radius * max(abs(arc.left), abs(arc.right)) for arc in arcs])
+    place = np.hypot([max(arc.sigma[0], FLOOR) for arc in arcs], SLIDING * distances)
     heading = np.hypot([max(arc.sigma[1], AIM) for arc in arcs], SLIDING * np.abs(turns))
     left, right = np.array([(arc.left, arc.right) for arc in arcs]).T
     _check_sides(left, right, seen)

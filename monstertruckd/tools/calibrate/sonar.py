@@ -43,12 +43,12 @@ DRIFT: Final = (0.003, 0.003, 0.01)
 """Standard deviation of what odometry is off by on an arc: distance from the wall (m) and heading (rad) from where the
 arc before ended, and the share by which it turns more, as gyroscopes and slipping wheels let it."""
 BELIEVED: Final = 0.01, 0.003
-"""Standard deviations before anything is measured, as shares: of the speed of sound (6 degrees Celsius), and of the way
-by odometry, which on another floor or under another load the wheels roll a little further or less far."""
+"""Standard deviations before anything is measured, as shares: of the speed of sound (6 degrees Celsius), and of the
+distance by odometry: on another floor or under another load the wheels roll a little further or less far."""
 NEAR: Final = 0.2
-"""Greatest error of a range that still may be the wall, m, before anything is fitted;"""
+"""Greatest error of a range that still may be the wall, m, before anything is fitted."""
 SIGMAS: Final = 4.0
-"""and in standard deviations afterwards."""
+"""The greatest error afterwards, in standard deviations."""
 BEYOND: Final = 0.3
 """Past the cone's edge the wall is still heard, rad: grazing sound is reflected away."""
 LEAST: Final = 12
@@ -63,7 +63,7 @@ BODIES: Final = ("differential", "skid_steer", "truck")
 """Bodies that turn within a metre."""
 COMMON: Final = 5
 """Parameters before those of the arcs: distance and direction of the wall, half the cone, factors of the ranges and of
-the way by odometry."""
+the distance by odometry."""
 
 _PARK: Final = Confirm(
     "park", "Stand the robot along the wall, the wall 1.7 m to its left, the middle of the wall beside it. Done?"
@@ -84,9 +84,9 @@ class SonarLeg:
     """One arc: where the robot was at every ping, and what came back."""
 
     poses: Mapping[str, Array]
-    """By sonar, (n, 3): x, y (m) and yaw (rad) in the frame of the robot as it was parked"""
+    """Poses by sonar, (n, 3): x, y (m) and yaw (rad) in the frame of the robot as it was parked"""
     ranges: Mapping[str, Array]
-    """By sonar, (n,), m; inf without an echo"""
+    """Ranges by sonar, (n,), m; inf without an echo"""
 
     @classmethod
     def of(cls, record: MoveRecord, origin: tuple[float, float, float]) -> "SonarLeg":
@@ -130,7 +130,7 @@ class SonarWizard:
     doc: ClassVar[str] = "where the sonars sit and look, their cones, and the speed of sound, from arcs beside a wall"
     room: ClassVar[str] = ROOM
     turn: float = 2 * math.pi
-    """Of each arc, rad"""
+    """Turn of each arc, rad"""
     tape_error: float = 0.002
     """Standard deviation of the taped distance, m"""
     speed: float = 0.12
@@ -150,10 +150,10 @@ class SonarWizard:
         front, rear, radius = arc(context.chassis, context.config.gate.angle)
         records = []
         for side, name in ((1, "left"), (-1, "right")):
-            for way in (1, -1):
+            for direction in (1, -1):
                 move = MoveStep(
-                    f"an arc to the {name}, {'ahead' if way > 0 else 'back'}",
-                    way * min(self.speed, config.gate.speed if way > 0 else config.gate.reverse_speed),
+                    f"an arc to the {name}, {'ahead' if direction > 0 else 'back'}",
+                    direction * min(self.speed, config.gate.speed if direction > 0 else config.gate.reverse_speed),
                     side * front,
                     side * rear,
                     2.0 * self.turn * radius,
@@ -329,10 +329,10 @@ class SonarModel:
 
     def _predicted(self, parameters: Array, echoes: "_Echoes") -> tuple[Array, Array]:
         """Ranges as the sonars measure them, m, and what the normal is past the cone's edge, rad."""
-        distance, direction, half, factor, way = parameters[:COMMON].tolist()
+        distance, direction, half, factor, scale = parameters[:COMMON].tolist()
         nearer, turned, swung = self._drift(parameters)[echoes.arcs].T
         x, y, yaw = parameters[self.first :].reshape(-1, 3)[echoes.sonars].T
-        poses = (echoes.poses + swung * echoes.swings).T * (way, way, 1.0)
+        poses = (echoes.poses + swung * echoes.swings).T * (scale, scale, 1.0)
         due, past = wall_range(poses, SonarPose(x, y, yaw), (distance - nearer, direction + turned), half)
         return due / factor, past
 

@@ -41,17 +41,17 @@ BLOCKS: Final = (math.radians(4.0), math.radians(15.0))
 FOLLOWS: Final = math.radians(2.0)
 """Difference between a joint and the tilt that it takes out, rad, up to which it follows."""
 SECTOR: Final = math.radians(20.0)
-"""To both sides of the direction in which a tilted lidar meets the floor."""
+"""Angle to both sides of the direction in which a tilted lidar meets the floor."""
 NEAR: Final = 0.15
 """Share by which a range may differ from the floor's."""
 NEARER: Final = 0.8
-"""Share of the distance of what stands there, up to which a floor differs clearly from it;"""
+"""Share of the distance of what stands there, up to which a floor differs clearly from it."""
 REACH: Final = 4.0
-"""and how far away the lidar still sees a floor, m."""
+"""Distance up to which the lidar sees a floor, m."""
 MOST: Final = 0.6
-"""Share of the beams of the sector that must be on the floor, for the lidar to look there;"""
+"""Share of the beams of the sector that must be on the floor, for the lidar to look there."""
 FEW: Final = 0.2
-"""and at most, for it not to."""
+"""Share that may be on the floor, for the lidar not to look there."""
 LEAST: Final = 10
 """Beams in the sector."""
 JOINTS: Final = ("pitch", "roll")
@@ -73,11 +73,11 @@ class RestMeasurement:
     """What was measured while the truck stood."""
 
     body: RollPitch
-    """By the compass"""
+    """Tilt of the body by the compass"""
     joints: RollPitch
     """As the driver says"""
     angles: Array
-    """Of the beams, rad, left positive; (n,)"""
+    """Angles of the beams, rad, left positive; (n,)"""
     ranges: Array
     """Medians, m; inf = nothing; (n,)"""
 

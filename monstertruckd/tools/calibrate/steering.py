@@ -39,14 +39,14 @@ APPROACH: Final = 0.2
 DEAD_BAND: Final = 2.0
 """Pulse, us, by which a servo may stop short of its goal."""
 BAND: Final = NORMAL * DEAD_BAND / math.sqrt(3)
-"""The same as half a 95 % interval, us."""
+"""The dead band as half a 95 % interval, us."""
 SPAN: Final = 50.0
 """Degrees of the servo between full circles to the left and to the right."""
 UNSCALED: Final = 0.5
 """Share of a turn that may be wrong before compass and drive are calibrated."""
 WHEELBASE: Final = 0.003
 """Share by which a taped wheelbase may be wrong."""
-WAY: Final = 0.02
+DISTANCE_ERROR: Final = 0.02
 """Share by which the distance may be wrong while the drive is not calibrated."""
 SHORT: Final = math.radians(2.0)
 """Servo angle, rad, that has to be missing before a stop is assumed; circles keep as far from the ends."""
@@ -207,7 +207,7 @@ class SteeringWizard:
         legs = []
         for wheels, steered in CIRCLED:
             for sign, side in SIDES:
-                servos = [ends.get((axle, sign * way), 0.0) for axle, way in enumerate(steered)]
+                servos = [ends.get((axle, sign * sense), 0.0) for axle, sense in enumerate(steered)]
                 front, rear = model.commands(servos, first, maps)
                 move = MoveStep(
                     f"a full circle by {wheels} wheels, {side}",
@@ -233,7 +233,7 @@ class SteeringWizard:
         fit = model.fit(legs, first)
         maps = Maps.from_parameters(fit.parameters)
         travel = [AxleTravel.of(reach.axle, reach.sign, reach.legs, model, maps) for reach in travel]
-        halves, share = half_widths(fit), _way_error(context) + WHEELBASE
+        halves, share = half_widths(fit), _distance_error(context) + WHEELBASE
         eye = "" if self.strings else "; errors common to both axles by eye and circles alone"
         band = f"95 % of the legs' noise, and the servo's dead band of {DEAD_BAND:g} us"
         estimates: list[Estimate] = []
@@ -299,7 +299,7 @@ class AxleTravel:
         stopped = sign * (meant - reached) > SHORT
         servo = reached if stopped else meant
         angle = model.axle_angle(axle, servo, maps)
-        noise = max(math.hypot(leg.sigma, SLIP * math.sqrt(model.way(leg))) / abs(leg.turn) for leg in legs)
+        noise = max(math.hypot(leg.sigma, SLIP * math.sqrt(model.distance(leg))) / abs(leg.turn) for leg in legs)
         half = abs(angle) * (NORMAL * noise / math.sqrt(len(legs)) + SCALE)
         return cls(axle, sign, servo, angle, stopped, half, tuple(legs))
 
@@ -437,10 +437,10 @@ def _deficits(maps: Maps, halves: Array, samples: int, band: str) -> list[Estima
     ]
 
 
-def _way_error(context: WizardContext) -> float:
+def _distance_error(context: WizardContext) -> float:
     """Share by which the counted distance may be wrong."""
     drive = context.known.get("drive")
     ratio = None if drive is None else drive.estimate("turns_per_metre")
     if ratio is None or ratio.low is None or ratio.high is None:
-        return WAY
+        return DISTANCE_ERROR
     return (ratio.high - ratio.low) / 2 / float(ratio.value)

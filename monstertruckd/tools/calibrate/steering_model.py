@@ -106,7 +106,7 @@ class SteeringRun:
     motor: Array
     """Turned between readings, rad; (n,)."""
     pulses: tuple[Array, Array]
-    """Of the front and rear servo meanwhile, us; (n,) each."""
+    """Pulses of the front and rear servo meanwhile, us; (n,) each."""
     turn: float
     """Measured between the rests, rad, left positive."""
     sigma: float
@@ -161,13 +161,13 @@ class SteeringModel:
         servos = (maps.servo(axle, np.concatenate([leg.pulses[axle] for leg in legs])) for axle in (0, 1))
         front, rear = self.axles(maps).angles(*servos)
         bicycle = self.chassis.bicycle
-        ways = self.chassis.drivetrain.distance(motor) / bicycle.drive_speed(np.ones_like(front), front, rear)
-        forward, sideways, turned = bicycle.body_twist(ways, front, rear)
+        rolled = self.chassis.drivetrain.distance(motor) / bicycle.drive_speed(np.ones_like(front), front, rear)
+        forward, sideways, turned = bicycle.body_twist(rolled, front, rear)
         turns = np.add.reduceat(turned, starts)
         heading = np.cumsum(turned) - turned / 2 - np.repeat(np.cumsum(turns) - turns, sizes)
         return turns, np.add.reduceat(forward * np.sin(heading) + sideways * np.cos(heading), starts)
 
-    def way(self, leg: SteeringRun) -> float:
+    def distance(self, leg: SteeringRun) -> float:
         """Distance rolled on a leg, m."""
         return float(np.abs(self.chassis.drivetrain.distance(leg.motor)).sum())
 
@@ -180,7 +180,7 @@ class SteeringModel:
             gain: share within which the scales are known beforehand.
         """
         guess = start.parameters
-        sigmas = np.array([math.hypot(leg.sigma, SLIP * math.sqrt(self.way(leg))) for leg in legs])
+        sigmas = np.array([math.hypot(leg.sigma, SLIP * math.sqrt(self.distance(leg))) for leg in legs])
         turns = np.array([leg.turn for leg in legs])
         strings = [(k, leg.offset, leg.offset_sigma) for k, leg in enumerate(legs) if leg.offset is not None]
 

@@ -51,7 +51,7 @@ class MoveRecord:
         found = self.of(topic)
         return [m for m in found if m.stamp < self.left], [m for m in found if m.stamp > self.arrived]
 
-    def way(self, drivetrain: DriveTrain) -> float:
+    def distance(self, drivetrain: DriveTrain) -> float:
         """Distance rolled by the wheels, m, by the drive's count; negative backwards."""
         if len(self.drive) < 2:
             return 0.0
@@ -116,7 +116,7 @@ class Number:
     name: str
     """Short, for answers given beforehand"""
     question: str
-    """With the unit that is expected"""
+    """The question, with the unit that is expected"""
     low: float
     high: float
     """Anything outside is asked again, or refused when it was given beforehand"""
@@ -162,9 +162,9 @@ class MoveStep:
     marked: bool = False
     """The operator measures from where it begins, so that it cannot start again once the truck has moved"""
 
-    def back(self, way: float) -> "MoveStep":
-        """Back over the first ``way`` m of it, m; of a weaving move straight back."""
-        back = replace(self, name=f"{self.name}, back", speed=-self.speed, metres=way, done=None, also=())
+    def back(self, distance: float) -> "MoveStep":
+        """Back over the first ``distance`` of it, m; of a weaving move straight back."""
+        back = replace(self, name=f"{self.name}, back", speed=-self.speed, metres=distance, done=None, also=())
         return replace(back, front=0.0, rear=0.0, weave=()) if self.weave else back
 
     def side(self, seconds: float) -> int:

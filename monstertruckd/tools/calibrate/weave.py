@@ -49,9 +49,9 @@ runs, and another time after each start: nothing between 0 and a period can be e
 def weaves(rounds: int) -> list[MoveStep]:
     """Forward and back, in turn."""
     return [
-        MoveStep(f"weaving {way}", sign * SPEED, ANGLE, -ANGLE, METRES, weave=WEAVE)
+        MoveStep(f"weaving {direction}", sign * SPEED, ANGLE, -ANGLE, METRES, weave=WEAVE)
         for _ in range(rounds)
-        for sign, way in ((1, "ahead"), (-1, "back"))
+        for sign, direction in ((1, "ahead"), (-1, "back"))
     ]
 
 
@@ -62,9 +62,9 @@ class Weave:
     curvature: Steps
     """Commanded, 1/m."""
     times: Array
-    """Of the headings, s; (n,)."""
-    ways: Array
-    """Rolled until then, m; (n,)."""
+    """Times of the headings, s; (n,)."""
+    distances: Array
+    """Distances rolled until then, m; (n,)."""
     stride: int
     """Headings from one to the one it is compared with."""
     turns: Array
@@ -90,17 +90,19 @@ class Weave:
         return cls(
             curvature=Steps.of(sent[:, 0], np.asarray(curvatures)),
             times=at,
-            ways=np.interp(at, times, rolled),
+            distances=np.interp(at, times, rolled),
             stride=stride,
             turns=yaws[stride:] - yaws[:-stride],
         )
 
     def residuals(self, delay: float, squared: float) -> Array:
         """Turns that remain unexplained, rad, whatever gain and trim are; arguments as ``Steps.integral``."""
-        turned = np.diff(self.curvature.integral(self.times, delay, squared)) / np.diff(self.times) * np.diff(self.ways)
+        turned = (
+            np.diff(self.curvature.integral(self.times, delay, squared)) / np.diff(self.times) * np.diff(self.distances)
+        )
         predicted = np.append(0.0, np.cumsum(turned))
         return unexplained(
-            self.turns, *(series[self.stride :] - series[: -self.stride] for series in (predicted, self.ways))
+            self.turns, *(series[self.stride :] - series[: -self.stride] for series in (predicted, self.distances))
         )
 
 

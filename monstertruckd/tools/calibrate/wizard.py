@@ -127,8 +127,8 @@ class WizardContext:
         which = f" ({self._moved} of {self._moves})" if self._moved <= self._moves else ""
         self._panel.say(f"moving{which}: {step.name}")
 
-        def report(way: float) -> None:
-            self._panel.progress(step.name, way, step.metres)
+        def report(distance: float) -> None:
+            self._panel.progress(step.name, distance, step.metres)
 
         return await self._mover.move(step, report, self._panel.say)
 

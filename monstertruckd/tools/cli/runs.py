@@ -61,7 +61,7 @@ class RunEnd:
     reason: Reason
     text: str
     figures: dict[str, Any]
-    """Of its last report: seconds ``elapsed``, and what else its kind has."""
+    """Figures of its last report: seconds ``elapsed``, and what else its kind has."""
 
     def as_json(self) -> dict[str, Any]:
         """Everything as plain data."""

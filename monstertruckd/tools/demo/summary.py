@@ -33,10 +33,10 @@ class Summary:
     truth: Array
     """Shape (n, 6): time s, x m, y m, yaw rad, speed m/s, stuck."""
     lateness_p99: float
-    """Of the control tick, s."""
+    """Lateness of the control tick, s."""
     lateness_max: float
     messages: dict[str, int] = field(default_factory=dict)
-    """By topic."""
+    """Number of messages by topic."""
     log_bytes: int = 0
     files: tuple[Path, ...] = ()
     digest: str | None = None

@@ -30,11 +30,11 @@ SPEED: Final = 0.06
 ANGLE: Final = 0.045
 """Angle of both axles, in opposite directions, rad: so small that the gate tolerates a turn to the wrong side."""
 LEAST_TURN: Final = 0.1
-"""Least turn of all moves together, rad, by which a sign can be judged;"""
+"""Least turn of all moves together, rad, by which a sign can be judged."""
 CLEAR: Final = 0.3
-"""and share of it that a sensor must have seen."""
+"""Share of the turn that a sensor must have seen."""
 AHEAD: Final = 0.05
-"""Least way of a move by which a sign can be judged, m."""
+"""Least distance of a move by which a sign can be judged, m."""
 UNSURE: Final = 0.05
 """Standard deviation of a motion by scans, m, above which it is not determined: 0.01 where a wall is ahead, 0.4 along a
 corridor."""
@@ -50,14 +50,14 @@ Drives = Callable[[MoveStep], Awaitable[MoveRecord]]
 class Movement:
     """One move, as each source measured it."""
 
-    way: float
-    """By the motor, m, negative backwards"""
+    distance: float
+    """Distance by the motor, m, negative backwards"""
     turn: float
-    """By motor and steering, rad, left positive"""
+    """Turn by motor and steering, rad, left positive"""
     seen: Mapping[str, float]
     """Turn by each sensor, rad"""
-    way_seen: float | None
-    """By the lidar, m; None = its scans do not match, or do not determine it, as in a corridor"""
+    distance_seen: float | None
+    """Distance by the lidar, m; None = its scans do not match, or do not determine it, as in a corridor"""
 
 
 async def signs(drives: Drives, config: TruckConfig, command: Callable[..., str]) -> list[Finding]:
@@ -77,8 +77,8 @@ async def signs(drives: Drives, config: TruckConfig, command: Callable[..., str]
     lidar = None if config.devices.lidar is None else np.array(config.devices.lidar.mount.planar)
     moves: list[Movement] = []
     for side, steered in (("left", ANGLE), ("right", -ANGLE)):
-        for way, speed in (("ahead", SPEED), ("back", -SPEED)):
-            step = MoveStep(f"20 cm {way}, wheels {side}", speed, steered, -steered, METRES, also=also)
+        for direction, speed in (("ahead", SPEED), ("back", -SPEED)):
+            step = MoveStep(f"20 cm {direction}, wheels {side}", speed, steered, -steered, METRES, also=also)
             try:
                 moves.append(movement(await drives(step), chassis, lidar))
             except TruckError as error:
@@ -95,7 +95,7 @@ def movement(record: MoveRecord, chassis: TruckChassis, lidar: Array | None) -> 
         chassis: of the robot.
         lidar: its mount, m and rad; None = there is none.
     """
-    way, turn = by_wheels(record, chassis)
+    distance, turn = by_wheels(record, chassis)
     seen: dict[str, float] = {}
     if len(record.attitude) > 1:
         seen["compass"] = record.turned()
@@ -106,22 +106,22 @@ def movement(record: MoveRecord, chassis: TruckChassis, lidar: Array | None) -> 
         still = rates[np.array([m.stamp for m in imu]) < record.left]
         rates = rates - (still.mean() if still.size else 0.0)
         seen["IMU"] = float(np.sum(np.diff(stamps) * (rates[1:] + rates[:-1]) / 2))
-    moved = None if lidar is None else by_lidar(record, (way, turn), lidar)
+    moved = None if lidar is None else by_lidar(record, (distance, turn), lidar)
     if moved is not None:
         seen["lidar"] = float(moved[2])
-    return Movement(way, turn, seen, None if moved is None or math.isnan(moved[0]) else float(moved[0]))
+    return Movement(distance, turn, seen, None if moved is None or math.isnan(moved[0]) else float(moved[0]))
 
 
 def by_wheels(record: MoveRecord, chassis: TruckChassis) -> tuple[float, float]:
     """Distance, m, and turn, rad, by motor and steering."""
     motor, front, rear = record.steps()
-    way = turn = 0.0
+    distance = turn = 0.0
     for step, servos in zip(motor.tolist(), zip(front.tolist(), rear.tolist(), strict=True), strict=True):
         axles = chassis.steering(*servos)
         along = float(chassis.drivetrain.distance(step)) / chassis.bicycle.drive_speed(1.0, *axles)
-        way += along
+        distance += along
         turn += along * chassis.bicycle.curvature(*axles)
-    return way, turn
+    return distance, turn
 
 
 def by_lidar(record: MoveRecord, wheels: tuple[float, float], mount: Array) -> Array | None:
@@ -137,8 +137,8 @@ def by_lidar(record: MoveRecord, wheels: tuple[float, float], mount: Array) -> A
     cloud, best, moved = Cloud.of(before), LEAST_OVERLAP, None
     ahead = np.array((math.cos(mount[2]), -math.sin(mount[2]), 0.0))  # of the body, in the lidar's axes
     for along, sense in ((1, 1), (-1, -1), (1, -1), (-1, 1)):
-        way, turn = along * wheels[0], sense * wheels[1]
-        body = np.array((way * math.cos(turn / 2), way * math.sin(turn / 2), turn))
+        distance, turn = along * wheels[0], sense * wheels[1]
+        body = np.array((distance * math.cos(turn / 2), distance * math.sin(turn / 2), turn))
         found = register(after, cloud, between(mount, compose(body, mount)), reach=0.15)
         found = register(after, cloud, found.pose)
         if found.overlap > best:
@@ -149,7 +149,7 @@ def by_lidar(record: MoveRecord, wheels: tuple[float, float], mount: Array) -> A
 
 
 def judged(moves: list[Movement], command: Callable[..., str]) -> Iterator[Finding]:
-    """Findings of all moves together: turns and ways of a move back count with their signs."""
+    """Findings of all moves together: turns and distances of a move back count with their signs."""
     turn = sum(abs(move.turn) for move in moves)
     if turn < LEAST_TURN:
         text = f"motor and steering turned it by {math.degrees(turn):.0f} degrees in all: too little for a sign"
@@ -158,7 +158,11 @@ def judged(moves: list[Movement], command: Callable[..., str]) -> Iterator[Findi
     shares = shares_of_turn(moves)
     against = [name for name, share in shares.items() if share < -CLEAR]
     agree = [name for name, share in shares.items() if share > CLEAR]
-    along = sum(move.way_seen * move.way for move in moves if move.way_seen is not None and abs(move.way) > AHEAD)
+    along = sum(
+        move.distance_seen * move.distance
+        for move in moves
+        if move.distance_seen is not None and abs(move.distance) > AHEAD
+    )
     backward = along < 0.0
     if backward and "lidar" in against:
         seen = "by the lidar it goes back where the motor counts ahead: the motor's sign is wrong"
@@ -187,10 +191,10 @@ def shares_of_turn(moves: Sequence[Movement]) -> dict[str, float]:
     """
     found = {}
     for name in ("compass", "IMU", "lidar"):
-        rows = [(move.turn, move.way, move.seen[name]) for move in moves if name in move.seen]
+        rows = [(move.turn, move.distance, move.seen[name]) for move in moves if name in move.seen]
         if len(rows) > 1:
-            turns, ways, seen = np.array(rows).T
-            found[name] = float(np.linalg.lstsq(np.column_stack((turns, ways)), seen, rcond=None)[0][0])
+            turns, distances, seen = np.array(rows).T
+            found[name] = float(np.linalg.lstsq(np.column_stack((turns, distances)), seen, rcond=None)[0][0])
     return found
 
 

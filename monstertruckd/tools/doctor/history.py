@@ -129,7 +129,7 @@ def _saturated(angles: list[tuple[float, float]], log: str) -> Iterator[Finding]
 
 
 def _signs(series: dict[str, Any], log: str) -> Iterator[Finding]:
-    """Turns by compass, IMU and wheels that go opposite ways."""
+    """Turns by compass, IMU and wheels in opposite directions."""
     if ODOMETRY.name not in series:
         return
     wheels = series[ODOMETRY.name]

@@ -478,7 +478,7 @@ class _Turning:
         self._steering = steering
         self._world = world
         self._course: Twist[float] = STILL
-        """Of several motors, the newest motion that was requested."""
+        """The newest requested motion of several motors."""
         self._turn_errors: deque[tuple[int, float]] = deque()
 
     def begin(self) -> None:

@@ -205,12 +205,12 @@ class DrillLeg:
     """One truck's share of a drill; can be sent to another process."""
 
     config: dict[str, Any]
-    """Of the simulated truck, as plain values."""
+    """Configuration of the simulated truck, as plain values."""
     seed: int
     number: int
     count: int
     version: str = __version__
-    """Of the program; another one would give another report."""
+    """Version of the program; another one would give another report."""
 
 
 class Drill:

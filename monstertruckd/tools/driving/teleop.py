@@ -168,7 +168,7 @@ class Teleop:
     _throttle: int = 0
     _turn: int = 0
     _side: int = 0
-    """Of a twist: 1 to the left, -1 to the right, 0 none."""
+    """Turn of a twist: 1 to the left, -1 to the right, 0 none."""
     _last: str = ""
     _until: int = 0
     """The driving keys are valid until then."""

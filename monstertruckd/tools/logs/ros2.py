@@ -232,7 +232,7 @@ def _text(message: Message, offset: int) -> Any:
 
 
 Converter = Callable[[Any, int], Any]
-"""From message and offset (ns) to the ROS message."""
+"""Converts a message, by the offset (ns) of its times, to the ROS message."""
 
 CONVERTERS: Final[dict[Topic[Any], tuple[str, Converter]]] = {
     t.SCAN: ("/sensor/scan", _scan),

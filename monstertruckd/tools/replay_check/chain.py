@@ -57,8 +57,8 @@ GIVEN: Final = frozenset({topics.PATH.name, topics.GATE.name})
 ASKED: Final = frozenset(
     topic.name for topic in (topics.GATE, topics.GROUND, topics.REQ_GOAL, topics.REQ_GOAL_CONTROL, topics.REQ_PATH)
 )
-"""The same for goals, whose paths are computed. Ground and goals have their turns at the same instants, in either
-order."""
+"""Not computed again, but read by planner and tracker where the robot drives to goals, whose paths are computed. Ground
+and goals have their turns at the same instants, in either order."""
 
 
 def replayable(config: TruckConfig) -> TruckConfig:

@@ -33,7 +33,8 @@ RESTS_ON_WORKER: Final = frozenset(
 )
 """Outputs a worker has a say in where the robot maps or localises."""
 RESTS_ON_GOALS: Final = frozenset({topics.TRACKER.name, topics.PLAN_DRIVE.name})
-"""The same where it drives to goals; of the wall clock several stamps of one tick are known as one."""
+"""Outputs a worker has a say in where the robot drives to goals; of the wall clock several stamps of one tick are known
+as one."""
 GOALS: Final = frozenset({topics.PATH.name, topics.GOAL.name})
 WORKER_TOLERANCE: Final = 0.02
 """Greatest difference, SI units, of outputs that rest on a worker's, in a log of the wall clock."""

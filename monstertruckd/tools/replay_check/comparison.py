@@ -38,7 +38,7 @@ class Difference:
     kind: Kind
     field: str
     value: float
-    """In SI units; +inf where the two cannot be subtracted."""
+    """Difference in SI units; +inf where the two cannot be subtracted."""
 
 
 def differences(before: Message, after: Message) -> list[Difference]:

@@ -32,7 +32,7 @@ class Check:
     config: Path | None
     """The other configuration; None = the log's own."""
     duration: float
-    """Of the log, s."""
+    """Duration of the log, s."""
     end: int
     """Instant up to which outputs were recorded, ns."""
     topics: tuple[TopicComparison, ...]

@@ -37,7 +37,7 @@ class EstimateError:
     position_rms: float
     """m"""
     position_end: float
-    """At the last pose, the frames laid over each other at the first ones, m"""
+    """Position error at the last pose, with the frames aligned at the first ones, m"""
     heading_rms: float
     """rad"""
     latency: float | None

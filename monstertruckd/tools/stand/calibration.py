@@ -43,9 +43,9 @@ class CameraCalibration(Schema):
     rotation: Numbers
     translation: Numbers
     lens_rms: float
-    """Of the board's corners, pixels"""
+    """RMS error of the board's corners, pixels"""
     place_rms: float
-    """Of the marks, m"""
+    """RMS error of the marks, m"""
     boards: int
     marks: int
 
@@ -56,7 +56,7 @@ class StandCalibration(Schema):
     version: Literal[1] = 1
     cameras: dict[str, CameraCalibration]
     overlap_rms: float | None
-    """By how much cameras disagree on a mark that several see, m; None: no mark is seen by two"""
+    """RMS difference between cameras of a mark that several see, m; None: no mark is seen by two"""
 
     def placed(self) -> dict[str, PlacedCamera]:
         """For use."""

@@ -112,9 +112,9 @@ class OverheadConfig(Schema):
     ruler_error: Annotated[float, Field(gt=0, le=0.1)] = 0.0015
     """Standard deviation of a mark's place, m"""
     robots: dict[RobotName, TaggedRobot] = {}
-    """With tags"""
+    """Robots with tags"""
     blobs: dict[RobotName, BlobRobot] = {}
-    """With coloured discs"""
+    """Robots with coloured discs"""
     calibration: Path = Path("runs/stand/calibration.json")
     """Written by `stand calibrate`"""
 

@@ -24,13 +24,13 @@ class MarkerPose(NamedTuple):
     x: float
     y: float
     yaw: float
-    """Of the direction in which a tag's printed upper edge, or the front disc, lies from the middle, rad."""
+    """Direction in which a tag's printed upper edge, or the front disc, lies from the middle, rad."""
     weight: float
     sigma: float
     """Standard deviation of x and y, m."""
     heading_sigma: float
     side: float
-    """Of the tag, or distance of the discs, m."""
+    """Side of the tag, or distance of the discs, m."""
 
 
 class RobotPose(NamedTuple):

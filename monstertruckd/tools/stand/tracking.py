@@ -24,7 +24,7 @@ from monstertruckd.tools.stand.identities import Identities
 from monstertruckd.tools.stand.poses import MarkerPose, RobotPose, merged, robot_pose, tag_pose
 
 FASTEST: Final = 3.0
-"""m/s: robots are not faster;"""
+"""Greatest speed of a robot, m/s."""
 SLACK: Final = 0.05
 """Distance up to which a change is no jump, m."""
 RATE_TIME: Final = 0.1
@@ -38,9 +38,9 @@ BUMPED: Final = 0.005
 BUMP_TIME: Final = 3.0
 """Seconds over which that is averaged."""
 BLIND: Final = 5.0
-"""Seconds without any mark, and"""
+"""Seconds without any mark after which a camera looks elsewhere."""
 BLIND_PICTURES: Final = 2 * EVERYWHERE
-"""so many pictures, in two of which at least marks were looked for: it looks elsewhere."""
+"""Pictures that must have come meanwhile: in two of them at least marks were searched for."""
 SILENT: Final = 1.0
 """Seconds without a picture after which a camera counts as lost."""
 
@@ -49,10 +49,10 @@ SILENT: Final = 1.0
 class _Known:
     pose: RobotPose
     side: float
-    """Of its tag, m."""
+    """Side of its tag, m."""
     doubts: int = 0
     rate: Array = field(default_factory=lambda: np.zeros(3))
-    """Of x, y and yaw, m/s and rad/s."""
+    """Rates of x, y and yaw, m/s and rad/s."""
 
     def at(self, stamp: int) -> Array:
         """x, y and yaw that are expected, (3,)."""

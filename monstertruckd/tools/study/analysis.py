@@ -28,15 +28,15 @@ class Circle:
     """A circle whose centre moves evenly."""
 
     radius: float
-    """Of the robot's middle, m."""
+    """Radius of the path of the robot's middle, m."""
     speed: float
-    """Of the robot's middle round the moving centre, m/s."""
+    """Speed of the robot's middle round the moving centre, m/s."""
     yaw_rate: float
     """Rad/s."""
     drift: tuple[float, float]
-    """Of the centre, dX/dt and dY/dt, m/s."""
+    """Drift of the centre, dX/dt and dY/dt, m/s."""
     centre: tuple[float, float]
-    """At the beginning, m."""
+    """Centre at the beginning, m."""
     arm: tuple[float, float]
     """Robot's middle as seen from the centre, in the robot's frame, m."""
     residual: float

@@ -31,7 +31,7 @@ class Run:
     """Rate of the left wheels, rad/s; of a line that of the first pass."""
     right: float
     times: Array
-    """Of the poses, (n,), s since the run's begin."""
+    """Times of the poses since the run's begin, s; (n,)."""
     poses: Array
     """(3, n): x, y (m), heading (rad)."""
     directions: Array

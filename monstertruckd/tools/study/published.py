@@ -12,13 +12,13 @@ class PublishedCircle:
 
     measured: MeasuredCircle
     speed_deviation: float
-    """From the ideal speed as printed, %."""
+    """Deviation from the ideal speed as printed, %."""
     recomputed_deviation: float | None
-    """From its own two speeds; None = it prints no sign."""
+    """Deviation from its own two speeds; None = it prints no sign."""
     radius_deviation: float
     """As printed, %."""
     drift: tuple[float, float] | None
-    """Of the centre, m/s; None = only its size is printed."""
+    """Drift of the centre, m/s; None = only its size is printed."""
     drift_speed: float
     """As printed, m/s."""
     intercepts: tuple[float, float] | None

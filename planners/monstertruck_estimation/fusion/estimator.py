@@ -442,7 +442,7 @@ def _without_turn(measurement: Measurement) -> Measurement:
 
 
 def _taken_back(measurement: Measurement, jump: float, at: int) -> Measurement:
-    """Whether a heading before the disturbance that began ``at``, ns, with a ``jump``, rad, is rejected."""
+    """Mark a heading before the disturbance that began ``at``, ns, with a ``jump``, rad, as rejected."""
     if not isinstance(measurement, HeadingMeasurement):
         return measurement
     return replace(measurement, taken_back=True, jump=jump if measurement.stamp == at else measurement.jump)

@@ -218,7 +218,7 @@ def kalman_update(state: FilterState, residual: Array, by_state: Array, noise: A
     return state.estimated(state.mean + gain @ residual, (covariance + covariance.T) / 2, nis=nis)
 
 
-def _wheel_measurement(state: FilterState, clone: slice, delta: Array) -> tuple[Array, Array]:
+def _motion_residual(state: FilterState, clone: slice, delta: Array) -> tuple[Array, Array]:
     """Residual, shape (3,), and derivative, (3, 15), of a motion since a clone."""
     then, now = state.mean[clone], state.mean[POSE]
     residual = delta - between(then, now)
@@ -235,7 +235,7 @@ def _wheels(state: FilterState, measured: WheelMeasurement, config: FusionConfig
             used = {**used, "tilt": measured.stamp}
         level = np.array((*_level(state, measured.tilt), 1.0))
         delta, dt = measured.delta * level, (measured.stamp - measured.since) / SECOND
-        residual, by_state = _wheel_measurement(state, WHEELS, delta)
+        residual, by_state = _motion_residual(state, WHEELS, delta)
         noise = measured.covariance + np.diag((QUANTUM[0] ** 2, QUANTUM[0] ** 2, QUANTUM[1] ** 2))
         if measured.slipping:
             noise = noise + np.diag(np.square((slip.speed * dt, slip.speed * dt, slip.turn * dt)))

@@ -36,7 +36,7 @@ BEHAVIOURS: Final = Catalog(
         name="follow",
         settings="monstertruck_planners.behave.follow:FollowConfig",
         implementation="monstertruck_planners.behave.follow:LeaderFollower",
-        doc="Follows the way of another robot at a distance",
+        doc="Follows the path of another robot at a distance",
     ),
     base=BehaviourConfig,
 )

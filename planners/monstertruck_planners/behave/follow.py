@@ -1,4 +1,4 @@
-"""Leader and follower: a robot drives along the way of another one, at a distance.
+"""Leader and follower: a robot drives along the path of another one, at a distance.
 
 The leader is not involved: the follower receives the poses that the leader publishes, keeps its trail, and steers
 towards a point on the trail (pure pursuit, Coulter 1992) at the leader's speed plus a share of the gap's error. A
@@ -39,7 +39,7 @@ class FollowConfig(BehaviourConfig):
     leader: str
     """One of the configuration's section `peers`"""
     distance: Metres = 1.0
-    """Behind the leader, along its way, from middle to middle, m"""
+    """Distance behind the leader along its path, from middle to middle, m"""
     speed: Annotated[float, Field(gt=0, le=5)] = 0.2
     """Greatest speed, m/s"""
     ahead: Metres = 0.4
@@ -87,7 +87,7 @@ class LeaderFollower:
         return cls(config, body)
 
     def begin(self) -> LeaderTrail:
-        """Nothing is known of the leader's way."""
+        """Nothing is known of the leader's path."""
         return LeaderTrail()
 
     def step(self, inputs: Inputs, state: LeaderTrail, t: float) -> BehaviourStep:
@@ -135,13 +135,13 @@ def extended(trail: LeaderTrail, me: Pose2D, leader: Pose2D) -> LeaderTrail:
 
 
 def _passed(here: Point, first: Point, second: Point) -> bool:
-    """Whether the follower is beyond ``first`` on the way to ``second``."""
+    """Whether the follower has passed ``first`` towards ``second``."""
     dx, dy = second.x - first.x, second.y - first.y
     return (here.x - first.x) * dx + (here.y - first.y) * dy > 0.0 or math.dist(here, first) < SPACING
 
 
 def length(points: tuple[Point, ...]) -> float:
-    """Of the way through points, m."""
+    """Length of the path through points, m."""
     return sum(math.dist(a, b) for a, b in itertools.pairwise(points))
 
 

@@ -228,15 +228,15 @@ class Move:
         return self._going(state, state.planned + RETURN * beyond)
 
     def _advanced(self, state: Progress, now: Odometry) -> Progress:
-        """With the way since the step before."""
+        """With the motion since the last step."""
         before = state.pose
         if before is None:
             return replace(state, pose=now)
         turn = math.remainder(now.pose.yaw - before.pose.yaw, math.tau)
         along = before.pose.yaw + turn / 2 + self._move.bearing
         dx, dy = now.pose.x - before.pose.x, now.pose.y - before.pose.y
-        way = turn if self._move.radius == 0.0 else dx * math.cos(along) + dy * math.sin(along)
-        return replace(state, pose=now, covered=state.covered + way, turned=state.turned + turn)
+        moved = turn if self._move.radius == 0.0 else dx * math.cos(along) + dy * math.sin(along)
+        return replace(state, pose=now, covered=state.covered + moved, turned=state.turned + turn)
 
     def _pace(self, twist: Twist2D) -> float:
         """Speed along the move, m/s or rad/s."""

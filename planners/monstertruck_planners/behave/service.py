@@ -265,8 +265,8 @@ class BehaviourService:
         self._pose = odometry
         if odometry is None or before is None:
             return run
-        way = math.hypot(odometry.pose.x - before.pose.x, odometry.pose.y - before.pose.y)
-        return replace(run, travelled=run.travelled + way)
+        distance = math.hypot(odometry.pose.x - before.pose.x, odometry.pose.y - before.pose.y)
+        return replace(run, travelled=run.travelled + distance)
 
     def _end(self, run: BehaviourRun, outcome: Reason, text: str, now: int) -> None:
         self._run = replace(run, outcome=outcome, text=text or outcome.text, ended=now)

@@ -103,7 +103,7 @@ class Option:
 
     frontier: Frontier
     pose: Pose
-    way: float
+    path_length: float
     """Metres, dearer in narrow places."""
     gain: float
     """New area that may be seen, m^2."""
@@ -113,7 +113,7 @@ class Option:
     @property
     def target(self) -> Viewpoint:
         """What is asked of the goal service."""
-        return Viewpoint(self.pose, self.frontier.middle, self.way, self.gain)
+        return Viewpoint(self.pose, self.frontier.middle, self.path_length, self.gain)
 
 
 class Explorer(Protocol):
@@ -178,26 +178,26 @@ class ExplorationView:
         self._costs = RouteCosts.of(vehicle, DriveCosts(margin=setup.margin))
         self._cell = route_map.coarse_cell
         self._cell_cost = route_map.cell_costs(self._costs)
-        self._ways = self._flood(self._cell_cost, self._cell, self.pose[:2])
+        self._to_go = self._flood(self._cell_cost, self._cell, self.pose[:2])
         self._rough: NDArray[np.int16] | None = None
-        if self._ways is not None:
-            self.options = self._find_options(self._ways)
+        if self._to_go is not None:
+            self.options = self._find_options(self._to_go)
 
-    # Ways
+    # Path lengths
 
-    def way_to(self, place: Point) -> float | None:
+    def path_length_to(self, place: Point) -> float | None:
         """Metres from the robot to a place, dearer where it is narrow; None = no path is known."""
-        if self._ways is None:
+        if self._to_go is None:
             return None
         at = self._open_cell(self._cell_cost, self._cell, place)
-        cost = UNREACHED if at is None else int(self._ways.cost[at])
+        cost = UNREACHED if at is None else int(self._to_go.cost[at])
         return None if cost >= UNREACHED else cost * self._cell / UNIT
 
     def free(self, poses: Array) -> NDArray[np.bool_]:
         """Whether the robot can stand at poses, shape (n, 3): (n,)."""
         return np.asarray(self._route_map.field.free(self.setup.footprint, poses, self.setup.margin), np.bool_)
 
-    def ways_between(self, options: list[Option]) -> Array:
+    def path_lengths_between(self, options: list[Option]) -> Array:
         """Metres from each option's place to each other's, shape (n, n); inf where no path is known."""
         if self._rough is None:
             self._rough = joined_cells(self._cell_cost)
@@ -205,10 +205,10 @@ class ExplorationView:
         at = [self._open_cell(self._rough, cell, option.pose[:2]) for option in options]
         result = np.full((len(options), len(options)), np.inf)
         for i, option in enumerate(options):
-            if (ways := self._flood(self._rough, cell, option.pose[:2])) is None:
+            if (to_go := self._flood(self._rough, cell, option.pose[:2])) is None:
                 continue
             for j, there in enumerate(at):
-                if there is not None and (cost := int(ways.cost[there])) < UNREACHED:
+                if there is not None and (cost := int(to_go.cost[there])) < UNREACHED:
                     result[i, j] = cost * cell / UNIT
         both: Array = np.minimum(result, result.T)
         return both
@@ -217,9 +217,9 @@ class ExplorationView:
         at = self._open_cell(cell_cost, cell, place)
         if at is None:
             return None
-        ways = cost_to_go(cell_cost, cell, at, at, 0, math.inf)
-        complete(ways)
-        return ways
+        to_go = cost_to_go(cell_cost, cell, at, at, 0, math.inf)
+        complete(to_go)
+        return to_go
 
     def _open_cell(self, cell_cost: NDArray[np.int16], cell: float, place: Point) -> tuple[int, int] | None:
         """The open cell nearest to a place, if there is one nearby."""
@@ -234,10 +234,10 @@ class ExplorationView:
 
     # Frontiers
 
-    def _find_options(self, ways: CostToGo) -> list[Option]:
+    def _find_options(self, to_go: CostToGo) -> list[Option]:
         options = []
         seen: dict[bytes, Viewpoints] = {}
-        reached = ways.cost < UNREACHED
+        reached = to_go.cost < UNREACHED
         for frontier in self._frontiers():
             if any(math.dist(frontier.middle, place) < BANNED for place in self.banned):
                 self.left_alone += 1
@@ -252,7 +252,7 @@ class ExplorationView:
             ):
                 look = self._look(frontier, near)
             seen[key] = look
-            option = self._option(frontier, look, ways)
+            option = self._option(frontier, look, to_go)
             if option is not None:
                 options.append(option)
         self.memory.looks = seen
@@ -342,12 +342,12 @@ class ExplorationView:
         first = np.argmax(free[room], axis=1)
         return places[room], bearings[room], headings[room, first]
 
-    def _option(self, frontier: Frontier, look: Viewpoints, ways: CostToGo) -> Option | None:
+    def _option(self, frontier: Frontier, look: Viewpoints, to_go: CostToGo) -> Option | None:
         """The nearest viewpoint of a frontier."""
         if not len(look.places):
             return None
         rows, columns = np.floor((look.places - (self._field.x, self._field.y)) / self._cell).astype(int).T[::-1]
-        cost = ways.cost[rows, columns]
+        cost = to_go.cost[rows, columns]
         for i in np.argsort(cost, kind="stable"):
             if cost[i] >= UNREACHED:
                 break
@@ -355,11 +355,11 @@ class ExplorationView:
             if any(math.dist((x, y), place) <= AVOIDED for place in self.avoided):
                 continue
             at = int(rows[i]), int(columns[i])
-            yaw = self._heading(ways, at, float(look.bearings[i]))
+            yaw = self._heading(to_go, at, float(look.bearings[i]))
             if not self.free(np.array([(x, y, yaw)]))[0]:
                 yaw = float(look.headings[i])
-            way = float(cost[i]) * self._cell / UNIT
-            return Option(frontier, (x, y, yaw), way, float(look.gains[i]), self._turn(ways, at))
+            length = float(cost[i]) * self._cell / UNIT
+            return Option(frontier, (x, y, yaw), length, float(look.gains[i]), self._turn(to_go, at))
         return None
 
     def gains(self, poses: Array) -> Array:
@@ -374,18 +374,18 @@ class ExplorationView:
         area: Array = cells * resolution**2
         return area
 
-    def _heading(self, ways: CostToGo, at: tuple[int, int], bearing: float) -> float:
+    def _heading(self, to_go: CostToGo, at: tuple[int, int], bearing: float) -> float:
         """That of the path to a coarse cell, if a frontier in that direction is in view then; else towards it."""
-        before = cell_ahead(ways.step, *at, float(BEHIND))
+        before = cell_ahead(to_go.step, *at, float(BEHIND))
         if before == at:
             return bearing
         arriving = math.atan2(at[0] - before[0], at[1] - before[1])
         in_view = abs(math.remainder(bearing - arriving, math.tau)) < self.setup.config.view / 2 - SIDEWARD
         return arriving if in_view else bearing
 
-    def _turn(self, ways: CostToGo, at: tuple[int, int]) -> float:
+    def _turn(self, to_go: CostToGo, at: tuple[int, int]) -> float:
         """Angle between the robot's heading and the beginning of the path to a coarse cell, rad."""
-        trail = cells_to_goal(ways.step, *at)
+        trail = cells_to_goal(to_go.step, *at)
         if len(trail) < 2:
             return 0.0
         there = self._centres(trail[max(len(trail) - 1 - 2 * BEHIND, 0)][None])[0]

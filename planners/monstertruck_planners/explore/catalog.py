@@ -11,7 +11,7 @@ EXPLORERS: Final = Catalog(
         name="information",
         settings="monstertruck_planners.explore.config:InformationConfig",
         implementation="monstertruck_planners.explore.scores:Information",
-        doc="The most new area per second of way",
+        doc="The most new area per second of driving",
         extra="planning",
     ),
     Plugin(

@@ -77,8 +77,8 @@ class Viewpoint:
     """Of the base, in map."""
     frontier: Point
     """Centre of the frontier or wall that is viewed."""
-    way: float = 0.0
-    """Metres there, for a point."""
+    path_length: float = 0.0
+    """Length of the path to a viewpoint, m."""
     gain: float = 0.0
     """New area that may be seen there, m^2."""
 

@@ -283,16 +283,18 @@ def tick(run: Exploration, seen: Observed, config: ExplorerConfig) -> Step:
 
 
 def _moved(run: Exploration, seen: Observed) -> Exploration:
-    counted, way = run.counted, 0.0
+    counted, distance = run.counted, 0.0
     if counted is None or seen.pose is None:
         counted = seen.pose
     elif (moved := math.dist(counted[:2], seen.pose[:2])) >= COUNTED:
-        counted, way = seen.pose, moved
+        counted, distance = seen.pose, moved
     charge = seen.charge if run.charge is None else run.charge
     trail = run.trail
     if seen.pose is not None and (not trail or math.dist(trail[-1][:2], seen.pose[:2]) >= TRAIL) and not run.backing:
         trail = (*trail, seen.pose)[-REMEMBERED:]
-    return replace(run, before=seen.pose, counted=counted, travelled=run.travelled + way, charge=charge, trail=trail)
+    return replace(
+        run, before=seen.pose, counted=counted, travelled=run.travelled + distance, charge=charge, trail=trail
+    )
 
 
 def _merged(before: ExploreAnswer, answer: ExploreAnswer) -> ExploreAnswer:
@@ -308,13 +310,13 @@ def _enough(run: Exploration, seen: Observed, config: ExplorerConfig) -> tuple[R
         return Reason.BUDGET_SPENT, f"after {run.budget:g} s"
     if seen.low:
         return Reason.BATTERY_LOW, Reason.BATTERY_LOW.text
-    way = run.newest.home
-    if seen.charge is None or way is None or run.charge is None:
+    home = run.newest.home
+    if seen.charge is None or home is None or run.charge is None:
         return None
-    needed = config.reserve * way * charge_per_metre(run, seen.charge, config)
+    needed = config.reserve * home * charge_per_metre(run, seen.charge, config)
     if seen.charge > needed:
         return None
-    return Reason.CHARGE_SPENT, f"{seen.charge:.0%} are left, {needed:.0%} are kept for {way:.1f} m"
+    return Reason.CHARGE_SPENT, f"{seen.charge:.0%} are left, {needed:.0%} are kept for {home:.1f} m"
 
 
 def charge_per_metre(run: Exploration, charge: float, config: ExplorerConfig) -> float:
@@ -419,7 +421,7 @@ def _back(run: Exploration) -> Step | None:
 
 def _go(run: Exploration, target: Viewpoint) -> Step:
     x, y, yaw = target.pose
-    text = f"({x:.2f}, {y:.2f}, {yaw:.2f}), {target.way:.1f} m away, for about {target.gain:.1f} m^2"
+    text = f"({x:.2f}, {y:.2f}, {yaw:.2f}), {target.path_length:.1f} m away, for about {target.gain:.1f} m^2"
     run = replace(_enter(run, ExplorationPhase.DRIVING), target=target, pursued=run.now, nothing=0, goals=run.goals + 1)
     return run, (Go(target.pose), Notice(Reason.FRONTIER_CHOSEN, Severity.INFO, text))
 
@@ -501,8 +503,8 @@ def _saving(run: Exploration, seen: Observed) -> Step:
     severity = Severity.INFO if run.final.exit_code == 0 else Severity.WARNING
     text = f"{run.final_text}; {kept}"
     ended = replace(_enter(run, ExplorationPhase.IDLE), outcome=run.final, text=text)
-    way = f"{ended.travelled:.1f} m and {ended.goals} goals in {ended.now - ended.begun:.0f} s"
-    return ended, (Notice(run.final, severity, f"{text}; {way}"),)
+    driven = f"{ended.travelled:.1f} m and {ended.goals} goals in {ended.now - ended.begun:.0f} s"
+    return ended, (Notice(run.final, severity, f"{text}; {driven}"),)
 
 
 def _end(run: Exploration, outcome: Reason, text: str, *actions: Action) -> Step:

@@ -58,7 +58,7 @@ class ExploringStep:
             frontiers=len(view.options),
             banned=view.left_alone,
             known=area,
-            home=None if task.home is None else view.way_to(task.home[:2]),
+            home=None if task.home is None else view.path_length_to(task.home[:2]),
             changed=changed,
         )
 

@@ -76,13 +76,13 @@ class WallLooks:
         best, least = None, math.inf
         for i in left[np.unique(np.linspace(0, len(left) - 1, COMPARED).astype(np.intp))]:
             pose = self._place(view, faces.points[i], faces.normals[i])
-            way = None if pose is None else view.way_to(pose[:2])
-            if pose is None or way is None:
+            length = None if pose is None else view.path_length_to(pose[:2])
+            if pose is None or length is None:
                 continue
             gain = int(np.count_nonzero(self._sees(view.known, faces, pose) & open_))
-            if gain and (way + WORTH) / gain < least:
+            if gain and (length + WORTH) / gain < least:
                 x, y = faces.points[i].tolist()
-                best, least = Viewpoint(pose, (x, y), way, gain * FACE), (way + WORTH) / gain
+                best, least = Viewpoint(pose, (x, y), length, gain * FACE), (length + WORTH) / gain
         return best
 
     def _place(self, view: ExplorationView, point: Array, normal: Array) -> Pose | None:

@@ -24,14 +24,14 @@ class Nearest:
         del seconds
         if still is not None:
             return pursued
-        return min(view.options, key=lambda option: option.way).target if view.options else None
+        return min(view.options, key=lambda option: option.path_length).target if view.options else None
 
 
 class Information:
     """The most new area per second of driving.
 
-    A goal that is pursued is kept unless another one is much better: what is new there becomes less on the path, as it
-    comes into sight, and a robot that turns to whatever is best at each instant leaves a bit of everything behind.
+    A goal that is pursued is kept unless another one is much better: its new area becomes smaller as it comes into
+    sight, and a robot that turns to whatever is best at each instant leaves a bit of everything behind.
 
     Args:
         config: settings.
@@ -54,7 +54,7 @@ class Information:
 
     def _rate(self, option: Option) -> float:
         config = self._config
-        return option.gain / (1.0 + option.way / config.speed + config.turning * option.turn / math.pi)
+        return option.gain / (1.0 + option.path_length / config.speed + config.turning * option.turn / math.pi)
 
 
 class Author:
@@ -79,7 +79,7 @@ class Author:
             return pursued
         if not view.options:
             return None
-        longest = max(option.way for option in view.options)
+        longest = max(option.path_length for option in view.options)
         largest = max(option.frontier.length for option in view.options)
         best = max(view.options, key=lambda option: self._score(option, longest, largest))
         self._chosen.append(best.frontier.middle)
@@ -90,7 +90,7 @@ class Author:
         times = sum(math.dist(option.frontier.middle, place) < config.near for place in self._chosen)
         return (
             config.size_weight * (1.0 - math.exp(-math.e * option.frontier.length / largest))
-            + config.distance_weight * math.exp(-math.e * option.way / max(longest, 1e-9))
+            + config.distance_weight * math.exp(-math.e * option.path_length / max(longest, 1e-9))
             + config.angle_weight * math.cos(option.turn / 2)
             + config.visits_weight * math.exp(-times)
         )

@@ -42,13 +42,13 @@ class Tour:
         chosen = options[0]
         if self._config.rest > 0.0 and len(options) > 2:
             first = np.array([self._first(option, option is still) for option in options])
-            distance = np.minimum(view.ways_between(options), FAR)
+            distance = np.minimum(view.path_lengths_between(options), FAR)
             chosen = options[best_beginning(first, distance, self._config.rest)]
         return pursued if chosen is still else chosen.target
 
     def _first(self, option: Option, present: bool) -> float:
         config = self._config
-        cost = option.way + config.turning * option.turn / math.pi - config.worth * math.sqrt(option.gain)
+        cost = option.path_length + config.turning * option.turn / math.pi - config.worth * math.sqrt(option.gain)
         return cost - config.keep if present else cost
 
 

@@ -182,7 +182,7 @@ class DeformStep:
     def __init__(self) -> None:
         self._setup: Setup | None = None
         self._walls: DistanceField | None = None
-        self._way: LocalRoute | None = None
+        self._route: LocalRoute | None = None
         self._rest: PosePath | None = None
         """The route from where its deformation began; None while it is free."""
 
@@ -200,15 +200,15 @@ class DeformStep:
         if task.grid is not None:
             self._walls = DistanceField.from_grid(task.grid, unknown_blocks=False)
         points, mapped = self._observe(setup, task)
-        if task.way is not None:
-            self._begin(task.way)
-        if self._way is None:
+        if task.route is not None:
+            self._begin(task.route)
+        if self._route is None:
             return DeformAnswer(0, "idle")
         here = self._vehicle.reference_pose(task.pose)
         self._advance(here)
-        if self._way.drivable and self._free(setup, here, task.pose, points, mapped):
+        if self._route.drivable and self._free(setup, here, task.pose, points, mapped):
             self._rest, self._state = None, LocalPlannerState()
-            return DeformAnswer(self._way.number, "free", place=self._place, complete=True)
+            return DeformAnswer(self._route.number, "free", place=self._place, complete=True)
         if self._rest is None:
             self._rest = self._guide.part(self._place, len(self._guide.poses))
         result = self._planner.plan(self._rest, self._window.field(self._walls), here, self._state)
@@ -219,7 +219,7 @@ class DeformStep:
         config = setup.config
         if config.local_planner is None:
             raise InputError("deforming: expected planner.local_planner")
-        self._setup, self._way = setup, None
+        self._setup, self._route = setup, None
         self._vehicle = Vehicle.truck(
             config.steering, angle=config.angle, geometry=setup.geometry, footprint=setup.footprint
         )
@@ -229,9 +229,9 @@ class DeformStep:
             world = load_map(config.map)
             self._walls = DistanceField(world.cells >= OCCUPIED, world.resolution, (*world.origin, 0.0))
 
-    def _begin(self, way: LocalRoute) -> None:
-        self._way, self._place = way, 0
-        self._guide = PosePath(moved(way.poses, self._vehicle.reference), way.directions)
+    def _begin(self, route: LocalRoute) -> None:
+        self._route, self._place = route, 0
+        self._guide = PosePath(moved(route.poses, self._vehicle.reference), route.directions)
         self._travelled = self._guide.travelled
         self._rest, self._state = None, LocalPlannerState()
 
@@ -276,17 +276,17 @@ class DeformStep:
         if deformed and pose_distance(guide.poses[at], here) > local.rejoin_distance:
             return False
         end = int(np.searchsorted(self._travelled, self._travelled[at] + setup.config.look_ahead)) + 1
-        way = np.vstack((here, guide.poses[at + 1 : end]))
+        rest = np.vstack((here, guide.poses[at + 1 : end]))
         margin = local.clearance + (local.rejoin_clearance if deformed else 0.0)
-        relative = poses_relative(moved(way, -self._vehicle.reference), pose)
+        relative = poses_relative(moved(rest, -self._vehicle.reference), pose)
         return (
             first_contact(setup.footprint, relative, points[~mapped], margin) is None
             and first_contact(setup.footprint, relative, points[mapped]) is None
         )
 
     def _answer(self, result: LocalPlan) -> DeformAnswer:
-        assert self._way is not None
-        number, path = self._way.number, result.path
+        assert self._route is not None
+        number, path = self._route.number, result.path
         if path is not None and path.length < SHORTEST and self._place == len(self._guide.poses) - 1:
             return DeformAnswer(number, "kept", result.reason, place=self._place, complete=True)
         if path is None or path.length < SHORTEST:

@@ -68,7 +68,7 @@ class RouteDeformation:
         self._number = 0
         self._route: PlanAnswer | None = None
         self._travelled: Array = np.zeros(1)
-        self._sent_way = 0
+        self._sent_route = 0
         self._answer: DeformAnswer | None = None
         self._since = 0
         """When what stands on the route began to block it, ns."""
@@ -187,18 +187,18 @@ class RouteDeformation:
         if odometry is None or self._clock.now() - odometry.received > ODOMETRY.fresh_for() * SECOND:
             return None
         grid = None if self._grid is None else self._grid.latest
-        way = None
-        if self._route is not None and (self._fresh or self._sent_way != self._number):
+        route = None
+        if self._route is not None and (self._fresh or self._sent_route != self._number):
             assert self._route.poses is not None
             assert self._route.directions is not None
-            way = LocalRoute(self._number, self._route.poses, self._route.directions, self._route.drivable)
-            self._sent_way = self._number
+            route = LocalRoute(self._number, self._route.poses, self._route.directions, self._route.drivable)
+            self._sent_route = self._number
         task = DeformTask(
             scan,
             pose_of(odometry),
             setup=self._setup if self._fresh else None,
             grid=grid if self._fresh or grid is not self._sent_grid else None,
-            way=way,
+            route=route,
             deviation=odometry.position_deviation,
             stamp=odometry.stamp,
             twist=twist_of(odometry),

@@ -77,18 +77,18 @@ def escape(
     sides = blocked_sides(footprint, points, config.room)
     ahead, behind = not sides.front, not sides.rear
     away = 0.0 if sides.left == sides.right else (-config.angle if sides.left else config.angle)
-    ways = ([1] if ahead else []) + ([-1] if behind else [])
+    directions = ([1] if ahead else []) + ([-1] if behind else [])
     if sides.front and not sides.rear:
-        ways = [-1]
-    for direction in ways:
+        directions = [-1]
+    for direction in directions:
         for angle in dict.fromkeys((away, 0.0)):
-            way = _way(config, geometry, footprint, points, direction, angle, crab=crab and config.crab, rear=rear)
-            if way is not None:
-                return way
+            found = _motion(config, geometry, footprint, points, direction, angle, crab=crab and config.crab, rear=rear)
+            if found is not None:
+                return found
     return None
 
 
-def _way(
+def _motion(
     config: EscapeConfig, geometry: FourWheelSteering, footprint: Footprint, points: Array, direction: int,
     away: float, *, crab: bool, rear: bool,
 ) -> Escape | None:  # fmt: skip

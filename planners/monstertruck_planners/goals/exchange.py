@@ -119,7 +119,7 @@ class DeformTask:
     """Of the base, in the map's frame."""
     setup: Setup | None = None
     grid: Grid | None = None
-    way: LocalRoute | None = None
+    route: LocalRoute | None = None
     deviation: float = 0.0
     """Standard deviation of the position, m."""
     stamp: int = 0

@@ -365,8 +365,8 @@ class PlanningStep:
         cells = static_map.with_points(points) if len(points) else static_map.cells
         self._route_map = route_map = self._map_of(cells, static_map)
         start, goal = (self._vehicle.reference_pose(p) for p in (task.pose, task.goal))
-        way = with_headings(task.pose, [ViaPoint(*place) for place in (*task.via, task.goal)])
-        via = [self._vehicle.reference_pose(pose) for pose in way[:-1]]
+        through = with_headings(task.pose, [ViaPoint(*place) for place in (*task.via, task.goal)])
+        via = [self._vehicle.reference_pose(pose) for pose in through[:-1]]
 
         def plan(planner: RoutePlanner) -> RouteResult:
             return replan(planner, route_map, self._route, start, goal, self._now, via=via)
@@ -447,7 +447,7 @@ class PlanningStep:
         config = setup.config
         known = np.vstack((self._memory.places, self._memory.doubted))
         near = static_map.obstacles(static_map.with_points(known), task.pose, NEARBY)
-        way = escape(
+        found = escape(
             config.escape,
             setup.geometry,
             setup.footprint,
@@ -456,12 +456,12 @@ class PlanningStep:
             rear=config.steering != "2ws",
         )
         self._route = None
-        if way is None:
+        if found is None:
             return PlanAnswer(Reason.STUCK, "both ends of the truck are blocked")
-        steering: tuple[Steering, ...] = (way.steering,) * len(way.poses)
-        poses = placed(way.poses, task.pose)
+        steering: tuple[Steering, ...] = (found.steering,) * len(found.poses)
+        poses = placed(found.poses, task.pose)
         length = float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum())
-        directions = np.full(len(poses), float(way.direction))
+        directions = np.full(len(poses), float(found.direction))
         return PlanAnswer(Reason.OK, "", poses, directions, steering, length, length)
 
 

@@ -23,8 +23,6 @@ HEADER = ["x", "y", "yaw", "direction"]
 MOST_BYTES: Final = 10_000_000
 """Size of a file of poses at most: a hundred thousand and more."""
 
-"""Modes in which the path stays as it is."""
-
 
 def load_path(file: FilePath, *, closed: bool, frame: str = "odom") -> Path:
     """Read a path in ``frame`` from CSV: header ``x,y,yaw,direction``; metres, metres, radians, +1 or -1.

@@ -134,11 +134,11 @@ class RunSummary:
     journal_count: int = 0
     """All of them."""
     stops: dict[int, Stop] = field(default_factory=dict)
-    """By number, each as last published."""
+    """Stops by number, each as last published."""
     drops: int = 0
     """Messages lost in the daemon's bounded queues, by its last count."""
     way: DrivenPath = field(default_factory=DrivenPath)
-    """In the map frame if the log has poses there, else in odom."""
+    """Driven path, in the map frame if the log has poses there, else in odom."""
     odometry: DrivenPath = field(default_factory=DrivenPath)
     path_plan: TruckPath | None = None
     tracker: TrackerState | None = None

@@ -63,7 +63,7 @@ class WallPdConfig(WallConfig):
     """Heading away from the wall by side and diagonal sonar from which on turning away ends, rad; as published none:
     the robot drives on while it still faces the wall"""
     free: Metres = 0.8
-    """Front range from which the way is free again, m; our figure"""
+    """Front range from which the path is free again, m; our figure"""
     lead: Annotated[float, Field(ge=0, le=1)] = 0.0
     """Seconds from an echo to the motion that answers it: the distance is that after so long on the present heading; 0
     as published: a robot whose sonars, gate and drives take 0.2 s swings without end"""

@@ -101,7 +101,7 @@ class Cone:
         return abs(math.remainder(normal - axis, math.tau)) - self.half <= self.critical
 
 
-ECHO: Final = ("x", "y", "axis", "range", "sonar", "way", "time")
+ECHO: Final = ("x", "y", "axis", "range", "sonar", "travelled", "time")
 """Columns of the echoes: place (m) and axis (rad) of the sonar in odom, range (m), its number; distance driven (m) and
 time (s) when it came."""
 

@@ -252,9 +252,9 @@ class WallLine:
         poses = tuple(entry for entry in state.poses if oldest <= entry[0] < odometry.stamp)
         poses = (*poses, (odometry.stamp, pose, odometry.twist.vx))
         pose, speed = _at(poses, odometry.stamp, self._config.play)
-        way = turn = 0.0
+        distance = turn = 0.0
         if state.poses:
-            way, turn = math.dist(pose[:2], state.pose[:2]), abs(math.remainder(pose[2] - state.pose[2], math.tau))
+            distance, turn = math.dist(pose[:2], state.pose[:2]), abs(math.remainder(pose[2] - state.pose[2], math.tau))
         dt = 0.0 if state.before is None else t - state.before
         v, w = _asked(state, t)
         behind = state.lag[0] + (v - speed) * dt, state.lag[1] + (w - (rate - bias)) * dt
@@ -262,7 +262,7 @@ class WallLine:
             bias=(bias, count),
             poses=poses,
             pose=pose,
-            travelled=state.travelled + way,
+            travelled=state.travelled + distance,
             turned=state.turned + turn,
             lag=(_clip(behind[0], LAG[0]), _clip(behind[1], LAG[1])),
             before=t,
@@ -343,7 +343,9 @@ class WallLine:
     def _nearer(self, state: LineState, faced: tuple[WallEstimate | None, WallEstimate | None]) -> LineState:
         """With the nearer one of the walls ahead by the sonars of either side."""
         lines = [line for line in faced if line is not None]
-        return state._replace(faced=faced, ahead=min(lines, key=lambda line: self._way_to(state, line), default=None))
+        return state._replace(
+            faced=faced, ahead=min(lines, key=lambda line: self._distance_to(state, line), default=None)
+        )
 
     def _faced(self, state: LineState, cone: Cone, group: tuple[int, int]) -> WallEstimate | None:
         """A wall ahead by the sonars from one number to another."""
@@ -371,10 +373,10 @@ class WallLine:
         fit = search(rows, at, cone)
         return fit if fit.explained >= max(LEAST, 0.3 * len(rows)) else None
 
-    def _way_left(self, state: LineState, cone: Cone) -> float:
+    def _distance_left(self, state: LineState, cone: Cone) -> float:
         """Distance until the robot stands before the wall ahead at the distance at which it follows walls, m."""
         ahead, fresh = state.ahead, _fresh(state.echoes, state)
-        left = math.inf if ahead is None else self._way_to(state, ahead)
+        left = math.inf if ahead is None else self._distance_to(state, ahead)
         for number in (DIAGONAL, FRONT, FAR):  # as if what it hears were right before the sonar
             rows = fresh[fresh[:, 4] == number][-3:]
             if number == DIAGONAL and state.wall is not None:
@@ -388,7 +390,7 @@ class WallLine:
         near = fresh[fresh[:, 4] >= DIAGONAL][-6:, 3]
         return min(left, 0.0) if np.count_nonzero(near < TOUCHING) >= 2 else left
 
-    def _way_to(self, state: LineState, line: WallEstimate) -> float:
+    def _distance_to(self, state: LineState, line: WallEstimate) -> float:
         """Distance until the robot stands at the distance at which it follows walls before one, m."""
         x, y, yaw = state.pose
         return (line.distance(x, y) - self._keep(state)) / max(math.cos(line.normal - yaw), 0.4)
@@ -406,8 +408,8 @@ class WallLine:
             return found
         for name, (value, count, first) in zip(self._names, state.equal, strict=True):
             if count >= EQUAL[0] and state.travelled - first >= EQUAL[1]:
-                way = state.travelled - first
-                return Reason.INPUT_CONTRADICTORY, f"sonar {name} measured {value:.3f} m all along {way:.2f} m"
+                distance = state.travelled - first
+                return Reason.INPUT_CONTRADICTORY, f"sonar {name} measured {value:.3f} m all along {distance:.2f} m"
         turns, stands = state.strays
         if turns is not None and t - turns > STRAY[1]:
             text = f"{state.w.at(t) * self._mirror:.2f} rad/s asked for and not turned: does a motor stall?"
@@ -426,10 +428,10 @@ class WallLine:
 
     def _disagreement(self, state: LineState, wall: WallEstimate, cone: Cone) -> tuple[Reason, str] | None:
         """A sonar that does not hear the wall that the other one hears."""
-        least, way = JUDGED
-        if state.travelled - state.marks[0] < way:
+        least, distance = JUDGED
+        if state.travelled - state.marks[0] < distance:
             return None
-        recent, shares = state.echoes[state.echoes[:, 5] > state.travelled - way], []
+        recent, shares = state.echoes[state.echoes[:, 5] > state.travelled - distance], []
         for number in (SIDE, DIAGONAL):
             rows = recent[recent[:, 4] == number]
             if len(rows) < least or not cone.hears(float(rows[-1, 2]), wall.normal):
@@ -501,8 +503,8 @@ class WallLine:
         return self._to(state._replace(v=self._stopping(TimedRamp(t, brake), left, t)), "brake")
 
     def _left(self, state: LineState, cone: Cone, t: float) -> float:
-        """``_way_left`` of where the robot is at ``t`` by its ramp, m."""
-        return self._way_left(state, cone) - state.lag[0] - state.v.at(t) * self._config.lead
+        """``_distance_left`` of where the robot is at ``t`` by its ramp, m."""
+        return self._distance_left(state, cone) - state.lag[0] - state.v.at(t) * self._config.lead
 
     def _stopping(self, ramp: TimedRamp, left: float, t: float) -> TimedRamp:
         """A ramp to standstill, computed again so that it covers what is left, if that is within the limits."""
@@ -581,10 +583,10 @@ class WallLine:
             state = state._replace(places=places)
         if state.travelled - places[0, 0] < config.lap_length:
             return state
-        way, bx, by, byaw = state.travelled - places[:, 0], *places[:, 1:].T
+        driven, bx, by, byaw = state.travelled - places[:, 0], *places[:, 1:].T
         passed = (x - bx) * np.cos(byaw) + (y - by) * np.sin(byaw) >= 0.0
-        near = np.hypot(x - bx, y - by) <= config.lap_radius + 0.01 * way
-        back = (way >= config.lap_length) & passed & near & (np.cos(yaw - byaw) >= math.cos(0.6))
+        near = np.hypot(x - bx, y - by) <= config.lap_radius + 0.01 * driven
+        back = (driven >= config.lap_length) & passed & near & (np.cos(yaw - byaw) >= math.cos(0.6))
         if back.any():
             place = state.travelled, *places[int(back.argmax()), 1:]
             return state._replace(laps=state.laps + 1, places=np.array([place]))

@@ -1,4 +1,4 @@
-"""The two published ways of following a wall by sonars, step by step as their author describes them.
+"""The two published methods of following a wall by sonars, step by step as their author describes them.
 
 Only the times that were set by hand are replaced: the approach ends by the ranges, the lap by odometry. Ramps keep
 their published weakness: one that a change of phase cuts short jumps to the end value it would have had.
@@ -25,7 +25,7 @@ DIAGONAL: Final = math.radians(45)
 """Angle between the side sonar and the diagonal one."""
 STALL: Final = 1.0
 """Seconds of requested but not measured motion after which a motor counts as stalled."""
-SAME_WAY: Final = 1.2
+SAME_HEADING: Final = 1.2
 """Greatest difference of the heading from that at the lap's beginning, rad: the robot weaves."""
 FOLLOWING: Final = ("follow", "free")
 """Phases in which a lap may begin: the robot drives along the wall."""
@@ -36,7 +36,7 @@ EDGE: Final = 0.1
 """Distance behind the edge of a gap over which the side sonar may measure the gap's own side wall, m."""
 BACK: Final = 0.05
 """Diagonal range times cos 45 degrees less side range below which it ends, m."""
-WALL_WAY: Final = 0.8
+WALL_LENGTH: Final = 0.8
 """Distance over which echoes make the line of a wall past whose gap it drives, m."""
 LEAST_ECHOES: Final = 4
 """Least number of echoes of such a line."""
@@ -77,7 +77,7 @@ def wall_distance(diagonal: float, side: float, offset: float = 0.0) -> float:
 
 
 def tightest_curvature(body: BehaviourBody) -> float:
-    """Greatest curvature of a body's way, 1/m; inf where it turns on the spot.
+    """Greatest curvature of a body's path, 1/m; inf where it turns on the spot.
 
     Raises:
         KinematicsError: it cannot turn.
@@ -219,7 +219,7 @@ class _Wall(ABC):
             return state
         if math.dist(begun[:2], pose[:2]) > config.lap_radius:
             return state
-        if math.cos(begun[2] - pose[2]) < math.cos(SAME_WAY):
+        if math.cos(begun[2] - pose[2]) < math.cos(SAME_HEADING):
             return state
         state = replace(state, laps=state.laps + 1, since=0.0)
         if state.laps < config.laps:
@@ -282,7 +282,7 @@ class WallPd(_Wall):
         if state.pose is None or not self._config.gap:
             return state
         x, y, yaw, now = state.pose[0], state.pose[1] * self._mirror, state.pose[2] * self._mirror, state.travelled
-        echoes = [echo for echo in state.echoes if now - echo[2] < WALL_WAY]
+        echoes = [echo for echo in state.echoes if now - echo[2] < WALL_LENGTH]
         reach, offset = ranges.diagonal * math.cos(DIAGONAL), self._config.offset
         for gap, ahead, aside in zip(state.gaps, (0.0, offset + reach), (ranges.side, reach), strict=True):
             if gap is None:
@@ -389,10 +389,10 @@ def _moved(state: WallState, odometry: Odometry) -> WallState:
     pose = (odometry.pose.x, odometry.pose.y, odometry.pose.yaw)
     if state.pose is None:
         return replace(state, pose=pose)
-    way = math.dist(pose[:2], state.pose[:2])
+    distance = math.dist(pose[:2], state.pose[:2])
     turn = abs(math.remainder(pose[2] - state.pose[2], math.tau))
     return replace(
-        state, pose=pose, travelled=state.travelled + way, since=state.since + way, turned=state.turned + turn
+        state, pose=pose, travelled=state.travelled + distance, since=state.since + distance, turned=state.turned + turn
     )
 
 

@@ -7,7 +7,6 @@ import pytest
 from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos.config import EposConfig
 from monstertruck_drivers.epos.driver import (
-    FAILURE_LIMIT,
     QUICK_EXCHANGE,
     RAD_S_PER_RPM,
     SLOW_EXCHANGE,
@@ -19,6 +18,7 @@ from monstertruck_drivers.epos.driver import (
 )
 from monstertruck_drivers.epos.exchange import RECENT
 from monstertruck_drivers.epos.protocol import OFF, Control, State, write_request
+from monstertruck_drivers.transaction import MISSES
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import DeviceFaultError, DeviceTimeoutError, ProtocolError
 from monstertruck_schemas.cmd import DriveAction
@@ -242,7 +242,7 @@ def test_so_many_failures_in_a_row_end_a_session_and_fewer_do_not():
     async def test(rig: Rig) -> None:
         async with rig.driving():
             await rig.drive(3_000)
-            for _ in range(2 * FAILURE_LIMIT):
+            for _ in range(2 * MISSES):
                 rig.emulator.inject("delay", "600", "1")
                 await rig.settle(2.5)
             assert rig.newest.mode is DriveMode.ENABLED

@@ -29,9 +29,9 @@ class FakeWorker:
     tasks: list[WorkerInput]
     at_once: int
     statuses: ClassVar[list[LocalisationStatus]] = []
-    """Of the scans to come,"""
+    """Status of each scan to come."""
     happened: ClassVar[list[tuple[str, ...]]] = []
-    """and their events."""
+    """Events of each scan to come."""
 
     def __init__(self, name: str, target: str, clock: VirtualClock, **settings: float) -> None:
         FakeWorker.tasks, FakeWorker.at_once = [], 0

@@ -239,4 +239,4 @@ def test_kinds_are_a_catalog_whose_default_is_information():
     assert list(EXPLORERS) == ["information", "tour", "nearest", "author"]
     assert TypeAdapter(AnyExplorer).validate_python({}).kind == "information"
     assert all(hasattr(make_explorer(config), "choose") for config in KINDS)
-    assert Viewpoint((0.0, 0.0, 0.0), (1.0, 0.0)).way == 0.0
+    assert Viewpoint((0.0, 0.0, 0.0), (1.0, 0.0)).path_length == 0.0

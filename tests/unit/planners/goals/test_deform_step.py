@@ -143,12 +143,12 @@ def test_a_route_does_not_back_into_what_was_seen_before_the_truck_turned_away()
     back = np.column_stack((np.arange(0.4, 3.01, 0.05), np.zeros(53), np.full(53, math.pi)))
     step.step(first)
     step.step(DeformTask(scan_of(ORIGIN, box), ORIGIN))
-    way = LocalRoute(2, back, -np.ones(len(back)))
-    answer = step.step(DeformTask(scan_of(away, box), away, way=way))
+    route = LocalRoute(2, back, -np.ones(len(back)))
+    answer = step.step(DeformTask(scan_of(away, box), away, route=route))
     assert answer.finding != "free"
     never, first = begun()
     never.step(first)
-    assert never.step(DeformTask(scan_of(away, box), away, way=way)).finding == "free", "it saw nothing"
+    assert never.step(DeformTask(scan_of(away, box), away, route=route)).finding == "free", "it saw nothing"
 
 
 def test_single_beams_that_fail_hide_nothing():
@@ -167,7 +167,7 @@ def test_where_there_is_no_way_round_the_beginning_is_driven_and_then_it_is_bloc
     assert answer.text
     assert "new" in found
     assert 0.5 < pose[0] < 1.6 - 0.235, "as far as it is free"
-    step.step(DeformTask(scan_of(pose), pose, way=LocalRoute(2, ROUTE, np.ones(81))))
+    step.step(DeformTask(scan_of(pose), pose, route=LocalRoute(2, ROUTE, np.ones(81))))
     answer = step.step(DeformTask(scan_of(pose), pose))
     assert (answer.number, answer.finding) == (2, "free"), "what went away is forgotten"
 

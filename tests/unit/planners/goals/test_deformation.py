@@ -108,7 +108,7 @@ def test_setup_and_route_are_sent_once_and_again_after_a_failure():
         await stage.scan()
         stage.actor.fails = False
         await stage.scan()
-        sent = [(task.setup is not None, task.way is not None) for task in stage.actor.tasks]
+        sent = [(task.setup is not None, task.route is not None) for task in stage.actor.tasks]
         assert sent == [(True, False), (False, True), (False, False), (False, False), (True, True)]
         assert len(stage.events) == 1
 

@@ -40,14 +40,14 @@ def track(turns: float, turn: float = 0.0) -> MoveRecord:
 
 def test_a_straight_run():
     run = TapedRun.of(track(2732.0), 2.0)
-    assert run.turns / run.way == pytest.approx(1366.0, rel=1e-5)
+    assert run.turns / run.length == pytest.approx(1366.0, rel=1e-5)
     assert TapedRun.of(track(-2732.0), 2.0).turns == pytest.approx(2732.0)
 
 
 def test_the_tape_measures_the_chord_of_a_bend():
     radius, turn = 8.0, 0.25
     run = TapedRun.of(track(2732.0, turn), 2 * radius * math.sin(turn / 2))
-    assert run.way == pytest.approx(radius * turn, rel=1e-4)
+    assert run.length == pytest.approx(radius * turn, rel=1e-4)
     assert run.bend == pytest.approx(turn**2 / 24, rel=0.02)
     assert arc(2.0, 0.0) == 2.0
 

@@ -72,7 +72,7 @@ def test_a_silent_device_says_what_to_do_once():
 def test_a_run_that_is_held_ends_by_what_holds_it(held: tuple[Reason, ...], kind: type[Exception], said: str):
     async def main(clock):
         mover = motion.Mover(None, clock, SimpleNamespace(drivetrain=None))
-        record = SimpleNamespace(left=0, way=lambda _: 0.0)
+        record = SimpleNamespace(left=0, distance=lambda _: 0.0)
 
         async def hold(*_: float) -> None:
             await clock.sleep(motion.PERIOD)
@@ -172,7 +172,7 @@ def test_after_a_stop_that_passed_it_drives_back_and_once_more():
     truck, record, said = hindered(STEP, (0.4, Reason.SCAN_STALE, 0.3), (0.7, Reason.LEASE_EXPIRED, 0.1))
     assert truck.turns == pytest.approx([0.0, 0.4, 0.0, 0.7, 0.0], abs=0.05)
     assert truck.x == pytest.approx(1.0, abs=0.05)
-    assert record.way(DriveTrain()) == pytest.approx(1.0, abs=0.05), "of the last one alone"
+    assert record.distance(DriveTrain()) == pytest.approx(1.0, abs=0.05), "of the last one alone"
     assert said == [
         "run: no fresh lidar scan; back to where it began, and once more",
         "run: no fresh drive request within its lease; back to where it began, and once more",

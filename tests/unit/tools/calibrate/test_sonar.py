@@ -134,5 +134,5 @@ def test_the_interval_of_the_sound_holds_wheels_that_roll_less_far_than_odometry
     assert first is not None
     assert second is not None
     half = (second.high - second.low) / 2
-    assert second.value - first.value < 0.6 * half, "0.9 of it if the way were taken for right"
+    assert second.value - first.value < 0.6 * half, "0.9 of it if the distance were taken for right"
     assert half < 3.4

@@ -23,11 +23,11 @@ CONFIGS = Path(__file__).resolve().parents[4] / "configs"
 TRUCK = load_config(CONFIGS / "truck.yaml", TruckConfig)[0]
 
 
-def moves(*, compass=1, imu=1, lidar=1, way=1):
+def moves(*, compass=1, imu=1, lidar=1, motion=1):
     shares = {"compass": 0.93 * compass, "IMU": 1.03 * imu, "lidar": lidar}
     return [
         Movement(
-            s * 0.2, t * s * 0.06, {k: share * s * (t * 0.06 + 0.04) for k, share in shares.items()}, way * s * 0.2
+            s * 0.2, t * s * 0.06, {k: share * s * (t * 0.06 + 0.04) for k, share in shares.items()}, motion * s * 0.2
         )
         for t in (1, -1)
         for s in (1, -1)
@@ -44,9 +44,9 @@ def found(rows):
         ({"compass": -1}, "sign compass", "against the steering and the IMU, lidar: it is mounted upside down", None),
         ({"imu": -1}, "sign IMU", "upside down", None),
         ({"lidar": -1}, "sign lidar", "upside down", None),
-        ({"way": -1}, "sign lidar", "the lidar looks back", None),
+        ({"motion": -1}, "sign lidar", "the lidar looks back", None),
         ({"compass": -1, "imu": -1, "lidar": -1}, "sign steering", "wrong", "calibrate steering --rough"),
-        ({"compass": -1, "imu": -1, "lidar": -1, "way": -1}, "sign motor", "wrong", "calibrate drive --sign-only"),
+        ({"compass": -1, "imu": -1, "lidar": -1, "motion": -1}, "sign motor", "wrong", "calibrate drive --sign-only"),
         ({"imu": 0.0}, "sign IMU", "0% of the turn", None),
         ({"compass": 0, "imu": 0, "lidar": 0}, "sign steering", "direction of one axle", "calibrate steering --rough"),
     ],
@@ -114,14 +114,14 @@ def corridor(x, yaw, noise, end=100.0):
 
 def test_a_corridor_tells_the_turn_and_not_the_way():
     noise = np.random.default_rng(2)
-    for end, way in ((100.0, math.nan), (3.0, 0.2)):
+    for end, distance in ((100.0, math.nan), (3.0, 0.2)):
         before, after = corridor(0.0, 0.0, noise, end), corridor(0.2, 0.05, noise, end)
         after = [scan.model_copy(update={"stamp": 100 + scan.stamp}) for scan in after]
         record = MoveRecord(others={"sensor/scan": before + after}, left=50, arrived=90)
         moved = by_lidar(record, (0.2, 0.05), np.zeros(3))
-        assert moved[0] == pytest.approx(way, abs=0.02, nan_ok=True)
+        assert moved[0] == pytest.approx(distance, abs=0.02, nan_ok=True)
         assert moved[2] == pytest.approx(0.05, abs=0.01)
-    rows = [replace(move, way_seen=None) for move in moves()]
+    rows = [replace(move, distance_seen=None) for move in moves()]
     assert not found(rows)
     assert "not seen" in next(f.seen for f in judged(rows, str) if f.check == "sign motor")
 
