@@ -305,34 +305,8 @@ def _register(  # type: ignore[no-untyped-def] # noqa: ANN202
 ):
     pose = start.copy()
     edge = reach if iterations > 0 else EDGE
-    h, g, stats = accumulate(
-        pose,
-        points,
-        normals,
-        variances,
-        map_points,
-        map_normals,
-        map_variances,
-        map_extents,
-        starts,
-        order,
-        reach,
-        edge,
-    )
-    for _ in range(iterations):
-        off = pose - guess
-        off[2] = (off[2] + math.pi) % (2 * math.pi) - math.pi
-        m = off @ prior @ off
-        w = TAILS / (TAILS + m)
-        total = h + w * prior
-        for k in range(3):
-            total[k, k] += 1e-6 + 1e-9 * total[k, k]
-        step = solve3(total, -(g + w * (prior @ off)))
-        pose = pose + step
-        way, turn = math.hypot(step[0], step[1]), abs(step[2])
-        done = edge == EDGE and way < 1e-4 and turn < 2e-5
-        if way < COARSE[0] and turn < COARSE[1]:
-            edge = EDGE
+    done = False
+    for remaining in range(iterations, -1, -1):
         h, g, stats = accumulate(
             pose,
             points,
@@ -347,8 +321,21 @@ def _register(  # type: ignore[no-untyped-def] # noqa: ANN202
             reach,
             edge,
         )
-        if done:
+        if done or remaining == 0:
             break
+        off = pose - guess
+        off[2] = (off[2] + math.pi) % (2 * math.pi) - math.pi
+        m = off @ prior @ off
+        w = TAILS / (TAILS + m)
+        total = h + w * prior
+        for k in range(3):
+            total[k, k] += 1e-6 + 1e-9 * total[k, k]
+        step = solve3(total, -(g + w * (prior @ off)))
+        pose = pose + step
+        way, turn = math.hypot(step[0], step[1]), abs(step[2])
+        done = edge == EDGE and way < 1e-4 and turn < 2e-5
+        if way < COARSE[0] and turn < COARSE[1]:
+            edge = EDGE
     off = pose - guess
     off[2] = (off[2] + math.pi) % (2 * math.pi) - math.pi
     stats[2] += TAILS * math.log(1.0 + (off @ prior @ off) / TAILS)
