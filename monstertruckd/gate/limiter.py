@@ -60,7 +60,10 @@ metre, m/m: a translation of 0.33 rad away from a wall does (0.34 m/m), a straig
 
 AHEAD: Final = 0.5
 """A motion whose forward speed is a smaller share of its pace has the speed limit of reverse: part of the footprint
-moves to where the lidar does not look."""
+moves to where the lidar does not look. One that is no reverse either turns on the spot or goes sideways."""
+DEPTH: Final = 0.2
+"""Ground that no scan has seen, nearer than this to a measured point, is not turned onto, m: what stands there is seen
+from one side only. Somebody who stands is about as deep."""
 
 MAX_SPEED: Final = 1e3
 """Requests are scaled down to this in every component before anything else, m/s and rad/s: sums of them stay finite."""
@@ -431,7 +434,9 @@ class ObstacleGuard:
             hidden = [twist for twist in rounded if twist[0] * TWIST_STEP < AHEAD]
             behind = self._memory.points() if hidden else None
             self._free = min(self._free_distance(*twist, behind) for twist in rounded)
-            self.known = self._known_distance(hidden)
+            self.known = math.inf
+            if behind is not None:
+                self._check_ground(hidden, np.concatenate((self._points, behind)))
         return self._free
 
     def _update_unseen(self, twists: frozenset[tuple[int, int, int]]) -> None:
@@ -462,12 +467,17 @@ class ObstacleGuard:
             (float(sweep.distances[contact - 1]) for contact in contacts if contact is not None), default=math.inf
         )
 
-    def _known_distance(self, twists: list[tuple[int, int, int]]) -> float:
+    def _check_ground(self, twists: list[tuple[int, int, int]], measured: Array) -> None:
+        """Update ``known``, and the free distance of turns onto ground next to measured points (n, 2) in base, m."""
         sweeps = [self._sweep(*twist) for twist in twists]
-        if not sweeps:
-            return math.inf
-        seen = self._memory.seen(np.concatenate([sweep.ground for sweep in sweeps]))
-        return float(np.concatenate([sweep.before for sweep in sweeps])[~seen].min(initial=math.inf))
+        ground, before = (np.concatenate([sweep[k] for sweep in sweeps]) for k in (2, 3))
+        aside = np.repeat([twist[0] * TWIST_STEP > -AHEAD for twist in twists], [len(s.ground) for s in sweeps])
+        hidden = ~self._memory.seen(ground)
+        self.known = float(before[hidden].min(initial=math.inf))
+        reached = hidden & aside & (before < self._free)
+        near = on_body(self._footprint, measured, self._reach + DEPTH) & ~on_body(self._footprint, measured, 0.0)
+        apart = ((ground[reached][:, None] - measured[near]) ** 2).sum(axis=2).min(axis=1, initial=math.inf)
+        self._free = float(before[reached][apart < DEPTH**2].min(initial=self._free))
 
     def allowed_speed(self, free: float, now: int) -> float:
         """Greatest pace from which the body stops comfortably within ``free`` metres, m/s."""

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from monstertruck_planners.collision import Footprint, ScanPoints
+from monstertruck_planners.collision import Footprint, ScanPoints, first_contact, swept_poses
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.cmd import DriveAction
 from monstertruck_schemas.reasons import Reason
@@ -306,6 +306,45 @@ def test_a_turn_grazes_nothing_that_the_lidar_has_left_behind(aside, stopped):
         guard.observe(scan(now))
     free = guard.free_distance(((0.0, 0.0, 7.0),))
     assert (free < 0.2) is stopped
+
+
+def person(x, y, angles):
+    """Points around somebody who stands there, 0.2 m in radius; the first direction is the lidar's."""
+    towards = math.atan2(-y, 0.14 - x)
+    return [(x + 0.2 * math.cos(towards + angle), y + 0.2 * math.sin(towards + angle)) for angle in angles]
+
+
+def test_a_turn_stops_before_the_side_of_somebody_that_the_lidar_does_not_see():
+    somebody, turn = (-0.05, -0.42), (0.0, 0.0, 7.0)
+    seen = [p for p in person(*somebody, np.linspace(-1.4, 1.4, 80)) if math.atan2(p[1], p[0] - 0.14) > -math.tau / 3]
+    distances = np.linspace(0.0, 0.3, 301)
+    contacts = [
+        distances[first_contact(FOOTPRINT, swept_poses(turn, distances), np.array(points))]
+        for points in (person(*somebody, np.linspace(0.0, math.tau, 200)), seen)
+    ]
+    assert contacts[0] < contacts[1] - 0.01, "it is the side that is not seen"
+    guard = ObstacleGuard(GateConfig(), FOOTPRINT, ScanPoints(MOUNT))
+    guard.observe(scan(SECOND, *seen))
+    assert guard.free_distance((turn,)) < contacts[0]
+    assert guard.free_distance(((-1.0, 0.0, 0.0),)) == math.inf, "in reverse such ground only slows"
+    assert guard.known == 0.0
+
+
+@pytest.mark.parametrize(("apart", "stopped"), [(0.16, True), (0.2, False)])
+def test_ground_that_nobody_has_seen_is_not_turned_onto_next_to_something(apart, stopped):
+    """The rear right corner moves on towards a point that it never touches."""
+    corner = np.array((-FOOTPRINT.half_length, -FOOTPRINT.half_width))
+    post = corner * (1.0 + apart / np.hypot(*corner))
+    ahead = np.add(post, (0.6, 0.0))
+    bearing = math.degrees(math.atan2(ahead[1], ahead[0] - 0.14))
+    guard = ObstacleGuard(GateConfig(), FOOTPRINT, ScanPoints(MOUNT))
+    now = SECOND
+    guard.observe(scan(now, tuple(ahead), unknown=((-120, bearing - 1, 3), (bearing + 1, 120, 3))))
+    for _ in range(150):
+        now += TICK
+        guard.move(now, (0.2, 0.0, 0.0), 0.02)
+    guard.observe(scan(now))
+    assert (guard.free_distance(((0.0, 0.0, 7.0),)) < 0.1) is stopped
 
 
 def surround(rig, *obstacles):
