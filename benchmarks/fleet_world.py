@@ -8,7 +8,8 @@ which the straight line leads past nobody it hears. Each hears where the others 
 counts behind it, where its lidar of 240 degrees sees nobody; it stops before what it sees and hears. Of those that are
 near to each other one has the right of way, for a minute each in turn: it waits, and the others drive away from those
 near them. Before people, and where that fails, a robot waits a time drawn by its seed, turns or drives elsewhere, and
-tries again; it backs up, where its lidar does not look, only as far as it must to turn.
+tries again; where it cannot turn it drives on a little, else it backs up, where its lidar does not look, only as far
+as it must to turn.
 Contacts in which a robot moves count against the goal; people who walk into a standing one are counted apart.
 """
 
@@ -191,7 +192,9 @@ class Pilot:
                 continue
             await self.clock.sleep(float(self.rng.uniform(0.3, 3.0)))
             if not await self.turn(float(self.rng.uniform(-1.5, 1.5))):
-                await self.move(length=-float(self.rng.uniform(0.1, 0.2)), speed=0.1)
+                # Ahead its lidar looks, and what it leaves behind has been seen.
+                if not await self.move(length=float(self.rng.uniform(0.2, 0.4)), speed=0.15):
+                    await self.move(length=-float(self.rng.uniform(0.1, 0.2)), speed=0.1)
             elif self.rng.random() < 0.5:
                 await self.move(length=float(self.rng.uniform(0.2, 0.8)), speed=0.15)
 
