@@ -60,7 +60,7 @@ metre, m/m: a translation of 0.33 rad away from a wall does (0.34 m/m), a straig
 
 AHEAD: Final = 0.5
 """A motion whose forward speed is a smaller share of its pace has the speed limit of reverse: part of the footprint
-moves to where the lidar does not look. One that is no reverse either turns on the spot or goes sideways."""
+moves to where the lidar does not look. One whose base is slower than that share turns on the spot."""
 DEPTH: Final = 0.2
 """Ground that no scan has seen, nearer than this to a measured point, is not turned onto, m: what stands there is seen
 from one side only. Somebody who stands is about as deep."""
@@ -468,13 +468,20 @@ class ObstacleGuard:
         )
 
     def _check_ground(self, twists: list[tuple[int, int, int]], measured: Array) -> None:
-        """Update ``known``, and the free distance of turns onto ground next to measured points (n, 2) in base, m."""
+        """Update ``known``, and shorten the free distance of turns on the spot.
+
+        Args:
+            twists: in steps of ``TWIST_STEP``.
+            measured: points in base, shape (n, 2), m.
+        """
         sweeps = [self._sweep(*twist) for twist in twists]
-        ground, before = (np.concatenate([sweep[k] for sweep in sweeps]) for k in (2, 3))
-        aside = np.repeat([twist[0] * TWIST_STEP > -AHEAD for twist in twists], [len(s.ground) for s in sweeps])
+        ground = np.concatenate([sweep.ground for sweep in sweeps])
+        before = np.concatenate([sweep.before for sweep in sweeps])
+        turns = [math.hypot(*twist[:2]) * TWIST_STEP < AHEAD for twist in twists]
+        turning = np.repeat(turns, [len(sweep.ground) for sweep in sweeps])
         hidden = ~self._memory.seen(ground)
         self.known = float(before[hidden].min(initial=math.inf))
-        reached = hidden & aside & (before < self._free)
+        reached = hidden & turning & (before < self._free)
         near = on_body(self._footprint, measured, self._reach + DEPTH) & ~on_body(self._footprint, measured, 0.0)
         apart = ((ground[reached][:, None] - measured[near]) ** 2).sum(axis=2).min(axis=1, initial=math.inf)
         self._free = float(before[reached][apart < DEPTH**2].min(initial=self._free))

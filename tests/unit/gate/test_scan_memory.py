@@ -326,8 +326,9 @@ def test_a_turn_stops_before_the_side_of_somebody_that_the_lidar_does_not_see():
     guard = ObstacleGuard(GateConfig(), FOOTPRINT, ScanPoints(MOUNT))
     guard.observe(scan(SECOND, *seen))
     assert guard.free_distance((turn,)) < contacts[0]
-    assert guard.free_distance(((-1.0, 0.0, 0.0),)) == math.inf, "in reverse such ground only slows"
-    assert guard.known == 0.0
+    for twist in ((-1.0, 0.0, 0.0), (0.0, 1.0, 0.0)):
+        assert guard.free_distance((twist,)) == math.inf, "in reverse and sideways such ground only slows"
+        assert guard.known == 0.0
 
 
 @pytest.mark.parametrize(("apart", "stopped"), [(0.16, True), (0.2, False)])
