@@ -16,7 +16,7 @@ from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.health import OdometryUse
 
 NOISE_MEMORY: Final = 40
-"""Scans over which the noise of odometry is estimated."""
+"""Scans over which the noise of odometry, and of the motion predicted without it, is estimated."""
 MAX_INNOVATION: Final = 4.0
 """Limit to which normalised innovations are clamped."""
 NOISE_LIMITS: Final = (1.0, 3.0)
@@ -70,8 +70,9 @@ class OdometryCheck:
 
     def __init__(self) -> None:
         self._steps: deque[Array] = deque()
-        """Seconds, motion by odometry and by the scans, shape (7,)."""
+        """Seconds, motion by odometry and by the scans, whether these measured the way; shape (8,)."""
         self._odom, self._scans, self._seconds = np.zeros(3), np.zeros(3), 0.0
+        self._seen = True
         self._row = 0
         self._wrong = np.zeros(2, bool)
         self._kept = np.ones(2, bool)
@@ -90,22 +91,26 @@ class OdometryCheck:
         way, turn = self._kept.tolist()
         return way, turn
 
-    def add(self, dt: float, odom: Array, moved: Array) -> None:
-        """Take the motions in base over ``dt`` seconds, shape (3,), by odometry and by the scans."""
+    def add(self, dt: float, odom: Array, moved: Array, *, seen: bool = True) -> None:
+        """Take the motions in base over ``dt`` seconds, shape (3,), by odometry and by the scans.
+
+        Where the scans have not ``seen`` the way (a corridor), it contradicts nothing, and agrees with nothing.
+        """
         self._seconds += dt
         self._odom, self._scans = compose(self._odom, odom), compose(self._scans, moved)
-        step = np.array((self._seconds, *self._odom, *self._scans))
+        self._seen &= seen
+        step = np.array((self._seconds, *self._odom, *self._scans, self._seen))
         if self._seconds < SAMPLE[0] or _motion(step) < SAMPLE[1]:
             return
         self._steps.append(step)
         while len(self._steps) > FEWEST_SAMPLES and self._long_enough_without_oldest():
             self._steps.popleft()
-        self._odom, self._scans, self._seconds = np.zeros(3), np.zeros(3), 0.0
+        self._odom, self._scans, self._seconds, self._seen = np.zeros(3), np.zeros(3), 0.0, True
         self._judge()
 
     def interrupt(self, dt: float) -> None:
         """Over ``dt`` seconds there is nothing to compare, and the next motion does not follow the last one."""
-        self._odom, self._scans, self._seconds = np.zeros(3), np.zeros(3), self._seconds + dt
+        self._odom, self._scans, self._seconds, self._seen = np.zeros(3), np.zeros(3), self._seconds + dt, True
 
     def _long_enough_without_oldest(self) -> bool:
         later = list(self._steps)[1:]
@@ -114,24 +119,26 @@ class OdometryCheck:
     def _judge(self) -> None:
         """Compare over the last three and more steps; drop odometry, or take it back."""
         rows = np.array(self._steps)[::-1]
-        differences = np.cumsum(rows[:, 1:4] - rows[:, 4:], axis=0)
+        differences = np.cumsum(rows[:, 1:4] - rows[:, 4:7], axis=0)
         off = np.stack((np.hypot(differences[:, 0], differences[:, 1]), np.abs(differences[:, 2])), axis=1)
-        lengths = np.cumsum(np.stack((_lengths(rows[:, 1:4]), _lengths(rows[:, 4:]))), axis=1)
-        motion = lengths.max(axis=0)
+        lengths = np.stack((_lengths(rows[:, 1:4]), _lengths(rows[:, 4:7])))
+        seen = np.stack((rows[:, 7], np.ones(len(rows))), axis=1)
+        motion = np.cumsum(lengths, axis=1).max(axis=0)
         slack = np.minimum(SLACK[0] + CROSSED * motion[:, ::-1], SLACK[1])
         wrong = (off > TOLERANCE * motion + slack)[FEWEST_SAMPLES - 1 :].any(axis=0)
         self._row = self._row + 1 if wrong.any() else 0
         if self._row >= CONTRADICTIONS:
             if not self.contradicted:
                 self.since = float(rows[:, 0].sum())
-                self._kept = off[-1] <= TOLERANCE * motion[-1]
+                # Wheels that say nothing agree with nothing.
+                self._kept = off[-1] < TOLERANCE * (lengths * seen).sum(axis=1).min(axis=0)
             self._wrong |= wrong
             self._kept &= ~wrong
             self._agreed[wrong] = 0.0
         if self.contradicted:
-            by_odometry, by_scans = _lengths(rows[0, 1:4]), _lengths(rows[0, 4:])
+            by_odometry, by_scans = lengths[:, 0]
             error = abs(by_odometry[0] - by_scans[0]), abs(rows[0, 3] - rows[0, 6])
-            self._agreed += np.stack((np.maximum(by_odometry, by_scans), error), axis=1)
+            self._agreed += np.stack((np.maximum(by_odometry, by_scans), error), axis=1) * seen[0][:, None]
             enough, good = self._agreed[:, 0] >= AGREED, self._agreed[:, 1] <= AGREEMENT * self._agreed[:, 0]
             self._agreed[enough & ~good] = 0.0
             self._wrong &= ~(enough & good)
@@ -147,7 +154,68 @@ def _lengths(motions: Array) -> Array:
 
 def _motion(step: Array) -> float:
     """Distance or turn, m or rad, of a step by odometry or the scans: what is most."""
-    return float(max(_lengths(step[1:4]).max(), _lengths(step[4:]).max()))
+    return float(max(_lengths(step[1:4]).max(), _lengths(step[4:7]).max()))
+
+
+STEPS: Final = 3
+"""Motions of which the median is the one that lasts from scan to scan."""
+CLEARLY: Final = 0.25
+"""Share of the velocity's mean squared error below which motions from scan to scan predict clearly better: half as far
+off."""
+MAX_STRETCH: Final = 3.0
+"""Greatest factor by which a pause makes a motion longer than the last one."""
+
+
+class ScanMotion:
+    """Predicts the motion between two scans from the last ones, without odometry.
+
+    Either the velocity lasts, or the motion from scan to scan: a busy host stamps scans that were made evenly in
+    bursts, none for a second and then some at once, or in the wrong order; over the times between such stamps a steady
+    robot would stand and leap. It is used where it has erred clearly less.
+
+    Args:
+        config: initial noise.
+    """
+
+    def __init__(self, config: MapperConfig) -> None:
+        self._config = config
+        self._times: deque[float] = deque(maxlen=NOISE_MEMORY)
+        self._steps: deque[tuple[float, Array]] = deque(maxlen=STEPS)
+        self._predictions = np.zeros((2, 3))
+        """By the velocity, and from scan to scan."""
+        self._errors = np.zeros(2)
+        """Their mean squares; a radian counts as a metre."""
+        self._accepted = False
+
+    def predict(self, dt: float) -> tuple[Array, Array]:
+        """Motion in base over the next ``dt`` seconds, and its covariance (3, 3)."""
+        self._times.append(dt)
+        if self._steps:
+            before, last = self._steps[-1]
+            lasting = last * (min(dt / before, MAX_STRETCH) if before > 0 else 0.0)
+            self._predictions = np.stack((lasting, np.median([step for _, step in self._steps], axis=0)))
+        best = int(self._errors[1] < CLEARLY * self._errors[0])
+        # Where stamps are no measure of the time, the usual time has passed at least.
+        seconds = max(dt, sum(self._times) / len(self._times)) if best else dt
+        place = self._config.odometry_floor[0] + self._config.blind_speed[0] * seconds
+        turn = self._config.odometry_floor[1] + self._config.blind_speed[1] * seconds
+        return self._predictions[best], np.diag((place**2, place**2, turn**2))
+
+    def learn(self, dt: float, moved: Array, match: ScanMatch) -> None:
+        """Take the motion ``moved``, shape (3,), in ``dt`` seconds by the match."""
+        before, self._accepted = self._accepted, match.accepted
+        # The first motion after a misfit makes up for what was predicted wrongly at it.
+        if not (before and match.accepted):
+            return
+        if self._steps and _is_clear(match):
+            errors = np.square(between(self._predictions, moved)).sum(axis=1)
+            self._errors += (errors - self._errors) / NOISE_MEMORY
+        self._steps.append((dt, moved))
+
+
+def _is_clear(match: ScanMatch) -> bool:
+    """Whether a match says what the motion was, without the prediction's help."""
+    return match.degeneracy >= CLEAR_MATCH[0] and match.overlap >= CLEAR_MATCH[1]
 
 
 class MotionPredictor:
@@ -165,6 +233,7 @@ class MotionPredictor:
         self._squares = np.ones(2)
         self._odom: Array | None = None
         self._by_odometry: tuple[Array, Array] | None = None
+        self._alone = ScanMotion(config)
         self._by_motion = np.zeros(3), np.zeros((3, 3))
         self._delta = np.zeros(3)
         self._dt = 0.0
@@ -222,17 +291,15 @@ class MotionPredictor:
             delta = None
         self._odom = now
         self._by_odometry = None if delta is None else (delta, self._noise(delta))
-        place = config.odometry_floor[0] + config.blind_speed[0] * dt
-        turn = config.odometry_floor[1] + config.blind_speed[1] * dt
-        motion = self._delta * (min(dt / self._dt, 3.0) if self._dt > 0 else 0.0)
-        self._by_motion = motion, np.diag((place**2, place**2, turn**2))
+        self._by_motion = self._alone.predict(dt)
         if self._by_odometry is None:
             return self._by_motion
         if not self.check.contradicted:
             return self._by_odometry
         way, turned = self.check.kept
         kept = np.array((way, way, turned))
-        return np.where(kept, self._by_odometry[0], motion), np.where(kept, self._by_odometry[1], self._by_motion[1])
+        motion, noise = self._by_motion
+        return np.where(kept, self._by_odometry[0], motion), np.where(kept, self._by_odometry[1], noise)
 
     def _noise(self, delta: Array) -> Array:
         """Covariance, shape (3, 3), of the motion ``delta`` by odometry."""
@@ -258,6 +325,7 @@ class MotionPredictor:
     def learn(self, dt: float, delta: Array, noise: Array, moved: Array, match: ScanMatch) -> None:
         """Compare the prediction ``delta`` (covariance ``noise``) with ``moved``, the motion by the match."""
         self._dt, self._delta = dt, moved
+        self._alone.learn(dt, moved, match)
         fitted, self._fitted = self._fitted, match.accepted and match.overlap >= LOW_OVERLAP
         # The first motion after a misfit makes up for what was predicted wrongly at it.
         if self._by_odometry is None or not (fitted and self._fitted):
@@ -266,9 +334,8 @@ class MotionPredictor:
         by_odometry = self._by_odometry[0]
         # Along a corridor the match takes the distance from the prediction; only its turn is measured.
         compared = (*by_odometry[:2], moved[2]) if match.degenerate else moved
-        self.check.add(dt, by_odometry, np.array(compared))
-        clear = match.degeneracy >= CLEAR_MATCH[0] and match.overlap >= CLEAR_MATCH[1]
-        if not clear or delta is not by_odometry:
+        self.check.add(dt, by_odometry, np.array(compared), seen=not match.degenerate)
+        if not _is_clear(match) or delta is not by_odometry:
             return
         off = between(delta, moved)
         place = (off[0] ** 2 + off[1] ** 2) / 2 / (noise[0, 0] + FIT_NOISE[0] ** 2)

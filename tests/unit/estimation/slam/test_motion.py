@@ -169,12 +169,12 @@ def test_one_late_odometry_is_no_contradiction():
     assert not compared(check, 1.0, 50).contradicted
 
 
-def misled(wrong):
+def misled(wrong, **more):
     """A model after 10 s of odometry that makes ``wrong`` of every motion, and what it predicts of the next one."""
     model, odom = MotionPredictor(MapperConfig()), np.zeros(3)
     for _ in range(100):
         delta, noise = model.predict(0.1, odom)
-        model.learn(0.1, delta, noise, STEP, match(tuple(STEP)))
+        model.learn(0.1, delta, noise, STEP, match(tuple(STEP), **more))
         odom = compose(odom, STEP * wrong)
     assert model.use is OdometryUse.CONTRADICTED
     return model.predict(0.1, compose(odom, (2.0, 0.0, 2.0) * STEP * wrong))[0]
@@ -190,6 +190,42 @@ def test_turns_by_odometry_count_on_if_only_its_ways_are_wrong():
 
 def test_nothing_of_odometry_counts_if_both_are_wrong():
     assert misled(np.array((2, 2, 2))) == pytest.approx(STEP, abs=5e-3)
+
+
+def test_ways_that_no_scan_saw_do_not_count_on():
+    """In a corridor the way is compared with itself."""
+    assert misled(np.array((1, 1, -1)), degeneracy=0.01) == pytest.approx(STEP, abs=5e-3)
+
+
+def test_wheels_that_are_stuck_while_the_robot_turns_on_the_spot_say_nothing_of_its_way():
+    check = OdometryCheck()
+    for k in range(20):
+        check.add(0.3, np.zeros(3), np.array((0.02 * (-1) ** k, 0.0, 0.2)))
+    assert check.contradicted
+    assert check.kept == (False, False)
+
+
+def alone(times, motions):
+    """What a model without odometry predicts of each of the ``motions`` in ``times``, s."""
+    model, predicted = MotionPredictor(MapperConfig()), []
+    for dt, moved in zip(times, motions, strict=True):
+        delta, noise = model.predict(dt, None)
+        model.learn(dt, delta, noise, moved, match(tuple(moved)))
+        predicted.append(delta)
+    return np.array(predicted)
+
+
+def test_scans_stamped_in_bursts_do_not_make_the_robot_leap():
+    times, motions = np.tile((0.001, 0.4), 50), np.tile(STEP, (100, 1))
+    motions[80:83] = 4 * STEP, -2 * STEP, STEP
+    """The second and the third scan of these were exchanged."""
+    assert alone(times, motions)[10:] == pytest.approx(np.tile(STEP, (90, 1)), abs=1e-9)
+
+
+def test_a_pause_makes_the_way_longer_where_the_stamps_are_right():
+    times = np.tile((0.1, 0.2), 50)
+    motions = times[:, None] * STEP
+    assert alone(times, motions)[10:] == pytest.approx(motions[10:])
 
 
 def test_a_corridor_does_not_contradict_the_way_by_odometry():
