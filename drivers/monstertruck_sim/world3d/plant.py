@@ -175,9 +175,13 @@ class RigidPlant(GriddedPlant):
     def stand(self, pitch: float, roll: float) -> None:
         """Lift it onto blocks that tilt it so, rad, or off them (0, 0); it keeps its place, and comes to rest there.
 
+        On the ground and to be there it goes on as it was.
+
         Raises:
             InputError: it does not stand so, and is as it was.
         """
+        if not any((pitch, roll, *self._on_blocks)):
+            return
         before, self._on_blocks = self._on_blocks, (pitch, roll)
         try:
             self.carry(self._pose)

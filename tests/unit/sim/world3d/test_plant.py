@@ -395,6 +395,14 @@ def test_it_drives_off_the_blocks_that_it_began_on(solid):
     assert truth.x > 0.5
 
 
+def test_put_onto_the_ground_that_it_is_on_it_drives_on(solid):
+    driver = solid()
+    driver.drive(0.3)
+    driver.wait(1.5)
+    driver.world.set_tilt(driver.now, GroundTilt())
+    assert driver.world.truth(driver.now).v == pytest.approx(0.3, abs=0.02)
+
+
 def test_blocks_on_which_it_cannot_stand_are_refused_and_it_stays_where_it_was(solid):
     driver = solid()
     with pytest.raises(InputError, match="falls off blocks that give it pitch 0 deg and roll 80 deg"):
