@@ -166,7 +166,7 @@ MAX_STRETCH: Final = 3.0
 """Greatest factor by which a pause makes a motion longer than the last one."""
 
 
-class ScanMotion:
+class LastMotionPredictor:
     """Predicts the motion between two scans from the last ones, without odometry.
 
     Either the velocity lasts, or the motion from scan to scan: a busy host stamps scans that were made evenly in
@@ -233,7 +233,7 @@ class MotionPredictor:
         self._squares = np.ones(2)
         self._odom: Array | None = None
         self._by_odometry: tuple[Array, Array] | None = None
-        self._alone = ScanMotion(config)
+        self._alone = LastMotionPredictor(config)
         self._by_motion = np.zeros(3), np.zeros((3, 3))
         self._delta = np.zeros(3)
         self._dt = 0.0
