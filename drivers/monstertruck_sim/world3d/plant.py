@@ -175,7 +175,7 @@ class RigidPlant(GriddedPlant):
     def stand(self, pitch: float, roll: float) -> None:
         """Lift it onto blocks that tilt it so, rad, or off them (0, 0); it keeps its place, and comes to rest there.
 
-        On the ground and to be there it goes on as it was.
+        Without a tilt nothing changes for a robot that is on no blocks.
 
         Raises:
             InputError: it does not stand so, and is as it was.

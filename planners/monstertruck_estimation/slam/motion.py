@@ -160,8 +160,8 @@ def _motion(step: Array) -> float:
 STEPS: Final = 3
 """Motions of which the median is the one that lasts from scan to scan."""
 CLEARLY: Final = 0.25
-"""Share of the velocity's mean squared error below which motions from scan to scan predict clearly better: half as far
-off."""
+"""Share of the mean squared error of the prediction by velocity below which that from scan to scan is used: half as
+far off."""
 MAX_STRETCH: Final = 3.0
 """Greatest factor by which a pause makes a motion longer than the last one."""
 
@@ -171,7 +171,7 @@ class LastMotionPredictor:
 
     Either the velocity lasts, or the motion from scan to scan: a busy host stamps scans that were made evenly in
     bursts, none for a second and then some at once, or in the wrong order; over the times between such stamps a steady
-    robot would stand and leap. It is used where it has erred clearly less.
+    robot would stand and leap. The motion from scan to scan is used where its errors were clearly smaller.
 
     Args:
         config: initial noise.
@@ -194,12 +194,12 @@ class LastMotionPredictor:
             before, last = self._steps[-1]
             lasting = last * (min(dt / before, MAX_STRETCH) if before > 0 else 0.0)
             self._predictions = np.stack((lasting, np.median([step for _, step in self._steps], axis=0)))
-        best = int(self._errors[1] < CLEARLY * self._errors[0])
+        from_scan_to_scan = bool(self._errors[1] < CLEARLY * self._errors[0])
         # Where stamps are no measure of the time, the usual time has passed at least.
-        seconds = max(dt, sum(self._times) / len(self._times)) if best else dt
+        seconds = max(dt, sum(self._times) / len(self._times)) if from_scan_to_scan else dt
         place = self._config.odometry_floor[0] + self._config.blind_speed[0] * seconds
         turn = self._config.odometry_floor[1] + self._config.blind_speed[1] * seconds
-        return self._predictions[best], np.diag((place**2, place**2, turn**2))
+        return self._predictions[int(from_scan_to_scan)], np.diag((place**2, place**2, turn**2))
 
     def learn(self, dt: float, moved: Array, match: ScanMatch) -> None:
         """Take the motion ``moved``, shape (3,), in ``dt`` seconds by the match."""

@@ -217,8 +217,7 @@ def alone(times, motions):
 
 def test_scans_stamped_in_bursts_do_not_make_the_robot_leap():
     times, motions = np.tile((0.001, 0.4), 50), np.tile(STEP, (100, 1))
-    motions[80:83] = 4 * STEP, -2 * STEP, STEP
-    """The second and the third scan of these were exchanged."""
+    motions[80:83] = 4 * STEP, -2 * STEP, STEP  # two scans were exchanged
     assert alone(times, motions)[10:] == pytest.approx(np.tile(STEP, (90, 1)), abs=1e-9)
 
 

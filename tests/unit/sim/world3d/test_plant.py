@@ -395,7 +395,7 @@ def test_it_drives_off_the_blocks_that_it_began_on(solid):
     assert truth.x > 0.5
 
 
-def test_put_onto_the_ground_that_it_is_on_it_drives_on(solid):
+def test_without_blocks_a_tilt_of_zero_does_not_stop_it(solid):
     driver = solid()
     driver.drive(0.3)
     driver.wait(1.5)
