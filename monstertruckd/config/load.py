@@ -685,6 +685,9 @@ def _give_ports(data: dict[str, Any]) -> None:
 
 def _explain(tree: Tree, path: Path, model: type[Schema], error: ValidationError) -> Iterator[str]:
     details = error.errors(include_url=False)
+    wrong = {detail["loc"][:depth] for detail in details for depth in range(len(detail["loc"]))}
+    # entries that are wrong are not counted, so a list of them is "too short"
+    details = [detail for detail in details if detail["type"] != "too_short" or detail["loc"] not in wrong]
     for detail in details[:MOST_MISTAKES]:
         key = _data_key(tree.data, detail["loc"])
         origin = tree.origin(key) or f"{path}:1"
@@ -703,6 +706,9 @@ def _sentence(detail: ErrorDetails, model: type[Schema], key: Key) -> str:
         return "missing; it has no default"
     if detail["type"] == "union_tag_invalid":
         return f"no kind {detail['ctx']['tag']!r}; expected one of {detail['ctx']['expected_tags']}"
+    if detail["type"] in ("too_short", "too_long"):
+        limit = "at least {min_length}" if detail["type"] == "too_short" else "at most {max_length}"
+        return f"expected {limit.format_map(detail['ctx'])} in number"
     message = detail["msg"].removeprefix("Value error, ")
     message = message[:1].lower() + message[1:]
     if detail["type"] == "value_error":

@@ -445,6 +445,9 @@ class TruckClient(Operator):
             place: of a mark, in map, m; None = where the robot is.
             yaw: rad; None = the robot's.
 
+        Returns:
+            Of a mark its place: ``x``, ``y`` (m) and ``yaw`` (rad) in map.
+
         Raises:
             RequestRefusedError: why not.
             NotFoundError: the robot, or the point, is not there, or the robot keeps none.

@@ -31,11 +31,11 @@ class GoToStep(MissionStep):
 
     do: Literal["goto"]
     x: Coordinate
-    """M, in map"""
+    """In map, m"""
     y: Coordinate
-    """M"""
+    """In m"""
     yaw: Coordinate
-    """Rad"""
+    """In rad"""
     via: Annotated[tuple[tuple[Coordinate, Coordinate], ...], Field(max_length=32, strict=False)] = ()
     """Places x, y to pass before"""
 
@@ -47,7 +47,7 @@ class PointStep(MissionStep):
     point: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,31}$")]
     """Name of the point of interest"""
     distance: Annotated[float, Field(ge=0, le=5)] = 0.7
-    """M before a tag"""
+    """Metres before a tag"""
 
 
 class LookStep(MissionStep):
@@ -55,9 +55,9 @@ class LookStep(MissionStep):
 
     do: Literal["look"]
     x: Coordinate
-    """M, in map"""
+    """In map, m"""
     y: Coordinate
-    """M"""
+    """In m"""
 
 
 class WaitStep(MissionStep):
@@ -96,7 +96,7 @@ class FollowWallStep(MissionStep):
     name: Name
     """Of the behaviour in the robot's configuration"""
     distance: Annotated[float, Field(gt=0, le=10_000)]
-    """M"""
+    """In m"""
 
 
 class RecordStep(MissionStep):

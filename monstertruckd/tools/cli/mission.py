@@ -62,10 +62,17 @@ def check_command(file: FileArgument, json_output: JsonOption = False) -> None:
         print_json(mission.model_dump(mode="json"))
         return
     rows = [
-        (str(number), in_words(step), str(step.retries), step.on_failure or mission.on_failure)
+        (
+            str(number),
+            str(step.retries),
+            "-" if step.limit is None else f"{step.limit:g}",
+            step.on_failure or mission.on_failure,
+            in_words(step),
+        )
         for number, step in enumerate(mission.steps, 1)
     ]
-    print_table(("step", "what", "retries", "on failure"), rows)
+    numbers = ("step", "retries", "limit s")
+    print_table((*numbers, "on failure", "what"), rows, right=numbers)
 
 
 @app.command("list")
@@ -87,7 +94,11 @@ def list_command(
     if json_output:
         print_json([dict(zip(("file", "name", "steps", "error"), row, strict=True)) for row in rows])
     elif rows:
-        print_table(("file", "name", "steps", "mistake"), [tuple(map(str, row)) for row in rows])
+        cells = [
+            (file, name, str(steps or ""), mistake.replace(f"{folder / file}:", "line ", 1))
+            for file, name, steps, mistake in rows
+        ]
+        print_table(("file", "name", "steps", "first mistake"), cells, right=("steps",))
     else:
         print(f"none: no *.yaml in {folder}")
 

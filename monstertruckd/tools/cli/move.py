@@ -51,6 +51,8 @@ def move(
     """
     from monstertruckd.tools.cli.runs import run_behaviour
 
+    if length is None and angle is None:
+        raise InputError("expected --length 0.5, or --radius 0 --angle 1.57, for example")
     spot = radius == 0.0
     given = {
         "radius": radius,
@@ -82,10 +84,9 @@ def _check(settings: dict[str, Any]) -> None:
     from monstertruck_planners.behave.move import MoveConfig
 
     try:
-        MoveConfig.model_validate(settings).move()
+        MoveConfig.model_validate(settings)
     except ValidationError as error:
         detail = error.errors(include_url=False)[0]
         where = "".join(f"--{name}: " for name in detail["loc"])
-        raise InputError(where + detail["msg"].removeprefix("Value error, ")) from None
-    except ValueError as error:
-        raise InputError(f"move: {error}") from None
+        message = detail["msg"].removeprefix("Value error, ").replace("Input should be ", "expected ")
+        raise InputError(where + message) from None

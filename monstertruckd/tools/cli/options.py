@@ -10,6 +10,7 @@ import typer
 
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT, is_endpoint, nearest
 from monstertruck_runtime.errors import InputError
+from monstertruckd.tools.cli.output import WHICH_ROBOT
 
 
 def complete_topic(incomplete: str) -> Iterator[tuple[str, str]]:
@@ -48,8 +49,15 @@ def complete_config(incomplete: str) -> list[str]:
     return sorted(str(file) for file in files if str(file).startswith(incomplete))
 
 
-def _nearest(endpoint: str) -> str:
-    """One parameter, for a callback of an option gets its value by position."""
+def _noted(context: typer.Context, option: typer.CallbackParam, value: str) -> str:
+    """Have the command that a refusal names reach the same robot."""
+    if value not in ("truck", DEFAULT_ENDPOINT):  # what ``arm`` and ``reset`` take without options
+        context.meta.setdefault(WHICH_ROBOT, {})[option.name] = f"{option.opts[0]} {value}"
+    return value
+
+
+def _nearest(context: typer.Context, option: typer.CallbackParam, value: str) -> str:
+    endpoint = _noted(context, option, value)
     if not is_endpoint(endpoint):
         raise InputError(
             f"--endpoint {endpoint!r}: expected tcp/HOST:PORT or tls/HOST:PORT, such as {DEFAULT_ENDPOINT}"
@@ -57,7 +65,7 @@ def _nearest(endpoint: str) -> str:
     return nearest(endpoint)
 
 
-RobotOption = Annotated[str, typer.Option("--robot", "-r", help="Name of the robot.")]
+RobotOption = Annotated[str, typer.Option("--robot", "-r", help="Name of the robot.", callback=_noted)]
 EndpointOption = Annotated[
     str,
     typer.Option(

@@ -20,7 +20,7 @@ from contextlib import contextmanager, suppress
 from enum import Enum
 from pathlib import PurePath
 from types import FrameType
-from typing import TYPE_CHECKING, Annotated, Any, Final, TextIO, cast
+from typing import TYPE_CHECKING, Annotated, Any, Final, Protocol, TextIO, cast
 
 import typer
 from typer.core import TyperCommand, TyperGroup
@@ -194,22 +194,30 @@ def wrapped(text: str, indent: str = "") -> str:
     return "\n".join("\n".join(wrapper.wrap(line)) for line in text.split("\n"))
 
 
+class Bar(Protocol):
+    """Shows how far something has come."""
+
+    def __call__(self, done: float, what: str | None = None, /) -> None:
+        """Set how much is done, and ``what`` is being done if that has changed."""
+        ...
+
+
 @contextmanager
-def progress(what: str, total: float | None = None) -> Iterator[Callable[[float], None]]:
+def progress(what: str, total: float | None = None) -> Iterator[Bar]:
     """A bar on standard error, if that is a terminal; yields a function that sets how much of ``total`` is done.
 
     Args:
-        what: is being done, in a word or two.
+        what: is being done, in a few words.
         total: amount; None = unknown.
     """
     if not on_terminal(sys.stderr):
-        yield lambda _: None
+        yield lambda _done, _what=None: None
         return
     from rich.progress import Progress
 
     with Progress(console=console(error=True), transient=True) as bar:
         task = bar.add_task(what, total=total)
-        yield lambda done: bar.update(task, completed=done)
+        yield lambda done, now=None: bar.update(task, completed=done, description=now)
 
 
 @contextmanager
@@ -230,10 +238,13 @@ def needs_extra(name: str) -> Iterator[None]:
 
 
 REMEDIES: Final = {
-    Reason.DISARMED: "`monstertruckd arm` lets it drive",
-    Reason.ESTOPPED: "`monstertruckd reset` clears the emergency stop",
+    Reason.DISARMED: ("monstertruckd arm", "lets it drive"),
+    Reason.ESTOPPED: ("monstertruckd reset", "clears the emergency stop"),
 }
-"""The command that removes the cause of a refusal."""
+"""The command that removes the cause of a refusal, and what it does."""
+
+WHICH_ROBOT: Final = "monstertruckd.which_robot"
+"""Key of a command's context: its options ``--robot`` and ``--endpoint`` as they were given."""
 
 
 def finish(reason: Reason, text: str = "") -> None:
@@ -248,9 +259,16 @@ def finish(reason: Reason, text: str = "") -> None:
 
 
 def with_remedy(reason: Reason, text: str) -> str:
-    """A refusal in words, and the command that removes its cause if there is one."""
-    remedy = REMEDIES.get(reason)
-    return text if remedy is None or remedy in text else f"{text}; {remedy}"
+    """A refusal in words, and the command that removes its cause if there is one, for the same robot."""
+    from typer._click.globals import get_current_context
+
+    if reason not in REMEDIES:
+        return text
+    command, effect = REMEDIES[reason]
+    context = get_current_context(silent=True)
+    which: dict[str, str] = {} if context is None else context.meta.get(WHICH_ROBOT, {})
+    remedy = f"`{' '.join((command, *which.values()))}` {effect}"
+    return text if remedy in text else f"{text}; {remedy}"
 
 
 def print_end(reason: Reason, text: str, values: Mapping[str, Any], *, json_output: bool) -> None:
@@ -270,9 +288,10 @@ def print_end(reason: Reason, text: str, values: Mapping[str, Any], *, json_outp
     if json_output:
         print_json(values)
     shown = re.sub(r"([-+]?\d+\.\d+) rad\b(?!/)", lambda rad: f"{rad[0]} ({math.degrees(float(rad[1])):.1f}°)", text)
+    whole = shown if reason.text in shown else f"{reason.text}: {shown}"
     if not json_output and not reason.exit_code:
-        print(f"{reason.text}: {shown}")
-    finish(reason, f"{reason.text}: {shown}")
+        print(wrapped(whole) if on_terminal(sys.stdout) else whole)
+    finish(reason, whole)
 
 
 def until_stopped(main: Callable[[WallClock], Coroutine[Any, Any, None]]) -> None:

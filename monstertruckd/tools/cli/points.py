@@ -107,8 +107,8 @@ def mark_command(
         raise InputError("expected x and y, or neither")
     require_finite(tuple(value for value in (x, y, yaw) if value is not None))
     place = None if x is None or y is None else (x, y)
-    _order(PointOrder.MARK, robot, endpoint, name, place, yaw)
-    remark(f"marked {name}")
+    marked = _order(PointOrder.MARK, robot, endpoint, name, place, yaw)
+    remark(f"marked {name} at x {marked['x']:.2f}, y {marked['y']:.2f} m, yaw {marked['yaw']:.2f} rad")
 
 
 @app.command("remove")
@@ -133,12 +133,12 @@ def _points(folder: Path | None, robot: str, endpoint: str) -> "list[PointOfInte
     return with_robot(_newest, robot, endpoint)
 
 
-def _order(order: "PointOrder", robot: str, endpoint: str, *what: Any) -> None:
-    async def main(client: "TruckClient", _: Clock) -> None:
+def _order(order: "PointOrder", robot: str, endpoint: str, *what: Any) -> dict[str, Any]:
+    async def main(client: "TruckClient", _: Clock) -> dict[str, Any]:
         await require_section(client, "points", WITHOUT)
-        await client.point(order, *what)
+        return await client.point(order, *what)
 
-    with_robot(main, robot, endpoint)
+    return with_robot(main, robot, endpoint)
 
 
 async def _newest(client: "TruckClient", clock: Clock) -> "list[PointOfInterest]":

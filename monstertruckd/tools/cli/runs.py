@@ -78,7 +78,7 @@ async def run_behaviour(
             BEHAVIOUR,
             lambda: client.behave(BehaviourOrder.START, name, settings),
             lambda: client.behave(BehaviourOrder.STOP, name),
-            lambda state: bar(state.elapsed),
+            lambda state: bar(state.elapsed, f"{name}: {state.phase or 'begins'}, {state.travelled:.1f} m"),
             ("behaviour", "elapsed", "travelled", "values"),
             arm=arm,
         )

@@ -234,8 +234,6 @@ def _truck(state: ScreenState) -> Panel:
         _row(table, "limit", f"{gate.speed_limit:.2f} m/s, stops in {gate.stopping_distance * 100:.1f} cm")
         if gate.waiting:
             _row(table, "waiting", ", ".join(gate.waiting))
-        if gate.weakened:
-            _row(table, "weakened", Text("\n".join(gate.weakened), style="bold yellow"))
     if odometry is not None:
         speed = math.copysign(math.hypot(odometry.twist.vx, odometry.twist.vy), odometry.twist.vx)
         _row(table, "speed", f"{speed:+.2f} m/s {math.degrees(odometry.twist.wz):+.0f}°/s")
@@ -258,6 +256,8 @@ def _truck(state: ScreenState) -> Panel:
         _row(table, "busy", Text(state.loop.busy, style="bold yellow"))
     elif state.loop is not None:
         _row(table, "tick late", f"p99 {state.loop.lateness_p99 * 1e3:.1f} ms max {state.loop.lateness_max * 1e3:.1f}")
+    if gate is not None and gate.weakened:  # last: it does not change, and a small screen cuts off the end
+        _row(table, "weakened", Text("\n".join(gate.weakened), style="bold yellow"))
     old = f", {state.silence:.0f} s ago" if state.gone else ""
     return Panel(table, title=f"mt/{state.robot}{old}", border_style="dim")
 

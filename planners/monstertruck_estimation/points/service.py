@@ -325,8 +325,11 @@ class PointService:
 
     # Requests
 
-    def take(self, request: PointRequest) -> None:
+    def take(self, request: PointRequest) -> Vector | None:
         """Mark a place, or forget a point.
+
+        Returns:
+            The place that was marked: x, y, yaw in map.
 
         Raises:
             RequestRefusedError: the sender may not, or the robot does not know where it is.
@@ -336,9 +339,11 @@ class PointService:
         reason = refusal(request, self._in.gate.latest, self._sequences, self._clock.now(), None)
         if reason is not Reason.OK:
             raise RequestRefusedError(reason)
+        place = None
         if request.order is PointOrder.REMOVE:
             if self._map.points.pop(request.name, None) is None:
-                raise NotFoundError(f"no point of interest {request.name!r}")
+                known = ", ".join(sorted(self._map.points)) or "none"
+                raise NotFoundError(f"no point of interest {request.name!r}: expected one of {known}")
             self._unanchored.pop(request.name, None)
             text = f"{request.name} removed by {request.source}"
         else:
@@ -347,6 +352,7 @@ class PointService:
         self._dirty[request.name] = None
         self._stamps = self._map.stamps()
         self._events(Reason.POINT_CHANGED, Severity.INFO, self.name, text)
+        return place
 
     def _mark(self, request: PointRequest) -> Vector:
         if (request.x is None) != (request.y is None):
@@ -394,7 +400,9 @@ def _apart(one: Vector, other: Vector) -> bool:
 
 
 def register_point_calls(rpc: RpcRegistry, service: PointService) -> None:
-    """Serve ``points``, whose payload is a ``PointRequest``, and ``point_picture`` with the ``name`` of a point.
+    """Serve ``points`` and ``point_picture``.
+
+    The first takes a ``PointRequest`` and answers a mark by its place, the second takes the ``name`` of a point.
 
     Args:
         rpc: where.
@@ -402,8 +410,8 @@ def register_point_calls(rpc: RpcRegistry, service: PointService) -> None:
     """
 
     async def points(payload: dict[str, Any]) -> dict[str, Any]:
-        service.take(parse_request(PointRequest, payload))
-        return {}
+        place = service.take(parse_request(PointRequest, payload))
+        return {} if place is None else dict(zip(("x", "y", "yaw"), place, strict=True))
 
     async def point_picture(payload: dict[str, Any]) -> dict[str, Any]:
         data = service.picture(str(payload.get("name", "")))

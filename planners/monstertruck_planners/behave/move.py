@@ -215,13 +215,12 @@ class Move:
         left = self._distance - state.covered
         stands = abs(self._pace(odometry.twist)) * LAG <= self._amounts.tolerance
         if state.phase == "arrive" and abs(left) <= self._amounts.tolerance and stands:
-            unit = "rad" if self._move.radius == 0.0 else "m"
-            return self._ended(
-                state, Reason.BEHAVIOUR_DONE, f"{state.covered:.3f} {unit}, turned {state.turned:.3f} rad"
-            )
+            way = "" if self._move.radius == 0.0 else f"{state.covered:.3f} m, "
+            return self._ended(state, Reason.BEHAVIOUR_DONE, f"{way}turned {state.turned:.3f} rad")
         if waited > PATIENCE:
+            unit = "rad" if self._move.radius == 0.0 else "m"
             reason = Reason.GOAL_MISSED if state.phase == "arrive" else Reason.STUCK
-            return self._ended(state, reason, f"{left:.3f} left and no progress for {waited:.1f} s: {gate.why}")
+            return self._ended(state, reason, f"{left:.3f} {unit} left and no progress for {waited:.1f} s: {gate.why}")
         off = state.target - state.covered
         usual = LAG * abs(state.planned)
         beyond = off - min(max(off, -usual), usual)

@@ -191,7 +191,9 @@ class BehaviourService:
     def _stop(self, request: BehaviourRequest, now: int) -> int:
         run = self._run
         if run is None or not run.running or request.behaviour not in ("", run.name):
-            raise RequestRefusedError(Reason.NOT_FOUND, f"{request.behaviour or 'no behaviour'} is not running")
+            name = request.behaviour
+            text = f"the behaviour {name} is not running" if name else "no behaviour is running"
+            raise RequestRefusedError(Reason.NOT_FOUND, text)
         self._end(run, Reason.CANCELLED, f"stopped by {request.source}", now)
         self._report(now)
         return run.number

@@ -8,7 +8,19 @@ from pydantic import Field, model_validator
 
 from monstertruck_planners.goals.exchange import Pose
 from monstertruck_schemas.base import Pose2D, Schema
-from monstertruck_schemas.mission import AnyStep, GoToStep, LookStep, Mission, PointStep, WaitStep
+from monstertruck_schemas.mission import (
+    AnyStep,
+    BehaviourStepOfMission,
+    ExploreStep,
+    FollowWallStep,
+    GoToStep,
+    LookStep,
+    Mission,
+    PointStep,
+    RecordStep,
+    ReturnStep,
+    WaitStep,
+)
 from monstertruck_schemas.reasons import Reason
 
 FINAL = frozenset({Reason.CANCELLED, Reason.DISARMED, Reason.ESTOPPED, Reason.SHUTDOWN})
@@ -105,19 +117,29 @@ def outcome(progress: MissionProgress, following: Next) -> StepEnd:
 
 
 def in_words(step: AnyStep) -> str:
-    """A step in a few words."""
+    """What a step does, in a line: all that it says, but for retries, policy and limit."""
     match step:
-        case GoToStep(x=x, y=y, yaw=yaw):
-            return f"goto {x:g} {y:g} {yaw:g}"
+        case GoToStep(x=x, y=y, yaw=yaw, via=via):
+            return " ".join((f"goto {x:g} {y:g} {yaw:g}", *(f"via {a:g},{b:g}" for a, b in via)))
         case LookStep(x=x, y=y):
             return f"look at {x:g} {y:g}"
-        case PointStep(point=point):
-            return f"goto_point {point}"
+        case PointStep(point=point, distance=distance):
+            return f"goto_point {point}, {distance:g} m before a tag"
         case WaitStep(seconds=seconds):
             return f"wait {seconds:g} s"
-        case _:
-            name = getattr(step, "name", "")
-            return f"{step.do} {name}".strip()
+        case ExploreStep(budget=budget, home=home, find=find):
+            words = "explore"
+            words += "" if budget is None else f" for {budget:g} s"
+            words += "" if find is None else f" until it knows {find} tags"
+            return f"{words} and home" if home else words
+        case BehaviourStepOfMission(name=name, settings=settings):
+            return " ".join((f"behaviour {name}", *(f"{key}={value}" for key, value in settings.items())))
+        case FollowWallStep(name=name, distance=distance):
+            return f"follow_wall {name} for {distance:g} m"
+        case RecordStep(note=note):
+            return f"record: {note}"
+        case ReturnStep():
+            return "return"
 
 
 class SavedProgress(Schema):

@@ -82,9 +82,9 @@ class Rig:
                 self.camera.put(CompressedImage(**header, frame="camera", data=show, sequence=i))
             await self.clock.sleep(0.05)
 
-    async def ask(self, order: PointOrder, name: str, **more) -> None:
+    async def ask(self, order: PointOrder, name: str, **more) -> dict[str, float]:
         self.seq += 1
-        await self.calls["points"]({
+        return await self.calls["points"]({
             "stamp": 0, "received": 0, "seq": self.seq, "source": "ann", "role": Role.STATION, "lease": 1.0,
             "nonce": "n", "order": order, "name": name, **more,
         })  # fmt: skip
@@ -145,12 +145,13 @@ def test_places_are_marked_moved_with_the_map_and_removed(tmp_path):
             await rig.ask(PointOrder.MARK, "dock")
         rig.speed = 1.0
         await rig.drive(2.0, show=b"")
-        await rig.ask(PointOrder.MARK, "here")
-        await rig.ask(PointOrder.MARK, "there", x=1.0, y=3.0, yaw=1.0)
+        here = await rig.ask(PointOrder.MARK, "here")
+        assert here["x"] > 1.0
+        assert await rig.ask(PointOrder.MARK, "there", x=1.0, y=3.0, yaw=1.0) == {"x": 1.0, "y": 3.0, "yaw": 1.0}
         for wrong in ({"x": 1.0}, {"name": "tag-9"}):
             with pytest.raises(InputError):
                 await rig.ask(PointOrder.MARK, **({"name": "odd"} | wrong))
-        with pytest.raises(NotFoundError, match="no point of interest 'nowhere'"):
+        with pytest.raises(NotFoundError, match="no point of interest 'nowhere': expected one of here, there"):
             await rig.ask(PointOrder.REMOVE, "nowhere")
         await rig.drive(1.5, show=b"")
         before = {point.name: point for point in rig.out[-1].points}

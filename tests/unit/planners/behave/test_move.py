@@ -2,6 +2,7 @@
 
 import itertools
 import math
+import re
 
 import pytest
 
@@ -73,6 +74,17 @@ def test_signs_are_those_of_rep_103_and_the_end_is_reached(profile, settings, en
     assert moved(rows) == pytest.approx(end, abs=0.015)
 
 
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"length": 0.02}, r"0\.0\d\d m, turned -?0\.000 rad"),
+        ({"radius": 0.0, "angle": 0.5}, r"turned 0\.[45]\d\d rad"),
+    ],
+)
+def test_its_end_says_how_far_it_went_and_turned(settings, said):
+    assert re.fullmatch(said, drive(**settings)[-1][1].text)
+
+
 @pytest.mark.parametrize("profile", ["trapezoid", "cubic", "ramp"])
 def test_the_speed_grows_and_falls_within_the_acceleration(profile):
     rows = drive(profile=profile, length=1.0, speed=0.2, acceleration=0.3)
@@ -95,7 +107,7 @@ def test_a_robot_that_does_not_move_any_more_is_stuck_for_what_the_gate_says():
     rows = drive(length=0.6, slow=lambda t: 0.0 if t > 2.5 else 1.0, reasons=(Reason.OBSTACLE_STOP,))
     end = rows[-1][1]
     assert end.outcome is Reason.STUCK
-    assert "obstacle within the stopping distance" in end.text
+    assert re.fullmatch(r"0\.\d{3} m left and no progress for 3\.\d s: obstacle within the stopping distance", end.text)
     assert end.motion is None
 
 

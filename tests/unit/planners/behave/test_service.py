@@ -254,6 +254,17 @@ def test_without_fresh_sonars_it_does_not_start_and_stops():
     on_bench(scenario)
 
 
+@pytest.mark.parametrize(
+    ("name", "said"), [("", "no behaviour is running"), ("wall", "the behaviour wall is not running")]
+)
+def test_what_does_not_run_cannot_be_stopped(name, said):
+    async def scenario(bench):
+        with pytest.raises(RequestRefusedError, match=said):
+            bench.stop(name)
+
+    on_bench(scenario)
+
+
 @pytest.mark.parametrize("way", ["obeys", "blocked"])
 def test_a_gate_that_does_not_let_it_drive_ends_it_with_the_gates_reason(way):
     async def scenario(bench):

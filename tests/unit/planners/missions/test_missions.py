@@ -84,11 +84,21 @@ def test_what_is_saved_comes_back():
     assert (again.mission, again.start, again.index, again.failures) == (at.mission, at.start, 1, 1)
 
 
-def test_steps_have_short_names():
-    steps = mission(
-        GO, {"do": "look", "x": 2, "y": 3}, WAIT, {"do": "follow_wall", "name": "left", "distance": 2}
-    ).steps
-    assert [in_words(step) for step in steps] == ["goto 1 0 0", "look at 2 3", "wait 3 s", "follow_wall left"]
+def test_a_line_says_all_that_a_step_does():
+    lines = {
+        "goto 1 0 0": GO,
+        "goto 1 0 0 via 2,3 via 0.5,4": {**GO, "via": [[2, 3], [0.5, 4]]},
+        "look at 2 3": {"do": "look", "x": 2, "y": 3},
+        "wait 3 s": WAIT,
+        "goto_point dock, 0.5 m before a tag": {"do": "goto_point", "point": "dock", "distance": 0.5},
+        "explore": {"do": "explore"},
+        "explore for 60 s until it knows 2 tags and home": {"do": "explore", "budget": 60, "find": 2, "home": True},
+        "behaviour move length=0.3": {"do": "behaviour", "name": "move", "settings": {"length": 0.3}},
+        "follow_wall left for 2 m": {"do": "follow_wall", "name": "left", "distance": 2},
+        "record: here": {"do": "record", "note": "here"},
+        "return": {"do": "return"},
+    }
+    assert [in_words(step) for step in mission(*lines.values()).steps] == list(lines)
 
 
 class Pretended:

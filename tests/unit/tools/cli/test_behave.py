@@ -14,6 +14,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import BehaviourOrder
 from monstertruck_schemas.state import GateMode, GateState
 from monstertruck_schemas.topics import BEHAVIOUR
+from monstertruckd.tools.cli import behave, runs
 from monstertruckd.tools.cli.main import app
 from monstertruckd.tools.cli.runs import run_behaviour
 
@@ -21,7 +22,7 @@ from monstertruckd.tools.cli.runs import run_behaviour
 def state(number=1, *, running=True, outcome=Reason.DRIVING, text=""):
     return BehaviourState(
         stamp=0, received=0, seq=0, number=number, behaviour="wall", kind="wall_pd", source="ann", running=running,
-        outcome=outcome, text=text, elapsed=2.0, travelled=0.3, values={"distance": 0.3},
+        phase="follow", outcome=outcome, text=text, elapsed=2.0, travelled=0.3, values={"distance": 0.3},
     )  # fmt: skip
 
 
@@ -113,6 +114,40 @@ def test_a_start_that_is_not_answered_is_stopped_and_a_refused_one_is_not(error,
     robot, end = run(refuses=error)
     assert end is error
     assert (robot.orders[-1] is BehaviourOrder.STOP) == stops
+
+
+def test_the_bar_says_what_the_robot_does_and_how_far_it_went(monkeypatch):
+    shown = []
+
+    @contextmanager
+    def progress(what):
+        shown.append(what)
+        yield lambda _, now: shown.append(now)
+
+    monkeypatch.setattr(runs, "progress", progress)
+    run(state(), state(running=False, outcome=Reason.BEHAVIOUR_DONE))
+    assert shown == ["wall", "wall: follow, 0.3 m", "wall: follow, 0.3 m"]
+
+
+@pytest.mark.parametrize(
+    ("options", "command"),
+    [
+        ([], "`monstertruckd arm` lets it drive"),
+        (["-r", "sonar"], "`monstertruckd arm --robot sonar` lets it drive"),
+        (
+            ["--endpoint", "tcp/10.0.0.1:7448", "--robot", "sonar"],
+            "`monstertruckd arm --endpoint tcp/10.0.0.1:7448 --robot sonar` lets it drive",
+        ),
+    ],
+)
+def test_the_command_that_a_refusal_names_reaches_the_same_robot(monkeypatch, options, command):
+    def refused(*_):
+        raise RequestRefusedError(Reason.DISARMED)
+
+    monkeypatch.setattr(behave, "with_robot", refused)
+    said = CliRunner().invoke(app, ["behave", "start", "wall", *options])
+    assert said.exit_code == Reason.DISARMED.exit_code
+    assert said.stderr.endswith(f"; {command}\n")
 
 
 def test_the_commands_have_help():

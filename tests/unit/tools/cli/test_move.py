@@ -13,13 +13,13 @@ from monstertruckd.tools.cli.runs import RunEnd
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ([], "expected either a length or an angle"),
+        ([], "expected --length 0.5, or --radius 0 --angle 1.57"),
         (["--length", "1", "--angle", "1"], "expected either a length or an angle"),
         (["--angle", "1"], "an angle needs a radius: 0 turns on the spot"),
         (["--radius", "0", "--length", "1"], "radius is 0"),
         (["--length", "0"], "the length or angle is 0: nothing would move"),
         (["--radius", "0", "--angle", "0"], "the length or angle is 0: nothing would move"),
-        (["--length", "1", "--speed", "-0.1"], "--speed"),
+        (["--length", "1", "--speed", "-0.1"], "--speed: expected greater than 0"),
         (["--length", "1", "--bearing", "7"], "--bearing"),
     ],
 )

@@ -332,6 +332,19 @@ def test_a_value_without_a_unit_is_followed_by_its_grade(
     assert capsys.readouterr().out.splitlines()[::2] == ["battery.gain: 1.25, A", "battery.gain: 1.25 V, A"]
 
 
+def test_an_end_says_its_reason_once_and_breaks_no_word(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    reason = Reason.OBSTACLE_STOP
+    with pytest.raises(typer.Exit):
+        print_end(reason, f"the gate does not let it drive: {reason.text}", {}, json_output=False)
+    assert capsys.readouterr().err == f"the gate does not let it drive: {reason.text}\n"
+    monkeypatch.setattr("monstertruckd.tools.cli.output.on_terminal", lambda _: True)
+    monkeypatch.setenv("COLUMNS", "40")
+    print_end(Reason.BEHAVIOUR_DONE, "turned 1.563 rad", {}, json_output=False)
+    assert capsys.readouterr().out == "a behaviour did what it was started for:\nturned 1.563 rad (89.6°)\n"
+
+
 def test_the_end_of_a_drive_says_angles_in_degrees_too(capsys: pytest.CaptureFixture[str]):
     text = "0.012 m and 0.031 rad away, at 0.500 rad/s"
     print_end(Reason.GOAL_REACHED, text, {}, json_output=False)

@@ -11,6 +11,7 @@ from monstertruck_estimation.points.files import save
 from monstertruck_runtime.yaml_files import read_yaml
 from monstertruck_schemas.points import PointKind, PointOfInterest
 from monstertruck_schemas.reasons import Reason
+from monstertruckd.tools.cli import points
 from monstertruckd.tools.cli.main import app
 
 TAG = PointOfInterest(
@@ -56,3 +57,9 @@ def test_a_robot_stands_before_a_tag_and_on_a_mark():
     assert before.yaw == pytest.approx(3.0 - np.pi)
     assert MARK.before(0.5).x == 3.0
     assert run("mark", "dock", "1.0").exit_code == Reason.BAD_INPUT.exit_code
+
+
+def test_a_mark_says_where_it_is(monkeypatch):
+    monkeypatch.setattr(points, "with_robot", lambda *_: {"x": 2.4, "y": 1.0, "yaw": -1.5})
+    done = run("mark", "dock")
+    assert done.stderr == "marked dock at x 2.40, y 1.00 m, yaw -1.50 rad\n"

@@ -160,6 +160,17 @@ def test_the_screen_shows_who_waits_and_what_weakens_the_truck():
         assert words in text
 
 
+def test_settings_that_weaken_the_truck_leave_room_for_what_changes():
+    state = full()
+    assert state.gate is not None
+    state.take(state.gate.model_copy(update={"weakened": ("gate.scan.critical false: " + "long " * 40,)}))
+    console = Console(width=80, height=24, record=True)
+    console.print(draw(state, 80), height=24)
+    text = console.export_text()
+    for name in ("pose", "battery", "speed", "tick late", "weakened"):
+        assert f"│ {name} " in text, name
+
+
 def test_a_busy_computer_is_said_in_words():
     state = full()
     assert "busy" not in "\n".join(plain(state))
