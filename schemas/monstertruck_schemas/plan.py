@@ -206,10 +206,12 @@ class MissionState(Message):
     """Attempt at the present step, counted from 1."""
     failures: Annotated[int, Field(ge=0)] = 0
     """Steps that have failed so far."""
+    failed: str = ""
+    """Why the last attempt at a step failed."""
     outcome: Reason = Reason.OK
     """DRIVING while it runs, then MISSION_DONE, CANCELLED, or why it ended."""
     text: str = ""
-    """The outcome in words."""
+    """The outcome in words; while it runs what the present step waits for."""
     elapsed: Annotated[float, Field(ge=0)] = 0.0
     """Seconds since it was started or resumed."""
 

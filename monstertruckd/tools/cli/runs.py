@@ -13,6 +13,7 @@ from monstertruck_schemas.mission import Mission
 from monstertruck_schemas.plan import BehaviourState, ExplorationPhase, ExplorationState, MissionState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import BehaviourOrder, ExploreOrder, MissionOrder
+from monstertruck_schemas.state import GateState
 from monstertruck_schemas.topics import BEHAVIOUR, EXPLORE, GATE, MISSION, Topic
 from monstertruckd.tools.cli.output import progress, with_remedy
 
@@ -99,8 +100,7 @@ async def run_exploration(
 
     def show(state: ExplorationState) -> None:
         nonlocal shown, due
-        held = gate.latest
-        stands = "" if held is None or held.mode.active else with_remedy(held.worst, held.why)
+        stands = _why_it_stands(gate)
         now = state.phase, state.goals, stands, state.text
         if report is not None and (now != shown or state.elapsed >= due):
             shown, due = now, state.elapsed + EVERY
@@ -128,30 +128,53 @@ async def run_mission(
         mission: None = resume the interrupted one.
         arm: arm the robot first.
         moved: see ``TruckClient.mission``.
-        report: gets a line for each step.
+        report: gets a line for each step, each that failed, and why the robot waits or stands.
 
     Raises:
         NotFoundError: the robot cannot do one of the steps.
     """
     order = MissionOrder.RESUME if mission is None else MissionOrder.START
-    shown = (0, 0)
+    before: MissionState | None = None
+    said = ""
 
     def show(state: MissionState) -> None:
-        nonlocal shown
-        if report is not None and (state.step, state.attempt) != shown and state.running:
-            shown = state.step, state.attempt
+        nonlocal before, said
+        if report is None or not state.running:
+            return
+        lines = [] if before is None else _failed(before, state)
+        if before is None or (state.step, state.attempt, state.doing) != (before.step, before.attempt, before.doing):
             again = f", attempt {state.attempt}" if state.attempt > 1 else ""
-            report(f"{state.elapsed:6.0f} s  step {state.step} of {state.steps}: {state.doing}{again}")
+            lines.append(f"step {state.step} of {state.steps}: {state.doing}{again}")
+        stands = _why_it_stands(gate)
+        trouble = f"it stands: {stands}" if stands else f"it waits: {state.text}" if state.text else ""
+        if trouble and trouble != said:
+            lines.append(trouble)
+        before, said = state, trouble
+        for line in lines:
+            report(f"{state.elapsed:6.0f} s  {line}")
 
-    return await _run(
-        client,
-        MISSION,
-        lambda: client.mission(order, mission, moved=moved),
-        lambda: client.mission(MissionOrder.STOP),
-        show,
-        ("name", "elapsed", "step", "failures"),
-        arm=arm,
-    )
+    with client.subscribe(GATE, latest()) as gate:
+        return await _run(
+            client,
+            MISSION,
+            lambda: client.mission(order, mission, moved=moved),
+            lambda: client.mission(MissionOrder.STOP),
+            show,
+            ("name", "elapsed", "step", "failures"),
+            arm=arm,
+        )
+
+
+def _failed(before: MissionState, state: MissionState) -> list[str]:
+    """A line on the attempt that has failed between two reports, if one has."""
+    again = state.step == before.step and state.attempt > before.attempt
+    return [f"it failed: {state.failed}"] if again or state.failures > before.failures else []
+
+
+def _why_it_stands(gate: Mailbox[GateState]) -> str:
+    """Why the gate lets the robot not drive, and the command that helps; nothing where it does."""
+    held = gate.latest
+    return "" if held is None or held.mode.active else with_remedy(held.worst, held.why)
 
 
 async def _run(

@@ -184,6 +184,10 @@ class MissionService:
         self._progress: MissionProgress | None = None
         self._began = 0
         self._end: StepEnd | None = None
+        self._waits = ""
+        """What the present step waits for."""
+        self._failed = ""
+        """Why the last attempt at a step failed."""
         self._interrupted: SavedProgress | None = None
         self._writing = asyncio.Lock()
         self._noted: Pose | None = None
@@ -242,7 +246,7 @@ class MissionService:
         self._check(progress.mission)
         assert self._tasks is not None
         self._number, self._source, self._progress = self._number + 1, request.source, progress
-        self._began, self._end, self._interrupted = now, None, None
+        self._began, self._end, self._interrupted, self._failed = now, None, None, ""
         text = f"{progress.mission.name}, {len(progress.mission.steps)} steps, asked for by {request.source}"
         if progress.index > 0:
             text += f", from step {progress.index + 1} on"
@@ -279,16 +283,25 @@ class MissionService:
         """Whether the robot has what the steps need.
 
         Raises:
-            NotFoundError: naming step and part.
+            NotFoundError: naming every step and part.
         """
-        for number, step in enumerate(mission.steps, 1):
-            if isinstance(step, ExploreStep) and self._parts.explorer is None:
-                raise NotFoundError(f"step {number}: explore: the robot's configuration has no section `explorer`")
-            if isinstance(step, PointStep) and self._in.points is None:
-                raise NotFoundError(f"step {number}: goto_point: the robot's configuration has no section `points`")
-            if isinstance(step, BehaviourStepOfMission | FollowWallStep) and step.name not in self._parts.names:
-                known = ", ".join(sorted(self._parts.names)) or "none"
-                raise NotFoundError(f"step {number}: no behaviour {step.name!r}: expected one of {known}")
+        lacking = [
+            f"step {number}: {lack}"
+            for number, step in enumerate(mission.steps, 1)
+            if (lack := self._lacks(step)) is not None
+        ]
+        if lacking:
+            raise NotFoundError("; ".join(lacking))
+
+    def _lacks(self, step: AnyStep) -> str | None:
+        if isinstance(step, ExploreStep) and self._parts.explorer is None:
+            return "explore: the robot's configuration has no section `explorer`"
+        if isinstance(step, PointStep) and self._in.points is None:
+            return "goto_point: the robot's configuration has no section `points`"
+        if isinstance(step, BehaviourStepOfMission | FollowWallStep) and step.name not in self._parts.names:
+            known = ", ".join(sorted(self._parts.names)) or "none"
+            return f"no behaviour {step.name!r}: expected one of {known}"
+        return None
 
     # Steps
 
@@ -298,7 +311,7 @@ class MissionService:
         following: Next = "step"
         try:
             while following in ("step", "again", "return"):
-                self._progress = progress
+                self._progress, self._waits = progress, ""
                 self._report(self._clock.now())
                 await self._save(progress)
                 step = ReturnStep(do="return") if progress.returning else progress.step
@@ -306,7 +319,8 @@ class MissionService:
                 self._events(Reason.MISSION_STEP, Severity.INFO, SOURCE, at)
                 end = await self._limited(step, progress)
                 if end.reason not in GOOD:
-                    self._events(end.reason, Severity.WARNING, SOURCE, f"{at}: {end.text or end.reason.text}")
+                    self._failed = end.text or end.reason.text
+                    self._events(end.reason, Severity.WARNING, SOURCE, f"{at}: {self._failed}")
                 progress, following = after(progress, end)
             self._finish(outcome(progress, following))
         except asyncio.CancelledError as stopped:
@@ -406,10 +420,13 @@ class MissionService:
         until = self._clock.now() + PATIENCE * SECOND
         while True:
             try:
-                return self._parts.goals.take(request())
+                number = self._parts.goals.take(request())
+                self._waits = ""
+                return number
             except RequestRefusedError as error:
                 if error.refusal not in PASSING or self._clock.now() > until:
                     raise
+                self._waits = str(error)
             await self._clock.sleep(AGAIN)
 
     async def _explore(self, step: ExploreStep) -> StepEnd:
@@ -555,7 +572,8 @@ class MissionService:
             **header, name=progress.mission.name, source=self._source, running=end is None, step=progress.index + 1,
             steps=len(progress.mission.steps), attempt=progress.attempt + 1, failures=progress.failures,
             doing="return" if progress.returning else in_words(progress.step),
-            outcome=Reason.DRIVING if end is None else end.reason, text="" if end is None else end.text,
+            outcome=Reason.DRIVING if end is None else end.reason, text=self._waits if end is None else end.text,
+            failed=self._failed,
             elapsed=(now - self._began) / SECOND,
         )  # fmt: skip
 

@@ -205,6 +205,22 @@ def test_a_mission_is_done_step_by_step_and_keeps_the_robot_armed(tmp_path: Path
     assert [report.step for report in robot.reports if report.running][-1] == 4
 
 
+def test_why_an_attempt_failed_is_reported_until_the_next_mission():
+    async def story(robot: Pretended) -> None:
+        robot.reached = [Reason.STUCK, Reason.GOAL_REACHED, Reason.GOAL_REACHED]
+        robot.order(MissionOrder.START, {**GO, "retries": 1}, GO)
+        await robot.clock.sleep(7.0)
+        robot.order(MissionOrder.START, WAIT)
+        await robot.clock.sleep(1.0)
+
+    reports = played(story).reports
+    assert {(report.attempt, report.failed) for report in reports if report.step == 1 and report.number == 1} == {
+        (1, ""),
+        (2, Reason.STUCK.text),
+    }
+    assert reports[-1].failed == ""
+
+
 def test_a_step_fails_when_what_does_it_falls_silent():
     async def story(robot: Pretended) -> None:
         robot.order(MissionOrder.START, GO)
@@ -281,6 +297,9 @@ def test_just_restarted_it_waits_for_a_pose_and_for_the_planner(tmp_path: Path):
     robot = played(story, file)
     assert robot.goals == [(1.0, 0.0)]
     assert robot.reports[-1].outcome is Reason.MISSION_DONE
+    running = [report for report in robot.reports if report.running]
+    assert running[-1].text == ""
+    assert Reason.PLANNER_STARTING.text in {report.text for report in running}, "what it waits for is said"
 
 
 @pytest.mark.parametrize("localised", [False, True])
@@ -334,17 +353,12 @@ def test_a_damaged_file_is_reported_and_forgotten(tmp_path: Path, text: str):
     assert robot.events[0][0] is Reason.BAD_INPUT
 
 
-@pytest.mark.parametrize(
-    ("step", "text"),
-    [
-        ({"do": "explore"}, "step 2: explore: .* section `explorer`"),
-        ({"do": "behaviour", "name": "wall"}, "step 2: no behaviour 'wall': expected one of none"),
-    ],
-)
-def test_what_the_robot_cannot_do_is_refused_before_it_sets_off(step: dict, text: str):
+def test_all_that_the_robot_cannot_do_is_named_before_it_sets_off():
+    lacks = "step 2: explore: .* section `explorer`; step 3: no behaviour 'wall': expected one of none"
+
     async def story(robot: Pretended) -> None:
-        with pytest.raises(NotFoundError, match=text):
-            robot.order(MissionOrder.START, GO, step)
+        with pytest.raises(NotFoundError, match=lacks):
+            robot.order(MissionOrder.START, GO, {"do": "explore"}, {"do": "behaviour", "name": "wall"})
         assert robot.goals == []
 
     played(story)

@@ -1,12 +1,18 @@
 """``mission check|list|run``: mistakes by line, lists, and what is run."""
 
+import asyncio
 from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
+from monstertruck_runtime.mailbox import Mailbox, fifo, latest
+from monstertruck_schemas.plan import MissionState
 from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.state import GateMode, GateState
+from monstertruck_schemas.topics import GATE, MISSION
 from monstertruckd.tools.cli.main import app
+from monstertruckd.tools.cli.runs import run_mission
 
 GOOD = """version: 2
 name: round
@@ -62,3 +68,44 @@ def test_list_names_missions_and_what_is_wrong(tmp_path: Path):
 def test_run_takes_a_file_or_the_interrupted_one(arguments: list[str]):
     done = CliRunner().invoke(app, ["mission", "run", *arguments])
     assert done.exit_code == Reason.BAD_INPUT.exit_code
+
+
+def followed(*states: dict[str, object], mode: GateMode = GateMode.DRIVING) -> list[str]:
+    """What a client prints of the mission reported so."""
+    reports, gate = Mailbox(fifo(64)), Mailbox(latest())
+    why = () if mode.active else (Reason.DISARMED,)
+    gate.put(GateState(stamp=1, received=1, seq=0, mode=mode, nonce="n", speed_limit=0.0, reasons=why))
+
+    class Robot:
+        def subscribe(self, topic, delivery):
+            return {MISSION: reports, GATE: gate}.get(topic) or Mailbox(delivery)
+
+        async def mission(self, *_, **__):
+            header = {"stamp": 1, "received": 1, "seq": 0, "frame": "map", "number": 3, "running": True, "attempt": 1}
+            for state in (*states, {"running": False, "outcome": Reason.MISSION_DONE}):
+                reports.put(MissionState(**{**header, "steps": 2, **state}))
+            return {"number": 3}
+
+    lines: list[str] = []
+    asyncio.run(run_mission(Robot(), None, arm=False, report=lines.append))
+    return lines
+
+
+def test_every_step_and_every_failure_is_a_line():
+    first, second = {"step": 1, "doing": "goto 1 0 0"}, {"step": 2, "doing": "return", "failures": 1}
+    missed = {"failed": "it missed"}
+    assert followed(first, first, {**first, **missed, "attempt": 2}, {**second, **missed, "elapsed": 12.0}) == [
+        "     0 s  step 1 of 2: goto 1 0 0",
+        "     0 s  it failed: it missed",
+        "     0 s  step 1 of 2: goto 1 0 0, attempt 2",
+        "    12 s  it failed: it missed",
+        "    12 s  step 2 of 2: return",
+    ]
+
+
+def test_what_a_step_waits_for_and_why_the_robot_stands_is_said_once():
+    step = {"step": 1, "doing": "goto 1 0 0"}
+    starts = {**step, "text": "the planner is starting"}
+    assert followed(starts, starts, step)[1:] == ["     0 s  it waits: the planner is starting"]
+    stands = "     0 s  it stands: the truck is disarmed; `monstertruckd arm` lets it drive"
+    assert followed(starts, step, mode=GateMode.DISARMED)[1:] == [stands]
