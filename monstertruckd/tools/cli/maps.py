@@ -202,31 +202,41 @@ def load_command(
     config: ConfigOption,
     output: Annotated[Path, typer.Option("--output", "-o", help="Configuration to write.")],
 ) -> None:
-    """Write a configuration with which the robot localises in a saved map; one written so before is replaced."""
+    """Write a configuration with which the robot localises in a saved map; one written so before is replaced.
+
+    An explorer is left out: it makes maps.
+    """
     from monstertruck_estimation.slam.storage import load
-    from monstertruck_runtime.errors import InputError
+    from monstertruck_runtime.errors import ConfigError, InputError
     from monstertruck_runtime.small_files import replace_file
     from monstertruck_runtime.yaml_files import read_yaml, yaml_text
     from monstertruckd.config.load import VERSION, load_truck
 
     load(place)
-    load_truck(config)
+    robot, _ = load_truck(config)
     values = {
         "include": str(config.resolve()),
         "version": VERSION,
         "slam": {"mode": "localisation", "map": str(place.resolve())},
     }
+    if robot.explorer is not None:
+        values["explorer"] = None
     if os.path.lexists(output) and (output.samefile(config) or not _made_by_load(read_yaml(output))):
         raise InputError(f"{output}: is there already, and this command did not write it; name another file")
     replace_file(output, yaml_text(values))
-    load_truck(output)
-    remark(f"wrote {output}: `monstertruckd run --config {output}` localises in {place}")
+    try:
+        load_truck(output)
+    except ConfigError:
+        output.unlink()
+        raise
+    command = "run" if robot.sim is None else "simulate --run"
+    remark(f"wrote {output}: `monstertruckd {command} --config {output}` localises in {place}")
 
 
 def _made_by_load(found: Any) -> bool:
     match found:
         case {"include": _, "version": _, "slam": {"mode": "localisation", "map": _, **others}, **more}:
-            return not others and not more
+            return not others and more in ({}, {"explorer": None})
     return False
 
 

@@ -8,6 +8,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from monstertruck_runtime.map_files import WorldMap, save_map
+from monstertruckd.config.load import load_truck
 from monstertruckd.tools.cli.main import app
 from tests.unit.estimation.slam.kit import BEAMS, LIDAR, ROOM, ranges, rounds
 
@@ -74,7 +75,8 @@ def test_a_log_without_a_usable_scan_is_one_sentence(log: Path, tmp_path: Path, 
     assert not (tmp_path / "map").exists()
 
 
-CONFIG = Path(__file__).parents[4] / "configs" / "slam.yaml"
+CONFIGS = Path(__file__).parents[4] / "configs"
+CONFIG = CONFIGS / "slam.yaml"
 
 
 def test_a_configuration_for_localisation_replaces_only_what_it_wrote_itself(tmp_path: Path):
@@ -99,9 +101,26 @@ def test_a_configuration_for_localisation_replaces_only_what_it_wrote_itself(tmp
         assert target.read_text() == before
 
 
-def test_a_configuration_that_is_refused_is_not_written(tmp_path: Path):
+def test_a_robot_that_explored_localises_in_what_it_has_saved(tmp_path: Path):
     save_map(WorldMap(np.zeros((10, 10), np.int8), 0.05), tmp_path / "map.yaml")
-    (tmp_path / "bad.yaml").write_text("rabbit: 1\n")
+    output = tmp_path / "out.yaml"
+    command = ["map", "load", str(tmp_path / "map.yaml"), "-c", str(CONFIGS / "explore.yaml"), "-o", str(output)]
+    for _ in range(2):
+        done = CliRunner().invoke(app, command)
+        assert done.exit_code == 0, done.stderr
+        assert f"`monstertruckd simulate --run --config {output}` localises in" in done.stderr
+    config, _ = load_truck(output)
+    assert config.explorer is None
+    assert config.slam is not None
+    assert config.slam.mode == "localisation"
+
+
+@pytest.mark.parametrize(
+    "base", ["version: 2\nrabbit: 1\n", f"include: {CONFIGS / 'robots' / 'sonar.yaml'}\nversion: 2\n"]
+)
+def test_a_configuration_that_is_refused_is_not_written(tmp_path: Path, base: str):
+    save_map(WorldMap(np.zeros((10, 10), np.int8), 0.05), tmp_path / "map.yaml")
+    (tmp_path / "bad.yaml").write_text(base)
     output = tmp_path / "out.yaml"
     done = CliRunner().invoke(
         app, ["map", "load", str(tmp_path / "map.yaml"), "-c", str(tmp_path / "bad.yaml"), "-o", str(output)]
