@@ -11,7 +11,7 @@ import os
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, Self, TypeVar
+from typing import Any, Final, Literal, Self, TypeVar, get_args, get_origin
 
 from pydantic import BaseModel, TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
@@ -24,9 +24,9 @@ from ruamel.yaml.reader import ReaderError
 
 from monstertruck_runtime.endpoints import emulated_ports
 from monstertruck_runtime.errors import ConfigError
-from monstertruck_runtime.plugins import kind_of, models_in
+from monstertruck_runtime.plugins import models_in
 from monstertruck_runtime.small_files import replace_file, require_file
-from monstertruck_schemas.base import LiveValue, Schema, field_docs, live_settings
+from monstertruck_schemas.base import LiveValue, Schema, field_docs, first_mistake, live_settings
 from monstertruckd.config.calibration import CalibrationStore, Result, WizardName, in_order, put_values
 from monstertruckd.config.truck import ROBOT, TruckConfig
 
@@ -144,10 +144,7 @@ def calibrated(config: T, tree: Tree) -> tuple[T, Tree]:
     try:
         changed = type(config).model_validate(data)
     except ValidationError as error:
-        detail = error.errors(include_url=False)[0]
-        where = ".".join(map(str, detail["loc"]))
-        text = detail["msg"].removeprefix("Value error, ")
-        raise ConfigError(f"{' with '.join(sources)}: {where}{': ' if where else ''}{text}") from error
+        raise ConfigError(f"{' with '.join(sources)}: {first_mistake(error)}") from error
     return changed, Tree(tree.data, origins, tree.files, calibration=path)
 
 
@@ -686,15 +683,17 @@ def _give_ports(data: dict[str, Any]) -> None:
 def _explain(tree: Tree, path: Path, model: type[Schema], error: ValidationError) -> Iterator[str]:
     details = error.errors(include_url=False)
     wrong = {detail["loc"][:depth] for detail in details for depth in range(len(detail["loc"]))}
-    # entries that are wrong are not counted, so a list of them is "too short"
-    details = [detail for detail in details if detail["type"] != "too_short" or detail["loc"] not in wrong]
-    for detail in details[:MOST_MISTAKES]:
-        key = _data_key(tree.data, detail["loc"])
+    mistakes: dict[Key, ErrorDetails] = {}
+    for detail in details:
+        # entries that are wrong are not counted, so a list of them is "too short"
+        if detail["type"] != "too_short" or detail["loc"] not in wrong:
+            mistakes.setdefault(_data_key(tree.data, detail["loc"]), detail)  # of a union the first member's
+    for key, detail in list(mistakes.items())[:MOST_MISTAKES]:
         origin = tree.origin(key) or f"{path}:1"
         dotted = ".".join(map(str, key)) or "configuration"
         yield f"{origin}: {dotted}: {_sentence(detail, model, key)}"
-    if more := details[MOST_MISTAKES:]:
-        yield f"{path}: {len(more)} more mistakes"
+    if (more := len(mistakes) - MOST_MISTAKES) > 0:
+        yield f"{path}: {more} more mistakes"
 
 
 def _sentence(detail: ErrorDetails, model: type[Schema], key: Key) -> str:
@@ -748,10 +747,17 @@ def _reach(model: type[BaseModel], key: Key) -> list[type[BaseModel]]:
 
 
 def _field_names(model: type[BaseModel], key: Key, detail: ErrorDetails) -> list[str]:
-    kinds = [part for part in detail["loc"] if isinstance(part, str)]
+    kinds = {part for part in detail["loc"] if isinstance(part, str)}
     candidates = _reach(model, key)
-    chosen = [model for model in candidates if kind_of(model) in kinds] or candidates
+    chosen = [model for model in candidates if _tags(model) & kinds] or candidates
     return sorted({name for candidate in chosen for name in candidate.model_fields})
+
+
+def _tags(model: type[BaseModel]) -> set[str]:
+    """Values of its keys that have one only: the kind, or what a step of a mission does."""
+    fields = model.model_fields.values()
+    choices = [get_args(field.annotation) for field in fields if get_origin(field.annotation) is Literal]
+    return {some[0] for some in choices if len(some) == 1}
 
 
 def _description(model: type[BaseModel], key: Key) -> str | None:

@@ -23,6 +23,7 @@ from pydantic import (
     GetJsonSchemaHandler,
     PlainSerializer,
     PlainValidator,
+    ValidationError,
     ValidationInfo,
     WithJsonSchema,
 )
@@ -70,6 +71,14 @@ class Schema(BaseModel):
         return all(_equal(a, b) for a, b in zip(self.__dict__.values(), other.__dict__.values(), strict=True))
 
     __hash__ = None  # type: ignore[assignment]  # messages carry arrays
+
+
+def first_mistake(error: ValidationError, *before: str) -> str:
+    """Key and text of the first mistake in what was validated; ``before`` are the keys that lead there."""
+    detail = error.errors(include_url=False)[0]
+    where = ".".join(map(str, (*before, *detail["loc"])))
+    text = detail["msg"].removeprefix("Value error, ")
+    return f"{where}: {text}" if where else text
 
 
 def field_docs(model: type[BaseModel]) -> dict[str, str]:

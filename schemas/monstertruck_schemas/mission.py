@@ -85,7 +85,7 @@ class BehaviourStepOfMission(MissionStep):
     do: Literal["behaviour"]
     name: Name
     """Name of the behaviour in the robot's configuration"""
-    settings: dict[str, float | str | bool] = Field(default_factory=dict)
+    settings: Annotated[dict[str, float | str | bool], Field(max_length=32)] = Field(default_factory=dict)
     """Settings that replace the configured ones"""
 
 

@@ -1,4 +1,4 @@
-"""A mission in the whole daemon: goals, a look, a note, and the way back."""
+"""A mission in the whole daemon: goals, a move, a note, and the way back."""
 
 import json
 from pathlib import Path
@@ -27,6 +27,7 @@ class MissionOperator(LocalOperator):
 def test_a_mission_is_driven_and_followed():
     steps = [
         {"do": "goto", "x": 2.4, "y": 3.9, "yaw": 0.0},
+        {"do": "behaviour", "name": "move", "settings": {"length": 0.2}},
         {"do": "record", "note": "in the hall"},
         {"do": "goto", "x": 99.0, "y": 99.0, "yaw": 0.0, "on_failure": "continue"},
         {"do": "wait", "seconds": 3.0},
@@ -44,9 +45,9 @@ def test_a_mission_is_driven_and_followed():
     rig = travel(story)
     end, state = ends
     assert end.reason is Reason.MISSION_INCOMPLETE, end.text
-    assert (end.figures["failures"], end.figures["step"]) == (1, 5)
-    assert state.steps == 5
-    assert [line.partition("step ")[2][:1] for line in lines] == list("12345")
+    assert (end.figures["failures"], end.figures["step"]) == (1, 6)
+    assert state.steps == 6
+    assert [line.partition("step ")[2][:1] for line in lines] == list("123456")
     assert_at(rig, 1.0, 3.95, 0.0)
 
 

@@ -6,12 +6,17 @@ from typing import Final
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
+from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.small_files import replace_file, require_file
+from monstertruck_schemas.base import first_mistake
+from monstertruck_schemas.plan import MAX_COORDINATE
 from monstertruck_schemas.points import PointOfInterest
 
 FILE: Final = "points.json"
 MOST_BYTES: Final = 5_000_000
+VARIANCES: Final = (1e-12, 1e12)
+"""The least and the greatest one of any direction that is taken from a file, m^2 or rad^2."""
 _POINTS: Final = TypeAdapter(list[PointOfInterest])
 
 
@@ -53,19 +58,25 @@ def load(folder: Path) -> list[tuple[PointOfInterest, bytes]]:
     except OSError as error:
         raise InputError(f"{file}: not readable as points of interest: {error.strerror or error}") from error
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        place = ".".join(map(str, first["loc"]))
-        raise InputError(
-            f"{file}: not readable as points of interest: {place}{': ' if place else ''}{first['msg']}"
-        ) from error
+        raise InputError(f"{file}: not readable as points of interest: {first_mistake(error)}") from error
     names = [point.name for point in points]
     for point in points:
-        covariance = np.reshape(point.covariance, (3, 3))
         if names.count(point.name) > 1:
             raise InputError(f"{file}: {point.name}: expected every name once")
-        if not np.allclose(covariance, covariance.T) or np.linalg.eigvalsh(covariance).min() <= 0.0:
-            raise InputError(f"{file}: {point.name}: covariance: expected a symmetric matrix of positive variances")
+        if max(map(abs, (point.x, point.y, point.z, point.yaw))) > MAX_COORDINATE:
+            raise InputError(f"{file}: {point.name}: expected at most {MAX_COORDINATE:g} m and rad")
+        if not _is_covariance(np.reshape(point.covariance, (3, 3))):
+            least, most = VARIANCES
+            text = f"expected a symmetric matrix of variances from {least:g} to {most:g}"
+            raise InputError(f"{file}: {point.name}: covariance: {text}")
     return [(point, _picture(folder / picture_name(point.name))) for point in points]
+
+
+def _is_covariance(matrix: Array) -> bool:
+    if not np.isfinite(matrix).all() or not np.allclose(matrix, matrix.T):
+        return False
+    least, _, most = np.linalg.eigvalsh(matrix)
+    return bool(VARIANCES[0] <= least and most <= VARIANCES[1])
 
 
 def _picture(file: Path) -> bytes:

@@ -268,7 +268,8 @@ class PointService:
                 self._publish(now)
             if self._unsaved and now - saved >= SAVE_PERIOD:
                 saved, self._unsaved = now, False
-                await self._save()
+                if not await self._save():
+                    self._unsaved = True
 
     def _correct(self) -> None:
         """What the mapper has moved since moves its points."""
@@ -310,14 +311,17 @@ class PointService:
                 self._folders = PointFolders(folder)
         self._dirty = dict.fromkeys(self._map.points)
 
-    async def _save(self) -> None:
+    async def _save(self) -> bool:
+        """Write them where they are kept; returns False if that failed."""
         folder, rows = self._folders.save, self._map.pictured()
         if folder is None or not (rows or (folder / files.FILE).exists()):
-            return
+            return True
         try:
             await self._offload(lambda: self._write(folder, rows))
         except OSError as error:
-            self._events(Reason.BAD_INPUT, Severity.WARNING, self.name, f"points not saved: {error}")
+            self._events(Reason.DISK_FULL, Severity.WARNING, self.name, f"points not saved: {error}")
+            return False
+        return True
 
     def _write(self, folder: Path, rows: list[tuple[PointOfInterest, bytes]]) -> None:
         with self._writing:  # at the end one may be under way

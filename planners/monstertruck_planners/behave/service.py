@@ -22,7 +22,7 @@ from monstertruck_runtime.errors import InputError, NotFoundError, RequestRefuse
 from monstertruck_runtime.mailbox import latest
 from monstertruck_runtime.ports import BusPort, EventSink, Publisher, Ready, RpcRegistry, Subscription
 from monstertruck_runtime.requests import Sequences, does_not_drive, parse_request, planner_request, refusal
-from monstertruck_schemas.base import Message
+from monstertruck_schemas.base import Message, first_mistake
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.plan import BehaviourState, GoalPhase, GoalState, TrackerState
 from monstertruck_schemas.reasons import Reason
@@ -340,8 +340,7 @@ def _with_settings(config: BehaviourConfig, settings: Mapping[str, Any]) -> Beha
     try:
         return type(config).model_validate({**config.model_dump(), **settings})
     except ValidationError as error:
-        detail = error.errors(include_url=False)[0]
-        raise InputError(f"{'.'.join(('settings', *map(str, detail['loc'])))}: {detail['msg']}") from None
+        raise InputError(first_mistake(error, "settings")) from None
 
 
 def register_behaviour_calls(rpc: RpcRegistry, service: BehaviourService) -> None:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from monstertruck_planners.collision import Footprint
 from monstertruck_planners.explore.catalog import AnyExplorer
 from monstertruck_planners.goals.exchange import Pose
+from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.state import Grid
 
 Point = tuple[float, float]
@@ -101,3 +102,7 @@ class ExploreAnswer:
     """Metres of the path home; None = not requested, or none is known."""
     changed: int = 0
     """Cells checked again for frontiers."""
+    failure: Reason | None = None
+    """Why there is no decision; None = there is one."""
+    text: str = ""
+    """The same in words."""

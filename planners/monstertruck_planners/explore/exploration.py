@@ -298,7 +298,9 @@ def _moved(run: Exploration, seen: Observed) -> Exploration:
 
 
 def _merged(before: ExploreAnswer, answer: ExploreAnswer) -> ExploreAnswer:
-    """The newest answer; the path home is kept from before if none is found now."""
+    """The newest answer; the path home is kept from before if none is found now, everything if there is none."""
+    if answer.failure is not None:
+        return before
     return answer if answer.home is not None else replace(answer, home=before.home)
 
 
@@ -336,7 +338,7 @@ def _looking(run: Exploration, seen: Observed) -> Step:
         return _go(run, answer.target)
     if answer.known == 0.0:
         if run.now - run.since > PATIENCE:
-            return _finish(run, Reason.NO_MAP, "no map to explore")
+            return _finish(run, answer.failure or Reason.NO_MAP, answer.text or "no map to explore")
         return replace(run, not_before=run.now + 1.0), ()
     if run.nothing + 1 < CONFIRM:
         return replace(run, nothing=run.nothing + 1, not_before=run.now + SETTLE), ()

@@ -13,7 +13,7 @@ from monstertruck_planners.explore.exploration import Action, Cancel, Choose, Ex
 from monstertruck_planners.goals.exchange import Pose, pose_of
 from monstertruck_runtime.actors.actor import Actor
 from monstertruck_runtime.clock import SECOND, Clock, Schedule
-from monstertruck_runtime.errors import RequestRefusedError, WorkerError
+from monstertruck_runtime.errors import RequestRefusedError, TruckError
 from monstertruck_runtime.mailbox import Mailbox
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, RpcRegistry, Subscription
 from monstertruck_runtime.requests import Sequences, does_not_drive, inner_request, parse_request, refusal
@@ -252,15 +252,13 @@ class ExplorerService:
 
     def _goal_end(self) -> tuple[Reason | None, str, str]:
         """How the goal that was sent ended, in words, and whose goal took its place."""
+        goal = self._in.goal.latest
+        newer = goal is not None and (self._goal is None or goal.number > self._goal)
+        if goal is not None and goal.source != SOURCE and goal.number > self._others and newer:
+            return None, "", goal.source
         if self._refused is not None:
             return *self._refused, ""
-        goal = self._in.goal.latest
-        if goal is None:
-            return None, "", ""
-        newer = self._goal is None or goal.number > self._goal
-        if goal.source != SOURCE and goal.number > self._others and newer:
-            return None, "", goal.source
-        if goal.number != self._goal or goal.phase is not GoalPhase.IDLE:
+        if goal is None or goal.number != self._goal or goal.phase is not GoalPhase.IDLE:
             return None, "", ""
         return goal.outcome, goal.text, ""
 
@@ -322,14 +320,15 @@ class ExplorerService:
         self._deciding = self._tasks.create_task(self._ask(task))
 
     async def _ask(self, task: ExploreTask) -> ExploreAnswer:
-        """The worker's answer; of one that failed and starts again: none."""
+        """The worker's answer; of one that failed and starts again: that it did."""
         assert self._actor is not None
         try:
             answer: ExploreAnswer = await self._actor.step(task)
-        except WorkerError as error:
-            self._fresh = True
-            self._events(error.reason, Severity.ERROR, SOURCE, str(error))
-            return ExploreAnswer(task.current, kept=task.current is not None)
+        except TruckError as error:
+            self._fresh, text = True, str(error)
+            self._events(error.reason, Severity.ERROR, SOURCE, text)
+            kept = task.current is not None
+            return ExploreAnswer(task.current, kept=kept, failure=error.reason, text=text.partition("\n")[0])
         if answer.kept:  # what comes back from a worker is a copy
             return replace(answer, target=task.current)
         return answer

@@ -85,7 +85,7 @@ class PlannerConfig(Schema):
     timeout: Positive = 600.0
     """Seconds for a goal; those in which the truck is not armed or the goal is paused do not count."""
     unarmed_timeout: Positive = 300.0
-    """Seconds a goal waits for the truck to be armed."""
+    """Seconds a goal waits for the truck to be armed, or for a fresh pose."""
     stuck: Positive = 4.0
     """Seconds without progress after which the recovery behaviours begin."""
     progress: Positive = 0.03

@@ -195,6 +195,8 @@ def tick(run: GoalRun, observed: Observations, config: PlannerConfig) -> Step:
     if run.elapsed > config.timeout:
         return _end(run, Reason.GOAL_TIMEOUT, f"not reached within {config.timeout:g} s")
     if run.unarmed > config.unarmed_timeout:
+        if observed.pose is None:
+            return _end(run, Reason.NO_MAP, f"no fresh pose for {config.unarmed_timeout:g} s")
         why = f": {observed.held}" if observed.held else ""
         return _end(run, Reason.DISARMED, f"not armed for {config.unarmed_timeout:g} s{why}")
     match run.phase:

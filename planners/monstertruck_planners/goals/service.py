@@ -41,7 +41,7 @@ from monstertruck_runtime.ports import Ready, RpcRegistry
 from monstertruck_runtime.requests import Sequences, parse_request, refusal
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.event import Severity
-from monstertruck_schemas.plan import MAX_COORDINATE, GoalPhase, GoalState
+from monstertruck_schemas.plan import MAX_COORDINATE, BehaviourState, GoalPhase, GoalState
 from monstertruck_schemas.reasons import Reason, in_words
 from monstertruck_schemas.req import GoalControl, GoalOrder, GoalRequest, Request
 from monstertruck_schemas.roles import ServiceName
@@ -196,6 +196,8 @@ class GoalService:
     def hold(self, who: str, *, on: bool) -> None:
         """Keep the truck armed between goals, by requests for standstill; for services that send several goals.
 
+        While a behaviour runs there are none: its own requests keep the truck armed.
+
         Args:
             who: the service.
             on: until it is called with False.
@@ -217,15 +219,19 @@ class GoalService:
         return state
 
     def _examine(self, request: Request, kind: str, *, moves: bool) -> None:
-        behaviour = None if self._in.behaviour is None else self._in.behaviour.latest
         reason = refusal(
             request, self._in.gate.latest, self._sequences[kind], self._clock.now(), self._max_age if moves else None
         )
         if reason is not Reason.OK:
             raise RequestRefusedError(reason)
-        if moves and behaviour is not None and behaviour.running:
+        if moves and (behaviour := self._behaviour()) is not None:
             text = f"the behaviour {behaviour.behaviour} of {behaviour.source} is running, stop it first"
             raise RequestRefusedError(Reason.BUSY, text)
+
+    def _behaviour(self) -> BehaviourState | None:
+        """The behaviour that runs."""
+        state = None if self._in.behaviour is None else self._in.behaviour.latest
+        return state if state is not None and state.running else None
 
     # Observations
 
@@ -241,7 +247,7 @@ class GoalService:
                 self._do(goal_run.tick(run, self._observe(now), self._config))
             if self._goal is not None and self._goal.active and self._goal.phase is not GoalPhase.PAUSED:
                 self._paths.stand_still()
-        elif self._held:
+        elif self._held and self._behaviour() is None:
             self._paths.stand_still()
         self._report(now)
 

@@ -71,6 +71,11 @@ class MissionProgress:
         """The present one."""
         return self.mission.steps[self.index]
 
+    @property
+    def doing(self) -> str:
+        """What the robot does, in a few words."""
+        return "return" if self.returning else in_words(self.step)
+
 
 def after(progress: MissionProgress, end: StepEnd) -> tuple[MissionProgress, Next]:
     """What follows the end of the present step, or that of the way back.
@@ -152,6 +157,12 @@ class SavedProgress(Schema):
     failures: Annotated[int, Field(ge=0)]
     at: Pose2D | None = None
     """Where the robot was, in map"""
+    why: Reason = Reason.OK
+    """The last failure"""
+    text: str = ""
+    """The same in words"""
+    returning: bool = False
+    """Whether it was driving back to where the mission began"""
 
     @model_validator(mode="after")
     def _at_a_step(self) -> Self:
@@ -170,12 +181,17 @@ class SavedProgress(Schema):
             index=progress.index,
             failures=progress.failures,
             at=None if at is None else Pose2D(x=at[0], y=at[1], yaw=at[2]),
+            why=progress.why.reason,
+            text=progress.why.text,
+            returning=progress.returning,
         )
 
     def progress(self) -> MissionProgress:
-        """The mission at the beginning of the step at which it was interrupted."""
-        start = self.start.x, self.start.y, self.start.yaw
-        return MissionProgress(self.mission, start, self.index, failures=self.failures)
+        """The mission at the beginning of the step, or of the way back, at which it was interrupted."""
+        start, why = (self.start.x, self.start.y, self.start.yaw), StepEnd(self.why, self.text)
+        return MissionProgress(
+            self.mission, start, self.index, failures=self.failures, why=why, returning=self.returning
+        )
 
     def away(self, pose: Pose) -> float:
         """Metres of a pose from where the robot was."""

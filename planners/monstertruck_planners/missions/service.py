@@ -18,16 +18,15 @@ from monstertruck_planners.missions.progress import (
     SavedProgress,
     StepEnd,
     after,
-    in_words,
     outcome,
 )
 from monstertruck_runtime.clock import SECOND, Clock, Schedule
 from monstertruck_runtime.errors import InputError, NotFoundError, RequestRefusedError, TruckError
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, RpcRegistry, Subscription
 from monstertruck_runtime.requests import Sequences, does_not_drive, inner_request, parse_request, refusal
-from monstertruck_runtime.small_files import replace_file
+from monstertruck_runtime.small_files import replace_file, require_file
 from monstertruck_runtime.threads import Offload
-from monstertruck_schemas.base import Pose2D
+from monstertruck_schemas.base import Pose2D, first_mistake
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.mission import (
     AnyStep,
@@ -63,6 +62,8 @@ from monstertruck_schemas.topics import ODOMETRY
 
 SOURCE: Final = ServiceName.MISSIONS.value
 """Source of the goals, behaviours and explorations of a mission."""
+OWN: Final = frozenset({SOURCE, ServiceName.EXPLORER.value})
+"""Sources of the goals that are pursued for a mission, or for an exploration."""
 RATE: Final = 5.0
 """Checks per second."""
 REPORT: Final = SECOND // 2
@@ -75,13 +76,13 @@ MOVED: Final = 1.0
 """Metres from where it was interrupted at which a robot counts as moved, or its odometry as begun again."""
 MOST_BYTES: Final = 1_000_000
 """Size of the saved progress at most."""
-PASSING: Final = frozenset({Reason.PLANNER_STARTING, Reason.NO_MAP, Reason.LEASE_EXPIRED})
-"""Refusals of a goal that do not depend on its place: it is sent again."""
+PASSING: Final = frozenset({Reason.PLANNER_STARTING, Reason.NO_MAP, Reason.LEASE_EXPIRED, Reason.BUSY})
+"""Refusals that pass: it is requested again. Busy is the robot with the step before: after a goal it brakes along a
+path, after an exploration the map is saved."""
 AGAIN: Final = 1.0
-"""Seconds until it is sent again."""
+"""Seconds until it is requested again."""
 PATIENCE: Final = 180.0
-"""Seconds for which it is sent again; a planner compiles for a minute or two after an installation."""
-
+"""Seconds for which it is requested again; a planner compiles for a minute or two after an installation."""
 SILENT: Final = 10.0
 """Seconds without a report of what does a step, which comes twice a second, after which it has failed."""
 
@@ -198,10 +199,13 @@ class MissionService:
 
     async def run(self, ready: Ready) -> None:
         """Serve until cancelled; what runs then can be resumed after a restart."""
-        self._interrupted = await self._offload(self._load)
-        if self._interrupted is not None:
-            text = f"{self._interrupted.mission.name} was interrupted at step {self._interrupted.index + 1}"
-            self._events(Reason.MISSION_INCOMPLETE, Severity.WARNING, SOURCE, f"{text}; it can be resumed")
+        try:
+            self._interrupted = await self._offload(self._load)
+        except InputError as error:
+            self._events(Reason.BAD_INPUT, Severity.WARNING, SOURCE, str(error))
+        if (saved := self._interrupted) is not None:
+            text = f"{saved.mission.name} was interrupted {_where(saved)}; it can be resumed"
+            self._events(Reason.MISSION_INCOMPLETE, Severity.WARNING, SOURCE, text)
         async with asyncio.TaskGroup() as tasks:
             self._tasks = tasks
             self._report(self._clock.now())
@@ -232,7 +236,7 @@ class MissionService:
         running = self._task is not None and not self._task.done()
         if not starts:
             if running and self._task is not None:
-                self._task.cancel(request.source)
+                self._stop(self._task, request.source)
             elif self._interrupted is not None:
                 self._drop(self._interrupted, request.source)
             else:
@@ -240,6 +244,8 @@ class MissionService:
             return self._number
         if running:
             raise RequestRefusedError(Reason.BUSY, f"the mission of {self._source} is running, stop it first")
+        if (other := self._other()) is not None:
+            raise RequestRefusedError(Reason.BUSY, f"{other}, stop it first")
         if gate is None or not gate.mode.active:
             raise does_not_drive(gate)
         progress = self._begin(request)
@@ -253,6 +259,15 @@ class MissionService:
         self._events(Reason.MISSION_STARTED, Severity.INFO, SOURCE, text)
         self._task = self._tasks.create_task(self._do_all(progress))
         return self._number
+
+    def _stop(self, task: asyncio.Task[None], source: str) -> None:
+        """End the mission that ``task`` does; its end may have been reported already."""
+        assert self._tasks is not None
+        if self._end is not None:
+            return
+        self._finish(StepEnd(Reason.CANCELLED, f"stopped by {source}"))
+        task.cancel()
+        self._tasks.create_task(self._forget())
 
     def _drop(self, interrupted: SavedProgress, source: str) -> None:
         """Forget a mission that nobody wants to resume."""
@@ -315,7 +330,7 @@ class MissionService:
                 self._report(self._clock.now())
                 await self._save(progress)
                 step = ReturnStep(do="return") if progress.returning else progress.step
-                at = f"step {progress.index + 1} of {len(progress.mission.steps)}: {in_words(step)}"
+                at = f"step {progress.index + 1} of {len(progress.mission.steps)}: {progress.doing}"
                 self._events(Reason.MISSION_STEP, Severity.INFO, SOURCE, at)
                 end = await self._limited(step, progress)
                 if end.reason not in GOOD:
@@ -323,11 +338,10 @@ class MissionService:
                     self._events(end.reason, Severity.WARNING, SOURCE, f"{at}: {self._failed}")
                 progress, following = after(progress, end)
             self._finish(outcome(progress, following))
-        except asyncio.CancelledError as stopped:
-            if not stopped.args:
+        except asyncio.CancelledError:
+            if self._end is None:  # the daemon ends: the progress stays on the disk
                 await self._save(progress)
-                raise  # the daemon ends: the progress stays on the disk
-            self._finish(StepEnd(Reason.CANCELLED, f"stopped by {stopped.args[0]}"))
+            raise
         finally:
             self._parts.goals.hold(SOURCE, on=False)
         await self._forget()
@@ -357,8 +371,7 @@ class MissionService:
                 case LookStep(x=x, y=y):
                     return await self._look(x, y)
                 case WaitStep(seconds=seconds):
-                    await self._clock.sleep(seconds)
-                    return StepEnd(Reason.OK)
+                    return await self._wait(seconds)
                 case ExploreStep():
                     return await self._explore(step)
                 case BehaviourStepOfMission(name=name, settings=settings):
@@ -376,6 +389,14 @@ class MissionService:
             return StepEnd(error.refusal, str(error))
         except TruckError as error:
             return StepEnd(error.reason, str(error))
+
+    async def _wait(self, seconds: float) -> StepEnd:
+        until = self._clock.now() + round(seconds * SECOND)
+        while (left := until - self._clock.now()) > 0:
+            if (other := self._other()) is not None:
+                return StepEnd(Reason.CANCELLED, other)
+            await self._clock.sleep(min(left / SECOND, 1.0 / RATE))
+        return StepEnd(Reason.OK)
 
     async def _go_before(self, step: PointStep) -> StepEnd:
         message = None if self._in.points is None else self._in.points.latest
@@ -396,7 +417,9 @@ class MissionService:
         waypoints = tuple(Waypoint(x=a, y=b) for a, b in via)
         pose = Pose2D(x=x, y=y, yaw=math.remainder(yaw, math.tau))
         goals = self._parts.goals
-        number = await self._taken(lambda: GoalRequest(**self._header(), frame="map", goal=pose, waypoints=waypoints))
+        number = await self._taken(
+            lambda: goals.take(GoalRequest(**self._header(), frame="map", goal=pose, waypoints=waypoints))
+        )
 
         def end() -> StepEnd | None:
             goal = self._in.goal.latest
@@ -411,16 +434,18 @@ class MissionService:
 
         return await self._until(end, stop, self._in.goal)
 
-    async def _taken(self, request: Callable[[], GoalRequest]) -> int:
-        """Number of a goal, which is requested again while what refuses it passes.
+    async def _taken(self, take: Callable[[], int]) -> int:
+        """Number of what ``take`` requests; it is requested again while what refuses it passes.
 
         Raises:
-            RequestRefusedError: something else does, or it has not passed.
+            RequestRefusedError: something else does, it has not passed, or somebody else drives.
         """
         until = self._clock.now() + PATIENCE * SECOND
         while True:
+            if (other := self._other()) is not None:
+                raise RequestRefusedError(Reason.CANCELLED, other)
             try:
-                number = self._parts.goals.take(request())
+                number = take()
                 self._waits = ""
                 return number
             except RequestRefusedError as error:
@@ -429,18 +454,32 @@ class MissionService:
                 self._waits = str(error)
             await self._clock.sleep(AGAIN)
 
+    def _other(self) -> str | None:
+        """What somebody else has the robot do."""
+        goal, behaviour, exploration = self._in.goal.latest, self._in.behaviour.latest, self._in.explore.latest
+        if goal is not None and goal.phase is not GoalPhase.IDLE and goal.source not in OWN:
+            return f"goal {goal.number} of {goal.source} is pursued"
+        if behaviour is not None and behaviour.running and behaviour.source != SOURCE:
+            return f"the behaviour {behaviour.behaviour} of {behaviour.source} is running"
+        if exploration is not None and exploration.running and exploration.source != SOURCE:
+            return f"the exploration of {exploration.source} is running"
+        return None
+
     async def _explore(self, step: ExploreStep) -> StepEnd:
         explorer = self._parts.explorer
         assert explorer is not None
-        header = self._header()
-        number = explorer.take(
-            ExploreRequest(**header, order=ExploreOrder.START, home=step.home, budget=step.budget, find=step.find)
+        what: dict[str, Any] = {"home": step.home, "budget": step.budget, "find": step.find}
+        number = await self._taken(
+            lambda: explorer.take(ExploreRequest(**self._header(), order=ExploreOrder.START, **what))
         )
 
         def end() -> StepEnd | None:
             state = self._in.explore.latest
-            ended = state is not None and state.number == number and not state.running
-            return StepEnd(state.outcome, state.text) if ended and state is not None else None
+            if state is None or state.number < number:
+                return None
+            if state.number > number:
+                return StepEnd(Reason.CANCELLED, f"{state.source} started another exploration")
+            return None if state.running else StepEnd(state.outcome, state.text)
 
         def stop() -> None:
             explorer.take(ExploreRequest(**self._header(), order=ExploreOrder.STOP))
@@ -450,31 +489,28 @@ class MissionService:
     async def _behave(self, name: str, settings: dict[str, Any], distance: float | None) -> StepEnd:
         behaviours = self._parts.behaviours
         assert behaviours is not None
-        self._parts.goals.hold(SOURCE, on=False)  # its own requests keep the robot armed
+        what: dict[str, Any] = {"behaviour": name, "settings": settings}
+        number = await self._taken(
+            lambda: behaviours.take(BehaviourRequest(**self._header(), order=BehaviourOrder.START, **what))
+        )
 
-        def stop() -> int:
-            return behaviours.take(BehaviourRequest(**self._header(), order=BehaviourOrder.STOP, behaviour=name))
+        def stop() -> None:
+            behaviours.take(BehaviourRequest(**self._header(), order=BehaviourOrder.STOP, behaviour=name))
 
         def end() -> StepEnd | None:
             state = self._in.behaviour.latest
-            if state is None or state.number != number:
+            if state is None or state.number < number:
                 return None
+            if state.number > number:
+                return StepEnd(Reason.CANCELLED, f"{state.source} started another behaviour")
             if not state.running:
                 return StepEnd(state.outcome, state.text)
-            far = distance is not None and state.travelled >= distance
-            return StepEnd(Reason.BEHAVIOUR_DONE, f"{state.travelled:.2f} m") if far else None
+            if distance is None or state.travelled < distance:
+                return None
+            stop()
+            return StepEnd(Reason.BEHAVIOUR_DONE, f"{state.travelled:.2f} m")
 
-        try:
-            number = behaviours.take(
-                BehaviourRequest(**self._header(), order=BehaviourOrder.START, behaviour=name, settings=settings)
-            )
-            result = await self._until(end, stop, self._in.behaviour)
-            state = self._in.behaviour.latest
-            if state is not None and state.number == number and state.running:
-                stop()
-            return result
-        finally:
-            self._parts.goals.hold(SOURCE, on=True)
+        return await self._until(end, stop, self._in.behaviour)
 
     async def _until(
         self, end: Callable[[], StepEnd | None], stop: Callable[[], object], reports: Subscription[Any]
@@ -508,18 +544,23 @@ class MissionService:
     # What outlasts a restart
 
     def _load(self) -> SavedProgress | None:
-        if self._file is None or not self._file.is_file() or self._file.stat().st_size > MOST_BYTES:
-            return None
+        """What was interrupted; to be called in a thread.
+
+        Raises:
+            InputError: the file is not what it should be.
+        """
+        file = self._file
         try:
-            return SavedProgress.model_validate_json(self._file.read_text(encoding="utf-8"))
-        except (OSError, ValueError, ValidationError) as error:
-            first = str(error).partition("\n")[0]
-            self._events(Reason.BAD_INPUT, Severity.WARNING, SOURCE, f"{self._file}: not readable: {first}")
-            return None
+            if file is None or not file.exists():
+                return None
+            require_file(file, MOST_BYTES)
+            return SavedProgress.model_validate_json(file.read_text(encoding="utf-8"))
+        except ValidationError as error:
+            raise InputError(f"{file}: not readable: {first_mistake(error)}") from error
+        except (OSError, ValueError) as error:
+            raise InputError(f"{file}: not readable: {error}") from error
 
     async def _save(self, progress: MissionProgress) -> None:
-        if progress.returning:
-            return
         self._noted = self._pose() or self._noted
         text = SavedProgress.of(progress, self._source, self._noted).model_dump_json()
         await self._write(lambda file: replace_file(file, text))
@@ -559,11 +600,10 @@ class MissionService:
         header: dict[str, Any] = {"stamp": now, "received": now, "seq": 0, "frame": "map", "number": self._number}
         if self._interrupted is not None:
             saved = self._interrupted
-            doing, index = in_words(saved.mission.steps[saved.index]), saved.index
             return MissionState(
-                **header, name=saved.mission.name, source=saved.source, resumable=True, step=index + 1,
-                steps=len(saved.mission.steps), doing=doing, failures=saved.failures, outcome=Reason.MISSION_INCOMPLETE,
-                text=f"interrupted at step {index + 1}",
+                **header, name=saved.mission.name, source=saved.source, resumable=True, step=saved.index + 1,
+                steps=len(saved.mission.steps), doing=saved.progress().doing, failures=saved.failures,
+                outcome=Reason.MISSION_INCOMPLETE, text=f"interrupted {_where(saved)}",
             )  # fmt: skip
         if (progress := self._progress) is None:
             return MissionState(**header)
@@ -571,11 +611,15 @@ class MissionService:
         return MissionState(
             **header, name=progress.mission.name, source=self._source, running=end is None, step=progress.index + 1,
             steps=len(progress.mission.steps), attempt=progress.attempt + 1, failures=progress.failures,
-            doing="return" if progress.returning else in_words(progress.step),
+            doing=progress.doing, failed=self._failed,
             outcome=Reason.DRIVING if end is None else end.reason, text=self._waits if end is None else end.text,
-            failed=self._failed,
             elapsed=(now - self._began) / SECOND,
         )  # fmt: skip
+
+
+def _where(saved: SavedProgress) -> str:
+    way_back = f"on the way back, after step {saved.index + 1} had failed"
+    return way_back if saved.returning else f"at step {saved.index + 1}"
 
 
 def register_mission_calls(rpc: RpcRegistry, service: MissionService) -> None:

@@ -224,6 +224,21 @@ def test_files_are_written_by_a_thread_and_failures_are_reported_by_the_loop(tmp
     assert [by for by, text in rig.events if "points not saved" in text] == [0]
 
 
+def test_points_that_were_not_saved_are_saved_later_though_nothing_changes(tmp_path):
+    (tmp_path / "file").touch()
+
+    async def story(rig: Rig) -> None:
+        await rig.drive(1.0, show=b"")
+        await rig.ask(PointOrder.MARK, "dock")
+        await rig.drive(14.0, show=b"")
+        assert any(reason is Reason.DISK_FULL and "points not saved" in text for reason, text in rig.events)
+        (tmp_path / "file").unlink()
+        await rig.drive(11.0, show=b"")
+        assert [point.name for point, _ in files.load(tmp_path / "file" / "map")] == ["dock"]
+
+    run_scenario(story, tmp_path / "file" / "map")
+
+
 def test_a_robot_that_is_lost_marks_no_place_of_its_own_and_reads_no_tags(tmp_path):
     async def story(rig: Rig) -> None:
         await rig.drive(1.5)

@@ -165,7 +165,11 @@ def test_a_tag_of_a_saved_map_is_seen_after_a_restart_of_the_computer_and_no_one
     ("change", "said"),
     [
         ({"x": "left"}, r"0\.x: Input should be a valid number"),
-        ({"covariance": [0.0] * 9}, "dock: covariance: expected a symmetric matrix of positive variances"),
+        ({"x": 1e308}, "dock: expected at most 10000 m and rad"),
+        ({"yaw": -1e300}, "dock: expected at most 10000 m and rad"),
+        ({"covariance": [0.0] * 9}, "dock: covariance: expected a symmetric matrix of variances from 1e-12 to"),
+        ({"covariance": [1e-320, 0, 0, 0, 1e-320, 0, 0, 0, 1]}, "dock: covariance: expected"),
+        ({"covariance": [math.inf, 0, 0, 0, 1, 0, 0, 0, 1]}, "dock: covariance: expected"),
         ({"covariance": [-1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]}, "dock: covariance: expected"),
         ({}, "dock: expected every name once"),
     ],

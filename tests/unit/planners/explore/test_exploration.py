@@ -302,6 +302,17 @@ def test_without_a_map_or_a_place_to_save_it_says_so():
     assert "map not saved" in stepped.run.text
 
 
+def test_where_the_worker_fails_again_and_again_it_says_that_and_not_that_there_is_no_map():
+    stepped = SteppedExploration(home=False)
+    stepped.look(ExploreAnswer(known=7.0, frontiers=2, home=3.0))
+    while stepped.run.phase is Phase.LOOKING:
+        stepped.look(ExploreAnswer(failure=Reason.NOT_INSTALLED, text="numba is missing"))
+        assert stepped.now < 100
+        assert stepped.run.newest.known == 7.0
+    assert stepped.saved().outcome is Reason.NOT_INSTALLED
+    assert "numba is missing" in stepped.run.text
+
+
 def test_stopped_it_cancels_the_goal_and_saves():
     stepped = SteppedExploration()
     stepped.drive()

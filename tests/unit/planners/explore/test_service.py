@@ -11,9 +11,12 @@ from monstertruck_planners.explore.config import InformationConfig
 from monstertruck_planners.explore.exchange import ExploreAnswer, ExploreSetup, ExploreTask, Viewpoint
 from monstertruck_planners.explore.service import ExplorerInputs, ExplorerService
 from monstertruck_runtime.clock import VirtualClock, run_virtual
+from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.mailbox import Mailbox, fifo
 from monstertruck_runtime.requests import inner_request
 from monstertruck_schemas.base import Message, Pose2D, Twist2D
+from monstertruck_schemas.plan import GoalPhase, GoalState
+from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import ExploreOrder, ExploreRequest
 from monstertruck_schemas.state import GateMode, GateState, Odometry
 
@@ -51,6 +54,32 @@ class Live:
     @property
     def latest(self) -> Message:
         return self._message.model_copy(update={"stamp": self._clock.now(), "received": self._clock.now()})
+
+
+def test_a_step_in_the_loop_that_refuses_its_input_is_an_answer_and_an_event():
+    class Refusing:
+        async def step(self, task: object) -> object:
+            raise InputError("map: not readable")
+
+    reported: list[tuple[object, ...]] = []
+    service = ExplorerService.__new__(ExplorerService)
+    service._actor, service._fresh = Refusing(), False
+    service._events = lambda *event: reported.append(event)
+    target = Viewpoint((1.0, 0.0, 0.0), (2.0, 0.0))
+    answer = asyncio.run(service._ask(ExploreTask((0.0, 0.0, 0.0), current=target)))
+    assert (answer.target, answer.kept, service._fresh) == (target, True, True)
+    assert (answer.failure, answer.text) == (Reason.BAD_INPUT, "map: not readable")
+    assert [event[0] for event in reported] == [Reason.BAD_INPUT]
+
+
+def test_an_operators_goal_after_one_of_its_own_was_refused_is_noticed():
+    service = ExplorerService.__new__(ExplorerService)
+    service._refused, service._goal, service._others = (Reason.LEASE_EXPIRED, "late"), 3, 1
+    newest = GoalState(stamp=0, received=0, seq=0, frame="map", number=4, source="bob", phase=GoalPhase.DRIVING)
+    service._in = SimpleNamespace(goal=SimpleNamespace(latest=newest))
+    assert service._goal_end() == (None, "", "bob")
+    service._in.goal.latest = newest.model_copy(update={"number": 1})
+    assert service._goal_end() == (Reason.LEASE_EXPIRED, "late", "")
 
 
 def test_the_answer_to_a_question_of_the_exploration_before_is_none():

@@ -224,6 +224,10 @@ def test_time_counts_only_while_the_truck_could_drive():
     waiting.step(210, armed=False, held="battery critical")
     assert waiting.run.outcome is Reason.DISARMED
     assert waiting.run.text == "not armed for 20 s: battery critical"
+    placeless = SteppedRun(PlannerConfig(unarmed_timeout=20.0))
+    placeless.step(answer=WAY)
+    placeless.step(210, armed=False, pose=None)
+    assert (placeless.run.outcome, placeless.run.text) == (Reason.NO_MAP, "no fresh pose for 20 s")
 
 
 def test_orders_pause_resume_and_cancel():

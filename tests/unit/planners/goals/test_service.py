@@ -52,6 +52,20 @@ def test_a_running_behaviour_excludes_a_goal_and_lets_one_be_cancelled(monkeypat
     service._examine(None, "goal", moves=True)
 
 
+def test_who_holds_the_truck_between_goals_does_not_stop_a_behaviour():
+    still = []
+    service = GoalService.__new__(GoalService)
+    service._goal, service._held = None, {"missions"}
+    service._keep_scan = service._report = lambda _: None
+    service._paths = SimpleNamespace(stand_still=lambda: still.append(1))
+    state = SimpleNamespace(running=False)
+    service._in = SimpleNamespace(behaviour=SimpleNamespace(latest=state))
+    service._tick(0)
+    state.running = True
+    service._tick(1)
+    assert still == [1]
+
+
 def test_who_waits_for_the_way_to_a_goal_is_not_informed_of_another_goals_way():
     async def main() -> None:
         service = GoalService.__new__(GoalService)

@@ -6,6 +6,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from pydantic import ValidationError
 
 from monstertruck_planners.missions.progress import MissionProgress, SavedProgress, StepEnd, after, in_words, outcome
 from monstertruck_planners.missions.service import SILENT, MissionInputs, MissionParts, MissionService
@@ -14,9 +15,9 @@ from monstertruck_runtime.errors import NotFoundError, RequestRefusedError
 from monstertruck_runtime.threads import inline
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.mission import Mission
-from monstertruck_schemas.plan import GoalPhase, GoalState
+from monstertruck_schemas.plan import BehaviourState, ExplorationPhase, ExplorationState, GoalPhase, GoalState
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import GoalOrder, MissionOrder, MissionRequest, Role
+from monstertruck_schemas.req import BehaviourOrder, GoalOrder, MissionOrder, MissionRequest, Role
 
 GO = {"do": "goto", "x": 1.0, "y": 0.0, "yaw": 0.0}
 WAIT = {"do": "wait", "seconds": 3.0}
@@ -82,6 +83,12 @@ def test_what_is_saved_comes_back():
     at, _ = after(progress({**GO, "on_failure": "continue"}, WAIT), MISSED)
     again = SavedProgress.model_validate_json(SavedProgress.of(at, "ann").model_dump_json()).progress()
     assert (again.mission, again.start, again.index, again.failures) == (at.mission, at.start, 1, 1)
+    assert again.why == MISSED, "it is in the text of the end"
+
+
+def test_a_step_takes_no_more_settings_than_a_behaviour_is_started_with():
+    with pytest.raises(ValidationError, match="at most 32"):
+        mission({"do": "behaviour", "name": "wall", "settings": {f"k{i}": 1.0 for i in range(33)}})
 
 
 def test_a_line_says_all_that_a_step_does():
@@ -101,10 +108,37 @@ def test_a_line_says_all_that_a_step_does():
     assert [in_words(step) for step in mission(*lines.values()).steps] == list(lines)
 
 
+class Behaviours:
+    """A robot that is busy at first, and whose behaviours take a second."""
+
+    def __init__(self, robot: "Pretended", busy: int) -> None:
+        self._robot, self._busy, self.asked = robot, busy, []
+
+    def take(self, request) -> int:
+        self.asked.append(request.order)
+        if self._busy:
+            self._busy -= 1
+            raise RequestRefusedError(Reason.BUSY, "the path 'halt-1.2' is followed")
+        running = request.order is BehaviourOrder.START
+        self.say(1, running, Reason.DRIVING if running else Reason.CANCELLED)
+        if running:
+            asyncio.get_running_loop().call_later(1.0, self.say, 1, False, Reason.BEHAVIOUR_DONE)
+        return 1
+
+    def say(self, number: int, running: bool, reason: Reason, source: str = "missions") -> None:
+        now = self._robot.clock.now()
+        self._robot.latest["behaviour"] = BehaviourState(
+            stamp=now, received=now, seq=0, frame="odom", number=number, behaviour="wall", source=source,
+            running=running, outcome=reason,
+        )  # fmt: skip
+
+
 class Pretended:
     """A robot whose goals end on request."""
 
-    def __init__(self, clock: VirtualClock, file: Path | None = None, *, localised: bool = False) -> None:
+    def __init__(
+        self, clock: VirtualClock, file: Path | None = None, *, localised: bool = False, busy: int = 0, offload=inline
+    ) -> None:
         self.clock, self.number, self.reached = clock, 0, [Reason.GOAL_REACHED] * 99
         self.latest = {"gate": None, "pose": None, "goal": None, "behaviour": None, "explore": None, "points": None}
         self.reports, self.events, self.goals, self.held = [], [], [], set()
@@ -113,10 +147,10 @@ class Pretended:
         dock = SimpleNamespace(name="dock", before=lambda away: Pose2D(x=7.0 - away, y=8.0, yaw=0.0))
         self.latest["points"] = SimpleNamespace(points=(dock,))
         self.latest["gate"] = SimpleNamespace(nonce="n", stamp=0, reasons=(), mode=SimpleNamespace(active=True))
-        self.seq, self.placed = 0, True
+        self.seq, self.placed, self.behaviours = 0, True, Behaviours(self, busy)
         self.service = MissionService(
-            MissionParts(self, None, None, frozenset()),
-            clock, file=file, localised=localised, offload=inline, max_age=5.0,
+            MissionParts(self, self.behaviours, None, frozenset({"wall"})),
+            clock, file=file, localised=localised, offload=offload, max_age=5.0,
             inputs=MissionInputs(**box), state=SimpleNamespace(next_seq=lambda: 1, put=self.reports.append),
             events=lambda reason, severity, source, text="", **_: self.events.append((reason, text)),
         )  # fmt: skip
@@ -142,8 +176,10 @@ class Pretended:
     def hold(self, who: str, *, on: bool):
         (self.held.add if on else self.held.discard)(who)
 
-    def _say(self, phase: GoalPhase, reason: Reason):
-        state = GoalState(stamp=1, received=1, seq=0, frame="map", number=self.number, phase=phase, outcome=reason)
+    def _say(self, phase: GoalPhase, reason: Reason, source: str = "missions"):
+        state = GoalState(
+            stamp=1, received=1, seq=0, frame="map", number=self.number, source=source, phase=phase, outcome=reason
+        )
         self.latest["goal"] = state
 
     def order(self, order: MissionOrder, *steps: dict, moved: bool = False, **more) -> int:
@@ -159,9 +195,9 @@ class Pretended:
         return self.service.take(request)
 
 
-def played(story, file: Path | None = None, *, localised: bool = False) -> Pretended:
+def played(story, file: Path | None = None, **more) -> Pretended:
     async def main(clock: VirtualClock) -> Pretended:
-        robot = Pretended(clock, file, localised=localised)
+        robot = Pretended(clock, file, **more)
         task = asyncio.create_task(robot.service.run(lambda: None))
         await clock.sleep(0.1)
         await story(robot)
@@ -231,6 +267,117 @@ def test_a_step_fails_when_what_does_it_falls_silent():
     robot = played(story)
     assert (robot.reports[-1].running, robot.reports[-1].outcome) == (False, Reason.SERVICE_FAILED)
     assert robot.latest["goal"].outcome is Reason.CANCELLED, "in case it only says nothing"
+
+
+def test_a_behaviour_is_asked_for_again_while_the_robot_brakes_after_a_goal():
+    async def story(robot: Pretended) -> None:
+        robot.order(MissionOrder.START, GO, {"do": "behaviour", "name": "wall"})
+        await robot.clock.sleep(8.0)
+
+    robot = played(story, busy=2)
+    assert robot.reports[-1].outcome is Reason.MISSION_DONE, robot.reports[-1].text
+    assert robot.behaviours.asked == [BehaviourOrder.START] * 3
+
+
+def test_what_another_client_started_in_its_place_is_neither_waited_for_nor_stopped():
+    async def story(robot: Pretended) -> None:
+        robot.order(MissionOrder.START, {"do": "behaviour", "name": "wall", "limit": 60.0})
+        await robot.clock.sleep(0.5)
+        robot.behaviours.say(2, True, Reason.DRIVING, "bob")
+        await robot.clock.sleep(0.4)
+
+    robot = played(story)
+    assert (robot.reports[-1].running, robot.reports[-1].outcome) == (False, Reason.CANCELLED)
+    assert "bob started another behaviour" in robot.reports[-1].text
+    assert robot.behaviours.asked == [BehaviourOrder.START]
+
+
+@pytest.mark.parametrize("what", ["goal", "behaviour", "explore"])
+def test_it_takes_nothing_over_from_somebody_else(what: str):
+    def drive(robot: Pretended) -> None:
+        now = robot.clock.now()
+        if what == "goal":
+            robot.number += 1
+            robot._say(GoalPhase.DRIVING, Reason.DRIVING, "bob")
+        elif what == "behaviour":
+            robot.behaviours.say(9, True, Reason.DRIVING, "bob")
+        else:
+            robot.latest["explore"] = ExplorationState(
+                stamp=now, received=now, seq=0, frame="map", number=1, source="bob", phase=ExplorationPhase.DRIVING
+            )
+
+    async def story(robot: Pretended) -> None:
+        robot.order(MissionOrder.START, WAIT, GO)
+        await robot.clock.sleep(1.0)
+        drive(robot)
+        await robot.clock.sleep(4.0)
+        assert (robot.reports[-1].running, robot.reports[-1].outcome) == (False, Reason.CANCELLED)
+        assert "of bob is" in robot.reports[-1].text
+        with pytest.raises(RequestRefusedError, match=r"of bob is .*, stop it first") as refused:
+            robot.order(MissionOrder.START, GO)
+        assert refused.value.refusal is Reason.BUSY
+
+    assert played(story).goals == []
+
+
+@pytest.mark.parametrize("after", [0.0, 1.0])
+def test_stopped_at_its_start_or_at_the_limit_of_a_step_it_has_ended(after: float):
+    async def story(robot: Pretended) -> None:
+        robot.order(MissionOrder.START, {**GO, "limit": 1.0, "on_failure": "continue"}, WAIT)
+        if after:
+            asyncio.get_running_loop().call_later(after, robot.order, MissionOrder.STOP)
+        else:
+            robot.order(MissionOrder.STOP)
+        await robot.clock.sleep(8.0)
+        assert robot.order(MissionOrder.START, WAIT) == 2, "it is not in the way of the next one"
+
+    robot = played(story)
+    (end,) = [report for report in robot.reports if report.number == 1 and not report.running]
+    assert (end.outcome, end.text) == (Reason.CANCELLED, "stopped by ann")
+
+
+def test_stopped_twice_it_is_not_resumed_after_a_restart(tmp_path: Path):
+    file = tmp_path / "mission.json"
+
+    async def story(robot: Pretended) -> None:
+        async def slow(work):
+            await robot.clock.sleep(0.3)
+            return work()
+
+        robot.service._offload = slow
+        robot.order(MissionOrder.START, GO, WAIT)
+        await robot.clock.sleep(1.0)
+        assert file.exists()
+        robot.order(MissionOrder.STOP)
+        await robot.clock.sleep(0.1)
+        with pytest.raises(RequestRefusedError, match="no mission is running"):
+            robot.order(MissionOrder.STOP)
+        await robot.clock.sleep(1.0)
+
+    played(story, file)
+    assert not file.exists()
+
+
+def test_interrupted_on_its_way_back_it_goes_on_back(tmp_path: Path):
+    file = tmp_path / "mission.json"
+
+    async def interrupted(robot: Pretended) -> None:
+        robot.reached[0] = Reason.GOAL_UNREACHABLE
+        robot.order(MissionOrder.START, {**GO, "on_failure": "return"}, WAIT)
+        await robot.clock.sleep(3.0)
+
+    assert played(interrupted, file).goals == [(1.0, 0.0), (5.0, 6.0)]
+
+    async def resumed(robot: Pretended) -> None:
+        assert (robot.reports[-1].doing, robot.reports[-1].resumable) == ("return", True)
+        assert "on the way back" in robot.reports[-1].text
+        robot.order(MissionOrder.RESUME)
+        await robot.clock.sleep(8.0)
+
+    robot = played(resumed, file)
+    assert robot.goals == [(5.0, 6.0)]
+    assert robot.reports[-1].outcome is Reason.GOAL_UNREACHABLE
+    assert robot.reports[-1].text.endswith(", back where it began")
 
 
 def test_stopped_it_cancels_its_goal():
@@ -341,24 +488,51 @@ def test_an_interrupted_mission_can_be_given_up(tmp_path: Path):
     assert robot.events[-1] == (Reason.CANCELLED, "round: given up by ann")
 
 
-@pytest.mark.parametrize("text", ["{", SavedProgress.of(progress(GO), "ann").model_dump_json().replace(":0", ":7")])
-def test_a_damaged_file_is_reported_and_forgotten(tmp_path: Path, text: str):
-    file = tmp_path / "mission.json"
+SAVED = SavedProgress.of(progress(GO), "ann").model_dump_json()
+
+
+@pytest.mark.parametrize(
+    ("text", "what"),
+    [
+        ("{", "Invalid JSON"),
+        (SAVED.replace(":0", ":7"), "expected one of 1 steps"),
+        (SAVED.replace('"source"', '"sauce"'), "not readable: source: Field required"),
+        (SAVED + " " * 1_000_000, "expected at most 1000000"),
+    ],
+)
+def test_a_damaged_file_is_reported_from_the_loop_and_forgotten(tmp_path: Path, text: str, what: str):
+    file, inside, by = tmp_path / "mission.json", [], []
     file.write_text(text)
 
-    async def story(robot: Pretended) -> None:
-        assert not robot.reports[-1].resumable
+    async def offload(work):
+        inside.append(1)
+        try:
+            return work()
+        finally:
+            inside.pop()
 
-    robot = played(story, file)
-    assert robot.events[0][0] is Reason.BAD_INPUT
+    async def main(clock: VirtualClock) -> Pretended:
+        robot = Pretended(clock, file, offload=offload)
+        robot.service._events = lambda *event, **_: by.append((len(inside), event[0], event[-1]))
+        task = asyncio.create_task(robot.service.run(lambda: None))
+        await clock.sleep(0.1)
+        task.cancel()
+        await asyncio.wait([task])
+        return robot
+
+    assert not run_virtual(main, start=SECOND).reports[-1].resumable
+    ((within, reason, said),) = by
+    assert (within, reason) == (0, Reason.BAD_INPUT)
+    assert str(file) in said
+    assert what in said
 
 
 def test_all_that_the_robot_cannot_do_is_named_before_it_sets_off():
-    lacks = "step 2: explore: .* section `explorer`; step 3: no behaviour 'wall': expected one of none"
+    lacks = "step 2: explore: .* section `explorer`; step 3: no behaviour 'left': expected one of wall"
 
     async def story(robot: Pretended) -> None:
         with pytest.raises(NotFoundError, match=lacks):
-            robot.order(MissionOrder.START, GO, {"do": "explore"}, {"do": "behaviour", "name": "wall"})
+            robot.order(MissionOrder.START, GO, {"do": "explore"}, {"do": "behaviour", "name": "left"})
         assert robot.goals == []
 
     played(story)

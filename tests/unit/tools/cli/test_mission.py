@@ -52,6 +52,17 @@ def test_steps_that_are_all_wrong_are_not_called_missing(tmp_path: Path):
     assert said == f"{file}:3: steps: expected at least 1 in number\n"
 
 
+def test_a_mistake_is_named_once_and_with_what_its_step_takes(tmp_path: Path):
+    file = tmp_path / "bad.yaml"
+    step = "{ do: behaviour, name: left, settings: { speed: .nan } }"
+    file.write_text(f"version: 2\nname: round\nsteps:\n  - {step}\n  - {{ do: wait, seconds: 1, quickly: 1 }}\n")
+    done = CliRunner().invoke(app, ["mission", "check", str(file)])
+    lines = [line.partition("bad.yaml:")[2] for line in done.output.splitlines() if "bad.yaml:" in line]
+    assert [line[:2] for line in lines] == ["4:", "5:"], done.output
+    assert lines[0].startswith("4: steps.0.settings.speed: input should be a finite number")
+    assert "steps.1.quickly: unknown key; known here: do, limit, on_failure, retries, seconds" in lines[1]
+
+
 def test_list_names_missions_and_what_is_wrong(tmp_path: Path):
     (tmp_path / "a.yaml").write_text(GOOD)
     (tmp_path / "b.yaml").write_text(BAD)
