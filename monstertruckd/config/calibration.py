@@ -20,7 +20,7 @@ from pydantic import AfterValidator, Field, ValidationError
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import ConfigError, NotFoundError
 from monstertruck_runtime.small_files import require_file
-from monstertruck_schemas.base import Schema
+from monstertruck_schemas.base import Schema, first_mistake
 from monstertruck_schemas.body import LensConfig, Mount, TurnDeficitConfig
 from monstertruckd.config.truck import TruckConfig
 
@@ -366,10 +366,7 @@ def with_values(config: C, results: Iterable[Result], source: Path | str) -> C:
     try:
         return type(config).model_validate(data)
     except ValidationError as error:
-        detail = error.errors(include_url=False)[0]
-        where = ".".join(str(part) for part in detail["loc"])
-        msg = f"{source}: {where}: {detail['msg'].removeprefix('Value error, ')}"
-        raise ConfigError(msg) from error
+        raise ConfigError(f"{source}: {first_mistake(error)}") from error
 
 
 def put_values(data: dict[str, Any], results: Iterable[Result], source: Path | str) -> None:

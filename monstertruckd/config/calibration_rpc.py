@@ -11,6 +11,7 @@ from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import InputError, RequestRefusedError
 from monstertruck_runtime.ports import EventSink
 from monstertruck_runtime.threads import Offload
+from monstertruck_schemas.base import first_mistake
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.roles import AccessRole
@@ -106,5 +107,4 @@ def _result(payload: Any) -> Result:
     try:
         return Result.model_validate_json(json.dumps(payload))
     except ValidationError as error:
-        detail = error.errors(include_url=False)[0]
-        raise InputError(f"result: {'.'.join(map(str, detail['loc']))}: {detail['msg']}") from error
+        raise InputError(f"result: {first_mistake(error)}") from error

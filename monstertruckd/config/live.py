@@ -14,7 +14,7 @@ from pydantic import ValidationError
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.ports import EventSink
 from monstertruck_runtime.threads import Offload
-from monstertruck_schemas.base import LiveValue, live_settings
+from monstertruck_schemas.base import LiveValue, first_mistake, live_settings
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.roles import AccessRole
@@ -45,10 +45,7 @@ def with_settings(config: T, values: Mapping[str, Any]) -> T:
     try:
         return type(config).model_validate(data)
     except ValidationError as error:
-        detail = error.errors(include_url=False)[0]
-        where = ".".join(map(str, detail["loc"]))
-        text = detail["msg"].removeprefix("Value error, ")
-        raise InputError(f"{where}: {text}" if where else text) from error
+        raise InputError(first_mistake(error)) from error
 
 
 class LiveConfig:

@@ -23,6 +23,7 @@ from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import InputError, NoAnswerError, NotFoundError, RequestRefusedError, TruckError
 from monstertruck_runtime.stations import own_source, tls_for
 from monstertruck_runtime.threads import in_thread
+from monstertruck_schemas.base import first_mistake
 from monstertruck_schemas.mission import Mission
 from monstertruck_schemas.plan import Path
 from monstertruck_schemas.reasons import Reason
@@ -262,8 +263,7 @@ def read_mission(text: str) -> Mission:
             raise InputError("mission: has an alias (*name): expected every value written out")
         return Mission.model_validate_json(json.dumps(YAML(typ="safe", pure=True).load(text)))
     except ValidationError as error:
-        detail = error.errors(include_url=False)[0]
-        raise InputError(f"mission: {'.'.join(map(str, detail['loc']))}: {detail['msg']}") from error
+        raise InputError(f"mission: {first_mistake(error)}") from error
     except (YAMLError, TypeError, ValueError, RecursionError) as error:
         raise InputError(f"mission: not valid YAML: {' '.join(str(error).split())[:160]}") from error
 

@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError, RequestRefusedError
 from monstertruck_runtime.mailbox import Delivery, Mailbox
-from monstertruck_schemas.base import Message
+from monstertruck_schemas.base import Message, first_mistake
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import DriveRequest, Order, Request, Role
 from monstertruck_schemas.state import GateState
@@ -100,9 +100,8 @@ def parse_request(model: type[R], payload: dict[str, Any]) -> R:
     try:
         return model.model_validate_json(json.dumps(payload), extra="ignore")  # a newer client may say more
     except ValidationError as error:
-        detail = error.errors(include_url=False)[0]
-        text = f"{'.'.join(map(str, detail['loc']))}: {detail['msg']}"
-        if detail["type"] == "finite_number":
+        text = first_mistake(error)
+        if error.errors(include_url=False)[0]["type"] == "finite_number":
             raise RequestRefusedError(Reason.NOT_FINITE, text) from None
         raise InputError(text) from None
 

@@ -16,7 +16,7 @@ from pydantic import Field, ValidationError
 
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.yaml_files import read_yaml
-from monstertruck_schemas.base import Schema
+from monstertruck_schemas.base import Schema, first_mistake
 from monstertruckd.tools.driving.modes import SteeringMode
 from monstertruckd.tools.driving.teleop import MODE_KEYS, TURN_RADIUS, TeleopRequest, axles
 
@@ -123,8 +123,7 @@ def read_mapping(file: Path) -> PadMapping:
     try:
         return PadMapping.model_validate(content)
     except ValidationError as error:
-        detail = error.errors(include_url=False)[0]
-        raise InputError(f"{file}: {'.'.join(map(str, detail['loc']))}: {detail['msg']}") from error
+        raise InputError(f"{file}: {first_mistake(error)}") from error
 
 
 @dataclass(slots=True)

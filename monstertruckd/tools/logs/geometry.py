@@ -7,6 +7,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from monstertruck_runtime.errors import InputError
+from monstertruck_schemas.base import first_mistake
 from monstertruckd.config.truck import Geometry
 
 
@@ -23,7 +24,4 @@ def recorded_geometry(log: Path, config: Mapping[str, Any]) -> Geometry:
     try:
         return Geometry.model_validate(config.get("geometry", {}), strict=False)
     except ValidationError as error:
-        detail = error.errors(include_url=False)[0]
-        where = ".".join(("geometry", *map(str, detail["loc"])))
-        text = detail["msg"].removeprefix("Value error, ")
-        raise InputError(f"{log}: config.json: {where}: {text}") from error
+        raise InputError(f"{log}: config.json: {first_mistake(error, 'geometry')}") from error

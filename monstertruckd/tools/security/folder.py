@@ -26,7 +26,7 @@ from pydantic import Field, ValidationError, field_validator, model_validator
 from monstertruck_runtime.errors import InputError, NotFoundError
 from monstertruck_runtime.small_files import replace_file
 from monstertruck_runtime.yaml_files import read_yaml, yaml_text
-from monstertruck_schemas.base import Schema
+from monstertruck_schemas.base import Schema, first_mistake
 from monstertruck_schemas.req import Role
 from monstertruck_schemas.roles import AccessRole
 from monstertruckd.bus.zenoh_config import OWNER_NAME, OwnerName, TlsConfig, ZenohConfig
@@ -414,6 +414,4 @@ def _validated(model: type[S], data: Any, where: Path | str) -> S:
     try:
         return model.model_validate(data, strict=False)
     except ValidationError as error:
-        detail = error.errors(include_url=False)[0]
-        place, text = ".".join(map(str, detail["loc"])), detail["msg"].removeprefix("Value error, ")
-        raise InputError(f"{where}: {place}{': ' if place else ''}{text}") from None
+        raise InputError(f"{where}: {first_mistake(error)}") from None

@@ -15,7 +15,7 @@ from pydantic_core import PydanticSerializationError
 
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.wire import foxglove
-from monstertruck_schemas.base import Message
+from monstertruck_schemas.base import Message, first_mistake
 from monstertruck_schemas.topics import Topic
 
 M = TypeVar("M", bound=Message)
@@ -81,10 +81,7 @@ def decode(topic: Topic[M], data: bytes) -> M:
             return topic.model.model_validate_json(data, extra="ignore")
         message = foxglove.decode(topic.model, data)
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        where = ".".join(str(part) for part in first["loc"])
-        msg = f"{topic.name}: {where + ': ' if where else ''}{first['msg']}"
-        raise InputError(msg) from None
+        raise InputError(f"{topic.name}: {first_mistake(error)}") from None
     except InputError as error:
         msg = f"{topic.name}: {error}"
         raise InputError(msg) from None
