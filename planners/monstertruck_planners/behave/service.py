@@ -335,7 +335,7 @@ def _with_settings(config: BehaviourConfig, settings: Mapping[str, Any]) -> Beha
     """
     if not settings:
         return config
-    if unknown := settings.keys() - type(config).model_fields.keys() | settings.keys() & {"kind"}:
+    if unknown := settings.keys() - type(config).model_fields.keys() | settings.keys() & {"kind", "rate"}:
         raise InputError(f"settings.{min(unknown)}: no setting of a run of {config.kind}")
     try:
         return type(config).model_validate({**config.model_dump(), **settings})

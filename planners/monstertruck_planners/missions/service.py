@@ -365,11 +365,11 @@ class MissionService:
         try:
             match step:
                 case GoToStep(x=x, y=y, yaw=yaw, via=via):
-                    return await self._go((x, y, yaw), via)
+                    return await self._go(lambda: (x, y, yaw), via)
                 case PointStep():
-                    return await self._go_before(step)
+                    return await self._go(lambda: self._before(step))
                 case LookStep(x=x, y=y):
-                    return await self._look(x, y)
+                    return await self._go(lambda: self._towards(x, y))
                 case WaitStep(seconds=seconds):
                     return await self._wait(seconds)
                 case ExploreStep():
@@ -382,7 +382,7 @@ class MissionService:
                     self._events(Reason.MISSION_NOTE, Severity.INFO, SOURCE, note)
                     return StepEnd(Reason.OK)
                 case ReturnStep():
-                    return await self._go(progress.start, ())
+                    return await self._go(lambda: progress.start)
                 case _:
                     assert_never(step)
         except RequestRefusedError as error:
@@ -398,28 +398,42 @@ class MissionService:
             await self._clock.sleep(min(left / SECOND, 1.0 / RATE))
         return StepEnd(Reason.OK)
 
-    async def _go_before(self, step: PointStep) -> StepEnd:
+    def _before(self, step: PointStep) -> Pose:
+        """Pose before a point of interest.
+
+        Raises:
+            RequestRefusedError: none are known yet.
+            NotFoundError: none has this name.
+        """
         message = None if self._in.points is None else self._in.points.latest
-        for point in () if message is None else message.points:
+        if message is None:
+            raise RequestRefusedError(Reason.NO_MAP, "no points of interest yet")
+        for point in message.points:
             if point.name == step.point:
                 pose = point.before(step.distance)
-                return await self._go((pose.x, pose.y, pose.yaw), ())
-        return StepEnd(Reason.NOT_FOUND, f"no point of interest {step.point!r} is known")
+                return pose.x, pose.y, pose.yaw
+        raise NotFoundError(f"no point of interest {step.point!r} is known")
 
-    async def _look(self, x: float, y: float) -> StepEnd:
-        pose = self._pose()
-        if pose is None:
-            return StepEnd(Reason.NO_MAP, "no fresh pose")
-        return await self._go((pose[0], pose[1], math.atan2(y - pose[1], x - pose[0])), ())
+    def _towards(self, x: float, y: float) -> Pose:
+        """Pose of the robot as it is, turned towards a place.
 
-    async def _go(self, goal: Pose, via: tuple[tuple[float, float], ...]) -> StepEnd:
-        x, y, yaw = goal
+        Raises:
+            RequestRefusedError: where it is is not known.
+        """
+        if (pose := self._pose()) is None:
+            raise RequestRefusedError(Reason.NO_MAP, "no fresh pose")
+        return pose[0], pose[1], math.atan2(y - pose[1], x - pose[0])
+
+    async def _go(self, where: Callable[[], Pose], via: tuple[tuple[float, float], ...] = ()) -> StepEnd:
         waypoints = tuple(Waypoint(x=a, y=b) for a, b in via)
-        pose = Pose2D(x=x, y=y, yaw=math.remainder(yaw, math.tau))
         goals = self._parts.goals
-        number = await self._taken(
-            lambda: goals.take(GoalRequest(**self._header(), frame="map", goal=pose, waypoints=waypoints))
-        )
+
+        def take() -> int:
+            x, y, yaw = where()
+            goal = Pose2D(x=x, y=y, yaw=math.remainder(yaw, math.tau))
+            return goals.take(GoalRequest(**self._header(), frame="map", goal=goal, waypoints=waypoints))
+
+        number = await self._taken(take)
 
         def end() -> StepEnd | None:
             goal = self._in.goal.latest
@@ -438,7 +452,7 @@ class MissionService:
         """Number of what ``take`` requests; it is requested again while what refuses it passes.
 
         Raises:
-            RequestRefusedError: something else does, it has not passed, or somebody else drives.
+            TruckError: something else does, it has not passed, or somebody else drives.
         """
         until = self._clock.now() + PATIENCE * SECOND
         while True:

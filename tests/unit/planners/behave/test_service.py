@@ -12,7 +12,7 @@ from monstertruck_planners.behave.service import SOURCE, BehaviourService
 from monstertruck_planners.behave.wall.config import WallPdConfig
 from monstertruck_runtime.bodies import build_chassis
 from monstertruck_runtime.clock import VirtualClock, run_virtual
-from monstertruck_runtime.errors import NotFoundError, RequestRefusedError
+from monstertruck_runtime.errors import InputError, NotFoundError, RequestRefusedError
 from monstertruck_runtime.mailbox import fifo, latest
 from monstertruck_schemas import topics
 from monstertruck_schemas.base import Twist2D
@@ -231,6 +231,16 @@ def test_it_needs_an_armed_robot_and_ends_when_it_is_disarmed(mode):
         bench.mode, bench.reasons = mode, (Reason(mode.value),)
         await bench.clock.sleep(0.3)
         assert bench.state.outcome is Reason(mode.value)
+
+    on_bench(scenario)
+
+
+@pytest.mark.parametrize("settings", [{"kind": "move"}, {"rate": 50.0}, {"spede": 0.1}])
+def test_a_run_takes_its_settings_but_no_kind_nor_rate_of_its_own(settings):
+    async def scenario(bench):
+        with pytest.raises(InputError, match=rf"settings\.{next(iter(settings))}: no setting of a run of wall_pd"):
+            bench.start(settings=settings)
+        bench.start(settings={"distance": 0.4})
 
     on_bench(scenario)
 

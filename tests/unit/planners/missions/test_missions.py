@@ -320,11 +320,30 @@ def test_it_takes_nothing_over_from_somebody_else(what: str):
     assert played(story).goals == []
 
 
-@pytest.mark.parametrize("after", [0.0, 1.0])
+def test_a_look_waits_for_a_pose_and_a_point_for_the_list_of_points():
+    async def story(robot: Pretended) -> None:
+        points, robot.latest["points"] = robot.latest["points"], None
+        robot.order(MissionOrder.START, {"do": "look", "x": 5.0, "y": 9.0}, {"do": "goto_point", "point": "dock"})
+        robot.latest["pose"] = None
+        await robot.clock.sleep(5.0)
+        assert (robot.reports[-1].running, robot.reports[-1].text) == (True, "no fresh pose")
+        robot.latest["pose"] = SimpleNamespace(received=2**60, pose=Pose2D(x=5.0, y=6.0, yaw=0.0))
+        await robot.clock.sleep(5.0)
+        assert robot.reports[-1].text == "no points of interest yet"
+        robot.latest["points"] = points
+        await robot.clock.sleep(5.0)
+
+    robot = played(story)
+    assert robot.reports[-1].outcome is Reason.MISSION_DONE
+    assert robot.goals == [(5.0, 6.0), (6.3, 8.0)]
+
+
+@pytest.mark.parametrize("after", [0.0, 0.5, 1.0])
 def test_stopped_at_its_start_or_at_the_limit_of_a_step_it_has_ended(after: float):
     async def story(robot: Pretended) -> None:
         robot.order(MissionOrder.START, {**GO, "limit": 1.0, "on_failure": "continue"}, WAIT)
         if after:
+            await robot.clock.sleep(1.0 - after)
             asyncio.get_running_loop().call_later(after, robot.order, MissionOrder.STOP)
         else:
             robot.order(MissionOrder.STOP)
