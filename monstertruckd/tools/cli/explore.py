@@ -10,7 +10,7 @@ from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruck_runtime.errors import InputError
 from monstertruckd.tools.cli.connection import require_section, with_robot
 from monstertruckd.tools.cli.options import EndpointOption, RobotOption
-from monstertruckd.tools.cli.output import JsonOption, print_end
+from monstertruckd.tools.cli.output import JsonOption, print_end, print_words
 
 if TYPE_CHECKING:
     from monstertruck_runtime.client import TruckClient
@@ -66,7 +66,7 @@ def explore(
         if stop:
             await client.explore(ExploreOrder.STOP)
             return None
-        report = None if json_output else print
+        report = None if json_output else print_words
         return await run_exploration(client, home=home, budget=seconds, find=find, arm=arm, report=report)
 
     end = with_robot(main, robot, endpoint)

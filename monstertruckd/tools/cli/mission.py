@@ -10,7 +10,7 @@ from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruck_runtime.errors import ConfigError, InputError, NotFoundError
 from monstertruckd.tools.cli.connection import require_section, with_robot
 from monstertruckd.tools.cli.options import EndpointOption, RobotOption
-from monstertruckd.tools.cli.output import JsonOption, command_group, print_end, print_json, print_table
+from monstertruckd.tools.cli.output import JsonOption, command_group, print_end, print_json, print_table, print_words
 
 if TYPE_CHECKING:
     from monstertruck_runtime.client import TruckClient
@@ -46,7 +46,7 @@ def run_command(
 
     async def main(client: "TruckClient", _: Clock) -> "RunEnd":
         await require_section(client, "planner", WITHOUT)
-        return await run_mission(client, mission, arm=arm, moved=moved, report=None if json_output else print)
+        return await run_mission(client, mission, arm=arm, moved=moved, report=None if json_output else print_words)
 
     end = with_robot(main, robot, endpoint)
     print_end(end.reason, end.text, end.as_json(), json_output=json_output)

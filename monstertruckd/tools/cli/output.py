@@ -182,6 +182,11 @@ def remark(text: str) -> None:
         print(text, file=sys.stderr, flush=True)
 
 
+def print_words(text: str) -> None:
+    """Print words on standard output; a terminal breaks none."""
+    print(wrapped(text) if on_terminal(sys.stdout) else text)
+
+
 def wrapped(text: str, indent: str = "") -> str:
     """Text broken between words where the terminal ends; what has no blanks, such as a path, stays whole."""
     wrapper = textwrap.TextWrapper(
@@ -290,7 +295,7 @@ def print_end(reason: Reason, text: str, values: Mapping[str, Any], *, json_outp
     shown = re.sub(r"([-+]?\d+\.\d+) rad\b(?!/)", lambda rad: f"{rad[0]} ({math.degrees(float(rad[1])):.1f}°)", text)
     whole = shown if reason.text in shown else f"{reason.text}: {shown}"
     if not json_output and not reason.exit_code:
-        print(wrapped(whole) if on_terminal(sys.stdout) else whole)
+        print_words(whole)
     finish(reason, whole)
 
 

@@ -82,7 +82,8 @@ def goto_command(
     async def main(client: "TruckClient", clock: Clock) -> "Arrival":
         named = {point.name: point for point in await _newest(client, clock)}
         if name not in named:
-            raise NotFoundError(f"no point of interest {name!r}: expected one of {', '.join(named) or 'none'}")
+            known = f"expected one of {', '.join(named)}" if named else "none is known"
+            raise NotFoundError(f"no point of interest {name!r}: {known}")
         pose = named[name].before(distance)
         with on_the_terminal() as report:
             return await drive_to(client, clock, (pose.x, pose.y, pose.yaw), [], arm=arm, report=report)
@@ -108,7 +109,7 @@ def mark_command(
     require_finite(tuple(value for value in (x, y, yaw) if value is not None))
     place = None if x is None or y is None else (x, y)
     marked = _order(PointOrder.MARK, robot, endpoint, name, place, yaw)
-    remark(f"marked {name} at x {marked['x']:.2f}, y {marked['y']:.2f} m, yaw {marked['yaw']:.2f} rad")
+    remark(f"marked {name} at x {marked['x']:.2f}, y {marked['y']:.2f} m, yaw {marked['yaw']:z.2f} rad")
 
 
 @app.command("remove")

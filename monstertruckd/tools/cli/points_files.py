@@ -17,7 +17,7 @@ COLUMNS: Final = ("name", "kind", "tag", "x_m", "y_m", "z_m", "yaw_rad", "sigma_
 
 def row_of(point: PointOfInterest) -> tuple[str, ...]:
     """Name and numbers for a table."""
-    place = (f"{value:.2f}" for value in (point.x, point.y, point.yaw))
+    place = (f"{value:z.2f}" for value in (point.x, point.y, point.yaw))
     return point.name, *place, f"{100 * position_deviation(point.covariance):.1f}", str(point.sightings)
 
 

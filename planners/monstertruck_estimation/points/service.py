@@ -346,8 +346,9 @@ class PointService:
         place = None
         if request.order is PointOrder.REMOVE:
             if self._map.points.pop(request.name, None) is None:
-                known = ", ".join(sorted(self._map.points)) or "none"
-                raise NotFoundError(f"no point of interest {request.name!r}: expected one of {known}")
+                names = ", ".join(sorted(self._map.points))
+                known = f"expected one of {names}" if names else "none is known"
+                raise NotFoundError(f"no point of interest {request.name!r}: {known}")
             self._unanchored.pop(request.name, None)
             text = f"{request.name} removed by {request.source}"
         else:

@@ -29,6 +29,7 @@ from monstertruckd.tools.cli.output import (
     print_end,
     print_json,
     print_table,
+    print_words,
     progress,
     remark,
     until_stopped,
@@ -352,3 +353,15 @@ def test_the_end_of_a_drive_says_angles_in_degrees_too(capsys: pytest.CaptureFix
     with pytest.raises(typer.Exit):
         print_end(Reason.GOAL_MISSED, text, {}, json_output=False)
     assert "0.031 rad (1.8°) away" in capsys.readouterr().err
+
+
+def test_lines_of_progress_break_no_word_on_a_terminal(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    line = "  155 s  it stands: no fresh drive feedback"
+    print_words(line)
+    assert capsys.readouterr().out == f"{line}\n"
+    monkeypatch.setattr("monstertruckd.tools.cli.output.on_terminal", lambda _: True)
+    monkeypatch.setenv("COLUMNS", "36")
+    print_words(line)
+    assert capsys.readouterr().out == "  155 s  it stands: no fresh drive\nfeedback\n"
