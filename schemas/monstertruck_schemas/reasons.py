@@ -140,6 +140,7 @@ class Reason(StrEnum):
     LOOP_CLOSED = "loop_closed", 0, "a place was recognised and the map corrected"
     JOIN_UNDONE = "join_undone", 0, "two parts of the map were joined wrongly, and are apart again"
     MAP_SAVED = "map_saved", 0, "the map was saved"
+    MAP_NOT_SAVED = "map_not_saved", 0, "the map could not be saved"
 
     # USB
     HUB_LOST = "hub_lost", 100, "a USB hub vanished with everything behind it"

@@ -411,7 +411,7 @@ class SlamService:
             poses = {None: "", True: ", poses by joint registration", False: ", poses by the graph"}[outputs.joint]
             self._events(Reason.MAP_SAVED, Severity.INFO, self.name, f"{outputs.saved}{poses}")
         if outputs.error is not None:
-            self._events(Reason.BAD_INPUT, Severity.WARNING, self.name, f"map not saved: {outputs.error}")
+            self._events(Reason.MAP_NOT_SAVED, Severity.WARNING, self.name, str(outputs.error))
 
 
 def carried_on(covariance: Array, before: Odometry, now: Odometry, turn: float) -> Array:

@@ -160,6 +160,8 @@ class Observed:
     """Whether the charge is too low to drive: the gate stops, and an unsaved map may be lost."""
     saved: str | None = None
     """Where the map was saved after that was requested; empty = nowhere."""
+    save_failure: str = ""
+    """Why it was saved nowhere."""
     found: int = 0
     """Points of interest that are known."""
 
@@ -501,7 +503,7 @@ def _back_home(run: Exploration, pose: Pose) -> Step:
 def _saving(run: Exploration, seen: Observed) -> Step:
     if seen.saved is None and run.now - run.since < SAVE:
         return run, ()
-    kept = f"map in {seen.saved}" if seen.saved else "map not saved"
+    kept = f"map in {seen.saved}" if seen.saved else f"map not saved{seen.save_failure and ': '}{seen.save_failure}"
     severity = Severity.INFO if run.final.exit_code == 0 else Severity.WARNING
     text = f"{run.final_text}; {kept}"
     ended = replace(_enter(run, ExplorationPhase.IDLE), outcome=run.final, text=text)

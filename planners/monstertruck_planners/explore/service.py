@@ -193,10 +193,10 @@ class ExplorerService:
 
     def _tick(self, now: int) -> None:
         self._keep_map()
-        saved = self._saved()
+        saved, failure = self._saved()
         run = self._run
         if run is not None and run.running:
-            self._do(exploration.tick(run, self._observe(now, saved), self._config))
+            self._do(exploration.tick(run, self._observe(now, saved, failure), self._config))
         run = self._run
         self._goals.hold(SOURCE, on=run is not None and run.running and run.phase is not ExplorationPhase.SAVING)
         self._report(now)
@@ -215,15 +215,19 @@ class ExplorerService:
                     self._sent_tiles = max(self._sent_tiles - 1, 0)
                 self._tiles.append(tile)
 
-    def _saved(self) -> str | None:
-        """Where the map was saved since that was requested."""
-        saved = None
+    def _saved(self) -> tuple[str | None, str]:
+        """Where the map was saved since that was requested, empty = nowhere; and why not."""
+        saved, failure = None, ""
         for event in self._in.events.drain():
-            if self._saves is not None and event.reason is Reason.MAP_SAVED and event.received >= self._saves:
+            if self._saves is None or event.received < self._saves:
+                continue
+            if event.reason is Reason.MAP_SAVED:
                 saved = event.text
-        return "" if self._cannot_save and self._saves is not None else saved
+            elif event.reason is Reason.MAP_NOT_SAVED:
+                saved, failure = "", event.text
+        return "" if self._cannot_save and self._saves is not None else saved, failure
 
-    def _observe(self, now: int, saved: str | None) -> Observed:
+    def _observe(self, now: int, saved: str | None, save_failure: str) -> Observed:
         answer = None
         if self._deciding is not None and self._deciding.done():
             answer, self._deciding = self._deciding.result(), None
@@ -242,6 +246,7 @@ class ExplorerService:
             low=battery is not None and fresh and battery.level in LOW,
             critical=battery is not None and fresh and battery.level is BatteryLevel.CRITICAL,
             saved=saved,
+            save_failure=save_failure,
             found=self._found(),
         )
 

@@ -454,7 +454,7 @@ class MissionService:
         Raises:
             TruckError: something else does, it has not passed, or somebody else drives.
         """
-        until = self._clock.now() + PATIENCE * SECOND
+        until, refused = self._clock.now() + PATIENCE * SECOND, False
         while True:
             if (other := self._other()) is not None:
                 raise RequestRefusedError(Reason.CANCELLED, other)
@@ -465,7 +465,9 @@ class MissionService:
             except RequestRefusedError as error:
                 if error.refusal not in PASSING or self._clock.now() > until:
                     raise
-                self._waits = str(error)
+                if refused:  # the first time it may only brake, which is nothing to tell
+                    self._waits = str(error)
+                refused = True
             await self._clock.sleep(AGAIN)
 
     def _other(self) -> str | None:

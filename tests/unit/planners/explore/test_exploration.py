@@ -299,7 +299,10 @@ def test_without_a_map_or_a_place_to_save_it_says_so():
         stepped.look(ExploreAnswer())
         assert stepped.now < 100
     assert stepped.step(saved="").outcome is Reason.NO_MAP
-    assert "map not saved" in stepped.run.text
+    assert stepped.run.text.endswith("map not saved")
+    full = SteppedExploration()
+    full.run, _ = exploration.stop(full.run, "bob", full.now)
+    assert full.step(saved="", save_failure="no space left").text == "stopped by bob; map not saved: no space left"
 
 
 def test_where_the_worker_fails_again_and_again_it_says_that_and_not_that_there_is_no_map():

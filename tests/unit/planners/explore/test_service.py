@@ -15,6 +15,7 @@ from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.mailbox import Mailbox, fifo
 from monstertruck_runtime.requests import inner_request
 from monstertruck_schemas.base import Message, Pose2D, Twist2D
+from monstertruck_schemas.event import Event, Severity
 from monstertruck_schemas.plan import GoalPhase, GoalState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import ExploreOrder, ExploreRequest
@@ -80,6 +81,23 @@ def test_an_operators_goal_after_one_of_its_own_was_refused_is_noticed():
     assert service._goal_end() == (None, "", "bob")
     service._in.goal.latest = newest.model_copy(update={"number": 1})
     assert service._goal_end() == (Reason.LEASE_EXPIRED, "late", "")
+
+
+def test_a_map_that_could_not_be_saved_is_not_waited_for():
+    service = ExplorerService.__new__(ExplorerService)
+    service._saves, service._cannot_save = 5, False
+    service._in = SimpleNamespace(events=Mailbox(fifo(8)))
+
+    def say(reason: Reason, at: int) -> None:
+        event = {"stamp": at, "received": at, "seq": 0, "source": "slam", "severity": Severity.WARNING}
+        service._in.events.put(Event(**event, reason=reason, text="no space left"))
+
+    say(Reason.MAP_NOT_SAVED, 4)
+    assert service._saved() == (None, ""), "that was an earlier request"
+    say(Reason.MAP_NOT_SAVED, 6)
+    assert service._saved() == ("", "no space left")
+    say(Reason.MAP_SAVED, 7)
+    assert service._saved() == ("no space left", "")
 
 
 def test_the_answer_to_a_question_of_the_exploration_before_is_none():
