@@ -311,8 +311,9 @@ class MissionService:
     def _lacks(self, step: AnyStep) -> str | None:
         if isinstance(step, ExploreStep) and self._parts.explorer is None:
             return "explore: the robot's configuration has no section `explorer`"
-        if isinstance(step, PointStep) and self._in.points is None:
-            return "goto_point: the robot's configuration has no section `points`"
+        looks = isinstance(step, PointStep) or (isinstance(step, ExploreStep) and step.find is not None)
+        if looks and self._in.points is None:
+            return f"{step.do}: the robot's configuration has no section `points`"
         if isinstance(step, BehaviourStepOfMission | FollowWallStep) and step.name not in self._parts.names:
             known = ", ".join(sorted(self._parts.names)) or "none"
             return f"no behaviour {step.name!r}: expected one of {known}"

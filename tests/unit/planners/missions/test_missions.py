@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -553,5 +554,15 @@ def test_all_that_the_robot_cannot_do_is_named_before_it_sets_off():
         with pytest.raises(NotFoundError, match=lacks):
             robot.order(MissionOrder.START, GO, {"do": "explore"}, {"do": "behaviour", "name": "left"})
         assert robot.goals == []
+
+    played(story)
+
+
+def test_a_robot_without_points_of_interest_is_not_sent_to_look_for_them():
+    async def story(robot: Pretended) -> None:
+        robot.service._parts = replace(robot.service._parts, explorer=SimpleNamespace())
+        robot.service._in = replace(robot.service._in, points=None)
+        with pytest.raises(NotFoundError, match=r"^step 2: explore: .* section `points`$"):
+            robot.order(MissionOrder.START, {"do": "explore"}, {"do": "explore", "find": 2})
 
     played(story)
