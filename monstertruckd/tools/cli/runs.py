@@ -101,7 +101,7 @@ async def run_exploration(
     def show(state: ExplorationState) -> None:
         nonlocal shown, due
         stands = _why_it_stands(gate)
-        now = state.phase, state.goals, stands, state.text
+        now = state.phase, state.goals, bool(stands), state.text  # what is stale comes and goes while it stands
         if report is not None and (now != shown or state.elapsed >= due):
             shown, due = now, state.elapsed + EVERY
             report(progress_line(state, stands))
@@ -146,9 +146,9 @@ async def run_mission(
             again = f", attempt {state.attempt}" if state.attempt > 1 else ""
             lines.append(f"step {state.step} of {state.steps}: {state.doing}{again}")
         stands = _why_it_stands(gate)
-        trouble = f"it stands: {stands}" if stands else f"it waits: {state.text}" if state.text else ""
+        trouble = "stands" if stands else state.text  # what is stale comes and goes while it stands
         if trouble and trouble != said:
-            lines.append(trouble)
+            lines.append(f"it stands: {stands}" if stands else f"it waits: {state.text}")
         before, said = state, trouble
         for line in lines:
             report(f"{state.elapsed:6.0f} s  {line}")

@@ -130,9 +130,16 @@ def test_a_truck_that_stands_disarmed_is_not_said_to_drive():
     )
     robot.states += (state(3, ExplorationPhase.IDLE, Reason.EXPLORED),)
     lines: list[str] = []
-    asyncio.run(run_exploration(robot, home=None, budget=None, arm=False, report=lines.append))
+
+    def report(line: str) -> None:
+        lines.append(line)
+        held = robot.gate.latest
+        robot.gate.put(held.model_copy(update={"reasons": (Reason.DISARMED, Reason.DRIVE_STALE)}))
+
+    asyncio.run(run_exploration(robot, home=None, budget=None, arm=False, report=report))
     assert lines[0] == "    0 s  it stands: the truck is disarmed; `monstertruckd arm` lets it drive"
     assert len(lines[0]) < 80
+    assert len(lines) == 2, "once, and at its end"
 
 
 def test_before_the_first_look_at_the_map_it_tells_no_zeros():

@@ -84,8 +84,12 @@ def test_run_takes_a_file_or_the_interrupted_one(arguments: list[str]):
 def followed(*states: dict[str, object], mode: GateMode = GateMode.DRIVING) -> list[str]:
     """What a client prints of the mission reported so."""
     reports, gate = Mailbox(fifo(64)), Mailbox(latest())
-    why = () if mode.active else (Reason.DISARMED,)
-    gate.put(GateState(stamp=1, received=1, seq=0, mode=mode, nonce="n", speed_limit=0.0, reasons=why))
+
+    def gate_says(*more: Reason) -> None:
+        why = () if mode.active else (Reason.DISARMED, *more)
+        gate.put(GateState(stamp=1, received=1, seq=0, mode=mode, nonce="n", speed_limit=0.0, reasons=why))
+
+    gate_says()
 
     class Robot:
         def subscribe(self, topic, delivery):
@@ -98,7 +102,12 @@ def followed(*states: dict[str, object], mode: GateMode = GateMode.DRIVING) -> l
             return {"number": 3}
 
     lines: list[str] = []
-    asyncio.run(run_mission(Robot(), None, arm=False, report=lines.append))
+
+    def report(line: str) -> None:
+        lines.append(line)
+        gate_says(Reason.DRIVE_STALE)
+
+    asyncio.run(run_mission(Robot(), None, arm=False, report=report))
     return lines
 
 
@@ -119,4 +128,4 @@ def test_what_a_step_waits_for_and_why_the_robot_stands_is_said_once():
     starts = {**step, "text": "the planner is starting"}
     assert followed(starts, starts, step)[1:] == ["     0 s  it waits: the planner is starting"]
     stands = "     0 s  it stands: the truck is disarmed; `monstertruckd arm` lets it drive"
-    assert followed(starts, step, mode=GateMode.DISARMED)[1:] == [stands]
+    assert followed(starts, step, step, mode=GateMode.DISARMED)[1:] == [stands], "though more becomes stale"
