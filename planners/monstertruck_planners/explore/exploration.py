@@ -28,6 +28,10 @@ RETURNS: Final = 6
 """Attempts to drive home."""
 BESIDE: Final = 1.0
 """Distance from a blocked start, as at a wall, within which the robot counts as back, m."""
+SPACING: Final = 0.25
+"""Distance between the places beside the start that are kept, m."""
+PLACES: Final = 3
+"""How many of them."""
 SAVE: Final = 30.0
 """Seconds to wait for the map to be saved."""
 AGAIN: Final = 2.0
@@ -212,6 +216,8 @@ class Exploration:
     before: Pose | None = None
     trail: tuple[Pose, ...] = ()
     """Where it came from, the newest last."""
+    near_home: tuple[Pose, ...] = ()
+    """Where it passed first within ``BESIDE`` of its start, ``SPACING`` apart."""
     stuck: int = 0
     """Goals in a row that failed where the robot stands."""
     stuck_at: Pose | None = None
@@ -295,8 +301,18 @@ def _moved(run: Exploration, seen: Observed) -> Exploration:
     if seen.pose is not None and (not trail or math.dist(trail[-1][:2], seen.pose[:2]) >= TRAIL) and not run.backing:
         trail = (*trail, seen.pose)[-REMEMBERED:]
     return replace(
-        run, before=seen.pose, counted=counted, travelled=run.travelled + distance, charge=charge, trail=trail
-    )
+        run, before=seen.pose, counted=counted, travelled=run.travelled + distance, charge=charge, trail=trail,
+        near_home=_near_home(run, seen.pose),
+    )  # fmt: skip
+
+
+def _near_home(run: Exploration, pose: Pose | None) -> tuple[Pose, ...]:
+    """Where a robot that set out has been: what it could not see behind itself at its start, it passed over there."""
+    places = run.near_home
+    if pose is None or len(places) == PLACES or math.dist(pose[:2], run.home[:2]) > BESIDE:
+        return places
+    apart = min(math.dist(pose[:2], place[:2]) for place in (run.home, *places))
+    return (*places, pose) if apart >= SPACING else places
 
 
 def _merged(before: ExploreAnswer, answer: ExploreAnswer) -> ExploreAnswer:
@@ -488,15 +504,14 @@ def _returning(run: Exploration, seen: Observed) -> Step:
         return replace(run, target=None, not_before=run.now + AGAIN * 2 ** (run.home_goals - 1)), ()
     if run.now < run.not_before:
         return run, ()
-    beside = [pose for pose in run.trail if 0.0 < math.dist(pose[:2], run.home[:2]) <= BESIDE]
-    places = (run.home, *beside)
+    places = (run.home, *run.near_home)
     pose = places[run.blocked % len(places)]
     return replace(run, target=Viewpoint(pose, pose[:2]), home_goals=run.home_goals + 1), (Go(pose),)
 
 
 def _back_home(run: Exploration, pose: Pose) -> Step:
     away = math.dist(pose[:2], run.home[:2])
-    where = "back at the start" if pose == run.home else f"{away:.1f} m from the start, which is blocked"
+    where = "back at the start" if pose == run.home else f"{away:.1f} m from the start, which the map does not show as free"
     return _end(run, run.final, f"{run.final_text}; {where}", Save())
 
 

@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from monstertruck_planners.explore import exploration
@@ -268,19 +269,26 @@ def test_the_way_home_is_tried_again_and_given_up_in_the_end():
 
 
 def test_where_the_start_is_blocked_a_place_beside_it_is_home():
-    """As for a robot that was started beside a wall: it stood where no goal may be."""
+    """As for a robot that was started beside a wall, or never saw what was behind it there, however far it drove."""
     stepped = SteppedExploration()
-    stepped.run = replace(stepped.run, trail=(HOME, (1.6, 2.0, 0.5)))
-    stepped.pose = (3.0, 2.0, 0.5)
-    stepped.exhaust()
+    stepped.drive()
+    for x in (1.1, 1.3, 1.6, 2.4, *np.arange(3.0, 12.0, 0.5)):
+        stepped.pose = (float(x), 2.0, 0.5)
+        stepped.step()
+    stepped.step(ended=Reason.GOAL_REACHED, answer=NOTHING)
+    while stepped.run.phase is not Phase.RETURNING:
+        stepped.look(NOTHING)
     stepped.step()
     assert stepped.actions == (Go(HOME),)
     stepped.step(ended=Reason.GOAL_BLOCKED)
     stepped.step(exploration.AGAIN)
+    assert stepped.actions == (Go((1.3, 2.0, 0.5)),)
+    stepped.step(ended=Reason.GOAL_BLOCKED)
+    stepped.step(2 * exploration.AGAIN)
     assert stepped.actions == (Go((1.6, 2.0, 0.5)),)
     stepped.step(ended=Reason.GOAL_REACHED)
     assert stepped.saved().outcome is Reason.EXPLORED
-    assert "0.6 m from the start, which is blocked" in stepped.run.text
+    assert "0.6 m from the start, which the map does not show as free" in stepped.run.text
 
 
 def test_a_robot_that_stands_beside_its_blocked_start_is_back():
@@ -290,7 +298,7 @@ def test_a_robot_that_stands_beside_its_blocked_start_is_back():
     stepped.step()
     stepped.step(ended=Reason.GOAL_BLOCKED)
     assert stepped.saved().outcome is Reason.EXPLORED
-    assert "0.9 m from the start, which is blocked" in stepped.run.text
+    assert "0.9 m from the start, which the map does not show as free" in stepped.run.text
 
 
 def test_without_a_map_or_a_place_to_save_it_says_so():
