@@ -56,7 +56,7 @@ class DriveReport:
         """Driven so far, 0..1."""
 
     def stands(self, gate: GateState) -> None:
-        """The truck stands, for other reasons than before."""
+        """The truck stands, for a reason that was not said since it does."""
 
 
 SILENT: Final = DriveReport()
@@ -241,12 +241,12 @@ async def _watched(
 
 
 async def _say_why_it_stands(gate: Mailbox[GateState], clock: Clock, report: DriveReport) -> None:
-    said: str | None = None
+    said: set[str] = set()  # what is stale comes and goes while it stands
     while True:
         await clock.sleep(2 * LOOK)
         state = gate.latest
         if state is None or state.mode.active:
-            said = None
-        elif state.why != said:
-            said = state.why
+            said.clear()
+        elif new := set[str](state.reasons or (state.mode,)) - said:
+            said |= new
             report.stands(state)

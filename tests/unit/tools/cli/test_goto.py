@@ -8,7 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from monstertruck_runtime.clock import SECOND, run_virtual
-from monstertruck_runtime.drives import drive_to, follow
+from monstertruck_runtime.drives import DriveReport, _say_why_it_stands, drive_to, follow
 from monstertruck_runtime.errors import NoAnswerError, NotFoundError, RequestRefusedError
 from monstertruck_runtime.mailbox import Mailbox, latest
 from monstertruck_schemas.plan import Path
@@ -223,6 +223,27 @@ class MovingRobot(SilentRobot):
 
 def gate_state(mode, nonce="n"):
     return GateState(stamp=0, received=0, seq=0, mode=mode, nonce=nonce, speed_limit=0.2)
+
+
+def test_each_reason_for_which_it_stands_is_said_once_until_it_drives():
+    off, stale, latched = (Reason.DISARMED,), (Reason.DISARMED, Reason.DRIVE_STALE), (Reason.ESTOPPED,)
+    said = []
+
+    class Report(DriveReport):
+        def stands(self, gate):
+            said.append(gate.reasons)
+
+    async def main(clock):
+        gate = Mailbox(latest())
+        watching = asyncio.create_task(_say_why_it_stands(gate, clock, Report()))
+        for reasons in (off, stale, off, stale, latched, (), off):
+            mode = GateMode.DISARMED if reasons else GateMode.DRIVING
+            gate.put(gate_state(mode).model_copy(update={"reasons": reasons}))
+            await clock.sleep(1.1)
+        watching.cancel()
+
+    run_virtual(main)
+    assert said == [off, stale, latched, off]
 
 
 class LostRobot(SilentRobot):
