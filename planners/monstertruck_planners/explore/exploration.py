@@ -511,7 +511,8 @@ def _returning(run: Exploration, seen: Observed) -> Step:
 
 def _back_home(run: Exploration, pose: Pose) -> Step:
     away = math.dist(pose[:2], run.home[:2])
-    where = "back at the start" if pose == run.home else f"{away:.1f} m from the start, which the map does not show as free"
+    beside = f"{away:.1f} m from the start, which the map does not show as free"
+    where = "back at the start" if pose == run.home else beside
     return _end(run, run.final, f"{run.final_text}; {where}", Save())
 
 
