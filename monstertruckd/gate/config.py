@@ -101,7 +101,7 @@ class ObstacleLimits(Schema):
     unseen_speed: LivePositive = 0.1
     """Speed limit while a sector of travel is not seen, m/s; one not seen for ``scan.stale_after`` stops the truck.
     Where the lidar does not look it is the limit onto ground that no scan of the last 30 s has seen."""
-    memory_distance: NotNegative = 1.0
+    memory_distance: NotNegative = 2.0
     """Travelled distance for which the points of earlier scans guard the truck where its lidar does not look, m."""
     open_ground: bool = False
     """Whether a scan without any range counts as free ground; otherwise it is not valid."""

@@ -43,7 +43,7 @@ DELIVERED = {
         "crawl": 0.02,
         "seen": 0.5,
         "unseen_speed": 0.1,
-        "memory_distance": 1.0,
+        "memory_distance": 2.0,
         "open_ground": False,
     },
     "sonar": {"stale_after": 0.3, "core": 0.2, "unseen_speed": 0.1},

@@ -308,6 +308,19 @@ def test_a_turn_grazes_nothing_that_the_lidar_has_left_behind(aside, stopped):
     assert (free < 0.2) is stopped
 
 
+def test_what_stands_beside_the_way_in_guards_the_way_out_again():
+    """A truck passed a door, and touched its jamb when it backed out: 1.5 m travelled lay between."""
+    guard = ObstacleGuard(GateConfig(), FOOTPRINT, ScanPoints(MOUNT))
+    guard.observe(scan(SECOND, (0.35, 0.3)))
+    now = SECOND
+    for speed, seconds in ((0.2, 5.0), (-0.1, 5.5)):
+        for _ in range(round(seconds / 0.02)):
+            now += TICK
+            guard.move(now, (speed, 0.0, 0.0), 0.02)
+    guard.observe(scan(now))
+    assert guard.free_distance(((0.0, 1.0, 0.0),)) < 0.3 + FOOTPRINT.padding - FOOTPRINT.half_width + 0.02
+
+
 def person(x, y, angles):
     """Points around somebody who stands there, 0.2 m in radius; the first direction is the lidar's."""
     towards = math.atan2(-y, 0.14 - x)
