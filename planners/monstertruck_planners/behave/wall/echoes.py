@@ -143,8 +143,12 @@ def refine(echoes: Array, before: WallEstimate, at: tuple[float, float], cone: C
     return _best(echoes, normals, distances, cost, information, at, cone)
 
 
-def search(echoes: Array, at: tuple[float, float], cone: Cone) -> EstimateFit:
-    """Fit a line to at least three echoes without an estimate: the best of several directions; see ``refine``."""
+def search(echoes: Array, at: tuple[float, float], cone: Cone, before: WallEstimate | None = None) -> EstimateFit:
+    """Fit a line to at least three echoes: the best of several directions, and of a line found before.
+
+    That one does not hold the fit; but without it a search may miss the line that fits best, and find one of other
+    echoes. See ``refine``.
+    """
     normals = np.linspace(-math.pi, math.pi, GUESSES[0], endpoint=False)
     sample = echoes
     if len(echoes) > SAMPLED:  # not every so many-th one, which could all be of one sonar
@@ -155,7 +159,10 @@ def search(echoes: Array, at: tuple[float, float], cone: Cone) -> EstimateFit:
     distances = np.median(sample[:, 3] / share + along, axis=1)
     normals, distances, cost, _ = _fitted(sample, normals, distances, at, cone, FREE, STEPS[1])
     best = _distinct(normals, distances, np.where(distances > 0.0, cost, np.inf))
-    return _best(echoes, *_fitted(echoes, normals[best], distances[best], at, cone, FREE, STEPS[2]), at, cone)
+    normals, distances = normals[best], distances[best]
+    if before is not None:
+        normals, distances = np.append(normals, before.normal), np.append(distances, before.distance(*at))
+    return _best(echoes, *_fitted(echoes, normals, distances, at, cone, FREE, STEPS[2]), at, cone)
 
 
 def _distinct(normals: Array, distances: Array, cost: Array) -> list[int]:

@@ -370,7 +370,7 @@ class WallLine:
             rows = rows[np.abs(residuals(rows, state.wall, cone)) > TIGHT]
         if len(rows) < LEAST:
             return None
-        fit = search(rows, at, cone)
+        fit = search(rows, at, cone, state.ahead)
         return fit if fit.explained >= max(LEAST, 0.3 * len(rows)) else None
 
     def _distance_left(self, state: LineState, cone: Cone) -> float:

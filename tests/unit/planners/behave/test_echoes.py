@@ -5,24 +5,11 @@ import math
 import numpy as np
 import pytest
 
-from monstertruck_planners.behave.wall.echoes import ECHO, TIGHT, Cone, WallEstimate, refine, residuals, search
+from monstertruck_planners.behave.wall.echoes import TIGHT, Cone, WallEstimate, refine, residuals, search
+from tests.unit.planners.behave.wall_kit import heard, turning
 
 CONE, BEAM = Cone(0.435, 0.45), Cone(0.0, 1.3)
-
-
-def heard(line, poses, cone, noise=0.0, seed=0):
-    """Echoes of side, diagonal and front sonar of a robot at poses."""
-    rng, rows = np.random.default_rng(seed), []
-    for i, (x, y, yaw) in enumerate(poses):
-        for number, (ex, ey, axis) in enumerate([(0.05, 0.05, math.pi / 2), (0.1, 0.05, math.pi / 4), (0.12, 0, 0)]):
-            c, s = math.cos(yaw), math.sin(yaw)
-            px, py, direction = x + c * ex - s * ey, y + s * ex + c * ey, yaw + axis
-            if not cone.hears(direction, line.normal):
-                continue
-            beyond = max(abs(math.remainder(line.normal - direction, math.tau)) - cone.half, 0.0)
-            distance = line.distance(px, py) / math.cos(beyond) + rng.normal(0, noise)
-            rows.append((px, py, direction, distance, number, 0.0, i * 0.1))
-    return np.array(rows).reshape(-1, len(ECHO))
+NEAR = WallEstimate(math.pi / 2, 0.35)
 
 
 def along(line, distance, metres, count=30, weave=0.1):
@@ -54,6 +41,14 @@ def test_a_third_of_other_echoes_does_not_move_it():
     fit = refine(echoes, WallEstimate(math.pi / 2 + 0.03, 0.36), poses[-1][:2], CONE)
     assert fit.line.distance(*poses[-1][:2]) == pytest.approx(0.35, abs=4e-3)
     assert fit.sigma[1] < 4e-3
+
+
+def test_a_line_found_before_is_not_lost_to_a_worse_one_nor_kept_against_a_better_one():
+    far = WallEstimate(0.1, 1.91)
+    echoes = turning([NEAR, far, WallEstimate(-0.93, 2.12)], CONE, np.linspace(1.0, -0.36, 40))
+    assert search(echoes, (0.0, 0.0), CONE, NEAR).line.normal == pytest.approx(NEAR.normal, abs=1e-3)
+    echoes = turning([NEAR, far], CONE, np.linspace(1.0, -0.36, 40))
+    assert search(echoes, (0.0, 0.0), CONE, far).line.normal == pytest.approx(NEAR.normal, abs=1e-3)
 
 
 def test_an_echo_from_where_no_sound_comes_back_belongs_to_no_line():

@@ -9,11 +9,11 @@ from pydantic import ValidationError
 from monstertruck_planners.behave.api import Inputs, RequestedMotion
 from monstertruck_planners.behave.wall import line
 from monstertruck_planners.behave.wall.config import WallLineConfig
-from monstertruck_planners.behave.wall.echoes import WallEstimate
+from monstertruck_planners.behave.wall.echoes import Cone, WallEstimate
 from monstertruck_planners.behave.wall.line import STANDSTILL, WallLine
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.topics import IMU, ODOMETRY, SONAR, TRANSFORMS
-from tests.unit.planners.behave.wall_kit import PERIOD, Robot, drive, frames, rectangle
+from tests.unit.planners.behave.wall_kit import PERIOD, Robot, drive, frames, rectangle, turning
 
 HALL = rectangle(4.0, 3.0)
 LIMITS = 0.6 + 1e-6, 4.8 + 1e-6
@@ -92,6 +92,17 @@ def test_it_stands_clear_of_a_wall_beside_the_one_it_drives_to():
         robot.move()
     assert state.phase == "turn"
     assert robot.clearance > 0.3
+
+
+def test_it_turns_to_the_wall_found_before_although_the_search_misses_it():
+    near, far = WallEstimate(math.pi / 2, 0.35), [WallEstimate(0.1, 1.91), WallEstimate(-0.93, 2.12)]
+    echoes = turning([near, *far], Cone(0.435, 0.45), np.linspace(1.0, -0.36, 40))
+    inputs, behaviour = Robot([], (0.0, 0.0, 0.0)).inputs(), WallLine(WallLineConfig())
+    messages = {topic.name: inputs.of(topic) for topic in (ODOMETRY, IMU, TRANSFORMS)}
+    messages[SONAR.name] = inputs.of(SONAR).model_copy(update={"field_of_view": 0.87})
+    state = behaviour.begin()._replace(phase="turn", ahead=near, echoes=echoes)
+    step = behaviour.step(Inputs(messages), state, 0.0)
+    assert step.state.ahead.distance(0.0, 0.0) == pytest.approx(0.35, abs=1e-3)
 
 
 def test_every_ramp_keeps_acceleration_and_jerk_at_100_hz_and_speeds_do_not_jump():

@@ -1,4 +1,4 @@
-"""A robot that does what it is asked for, and beams that measure the walls of a polygon exactly."""
+"""A robot that does what it is asked for, beams that measure the walls of a polygon exactly, and echoes of lines."""
 
 import math
 from dataclasses import dataclass, field
@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from monstertruck_planners.behave.api import Behaviour, BehaviourStep, Inputs, RequestedMotion
+from monstertruck_planners.behave.wall.echoes import ECHO
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.base import Pose2D, Twist2D
 from monstertruck_schemas.reasons import Reason
@@ -20,6 +21,8 @@ PLACES = {
     "fr": (0.05, -0.05, -math.pi / 4),
     "r": (0.0, -0.05, -math.pi / 2),
 }
+AHEAD = (0.05, 0.05, math.pi / 2), (0.1, 0.05, math.pi / 4), (0.12, 0.0, 0.0), (0.1, -0.05, -math.pi / 4)
+"""Sonars of ``heard``: side, diagonal, front and far one."""
 FURTHEST = 3.0
 PERIOD = 0.1
 
@@ -190,3 +193,27 @@ def drive(behaviour: Behaviour, robot: Robot, seconds: float) -> Drive:
         robot.ask(step.motion or RequestedMotion())
         robot.move()
     return Drive(steps, np.array(poses), clearance)
+
+
+def heard(line, poses, cone, noise=0.0, seed=0):
+    """Echoes of a line by side, diagonal, front and far sonar of a robot at poses."""
+    rng, rows = np.random.default_rng(seed), []
+    for i, (x, y, yaw) in enumerate(poses):
+        for number, (ex, ey, axis) in enumerate(AHEAD):
+            c, s = math.cos(yaw), math.sin(yaw)
+            px, py, direction = x + c * ex - s * ey, y + s * ex + c * ey, yaw + axis
+            if not cone.hears(direction, line.normal):
+                continue
+            beyond = max(abs(math.remainder(line.normal - direction, math.tau)) - cone.half, 0.0)
+            distance = line.distance(px, py) / math.cos(beyond) + rng.normal(0, noise)
+            rows.append((px, py, direction, distance, number, 0.0, i * 0.1))
+    return np.array(rows).reshape(-1, len(ECHO))
+
+
+def turning(lines, cone, yaws):
+    """Echoes of the first of some lines that each sonar hears, of a robot that turns on the spot at the origin."""
+    poses, first = [(0.0, 0.0, yaw) for yaw in yaws], {}
+    for line in lines:
+        for row in heard(line, poses, cone):
+            first.setdefault((row[6], row[4]), row)
+    return np.array([first[key] for key in sorted(first)])
