@@ -4,7 +4,7 @@
 - ``door``: the nearest door is shut, of every other seed for ``SHUT`` seconds, else for good;
 - ``person``: somebody walks about from the beginning, and stops or turns before the truck;
 - ``lidar``: its plug is out for ``UNPLUGGED`` seconds, then the truck is armed again;
-- ``battery``: it is changed for one nearly empty when the truck is ``FAR`` from its start.
+- ``battery``: it is changed for one nearly empty when the truck is ``FAR`` from its start, or after ``LATEST`` seconds.
 
 A run ends safely if it ends in time, touches nothing, and the truck stands. The map is doubled if more than ``DOUBLED``
 of its walls are more than 0.15 m from true ones (the door leaf counts as such). It says what it did if its end has a
@@ -38,7 +38,7 @@ BUDGET, LIMIT = 240.0, 600.0
 """Seconds of exploring, and until the end."""
 WHEN: Final = (15.0, 60.0)
 """Seconds after the start between which the fault comes."""
-SHUT, UNPLUGGED, FAR = 60.0, 5.0, 4.0
+SHUT, UNPLUGGED, FAR, LATEST = 60.0, 5.0, 4.0, 200.0
 CARRIED: Final = (1.5, 6.0)
 """Least and greatest way of a robot that is carried off, m."""
 DOUBLED: Final = 0.05
@@ -72,7 +72,8 @@ def explored(seed: int, fault: str) -> dict[str, Any]:
                 truck.rig.ports["lidar"].plug()
                 await arm_again(truck, 6.0)
             case "battery":
-                while math.dist(truck.here[:2], truck.start[:2]) < FAR:
+                began = truck.clock.now()
+                while math.dist(truck.here[:2], truck.start[:2]) < FAR and truck.clock.now() < began + LATEST * SECOND:
                     await truck.clock.sleep(0.5)
                 noted(truck)
                 truck.rig.world.set_charge(truck.clock.now(), float(rng.uniform(0.05, 0.12)))
