@@ -1,6 +1,6 @@
 """How punctual the control tick is during everything else the daemon does, and what the daemon costs.
 
-    python benchmarks/loop.py [--rounds N] [--seconds S] [--with slam|planning]
+    python benchmarks/loop.py [--rounds N] [--seconds S] [--with slam|planning|exploring]
 
 The whole truck drives lap after lap, armed again after every stop: the daemon with every device at full rate, recording
 to disk, in one process; world and emulated devices behind ptys in another; a third subscribes to all it publishes.
@@ -8,8 +8,8 @@ Rounds alternate with an empty event loop that only ticks at the same rate, whil
 floor. Lateness is that of the gate's 50 Hz tick; the figure is the median of the rounds. Processor time and memory are
 those of the daemon's process alone, without its workers, from ``WARM_UP`` seconds after the truck drives. For as long
 again the callbacks of its event loop are measured, in processor time of the thread, which has a cost of its own.
-``--with`` adds mapping, or planner, deformer and goals in the rooms instead of the laps; then only the lateness has a
-goal. The last line is JSON.
+``--with`` adds mapping, or planner, deformer and goals in the rooms instead of the laps, or an exploration of the rooms
+by mapper, explorer and planner; then only the lateness has a goal. The last line is JSON.
 """
 
 import argparse
@@ -35,6 +35,7 @@ from monstertruck_runtime.errors import RequestRefusedError
 from monstertruck_runtime.mailbox import fifo, latest
 from monstertruck_schemas import topics
 from monstertruck_schemas.plan import GoalPhase
+from monstertruck_schemas.req import ExploreOrder
 from monstertruck_schemas.state import GateMode
 from monstertruckd.tools.demo.runs import connect, free_endpoint, write_overlay
 from monstertruckd.tools.simulation.operator import drive_lap
@@ -58,6 +59,15 @@ ADDED: dict[str, dict[str, Any]] = {
         "path": None,
         "planner": {"map": str(ROOMS), "local_planner": {"kind": "rsband"}},
         "tracker": {"kind": "lqr"},
+        "odometry": {"start": {"x": 1.0, "y": 3.95, "yaw": 0.0}},
+        "sim": {"world": {"map": "rooms"}},
+    },
+    "exploring": {
+        "path": None,
+        "planner": {"map": None},
+        "tracker": {"kind": "lqr"},
+        "slam": {"mode": "mapping", "grid": {"passed": 5.6, "free_footprint": True}, "map_period": 2.0},
+        "explorer": {"kind": "information"},
         "odometry": {"start": {"x": 1.0, "y": 3.95, "yaw": 0.0}},
         "sim": {"world": {"map": "rooms"}},
     },
@@ -159,7 +169,21 @@ async def wander(client: TruckClient, clock: Clock) -> None:
                 await clock.sleep(0.25)
 
 
-async def daemon_round(clock: Clock, config: Path, endpoint: str, seconds: float, *, goals: bool) -> dict[str, Any]:
+async def explore(client: TruckClient, clock: Clock) -> None:
+    """Have the truck explore; again where that is refused or has ended."""
+    with client.subscribe(topics.EXPLORE, latest()) as states:
+        while True:
+            if states.latest is None or not states.latest.running:
+                with suppress(RequestRefusedError):
+                    await client.explore(ExploreOrder.START)
+            await clock.sleep(1.0)
+
+
+SENT = {"planning": wander, "exploring": explore}
+"""Who says where the truck drives; without: lap after lap."""
+
+
+async def daemon_round(clock: Clock, config: Path, endpoint: str, seconds: float, added: str | None) -> dict[str, Any]:
     """Figures of one run of the daemon."""
     report = config.with_name("report.json")
     async with process(str(HERE / "loop_watched.py"), "daemon", str(config), str(report)) as daemon:  # noqa: SIM117
@@ -169,11 +193,11 @@ async def daemon_round(clock: Clock, config: Path, endpoint: str, seconds: float
             await subscriber.stdout.readline()
             drives = Drives()
             tasks = [asyncio.create_task(drives.watch(client))]
-            if goals:
-                tasks.append(asyncio.create_task(wander(client, clock)))
+            tasks.append(asyncio.create_task(drive(client, clock, drives, laps=added not in SENT)))
+            if added in SENT:
+                tasks.append(asyncio.create_task(SENT[added](client, clock)))
                 with client.subscribe(topics.PATH, latest()) as paths:
                     await paths.next()
-            tasks.append(asyncio.create_task(drive(client, clock, drives, laps=not goals)))
             async with clock.deadline(TIMEOUT):
                 while not drives.states:
                     await clock.sleep(0.1)
@@ -245,7 +269,7 @@ async def compare(clock: Clock, rounds: int, seconds: float, added: str | None) 
                     await clock.sleep(0.1)
             for _ in range(rounds):
                 floor.append(await empty_round(config, seconds))
-                runs.append(await daemon_round(clock, config, endpoint, seconds, goals=added == "planning"))
+                runs.append(await daemon_round(clock, config, endpoint, seconds, added))
     return figures(floor, runs)
 
 
