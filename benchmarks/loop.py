@@ -180,7 +180,7 @@ async def explore(client: TruckClient, clock: Clock) -> None:
 
 
 SENT = {"planning": wander, "exploring": explore}
-"""Who says where the truck drives; without: lap after lap."""
+"""What sends the truck; without: lap after lap."""
 
 
 async def daemon_round(clock: Clock, config: Path, endpoint: str, seconds: float, added: str | None) -> dict[str, Any]:

@@ -39,6 +39,7 @@ BUDGET, LIMIT = 240.0, 600.0
 WHEN: Final = (15.0, 60.0)
 """Seconds after the start between which the fault comes."""
 SHUT, UNPLUGGED, FAR, LATEST = 60.0, 5.0, 4.0, 200.0
+"""s, s, m, s."""
 CARRIED: Final = (1.5, 6.0)
 """Least and greatest way of a robot that is carried off, m."""
 DOUBLED: Final = 0.05
