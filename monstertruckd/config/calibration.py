@@ -240,7 +240,7 @@ class CalibrationStore:
             require_file(path, MOST_BYTES)
             file = CalibrationFile.model_validate_json(path.read_bytes())
         except (OSError, ValidationError) as error:
-            what = error.strerror if isinstance(error, OSError) else _first_mistake(error)
+            what = error.strerror if isinstance(error, OSError) else first_mistake(error)
             msg = f"{path}: no usable calibration: {what}; move it away to go back to the one before"
             raise ConfigError(msg) from error
         if file.robot != self._robot:
@@ -343,11 +343,6 @@ class CalibrationStore:
 
 def _number(path: Path) -> int:
     return int(path.name.partition("-")[0])
-
-
-def _first_mistake(error: ValidationError) -> str:
-    detail = error.errors(include_url=False)[0]
-    return f"{'.'.join(map(str, detail['loc'])) or 'file'}: {detail['msg'][:1].lower()}{detail['msg'][1:]}"
 
 
 def with_values(config: C, results: Iterable[Result], source: Path | str) -> C:

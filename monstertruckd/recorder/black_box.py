@@ -17,6 +17,7 @@ from types import TracebackType
 from typing import Any, Final, Self
 
 from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.errors import disk_reason
 from monstertruck_runtime.ports import EventSink
 from monstertruck_runtime.stop_text import causes_text
 from monstertruck_runtime.threads import Offload, in_daemon_thread
@@ -26,7 +27,7 @@ from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.topics import TOPICS, Topic
 from monstertruckd.gate.stops import Trip
 from monstertruckd.recorder.config import BlackBoxConfig, Compression
-from monstertruckd.recorder.log_file import RUN_LOG, LogEntry, LogFile, disk_reason, log_offset
+from monstertruckd.recorder.log_file import RUN_LOG, LogEntry, LogFile, log_offset
 from monstertruckd.recorder.repair import in_use
 from monstertruckd.recorder.ring import Retention, Ring, RingSnapshot
 

@@ -1,6 +1,5 @@
 """Log files and their folder: topics as MCAP channels, one file being written, numbered names."""
 
-import errno
 import fcntl
 import json
 import os
@@ -15,7 +14,6 @@ from mcap.writer import CompressionType, Writer
 
 from monstertruck_runtime import wire
 from monstertruck_runtime.clock import is_date
-from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.topics import Topic
 from monstertruckd import __version__
 from monstertruckd.recorder.config import Compression
@@ -91,11 +89,6 @@ class LogEntry(NamedTuple):
     sequence: int
     """Counts the topic's messages; a gap is a message dropped on the way to the log."""
     payload: bytes
-
-
-def disk_reason(error: OSError) -> Reason:
-    """Reason of a failed write."""
-    return Reason.DISK_FULL if error.errno in {errno.ENOSPC, errno.EDQUOT} else Reason.RECORDING_FAILED
 
 
 class LogFile:

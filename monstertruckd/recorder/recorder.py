@@ -14,12 +14,13 @@ from typing import Any, Final, Self
 
 from monstertruck_runtime import wire
 from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.errors import disk_reason
 from monstertruck_schemas.health import RecorderHealth
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.topics import TOPICS, Topic
 from monstertruckd.recorder.config import RecorderConfig
-from monstertruckd.recorder.log_file import LogEntry, LogFile, LogFolder, disk_reason, log_offset
+from monstertruckd.recorder.log_file import LogEntry, LogFile, LogFolder, log_offset
 from monstertruckd.recorder.repair import in_use, start_repair
 
 _DIGEST_FRAME = struct.Struct("<qII")

@@ -5,6 +5,7 @@ from typing import Annotated, Final, Literal
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from monstertruck_runtime.errors import InputError
+from monstertruck_schemas.base import first_mistake
 from monstertruck_schemas.req import UNCONDITIONAL, BehaviourOrder, ExploreOrder, GoalOrder, MissionOrder, Order, Role
 from monstertruck_schemas.roles import AccessRole
 
@@ -241,6 +242,4 @@ def parse(data: str) -> AnyCommand:
     try:
         return _COMMANDS.validate_json(data)
     except ValidationError as error:
-        detail = error.errors(include_url=False)[0]
-        where = ".".join(map(str, detail["loc"])) or "message"
-        raise InputError(f"{where}: {detail['msg']}") from None
+        raise InputError(first_mistake(error, "message")) from None

@@ -1,5 +1,6 @@
 """The error tree: every expected failure of the project derives from ``TruckError`` and knows its reason."""
 
+import errno
 from typing import ClassVar
 
 from monstertruck_schemas.reasons import Reason
@@ -137,3 +138,8 @@ class WorkerTimeoutError(WorkerError):
     """A worker missed its deadline and was killed."""
 
     reason = Reason.WORKER_TIMEOUT
+
+
+def disk_reason(error: OSError) -> Reason:
+    """Reason of a failed write: whether space is what is missing."""
+    return Reason.DISK_FULL if error.errno in {errno.ENOSPC, errno.EDQUOT} else Reason.RECORDING_FAILED

@@ -34,7 +34,7 @@ class Reason(StrEnum):
     BUSY = "busy", 7, "in use by another process or caller"
     DISK_FULL = "disk_full", 8, "no space left to record"
     LOG_DAMAGED = "log_damaged", 9, "log is truncated or damaged"
-    RECORDING_FAILED = "recording_failed", 10, "log cannot be written"
+    RECORDING_FAILED = "recording_failed", 10, "a log or another file cannot be written"
     NOT_SUPPORTED = "not_supported", 11, "the robot cannot do that"
     NOT_PERMITTED = "not_permitted", 12, "the user may not do that"
     NOT_INSTALLED = "not_installed", 13, "something is not installed, or not as it should be"

@@ -6,7 +6,6 @@ mean the same: commands that run until they are stopped end with 0 (``until_stop
 ``CANCELLED``.
 """
 
-import errno
 import json
 import math
 import os
@@ -26,7 +25,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from monstertruck_runtime.clock import WallClock, run_wall
-from monstertruck_runtime.errors import NotInstalledError, RequestRefusedError, TruckError
+from monstertruck_runtime.errors import NotInstalledError, RequestRefusedError, TruckError, disk_reason
 from monstertruck_schemas.reasons import Reason
 
 if TYPE_CHECKING:
@@ -365,7 +364,7 @@ class CommandGroup(TyperGroup):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             raise typer.Exit from None
         except OSError as error:
-            full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+            full = disk_reason(error) is Reason.DISK_FULL
             if full and error.filename is None:  # most likely standard output, which must not be tried again
                 os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             if not full and error.filename is None:

@@ -19,7 +19,7 @@ from monstertruck_estimation.se2 import Vector, between, compose
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.actors.actor import Actor
 from monstertruck_runtime.clock import SECOND, Clock, Schedule
-from monstertruck_runtime.errors import InputError, NotFoundError, RequestRefusedError, WorkerError
+from monstertruck_runtime.errors import InputError, NotFoundError, RequestRefusedError, WorkerError, disk_reason
 from monstertruck_runtime.mailbox import Mailbox
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, RpcRegistry, Subscription
 from monstertruck_runtime.requests import Sequences, parse_request, refusal
@@ -319,7 +319,7 @@ class PointService:
         try:
             await self._offload(lambda: self._write(folder, rows))
         except OSError as error:
-            self._events(Reason.DISK_FULL, Severity.WARNING, self.name, f"points not saved: {error}")
+            self._events(disk_reason(error), Severity.WARNING, self.name, f"points not saved: {error}")
             return False
         return True
 

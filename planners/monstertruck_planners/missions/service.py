@@ -21,7 +21,7 @@ from monstertruck_planners.missions.progress import (
     outcome,
 )
 from monstertruck_runtime.clock import SECOND, Clock, Schedule
-from monstertruck_runtime.errors import InputError, NotFoundError, RequestRefusedError, TruckError
+from monstertruck_runtime.errors import InputError, NotFoundError, RequestRefusedError, TruckError, disk_reason
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, RpcRegistry, Subscription
 from monstertruck_runtime.requests import Sequences, does_not_drive, inner_request, parse_request, refusal
 from monstertruck_runtime.small_files import replace_file, require_file
@@ -600,7 +600,7 @@ class MissionService:
             async with self._writing:
                 await self._offload(lambda: change(file))
         except OSError as error:
-            self._events(Reason.DISK_FULL, Severity.WARNING, SOURCE, f"{file}: progress not kept: {error}")
+            self._events(disk_reason(error), Severity.WARNING, SOURCE, f"{file}: progress not kept: {error}")
 
     # Reports
 

@@ -179,7 +179,7 @@ def test_a_torn_draft_is_no_calibration(store: CalibrationStore):
 def test_a_damaged_file_is_named_with_the_way_back(store: CalibrationStore):
     path = store.save(ratio(640.0), NOON)
     path.write_text(path.read_text()[:100])
-    with pytest.raises(ConfigError, match=rf"{path}: no usable calibration: .*move it away"):
+    with pytest.raises(ConfigError, match=rf"{path}: no usable calibration: Invalid JSON: .*; move it away"):
         store.current()
 
 

@@ -134,7 +134,8 @@ def test_commands_are_read_and_wrong_ones_refused_by_field():
         ('{"do": "fly"}', "message"),
         ('{"do": "drive", "heard": 1, "since": 2, "input": "keys", "role": "estop"}', "role"),
         ("[]", "message"),
-        ("{", "message"),
+        ("{", "message: Invalid JSON"),
+        ('{"do": "drive", "heard": 1, "since": 2, "input": "voice"}', r"message\.drive\.input: "),
     ):
         with pytest.raises(InputError, match=field):
             commands.parse(wrong)

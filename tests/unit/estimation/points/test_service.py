@@ -2,6 +2,7 @@
 
 import asyncio
 import base64
+import errno
 import math
 from contextlib import suppress
 from types import SimpleNamespace
@@ -231,12 +232,27 @@ def test_points_that_were_not_saved_are_saved_later_though_nothing_changes(tmp_p
         await rig.drive(1.0, show=b"")
         await rig.ask(PointOrder.MARK, "dock")
         await rig.drive(14.0, show=b"")
-        assert any(reason is Reason.DISK_FULL and "points not saved" in text for reason, text in rig.events)
+        assert any(reason is Reason.RECORDING_FAILED and "points not saved" in text for reason, text in rig.events)
         (tmp_path / "file").unlink()
         await rig.drive(11.0, show=b"")
         assert [point.name for point, _ in files.load(tmp_path / "file" / "map")] == ["dock"]
 
     run_scenario(story, tmp_path / "file" / "map")
+
+
+def test_points_not_saved_for_want_of_space_say_so(tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(files, "save", full)
+
+    async def story(rig: Rig) -> None:
+        await rig.drive(1.0, show=b"")
+        await rig.ask(PointOrder.MARK, "dock")
+        await rig.drive(11.0, show=b"")
+
+    rig = run_scenario(story, tmp_path)
+    assert {reason for reason, text in rig.events if "not saved" in text} == {Reason.DISK_FULL}
 
 
 def test_a_robot_that_is_lost_marks_no_place_of_its_own_and_reads_no_tags(tmp_path):

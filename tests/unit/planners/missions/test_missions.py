@@ -1,7 +1,9 @@
 """Missions: what follows a step, and the service with services that only pretend to drive."""
 
 import asyncio
+import errno
 import json
+import os
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -467,6 +469,20 @@ def test_just_restarted_it_waits_for_a_pose_and_for_the_planner(tmp_path: Path):
     running = [report for report in robot.reports if report.running]
     assert running[-1].text == ""
     assert Reason.PLANNER_STARTING.text in {report.text for report in running}, "what it waits for is said"
+
+
+@pytest.mark.parametrize(("code", "reason"), [(errno.ENOSPC, Reason.DISK_FULL), (errno.EIO, Reason.RECORDING_FAILED)])
+def test_progress_that_cannot_be_kept_is_told_apart_by_what_the_disk_says(tmp_path: Path, code: int, reason: Reason):
+    async def offload(work):
+        raise OSError(code, os.strerror(code))
+
+    async def story(robot: Pretended) -> None:
+        robot.service._offload = offload
+        robot.order(MissionOrder.START, GO)
+        await robot.clock.sleep(1.0)
+
+    robot = played(story, tmp_path / "mission.json")
+    assert {reason for reason, text in robot.events if "progress not kept" in text} == {reason}
 
 
 @pytest.mark.parametrize("localised", [False, True])
