@@ -19,6 +19,7 @@ from monstertruckd.tools.cli.output import (
     on_terminal,
     print_json,
     print_table,
+    print_words,
     remark,
     until_stopped,
 )
@@ -130,7 +131,7 @@ def simulate(
 
     async def main(clock: Clock) -> None:
         nonlocal code
-        code = await serve(clock, simulated, truth, files if run else ())
+        code = await serve(clock, simulated, print_words, truth, files if run else ())
 
     until_stopped(main)
     if code:

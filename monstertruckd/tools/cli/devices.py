@@ -16,6 +16,7 @@ from monstertruckd.tools.cli.output import (
     needs_extra,
     print_json,
     print_table,
+    print_words,
     remark,
     until_stopped,
 )
@@ -62,7 +63,7 @@ def emulate(
             remark(f"{device} on {port}; faults on standard input, Ctrl-C ends")
             if (limits := OWN_CLIENTS.get(DEVICES.named(device).opens)) is not None:
                 remark(f"{device}: {limits}")
-            await FaultConsole(CommandedGroup("device", {device: emulated}), sys.stdin, typer.echo).run()
+            await FaultConsole(CommandedGroup("device", {device: emulated}), sys.stdin, print_words).run()
 
     until_stopped(main)
 

@@ -208,7 +208,7 @@ def load_command(
     """
     from monstertruck_estimation.slam.storage import load
     from monstertruck_runtime.errors import ConfigError, InputError
-    from monstertruck_runtime.small_files import replace_file
+    from monstertruck_runtime.small_files import whole_file
     from monstertruck_runtime.yaml_files import read_yaml, yaml_text
     from monstertruckd.config.load import VERSION, load_truck
 
@@ -223,12 +223,12 @@ def load_command(
         values["explorer"] = None
     if os.path.lexists(output) and (output.samefile(config) or not _made_by_load(read_yaml(output))):
         raise InputError(f"{output}: is there already, and this command did not write it; name another file")
-    replace_file(output, yaml_text(values))
-    try:
-        load_truck(output)
-    except ConfigError:
-        output.unlink()
-        raise
+    with whole_file(output) as part:
+        part.write_text(yaml_text(values), encoding="utf-8")
+        try:
+            load_truck(part)
+        except ConfigError as error:
+            raise ConfigError(str(error).replace(str(part), str(output))) from error
     command = "run" if robot.sim is None else "simulate --run"
     remark(f"wrote {output}: `monstertruckd {command} --config {output}` localises in {place}")
 

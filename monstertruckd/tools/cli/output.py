@@ -182,8 +182,8 @@ def remark(text: str) -> None:
 
 
 def print_words(text: str) -> None:
-    """Print words on standard output; a terminal breaks none."""
-    print(wrapped(text) if on_terminal(sys.stdout) else text)
+    """Print words on standard output, at once; a terminal breaks none."""
+    print(wrapped(text) if on_terminal(sys.stdout) else text, flush=True)
 
 
 def wrapped(text: str, indent: str = "") -> str:

@@ -37,6 +37,7 @@ from monstertruckd.tools.simulation.ports import claimed
 from monstertruckd.tools.simulation.program import program
 from monstertruckd.tools.simulation.tape import EmulatedTape
 
+Say = Callable[[str], object]
 TRUTH_PERIOD = SECOND // 20
 ANOTHER: Final = (
     "probably another `simulate` on this computer; Ctrl-C in its terminal ends it. "
@@ -73,7 +74,11 @@ class TruthLog:
 
 
 async def serve(
-    clock: Clock, configs: Sequence[SimulatedTruckConfig], truth: Path | None = None, daemons_of: Sequence[Path] = ()
+    clock: Clock,
+    configs: Sequence[SimulatedTruckConfig],
+    say: Say,
+    truth: Path | None = None,
+    daemons_of: Sequence[Path] = (),
 ) -> int:
     """Serve the devices of robots in one world behind ptys at their configured ports until SIGTERM or SIGINT.
 
@@ -83,6 +88,7 @@ async def serve(
     Args:
         clock: time.
         configs: the robots; of several ``as_fleet`` has made sure that they can share a world.
+        say: gets a line for the terminal: answers to commands, contacts, what is ready.
         truth: file of what really happened.
         daemons_of: configurations of daemons that are run meanwhile: stopped before the devices go, and when all have
             ended by themselves the devices go, too.
@@ -106,13 +112,13 @@ async def serve(
         except BusyError as error:
             raise BusyError(f"{error}: {ANOTHER}") from None
         scene = shared_scene(configs)
-        scene.on_contact = lambda contact: _say(str(contact))
+        scene.on_contact = lambda contact: say(str(contact))
         robots = []
         for config in configs:
             folder = Path(stack.enter_context(TemporaryDirectory(prefix="monstertruck-")))
             stack.enter_context(_linked(config, folder))
-            robots.append(ServedRobot(config, clock, folder, scene, keeps_truth=truth is not None))
-        return await _serve(clock, robots, truth, daemons_of)
+            robots.append(ServedRobot(config, clock, folder, scene, say, keeps_truth=truth is not None))
+        return await _serve(clock, robots, say, truth, daemons_of)
 
 
 @contextmanager
@@ -141,11 +147,19 @@ class ServedRobot:
         clock: time.
         folder: of its emulated computer.
         scene: world.
+        say: gets a line for the terminal.
         keeps_truth: whether what really happens is requested at the end; a day of it is 80 MB.
     """
 
     def __init__(
-        self, config: SimulatedTruckConfig, clock: Clock, folder: Path, scene: Surroundings, *, keeps_truth: bool
+        self,
+        config: SimulatedTruckConfig,
+        clock: Clock,
+        folder: Path,
+        scene: Surroundings,
+        say: Say,
+        *,
+        keeps_truth: bool,
     ) -> None:
         self.config, self._clock = config, clock
         devices = config.devices.present()
@@ -172,11 +186,11 @@ class ServedRobot:
         }
         emulated |= {name: EmulatedFiles(files) for name, files in self._robot.monitored.items()}
         body = config.sim.world.truck.length, config.sim.world.truck.width
-        emulated |= {"usb": self._computer, "tape": EmulatedTape(self._robot.world, clock, body, _say)}
+        emulated |= {"usb": self._computer, "tape": EmulatedTape(self._robot.world, clock, body, say)}
         self.console = CommandedGroup("device", emulated)
 
-    def tasks(self, say: Callable[[str], None]) -> Iterator[asyncio.Task[Any]]:
-        """Everything that runs as long as it is served; ``say`` gets a line for the terminal."""
+    def tasks(self, say: Say) -> Iterator[asyncio.Task[Any]]:
+        """Everything that runs as long as it is served; ``say`` gets a line, in which the robot need not be named."""
         config, world, clock = self.config, self._robot.world, self._clock
         yield asyncio.create_task(self._robot.run(), name=config.robot)
         if self._keeps_truth:
@@ -190,10 +204,12 @@ class ServedRobot:
             context = SimContext(config.sim, config.devices, self._robot, self._computer, clock)
             yield asyncio.create_task(FaultInjector(context, config.sim.drill, say).run(), name="faults")
         if self._robot.recorded is not None:
-            yield asyncio.create_task(_report_end(self._robot.recorded), name="recording")
+            yield asyncio.create_task(_report_end(self._robot.recorded, say), name="recording")
 
 
-async def _serve(clock: Clock, robots: Sequence[ServedRobot], truth: Path | None, daemons_of: Sequence[Path]) -> int:
+async def _serve(
+    clock: Clock, robots: Sequence[ServedRobot], say: Say, truth: Path | None, daemons_of: Sequence[Path]
+) -> int:
     alone = len(robots) == 1
     stop = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -201,14 +217,14 @@ async def _serve(clock: Clock, robots: Sequence[ServedRobot], truth: Path | None
     tasks: list[asyncio.Task[Any]] = []
     for robot in robots:
         prefix = "" if alone else f"{robot.config.robot}: "
-        tasks += robot.tasks(lambda line, prefix=prefix: _say(prefix + line))  # type: ignore[misc]
+        tasks += robot.tasks(lambda line, prefix=prefix: say(prefix + line))  # type: ignore[misc]
     known = CommandedGroup("robot", {robot.config.robot: robot.console for robot in robots})
-    console = FaultConsole(robots[0].console if alone else known, sys.stdin, _say)
+    console = FaultConsole(robots[0].console if alone else known, sys.stdin, say)
     tasks.append(asyncio.create_task(console.run(), name="console"))
     waiting = asyncio.create_task(stop.wait())
     settle()
     if not daemons_of:  # who will say themselves when all of their services are
-        _say("ready")
+        say("ready")
     ended_by = 0
     async with AsyncExitStack() as stack:
         if daemons_of:
@@ -216,7 +232,7 @@ async def _serve(clock: Clock, robots: Sequence[ServedRobot], truth: Path | None
                 await stack.enter_async_context(program(None, "run", "--config", str(file))) for file in daemons_of
             ]
             names = [robot.config.robot for robot in robots]
-            tasks.append(daemons := asyncio.create_task(_last_end(programs, names), name="daemons"))
+            tasks.append(daemons := asyncio.create_task(_last_end(programs, names, say), name="daemons"))
         await asyncio.wait([waiting, *tasks], return_when=asyncio.FIRST_COMPLETED)
         if daemons_of and daemons.done():
             ended_by = daemons.result()
@@ -237,14 +253,14 @@ def save_truth(file: Path, logs: Mapping[str, TruthLog]) -> None:
     np.savez(file, **arrays)
 
 
-async def _last_end(programs: Sequence[asyncio.subprocess.Process], names: Sequence[str]) -> int:
+async def _last_end(programs: Sequence[asyncio.subprocess.Process], names: Sequence[str], say: Say) -> int:
     """Wait until all daemons have ended; the first code that is none of success."""
     codes: list[int] = []
 
     async def end(process: asyncio.subprocess.Process, name: str) -> None:
         codes.append(code := await process.wait())
         if len(programs) > 1:
-            _say(f"{name}: its daemon ended with code {code}")
+            say(f"{name}: its daemon ended with code {code}")
 
     await asyncio.gather(*map(end, programs, names))
     return next((code for code in codes if code), 0)
@@ -276,12 +292,7 @@ async def _watch(clock: Clock, world: World, camera: CeilingCamera, board: HeldB
         port.unplug()
 
 
-async def _report_end(recorded: RecordedHokuyoEmulator) -> None:
+async def _report_end(recorded: RecordedHokuyoEmulator, say: Say) -> None:
     await recorded.finished.wait()
-    _say(f"recording sent, began {recorded.began}")
+    say(f"recording sent, began {recorded.began}")
     await asyncio.Event().wait()
-
-
-def _say(line: str) -> None:
-    sys.stdout.write(line + "\n")
-    sys.stdout.flush()

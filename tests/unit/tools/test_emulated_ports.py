@@ -61,7 +61,7 @@ def test_a_real_robot_has_to_name_its_ports(tmp_path: Path):
 async def test_a_second_simulator_is_refused_and_leaves_the_first_alone(own: Path):
     config = load_simulated(CONFIGS / "demo.yaml")
     with claimed(*paths(config).values()), pytest.raises(BusyError) as refused:
-        await serve(WallClock(), [config])
+        await serve(WallClock(), [config], print)
     port = f"{own}/ports/truck/lidar: another program (process {os.getpid()}) serves this port"
     assert str(refused.value).startswith(
         f"{port}: probably another `simulate` on this computer; Ctrl-C in its terminal"
@@ -78,7 +78,7 @@ async def test_nor_does_it_take_the_emulated_computer_of_the_first(own: Path, tm
     with (tmp_path / ".machine.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         with pytest.raises(BusyError, match="machine: another program serves this port"):
-            await serve(WallClock(), [load_simulated(file)])
+            await serve(WallClock(), [load_simulated(file)], print)
     assert (tmp_path / "machine").readlink() == tmp_path
 
 

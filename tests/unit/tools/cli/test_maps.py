@@ -126,7 +126,26 @@ def test_a_configuration_that_is_refused_is_not_written(tmp_path: Path, base: st
         app, ["map", "load", str(tmp_path / "map.yaml"), "-c", str(tmp_path / "bad.yaml"), "-o", str(output)]
     )
     assert done.exit_code == 2
-    assert not output.exists()
+    assert {file.name for file in tmp_path.iterdir()} == {"bad.yaml", "map.yaml", "map.png"}
+
+
+def test_a_configuration_that_is_refused_leaves_the_former_one(tmp_path: Path):
+    save_map(WorldMap(np.zeros((10, 10), np.int8), 0.05), tmp_path / "map.yaml")
+    output, sonar = tmp_path / "out.yaml", CONFIGS / "robots" / "sonar.yaml"
+
+    def load(config: Path) -> Result:
+        return CliRunner().invoke(
+            app, ["map", "load", str(tmp_path / "map.yaml"), "-c", str(config), "-o", str(output)]
+        )
+
+    assert load(CONFIG).exit_code == 0
+    before = output.read_text()
+    refused = load(sonar)
+    assert refused.exit_code == 2
+    assert str(output) in refused.stderr
+    assert ".part" not in refused.stderr
+    assert output.read_text() == before
+    assert load(CONFIG).exit_code == 0
 
 
 def test_a_folder_that_cannot_be_made_is_reported_before_the_map_is_built(log: Path, tmp_path: Path):

@@ -15,10 +15,12 @@ from typing import Any
 
 import pytest
 import typer
+from typer.testing import CliRunner
 
 from monstertruck_runtime.errors import ConfigError, NotFoundError, RequestRefusedError, TruckError
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.reasons import Reason
+from monstertruck_sim.console import CommandedGroup, FaultConsole
 from monstertruckd.config.calibration import Estimate, Result
 from monstertruckd.tools.cli.calibrate import _print
 from monstertruckd.tools.cli.main import app
@@ -365,3 +367,21 @@ def test_lines_of_progress_break_no_word_on_a_terminal(
     monkeypatch.setenv("COLUMNS", "36")
     print_words(line)
     assert capsys.readouterr().out == "  155 s  it stands: no fresh drive\nfeedback\n"
+
+
+def test_answers_of_emulated_robots_break_no_word_on_a_terminal(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    async def serve(clock, configs, say, *_) -> int:
+        devices = ("lidar", "drive", "steering", "compass", "stabiliser")
+        FaultConsole(CommandedGroup("device", dict.fromkeys(devices)), sys.stdin, say).execute("wheel")
+        return 0
+
+    monkeypatch.setattr("monstertruckd.tools.simulation.simulate.serve", serve)
+    monkeypatch.setattr("monstertruckd.tools.cli.output.on_terminal", lambda _: True)
+    monkeypatch.setenv("COLUMNS", "40")
+    assert CliRunner().invoke(app, ["simulate"]).output.splitlines() == [
+        "error: name a device first: lidar,",
+        "drive, steering, compass, stabiliser;",
+        "`lidar help` lists its commands",
+    ]
