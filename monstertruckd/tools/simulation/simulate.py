@@ -37,7 +37,7 @@ from monstertruckd.tools.simulation.ports import claimed
 from monstertruckd.tools.simulation.program import program
 from monstertruckd.tools.simulation.tape import EmulatedTape
 
-Say = Callable[[str], object]
+Say = Callable[[str], None]
 TRUTH_PERIOD = SECOND // 20
 ANOTHER: Final = (
     "probably another `simulate` on this computer; Ctrl-C in its terminal ends it. "
