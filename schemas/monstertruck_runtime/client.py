@@ -388,12 +388,17 @@ class TruckClient(Operator):
             },
         )
 
-    async def goal_control(self, order: GoalOrder) -> None:
-        """Pause, resume or cancel the goal. Raises as ``goal`` does."""
-        await self.call("goal_control", {**await self._answered(1.0), "order": order})
+    async def goal_control(self, order: GoalOrder, *, own: bool = False) -> None:
+        """Pause, resume or cancel the goal; ``own``: only one that this client sent. Raises as ``goal`` does."""
+        await self.call("goal_control", {**await self._answered(1.0), "order": order, "own": own})
 
     async def behave(
-        self, order: BehaviourOrder, behaviour: str = "", settings: Mapping[str, Any] | None = None
+        self,
+        order: BehaviourOrder,
+        behaviour: str = "",
+        settings: Mapping[str, Any] | None = None,
+        *,
+        own: bool = False,
     ) -> dict[str, Any]:
         """Start a configured behaviour, or stop it; answers with its ``number``. Progress is on ``plan/behaviour``.
 
@@ -401,6 +406,7 @@ class TruckClient(Operator):
             order: what.
             behaviour: its name.
             settings: those that replace the configured ones for this run.
+            own: of a stop: only one that this client started.
 
         Raises:
             RequestRefusedError: why it does not start, or nothing runs.
@@ -408,11 +414,18 @@ class TruckClient(Operator):
             NotFoundError: the robot is not there, or has no such behaviour.
             NoAnswerError: no answer in time.
         """
-        request = {"order": order, "behaviour": behaviour} | ({"settings": dict(settings)} if settings else {})
+        request = {"order": order, "behaviour": behaviour, "own": own}
+        request |= {"settings": dict(settings)} if settings else {}
         return await self.call("behave", {**await self._answered(1.0), **request})
 
     async def explore(
-        self, order: ExploreOrder, *, home: bool | None = None, budget: float | None = None, find: int | None = None
+        self,
+        order: ExploreOrder,
+        *,
+        home: bool | None = None,
+        budget: float | None = None,
+        find: int | None = None,
+        own: bool = False,
     ) -> dict[str, Any]:
         """Start an exploration, or end it; answers with its ``number``. Progress is on ``plan/explore``.
 
@@ -421,13 +434,15 @@ class TruckClient(Operator):
             home: drive back to the start at the end; None = as configured.
             budget: seconds after which it ends; None = as configured.
             find: look for tags on walls, too, and end when so many are known.
+            own: of a stop: only one that this client started.
 
         Raises:
             RequestRefusedError: why it does not start, or none runs.
             NotFoundError: the robot is not there, or does not explore.
             NoAnswerError: no answer in time.
         """
-        request = {"order": order, "home": home, "budget": budget} | ({} if find is None else {"find": find})
+        request = {"order": order, "home": home, "budget": budget, "own": own}
+        request |= {} if find is None else {"find": find}
         return await self.call("explore", {**await self._answered(1.0), **request})
 
     async def point(
@@ -459,7 +474,7 @@ class TruckClient(Operator):
         )
 
     async def mission(
-        self, order: MissionOrder, mission: Mission | None = None, *, moved: bool = False
+        self, order: MissionOrder, mission: Mission | None = None, *, moved: bool = False, own: bool = False
     ) -> dict[str, Any]:
         """Start a mission, resume one, or end it; answers with its ``number``. Progress is on ``plan/mission``.
 
@@ -467,6 +482,7 @@ class TruckClient(Operator):
             order: what.
             mission: to be started.
             moved: resume it although the robot is not where it was interrupted.
+            own: of a stop: only one that this client started, or resumed.
 
         Raises:
             RequestRefusedError: why it does not start, or none runs.
@@ -474,7 +490,7 @@ class TruckClient(Operator):
             NoAnswerError: no answer in time.
         """
         steps = None if mission is None else mission.model_dump(mode="json")
-        wanted = {"order": order, "mission": steps, "moved": moved}
+        wanted = {"order": order, "mission": steps, "moved": moved, "own": own}
         return await self.call("mission", {**await self._answered(1.0), **wanted})
 
     async def path(self, path: DrivePath, lease: float = 1.0) -> None:

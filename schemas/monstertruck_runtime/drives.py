@@ -37,8 +37,8 @@ class Driver(Operator, Protocol):
         """Request to drive to a pose by way of waypoints."""
         ...
 
-    async def goal_control(self, order: GoalOrder) -> None:
-        """Pause, resume, cancel."""
+    async def goal_control(self, order: GoalOrder, *, own: bool = False) -> None:
+        """Pause, resume, cancel; ``own``: only a goal that this client sent."""
         ...
 
     async def path(self, path: Path, lease: float = 1.0) -> None:
@@ -89,7 +89,7 @@ async def drive_to(
     arm: bool,
     report: DriveReport = SILENT,
 ) -> Arrival:
-    """Send a goal and wait for its end; cancelled or without an answer, it cancels the goal.
+    """Send a goal and wait for its end; cancelled or without an answer, it cancels the goal, but nobody else's.
 
     Raises:
         RequestRefusedError: the goal or the arming was refused, or the robot restarted.
@@ -98,7 +98,7 @@ async def drive_to(
     with driver.subscribe(GOAL, fifo(256)) as states, driver.subscribe(GATE, latest()) as gate:
 
         async def cancel() -> None:
-            await driver.goal_control(GoalOrder.CANCEL)
+            await driver.goal_control(GoalOrder.CANCEL, own=True)
 
         async with _taken_back(cancel):
             number = await _taken_on(driver, clock, goal, via, report)

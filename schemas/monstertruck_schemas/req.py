@@ -42,6 +42,11 @@ class Request(Message):
     instance: Annotated[str, Field(max_length=32)] | None = None
     """Random name of this run of the sender's program: while its lease runs, no other program takes over its source."""
 
+    @property
+    def program(self) -> tuple[str, str | None]:
+        """Source and instance: which run of which program asks."""
+        return self.source, self.instance
+
 
 NEUTRAL = 1e-3
 """A request below this in all its speeds, m/s and rad/s, is for standstill."""
@@ -198,6 +203,8 @@ class GoalControl(Request):
     """Interrupt, resume or give up the present goal."""
 
     order: GoalOrder
+    own: bool = False
+    """Only a goal that the same program sent."""
 
 
 class BehaviourOrder(StrEnum):
@@ -215,6 +222,8 @@ class BehaviourRequest(Request):
     """Name of the behaviour to start; of a stop: only that one, empty = whichever runs."""
     settings: Annotated[dict[str, float | str | bool | None], Field(max_length=32)] = Field(default_factory=dict)
     """For a start: settings that replace the configured ones for this run."""
+    own: bool = False
+    """Of a stop: only a behaviour that the same program started."""
 
 
 class ExploreOrder(StrEnum):
@@ -234,6 +243,8 @@ class ExploreRequest(Request):
     """Seconds after which it ends; None = as configured."""
     find: Annotated[int, Field(ge=1, le=10_000)] | None = None
     """Look for tags on walls, and end when the map has so many of them; None = explore only."""
+    own: bool = False
+    """Of a stop: only an exploration that the same program started."""
 
 
 class MissionOrder(StrEnum):
@@ -251,7 +262,9 @@ class MissionRequest(Request):
     mission: Mission | None = None
     """For a start."""
     moved: bool = False
-    """For a resume: the robot is not where the mission was interrupted, and its pose is right"""
+    """For a resume: the robot is not where the mission was interrupted, and its pose is right."""
+    own: bool = False
+    """Of a stop: only a mission that the same program started and that runs."""
 
 
 class PathRequest(Request):

@@ -138,7 +138,7 @@ class LocalDriver(LocalOperator):
     ) -> dict[str, Any]:
         return await self._trip.goal(*goal, via=via)
 
-    async def goal_control(self, order: GoalOrder) -> None:
+    async def goal_control(self, order: GoalOrder, *, own: bool = False) -> None:
         await self._trip.order(order)
 
     async def path(self, path: DrivePath, lease: float = 1.0) -> None:

@@ -19,9 +19,10 @@ pytestmark = [pytest.mark.virtual, pytest.mark.timeout(300)]
 class MissionOperator(LocalOperator):
     """Gives orders about missions as ``TruckClient`` does."""
 
-    async def mission(self, order, mission=None, *, moved=False):
+    async def mission(self, order, mission=None, *, moved=False, own=False):
         steps = None if mission is None else mission.model_dump(mode="json")
-        return await self.call("mission", {**await self.header(), "order": order, "mission": steps, "moved": moved})
+        wanted = {"order": order, "mission": steps, "moved": moved, "own": own}
+        return await self.call("mission", {**await self.header(), **wanted})
 
 
 def test_a_mission_is_driven_and_followed():

@@ -29,7 +29,12 @@ class BehaviourClient(Operator, Protocol):
     """Client of a robot that has behaviours."""
 
     async def behave(
-        self, order: BehaviourOrder, behaviour: str = "", settings: Mapping[str, Any] | None = None
+        self,
+        order: BehaviourOrder,
+        behaviour: str = "",
+        settings: Mapping[str, Any] | None = None,
+        *,
+        own: bool = False,
     ) -> dict[str, Any]:
         """Start or stop a behaviour."""
         ...
@@ -39,7 +44,13 @@ class ExploringClient(Operator, Protocol):
     """Client of a robot that explores."""
 
     async def explore(
-        self, order: ExploreOrder, *, home: bool | None = None, budget: float | None = None, find: int | None = None
+        self,
+        order: ExploreOrder,
+        *,
+        home: bool | None = None,
+        budget: float | None = None,
+        find: int | None = None,
+        own: bool = False,
     ) -> dict[str, Any]:
         """Start an exploration, or end it."""
         ...
@@ -49,7 +60,7 @@ class MissionClient(Operator, Protocol):
     """Client of a robot that does missions."""
 
     async def mission(
-        self, order: MissionOrder, mission: Mission | None = None, *, moved: bool = False
+        self, order: MissionOrder, mission: Mission | None = None, *, moved: bool = False, own: bool = False
     ) -> dict[str, Any]:
         """Start, resume or end one."""
         ...
@@ -78,7 +89,7 @@ async def run_behaviour(
             client,
             BEHAVIOUR,
             lambda: client.behave(BehaviourOrder.START, name, settings),
-            lambda: client.behave(BehaviourOrder.STOP, name),
+            lambda: client.behave(BehaviourOrder.STOP, name, own=True),
             lambda state: bar(state.elapsed, f"{name}: {state.phase or 'begins'}, {state.travelled:.1f} m"),
             ("behaviour", "elapsed", "travelled", "values"),
             arm=arm,
@@ -111,7 +122,7 @@ async def run_exploration(
             client,
             EXPLORE,
             lambda: client.explore(ExploreOrder.START, home=home, budget=budget, find=find),
-            lambda: client.explore(ExploreOrder.STOP),
+            lambda: client.explore(ExploreOrder.STOP, own=True),
             show,
             ("elapsed", "travelled", "known", "goals"),
             arm=arm,
@@ -158,7 +169,7 @@ async def run_mission(
             client,
             MISSION,
             lambda: client.mission(order, mission, moved=moved),
-            lambda: client.mission(MissionOrder.STOP),
+            lambda: client.mission(MissionOrder.STOP, own=True),
             show,
             ("name", "elapsed", "step", "failures"),
             arm=arm,
@@ -187,7 +198,7 @@ async def _run(
     *,
     arm: bool,
 ) -> RunEnd:
-    """Start a run and wait for its end; cancelled or without an answer, it is stopped.
+    """Start a run and wait for its end; cancelled or without an answer, it is stopped, but nobody else's.
 
     Raises:
         RequestRefusedError: the start or the arming was refused, or the robot restarted.

@@ -55,10 +55,15 @@ class LocalOperator(Operator):
         return wire.decode(topics.GATE, json.dumps(answer).encode())
 
     async def behave(
-        self, order: BehaviourOrder, behaviour: str = "", settings: Mapping[str, Any] | None = None
+        self,
+        order: BehaviourOrder,
+        behaviour: str = "",
+        settings: Mapping[str, Any] | None = None,
+        *,
+        own: bool = False,
     ) -> dict[str, Any]:
         """Start or stop a behaviour as ``TruckClient.behave`` does."""
-        request = {"order": order, "behaviour": behaviour, "settings": dict(settings or {})}
+        request = {"order": order, "behaviour": behaviour, "settings": dict(settings or {}), "own": own}
         return await self.call("behave", {**await self.header(), **request})
 
     async def drive_shafts(self, *rates: float, lease: float = 0.25) -> None:

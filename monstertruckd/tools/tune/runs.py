@@ -38,7 +38,12 @@ class TunedRobot(Protocol):
         ...
 
     async def behave(
-        self, order: BehaviourOrder, behaviour: str = "", settings: Mapping[str, Any] | None = None
+        self,
+        order: BehaviourOrder,
+        behaviour: str = "",
+        settings: Mapping[str, Any] | None = None,
+        *,
+        own: bool = False,
     ) -> dict[str, Any]:
         """Start or stop a behaviour."""
         ...
@@ -156,12 +161,12 @@ def _over(wanted: float, seconds: float, samples: Samples) -> bool:
 async def _run(client: TunedRobot, name: str, settings: Mapping[str, Any], over: Callable[[Samples], bool]) -> Samples:
     """One start of the behaviour: the first stretch of following that is over; a corner begins another one."""
     with client.subscribe(BEHAVIOUR, fifo(1024)) as states:
-        number = int((await client.behave(BehaviourOrder.START, name, settings))["number"])
         try:
+            number = int((await client.behave(BehaviourOrder.START, name, settings))["number"])
             return await _followed(states, number, over)
         finally:
             with suppress(TruckError):
-                await client.behave(BehaviourOrder.STOP, name)
+                await client.behave(BehaviourOrder.STOP, name, own=True)
 
 
 async def _followed(states: Mailbox[BehaviourState], number: int, over: Callable[[Samples], bool]) -> Samples:

@@ -110,6 +110,8 @@ class BehaviourService:
         self._events: EventSink = bus.event_sink()
         self._sequences = Sequences(max_age)
         self._run: BehaviourRun | None = None
+        self._program: tuple[str, str | None] | None = None
+        """Which started it."""
         self._pose: Odometry | None = None
         self._reported: BehaviourState | None = None
 
@@ -166,7 +168,7 @@ class BehaviourService:
             raise RequestRefusedError(Reason.INPUT_STALE, stale)
         number = 1 if run is None else run.number + 1
         self._run = BehaviourRun(number, name, config, behaviour, request.source, now, behaviour.begin())
-        self._pose = self._odometry.latest
+        self._program, self._pose = request.program, self._odometry.latest
         self._events(Reason.BEHAVIOUR_STARTED, Severity.INFO, SOURCE, f"{name} started by {request.source}")
         self._report(now)
         return number
@@ -190,6 +192,8 @@ class BehaviourService:
 
     def _stop(self, request: BehaviourRequest, now: int) -> int:
         run = self._run
+        if run is not None and run.running and request.own and request.program != self._program:
+            raise RequestRefusedError(Reason.NOT_FOUND, f"the behaviour {run.name} of {run.source} is running")
         if run is None or not run.running or request.behaviour not in ("", run.name):
             name = request.behaviour
             text = f"the behaviour {name} is not running" if name else "no behaviour is running"

@@ -111,6 +111,8 @@ class ExplorerService:
         self._in, self._out, self._events = inputs, state, events
         self._sequences = Sequences(max_age)
         self._run: Exploration | None = None
+        self._program: tuple[str, str | None] | None = None
+        """Which started it."""
         self._tiles: deque[Grid] = deque(maxlen=TILES)
         self._whole: Grid | None = None
         self._sent_whole: Grid | None = None
@@ -161,6 +163,8 @@ class ExplorerService:
         if not starts:
             if run is None or not running:
                 raise RequestRefusedError(Reason.NOT_FOUND, "no exploration is running")
+            if request.own and request.program != self._program:
+                raise RequestRefusedError(Reason.NOT_FOUND, f"the exploration of {run.source} is running")
             self._do(exploration.stop(run, request.source, now / SECOND))
             return run.number
         if running and run is not None:
@@ -179,6 +183,7 @@ class ExplorerService:
         self._others = 0 if goal is None else goal.number
         if request.find is not None and self._in.points is None:
             raise RequestRefusedError(Reason.NOT_SUPPORTED, "this robot keeps no points of interest: section `points`")
+        self._program = request.program
         home = self._config.home if request.home is None else request.home
         number = 1 if run is None else run.number + 1
         budget = request.budget or self._config.budget
@@ -359,7 +364,7 @@ class ExplorerService:
             self._goal = None
             return
         self._goal = None
-        self._goals.control(GoalControl(**self._header(), order=GoalOrder.CANCEL))
+        self._goals.control(GoalControl(**self._header(), order=GoalOrder.CANCEL, own=True))
 
     def _report(self, now: int) -> None:
         state = state_of(self._run, self._config.kind, now)

@@ -102,6 +102,8 @@ class GoalService:
         self._place, self._deformation = actor, deformation
         self._sequences = {"goal": Sequences(max_age), "goal_control": Sequences(max_age)}
         self._goal: GoalRun | None = None
+        self._program: tuple[str, str | None] | None = None
+        """Which sent it."""
         self._number = 0
         self._held: set[str] = set()
         self._paths = PathPublisher(clock, inputs, outputs, deceleration)
@@ -178,7 +180,7 @@ class GoalService:
             raise RequestRefusedError(Reason.BAD_INPUT, f"goal: expected at most {MAX_COORDINATE:g} m and rad")
         if self._goal is not None and self._goal.active:
             self._do(goal_run.order(self._goal, GoalOrder.CANCEL, request.source, self._seconds()))
-        self._number += 1
+        self._number, self._program = self._number + 1, request.program
         self._do(goal_run.begin(self._number, goal, request.source, self._seconds(), via))
         return self._number
 
@@ -191,6 +193,9 @@ class GoalService:
         self._examine(request, "goal_control", moves=request.order is GoalOrder.RESUME)
         if self._goal is None or not self._goal.active:
             raise RequestRefusedError(Reason.NOT_FOUND, f"{request.order}: no goal is being pursued")
+        if request.own and request.program != self._program:
+            text = f"{request.order}: goal {self._goal.number} of {self._goal.source} is pursued"
+            raise RequestRefusedError(Reason.NOT_FOUND, text)
         self._do(goal_run.order(self._goal, request.order, request.source, self._seconds()))
 
     def hold(self, who: str, *, on: bool) -> None:

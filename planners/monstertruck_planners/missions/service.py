@@ -182,6 +182,8 @@ class MissionService:
         self._seq = 0
         self._number = 0
         self._source = ""
+        self._program: tuple[str, str | None] | None = None
+        """Which started it."""
         self._progress: MissionProgress | None = None
         self._began = 0
         self._end: StepEnd | None = None
@@ -235,6 +237,8 @@ class MissionService:
             raise RequestRefusedError(reason)
         running = self._task is not None and not self._task.done()
         if not starts:
+            if request.own and not (running and request.program == self._program):
+                raise RequestRefusedError(Reason.NOT_FOUND, f"no mission of {request.source} is running")
             if running and self._task is not None:
                 self._stop(self._task, request.source)
             elif self._interrupted is not None:
@@ -252,7 +256,8 @@ class MissionService:
         self._check(progress.mission)
         assert self._tasks is not None
         self._number, self._source, self._progress = self._number + 1, request.source, progress
-        self._began, self._end, self._interrupted, self._failed = now, None, None, ""
+        self._program, self._began, self._end = request.program, now, None
+        self._interrupted, self._failed = None, ""
         text = f"{progress.mission.name}, {len(progress.mission.steps)} steps, asked for by {request.source}"
         if progress.index > 0:
             text += f", from step {progress.index + 1} on"
@@ -445,7 +450,7 @@ class MissionService:
             return StepEnd(goal.outcome, goal.text) if goal.phase is GoalPhase.IDLE else None
 
         def stop() -> None:
-            goals.control(GoalControl(**self._header(), order=GoalOrder.CANCEL))
+            goals.control(GoalControl(**self._header(), order=GoalOrder.CANCEL, own=True))
 
         return await self._until(end, stop, self._in.goal)
 
@@ -499,7 +504,7 @@ class MissionService:
             return None if state.running else StepEnd(state.outcome, state.text)
 
         def stop() -> None:
-            explorer.take(ExploreRequest(**self._header(), order=ExploreOrder.STOP))
+            explorer.take(ExploreRequest(**self._header(), order=ExploreOrder.STOP, own=True))
 
         return await self._until(end, stop, self._in.explore)
 
@@ -512,7 +517,8 @@ class MissionService:
         )
 
         def stop() -> None:
-            behaviours.take(BehaviourRequest(**self._header(), order=BehaviourOrder.STOP, behaviour=name))
+            stopping: dict[str, Any] = {"order": BehaviourOrder.STOP, "behaviour": name, "own": True}
+            behaviours.take(BehaviourRequest(**self._header(), **stopping))
 
         def end() -> StepEnd | None:
             state = self._in.behaviour.latest

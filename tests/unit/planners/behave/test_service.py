@@ -98,8 +98,8 @@ class Bench:
     def start(self, name="wall", **more):
         return self.order(BehaviourOrder.START, name, **more)
 
-    def stop(self, name=""):
-        return self.order(BehaviourOrder.STOP, name)
+    def stop(self, name="", **more):
+        return self.order(BehaviourOrder.STOP, name, **more)
 
     @property
     def state(self):
@@ -186,6 +186,20 @@ def test_one_behaviour_at_a_time_and_only_those_configured():
             bench.stop()
         assert caught.value.refusal is Reason.NOT_FOUND
         assert bench.start("other") == 2
+
+    on_bench(scenario)
+
+
+@pytest.mark.parametrize("other", [{"source": "bob"}, {"instance": "another"}])
+def test_who_stops_only_its_own_stops_nobody_elses(other):
+    async def scenario(bench):
+        bench.start(instance="one")
+        with pytest.raises(RequestRefusedError, match="the behaviour wall of ann is running") as caught:
+            bench.stop("wall", own=True, **{"instance": "one", **other})
+        assert caught.value.refusal is Reason.NOT_FOUND
+        assert bench.state.running
+        bench.stop("wall", own=True, instance="one")
+        assert not bench.state.running
 
     on_bench(scenario)
 

@@ -5,13 +5,14 @@ from types import SimpleNamespace
 from typing import Self
 
 import numpy as np
+import pytest
 
 from monstertruck_planners.collision import Footprint
 from monstertruck_planners.explore.config import InformationConfig
 from monstertruck_planners.explore.exchange import ExploreAnswer, ExploreSetup, ExploreTask, Viewpoint
 from monstertruck_planners.explore.service import ExplorerInputs, ExplorerService
 from monstertruck_runtime.clock import VirtualClock, run_virtual
-from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.errors import InputError, RequestRefusedError
 from monstertruck_runtime.mailbox import Mailbox, fifo
 from monstertruck_runtime.requests import inner_request
 from monstertruck_schemas.base import Message, Pose2D, Twist2D
@@ -98,6 +99,28 @@ def test_a_map_that_could_not_be_saved_is_not_waited_for():
     assert service._saved() == ("", "no space left")
     say(Reason.MAP_SAVED, 7)
     assert service._saved() == ("no space left", "")
+
+
+def test_who_stops_only_its_own_stops_nobody_elses(monkeypatch: pytest.MonkeyPatch):
+    service, ended = ExplorerService.__new__(ExplorerService), []
+    monkeypatch.setattr("monstertruck_planners.explore.service.refusal", lambda *_: Reason.OK)
+    monkeypatch.setattr("monstertruck_planners.explore.service.exploration.stop", lambda _, source, __: source)
+    service._run = SimpleNamespace(running=True, source="ann", number=1)
+    service._program, service._do = ("ann", "one"), ended.append
+    service._in, service._clock = SimpleNamespace(gate=SimpleNamespace(latest=None)), SimpleNamespace(now=lambda: 0)
+    service._sequences, service._max_age = None, 0.5
+
+    def stop(source: str, instance: str) -> None:
+        header = inner_request(1, None, 0, source) | {"instance": instance}
+        service.take(ExploreRequest(**header, order=ExploreOrder.STOP, own=True))
+
+    for program in (("bob", "one"), ("ann", "another")):
+        with pytest.raises(RequestRefusedError, match="the exploration of ann is running") as refused:
+            stop(*program)
+        assert refused.value.refusal is Reason.NOT_FOUND
+    assert ended == []
+    stop("ann", "one")
+    assert ended == ["ann"]
 
 
 def test_the_answer_to_a_question_of_the_exploration_before_is_none():

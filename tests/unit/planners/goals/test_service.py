@@ -16,8 +16,10 @@ from monstertruck_planners.goals.service import GoalService
 from monstertruck_runtime.clock import run_virtual
 from monstertruck_runtime.errors import InputError, RequestRefusedError, WorkerError
 from monstertruck_runtime.mailbox import Mailbox, latest
+from monstertruck_runtime.requests import inner_request
 from monstertruck_schemas.plan import GoalPhase, GoalState
 from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import GoalControl, GoalOrder
 from tests.unit.planners.kit import scanned_on_the_move
 
 
@@ -50,6 +52,26 @@ def test_a_running_behaviour_excludes_a_goal_and_lets_one_be_cancelled(monkeypat
     service._examine(None, "goal", moves=False)
     running.running = False
     service._examine(None, "goal", moves=True)
+
+
+def test_who_cancels_only_its_own_cancels_nobody_elses(monkeypatch: pytest.MonkeyPatch):
+    service, done = GoalService.__new__(GoalService), []
+    monkeypatch.setattr(service, "_examine", lambda *_, **__: None)
+    monkeypatch.setattr("monstertruck_planners.goals.service.goal_run.order", lambda _, what, *__: what)
+    service._goal, service._program = SimpleNamespace(active=True, number=3, source="ann"), ("ann", "one")
+    service._do, service._clock = done.append, SimpleNamespace(now=lambda: 0)
+
+    def cancel(source: str, instance: str) -> None:
+        header = inner_request(1, None, 0, source) | {"instance": instance}
+        service.control(GoalControl(**header, order=GoalOrder.CANCEL, own=True))
+
+    for program in (("bob", "one"), ("ann", "another")):
+        with pytest.raises(RequestRefusedError, match="goal 3 of ann is pursued") as refused:
+            cancel(*program)
+        assert refused.value.refusal is Reason.NOT_FOUND
+    assert done == []
+    cancel("ann", "one")
+    assert done == [GoalOrder.CANCEL]
 
 
 def test_who_holds_the_truck_between_goals_does_not_stop_a_behaviour():

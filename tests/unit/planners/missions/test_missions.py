@@ -118,6 +118,7 @@ class Behaviours:
         self._robot, self._busy, self.asked = robot, busy, []
 
     def take(self, request) -> int:
+        assert request.own is (request.order is BehaviourOrder.STOP)
         self.asked.append(request.order)
         if self._busy:
             self._busy -= 1
@@ -172,7 +173,7 @@ class Pretended:
         return self.number
 
     def control(self, request):
-        assert request.order is GoalOrder.CANCEL
+        assert (request.order, request.own) == (GoalOrder.CANCEL, True)
         self.task.cancel()
         self._say(GoalPhase.IDLE, Reason.CANCELLED)
 
@@ -185,15 +186,17 @@ class Pretended:
         )
         self.latest["goal"] = state
 
-    def order(self, order: MissionOrder, *steps: dict, moved: bool = False, **more) -> int:
+    def order(
+        self, order: MissionOrder, *steps: dict, moved: bool = False, own: bool = False, source: str = "ann", **more
+    ) -> int:
         self.seq += 1
         now = self.clock.now()
         self.latest["gate"].stamp = now
         if self.placed:
             self.latest["pose"] = SimpleNamespace(received=now, pose=Pose2D(x=5.0, y=6.0, yaw=0.0))
         request = MissionRequest(
-            stamp=now, received=now, seq=self.seq, source="ann", role=Role.STATION, lease=1.0, nonce="n",
-            gate_stamp=now, order=order, moved=moved, mission=mission(*steps, **more) if steps else None,
+            stamp=now, received=now, seq=self.seq, source=source, role=Role.STATION, lease=1.0, nonce="n",
+            gate_stamp=now, order=order, moved=moved, own=own, mission=mission(*steps, **more) if steps else None,
         )  # fmt: skip
         return self.service.take(request)
 
@@ -415,6 +418,25 @@ def test_stopped_it_cancels_its_goal():
     assert robot.latest["goal"].outcome is Reason.CANCELLED
     assert robot.reports[-1].outcome is Reason.CANCELLED
     assert "ann" in robot.reports[-1].text
+
+
+def test_who_stops_only_its_own_ends_no_mission_of_others_and_gives_none_up(tmp_path: Path):
+    file = tmp_path / "mission.json"
+    file.write_text(SavedProgress.of(progress(GO), "ann").model_dump_json())
+
+    async def story(robot: Pretended) -> None:
+        with pytest.raises(RequestRefusedError, match="no mission of ann is running"):
+            robot.order(MissionOrder.STOP, own=True)
+        robot.order(MissionOrder.RESUME)
+        await robot.clock.sleep(0.5)
+        with pytest.raises(RequestRefusedError, match="no mission of bob is running") as refused:
+            robot.order(MissionOrder.STOP, own=True, source="bob")
+        assert refused.value.refusal is Reason.NOT_FOUND
+        assert robot.reports[-1].running
+        robot.order(MissionOrder.STOP, own=True)
+        assert not robot.reports[-1].running
+
+    played(story, file)
 
 
 def test_a_step_that_takes_too_long_has_failed_and_its_goal_is_cancelled():

@@ -53,7 +53,8 @@ class Robot:
     async def arm(self, *, hold=False):
         self.orders.append("arm")
 
-    async def behave(self, order, behaviour="", settings=None):
+    async def behave(self, order, behaviour="", settings=None, *, own=False):
+        assert own is (order is BehaviourOrder.STOP), "nobody else's is stopped"
         self.orders.append(order)
         if order is BehaviourOrder.START:
             if self.refuses is not None:

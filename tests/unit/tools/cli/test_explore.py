@@ -39,7 +39,8 @@ class Robot:
     async def arm(self):
         self.orders.append(("arm",))
 
-    async def explore(self, order: ExploreOrder, *, home=None, budget=None, find=None):
+    async def explore(self, order: ExploreOrder, *, home=None, budget=None, find=None, own=False):
+        assert own is (order is ExploreOrder.STOP), "nobody else's is stopped"
         self.orders.append((order, home, budget))
         if self.refuse:
             raise RequestRefusedError(Reason.BUSY)

@@ -96,7 +96,8 @@ class SilentRobot:
         await self._ask("goal")
         return {"number": 1}
 
-    async def goal_control(self, order):
+    async def goal_control(self, order, *, own=False):
+        assert own, "nobody else's is cancelled"
         await self._ask(order.value)
 
     async def path(self, path, lease=1.0):

@@ -44,8 +44,9 @@ class Client:
         self.box = Mailbox(delivery)
         yield self.box
 
-    async def behave(self, order, behaviour="", settings=None):
+    async def behave(self, order, behaviour="", settings=None, *, own=False):
         if order is BehaviourOrder.STOP:
+            assert own, "nobody else's is stopped"
             self.running = ""
             return {}
         assert self.armed
@@ -118,6 +119,21 @@ def test_a_robot_that_was_armed_without_saying_so_is_disarmed(lost):
     with pytest.raises(type(lost)):
         tuned(client, [])
     assert client.armed is False
+
+
+def test_a_start_that_is_not_answered_is_taken_back():
+    client, start = Client(), Client.behave
+
+    async def behave(order, behaviour="", settings=None, *, own=False):
+        await start(client, order, behaviour, settings, own=own)
+        if order is BehaviourOrder.START:
+            raise asyncio.CancelledError
+
+    client.behave = behave
+    with pytest.raises(asyncio.CancelledError):
+        tuned(client, [])
+    assert client.number == 1
+    assert not client.running
 
 
 def test_a_robot_that_refuses_to_be_armed_may_be_driven_by_somebody_else_and_is_left_alone():
