@@ -15,7 +15,7 @@ import zenoh
 from zenoh import ext, handlers
 
 from monstertruck_runtime import wire
-from monstertruck_runtime.clock import Clock, WallClock
+from monstertruck_runtime.clock import SECOND, Clock, WallClock
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruck_runtime.errors import (
     InputError,
@@ -566,10 +566,12 @@ class TruckClient(Operator):
         if tls is not None:
             self._take_name(tls.owner())
         config = session_config(self.endpoint, self._timeout, tls)
+        began = self._clock.now()
         try:
             self._session = zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
         except zenoh.ZError as error:
-            msg = f"no robot answers at {self.endpoint} within {self._timeout:g} s: is its daemon running there "
+            waited = (self._clock.now() - began) / SECOND  # longer than ``timeout`` where the computer is busy
+            msg = f"no robot answers at {self.endpoint} within {waited:.1f} s: is its daemon running there "
             msg += "(`monstertruckd run`, or `simulate --run`), or is it elsewhere (--endpoint)?"
             raise NotFoundError(msg) from error
 

@@ -225,7 +225,8 @@ def _truck(state: ScreenState) -> Panel:
     gate, odometry = state.gate, state.odometry
     if gate is not None:
         _row(table, "gate", Text(gate.mode.value.upper(), style=MODE_STYLE[gate.mode]))
-        _row(table, "driver", f"{gate.holder or '-'}{f' ({gate.role.value})' if gate.role else ''}")
+        role = f" ({gate.role.value})" if gate.role and gate.role.value != gate.holder else ""
+        _row(table, "driver", f"{gate.holder or '-'}{role}")
         if gate.form is not None and gate.twist is not None:
             vx, vy, wz = gate.twist.vx, gate.twist.vy, math.degrees(gate.twist.wz)
             _row(table, gate.form.value, f"{vx:+.2f} {vy:+.2f} m/s {wz:+.0f}°/s")

@@ -5,9 +5,11 @@ import json
 import re
 import subprocess
 import sys
+import time
 from typing import Any
 
 import pytest
+import zenoh
 
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.errors import InputError, NoAnswerError, NotFoundError, RequestRefusedError
@@ -251,8 +253,19 @@ async def test_a_restarted_robot_is_found_again_with_its_new_nonce():
 
 
 async def test_nobody_at_the_endpoint():
-    with pytest.raises(NotFoundError, match=r"no robot answers at tcp/127\.0\.0\.1:\d+ within 0.2 s"):
+    with pytest.raises(NotFoundError, match=r"no robot answers at tcp/127\.0\.0\.1:\d+ within \d\.\d s"):
         async with TruckClient(endpoint=free_endpoint(), timeout=0.2):
+            pass
+
+
+async def test_it_says_how_long_it_really_waited(monkeypatch):
+    def open_slowly(_):
+        time.sleep(0.3)
+        raise zenoh.ZError
+
+    monkeypatch.setattr(zenoh, "open", open_slowly)
+    with pytest.raises(NotFoundError, match=r"within 0\.[3-9] s"):
+        async with TruckClient(timeout=0.1):
             pass
 
 

@@ -88,7 +88,6 @@ def test_it_shows_what_matters():
     text = console.export_text()
     for words in (
         "DRIVING",
-        "tracker (tracker)",
         "tilted: speed limited",
         "+1.25 -0.50 m",
         "-0.10 m/s",
@@ -104,6 +103,15 @@ def test_it_shows_what_matters():
     ):
         assert words in text
     assert any(0x2800 < ord(sign) < 0x2900 for sign in text), "the scan is drawn"
+
+
+def test_who_drives_is_said_once():
+    state = full()
+    assert re.search(r"driver +tracker ", shown(state, 140, 40).export_text())
+    assert "(tracker)" not in shown(state, 140, 40).export_text()
+    assert state.gate is not None
+    state.take(state.gate.model_copy(update={"holder": "ann@desk:7", "role": Role.STATION}))
+    assert "ann@desk:7 (station)" in shown(state, 140, 40).export_text()
 
 
 def test_a_path_driven_to_its_end_is_whole_though_the_next_lap_begins_at_nought():
