@@ -100,9 +100,7 @@ def build_planners(
         behaviours = BehaviourService(config.behaviours, clock, bus, requests, config.gate.max_request_age, moved)
         yield behaviours
     if goals is not None:
-        yield _build_missions(
-            config, bus, clock, MissionParts(goals, behaviours, explorer, frozenset(config.behaviours))
-        )
+        yield _build_missions(config, bus, clock, MissionParts(goals, behaviours, explorer))
     if config.devices.stabiliser is not None and config.devices.compass is not None:
         yield LEVELLING.implementation(config.levelling)(config.levelling, clock, bus)
     if config.map is not None and config.devices.lidar is not None:

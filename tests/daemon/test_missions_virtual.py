@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.mailbox import fifo
 from monstertruck_schemas import topics
 from monstertruck_schemas.mission import Mission
@@ -34,11 +35,17 @@ def test_a_mission_is_driven_and_followed():
         {"do": "wait", "seconds": 3.0},
         {"do": "return"},
     ]
-    mission = Mission.model_validate_json(json.dumps({"version": 2, "name": "hall", "steps": steps}))
+    slides = {"do": "behaviour", "name": "move", "settings": {"length": 0.2, "bearing": 1.57}}
+    mission, wrong = (
+        Mission.model_validate_json(json.dumps({"version": 2, "name": "hall", "steps": some}))
+        for some in (steps, [steps[0], slides])
+    )
     lines, ends = [], []
 
     async def story(trip: Trip) -> None:
         client = MissionOperator(trip.rig.daemon, trip.clock)
+        with pytest.raises(InputError, match="^step 2: .*this body cannot move sideways"):
+            await run_mission(client, wrong, arm=True)
         with trip.rig.bus.subscribe(topics.MISSION, fifo(4096)) as states:
             ends.append(await run_mission(client, mission, arm=True, report=lines.append))
             ends.append(states.latest)

@@ -136,6 +136,22 @@ class BehaviourService:
 
     # Requests
 
+    def check(self, name: str, settings: Mapping[str, Any]) -> None:
+        """Whether a behaviour could be started with these settings, were the robot ready to drive.
+
+        Raises:
+            NotFoundError: no such behaviour is configured.
+            InputError: the settings are wrong, or not complete; the text names the first key.
+            RequestRefusedError: the body cannot do that.
+        """
+        self._configured(name, settings)
+
+    def _configured(self, name: str, settings: Mapping[str, Any]) -> tuple[BehaviourConfig, Behaviour]:
+        if name not in self.configs:
+            raise NotFoundError(f"no behaviour {name!r}: expected one of {', '.join(self.configs) or 'none'}")
+        config = _with_settings(self.configs[name], settings)
+        return config, self._made(config)
+
     def take(self, request: BehaviourRequest) -> int:
         """Carry out a request; returns the number of the behaviour it started or stopped.
 
@@ -152,8 +168,7 @@ class BehaviourService:
 
     def _start(self, request: BehaviourRequest, gate: GateState | None, now: int) -> int:
         name, run = request.behaviour, self._run
-        if name not in self.configs:
-            raise NotFoundError(f"no behaviour {name!r}: expected one of {', '.join(self.configs) or 'none'}")
+        config, behaviour = self._configured(name, request.settings)
         if run is not None and run.running:
             raise RequestRefusedError(
                 Reason.BUSY, f"the behaviour {run.name} of {run.source} is running, stop it first"
@@ -162,8 +177,6 @@ class BehaviourService:
             raise RequestRefusedError(Reason.BUSY, other)
         if gate is None or not gate.mode.accepts_motion:
             raise does_not_drive(gate)
-        config = _with_settings(self.configs[name], request.settings)
-        behaviour = self._made(config)
         if (stale := self._stale(behaviour, now)) is not None:
             raise RequestRefusedError(Reason.INPUT_STALE, stale)
         number = 1 if run is None else run.number + 1

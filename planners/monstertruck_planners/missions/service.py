@@ -3,7 +3,7 @@
 import asyncio
 import contextlib
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Protocol, TypeVar, assert_never
@@ -112,6 +112,10 @@ class BehavioursOfMission(Protocol):
         """Start or stop one; returns its number."""
         ...
 
+    def check(self, name: str, settings: Mapping[str, Any]) -> None:
+        """Whether one could be started with these settings."""
+        ...
+
 
 class ExplorerOfMission(Protocol):
     """The service of exploration."""
@@ -141,8 +145,6 @@ class MissionParts:
     goals: GoalsOfMission
     behaviours: BehavioursOfMission | None
     explorer: ExplorerOfMission | None
-    names: frozenset[str]
-    """Names of the configured behaviours."""
 
 
 class MissionService:
@@ -228,8 +230,8 @@ class MissionService:
 
         Raises:
             RequestRefusedError: the sender may not, or it cannot be done now.
-            NotFoundError: a step needs what the robot does not have.
-            InputError: a start without a mission.
+            NotFoundError: steps need what the robot does not have.
+            InputError: a start without a mission, or steps with settings that their behaviours do not take.
         """
         starts, now, gate = request.order is not MissionOrder.STOP, self._clock.now(), self._in.gate.latest
         reason = refusal(request, gate, self._sequences, now, self._max_age if starts else None)
@@ -300,29 +302,32 @@ class MissionService:
         return MissionProgress(request.mission, pose)
 
     def _check(self, mission: Mission) -> None:
-        """Whether the robot has what the steps need.
+        """Whether the robot has what the steps need, and its behaviours take their settings.
 
         Raises:
-            NotFoundError: naming every step and part.
+            NotFoundError: what it does not have, naming every step and part.
+            InputError: settings are wrong as well, or they alone.
         """
-        lacking = [
-            f"step {number}: {lack}"
-            for number, step in enumerate(mission.steps, 1)
-            if (lack := self._lacks(step)) is not None
-        ]
-        if lacking:
-            raise NotFoundError("; ".join(lacking))
+        wrong: list[tuple[int, TruckError]] = []
+        for number, step in enumerate(mission.steps, 1):
+            try:
+                self._check_step(step)
+            except TruckError as error:
+                wrong.append((number, error))
+        if wrong:
+            lacks = all(isinstance(error, NotFoundError) for _, error in wrong)
+            raise (NotFoundError if lacks else InputError)("; ".join(f"step {number}: {why}" for number, why in wrong))
 
-    def _lacks(self, step: AnyStep) -> str | None:
+    def _check_step(self, step: AnyStep) -> None:
         if isinstance(step, ExploreStep) and self._parts.explorer is None:
-            return "explore: the robot's configuration has no section `explorer`"
+            raise NotFoundError("explore: the robot's configuration has no section `explorer`")
         looks = isinstance(step, PointStep) or (isinstance(step, ExploreStep) and step.find is not None)
         if looks and self._in.points is None:
-            return f"{step.do}: the robot's configuration has no section `points`"
-        if isinstance(step, BehaviourStepOfMission | FollowWallStep) and step.name not in self._parts.names:
-            known = ", ".join(sorted(self._parts.names)) or "none"
-            return f"no behaviour {step.name!r}: expected one of {known}"
-        return None
+            raise NotFoundError(f"{step.do}: the robot's configuration has no section `points`")
+        if isinstance(step, BehaviourStepOfMission | FollowWallStep):
+            if self._parts.behaviours is None:
+                raise NotFoundError(f"{step.do}: the robot's configuration has no section `behaviours`")
+            self._parts.behaviours.check(step.name, step.settings if isinstance(step, BehaviourStepOfMission) else {})
 
     # Steps
 

@@ -254,6 +254,14 @@ def test_a_run_takes_its_settings_but_no_kind_nor_rate_of_its_own(settings):
     async def scenario(bench):
         with pytest.raises(InputError, match=rf"settings\.{next(iter(settings))}: no setting of a run of wall_pd"):
             bench.start(settings=settings)
+        with pytest.raises(InputError, match=r"no setting of a run of wall_pd"):
+            bench.service.check("wall", settings)
+        bench.mode = GateMode.DISARMED
+        await bench.clock.sleep(0.2)
+        bench.service.check("wall", {"distance": 0.4})
+        assert bench.state.number == 0
+        bench.mode = GateMode.ARMED
+        await bench.clock.sleep(0.2)
         bench.start(settings={"distance": 0.4})
 
     on_bench(scenario)

@@ -14,7 +14,7 @@ from pydantic import ValidationError
 from monstertruck_planners.missions.progress import MissionProgress, SavedProgress, StepEnd, after, in_words, outcome
 from monstertruck_planners.missions.service import SILENT, MissionInputs, MissionParts, MissionService
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
-from monstertruck_runtime.errors import NotFoundError, RequestRefusedError
+from monstertruck_runtime.errors import InputError, NotFoundError, RequestRefusedError
 from monstertruck_runtime.threads import inline
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.mission import Mission
@@ -129,6 +129,12 @@ class Behaviours:
             asyncio.get_running_loop().call_later(1.0, self.say, 1, False, Reason.BEHAVIOUR_DONE)
         return 1
 
+    def check(self, name: str, settings: dict[str, object]) -> None:
+        if name != "wall":
+            raise NotFoundError(f"no behaviour {name!r}: expected one of wall")
+        if wrong := settings.keys() - {"distance"}:
+            raise InputError(f"settings.{min(wrong)}: no setting of a run of wall_pd")
+
     def say(self, number: int, running: bool, reason: Reason, source: str = "missions") -> None:
         now = self._robot.clock.now()
         self._robot.latest["behaviour"] = BehaviourState(
@@ -153,7 +159,7 @@ class Pretended:
         self.latest["gate"] = SimpleNamespace(nonce="n", stamp=0, reasons=(), mode=SimpleNamespace(active=True))
         self.seq, self.placed, self.behaviours = 0, True, Behaviours(self, busy)
         self.service = MissionService(
-            MissionParts(self, self.behaviours, None, frozenset({"wall"})),
+            MissionParts(self, self.behaviours, None),
             clock, file=file, localised=localised, offload=offload, max_age=5.0,
             inputs=MissionInputs(**box), state=SimpleNamespace(next_seq=lambda: 1, put=self.reports.append),
             events=lambda reason, severity, source, text="", **_: self.events.append((reason, text)),
@@ -591,6 +597,25 @@ def test_all_that_the_robot_cannot_do_is_named_before_it_sets_off():
     async def story(robot: Pretended) -> None:
         with pytest.raises(NotFoundError, match=lacks):
             robot.order(MissionOrder.START, GO, {"do": "explore"}, {"do": "behaviour", "name": "left"})
+        assert robot.goals == []
+
+    played(story)
+
+
+def test_settings_that_a_behaviour_does_not_take_are_named_before_it_sets_off():
+    wrong, right = ({"do": "behaviour", "name": "wall", "settings": {key: 0.3}} for key in ("distanse", "distance"))
+
+    async def story(robot: Pretended) -> None:
+        with pytest.raises(InputError, match=r"^step 2: settings\.distanse: no setting of a run of wall_pd$"):
+            robot.order(MissionOrder.START, GO, wrong)
+        with pytest.raises(InputError, match=r"^step 1: settings\.distanse: .*; step 2: no behaviour 'left'"):
+            robot.order(MissionOrder.START, wrong, {"do": "follow_wall", "name": "left", "distance": 1.0})
+        robot.order(MissionOrder.START, right)
+        robot.order(MissionOrder.STOP)
+        await robot.clock.sleep(0.5)
+        robot.service._parts = replace(robot.service._parts, behaviours=None)
+        with pytest.raises(NotFoundError, match=r"^step 1: behaviour: .* section `behaviours`$"):
+            robot.order(MissionOrder.START, right)
         assert robot.goals == []
 
     played(story)
