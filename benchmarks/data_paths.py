@@ -144,7 +144,7 @@ class Trace:
             self._note(above)
 
     def _carry(self, value: Any, depth: int = 3) -> None:
-        if id(value) in self._carriers:
+        if id(value) in self._carriers or (isinstance(value, tuple | bytes) and not value):  # of which there is one
             return
         if isinstance(value, tuple | list):
             parts: Collection[Any] = value

@@ -26,8 +26,7 @@ from monstertruck_planners.local.config import LocalPlannerConfig
 from monstertruck_planners.local.elastic_band import CoveringDiscs, clearance, cover_footprint
 from monstertruck_planners.route.api import RouteMap, Vehicle
 from monstertruck_planners.route.config import HybridConfig
-from monstertruck_planners.route.hybrid import HybridPlanner
-from monstertruck_planners.route.hybrid_search import RESOLUTIONS
+from monstertruck_planners.route.hybrid import RESOLUTIONS, HybridPlanner
 from monstertruck_planners.route.motion import MotionPath, advance
 from monstertruck_planners.route.search import CHECK_MARGIN
 from monstertruck_runtime.errors import InputError

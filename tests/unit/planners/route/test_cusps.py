@@ -10,8 +10,7 @@ from monstertruck_planners.goals.config import PlannerConfig
 from monstertruck_planners.route.api import Budget, RouteMap, Vehicle, check_endpoints
 from monstertruck_planners.route.config import HybridConfig, LatticeConfig
 from monstertruck_planners.route.heuristic import cell_at, cost_to_go
-from monstertruck_planners.route.hybrid import HybridPlanner
-from monstertruck_planners.route.hybrid_search import RESOLUTIONS, SearchProblem, SearchRun
+from monstertruck_planners.route.hybrid import RESOLUTIONS, HybridPlanner, SearchProblem, SearchRun
 from monstertruck_planners.route.lattice import LatticePlanner
 from monstertruck_planners.route.motion import MotionPath
 from monstertruck_planners.route.search import count_cusps

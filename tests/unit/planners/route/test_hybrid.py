@@ -6,8 +6,7 @@ import pytest
 
 from monstertruck_planners.route.api import RouteMap, Vehicle
 from monstertruck_planners.route.config import HybridConfig
-from monstertruck_planners.route.hybrid import HybridPlanner
-from monstertruck_planners.route.hybrid_search import RESOLUTIONS
+from monstertruck_planners.route.hybrid import RESOLUTIONS, HybridPlanner
 from monstertruck_planners.route.motion import MotionPath
 from monstertruck_planners.route.replan import KeepPolicy, ViaPoint, plan_through, remaining_route, replan
 from monstertruck_planners.route.smoothing import current_segments, editable, shortcut

@@ -8,8 +8,7 @@ import pytest
 from monstertruck_planners.collision import DistanceField, Footprint
 from monstertruck_planners.route.config import HybridConfig
 from monstertruck_planners.route.corridors import footprint_fits
-from monstertruck_planners.route.hybrid import HybridPlanner, narrower_configs
-from monstertruck_planners.route.hybrid_search import MAX_TABLE_CELLS, RESOLUTIONS
+from monstertruck_planners.route.hybrid import MAX_TABLE_CELLS, RESOLUTIONS, HybridPlanner, narrower_configs
 from monstertruck_planners.route.replan import ViaPoint, plan_through, replan
 from monstertruck_schemas.reasons import Reason
 from tests.unit.planners.route.route_kit import CAR, TRUCK, assert_drivable, ground
