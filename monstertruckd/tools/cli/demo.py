@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from monstertruck_runtime.clock import Clock
-from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.errors import ConfigError, InputError
 from monstertruck_runtime.small_files import require_place
 from monstertruckd.tools.cli.options import SimulatedOption
 from monstertruckd.tools.cli.output import (
@@ -48,6 +48,11 @@ def demo(
     from monstertruckd.tools.simulation.config import load_simulated
 
     simulated = load_simulated(config)
+    if simulated.path is None:
+        raise ConfigError(
+            f"{config}: path: expected the path to drive, there is none; "
+            f"`monstertruckd simulate --run --config {config}` starts this robot"
+        )
     if film is not None and (not fast or simulated.sim.world.engine != "mujoco" or film.suffix.lower() != ".gif"):
         raise InputError(f"--film {film}: expected --fast, engine mujoco, and a name.gif")
     if film is not None:

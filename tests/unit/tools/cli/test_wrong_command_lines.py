@@ -54,6 +54,11 @@ WRONG = (
     ("set gate.speed nan", 3, "gate.speed nan: expected a finite number"),
     ("set gate.speed -- -inf", 3, "gate.speed -inf: expected a finite number"),
     ("set gate.speed 1e999", 3, "gate.speed 1e999: expected a finite number"),
+    (
+        "demo --fast -c configs/goals.yaml",
+        2,
+        "configs/goals.yaml: path: expected the path to drive, there is none; `mons",
+    ),
     ("demo --seed x", 2, "Error: Invalid value for '--seed': expected a whole number"),
     ("demo --seed -1 --fast -c /nonexistent", 2, "/nonexistent: cannot be read: No such file or directory"),
     (
