@@ -59,7 +59,7 @@ def list_command(
     folder: Annotated[Path, typer.Argument(help="Folder of logs, with all folders in it.")] = Path("logs"),
     json_output: JsonOption = False,
 ) -> None:
-    """The logs of a folder: when, how long, how much, finished or not."""
+    """The logs of a folder, the newest last: when, whose, how long, how much, finished or not."""
     from monstertruckd.tools.logs.summary import LogState, list_logs
 
     logs = list_logs(folder)
@@ -70,10 +70,11 @@ def list_command(
         remark(f"{folder}: no logs")
         return
     print_table(
-        ("begins (UTC)", "seconds", "messages", "MB", "state", "log"),
+        ("begins (UTC)", "robot", "seconds", "messages", "MB", "state", "log"),
         [
             (
                 log.started or "-",
+                log.robot or "-",
                 "-" if log.duration is None else f"{log.duration:.1f}",
                 "-" if log.messages is None else str(log.messages),
                 f"{log.size / 1e6:.2f}",

@@ -3,6 +3,7 @@
 from contextlib import suppress
 from dataclasses import dataclass
 from enum import StrEnum
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +11,10 @@ from mcap.reader import make_reader
 from mcap.records import Attachment, Channel, Message, Metadata, Schema
 
 from monstertruck_runtime.clock import SECOND, is_date
-from monstertruck_runtime.errors import InputError, NotFoundError
+from monstertruck_runtime.errors import ConfigError, InputError, NotFoundError
 from monstertruckd.recorder.reader import DAMAGE, LogReader, index_is_sound, is_finished
 from monstertruckd.recorder.repair import in_use
-from monstertruckd.tools.logs.messages import real_offset, utc
+from monstertruckd.tools.logs.messages import first_offset, real_offset, utc
 
 
 def info(path: str | Path) -> dict[str, Any]:
@@ -94,27 +95,33 @@ class LogSummary:
     size: int
     """Bytes."""
     state: LogState
+    robot: str | None = None
+    """Whose log it is; None if that is not in it."""
     started: str | None = None
-    """UTC; None if the date is unknown, or the log is not finished."""
+    """UTC; None if the date is unknown."""
     duration: float | None = None
     """Seconds; None if the log is not finished."""
     messages: int | None = None
 
 
 def list_logs(folder: Path) -> list[LogSummary]:
-    """All logs in ``folder`` and below, by name; one that is removed meanwhile is none.
+    """All logs in ``folder`` and below, the newest last; one that is removed meanwhile is none.
+
+    They are sorted by their begin, or by the file's last change where that is not known.
 
     Raises:
         NotFoundError: no such folder.
     """
     if not folder.is_dir():
         raise NotFoundError(f"{folder}: no such folder")
-    found = []
+    found: list[tuple[str, LogSummary]] = []
     for path in sorted(folder.rglob("*.mcap")):
         if path.is_file():
             with suppress(FileNotFoundError, NotFoundError):
-                found.append(_summary_of(path))
-    return found
+                changed = utc(path.stat().st_mtime_ns)
+                log = _summary_of(path)
+                found.append((log.started or changed, log))
+    return [log for _, log in sorted(found, key=itemgetter(0))]
 
 
 def _summary_of(path: Path) -> LogSummary:
@@ -123,28 +130,50 @@ def _summary_of(path: Path) -> LogSummary:
         reader = LogReader(path)
     except InputError:
         return LogSummary(path, size, LogState.UNREADABLE)
+    robot = _robot(reader)
     if not is_finished(path):
-        return LogSummary(path, size, LogState.WRITING if in_use(path) else LogState.UNFINISHED)
+        state = LogState.WRITING if in_use(path) else LogState.UNFINISHED
+        return LogSummary(path, size, state, robot, _first_date(reader))
     try:
         with path.open("rb") as file:
             if not index_is_sound(file):
-                return LogSummary(path, size, LogState.DAMAGED)
+                return LogSummary(path, size, LogState.DAMAGED, robot, _first_date(reader))
             file.seek(0)
             summary = make_reader(file).get_summary()
         statistics = None if summary is None else summary.statistics
         if statistics is None:
-            return LogSummary(path, size, LogState.FINISHED)
+            return LogSummary(path, size, LogState.FINISHED, robot)
         real = statistics.message_start_time + _offset(reader)
     except DAMAGE:
-        return LogSummary(path, size, LogState.DAMAGED)
+        return LogSummary(path, size, LogState.DAMAGED, robot, _first_date(reader))
     return LogSummary(
         path,
         size,
         LogState.FINISHED,
+        robot,
         started=utc(real) if is_date(real) else None,
         duration=(statistics.message_end_time - statistics.message_start_time) / SECOND,
         messages=statistics.message_count,
     )
+
+
+def _robot(reader: LogReader) -> str | None:
+    """Its name in the attached configuration."""
+    with suppress(ConfigError, InputError):
+        name = reader.config().get("robot")
+        return name if isinstance(name, str) else None
+    return None
+
+
+def _first_date(reader: LogReader) -> str | None:
+    """UTC of the first message of a log without an index, by what its run knew of the date when it began."""
+    first = next(iter(reader), None)
+    if first is None:
+        return None
+    with suppress(InputError):
+        real = first.log_time + first_offset(reader.path, reader.metadata().get("run", {}))
+        return utc(real) if is_date(real) else None
+    return None
 
 
 def _offset(reader: LogReader) -> int:

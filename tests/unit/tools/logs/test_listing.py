@@ -2,6 +2,7 @@
 
 import fcntl
 import json
+import os
 import sys
 from pathlib import Path
 
@@ -24,7 +25,7 @@ def folder(tmp_path: Path) -> Path:
     """A finished log with and one without a date, one broken off, and no log at all."""
     (tmp_path / "box").mkdir()
     for name, dated in (("run-1.mcap", True), ("box/run-2.mcap", False)):
-        writer = Writer(tmp_path / name)
+        writer = Writer(tmp_path / name, **({"config": {"robot": "lorry"}} if dated else {}))
         for number in range(4):
             writer.put(GATE, gate((1 + number) * SECOND, number))
         if dated:
@@ -32,13 +33,16 @@ def folder(tmp_path: Path) -> Path:
         writer.log.finish()
     (tmp_path / "run-3.mcap").write_bytes((tmp_path / "run-1.mcap").read_bytes()[:-20])
     (tmp_path / "run-4.mcap").write_bytes(b"no log, but the end \x89MCAP0\r\n")
+    for number, name in enumerate(("run-1.mcap", "run-4.mcap", "run-3.mcap", "box/run-2.mcap"), start=20_000):
+        os.utime(tmp_path / name, (number * 86_400,) * 2)  # 2024: before the date in the first one
     return tmp_path
 
 
-def test_every_log_says_when_how_long_and_how_much(folder: Path):
-    undated, dated, broken, foreign = list_logs(folder)
+def test_every_log_says_when_whose_how_long_and_how_much_and_the_newest_is_last(folder: Path):
+    foreign, broken, undated, dated = list_logs(folder)
     size = (folder / "run-1.mcap").stat().st_size
-    assert dated == LogSummary(folder / "run-1.mcap", size, LogState.FINISHED, "2026-05-01 01:46:41", 3.0, 5)
+    assert dated == LogSummary(folder / "run-1.mcap", size, LogState.FINISHED, "lorry", "2026-05-01 01:46:41", 3.0, 5)
+    assert (broken.path.name, broken.robot, undated.robot) == ("run-3.mcap", "lorry", None)
     assert (undated.path.name, undated.started, undated.messages) == ("run-2.mcap", None, 4)
     assert (broken.state, broken.messages, broken.duration) == (LogState.UNFINISHED, None, None)
     assert foreign.state is LogState.UNREADABLE
@@ -47,8 +51,20 @@ def test_every_log_says_when_how_long_and_how_much(folder: Path):
 def test_a_log_being_written_is_distinguished_from_one_broken_off(folder: Path):
     with (folder / "run-3.mcap").open("rb") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
-        assert list_logs(folder)[2].state is LogState.WRITING
-    assert list_logs(folder)[2].state is LogState.UNFINISHED
+        assert list_logs(folder)[1].state is LogState.WRITING
+    assert list_logs(folder)[1].state is LogState.UNFINISHED
+
+
+def test_a_log_without_its_end_has_its_date_from_its_beginning(tmp_path: Path):
+    whole = tmp_path / "run-1.mcap"
+    writer = Writer(whole, {"real_offset_ns": str(MAY_2026)})
+    for number in range(4):
+        writer.put(GATE, gate((1 + number) * SECOND, number))
+    writer.log.finish()
+    broken = tmp_path / "run-2.mcap"
+    broken.write_bytes(whole.read_bytes()[:-20])
+    (tmp_path / "run-3.mcap").write_bytes(whole.read_bytes()[:300])
+    assert [log.started for log in list_logs(tmp_path)] == ["2026-05-01 01:46:41"] * 2 + [None]
 
 
 def test_no_damage_of_one_log_hides_the_others(folder: Path):
@@ -70,7 +86,7 @@ def test_what_dates_a_log_may_be_damaged_or_a_name_lead_nowhere(folder: Path):
     undated = folder / "box/run-2.mcap"
     undated.write_bytes(undated.read_bytes().replace(number + b"5", number + b"u"))
     (folder / "gone.mcap").symlink_to(folder / "nothing")
-    assert [log.state for log in list_logs(folder)] == ["finished", "finished", "unfinished", "unreadable"]
+    assert [log.state for log in list_logs(folder)] == ["unreadable", "unfinished", "finished", "finished"]
 
 
 def test_a_log_that_goes_meanwhile_does_not_hide_the_others(folder: Path, monkeypatch: pytest.MonkeyPatch):
@@ -82,7 +98,7 @@ def test_a_log_that_goes_meanwhile_does_not_hide_the_others(folder: Path, monkey
         return real(path)
 
     monkeypatch.setattr(summary, "is_finished", gone)
-    assert [log.path.name for log in list_logs(folder)] == ["run-2.mcap", "run-3.mcap", "run-4.mcap"]
+    assert [log.path.name for log in list_logs(folder)] == ["run-4.mcap", "run-3.mcap", "run-2.mcap"]
 
 
 def test_no_folder_is_not_no_logs(tmp_path: Path):
@@ -101,14 +117,14 @@ def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
 def test_the_commands(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
     assert run(monkeypatch, "list", str(folder)) == 0
     out, err = capsys.readouterr()
-    assert out.splitlines()[2].split() == [
-        "2026-05-01", "01:46:41", "3.0", "5", "0.01", "finished", str(folder / "run-1.mcap")
+    assert out.splitlines()[-1].split() == [
+        "2026-05-01", "01:46:41", "lorry", "3.0", "5", "0.01", "finished", str(folder / "run-1.mcap")
     ]  # fmt: skip
     assert "log recover FILE" in err
     assert run(monkeypatch, "recover", str(folder / "run-3.mcap"), "--json") == 0
     assert json.loads(capsys.readouterr().out)["messages"] == 5
     assert run(monkeypatch, "list", str(folder), "--json") == 0
-    assert [row["state"] for row in json.loads(capsys.readouterr().out)] == ["finished"] * 3 + ["unreadable"]
+    assert [row["state"] for row in json.loads(capsys.readouterr().out)] == ["unreadable"] + ["finished"] * 3
     assert run(monkeypatch, "info", str(folder / "run-3.mcap")) == 0
     assert capsys.readouterr().out.splitlines()[1].split() == ["topic", "schema", "messages", "Hz", "kB", "unpacked"]
     (folder / "none").mkdir()
