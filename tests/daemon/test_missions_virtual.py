@@ -44,7 +44,7 @@ def test_a_mission_is_driven_and_followed():
 
     async def story(trip: Trip) -> None:
         client = MissionOperator(trip.rig.daemon, trip.clock)
-        with pytest.raises(InputError, match="^step 2: .*this body cannot move sideways"):
+        with pytest.raises(InputError, match=r"^step 2: .*this body cannot move sideways"):
             await run_mission(client, wrong, arm=True)
         with trip.rig.bus.subscribe(topics.MISSION, fifo(4096)) as states:
             ends.append(await run_mission(client, mission, arm=True, report=lines.append))
