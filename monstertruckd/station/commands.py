@@ -118,6 +118,8 @@ class DoMission(_Command):
     order: MissionOrder
     text: Annotated[str, Field(max_length=MOST_BYTES)] = ""
     """Of a start: the mission's file, YAML."""
+    moved: bool = False
+    """Of a resume: the robot is not where the mission was interrupted, and its pose is right."""
 
 
 class Track(_Command):

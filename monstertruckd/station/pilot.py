@@ -249,7 +249,7 @@ async def _mission(client: TruckClient, command: DoMission) -> dict[str, Any]:
     mission = None
     if command.order is MissionOrder.START:
         mission = await in_thread(lambda: read_mission(command.text))
-    return await client.mission(command.order, mission)
+    return await client.mission(command.order, mission, moved=command.moved)
 
 
 def read_mission(text: str) -> Mission:

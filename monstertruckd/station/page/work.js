@@ -33,7 +33,8 @@ export class Work {
     byId("explore-stop").onclick = () => this.ask("task.explore", { do: "explore", order: "stop" });
     byId("mission-start").onclick = () => byId("mission-file").click();
     byId("mission-file").onchange = () => this.startMission();
-    byId("mission-resume").onclick = () => this.ask("task.mission", { do: "mission", order: "resume" });
+    byId("mission-resume").onclick = () => this.resumeMission();
+    byId("mission-moved").onclick = () => this.resumeMission({ moved: true });
     byId("mission-stop").onclick = () => this.ask("task.mission", { do: "mission", order: "stop" });
   }
 
@@ -42,6 +43,7 @@ export class Work {
   }
 
   clear() {
+    this.elsewhere = false;
     byId("settings").replaceChildren();
     byId("recordings").replaceChildren();
     if (!byId("pane-settings").hidden) this.loadSettings();
@@ -69,9 +71,10 @@ export class Work {
     byId("task-mission").hidden = !facts?.goals;
     byId("mission-start").hidden = mission?.running || observer;
     byId("mission-stop").hidden = !mission?.running || observer;
-    byId("mission-resume").hidden = !mission?.resumable || mission?.running || observer;
+    byId("mission-resume").hidden = !mission?.resumable || observer;
+    byId("mission-moved").hidden = !this.elsewhere || !mission?.resumable || observer;
     text("mission-state", mission?.running ? words("task.mission.state", { name: mission.name, step: mission.step, steps: mission.steps, doing: mission.doing })
-      : mission?.number ? mission.text || reason(mission.outcome) : words("task.none"));
+      : mission?.number || mission?.resumable ? mission.text || reason(mission.outcome) : words("task.none"));
     const names = facts?.behaviours ?? [];
     byId("task-behaviours").hidden = !names.length;
     const key = `${names.join()}|${behaviour?.running ? behaviour.behaviour : ""}|${observer}`;
@@ -92,6 +95,12 @@ export class Work {
     const [file] = byId("mission-file").files;
     byId("mission-file").value = "";
     if (file) this.ask("task.mission", { do: "mission", order: "start", text: await file.text() });
+  }
+
+  async resumeMission(more = {}) {
+    const answer = await this.ask("task.mission", { do: "mission", order: "resume", ...more });
+    this.elsewhere = answer.reason === "pose_lost"; // the robot is not where it was interrupted
+    this.showTasks();
   }
 
   // Settings

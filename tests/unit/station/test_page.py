@@ -170,6 +170,28 @@ async def a_stop_is_shown_with_its_chain_of_causes(page: Page) -> None:
     assert "lidar: <b>unplugged</b>" in shown, "as text, whatever a device says"
 
 
+async def a_mission_of_a_robot_that_was_moved_goes_on_once_that_is_said(page: Page) -> None:
+    async def press(button: str, **answer: Any) -> dict[str, Any]:
+        await page.evaluate("void (window.sent = [])")
+        await page.click(button)
+        (asked,) = await page.evaluate("window.sent.filter((each) => each.do === 'mission')")
+        await say(page, {"kind": "answer", "id": asked.pop("id"), **answer})
+        return asked
+
+    stopped = {"number": 0, "running": False, "resumable": True, "name": "round", "text": "interrupted at step 2"}
+    await say(page, FACTS | {"goals": True}, {"kind": "mission", "m": stopped})
+    await page.click("#tab-tasks")
+    assert await page.inner_text("#mission-state") == "interrupted at step 2"
+    assert not await page.is_visible("#mission-moved"), "unless the robot asks"
+    refused = {"ok": False, "reason": "pose_lost", "text": "its pose is 3.0 m from where round was interrupted"}
+    assert await press("#mission-resume", **refused) == {"do": "mission", "order": "resume"}
+    assert "3.0 m from where" in await page.inner_text("#refusal")
+    assert await press("#mission-moved", ok=True) == {"do": "mission", "order": "resume", "moved": True}
+    assert not await page.is_visible("#mission-moved")
+    await say(page, {"kind": "mission", "m": stopped | {"number": 1, "running": True, "resumable": False}})
+    assert not await page.is_visible("#mission-resume")
+
+
 async def test_the_page_drives_as_the_hand_does_and_shows_what_is_true(tmp_path: Path):
     """All in one browser, for it takes seconds to start."""
     async with serving() as (station, _), chromium(tmp_path) as browser:
@@ -188,4 +210,5 @@ async def test_the_page_drives_as_the_hand_does_and_shows_what_is_true(tmp_path:
         await parts_of_the_map_outlive_the_whole_map_that_they_belong_to(page)
         await a_robot_without_a_map_is_called_so(page)
         await a_stop_is_shown_with_its_chain_of_causes(page)
+        await a_mission_of_a_robot_that_was_moved_goes_on_once_that_is_said(page)
         assert errors == []

@@ -73,6 +73,21 @@ async def test_a_path_that_is_refused_by_the_station_is_answered():
     assert (answer["kind"], answer["id"], answer["ok"]) == ("answer", 7, False)
 
 
+async def test_a_mission_is_resumed_as_the_page_says():
+    class Truck:
+        async def mission(self, order, mission=None, *, moved=False):
+            asked.append((order, mission, moved))
+            return {"number": 1}
+
+    viewer, asked = Viewer(), []
+    pilot = Pilot(RobotAddress("truck", "tcp/127.0.0.1:1"), "page", viewer, WallClock())
+    pilot._client = Truck()
+    for more in ({}, {"moved": True}):
+        pilot.ask(commands.parse(json.dumps({"do": "mission", "id": 7, "order": "resume", **more})))
+        await shown(viewer)
+    assert asked == [("resume", None, False), ("resume", None, True)]
+
+
 def test_a_mission_is_read_and_a_wrong_one_refused_by_field():
     mission = read_mission("version: 2\nname: round\nsteps:\n  - {do: goto, x: 1, y: 2, yaw: 0}\n")
     assert mission.steps[0].x == 1.0
