@@ -246,6 +246,7 @@ def _build_explorer(
         slam=bus.subscribe(topics.SLAM, latest()),
         battery=bus.subscribe(topics.BATTERY, latest()),
         events=bus.subscribe(topics.EVENT, fifo(256)),
+        health=bus.subscribe(topics.HEALTH, latest()),
         points=None if config.points is None or camera is None else bus.subscribe(topics.POINTS, latest()),
     )
     return ExplorerService(

@@ -8,6 +8,8 @@ import pytest
 from scipy.ndimage import distance_transform_edt
 
 from monstertruck_estimation.slam.storage import load
+from monstertruck_planners.goals.service import GoalService
+from monstertruck_planners.track.service import TrackingStep
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.errors import RequestRefusedError
 from monstertruck_runtime.mailbox import fifo
@@ -142,6 +144,37 @@ def test_it_stops_on_request_and_gives_way_to_other_goals(budget: float | None, 
     assert "goal of operator" in ends[1].text
     assert not truth[:, 5].any()
     assert ends[0].phase is ExplorationPhase.IDLE
+
+
+@pytest.mark.parametrize(
+    ("name", "work"),
+    [
+        ("goals", (GoalService, "_tick")),
+        pytest.param("tracker", (TrackingStep, "_choose_path"), marks=pytest.mark.long),
+    ],
+)
+def test_a_service_that_dies_by_a_bug_ends_it_with_its_name_and_a_saved_map(
+    name: str, work: tuple[type, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    ends = []
+
+    def bug(*_: object, **__: object) -> None:
+        raise RuntimeError("a bug")
+
+    async def scenario(truck: ExploringTruck) -> None:
+        await truck.operator.arm()
+        await truck.order(ExploreOrder.START, budget=600.0)
+        await truck.clock.sleep(5.0)
+        monkeypatch.setattr(*work, bug)
+        ends.append(await truck.end(20.0))
+        await truck.clock.sleep(1.0)
+
+    _, truth = run_scenario(scenario, tmp_path)
+    (state,) = ends
+    assert (state.outcome, state.phase) == (Reason.SERVICE_FAILED, ExplorationPhase.IDLE)
+    assert state.text.startswith(f"{name}: ")
+    assert load(tmp_path / "map").grid.cells.any()
+    assert truth[-1, 1:3] == pytest.approx(truth[-20, 1:3], abs=1e-3), "it stands"
 
 
 def doubled(folder: Path) -> float:

@@ -166,6 +166,8 @@ class Observed:
     """Where the map was saved after that was requested; empty = nowhere."""
     save_failure: str = ""
     """Why it was saved nowhere."""
+    failed: str = ""
+    """Which service failed for good and why, where the robot cannot drive to goals without it."""
     found: int = 0
     """Points of interest that are known."""
 
@@ -278,6 +280,8 @@ def tick(run: Exploration, seen: Observed, config: ExplorerConfig) -> Step:
         return _end(run, Reason.CANCELLED, f"the goal of {seen.displaced} is pursued now", Save())
     if seen.critical:
         return _end(run, Reason.BATTERY_CRITICAL, "it stands where it is", Cancel(), Save())
+    if seen.failed:
+        return _end(run, Reason.SERVICE_FAILED, seen.failed, Cancel(), Save())
     if run.phase is ExplorationPhase.LOST:
         return _lost(run, seen, config)
     if seen.pose is None:

@@ -4,6 +4,7 @@ import asyncio
 import math
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, Final, Protocol
 
@@ -19,7 +20,7 @@ from monstertruck_runtime.ports import EventSink, Publisher, Ready, RpcRegistry,
 from monstertruck_runtime.requests import Sequences, does_not_drive, inner_request, parse_request, refusal
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.event import Event, Severity
-from monstertruck_schemas.health import LocalisationStatus, SlamHealth
+from monstertruck_schemas.health import HealthTable, LocalisationStatus, ServiceState, SlamHealth
 from monstertruck_schemas.plan import ExplorationPhase, ExplorationState, GoalPhase, GoalState
 from monstertruck_schemas.points import PointKind, PointsOfInterest
 from monstertruck_schemas.reasons import Reason
@@ -73,6 +74,7 @@ class ExplorerInputs:
     slam: Subscription[SlamHealth]
     battery: Subscription[Battery]
     events: Mailbox[Event]
+    health: Subscription[HealthTable]
     points: Subscription[PointsOfInterest] | None = None
 
 
@@ -252,8 +254,17 @@ class ExplorerService:
             critical=battery is not None and fresh and battery.level is BatteryLevel.CRITICAL,
             saved=saved,
             save_failure=save_failure,
+            failed=self._failed(),
             found=self._found(),
         )
+
+    def _failed(self) -> str:
+        """Which service failed for good and why: that of the goals, or any for which the gate lets nobody drive."""
+        table, gate = self._in.health.latest, self._in.gate.latest
+        blocked = gate is not None and Reason.SERVICE_FAILED in gate.reasons
+        failed = () if table is None else [row for row in table.services if row.state is ServiceState.FAILED]
+        names = [f"{row.name}: {row.detail}" for row in failed if blocked or row.name == ServiceName.GOALS]
+        return "; ".join(names)
 
     def _found(self) -> int:
         """Tags that are known."""
@@ -364,7 +375,8 @@ class ExplorerService:
             self._goal = None
             return
         self._goal = None
-        self._goals.control(GoalControl(**self._header(), order=GoalOrder.CANCEL, own=True))
+        with suppress(RequestRefusedError):  # it has ended, or is somebody else's, since that was published
+            self._goals.control(GoalControl(**self._header(), order=GoalOrder.CANCEL, own=True))
 
     def _report(self, now: int) -> None:
         state = state_of(self._run, self._config.kind, now)

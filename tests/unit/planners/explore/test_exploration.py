@@ -219,6 +219,22 @@ def test_a_battery_that_may_give_out_any_moment_has_the_map_saved_at_once():
     assert stepped.saved().outcome is Reason.BATTERY_CRITICAL
 
 
+@pytest.mark.parametrize("phase", [Phase.LOOKING, Phase.DRIVING, Phase.LOST, Phase.RETURNING])
+def test_where_a_service_failed_it_ends_where_it_stands_and_saves_the_map(phase: Phase):
+    stepped = SteppedExploration()
+    if phase is not Phase.LOOKING:
+        stepped.drive()
+    if phase is Phase.LOST:
+        stepped.pose = None
+        stepped.step()
+    elif phase is Phase.RETURNING:
+        stepped.step(low=True)
+    stepped.step(failed="goals: a bug")
+    assert stepped.actions == (Cancel(), Save())
+    run = stepped.saved()
+    assert (run.outcome, run.text) == (Reason.SERVICE_FAILED, "goals: a bug; map in somewhere")
+
+
 @pytest.mark.parametrize("reason", [Reason.DISARMED, Reason.BUSY])
 def test_where_no_place_helps_it_ends_where_it_stands(reason: Reason):
     stepped = SteppedExploration()

@@ -17,6 +17,7 @@ from monstertruck_runtime.mailbox import Mailbox, fifo
 from monstertruck_runtime.requests import inner_request
 from monstertruck_schemas.base import Message, Pose2D, Twist2D
 from monstertruck_schemas.event import Event, Severity
+from monstertruck_schemas.health import ServiceHealth, ServiceState
 from monstertruck_schemas.plan import GoalPhase, GoalState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import ExploreOrder, ExploreRequest
@@ -101,6 +102,40 @@ def test_a_map_that_could_not_be_saved_is_not_waited_for():
     assert service._saved() == ("no space left", "")
 
 
+def test_it_is_told_of_failed_services_without_which_it_cannot_drive():
+    service = ExplorerService.__new__(ExplorerService)
+    rows = [
+        ServiceHealth(name=name, state=state, since=0, detail=f"{name} fell")
+        for name, state in (
+            ("goals", ServiceState.READY),
+            ("camera", ServiceState.FAILED),
+            ("tracker", ServiceState.BACKOFF),
+        )
+    ]
+    gate = SimpleNamespace(reasons=())
+    service._in = SimpleNamespace(
+        health=SimpleNamespace(latest=SimpleNamespace(services=rows)), gate=SimpleNamespace(latest=gate)
+    )
+    assert service._failed() == "", "the gate lets it drive without a camera"
+    gate.reasons = (Reason.SERVICE_FAILED,)
+    assert service._failed() == "camera: camera fell"
+    gate.reasons, rows[0] = (), rows[0].model_copy(update={"state": ServiceState.FAILED})
+    assert service._failed() == "goals: goals fell", "whether the gate lets it drive or not"
+
+
+def test_a_goal_that_has_ended_since_the_newest_report_is_not_cancelled_once_more():
+    def control(_: object) -> None:
+        raise RequestRefusedError(Reason.NOT_FOUND, "cancel: no goal is being pursued")
+
+    service = ExplorerService.__new__(ExplorerService)
+    goal = GoalState(stamp=0, received=0, seq=0, frame="map", number=3, source="explorer", phase=GoalPhase.DRIVING)
+    service._in = SimpleNamespace(goal=SimpleNamespace(latest=goal), gate=SimpleNamespace(latest=None))
+    service._seq, service._goal, service._clock = 0, 3, SimpleNamespace(now=lambda: 0)
+    service._goals = SimpleNamespace(control=control)
+    service._cancel()
+    assert service._goal is None
+
+
 def test_who_stops_only_its_own_stops_nobody_elses(monkeypatch: pytest.MonkeyPatch):
     service, ended = ExplorerService.__new__(ExplorerService), []
     monkeypatch.setattr("monstertruck_planners.explore.service.refusal", lambda *_: Reason.OK)
@@ -142,7 +177,7 @@ def test_the_answer_to_a_question_of_the_exploration_before_is_none():
             None, max_age=1.0,
             inputs=ExplorerInputs(
                 gate=Live(gate, clock), pose=Live(pose, clock), goal=none, grid=none, tiles=Mailbox(fifo(8)),
-                slam=none, battery=none, events=Mailbox(fifo(8)),
+                slam=none, battery=none, events=Mailbox(fifo(8)), health=none,
             ),
             state=newest(next_seq=lambda: 0, put=lambda _: None),
             events=lambda *_, **__: None,
