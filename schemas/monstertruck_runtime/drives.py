@@ -11,12 +11,13 @@ from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError, Truc
 from monstertruck_runtime.mailbox import Mailbox, fifo, latest
 from monstertruck_runtime.presence import while_it_runs
 from monstertruck_runtime.requests import Operator
+from monstertruck_runtime.standing import Standing, standing
 from monstertruck_schemas.event import Event, Severity
 from monstertruck_schemas.plan import GoalPhase, GoalState, Path, TrackerState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import GoalOrder
 from monstertruck_schemas.state import GateState
-from monstertruck_schemas.topics import EVENT, GATE, GOAL, PATH, TRACKER
+from monstertruck_schemas.topics import EVENT, GOAL, PATH, TRACKER
 
 LOOK: Final = 0.5
 """Half the period of reports why the truck stands, s."""
@@ -55,8 +56,8 @@ class DriveReport:
     def under_way(self, what: str, share: float) -> None:
         """Driven so far, 0..1."""
 
-    def stands(self, gate: GateState) -> None:
-        """The truck stands, for a reason that was not said since it does."""
+    def stands(self, gate: GateState, why: str) -> None:
+        """The truck stands, for a reason that was not said since it does; ``why`` words all of them."""
 
 
 SILENT: Final = DriveReport()
@@ -95,7 +96,7 @@ async def drive_to(
         RequestRefusedError: the goal or the arming was refused, or the robot restarted.
         NoAnswerError: the robot does not answer, or has been silent for a minute.
     """
-    with driver.subscribe(GOAL, fifo(256)) as states, driver.subscribe(GATE, latest()) as gate:
+    with driver.subscribe(GOAL, fifo(256)) as states, standing(driver) as stand:
 
         async def cancel() -> None:
             await driver.goal_control(GoalOrder.CANCEL, own=True)
@@ -103,7 +104,7 @@ async def drive_to(
         async with _taken_back(cancel):
             number = await _taken_on(driver, clock, goal, via, report)
         end = _goal_end(states, number, report)
-        return await _watched(driver, clock, gate, arm=arm, end=end, undo=cancel, report=report)
+        return await _watched(driver, clock, stand, arm=arm, end=end, undo=cancel, report=report)
 
 
 async def _taken_on(
@@ -167,19 +168,19 @@ async def follow(driver: Driver, clock: Clock, path: Path, *, arm: bool, report:
     path = path.model_copy(update={"name": f"{path.name[:96]}-{clock.now():x}"})
     with (
         driver.subscribe(TRACKER, fifo(256)) as states,
-        driver.subscribe(GATE, latest()) as gate,
+        standing(driver) as stand,
         driver.subscribe(EVENT, fifo(256)) as events,
         driver.subscribe(PATH, latest()) as present,
     ):
         with suppress(TimeoutError):
             async with clock.deadline(STAND_TIMEOUT):
-                while (await gate.next()).mode.moving:
+                while (await stand.gate.next()).mode.moving:
                     pass
         async with _taken_back(driver.stop):
             await driver.path(path)
             await _accepted(driver, clock, events, present, path.name)
         end = _path_end(clock, states, path.name, report)
-        return await _watched(driver, clock, gate, arm=arm, end=end, undo=driver.stop, report=report)
+        return await _watched(driver, clock, stand, arm=arm, end=end, undo=driver.stop, report=report)
 
 
 async def _accepted(driver: Driver, clock: Clock, events: Mailbox[Event], present: Mailbox[Path], name: str) -> None:
@@ -209,7 +210,7 @@ async def _path_end(clock: Clock, states: Mailbox[TrackerState], name: str, repo
 async def _watched(
     driver: Driver,
     clock: Clock,
-    gate: Mailbox[GateState],
+    stand: Standing,
     *,
     arm: bool,
     end: Awaitable[Arrival],
@@ -217,10 +218,10 @@ async def _watched(
     report: DriveReport,
 ) -> Arrival:
     """Wait for the end and report why the truck stands meanwhile; ``undo`` if cancelled or refused."""
-    watching = asyncio.create_task(_say_why_it_stands(gate, clock, report))
+    watching = asyncio.create_task(_say_why_it_stands(stand, clock, report))
     ending = asyncio.ensure_future(while_it_runs(driver, end))
     try:
-        if arm and not ((state := gate.latest) is not None and state.mode.active):
+        if arm and not ((state := stand.gate.latest) is not None and state.mode.active):
             # A truck that is armed already may have set off.
             try:
                 async with _taken_back(driver.disarm):
@@ -240,13 +241,13 @@ async def _watched(
         ending.cancel()
 
 
-async def _say_why_it_stands(gate: Mailbox[GateState], clock: Clock, report: DriveReport) -> None:
+async def _say_why_it_stands(stand: Standing, clock: Clock, report: DriveReport) -> None:
     said: set[str] = set()  # what is stale comes and goes while it stands
     while True:
         await clock.sleep(2 * LOOK)
-        state = gate.latest
-        if state is None or state.mode.active:
+        why, state = stand.why(), stand.gate.latest
+        if not why or state is None:
             said.clear()
         elif new := set[str](state.reasons or (state.mode,)) - said:
             said |= new
-            report.stands(state)
+            report.stands(state, why)

@@ -179,6 +179,10 @@ class ExplorationState(Message):
     """Places it set off for."""
     failures: Annotated[int, Field(ge=0)] = 0
     """Number of these whose place was not reached."""
+    find: Annotated[int, Field(ge=1)] | None = None
+    """Tags that are looked for; None = it only explores."""
+    found: Annotated[int, Field(ge=0)] = 0
+    """Tags in the map."""
 
     @property
     def running(self) -> bool:

@@ -30,9 +30,9 @@ class TerminalReport(DriveReport):
             self._show = self._shown.enter_context(progress(what, 1.0))
         self._show(share)
 
-    def stands(self, gate: GateState) -> None:
+    def stands(self, gate: GateState, why: str) -> None:
         """Say it."""
-        remark(f"waiting: {with_remedy(gate.worst, gate.why)}")
+        remark(f"waiting: {with_remedy(gate.worst, why)}")
 
 
 @contextmanager

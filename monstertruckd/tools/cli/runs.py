@@ -1,20 +1,21 @@
 """A behaviour, an exploration or a mission from its start to its end, as a client of the robot."""
 
+import asyncio
 from collections.abc import Awaitable, Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Final, Protocol, TypeVar
 
 from monstertruck_runtime.errors import NoAnswerError, TruckError
-from monstertruck_runtime.mailbox import Mailbox, fifo, latest
+from monstertruck_runtime.mailbox import Mailbox, fifo
 from monstertruck_runtime.presence import while_it_runs
 from monstertruck_runtime.requests import Operator
+from monstertruck_runtime.standing import Standing, standing
 from monstertruck_schemas.mission import Mission
 from monstertruck_schemas.plan import BehaviourState, ExplorationPhase, ExplorationState, MissionState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import BehaviourOrder, ExploreOrder, MissionOrder
-from monstertruck_schemas.state import GateState
-from monstertruck_schemas.topics import BEHAVIOUR, EXPLORE, GATE, MISSION, Topic
+from monstertruck_schemas.topics import BEHAVIOUR, EXPLORE, MISSION, Topic
 from monstertruckd.tools.cli.output import progress, with_remedy
 
 EVERY: Final = 5.0
@@ -105,27 +106,32 @@ async def run_exploration(
     arm: bool,
     report: Report | None = None,
 ) -> RunEnd:
-    """Start an exploration and wait for its end, see ``_run``; its arguments are those of ``TruckClient.explore``."""
-    shown: tuple[Any, ...] = ()
+    """Start an exploration and wait for its end, see ``_run``; its arguments are those of ``TruckClient.explore``.
+
+    Cancelled, it waits until the map is saved, and its end says where.
+    """
+    shown: tuple[Any, ...] | None = None
     due = 0.0
 
     def show(state: ExplorationState) -> None:
         nonlocal shown, due
-        stands = _why_it_stands(gate)
-        now = state.phase, state.goals, bool(stands), state.text  # what is stale comes and goes while it stands
+        stands = _why_it_stands(stand)
+        found = 0 if state.find is None else state.found
+        now = () if stands else (state.phase, state.goals, found, state.text)  # these come and go while it stands
         if report is not None and (now != shown or state.elapsed >= due):
             shown, due = now, state.elapsed + EVERY
             report(progress_line(state, stands))
 
-    with client.subscribe(GATE, latest()) as gate:
+    with standing(client) as stand:
         return await _run(
             client,
             EXPLORE,
             lambda: client.explore(ExploreOrder.START, home=home, budget=budget, find=find),
             lambda: client.explore(ExploreOrder.STOP, own=True),
             show,
-            ("elapsed", "travelled", "known", "goals"),
+            ("elapsed", "travelled", "known", "goals", "found"),
             arm=arm,
+            to_its_end=True,
         )
 
 
@@ -156,7 +162,7 @@ async def run_mission(
         if before is None or (state.step, state.attempt, state.doing) != (before.step, before.attempt, before.doing):
             again = f", attempt {state.attempt}" if state.attempt > 1 else ""
             lines.append(f"step {state.step} of {state.steps}: {state.doing}{again}")
-        stands = _why_it_stands(gate)
+        stands = _why_it_stands(stand)
         trouble = "stands" if stands else state.text  # what is stale comes and goes while it stands
         if trouble and trouble != said:
             lines.append(f"it stands: {stands}" if stands else f"it waits: {state.text}")
@@ -164,7 +170,7 @@ async def run_mission(
         for line in lines:
             report(f"{state.elapsed:6.0f} s  {line}")
 
-    with client.subscribe(GATE, latest()) as gate:
+    with standing(client) as stand:
         return await _run(
             client,
             MISSION,
@@ -182,10 +188,10 @@ def _failed(before: MissionState, state: MissionState) -> list[str]:
     return [f"it failed: {state.failed}"] if again or state.failures > before.failures else []
 
 
-def _why_it_stands(gate: Mailbox[GateState]) -> str:
+def _why_it_stands(stand: Standing) -> str:
     """Why the gate lets the robot not drive, and the command that helps; nothing where it does."""
-    held = gate.latest
-    return "" if held is None or held.mode.active else with_remedy(held.worst, held.why)
+    why, held = stand.why(), stand.gate.latest
+    return with_remedy(held.worst, why) if why and held is not None else ""
 
 
 async def _run(
@@ -197,8 +203,11 @@ async def _run(
     figures: tuple[str, ...],
     *,
     arm: bool,
+    to_its_end: bool = False,
 ) -> RunEnd:
     """Start a run and wait for its end; cancelled or without an answer, it is stopped, but nobody else's.
+
+    With ``to_its_end`` one that is cancelled ends as any other does, once the robot has stopped it.
 
     Raises:
         RequestRefusedError: the start or the arming was refused, or the robot restarted.
@@ -207,6 +216,7 @@ async def _run(
     with client.subscribe(topic, fifo(256)) as states:
         if arm:
             await client.arm()
+        number: int | None = None
         try:
             number = int((await start())["number"])
             return await while_it_runs(client, _followed(states, number, show, figures))
@@ -214,6 +224,8 @@ async def _run(
             if not isinstance(error, TruckError) or isinstance(error, NoAnswerError):
                 with suppress(TruckError):
                     await stop()
+                    if to_its_end and number is not None and isinstance(error, asyncio.CancelledError):
+                        return await while_it_runs(client, _followed(states, number, show, figures))
             raise
 
 
@@ -239,7 +251,6 @@ def progress_line(state: ExplorationState, stands: str = "") -> str:
         return f"{state.elapsed:5.0f} s  it waits: {state.text}"
     if state.phase is ExplorationPhase.LOOKING and not state.known:
         return f"{state.elapsed:5.0f} s  waits for the first look at the map"
-    return (
-        f"{state.elapsed:5.0f} s {state.travelled:6.1f} m  {state.known:6.1f} m^2 known, "
-        f"{state.frontiers:2d} frontiers  {state.phase}{where}"
-    )
+    found = "" if state.find is None else f", {state.found}/{state.find} tags"
+    known = f"{state.known:6.1f} m^2{'' if found else ' known'}, {state.frontiers:2d} frontiers{found}"
+    return f"{state.elapsed:5.0f} s {state.travelled:6.1f} m  {known}  {state.phase}{where}"

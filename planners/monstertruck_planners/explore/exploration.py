@@ -191,6 +191,8 @@ class Exploration:
     """At places to look from."""
     find: int | None = None
     """Number of points of interest at which it ends; None = not limited."""
+    found: int = 0
+    """Points of interest that are known."""
     phase: ExplorationPhase = ExplorationPhase.LOOKING
     since: float = 0.0
     """Begin of the phase, s."""
@@ -269,7 +271,7 @@ def stop(run: Exploration, source: str, now: float) -> Step:
 
 def tick(run: Exploration, seen: Observed, config: ExplorerConfig) -> Step:
     """One step with new observations."""
-    run = _moved(replace(run, now=seen.now), seen)
+    run = _moved(replace(run, now=seen.now, found=seen.found), seen)
     if seen.answer is not None:
         run = replace(run, newest=_merged(run.newest, seen.answer), waiting=False)
     if not run.running:

@@ -413,6 +413,8 @@ def state_of(run: Exploration | None, kind: str, now: int) -> ExplorationState:
         home=run.newest.home,
         goals=run.goals,
         failures=run.failures,
+        find=run.find,
+        found=run.found,
     )
 
 

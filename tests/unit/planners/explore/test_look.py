@@ -9,6 +9,7 @@ from monstertruck_planners.explore.config import TourConfig
 from monstertruck_planners.explore.exchange import CameraView, ExploreSetup, ExploreTask
 from monstertruck_planners.explore.explore_step import ExploringStep
 from monstertruck_planners.explore.look import faces_of
+from monstertruck_planners.explore.service import state_of
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.plan import ExplorationPhase
 from monstertruck_schemas.reasons import Reason
@@ -64,6 +65,8 @@ def test_it_ends_when_enough_is_found_and_says_how_much_was_not():
     stepped.drive()
     stepped.step(found=2)
     assert stepped.run.phase is ExplorationPhase.DRIVING
+    reported = state_of(stepped.run, "tour", 0)
+    assert (reported.found, reported.find) == (2, 3)
     stepped.step(found=3)
     assert stepped.run.phase is ExplorationPhase.RETURNING
     assert stepped.run.final is Reason.POINTS_FOUND

@@ -7,11 +7,12 @@ import pytest
 from monstertruck_runtime.errors import InputError, NoAnswerError, RequestRefusedError
 from monstertruck_runtime.mailbox import Mailbox, fifo, latest
 from monstertruck_schemas.base import Pose2D
+from monstertruck_schemas.event import Event, Severity
 from monstertruck_schemas.plan import ExplorationPhase, ExplorationState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import ExploreOrder
 from monstertruck_schemas.state import GateMode, GateState
-from monstertruck_schemas.topics import EXPLORE, GATE
+from monstertruck_schemas.topics import EVENT, EXPLORE, GATE
 from monstertruckd.tools.cli.explore import seconds_of
 from monstertruckd.tools.cli.runs import progress_line, run_exploration
 
@@ -31,10 +32,11 @@ class Robot:
         self.orders: list[tuple[str, ...]] = []
         self.mailbox: Mailbox[ExplorationState] = Mailbox(fifo(64), lambda _: None)
         self.gate: Mailbox[GateState] = Mailbox(latest())
+        self.events: Mailbox[Event] = Mailbox(fifo(64))
         self.states, self.refuse = states, refuse
 
     def subscribe(self, topic, delivery):
-        return {EXPLORE: self.mailbox, GATE: self.gate}.get(topic) or Mailbox(delivery)
+        return {EXPLORE: self.mailbox, GATE: self.gate, EVENT: self.events}.get(topic) or Mailbox(delivery)
 
     async def arm(self):
         self.orders.append(("arm",))
@@ -116,6 +118,41 @@ def test_refused_it_stops_nothing_and_without_the_robot_it_tries_to():
     assert gone.orders[-1][0] is ExploreOrder.STOP
 
 
+def test_stopped_by_its_user_it_says_where_the_map_is():
+    robot = Robot(state(3, ExplorationPhase.DRIVING, known=3.0))
+    lines: list[str] = []
+
+    async def interrupted():
+        task = asyncio.create_task(run_exploration(robot, home=None, budget=None, arm=False, report=lines.append))
+        await asyncio.sleep(0.01)
+        robot.states = (
+            state(3, ExplorationPhase.SAVING, known=3.0),
+            state(3, ExplorationPhase.IDLE, Reason.CANCELLED, text="stopped by ann; map in runs/explored"),
+        )
+        task.cancel()
+        return await task
+
+    end = asyncio.run(interrupted())
+    assert [order for order, *_ in robot.orders] == [ExploreOrder.START, ExploreOrder.STOP]
+    assert (end.reason, end.text) == (Reason.CANCELLED, "stopped by ann; map in runs/explored")
+    assert "saving" in lines[-2], "while it waits"
+
+
+def test_the_tags_that_are_found_are_counted_at_once():
+    robot = Robot(
+        *(state(3, ExplorationPhase.DRIVING, elapsed=t, known=9.0, find=6, found=n) for t, n in ((1, 2), (2, 3))),
+        state(3, ExplorationPhase.DRIVING, elapsed=3.0, known=9.0, find=6, found=3),
+        state(3, ExplorationPhase.IDLE, Reason.POINTS_FOUND, find=6, found=6),
+    )
+    lines: list[str] = []
+    end = asyncio.run(run_exploration(robot, home=None, budget=None, find=6, arm=False, report=lines.append))
+    assert [line.partition("frontiers, ")[2][:8] for line in lines] == ["2/6 tags", "3/6 tags", "6/6 tags"]
+    assert end.figures["found"] == 6
+    there = Pose2D(x=12.0, y=-3.0, yaw=0.0)
+    busy = state(3, ExplorationPhase.RETURNING, elapsed=9e3, travelled=2e3, known=5e3, frontiers=20, target=there)
+    assert len(progress_line(busy.model_copy(update={"find": 6, "found": 3}))) < 80
+
+
 def test_another_exploration_ends_it():
     robot = Robot(state(4, ExplorationPhase.LOOKING, source="bob"))
     end = asyncio.run(run_exploration(robot, home=None, budget=None, arm=False))
@@ -123,13 +160,20 @@ def test_another_exploration_ends_it():
 
 
 def test_a_truck_that_stands_disarmed_is_not_said_to_drive():
-    robot = Robot(*(state(3, ExplorationPhase.DRIVING, elapsed=float(t)) for t in (0, 1, 2)))
+    phases = ExplorationPhase.DRIVING, ExplorationPhase.LOOKING, ExplorationPhase.DRIVING
+    robot = Robot(*(state(3, phase, elapsed=float(t), goals=t) for t, phase in enumerate(phases)))
     robot.gate.put(
         GateState(
             stamp=1, received=1, seq=0, mode=GateMode.DISARMED, nonce="n", speed_limit=0.0, reasons=(Reason.DISARMED,)
         )
     )
     robot.states += (state(3, ExplorationPhase.IDLE, Reason.EXPLORED),)
+    robot.events.put(
+        Event(
+            stamp=1, received=1, seq=0, reason=Reason.DISARMED, severity=Severity.INFO, source="gate",
+            text="disarmed by bob",
+        )
+    )  # fmt: skip
     lines: list[str] = []
 
     def report(line: str) -> None:
@@ -138,9 +182,8 @@ def test_a_truck_that_stands_disarmed_is_not_said_to_drive():
         robot.gate.put(held.model_copy(update={"reasons": (Reason.DISARMED, Reason.DRIVE_STALE)}))
 
     asyncio.run(run_exploration(robot, home=None, budget=None, arm=False, report=report))
-    assert lines[0] == "    0 s  it stands: the truck is disarmed; `monstertruckd arm` lets it drive"
-    assert len(lines[0]) < 80
-    assert len(lines) == 2, "once, and at its end"
+    assert lines[0] == "    0 s  it stands: the truck is disarmed (disarmed by bob); `monstertruckd arm` lets it drive"
+    assert len(lines) == 1, "once"
 
 
 def test_before_the_first_look_at_the_map_it_tells_no_zeros():

@@ -10,7 +10,9 @@ from typer.testing import CliRunner
 from monstertruck_runtime.clock import SECOND, run_virtual
 from monstertruck_runtime.drives import DriveReport, _say_why_it_stands, drive_to, follow
 from monstertruck_runtime.errors import NoAnswerError, NotFoundError, RequestRefusedError
-from monstertruck_runtime.mailbox import Mailbox, latest
+from monstertruck_runtime.mailbox import Mailbox, fifo, latest
+from monstertruck_runtime.standing import Standing
+from monstertruck_schemas.event import Event, Severity
 from monstertruck_schemas.plan import Path
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.state import GateMode, GateState
@@ -171,11 +173,7 @@ def test_a_goal_waits_while_the_planner_is_starting_and_says_for_what(starts, re
 def test_what_a_goal_waits_for_is_said_with_the_command_that_helps(capsys):
     with on_the_terminal() as report:
         for reason in (Reason.DISARMED, Reason.ESTOPPED):
-            report.stands(
-                GateState(
-                    stamp=0, received=0, seq=0, mode=GateMode.DISARMED, nonce="", speed_limit=0.0, reasons=(reason,)
-                )
-            )
+            report.stands(gate_state(GateMode.DISARMED).model_copy(update={"reasons": (reason,)}), reason.text)
     assert capsys.readouterr().err.splitlines() == [
         "waiting: the truck is disarmed; `monstertruckd arm` lets it drive",
         "waiting: emergency stop is latched; `monstertruckd reset` clears the emergency stop",
@@ -226,25 +224,32 @@ def gate_state(mode, nonce="n"):
     return GateState(stamp=0, received=0, seq=0, mode=mode, nonce=nonce, speed_limit=0.2)
 
 
+def disarmed(text):
+    return Event(stamp=0, received=0, seq=0, reason=Reason.DISARMED, severity=Severity.INFO, source="gate", text=text)
+
+
 def test_each_reason_for_which_it_stands_is_said_once_until_it_drives():
     off, stale, latched = (Reason.DISARMED,), (Reason.DISARMED, Reason.DRIVE_STALE), (Reason.ESTOPPED,)
     said = []
 
     class Report(DriveReport):
-        def stands(self, gate):
-            said.append(gate.reasons)
+        def stands(self, gate, why):
+            said.append((gate.reasons, why))
 
     async def main(clock):
-        gate = Mailbox(latest())
-        watching = asyncio.create_task(_say_why_it_stands(gate, clock, Report()))
+        gate, events = Mailbox(latest()), Mailbox(fifo(64))
+        watching = asyncio.create_task(_say_why_it_stands(Standing(gate, Mailbox(latest()), events), clock, Report()))
         for reasons in (off, stale, off, stale, latched, (), off):
             mode = GateMode.DISARMED if reasons else GateMode.DRIVING
             gate.put(gate_state(mode).model_copy(update={"reasons": reasons}))
+            if reasons == off:
+                events.put(disarmed("disarmed by ann"))
             await clock.sleep(1.1)
         watching.cancel()
 
     run_virtual(main)
-    assert said == [off, stale, latched, off]
+    assert [reasons for reasons, _ in said] == [off, stale, latched, off]
+    assert said[0][1] == "the truck is disarmed (disarmed by ann)"
 
 
 class LostRobot(SilentRobot):
