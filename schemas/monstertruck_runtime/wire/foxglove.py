@@ -72,7 +72,8 @@ def _write_time(timestamp: Any, stamp: int) -> None:
 
 
 def _nanoseconds(timestamp: Any) -> int:
-    return int(timestamp.seconds) * SECOND + int(timestamp.nanos)
+    nanoseconds: int = timestamp.seconds * SECOND + timestamp.nanos
+    return nanoseconds
 
 
 def _write_counters(message: Message, proto: Any) -> None:
@@ -127,12 +128,13 @@ def _packed(*numbers: float) -> bytes:
     return struct.pack(f"<{len(numbers)}d", *numbers)
 
 
-def _unpacked(numbers: _Numbers, count: int) -> tuple[float, ...]:
+def _unpacked(numbers: _Numbers, count: int) -> list[float]:
     """So many numbers."""
-    if len(numbers) != (8 * count if isinstance(numbers, bytes) else count):
-        msg = f"expected {count} numbers, got {len(_array(numbers))}"
+    values: list[float] = _array(numbers).tolist()
+    if len(values) != count:
+        msg = f"expected {count} numbers, got {len(values)}"
         raise InputError(msg)
-    return struct.unpack(f"<{count}d", numbers) if isinstance(numbers, bytes) else tuple(numbers)
+    return values
 
 
 def _pose2d(exact: _Numbers, pose: Any) -> Pose2D:
