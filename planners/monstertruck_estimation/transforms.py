@@ -115,6 +115,12 @@ def planar(parent: str, child: str, stamp: int, pose: Vector) -> Transform:
     )
 
 
+def planar_pose(transform: Transform) -> Vector:
+    """x, y (m) and yaw (rad) of a transform, seen from above."""
+    x, y, _ = transform.translation
+    return x, y, yaw_of(transform.rotation)
+
+
 def _sum(a: Vector, b: Vector) -> Vector:
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 

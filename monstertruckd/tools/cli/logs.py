@@ -253,7 +253,7 @@ def animate_command(
     width: Annotated[int, typer.Option(min=64, max=1920, help="Pixels.")] = 560,
     json_output: JsonOption = False,
 ) -> None:
-    """Write a drive as a moving picture: the truck from above, its path, and what its lidar sees."""
+    """Write a drive as a moving picture: the robot from above, its path, and what its lidar or sonars see."""
     from monstertruckd.recorder.reader import open_log
 
     with needs_extra("logs"):

@@ -1,4 +1,4 @@
-"""A drive as a moving picture: the truck from above, its path, and what its lidar has seen so far."""
+"""A drive as a moving picture: the robot from above, its path, and what its lidar or sonars have seen so far."""
 
 import math
 from dataclasses import dataclass, field
@@ -14,9 +14,9 @@ from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import CommandFailedError, InputError, TruckError
 from monstertruck_runtime.moving_picture import MovingPicture
 from monstertruck_schemas.plan import Path as DrivePath
-from monstertruck_schemas.sensor import LaserScan
+from monstertruck_schemas.sensor import LaserScan, SonarRanges
 from monstertruck_schemas.state import Odometry, Transforms
-from monstertruck_schemas.topics import ODOMETRY, PATH, POSE, SCAN, TRANSFORMS
+from monstertruck_schemas.topics import ODOMETRY, PATH, POSE, SCAN, SONAR, TRANSFORMS
 from monstertruckd.config.truck import Geometry
 from monstertruckd.recorder.reader import LogReader, spare_log
 from monstertruckd.tools.logs.geometry import recorded_geometry
@@ -53,9 +53,11 @@ class AnimationFrame:
     speed: float
     """M/s."""
     points: Array
-    """Returns of the newest scan in map, shape (n, 2), m."""
+    """Returns of the newest scan in map, or the middles of ``arcs``, shape (n, 2), m."""
     path: Array
     """Poses of the present path, shape (n, 3)."""
+    arcs: list[Array]
+    """On which the newest echoes of sonars lie, in map, each of shape (n, 2), m."""
 
 
 @dataclass(slots=True)
@@ -69,6 +71,9 @@ class _Gathering:
     odometry: Odometry | None = None
     points: Array = field(default_factory=lambda: np.zeros((0, 2)))
     path: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    arcs: list[Array] = field(default_factory=list)
+    scanned: bool = False
+    """Whether the log has scans, which show more than echoes."""
     began: int | None = None
     due: int = 0
 
@@ -82,7 +87,11 @@ class _Gathering:
             case DrivePath():
                 self.path = message.poses.reshape(-1, 3)
             case LaserScan() if self.odometry is not None:
-                self.points = self.scans.place(message)[1]
+                self.points, self.scanned = self.scans.place(message)[1], True
+            case SonarRanges() if self.odometry is not None:
+                self.arcs = self.scans.arcs(message)
+                if not self.scanned:
+                    self.points = np.array([line[len(line) // 2] for line in self.arcs]).reshape(-1, 2)
         if self.odometry is None:
             return
         if self.began is None:
@@ -92,7 +101,8 @@ class _Gathering:
             pose = self.odometry.pose
             seconds = (log_time - self.began) / SECOND
             at = (pose.x, pose.y, pose.yaw)
-            self.scenes.append(AnimationFrame(seconds, at, self.odometry.twist.vx, self.points, self.path))
+            speed = self.odometry.twist.vx
+            self.scenes.append(AnimationFrame(seconds, at, speed, self.points, self.path, self.arcs))
 
 
 def animate(
@@ -139,7 +149,7 @@ def _scenes(reader: LogReader, period: int, report: Progress) -> list[AnimationF
     """Poses in map; those of odometry where the log has no others."""
     for pose in (POSE.name, ODOMETRY.name):
         gathering = _Gathering(period)
-        wanted = {pose, SCAN.name, PATH.name, TRANSFORMS.name}
+        wanted = {pose, SCAN.name, SONAR.name, PATH.name, TRANSFORMS.name}
         for message in reader:
             report(reader.position)
             if message.topic in wanted:
@@ -154,7 +164,7 @@ def _scenes(reader: LogReader, period: int, report: Progress) -> list[AnimationF
 
 
 class _AnimationCanvas:
-    """Draws scenes; what the lidar saw stays.
+    """Draws scenes; what lidar or sonars saw stays.
 
     Args:
         scenes: all of them, for the section that is shown.
@@ -188,6 +198,8 @@ class _AnimationCanvas:
                 draw.line(points, colour, 2)
         for x, y in self._pixels(scene.points):
             draw.ellipse((x - 1, y - 1, x + 1, y + 1), BEAM)
+        for line in scene.arcs:
+            draw.line(self._pixels(line), BEAM, 1)
         corners = placed(np.column_stack((self._body, np.zeros(4))), scene.pose)[:, :2]
         draw.polygon(self._pixels(corners), BODY)
         nose = placed(np.array([[self._body[0, 0], 0.0, 0.0]]), scene.pose)[:, :2]

@@ -16,9 +16,11 @@ from rich.style import Style
 from rich.table import Table
 from rich.text import Text
 
+from monstertruck_estimation.transforms import FrameTree, planar_pose
 from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.collision import scan_points
 from monstertruck_runtime.clock import SECOND
+from monstertruck_runtime.errors import NotFoundError
 from monstertruck_runtime.stop_text import stop_lines
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.event import Event, Severity, Stop
@@ -32,8 +34,9 @@ from monstertruck_schemas.health import (
 )
 from monstertruck_schemas.plan import TrackerState
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.sensor import Attitude, Battery, LaserScan
-from monstertruck_schemas.state import GateMode, GateState, Odometry
+from monstertruck_schemas.sensor import Attitude, Battery, LaserScan, SonarRanges
+from monstertruck_schemas.state import GateMode, GateState, Odometry, Transforms
+from monstertruckd.gate.sonars import arc
 
 MODE_STYLE = {
     GateMode.DISARMED: "yellow",
@@ -50,8 +53,6 @@ STATE_STYLE = {
     ServiceState.STOPPED: "dim",
 }
 EVENT_STYLE = {Severity.INFO: "green", Severity.WARNING: "yellow", Severity.ERROR: "bold red"}
-LIDAR = (0.14, 0.0, 0.0)
-"""Mount assumed by the picture; the robot's own transforms are not needed for a screen of this grain."""
 VIEW_METRES = 2.6
 """Least distance the scan view shows ahead and to each side."""
 WIDE = 104
@@ -83,6 +84,8 @@ class ScreenState:
     gate: GateState | None = None
     odometry: Odometry | None = None
     scan: LaserScan | None = None
+    sonar: SonarRanges | None = None
+    transforms: Transforms | None = None
     attitude: Attitude | None = None
     battery: Battery | None = None
     calibration: CalibrationHealth | None = None
@@ -142,6 +145,8 @@ _NEWEST: Final[dict[type, str]] = {
     GateState: "gate",
     Odometry: "odometry",
     LaserScan: "scan",
+    SonarRanges: "sonar",
+    Transforms: "transforms",
     Attitude: "attitude",
     Battery: "battery",
     CalibrationHealth: "calibration",
@@ -177,7 +182,7 @@ def draw(state: ScreenState, width: int, events: int = 6) -> RenderableType:
         banner = _banner(state).wrap(_WRAPPING, max(1, width))
         rows.insert(0, Layout(Group(*banner), name="gone", size=len(banner)))
     layout.split_column(*rows)
-    scan = Layout(paint(Panel(_Braille(state), title="scan and trail, robot frame", border_style="dim")))
+    scan = Layout(paint(Panel(_Braille(state), title=_view_title(state), border_style="dim")))
     truck = Layout(paint(_truck(state)), size=40)
     if width >= WIDE:
         layout["top"].split_row(truck, scan, Layout(paint(_services(state)), size=34))
@@ -320,8 +325,13 @@ _WRAPPING: Final = Console()
 """What breaks lines; nothing is written to it."""
 
 
+def _view_title(state: ScreenState) -> str:
+    sensors = ["scan"] * (state.scan is not None or state.sonar is None) + ["sonars"] * (state.sonar is not None)
+    return f"{', '.join(sensors)} and trail, robot frame"
+
+
 class _Braille:
-    """Scan points and trail as braille dots, forward up, sized by the space there is."""
+    """Scan points, echoes of sonars and trail as braille dots, forward up, sized by the space there is."""
 
     def __init__(self, state: ScreenState) -> None:
         self._state = state
@@ -332,14 +342,16 @@ class _Braille:
         scale = min(width, height * 4 * HORIZON) / VIEW_METRES
         cells = np.zeros((height, width), np.uint8)
         if self._state.scan is not None:
-            _plot(cells, scan_points(self._state.scan, LIDAR), scale)
-        trail_cells = np.zeros_like(cells)
+            mount = _mount(self._state, self._state.scan.frame) or (0.0, 0.0, 0.0)
+            _plot(cells, scan_points(self._state.scan, mount), scale)
+        echo_cells, trail_cells = np.zeros_like(cells), np.zeros_like(cells)
+        _plot(echo_cells, _echo_points(self._state), scale)
         _plot(trail_cells, _trail_points(self._state), scale)
         lines = [Text() for _ in range(height)]
-        for line, row, trail in zip(lines, cells, trail_cells, strict=True):
-            for bits, trail_bits in zip(row.tolist(), trail.tolist(), strict=True):
-                style = "green" if trail_bits and not bits else "cyan"
-                line.append(chr(0x2800 + (bits | trail_bits)), style=style)
+        for line, *row in zip(lines, cells.tolist(), echo_cells.tolist(), trail_cells.tolist(), strict=True):
+            for bits, echo, trail in zip(*row, strict=True):
+                style = "cyan" if bits else "magenta" if echo else "green"
+                line.append(chr(0x2800 + (bits | echo | trail)), style=style)
         truck = lines[int(height * HORIZON)]
         truck.plain = _with_arrow(truck.plain, width // 2)
         return lines
@@ -347,6 +359,27 @@ class _Braille:
 
 def _with_arrow(line: str, at: int) -> str:
     return f"{line[:at]}▲{line[at + 1 :]}"
+
+
+def _mount(state: ScreenState, frame: str) -> tuple[float, float, float] | None:
+    """Pose (x, y, yaw) of a sensor in base, m, m, rad; None where it is not known."""
+    if state.transforms is None:
+        return None
+    try:
+        return planar_pose(FrameTree(state.transforms.transforms).lookup("base", frame))
+    except NotFoundError:
+        return None
+
+
+def _echo_points(state: ScreenState) -> Array:
+    """Points of the arcs on which the echoes lie, as far as the places of the sonars are known, (n, 2), m in base."""
+    arcs = [np.empty((0, 2))]
+    if state.sonar is not None:
+        for echo in state.sonar.sonars:
+            place = _mount(state, f"sonar_{echo.name}")
+            if echo.answered and echo.range is not None and place is not None:
+                arcs.append(arc(place, echo.range, state.sonar.field_of_view / 2))
+    return np.concatenate(arcs)
 
 
 def _trail_points(state: ScreenState) -> Array:

@@ -14,6 +14,7 @@ from monstertruck_runtime.errors import NoAnswerError, NotFoundError
 from monstertruck_runtime.mailbox import fifo, latest
 from monstertruck_schemas import topics
 from monstertruck_schemas.base import Message
+from monstertruck_schemas.sensor import SonarEcho
 from monstertruck_schemas.topics import Topic
 from monstertruckd.tools.status.screen import ScreenState, calibration_badge, draw
 
@@ -21,6 +22,8 @@ SHOWN: tuple[Topic[Any], ...] = (
     topics.GATE,
     topics.ODOMETRY,
     topics.SCAN,
+    topics.SONAR,
+    topics.TRANSFORMS,
     topics.COMPASS,
     topics.BATTERY,
     topics.TRACKER,
@@ -30,6 +33,8 @@ SHOWN: tuple[Topic[Any], ...] = (
     topics.RECORDER,
     topics.STOP,
 )
+PICTURED = frozenset({topics.SCAN.name, topics.TRANSFORMS.name})
+"""Shown by the picture alone, not in words."""
 PERIOD = 0.1
 RETRY = 1.0
 """Seconds in which a robot that is there answers."""
@@ -117,7 +122,7 @@ async def print_once(clock: Clock, robot: str, endpoint: str, *, json_output: bo
         if not newest:
             raise NoAnswerError(f"robot {robot!r} at {endpoint} published nothing for a second")
         if json_output:
-            rows = {name: m.model_dump(mode="json") for name, m in newest.items() if name != topics.SCAN.name}
+            rows = {name: m.model_dump(mode="json") for name, m in newest.items() if name not in PICTURED}
             print(json.dumps(rows, indent=2))
             return
         state = ScreenState(robot, clock.now())
@@ -125,6 +130,12 @@ async def print_once(clock: Clock, robot: str, endpoint: str, *, json_output: bo
             state.take(message)
         for line in plain(state):
             print(line)
+
+
+def _echo(echo: SonarEcho) -> str:
+    """One sonar: ``fl 0.42 m``."""
+    distance = "no echo" if echo.range is None else f"{echo.range:.2f} m"
+    return f"{echo.name} {distance if echo.answered else 'silent'}"
 
 
 def plain(state: ScreenState) -> list[str]:
@@ -142,6 +153,8 @@ def plain(state: ScreenState) -> list[str]:
     if state.battery is not None:
         volts = "-" if state.battery.voltage is None else f"{state.battery.voltage:.2f}"
         lines.append(f"battery   {volts} V, {state.battery.level.value}")
+    if state.sonar is not None:
+        lines.append(f"sonars    {', '.join(map(_echo, state.sonar.sonars))}")
     if state.calibration is not None and state.calibration.wizards:
         lines.append(f"calibrated {calibration_badge(state.calibration)}")
     if state.loop is not None:

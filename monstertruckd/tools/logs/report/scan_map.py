@@ -9,13 +9,14 @@ from typing import Final
 import numpy as np
 from PIL import Image
 
-from monstertruck_estimation.transforms import FrameTree, yaw_of
+from monstertruck_estimation.transforms import FrameTree, planar_pose
 from monstertruck_kinematics.elementary import Array
-from monstertruck_planners.collision import scan_points
+from monstertruck_planners.collision import placed, scan_points
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import NotFoundError
-from monstertruck_schemas.sensor import LaserScan
+from monstertruck_schemas.sensor import LaserScan, SonarRanges
 from monstertruck_schemas.state import Grid, Odometry, Transforms
+from monstertruckd.gate.sonars import arc
 from monstertruckd.recorder.occupancy import Area, OccupancyRaster
 
 _MAX_TILT: Final = math.radians(3)
@@ -59,19 +60,27 @@ class PlacedScans:
     def place(self, scan: LaserScan) -> tuple[Array, Array]:
         """Place of the lidar, shape (2,), and its returns, shape (n, 2), m; at least one pose must be known."""
         x, y, yaw = self._pose_at(scan.stamp + round(scan.scan_time / 2 * SECOND))
-        mount = self._mount(scan.frame)
+        mount = self._mount(scan.frame) or (0.0, 0.0, 0.0)
         cos, sin = math.cos(yaw), math.sin(yaw)
         turn = np.array([[cos, sin], [-sin, cos]])
         at = np.array([x, y])
         return at + np.array(mount[:2]) @ turn, at + scan_points(scan, mount) @ turn
 
-    def _mount(self, frame: str) -> tuple[float, float, float]:
+    def arcs(self, ranges: SonarRanges) -> list[Array]:
+        """For each echo of a sonar whose place is known the arc it lies on, (n, 2), m; at least one pose is known."""
+        found = []
+        for echo in ranges.sonars:
+            mount = self._mount(f"sonar_{echo.name}")
+            if echo.answered and echo.range is not None and mount is not None:
+                points = arc(mount, echo.range, ranges.field_of_view / 2)
+                found.append(placed(np.column_stack((points, np.zeros(len(points)))), self._pose_at(echo.stamp))[:, :2])
+        return found
+
+    def _mount(self, frame: str) -> tuple[float, float, float] | None:
         try:
-            transform = self._mounts.lookup("base", frame)
+            return planar_pose(self._mounts.lookup("base", frame))
         except NotFoundError:
-            return 0.0, 0.0, 0.0
-        x, y, _ = transform.translation
-        return x, y, yaw_of(transform.rotation)
+            return None
 
     def _pose_at(self, stamp: int) -> tuple[float, float, float]:
         table = np.array(self._poses, np.float64)

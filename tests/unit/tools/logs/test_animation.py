@@ -1,16 +1,24 @@
 """Drives as moving pictures."""
 
+import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
+from monstertruck_estimation.transforms import mount
+from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import CommandFailedError, InputError
+from monstertruck_schemas.sensor import SonarEcho, SonarRanges
+from monstertruck_schemas.state import Transforms
+from monstertruck_schemas.topics import ODOMETRY, SONAR, TRANSFORMS
 from monstertruckd.recorder.reader import open_log
 from monstertruckd.tools.cli.logs import app
 from monstertruckd.tools.logs import animation
 from monstertruckd.tools.logs.animation import BEAM, BODY, PLANNED, WALL, animate
+from tests.unit.tools.logs.log_kit import Writer, odometry
 
 GOLDEN = min((Path(__file__).parents[3] / "data" / "golden").glob("*/run.mcap"))
 
@@ -66,3 +74,35 @@ def test_the_command_says_what_it_wrote(tmp_path: Path):
     done = CliRunner().invoke(app, ["animate", str(GOLDEN), str(file), "--width", "64"])
     assert done.exit_code == 0, done.output
     assert done.output.startswith(f"{file}: ")
+
+
+def test_what_sonars_heard_is_drawn_where_they_were(tmp_path: Path):
+    writer = Writer(tmp_path / "sonar.mcap", config={"geometry": {"length": 0.32, "width": 0.3}})
+    turned = mount("sonar_l", (0.1, 0.0, 0.0), (0.0, 0.0, math.pi / 2))
+    writer.put(TRANSFORMS, Transforms(stamp=SECOND, received=SECOND, seq=0, transforms=(turned,)))
+    for number in range(10):
+        now = (1 + number) * SECOND // 2
+        writer.put(ODOMETRY, odometry(now, number))
+        echoes = (
+            SonarEcho(name="l", range=1.0, stamp=now),
+            SonarEcho(name="r", range=1.0, stamp=now),
+            SonarEcho(name="l", answered=False, stamp=now),
+        )
+        ranges = SonarRanges(
+            stamp=now, received=now, seq=number, sonars=echoes, field_of_view=0.5, range_min=0.02, range_max=3.0
+        )
+        writer.put(SONAR, ranges)
+    writer.log.finish()
+    scenes = animation._scenes(open_log(writer.log.path), SECOND, lambda _: None)
+    for scene in scenes[1:]:
+        (line,) = scene.arcs
+        sonar = np.array([scene.pose[0] - 0.1 + 0.1, 0.0])  # of the round before this pose, 0.1 m back
+        assert scene.points == pytest.approx(sonar[None] + (0.0, 1.0), abs=0.011)
+        assert np.hypot(*(line - sonar).T) == pytest.approx(1.0)
+        assert np.ptp(line[:, 0]) == pytest.approx(2 * math.sin(0.25))
+    assert len(scenes) > 3
+    file = tmp_path / "sonar.gif"
+    animate(open_log(writer.log.path), file, speed=8.0, width=320)
+    with Image.open(file) as picture:
+        picture.seek(picture.n_frames - 1)
+        assert {BEAM, WALL} <= colours(picture)

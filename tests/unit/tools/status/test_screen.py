@@ -1,19 +1,21 @@
 """The live screen draws whatever there is, in any terminal."""
 
+import math
 import re
 
 import numpy as np
 import pytest
 from rich.console import Console
 
+from monstertruck_estimation.transforms import mount
 from monstertruck_schemas.base import Pose2D, Twist2D
 from monstertruck_schemas.event import Cause, Event, Severity, Stop
 from monstertruck_schemas.health import HealthTable, LoopHealth, RecorderHealth, ServiceHealth, ServiceState
 from monstertruck_schemas.plan import TrackerState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Role
-from monstertruck_schemas.sensor import Attitude, Battery, BatteryLevel, LaserScan
-from monstertruck_schemas.state import GateMode, GateState, Odometry
+from monstertruck_schemas.sensor import Attitude, Battery, BatteryLevel, LaserScan, SonarEcho, SonarRanges
+from monstertruck_schemas.state import GateMode, GateState, Odometry, Transforms
 from monstertruckd.tools.status.screen import ScreenState, draw
 from monstertruckd.tools.status.watch import place, plain
 
@@ -208,6 +210,44 @@ def test_a_small_terminal_shows_the_scan_too():
     assert "lidar" in text
     assert "0 of 1 ready" in text
     assert "TILT" in text.upper()
+
+
+def test_the_echoes_of_sonars_are_drawn_where_they_are_mounted_and_said_in_words():
+    state = ScreenState("sonar", heard=0)
+    echoes = (
+        SonarEcho(name="f", range=1.0, stamp=0),
+        SonarEcho(name="l", stamp=0),
+        SonarEcho(name="r", answered=False, stamp=0),
+    )
+    state.take(SonarRanges(**HEADER, sonars=echoes, field_of_view=1.0, range_min=0.02, range_max=3.0))
+    assert plain(state) == ["sonars    f 1.00 m, l no echo, r silent"]
+
+    def drawn() -> list[str]:
+        lines = shown(state, 140, 40).export_text(styles=True).splitlines()
+        return [line for line in lines if re.search("\x1b\\[35m[\u2801-\u28ff]", line)]
+
+    assert drawn() == [], "their places are not known yet"
+    state.take(Transforms(**HEADER, transforms=(mount("sonar_f", (0.1, 0.0, 0.0)),)))
+    arc = drawn()
+    assert 1 <= len(arc) <= 4, "an arc ahead"
+    assert "sonars and trail" in shown(state, 140, 40).export_text()
+    state.take(Transforms(**HEADER, transforms=(mount("sonar_f", (0.1, 0.0, 0.0), (0.0, 0.0, 1.57)),)))
+    assert len(drawn()) > len(arc), "one at the side is upright"
+
+
+def test_a_scan_is_drawn_from_where_the_lidar_is_mounted():
+    state = full()
+
+    def picture() -> list[str]:
+        return [line for line in shown(state, 140, 40).export_text().splitlines() if re.search("[\u2801-\u28ff]", line)]
+
+    assert state.scan is not None
+    state.take(state.scan.model_copy(update={"frame": "lidar"}))
+    before = picture()
+    state.take(Transforms(**HEADER, transforms=(mount("base", (0.0, 0.0, 0.0), parent="odom"),)))
+    assert picture() == before, "not known"
+    state.take(Transforms(**HEADER, transforms=(mount("lidar", (0.3, 0.0, 0.0), (0.0, 0.0, math.pi)),)))
+    assert picture() != before
 
 
 def test_a_robot_that_fell_silent_is_not_shown_as_alive():
