@@ -84,11 +84,10 @@ def after(progress: MissionProgress, end: StepEnd) -> tuple[MissionProgress, Nex
         The progress then, and what is next: the step that is now the present one, the same once more, the way back,
         the end after all steps, or an end before.
     """
+    if progress.returning:
+        return replace(progress, why=_returned(progress.why, end)), "ended"
     if end.reason in FINAL:
         return replace(progress, why=end, failures=progress.failures + 1), "ended"
-    if progress.returning:
-        why = progress.why if end.reason in GOOD else end
-        return replace(progress, why=why), "ended"
     if end.reason in GOOD:
         return _onward(progress)
     if progress.attempt < progress.step.retries:
@@ -98,9 +97,17 @@ def after(progress: MissionProgress, end: StepEnd) -> tuple[MissionProgress, Nex
         case "continue":
             return _onward(failed)
         case "return":
-            return replace(failed, returning=True), "return"
+            return replace(failed, returning=True, attempt=0), "return"
         case "abort":
             return failed, "ended"
+
+
+def _returned(why: StepEnd, end: StepEnd) -> StepEnd:
+    """Why a mission ended whose step failed with ``why``, and whose way back ended with ``end``."""
+    failed = why.text or why.reason.text
+    if end.reason in GOOD:
+        return StepEnd(why.reason, f"{failed}, back where it began")
+    return StepEnd(end.reason, f"{failed}; not back where it began: {end.text or end.reason.text}")
 
 
 def _onward(progress: MissionProgress) -> tuple[MissionProgress, Next]:
@@ -116,9 +123,8 @@ def outcome(progress: MissionProgress, following: Next) -> StepEnd:
         if progress.failures == 0:
             return StepEnd(Reason.MISSION_DONE, f"{count} steps")
         return StepEnd(Reason.MISSION_INCOMPLETE, f"{progress.failures} of {count} steps failed; {progress.why.text}")
-    back = ", back where it began" if progress.returning and progress.why.reason not in FINAL else ""
     at = f"step {progress.index + 1} of {count} ({in_words(progress.step)})"
-    return StepEnd(progress.why.reason, f"{at}: {progress.why.text or progress.why.reason.text}{back}")
+    return StepEnd(progress.why.reason, f"{at}: {progress.why.text or progress.why.reason.text}")
 
 
 def in_words(step: AnyStep) -> str:

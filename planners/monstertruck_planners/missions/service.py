@@ -544,14 +544,15 @@ class MissionService:
         self, end: Callable[[], StepEnd | None], stop: Callable[[], object], reports: Subscription[Any]
     ) -> StepEnd:
         """Wait for an end; cancelled, out of time or without ``reports``, have it stopped."""
-        schedule, since = Schedule(self._clock, RATE), self._clock.now()
+        schedule, newest, silent = Schedule(self._clock, RATE), reports.latest, 0
         ended: StepEnd | None = None
         try:
             while (ended := end()) is None:
+                # Counted by checks: while this process stands, as in a suspended computer, nobody can report.
+                silent = silent + 1 if reports.latest is newest else 0
                 newest = reports.latest
-                heard = since if newest is None else max(since, newest.received)
-                if self._clock.now() - heard > SILENT * SECOND:
-                    return StepEnd(Reason.SERVICE_FAILED, f"what does the step has said nothing for {SILENT:g} s")
+                if silent > SILENT * RATE:
+                    return StepEnd(Reason.SERVICE_FAILED, f"nothing was reported on it for {SILENT:g} s")
                 await schedule.next()
         finally:
             if ended is None:

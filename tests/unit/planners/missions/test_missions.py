@@ -70,6 +70,21 @@ def test_the_policy_of_a_step_counts_before_that_of_the_mission():
     assert outcome(back, following).reason is Reason.GOAL_UNREACHABLE
 
 
+@pytest.mark.parametrize("reason", [Reason.GOAL_BLOCKED, Reason.DISARMED])
+def test_a_way_back_that_fails_too_is_told_with_what_made_it_drive_back(reason: Reason):
+    step = {**GO, "retries": 1, "on_failure": "return"}
+    at, _ = after(progress(WAIT, step), StepEnd(Reason.OK))
+    for following in ("again", "return"):
+        at, next_ = after(at, MISSED)
+        assert next_ == following
+    assert at.attempt == 0, "the way back is tried for the first time"
+    at, following = after(at, StepEnd(reason, "a box"))
+    assert (following, at.failures) == ("ended", 1)
+    end = outcome(at, following)
+    assert end.reason is reason
+    assert end.text == "step 2 of 2 (goto 1 0 0): walls; not back where it began: a box"
+
+
 def test_points_that_were_looked_for_and_found_are_no_failure():
     at, following = after(progress({"do": "explore", "find": 2}, WAIT), StepEnd(Reason.POINTS_FOUND))
     assert (at.index, at.failures, following) == (1, 0, "step")
@@ -279,6 +294,20 @@ def test_a_step_fails_when_what_does_it_falls_silent():
     robot = played(story)
     assert (robot.reports[-1].running, robot.reports[-1].outcome) == (False, Reason.SERVICE_FAILED)
     assert robot.latest["goal"].outcome is Reason.CANCELLED, "in case it only says nothing"
+
+
+def test_a_process_that_stood_for_a_while_is_not_taken_for_silence():
+    async def story(robot: Pretended) -> None:
+        robot.order(MissionOrder.START, GO, WAIT)
+        await robot.clock.sleep(1.0)
+        robot.task.cancel()
+        robot.clock.spend(3 * SILENT)
+        await robot.clock.sleep(1.0)
+        assert (robot.reports[-1].running, robot.reports[-1].failed) == (True, "")
+        robot._say(GoalPhase.IDLE, Reason.GOAL_REACHED)
+        await robot.clock.sleep(0.5)
+
+    assert played(story).reports[-1].step == 2
 
 
 def test_a_behaviour_is_asked_for_again_while_the_robot_brakes_after_a_goal():
