@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Final, Self
 
 from monstertruck_runtime.clock import SECOND, Clock
@@ -246,9 +245,7 @@ class BlackBox:
         self._saving = asyncio.create_task(self._save_all(), name=f"{self.name} saving")
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         self.freeze()
         for frozen in self._frozen:
             self._taken.put_nowait(frozen)

@@ -258,9 +258,7 @@ class Recorder:
         threading.Thread(target=self._run, args=(now, offset), name="recorder", daemon=True).start()
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         self._recording = False
         self._hand_over()
         self._queue.put(None)

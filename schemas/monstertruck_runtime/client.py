@@ -8,7 +8,6 @@ import secrets
 import threading
 from collections.abc import Callable, Coroutine, Mapping, Sequence
 from functools import partial
-from types import TracebackType
 from typing import Any, Final, Generic, Self, TypeVar
 
 import zenoh
@@ -192,9 +191,7 @@ class TruckClient(Operator):
             raise
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         """End all subscriptions and the session."""
         for mailbox in list(self._subscriptions):
             mailbox.close()

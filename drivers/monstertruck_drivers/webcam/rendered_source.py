@@ -1,7 +1,6 @@
 """Pictures of the emulated camera over its port, and the camera at a path, whichever is there."""
 
 from pathlib import Path
-from types import TracebackType
 from typing import Final, Self
 
 from monstertruck_drivers.link import BUFFER_LIMIT, Link, Port, SerialPort
@@ -77,9 +76,7 @@ class RenderedStream:
     async def __aenter__(self) -> Self:
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         if not self._link.is_lost:
             self._link.write(b"CLOSE\n")
         self._link.close()

@@ -2,7 +2,6 @@
 
 import errno
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Final, Protocol, Self
 
 from monstertruck_runtime.errors import (
@@ -60,9 +59,7 @@ class FrameStream(Protocol):
         """The stream itself."""
         ...
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         """Stop the camera and let it go."""
         ...
 

@@ -6,7 +6,6 @@ import errno
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
-from types import TracebackType
 from typing import Any, Final, Self
 
 from monstertruck_drivers.webcam import v4l2
@@ -155,9 +154,7 @@ class V4l2Stream:
     async def __aenter__(self) -> Self:
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         self._loop.remove_reader(self._camera.fd)
         await self._offload(self._camera.stop)
 

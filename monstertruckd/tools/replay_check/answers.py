@@ -6,7 +6,6 @@ was computed is kept, to be compared with it.
 
 import asyncio
 from dataclasses import replace
-from types import TracebackType
 from typing import Any, Final, Self
 
 import numpy as np
@@ -75,10 +74,8 @@ class _Replayed:
     async def __aenter__(self) -> Self:
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        await self._inner.__aexit__(kind, error, trace)
+    async def __aexit__(self, *failure: object) -> None:
+        await self._inner.__aexit__(*failure)
 
 
 class ReplayedPlanner(_Replayed):

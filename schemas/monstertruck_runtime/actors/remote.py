@@ -15,7 +15,6 @@ from contextlib import AbstractAsyncContextManager
 from enum import Enum
 from functools import cached_property, partial
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Final, Protocol, Self, get_type_hints
 
 import numpy as np
@@ -273,9 +272,7 @@ class RemoteActor:
     async def __aenter__(self) -> Self:
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         self._task = None
 
 
