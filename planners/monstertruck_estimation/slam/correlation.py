@@ -20,6 +20,9 @@ from monstertruck_estimation.slam.registration import Cloud
 from monstertruck_estimation.slam.scans import Scan
 from monstertruck_kinematics.elementary import Array
 
+Pyramid = NDArray[np.uint8]
+Blocks = NDArray[np.int32]
+
 RESOLUTION: Final = 0.05
 """Edge of a cell, m."""
 LONGEST: Final = 0.5
@@ -38,7 +41,7 @@ WORK: Final = 400_000
 class LikelihoodGrid:
     """Pyramid of likelihoods, 0..255, of finding a surface in a cell."""
 
-    levels: NDArray[np.uint8]
+    levels: Pyramid
     """Shape (levels, rows, columns): level k is the maximum over squares of 2^k cells up and right of the cell."""
     origin: tuple[float, float]
     """Corner of the cell (0, 0), m."""
@@ -110,7 +113,7 @@ def correlate(
     lever = _lever(points)
     step = RESOLUTION / lever
     half = math.ceil(window[1] / step)
-    turns = np.arange(-half, half + 1) * step
+    turns = np.arange(-half, half + 1, dtype=np.float64) * step
     cells = math.ceil(window[0] / RESOLUTION)
     offsets = _rotated(points, guess, turns, grid.origin[0], grid.origin[1])
     penalty = (DOUBT * (RESOLUTION / deviation[0]) ** 2, DOUBT / deviation[1] ** 2)
@@ -135,7 +138,7 @@ def _lever(points: Array) -> float:
 
 
 @njit(cache=True)
-def _stamp(grid, points, normals, extents, x0, y0):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+def _stamp(grid: Pyramid, points: Array, normals: Array, extents: Array, x0: float, y0: float) -> None:
     for i in range(points.shape[0]):
         half = min(extents[i], LONGEST)
         steps = int(half / RESOLUTION)
@@ -146,7 +149,7 @@ def _stamp(grid, points, normals, extents, x0, y0):  # type: ignore[no-untyped-d
 
 
 @njit(cache=True)
-def _dot(grid, px, py):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+def _dot(grid: Pyramid, px: float, py: float) -> None:
     half = 4
     cx, cy = int(px), int(py)
     # The exponential of a sum is a product: one factor per column and one per row.
@@ -162,7 +165,7 @@ def _dot(grid, px, py):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
             grid[gy, cx - half + k] = max(grid[gy, cx - half + k], value)
 
 
-def _pool(source: NDArray[np.uint8], target: NDArray[np.uint8], step: int) -> None:
+def _pool(source: Pyramid, target: Pyramid, step: int) -> None:
     """Maximum of each cell and those ``step`` further right, up, and both; the last row and column continue outside."""
     right = source.copy()
     np.maximum(source[:, :-step], source[:, step:], out=right[:, :-step])
@@ -172,7 +175,7 @@ def _pool(source: NDArray[np.uint8], target: NDArray[np.uint8], step: int) -> No
 
 
 @njit(cache=True)
-def _rotated(points, guess, turns, x0, y0):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+def _rotated(points: Array, guess: Array, turns: Array, x0: float, y0: float) -> Blocks:
     """Cells of the points at the guess, for every turn: shape (turns, points, 2)."""
     result = np.empty((turns.size, points.shape[0], 2), np.int32)
     for k in range(turns.size):
@@ -186,18 +189,18 @@ def _rotated(points, guess, turns, x0, y0):  # type: ignore[no-untyped-def] # no
 
 
 @njit(cache=True)
-def _bound(level, offsets, ix, iy):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+def _bound(level: Pyramid, offsets: Blocks, ix: int, iy: int) -> float:
     rows, columns = level.shape
     total = 0
     for i in range(offsets.shape[0]):
         x, y = offsets[i, 0] + ix, offsets[i, 1] + iy
         if 0 <= x < columns and 0 <= y < rows:
             total += level[y, x]
-    return total / (255.0 * offsets.shape[0])
+    return float(total / (255.0 * offsets.shape[0]))
 
 
 @njit(cache=True)
-def _least_square(low, width):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+def _least_square(low: int, width: int) -> int:
     """Least square of the whole numbers low .. low + width - 1."""
     high = low + width - 1
     if low > 0:
@@ -208,7 +211,9 @@ def _least_square(low, width):  # type: ignore[no-untyped-def] # noqa: ANN001, A
 
 
 @njit(cache=True)
-def _coarsest(levels, offsets, turns, cells, by_cell, by_turn):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+def _coarsest(
+    levels: Pyramid, offsets: Blocks, turns: Array, cells: int, by_cell: float, by_turn: float
+) -> tuple[Blocks, Array]:
     """Blocks of the coarsest level (turn index, x, y, level), the greatest bound first, and their bounds."""
     top = levels.shape[0] - 1
     while top > 0 and (1 << top) > 2 * cells:
@@ -233,23 +238,11 @@ def _coarsest(levels, offsets, turns, cells, by_cell, by_turn):  # type: ignore[
 
 
 @njit(cache=True)
-def _search(  # type: ignore[no-untyped-def] # noqa: ANN202
-    levels,  # noqa: ANN001
-    offsets,  # noqa: ANN001
-    turns,  # noqa: ANN001
-    cells,  # noqa: ANN001
-    by_cell,  # noqa: ANN001
-    by_turn,  # noqa: ANN001
-    blocks,  # noqa: ANN001
-    bounds,  # noqa: ANN001
-    least,  # noqa: ANN001
-    most,  # noqa: ANN001
-    shut_k,  # noqa: ANN001
-    shut_x,  # noqa: ANN001
-    shut_y,  # noqa: ANN001
-    shut_cells,  # noqa: ANN001
-    shut_turns,  # noqa: ANN001
-):
+def _search(
+    levels: Pyramid, offsets: Blocks, turns: Array, cells: int, by_cell: float, by_turn: float, blocks: Blocks,
+    bounds: Array, least: float, most: int, shut_k: int, shut_x: float, shut_y: float, shut_cells: float,
+    shut_turns: float,
+) -> tuple[float, int, int, int, float]:  # fmt: skip
     """Best-first branch and bound: score, turn index, x cells, y cells, and what a pose not evaluated may score.
 
     The turn index is -1 if nothing reached ``least``. The search begins with the sorted ``blocks`` of the coarsest
@@ -301,7 +294,7 @@ def _search(  # type: ignore[no-untyped-def] # noqa: ANN202
 
 
 @njit(cache=True)
-def _float(keys, heap, at, bound, k, x, y, level):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+def _float(keys: Array, heap: Blocks, at: int, bound: float, k: int, x: int, y: int, level: int) -> None:
     """Add a block to the heap at its end, ``at``."""
     while at:
         above = (at - 1) // 2
@@ -314,7 +307,7 @@ def _float(keys, heap, at, bound, k, x, y, level):  # type: ignore[no-untyped-de
 
 
 @njit(cache=True)
-def _sink(keys, heap, size):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+def _sink(keys: Array, heap: Blocks, size: int) -> None:
     """Put the last block, ``size``, in the place of the first, which was taken."""
     bound = keys[size]
     at = 0
@@ -378,7 +371,9 @@ def merged(scans: Sequence[Scan], poses: Array) -> Scan:
 
 
 @njit(cache=True)
-def _average(points, normals, variances, extents, keys, order):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+def _average(
+    points: Array, normals: Array, variances: Array, extents: Array, keys: NDArray[np.int64], order: NDArray[np.int64]
+) -> tuple[Array, Array, Array, Array]:
     """Means of runs of equal keys; points are weighted by how well they lie on their surface."""
     n = keys.size
     runs = 0

@@ -177,18 +177,10 @@ def _ordering(edges: Edges, count: int) -> Index:
 
 
 @njit(cache=True)
-def _assemble(  # type: ignore[no-untyped-def] # noqa: ANN202
-    origins,  # noqa: ANN001
-    targets,  # noqa: ANN001
-    off,  # noqa: ANN001
-    information,  # noqa: ANN001
-    weights,  # noqa: ANN001
-    first,  # noqa: ANN001
-    second,  # noqa: ANN001
-    slots,  # noqa: ANN001
-    data,  # noqa: ANN001
-    gradient,  # noqa: ANN001
-):
+def _assemble(
+    origins: Array, targets: Array, off: Array, information: Array, weights: Array, first: Index, second: Index,
+    slots: Index, data: Array, gradient: Array,
+) -> None:  # fmt: skip
     """Add every edge's blocks to ``data`` at its four ``slots``, and its pull to ``gradient``."""
     by_origin, by_target = np.zeros((3, 3)), np.zeros((3, 3))
     by_origin[2, 2], by_target[2, 2] = -1.0, 1.0
@@ -255,7 +247,7 @@ def drift(poses: Array, edges: Edges, spread: Array, source: int) -> tuple[Array
 
 
 @njit(cache=True)
-def _carry(local, order, parents, steps, source):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+def _carry(local: Array, order: Index, parents: Index, steps: Array, source: int) -> Array:
     """Covariances compounded from parent to child; ``local`` are the poses in the frame of the source."""
     result = np.full((local.shape[0], 3, 3), np.inf)
     result[source] = 0.0

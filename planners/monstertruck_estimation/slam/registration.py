@@ -147,12 +147,12 @@ def normal_equations(scan: Scan, cloud: Cloud, pose: Array, reach: float = CELL)
 
 
 @njit(cache=True)
-def _bucket(cx, cy, mask):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+def _bucket(cx: int | np.int64, cy: int | np.int64, mask: int) -> int | np.int64:
     return (cx * 73856093 ^ cy * 19349663) & mask
 
 
 @njit(cache=True)
-def _hashed(points):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+def _hashed(points: Array) -> tuple[Index, Index]:
     """Buckets by counting sort: starts and order."""
     n = points.shape[0]
     size = 16
@@ -177,7 +177,9 @@ def _hashed(points):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
 
 
 @njit(cache=True)
-def _nearest(x, y, nx, ny, points, normals, starts, order, reach):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+def _nearest(
+    x: float, y: float, nx: float, ny: float, points: Array, normals: Array, starts: Index, order: Index, reach: float
+) -> int:
     """Nearest element that faces the same half-plane; -1 if there is none within ``reach``."""
     mask = starts.size - 2
     cx = np.int64(math.floor(x / CELL))
@@ -196,20 +198,10 @@ def _nearest(x, y, nx, ny, points, normals, starts, order, reach):  # type: igno
 
 
 @njit(cache=True)
-def accumulate(  # type: ignore[no-untyped-def] # noqa: ANN201
-    pose,  # noqa: ANN001
-    points,  # noqa: ANN001
-    normals,  # noqa: ANN001
-    variances,  # noqa: ANN001
-    map_points,  # noqa: ANN001
-    map_normals,  # noqa: ANN001
-    map_variances,  # noqa: ANN001
-    map_extents,  # noqa: ANN001
-    starts,  # noqa: ANN001
-    order,  # noqa: ANN001
-    reach,  # noqa: ANN001
-    edge,  # noqa: ANN001
-):
+def accumulate(
+    pose: Array, points: Array, normals: Array, variances: Array, map_points: Array, map_normals: Array,
+    map_variances: Array, map_extents: Array, starts: Index, order: Index, reach: float, edge: float,
+) -> tuple[Array, Array, Array]:  # fmt: skip
     """Normal equations at ``pose``: information H (3, 3), gradient g (3,), (pairs, sum of squares across, cost)."""
     h = np.zeros((3, 3))
     g = np.zeros(3)
@@ -260,7 +252,7 @@ def accumulate(  # type: ignore[no-untyped-def] # noqa: ANN201
 
 
 @njit(cache=True)
-def solve3(h, g):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN201
+def solve3(h: Array, g: Array) -> Array:
     """Solution of the symmetric positive system h x = g by Cholesky; zeros if it is singular."""
     x = np.zeros(3)
     a = h[0, 0]
@@ -287,40 +279,19 @@ def solve3(h, g):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN201
 
 
 @njit(cache=True)
-def _register(  # type: ignore[no-untyped-def] # noqa: ANN202
-    points,  # noqa: ANN001
-    normals,  # noqa: ANN001
-    variances,  # noqa: ANN001
-    map_points,  # noqa: ANN001
-    map_normals,  # noqa: ANN001
-    map_variances,  # noqa: ANN001
-    map_extents,  # noqa: ANN001
-    starts,  # noqa: ANN001
-    order,  # noqa: ANN001
-    start,  # noqa: ANN001
-    guess,  # noqa: ANN001
-    prior,  # noqa: ANN001
-    iterations,  # noqa: ANN001
-    reach,  # noqa: ANN001
-):
+def _register(
+    points: Array, normals: Array, variances: Array, map_points: Array, map_normals: Array, map_variances: Array,
+    map_extents: Array, starts: Index, order: Index, start: Array, guess: Array, prior: Array, iterations: int,
+    reach: float,
+) -> tuple[Array, Array, Array]:  # fmt: skip
     pose = start.copy()
     edge = reach if iterations > 0 else EDGE
     done = False
     for remaining in range(iterations, -1, -1):
         h, g, stats = accumulate(
-            pose,
-            points,
-            normals,
-            variances,
-            map_points,
-            map_normals,
-            map_variances,
-            map_extents,
-            starts,
-            order,
-            reach,
+            pose, points, normals, variances, map_points, map_normals, map_variances, map_extents, starts, order, reach,
             edge,
-        )
+        )  # fmt: skip
         if done or remaining == 0:
             break
         off = pose - guess
