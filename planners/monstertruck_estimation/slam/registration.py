@@ -102,15 +102,7 @@ def register(
         start: shape (3,), first pose, where a coarse search found a better one.
     """
     pose, information, stats = _register(
-        scan.points,
-        scan.normals,
-        scan.variances,
-        cloud.points,
-        cloud.normals,
-        cloud.variances,
-        cloud.extents,
-        cloud.starts,
-        cloud.order,
+        *_elements(scan, cloud),
         np.ascontiguousarray(guess if start is None else start, dtype=np.float64),
         np.ascontiguousarray(guess, dtype=np.float64),
         np.ascontiguousarray(prior),
@@ -129,21 +121,14 @@ def measure(scan: Scan, cloud: Cloud, pose: Array) -> Fit:
 
 def normal_equations(scan: Scan, cloud: Cloud, pose: Array, reach: float = CELL) -> tuple[Array, Array, int]:
     """Information (3, 3) and gradient (3,) of a registration at ``pose``, and the number of fitting pairs."""
-    h, g, stats = accumulate(
-        np.ascontiguousarray(pose),
-        scan.points,
-        scan.normals,
-        scan.variances,
-        cloud.points,
-        cloud.normals,
-        cloud.variances,
-        cloud.extents,
-        cloud.starts,
-        cloud.order,
-        min(reach, CELL),
-        EDGE,
-    )
+    h, g, stats = accumulate(np.ascontiguousarray(pose), *_elements(scan, cloud), min(reach, CELL), EDGE)
     return h, g, int(stats[0])
+
+
+def _elements(scan: Scan, cloud: Cloud) -> tuple[Array, Array, Array, Array, Array, Array, Array, Index, Index]:
+    """What the kernels take of both."""
+    moved = scan.points, scan.normals, scan.variances
+    return *moved, cloud.points, cloud.normals, cloud.variances, cloud.extents, cloud.starts, cloud.order
 
 
 @njit(cache=True)
