@@ -115,7 +115,7 @@ class Hands:
 
     def drive(self, speed: float) -> None:
         """Wheel speed, m/s."""
-        self.world.motor.command(self.now, -speed * RPM, 20_000.0)
+        self.world.motors[0].command(self.now, -speed * RPM, 20_000.0)
 
     def wait(self, seconds: float) -> Any:
         """Truth afterwards."""

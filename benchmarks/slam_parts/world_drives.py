@@ -150,8 +150,8 @@ def _leg(
         drive.truth.append((now / SECOND, *pose))
         drive.stuck |= state.stuck
         if count % 5 == 0:
-            world.motor.command(now, pilot.steer(pose, line), 20_000.0)
-            reading = world.motor.reading(now)
+            world.motors[0].command(now, pilot.steer(pose, line), 20_000.0)
+            reading = world.motors[0].reading(now)
             seconds = now / SECOND
             if any(burst <= seconds - 1.0 < burst + 0.8 for burst in bursts):
                 slipped += 0.9 * (reading.turns - before)

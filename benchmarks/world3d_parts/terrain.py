@@ -249,7 +249,7 @@ def slopes(seeds: int) -> dict[str, float]:
         fallen, steepest = fallen + (tilt > FALLEN), max(steepest, tilt)
         alone = World(WorldConfig.model_validate(world), seed)
         alone.truth(0)
-        alone.motor.command(0, -0.2 * RPM, 20_000.0)
+        alone.motors[0].command(0, -0.2 * RPM, 20_000.0)
         tilt = max(_tilted(alone, step * SECOND // 20) for step in range(1, 500))
         bare += tilt > FALLEN
         print(f"seed {seed}: {fallen} overturned with the gate, {bare} without", flush=True)

@@ -179,11 +179,6 @@ class MemoryPort:
         self._plugged = False
         self._link: Link | None = None
 
-    @property
-    def plugged(self) -> bool:
-        """True while the cable is in."""
-        return self._plugged
-
     def plug(self) -> None:
         """Connect the cable."""
         if not self._plugged:

@@ -16,7 +16,7 @@ from typing import Protocol, Self
 import serial
 import serial_asyncio
 
-from monstertruck_runtime.errors import DeviceLostError, PortBusyError, ProtocolError
+from monstertruck_runtime.errors import DeviceLostError, PortBusyError
 
 BAUD = 115200
 """Bits per second of a line whose device takes any."""
@@ -130,24 +130,6 @@ class Link:
                 await self._more(due, count)
         data = bytes(self._buffer[:count])
         del self._buffer[:count]
-        return data
-
-    async def until(self, end: bytes, limit: int = 4096) -> bytes:
-        """Read up to and including ``end``.
-
-        Raises:
-            DeviceLostError: the link went down before it came.
-            ProtocolError: more than ``limit`` bytes came without ``end``; they are dropped.
-        """
-        start = 0
-        while (at := self._buffer.find(end, start)) < 0:
-            if len(self._buffer) > limit:
-                self._buffer.clear()
-                raise ProtocolError(f"{self.name}: {limit} bytes without {end!r}")
-            start = max(0, len(self._buffer) - len(end) + 1)
-            await self._more()
-        data = bytes(self._buffer[: at + len(end)])
-        del self._buffer[: at + len(end)]
         return data
 
     def take(self, count: int) -> bytes | None:

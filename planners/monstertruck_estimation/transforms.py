@@ -227,11 +227,6 @@ class TransformService:
         if joints is not None:
             self._tree.put(joints[0])
 
-    def lookup(self, parent: str, child: str) -> Transform:
-        """Newest pose of ``child`` in ``parent``; see ``FrameTree.lookup``."""
-        self._refresh()
-        return self._tree.lookup(parent, child)
-
     async def run(self, ready: Ready) -> None:
         """Publish until cancelled."""
         ready()

@@ -37,11 +37,6 @@ class Subscription(Protocol[M_co]):
         """Newest message, or None before the first; reading it consumes nothing."""
         ...
 
-    @property
-    def drops(self) -> int:
-        """Messages lost because the FIFO was full (latest-only delivery never counts)."""
-        ...
-
     async def next(self) -> M_co:
         """Wait for a message not returned by ``next`` yet."""
         ...

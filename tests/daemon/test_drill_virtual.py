@@ -15,7 +15,7 @@ import pytest
 from monstertruck_drivers.cable import MemoryPort
 from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos.protocol import write_request
-from monstertruck_drivers.steppers.protocol import run
+from monstertruck_drivers.steppers.protocol import Line
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.mailbox import fifo
@@ -272,7 +272,7 @@ def watched(
 
 
 def motor(rpm: float) -> Callable[[Bare], None]:
-    return lambda bare: bare.world.motor.command(bare.clock.now(), -rpm, 1e5)
+    return lambda bare: bare.world.motors[0].command(bare.clock.now(), -rpm, 1e5)
 
 
 def said(bare: Bare, role: str) -> None:
@@ -541,7 +541,7 @@ def test_a_held_second_shaft_that_is_driven_on_and_motion_back_before_standstill
 @pytest.mark.parametrize(("rate", "rules"), [(150, set[str]()), (190, {"speed bytes"})])
 def test_the_lines_to_steppers_are_read(rate: int, rules: set[str]):
     def scene(bare: Bare) -> None:
-        bare.ports["wheels"].device.take(bytes(run(1, (1000 * rate,) * 4)))
+        bare.ports["wheels"].device.take(bytes(Line("R", 1, (str(1000 * rate),) * 4)))
 
     assert watched(scene, robot="skid_stand", seconds=0.3) == rules
     assert watched(scene, robot="skid_stand", seconds=0.3, disarmed=True) == rules, "it was asked before the order"

@@ -71,7 +71,7 @@ def troubled() -> dict:
             for topic in (topics.ODOMETRY, topics.FUSION, topics.EVENT)
         }
         operator = LocalOperator(rig.daemon, clock)
-        compass, motor = rig.world.compass, rig.world.motor
+        compass, motor = rig.world.compass, rig.world.motors[0]
         at = {}
         async with rig.running():
             await clock.sleep(1.5)

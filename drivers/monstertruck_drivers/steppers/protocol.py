@@ -218,11 +218,6 @@ class Status:
         return Line("s", seq, tuple(map(str, numbers)))
 
 
-def run(seq: int, rates: tuple[int, ...]) -> Line:
-    """Request to run at rates in 1/1000 step/s."""
-    return Line("R", seq, tuple(map(str, rates)))
-
-
 def wrapped(steps: int) -> int:
     """Steps as the controller counts them, signed 32 bits."""
     return (steps + (1 << 31) & _MASK) - (1 << 31)

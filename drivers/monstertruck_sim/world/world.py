@@ -107,11 +107,6 @@ class World:
         return self._plant
 
     @property
-    def motor(self) -> MotorPlant:
-        """The first driven shaft, of the truck the only one."""
-        return self.motors[0]
-
-    @property
     def obstacles(self) -> tuple[Obstacle, ...]:
         """Obstacles in the world that are not on its map."""
         return self._space.obstacles

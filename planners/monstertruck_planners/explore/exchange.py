@@ -100,8 +100,6 @@ class ExploreAnswer:
     """Area of the free ground in the map, m^2."""
     home: float | None = None
     """Metres of the path home; None = not requested, or none is known."""
-    changed: int = 0
-    """Cells checked again for frontiers."""
     failure: Reason | None = None
     """Why there is no decision; None = there is one."""
     text: str = ""

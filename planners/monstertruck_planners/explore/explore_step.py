@@ -40,13 +40,13 @@ class ExploringStep:
             self._looks = WallLooks(task.setup.camera)
         if self._setup is None or self._explorer is None:
             raise InputError("exploring: expected a setup before anything else")
-        changed = self._take(task)
+        self._take(task)
         known = self._map
         if known is None:
             return ExploreAnswer()
         area = known.free * known.resolution**2
         if not task.choose:
-            return ExploreAnswer(known=area, changed=changed)
+            return ExploreAnswer(known=area)
         view = ExplorationView(known, self._setup, task.pose, task.banned, task.avoided, self._memory)
         target = self._explorer.choose(view, task.current, self._still(view, task.current), task.pursued)
         if task.find:
@@ -59,21 +59,17 @@ class ExploringStep:
             banned=view.left_alone,
             known=area,
             home=None if task.home is None else view.path_length_to(task.home[:2]),
-            changed=changed,
         )
 
-    def _take(self, task: ExploreTask) -> int:
-        changed = 0
+    def _take(self, task: ExploreTask) -> None:
         for grid, whole in (
             *(((task.whole, True),) if task.whole is not None else ()),
             *((t, False) for t in task.tiles),
         ):
             if self._map is None:
                 self._map = FrontierMap(grid)
-                changed += grid.width * grid.height
             else:
-                changed += self._map.put(grid, whole=whole)
-        return changed
+                self._map.put(grid, whole=whole)
 
     @staticmethod
     def _still(view: ExplorationView, current: Viewpoint | None) -> Option | None:

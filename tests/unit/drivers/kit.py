@@ -8,6 +8,7 @@ from typing import Any, Generic, Protocol, TypeVar
 
 from monstertruck_drivers.cable import EmulatedPort, MemoryPort
 from monstertruck_drivers.computer import Computer, Machine, Sysfs
+from monstertruck_drivers.link import Link
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.threads import inline
 from monstertruck_schemas.base import Message
@@ -20,6 +21,14 @@ M = TypeVar("M", bound=Message)
 def emulated_computer(root: Path, clock: Clock) -> Computer:
     """The computer whose files are in ``root``; they are read at once, so that the virtual clock goes on."""
     return Computer(Machine(clock, Sysfs(root / "sys"), root / "dev", inline), root)
+
+
+async def read_until(link: Link, end: bytes) -> bytes:
+    """Bytes up to and including ``end``."""
+    data = b""
+    while not data.endswith(end):
+        data += await link.exactly(1)
+    return data
 
 
 class Kept(Generic[M]):

@@ -6,10 +6,12 @@ import numpy as np
 
 from monstertruck_estimation.body_tilt import Tilt
 from monstertruck_estimation.odometry import DeadReckoning, OdometryConfig
+from monstertruck_estimation.transforms import TransformService
 from monstertruck_kinematics.chassis import Dimensions, truck_chassis
 from monstertruck_kinematics.truck import DriveTrain, FourWheelSteering
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.sensor import Attitude, DriveFeedback, DriveMode, SteeringFeedback
+from monstertruck_schemas.state import Transform
 
 STEERING = FourWheelSteering()
 DRIVETRAIN = DriveTrain()
@@ -81,3 +83,9 @@ class Truck:
 
 def spread(covariance):
     return np.sqrt(np.diag(np.reshape(covariance, (3, 3))))
+
+
+def looked_up(service: TransformService, parent: str, child: str) -> Transform:
+    """Newest pose of ``child`` in ``parent``, as the service would publish it now."""
+    service._refresh()
+    return service._tree.lookup(parent, child)

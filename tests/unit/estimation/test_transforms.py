@@ -24,6 +24,7 @@ from monstertruck_runtime.clock import SECOND, run_virtual
 from monstertruck_runtime.errors import InputError, NotFoundError
 from monstertruck_schemas.base import Pose2D, Twist2D
 from monstertruck_schemas.state import Odometry
+from tests.unit.estimation.kit import looked_up
 
 angle = st.floats(-3.1, 3.1)
 metre = st.floats(-5, 5)
@@ -146,7 +147,7 @@ def test_service_publishes_the_whole_tree_ten_times_a_second():
             twist_covariance=np.zeros(9),
             age=0.0,
         )
-        assert service.lookup("map", "lidar").translation == pytest.approx((1.14, 0.0, 0.2))
+        assert looked_up(service, "map", "lidar").translation == pytest.approx((1.14, 0.0, 0.2))
         await clock.sleep(0.9)
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)

@@ -39,7 +39,7 @@ class Driver:
     def drive(self, speed, acceleration=20_000.0):
         """Wheel speed in m/s, forwards positive; None = power off."""
         target = None if speed is None else -speed * RPM_PER_SPEED
-        self.world.motor.command(self.now, target, acceleration)
+        self.world.motors[0].command(self.now, target, acceleration)
 
     def wait(self, seconds):
         self.now += round(seconds * SECOND)

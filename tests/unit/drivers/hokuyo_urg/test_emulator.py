@@ -24,6 +24,7 @@ from monstertruck_drivers.link import Link, SerialPort
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual, run_wall
 from monstertruck_runtime.errors import DeviceLostError, InputError, ProtocolError
 from tests.unit.drivers.hokuyo_urg.rig import Pattern, Rig, bench, talk
+from tests.unit.drivers.kit import read_until
 
 MD = "MD0044072501000"
 
@@ -159,9 +160,9 @@ def test_scans_come_after_their_revolution():
     async def play(rig: Rig, port: MemoryPort, clock: VirtualClock) -> None:
         async with await port.open() as link:
             link.write(f"{MD}\n".encode())
-            await link.until(b"\n\n")
+            await read_until(link, b"\n\n")
             for _ in range(5):
-                await link.until(b"\n\n")
+                await read_until(link, b"\n\n")
                 age = clock.now() - rig.emulator._source.times[-1]
                 assert 0.0708 * SECOND < age < 0.08 * SECOND
 
@@ -200,7 +201,7 @@ def test_streaming_survives_a_closed_client():
         await talk(port, clock, MD, wait=0.3)
         await clock.sleep(60)
         async with await port.open() as link:
-            return (await link.until(b"\n"))[:-1]
+            return (await read_until(link, b"\n"))[:-1]
 
     assert on_bench(play) == MD.encode()
 
@@ -316,9 +317,9 @@ def test_batching_delays_scans_but_keeps_their_order():
         ages, counters = [], []
         async with await port.open() as link:
             link.write(f"{MD}\n".encode())
-            await link.until(b"\n\n")
+            await read_until(link, b"\n\n")
             for _ in range(50):
-                block = await link.until(b"\n\n")
+                block = await read_until(link, b"\n\n")
                 ages.append((clock.now() - rig.emulator._source.times[-1]) // 1_000_000)
                 counters.append(decode_counter(replies(block)[0].lines[0]))
         return ages, counters
@@ -434,7 +435,7 @@ def test_a_closed_pty_is_an_unplugged_sensor(tmp_path: Path):
             async with link:
                 link.write(b"QT\n")
                 async with asyncio.timeout(2):
-                    assert await link.until(b"\n\n") == b"QT\n00P\n\n"
+                    assert await read_until(link, b"\n\n") == b"QT\n00P\n\n"
                     port.unplug()
                     with pytest.raises(DeviceLostError):
                         await link.read()

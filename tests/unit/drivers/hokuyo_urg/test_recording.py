@@ -12,6 +12,7 @@ from monstertruck_drivers.hokuyo_urg.recording import RecordedHokuyoEmulator, Re
 from monstertruck_runtime.clock import VirtualClock, run_virtual
 from monstertruck_runtime.errors import InputError
 from tests.unit.drivers.hokuyo_urg.rig import STEP_NS, Rig, bench
+from tests.unit.drivers.kit import read_until
 
 DATA = Path(__file__).parents[3] / "data" / "urg04lx_exp2.dat.gz"
 
@@ -60,9 +61,9 @@ def test_a_single_scan_before_the_start_is_the_first(recording: RecordedRanges):
         emulator = RecordedHokuyoEmulator(clock, recording, state="scip2")
         async with bench(clock, emulator=emulator) as rig, await rig.port.open() as link:
             link.write(b"BM\n")
-            await link.until(b"\n\n")
+            await read_until(link, b"\n\n")
             link.write(b"GS0043072501\n")
-            assert (await link.until(b"\n\n")).startswith(b"GS0043072501\n00P\n")
+            assert (await read_until(link, b"\n\n")).startswith(b"GS0043072501\n00P\n")
 
     run_virtual(main)
 

@@ -143,7 +143,7 @@ async def test_scans_of_a_moving_truck_are_the_worlds():
     world, clock = World(WorldConfig(map="rooms"), seed=3), WallClock()
     recorded = Recorded(world.lidar)
     started = world.truth(clock.now())
-    world.motor.command(clock.now(), -8000.0, 10_000.0)
+    world.motors[0].command(clock.now(), -8000.0, 10_000.0)
     scans = await use(recorded, work, timer_start=COUNTER - 2000)
 
     assert len(scans) == 40

@@ -24,6 +24,7 @@ from monstertruck_runtime.errors import (
 from monstertruck_schemas.cmd import DriveAction, DriveCommand
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import DriveMode
+from tests.unit.drivers.kit import read_until
 from tests.unit.drivers.steppers.rig import bench
 
 STEP = math.tau / 400
@@ -378,12 +379,12 @@ def test_requests_it_cannot_carry_out():
         async with await rig.port.open() as link:
             for text, code in ((Line("X", 1), "1"), (Line("R", 2, ("5",)), "2"), (Line("C", 3, ("9", "1", "1")), "2")):
                 link.write(bytes(text))
-                assert Splitter().feed(await link.until(b"\n")) == [Line("e", text.seq, (code,))]
+                assert Splitter().feed(await read_until(link, b"\n")) == [Line("e", text.seq, (code,))]
             link.write(bytes(Line("R", 4, ("100000",) * 4)))
-            await link.until(b"\n")
+            await read_until(link, b"\n")
             await rig.settle(0.1)
             link.write(bytes(Line("C", 5, ("4000", "8000", "300"))))
-            assert Splitter().feed(await link.until(b"\n")) == [Line("e", 5, ("3",))]
+            assert Splitter().feed(await read_until(link, b"\n")) == [Line("e", 5, ("3",))]
 
     on_bench(test)
 

@@ -14,7 +14,6 @@ from monstertruck_drivers.steppers.protocol import (
     Status,
     crc,
     decode,
-    run,
     step_of,
     wrapped,
 )
@@ -35,7 +34,7 @@ def test_the_sum_is_that_of_the_catalogues():
     ("line", "data"),
     [
         (Line("I", 1), b":I 1*6F34\n"),
-        (run(7, (100_000, -50_000, 0, 1)), b":R 7 100000 -50000 0 1*9B95\n"),
+        (Line("R", 7, ("100000", "-50000", "0", "1")), b":R 7 100000 -50000 0 1*9B95\n"),
         (Identity("STEP4", 1, 4, 400, 10).line(1), b":i 1 STEP4 1 4 400 10*D4B1\n"),
         (
             Status(MotorState.RUN, 0, 1234, (5, -6, 7, 8), (1, 2, 3, 4)).line(255),

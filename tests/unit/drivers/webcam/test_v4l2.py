@@ -84,7 +84,7 @@ def test_names_of_pixel_formats():
 
 def test_the_real_kernel(tmp_path):
     """What of it can be tried without a camera: a regular file is mapped, and refuses requests."""
-    kernel = v4l2.LinuxKernel()
+    kernel = v4l2.Kernel()
     for name in ("video10", "video2"):
         (tmp_path / name).write_bytes(b"0123456789")
     nodes = kernel.nodes(str(tmp_path / "video*"))

@@ -28,7 +28,7 @@ def worlds(*starts: tuple[float, float, float], people: tuple[PersonConfig, ...]
 
 
 def drive(world: World, now: int, speed: float) -> None:
-    world.motor.command(now, -speed * RPM_PER_SPEED, 20_000.0)
+    world.motors[0].command(now, -speed * RPM_PER_SPEED, 20_000.0)
 
 
 def walk(*points: tuple[float, float], **habits: object) -> PersonConfig:

@@ -262,9 +262,9 @@ def test_the_ground_wire_offsets_the_battery_input(field):
 
 def test_readings_have_the_controllers_sign(field):
     driver = field()
-    driver.world.motor.command(driver.now, 3000.0, 1e5)
+    driver.world.motors[0].command(driver.now, 3000.0, 1e5)
     truth = driver.wait(1)
-    reading = driver.world.motor.reading(driver.now)
+    reading = driver.world.motors[0].reading(driver.now)
     assert truth.v < 0  # inverted: the controller's positive sense is backwards
     assert reading.turns > 0
     assert reading.rpm == pytest.approx(3000, rel=1e-3)
@@ -277,8 +277,8 @@ def test_current_and_analog_noise(field):
     currents, volts = [], []
     for _ in range(300):
         driver.wait(0.05)
-        currents.append(driver.world.motor.reading(driver.now).current_ma)
+        currents.append(driver.world.motors[0].reading(driver.now).current_ma)
         volts.append(driver.world.servos.analog_volts(5, driver.now))
     assert np.std(currents) == pytest.approx(10, rel=0.2)
     assert np.std(volts) == pytest.approx(0.003, rel=0.2)
-    assert driver.world.motor.reading(driver.now).current_ma == currents[-1]  # the same instant, the same draw
+    assert driver.world.motors[0].reading(driver.now).current_ma == currents[-1]  # the same instant, the same draw

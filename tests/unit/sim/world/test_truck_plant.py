@@ -31,7 +31,7 @@ def test_straight_distance_is_motor_turns_through_the_ratio(field):
     driver.wait(5)
     driver.drive(0.0)
     truth = driver.wait(2)
-    turns = -driver.world.motor.reading(driver.now).turns
+    turns = -driver.world.motors[0].reading(driver.now).turns
     assert truth.v == pytest.approx(0, abs=1e-6)
     assert hypot(truth.x, truth.y) == pytest.approx(turns * ROLLED_PER_TURN, rel=2e-4)
     assert truth.x == pytest.approx(1.0, rel=0.01)
@@ -89,14 +89,14 @@ def test_ramp_and_lags(field):
     driver = field(truck=IDEAL)
     driver.drive(0.2, acceleration=17_057.0)  # 0.2 m/s in about a second
     driver.wait(0.5)
-    reading = driver.world.motor.reading(driver.now)
+    reading = driver.world.motors[0].reading(driver.now)
     truth = driver.world.truth(driver.now)
     assert reading.demand_rpm == pytest.approx(-8528.5, rel=1e-3)
     assert abs(reading.demand_rpm) > abs(reading.rpm) > 0.9 * abs(reading.demand_rpm)
     assert 0.05 < truth.v < abs(reading.rpm) * ROLLED_PER_TURN / 60
     driver.drive(None)
     assert driver.wait(1.5).v == pytest.approx(0, abs=1e-4)
-    assert driver.world.motor.reading(driver.now).current_ma == 0
+    assert driver.world.motors[0].reading(driver.now).current_ma == 0
 
 
 def test_servo_rate_and_limit(field):
@@ -180,10 +180,10 @@ def test_wall_stops_the_body_and_the_clutch_slips(field):
     driver.steer(0.0, 0.0)
     driver.drive(0.2)
     driver.wait(5)
-    turns = driver.world.motor.reading(driver.now).turns
+    turns = driver.world.motors[0].reading(driver.now).turns
     before = driver.world.truth(driver.now)
     after = driver.wait(2)
-    reading = driver.world.motor.reading(driver.now)
+    reading = driver.world.motors[0].reading(driver.now)
     assert after.stuck
     assert after.clutch_slipping
     assert after.x == pytest.approx(before.x, abs=1e-4) == pytest.approx(0.8 - 0.235, abs=2e-3)
@@ -226,7 +226,7 @@ def test_clutch_slips_when_pulled_too_hard(field):
     late = driver.wait(3)
     assert not late.clutch_slipping
     assert late.v == pytest.approx(0.2, rel=1e-3)
-    turns = -driver.world.motor.reading(driver.now).turns
+    turns = -driver.world.motors[0].reading(driver.now).turns
     assert turns * ROLLED_PER_TURN - late.x > 0.005
 
 
@@ -267,7 +267,7 @@ def test_climbing_costs_current(field):
     for driver in (flat, climbing):
         driver.drive(0.15)
         driver.wait(5)  # the slope's peak
-        currents.append(-driver.world.motor.reading(driver.now).current_ma)
+        currents.append(-driver.world.motors[0].reading(driver.now).current_ma)
     assert currents[1] > currents[0] + 150
 
 
@@ -299,7 +299,7 @@ def test_battery_reaches_the_analog_input_and_can_be_exchanged(field):
     truth = driver.wait(1)
     assert driver.world.servos.analog_volts(5, driver.now) == pytest.approx(truth.supply_v / 10, abs=0.001)
     assert truth.supply_v < 22.2
-    assert driver.world.motor.reading(driver.now).supply_v == truth.supply_v
+    assert driver.world.motors[0].reading(driver.now).supply_v == truth.supply_v
 
 
 def test_contact_is_tested_whenever_something_is_near(field):
@@ -330,7 +330,7 @@ def test_a_carried_truck_stands_elsewhere_and_its_lidar_sees_no_way_between(fiel
     driver = field(truck=IDEAL, walls=[(3.0, -6.0, 3.2, 6.0)])
     driver.drive(0.2)
     driver.wait(2)
-    before = driver.world.motor.reading(driver.now).turns
+    before = driver.world.motors[0].reading(driver.now).turns
     driver.world.carry(driver.now, (-2.0, 1.0, pi / 2))
     truth = driver.world.truth(driver.now)
     assert (truth.x, truth.y, truth.yaw, truth.v) == (-2.0, 1.0, pi / 2, 0.0)
@@ -338,7 +338,7 @@ def test_a_carried_truck_stands_elsewhere_and_its_lidar_sees_no_way_between(fiel
     ranges = driver.world.lidar.scan(driver.now - 100_000_000)
     assert ranges[384 - 256] / 1000 == pytest.approx(5.0, abs=0.02)
     assert driver.wait(3).y > 1.4, "the motor turns on"
-    assert driver.world.motor.reading(driver.now).turns < before
+    assert driver.world.motors[0].reading(driver.now).turns < before
 
 
 @pytest.mark.parametrize("pose", [(3.1, 0.0, 0.0), (1.0, 1.0, 0.0)])

@@ -128,7 +128,7 @@ def test_geometries_of_another_file_are_seen_and_touched(tmp_path):
     assert world.lidar.scan(0)[384] == pytest.approx(1100 - 140, abs=1)
     world.sonars.fire("f", 0)
     assert world.sonars.range("f") == pytest.approx(1.1 - 0.12, abs=0.005)
-    world.motor.command(0, -16_000.0, 20_000.0)
+    world.motors[0].command(0, -16_000.0, 20_000.0)
     assert world.truth(9_000_000_000).x == pytest.approx(1.1 - 0.235, abs=0.02)
 
 

@@ -423,7 +423,7 @@ def test_people_walk_into_it_and_are_felt():
         }
     )
     world = World(config, 1)
-    world.motor.command(0, -0.2 * 644 / (2 * pi * 0.075) * 60, 20_000.0)
+    world.motors[0].command(0, -0.2 * 644 / (2 * pi * 0.075) * 60, 20_000.0)
     for t in range(1, 60):
         world.truth(t * SECOND // 10)
     assert world.scene.contacts

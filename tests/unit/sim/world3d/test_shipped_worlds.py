@@ -26,7 +26,7 @@ def test_the_truck_drives_on(name, tilt):
         settings = settings.model_copy(update={"start": Pose2D(x=step.x, y=step.y + 0.5, yaw=-pi / 2)})
     world = World(settings, 1)
     begin = world.truth(0)
-    world.motor.command(0, -0.3 * 644 / (2 * pi * 0.075) * 60, 20_000.0)
+    world.motors[0].command(0, -0.3 * 644 / (2 * pi * 0.075) * 60, 20_000.0)
     greatest = 0.0
     for tenth in range(1, 45):
         truth = world.truth(tenth * SECOND // 10)
