@@ -6,7 +6,7 @@ fail a local search takes over; a path is kept while it is free.
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -46,15 +46,6 @@ MAX_DETOUR = 1.6
 """A motion between two band poses is a detour if it is longer than this factor on their distance."""
 
 
-@dataclass(frozen=True)
-class JoinedMotion:
-    """A motion found by a strategy."""
-
-    path: MotionPath
-    last: int
-    """Index of the band's pose at which it ends."""
-
-
 class RsbandPlanner:
     """The local planner of kind ``rsband``.
 
@@ -70,9 +61,10 @@ class RsbandPlanner:
         self._reeds_shepp = vehicle.reeds_shepp(costs)
         self._core = LocalPlannerCore(vehicle, self.config, costs)
         self._band_parameters = band_parameters(self.config.band, self._core.cover)
-        self._strategy: Callable[[PosePath, DistanceField, Array], JoinedMotion | None] = getattr(
+        strategy: Callable[[PosePath, DistanceField, Array], MotionPath | None] = getattr(
             self, f"_{self.config.strategy}"
         )
+        self._strategy = strategy
 
     def plan(self, route: PosePath, obstacles: DistanceField, pose: ArrayLike, state: LocalPlannerState) -> LocalPlan:
         """One cycle, see ``LocalPlanner``."""
@@ -116,11 +108,11 @@ class RsbandPlanner:
             "broken": float(band.path is None),
         }
         if band.path is not None:
-            motion = self._strategy(band.path, obstacles, robot_pose)
-            if motion is not None:
-                after = replace(state, band=band.path.part(1, len(band.path.poses)), path=motion.path, failed=0)
-                done = ends_at(motion.path, state.route.poses[-1])  # type: ignore[union-attr]
-                return LocalPlan(Reason.OK, after, motion.path, done, statistics=statistics)
+            path = self._strategy(band.path, obstacles, robot_pose)
+            if path is not None:
+                after = replace(state, band=band.path.part(1, len(band.path.poses)), path=path, failed=0)
+                done = ends_at(path, state.route.poses[-1])  # type: ignore[union-attr]
+                return LocalPlan(Reason.OK, after, path, done, statistics=statistics)
         statistics["searched"] = 1.0
         path, band_of_path, why = self._core.search(obstacles, robot_pose, local, state.failed)
         if path is None:
@@ -135,12 +127,10 @@ class RsbandPlanner:
         path = self._reeds_shepp.path(robot_pose, goal)
         return path if len(path.segments) and self._core.free(obstacles, path) else None
 
-    def _start_to_end(self, band: PosePath, obstacles: DistanceField, robot_pose: Array) -> JoinedMotion | None:
-        last = len(band.poses) - 1
-        path = self._join(obstacles, robot_pose, band.poses[last])
-        return JoinedMotion(path, last) if path is not None else None
+    def _start_to_end(self, band: PosePath, obstacles: DistanceField, robot_pose: Array) -> MotionPath | None:
+        return self._join(obstacles, robot_pose, band.poses[-1])
 
-    def _start_to_next(self, band: PosePath, obstacles: DistanceField, robot_pose: Array) -> JoinedMotion | None:
+    def _start_to_next(self, band: PosePath, obstacles: DistanceField, robot_pose: Array) -> MotionPath | None:
         """To the first pose at the sub-goal's distance, or further if that needs no change of direction."""
         travelled = band.travelled
         end = next(
@@ -159,29 +149,27 @@ class RsbandPlanner:
             if path is None:
                 continue
             if path.cusps == 0:
-                return JoinedMotion(path, last)
-            if found is None or path.length + self.config.sub_goal * factor < found.path.length:
-                found = JoinedMotion(path, last)
+                return path
+            if found is None or path.length + self.config.sub_goal * factor < found.length:
+                found = path
         return found
 
-    def _start_to_receding_end(
-        self, band: PosePath, obstacles: DistanceField, robot_pose: Array
-    ) -> JoinedMotion | None:
+    def _start_to_receding_end(self, band: PosePath, obstacles: DistanceField, robot_pose: Array) -> MotionPath | None:
         for last in reversed(list(self._via_indices(band))):
             path = self._join(obstacles, robot_pose, band.poses[last])
             if path is not None:
-                return JoinedMotion(path, last)
+                return path
         return None
 
-    def _point_to_point(self, band: PosePath, obstacles: DistanceField, robot_pose: Array) -> JoinedMotion | None:
+    def _point_to_point(self, band: PosePath, obstacles: DistanceField, robot_pose: Array) -> MotionPath | None:
         return self._chain(band, obstacles, robot_pose, skip=False)
 
-    def _skip_failures(self, band: PosePath, obstacles: DistanceField, robot_pose: Array) -> JoinedMotion | None:
+    def _skip_failures(self, band: PosePath, obstacles: DistanceField, robot_pose: Array) -> MotionPath | None:
         return self._chain(band, obstacles, robot_pose, skip=True)
 
-    def _chain(self, band: PosePath, obstacles: DistanceField, robot_pose: Array, *, skip: bool) -> JoinedMotion | None:
+    def _chain(self, band: PosePath, obstacles: DistanceField, robot_pose: Array, *, skip: bool) -> MotionPath | None:
         legs: list[MotionPath] = []
-        at, reached = robot_pose, 0
+        at = robot_pose
         for last in self._via_indices(band):
             path = self._join(obstacles, at, band.poses[last])
             backs = legs and path is not None and (path.segments[:, 0] * band.directions[last] < 0).any()
@@ -190,8 +178,8 @@ class RsbandPlanner:
                     break
                 continue
             legs.append(path)
-            at, reached = path.end, last
-        return JoinedMotion(joined(legs), reached) if legs else None
+            at = path.end
+        return joined(legs) if legs else None
 
     @staticmethod
     def _is_detour(path: MotionPath, at: Array) -> bool:
