@@ -4,13 +4,13 @@ import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import asynccontextmanager, suppress
 from dataclasses import asdict, dataclass
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
+from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError, TruckError
 from monstertruck_runtime.mailbox import Mailbox, fifo, latest
 from monstertruck_runtime.presence import while_it_runs
-from monstertruck_runtime.requests import Operator
 from monstertruck_runtime.standing import Standing, standing
 from monstertruck_schemas.event import Event, Severity
 from monstertruck_schemas.plan import GoalPhase, GoalState, Path, TrackerState
@@ -27,24 +27,6 @@ ACCEPT_TIMEOUT: Final = 3.0
 """Seconds in which a path is accepted or refused."""
 STAND_TIMEOUT: Final = 2.0
 """Seconds that a path waits for a truck that is still moving: one that has just reached its goal comes to rest."""
-
-
-class Driver(Operator, Protocol):
-    """Client of a robot that drives to goals and along paths."""
-
-    async def goal(
-        self, goal: tuple[float, float, float], frame: str = "map", via: Sequence[tuple[float, ...]] = ()
-    ) -> dict[str, Any]:
-        """Request to drive to a pose by way of waypoints."""
-        ...
-
-    async def goal_control(self, order: GoalOrder, *, own: bool = False) -> None:
-        """Pause, resume, cancel; ``own``: only a goal that this client sent."""
-        ...
-
-    async def path(self, path: Path, lease: float = 1.0) -> None:
-        """Request to follow a path."""
-        ...
 
 
 class DriveReport:
@@ -82,7 +64,7 @@ class Arrival:
 
 
 async def drive_to(
-    driver: Driver,
+    driver: TruckClient,
     clock: Clock,
     goal: tuple[float, float, float],
     via: Sequence[tuple[float, ...]] = (),
@@ -108,7 +90,7 @@ async def drive_to(
 
 
 async def _taken_on(
-    driver: Driver,
+    driver: TruckClient,
     clock: Clock,
     goal: tuple[float, float, float],
     via: Sequence[tuple[float, ...]],
@@ -158,7 +140,7 @@ async def _goal_end(states: Mailbox[GoalState], number: int, report: DriveReport
     raise NoAnswerError("the link to the robot was closed")
 
 
-async def follow(driver: Driver, clock: Clock, path: Path, *, arm: bool, report: DriveReport = SILENT) -> Arrival:
+async def follow(driver: TruckClient, clock: Clock, path: Path, *, arm: bool, report: DriveReport = SILENT) -> Arrival:
     """Send a path and wait for its end; cancelled or without an answer, it stops the truck.
 
     Raises:
@@ -183,7 +165,9 @@ async def follow(driver: Driver, clock: Clock, path: Path, *, arm: bool, report:
         return await _watched(driver, clock, stand, arm=arm, end=end, undo=driver.stop, report=report)
 
 
-async def _accepted(driver: Driver, clock: Clock, events: Mailbox[Event], present: Mailbox[Path], name: str) -> None:
+async def _accepted(
+    driver: TruckClient, clock: Clock, events: Mailbox[Event], present: Mailbox[Path], name: str
+) -> None:
     try:
         async with clock.deadline(ACCEPT_TIMEOUT):
             while present.latest is None or present.latest.name != name:
@@ -208,7 +192,7 @@ async def _path_end(clock: Clock, states: Mailbox[TrackerState], name: str, repo
 
 
 async def _watched(
-    driver: Driver,
+    driver: TruckClient,
     clock: Clock,
     stand: Standing,
     *,

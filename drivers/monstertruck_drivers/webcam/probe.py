@@ -23,7 +23,7 @@ async def probe(
         JSON-able: ``nodes``: path, driver, card, bus, whether it captures, pixel formats, and the sizes and rates of
         motion JPEG; or why it cannot be asked.
     """
-    system = kernel or v4l2.LinuxKernel()
+    system = kernel or v4l2.Kernel()
     return await offload(lambda: {"nodes": [_describe(path, system) for path in system.nodes(pattern)]})
 
 

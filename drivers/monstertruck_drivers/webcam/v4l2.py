@@ -10,7 +10,7 @@ import os
 import struct
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Final
 
 from monstertruck_drivers.webcam.source import Mode
 from monstertruck_runtime.clock import SECOND
@@ -65,51 +65,15 @@ ENUM_FRAMESIZES: Final = _request(_READ | _WRITE, 74, FRAME_SIZE.size)
 ENUM_FRAMEINTERVALS: Final = _request(_READ | _WRITE, 75, FRAME_INTERVAL.size)
 
 
-class Mapping(Protocol):
-    """Memory of one buffer, shared with the kernel."""
-
-    def __getitem__(self, part: slice, /) -> bytes:
-        """Copy out a part."""
-        ...
-
-    def close(self) -> None:
-        """Unmap."""
-        ...
-
-
-class Kernel(Protocol):
+class Kernel:
     """The system calls a camera is used through; every one of them may block."""
-
-    def nodes(self, pattern: str) -> list[str]:
-        """Existing device nodes that fit a glob pattern."""
-        ...
-
-    def open(self, path: str) -> int:
-        """Open without blocking later reads; raises ``OSError``."""
-        ...
-
-    def close(self, fd: int) -> None:
-        """Close."""
-        ...
-
-    def ioctl(self, fd: int, request: int, argument: bytearray) -> None:
-        """Carry out a request; ``argument`` is changed in place. Raises ``OSError``."""
-        ...
-
-    def map(self, fd: int, length: int, offset: int) -> Mapping:
-        """Map a buffer; raises ``OSError``."""
-        ...
-
-
-class LinuxKernel:
-    """The real one."""
 
     def nodes(self, pattern: str) -> list[str]:
         """Existing device nodes that fit a glob pattern, video2 before video10."""
         return sorted(map(str, Path("/").glob(pattern.lstrip("/"))), key=lambda path: (len(path), path))
 
     def open(self, path: str) -> int:
-        """Open without blocking later reads."""
+        """Open without blocking later reads; raises ``OSError``."""
         return os.open(path, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
 
     def close(self, fd: int) -> None:
@@ -117,11 +81,11 @@ class LinuxKernel:
         os.close(fd)
 
     def ioctl(self, fd: int, request: int, argument: bytearray) -> None:
-        """Carry out a request."""
+        """Carry out a request; ``argument`` is changed in place. Raises ``OSError``."""
         fcntl.ioctl(fd, request, argument, True)
 
-    def map(self, fd: int, length: int, offset: int) -> Mapping:
-        """Map a buffer, to read it."""
+    def map(self, fd: int, length: int, offset: int) -> mmap.mmap:
+        """Map a buffer, to read it; raises ``OSError``."""
         return mmap.mmap(fd, length, mmap.MAP_SHARED, mmap.PROT_READ, offset=offset)
 
 

@@ -6,6 +6,7 @@ import errno
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
+from mmap import mmap
 from typing import Any, Final, Self
 
 from monstertruck_drivers.webcam import v4l2
@@ -31,7 +32,7 @@ class V4l2Source:
         self, pattern: str = "/dev/video*", kernel: v4l2.Kernel | None = None, offload: Offload = in_thread
     ) -> None:
         self.name = pattern
-        self._kernel = kernel or v4l2.LinuxKernel()
+        self._kernel = kernel or v4l2.Kernel()
         self._offload = offload
 
     async def open(self, mode: Mode, buffers: int) -> "V4l2Stream":
@@ -54,7 +55,7 @@ class Camera:
         self.fd = fd
         self.mode = Mode(0, 0, 0.0)
         self._kernel = kernel
-        self._memory: list[v4l2.Mapping] = []
+        self._memory: list[mmap] = []
 
     @classmethod
     def start(cls, pattern: str, kernel: v4l2.Kernel, mode: Mode, buffers: int) -> "Camera":

@@ -18,6 +18,7 @@ from monstertruck_runtime.errors import NotInstalledError
 from monstertruck_sim.world.config import CameraConfig, TagConfig
 from monstertruck_sim.world.noise import CAMERA, generator
 from monstertruck_sim.world.plant import Caster, Plant, Pose
+from monstertruck_sim.world.scene import Surroundings
 
 Picture = NDArray[np.uint8]
 """(height, width, 3): red, green, blue; the top row first."""
@@ -84,18 +85,6 @@ class Holder(Protocol):
         ...
 
 
-class Crowd(Protocol):
-    """Who moves around, as the camera sees it."""
-
-    def people_at(self, time_ns: int, /) -> Sequence[tuple[float, float, float]]:
-        """Place and radius of everybody, m."""
-        ...
-
-    def robots_beside(self, own: Plant, /) -> Sequence[Plant]:
-        """What moves the other robots."""
-        ...
-
-
 def mounted(pose: Pose, config: CameraConfig, attitude: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> CameraPlace:
     """The camera of a robot at ``pose``.
 
@@ -146,7 +135,7 @@ class SimulatedView:
         config: CameraConfig,
         *,
         tags: Sequence[TagConfig] = (),
-        crowd: Crowd | None = None,
+        crowd: Surroundings | None = None,
         holder: Holder | None = None,
         wall_height: float = 0.6,
         seed: int | None = None,

@@ -3,14 +3,14 @@
 import asyncio
 from collections.abc import AsyncIterator, Callable
 from contextlib import ExitStack, asynccontextmanager, suppress
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 from monstertruck_kinematics.chassis import Chassis
 from monstertruck_kinematics.truck import DriveTrain
+from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError, TruckError
 from monstertruck_runtime.mailbox import Mailbox, fifo
-from monstertruck_runtime.requests import Operator
 from monstertruck_schemas import topics
 from monstertruck_schemas.cmd import DriveCommand, SteeringCommand
 from monstertruck_schemas.reasons import Reason, in_words
@@ -64,14 +64,6 @@ ADVICE: Final = {
 """Advice by transient reason: a move that one of them stopped is driven again."""
 
 
-class MovedTruck(Operator, Protocol):
-    """Client of a truck that a wizard moves."""
-
-    async def drive(self, speed: float, front: float, rear: float = 0.0, lease: float = 0.3) -> None:
-        """Request a motion."""
-        ...
-
-
 class Mover:
     """Drives moves.
 
@@ -81,7 +73,7 @@ class Mover:
         chassis: for the distance.
     """
 
-    def __init__(self, truck: MovedTruck, clock: Clock, chassis: Chassis) -> None:
+    def __init__(self, truck: TruckClient, clock: Clock, chassis: Chassis) -> None:
         self._truck = truck
         self._clock = clock
         self._drivetrain = chassis.drivetrain
@@ -169,7 +161,7 @@ class _Run:
 
     def __init__(
         self,
-        truck: MovedTruck,
+        truck: TruckClient,
         clock: Clock,
         feeds: tuple[
             Mailbox[DriveFeedback],

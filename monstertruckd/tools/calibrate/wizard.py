@@ -12,6 +12,7 @@ from contextlib import ExitStack
 from types import MappingProxyType
 from typing import Any, ClassVar, Final, Protocol, TypeVar
 
+from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import InputError, NoAnswerError, RequestRefusedError
 from monstertruck_runtime.mailbox import fifo, latest
@@ -21,7 +22,7 @@ from monstertruckd.config.calibration import Result, Value, WizardName, value_at
 from monstertruckd.config.calibration_rpc import SAVE
 from monstertruckd.config.expiry import state_of
 from monstertruckd.config.truck import TruckConfig
-from monstertruckd.tools.calibrate.motion import MovedTruck, Mover
+from monstertruckd.tools.calibrate.motion import Mover
 from monstertruckd.tools.calibrate.steps import Collect, Confirm, MoveRecord, MoveStep, Number, Panel, WatchStep
 
 M = TypeVar("M", bound=Message)
@@ -59,7 +60,7 @@ class WizardContext:
 
     def __init__(
         self,
-        truck: MovedTruck,
+        truck: TruckClient,
         panel: Panel,
         clock: Clock,
         config: TruckConfig,
@@ -183,7 +184,7 @@ class WizardContext:
 
 async def calibrate(
     wizard: Wizard,
-    truck: MovedTruck,
+    truck: TruckClient,
     panel: Panel,
     clock: Clock,
     config: TruckConfig,

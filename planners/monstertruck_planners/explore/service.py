@@ -6,12 +6,13 @@ from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 from monstertruck_planners.explore import exploration
 from monstertruck_planners.explore.exchange import ExploreAnswer, ExploreSetup, ExploreTask
 from monstertruck_planners.explore.exploration import Action, Cancel, Choose, Exploration, Go, Notice, Observed, Save
 from monstertruck_planners.goals.exchange import Pose, pose_of
+from monstertruck_planners.goals.service import GoalService
 from monstertruck_runtime.actors.actor import Actor
 from monstertruck_runtime.clock import SECOND, Clock, Schedule
 from monstertruck_runtime.errors import RequestRefusedError, TruckError
@@ -44,22 +45,6 @@ NO_PLACE: Final = frozenset({LocalisationStatus.LOST, LocalisationStatus.SEARCHI
 LOW: Final = frozenset({BatteryLevel.LOW, BatteryLevel.CRITICAL})
 TILES: Final = 4096
 """Tiles kept since the newest whole map."""
-
-
-class Goals(Protocol):
-    """The goal service."""
-
-    def take(self, request: GoalRequest) -> int:
-        """Take on a goal; returns its number."""
-        ...
-
-    def control(self, request: GoalControl) -> None:
-        """Cancel it."""
-        ...
-
-    def hold(self, who: str, *, on: bool) -> None:
-        """Keep the robot armed between goals."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +85,7 @@ class ExplorerService:
         setup: ExploreSetup,
         clock: Clock,
         actor: Actor,
-        goals: Goals,
+        goals: GoalService,
         save: Callable[[], bool] | None,
         *,
         max_age: float,

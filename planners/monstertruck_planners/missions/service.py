@@ -3,14 +3,17 @@
 import asyncio
 import contextlib
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Protocol, TypeVar, assert_never
+from typing import Any, Final, assert_never
 
 from pydantic import ValidationError
 
+from monstertruck_planners.behave.service import BehaviourService
+from monstertruck_planners.explore.service import ExplorerService
 from monstertruck_planners.goals.exchange import Pose, pose_of
+from monstertruck_planners.goals.service import GoalService
 from monstertruck_planners.missions.progress import (
     GOOD,
     MissionProgress,
@@ -86,44 +89,6 @@ PATIENCE: Final = 180.0
 SILENT: Final = 10.0
 """Seconds without a report of what does a step, which comes twice a second, after which it has failed."""
 
-S = TypeVar("S")
-
-
-class GoalsOfMission(Protocol):
-    """The goal service."""
-
-    def take(self, request: GoalRequest) -> int:
-        """Take on a goal; returns its number."""
-        ...
-
-    def control(self, request: GoalControl) -> None:
-        """Cancel it."""
-        ...
-
-    def hold(self, who: str, *, on: bool) -> None:
-        """Keep the robot armed between goals."""
-        ...
-
-
-class BehavioursOfMission(Protocol):
-    """The service of behaviours."""
-
-    def take(self, request: BehaviourRequest) -> int:
-        """Start or stop one; returns its number."""
-        ...
-
-    def check(self, name: str, settings: Mapping[str, Any]) -> None:
-        """Whether one could be started with these settings."""
-        ...
-
-
-class ExplorerOfMission(Protocol):
-    """The service of exploration."""
-
-    def take(self, request: ExploreRequest) -> int:
-        """Start or stop it; returns its number."""
-        ...
-
 
 @dataclass(frozen=True, slots=True)
 class MissionInputs:
@@ -142,9 +107,9 @@ class MissionInputs:
 class MissionParts:
     """What steps are done by."""
 
-    goals: GoalsOfMission
-    behaviours: BehavioursOfMission | None
-    explorer: ExplorerOfMission | None
+    goals: GoalService
+    behaviours: BehaviourService | None
+    explorer: ExplorerService | None
 
 
 class MissionService:
