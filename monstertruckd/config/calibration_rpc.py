@@ -59,7 +59,7 @@ def register(
     def at_rest() -> None:
         if mode().active:
             raise RequestRefusedError(
-                Reason.BUSY, f"the truck is {mode()}: calibrations are written while it is disarmed"
+                Reason.BUSY, f"the robot is {mode()}: calibrations are written while it is disarmed"
             )
 
     async def show(_: dict[str, Any]) -> dict[str, Any]:

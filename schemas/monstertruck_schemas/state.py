@@ -211,4 +211,4 @@ class GateState(Message):
     @property
     def why(self) -> str:
         """Why the truck stands or is slow, in words; its mode where no reason is named."""
-        return in_words(self.reasons) or f"the truck is {self.mode}"
+        return in_words(self.reasons) or f"the robot is {self.mode}"

@@ -267,7 +267,7 @@ CALIBRATION: Final = Topic(
 )
 LOOP: Final = Topic("health/loop", LoopHealth, W.DAEMON, "Lateness of the control tick", 1, stale_after=3.0)
 RECORDER: Final = Topic("health/recorder", RecorderHealth, W.DAEMON, "Recorder", 1, stale_after=3.0, retained=True)
-LINK: Final = Topic("health/link", LinkHealth, W.DRIVER, "Wi-Fi or Ethernet link of the truck", 1, stale_after=3.0)
+LINK: Final = Topic("health/link", LinkHealth, W.DRIVER, "Wi-Fi or Ethernet link of the robot", 1, stale_after=3.0)
 HOST: Final = Topic(
     "health/host", HostHealth, W.DRIVER, "Load, temperature, memory and disk of the computer", 1, stale_after=3.0
 )
@@ -278,7 +278,7 @@ FUSION: Final = Topic(
 USB: Final = Topic("health/usb", UsbTree, W.DAEMON, "USB hubs, ports and devices", 1, stale_after=3.0, retained=True)
 
 EVENT: Final = Topic("event/event", Event, W.DAEMON, "Decisions, faults and recoveries")
-STOP: Final = Topic("event/stop", Stop, W.GATE, "Why the truck was stopped, with the chain of causes", retained=True)
+STOP: Final = Topic("event/stop", Stop, W.GATE, "Why the robot was stopped, with the chain of causes", retained=True)
 LOG: Final = Topic("event/log", LogRecord, W.DAEMON, "The daemon's journal", foxglove="foxglove.Log")
 
 REQ_DRIVE: Final = Topic(

@@ -369,5 +369,5 @@ def test_a_value_that_may_not_be_set_or_does_not_fit_is_refused(key: str, value:
 def test_a_wizard_needs_its_device(tmp_path: Path):
     config, rng = yard(tmp_path, 1)
     blind = config.model_copy(update={"devices": config.devices.model_copy(update={"compass": None})})
-    with pytest.raises(InputError, match=r"devices\.compass\.driver\.rate: not in this truck's configuration"):
+    with pytest.raises(InputError, match=r"devices\.compass\.driver\.rate: not in this robot's configuration"):
         run_session(blind, CompassWizard(), rng)

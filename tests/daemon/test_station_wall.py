@@ -255,7 +255,7 @@ async def test_a_hand_that_lets_go_and_a_browser_that_freezes_reloads_or_loses_i
 
 
 async def _stops(gate: Mailbox[GateState], commands: Mailbox[DriveCommand]) -> None:
-    """Wait until the truck is disarmed; a lease after the last heartbeat the motor is asked for nothing any more.
+    """Wait until the robot is disarmed; a lease after the last heartbeat the motor is asked for nothing any more.
 
     Within its lease a request outlives a short fault, such as the stop of a busy computer, and so drives once more.
     """

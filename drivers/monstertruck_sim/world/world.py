@@ -73,7 +73,7 @@ class World:
         self.map = place.map
         self._footprint = PlanOutline(self.scene, config.truck, name)
         if self.scene.overlap(self.scene.solid, self._footprint.box(start)) > 0:
-            raise InputError(f"start: the truck at {start} touches what is not free on the map {config.map}")
+            raise InputError(f"start: the robot at {start} touches what is not free on the map {config.map}")
         self._plant, self._space, sweep, solids = make_engine(config, self._footprint, start, noise_seed, lidar=lidar)
         self._plant.together = self.scene.advance
         self._plant.on_blocked = self._footprint.blocked
@@ -156,7 +156,7 @@ class World:
         """
         solid = self.scene.overlap(self.scene.solid, self._footprint.box(pose))
         if solid + self._space.contact(*pose) > 0:
-            raise InputError(f"carry: the truck at {pose} touches what is not free")
+            raise InputError(f"carry: the robot at {pose} touches what is not free")
         self._plant.advance(time_ns)
         self._plant.carry(pose)
 

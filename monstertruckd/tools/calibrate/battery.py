@@ -63,7 +63,7 @@ class BatteryWizard:
         gain, offset = (float(context.value(key)) for key in keys)
         earlier = context.known.get("battery")
         readings = [] if self.fresh or earlier is None else [MeterReading(*row) for row in earlier.readings]
-        context.say("Measure at rest, with everything switched on that is always on; the truck does not move.")
+        context.say("Measure at rest, with everything switched on that is always on; the robot does not move.")
         while True:
             volts = await context.ask(METER)
             taken = await context.collect(Collect("battery voltage", topics.BATTERY, self.samples, 30.0))
@@ -81,7 +81,7 @@ class BatteryWizard:
             return "monitors.battery.divider", "monitors.battery.offset"
         if config.devices.steering is not None and config.devices.steering.driver.battery is not None:
             return f"{STEERING}.battery.gain", f"{STEERING}.battery.offset"
-        raise RequestRefusedError(Reason.NOT_SUPPORTED, "this truck measures no battery voltage")
+        raise RequestRefusedError(Reason.NOT_SUPPORTED, "this robot measures no battery voltage")
 
     @staticmethod
     def _step(context: WizardContext) -> float:

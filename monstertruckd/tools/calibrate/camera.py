@@ -126,7 +126,7 @@ def check_kept(before: LidarPlace, after: LidarPlace | None) -> None:
     turn = 0.0 if after is None else float(np.linalg.norm(cv2.Rodrigues(before.axes.T @ after.axes)[0]))
     if turn > KEPT:
         raise InputError(
-            f"the lidar has turned by {math.degrees(turn):.1f} degrees on its stabiliser meanwhile: stand the truck "
+            f"the lidar has turned by {math.degrees(turn):.1f} degrees on its stabiliser meanwhile: stand the robot "
             "firmly, lean on nothing of it, and begin anew"
         )
 

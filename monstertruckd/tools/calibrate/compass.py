@@ -82,7 +82,7 @@ class FieldCircle:
                 "the compass sends no magnetic field: its field mask needs 64 (devices.compass.driver.fields)"
             )
         if len(rows) < FEWEST:
-            raise InputError(f"{len(rows)} readings of the compass while the truck moved: expected {FEWEST} or more")
+            raise InputError(f"{len(rows)} readings of the compass while the robot moved: expected {FEWEST} or more")
         return cls(*np.array(rows).T)
 
 
@@ -91,7 +91,7 @@ class CompassWizard:
     """One circle forward, the same one back: what the motor's current adds changes its sign with the direction."""
 
     name: ClassVar[WizardName] = "compass"
-    doc: ClassVar[str] = "the truck's own magnetism, from a driven circle"
+    doc: ClassVar[str] = "the robot's own magnetism, from a driven circle"
     room: ClassVar[str] = ROOM
     speed: float = 0.07
     """m/s: slowly, for a compass with much iron runs ahead and falls behind by turns, which the gate takes for
@@ -130,7 +130,7 @@ def result_of(circle: FieldCircle) -> Result:
         InputError: no full circle was driven, the field turns the wrong way round, or is no ellipse.
     """
     if np.ptp(circle.heading) == 0.0:
-        raise InputError("the unit's heading stays the same while the truck turns: unplug the compass, and plug it in")
+        raise InputError("the unit's heading stays the same while the robot turns: unplug the compass, and plug it in")
     fit = fit_ellipse(circle)
     iron = IronConfig(**dict(zip(_NAMES, _iron(fit.parameters), strict=True)))
     angle = _angles(circle, iron)
@@ -143,7 +143,7 @@ def result_of(circle: FieldCircle) -> Result:
     radius = float(fit.parameters[4])
     if not np.isfinite(fit.standard_errors[:5]).all() or fit.rms > DISTURBED * radius:
         raise InputError(
-            f"the field is {fit.rms:.1f} uT off the ellipse of {radius:.0f} uT that the truck's own iron can make of "
+            f"the field is {fit.rms:.1f} uT off the ellipse of {radius:.0f} uT that the robot's own iron can make of "
             "it: a magnet is near the compass, or iron in the ground or passing by; go elsewhere, or move the compass"
         )
     errors = NORMAL * correlation_factor(fit.residuals) * _iron_errors(fit)
@@ -185,7 +185,7 @@ def result_of(circle: FieldCircle) -> Result:
         unobserved=(
             "hard and soft iron along z: on a slope the heading errs by up to (hard_z / horizontal field) x slope",
             "the strength of the field: all values are in the unit's own scale",
-            "a rotation of the unit on the truck: a constant error of the heading",
+            "a rotation of the unit on the robot: a constant error of the heading",
         ),
     )
 
@@ -285,7 +285,7 @@ def _check_coverage(angles: Array) -> None:
     gap = float(max(np.diff(around).max(), around[0] + 2 * math.pi - around[-1]))
     if gap > GAP:
         raise InputError(
-            f"the truck has not turned all the way round: {math.degrees(gap):.0f} deg of the circle are missing; "
+            f"the robot has not turned all the way round: {math.degrees(gap):.0f} deg of the circle are missing; "
             "calibrate the steering's directions first"
         )
 

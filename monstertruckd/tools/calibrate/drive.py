@@ -26,7 +26,7 @@ from monstertruckd.tools.calibrate.wizard import CLEAR, WizardContext
 RATIO: Final = "geometry.drive_ratio"
 INVERTED: Final = "devices.drive.driver.inverted"
 RATE: Final = "devices.drive.driver.rate"
-ROOM: Final = "a straight of 3 m (half a metre of it behind the truck), 1 m wide, level"
+ROOM: Final = "a straight of 3 m (half a metre of it behind the robot), 1 m wide, level"
 
 TAPE_SCALE: Final = 0.0005
 """Share by which a class II tape may be wrong, its sag included."""
@@ -39,7 +39,7 @@ ASIDE: Final = math.tan(BENT / 2)
 APART: Final = 0.03
 """Share by which two runs may differ before one of them must be a slip of the pen."""
 
-_FORWARD: Final = Confirm("forward", "Did the truck roll FORWARD, lidar first?", fact=True)
+_FORWARD: Final = Confirm("forward", "Did the robot roll FORWARD, lidar first?", fact=True)
 _MARK: Final = Confirm("mark", "Mark the floor straight below the middle of the front bumper. Done?")
 _DISTANCE: Final = Number(
     "distance", "Distance from that mark to below the middle of the front bumper now, m", 0.2, 20.0
@@ -78,7 +78,7 @@ class DriveWizard:
         if self.sign_only:
             return Result(
                 wizard="drive",
-                measured="the truck was commanded forward and rolled forward",
+                measured="the robot was commanded forward and rolled forward",
                 estimates=(_sign(inverted),),
                 partial=True,
             )
@@ -105,7 +105,7 @@ class DriveWizard:
     def _reversed(inverted: bool) -> Result:
         return Result(
             wizard="drive",
-            measured="the truck was commanded forward and rolled backward",
+            measured="the robot was commanded forward and rolled backward",
             estimates=(_sign(not inverted),),
             unobserved=("the ratio: nothing is driven any further with the sign wrong",),
             partial=True,
@@ -200,13 +200,13 @@ class TapedRun:
             turn, _ = track.turn()
             if abs(turn) > BENT:
                 raise InputError(
-                    f"the truck turned by {math.degrees(turn):.0f} deg on its way: "
+                    f"the robot turned by {math.degrees(turn):.0f} deg on its way: "
                     "run `calibrate steering --rough` first"
                 )
             length = arc(distance, turn)
         elif not straight:
             raise InputError(
-                f"the truck turned by more than {math.degrees(BENT):.0f} deg on its way: set the middle of its servos "
+                f"the robot turned by more than {math.degrees(BENT):.0f} deg on its way: set the middle of its servos "
                 "(devices.steering.driver.front.centre_us, .rear.centre_us), for `calibrate steering` needs a compass"
             )
         else:

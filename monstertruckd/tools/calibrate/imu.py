@@ -58,7 +58,7 @@ class Turn:
         """
         readings = record.of(topics.IMU)
         if len(readings) < 2:
-            raise InputError("the inertial measurement unit sent nothing while the truck turned")
+            raise InputError("the inertial measurement unit sent nothing while the robot turned")
         stamps = np.array([r.stamp for r in readings], dtype=np.float64) / SECOND
         rates = np.array([r.angular_velocity.z for r in readings]) / scale + bias
         turned, noise = record.turn()
@@ -67,7 +67,7 @@ class Turn:
         between = (stamps >= record.left / SECOND - 0.2) & (stamps <= record.arrived / SECOND + 0.2)
         heard = np.concatenate(((record.left / SECOND,), stamps[between], (record.arrived / SECOND,)))
         if (silent := float(np.diff(heard).max())) > SILENT:
-            raise InputError(f"the unit was silent for {silent:.1f} s while the truck turned: measure again")
+            raise InputError(f"the unit was silent for {silent:.1f} s while the robot turned: measure again")
         integral = float(np.trapezoid(rates[between], stamps[between]))
         seconds = float(np.ptp(stamps[between]))
         return cls(integral, seconds, turned, math.hypot(noise, HEADING, 0.01 * min(over, 1.0)))
@@ -90,7 +90,7 @@ class ImuWizard:
         rate = context.value(f"{IMU}.rate_z"), context.value(f"{IMU}.rate_scale")
         await context.confirm(CLEAR)
         resting = await context.collect(Collect("the unit at rest", topics.IMU, RESTING, 60.0))
-        tilt = await context.collect(Collect("the truck's tilt", topics.COMPASS, 20))
+        tilt = await context.collect(Collect("the robot's tilt", topics.COMPASS, 20))
         turns = []
         if self.turns:
             length = math.tau / context.chassis.bicycle.curvature(ANGLE, -ANGLE)

@@ -183,7 +183,7 @@ class LidarWizard:
 
     async def _level(self, context: WizardContext) -> tuple[Estimate, ...]:
         scans = await context.collect(Collect("distances of the walls", topics.SCAN, 10))
-        tilt = await context.collect(Collect("the truck's tilt", topics.COMPASS, 20))
+        tilt = await context.collect(Collect("the robot's tilt", topics.COMPASS, 20))
         joints = await joint_angles(context)
         ahead, left = (beam_distance(scans, angle) for angle in (0.0, QUARTER))
         heights = [(await context.ask(step)) / 100 for step in HEIGHTS]
@@ -270,7 +270,7 @@ def result_of(
         estimated("y", y, "m", len(legs), f"left of it; {noise}", f"{LIDAR}.y"),
         estimated(
             "yaw", yaw, "rad", len(legs),
-            f"against the direction of travel, left positive; {noise}, and of what the truck may crab", f"{LIDAR}.yaw",
+            f"against the direction of travel, left positive; {noise}, and of what the robot may crab", f"{LIDAR}.yaw",
         ),
         *level,
     ]  # fmt: skip
@@ -282,7 +282,7 @@ def result_of(
         measured=f"{len(legs)} legs between rests; unexplained {1000 * _unexplained(fit, legs):.1f} mm",
         estimates=tuple(estimates),
         unobserved=(
-            "a truck that crabs looks like a lidar that is turned",
+            "a robot that crabs looks like a lidar that is turned",
             *(() if level else ("pitch and roll of its plane: measure heights (--heights)",)),
         ),
         partial=not level,

@@ -40,12 +40,12 @@ SETTLE: Final = 5.0
 """Seconds in which it must come to rest."""
 DEPTH: Final = 4096
 LATE: Final = (
-    "requests came too late: end what else keeps this computer or the link to the truck busy, or run the command on "
-    "the truck's own computer, and repeat it; nothing was saved"
+    "requests came too late: end what else keeps this computer or the link to the robot busy, or run the command on "
+    "the robot's own computer, and repeat it; nothing was saved"
 )
 """What to do about a lease that expired."""
 SILENT: Final = (
-    "a device was silent (`monstertruckd status` names it), or the truck's computer is too busy: end what keeps it so, "
+    "a device was silent (`monstertruckd status` names it), or the robot's computer is too busy: end what keeps it so, "
     "and repeat the command; nothing was saved"
 )
 """What to do about measurements or ticks that came too late."""
@@ -199,7 +199,7 @@ class _Run:
             self._take()
         if self.state.mode.active:
             holder = f", {self.state.holder} drives" if self.state.holder else ""
-            raise RequestRefusedError(Reason.BUSY, f"the truck is armed already{holder}: disarm it first")
+            raise RequestRefusedError(Reason.BUSY, f"the robot is armed already{holder}: disarm it first")
 
     async def arm(self) -> None:
         """Request standstill for a moment, so that no lower role can drive, and arm.
@@ -215,7 +215,7 @@ class _Run:
         try:
             while not self._driving():
                 if self._clock.now() > end:
-                    raise refusal or NoAnswerError(f"the gate did not arm the truck within {ARMING:g} s")
+                    raise refusal or NoAnswerError(f"the gate did not arm the robot within {ARMING:g} s")
                 await self._truck.drive(0.0, 0.0, 0.0, LEASE)
                 requests += 1
                 if arming is not None and arming.done():
@@ -312,9 +312,9 @@ class _Run:
             return
         reasons = state.hindrances
         if not reasons and state.mode is GateMode.DRIVING:
-            raise RequestRefusedError(Reason.BUSY, f"{state.holder} drives the truck")
+            raise RequestRefusedError(Reason.BUSY, f"{state.holder} drives the robot")
         if not reasons and state.mode.active:  # armed still, but this wizard's requests hold it no longer
             reasons = (Reason.LEASE_EXPIRED,)
-        text = in_words(reasons) or f"the truck is {state.mode}"
+        text = in_words(reasons) or f"the robot is {state.mode}"
         advice = "".join(f"; {text}" for text in dict.fromkeys(ADVICE[r] for r in reasons if r in ADVICE))
         raise RequestRefusedError(reasons[0] if reasons else Reason.DISARMED, f"stopped by the gate: {text}{advice}")

@@ -25,7 +25,7 @@ from monstertruckd.tools.calibrate.steering_model import AXLES, EYE, SLIP, Maps,
 from monstertruckd.tools.calibrate.steps import Confirm, MoveRecord, MoveStep, Number
 from monstertruckd.tools.calibrate.wizard import CLEAR, WizardContext
 
-ROOM: Final = "3.5 m x 3.5 m on either side: squares of 2.4 m to the left and to the right of the truck, level"
+ROOM: Final = "3.5 m x 3.5 m on either side: squares of 2.4 m to the left and to the right of the robot, level"
 SPEED: Final = 0.15
 CORNER: Final = 0.08
 """Speed in the corners, m/s: fast ones are wider, as tyres slip outward."""
@@ -181,7 +181,7 @@ class OdometryWizard:
             estimates=tuple(estimates),
             unobserved=(
                 "gear ratio and wheel radius apart from each other",
-                "equal errors of both centres: the truck crabs, and its squares close",
+                "equal errors of both centres: the robot crabs, and its squares close",
                 "the wheelbase apart from the servos' scale: their product is measured",
             ),
         )

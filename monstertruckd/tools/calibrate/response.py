@@ -94,7 +94,7 @@ class ResponseFit:
         bounds = np.array(SLOWEST)
         fit = least_squares(lambda parameters: residuals(*parameters.tolist()), np.array(START), -bounds, bounds)
         if not np.isfinite(fit.standard_errors).all():
-            raise InputError("dead time and lag do not show: does the truck follow its commands?")
+            raise InputError("dead time and lag do not show: does the robot follow its commands?")
         halves = NORMAL * correlation_factor(fit.residuals) * fit.standard_errors
         delay, squared = (Interval(float(x), float(half)) for x, half in zip(fit.parameters, halves, strict=True))
         return cls(delay.joined(CONFIDENCE * wait), squared.widened(rounded), fit.residuals.size)

@@ -29,7 +29,7 @@ from monstertruckd.tools.calibrate.steps import Collect, Confirm
 from monstertruckd.tools.calibrate.wizard import WizardContext
 
 ROOM: Final = (
-    "a level floor, a wall 2.5 to 3.5 m ahead of the truck and one to its left, nothing within 2.5 m ahead and to the "
+    "a level floor, a wall 2.5 to 3.5 m ahead of the robot and one to its left, nothing within 2.5 m ahead and to the "
     "right; two blocks, 4 to 6 cm high"
 )
 TILT: Final = math.radians(0.2)
@@ -56,7 +56,7 @@ LEAST: Final = 10
 """Beams in the sector."""
 JOINTS: Final = ("pitch", "roll")
 
-_LEVEL: Final = Confirm("level", "Stand the truck on the level floor, wheels straight, and let go. Done?")
+_LEVEL: Final = Confirm("level", "Stand the robot on the level floor, wheels straight, and let go. Done?")
 _NOSE: Final = Confirm("nose", "Put the rear wheels on blocks, so that the nose is low, and let go. Done?")
 _SIDE: Final = Confirm("side", "Put the left wheels on blocks instead, so that the right side is low. Done?")
 
@@ -141,9 +141,9 @@ class StabiliserWizard:
 
     @staticmethod
     async def _stand(context: WizardContext) -> tuple[RestMeasurement, list[LaserScan]]:
-        await context.collect(Collect("the truck comes to rest", topics.SCAN, 20))
+        await context.collect(Collect("the robot comes to rest", topics.SCAN, 20))
         scans = await context.collect(Collect("what the lidar sees", topics.SCAN, 10))
-        tilts = await context.collect(Collect("the truck's tilt", topics.COMPASS, 20))
+        tilts = await context.collect(Collect("the robot's tilt", topics.COMPASS, 20))
         joints = await context.collect(Collect("positions of the servos", topics.STABILISER, 20))
         return RestMeasurement.of(scans, tilts, joints), scans
 

@@ -23,7 +23,7 @@ from monstertruckd.tools.calibrate.steps import Confirm, MoveStep, Number
 from monstertruckd.tools.calibrate.weave import estimates, response, weaves
 from monstertruckd.tools.calibrate.wizard import CLEAR, WizardContext
 
-ROOM: Final = "2.5 m x 2.5 m, level, the truck in the middle; with --rough 1.5 m x 1.5 m"
+ROOM: Final = "2.5 m x 2.5 m, level, the robot in the middle; with --rough 1.5 m x 1.5 m"
 
 ROUGH: Final = (0.06, 0.1, 0.4)
 """Speed (m/s), axle angle (rad) and distance (m) of the first arcs: too little turn for the gate to call the steering
@@ -58,10 +58,10 @@ SEEN: Final = 5.0
 """Standard errors of a turn that make its direction sure."""
 
 _TURNED: Final = Confirm(
-    "turned", "Steered to the left and driving ahead: did the truck turn to the LEFT, seen from above?", fact=True
+    "turned", "Steered to the left and driving ahead: did the robot turn to the LEFT, seen from above?", fact=True
 )
 _STRING: Final = Confirm(
-    "string", "Lay a string along the truck's left side, 2.5 m ahead, and mark the middle of that side on it. Done?"
+    "string", "Lay a string along the robot's left side, 2.5 m ahead, and mark the middle of that side on it. Done?"
 )
 _OFFSET: Final = Number(
     "offset", "How far has the middle of the left side moved off the string's line, cm, left positive?", -60.0, 60.0
@@ -76,7 +76,7 @@ class SteeringWizard:
     """Short arcs for the directions; then travel, straights along a string, full circles and weaves."""
 
     name: ClassVar[WizardName] = "steering"
-    doc: ClassVar[str] = "centre, direction, travel and pulses of both axles, from the truck's turns and a string"
+    doc: ClassVar[str] = "centre, direction, travel and pulses of both axles, from the robot's turns and a string"
     room: ClassVar[str] = ROOM
     rough: bool = False
     """Directions and a first centre only: before the compass is calibrated"""
@@ -142,7 +142,7 @@ class SteeringWizard:
         await context.move(MoveStep("front wheels left once more, to see where it turns", speed, angle, 0.0, metres))
         if await context.confirm(_TURNED):
             raise InputError(
-                "the truck turns as it is steered, and the compass the other way: it is mounted upside down, or its "
+                "the robot turns as it is steered, and the compass the other way: it is mounted upside down, or its "
                 "heading has the wrong sign; nothing was saved"
             )
 
@@ -268,7 +268,7 @@ class SteeringWizard:
                 "the wheelbase, whose error shows as scale, and the linkage but for what its turns lack",
                 "travel beyond the limits of gate and servo",
                 "an error of devices.compass.driver.delay, which shows as dead time of the steering",
-                *(() if self.strings else ("equal errors of both centres, but by unlike circles: the truck crabs",)),
+                *(() if self.strings else ("equal errors of both centres, but by unlike circles: the robot crabs",)),
             ),
         )
 
@@ -354,7 +354,7 @@ def steered_senses(arcs: tuple[list[SteeringRun], list[SteeringRun]]) -> tuple[i
         error = math.hypot(*(leg.sigma for leg in legs)) / 4
         if abs(turn) < SEEN * error:
             raise InputError(
-                f"{AXLES[axle]} wheels: steered, they turn the truck by {math.degrees(turn):.2f} deg only: "
+                f"{AXLES[axle]} wheels: steered, they turn the robot by {math.degrees(turn):.2f} deg only: "
                 "a servo without supply, or on another channel?"
             )
         signs.append(1 if turn > 0 else -1)
@@ -396,7 +396,7 @@ def _direction(name: str, scale: float, samples: int) -> Estimate:
         name=f"{name}_direction",
         value=1 if scale > 0 else -1,
         samples=samples,
-        meaning="+1: a longer pulse steers left; by the sense in which the truck turned",
+        meaning="+1: a longer pulse steers left; by the sense in which the robot turned",
         key=f"{STEERING}.{name}.direction",
     )
 

@@ -67,7 +67,7 @@ class Maps:
         """
         steering = config.devices.steering
         if steering is None:
-            raise InputError("devices.steering: not in this truck's configuration, so there is nothing to calibrate")
+            raise InputError("devices.steering: not in this robot's configuration, so there is nothing to calibrate")
         servos = (steering.driver.front, steering.driver.rear)
         front, rear = servos
         deficit = config.body.turn_deficit.model_dump() if isinstance(config.body, TruckBody) else {}

@@ -30,7 +30,7 @@ T = TypeVar("T")
 
 WATCHED: Final = 64
 """Messages kept between two looks."""
-CLEAR: Final = Confirm("clear", "The truck is about to move. Is the floor free as described?")
+CLEAR: Final = Confirm("clear", "The robot is about to move. Is the floor free as described?")
 
 
 class Wizard(Protocol):
@@ -92,7 +92,7 @@ class WizardContext:
         """
         value = value_at(self._values, key)
         if value is None:
-            raise InputError(f"{key}: not in this truck's configuration, so there is nothing to calibrate")
+            raise InputError(f"{key}: not in this robot's configuration, so there is nothing to calibrate")
         return value
 
     async def ask(self, step: Number) -> float:

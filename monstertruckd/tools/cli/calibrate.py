@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from monstertruckd.tools.calibrate.steps import Panel
     from monstertruckd.tools.calibrate.wizard import Wizard
 
-app = command_group("Calibrate this truck: guided, step by step; Ctrl-C gives up at any step.")
+app = command_group("Calibrate this robot: guided, step by step; Ctrl-C gives up at any step.")
 
 TIMEOUT: Final = 10.0
 """Seconds to wait for the link and for answers."""
@@ -129,7 +129,7 @@ def steering(
 
 @_wizard
 def compass() -> "Wizard":
-    """The truck's own magnetism, hard and soft iron: a circle forward and back. Asks `clear`."""
+    """The robot's own magnetism, hard and soft iron: a circle forward and back. Asks `clear`."""
     from monstertruckd.tools.calibrate.compass import CompassWizard
 
     return CompassWizard()

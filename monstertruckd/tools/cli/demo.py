@@ -58,7 +58,7 @@ def demo(
     if film is not None:
         require_place(film)
     folder = _fresh(output)
-    remark(f"starting the emulated truck and its daemon; log, map and outputs go to {folder}")
+    remark(f"starting the emulated robot and its daemon; log, map and outputs go to {folder}")
     screen = on_terminal(sys.stdout) and not json_output
     try:
         if fast:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from monstertruck_runtime.clock import Clock
     from monstertruckd.tools.doctor.context import Finding
 
-CLEAR = "The truck is about to drive 20 cm ahead and back. Is half a metre free all around, and somebody at the switch?"
+CLEAR = "The robot is about to drive 20 cm ahead and back. Is half a metre free all around, and somebody at the switch?"
 STYLES = {"ok": "green", "warn": "yellow", "fail": "bold red"}
 
 
@@ -28,7 +28,7 @@ def doctor(
         typer.Option(
             "--config",
             "-c",
-            help="Configuration of the truck; default: the installed service's.",
+            help="Configuration of the robot; default: the installed service's.",
             autocompletion=complete_config,
         ),
     ] = None,

@@ -32,7 +32,7 @@ def drill(
     ] = None,
     json_output: JsonOption = False,
 ) -> None:
-    """Inject random faults into the emulated truck while it drives, and score its reactions.
+    """Inject random faults into the emulated robot while it drives, and score its reactions.
 
     Everything runs on a virtual clock, with the deadman line wired. Exit code 1 if any motion was unsafe or any service
     did not recover.

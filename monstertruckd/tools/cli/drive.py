@@ -31,14 +31,14 @@ def drive(
         typer.Option("--mapping", help="YAML file with what its sticks and buttons do (docs/command-line.md)."),
     ] = None,
 ) -> None:
-    """Drive with the keyboard: the truck moves only while a key is held, in this terminal.
+    """Drive with the keyboard: the robot moves only while a key is held, in this terminal.
 
     `Enter` arms, `W A S D` or the arrow keys drive, `space` stops, `e` is the emergency stop and
     `r` resets it, `1` to `5` choose front, rear, counter, crab or hybrid steering, `z` and `c`
     the drift of the last, `x` straightens the wheels, `+` and `-` change the speed, `q` ends.
     `6` drives by twist: `A` and `D` turn, also on the spot, `z` and `c` move left and right.
 
-    With `--gamepad`: the truck moves only while the right shoulder button or trigger is held; left stick,
+    With `--gamepad`: the robot moves only while the right shoulder button or trigger is held; left stick,
     start arms, A stops, B is the emergency stop, X resets it, Y or the cross change steering and speed.
     """
     from monstertruck_runtime.errors import InputError

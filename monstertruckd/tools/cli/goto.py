@@ -1,4 +1,4 @@
-"""``goto`` and ``track``: send the truck to a pose or along a path, and follow it there."""
+"""``goto`` and ``track``: send the robot to a pose or along a path, and follow it there."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 ROUTE_TIMEOUT: Final = 6.0
 """Seconds to wait for a first route."""
 
-ArmOption = Annotated[bool, typer.Option("--arm", help="Arm the truck as well; it drives off at once.")]
+ArmOption = Annotated[bool, typer.Option("--arm", help="Arm the robot as well; it drives off at once.")]
 
 
 def goto(
@@ -60,7 +60,7 @@ def track(
 ) -> None:
     """Send a path to the robot and follow how it is driven.
 
-    Ends at its end or when it is lost, with the reason's exit code. Ctrl-C stops the truck.
+    Ends at its end or when it is lost, with the reason's exit code. Ctrl-C stops the robot.
     """
     from monstertruck_planners.track.paths import load_path
     from monstertruck_runtime.drives import follow

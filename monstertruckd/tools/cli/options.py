@@ -88,7 +88,7 @@ ConfigOption = Annotated[
 ]
 SimulatedOption = Annotated[
     Path,
-    typer.Option("--config", "-c", help="Configuration of a simulated truck.", autocompletion=complete_config),
+    typer.Option("--config", "-c", help="Configuration of a simulated robot.", autocompletion=complete_config),
 ]
 ConfigArgument = Annotated[
     Path,

@@ -91,7 +91,7 @@ async def _announce(client: "TruckClient", *, hold: bool) -> None:
 
 
 async def _set_off(client: "TruckClient", gate: "GateState | None") -> list[str]:
-    """Who drives as soon as the truck is armed: those who ask for it now, and the tracker if it has a path."""
+    """Who drives as soon as the robot is armed: those who ask for it now, and the tracker if it has a path."""
     from monstertruck_runtime.mailbox import latest
     from monstertruck_schemas.topics import TRACKER
 
@@ -141,14 +141,14 @@ def arm(
         bool, typer.Option("--hold", help="Let no tracker drive, along a configured path too, until armed without.")
     ] = False,
 ) -> None:
-    """Allow the truck to move; says before who sets off then, such as the tracker of a configured path."""
+    """Allow the robot to move; says before who sets off then, such as the tracker of a configured path."""
     _run("arm", robot, endpoint, json_output=json_output, hold=hold)
 
 
 def disarm(
     robot: RobotOption = "truck", endpoint: EndpointOption = DEFAULT_ENDPOINT, json_output: JsonOption = False
 ) -> None:
-    """Stop the truck by its ordinary ramp, and allow no motion until it is armed again."""
+    """Stop the robot by its ordinary ramp, and allow no motion until it is armed again."""
     _run("disarm", robot, endpoint, json_output=json_output)
 
 
@@ -162,5 +162,5 @@ def estop(
 def reset(
     robot: RobotOption = "truck", endpoint: EndpointOption = DEFAULT_ENDPOINT, json_output: JsonOption = False
 ) -> None:
-    """Clear an emergency stop; the truck must stand and stays disarmed."""
+    """Clear an emergency stop; the robot must stand and stays disarmed."""
     _run("reset", robot, endpoint, json_output=json_output)

@@ -21,7 +21,7 @@ FolderOption = Annotated[
 HERE = Path("security")
 NameArgument = Annotated[str, typer.Argument(help="Name of the station: letters, digits and . _ - @, no . or @ first.")]
 RESTART = (
-    "Takes effect once these files are on the robot and its daemon was restarted; restart it while the truck stands."
+    "Takes effect once these files are on the robot and its daemon was restarted; restart it while the robot stands."
 )
 
 

@@ -30,7 +30,7 @@ def install_service(
         typer.Option(
             "--config",
             "-c",
-            help="Configuration of the truck, copied to /etc/monstertruckd; default: the one that is there.",
+            help="Configuration of the robot, copied to /etc/monstertruckd; default: the one that is there.",
             autocompletion=complete_config,
         ),
     ] = None,
@@ -46,7 +46,7 @@ def install_service(
         typer.Option(
             "--upgrade",
             help="Run this version instead of the installed one, which comes back if this one does not become ready; "
-            "refused while the truck is armed.",
+            "refused while the robot is armed.",
         ),
     ] = False,
     dry_run: DryOption = False,

@@ -158,7 +158,7 @@ def access(context: HostContext) -> Iterator[Finding]:
     zenoh = context.config.zenoh
     if zenoh.open_endpoints:
         seen = (
-            f"{', '.join(zenoh.open_endpoints)}: anyone who reaches it may drive the truck; use tls/... with zenoh.tls"
+            f"{', '.join(zenoh.open_endpoints)}: anyone who reaches it may drive the robot; use tls/... with zenoh.tls"
         )
         yield fail("access", Reason.LINK_OPEN, seen)
     elif zenoh.certified_endpoints:

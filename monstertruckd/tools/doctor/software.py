@@ -88,7 +88,7 @@ def _install_command(context: HostContext) -> str:
 async def service(context: HostContext) -> AsyncIterator[Finding]:
     """Whether the service is installed, up to date and running."""
     if not context.at(UNIT).is_file():
-        seen = "not installed: nothing starts the daemon, and nothing stops the truck when it dies"
+        seen = "not installed: nothing starts the daemon, and nothing stops the robot when it dies"
         yield warn("service", Reason.NOT_INSTALLED, seen, context.install_command())
         return
     if stale := _stale(context):
@@ -120,7 +120,7 @@ def rules(context: HostContext) -> Iterator[Finding]:
     if not context.runs("ModemManager"):
         yield fine("ModemManager", "does not run")
     elif installed:
-        yield fine("ModemManager", "runs, and ignores the truck's ports")
+        yield fine("ModemManager", "runs, and ignores the robot's ports")
     else:
         seen = "runs, and sends commands to serial ports that it takes for modems"
         yield warn("ModemManager", Reason.NOT_INSTALLED, seen, context.install_command())

@@ -85,10 +85,10 @@ def plan(config_file: Path | None, user: str | None, program: Program, root: Pat
         raise InputError(hidden)
     source = config_file or installed_config(root) or below(root, CONFIG)
     if config_file is None and not source.is_file():
-        raise NotFoundError(f"{source}: no configuration is installed; name the truck's with --config FILE")
+        raise NotFoundError(f"{source}: no configuration is installed; name the robot's with --config FILE")
     config, tree = load_truck(source)
     if "sim" in tree.data:
-        raise ConfigError(f"{source}: sim: is a simulated truck; a service drives a real one")
+        raise ConfigError(f"{source}: sim: is a simulated robot; a service drives a real one")
     installed, copies = _placed(tree.files, below(root, FOLDER))
     return InstallPlan(
         (

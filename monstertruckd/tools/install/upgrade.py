@@ -93,7 +93,7 @@ def _refuse_armed(run: Run) -> None:
     status = dict(line.split("=", 1) for line in run(STATUS).splitlines() if "=" in line)
     mode = MODES.get(status.get("StatusText", "").split(";")[0])
     if status.get("ActiveState") == "active" and mode is not None and mode.active:
-        raise BusyError(f"the truck is {mode.value}: an upgrade restarts the daemon; disarm it first")
+        raise BusyError(f"the robot is {mode.value}: an upgrade restarts the daemon; disarm it first")
 
 
 def _put_back(before: list[_Before], run: Run) -> None:

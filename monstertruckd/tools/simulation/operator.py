@@ -173,5 +173,5 @@ async def _arm(operator: Operator, clock: Clock, timeout: float) -> None:
                     return
                 await clock.sleep(0.25)
     except TimeoutError:
-        text = f"the truck could not be armed within {timeout:g} s: {refusal or 'no answer'}"
+        text = f"the robot could not be armed within {timeout:g} s: {refusal or 'no answer'}"
         raise NoAnswerError(text) from None

@@ -258,7 +258,7 @@ class Fusion:
         dt = (measured.stamp - measured.since) / SECOND
         x, y, yaw = np.abs(measured.delta).tolist()
         if max(x, y) > self._config.max_speed * dt + MARGIN[0] or yaw > self._config.max_turn * dt + MARGIN[1]:
-            self._left_out["lidar: faster than the truck can be"] += 1
+            self._left_out["lidar: faster than the robot can be"] += 1
             return
         self._apply_slip(self._slip.scans(measured))
         if self._slip.doubted:

@@ -314,7 +314,7 @@ def checked_pose(pose: ArrayLike) -> Array:
     """
     robot_pose = np.array(pose, dtype=np.float64)
     if robot_pose.shape != (3,) or not np.isfinite(robot_pose).all():
-        raise InputError("local planner: expected the truck's pose as three finite numbers")
+        raise InputError("local planner: expected the robot's pose as three finite numbers")
     return robot_pose
 
 

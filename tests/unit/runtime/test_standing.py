@@ -50,7 +50,7 @@ def test_where_it_stood_before_anybody_looked_only_what_holds_it_is_known():
     robot.stop(GateMode.STOPPING, "long ago")
     assert robot.standing.why() == ""
     assert robot.gate(GateMode.DISARMED, Reason.DISARMED, Reason.SCAN_STALE) == f"{OFF}, {Reason.SCAN_STALE.text}"
-    assert robot.gate(GateMode.DISARMED) == "the truck is disarmed"
+    assert robot.gate(GateMode.DISARMED) == "the robot is disarmed"
     assert robot.gate(GateMode.DRIVING, Reason.OBSTACLE_SLOW) == ""
 
 

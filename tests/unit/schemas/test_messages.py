@@ -221,14 +221,14 @@ def test_arrays_have_one_dimension():
 @pytest.mark.parametrize(
     ("mode", "reasons", "worst", "hindrances", "why"),
     [
-        (GateMode.ARMED, (), Reason.DISARMED, 0, "the truck is armed"),
-        (GateMode.DISARMED, (Reason.DISARMED,), Reason.DISARMED, 0, "the truck is disarmed"),
+        (GateMode.ARMED, (), Reason.DISARMED, 0, "the robot is armed"),
+        (GateMode.DISARMED, (Reason.DISARMED,), Reason.DISARMED, 0, "the robot is disarmed"),
         (
             GateMode.DISARMED,
             (Reason.SCAN_STALE, Reason.DISARMED),
             Reason.SCAN_STALE,
             1,
-            "no fresh lidar scan, the truck is disarmed",
+            "no fresh lidar scan, the robot is disarmed",
         ),
     ],
 )
@@ -237,3 +237,7 @@ def test_the_gate_says_why_the_truck_stands(
 ):
     state = GateState(**HEADER, mode=mode, nonce="n", speed_limit=0.0, reasons=reasons)  # type: ignore[arg-type]
     assert (state.worst, len(state.hindrances), state.why) == (worst, hindrances, why)
+
+
+def test_reasons_are_of_every_robot_not_of_the_truck_alone():
+    assert [reason for reason in Reason if "truck" in reason.text] == []

@@ -164,10 +164,10 @@ def test_a_magnet_that_makes_no_circle_of_it_is_refused_and_gets_no_interval_wit
 
 
 def test_a_heading_that_stays_and_too_few_readings_are_named():
-    with pytest.raises(InputError, match="stays the same while the truck turns"):
+    with pytest.raises(InputError, match="stays the same while the robot turns"):
         result_of(replace(circle(), heading=np.zeros(800)))
     record = MoveRecord(others={topics.COMPASS.name: [reading(100 + i, i) for i in range(9)]}, left=99, arrived=200)
-    with pytest.raises(InputError, match="18 readings of the compass while the truck moved: expected 24"):
+    with pytest.raises(InputError, match="18 readings of the compass while the robot moved: expected 24"):
         FieldCircle.of([record, record])
 
 

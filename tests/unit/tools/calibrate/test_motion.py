@@ -36,7 +36,7 @@ def stopped(*reasons: Reason, mode: GateMode = GateMode.DISARMED) -> RequestRefu
 
 def test_a_stop_has_the_reason_of_the_gate():
     assert stopped(Reason.DISARMED, Reason.OBSTACLE_STOP).refusal is Reason.OBSTACLE_STOP
-    assert str(stopped(Reason.DISARMED)) == "stopped by the gate: the truck is disarmed"
+    assert str(stopped(Reason.DISARMED)) == "stopped by the gate: the robot is disarmed"
 
 
 def test_an_expired_lease_says_what_to_do():
@@ -66,7 +66,7 @@ def test_a_silent_device_says_what_to_do_once():
             RequestRefusedError,
             "run: no progress for 3 s (obstacle within the stopping distance)",
         ),
-        ((), NoAnswerError, "run: no progress for 3 s (the truck is driving)"),
+        ((), NoAnswerError, "run: no progress for 3 s (the robot is driving)"),
     ],
 )
 def test_a_run_that_is_held_ends_by_what_holds_it(held: tuple[Reason, ...], kind: type[Exception], said: str):

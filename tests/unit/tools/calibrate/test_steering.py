@@ -171,7 +171,7 @@ def test_the_moves_that_are_announced_are_those_that_are_made(wizard: SteeringWi
 
 def test_wheels_that_do_not_steer_are_named():
     dead = ([leg(0, 0, d * 0.4, BELIEVED) for d in (1, -1, 1, -1)],) * 2
-    with pytest.raises(InputError, match="front wheels: steered, they turn the truck by"):
+    with pytest.raises(InputError, match="front wheels: steered, they turn the robot by"):
         steered_senses(dead)
 
 

@@ -179,7 +179,7 @@ def test_values_of_the_running_configuration():
         context.value("devices.camera.driver.rate")
         return RESULT
 
-    with pytest.raises(InputError, match=r"devices\.camera\.driver\.rate: not in this truck's configuration"):
+    with pytest.raises(InputError, match=r"devices\.camera\.driver\.rate: not in this robot's configuration"):
         run(steps)
 
 

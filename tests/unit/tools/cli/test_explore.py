@@ -182,7 +182,7 @@ def test_a_truck_that_stands_disarmed_is_not_said_to_drive():
         robot.gate.put(held.model_copy(update={"reasons": (Reason.DISARMED, Reason.DRIVE_STALE)}))
 
     asyncio.run(run_exploration(robot, home=None, budget=None, arm=False, report=report))
-    assert lines[0] == "    0 s  it stands: the truck is disarmed (disarmed by bob); `monstertruckd arm` lets it drive"
+    assert lines[0] == "    0 s  it stands: the robot is disarmed (disarmed by bob); `monstertruckd arm` lets it drive"
     assert len(lines) == 1, "once"
 
 

@@ -175,7 +175,7 @@ def test_what_a_goal_waits_for_is_said_with_the_command_that_helps(capsys):
         for reason in (Reason.DISARMED, Reason.ESTOPPED):
             report.stands(gate_state(GateMode.DISARMED).model_copy(update={"reasons": (reason,)}), reason.text)
     assert capsys.readouterr().err.splitlines() == [
-        "waiting: the truck is disarmed; `monstertruckd arm` lets it drive",
+        "waiting: the robot is disarmed; `monstertruckd arm` lets it drive",
         "waiting: emergency stop is latched; `monstertruckd reset` clears the emergency stop",
     ]
 
@@ -249,7 +249,7 @@ def test_each_reason_for_which_it_stands_is_said_once_until_it_drives():
 
     run_virtual(main)
     assert [reasons for reasons, _ in said] == [off, stale, latched, off]
-    assert said[0][1] == "the truck is disarmed (disarmed by ann)"
+    assert said[0][1] == "the robot is disarmed (disarmed by ann)"
 
 
 class LostRobot(SilentRobot):

@@ -127,5 +127,5 @@ def test_what_a_step_waits_for_and_why_the_robot_stands_is_said_once():
     step = {"step": 1, "doing": "goto 1 0 0"}
     starts = {**step, "text": "the planner is starting"}
     assert followed(starts, starts, step)[1:] == ["     0 s  it waits: the planner is starting"]
-    stands = "     0 s  it stands: the truck is disarmed; `monstertruckd arm` lets it drive"
+    stands = "     0 s  it stands: the robot is disarmed; `monstertruckd arm` lets it drive"
     assert followed(starts, step, step, mode=GateMode.DISARMED)[1:] == [stands], "though more becomes stale"

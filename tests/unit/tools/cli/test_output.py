@@ -227,7 +227,7 @@ def test_finish_is_silent_about_success_only(capsys: pytest.CaptureFixture[str])
 @pytest.mark.parametrize(
     ("reason", "text", "words"),
     [
-        (Reason.DISARMED, "", "the truck is disarmed; `monstertruckd arm` lets it drive\n"),
+        (Reason.DISARMED, "", "the robot is disarmed; `monstertruckd arm` lets it drive\n"),
         (
             Reason.DISARMED,
             "it stands: `monstertruckd arm` lets it drive",

@@ -48,7 +48,7 @@ WRONG = (
     (
         "simulate -c configs/truck.yaml",
         2,
-        "configs/truck.yaml: describes a real truck: it has no section `sim`, as conf",
+        "configs/truck.yaml: describes a real robot: it has no section `sim`, as conf",
     ),
     ("simulate --robots configs/demo.yaml,", 3, "--robots configs/demo.yaml,: expected names of files with one comma"),
     ("set gate.speed nan", 3, "gate.speed nan: expected a finite number"),
@@ -64,7 +64,7 @@ WRONG = (
     (
         "demo -c configs/truck.yaml --fast",
         2,
-        "configs/truck.yaml: describes a real truck: it has no section `sim`, as conf",
+        "configs/truck.yaml: describes a real robot: it has no section `sim`, as conf",
     ),
     ("drill --nope", 2, "Error: No such option: --nope"),
     ("drill x y", 2, "Error: Got unexpected extra argument(s) (x y)"),

@@ -136,7 +136,7 @@ def test_modem_manager_is_harmless_with_the_rules(tmp_path: Path):
         (emulated.folder / RULES.relative_to("/")).unlink()
 
     assert see(tmp_path / "a", rules)["ModemManager"].seen == "does not run"
-    assert see(tmp_path / "b", rules, running)["ModemManager"].seen == "runs, and ignores the truck's ports"
+    assert see(tmp_path / "b", rules, running)["ModemManager"].seen == "runs, and ignores the robot's ports"
     assert see(tmp_path / "c", rules, without_rules)["ModemManager"].level is Level.WARN
 
 

@@ -178,12 +178,12 @@ def test_who_may_not_write_gets_the_reason(tmp_path: Path, monkeypatch: pytest.M
 
 
 def test_a_simulated_truck_is_no_service(tmp_path: Path):
-    with pytest.raises(ConfigError, match=r"demo.yaml: sim: is a simulated truck"):
+    with pytest.raises(ConfigError, match=r"demo.yaml: sim: is a simulated robot"):
         truck_plan(tmp_path, ROOT / "configs" / "demo.yaml")
 
 
 def test_without_any_configuration_it_asks_for_one(tmp_path: Path):
-    with pytest.raises(NotFoundError, match="name the truck's with --config FILE"):
+    with pytest.raises(NotFoundError, match="name the robot's with --config FILE"):
         truck_plan(tmp_path, None)
 
 

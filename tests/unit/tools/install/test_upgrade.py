@@ -93,7 +93,7 @@ def test_what_stands_or_does_not_run_is_upgraded(state: str, mode: str, computer
 def test_a_truck_armed_while_files_were_written_is_not_restarted(computer: Computer):
     before = computer.unit
     computer.status = ["disarmed", "armed"]
-    with pytest.raises(BusyError, match="the truck is armed"):
+    with pytest.raises(BusyError, match="the robot is armed"):
         computer.upgrade(config=TRUCK)
     assert computer.unit == before
     assert computer.ran == [*AFTER_INSTALL, *AFTER_INSTALL]

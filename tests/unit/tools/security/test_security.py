@@ -182,7 +182,7 @@ def test_the_commands_from_nothing_to_rules(tmp_path: Path):
     assert run.invoke(app, ["security", "init", "--address", "10.0.0.7", *folder]).exit_code == 0
     added = run.invoke(app, ["security", "add", "ann", "--role", "engineer", "--rank", "gamepad", *folder])
     assert added.exit_code == 0
-    assert "restart it while the truck stands" in added.output
+    assert "restart it while the robot stands" in added.output
     again = run.invoke(app, ["security", "add", "ann", "--role", "engineer", "--rank", "gamepad", *folder])
     assert "The robot needs nothing" in again.output
     shown = run.invoke(app, ["security", "show", "--json", *folder])
@@ -191,4 +191,4 @@ def test_the_commands_from_nothing_to_rules(tmp_path: Path):
     assert printed[0]["access_control"]["subjects"][0]["cert_common_names"] == ["ann"]
     revoked = run.invoke(app, ["security", "revoke", "ann", *folder])
     assert revoked.exit_code == 0
-    assert "restart it while the truck stands" in revoked.output
+    assert "restart it while the robot stands" in revoked.output
