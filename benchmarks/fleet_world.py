@@ -36,12 +36,13 @@ from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import SECOND, Clock, VirtualClock, run_virtual, run_wall
 from monstertruck_runtime.errors import NoAnswerError, NotFoundError, RequestRefusedError
 from monstertruck_runtime.mailbox import Mailbox, latest
+from monstertruck_runtime.requests import Operator
 from monstertruck_runtime.yaml_files import yaml_text
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.state import GateState, Odometry, Peers
 from monstertruck_schemas.topics import GATE, PEERS, POSE
 from monstertruck_sim.world.scene import MOVING, Contact
-from monstertruckd.tools.cli.runs import BehaviourClient, RunEnd, run_behaviour
+from monstertruckd.tools.cli.runs import RunEnd, run_behaviour
 from monstertruckd.tools.demo.runs import free_endpoint
 from monstertruckd.tools.simulation.config import load_simulated
 from monstertruckd.tools.simulation.operator import LocalOperator
@@ -131,7 +132,7 @@ class Pilot:
         number: of the robot in ``ROBOTS``.
     """
 
-    driver: BehaviourClient
+    driver: Operator
     clock: Clock
     seed: int
     score: Score

@@ -6,7 +6,7 @@ import json
 import logging
 import secrets
 import threading
-from collections.abc import Callable, Coroutine, Mapping, Sequence
+from collections.abc import Callable, Coroutine, Sequence
 from functools import partial
 from typing import Any, Final, Generic, Self, TypeVar
 
@@ -35,7 +35,6 @@ from monstertruck_schemas.points import PointOrder
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import (
     UNCONDITIONAL,
-    BehaviourOrder,
     ControlRequest,
     DriveRequest,
     ExploreOrder,
@@ -301,7 +300,7 @@ class TruckClient(Operator):
         Raises:
             NoAnswerError: the robot's nonce did not come in time.
         """
-        header = await self._answered(lease)
+        header = await self.header(lease)
         self._put(REQ_DRIVE, DriveRequest(**header, speed=speed, front=front, rear=rear))
 
     async def drive_twist(self, vx: float, vy: float = 0.0, wz: float = 0.0, lease: float = 0.3) -> None:
@@ -309,7 +308,7 @@ class TruckClient(Operator):
 
         What the body cannot do is refused by the robot with an event ``impossible_motion``. Raises as ``drive`` does.
         """
-        header = await self._answered(lease)
+        header = await self.header(lease)
         twist = RequestedTwist(vx=vx, vy=vy, wz=wz)
         self._put(REQ_DRIVE, DriveRequest(**header, speed=0.0, front=0.0, twist=twist))
 
@@ -318,7 +317,7 @@ class TruckClient(Operator):
 
         Limits, ramps and the sweep hold as for every request. Raises as ``drive`` does.
         """
-        self._put(REQ_DRIVE, DriveRequest(**await self._answered(lease), speed=0.0, front=0.0, shafts=rates))
+        self._put(REQ_DRIVE, DriveRequest(**await self.header(lease), speed=0.0, front=0.0, shafts=rates))
 
     def publish_stand_pose(self, pose: StandPose) -> None:
         """Say where the robot really is, as a test stand sees it: the robot records it, and nothing in it reads it."""
@@ -356,7 +355,7 @@ class TruckClient(Operator):
         return await self._outcome(Order.HAND_OVER, self._overtaking, {"to": to})
 
     async def _outcome(self, order: Order, overtaking: int, more: dict[str, Any]) -> GateState:
-        header = self._header(1.0) if order in UNCONDITIONAL else await self._answered(1.0)
+        header = self._header(1.0) if order in UNCONDITIONAL else await self.header()
         if overtaking != self._overtaking and order not in UNCONDITIONAL:
             raise RequestRefusedError(Reason.BAD_SEQUENCE, f"{order.value}: overtaken by a stop")
         return wire.decode(GATE, await self._call(order.value, header | more, ORDER_TIMEOUT))
@@ -378,7 +377,7 @@ class TruckClient(Operator):
         return await self.call(
             "goal",
             {
-                **await self._answered(1.0),
+                **await self.header(),
                 "frame": frame,
                 "goal": {"x": x, "y": y, "yaw": yaw},
                 "waypoints": [dict(zip(("x", "y", "yaw"), place, strict=False)) for place in via],
@@ -387,33 +386,7 @@ class TruckClient(Operator):
 
     async def goal_control(self, order: GoalOrder, *, own: bool = False) -> None:
         """Pause, resume or cancel the goal; ``own``: only one that this client sent. Raises as ``goal`` does."""
-        await self.call("goal_control", {**await self._answered(1.0), "order": order, "own": own})
-
-    async def behave(
-        self,
-        order: BehaviourOrder,
-        behaviour: str = "",
-        settings: Mapping[str, Any] | None = None,
-        *,
-        own: bool = False,
-    ) -> dict[str, Any]:
-        """Start a configured behaviour, or stop it; answers with its ``number``. Progress is on ``plan/behaviour``.
-
-        Args:
-            order: what.
-            behaviour: its name.
-            settings: those that replace the configured ones for this run.
-            own: of a stop: only one that this client started.
-
-        Raises:
-            RequestRefusedError: why it does not start, or nothing runs.
-            InputError: a setting is wrong.
-            NotFoundError: the robot is not there, or has no such behaviour.
-            NoAnswerError: no answer in time.
-        """
-        request = {"order": order, "behaviour": behaviour, "own": own}
-        request |= {"settings": dict(settings)} if settings else {}
-        return await self.call("behave", {**await self._answered(1.0), **request})
+        await self.call("goal_control", {**await self.header(), "order": order, "own": own})
 
     async def explore(
         self,
@@ -440,7 +413,7 @@ class TruckClient(Operator):
         """
         request = {"order": order, "home": home, "budget": budget, "own": own}
         request |= {} if find is None else {"find": find}
-        return await self.call("explore", {**await self._answered(1.0), **request})
+        return await self.call("explore", {**await self.header(), **request})
 
     async def point(
         self,
@@ -467,7 +440,7 @@ class TruckClient(Operator):
         """
         x, y = (None, None) if place is None else place
         return await self.call(
-            "points", {**await self._answered(1.0), "order": order, "name": name, "x": x, "y": y, "yaw": yaw}
+            "points", {**await self.header(), "order": order, "name": name, "x": x, "y": y, "yaw": yaw}
         )
 
     async def mission(
@@ -488,11 +461,11 @@ class TruckClient(Operator):
         """
         steps = None if mission is None else mission.model_dump(mode="json")
         wanted = {"order": order, "mission": steps, "moved": moved, "own": own}
-        return await self.call("mission", {**await self._answered(1.0), **wanted})
+        return await self.call("mission", {**await self.header(), **wanted})
 
     async def path(self, path: DrivePath, lease: float = 1.0) -> None:
         """Request to follow a path computed here. Raises as ``drive`` does."""
-        self._put(REQ_PATH, PathRequest(**await self._answered(lease), frame=path.frame, path=path))
+        self._put(REQ_PATH, PathRequest(**await self.header(lease), frame=path.frame, path=path))
 
     def _put(self, topic: Topic[M], message: M, key: Callable[[str, str], str] | None = None) -> None:
         assert topic.writer is Writer.OUTSIDE
@@ -523,8 +496,8 @@ class TruckClient(Operator):
                     msg = f"robot {self.robot!r} does not publish its gate state at {self.endpoint}"
                     raise NoAnswerError(msg) from None
 
-    async def _answered(self, lease: float) -> dict[str, Any]:
-        """Header of a request once the robot's nonce is known."""
+    async def header(self, lease: float = 1.0) -> dict[str, Any]:
+        """Header of a request once the robot's nonce is known; raises as ``ready`` does."""
         await self.ready()
         return self._header(lease)
 

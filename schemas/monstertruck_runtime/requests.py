@@ -5,7 +5,7 @@ The gate and the planners check requests by the same rules, whether they come by
 
 import json
 import math
-from collections.abc import Collection, Coroutine
+from collections.abc import Collection, Coroutine, Mapping
 from typing import Any, Final, Protocol, TypeVar
 
 from pydantic import ValidationError
@@ -15,7 +15,7 @@ from monstertruck_runtime.errors import InputError, RequestRefusedError
 from monstertruck_runtime.mailbox import Delivery, Mailbox
 from monstertruck_schemas.base import Message, first_mistake
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import DriveRequest, Order, Request, Role
+from monstertruck_schemas.req import BehaviourOrder, DriveRequest, Order, Request, Role
 from monstertruck_schemas.state import GateState
 from monstertruck_schemas.topics import Topic, owner_of
 
@@ -51,6 +51,10 @@ class Operator(Protocol):
         """Call ``rpc`` with a JSON object; returns its answer."""
         ...
 
+    async def header(self, lease: float = 1.0) -> dict[str, Any]:
+        """Header of the next request, as plain data."""
+        ...
+
     def order(self, order: Order, *, hold: bool = False) -> Coroutine[Any, Any, GateState]:
         """Give an order; the coroutine waits until it is carried out and returns the gate's state then.
 
@@ -84,6 +88,36 @@ class Operator(Protocol):
     async def stop(self) -> GateState:
         """Stop driving by the ordinary ramp; answered once at rest. Raises as ``order`` does."""
         return await self.order(Order.STOP)
+
+    async def drive_shafts(self, *rates: float, lease: float = 0.3) -> None:
+        """Request the rate of the wheels on every driven shaft, rad/s, for ``lease`` seconds."""
+        ...
+
+    async def behave(
+        self,
+        order: BehaviourOrder,
+        behaviour: str = "",
+        settings: Mapping[str, Any] | None = None,
+        *,
+        own: bool = False,
+    ) -> dict[str, Any]:
+        """Start a configured behaviour, or stop it; answers with its ``number``. Progress is on ``plan/behaviour``.
+
+        Args:
+            order: what.
+            behaviour: its name.
+            settings: those that replace the configured ones for this run.
+            own: of a stop: only one that this client started.
+
+        Raises:
+            RequestRefusedError: why it does not start, or nothing runs.
+            InputError: a setting is wrong.
+            NotFoundError: the robot is not there, or has no such behaviour.
+            NoAnswerError: no answer in time.
+        """
+        request = {"order": order, "behaviour": behaviour, "own": own}
+        request |= {"settings": dict(settings)} if settings else {}
+        return await self.call("behave", {**await self.header(), **request})
 
 
 def parse_request(model: type[R], payload: dict[str, Any]) -> R:

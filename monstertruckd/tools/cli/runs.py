@@ -4,8 +4,9 @@ import asyncio
 from collections.abc import Awaitable, Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any, Final, Protocol, TypeVar
+from typing import Any, Final, TypeVar
 
+from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.errors import NoAnswerError, TruckError
 from monstertruck_runtime.mailbox import Mailbox, fifo
 from monstertruck_runtime.presence import while_it_runs
@@ -26,47 +27,6 @@ Report = Callable[[str], object]
 """Gets a line of progress now and then."""
 
 
-class BehaviourClient(Operator, Protocol):
-    """Client of a robot that has behaviours."""
-
-    async def behave(
-        self,
-        order: BehaviourOrder,
-        behaviour: str = "",
-        settings: Mapping[str, Any] | None = None,
-        *,
-        own: bool = False,
-    ) -> dict[str, Any]:
-        """Start or stop a behaviour."""
-        ...
-
-
-class ExploringClient(Operator, Protocol):
-    """Client of a robot that explores."""
-
-    async def explore(
-        self,
-        order: ExploreOrder,
-        *,
-        home: bool | None = None,
-        budget: float | None = None,
-        find: int | None = None,
-        own: bool = False,
-    ) -> dict[str, Any]:
-        """Start an exploration, or end it."""
-        ...
-
-
-class MissionClient(Operator, Protocol):
-    """Client of a robot that does missions."""
-
-    async def mission(
-        self, order: MissionOrder, mission: Mission | None = None, *, moved: bool = False, own: bool = False
-    ) -> dict[str, Any]:
-        """Start, resume or end one."""
-        ...
-
-
 @dataclass(frozen=True, slots=True)
 class RunEnd:
     """How a run ended."""
@@ -81,9 +41,7 @@ class RunEnd:
         return {"reason": self.reason, "text": self.text, **self.figures}
 
 
-async def run_behaviour(
-    client: BehaviourClient, name: str, *, arm: bool, settings: Mapping[str, Any] | None = None
-) -> RunEnd:
+async def run_behaviour(client: Operator, name: str, *, arm: bool, settings: Mapping[str, Any] | None = None) -> RunEnd:
     """Start a behaviour and wait for its end, see ``_run``; ``settings`` replace the configured ones."""
     with progress(name) as bar:
         return await _run(
@@ -98,7 +56,7 @@ async def run_behaviour(
 
 
 async def run_exploration(
-    client: ExploringClient,
+    client: TruckClient,
     *,
     home: bool | None,
     budget: float | None,
@@ -136,7 +94,7 @@ async def run_exploration(
 
 
 async def run_mission(
-    client: MissionClient, mission: Mission | None, *, arm: bool, moved: bool = False, report: Report | None = None
+    client: TruckClient, mission: Mission | None, *, arm: bool, moved: bool = False, report: Report | None = None
 ) -> RunEnd:
     """Start a mission and wait for its end, see ``_run``.
 

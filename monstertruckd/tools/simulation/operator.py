@@ -1,7 +1,6 @@
 """An operator that arms the truck and watches a lap, over Zenoh or inside the daemon's process."""
 
 import json
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -16,7 +15,7 @@ from monstertruck_runtime.requests import Operator
 from monstertruck_schemas import topics
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import UNCONDITIONAL, BehaviourOrder, ControlRequest, DriveRequest, Order, Role
+from monstertruck_schemas.req import UNCONDITIONAL, ControlRequest, DriveRequest, Order, Role
 from monstertruck_schemas.state import GateState
 from monstertruck_schemas.topics import Topic
 from monstertruckd.daemon import Daemon
@@ -53,18 +52,6 @@ class LocalOperator(Operator):
             self._daemon.bus.inject(topics.REQ_CONTROL, request)
         answer = await self.call(order.value, {**await self.header(), "hold": hold})
         return wire.decode(topics.GATE, json.dumps(answer).encode())
-
-    async def behave(
-        self,
-        order: BehaviourOrder,
-        behaviour: str = "",
-        settings: Mapping[str, Any] | None = None,
-        *,
-        own: bool = False,
-    ) -> dict[str, Any]:
-        """Start or stop a behaviour as ``TruckClient.behave`` does."""
-        request = {"order": order, "behaviour": behaviour, "settings": dict(settings or {}), "own": own}
-        return await self.call("behave", {**await self.header(), **request})
 
     async def drive_shafts(self, *rates: float, lease: float = 0.25) -> None:
         """Request wheel rates of every driven shaft, rad/s, as ``TruckClient.drive_shafts`` does."""

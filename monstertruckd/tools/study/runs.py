@@ -2,14 +2,13 @@
 
 import math
 from collections.abc import Sequence
-from typing import Final, NamedTuple, Protocol
+from typing import Final, NamedTuple
 
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import InputError, RequestRefusedError
-from monstertruck_runtime.mailbox import Delivery, Mailbox, latest
+from monstertruck_runtime.mailbox import latest
+from monstertruck_runtime.requests import Operator
 from monstertruck_schemas import topics
-from monstertruck_schemas.state import GateState
-from monstertruck_schemas.topics import Topic
 from monstertruckd.config.truck import TruckConfig
 
 PERIOD: Final = 0.05
@@ -19,28 +18,6 @@ PAUSE: Final = 0.6
 """Seconds of standstill at a reversal."""
 SETTLING: Final = 2.0
 """Seconds at the beginning of a run that the analysis leaves out; they are driven besides."""
-
-
-class OpenLoop(Protocol):
-    """Client of one robot that drives by shaft speeds."""
-
-    source: str
-
-    def subscribe(self, topic: Topic[GateState], delivery: Delivery) -> Mailbox[GateState]:
-        """Subscribe to a topic."""
-        ...
-
-    async def arm(self, *, hold: bool = False) -> GateState:
-        """Allow driving."""
-        ...
-
-    async def disarm(self) -> GateState:
-        """Stop and forbid driving."""
-        ...
-
-    async def drive_shafts(self, *rates: float, lease: float = LEASE) -> None:
-        """Request wheel rates, rad/s."""
-        ...
 
 
 class Stretch(NamedTuple):
@@ -122,7 +99,7 @@ def shaft_rates(config: TruckConfig, stretch: Stretch) -> tuple[float, ...]:
     return (stretch.left, stretch.right) * (len(config.chassis().shafts) // 2)
 
 
-async def drive(robot: OpenLoop, clock: Clock, config: TruckConfig, plan: Sequence[Stretch]) -> float:
+async def drive(robot: Operator, clock: Clock, config: TruckConfig, plan: Sequence[Stretch]) -> float:
     """Arm, drive a plan, disarm.
 
     Returns:

@@ -3,16 +3,17 @@
 import asyncio
 import math
 from collections.abc import Awaitable, Callable, Generator, Mapping, Sequence
-from contextlib import AbstractContextManager, suppress
+from contextlib import suppress
 from functools import partial
-from typing import Any, Final, NamedTuple, Protocol
+from typing import Any, Final, NamedTuple
 
 from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError, TruckError
-from monstertruck_runtime.mailbox import Delivery, Mailbox, fifo
+from monstertruck_runtime.mailbox import Mailbox, fifo
+from monstertruck_runtime.requests import Operator
 from monstertruck_schemas.plan import BehaviourState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import BehaviourOrder
-from monstertruck_schemas.topics import BEHAVIOUR, Topic
+from monstertruck_schemas.topics import BEHAVIOUR
 from monstertruckd.tools.tune.recipe import RunVerdict, WallGains, judged, recipe
 
 STEP: Final = 0.05
@@ -26,35 +27,6 @@ CALM_WITHIN: Final = 0.02
 """Distance error below which a robot is ready for a run, m."""
 CALM_FOR: Final = 2.0
 """Seconds for which the error must be below ``CALM_WITHIN``."""
-
-
-class TunedRobot(Protocol):
-    """Client of a robot that has behaviours."""
-
-    def subscribe(
-        self, topic: Topic[BehaviourState], delivery: Delivery
-    ) -> AbstractContextManager[Mailbox[BehaviourState]]:
-        """Subscribe to a topic."""
-        ...
-
-    async def behave(
-        self,
-        order: BehaviourOrder,
-        behaviour: str = "",
-        settings: Mapping[str, Any] | None = None,
-        *,
-        own: bool = False,
-    ) -> dict[str, Any]:
-        """Start or stop a behaviour."""
-        ...
-
-    async def arm(self) -> Any:
-        """Allow driving."""
-        ...
-
-    async def disarm(self) -> Any:
-        """Forbid driving."""
-        ...
 
 
 Samples = Sequence[tuple[float, float]]
@@ -79,7 +51,7 @@ class TuningRun(NamedTuple):
 
 
 async def tune(
-    client: TunedRobot,
+    client: Operator,
     name: str,
     distance: float,
     first: float,
@@ -118,7 +90,7 @@ async def tune(
 
 
 async def _tuned(
-    client: TunedRobot,
+    client: Operator,
     name: str,
     distance: float,
     trials: Generator[WallGains, RunVerdict, WallGains | None],
@@ -158,7 +130,7 @@ def _over(wanted: float, seconds: float, samples: Samples) -> bool:
     return samples[-1][0] >= seconds or abs(samples[-1][1] - wanted) > LOST
 
 
-async def _run(client: TunedRobot, name: str, settings: Mapping[str, Any], over: Callable[[Samples], bool]) -> Samples:
+async def _run(client: Operator, name: str, settings: Mapping[str, Any], over: Callable[[Samples], bool]) -> Samples:
     """One start of the behaviour: the first stretch of following that is over; a corner begins another one."""
     with client.subscribe(BEHAVIOUR, fifo(1024)) as states:
         try:

@@ -15,13 +15,14 @@ from contextlib import AbstractAsyncContextManager
 from enum import Enum
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, Final, Protocol, Self, get_type_hints
+from typing import Any, Final, Self, get_type_hints
 
 import numpy as np
 
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import InputError, NotFoundError, TruckError, WorkerError, WorkerTimeoutError
 from monstertruck_runtime.plugins import classes_in
+from monstertruck_runtime.requests import Operator
 from monstertruck_runtime.threads import in_thread
 from monstertruck_schemas.base import Schema
 
@@ -305,22 +306,9 @@ class RemoteWorkQueue:
         return await actor.serve(payload)
 
 
-class Caller(Protocol):
-    """What is needed of a ``TruckClient``."""
-
-    @property
-    def source(self) -> str:
-        """Name of the caller."""
-        ...
-
-    async def call(self, rpc: str, payload: dict[str, Any] | None = None) -> dict[str, Any]:
-        """Call the robot."""
-        ...
-
-
 async def serve(
     clock: Clock,
-    connect: Callable[[], AbstractAsyncContextManager[Caller]],
+    connect: Callable[[], AbstractAsyncContextManager[Operator]],
     steps: Mapping[str, str],
     codec: StepCodec,
 ) -> None:
@@ -345,7 +333,7 @@ async def serve(
         await clock.sleep(RETRY)
 
 
-async def work(caller: Caller, clock: Clock, name: str, target: str, codec: StepCodec, server: str) -> None:
+async def work(caller: Operator, clock: Clock, name: str, target: str, codec: StepCodec, server: str) -> None:
     """Call for one kind of steps, take them, bring the outputs; until cancelled.
 
     Raises:

@@ -320,7 +320,7 @@ async def test_a_stop_withdraws_an_order_that_still_waits_for_the_nonce(monkeypa
     client = TruckClient()
     known, called, put = asyncio.Event(), [], []
 
-    async def answered(_lease):
+    async def answered(*_):
         await known.wait()
         return {}
 
@@ -328,7 +328,7 @@ async def test_a_stop_withdraws_an_order_that_still_waits_for_the_nonce(monkeypa
         called.append(name)
         await asyncio.Event().wait()
 
-    monkeypatch.setattr(client, "_answered", answered)
+    monkeypatch.setattr(client, "header", answered)
     monkeypatch.setattr(client, "_call", call)
     monkeypatch.setattr(client, "_put", lambda _topic, request, _key: put.append(request.order))
     monkeypatch.setattr(client, "_header", lambda _lease: header())
