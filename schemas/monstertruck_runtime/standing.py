@@ -72,7 +72,7 @@ class Standing:
                 continue
             if event.reason in BEGINS:
                 self._since, self._said = event.stamp, []
-            elif event.reason in ENDS and event.text:
+            elif event.reason in ENDS and event.text not in ("", event.reason.text):
                 self._said.append(event.text)
 
 

@@ -65,7 +65,7 @@ def test_who_disarmed_it_at_rest_or_on_its_way_is_named_once():
     robot.event(Reason.DRIVING)
     robot.event(Reason.DISARMED, "disarmed by bob")
     robot.stop(GateMode.STOPPING, "disarmed by bob")
-    robot.event(Reason.DISARMED)
+    robot.event(Reason.DISARMED, OFF)
     assert robot.gate(GateMode.DISARMED, Reason.DISARMED) == f"{OFF} (disarmed by bob)"
 
 
