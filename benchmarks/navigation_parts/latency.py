@@ -1,4 +1,4 @@
-"""Trackers that do not know, or know wrongly, how late the axles answer: the yardstick plant of the part tracking.
+"""Trackers that do not know, or know wrongly, how late the axles answer: the reference model of the part tracking.
 
 Each tracker that reckons with the delay drives every course with axles that answer after 0 to 150 ms, once with nothing
 configured, with 0, 50 and 150 ms of dead time configured, and with what is right. It is compared with pure pursuit with

@@ -1,6 +1,6 @@
 """Processor time of a step of ``mpc``, against the same programme by CasADi's SQP method with OSQP.
 
-Both are trackers on the yardstick plant of the part tracking, with the same base class, model, costs, limits and
+Both are trackers on the reference model of the part tracking, with the same base class, model, costs, limits and
 horizon; each drives every course, in turns. ``programme`` is ours with all it takes from the path, and of the peer
 the call of the solver alone. The peer takes one Gauss-Newton iteration per step from its last plan, as
 ours does; its functions are built beforehand. All rounds take the same steps, and the least time of a step counts: what

@@ -1,4 +1,4 @@
-"""Trackers on courses with the yardstick plant: error, worst error, swept width; forward, backward, with cusps.
+"""Trackers on courses with the reference model: error, worst error, swept width; forward, backward, with cusps.
 
 The plant is a kinematic bicycle about the rear axle, wheelbase 0.30 m, steering +-0.6 rad, 10 ms steps, asked at 10 Hz,
 started 5 cm to the left. "ideal" steers at once; "lag" has 50 ms dead time, 0.10 s lag and 5 rad/s. The error is the

@@ -36,7 +36,7 @@ from monstertruck_schemas.body import TruckBody
 from monstertruck_schemas.roles import SHAFTS, DeviceRole
 from monstertruckd.bus.zenoh_config import PeerConfig, ZenohConfig
 from monstertruckd.config.device_safety import beyond_devices, unattended_times, weakened_devices
-from monstertruckd.gate.config import SIGHT, BodyLimits, GateConfig, beyond, weakened
+from monstertruckd.gate.config import SIGHT, BodyLimits, GateConfig, impossible_settings, weakened
 from monstertruckd.recorder.config import BlackBoxConfig, MapRender, RecorderConfig
 
 ROBOT: Final = "truck"
@@ -241,7 +241,7 @@ class TruckConfig(Schema):
         body = self.body_limits
         times = unattended_times(self.devices)
         devices = beyond_devices(self.devices, self.monitors, self.gate.standstill, body)
-        for excess in (*beyond(self.gate, body, times), *devices):
+        for excess in (*impossible_settings(self.gate, body, times), *devices):
             raise ValueError(excess)
         self._check_planner()
         if self.behaviours.keys() - {MOVE} and (lack := self.missing_actuators()):

@@ -264,7 +264,7 @@ class BodyLimits:
         return min(self.pull / self.mass, GRIP * GRAVITY)
 
 
-def beyond(config: GateConfig, body: BodyLimits, times: Iterable[tuple[str, float]] = ()) -> Iterator[str]:
+def impossible_settings(config: GateConfig, body: BodyLimits, times: Iterable[tuple[str, float]] = ()) -> Iterator[str]:
     """Every setting that asks for more than the body can do, with what it can.
 
     Args:

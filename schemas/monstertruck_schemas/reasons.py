@@ -1,6 +1,7 @@
 """One enum of reason codes, shared by gate, services, RPC, events and CLI exit codes.
 
-Members only ever get added; a value or an exit code is never reused.
+Members only ever get added; a value or an exit code is never reused, and exit codes stay below 126. Plug-ins use the
+members there are.
 """
 
 from collections.abc import Iterable

@@ -87,7 +87,9 @@ class Topic(Generic[M]):
     rate: float | None = None
     """Nominal rate in Hz; None = on change."""
     stale_after: float | None = None
-    """Seconds after which the newest message no longer counts; gate, tracker, goals and levelling take it from here."""
+    """Seconds after which the newest message no longer counts, for every reader in the robot. What moves the truck is
+    limited otherwise (requests by their lease, commands by ``command_timeout`` of the drivers): such limits are shown
+    only."""
     logged: bool = True
     retained: bool = False
     """Late joiners get the newest message at once."""
@@ -129,16 +131,21 @@ class Topic(Generic[M]):
 
 W = Writer
 
+DRIVE_STALE: Final = 0.2
+"""``stale_after`` of every driven shaft, s."""
+POSE_STALE: Final = 0.2
+"""``stale_after`` of dead reckoning and of the pose in the map, s: whoever follows a pose reads either."""
+
 SCAN: Final = Topic(
     "sensor/scan", LaserScan, W.DRIVER, "Lidar revolution", 10, stale_after=0.25, foxglove="foxglove.LaserScan"
 )
 COMPASS: Final = Topic("sensor/compass", Attitude, W.DRIVER, "Heading and tilt", 20, stale_after=0.25)
-DRIVE: Final = Topic("sensor/drive", DriveFeedback, W.DRIVER, "Drive motor feedback", 20, stale_after=0.2)
+DRIVE: Final = Topic("sensor/drive", DriveFeedback, W.DRIVER, "Drive motor feedback", 20, stale_after=DRIVE_STALE)
 DRIVE_2: Final = Topic(
-    "sensor/drive_2", DriveFeedback, W.DRIVER, "Second driven shaft, where there is one", 20, stale_after=0.2
+    "sensor/drive_2", DriveFeedback, W.DRIVER, "Second driven shaft, where there is one", 20, stale_after=DRIVE_STALE
 )
-DRIVE_3: Final = Topic("sensor/drive_3", DriveFeedback, W.DRIVER, "Third driven shaft", 20, stale_after=0.2)
-DRIVE_4: Final = Topic("sensor/drive_4", DriveFeedback, W.DRIVER, "Fourth driven shaft", 20, stale_after=0.2)
+DRIVE_3: Final = Topic("sensor/drive_3", DriveFeedback, W.DRIVER, "Third driven shaft", 20, stale_after=DRIVE_STALE)
+DRIVE_4: Final = Topic("sensor/drive_4", DriveFeedback, W.DRIVER, "Fourth driven shaft", 20, stale_after=DRIVE_STALE)
 STEERING: Final = Topic("sensor/steering", SteeringFeedback, W.DRIVER, "Servo pulses being sent", 20, stale_after=0.25)
 BATTERY: Final = Topic("sensor/battery", Battery, W.DRIVER, "Pack voltage and level", 10, stale_after=2.0)
 CAMERA: Final = Topic(
@@ -167,11 +174,11 @@ ODOMETRY: Final = Topic(
     W.ESTIMATION,
     "Dead-reckoned pose in odom",
     50,
-    stale_after=0.2,
+    stale_after=POSE_STALE,
     foxglove="foxglove.PoseInFrame",
 )
 POSE: Final = Topic(
-    "state/pose", Odometry, W.ESTIMATION, "Pose in map", 50, stale_after=0.2, foxglove="foxglove.PoseInFrame"
+    "state/pose", Odometry, W.ESTIMATION, "Pose in map", 50, stale_after=POSE_STALE, foxglove="foxglove.PoseInFrame"
 )
 SCAN_MOTION: Final = Topic(
     "state/scan_motion", ScanMotion, W.ESTIMATION, "Motion of base between two scans, by the scans alone", 10

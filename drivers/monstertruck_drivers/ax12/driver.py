@@ -320,7 +320,7 @@ class Ax12Driver:
             if session.strange >= STRANGE:
                 raise WrongDeviceError(
                     f"{self._port.name}: {session.strange} bytes, but no answer of an AX-12A: another device, another "
-                    f"baud rate than {p.BAUD}, or several units with one id; expected ids {ids}"
+                    f"baud rate than {session.baud}, or several units with one id; expected ids {ids}"
                 )
             raise DeviceTimeoutError(
                 f"{self._port.name}: silence; expected AX-12A units {ids}: is the 12 V rail up, the adapter at TTL?"

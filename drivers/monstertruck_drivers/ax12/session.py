@@ -43,7 +43,8 @@ class Ax12Session:
         self._link = link
         self._clock = clock
         self._timeout = timeout
-        self._baud = link.baud or protocol.BAUD
+        self.baud = link.baud or protocol.BAUD
+        """Bits per second of the line."""
         self._quiet_until = 0
 
     async def find_echo(self, *units: int) -> None:
@@ -104,7 +105,7 @@ class Ax12Session:
         await self._clock.sleep_until(self._quiet_until)
         packet = protocol.sync_write(start, data)
         self._link.write(packet)
-        self._quiet_until = self._clock.now() + round((len(packet) * 10 / self._baud + GAP) * SECOND)
+        self._quiet_until = self._clock.now() + round((len(packet) * 10 / self.baud + GAP) * SECOND)
 
     async def _ask(self, unit: int, request: bytes, count: int, retries: int) -> Answer:
         for attempt in range(1 + retries):
@@ -135,7 +136,7 @@ class Ax12Session:
         # A damaged length must not make the parser wait for more than can come.
         parser = Ax12Parser(longest=max(len(request) - 4, count + 2))
         echo_due = self.echo
-        end = self._clock.now() + round(self._timeout(len(request) + 6 + count, self._baud) * SECOND)
+        end = self._clock.now() + round(self._timeout(len(request) + 6 + count, self.baud) * SECOND)
         while (left := end - self._clock.now()) > 0:
             try:
                 data = await self._link.read(left / SECOND)

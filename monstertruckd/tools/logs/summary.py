@@ -1,7 +1,7 @@
 """Summaries: of one log by reading it, of a folder's logs by their indices."""
 
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from operator import itemgetter
 from pathlib import Path
@@ -125,32 +125,30 @@ def list_logs(folder: Path) -> list[LogSummary]:
 
 
 def _summary_of(path: Path) -> LogSummary:
-    size = path.stat().st_size
+    known = LogSummary(path, path.stat().st_size, LogState.UNREADABLE)
     try:
         reader = LogReader(path)
     except InputError:
-        return LogSummary(path, size, LogState.UNREADABLE)
-    robot = _robot(reader)
+        return known
+    known = replace(known, robot=_robot(reader))
     if not is_finished(path):
         state = LogState.WRITING if in_use(path) else LogState.UNFINISHED
-        return LogSummary(path, size, state, robot, _first_date(reader))
+        return replace(known, state=state, started=_first_date(reader))
     try:
         with path.open("rb") as file:
             if not index_is_sound(file):
-                return LogSummary(path, size, LogState.DAMAGED, robot, _first_date(reader))
+                return replace(known, state=LogState.DAMAGED, started=_first_date(reader))
             file.seek(0)
             summary = make_reader(file).get_summary()
         statistics = None if summary is None else summary.statistics
         if statistics is None:
-            return LogSummary(path, size, LogState.FINISHED, robot)
+            return replace(known, state=LogState.FINISHED)
         real = statistics.message_start_time + _offset(reader)
     except DAMAGE:
-        return LogSummary(path, size, LogState.DAMAGED, robot, _first_date(reader))
-    return LogSummary(
-        path,
-        size,
-        LogState.FINISHED,
-        robot,
+        return replace(known, state=LogState.DAMAGED, started=_first_date(reader))
+    return replace(
+        known,
+        state=LogState.FINISHED,
         started=utc(real) if is_date(real) else None,
         duration=(statistics.message_end_time - statistics.message_start_time) / SECOND,
         messages=statistics.message_count,

@@ -4,7 +4,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,7 @@ from monstertruck_planners.collision import scan_points
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import NotFoundError
 from monstertruck_runtime.stop_text import stop_lines
+from monstertruck_schemas import topics
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.event import Event, Severity, Stop
 from monstertruck_schemas.health import (
@@ -36,6 +37,7 @@ from monstertruck_schemas.plan import TrackerState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import Attitude, Battery, LaserScan, SonarRanges
 from monstertruck_schemas.state import GateMode, GateState, Odometry, Transforms
+from monstertruck_schemas.topics import Topic
 from monstertruckd.gate.sonars import arc
 
 MODE_STYLE = {
@@ -120,7 +122,7 @@ class ScreenState:
         """
         self.now = message.stamp
         self.began = message.stamp if self.began is None else self.began
-        if (name := _NEWEST.get(type(message))) is not None:
+        if (name := _FIELDS.get(type(message))) is not None:
             setattr(self, name, message)
         match message:
             case Odometry():
@@ -141,22 +143,23 @@ def calibration_badge(health: CalibrationHealth) -> str:
     return "; ".join(f"{grade} {', '.join(names)}" for grade, names in sorted(good.items()))
 
 
-_NEWEST: Final[dict[type, str]] = {
-    GateState: "gate",
-    Odometry: "odometry",
-    LaserScan: "scan",
-    SonarRanges: "sonar",
-    Transforms: "transforms",
-    Attitude: "attitude",
-    Battery: "battery",
-    CalibrationHealth: "calibration",
-    TrackerState: "tracker",
-    HealthTable: "health",
-    LoopHealth: "loop",
-    RecorderHealth: "recorder",
-    Stop: "stop",
+SHOWN: Final[dict[str, Topic[Any]]] = {
+    "gate": topics.GATE,
+    "odometry": topics.ODOMETRY,
+    "scan": topics.SCAN,
+    "sonar": topics.SONAR,
+    "transforms": topics.TRANSFORMS,
+    "attitude": topics.COMPASS,
+    "battery": topics.BATTERY,
+    "calibration": topics.CALIBRATION,
+    "tracker": topics.TRACKER,
+    "health": topics.HEALTH,
+    "loop": topics.LOOP,
+    "recorder": topics.RECORDER,
+    "stop": topics.STOP,
 }
-"""Where the newest message of each kind is kept."""
+"""Topics of which ``ScreenState`` keeps the newest message, by its field."""
+_FIELDS: Final = {topic.model: name for name, topic in SHOWN.items()}
 
 
 def draw(state: ScreenState, width: int, events: int = 6) -> RenderableType:

@@ -2,7 +2,6 @@
 
 import asyncio
 import json
-from typing import Any
 
 from rich.console import Console
 from rich.live import Live
@@ -15,24 +14,8 @@ from monstertruck_runtime.mailbox import fifo, latest
 from monstertruck_schemas import topics
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.sensor import SonarEcho
-from monstertruck_schemas.topics import Topic
-from monstertruckd.tools.status.screen import ScreenState, calibration_badge, draw
+from monstertruckd.tools.status.screen import SHOWN, ScreenState, calibration_badge, draw
 
-SHOWN: tuple[Topic[Any], ...] = (
-    topics.GATE,
-    topics.ODOMETRY,
-    topics.SCAN,
-    topics.SONAR,
-    topics.TRANSFORMS,
-    topics.COMPASS,
-    topics.BATTERY,
-    topics.TRACKER,
-    topics.HEALTH,
-    topics.LOOP,
-    topics.CALIBRATION,
-    topics.RECORDER,
-    topics.STOP,
-)
 PICTURED = frozenset({topics.SCAN.name, topics.TRANSFORMS.name})
 """Shown by the picture alone, not in words."""
 PERIOD = 0.1
@@ -52,7 +35,7 @@ class Follower:
     def __init__(self, client: TruckClient, clock: Clock, state: ScreenState | None = None) -> None:
         self.state = state or ScreenState(f"{client.robot} {place(client.endpoint)}", clock.now())
         self._clock = clock
-        self._newest = [client.subscribe(topic, latest()) for topic in SHOWN]
+        self._newest = [client.subscribe(topic, latest()) for topic in SHOWN.values()]
         self._events = client.subscribe(topics.EVENT, fifo(64))
 
     async def run(self) -> None:
@@ -116,7 +99,7 @@ async def print_once(clock: Clock, robot: str, endpoint: str, *, json_output: bo
         NoAnswerError: the robot published nothing for a second.
     """
     async with TruckClient(robot, endpoint, clock=clock) as client:
-        boxes = {topic.name: client.subscribe(topic, latest()) for topic in SHOWN}
+        boxes = {topic.name: client.subscribe(topic, latest()) for topic in SHOWN.values()}
         await clock.sleep(1.2)
         newest: dict[str, Message] = {name: box.latest for name, box in boxes.items() if box.latest is not None}
         if not newest:

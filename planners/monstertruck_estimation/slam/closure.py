@@ -473,7 +473,7 @@ def crossings(keyframes: KeyframeMap, own: NDArray[np.intp], others: NDArray[np.
 
 
 def opposed(keyframes: KeyframeMap, own: NDArray[np.intp], others: NDArray[np.intp]) -> Pieces[bool]:
-    """Whether the keyframes ``own`` and ``others`` look through too much of each other's walls to be of one map.
+    """Whether too many beams of the keyframes ``own`` and ``others`` pass through each other's walls for one map.
 
     As a whole, or along any stretch of ``own``: the way out of a room that only looks like another one is short.
     """

@@ -56,7 +56,7 @@ class MatchStatus(StrEnum):
     OVERLAP = "overlap"
     FAR = "far"
     CONTRADICTED = "contradicted"
-    """Scan and map look through each other's walls there."""
+    """Beams of the scan pass through walls of the map there, or beams of the map through what the scan meets."""
     UNSURE = "unsure"
     """After a gap in the scans: the robot may be anywhere, and one place that fits is no proof."""
 

@@ -129,7 +129,7 @@ class GoalRun:
     moved: float = 0.0
     """When progress was last seen, s."""
     blocked_scans: int = 0
-    """Looks in a row that showed the way blocked."""
+    """Scans in a row that showed the way blocked."""
     blocks: int = 0
     nearest: float = math.inf
     """Least remaining length of any route so far, m."""
@@ -185,10 +185,10 @@ def displaced(run: GoalRun, text: str) -> Step:
 
 def tick(run: GoalRun, observed: Observations, config: PlannerConfig) -> Step:
     """One step with new observations."""
-    passed, run = observed.now - run.now, replace(run, now=observed.now)
-    if run.phase in (GoalPhase.IDLE, GoalPhase.PAUSED):
+    passed, phase, run = observed.now - run.now, run.phase, replace(run, now=observed.now)
+    if phase is GoalPhase.IDLE or phase is GoalPhase.PAUSED:
         return run, ()
-    if observed.armed or run.phase is GoalPhase.PLANNING:
+    if observed.armed or phase is GoalPhase.PLANNING:
         run = replace(run, elapsed=run.elapsed + passed, unarmed=0.0)
     else:
         run = replace(run, unarmed=run.unarmed + passed, moved=observed.now)
@@ -199,13 +199,15 @@ def tick(run: GoalRun, observed: Observations, config: PlannerConfig) -> Step:
             return _end(run, Reason.NO_MAP, f"no fresh pose for {config.unarmed_timeout:g} s")
         why = f": {observed.held}" if observed.held else ""
         return _end(run, Reason.DISARMED, f"not armed for {config.unarmed_timeout:g} s{why}")
-    match run.phase:
+    match phase:
         case GoalPhase.PLANNING:
             return (run, ()) if observed.answer is None else _planned(run, observed, observed.answer, config)
         case GoalPhase.WAITING:
             return _plan(run, config) if observed.now - run.since >= config.wait else (run, ())
-        case _:
+        case GoalPhase.DRIVING | GoalPhase.BACKING_OUT:
             return _drive(run, observed, config)
+        case _:
+            assert_never(phase)
 
 
 def _planned(run: GoalRun, observed: Observations, answer: PlanAnswer, config: PlannerConfig) -> Step:

@@ -15,7 +15,7 @@ from monstertruck_drivers.steppers.config import StepperConfig
 from monstertruckd.config.device_safety import WEAKER_ABOVE, WEAKER_BELOW, beyond_devices, unattended_times
 from monstertruckd.config.load import load_truck
 from monstertruckd.config.truck import TruckConfig
-from monstertruckd.gate.config import beyond
+from monstertruckd.gate.config import impossible_settings
 
 CONFIGS = Path(__file__).resolve().parents[3] / "configs"
 PLACES = {
@@ -94,7 +94,7 @@ def truck(name: str = "", value: Any = None) -> TruckConfig:
 def refusals(config: TruckConfig, **changes: Any) -> list[str]:
     """What is beyond the robot, with another body or other monitors."""
     body, monitors = changes.get("body", config.body_limits), changes.get("monitors", config.monitors)
-    found = beyond(config.gate, body, unattended_times(config.devices))
+    found = impossible_settings(config.gate, body, unattended_times(config.devices))
     return [*found, *beyond_devices(config.devices, monitors, config.gate.standstill, body)]
 
 

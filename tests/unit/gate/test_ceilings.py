@@ -12,7 +12,7 @@ from monstertruckd.gate.config import (
     WEAKER_BELOW,
     BodyLimits,
     GateConfig,
-    beyond,
+    impossible_settings,
     stopping_distance,
     weakened,
 )
@@ -46,7 +46,7 @@ AS_THE_SPEED = {
 
 
 def refusals(body=BODY, **config):
-    return list(beyond(GateConfig(**config), body))
+    return list(impossible_settings(GateConfig(**config), body))
 
 
 def test_the_defaults_are_within_all_ceilings_and_weaken_nothing():
@@ -87,7 +87,7 @@ def test_what_a_body_cannot_do_is_refused_by_name(config, expected):
 def test_a_ceiling_is_still_within_it_up_to_rounding(name, limit):
     unchecked = GateConfig().model_copy
     for excess, found in ((0.0, []), (1e-9, []), (1.5e-9, [f"gate.{name}"])):
-        refused = beyond(unchecked(update={name: limit + excess}), BODY)
+        refused = impossible_settings(unchecked(update={name: limit + excess}), BODY)
         assert [text.split()[0] for text in refused] == found
 
 
@@ -98,15 +98,15 @@ def test_a_time_is_at_most_that_of_its_own_length(name):
         config = GateConfig(speed=0.25)
         section, _, key = name.rpartition(".")
         update = {section: getattr(config, section).model_copy(update={key: seconds})} if section else {key: seconds}
-        assert [text.split()[0] for text in beyond(config.model_copy(update=update), body)] == found
+        assert [text.split()[0] for text in impossible_settings(config.model_copy(update=update), body)] == found
 
 
 def test_the_distance_to_standstill_and_the_speed_in_reverse_may_be_as_much_as_their_limits():
     config = GateConfig(reverse_speed=0.21)
     needed = stopping_distance(config)
-    assert list(beyond(config, BodyLimits(0.47, 7.25, 25.0, None, needed))) == []
-    assert len(list(beyond(config, BodyLimits(0.47, 7.25, 25.0, None, needed - 1e-9)))) == 1
-    assert list(beyond(config, BodyLimits(needed, 7.25, 25.0, None, None))) == []
+    assert list(impossible_settings(config, BodyLimits(0.47, 7.25, 25.0, None, needed))) == []
+    assert len(list(impossible_settings(config, BodyLimits(0.47, 7.25, 25.0, None, needed - 1e-9)))) == 1
+    assert list(impossible_settings(config, BodyLimits(needed, 7.25, 25.0, None, None))) == []
 
 
 def test_a_fast_truck_must_stop_within_what_its_lidar_sees():

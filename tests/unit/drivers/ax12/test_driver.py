@@ -228,7 +228,8 @@ def test_other_units_are_refused():
 
 def test_two_units_of_one_number_are_refused():
     async def test(rig: Rig) -> None:
-        with pytest.raises(WrongDeviceError, match="several units with one id"):
+        rig.port.device.baud = 500_000
+        with pytest.raises(WrongDeviceError, match="another baud rate than 500000, or several units with one id"):
             await rig.session()
 
     on_bench(test, ids=(1, 1))

@@ -6,8 +6,17 @@ import pytest
 from monstertruck_estimation.se2 import between, compose, inverse, transform
 from monstertruck_estimation.slam.correlation import LikelihoodGrid, Submap, correlate, merged
 from monstertruck_estimation.slam.kiss_matcher import KissMatcher
-from monstertruck_estimation.slam.registration import Cloud, register
-from monstertruck_estimation.slam.scan_matcher import MatchStatus, PlanarMatcher
+from monstertruck_estimation.slam.registration import Cloud, Fit, register
+from monstertruck_estimation.slam.scan_matcher import (
+    GATE,
+    GATE_LOW_OVERLAP,
+    LOW_OVERLAP,
+    MIN_OVERLAP,
+    MIN_PAIRS,
+    MatchStatus,
+    PlanarMatcher,
+    gated,
+)
 from monstertruck_estimation.slam.scans import Scan, ScanGeometry, prepare
 from tests.unit.estimation.slam.kit import CORRIDOR, ROOM, box, scan
 
@@ -32,6 +41,32 @@ def test_the_fine_fit_finds_the_place_and_knows_how_well():
     assert fit.overlap > 0.9
     assert fit.residual < 0.012
     assert np.linalg.eigvalsh(fit.information)[0] > 100
+
+
+@pytest.mark.parametrize(
+    ("overlap", "pairs", "off", "verdict"),
+    [
+        (0.9, 200, 5.9, MatchStatus.ACCEPTED),
+        (0.9, 200, 6.1, MatchStatus.FAR),
+        (0.59, 200, 2.9, MatchStatus.ACCEPTED),
+        (0.59, 200, 3.1, MatchStatus.FAR),
+        (0.36, 200, 1.0, MatchStatus.ACCEPTED),
+        (0.34, 200, 1.0, MatchStatus.OVERLAP),
+        (0.9, 12, 1.0, MatchStatus.ACCEPTED),
+        (0.9, 11, 1.0, MatchStatus.EMPTY),
+    ],
+)
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_the_gate(axis: int, overlap: float, pairs: int, off: float, verdict: MatchStatus):
+    assert (GATE, GATE_LOW_OVERLAP, LOW_OVERLAP, MIN_OVERLAP, MIN_PAIRS) == (6.0, 3.0, 0.6, 0.35, 12)
+    guess, deviations = np.array((1.0, -2.0, math.pi)), np.array((0.1, 0.2, 0.05))
+    fitted = guess.copy()
+    fitted[axis] += off * deviations[axis]
+    fitted[2] = math.remainder(fitted[2], math.tau)  # the other side of +-pi
+    fit = Fit(fitted, np.diag((1e4, 1e4, 1e4)), overlap, 0.01, pairs, 0.0)
+    match = gated(fit, guess, np.diag(deviations**2))
+    assert match.verdict is verdict
+    assert match.pose == pytest.approx(fitted if match.accepted else guess)
 
 
 @pytest.mark.parametrize("moved", [0.1, 0.15, 0.2])
