@@ -142,8 +142,8 @@ NEAR: Final = 6
 def contradicts(keyframes: KeyframeMap, scan: Scan, pose: Array, most: float = CONTRADICTION) -> bool:
     """Whether ``scan`` at ``pose``, shape (3,), and the keyframes around it contradict each other.
 
-    They do where more than a share ``most`` of the beams of either pass through walls of the other. What no keyframe saw contradicts
-    nothing: the robot drove on by odometry alone, where there was little to see.
+    They do where more than a share ``most`` of the beams of either pass through walls of the other. What no keyframe
+    saw contradicts nothing: the robot drove on by odometry alone, where there was little to see.
     """
     own = np.flatnonzero(keyframes.part == keyframes.part[-1])
     off = keyframes.poses[own, :2] - pose[:2]
