@@ -12,10 +12,14 @@ This is the only module that may import ``time``.
 import asyncio
 import contextvars
 import heapq
+import itertools
 import selectors
+import signal
+import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Coroutine
+from types import FrameType
 from typing import Any, Final, NamedTuple, Protocol, TypeVar, TypeVarTuple
 
 import uvloop
@@ -302,9 +306,35 @@ def run_replay(
 
 
 def run_wall(main: Callable[[WallClock], Coroutine[Any, Any, T]]) -> T:
-    """Run ``main(clock)`` on uvloop."""
-    with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
-        return runner.run(main(WallClock()))
+    """Run ``main(clock)`` on uvloop. Ctrl-C cancels it, a second one does not disturb its end, a third one does.
+
+    Whoever presses twice, or timeout(1), which signals a program and its group, would leave a robot driving that the
+    end of ``main`` stops.
+    """
+
+    async def work() -> T:
+        if before is signal.default_int_handler and here:
+            _ignore_second_interrupt()
+        return await main(WallClock())
+
+    before, here = signal.getsignal(signal.SIGINT), threading.current_thread() is threading.main_thread()
+    try:
+        with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
+            return runner.run(work())
+    finally:
+        if here and signal.getsignal(signal.SIGINT) is not before:
+            signal.signal(signal.SIGINT, before)
+
+
+def _ignore_second_interrupt() -> None:
+    """Inside an ``asyncio.Runner``, whose handler cancels at the first interrupt and breaks off at the others."""
+    handler, come = signal.getsignal(signal.SIGINT), itertools.count(1)
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        if next(come) != 2 and callable(handler):
+            handler(number, frame)
+
+    signal.signal(signal.SIGINT, interrupt)
 
 
 AHEAD: Final = 4 * MILLISECOND

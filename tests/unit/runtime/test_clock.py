@@ -1,12 +1,13 @@
 """The virtual loop jumps; deadlines, ordering and determinism hold on it."""
 
 import asyncio
+import signal
 import socket
 import weakref
 
 import pytest
 
-from monstertruck_runtime.clock import SECOND, ReplayClock, VirtualClock, WallClock, run_replay, run_virtual
+from monstertruck_runtime.clock import SECOND, ReplayClock, VirtualClock, WallClock, run_replay, run_virtual, run_wall
 
 
 def test_an_hour_of_sleep_takes_no_time_and_wakes_on_time():
@@ -142,3 +143,23 @@ def test_watched_files_are_heard_while_timers_run():
             return data
 
     assert run_virtual(main) == b"hello"
+
+
+@pytest.mark.parametrize(("interrupts", "ended"), [(1, True), (2, True), (3, False)])
+def test_a_second_interrupt_does_not_disturb_the_end_of_the_first_and_a_third_breaks_it_off(interrupts, ended):
+    ends = []
+
+    async def main(clock):
+        for _ in range(interrupts):
+            asyncio.get_running_loop().call_soon(signal.raise_signal, signal.SIGINT)
+        try:
+            await clock.sleep(10.0)
+        finally:
+            await clock.sleep(0.05)
+            ends.append(clock.now())
+
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        run_wall(main)
+    assert bool(ends) is ended
+    assert signal.getsignal(signal.SIGINT) is before
