@@ -73,7 +73,7 @@ def test_no_damage_of_one_log_hides_the_others(folder: Path):
     index = int.from_bytes(whole[-28:-20], "little")
     damaged = folder / "run-5.mcap"
     damaged.write_bytes(whole)
-    for place in range(index, len(whole) - 8, 5):
+    for place in range(index, len(whole) - 8, 9):
         with flipped(damaged, place, 0x80):
             *others, last = list_logs(folder)
             assert last.state is LogState.DAMAGED
