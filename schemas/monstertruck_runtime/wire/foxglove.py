@@ -20,6 +20,7 @@ from google.protobuf.descriptor_pb2 import FileDescriptorProto, FileDescriptorSe
 from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message import DecodeError
 from google.protobuf.message_factory import GetMessageClass
+from google.protobuf.unknown_fields import UnknownFieldSet
 from numpy.typing import NDArray
 
 from monstertruck_runtime.clock import SECOND
@@ -430,14 +431,10 @@ def decode(model: type[Message], data: bytes) -> Message:
     """
     binding = _BINDINGS[model]
     try:
-        proto = _parse_packed(binding.packed, data) or binding.proto.FromString(data)
+        proto = binding.packed.FromString(data)
+        # Numbers that are not packed are unknown fields here; in several pieces they come from no writer of our fields.
+        if not proto.received or len(UnknownFieldSet(proto)):
+            proto = binding.proto.FromString(data)
     except DecodeError as error:
         raise InputError(str(error)) from None
     return model.model_validate(binding.read(proto))
-
-
-def _parse_packed(packed: type[Any], data: bytes) -> Any | None:
-    """Message of ``data`` if its numbers are packed in one piece, as we write them and protobuf need not."""
-    proto = packed.FromString(data)
-    proto.DiscardUnknownFields()
-    return proto if proto.ByteSize() == len(data) else None

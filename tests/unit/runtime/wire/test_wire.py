@@ -225,9 +225,9 @@ def test_arrays_written_one_number_at_a_time_are_read():
     assert wire.decode(t.SCAN, data).ranges.tolist() == [6.0, 7.0, 8.0]
 
 
-def test_arrays_written_in_pieces_are_read_whole():
+def test_arrays_that_another_writer_split_are_read_whole():
     piece = varint(6 << 3 | DELIMITED) + delimited(np.array((7.0, 8.0)).tobytes())
-    data = wire.encode(t.SCAN, scan(ranges=[6.0], codes=[1, 2, 3])) + piece
+    data = wire.encode(t.SCAN, scan(received=0, ranges=[6.0], codes=[1, 2, 3])) + piece
     assert wire.decode(t.SCAN, data).ranges.tolist() == [6.0, 7.0, 8.0]
 
 
@@ -251,6 +251,9 @@ def test_truncated_scan_is_refused(cut):
         wire.decode(t.SCAN, wire.encode(t.SCAN, scan())[:-cut])
 
 
+RECEIVED = varint(1000 << 3 | FIXED64) + b"12345678"
+
+
 @pytest.mark.parametrize(
     ("data", "text"),
     [
@@ -259,7 +262,8 @@ def test_truncated_scan_is_refused(cut):
         pytest.param(b"\x80\x80", "corrupt", id="truncated number"),
         pytest.param(b"\x20" + b"\xff" * 11, "corrupt", id="number of more than 64 bits"),
         pytest.param(b"\x12\x01\xff", "UTF-8", id="text"),
-        pytest.param(b"\x32\x07abcdefg", "of 7 bytes", id="doubles of 7 bytes"),
+        pytest.param(b"\x32\x07abcdefg", "corrupt", id="doubles of 7 bytes"),
+        pytest.param(RECEIVED + b"\x32\x07abcdefg", "of 7 bytes", id="doubles of 7 bytes by our writer"),
         pytest.param(b"", "frame", id="nothing"),
     ],
 )
