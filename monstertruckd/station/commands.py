@@ -22,6 +22,12 @@ class _Command(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
+class Asked(_Command):
+    """A command whose outcome is answered."""
+
+    id: Id
+
+
 class Watch(_Command):
     """Look at a robot."""
 
@@ -65,56 +71,50 @@ class Heartbeat(_Command):
         return {"stick": Role.STATION, "keys": Role.KEYBOARD, "gamepad": Role.GAMEPAD}[self.input]
 
 
-class GiveOrder(_Command):
+class GiveOrder(Asked):
     """Arm, disarm, stop, emergency stop or its reset."""
 
     do: Literal["order"]
-    id: Id
     order: Order
     hold: bool = False
 
 
-class SetGoal(_Command):
+class SetGoal(Asked):
     """Drive to a pose in the frame of the map, by way of others."""
 
     do: Literal["goal"]
-    id: Id
     goal: tuple[Number, Number, Number]
     via: Annotated[
         tuple[Annotated[tuple[Number, ...], Field(min_length=2, max_length=3)], ...], Field(max_length=32)
     ] = ()
 
 
-class ChangeGoal(_Command):
+class ChangeGoal(Asked):
     """Pause, resume or cancel the goal."""
 
     do: Literal["goal_control"]
-    id: Id
     order: GoalOrder
 
 
-class Behave(_Command):
+class Behave(Asked):
     """Start or stop a behaviour."""
 
     do: Literal["behave"]
-    id: Id
     order: BehaviourOrder
     behaviour: Annotated[str, Field(max_length=64)] = ""
 
 
-class Explore(_Command):
+class Explore(Asked):
     """Start an exploration, or end it."""
 
     do: Literal["explore"]
-    id: Id
     order: ExploreOrder
 
 
-class DoMission(_Command):
+class DoMission(Asked):
     """Start a mission, resume one, or end it."""
 
     do: Literal["mission"]
-    id: Id
     order: MissionOrder
     text: Annotated[str, Field(max_length=MOST_BYTES)] = ""
     """Of a start: the mission's file, YAML."""
@@ -122,74 +122,65 @@ class DoMission(_Command):
     """Of a resume: the robot is not where the mission was interrupted, and its pose is right."""
 
 
-class Track(_Command):
+class Track(Asked):
     """Follow a path that was drawn on the map, in its frame."""
 
     do: Literal["track"]
-    id: Id
     points: Annotated[tuple[tuple[Number, Number], ...], Field(min_length=2, max_length=400)]
 
 
-class AskToDrive(_Command):
+class AskToDrive(Asked):
     """Ask whoever drives to hand over."""
 
     do: Literal["ask"]
-    id: Id
 
 
-class HandOver(_Command):
+class HandOver(Asked):
     """Let somebody drive who has asked to."""
 
     do: Literal["hand_over"]
-    id: Id
     to: Annotated[str, Field(max_length=64)]
 
 
-class Acknowledge(_Command):
+class Acknowledge(Asked):
     """A warning was seen."""
 
     do: Literal["acknowledge"]
-    id: Id
     text: Annotated[str, Field(max_length=200)]
 
 
-class ListSettings(_Command):
+class ListSettings(Asked):
     """What may be changed while the robot runs."""
 
     do: Literal["settings"]
-    id: Id
 
 
-class ChangeSetting(_Command):
+class ChangeSetting(Asked):
     """Change a setting while the robot runs."""
 
     do: Literal["set"]
-    id: Id
     key: Annotated[str, Field(max_length=100)]
     value: Number | bool | Annotated[str, Field(max_length=100)]
     save: bool = False
 
 
-class ListRecordings(_Command):
+class ListRecordings(Asked):
     """The recordings on the robot."""
 
     do: Literal["recordings"]
-    id: Id
 
 
-class DeleteRecording(_Command):
+class DeleteRecording(Asked):
     """Delete one of them."""
 
     do: Literal["delete_recording"]
-    id: Id
     name: Annotated[str, Field(max_length=128)]
 
 
-class ReplayRecording(_Command):
+class ReplayRecording(Asked):
     """Fetch a recording from the robot, and show it."""
 
     do: Literal["replay"]
-    id: Id
     name: Annotated[str, Field(max_length=128)]
 
 
@@ -202,8 +193,12 @@ class ControlReplay(_Command):
     rate: Number | None = None
 
 
-Asked = (
-    GiveOrder
+AnyCommand = (
+    Watch
+    | LookAtFleet
+    | EchoRequest
+    | Heartbeat
+    | GiveOrder
     | SetGoal
     | ChangeGoal
     | Behave
@@ -218,9 +213,8 @@ Asked = (
     | ListRecordings
     | DeleteRecording
     | ReplayRecording
+    | ControlReplay
 )
-"""Commands whose outcome is answered."""
-AnyCommand = Watch | LookAtFleet | EchoRequest | Heartbeat | ControlReplay | Asked
 Command = Annotated[AnyCommand, Field(discriminator="do")]
 
 _COMMANDS: Final[TypeAdapter[AnyCommand]] = TypeAdapter(Command)
