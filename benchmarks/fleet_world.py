@@ -46,7 +46,8 @@ from monstertruckd.tools.cli.runs import RunEnd, run_behaviour
 from monstertruckd.tools.demo.runs import free_endpoint
 from monstertruckd.tools.simulation.config import load_simulated
 from monstertruckd.tools.simulation.operator import LocalOperator
-from monstertruckd.tools.simulation.virtual_rig import VirtualRig, virtual_fleet
+from monstertruckd.tools.simulation.virtual_rig import VirtualRig
+from tests.fleet_kit import virtual_fleet
 
 ROOT = Path(__file__).resolve().parents[1]
 ROBOTS = {

@@ -27,7 +27,7 @@ from monstertruck_schemas.state import GateMode, GateState
 from monstertruck_schemas.topics import Topic
 from monstertruck_sim.faults import Fault, SimContext, apply
 from monstertruckd.bus.local import Bus
-from monstertruckd.tools.drill.observer import AT_REST, Violation, stop_bytes, written
+from monstertruckd.tools.drill.observer import AT_REST, STOP_CONTROLS, Violation, WireTap, written
 from monstertruckd.tools.drill.truck import DaemonReport, DrillTruck, DrivingStation
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
 
@@ -450,6 +450,15 @@ def cells(scenario: Scenario, reaction: Reaction) -> tuple[str, ...]:
         ", ".join(reasons),
         _seconds(reaction.recovered_after_s),
     )
+
+
+def stop_bytes(tap: WireTap, since: int) -> int | None:
+    """Instant at which the first write that stops the motor has reached an EPOS: target 0, quick stop, halt, off."""
+    for instant, index, value in written(tap, since):
+        target = index == od.TARGET_VELOCITY.index and value == 0
+        if target or (index == od.CONTROLWORD.index and value in STOP_CONTROLS):
+            return instant
+    return None
 
 
 def _seconds(value: float | None) -> str:

@@ -23,7 +23,7 @@ from monstertruck_schemas.sensor import Imu, SonarEcho, SonarRanges, Vector3
 from monstertruck_schemas.state import Odometry, Transform, Transforms
 from monstertruck_schemas.topics import IMU, ODOMETRY, SONAR, TRANSFORMS
 from monstertruck_sim.world.config import FIVE_SONARS, SonarModelConfig
-from monstertruck_sim.world.sonar import survey
+from tests.sonar_kit import survey
 from wall_parts.arena import Arena, blocked, rays
 
 FINE: Final = 0.01

@@ -16,7 +16,8 @@ from monstertruck_sim.world.scene import Contact
 from monstertruckd.config.load import load_config
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
 from monstertruckd.tools.simulation.operator import LocalOperator
-from monstertruckd.tools.simulation.virtual_rig import VirtualRig, virtual_fleet
+from monstertruckd.tools.simulation.virtual_rig import VirtualRig
+from tests.fleet_kit import virtual_fleet
 
 pytestmark = [pytest.mark.virtual, pytest.mark.timeout(120)]
 

@@ -123,15 +123,6 @@ def _writes(received: Iterable[tuple[int, bytes]]) -> list[tuple[int, int, int]]
     return found
 
 
-def stop_bytes(tap: WireTap, since: int) -> int | None:
-    """Instant at which the first write that stops the motor has reached an EPOS: target 0, quick stop, halt, off."""
-    for instant, index, value in written(tap, since):
-        target = index == od.TARGET_VELOCITY.index and value == 0
-        if target or (index == od.CONTROLWORD.index and value in STOP_CONTROLS):
-            return instant
-    return None
-
-
 class MotorWire(Protocol):
     """What the bytes to a motor controller ask its motors for."""
 

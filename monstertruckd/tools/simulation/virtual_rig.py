@@ -3,9 +3,8 @@
 import asyncio
 import os
 import signal
-from collections.abc import AsyncIterator, Sequence
-from contextlib import AsyncExitStack, ExitStack, asynccontextmanager
-from functools import partial
+from collections.abc import AsyncIterator
+from contextlib import ExitStack, asynccontextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Final
@@ -15,7 +14,7 @@ from monstertruck_drivers.usb.config import UsbPortConfig
 from monstertruck_runtime.clock import VirtualClock
 from monstertruck_runtime.threads import inline
 from monstertruck_schemas.sensor import StandPose
-from monstertruck_schemas.topics import POSE, STAND_POSE
+from monstertruck_schemas.topics import STAND_POSE
 from monstertruck_sim.computer import EmulatedComputer
 from monstertruck_sim.faults import FaultInjector, SimContext
 from monstertruck_sim.robot import SimulatedRobot
@@ -25,7 +24,6 @@ from monstertruckd.bus.local import Bus
 from monstertruckd.config.load import Tree
 from monstertruckd.daemon import Daemon
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
-from monstertruckd.tools.simulation.fleet import as_fleet, shared_scene
 from monstertruckd.tools.simulation.simulate import TruthLog
 
 IN_MEMORY: Final = "/dev/shm"  # noqa: S108 - a folder of its own is made in it
@@ -171,23 +169,3 @@ class VirtualRig:
         assert self._daemon_task is not None
         if not self._daemon_task.cancelled():
             await self._daemon_task
-
-
-@asynccontextmanager
-async def virtual_fleet(
-    configs: Sequence[SimulatedTruckConfig], clock: VirtualClock
-) -> AsyncIterator[tuple[list[VirtualRig], Surroundings]]:
-    """Several robots in one world, their daemons on one virtual clock; the world of the first one.
-
-    Raises:
-        InputError: two robots claim the same thing, or overlap.
-    """
-    configs = as_fleet(configs)
-    scene = shared_scene(configs)
-    async with AsyncExitStack() as stack:
-        rigs = [await stack.enter_async_context(VirtualRig(config, clock, scene=scene).running()) for config in configs]
-        for rig in rigs:
-            for other in rigs:
-                if rig.daemon.peers is not None and other.config.robot in rig.config.peers:
-                    other.bus.listen(POSE, partial(rig.daemon.peers.hear, other.config.robot))
-        yield rigs, scene

@@ -9,7 +9,8 @@ from monstertruck_runtime.errors import InputError
 from monstertruck_sim.world.config import FIVE_SONARS, ImuModelConfig, SonarModelConfig, SonarPlace
 from monstertruck_sim.world.obstacles import Disc, discs_and_segments
 from monstertruck_sim.world.raycast import cast_rays, clearance
-from monstertruck_sim.world.sonar import SPEED_OF_SOUND, Ping, beam, cone, heard, leaning, placed, surface, survey
+from monstertruck_sim.world.sonar import SPEED_OF_SOUND, Ping, beam, cone, heard, leaning, placed, surface
+from tests.sonar_kit import survey
 
 SECOND = 1_000_000_000
 EMPTY = clearance(np.zeros((2, 2), np.bool_))
