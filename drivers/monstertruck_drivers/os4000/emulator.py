@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from monstertruck_drivers.cable import DeviceEnd
-from monstertruck_drivers.emulation import AttitudeSource, CompassReading, EmulatorSetup, ReceivedBytes
+from monstertruck_drivers.emulation import AttitudeSource, EmulatorSetup, ReceivedBytes
 from monstertruck_drivers.os4000.protocol import (
     BAUDS,
     ESC,
@@ -68,23 +68,6 @@ VALUE_KEYS: Final = (Key.RATE, Key.FIELDS, Key.FORMAT, Key.FACTORY_BAUD, Key.MOU
 CALIBRATION_KEYS: Final = (Key.CALIBRATE_LEVEL, Key.CALIBRATE_VERTICAL)
 
 
-class Turntable:
-    """An attitude for the bench: level, turning once a minute."""
-
-    def compass(self, time_ns: int) -> CompassReading:
-        """Reading at ``time_ns``."""
-        heading = time_ns / SECOND * 6 % 360
-        north = math.radians(heading)
-        return CompassReading(
-            heading_deg=heading,
-            pitch_deg=0.0,
-            roll_deg=0.0,
-            temperature_c=20.0,
-            field=(250 * math.cos(north), 250 * math.sin(north), -390.0),
-            acceleration=(0.0, 0.0, 1.0),
-        )
-
-
 class Os4000Emulator:
     """An OS4000-T that streams from power-up on.
 
@@ -97,7 +80,7 @@ class Os4000Emulator:
 
     Args:
         clock: time.
-        source: physics; without it a turntable.
+        source: physics.
         seed: of the sensors' fine noise and of garbled bytes.
         rate: stored rate.
         fields: stored field mask.
@@ -109,7 +92,7 @@ class Os4000Emulator:
     def __init__(
         self,
         clock: Clock,
-        source: AttitudeSource | None = None,
+        source: AttitudeSource,
         *,
         seed: int = 0,
         rate: int = 20,
@@ -126,7 +109,7 @@ class Os4000Emulator:
         self.host_baud: int | None = None
         """Rate the host uses; None = the same as the unit."""
         self._clock = clock
-        self._source = source or Turntable()
+        self._source = source
         self._rng = np.random.default_rng(seed)
         self._terminators = terminators
         self._settle = round(settle * SECOND)

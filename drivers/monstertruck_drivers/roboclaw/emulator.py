@@ -19,14 +19,6 @@ THINKING: Final = MILLISECOND
 """Ns from a request to its answer."""
 
 
-class StandingWheels:
-    """Wheels that never turn."""
-
-    def wheels(self, time_ns: int) -> tuple[float, float]:
-        """Always 0."""
-        return 0.0, 0.0
-
-
 class RoboclawEmulator:
     """A unit with its encoders wired as the settings say.
 
@@ -40,12 +32,12 @@ class RoboclawEmulator:
         settings: address, counts per turn, which input is whose.
     """
 
-    def __init__(self, clock: Clock, source: WheelSource | None = None, settings: RoboclawConfig | None = None) -> None:
+    def __init__(self, clock: Clock, source: WheelSource, settings: RoboclawConfig | None = None) -> None:
         self.name = "roboclaw"
         self.received = ReceivedBytes()
         """Newest bytes from the host."""
         self._clock = clock
-        self._source = source or StandingWheels()
+        self._source = source
         self._settings = settings or RoboclawConfig()
         self._stuck = {"left": False, "right": False}
         self._mirrored = {"left": False, "right": False}

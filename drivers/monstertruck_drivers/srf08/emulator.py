@@ -50,17 +50,6 @@ class Module:
     ghost: int | None = None
 
 
-class Wall:
-    """A wall one metre from every sonar."""
-
-    def fire(self, name: str, time_ns: int) -> None:
-        """Nothing moves."""
-
-    def range(self, name: str) -> float:
-        """Always 1 m."""
-        return 1.0
-
-
 class Srf08Emulator:
     """A USB-ISS with one SRF08 for each sonar of the settings.
 
@@ -70,20 +59,20 @@ class Srf08Emulator:
 
     Args:
         clock: time.
-        source: physics; without it a wall.
+        source: physics.
         settings: names and addresses.
         seed: of the timers' jitter.
     """
 
     def __init__(
-        self, clock: Clock, source: SonarSource | None = None, settings: Srf08Config | None = None, *, seed: int = 0
+        self, clock: Clock, source: SonarSource, settings: Srf08Config | None = None, *, seed: int = 0
     ) -> None:
         self.name = "srf08"
         self.received = ReceivedBytes()
         """Bytes the host sent, for tests."""
         self.modules = {sonar.address: Module(name) for name, sonar in (settings or Srf08Config()).sonars.items()}
         self._clock = clock
-        self._source = source or Wall()
+        self._source = source
         self._rng = np.random.default_rng(seed)
         self._silent = False
         self._i2c = False

@@ -3,7 +3,6 @@
 import asyncio
 import errno
 import io
-from collections.abc import Callable
 from functools import cache
 from typing import Final
 
@@ -64,7 +63,7 @@ class WebcamEmulator:
 
     Args:
         clock: time.
-        view: what is to be seen; None = grey.
+        view: what is to be seen.
         offload: where pictures are drawn: a thread, or ``inline`` on the virtual clock.
         usb: the port it hangs on, for ``vanish``.
     """
@@ -72,7 +71,7 @@ class WebcamEmulator:
     def __init__(
         self,
         clock: Clock,
-        view: ViewSource | None = None,
+        view: ViewSource,
         *,
         offload: Offload = in_thread,
         usb: EmulatedPort | None = None,
@@ -186,18 +185,12 @@ class WebcamEmulator:
         self._sequence += 1
         if self._uses_up("drop"):
             return
-        draw = self._drawing(stamp)
+        draw = self._view.exposure(stamp, self._size)
         data = self._damaged(await self._offload(lambda: jpeg(draw(), number)))
         packet = CameraPacket(PacketKind.PICTURE, number, stamp + self._jump, data).encode()
         for at in range(0, len(packet), CHUNK):
             await self._clock.sleep(CHUNK_PAUSE)
             end.write(packet[at : at + CHUNK])
-
-    def _drawing(self, stamp: int) -> Callable[[], NDArray[np.uint8]]:
-        if self._view is None:
-            width, height = self._size
-            return lambda: np.full((height, width, 3), 128, np.uint8)
-        return self._view.exposure(stamp, self._size)
 
     def _damaged(self, data: bytes) -> bytes:
         if self._bare:

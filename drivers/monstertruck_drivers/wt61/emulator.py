@@ -6,8 +6,8 @@ from typing import Final
 import numpy as np
 
 from monstertruck_drivers.cable import DeviceEnd
-from monstertruck_drivers.emulation import EmulatorSetup, ImuReading, ImuSource, ReceivedBytes
-from monstertruck_drivers.wt61.protocol import BAUD, GRAVITY, RATE, TOGGLE_SLEEP, Wt61Kind, Wt61Packet, build, measured
+from monstertruck_drivers.emulation import EmulatorSetup, ImuSource, ReceivedBytes
+from monstertruck_drivers.wt61.protocol import BAUD, RATE, TOGGLE_SLEEP, Wt61Kind, Wt61Packet, build, measured
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import InputError
 
@@ -15,14 +15,6 @@ BOOT: Final = 300_000_000
 """Nanoseconds from power-up to the first packet."""
 _COUNT_NOISE: Final = 2.0
 """Standard deviation of the converters, in their own counts."""
-
-
-class Bench:
-    """A unit that lies level on a table."""
-
-    def imu(self, time_ns: int) -> ImuReading:
-        """Reading at ``time_ns``."""
-        return ImuReading((0.0, 0.0, 0.0), (0.0, 0.0, GRAVITY), 30.0)
 
 
 class Wt61Emulator:
@@ -34,16 +26,16 @@ class Wt61Emulator:
 
     Args:
         clock: time.
-        source: physics; without it a table.
+        source: physics.
         seed: of the converters' noise.
     """
 
-    def __init__(self, clock: Clock, source: ImuSource | None = None, *, seed: int = 0) -> None:
+    def __init__(self, clock: Clock, source: ImuSource, *, seed: int = 0) -> None:
         self.name = "wt61"
         self.received = ReceivedBytes()
         """Bytes the host sent, for tests."""
         self._clock = clock
-        self._source = source or Bench()
+        self._source = source
         self._rng = np.random.default_rng(seed)
         self._faults = {"frozen": False, "silent": False, "inverted": False, "asleep": False}
         self._bad_checksums = 0

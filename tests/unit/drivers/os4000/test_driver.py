@@ -28,7 +28,7 @@ from monstertruck_schemas.event import Severity
 from monstertruck_schemas.health import ServiceHealth
 from monstertruck_schemas.reasons import Reason
 from tests.unit.drivers.kit import Events, Kept, background
-from tests.unit.drivers.os4000.rig import Rig, bench
+from tests.unit.drivers.os4000.rig import Rig, Table, bench
 
 
 def on_bench(test, config: Os4000Config | None = None, **options):
@@ -353,7 +353,7 @@ def test_probe_tells_what_is_there():
 async def test_over_a_pty_on_the_wall_clock(tmp_path: Path):
     clock = WallClock()
     pty = PtyPort(tmp_path / "compass")
-    emulator = Os4000Emulator(clock)
+    emulator = Os4000Emulator(clock, Table())
     out = Kept()
     driver = Os4000Driver(Os4000Config(), SerialPort(tmp_path / "compass", 19200), clock, out, Events())
     pty.plug()

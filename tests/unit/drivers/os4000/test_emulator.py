@@ -1,6 +1,5 @@
 """The emulated compass behaves as the manual says."""
 
-import asyncio
 import contextlib
 
 import pytest
@@ -8,9 +7,9 @@ import pytest
 from monstertruck_drivers.link import Link
 from monstertruck_drivers.os4000.emulator import Os4000Emulator
 from monstertruck_drivers.os4000.protocol import Fields, Key, Os4000Parser, Sentence, key, value
-from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
+from monstertruck_runtime.clock import VirtualClock, run_virtual
 from monstertruck_runtime.errors import InputError
-from tests.unit.drivers.os4000.rig import Rig, bench
+from tests.unit.drivers.os4000.rig import Rig, Table, bench
 
 
 class Terminal:
@@ -319,20 +318,9 @@ def test_disturbance_drift_silence_and_pending():
 def test_unknown_faults_are_refused_with_the_list_of_known_ones(fault: tuple[str, ...]):
     async def main(clock: VirtualClock) -> None:
         with pytest.raises(InputError, match="bad_checksum N"):
-            Os4000Emulator(clock).inject(*fault)
+            Os4000Emulator(clock, Table()).inject(*fault)
 
     run_virtual(main)
-
-
-def test_alone_it_is_a_turntable():
-    async def main(clock: VirtualClock) -> tuple[float, float]:
-        emulator = Os4000Emulator(clock, pace=False)
-        first = emulator._source.compass(clock.now()).heading_deg
-        await asyncio.sleep(0)
-        return first, emulator._source.compass(clock.now() + 10 * SECOND).heading_deg
-
-    first, later = run_virtual(main)
-    assert (later - first) % 360 == pytest.approx(60)
 
 
 def test_two_runs_of_one_seed_are_equal_and_another_seed_differs():

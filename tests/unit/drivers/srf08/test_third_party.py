@@ -26,9 +26,19 @@ FLIGHT = 2.0 / 343.0 * 1e6
 pytestmark = pytest.mark.wall
 
 
+class Wall:
+    """A wall one metre from every sonar."""
+
+    def fire(self, name: str, time_ns: int) -> None:
+        pass
+
+    def range(self, name: str) -> float:
+        return 1.0
+
+
 async def use(folder: Path, work: Callable[[UsbIss], T]) -> T:
     """Let a thread work with a client while the emulator runs on this loop."""
-    port, emulator = PtyPort(folder / "iss"), Srf08Emulator(WallClock())
+    port, emulator = PtyPort(folder / "iss"), Srf08Emulator(WallClock(), Wall())
     running = asyncio.create_task(emulator.run(port.device))
     await asyncio.sleep(0)
     port.plug()
