@@ -53,7 +53,6 @@ class Ax12Bus:
         positions: of the shafts at the start, steps per unit number; 512 where not named.
         load: what pushes the shafts.
         voltage: supply at the units.
-        name: of the device.
 
     Raises:
         InputError: too many units, or a bad number.
@@ -72,11 +71,10 @@ class Ax12Bus:
         positions: Mapping[int, float] | None = None,
         load: Load = no_load,
         voltage: Voltage = steady_voltage,
-        name: str = "ax12",
     ) -> None:
         if len(ids) > UNITS_MAX or not all(0 <= ident <= p.ID_MAX for ident in ids):
-            raise InputError(f"{name}: ids {tuple(ids)}: expected at most {UNITS_MAX}, each 0..{p.ID_MAX}")
-        self.name = name
+            raise InputError(f"ax12: ids {tuple(ids)}: expected at most {UNITS_MAX}, each 0..{p.ID_MAX}")
+        self.name = "ax12"
         self.received = ReceivedBytes()
         """Bytes the host sent, for tests."""
         self.latency_s = latency_s

@@ -31,7 +31,6 @@ class IioEmulator:
         seed: of the noise.
         channel: input the divider hangs on.
         device: the converter's name.
-        noise_lsb: standard deviation.
     """
 
     FULL_SCALE: Final = 4095
@@ -45,10 +44,8 @@ class IioEmulator:
         seed: int = 0,
         channel: int = 0,
         device: str = "mcp3208",
-        noise_lsb: float = 1.0,
-        name: str = "battery",
     ) -> None:
-        self.name = name
+        self.name = "battery"
         self.plugged = False
         """Whether the kernel shows it."""
         self._files = FileTree(root / CONVERTERS)
@@ -57,7 +54,8 @@ class IioEmulator:
         self._rng = np.random.default_rng(seed)
         self._stem = f"in_voltage{channel}"
         self._device = device
-        self._noise = noise_lsb
+        self._noise = 1.0
+        """Standard deviation, LSB."""
         self._forced: str | None = None
         self._bounce_until = 0
         self.plug()

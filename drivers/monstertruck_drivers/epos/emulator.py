@@ -61,14 +61,11 @@ class EposEmulator:
         clock: time.
         motor: shaft and load; None = a free motor of its own.
         seed: of delays and noise.
-        name: in messages.
         node: node id it answers to (besides 0).
     """
 
-    def __init__(
-        self, clock: Clock, motor: MotorPlant | None = None, *, seed: int = 0, name: str = "epos", node: int = 1
-    ) -> None:
-        self.name = name
+    def __init__(self, clock: Clock, motor: MotorPlant | None = None, *, seed: int = 0, node: int = 1) -> None:
+        self.name = "epos"
         self.firmware = Firmware(clock.now, motor or FreeMotor(), np.random.default_rng(seed))
         self.received: deque[tuple[int, bytes]] = deque(maxlen=4096)
         """Newest bytes from the host, with their instants."""

@@ -162,7 +162,6 @@ class HokuyoEmulator:
         jitter: greatest delay of a scan by USB batching, s.
         min_step: first step that measures (``AMIN``).
         max_step: last step that measures (``AMAX``).
-        name: for logs.
     """
 
     def __init__(
@@ -179,9 +178,8 @@ class HokuyoEmulator:
         jitter: float = 0.0,
         min_step: int = 44,
         max_step: int = 725,
-        name: str = "lidar",
     ) -> None:
-        self.name = name
+        self.name = "lidar"
         self.received: deque[str] = deque(maxlen=1000)
         """Newest request lines, for tests."""
         self._clock = clock

@@ -3,7 +3,7 @@
 import asyncio
 import gzip
 from pathlib import Path
-from typing import Final, Self
+from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -103,23 +103,11 @@ class RecordedHokuyoEmulator(HokuyoEmulator):
         recording: what it sees and when.
         seed: of the USB jitter.
         state: what the host finds; ``streaming`` starts the recording at once.
-        timer_start: counter at construction, ms.
-        drift_ppm: how much faster than the world the sensor's clock runs.
-        jitter: greatest delay of a scan by USB batching, s.
-        name: for logs.
+        options: others of ``HokuyoEmulator``.
     """
 
     def __init__(
-        self,
-        clock: Clock,
-        recording: RecordedRanges,
-        *,
-        seed: int = 0,
-        state: StartState = "scip1",
-        timer_start: int = 0,
-        drift_ppm: float = 0.0,
-        jitter: float = 0.0,
-        name: str = "lidar",
+        self, clock: Clock, recording: RecordedRanges, *, seed: int = 0, state: StartState = "scip1", **options: Any
     ) -> None:
         self.finished = asyncio.Event()
         """Set once the last recorded scan was sent."""
@@ -129,18 +117,8 @@ class RecordedHokuyoEmulator(HokuyoEmulator):
         self._wanted = asyncio.Event()
         self._first = 0
         self._index = -1
-        super().__init__(
-            clock,
-            recording,
-            seed=seed,
-            state=state,
-            timer_start=timer_start,
-            drift_ppm=drift_ppm,
-            jitter=jitter,
-            min_step=FIRST_STEP,
-            max_step=LAST_STEP,
-            name=name,
-        )
+        options |= {"min_step": FIRST_STEP, "max_step": LAST_STEP}
+        super().__init__(clock, recording, seed=seed, state=state, **options)
         if state == "streaming":
             self._wanted.set()
 

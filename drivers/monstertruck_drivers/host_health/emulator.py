@@ -29,8 +29,8 @@ class HostEmulator:
         clock: time.
     """
 
-    def __init__(self, root: Path, clock: Clock, name: str = "host") -> None:
-        self.name = name
+    def __init__(self, root: Path, clock: Clock) -> None:
+        self.name = "host"
         self._files = FileTree(root)
         self._clock = clock
         self._busy_ticks = self._ticks = 0

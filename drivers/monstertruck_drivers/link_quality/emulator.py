@@ -22,23 +22,21 @@ ON_AIR: Final = 20_000
 class NetworkEmulator:
     """``wlan0`` with a signal, ``eth0`` with or without a cable, ``lo``.
 
-    Faults (``inject``): ``signal DBM`` (instead of the source), ``style normal|no_dot|unsigned|header|missing`` (how
+    Faults (``inject``): ``signal DBM`` (from now on), ``style normal|no_dot|unsigned|header|missing`` (how
     /proc/net/wireless is printed), ``wifi on|off``, ``cable on|off``, ``remove`` (the Wi-Fi stick is unplugged),
     ``plug``, ``reset`` (counters start again).
 
     Args:
         root: folder that stands for /.
         clock: time.
-        signal: dBm at an instant, ns; None = out of reach.
     """
 
-    def __init__(
-        self, root: Path, clock: Clock, signal: Callable[[int], float | None] = lambda _: -55.0, name: str = "link"
-    ) -> None:
-        self.name = name
+    def __init__(self, root: Path, clock: Clock) -> None:
+        self.name = "link"
         self._files = FileTree(root)
         self._clock = clock
-        self._signal = signal
+        self._signal: Callable[[int], float | None] = lambda _: -55.0
+        """dBm at an instant, ns; None = out of reach."""
         self._style = "normal"
         self._wifi = self._present = True
         self._cable = False

@@ -112,9 +112,8 @@ class MaestroEmulator:
         rail_drift_v: float = 0.0,
         usb: EmulatedPort | None = None,
         on_output: Callable[[int, bool], None] | None = None,
-        name: str = "maestro",
     ) -> None:
-        self.name = name
+        self.name = "maestro"
         self.usb = usb
         self.on_output = on_output
         self.received = ReceivedBytes()

@@ -100,9 +100,8 @@ class Os4000Emulator:
         terminators: bytes = b" \r",
         settle: float = 0.8,
         pace: bool = True,
-        name: str = "os4000",
     ) -> None:
-        self.name = name
+        self.name = "os4000"
         self.settings = Settings(rate, fields)
         self.received = ReceivedBytes()
         """Bytes the host sent, for tests."""

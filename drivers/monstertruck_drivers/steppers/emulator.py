@@ -53,7 +53,6 @@ class StepperEmulator:
     Args:
         clock: time.
         plants: what the motors turn; free motors take the missing places.
-        name: in messages.
         motors: it has.
         steps_per_turn: of each.
     """
@@ -63,11 +62,10 @@ class StepperEmulator:
         clock: Clock,
         plants: Sequence[MotorPlant] = (),
         *,
-        name: str = "steppers",
         motors: int = MOTORS,
         steps_per_turn: int = 400,
     ) -> None:
-        self.name = name
+        self.name = "steppers"
         self.received = ReceivedBytes()
         """Newest bytes from the host."""
         self._clock = clock

@@ -75,9 +75,8 @@ class WebcamEmulator:
         *,
         offload: Offload = in_thread,
         usb: EmulatedPort | None = None,
-        name: str = "camera",
     ) -> None:
-        self.name = name
+        self.name = "camera"
         self.usb = usb
         self._clock = clock
         self._view = view
