@@ -94,7 +94,7 @@ class ThreadHop(Generic[T]):
                     self._discard(item)
             return
         if self._rank is None:
-            item = self._pop()
+            item = items.popleft() if items else None  # whoever makes room leaves one
         else:
             with self._lock:
                 item = self._pop()

@@ -68,29 +68,16 @@ def _message_class(name: str, *, packed: bool) -> type[Any]:
     return GetMessageClass(pool.FindMessageTypeByName(name))
 
 
-def _write_time(timestamp: Any, stamp: int) -> None:
-    timestamp.seconds, timestamp.nanos = divmod(stamp, SECOND)
-
-
-def _nanoseconds(timestamp: Any) -> int:
-    nanoseconds: int = timestamp.seconds * SECOND + timestamp.nanos
-    return nanoseconds
-
-
-def _write_counters(message: Message, proto: Any) -> None:
+def _write_header(message: Message, proto: Any) -> None:
+    proto.timestamp.seconds, proto.timestamp.nanos = divmod(message.stamp, SECOND)
+    proto.frame_id = message.frame
     proto.received = message.received
     proto.seq = message.seq
 
 
-def _write_header(message: Message, proto: Any) -> None:
-    _write_time(proto.timestamp, message.stamp)
-    proto.frame_id = message.frame
-    _write_counters(message, proto)
-
-
 def _own_header(proto: Any) -> dict[str, Any]:
     return {
-        "stamp": _nanoseconds(proto.timestamp),
+        "stamp": proto.timestamp.seconds * SECOND + proto.timestamp.nanos,
         "received": proto.received,
         "seq": proto.seq,
         "frame": proto.frame_id,
@@ -156,7 +143,7 @@ def _write_scan(scan: LaserScan, proto: Any) -> None:
     proto.ranges = scan.ranges.tobytes()
     proto.codes = scan.codes.tobytes()
     if scan.tilt is not None:
-        proto.tilt = _packed(scan.tilt)
+        proto.tilt = struct.pack("<d", scan.tilt)
 
 
 def _read_scan(proto: Any) -> _Fields:
@@ -170,7 +157,7 @@ def _read_scan(proto: Any) -> _Fields:
         "range_max": proto.range_max,
         "ranges": _array(proto.ranges),
         "codes": np.frombuffer(proto.codes, np.uint8),
-        "tilt": _unpacked(proto.tilt, 1)[0] if proto.tilt else None,
+        "tilt": _array(proto.tilt).tolist()[0] if proto.tilt else None,
     }
 
 
@@ -312,7 +299,8 @@ def _read_ground(proto: Any) -> _Fields:
 
 
 def _write_transforms(tree: Transforms, proto: Any) -> None:
-    _write_counters(tree, proto)
+    proto.received = tree.received
+    proto.seq = tree.seq
     proto.stamp = tree.stamp
     proto.frame = tree.frame
     for transform in tree.transforms:
@@ -320,7 +308,7 @@ def _write_transforms(tree: Transforms, proto: Any) -> None:
 
 
 def _write_transform(transform: Transform, proto: Any) -> None:
-    _write_time(proto.timestamp, transform.stamp)
+    proto.timestamp.seconds, proto.timestamp.nanos = divmod(transform.stamp, SECOND)
     proto.parent_frame_id = transform.parent
     proto.child_frame_id = transform.child
     t, q = proto.translation, proto.rotation
@@ -343,7 +331,7 @@ def _read_transform(proto: Any) -> Transform:
     return Transform(
         parent=proto.parent_frame_id,
         child=proto.child_frame_id,
-        stamp=_nanoseconds(proto.timestamp),
+        stamp=proto.timestamp.seconds * SECOND + proto.timestamp.nanos,
         translation=(t.x, t.y, t.z),
         rotation=(q.x, q.y, q.z, q.w),
     )
@@ -355,8 +343,9 @@ _LEVEL_NUMBERS: Final = {level: number for number, level in _LEVELS.items()}
 
 
 def _write_log(record: LogRecord, proto: Any) -> None:
-    _write_counters(record, proto)
-    _write_time(proto.timestamp, record.stamp)
+    proto.received = record.received
+    proto.seq = record.seq
+    proto.timestamp.seconds, proto.timestamp.nanos = divmod(record.stamp, SECOND)
     proto.frame = record.frame
     proto.level = _LEVEL_NUMBERS[record.level]
     proto.message = record.text
@@ -367,7 +356,7 @@ def _write_log(record: LogRecord, proto: Any) -> None:
 
 def _read_log(proto: Any) -> _Fields:
     return {
-        "stamp": _nanoseconds(proto.timestamp),
+        "stamp": proto.timestamp.seconds * SECOND + proto.timestamp.nanos,
         "received": proto.received,
         "seq": proto.seq,
         "frame": proto.frame,
