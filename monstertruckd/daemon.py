@@ -24,9 +24,9 @@ from monstertruck_estimation.points.service import PointService, register_point_
 from monstertruck_estimation.slam.service import SlamService
 from monstertruck_kinematics.chassis import Chassis
 from monstertruck_planners.behave.service import BehaviourService, register_behaviour_calls
-from monstertruck_planners.explore.service import ExplorerService, register_explorer_calls
+from monstertruck_planners.explore.service import ExplorerService
 from monstertruck_planners.goals.service import GoalService, register_goal_calls
-from monstertruck_planners.missions.service import MissionService, register_mission_calls
+from monstertruck_planners.missions.service import MissionService
 from monstertruck_planners.steps import CODEC
 from monstertruck_runtime.actors.actor import ActorFactory
 from monstertruck_runtime.actors.remote import RPC as REMOTE_STEP
@@ -35,6 +35,7 @@ from monstertruck_runtime.clock import Clock, VirtualClock
 from monstertruck_runtime.errors import ConfigError, InputError
 from monstertruck_runtime.mailbox import latest
 from monstertruck_runtime.ports import EventSink, Handler
+from monstertruck_runtime.requests import register_numbered
 from monstertruck_runtime.service import OnBug, RestartPolicy, Scope, Service, scope, supervise
 from monstertruck_runtime.slowness import SlowComputer, factor_of
 from monstertruck_runtime.threads import Offload, in_daemon_thread, in_thread, inline
@@ -42,7 +43,7 @@ from monstertruck_schemas import topics
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.health import ServiceHealth, ServiceState
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import GoalRequest
+from monstertruck_schemas.req import ExploreRequest, GoalRequest, MissionRequest
 from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.topics import DRIVES, TOPICS, Topic, Writer
 from monstertruckd.assembly.devices import Cabling, build_drivers, measures_battery, of_duty, sensor_services
@@ -186,9 +187,9 @@ class Daemon:
                 if isinstance(service, GoalService):
                     register_goal_calls(self.rpc, service, self.clock)
                 if isinstance(service, ExplorerService):
-                    register_explorer_calls(self.rpc, service)
+                    register_numbered(self.rpc, "explore", ExploreRequest, service.take)
                 if isinstance(service, MissionService):
-                    register_mission_calls(self.rpc, service)
+                    register_numbered(self.rpc, "mission", MissionRequest, service.take)
                 if isinstance(service, BehaviourService):
                     register_behaviour_calls(self.rpc, service)
             if self._notify is not None:

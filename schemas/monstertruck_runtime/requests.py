@@ -5,7 +5,7 @@ The gate and the planners check requests by the same rules, whether they come by
 
 import json
 import math
-from collections.abc import Collection, Coroutine, Mapping
+from collections.abc import Callable, Collection, Coroutine, Mapping
 from typing import Any, Final, Protocol, TypeVar
 
 from pydantic import ValidationError
@@ -13,6 +13,7 @@ from pydantic import ValidationError
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError, RequestRefusedError
 from monstertruck_runtime.mailbox import Delivery, Mailbox
+from monstertruck_runtime.ports import RpcRegistry
 from monstertruck_schemas.base import Message, first_mistake
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import BehaviourOrder, DriveRequest, Order, Request, Role
@@ -138,6 +139,15 @@ def parse_request(model: type[R], payload: dict[str, Any]) -> R:
         if error.errors(include_url=False)[0]["type"] == "finite_number":
             raise RequestRefusedError(Reason.NOT_FINITE, text) from None
         raise InputError(text) from None
+
+
+def register_numbered(rpc: RpcRegistry, name: str, model: type[R], take: Callable[[R], int]) -> None:
+    """Serve ``name``, whose payload is a ``model``; it is answered with the ``number`` that ``take`` gives it."""
+
+    async def call(payload: dict[str, Any]) -> dict[str, Any]:
+        return {"number": take(parse_request(model, payload))}
+
+    rpc.register(name, call)
 
 
 class Sequences:

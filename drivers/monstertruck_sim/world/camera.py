@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.elementary import Array, rotation
 from monstertruck_runtime.errors import NotInstalledError
 from monstertruck_sim.world.config import CameraConfig, TagConfig
 from monstertruck_sim.world.noise import CAMERA, generator
@@ -97,18 +97,6 @@ def mounted(pose: Pose, config: CameraConfig, attitude: tuple[float, float, floa
     centre = np.array((pose[0], pose[1], attitude[2])) + body @ np.array((config.x, config.y, config.height))
     forward, left, up = (body @ rotation(config.yaw, config.pitch, config.roll)).T
     return CameraPlace(centre, np.stack((-left, -up, forward)))
-
-
-def rotation(yaw: float, pitch: float, roll: float) -> Array:
-    """From a body's axes to those it is turned against, (3, 3): yaw, then pitch, then roll (REP 103)."""
-    cy, sy, cp, sp, cr, sr = cos(yaw), sin(yaw), cos(pitch), sin(pitch), cos(roll), sin(roll)
-    return np.array(
-        (
-            (cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
-            (sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),
-            (-sp, cp * sr, cp * cr),
-        )
-    )
 
 
 class SimulatedView:

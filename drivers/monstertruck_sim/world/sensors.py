@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_drivers.emulation import CompassReading, ImuReading, JointSource, MotorReading, PulseSource
-from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.elementary import Array, rotation
 from monstertruck_runtime.clock import SECOND
 from monstertruck_sim.world.board import panel_ranges
-from monstertruck_sim.world.camera import FlatPanel, rotation
+from monstertruck_sim.world.camera import FlatPanel
 from monstertruck_sim.world.config import (
     BatteryModelConfig,
     CompassModelConfig,

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from monstertruck_estimation.vision.board import BoardReader
 from monstertruck_estimation.vision.lens import BoardPose, Lens, board_pose
-from monstertruck_estimation.vision.mount import camera_axes, rotation
-from monstertruck_kinematics.elementary import Array
+from monstertruck_estimation.vision.mount import camera_axes
+from monstertruck_kinematics.elementary import Array, rotation
 from monstertruck_kinematics.fitting import FitResult, least_squares
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.board import BoardConfig

@@ -21,7 +21,7 @@ from monstertruck_runtime.clock import SECOND, Clock, Schedule
 from monstertruck_runtime.errors import InputError, NotFoundError, RequestRefusedError
 from monstertruck_runtime.mailbox import latest
 from monstertruck_runtime.ports import BusPort, EventSink, Publisher, Ready, RpcRegistry, Subscription
-from monstertruck_runtime.requests import Sequences, does_not_drive, parse_request, planner_request, refusal
+from monstertruck_runtime.requests import Sequences, does_not_drive, planner_request, refusal, register_numbered
 from monstertruck_schemas.base import Message, first_mistake
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.plan import BehaviourState, GoalPhase, GoalState, TrackerState
@@ -368,13 +368,10 @@ def register_behaviour_calls(rpc: RpcRegistry, service: BehaviourService) -> Non
         service: what runs them.
     """
 
-    async def behave(payload: dict[str, Any]) -> dict[str, Any]:
-        return {"number": service.take(parse_request(BehaviourRequest, payload))}
-
     async def behaviours(_: dict[str, Any]) -> dict[str, Any]:
         return {
             name: {"kind": config.kind, "doc": BEHAVIOURS[config.kind].doc} for name, config in service.configs.items()
         }
 
-    rpc.register("behave", behave)
+    register_numbered(rpc, "behave", BehaviourRequest, service.take)
     rpc.register("behaviours", behaviours, AccessRole.OBSERVER)

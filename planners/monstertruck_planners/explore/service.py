@@ -17,8 +17,8 @@ from monstertruck_runtime.actors.actor import Actor
 from monstertruck_runtime.clock import SECOND, Clock, Schedule
 from monstertruck_runtime.errors import RequestRefusedError, TruckError
 from monstertruck_runtime.mailbox import Mailbox
-from monstertruck_runtime.ports import EventSink, Publisher, Ready, RpcRegistry, Subscription
-from monstertruck_runtime.requests import Sequences, does_not_drive, inner_request, parse_request, refusal
+from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
+from monstertruck_runtime.requests import Sequences, does_not_drive, inner_request, refusal
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.event import Event, Severity
 from monstertruck_schemas.health import HealthTable, LocalisationStatus, ServiceState, SlamHealth
@@ -401,17 +401,3 @@ def state_of(run: Exploration | None, kind: str, now: int) -> ExplorationState:
         find=run.find,
         found=run.found,
     )
-
-
-def register_explorer_calls(rpc: RpcRegistry, service: ExplorerService) -> None:
-    """Serve ``explore``, whose payload is an ``ExploreRequest``.
-
-    Args:
-        rpc: where.
-        service: what explores.
-    """
-
-    async def explore(payload: dict[str, Any]) -> dict[str, Any]:
-        return {"number": service.take(parse_request(ExploreRequest, payload))}
-
-    rpc.register("explore", explore)

@@ -25,8 +25,8 @@ from monstertruck_planners.missions.progress import (
 )
 from monstertruck_runtime.clock import SECOND, Clock, Schedule
 from monstertruck_runtime.errors import InputError, NotFoundError, RequestRefusedError, TruckError, disk_reason
-from monstertruck_runtime.ports import EventSink, Publisher, Ready, RpcRegistry, Subscription
-from monstertruck_runtime.requests import Sequences, does_not_drive, inner_request, parse_request, refusal
+from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
+from monstertruck_runtime.requests import Sequences, does_not_drive, inner_request, refusal
 from monstertruck_runtime.small_files import replace_file, require_file
 from monstertruck_runtime.threads import Offload
 from monstertruck_schemas.base import Pose2D, first_mistake
@@ -614,17 +614,3 @@ class MissionService:
 def _where(saved: SavedProgress) -> str:
     way_back = f"on the way back, after step {saved.index + 1} had failed"
     return way_back if saved.returning else f"at step {saved.index + 1}"
-
-
-def register_mission_calls(rpc: RpcRegistry, service: MissionService) -> None:
-    """Serve ``mission``, whose payload is a ``MissionRequest``.
-
-    Args:
-        rpc: where.
-        service: what does them.
-    """
-
-    async def mission(payload: dict[str, Any]) -> dict[str, Any]:
-        return {"number": service.take(parse_request(MissionRequest, payload))}
-
-    rpc.register("mission", mission)
