@@ -4,8 +4,11 @@ import numpy as np
 import pytest
 
 from monstertruck_runtime.clock import SECOND
+from monstertruck_runtime.errors import RequestRefusedError
 from monstertruck_schemas.health import LocalisationStatus
 from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import BehaviourOrder
+from tests.daemon.goal_kit import Trip, travel
 from tests.daemon.slam_kit import CONFIGS, Drive, driven, lap
 
 pytestmark = [pytest.mark.virtual, pytest.mark.timeout(300)]
@@ -30,6 +33,27 @@ def test_the_truck_finds_itself_on_its_map():
     reasons = {event.reason for event in drive.events}
     assert Reason.POSE_FOUND in reasons
     assert Reason.OUTSIDE_MAP not in reasons
+
+
+def test_before_it_has_found_itself_it_takes_no_goal_and_no_mission():
+    goal = {"frame": "map", "goal": {"x": 3.4, "y": 3.9, "yaw": 0.0}}
+    steps = [{"do": "goto", "x": 3.4, "y": 3.9, "yaw": 0.0}]
+    asked = {
+        "goal": goal,
+        "mission": {"order": "start", "mission": {"version": 2, "name": "there", "steps": steps}},
+    }
+
+    async def story(trip: Trip) -> None:
+        await trip.arm()
+        for call, request in asked.items():
+            with pytest.raises(RequestRefusedError, match="`monstertruckd drive`") as refused:
+                await trip.operator.call(call, {**await trip.operator.header(), **request})
+            assert refused.value.refusal is Reason.POSE_LOST
+        await trip.operator.behave(BehaviourOrder.START, "move", {"length": 1.1, "speed": 0.2})
+        await trip.clock.sleep(9.0)
+        assert (await trip.goal(3.4, 3.9, 0.0))["planned"]
+
+    travel(story, slam={"mode": "localisation", "map": CONFIGS / "worlds" / "rooms.yaml"})
 
 
 def test_the_truck_is_outside_of_another_places_map():

@@ -7,6 +7,8 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.collision import Footprint
 from monstertruck_planners.goals.config import PlannerConfig
+from monstertruck_runtime.errors import RequestRefusedError
+from monstertruck_schemas.health import LocalisationStatus, SlamHealth
 from monstertruck_schemas.plan import Steering
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import LaserScan
@@ -153,6 +155,18 @@ class DeformAnswer:
 def level(scan: LaserScan, config: PlannerConfig) -> bool:
     """Whether the plane of a scan was level enough to show obstacles; true where its tilt is not known."""
     return scan.tilt is None or scan.tilt <= config.max_tilt
+
+
+def require_place(slam: SlamHealth | None) -> None:
+    """Whether the pose in map means something, by the newest state of the mapping; None = there is none.
+
+    Raises:
+        RequestRefusedError: it does not: the robot has not found its place on its saved map.
+    """
+    if slam is not None and slam.standing in (LocalisationStatus.SEARCHING, LocalisationStatus.OUTSIDE):
+        text = f"its place on the saved map is not known ({slam.standing})"
+        text += ": `monstertruckd drive` it a metre or two there, by which it finds itself"
+        raise RequestRefusedError(Reason.POSE_LOST, text)
 
 
 def explained_within(config: PlannerConfig, deviation: float) -> float:

@@ -14,6 +14,7 @@ from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.mailbox import Mailbox
 from monstertruck_runtime.ports import EventSink, Publisher, Subscription
 from monstertruck_runtime.requests import planner_request
+from monstertruck_schemas.health import SlamHealth
 from monstertruck_schemas.plan import BehaviourState, GoalState, Path, TrackerState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import DriveRequest, GoalControl, GoalRequest
@@ -48,6 +49,7 @@ class GoalInputs:
     """None = the configured map."""
     ground: Subscription[Ground] | None = None
     behaviour: Subscription[BehaviourState] | None = None
+    slam: Subscription[SlamHealth] | None = None
 
 
 @dataclass(frozen=True, slots=True)

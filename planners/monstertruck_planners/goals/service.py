@@ -22,6 +22,7 @@ from monstertruck_planners.goals.exchange import (
     Setup,
     level,
     pose_of,
+    require_place,
     twist_of,
 )
 from monstertruck_planners.goals.goal_run import Action, Follow, GoalRun, Halt, Observations, Plan, Report
@@ -168,6 +169,7 @@ class GoalService:
         pose = self._in.pose.latest
         if pose is None:
             raise RequestRefusedError(Reason.NO_MAP, "no pose yet")
+        require_place(None if self._in.slam is None else self._in.slam.latest)
         if request.frame not in (pose.frame, "map"):
             frames = " or ".join(map(repr, dict.fromkeys((pose.frame, "map"))))
             raise RequestRefusedError(Reason.BAD_INPUT, f"goal in frame {request.frame!r}: expected {frames}")

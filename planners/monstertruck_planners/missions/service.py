@@ -12,7 +12,7 @@ from pydantic import ValidationError
 
 from monstertruck_planners.behave.service import BehaviourService
 from monstertruck_planners.explore.service import ExplorerService
-from monstertruck_planners.goals.exchange import Pose, pose_of
+from monstertruck_planners.goals.exchange import Pose, pose_of, require_place
 from monstertruck_planners.goals.service import GoalService
 from monstertruck_planners.missions.progress import (
     GOOD,
@@ -31,6 +31,7 @@ from monstertruck_runtime.small_files import replace_file, require_file
 from monstertruck_runtime.threads import Offload
 from monstertruck_schemas.base import Pose2D, first_mistake
 from monstertruck_schemas.event import Severity
+from monstertruck_schemas.health import SlamHealth
 from monstertruck_schemas.mission import (
     AnyStep,
     BehaviourStepOfMission,
@@ -79,7 +80,9 @@ MOVED: Final = 1.0
 """Metres from where it was interrupted at which a robot counts as moved, or its odometry as begun again."""
 MOST_BYTES: Final = 1_000_000
 """Size of the saved progress at most."""
-PASSING: Final = frozenset({Reason.PLANNER_STARTING, Reason.NO_MAP, Reason.LEASE_EXPIRED, Reason.BUSY})
+PASSING: Final = frozenset(
+    {Reason.PLANNER_STARTING, Reason.NO_MAP, Reason.POSE_LOST, Reason.LEASE_EXPIRED, Reason.BUSY}
+)
 """Refusals that pass: it is requested again. Busy is the robot with the step before: after a goal it brakes along a
 path, after an exploration the map is saved."""
 AGAIN: Final = 1.0
@@ -101,6 +104,7 @@ class MissionInputs:
     behaviour: Subscription[BehaviourState]
     explore: Subscription[ExplorationState]
     points: Subscription[PointsOfInterest] | None = None
+    slam: Subscription[SlamHealth] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -257,6 +261,7 @@ class MissionService:
             raise InputError("mission: missing")
         if (pose := self._pose()) is None:
             raise RequestRefusedError(Reason.NO_MAP, "no pose in a map yet")
+        require_place(None if self._in.slam is None else self._in.slam.latest)
         if resumed is not None:
             if not self._localised and not request.moved and (away := resumed.away(pose)) > MOVED:
                 text = f"its pose is {away:.1f} m from where {resumed.mission.name} was interrupted"

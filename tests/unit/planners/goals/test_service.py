@@ -33,7 +33,7 @@ def test_a_goal_that_comes_too_early_is_refused_by_what_is_missing(
     service = GoalService.__new__(GoalService)
     monkeypatch.setattr(service, "_examine", lambda *_, **__: None)
     service._actor = actor
-    service._in = SimpleNamespace(pose=SimpleNamespace(latest=None))
+    service._in = SimpleNamespace(pose=SimpleNamespace(latest=None), slam=None)
     with pytest.raises(RequestRefusedError, match=text) as refused:
         service.take(None)
     assert refused.value.refusal is reason

@@ -165,7 +165,8 @@ class Pretended:
         self, clock: VirtualClock, file: Path | None = None, *, localised: bool = False, busy: int = 0, offload=inline
     ) -> None:
         self.clock, self.number, self.reached = clock, 0, [Reason.GOAL_REACHED] * 99
-        self.latest = {"gate": None, "pose": None, "goal": None, "behaviour": None, "explore": None, "points": None}
+        topics = ("gate", "pose", "goal", "behaviour", "explore", "points", "slam")
+        self.latest = dict.fromkeys(topics)
         self.reports, self.events, self.goals, self.held = [], [], [], set()
         self.refusals: list[RequestRefusedError] = []
         box = {name: self._box(name) for name in self.latest}
@@ -359,6 +360,17 @@ def test_it_takes_nothing_over_from_somebody_else(what: str):
         assert refused.value.refusal is Reason.BUSY
 
     assert played(story).goals == []
+
+
+def test_a_robot_that_has_lost_its_place_is_waited_for():
+    async def story(robot: Pretended) -> None:
+        robot.refusals = [RequestRefusedError(Reason.POSE_LOST, "where is it?")] * 3
+        robot.order(MissionOrder.START, GO)
+        await robot.clock.sleep(2.0)
+        assert (robot.reports[-1].running, robot.reports[-1].text) == (True, "where is it?")
+        await robot.clock.sleep(6.0)
+
+    assert played(story).reports[-1].outcome is Reason.MISSION_DONE
 
 
 def test_a_look_waits_for_a_pose_and_a_point_for_the_list_of_points():
