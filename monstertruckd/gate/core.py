@@ -12,7 +12,7 @@ source may continue; a fault longer than ``disarm_after``, or one of ``DISARMING
 import math
 from collections import deque
 from collections.abc import Mapping
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, assert_never
 
 from monstertruck_kinematics.chassis import Chassis
 from monstertruck_kinematics.elementary import KinematicsError
@@ -25,7 +25,7 @@ from monstertruck_schemas.cmd import DriveAction
 from monstertruck_schemas.event import Cause, Event, Severity
 from monstertruck_schemas.health import HealthTable
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import UNCONDITIONAL, ControlRequest, DriveForm, DriveRequest, Order, Role
+from monstertruck_schemas.req import ControlRequest, DriveForm, DriveRequest, Order, Role
 from monstertruck_schemas.sensor import Attitude, Battery, DriveFeedback, LaserScan, SonarRanges, SteeringFeedback
 from monstertruck_schemas.state import GateMode, Odometry, Peers
 from monstertruckd.gate.arbitration import EventLog, GateEvent, GateStateMachine, Source, Sources
@@ -285,35 +285,38 @@ class Gate:
     def control(self, request: ControlRequest, now: int) -> Decision:
         """Carry out an order, or refuse it.
 
-        ESTOP and STOP are accepted from every source, authenticated or not: stopping is always safe. ARM and RESET need
-        an operator's role, a truck at rest and no operator requesting motion. An authenticated ESTOP or STOP uses its
-        sequence number, so that an earlier order of its source that arrives later, over another channel, is refused.
+        ESTOP and STOP are accepted from every source that the bus lets in, authenticated or not: stopping is always
+        safe. ARM and RESET need an operator's role, a truck at rest and no operator requesting motion. An authenticated
+        ESTOP or STOP uses its sequence number, so that an earlier order of its source that arrives later, over another
+        channel, is refused.
         So is an ARM or RESET whose sender did not know yet of another's ESTOP, STOP or DISARM.
         """
-        reason = self._sources.accept_order(request, now)
-        if request.order in UNCONDITIONAL:
+        reason, order = self._sources.accept_order(request, now), request.order
+        if order is Order.ESTOP or order is Order.STOP:
             # The second copy of an order that came by topic and by call has a used number.
             authenticated = reason in (Reason.OK, Reason.BAD_SEQUENCE)
             self._sources.stopped(request.source if authenticated else "", now)
-            return self._estop(request, now) if request.order is Order.ESTOP else self._stop_by(request, now)
+            return self._estop(request, now) if order is Order.ESTOP else self._stop_by(request, now)
         if reason is not Reason.OK:
             return self._refuse_order(now, reason, request)
         if stopped_by := self._sources.overtaken(request):
             text = f"{stopped_by} has ordered a stop meanwhile"
             return self._refuse_order(now, Reason.BAD_SEQUENCE, request, text)
-        if request.order is Order.DISARM:
+        if order is Order.DISARM:
             return self._disarm_by(request, now)
         if request.role not in OPERATORS:
             return self._refuse_order(now, Reason.BAD_ROLE, request)
-        match request.order:
+        match order:
             case Order.ASK:
                 return self._ask(request, now)
             case Order.HAND_OVER:
                 return self._hand_over(request, now)
             case Order.ARM:
                 return self._arm(request, now)
-            case _:
+            case Order.RESET:
                 return self._reset(request, now)
+            case _:
+                assert_never(order)
 
     def _refuse(self, now: int, reason: Reason, request: DriveRequest | ControlRequest, text: str = "") -> Reason:
         what = request.order.value if isinstance(request, ControlRequest) else "drive"

@@ -2,10 +2,10 @@
 
 import asyncio
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Final, TypeVar
+from typing import Any, Final, TypeVar, assert_never
 
 import numpy as np
 
@@ -430,17 +430,6 @@ class _Feed:
             self._observe(message)
 
 
-CARRIED_OUT: Final[Mapping[Order, Callable[[GateMode], bool]]] = {
-    Order.ARM: lambda mode: mode.active,
-    Order.DISARM: lambda mode: not mode.active,
-    Order.ESTOP: lambda mode: mode is GateMode.ESTOPPED,
-    Order.RESET: lambda mode: mode is not GateMode.ESTOPPED,
-    Order.STOP: lambda mode: not mode.moving,
-    Order.ASK: lambda _: True,
-    Order.HAND_OVER: lambda _: True,
-}
-"""Modes that show an order as carried out."""
-
 STANDSTILL: Final = 4.0
 """Seconds for the truck to come to rest."""
 
@@ -476,10 +465,29 @@ async def _carry_out(bus: Bus, clock: Clock, order: Order, payload: dict[str, An
             async with clock.deadline(STANDSTILL):
                 while True:
                     state = await states.next()
-                    if CARRIED_OUT[order](state.mode):
+                    if _is_carried_out(order, state.mode):
                         return state.model_dump(mode="json")
                     if order not in GRADUAL:
                         raise RequestRefusedError(state.worst)
         except TimeoutError:
             msg = f"{order.value} accepted, but standstill is not confirmed after {STANDSTILL:g} s"
             raise NoAnswerError(msg) from None
+
+
+def _is_carried_out(order: Order, mode: GateMode) -> bool:
+    """Whether ``mode`` shows that ``order`` has been carried out."""
+    match order:
+        case Order.ARM:
+            return mode.active
+        case Order.DISARM:
+            return not mode.active
+        case Order.ESTOP:
+            return mode is GateMode.ESTOPPED
+        case Order.RESET:
+            return mode is not GateMode.ESTOPPED
+        case Order.STOP:
+            return not mode.moving
+        case Order.ASK | Order.HAND_OVER:
+            return True
+        case _:
+            assert_never(order)

@@ -50,7 +50,7 @@ class OnBug(StrEnum):
     """What an unexpected exception in a service does."""
 
     EXIT = "exit"
-    """Gate, actuators, bus: the process must not go on."""
+    """Gate, actuators, bridge to Zenoh: the process must not go on."""
     FAIL = "fail"
     """Any other: stop the truck through the gate, fail this service alone."""
 
@@ -126,7 +126,7 @@ async def supervise(
             return
 
         if isinstance(lost, PortBusyError) and on_bug is OnBug.EXIT and session.starts == 1:
-            # Two daemons must not lie in wait for each other's actuators.
+            # Two daemons must not compete for each other's actuators.
             session.report_state(ServiceState.FAILED, lost.reason, str(lost))
             raise PortBusyError(f"{service.name}: {lost}")
         detail = str(lost) or type(lost).__name__

@@ -1,4 +1,4 @@
-"""How slow may a computer be: on the virtual clock, a run is charged the processor time that a slower one would take.
+"""How slow may a computer be: on the virtual clock, a run takes the processor time that a slower one would.
 
 What the tasks of a service compute is measured turn by turn and moves the virtual time on by its processor time times a
 factor: timers that are due meanwhile fire late, as on that computer. A worker's result is delivered after its declared
@@ -6,7 +6,7 @@ latency times the factor, or after its measured processor time times the factor,
 processors of their own. Such runs depend on this computer's speed, so no two are alike. Without a factor nothing is
 measured, and runs are reproducible.
 
-Callbacks that belong to no task of a service (the links' bytes, the world) are not charged.
+Callbacks that belong to no task of a service (the links' bytes, the world) take no such time.
 """
 
 import asyncio
@@ -38,7 +38,7 @@ class SlowComputer:
     """A computer whose every core is ``factor`` times slower than this one's.
 
     Args:
-        clock: that is charged; at most one slow computer per clock.
+        clock: whose time is moved on; at most one slow computer per clock.
         factor: how much slower it is.
     """
 
@@ -77,7 +77,7 @@ def slow_computer(clock: Clock) -> SlowComputer | None:
 
 
 class _Measured(Coroutine[Any, Any, T]):
-    """A coroutine whose every turn is charged."""
+    """A coroutine whose every turn is measured."""
 
     def __init__(self, work: Coroutine[Any, Any, T], name: str, computer: SlowComputer) -> None:
         self._work = work

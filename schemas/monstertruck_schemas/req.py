@@ -142,7 +142,7 @@ class DriveRequest(Request):
 
 
 class Order(StrEnum):
-    """What a control request can ask of the gate."""
+    """What a control request can ask of the gate; each is a remote call, too. What the gate does not do is none."""
 
     ARM = "arm"
     DISARM = "disarm"
@@ -159,7 +159,8 @@ STARTING: Final = frozenset({Order.ARM, Order.RESET})
 """Orders after which the truck may move: they must carry a recent gate stamp."""
 
 UNCONDITIONAL: Final = frozenset({Order.ESTOP, Order.STOP})
-"""Orders that everybody may give, at any rate: stopping is always safe. They are sent by topic, ahead of all calls."""
+"""Orders that the gate takes at any rate and whatever they say of themselves: stopping is always safe. They are sent by
+topic, ahead of all calls."""
 
 
 class ControlRequest(Request):

@@ -374,7 +374,7 @@ def rpc_key(robot: str, name: str, source: str | None = None) -> str:
 
 
 ESTOP_WAY: Final = "req/estop"
-"""Name of the emergency stop's own way in; inside the robot it is an order on ``req/control`` like any other."""
+"""Name of the emergency stop's own key; inside the robot it is an order on ``req/control`` like any other."""
 
 
 def estop_key(robot: str, source: str = "*") -> str:

@@ -19,14 +19,14 @@ from monstertruck_estimation.slam.grid import NONE, GridBuilder, passed_ends
 from monstertruck_estimation.slam.keyframes import LOOSENED, KeyframeMap, Trajectory
 from monstertruck_estimation.slam.motion import ClockOffsetEstimator, MotionPredictor, ScanOdometry, velocity
 from monstertruck_estimation.slam.relocation import (
-    ASTRAY,
-    ASTRAY_CONTRADICTION,
     OFF_MOTION,
+    OFF_MOTION_SUSPECT,
+    SUSPECT_CONTRADICTION,
     LossDetector,
     Relocation,
     contradicts,
     exceeds,
-    foreseen,
+    prediction_is_certain,
 )
 from monstertruck_estimation.slam.scan_matcher import (
     LOW_OVERLAP,
@@ -199,11 +199,11 @@ class Mapper:
         if match.accepted and (off := self._motion.off(between(self._pose, match.pose))):
             if exceeds(off, OFF_MOTION):
                 return rejected(guess, covariance, MatchStatus.FAR)
-            if exceeds(off, ASTRAY[self._loss.doubts(match)]):
-                suspect, most = True, ASTRAY_CONTRADICTION
+            if exceeds(off, OFF_MOTION_SUSPECT[self._loss.doubts(match)]):
+                suspect, most = True, SUSPECT_CONTRADICTION
         if (suspect or after_gap) and contradicts(self.map, scan, match.pose, most):
             return rejected(guess, covariance, MatchStatus.CONTRADICTED)
-        if after_gap and not foreseen(covariance) and self._has_moved(match.pose):
+        if after_gap and not prediction_is_certain(covariance) and self._has_moved(match.pose):
             return rejected(guess, covariance, MatchStatus.UNSURE)
         return match
 

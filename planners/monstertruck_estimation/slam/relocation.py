@@ -105,17 +105,17 @@ class LossDetector:
         self._misfits, self.after_gap, self.fitted = 0, False, self._stamp or 0
 
 
-FORESEEN: Final = (0.5, 0.5)
-"""Standard deviation of the predicted pose, m and rad, up to which the robot is where a match near it says."""
+CERTAIN_PREDICTION: Final = (0.5, 0.5)
+"""Standard deviation of the predicted pose, m and rad, up to which a match near it is believed after a gap."""
 
 
-def foreseen(covariance: Array) -> bool:
+def prediction_is_certain(covariance: Array) -> bool:
     """Whether a predicted pose, of ``covariance`` (3, 3), is known so well that no other place comes into question.
 
-    A match in a wider window is one place that fits, of how many nobody has looked.
+    A match in a wider window is one place that fits; there may be others.
     """
     place, turn = deviations(covariance)
-    return place <= FORESEEN[0] and turn <= FORESEEN[1]
+    return place <= CERTAIN_PREDICTION[0] and turn <= CERTAIN_PREDICTION[1]
 
 
 OFF_MOTION: Final = (0.5, 1.0)
@@ -124,9 +124,9 @@ OFF_MOTION: Final = (0.5, 1.0)
 With every misfit the window of the next match grows, and that of the last motion is wide: a robot that was carried fits
 somewhere in it sooner or later. The last motion corrects wheels that are late.
 """
-ASTRAY: Final = ((0.25, 0.25), (0.1, 0.1))
-"""Difference from which on such a match may be at a similar place, without a doubt and in doubt."""
-ASTRAY_CONTRADICTION: Final = 0.03
+OFF_MOTION_SUSPECT: Final = ((0.25, 0.25), (0.1, 0.1))
+"""Difference from which on such a match may be at a place that looks similar: usual matches, and doubtful ones."""
+SUSPECT_CONTRADICTION: Final = 0.03
 """Greatest contradiction of scan and map of such a match."""
 
 
