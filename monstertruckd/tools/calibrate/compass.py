@@ -18,7 +18,7 @@ from monstertruck_kinematics.fitting import FitResult, least_squares
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas import topics
 from monstertruckd.config.calibration import COMPASS, Estimate, Result, WizardName
-from monstertruckd.tools.calibrate.statistics import NORMAL, correlation_factor
+from monstertruckd.tools.calibrate.statistics import NORMAL, Interval, correlation_factor, estimated
 from monstertruckd.tools.calibrate.steps import MoveRecord, MoveStep
 from monstertruckd.tools.calibrate.wizard import CLEAR, WizardContext
 
@@ -218,21 +218,9 @@ def _motor(circle: FieldCircle, fit: FitResult) -> list[Estimate]:
         samples=circle.x.size,
         meaning="greatest turn of the heading by an ampere of motor current, across the disturbance; for information",
     )
-    return [
-        *(
-            Estimate(
-                name=name,
-                value=value,
-                low=value - half,
-                high=value + half,
-                unit="uT/A",
-                samples=circle.x.size,
-                meaning="field of an ampere of motor current, forward positive; 95 % of the readings' noise",
-            )
-            for name, value, half in found
-        ),
-        turn,
-    ]
+    meaning = "field of an ampere of motor current, forward positive; 95 % of the readings' noise"
+    fields = (estimated(name, Interval(value, half), "uT/A", circle.x.size, meaning) for name, value, half in found)
+    return [*fields, turn]
 
 
 def fit_ellipse(circle: FieldCircle) -> FitResult:

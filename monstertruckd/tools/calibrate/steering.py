@@ -17,7 +17,7 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.errors import InputError, RequestRefusedError
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.config.calibration import STEERING, Estimate, Result, WizardName
-from monstertruckd.tools.calibrate.statistics import NORMAL
+from monstertruckd.tools.calibrate.statistics import NORMAL, Interval, estimated
 from monstertruckd.tools.calibrate.steering_model import AXLES, SLIP, Maps, SteeringModel, SteeringRun, half_widths
 from monstertruckd.tools.calibrate.steps import Confirm, MoveStep, Number
 from monstertruckd.tools.calibrate.weave import estimates, response, weaves
@@ -402,16 +402,8 @@ def _direction(name: str, scale: float, samples: int) -> Estimate:
 
 
 def _centre(name: str, centre: float, half: float, samples: int, meaning: str) -> Estimate:
-    return Estimate(
-        name=f"{name}_centre",
-        value=centre,
-        low=centre - half,
-        high=centre + half,
-        unit="us",
-        samples=samples,
-        meaning=f"pulse that steers straight ahead; {meaning}",
-        key=f"{STEERING}.{name}.centre_us",
-    )
+    meaning, key = f"pulse that steers straight ahead; {meaning}", f"{STEERING}.{name}.centre_us"
+    return estimated(f"{name}_centre", Interval(centre, half), "us", samples, meaning, key)
 
 
 def _deficits(maps: Maps, halves: Array, samples: int, band: str) -> list[Estimate]:
@@ -424,17 +416,12 @@ def _deficits(maps: Maps, halves: Array, samples: int, band: str) -> list[Estima
         band: what the intervals cover.
     """
     return [
-        Estimate(
-            name=f"deficit_{name}",
-            value=value,
-            low=value - float(half),
-            high=value + float(half),
-            samples=samples,
-            meaning=f"what the turns lack by the linkage, {name.replace('_', ' ')}; {band}",
-            key=f"body.turn_deficit.{name}",
+        estimated(
+            f"deficit_{name}", Interval(value, float(half)), "", samples,
+            f"what the turns lack by the linkage, {name.replace('_', ' ')}; {band}", f"body.turn_deficit.{name}",
         )
         for (name, value), half in zip(asdict(maps.deficit).items(), halves, strict=True)
-    ]
+    ]  # fmt: skip
 
 
 def _distance_error(context: WizardContext) -> float:
