@@ -22,7 +22,7 @@ from monstertruck_runtime.ports import Value
 from monstertruck_runtime.requests import OPERATORS
 from monstertruck_runtime.stop_text import causes_text
 from monstertruck_schemas.cmd import DriveAction
-from monstertruck_schemas.event import Cause, Event, Severity
+from monstertruck_schemas.event import Cause, Event, Severity, Stop
 from monstertruck_schemas.health import HealthTable
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import ControlRequest, DriveForm, DriveRequest, Order, Role
@@ -34,7 +34,7 @@ from monstertruckd.gate.limiter import CommandLimiter, Motion, ObstacleGuard
 from monstertruckd.gate.peers import PeerGuard
 from monstertruckd.gate.sensors import DRIVE_LOSSES, STALE_SENSORS, Assessment, SensorMonitor, ShaftCheck, SteeringCheck
 from monstertruckd.gate.sonars import SonarGuard
-from monstertruckd.gate.stops import CauseBuilder, Outages, StopLog, Trip
+from monstertruckd.gate.stops import CauseBuilder, Outages, StopLog
 
 URGENT: Final = frozenset(
     {Reason.DRIVE_STALE, Reason.DRIVE_FAULT, Reason.TICK_STALLED, Reason.SERVICE_FAILED, Reason.SHUTDOWN}
@@ -104,7 +104,7 @@ class GateOutput(NamedTuple):
     handed_to: str | None
     """Operator to whom the drive was handed over in this tick."""
     events: tuple[GateEvent, ...]
-    trips: tuple[Trip, ...]
+    trips: tuple[Stop, ...]
 
 
 class Gate:

@@ -14,7 +14,6 @@ from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError
 from monstertruck_runtime.mailbox import fifo
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, RpcRegistry, Subscription
 from monstertruck_runtime.requests import parse_request
-from monstertruck_runtime.stop_text import causes_text
 from monstertruck_runtime.threads import Offload, in_thread
 from monstertruck_schemas.base import Twist2D, servo_fields
 from monstertruck_schemas.cmd import DriveCommand, SteeringCommand
@@ -30,7 +29,6 @@ from monstertruckd.bus.local import Bus
 from monstertruckd.gate.config import GateConfig
 from monstertruckd.gate.core import Decision, Gate, GateOutput
 from monstertruckd.gate.latch import Latch
-from monstertruckd.gate.stops import Trip
 
 log = logging.getLogger(__name__)
 
@@ -136,7 +134,7 @@ class GateService:
         outputs: GateOutputs,
         events: EventSink,
         latch: Latch,
-        black_box: Callable[[Trip], str | None] = lambda _: None,
+        black_box: Callable[[Stop], str | None] = lambda _: None,
         offload: Offload = in_thread,
         weakened: tuple[str, ...] = (),
     ) -> None:
@@ -324,26 +322,11 @@ class GateService:
         if (output.mode is GateMode.ESTOPPED) != self._latched:
             self._latch_differs.set()
 
-    def _stop(self, trip: Trip, now: int) -> Stop:
+    def _stop(self, trip: Stop, now: int) -> Stop:
         if trip.number != self._boxed[0]:
             self._boxed = trip.number, self._black_box(trip)
-        return Stop(
-            stamp=trip.at,
-            received=now,
-            seq=self._outputs.stops.next_seq(),
-            number=trip.number,
-            reason=trip.reason,
-            mode=trip.mode,
-            ordered=trip.ordered,
-            quick=trip.quick,
-            holder=trip.holder,
-            role=trip.role,
-            speed=trip.speed,
-            stopping_distance=trip.stopping_distance,
-            causes=trip.causes,
-            black_box=self._boxed[1],
-            text=f"stopped: {causes_text(trip.causes, trip.at)}",
-        )
+        seq = self._outputs.stops.next_seq()
+        return trip.model_copy(update={"received": now, "seq": seq, "black_box": self._boxed[1]})
 
     def _state(self, output: GateOutput, now: int) -> GateState:
         return GateState(

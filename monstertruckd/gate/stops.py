@@ -1,17 +1,17 @@
 """Why the truck was stopped: causes with measurements, lost devices behind them, and the numbered log of stops."""
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Final
 
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.stop_text import causes_text, duration_text
 from monstertruck_schemas.base import Message
-from monstertruck_schemas.event import Cause, Event, Measurement, Severity
+from monstertruck_schemas.event import Cause, Event, Measurement, Severity, Stop
 from monstertruck_schemas.health import HealthTable, ServiceHealth, ServiceState
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import DriveRequest, Role
+from monstertruck_schemas.req import DriveRequest
 from monstertruck_schemas.roles import DeviceRole, ServiceName
 from monstertruck_schemas.sensor import DriveMode
 from monstertruck_schemas.state import GateMode
@@ -264,27 +264,6 @@ def _cause_of(event: Event) -> Cause:
     return Cause(reason=event.reason, source=event.source, since=event.stamp, text=event.text or event.reason.text)
 
 
-@dataclass(frozen=True, slots=True)
-class Trip:
-    """One stop; the fields of ``Stop``."""
-
-    number: int
-    at: int
-    mode: GateMode
-    causes: tuple[Cause, ...]
-    ordered: bool
-    quick: bool
-    holder: str | None
-    role: Role | None
-    speed: float | None
-    stopping_distance: float
-
-    @property
-    def reason(self) -> Reason:
-        """That of its first cause."""
-        return self.causes[0].reason
-
-
 class StopLog:
     """Collects stops between two ticks, and causes of the newest one that become known afterwards.
 
@@ -299,8 +278,8 @@ class StopLog:
         """Of the newest stop, before ``Outages.explain``."""
         self._over: dict[Reason, int] = {}
         """When a sensor whose silence was a cause of it was fresh again, ns."""
-        self._newest: Trip | None = None
-        self._pending: list[Trip] = []
+        self._newest: Stop | None = None
+        self._pending: list[Stop] = []
 
     def add(
         self,
@@ -328,17 +307,22 @@ class StopLog:
         """
         self._count += 1
         self._causes, self._over = tuple(causes), {}
-        self._newest = Trip(
+        explained = self._outages.explain(causes)
+        self._newest = Stop(
+            stamp=now,
+            received=now,
+            seq=0,
             number=self._count,
-            at=now,
+            reason=explained[0].reason,
             mode=mode,
-            causes=self._outages.explain(causes),
+            causes=explained,
             ordered=ordered,
             quick=quick,
             holder=None if driver is None else driver.source,
             role=None if driver is None else driver.role,
             speed=speed,
             stopping_distance=stopping_distance,
+            text=_text(explained, now),
         )
         self._pending.append(self._newest)
 
@@ -347,10 +331,10 @@ class StopLog:
         newest = self._newest
         if newest is None:
             return ""
-        return f"stopped {duration_text((now - newest.at) / SECOND)} ago: {causes_text(newest.causes, newest.at)}"
+        return f"stopped {duration_text((now - newest.stamp) / SECOND)} ago: {causes_text(newest.causes, newest.stamp)}"
 
-    def drain(self, now: int, present: Collection[Reason]) -> tuple[Trip, ...]:
-        """Stops since the last call, or the newest one again if more of its causes are known.
+    def drain(self, now: int, present: Collection[Reason]) -> tuple[Stop, ...]:
+        """Stops since the last call, or the newest one again if more of its causes are known; their ``seq`` is still 0.
 
         Args:
             now: ns.
@@ -360,11 +344,16 @@ class StopLog:
         for cause in self._causes:
             if cause.reason in STALE_SENSORS and cause.reason not in present:
                 self._over.setdefault(cause.reason, now)
-        if newest is not None and not self._pending and now - newest.at <= EXPLAINED_WITHIN:
+        if newest is not None and not self._pending and now - newest.stamp <= EXPLAINED_WITHIN:
             causes = self._outages.explain(self._causes, self._over)
             if causes != newest.causes:
-                self._newest = replace(newest, causes=causes)
+                known = {"reason": causes[0].reason, "causes": causes, "text": _text(causes, newest.stamp)}
+                self._newest = newest.model_copy(update=known)
                 return (self._newest,)
-        trips = tuple(self._pending)
+        stops = tuple(self._pending)
         self._pending.clear()
-        return trips
+        return stops
+
+
+def _text(causes: Sequence[Cause], now: int) -> str:
+    return f"stopped: {causes_text(causes, now)}"

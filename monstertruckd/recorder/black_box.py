@@ -20,11 +20,10 @@ from monstertruck_runtime.errors import disk_reason
 from monstertruck_runtime.ports import EventSink
 from monstertruck_runtime.stop_text import causes_text
 from monstertruck_runtime.threads import Offload, in_daemon_thread
-from monstertruck_schemas.event import Severity
+from monstertruck_schemas.event import Severity, Stop
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.topics import TOPICS, Topic
-from monstertruckd.gate.stops import Trip
 from monstertruckd.recorder.config import BlackBoxConfig, Compression
 from monstertruckd.recorder.log_file import RUN_LOG, LogEntry, LogFile, log_offset
 from monstertruckd.recorder.repair import in_use
@@ -167,7 +166,7 @@ class _Pending:
     name: str
     reason: Reason
     due: int
-    trips: list[Trip] = field(default_factory=list)
+    trips: list[Stop] = field(default_factory=list)
 
     @property
     def what(self) -> str:
@@ -282,7 +281,7 @@ class BlackBox:
         self._sequences[topic.name] = sequence + 1
         self.ring.add(LogEntry(topic, self._clock.now() if at is None else at, stamp, sequence, payload))
 
-    def trip(self, trip: Trip) -> str | None:
+    def trip(self, trip: Stop) -> str | None:
         """Note a trip of the gate.
 
         Returns:
@@ -291,7 +290,7 @@ class BlackBox:
         """
         if trip.reason in self._config.unless:
             return None
-        soon = trip.at + round(self._config.after * SECOND)
+        soon = trip.stamp + round(self._config.after * SECOND)
         pending = next((it for it in self._pending if it.reason is trip.reason or it.due <= soon), None)
         if pending is None:
             pending = _Pending(self._folder.next_name(trip.reason), trip.reason, max(soon, self._allowed(trip)))
@@ -301,13 +300,13 @@ class BlackBox:
         self._wake.set()
         return pending.name
 
-    def _allowed(self, trip: Trip) -> int:
+    def _allowed(self, trip: Stop) -> int:
         """From when on there may be another box of this trip's reason; never so late that it would miss the trip."""
         last = self._last.get(trip.reason)
         if last is None:
-            return trip.at
+            return trip.stamp
         interval, before = (round(it * SECOND) for it in (self._config.interval, self._config.before))
-        return min(last + interval, trip.at + before)
+        return min(last + interval, trip.stamp + before)
 
     async def _take(self) -> None:
         """Take each box's content at the instant it is due, whatever the disk is doing."""
@@ -346,15 +345,15 @@ class BlackBox:
             **self._metadata,
             "real_offset_ns": str(offset),
             "stops": ",".join(str(trip.number) for trip in pending.trips),
-            "stopped_at_ns": str(first.at),
+            "stopped_at_ns": str(first.stamp),
             "reason": first.reason.value,
-            "text": "; ".join(causes_text(trip.causes, trip.at) for trip in pending.trips),
+            "text": "; ".join(causes_text(trip.causes, trip.stamp) for trip in pending.trips),
             "lost": str(self.ring.lost),
         }
         if (run_log := self._log()) is not None:
             metadata[RUN_LOG] = str(run_log.absolute())
         try:
-            dated = log_offset(first.at, offset)
+            dated = log_offset(first.stamp, offset)
             name = await self._offload(partial(self._write, pending.name, entries, metadata, dated))
         except OSError as error:
             self._failed(error, f"{pending.name} is lost")

@@ -110,7 +110,7 @@ def test_an_emergency_stop_is_reported_once_as_an_error_with_who_asked():
     trip = rig.trips[0]
     assert (trip.mode, trip.quick, trip.ordered, trip.holder) == (GateMode.ESTOPPED, True, False, "ann")
     assert (trip.causes[0].text, trip.causes[0].source) == ("emergency stop by bob", "bob")
-    assert trip.causes[0].since == trip.at
+    assert trip.causes[0].since == trip.stamp
 
 
 def test_a_second_emergency_stop_soon_after_the_reset_is_reported_again():

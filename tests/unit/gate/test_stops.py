@@ -50,9 +50,9 @@ def test_a_lapsed_lease_names_holder_silence_and_round_trip():
     silence = figures(cause)["request age"]
     assert silence.limit == pytest.approx(0.25)
     assert 0.25 < silence.value <= 0.27 + 1e-9
-    assert cause.since == trip.at - round((silence.value - silence.limit) * SECOND)
+    assert cause.since == trip.stamp - round((silence.value - silence.limit) * SECOND)
     assert figures(cause)["round trip"].value == pytest.approx(0.18)
-    assert causes_text(trip.causes, trip.at) == (
+    assert causes_text(trip.causes, trip.stamp) == (
         "lease of ann expired (for 10 ms, request age 260 ms, limit 250 ms, round trip 180 ms)"
     )
 
@@ -80,7 +80,7 @@ def test_a_silent_sensor_is_named_with_its_age(sensor, reason, source, limit):
     (cause,) = trip.causes
     assert (cause.reason, cause.source, cause.because) == (reason, source, None)
     assert figures(cause)["age"].limit == limit
-    assert figures(cause)["age"].value == pytest.approx((trip.at - last) / SECOND)
+    assert figures(cause)["age"].value == pytest.approx((trip.stamp - last) / SECOND)
     assert cause.since == last + round(limit * SECOND)
     assert trip.quick is (sensor == "drive")
 
@@ -119,13 +119,13 @@ def test_a_lost_hub_is_behind_the_lost_lidar_behind_the_stop():
     )
     rig.tick()
     better = rig.trips[-1]
-    assert (better.number, better.at) == (trip.number, trip.at)
+    assert (better.number, better.stamp) == (trip.number, trip.stamp)
     assert [(cause.reason, cause.because) for cause in better.causes] == [
         (Reason.SCAN_STALE, 1),
         (Reason.DEVICE_LOST, 2),
         (Reason.HUB_LOST, None),
     ]
-    assert causes_text(better.causes, better.at) == (
+    assert causes_text(better.causes, better.stamp) == (
         "no fresh lidar scan (for 20 ms, age 20 ms, limit 250 ms), because lidar: port vanished (for 20 ms), "
         "because hub 1-2 vanished: lidar, camera"
     )
@@ -149,7 +149,7 @@ def test_one_hub_behind_two_sensors_comes_once():
         ("usb", None),
         ("steering", 3),
     ]
-    assert causes_text(trip.causes, trip.at).count("hub 1-1") == 2, "each chain is reported to its end"
+    assert causes_text(trip.causes, trip.stamp).count("hub 1-1") == 2, "each chain is reported to its end"
 
 
 def test_an_outage_that_is_over_is_not_behind_a_later_silence():
@@ -193,7 +193,7 @@ def test_a_failed_service_is_named_with_what_it_failed_of():
         (Reason.SERVICE_FAILED, "tracker", 1),
         (Reason.INTERNAL, "tracker", None),
     ]
-    assert causes_text(trip.causes, trip.at).startswith(
+    assert causes_text(trip.causes, trip.stamp).startswith(
         "a service failed: tracker, because tracker: unexpected exception"
     )
     assert trip.quick

@@ -15,10 +15,9 @@ from monstertruck_runtime import wire
 from monstertruck_runtime.clock import SECOND, WallClock, run_virtual
 from monstertruck_runtime.threads import inline
 from monstertruck_schemas import topics as t
-from monstertruck_schemas.event import Cause, Event, Severity
+from monstertruck_schemas.event import Cause, Event, Severity, Stop
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.state import ClockOffset, GateMode
-from monstertruckd.gate.stops import Trip
 from monstertruckd.recorder import black_box as module
 from monstertruckd.recorder.black_box import BlackBox, black_boxes
 from monstertruckd.recorder.config import BlackBoxConfig, Compression
@@ -30,9 +29,13 @@ from tests.unit.tools.logs.log_kit import MAY_2026
 
 def trip(now, reason=Reason.SCAN_STALE, number=1):
     cause = Cause(reason=reason, source="lidar", since=now, text=reason.text)
-    return Trip(
+    return Stop(
+        stamp=now,
+        received=now,
+        seq=0,
         number=number,
-        at=now,
+        reason=reason,
+        text="stopped",
         mode=GateMode.STOPPING,
         causes=(cause,),
         ordered=False,
@@ -191,10 +194,10 @@ def test_a_trip_soon_after_another_shares_its_box(tmp_path: Path):
 def test_boxes_of_one_reason_are_rate_limited_but_every_trip_lies_in_one(tmp_path: Path):
     async def scenario(bench):
         names, instants = [], []
-        for number in range(5):
+        for number in range(1, 6):
             await bench.drive(7)
             instants.append(bench.clock.now())
-            names.append(bench.trip(Reason.TILT_STOP if number == 3 else Reason.SCAN_STALE, number))
+            names.append(bench.trip(Reason.TILT_STOP if number == 4 else Reason.SCAN_STALE, number))
         assert [name[9:-5] for name in names] == [
             "000001-scan_stale",
             *["000002-scan_stale"] * 2,
@@ -206,7 +209,7 @@ def test_boxes_of_one_reason_are_rate_limited_but_every_trip_lies_in_one(tmp_pat
         await bench.drive(2)
         assert len(bench.files) == 3
         stops = [open_log(tmp_path / name).metadata()["run"]["stops"] for name in bench.files]
-        assert stops == ["0", "1,2,4", "3"]
+        assert stops == ["1", "2,3,5", "4"]
         first, last = seconds(list(open_log(tmp_path / names[1])))
         assert first < instants[1] / SECOND < instants[4] / SECOND < last
         assert bench.trip(Reason.STOPPED) is None, "an order is no accident"
@@ -382,7 +385,7 @@ def test_the_oldest_boxes_go_but_the_newest_of_each_reason_stays(tmp_path: Path)
 
     async def scenario(bench):
         for number, reason in enumerate(
-            (Reason.TILT_STOP, Reason.SCAN_STALE, Reason.SCAN_STALE, Reason.DRIVE_STALE, Reason.SCAN_STALE)
+            (Reason.TILT_STOP, Reason.SCAN_STALE, Reason.SCAN_STALE, Reason.DRIVE_STALE, Reason.SCAN_STALE), 1
         ):
             bench.trip(reason, number)
             await bench.drive(6)
