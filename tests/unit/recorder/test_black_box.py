@@ -215,7 +215,7 @@ def test_boxes_of_one_reason_are_rate_limited_but_every_trip_lies_in_one(tmp_pat
         assert bench.trip(Reason.STOPPED) is None, "an order is no accident"
 
     bench = on_bench(tmp_path, scenario)
-    assert [text for _, text, _ in bench.reported][-1] == "stops 1, 2, 4 are in blackbox-000002-scan_stale.mcap"
+    assert [text for _, text, _ in bench.reported][-1] == "stops 2, 3, 5 are in blackbox-000002-scan_stale.mcap"
 
 
 def test_no_trip_waits_until_the_minute_before_it_is_forgotten(tmp_path: Path):
