@@ -79,14 +79,12 @@ def decode(topic: Topic[M], data: bytes) -> M:
     try:
         if topic.foxglove is None:
             return topic.model.model_validate_json(data, extra="ignore")
-        message = foxglove.decode(topic.model, data)
+        return foxglove.decode(topic.model, data)
     except ValidationError as error:
         raise InputError(f"{topic.name}: {first_mistake(error)}") from None
     except InputError as error:
         msg = f"{topic.name}: {error}"
         raise InputError(msg) from None
-    assert isinstance(message, topic.model)
-    return message
 
 
 @cache

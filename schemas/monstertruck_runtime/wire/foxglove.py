@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 from google.protobuf.descriptor import FileDescriptor
@@ -31,6 +31,8 @@ from monstertruck_schemas.event import LogLevel, LogRecord
 from monstertruck_schemas.plan import Path
 from monstertruck_schemas.sensor import CompressedImage, LaserScan
 from monstertruck_schemas.state import Grid, Ground, Odometry, Transform, Transforms
+
+M = TypeVar("M", bound=Message)
 
 
 def _files(file: FileDescriptor) -> dict[str, FileDescriptorProto]:
@@ -411,7 +413,7 @@ def encode(message: Message) -> bytes:
     return data
 
 
-def decode(model: type[Message], data: bytes) -> Message:
+def decode(model: type[M], data: bytes) -> M:
     """Parse and validate the bytes of one message.
 
     Raises:
