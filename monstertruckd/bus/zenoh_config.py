@@ -121,7 +121,7 @@ class ZenohConfig(Schema):
     def _guarded(self) -> Self:
         if self.open_endpoints and not self.insecure:
             raise ValueError(
-                f"zenoh: {', '.join(self.open_endpoints)}: anybody on the network could drive the truck; "
+                f"zenoh: {', '.join(self.open_endpoints)}: anybody on the network could drive the robot; "
                 "expected tls/... endpoints with zenoh.tls (monstertruckd security init), or zenoh.insecure: true"
             )
         if self.certified_endpoints and self.tls is None:

@@ -288,7 +288,7 @@ def impossible_settings(config: GateConfig, body: BodyLimits, times: Iterable[tu
         whose = "its own length, as it has no lidar" if body.sight is None else "what the lidar is sure to see"
         yield (
             f"gate.speed {config.speed:g} m/s: with gate.scan.stale_after, max_latency, reaction and deceleration the "
-            f"truck stands after {needed:.3g} m: at most {seen:.2f} m, {whose}"
+            f"robot stands after {needed:.3g} m: at most {seen:.2f} m, {whose}"
         )
     longest = body.length / config.speed
     for name, seconds in (*_times(config), *times):
@@ -401,7 +401,7 @@ def weakened(config: GateConfig) -> tuple[str, ...]:
     default = GateConfig()
     texts = [*weaker("gate", config, default, WEAKER_ABOVE, WEAKER_BELOW)]
     texts += [
-        f"gate.{name}.critical false: a silent sensor does not stop the truck"
+        f"gate.{name}.critical false: a silent sensor does not stop the robot"
         for name, limit in required_sensors(config).items()
         if not limit.critical
     ]
@@ -412,7 +412,7 @@ def weakened(config: GateConfig) -> tuple[str, ...]:
     if config.obstacle.open_ground:
         texts.append("gate.obstacle.open_ground true: a scan without any range counts as free ground")
     if more := sorted(set(config.tolerated_failures) - set(default.tolerated_failures)):
-        texts.append(f"gate.tolerated_failures: {', '.join(more)} may fail while the truck drives")
+        texts.append(f"gate.tolerated_failures: {', '.join(more)} may fail while the robot drives")
     if config.remote_trackers:
         texts.append(f"gate.remote_trackers: {', '.join(config.remote_trackers)} may drive from outside")
     return tuple(texts)

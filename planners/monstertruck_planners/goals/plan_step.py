@@ -386,7 +386,7 @@ class PlanningStep:
             return replace(answer, clearance=self._clearance(route_map, answer))
         if result.poses is None or self._setup.config.local_planner is None:
             return PlanAnswer(
-                Reason.BAD_INPUT, "this planner's routes are no motions of the truck: set planner.local_planner"
+                Reason.BAD_INPUT, "this planner's routes are no motions of the robot: set planner.local_planner"
             )
         poses = moved(result.poses, -self._vehicle.reference)
         length = float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum())
@@ -457,7 +457,7 @@ class PlanningStep:
         )
         self._route = None
         if found is None:
-            return PlanAnswer(Reason.STUCK, "both ends of the truck are blocked")
+            return PlanAnswer(Reason.STUCK, "both ends of the robot are blocked")
         steering: tuple[Steering, ...] = (found.steering,) * len(found.poses)
         poses = placed(found.poses, task.pose)
         length = float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum())

@@ -135,7 +135,7 @@ class PathService:
         if reason is not Reason.OK:
             raise RequestRefusedError(reason)
         if gate is not None and gate.mode.moving:
-            raise RequestRefusedError(Reason.BUSY, f"the truck is {gate.mode}, stop it first")
+            raise RequestRefusedError(Reason.BUSY, f"the robot is {gate.mode}, stop it first")
         behaviour = self._behaviour.latest
         if behaviour is not None and behaviour.running:
             raise RequestRefusedError(Reason.BUSY, f"the behaviour {behaviour.behaviour} is running, stop it first")

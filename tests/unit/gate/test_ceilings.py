@@ -199,11 +199,11 @@ def test_sensors_checks_and_services_that_are_switched_off_are_named():
         remote_trackers=("desk",),
     )
     assert weakened(config) == (
-        "gate.scan.critical false: a silent sensor does not stop the truck",
+        "gate.scan.critical false: a silent sensor does not stop the robot",
         "gate.turning null: servos without supply are not noticed",
         "gate.blocked null: a blocked shaft is not noticed",
         "gate.obstacle.open_ground true: a scan without any range counts as free ground",
-        "gate.tolerated_failures: slam may fail while the truck drives",
+        "gate.tolerated_failures: slam may fail while the robot drives",
         "gate.remote_trackers: desk may drive from outside",
     )
 
