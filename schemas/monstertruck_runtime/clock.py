@@ -343,7 +343,7 @@ AHEAD: Final = 4 * MILLISECOND
 ESTIMATES: Final = AHEAD + MILLISECOND
 """Lead of services whose estimates the others use, ns."""
 
-QUESTIONS: Final = ESTIMATES + 3 * MILLISECOND
+POLLING: Final = ESTIMATES + 3 * MILLISECOND
 """Lead of services that query a device, ns: unless its line is slow, the answer is there when the estimates are
 made."""
 

@@ -4,7 +4,7 @@ from collections import defaultdict
 
 import pytest
 
-from monstertruck_runtime.clock import AHEAD, ESTIMATES, IN_THREADS, MILLISECOND, QUESTIONS, VirtualClock, run_virtual
+from monstertruck_runtime.clock import AHEAD, ESTIMATES, IN_THREADS, MILLISECOND, POLLING, VirtualClock, run_virtual
 from monstertruck_schemas import topics
 from monstertruckd.bus.outgoing import BEHIND
 from monstertruckd.config.load import load_config
@@ -50,7 +50,7 @@ def test_devices_are_asked_before_the_estimates_are_made():
     found = seen(ASKED, lambda message, _: message.received)
     for topic, (rate, takes) in ASKED.items():
         period = 1000 * MILLISECOND // rate
-        took = sorted((instant + QUESTIONS) % period for instant in found[topic])
+        took = sorted((instant + POLLING) % period for instant in found[topic])
         assert len(took) == pytest.approx(2 * rate, abs=1), topic.name
         assert (takes - 1) * MILLISECOND <= took[len(took) // 2] <= takes * MILLISECOND, topic.name
         assert took[0] >= took[len(took) // 2] - MILLISECOND // 10, topic.name

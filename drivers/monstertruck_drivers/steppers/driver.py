@@ -16,7 +16,7 @@ from monstertruck_drivers.steppers.config import StepperConfig
 from monstertruck_drivers.steppers.protocol import Identity, MotorState, RefusalCode, Status, step_of
 from monstertruck_drivers.steppers.session import ATTEMPTS, RequestRefusedByDeviceError, StepperSession
 from monstertruck_drivers.transaction import Misses
-from monstertruck_runtime.clock import QUESTIONS, SECOND, Clock, Schedule
+from monstertruck_runtime.clock import POLLING, SECOND, Clock, Schedule
 from monstertruck_runtime.errors import (
     DeviceError,
     DeviceLostError,
@@ -171,7 +171,7 @@ class StepperDriver:
         return identity
 
     async def _serve(self, session: StepperSession, motors: int, ready: Ready) -> None:
-        schedule = Schedule(self._clock, self._config.rate, QUESTIONS)
+        schedule = Schedule(self._clock, self._config.rate, POLLING)
         misses, reported = Misses(), False
         noise, noted = session.splitter.bad, self._clock.now()
         due = 0

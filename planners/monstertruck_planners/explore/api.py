@@ -16,7 +16,7 @@ from monstertruck_planners.explore.exchange import ExploreSetup, Point, Viewpoin
 from monstertruck_planners.explore.frontier import FrontierMap
 from monstertruck_planners.explore.kernels import far_from_obstacles, joined_cells, new_areas, shares_seen
 from monstertruck_planners.goals.exchange import Pose
-from monstertruck_planners.goals.plan_step import BESIDE, standing_free
+from monstertruck_planners.goals.plan_step import ASSUMED_FREE, standing_free
 from monstertruck_planners.route.api import RouteCosts, RouteMap, Vehicle
 from monstertruck_planners.route.config import DriveCosts
 from monstertruck_planners.route.heuristic import (
@@ -169,7 +169,7 @@ class ExplorationView:
         setup, known = self.setup, self.known
         vehicle = Vehicle(setup.footprint, setup.radius)
         place = known.resolution, known.origin
-        cells = standing_free(known.cells, *place, setup.footprint, self.pose, BESIDE)
+        cells = standing_free(known.cells, *place, setup.footprint, self.pose, ASSUMED_FREE)
         route_map = RouteMap.from_cells(
             cells, known.resolution, known.origin, "blocked", previous=self.memory.route_map
         )

@@ -26,7 +26,7 @@ PATIENCE: Final = 30.0
 """Seconds to wait for a first map."""
 RETURNS: Final = 6
 """Attempts to drive home."""
-BESIDE: Final = 1.0
+NEAR_START: Final = 1.0
 """Distance from a blocked start, as at a wall, within which the robot counts as back, m."""
 SPACING: Final = 0.25
 """Distance between the places beside the start that are kept, m."""
@@ -221,7 +221,7 @@ class Exploration:
     trail: tuple[Pose, ...] = ()
     """Where it came from, the newest last."""
     near_home: tuple[Pose, ...] = ()
-    """Where it passed first within ``BESIDE`` of its start, ``SPACING`` apart."""
+    """Where it passed first within ``NEAR_START`` of its start, ``SPACING`` apart."""
     stuck: int = 0
     """Goals in a row that failed where the robot stands."""
     stuck_at: Pose | None = None
@@ -315,7 +315,7 @@ def _moved(run: Exploration, seen: Observed) -> Exploration:
 def _near_home(run: Exploration, pose: Pose | None) -> tuple[Pose, ...]:
     """Where a robot that set out has been: what it could not see behind itself at its start, it passed over there."""
     places = run.near_home
-    if pose is None or len(places) == PLACES or math.dist(pose[:2], run.home[:2]) > BESIDE:
+    if pose is None or len(places) == PLACES or math.dist(pose[:2], run.home[:2]) > NEAR_START:
         return places
     apart = min(math.dist(pose[:2], place[:2]) for place in (run.home, *places))
     return (*places, pose) if apart >= SPACING else places
@@ -501,7 +501,7 @@ def _returning(run: Exploration, seen: Observed) -> Step:
         if seen.ended is Reason.GOAL_REACHED:
             return _back_home(run, run.target.pose)
         if seen.ended is Reason.GOAL_BLOCKED and seen.pose is not None:
-            if math.dist(seen.pose[:2], run.home[:2]) <= BESIDE:
+            if math.dist(seen.pose[:2], run.home[:2]) <= NEAR_START:
                 return _back_home(run, seen.pose)
             run = replace(run, blocked=run.blocked + 1)
         if seen.ended in HOPELESS or seen.ended is Reason.CANCELLED or run.home_goals >= RETURNS:

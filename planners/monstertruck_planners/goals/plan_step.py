@@ -50,18 +50,18 @@ NEARBY: Final = 1.5
 """Distance within which obstacles count when backing out, and are kept, m."""
 
 
-HELD: Final = frozenset({Reason.START_BLOCKED, Reason.GOAL_UNREACHABLE})
+OVERLAPPING: Final = frozenset({Reason.START_BLOCKED, Reason.GOAL_UNREACHABLE})
 """Why there is no route for a truck that overlaps an obstacle where it stands."""
-BESIDE: Final = 0.15
+ASSUMED_FREE: Final = 0.15
 """Unknown ground within this distance of the truck counts as free, m."""
-RIM: Final = 1.5
+MAP_OVERLAP: Final = 1.5
 """Cells by which the truck may overlap an obstacle of the map where it stands."""
 CLEARANCE: Final = 0.2
 """Clearance of the poses of an answer is measured up to this, m."""
 
 BEAM_WIDTH: Final = 0.012
 """Difference in bearing up to which a beam shows a place, rad: two steps of a URG-04LX."""
-THROUGH: Final = 0.10
+SEEN_BEYOND: Final = 0.10
 """Distance by which all these beams must reach beyond it, m."""
 
 
@@ -76,7 +76,7 @@ class ObstacleMemory:
         self._square = square
         self.places: Array = np.empty((0, 2))
         """Shape (n, 2), m."""
-        self.doubted: Array = np.empty((0, 2))
+        self.suspended: Array = np.empty((0, 2))
         """Shape (k, 2), m: cleared by the map, not seen free by a scan. They count where the lidar does not look."""
 
     def look(self, points: Array, sensor: Array) -> None:
@@ -87,26 +87,26 @@ class ObstacleMemory:
             sensor: shape (2,), where it was taken.
         """
         self.places = self.places[~seen_through(self.places, points, sensor)]
-        self.doubted = self.doubted[~seen_through(self.doubted, points, sensor)]
+        self.suspended = self.suspended[~seen_through(self.suspended, points, sensor)]
 
     def keep(self, points: Array) -> None:
         """Remember places, shape (n, 2)."""
         self.places = _one_per_square(np.vstack((self.places, points)), self._square)
 
-    def doubt(self, where: NDArray[np.bool_]) -> None:
-        """Mark places, shape (n,), as doubted: they no longer count where the lidar looks."""
-        self.doubted = _one_per_square(np.vstack((self.doubted, self.places[where])), self._square)
+    def suspend(self, where: NDArray[np.bool_]) -> None:
+        """Mark places, shape (n,), as suspended: they no longer count where the lidar looks."""
+        self.suspended = _one_per_square(np.vstack((self.suspended, self.places[where])), self._square)
         self.places = self.places[~where]
 
-    def trust(self, where: NDArray[np.bool_]) -> None:
-        """Count doubted places, shape (k,), again."""
-        self.keep(self.doubted[where])
-        self.doubted = self.doubted[~where]
+    def restore(self, where: NDArray[np.bool_]) -> None:
+        """Count suspended places, shape (k,), again."""
+        self.keep(self.suspended[where])
+        self.suspended = self.suspended[~where]
 
     def drop_explained(self, unexplained: Callable[[Array], NDArray[np.bool_]]) -> None:
         """Keep the places, shape (n, 2), of which ``unexplained`` is true, shape (n,)."""
         self.places = self.places[unexplained(self.places)]
-        self.doubted = self.doubted[unexplained(self.doubted)]
+        self.suspended = self.suspended[unexplained(self.suspended)]
 
 
 def seen_through(places: Array, points: Array, sensor: Array) -> NDArray[np.bool_]:
@@ -131,7 +131,7 @@ def seen_through(places: Array, points: Array, sensor: Array) -> NDArray[np.bool
     towards, far = _polar(places - sensor)
     first, last = (np.searchsorted(bearings, towards + side) for side in (-BEAM_WIDTH, BEAM_WIDTH))
     nearest = np.minimum.reduceat(np.append(ranges, np.inf), np.column_stack((first, last)).ravel())[::2]
-    return np.asarray((last > first) & (nearest > far + THROUGH))
+    return np.asarray((last > first) & (nearest > far + SEEN_BEYOND))
 
 
 def _polar(points: Array) -> tuple[Array, Array]:
@@ -216,7 +216,7 @@ def standing_free(
     centres = np.column_stack((column + 0.5, row + 0.5, np.zeros(len(row)))) * resolution
     gap = rectangle_distance(footprint, np.array([pose]), placed(centres, origin)[:, :2])[0]
     unknown, touched = cells[row, column] < 0, resolution * math.sqrt(0.5)
-    freed = np.where(unknown, gap < touched + beside, (gap < touched) & (gap > -RIM * resolution))
+    freed = np.where(unknown, gap < touched + beside, (gap < touched) & (gap > -MAP_OVERLAP * resolution))
     kept = cells.copy()
     kept[row[freed], column[freed]] = 0
     return kept
@@ -323,22 +323,22 @@ class PlanningStep:
             memory.look(scan.points, scan.sensor)
             memory.keep(scan.points)
         if task.clear:
-            memory.doubt(np.hypot(*(memory.places - task.pose[:2]).T) > NEARBY)
+            memory.suspend(np.hypot(*(memory.places - task.pose[:2]).T) > NEARBY)
         memory.look(task.points, placed(np.array([setup.lidar]), task.pose)[0, :2])
         memory.keep(task.points)
         tolerance = explained_within(setup.config, task.deviation)
         memory.drop_explained(lambda places: static_map.unexplained(places, tolerance))
 
     def _plan(self, static_map: StaticMap, task: PlanTask) -> PlanAnswer:
-        """A route that does not reverse into doubted places: those near it count again, then all."""
+        """A route that does not reverse into suspended places: those near it count again, then all."""
         answer = self._plan_once(static_map, task)
         for nearby in (NEARBY, math.inf):
-            doubted = self._memory.doubted
-            touched = self._backs_into(answer, doubted)
+            suspended = self._memory.suspended
+            touched = self._backs_into(answer, suspended)
             if not touched.any():
                 break
-            apart = np.hypot(*(doubted[:, None] - doubted[touched]).transpose(2, 0, 1)).min(axis=1)
-            self._memory.trust(apart <= nearby)
+            apart = np.hypot(*(suspended[:, None] - suspended[touched]).transpose(2, 0, 1)).min(axis=1)
+            self._memory.restore(apart <= nearby)
             self._route = None
             answer = self._plan_once(static_map, task)
         return answer
@@ -372,7 +372,7 @@ class PlanningStep:
             return replan(planner, route_map, self._route, start, goal, self._now, via=via)
 
         result = plan(self._planner)
-        if result.reason in HELD:
+        if result.reason in OVERLAPPING:
             self._route_map = route_map = self._standing(static_map, cells, task.pose)
             result = plan(self._planner)
         elif (room := self._cusp_clearance(route_map, result)) < self._setup.cusp_clearance:
@@ -416,7 +416,7 @@ class PlanningStep:
         origin = (float(corner[0]), float(corner[1]), static_map.origin[2])
         outside = np.pad(np.zeros(cells.shape, np.bool_), margin, constant_values=True)
         around = np.pad(cells, margin, constant_values=-1)
-        freed = standing_free(around, static_map.resolution, origin, footprint, pose, BESIDE)
+        freed = standing_free(around, static_map.resolution, origin, footprint, pose, ASSUMED_FREE)
         freed[outside & (freed < 0)] = 100
         tilt, roughness = self._layers or (None, None)
         return RouteMap.from_cells(
@@ -445,7 +445,7 @@ class PlanningStep:
         setup = self._setup
         assert setup is not None
         config = setup.config
-        known = np.vstack((self._memory.places, self._memory.doubted))
+        known = np.vstack((self._memory.places, self._memory.suspended))
         near = static_map.obstacles(static_map.with_points(known), task.pose, NEARBY)
         found = escape(
             config.escape,

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from monstertruck_planners.goals.plan_step import BEAM_WIDTH, THROUGH, ObstacleMemory, seen_through
+from monstertruck_planners.goals.plan_step import BEAM_WIDTH, SEEN_BEYOND, ObstacleMemory, seen_through
 
 HERE = np.zeros(2)
 
@@ -25,7 +25,7 @@ def ring(radius: float, *gaps: tuple[float, float]) -> np.ndarray:
 def test_a_place_is_seen_through_if_all_returns_near_its_bearing_lie_beyond(bearing: float):
     place = 2.0 * np.array([[math.cos(bearing), math.sin(bearing)]])
     assert seen_through(place, ring(3.0), HERE)
-    assert not seen_through(place, ring(2.0 + 0.9 * THROUGH), HERE)
+    assert not seen_through(place, ring(2.0 + 0.9 * SEEN_BEYOND), HERE)
     assert not seen_through(place, ring(1.0), HERE), "something is before it"
     assert not seen_through(place, np.vstack((ring(3.0), 0.995 * place)), HERE), "one beam still meets it"
 
@@ -49,7 +49,7 @@ def test_it_agrees_with_looking_at_every_pair(places: list[tuple[float, float]],
             for point in points
             if abs(math.remainder(math.atan2(point[1], point[0]) - math.atan2(y, x), math.tau)) < BEAM_WIDTH
         ]
-        expected.append(bool(near) and min(near) > math.hypot(x, y) + THROUGH)
+        expected.append(bool(near) and min(near) > math.hypot(x, y) + SEEN_BEYOND)
     assert seen_through(np.array(places), np.array(points), HERE).tolist() == expected
 
 
@@ -64,14 +64,14 @@ def test_it_keeps_one_place_a_square_until_a_scan_or_somebody_says_otherwise():
     assert len(memory.places) == 0
 
 
-def test_what_is_doubted_waits_until_a_scan_sees_through_it_or_it_counts_again():
+def test_what_is_suspended_waits_until_a_scan_sees_through_it_or_it_counts_again():
     memory = ObstacleMemory(0.05)
     memory.keep(np.array([[1.01, 0.01], [-1.0, 0.0], [-2.0, 0.0]]))
-    memory.doubt(np.array([True, True, True]))
-    assert (len(memory.places), len(memory.doubted)) == (0, 3)
+    memory.suspend(np.array([True, True, True]))
+    assert (len(memory.places), len(memory.suspended)) == (0, 3)
     memory.look(ring(2.0, (3.0, 3.3)), HERE)
-    assert sorted(memory.doubted[:, 0]) == [-2.0, -1.0]
-    memory.trust(memory.doubted[:, 0] > -1.5)
-    assert (memory.places.tolist(), memory.doubted.tolist()) == ([[-1.0, 0.0]], [[-2.0, 0.0]])
+    assert sorted(memory.suspended[:, 0]) == [-2.0, -1.0]
+    memory.restore(memory.suspended[:, 0] > -1.5)
+    assert (memory.places.tolist(), memory.suspended.tolist()) == ([[-1.0, 0.0]], [[-2.0, 0.0]])
     memory.drop_explained(lambda places: places[:, 0] > 0.0)
-    assert (len(memory.places), len(memory.doubted)) == (0, 0)
+    assert (len(memory.places), len(memory.suspended)) == (0, 0)
