@@ -214,20 +214,17 @@ class GateConfig(Schema):
             )
             raise ValueError(msg)
         if self.tick_stall <= 1.0 / self.rate:
-            msg = f"tick_stall {self.tick_stall} s: expected more than one tick, {1.0 / self.rate:g} s"
-            raise ValueError(msg)
+            raise ValueError(f"tick_stall {self.tick_stall} s: expected more than one tick, {1.0 / self.rate:g} s")
         if self.standstill > self.obstacle.crawl:
             msg = f"standstill {self.standstill} m/s: expected at most obstacle.crawl, {self.obstacle.crawl} m/s"
             raise ValueError(msg)
         if self.obstacle.crawl >= self.speed:
-            msg = f"obstacle.crawl {self.obstacle.crawl} m/s: expected less than speed, {self.speed} m/s"
-            raise ValueError(msg)
+            raise ValueError(f"obstacle.crawl {self.obstacle.crawl} m/s: expected less than speed, {self.speed} m/s")
         if self.short_faults_within < self.short_faults:
             msg = f"short_faults_within {self.short_faults_within} s: expected a second for each of {self.short_faults}"
             raise ValueError(msg)
         if max(vars(self.leases).values()) >= self.disarm_after:
-            msg = f"disarm_after {self.disarm_after} s: expected more than every lease"
-            raise ValueError(msg)
+            raise ValueError(f"disarm_after {self.disarm_after} s: expected more than every lease")
         return self
 
 

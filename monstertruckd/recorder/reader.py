@@ -137,8 +137,7 @@ def spare_log(output: Path) -> None:
     if output.is_file():
         with output.open("rb") as file:
             if file.read(len(MAGIC)) == MAGIC:
-                msg = f"{output}: is a log, which is not overwritten; name another file"
-                raise InputError(msg)
+                raise InputError(f"{output}: is a log, which is not overwritten; name another file")
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,8 +163,7 @@ class LogMessage:
         """
         topic = BY_NAME.get(self.topic)
         if topic is None or topic.schema_name != self.schema:
-            msg = f"topic {self.topic!r} with schema {self.schema!r} is not one of ours"
-            raise NotFoundError(msg)
+            raise NotFoundError(f"topic {self.topic!r} with schema {self.schema!r} is not one of ours")
         return wire.decode(topic, self.payload)
 
 
@@ -195,17 +193,13 @@ class LogReader:
             with path.open("rb") as file:
                 head = file.read(len(MAGIC))
         except FileNotFoundError:
-            msg = f"{path}: no such log"
-            raise NotFoundError(msg) from None
+            raise NotFoundError(f"{path}: no such log") from None
         except IsADirectoryError:
-            msg = f"{path}: a folder; `monstertruckd log list {path}` lists the logs in it"
-            raise InputError(msg) from None
+            raise InputError(f"{path}: a folder; `monstertruckd log list {path}` lists the logs in it") from None
         except OSError as error:
-            msg = f"{path}: cannot be read: {error.strerror}"
-            raise InputError(msg) from None
+            raise InputError(f"{path}: cannot be read: {error.strerror}") from None
         if not MAGIC.startswith(head):
-            msg = f"{path}: not an MCAP log"
-            raise InputError(msg)
+            raise InputError(f"{path}: not an MCAP log")
 
     def __iter__(self) -> Iterator[LogMessage]:
         schemas: dict[int, Schema] = {}

@@ -62,12 +62,10 @@ def recover(source: str | Path, target: str | Path, stop: threading.Event | None
     part = target.with_name(target.name + _PART)
     with source.open("rb") as original:
         if not _lock(original, fcntl.LOCK_EX):
-            msg = f"{source}: is being written"
-            raise InputError(msg)
+            raise InputError(f"{source}: is being written")
         in_place = target.exists()
         if in_place and not target.samefile(source):
-            msg = f"{target}: exists already; name a new file"
-            raise InputError(msg)
+            raise InputError(f"{target}: exists already; name a new file")
         try:
             with part.open("wb") as output:
                 messages = _copy(reader, output, stop)
@@ -79,8 +77,7 @@ def recover(source: str | Path, target: str | Path, stop: threading.Event | None
                 part.replace(target)
         except OSError as error:
             part.unlink(missing_ok=True)
-            msg = f"{target}: cannot be written: {error.strerror}"
-            raise InputError(msg) from error
+            raise InputError(f"{target}: cannot be written: {error.strerror}") from error
         except BaseException:
             part.unlink(missing_ok=True)
             raise
@@ -131,8 +128,7 @@ def _copy(reader: LogReader, output: BinaryIO, stop: threading.Event | None) -> 
     started = False
     for record in reader.records():
         if stop is not None and stop.is_set():
-            msg = f"{reader.path}: repair abandoned"
-            raise InputError(msg)
+            raise InputError(f"{reader.path}: repair abandoned")
         if not started:
             header = record if isinstance(record, Header) else Header("", "")
             writer.start(header.profile, header.library)

@@ -146,11 +146,9 @@ class FrameTree:
         child, parent = transform.child, transform.parent
         known = self._by_child.get(child)
         if known is not None and known.parent != parent:
-            msg = f"frame {child!r} hangs on {known.parent!r}: expected no second parent, got {parent!r}"
-            raise InputError(msg)
+            raise InputError(f"frame {child!r} hangs on {known.parent!r}: expected no second parent, got {parent!r}")
         if known is None and (child == parent or child in self._ancestors(parent)):
-            msg = f"frame {child!r} on {parent!r} closes a loop: expected a tree"
-            raise InputError(msg)
+            raise InputError(f"frame {child!r} on {parent!r} closes a loop: expected a tree")
         self._by_child[child] = transform
 
     def lookup(self, parent: str, child: str) -> Transform:
@@ -164,8 +162,7 @@ class FrameTree:
         shared = next((frame for frame in self._ancestors(child) if frame in there and frame in known), None)
         if shared is None:
             names = ", ".join(sorted(known)) or "none"
-            msg = f"no transform from {child!r} to {parent!r}: known frames are {names}"
-            raise NotFoundError(msg)
+            raise NotFoundError(f"no transform from {child!r} to {parent!r}: known frames are {names}")
         return compose(invert(self._chain(parent, shared)), self._chain(child, shared))
 
     def all(self, now: int) -> tuple[Transform, ...]:

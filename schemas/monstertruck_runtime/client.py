@@ -556,8 +556,7 @@ class TruckClient(Operator):
 
     def _open_session(self) -> zenoh.Session:
         if self._session is None:
-            msg = "use the client inside its 'async with'"
-            raise RuntimeError(msg)
+            raise RuntimeError("use the client inside its 'async with'")
         return self._session
 
     def _unsubscribe(self, mailbox: Mailbox[Any]) -> None:

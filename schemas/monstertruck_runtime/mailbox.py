@@ -27,8 +27,7 @@ def latest() -> Delivery:
 def fifo(depth: int) -> Delivery:
     """Up to ``depth`` messages wait in order; beyond that the oldest is lost and counted."""
     if depth < 1:
-        msg = f"a FIFO holds at least one message, not {depth}"
-        raise ValueError(msg)
+        raise ValueError(f"a FIFO holds at least one message, not {depth}")
     return Delivery(depth, counted=True)
 
 
@@ -88,8 +87,7 @@ class Mailbox(Generic[M]):
         """
         while not self._unread:
             if self._closed:
-                msg = "the subscription is closed"
-                raise RuntimeError(msg)
+                raise RuntimeError("the subscription is closed")
             await self._news()
         return self._unread.popleft()
 
@@ -132,8 +130,7 @@ class Mailbox(Generic[M]):
     async def _news(self, due: float | None = None, take: Callable[[M], bool] | None = None) -> bool:
         """Wait for the next message or the end; False if ``due``, loop time, came first."""
         if self._reader is not None:
-            msg = "a subscription has one reader; subscribe again for another"
-            raise RuntimeError(msg)
+            raise RuntimeError("a subscription has one reader; subscribe again for another")
         loop = asyncio.get_running_loop()
         reader: asyncio.Future[bool] = loop.create_future()
         self._reader, self._take = reader, take

@@ -258,14 +258,12 @@ class _LoopThread:
     def _submit(self, work: Coroutine[Any, Any, T]) -> T:
         if not self._thread.is_alive():
             work.close()
-            msg = "the session was closed, or this process was forked from the one that opened it"
-            raise RuntimeError(msg)
+            raise RuntimeError("the session was closed, or this process was forked from the one that opened it")
         future = asyncio.run_coroutine_threadsafe(work, self._loop)
         try:
             return future.result()
         except CancelledError:
-            msg = "the session was closed meanwhile"
-            raise RuntimeError(msg) from None
+            raise RuntimeError("the session was closed meanwhile") from None
         except BaseException:
             if not future.done():
                 # The coroutine takes its request back, and ends, before the interrupt is passed on.

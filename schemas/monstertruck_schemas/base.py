@@ -172,8 +172,7 @@ def _frozen_array(dtype: type[np.generic], size: int | None) -> PlainValidator:
         else:
             array = _array(value, dtype, info)
         if size is not None and len(array) != size:
-            msg = f"expected {size} numbers, got {len(array)}"
-            raise ValueError(msg)
+            raise ValueError(f"expected {size} numbers, got {len(array)}")
         return np.frombuffer(array.tobytes(), exact) if array.flags.writeable else array
 
     return PlainValidator(freeze)
@@ -187,15 +186,13 @@ def _array(value: Any, dtype: type[np.generic], info: ValidationInfo) -> NDArray
     """
     # It is looked at first: numpy takes its time over strings and nested lists.
     if info.mode == "json" and not (isinstance(value, list) and {int, float}.issuperset(map(type, value))):
-        msg = "expected a list of numbers"
-        raise ValueError(msg)
+        raise ValueError("expected a list of numbers")
     try:
         array = np.asarray(value, dtype=dtype)
     except (TypeError, OverflowError) as error:
         raise ValueError(str(error)) from error
     if array.ndim != 1:
-        msg = f"expected one dimension, got {array.ndim}"
-        raise ValueError(msg)
+        raise ValueError(f"expected one dimension, got {array.ndim}")
     return array
 
 

@@ -135,8 +135,7 @@ def _folder(directory: str | Path) -> Path:
     try:
         directory.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        msg = f"{directory}: cannot be made: {error.strerror}"
-        raise InputError(msg) from None
+        raise InputError(f"{directory}: cannot be made: {error.strerror}") from None
     return directory
 
 
@@ -250,11 +249,9 @@ def export_mcap(
         if not topics:
             file.unlink()
     except FileExistsError:
-        msg = f"{file}: is there already"
-        raise InputError(msg) from None
+        raise InputError(f"{file}: is there already") from None
     except OSError as error:
-        msg = f"{file}: cannot be written: {error.strerror}"
-        raise InputError(msg) from error
+        raise InputError(f"{file}: cannot be written: {error.strerror}") from error
     return topics
 
 

@@ -61,8 +61,7 @@ class Selection:
     def __post_init__(self) -> None:
         require_topics(*self.topics)
         if not self.start < self.end:
-            msg = f"from {self.start:g} s to {self.end:g} s: expected an end after the start"
-            raise InputError(msg)
+            raise InputError(f"from {self.start:g} s to {self.end:g} s: expected an end after the start")
 
     def of(self, reader: LogReader, progress: Progress | None = None) -> Iterator[tuple[LogMessage, Message]]:
         """The selected messages with their decoded forms; those of other schemas are skipped.
@@ -85,8 +84,7 @@ class Selection:
             except NotFoundError:
                 continue
             except TruckError as error:
-                msg = f"{reader.path}: message {number}: {error}"
-                raise InputError(msg) from None
+                raise InputError(f"{reader.path}: message {number}: {error}") from None
 
 
 ALL = Selection()

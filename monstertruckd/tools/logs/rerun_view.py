@@ -82,8 +82,7 @@ def convert(
             _record(reader, part, offset, selection, progress)
     except (OSError, RuntimeError) as error:  # rerun raises the latter
         why = error.strerror if isinstance(error, OSError) else error
-        msg = f"{output}: cannot be written: {why}"
-        raise InputError(msg) from None
+        raise InputError(f"{output}: cannot be written: {why}") from None
     return output
 
 
@@ -369,5 +368,4 @@ def _run_viewer(arguments: list[str], confined: dict[str, str], *, quiet: bool =
     output = subprocess.DEVNULL if quiet else None
     done = subprocess.run(command, env=confined, stdout=output, stderr=output, check=False)  # noqa: S603  # our own
     if done.returncode:
-        msg = f"the rerun viewer ended with {done.returncode}; --save writes a file instead"
-        raise CommandFailedError(msg)
+        raise CommandFailedError(f"the rerun viewer ended with {done.returncode}; --save writes a file instead")

@@ -74,11 +74,9 @@ def export_ros2(
         if not topics:
             shutil.rmtree(directory)
     except WriterError as error:
-        msg = f"{directory}: no bag can be made there: {error}"
-        raise InputError(msg) from error
+        raise InputError(f"{directory}: no bag can be made there: {error}") from error
     except OSError as error:
-        msg = f"{directory}: cannot be written: {error.strerror}"
-        raise InputError(msg) from error
+        raise InputError(f"{directory}: cannot be written: {error.strerror}") from error
     return topics
 
 

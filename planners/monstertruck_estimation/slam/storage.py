@@ -110,8 +110,7 @@ def save(folder: Path, patch: GridPatch, graph: SavedGraph | None) -> None:
         OSError: a file could not be written.
     """
     if not patch.cells.size:
-        msg = f"{folder}: nothing is mapped yet"
-        raise InputError(msg)
+        raise InputError(f"{folder}: nothing is mapped yet")
     folder.mkdir(parents=True, exist_ok=True)
     if graph is not None and graph.scans:
         counts = [len(scan) for scan in graph.scans]
@@ -149,21 +148,17 @@ def _read_graph(path: Path) -> SavedGraph:
         with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        msg = f"{path}: not a graph: {error}"
-        raise InputError(msg) from error
+        raise InputError(f"{path}: not a graph: {error}") from error
     if arrays.get("version") is None or int(arrays["version"]) != VERSION:
-        msg = f"{path}: version: expected {VERSION}, got {arrays.get('version')}"
-        raise InputError(msg)
+        raise InputError(f"{path}: version: expected {VERSION}, got {arrays.get('version')}")
     for name, shape in {**_SHAPES, "starts": ()}.items():
         if name not in arrays or arrays[name].shape[1:] != shape or arrays[name].ndim != len(shape) + 1:
             found = arrays[name].shape if name in arrays else "nothing"
-            msg = f"{path}: {name}: expected rows of shape {shape}, got {found}"
-            raise InputError(msg)
+            raise InputError(f"{path}: {name}: expected rows of shape {shape}, got {found}")
     starts, count = arrays["starts"], len(arrays["poses"])
     whole = len(starts) == count + 1 and starts[0] == 0 and (np.diff(starts) >= 0).all()
     if not whole or starts[-1] != len(arrays["points"]) or len(arrays["stamps"]) != count:
-        msg = f"{path}: starts: expected {count + 1} rising numbers from 0 to {len(arrays['points'])}"
-        raise InputError(msg)
+        raise InputError(f"{path}: starts: expected {count + 1} rising numbers from 0 to {len(arrays['points'])}")
     every = {name: arrays[name].astype(np.float64) for name in ELEMENTS if name in arrays}
     scans = tuple(
         elements(**{name: values[a:b] for name, values in every.items()}) for a, b in itertools.pairwise(starts)

@@ -50,8 +50,7 @@ class SlamWorker:
             self._begin(inputs.start)
         estimator = self._estimator
         if estimator is None:
-            msg = "estimation: expected a start before anything else"
-            raise InputError(msg)
+            raise InputError("estimation: expected a start before anything else")
         made, refused = None, None
         if inputs.scan is not None:
             refused = self._refusal(inputs.scan)

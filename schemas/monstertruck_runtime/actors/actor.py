@@ -251,8 +251,7 @@ class WorkerActor:
                 async with self._clock.deadline(self._start_timeout):
                     await self._wait(process.receive)
         except TimeoutError:
-            msg = f"worker {self.name} did not start within {self._start_timeout} s"
-            raise WorkerTimeoutError(msg) from None
+            raise WorkerTimeoutError(f"worker {self.name} did not start within {self._start_timeout} s") from None
         self._built = True
 
     async def _step_really(self, process: WorkerProcess, inputs: Any) -> Any:

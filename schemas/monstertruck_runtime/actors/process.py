@@ -90,8 +90,7 @@ class WorkerProcess:
         except (EOFError, OSError) as error:
             raise WorkerError(self._gone()) from error
         if not success:
-            msg = f"worker {self._name} raised\n{value}"
-            raise WorkerError(msg)
+            raise WorkerError(f"worker {self._name} raised\n{value}")
         return value
 
     def exchange(self, inputs: Any) -> Any:

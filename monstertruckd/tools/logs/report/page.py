@@ -68,8 +68,7 @@ def report(log: str | Path, output: str | Path | None = None, progress: Progress
         file.parent.mkdir(parents=True, exist_ok=True)
         replace_file(file, page(run))
     except OSError as error:
-        msg = f"{file}: cannot be written: {error.strerror}"
-        raise InputError(msg) from None
+        raise InputError(f"{file}: cannot be written: {error.strerror}") from None
     return RunReport(file, run)
 
 
