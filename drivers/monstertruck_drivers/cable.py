@@ -163,11 +163,9 @@ class EmulatedPort(Protocol):
 
     def plug(self) -> None:
         """Connect the cable."""
-        ...
 
     def unplug(self) -> None:
         """Pull the cable: the host's link is lost."""
-        ...
 
 
 class MemoryPort:

@@ -64,11 +64,9 @@ class Watcher(Protocol):
 
     def start(self, hint: Callable[[], None]) -> None:
         """Call ``hint`` on the running loop whenever something may have changed, until ``stop``."""
-        ...
 
     def stop(self) -> None:
         """No more hints; may be called again."""
-        ...
 
 
 class NoWatcher:

@@ -67,11 +67,9 @@ class Emulator(Protocol):
 
     async def run(self, end: DeviceEnd) -> None:
         """Serve until cancelled; survives hosts that come, go and die."""
-        ...
 
     def power_cycle(self) -> None:
         """Supply off and on again: volatile state is lost, stored settings stay."""
-        ...
 
     def inject(self, fault: str, *values: str) -> None:
         """Start (or end) a device fault by name.
@@ -79,7 +77,6 @@ class Emulator(Protocol):
         Raises:
             InputError: unknown fault or bad value; the text lists what is known.
         """
-        ...
 
 
 class FileEmulator(Protocol):
@@ -87,7 +84,6 @@ class FileEmulator(Protocol):
 
     async def run(self) -> None:
         """Bring them up to date until cancelled."""
-        ...
 
     def inject(self, fault: str, *values: str) -> None:
         """Start or end a fault.
@@ -95,7 +91,6 @@ class FileEmulator(Protocol):
         Raises:
             InputError: unknown fault or bad value.
         """
-        ...
 
 
 class RangeSource(Protocol):
@@ -106,7 +101,6 @@ class RangeSource(Protocol):
 
         Shape (769,), step 0..768; values below 20 are the sensor's error codes.
         """
-        ...
 
 
 class MotorReading(NamedTuple):
@@ -125,11 +119,9 @@ class MotorPlant(Protocol):
 
     def command(self, time_ns: int, target_rpm: float | None, accel_rpm_s: float) -> None:
         """From ``time_ns`` on ramp towards ``target_rpm``; None = power stage off, coasting."""
-        ...
 
     def reading(self, time_ns: int) -> MotorReading:
         """State at ``time_ns`` (never earlier than a time already requested)."""
-        ...
 
 
 class PulseSource(Protocol):
@@ -137,7 +129,6 @@ class PulseSource(Protocol):
 
     def pulse_us(self, channel: int, time_ns: int) -> float | None:
         """Pulse being sent, microseconds; None = no pulses."""
-        ...
 
 
 class ServoPlant(Protocol):
@@ -145,15 +136,12 @@ class ServoPlant(Protocol):
 
     def attach(self, pulses: PulseSource) -> None:
         """Name the controller whose pulses move the servos."""
-        ...
 
     def advance(self, time_ns: int) -> None:
         """Let the servos follow their pulses up to ``time_ns``."""
-        ...
 
     def analog_volts(self, channel: int, time_ns: int) -> float:
         """Voltage at an analog input."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,7 +166,6 @@ class AttitudeSource(Protocol):
 
     def compass(self, time_ns: int) -> CompassReading:
         """Reading at ``time_ns``."""
-        ...
 
 
 class ImuReading(NamedTuple):
@@ -196,7 +183,6 @@ class ImuSource(Protocol):
 
     def imu(self, time_ns: int) -> ImuReading:
         """Reading at ``time_ns``."""
-        ...
 
 
 class WheelSource(Protocol):
@@ -204,7 +190,6 @@ class WheelSource(Protocol):
 
     def wheels(self, time_ns: int) -> tuple[float, float]:
         """Angle of the left and of the right wheel, rad, forward positive; it grows from turn to turn."""
-        ...
 
 
 class SonarSource(Protocol):
@@ -216,11 +201,9 @@ class SonarSource(Protocol):
         Raises:
             InputError: the robot has no sonar of that name.
         """
-        ...
 
     def range(self, name: str) -> float:
         """Distance that the newest ping of a sonar came to, m, once its sound is back; inf = no echo."""
-        ...
 
 
 class JointSource(Protocol):
@@ -228,7 +211,6 @@ class JointSource(Protocol):
 
     def angles(self, times_ns: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """True pitch and roll, rad, REP 103, at rising instants of the last second; each (n,)."""
-        ...
 
 
 class ViewSource(Protocol):
@@ -244,7 +226,6 @@ class ViewSource(Protocol):
         Returns:
             Makes (height, width, 3): red, green, blue; the top row first.
         """
-        ...
 
 
 class Horn(NamedTuple):
@@ -262,58 +243,46 @@ class Physics(Protocol):
     @property
     def lidar(self) -> RangeSource:
         """What the lidar sees."""
-        ...
 
     @property
     def view(self) -> ViewSource:
         """What stands around the truck."""
-        ...
 
     @property
     def motors(self) -> tuple[MotorPlant, ...]:
         """Of the driven shafts."""
-        ...
 
     @property
     def servos(self) -> ServoPlant:
         """Of the axles, with the inputs of their controller."""
-        ...
 
     @property
     def compass(self) -> AttitudeSource:
         """Magnetic heading and tilt."""
-        ...
 
     @property
     def sonars(self) -> SonarSource:
         """Of the robot's sides."""
-        ...
 
     @property
     def imu(self) -> ImuSource:
         """Angular velocity and specific force."""
-        ...
 
     @property
     def wheels(self) -> WheelSource:
         """Rear wheels that roll along."""
-        ...
 
     def battery_volts(self, time_ns: int) -> float:
         """Voltage behind the battery's divider."""
-        ...
 
     def horns(self) -> tuple[Horn, Horn]:
         """How the mount's pitch and roll servo were put together."""
-        ...
 
     def carry_lidar(self, joints: JointSource) -> None:
         """Put the lidar onto a mount with joints."""
-        ...
 
     def mount_torque(self, joint: int) -> float:
         """With which the lidar pushes its pitch (0) or roll (1) joint, Nm, at the newest instant of the world."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)

@@ -216,11 +216,9 @@ class LinkWaiter(Protocol):
 
     def on_bytes(self) -> None:
         """Bytes came, or the link is lost."""
-        ...
 
     def on_timeout(self) -> None:
         """The wait has lasted too long."""
-        ...
 
 
 class _Sleeper:
@@ -263,7 +261,6 @@ class Port(Protocol):
             DeviceLostError: nothing is plugged in.
             PortBusyError: another process holds it.
         """
-        ...
 
 
 class SerialPort:

@@ -27,7 +27,6 @@ class Commanded(Protocol):
         Raises:
             InputError: it is unknown; the text lists the known ones.
         """
-        ...
 
 
 @dataclass(frozen=True, slots=True)

@@ -88,7 +88,6 @@ class RecorderDisk(Protocol):
 
     def refuse(self, error: OSError) -> None:
         """Fail every write that follows."""
-        ...
 
 
 class ComputerPower(Protocol):
@@ -96,11 +95,9 @@ class ComputerPower(Protocol):
 
     async def cut(self) -> None:
         """The daemon is gone at once; cables that lead to it must be dead before."""
-        ...
 
     def give(self) -> None:
         """The computer has started, and with it a new daemon."""
-        ...
 
 
 class Workers(Protocol):
@@ -108,7 +105,6 @@ class Workers(Protocol):
 
     def kill(self, name: str) -> None:
         """End a worker as SIGKILL does, and wait until it is dead; nothing if it does not run."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)

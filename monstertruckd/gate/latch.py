@@ -21,11 +21,9 @@ class Latch(Protocol):
 
     def engaged(self) -> bool:
         """Whether the emergency stop is latched, by the file or by the mark."""
-        ...
 
     def stored(self) -> bool | None:
         """Whether the file says so, which outlasts a loss of power; None = it cannot be read."""
-        ...
 
     def mark(self, engaged: bool) -> None:
         """Set or clear the mark; never blocks.
@@ -33,7 +31,6 @@ class Latch(Protocol):
         Raises:
             OSError: it could not be written.
         """
-        ...
 
     def store(self, engaged: bool) -> None:
         """Set the flag and sync it to the disk; may block.
@@ -41,11 +38,9 @@ class Latch(Protocol):
         Raises:
             OSError: it could not be stored.
         """
-        ...
 
     def close(self) -> None:
         """Remove the mark: the disk agrees, and nothing changes any more."""
-        ...
 
 
 class MemoryLatch:

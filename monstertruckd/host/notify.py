@@ -24,7 +24,6 @@ class Notify(Protocol):
 
     def __call__(self, *lines: str) -> bool:
         """Send them as one message, or lose them."""
-        ...
 
 
 def notify_socket(address: str) -> Notify:

@@ -35,7 +35,6 @@ class Recorded(Protocol):
 
     def decode(self) -> Message:
         """The typed message."""
-        ...
 
 
 class RecordedLog(Iterable[Any], Protocol):
@@ -43,7 +42,6 @@ class RecordedLog(Iterable[Any], Protocol):
 
     def config(self) -> dict[str, Any]:
         """The configuration it was recorded with."""
-        ...
 
 
 LogOpener = Callable[[Path], RecordedLog]

@@ -22,11 +22,9 @@ class Drive(Protocol):
     @property
     def inputs(self) -> tuple[str, ...]:
         """Names of the command's entries."""
-        ...
 
     def forward(self, command: Sequence[Real]) -> Twist[Real]:
         """Twist that a command produces."""
-        ...
 
     def inverse(self, twist: Sequence[Real]) -> tuple[Real, ...]:
         """Command that produces a twist, without regard to limits.
@@ -34,19 +32,15 @@ class Drive(Protocol):
         Raises:
             KinematicsError: the family cannot produce this twist (the component is named), or NaN.
         """
-        ...
 
     def limited(self, command: Sequence[Real]) -> tuple[Real, ...]:
         """Command within the limits, on the same path (curvature and side) as far as the steering allows."""
-        ...
 
     def jacobian(self, command: Sequence[Real]) -> Array:
         """(3, m, ...) derivative of the twist by the command."""
-        ...
 
     def wheels(self, command: Sequence[float]) -> tuple[Wheel, ...]:
         """The wheels at a command's steering angles, for ``wheels.analyse``."""
-        ...
 
 
 def scaled_to(values: Sequence[Real], limit: float) -> Real:

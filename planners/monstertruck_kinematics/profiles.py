@@ -158,15 +158,12 @@ class MotionProfile(Protocol):
     @property
     def duration(self) -> float:
         """Total time, s."""
-        ...
 
     def position(self, times: Array) -> Array:
         """(N,) distance covered, m (rad for a turn on the spot); constant before the start and after the end."""
-        ...
 
     def speed(self, times: Array) -> Array:
         """(N,) its derivative."""
-        ...
 
 
 @dataclass(frozen=True)

@@ -54,26 +54,21 @@ class Clock(Protocol):
 
     def now(self) -> int:
         """Nanoseconds of the daemon's monotonic time."""
-        ...
 
     def real_offset(self) -> int:
         """Nanoseconds to add to ``now()`` for real (UNIX) time."""
-        ...
 
     async def sleep(self, seconds: float) -> None:
         """Wait at least ``seconds``."""
-        ...
 
     async def sleep_until(self, instant: int) -> None:
         """Wait until ``now() >= instant``; returns at once if that has passed."""
-        ...
 
     def deadline(self, seconds: float) -> asyncio.Timeout:
         """Async context manager that raises ``TimeoutError`` inside after ``seconds``.
 
         On the wall clock it may be 1.5 ms early.
         """
-        ...
 
 
 class _LoopClock(ABC):

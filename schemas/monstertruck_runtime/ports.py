@@ -22,11 +22,9 @@ class Publisher(Protocol[M_contra]):
 
     def next_seq(self) -> int:
         """Sequence number for the next message of this topic."""
-        ...
 
     def put(self, message: M_contra) -> None:
         """Hand the message to every subscriber; never blocks."""
-        ...
 
 
 class Subscription(Protocol[M_co]):
@@ -35,11 +33,9 @@ class Subscription(Protocol[M_co]):
     @property
     def latest(self) -> M_co | None:
         """Newest message, or None before the first; reading it consumes nothing."""
-        ...
 
     async def next(self) -> M_co:
         """Wait for a message not returned by ``next`` yet."""
-        ...
 
     async def next_within(self, seconds: float, take: Callable[[M_co], bool] | None = None) -> M_co | None:
         """The same, or None if nothing comes in that time.
@@ -49,7 +45,6 @@ class Subscription(Protocol[M_co]):
             take: gets a message that comes during the wait at once, in its writer's own callback; if it says True the
                 wait goes on, and the message counts as read.
         """
-        ...
 
 
 class EventSink(Protocol):
@@ -57,7 +52,6 @@ class EventSink(Protocol):
 
     def __call__(self, reason: Reason, severity: Severity, source: str, text: str = "", **values: Value) -> None:
         """Publish one event."""
-        ...
 
 
 class BusPort(Protocol):
@@ -69,15 +63,12 @@ class BusPort(Protocol):
         Raises:
             RuntimeError: ``writer`` is not the topic's writer, or the write end is taken.
         """
-        ...
 
     def subscribe(self, topic: Topic[M], delivery: Delivery) -> Mailbox[M]:
         """A read end of ``topic``; of a retained topic it holds the newest message at once."""
-        ...
 
     def event_sink(self) -> EventSink:
         """Where events go."""
-        ...
 
 
 Ready = Callable[[], None]
@@ -92,4 +83,3 @@ class RpcRegistry(Protocol):
 
     def register(self, name: str, handler: Handler, role: AccessRole = AccessRole.PILOT) -> None:
         """Serve ``name`` by ``handler`` for callers that have ``role``, or one that may do more."""
-        ...

@@ -22,7 +22,6 @@ class Subscriber(Protocol):
 
     def subscribe(self, topic: Any, delivery: Delivery) -> Any:
         """A mailbox that is a context manager."""
-        ...
 
 
 async def while_it_runs(robot: Subscriber, work: Awaitable[T]) -> T:

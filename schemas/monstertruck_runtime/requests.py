@@ -46,15 +46,12 @@ class Operator(Protocol):
 
     def subscribe(self, topic: Topic[M], delivery: Delivery) -> Mailbox[M]:
         """Subscribe to a topic."""
-        ...
 
     async def call(self, rpc: str, payload: dict[str, Any] | None = None) -> dict[str, Any]:
         """Call ``rpc`` with a JSON object; returns its answer."""
-        ...
 
     async def header(self, lease: float = 1.0) -> dict[str, Any]:
         """Header of the next request, as plain data."""
-        ...
 
     def order(self, order: Order, *, hold: bool = False) -> Coroutine[Any, Any, GateState]:
         """Give an order; the coroutine waits until it is carried out and returns the gate's state then.
@@ -68,7 +65,6 @@ class Operator(Protocol):
             NoAnswerError: no answer in time.
             NotFoundError: the robot is not there.
         """
-        ...
 
     async def arm(self, *, hold: bool = False) -> GateState:
         """Allow driving, unless ``hold`` by planners too; answered once armed. Raises as ``order`` does."""
@@ -92,7 +88,6 @@ class Operator(Protocol):
 
     async def drive_shafts(self, *rates: float, lease: float = 0.3) -> None:
         """Request the rate of the wheels on every driven shaft, rad/s, for ``lease`` seconds."""
-        ...
 
     async def behave(
         self,

@@ -43,7 +43,6 @@ class Service(Protocol):
 
     async def run(self, ready: Ready) -> None:
         """Serve one session until cancelled; raise ``TruckError`` when it is lost."""
-        ...
 
 
 class OnBug(StrEnum):

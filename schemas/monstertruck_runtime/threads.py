@@ -155,4 +155,3 @@ class Offload(Protocol):
 
     def __call__(self, function: Callable[[], T], /) -> Awaitable[T]:
         """Run ``function`` and wait for its result."""
-        ...

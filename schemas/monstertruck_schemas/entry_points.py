@@ -20,7 +20,6 @@ class Named(Protocol):
     @property
     def name(self) -> str:
         """By which it is found."""
-        ...
 
 
 R = TypeVar("R", bound=Named)

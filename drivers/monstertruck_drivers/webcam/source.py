@@ -53,15 +53,12 @@ class FrameStream(Protocol):
             DeviceLostError: unplugged.
             DeviceError: the camera failed otherwise.
         """
-        ...
 
     async def __aenter__(self) -> Self:
         """The stream itself."""
-        ...
 
     async def __aexit__(self, *_: object) -> None:
         """Stop the camera and let it go."""
-        ...
 
 
 class FrameSource(Protocol):
@@ -79,7 +76,6 @@ class FrameSource(Protocol):
             DeviceFaultError: no bandwidth on its hub.
             DeviceError: it failed otherwise.
         """
-        ...
 
 
 _KINDS: Final[dict[int, type[DeviceError]]] = {

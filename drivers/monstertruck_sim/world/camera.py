@@ -82,7 +82,6 @@ class Holder(Protocol):
 
     def panel_at(self, time_ns: int, place: CameraPlace, /) -> FlatPanel:
         """The board at an instant, before a camera at ``place``."""
-        ...
 
 
 def mounted(pose: Pose, config: CameraConfig, attitude: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> CameraPlace:

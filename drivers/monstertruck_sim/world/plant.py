@@ -74,66 +74,53 @@ class Plant(Protocol):
     @property
     def pose(self) -> Pose:
         """Of the geometric centre in the map frame, at the newest instant; the heading counts turns."""
-        ...
 
     @property
     def twist(self) -> Twist:
         """Velocity in the body frame: m/s, m/s, rad/s."""
-        ...
 
     @property
     def attitude(self) -> tuple[float, float]:
         """Pitch (nose down positive) and roll (right side down positive), rad."""
-        ...
 
     @property
     def acceleration(self) -> Vector:
         """Of the body, forward, left and up in its level frame, as a sensor on it feels it, m/s^2; without gravity."""
-        ...
 
     @property
     def rates(self) -> Vector:
         """Angular velocity about forward, left and up of the level frame, rad/s."""
-        ...
 
     @property
     def current(self) -> float:
         """Of all motors together, A."""
-        ...
 
     def advance(self, time_ns: int) -> None:
         """Integrate up to an instant; the first call sets the start, earlier instants change nothing."""
-        ...
 
     def integrate(self, time_ns: int) -> None:
         """``advance`` of this robot alone."""
-        ...
 
     def slot(self, time_ns: int, period_ns: int) -> int:
         """Number of the period since the start that an instant falls into: the index of its noise."""
-        ...
 
     joints: JointSource | None
     """Joints of the lidar's mount; None: it is fixed."""
 
     def mount_torque(self, joint: int, /) -> float:
         """With which the lidar pushes its pitch (0) or roll (1) joint at the newest instant, Nm; 0 in the plane."""
-        ...
 
     def carry(self, pose: Pose) -> None:
         """Put the robot down elsewhere, at rest; sensors see no way between the two places."""
-        ...
 
     def truth(self) -> TruthState:
         """State at the newest instant."""
-        ...
 
     def poses(self, times_ns: NDArray[np.int64]) -> Array:
         """Poses at instants of the last half second, (6, n): x, y, yaw, pitch, roll, and the base's height.
 
         The height is 0 in the plane, whatever its ground.
         """
-        ...
 
 
 class Caster(Protocol):
@@ -146,7 +133,6 @@ class Caster(Protocol):
 
         What moves is met where it was at ``times_ns``, one a ray and rising; None = now.
         """
-        ...
 
 
 class Space(Protocol):
@@ -155,17 +141,14 @@ class Space(Protocol):
     @property
     def obstacles(self) -> tuple[Obstacle, ...]:
         """Things in it that are not on its map."""
-        ...
 
     def cast(
         self, xs: Array, ys: Array, angles: Array, reach: float, times_ns: NDArray[np.int64] | None = None, /
     ) -> Array:
         """As ``Caster``."""
-        ...
 
     def contact(self, x: float, y: float, yaw: float, /) -> float:
         """How deep the footprint at a pose reaches into things, m; 0 = free."""
-        ...
 
     def add(self, obstacle: Obstacle) -> None:
         """Put something into it: seen by the lidar, stops robots.
@@ -173,7 +156,6 @@ class Space(Protocol):
         Raises:
             InputError: there is no room for more.
         """
-        ...
 
     def remove(self, obstacle: Obstacle) -> None:
         """Take it away again.
@@ -181,7 +163,6 @@ class Space(Protocol):
         Raises:
             InputError: it is not there.
         """
-        ...
 
     def set_tilt(self, tilt: TiltConfig) -> None:
         """From now on tilt the robot in another way.
@@ -189,7 +170,6 @@ class Space(Protocol):
         Raises:
             InputError: the engine computes the tilt itself.
         """
-        ...
 
 
 class GriddedPlant(ABC):

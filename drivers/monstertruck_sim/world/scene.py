@@ -56,25 +56,20 @@ class Neighbour(Protocol):
     @property
     def plant(self) -> Plant:
         """What moves it."""
-        ...
 
     @property
     def outline(self) -> Box:
         """Footprint at its newest instant."""
-        ...
 
     @property
     def pace(self) -> float:
         """Speed of its fastest point, m/s."""
-        ...
 
     def integrate(self, time_ns: int) -> None:
         """Move on to an instant; the first call sets the start."""
-        ...
 
     def outlines(self, times_ns: NDArray[np.int64]) -> list[Box]:
         """Footprints at instants of the last half second."""
-        ...
 
 
 class Surroundings:

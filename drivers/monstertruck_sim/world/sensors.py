@@ -61,7 +61,6 @@ class Sweep(Protocol):
             beams: directions in the body frame; None: ``BEAM_ANGLES`` in the body's plane.
             times_ns: instants of the beams, (769,), rising.
         """
-        ...
 
 
 class UnevenGround(Protocol):
@@ -69,11 +68,9 @@ class UnevenGround(Protocol):
 
     def height(self, x: Array, y: Array) -> Array:
         """Metres at points in the map frame; all of one shape."""
-        ...
 
     def cast(self, xs: Array, ys: Array, zs: Array, headings: Array, rises: Array, reach: float) -> Array:
         """Horizontal distances at which beams from points meet it; inf = not within ``reach``; all (n,)."""
-        ...
 
 
 class PlaneSweep:

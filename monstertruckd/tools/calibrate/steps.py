@@ -209,11 +209,9 @@ class Panel(Protocol):
 
     def say(self, text: str) -> None:
         """Show a sentence."""
-        ...
 
     def progress(self, name: str, done: float, total: float) -> None:
         """Show how far a step has come."""
-        ...
 
     async def number(self, step: Number) -> float:
         """Ask.
@@ -221,8 +219,6 @@ class Panel(Protocol):
         Raises:
             InputError: there is no answer.
         """
-        ...
 
     async def confirm(self, step: Confirm) -> bool:
         """Ask. Raises as ``number`` does."""
-        ...

@@ -44,7 +44,6 @@ class Wizard(Protocol):
 
     async def __call__(self, context: "WizardContext") -> Result:
         """Measure."""
-        ...
 
 
 class WizardContext:

@@ -130,11 +130,9 @@ class MotorWire(Protocol):
 
     def read(self) -> Iterator[tuple[int, int, float]]:
         """(ns, shaft, m/s over ground) of what has come since the last call; 0 = any stop."""
-        ...
 
     def forget(self) -> None:
         """What has come before does not count."""
-        ...
 
 
 class _MotorWireReader:

@@ -346,40 +346,31 @@ class Estimator(Protocol):
     @property
     def twist(self) -> Vector:
         """Velocity of base by the last scans, m/s and rad/s."""
-        ...
 
     @property
     def odometry(self) -> OdometryUse:
         """Whether the motion between scans is predicted by odometry."""
-        ...
 
     def step(self, scan: Scan, inputs: ScanInput) -> SlamEstimate | None:
         """Take a scan; None if it is not later than the one before."""
-        ...
 
     def changes(self) -> tuple[list[GridPatch], bool]:
         """Tiles that have changed since the last call, and whether the grid was rebuilt."""
-        ...
 
     def patch(self) -> GridPatch:
         """The whole grid."""
-        ...
 
     def graph(self) -> SavedGraph | None:
         """The pose graph to save with the grid; None without one."""
-        ...
 
     def trajectory(self) -> tuple[NDArray[np.int64], Array] | None:
         """Stamps (n,), ns, and poses (n, 3) of base in map at all scans; None in a saved map."""
-        ...
 
     def poses_at(self, stamps: NDArray[np.int64]) -> Array | None:
         """Base in map at instants (n,), ns: (n, 3), NaN where it is not known; None in a saved map."""
-        ...
 
     def finish(self) -> bool:
         """Optimise everything jointly; False if the result was not kept."""
-        ...
 
 
 class MappingEstimator:

@@ -105,7 +105,6 @@ class ScanMatcher(Protocol):
             covariance: shape (3, 3), of ``guess``.
             submap: the map around the predicted pose.
         """
-        ...
 
 
 class PlanarMatcher:

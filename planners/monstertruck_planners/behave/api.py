@@ -91,7 +91,6 @@ class Behaviour(Protocol):
 
     def begin(self) -> Any:
         """State before the first step."""
-        ...
 
     def step(self, inputs: Inputs, state: Any, t: float) -> BehaviourStep:
         """One step.
@@ -101,4 +100,3 @@ class Behaviour(Protocol):
             state: of the step before.
             t: s since the behaviour was started.
         """
-        ...

@@ -130,7 +130,6 @@ class Explorer(Protocol):
             still: the option which that is by now; None = its frontier is gone.
             seconds: for how long it has been pursued.
         """
-        ...
 
 
 @dataclass

@@ -119,7 +119,6 @@ class LocalPlanner(Protocol):
         Raises:
             InputError: a pose that is none.
         """
-        ...
 
 
 def pose_distance(a: Array, b: Array, reach: float = 0.3) -> Array:

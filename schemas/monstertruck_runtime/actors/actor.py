@@ -30,19 +30,15 @@ class Actor(Protocol):
 
     async def __aenter__(self) -> Self:
         """Begin."""
-        ...
 
     async def __aexit__(self, *_: object) -> None:
         """End."""
-        ...
 
     async def start(self) -> None:
         """Make ready for the first step."""
-        ...
 
     async def step(self, inputs: Any) -> Any:
         """Take one step."""
-        ...
 
 
 class ResultDelivery(Protocol):
@@ -50,7 +46,6 @@ class ResultDelivery(Protocol):
 
     async def wait(self, clock: VirtualClock, due: int) -> None:
         """Return when a result that is due at ``due``, ns, may be delivered."""
-        ...
 
 
 class VirtualDelivery:
