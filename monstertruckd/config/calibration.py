@@ -22,6 +22,7 @@ from monstertruck_runtime.errors import ConfigError, NotFoundError
 from monstertruck_runtime.small_files import require_file
 from monstertruck_schemas.base import Schema, first_mistake
 from monstertruck_schemas.body import LensConfig, Mount, TurnDeficitConfig
+from monstertruckd.config.renamed import fits, present_key
 from monstertruckd.config.truck import TruckConfig
 
 C = TypeVar("C", bound=TruckConfig)
@@ -119,8 +120,8 @@ class Estimate(Schema):
     """Measurements it rests on"""
     meaning: str
     """What the value is, and what its interval covers"""
-    key: str | None = None
-    """Place in the configuration that it sets; None: for information only"""
+    key: Annotated[str, AfterValidator(present_key)] | None = None
+    """Place in the configuration that it sets, of whatever version; None: for information only"""
     date: str = ""
     """When it was measured, UTC by the robot's clock; set when it is saved"""
     grade: Grade | None = None
@@ -387,7 +388,7 @@ def in_order(results: Iterable[Result]) -> list[tuple[Result, int, Estimate]]:
 def _set(data: dict[str, Any], estimate: Estimate, result: Result, source: Path | str) -> None:
     assert estimate.key is not None
     if not may_set(result.wizard, estimate.key):
-        raise ConfigError(f"{source}: {estimate.key}: the wizard {result.wizard} has no business there")
+        raise ConfigError(f"{source}: the wizard {result.wizard} may not set {estimate.key}")
     *way, last = estimate.key.split(".")
     section: Any = data
     for part in way:
@@ -400,11 +401,7 @@ def _set(data: dict[str, Any], estimate: Estimate, result: Result, source: Path 
 def may_set(wizard: WizardName, key: str) -> bool:
     """Whether a wizard may set a value of the configuration, by ``KEYS``."""
     names = key.split(".")
-    patterns = (pattern.split(".") for pattern in KEYS[wizard])
-    return any(
-        len(parts) == len(names) and all(part in ("*", name) for part, name in zip(parts, names, strict=True))
-        for parts in patterns
-    )
+    return any(fits(names, pattern) for pattern in KEYS[wizard])
 
 
 def value_at(config: Mapping[str, Any], key: str) -> Value | None:

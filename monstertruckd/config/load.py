@@ -10,6 +10,7 @@ import json
 import os
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, Literal, Self, TypeVar, get_args, get_origin
 
@@ -28,6 +29,7 @@ from monstertruck_runtime.plugins import models_in
 from monstertruck_runtime.small_files import replace_file, require_file
 from monstertruck_schemas.base import LiveValue, Schema, field_docs, first_mistake, live_settings
 from monstertruckd.config.calibration import CalibrationStore, Result, WizardName, in_order, put_values
+from monstertruckd.config.renamed import RENAMED
 from monstertruckd.config.truck import ROBOT, TruckConfig
 
 Key = tuple[str | int, ...]
@@ -159,6 +161,8 @@ def _calibrated_origins(results: Mapping[WizardName, Result], lines: Mapping[Key
 class SavedSettings:
     """The file of live settings that outlast the run; its methods may block for a file system's time.
 
+    Keys of any version are read under their present names, which the file has once something is saved in it.
+
     Args:
         folder: the robot's ``state_directory``; the file in it is made when the first setting is saved.
         robot: its name.
@@ -175,7 +179,7 @@ class SavedSettings:
         """
         if not self.path.exists():
             return {}
-        root, origins = YamlText.read(self.path).root, dict[Key, Origin]()
+        root, origins = self._text().root, dict[Key, Origin]()
         content = {} if root is None else _build(root, _Builder(self.path, origins), ())
         return {".".join(key): (value, origins[key].line) for key, value in _leaves(content, ())}
 
@@ -188,7 +192,9 @@ class SavedSettings:
         known = {setting.key for setting in live_settings(config)}
         for key, (_, line) in values.items():
             if key not in known:
-                raise ConfigError(f"{self.path}:{line}: {key}: is no setting that can be changed while running")
+                raise ConfigError(
+                    f"{self.path}:{line}: {key}: cannot be changed while the robot runs; remove it from this file"
+                )
         put_settings(data, {key: value for key, (value, _) in values.items()})
 
     def save(self, values: Mapping[str, LiveValue]) -> None:
@@ -197,7 +203,7 @@ class SavedSettings:
         Raises:
             ConfigError: the file is damaged, or cannot be written; nothing has changed then.
         """
-        content = _with_comments(YamlText.read(self.path).text) if self.values() else None
+        content = _with_comments(self._text().text) if self.values() else None
         if content is None:
             content = CommentedMap()
             content.yaml_set_start_comment(HEAD)
@@ -216,6 +222,11 @@ class SavedSettings:
             replace_file(self.path, out.getvalue())
         except OSError as error:
             raise ConfigError(f"{self.path}: settings cannot be saved: {error.strerror}") from error
+
+    def _text(self) -> "YamlText":
+        text = YamlText.read(self.path)
+        bring_up_to_date(text, OLDEST)
+        return text
 
 
 def _with_comments(text: str) -> Any:
@@ -498,8 +509,7 @@ class YamlText:
 
     def node(self, *key: str) -> Node | None:
         """The node at ``key``; None if there is none."""
-        pair = self._pair(key)
-        return None if pair is None else pair[1]
+        return next((value for _, value in self._pairs(key)), None)
 
     def value(self, *key: str) -> str | None:
         """The plain value at ``key`` as it is written, without quotes; None for anything else."""
@@ -515,26 +525,25 @@ class YamlText:
         return True
 
     def rename(self, key: tuple[str, ...], name: str) -> bool:
-        """Rename the last part of ``key``; False if it is not there."""
-        pair = self._pair(key)
-        if pair is None:
-            return False
-        start, end = pair[0].start_mark.index, pair[0].end_mark.index
-        quoted = json.dumps(name) if self.text[start] in "\"'" else name
-        self._set(self.text[:start] + quoted + self.text[end:])
-        return True
+        """Rename the last part of ``key``, in which ``*`` is any one name; False if it is not there."""
+        text = self.text
+        places = {(node.start_mark.index, node.end_mark.index) for node, _ in self._pairs(key)}
+        for start, end in sorted(places, reverse=True):
+            quoted = json.dumps(name) if text[start] in "\"'" else name
+            text = text[:start] + quoted + text[end:]
+        if places:
+            self._set(text)
+        return bool(places)
 
-    def _pair(self, key: tuple[str, ...]) -> tuple[Node, Node] | None:
-        node = self.root
-        pair = None
+    def _pairs(self, key: tuple[str, ...]) -> list[tuple[Node, Node]]:
+        """Name and value of all that fits ``key``."""
+        nodes: list[Node | None] = [self.root]
+        pairs: list[tuple[Node, Node]] = []
         for part in key:
-            if not isinstance(node, MappingNode):
-                return None
-            pair = next(((name, value) for name, value in node.value if name.value == part), None)
-            if pair is None:
-                return None
-            node = pair[1]
-        return pair
+            sections = [node for node in nodes if isinstance(node, MappingNode)]
+            pairs = [pair for section in sections for pair in section.value if part in ("*", pair[0].value)]
+            nodes = list(dict.fromkeys(value for _, value in pairs))  # an alias repeats its node
+        return pairs
 
 
 def _end(node: Node) -> int:
@@ -552,32 +561,15 @@ def _end(node: Node) -> int:
 Step = Callable[[YamlText], None]
 """Edits one file from its version to the next; must be idempotent."""
 
-RENAMED: Final = (
-    (("gate", "obstacle", "beside"), "side_clearance"),
-    (("odometry", "compass", "patience"), "steady_time"),
-    (("placement", "deformer"), "local_planner"),
-    (("planner", "deform"), "local_planner"),
-    (("planner", "ladder"), "recovery"),
-    (("planner", "local", "beside"), "rejoin_distance"),
-    (("planner", "local", "patience"), "blocked_timeout"),
-    (("planner", "local", "rejoin"), "rejoin_clearance"),
-    (("planner", "route", "greed"), "heuristic_weight"),
-    (("planner", "sightings"), "blocked_scans"),
-    (("slam", "mapper", "thinning"), "pruning"),
-    (("tracker", "turn_within"), "steering_distance"),
-    (("usb", "patience"), "empty_timeout"),
-)
-"""Keys of version 1, as of release 0.1.0, and what version 2 calls their last part."""
 
-
-def _rename_keys(text: YamlText) -> None:
-    for key, name in RENAMED:
-        text.rename(key, name)
+def _rename_keys(names: Mapping[str, str], text: YamlText) -> None:
+    for key, name in names.items():
+        text.rename(tuple(key.split(".")), name)
 
 
 VERSION: Final = 2
 """Version of the configuration files that this program writes."""
-STEPS: Final[dict[int, Step]] = {1: _rename_keys}
+STEPS: Final[dict[int, Step]] = {version: partial(_rename_keys, names) for version, names in RENAMED.items()}
 """Migration steps by the version they start from."""
 OLDEST: Final = min(STEPS)
 

@@ -62,20 +62,20 @@ def _visit(
         raise ConfigError(f"{path}: includes itself through {' > '.join(map(str, including))}")
     if place in upgrades:
         return
-    before, version = text.text, _version(text, inherited, target)
+    before, version = text.text, _version(text, inherited, steps, target)
     for name in _includes(text):
         _visit(included(path, name), version, steps, target, upgrades, (*including, place))
     run_steps(text, version, steps, target)
     upgrades[place] = Upgrade(path, version, before, text.text)
 
 
-def _version(text: YamlText, inherited: int | None, target: int) -> int:
+def _version(text: YamlText, inherited: int | None, steps: Mapping[int, Step], target: int) -> int:
     node, said = text.node("version"), text.value("version")
     if node is None and inherited is not None:
         return inherited
     line = 1 if node is None else node.start_mark.line + 1
-    if said is None or not said.isdecimal():
-        raise ConfigError(f"{text.path}:{line}: version: expected a number of 0 to {target}, found {said!r}")
+    if said is None or not said.isdecimal() or int(said) < min(steps):
+        raise ConfigError(f"{text.path}:{line}: version: expected {min(steps)} to {target}, found {said}")
     if int(said) > target:
         raise ConfigError(f"{text.path}:{line}: version: {said} is newer than this program, which knows up to {target}")
     return int(said)

@@ -354,7 +354,7 @@ def test_a_strange_result_is_refused(result: Any, said: str, tmp_path: Path):
 @pytest.mark.parametrize(
     ("key", "value", "said"),
     [
-        ("gate.speed", 9.0, "the wizard drive has no business there"),
+        ("gate.speed", 9.0, "the wizard drive may not set gate.speed"),
         ("geometry.drive_ratio", -3.0, "greater than or equal to 1"),
     ],
 )

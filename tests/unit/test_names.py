@@ -23,7 +23,7 @@ PRIVATE = re.compile(
 )
 """reported, request, search, path check, recovery behaviour, fault, host context, pruning, without waiting, failed,
 resumed, iteration of the event loop"""
-OLD_KEY = re.compile(r'^    \(\("\w+", .*"\),$')
+OLD_KEY = re.compile(r'^        "\w+\.[\w.*]+": "\w+",$')
 """A row of the table of keys that were renamed."""
 
 

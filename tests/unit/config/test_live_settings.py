@@ -162,7 +162,7 @@ def test_what_the_next_start_would_refuse_is_not_saved(config: TruckConfig):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("gate:\n  rate: 10\n", r":2: gate\.rate: is no setting"),
+        ("gate:\n  rate: 10\n", r":2: gate\.rate: cannot be changed while the robot runs"),
         ("gate:\n  speed: 9.0\n", "at most"),
         ("gate: [\n", "not valid YAML"),
         ("gate:\n  speed: 0.2\n  speed: 0.1\n", ":3: speed: given twice"),

@@ -5,11 +5,16 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
+from pydantic import BaseModel
 
 from monstertruck_estimation.fusion.config import FusionConfig
 from monstertruck_runtime.errors import ConfigError, InputError
-from monstertruckd.config.load import Step, YamlText, load_config, load_tree, load_truck
+from monstertruck_runtime.plugins import models_in
+from monstertruck_schemas.base import live_settings
+from monstertruckd.config.calibration import KEYS, WizardName, may_set, value_at
+from monstertruckd.config.load import SavedSettings, Step, YamlText, load_config, load_tree, load_truck, resolved
 from monstertruckd.config.migrate import carry_out, plan
+from monstertruckd.config.renamed import RENAMED, present_key
 from monstertruckd.config.truck import TruckConfig
 from monstertruckd.tools.replay_check.recorded import recorded_config
 from tests.unit.config.test_loading import Root
@@ -91,8 +96,8 @@ def test_a_previous_file_of_another_content_is_not_lost(old: Path):
     ("text", "complaint"),
     [
         ("version: 3\n", r"a\.yaml:1: version: 3 is newer than this program, which knows up to 2"),
-        ("robot: x\n", r"a\.yaml:1: version: expected a number of 0 to 2, found None"),
-        ("\nversion: one\n", r"a\.yaml:2: version: expected a number of 0 to 2, found 'one'"),
+        ("robot: x\n", r"a\.yaml:1: version: expected 0 to 2, found None"),
+        ("\nversion: one\n", r"a\.yaml:2: version: expected 0 to 2, found one"),
         ("version: {\n", r"a\.yaml:2: not valid YAML"),
         ("- version\n", r"a\.yaml:1: expected a mapping"),
         ("version: 0\ninclude: gone.yaml\n", r"gone\.yaml: cannot be read"),
@@ -112,8 +117,9 @@ def test_a_hole_in_the_chain_is_said(old: Path):
 
 
 def test_a_version_without_a_way_up_is_refused(old: Path):
-    with pytest.raises(ConfigError, match=r"old\.yaml:2: version: expected 1 to 2, found 0"):
-        load_config(old, Root)
+    for read in (lambda: load_config(old, Root), lambda: plan(old)):
+        with pytest.raises(ConfigError, match=r"old\.yaml:2: version: expected 1 to 2, found 0"):
+            read()
 
 
 RELEASE_0_1_0 = """version: 1
@@ -193,6 +199,122 @@ def test_the_configuration_in_a_log_of_0_1_0_is_read(release_0_1_0: Path):
     values["planner"] |= {"ladder": values["planner"].pop("recovery")}
     values["gate"] = {"obstacle": {"beside": 0.03}}
     check_0_1_0(recorded_config(Path("run.mcap"), {"config.json": json.dumps(values).encode()}))
+
+
+SETTINGS_0_1_0 = """gate:
+  speed: 0.2
+  reverse_speed: 0.14
+  angle: 0.42
+  acceleration: 0.4
+  yaw_acceleration: 5.0
+  steering_rate: 0.9
+  tilt: { slow: 0.2, stop: 0.34, slow_speed: 0.07 }
+  obstacle:
+    ahead: 0.06
+    beside: 0.03  # the hedge
+    deceleration: 0.14
+    unseen_speed: 0.09
+"""
+"""Settings that may be changed while the robot runs, as 0.1.0 called them."""
+
+CALIBRATION_0_1_0: dict[WizardName, dict[str, float]] = {
+    "battery": {"devices.steering.driver.battery.gain": 1.02, "devices.steering.driver.battery.offset": 0.1},
+    "compass": {
+        f"devices.compass.driver.iron.{name}": value
+        for name, value in {"hard_x": 7.5, "hard_y": -3.0, "soft_xx": 1.05, "soft_xy": 0.02, "soft_yy": 0.96}.items()
+    },
+    "drive": {"geometry.drive_ratio": 640.0, "devices.drive.driver.inverted": True},
+    "steering": {
+        f"devices.steering.driver.{axle}.{name}": value
+        for axle in ("front", "rear")
+        for name, value in {
+            "centre_us": 1490.0, "scale_us_per_deg": 14.5, "direction": -1, "min_us": 1100.0, "max_us": 1880.0
+        }.items()
+    },
+}  # fmt: skip
+"""What the wizards of 0.1.0 measured of a truck with its battery on the servo controller."""
+
+
+@pytest.fixture
+def state(tmp_path: Path) -> Path:
+    """State directory of the robot of ``truck.yaml`` next to it."""
+    configs = Path(__file__).resolve().parents[3] / "configs"
+    state = tmp_path / "state"
+    state.mkdir()
+    (tmp_path / "truck.yaml").write_text(f"include: {configs}/truck.yaml\nversion: 2\nstate_directory: {state}\n")
+    return state
+
+
+def calibrated_by_0_1_0(state: Path, measured: Mapping[WizardName, Mapping[str, float]]) -> None:
+    """Write a file with the fields that 0.1.0 wrote."""
+    results = {
+        wizard: {
+            "wizard": wizard,
+            "date": "2026-11-21T16:01:02Z",
+            "measured": "taped",
+            "estimates": [
+                {"name": key, "value": value, "samples": 4, "meaning": "test", "key": key, "date": ""}
+                for key, value in values.items()
+            ],
+        }
+        for wizard, values in measured.items()
+    }
+    head = {"version": 1, "number": 1, "robot": "truck", "written": "2026-11-21T16:01:02Z", "change": "all"}
+    (state / "calibration").mkdir()
+    (state / "calibration" / "0001-2026-11-21T160102Z.json").write_text(json.dumps(head | {"results": results}))
+
+
+def test_settings_and_calibration_of_0_1_0_are_read(state: Path):
+    saved = SavedSettings(state, "truck")
+    saved.path.write_text(SETTINGS_0_1_0)
+    calibrated_by_0_1_0(state, CALIBRATION_0_1_0)
+    config, tree = load_truck(state.parent / "truck.yaml")
+    assert config.gate.obstacle.side_clearance == 0.03
+    assert str(tree.origin(("gate", "obstacle", "side_clearance"))) == f"{saved.path}:11"
+    values = resolved(config)
+    for measured in CALIBRATION_0_1_0.values():
+        assert {key: value_at(values, present_key(key)) for key in measured} == measured
+    saved.save({"gate.obstacle.ahead": 0.05})
+    assert "    side_clearance: 0.03  # the hedge\n" in saved.path.read_text(), "one name, not both"
+    assert load_truck(state.parent / "truck.yaml")[0].gate.obstacle.side_clearance == 0.03
+
+
+def test_files_of_0_1_0_above_name_every_renamed_key_that_may_stand_there(state: Path):
+    live = {setting.key for setting in live_settings(load_truck(state.parent / "truck.yaml")[0])}
+    assert {old for old in RENAMED[1] if present_key(old) in live} == {"gate.obstacle.beside"}
+    assert not [old for old in RENAMED[1] if any(may_set(wizard, present_key(old)) for wizard in KEYS)]
+
+
+def test_a_key_renamed_below_any_name_is_so_in_all_files(state: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(RENAMED[1], "devices.steering.driver.*.middle_us", "centre_us")
+    truck = state.parent / "truck.yaml"
+    axles = "{front: {middle_us: 1480.0}, 'rear': {'middle_us': 1470.0}}"
+    text = truck.read_text().replace("version: 2", "version: 1")
+    truck.write_text(f"{text}devices: {{steering: {{driver: {axles}}}}}\n")
+
+    def centres() -> tuple[float, float]:
+        steering = load_truck(truck)[0].devices.steering
+        assert steering is not None
+        return steering.driver.front.centre_us, steering.driver.rear.centre_us
+
+    assert centres() == (1480.0, 1470.0)
+    carry_out(plan(truck))
+    assert "{front: {centre_us: 1480.0}, 'rear': {\"centre_us\": 1470.0}}" in truck.read_text()
+    calibrated_by_0_1_0(state, {"steering": {"devices.steering.driver.rear.middle_us": 1450.0}})
+    assert centres() == (1480.0, 1450.0)
+
+
+@pytest.mark.parametrize(("old", "name"), [row for rows in RENAMED.values() for row in rows.items()])
+def test_a_renamed_key_is_there_and_its_old_name_is_nobody_elses(old: str, name: str):
+    *way, last = old.split(".")
+    models: list[type[BaseModel]] = [TruckConfig]
+    for part in way:
+        if part != "*":  # the models of a mapping by name are those of its values
+            fields = [model.model_fields[part] for model in models if part in model.model_fields]
+            models = [model for field in fields for model in models_in(field)]
+    known = {field for model in models for field in model.model_fields}
+    assert name in known
+    assert last not in known
 
 
 def test_edits_touch_nothing_else():
