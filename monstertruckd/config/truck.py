@@ -31,8 +31,8 @@ from monstertruck_planners.track.catalog import AnyTracker
 from monstertruck_planners.track.config import STEERING_MODES
 from monstertruck_runtime.bodies import AnyBody, build_chassis
 from monstertruck_runtime.slowness import Board
-from monstertruck_schemas.base import Schema
-from monstertruck_schemas.body import TruckBody
+from monstertruck_schemas.base import Name, Schema
+from monstertruck_schemas.body import Metres, TruckBody
 from monstertruck_schemas.roles import SHAFTS, DeviceRole
 from monstertruckd.bus.zenoh_config import PeerConfig, ZenohConfig
 from monstertruckd.config.device_safety import beyond_devices, unattended_times, weakened_devices
@@ -40,14 +40,11 @@ from monstertruckd.gate.config import SIGHT, BodyLimits, GateConfig, impossible_
 from monstertruckd.recorder.config import BlackBoxConfig, MapRender, RecorderConfig
 
 ROBOT: Final = "truck"
-RobotName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,31}$")]
 """A robot's name where none is given."""
 BLIND: Final = "devices: no range sensor: nothing stops the robot before an obstacle"
 
 MOVE: Final = "move"
 """Name of the behaviour that every robot has."""
-
-Metres = Annotated[float, Field(gt=0, le=10)]
 
 
 class Geometry(Schema):
@@ -116,7 +113,7 @@ class TruckConfig(Schema):
     """Keys that name files which must exist; relative to the configuration file that names them."""
 
     version: Literal[2]
-    robot: RobotName = ROBOT
+    robot: Name = ROBOT
     """Name of this robot in every key"""
     body: AnyBody = TruckBody()
     """Kind of robot, with what only this kind has"""
@@ -136,13 +133,11 @@ class TruckConfig(Schema):
     """How goals are reached; null = the robot follows paths only"""
     explorer: AnyExplorer | None = None
     """How unknown ground is explored; null = the robot does not explore"""
-    behaviours: dict[Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,31}$")], AnyBehaviour] = Field(
-        default_factory=dict, validate_default=True
-    )
+    behaviours: dict[Name, AnyBehaviour] = Field(default_factory=dict, validate_default=True)
     """Reactive behaviours (without a path) by name; started by `behave start`. `move` is always there"""
     lidar_sonars: LidarSonarsConfig | None = None
     """Sonars computed from the lidar, for behaviours of a robot that has none; null = none"""
-    peers: dict[Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,31}$")], PeerConfig] = Field(default_factory=dict)
+    peers: dict[Name, PeerConfig] = Field(default_factory=dict)
     """Other robots whose poses are received, by name, for behaviours such as `follow`"""
     placement: PlacementConfig = PlacementConfig()
     path: PathConfig | None = None

@@ -32,6 +32,8 @@ from pydantic_core import CoreSchema
 
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
+Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,31}$")]
+"""Of a robot, a behaviour or a mission."""
 
 
 class Live:

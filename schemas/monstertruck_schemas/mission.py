@@ -4,11 +4,10 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from monstertruck_schemas.base import Schema
+from monstertruck_schemas.base import Name, Schema
 
 Coordinate = Annotated[float, Field(ge=-10_000, le=10_000)]
 Seconds = Annotated[float, Field(gt=0, le=86_400)]
-Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,31}$")]
 
 Policy = Literal["abort", "continue", "return"]
 """After a step that failed: end the mission; continue with the next step; drive back to where it began, and end."""

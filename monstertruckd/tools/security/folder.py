@@ -26,12 +26,12 @@ from pydantic import Field, ValidationError, field_validator, model_validator
 from monstertruck_runtime.errors import InputError, NotFoundError
 from monstertruck_runtime.small_files import replace_file
 from monstertruck_runtime.yaml_files import read_yaml, yaml_text
-from monstertruck_schemas.base import Schema, first_mistake
+from monstertruck_schemas.base import Name, Schema, first_mistake
 from monstertruck_schemas.req import Role
 from monstertruck_schemas.roles import AccessRole
 from monstertruckd.bus.zenoh_config import OWNER_NAME, OwnerName, TlsConfig, ZenohConfig
 from monstertruckd.config.load import VERSION
-from monstertruckd.config.truck import ROBOT, RobotName
+from monstertruckd.config.truck import ROBOT
 from monstertruckd.tools.security.certificates import (
     DAY,
     Certificate,
@@ -81,7 +81,7 @@ class TrustedRouter(Schema):
 class CertificateRegister(Schema):
     """What an authority has certified."""
 
-    robot: RobotName
+    robot: Name
     addresses: tuple[str, ...] = Field(min_length=1)
     """Addresses and host names of the robot."""
     place: Path = PLACE

@@ -5,11 +5,9 @@ from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from monstertruck_schemas.base import Schema
+from monstertruck_schemas.base import Name, Schema
 from monstertruck_schemas.board import BoardConfig, Colour
-
-Metres = Annotated[float, Field(gt=0, le=10)]
-RobotName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,31}$")]
+from monstertruck_schemas.body import Metres
 
 
 class VideoDevice(Schema):
@@ -111,9 +109,9 @@ class OverheadConfig(Schema):
     """Side of the black square of tags on the table, m"""
     ruler_error: Annotated[float, Field(gt=0, le=0.1)] = 0.0015
     """Standard deviation of a mark's place, m"""
-    robots: dict[RobotName, TaggedRobot] = {}
+    robots: dict[Name, TaggedRobot] = {}
     """Robots with tags"""
-    blobs: dict[RobotName, BlobRobot] = {}
+    blobs: dict[Name, BlobRobot] = {}
     """Robots with coloured discs"""
     calibration: Path = Path("runs/stand/calibration.json")
     """Written by `stand calibrate`"""

@@ -5,9 +5,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from monstertruck_schemas.base import Schema
+from monstertruck_schemas.base import Positive, Schema
 
-Positive = Annotated[float, Field(gt=0)]
 Count = Annotated[int, Field(gt=0)]
 
 

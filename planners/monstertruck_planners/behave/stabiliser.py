@@ -36,7 +36,7 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND, Clock, Schedule
 from monstertruck_runtime.mailbox import Mailbox, fifo, latest
 from monstertruck_runtime.ports import BusPort, Publisher, Ready, Subscription
-from monstertruck_schemas.base import Schema
+from monstertruck_schemas.base import Positive, Schema
 from monstertruck_schemas.plan import StabiliserCommand
 from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.sensor import Attitude
@@ -55,7 +55,6 @@ DECIDED: Final = 4
 LEAST_ERROR: Final = math.radians(0.1)
 """Filters better than this are equally good, rad: the compass's resolution."""
 
-Positive = Annotated[float, Field(gt=0)]
 Limit = Annotated[float, Field(gt=0, lt=math.pi / 2)]
 
 
