@@ -4,8 +4,11 @@ import re
 from dataclasses import dataclass
 from typing import Self
 
+from monstertruck_runtime.client import TruckClient
+from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT, is_endpoint, nearest
 from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.stations import own_source, tls_for
 
 _NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 
@@ -30,3 +33,9 @@ class RobotAddress:
         if at and not is_endpoint(endpoint):
             raise InputError(f"robot {text!r}: expected an endpoint such as tcp/192.168.1.7:7447 behind the @")
         return cls(name, nearest(endpoint or DEFAULT_ENDPOINT))
+
+    def session(self, program: str, clock: Clock, timeout: float) -> TruckClient:
+        """A session with the robot for a program of the station; ``timeout`` as of ``TruckClient``, s."""
+        tls = tls_for(self.endpoint)
+        source = own_source(None if tls is None else tls.owner(), program)
+        return TruckClient(self.name, self.endpoint, source=source, clock=clock, timeout=timeout, tls=tls)

@@ -13,7 +13,6 @@ from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import NotFoundError, NotPermittedError, RequestRefusedError, TruckError
 from monstertruck_runtime.recordings import fetch_recording
-from monstertruck_runtime.stations import own_source, tls_for
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.station.address import RobotAddress
 
@@ -81,9 +80,7 @@ async def fetch(
 
 
 def _session(address: RobotAddress, user: str, clock: Clock) -> TruckClient:
-    tls = tls_for(address.endpoint)
-    source = own_source(None if tls is None else tls.owner(), f"{user}{'.' * bool(user)}files")
-    return TruckClient(address.name, address.endpoint, source=source, clock=clock, timeout=WAIT, tls=tls)
+    return address.session(f"{user}{'.' * bool(user)}files", clock, WAIT)
 
 
 async def _stream(

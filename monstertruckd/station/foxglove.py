@@ -24,7 +24,6 @@ from monstertruck_runtime import wire
 from monstertruck_runtime.client import ORDER_TIMEOUT, TruckClient
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import BusyError, InputError, RequestRefusedError, TruckError
-from monstertruck_runtime.stations import own_source, tls_for
 from monstertruck_schemas.req import Order
 from monstertruck_schemas.topics import TOPICS, Topic
 from monstertruckd.station.address import RobotAddress
@@ -129,19 +128,13 @@ class FoxgloveServer:
             ready()
             while True:
                 with suppress(TruckError):  # the page says what is wrong
-                    async with self._session() as client:
+                    async with self._address.session("foxglove", self._clock, RETRY) as client:
                         await self._follow(client)
                 await self._clock.sleep(RETRY)
         finally:
             self._client = None
             self._remarks.tell()
             await asyncio.to_thread(server.stop)
-
-    def _session(self) -> TruckClient:
-        name, endpoint = self._address.name, self._address.endpoint
-        tls = tls_for(endpoint)
-        source = own_source(None if tls is None else tls.owner(), "foxglove")
-        return TruckClient(name, endpoint, source=source, clock=self._clock, timeout=RETRY, tls=tls)
 
     async def _follow(self, client: TruckClient) -> None:
         self._client = client

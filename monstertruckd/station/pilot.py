@@ -21,7 +21,6 @@ from ruamel.yaml.events import AliasEvent
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import InputError, NoAnswerError, NotFoundError, RequestRefusedError, TruckError
-from monstertruck_runtime.stations import own_source, tls_for
 from monstertruck_runtime.threads import in_thread
 from monstertruck_schemas.base import first_mistake
 from monstertruck_schemas.mission import Mission
@@ -130,7 +129,7 @@ class Pilot:
         try:
             while True:
                 with suppress(TruckError):  # the feed says what is wrong
-                    async with self._session() as client:
+                    async with self._address.session(self._name, self._clock, RETRY) as client:
                         self._client = client
                         self._viewer.send(frames.text("pilot", source=client.source))
                         while not self._ready:
@@ -145,12 +144,6 @@ class Pilot:
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
-
-    def _session(self) -> TruckClient:
-        name, endpoint = self._address.name, self._address.endpoint
-        tls = tls_for(endpoint)
-        source = own_source(None if tls is None else tls.owner(), self._name)
-        return TruckClient(name, endpoint, source=source, clock=self._clock, timeout=RETRY, tls=tls)
 
     def drive(self, motion: Heartbeat) -> None:
         """Pass one heartbeat on, unless it is late or would have to wait for the robot."""

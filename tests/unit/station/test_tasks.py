@@ -130,7 +130,7 @@ class Robot:
 
 
 async def test_a_recording_is_downloaded_gone_on_with_and_refused_as_the_robot_says(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(downloads, "TruckClient", Robot)
+    monkeypatch.setattr("monstertruckd.station.address.TruckClient", Robot)
     place = Place(port=int(free_endpoint().rpartition(":")[2]))
     station = Station([RobotAddress("truck", "tcp/127.0.0.1:1")], WallClock(), place)
     runner = aiohttp.web.AppRunner(station.application())
@@ -179,7 +179,7 @@ async def test_a_recording_is_downloaded_gone_on_with_and_refused_as_the_robot_s
 async def test_a_recording_is_fetched_at_its_places_and_a_huge_one_is_not(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(downloads, "TruckClient", Robot)
+    monkeypatch.setattr("monstertruckd.station.address.TruckClient", Robot)
     file, shares = tmp_path / "run.mcap", []
 
     async def fetch():
