@@ -20,7 +20,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Coroutine
 from types import FrameType
-from typing import Any, Final, NamedTuple, Protocol, TypeVar, TypeVarTuple
+from typing import Any, Final, NamedTuple, TypeVar, TypeVarTuple
 
 import uvloop
 
@@ -49,46 +49,35 @@ def processor_time() -> float:
     return time.thread_time()
 
 
-class Clock(Protocol):
-    """The clock that services are given."""
+class Clock(ABC):
+    """The clock that services are given; sleeping uses the timers of the running loop."""
 
+    @abstractmethod
     def now(self) -> int:
         """Nanoseconds of the daemon's monotonic time."""
 
+    @abstractmethod
     def real_offset(self) -> int:
         """Nanoseconds to add to ``now()`` for real (UNIX) time."""
 
     async def sleep(self, seconds: float) -> None:
         """Wait at least ``seconds``."""
+        await asyncio.sleep(seconds)
 
     async def sleep_until(self, instant: int) -> None:
         """Wait until ``now() >= instant``; returns at once if that has passed."""
+        while (left := instant - self.now()) > 0:
+            await asyncio.sleep(left / SECOND)
 
     def deadline(self, seconds: float) -> asyncio.Timeout:
         """Async context manager that raises ``TimeoutError`` inside after ``seconds``.
 
         On the wall clock it may be 1.5 ms early.
         """
-
-
-class _LoopClock(ABC):
-    """Shared part: sleeping uses the timers of the running loop."""
-
-    @abstractmethod
-    def now(self) -> int: ...
-
-    async def sleep(self, seconds: float) -> None:
-        await asyncio.sleep(seconds)
-
-    async def sleep_until(self, instant: int) -> None:
-        while (left := instant - self.now()) > 0:
-            await asyncio.sleep(left / SECOND)
-
-    def deadline(self, seconds: float) -> asyncio.Timeout:
         return asyncio.timeout(seconds)
 
 
-class WallClock(_LoopClock):
+class WallClock(Clock):
     """CLOCK_MONOTONIC and uvloop, whose timers count its whole milliseconds."""
 
     async def sleep(self, seconds: float) -> None:
@@ -246,7 +235,7 @@ class _VirtualSelector(selectors.DefaultSelector):
         return events
 
 
-class VirtualClock(_LoopClock):
+class VirtualClock(Clock):
     """Clock of a ``VirtualLoop``; its real time is fixed but for ``step_real``, so that runs are reproducible."""
 
     def __init__(self, loop: VirtualLoop, real_offset: int = 0) -> None:

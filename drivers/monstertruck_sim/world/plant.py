@@ -54,75 +54,6 @@ class TruthState(NamedTuple):
     """A, forwards positive."""
 
 
-class Plant(Protocol):
-    """One robot, as its sensors and actuators see it."""
-
-    battery: BatteryModel
-    shafts: tuple[Shaft, ...]
-    """Driven ones."""
-    currents: list[float]
-    """Currents of their motors, A."""
-    pulses: PulseSource | None
-    """Pulses of the controller that moves the steering servos."""
-    servo_supply: bool
-    """The steering servos have their 5 V."""
-    together: Callable[[int], None]
-    """Brings what else moves in the world to an instant (ns), before this robot is integrated to it."""
-    on_blocked: Callable[[Pose, Twist], None]
-    """Gets a pose that something keeps the robot from, and the twist with which it went there."""
-
-    @property
-    def pose(self) -> Pose:
-        """Of the geometric centre in the map frame, at the newest instant; the heading counts turns."""
-
-    @property
-    def twist(self) -> Twist:
-        """Velocity in the body frame: m/s, m/s, rad/s."""
-
-    @property
-    def attitude(self) -> tuple[float, float]:
-        """Pitch (nose down positive) and roll (right side down positive), rad."""
-
-    @property
-    def acceleration(self) -> Vector:
-        """Of the body, forward, left and up in its level frame, as a sensor on it feels it, m/s^2; without gravity."""
-
-    @property
-    def rates(self) -> Vector:
-        """Angular velocity about forward, left and up of the level frame, rad/s."""
-
-    @property
-    def current(self) -> float:
-        """Of all motors together, A."""
-
-    def advance(self, time_ns: int) -> None:
-        """Integrate up to an instant; the first call sets the start, earlier instants change nothing."""
-
-    def integrate(self, time_ns: int) -> None:
-        """``advance`` of this robot alone."""
-
-    def slot(self, time_ns: int, period_ns: int) -> int:
-        """Number of the period since the start that an instant falls into: the index of its noise."""
-
-    joints: JointSource | None
-    """Joints of the lidar's mount; None: it is fixed."""
-
-    def mount_torque(self, joint: int, /) -> float:
-        """With which the lidar pushes its pitch (0) or roll (1) joint at the newest instant, Nm; 0 in the plane."""
-
-    def carry(self, pose: Pose) -> None:
-        """Put the robot down elsewhere, at rest; sensors see no way between the two places."""
-
-    def truth(self) -> TruthState:
-        """State at the newest instant."""
-
-    def poses(self, times_ns: NDArray[np.int64]) -> Array:
-        """Poses at instants of the last half second, (6, n): x, y, yaw, pitch, roll, and the base's height.
-
-        The height is 0 in the plane, whatever its ground.
-        """
-
-
 class Caster(Protocol):
     """Sight in the plane."""
 
@@ -172,8 +103,8 @@ class Space(Protocol):
         """
 
 
-class GriddedPlant(ABC):
-    """Robot that is integrated lazily on a fixed grid of time: actuators, battery, and the trail of its poses.
+class Plant(ABC):
+    """One robot, as its sensors and actuators see it, integrated lazily on a fixed grid of time.
 
     Args:
         config: true parameters.
@@ -194,9 +125,13 @@ class GriddedPlant(ABC):
         self._chassis = config.chassis()
         count = len(self._chassis.shafts)
         self.shafts = tuple(Shaft(config.motor) for _ in range(count))
+        """Driven ones."""
         self.currents = [0.0] * count
+        """Currents of their motors, A."""
         self.pulses: PulseSource | None = None
+        """Pulses of the controller that moves the steering servos."""
         self.servo_supply = True
+        """The steering servos have their 5 V."""
         self._servos = tuple(map(Servo, config.servos))
         self._start_ns: int | None = None
         self._elapsed = 0
@@ -209,8 +144,11 @@ class GriddedPlant(ABC):
         self._slipping = [False] * count
         self._trail: deque[tuple[float, ...]] = deque(maxlen=_KEPT_NS // self.STEP_NS)
         self.joints: JointSource | None = None
+        """Joints of the lidar's mount; None: it is fixed."""
         self.together: Callable[[int], None] = lambda _: None
+        """Brings what else moves in the world to an instant (ns), before this robot is integrated to it."""
         self.on_blocked: Callable[[Pose, Twist], None] = lambda _pose, _twist: None
+        """Gets a pose that something keeps the robot from, and the twist with which it went there."""
 
     @property
     def pose(self) -> Pose:
@@ -224,8 +162,18 @@ class GriddedPlant(ABC):
 
     @property
     def attitude(self) -> tuple[float, float]:
-        """Pitch and roll."""
+        """Pitch (nose down positive) and roll (right side down positive), rad."""
         return self._attitude
+
+    @property
+    @abstractmethod
+    def acceleration(self) -> Vector:
+        """Of the body, forward, left and up in its level frame, as a sensor on it feels it, m/s^2; without gravity."""
+
+    @property
+    @abstractmethod
+    def rates(self) -> Vector:
+        """Angular velocity about forward, left and up of the level frame, rad/s."""
 
     @property
     def current(self) -> float:
@@ -253,8 +201,12 @@ class GriddedPlant(ABC):
                 self._remember()
 
     def mount_torque(self, _joint: int, /) -> float:
-        """As ``Plant``."""
+        """With which the lidar pushes its pitch (0) or roll (1) joint at the newest instant, Nm; 0 in the plane."""
         return 0.0
+
+    @abstractmethod
+    def carry(self, pose: Pose) -> None:
+        """Put the robot down elsewhere, at rest; sensors see no way between the two places."""
 
     def slot(self, time_ns: int, period_ns: int) -> int:
         """Number of the period since the start that an instant falls into: the index of its noise."""
@@ -284,9 +236,10 @@ class GriddedPlant(ABC):
         )
 
     def poses(self, times_ns: NDArray[np.int64]) -> Array:
-        """Poses at instants of the last half second, (6, n): x, y, yaw, pitch, roll, height.
+        """Poses at instants of the last half second, (6, n): x, y, yaw, pitch, roll, and the base's height.
 
-        Instants not yet integrated are extrapolated at the present velocity; none of them binds the future.
+        The height is 0 in the plane, whatever its ground. Instants not yet integrated are extrapolated at the present
+        velocity; none of them binds the future.
         """
         assert self._start_ns is not None
         seconds = (times_ns - self._start_ns) * 1e-9

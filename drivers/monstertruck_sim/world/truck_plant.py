@@ -17,7 +17,7 @@ from monstertruck_kinematics.truck import LinkedAxles
 from monstertruck_sim.world.actuators import RPM, Shaft
 from monstertruck_sim.world.config import BatteryModelConfig, SimTruckConfig
 from monstertruck_sim.world.noise import SLIP, SlowNoise
-from monstertruck_sim.world.plant import GRAVITY, GriddedPlant, Pose, Vector
+from monstertruck_sim.world.plant import GRAVITY, Plant, Pose, Vector
 from monstertruck_sim.world.skid import SkidEffects
 
 STEP_NS = 5_000_000
@@ -32,7 +32,7 @@ Tilt = Callable[[int, float, float, float], tuple[float, float]]
 """Pitch (nose down positive) and roll (right side down positive), rad, at (elapsed ns, x, y, yaw)."""
 
 
-class TruckPlant(GriddedPlant):
+class TruckPlant(Plant):
     """One robot in its surroundings: by default the truck, else the body that ``config`` names.
 
     Every driven shaft has its own motor, clutch and share of the mass.

@@ -15,7 +15,7 @@ from monstertruck_kinematics.description import HEAD_JOINTS, Mechanics
 from monstertruck_runtime.errors import CommandFailedError, InputError
 from monstertruck_sim.world.actuators import RPM
 from monstertruck_sim.world.config import BatteryModelConfig, SimTruckConfig
-from monstertruck_sim.world.plant import GriddedPlant, Pose, Vector
+from monstertruck_sim.world.plant import Plant, Pose, Vector
 from monstertruck_sim.world3d.model import (
     CARRIES,
     HEAD_LAG,
@@ -79,7 +79,7 @@ def _tyres(model: mujoco.MjModel, parts: Mechanics, radius: float) -> _Tyres | N
     return _Tyres(tuple(found), parts.tyre_spring, radius * TIMESTEP / parts.relaxation)
 
 
-class RigidPlant(GriddedPlant):
+class RigidPlant(Plant):
     """One robot among rigid bodies.
 
     Args:

@@ -5,12 +5,13 @@ operator's orders. A hundred times a second each rule says what is unsafe in an 
 """
 
 import math
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Final, Protocol
+from typing import Final
 
 import numpy as np
 
@@ -123,20 +124,8 @@ def _writes(received: Iterable[tuple[int, bytes]]) -> list[tuple[int, int, int]]
     return found
 
 
-class MotorWire(Protocol):
-    """What the bytes to a motor controller ask its motors for."""
-
-    tap: WireTap
-
-    def read(self) -> Iterator[tuple[int, int, float]]:
-        """(ns, shaft, m/s over ground) of what has come since the last call; 0 = any stop."""
-
-    def forget(self) -> None:
-        """What has come before does not count."""
-
-
-class _MotorWireReader:
-    """Takes every item of a tap once."""
+class MotorWire(ABC):
+    """What the bytes to a motor controller ask its motors for; takes every item of a tap once."""
 
     def __init__(self, tap: WireTap) -> None:
         self.tap = tap
@@ -147,14 +136,18 @@ class _MotorWireReader:
         self._read += len(fresh)
         return fresh
 
+    @abstractmethod
+    def read(self) -> Iterator[tuple[int, int, float]]:
+        """(ns, shaft, m/s over ground) of what has come since the last call; 0 = any stop."""
+
     def forget(self) -> None:
-        """See ``MotorWire``."""
+        """What has come before does not count."""
         self._read = 0
         self.tap.to_device.clear()
         self.tap.to_host.clear()
 
 
-class _EposWire(_MotorWireReader):
+class _EposWire(MotorWire):
     """One shaft.
 
     Args:
@@ -177,7 +170,7 @@ class _EposWire(_MotorWireReader):
                 yield instant, self._shaft, 0.0
 
 
-class _StepperWire(_MotorWireReader):
+class _StepperWire(MotorWire):
     """All shafts of a body with steppers.
 
     Args:

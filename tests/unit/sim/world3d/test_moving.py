@@ -55,7 +55,7 @@ def pair(gap, **world):
 def test_robots_see_each_other_and_the_one_behind_is_stopped():
     behind, ahead = pair(1.0)
     assert behind.lidar.scan(0)[384] == pytest.approx(1000 - 140 - 235, abs=2)
-    behind.motor.command(0, -0.2 * RPM, 20_000.0)
+    behind.motors[0].command(0, -0.2 * RPM, 20_000.0)
     for tenth in range(1, 60):
         behind.truth(tenth * SECOND // 10)
         ahead.truth(tenth * SECOND // 10)
@@ -67,8 +67,8 @@ def test_robots_see_each_other_and_the_one_behind_is_stopped():
 
 def test_a_robot_that_drives_away_is_followed_to_where_it_is():
     behind, ahead = pair(0.8)
-    ahead.motor.command(0, -0.2 * RPM, 20_000.0)
-    behind.motor.command(0, -0.2 * RPM, 20_000.0)
+    ahead.motors[0].command(0, -0.2 * RPM, 20_000.0)
+    behind.motors[0].command(0, -0.2 * RPM, 20_000.0)
     for tenth in range(1, 60):
         behind.truth(tenth * SECOND // 10)
         ahead.truth(tenth * SECOND // 10)
@@ -85,19 +85,19 @@ def test_the_ground_is_the_same_for_both_and_level_where_either_begins():
 
 def test_a_robot_whose_daemon_is_gone_stands_in_the_way_until_another_daemon_drives_it():
     behind, ahead = pair(0.7)
-    ahead.motor.command(0, -0.2 * RPM, 20_000.0)
+    ahead.motors[0].command(0, -0.2 * RPM, 20_000.0)
     ahead.truth(SECOND // 2)
-    ahead.motor.command(SECOND // 2, None, 20_000.0)
-    behind.motor.command(SECOND // 2, -0.2 * RPM, 20_000.0)
+    ahead.motors[0].command(SECOND // 2, None, 20_000.0)
+    behind.motors[0].command(SECOND // 2, -0.2 * RPM, 20_000.0)
     for tenth in range(5, 30):  # nobody asks for the other one, not even where it is
         behind.truth(tenth * SECOND // 10)
     stopped = behind.truth(3 * SECOND)
     assert stopped.stuck
-    behind.motor.command(3 * SECOND, 0.0, 20_000.0)
+    behind.motors[0].command(3 * SECOND, 0.0, 20_000.0)
     stood = ahead.truth(3 * SECOND)
     assert stopped.x == pytest.approx(stood.x - 0.47, abs=0.02)
     assert abs(stood.v) < 0.01
-    ahead.motor.command(3 * SECOND, -0.2 * RPM, 20_000.0)
+    ahead.motors[0].command(3 * SECOND, -0.2 * RPM, 20_000.0)
     assert ahead.truth(4 * SECOND).x > stood.x + 0.08
 
 
