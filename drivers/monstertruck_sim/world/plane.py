@@ -1,5 +1,6 @@
 """The engine ``plane``: a footprint that moves over a map, tilted by a profile of the ground or as commanded."""
 
+from abc import ABC, abstractmethod
 from math import hypot, radians
 from typing import NamedTuple
 
@@ -10,7 +11,7 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.errors import InputError
 from monstertruck_sim.world.config import SimTruckConfig, SinusoidTilt, SteadyTilt, TiltConfig, WorldConfig
 from monstertruck_sim.world.obstacles import Box, Obstacle
-from monstertruck_sim.world.plant import Plant, Pose, Space, Twist
+from monstertruck_sim.world.plant import Caster, Plant, Pose, Twist
 from monstertruck_sim.world.scene import Surroundings
 from monstertruck_sim.world.sensors import PlaneSweep, Sweep
 from monstertruck_sim.world.sonar import Solids
@@ -19,16 +20,6 @@ from monstertruck_sim.world.truck_plant import TruckPlant
 
 _ROOM = 0.05
 """Metres around the footprint: known to be free, they spare the contact test until the truck has crossed them."""
-
-
-class Engine(NamedTuple):
-    """What moves one robot, and what is around it."""
-
-    plant: Plant
-    space: Space
-    sweep: Sweep
-    solids: Solids | None = None
-    """What sonars hear beside the walls."""
 
 
 class PlanOutline:
@@ -90,22 +81,18 @@ class PlanOutline:
         return self.scene.fixed_overlap(self.box(pose, room))
 
 
-class PlaneSpace:
-    """``Space`` of the plane.
+class Space(ABC):
+    """What is around one robot.
 
     Args:
         footprint: of the robot, in its surroundings.
-        config: of the world.
     """
 
-    def __init__(self, footprint: PlanOutline, config: WorldConfig) -> None:
-        self._scene, self._truck = footprint.scene, config.truck
-        self.contact, self.cast = footprint.overlap, footprint.cast
-        profile = self._scene.place.profile
-        uneven = profile is not None or bool(config.rough)
-        self.terrain = Terrain(profile or LEVEL, config.rough) if uneven else None
-        """The ground; None: level."""
-        self._tilt: TiltConfig = config.tilt
+    def __init__(self, footprint: PlanOutline) -> None:
+        self._scene = footprint.scene
+        self.contact = footprint.overlap
+        """How deep the footprint at a pose reaches into things, m; 0 = free."""
+        self.cast: Caster = footprint.cast
 
     @property
     def obstacles(self) -> tuple[Obstacle, ...]:
@@ -113,7 +100,11 @@ class PlaneSpace:
         return self._scene.obstacles
 
     def add(self, obstacle: Obstacle) -> None:
-        """Put something into it."""
+        """Put something into it: seen by the lidar, stops robots.
+
+        Raises:
+            InputError: there is no room for more.
+        """
         self._scene.set_obstacles((*self.obstacles, obstacle))
 
     def remove(self, obstacle: Obstacle) -> None:
@@ -122,7 +113,46 @@ class PlaneSpace:
         Raises:
             InputError: it is not there.
         """
-        self._scene.set_obstacles(without(self.obstacles, obstacle))
+        if obstacle not in self.obstacles:
+            raise InputError(f"obstacle {obstacle}: not in the world")
+        index = self.obstacles.index(obstacle)
+        self._scene.set_obstacles(self.obstacles[:index] + self.obstacles[index + 1 :])
+
+    @abstractmethod
+    def set_tilt(self, tilt: TiltConfig) -> None:
+        """From now on tilt the robot in another way.
+
+        Raises:
+            InputError: the engine computes the tilt itself.
+        """
+
+
+class Engine(NamedTuple):
+    """What moves one robot, and what is around it."""
+
+    plant: Plant
+    space: Space
+    sweep: Sweep
+    solids: Solids | None = None
+    """What sonars hear beside the walls."""
+
+
+class PlaneSpace(Space):
+    """``Space`` of the plane.
+
+    Args:
+        footprint: of the robot, in its surroundings.
+        config: of the world.
+    """
+
+    def __init__(self, footprint: PlanOutline, config: WorldConfig) -> None:
+        super().__init__(footprint)
+        self._truck = config.truck
+        profile = self._scene.place.profile
+        uneven = profile is not None or bool(config.rough)
+        self.terrain = Terrain(profile or LEVEL, config.rough) if uneven else None
+        """The ground; None: level."""
+        self._tilt: TiltConfig = config.tilt
 
     def set_tilt(self, tilt: TiltConfig) -> None:
         """From now on tilt the robot in another way."""
@@ -137,18 +167,6 @@ class PlaneSpace:
         if self.terrain is None:
             return 0.0, 0.0
         return self.terrain.tilt(x, y, yaw, self._truck.wheelbase, self._truck.track)
-
-
-def without(obstacles: tuple[Obstacle, ...], obstacle: Obstacle) -> tuple[Obstacle, ...]:
-    """``obstacles`` less one.
-
-    Raises:
-        InputError: it is not among them.
-    """
-    if obstacle not in obstacles:
-        raise InputError(f"obstacle {obstacle}: not in the world")
-    index = obstacles.index(obstacle)
-    return obstacles[:index] + obstacles[index + 1 :]
 
 
 def plane(config: WorldConfig, footprint: PlanOutline, start: Pose, seed: int | None) -> Engine:

@@ -13,8 +13,7 @@ from monstertruck_drivers.emulation import JointSource, PulseSource
 from monstertruck_kinematics.elementary import Array, integrate
 from monstertruck_sim.world.actuators import RPM, Servo, Shaft
 from monstertruck_sim.world.battery import BatteryModel
-from monstertruck_sim.world.config import BatteryModelConfig, SimTruckConfig, TiltConfig
-from monstertruck_sim.world.obstacles import Obstacle
+from monstertruck_sim.world.config import BatteryModelConfig, SimTruckConfig
 
 SERVO_FRAME_NS = 20_000_000
 GRAVITY = 9.81
@@ -63,43 +62,6 @@ class Caster(Protocol):
         """Ranges along rays from (xs, ys) at angles up to a reach, in the map frame; inf = nothing.
 
         What moves is met where it was at ``times_ns``, one a ray and rising; None = now.
-        """
-
-
-class Space(Protocol):
-    """What is around one robot."""
-
-    @property
-    def obstacles(self) -> tuple[Obstacle, ...]:
-        """Things in it that are not on its map."""
-
-    def cast(
-        self, xs: Array, ys: Array, angles: Array, reach: float, times_ns: NDArray[np.int64] | None = None, /
-    ) -> Array:
-        """As ``Caster``."""
-
-    def contact(self, x: float, y: float, yaw: float, /) -> float:
-        """How deep the footprint at a pose reaches into things, m; 0 = free."""
-
-    def add(self, obstacle: Obstacle) -> None:
-        """Put something into it: seen by the lidar, stops robots.
-
-        Raises:
-            InputError: there is no room for more.
-        """
-
-    def remove(self, obstacle: Obstacle) -> None:
-        """Take it away again.
-
-        Raises:
-            InputError: it is not there.
-        """
-
-    def set_tilt(self, tilt: TiltConfig) -> None:
-        """From now on tilt the robot in another way.
-
-        Raises:
-            InputError: the engine computes the tilt itself.
         """
 
 

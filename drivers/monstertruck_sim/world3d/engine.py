@@ -21,7 +21,7 @@ from monstertruck_runtime.map_files import OCCUPIED
 from monstertruck_sim.world.config import LidarConfig, SimTruckConfig, TiltConfig, WorldConfig
 from monstertruck_sim.world.mechanics import description, mechanics, platform_wheels
 from monstertruck_sim.world.obstacles import Box, Disc, Obstacle
-from monstertruck_sim.world.plane import Engine, PlanOutline, without
+from monstertruck_sim.world.plane import Engine, PlanOutline, Space
 from monstertruck_sim.world.plant import Caster, Pose
 from monstertruck_sim.world.scene import Neighbour
 from monstertruck_sim.world.sensors import LEVEL_BEAMS, Beams, UnevenGround, over, turned
@@ -59,7 +59,7 @@ class LevelGround:
         return np.where(met <= reach, met, np.inf)
 
 
-class RigidSpace:
+class RigidSpace(Space):
     """``Space`` of rigid bodies: spare ones stand for what is put into the world, for people and for other robots.
 
     Args:
@@ -70,20 +70,13 @@ class RigidSpace:
     """
 
     def __init__(self, footprint: PlanOutline, plant: RigidPlant, ground: UnevenGround, name: str) -> None:
-        self._footprint, self._scene, self._plant, self._ground, self._name = (
-            footprint, footprint.scene, plant, ground, name,
-        )  # fmt: skip
-        self.contact, self.cast = footprint.overlap, footprint.cast
+        super().__init__(footprint)
+        self._plant, self._ground, self._name = plant, ground, name
         self._shown: dict[str, list[_Shown]] = {"disc": [None] * SPARE, "box": [None] * SPARE}
         self._known: tuple[Obstacle, ...] = ()
         for kind, spare in self._shown.items():
             for i in range(len(spare)):
                 self._show(f"{kind}_{i}", None)
-
-    @property
-    def obstacles(self) -> tuple[Obstacle, ...]:
-        """Things in it that are not on its map."""
-        return self._scene.obstacles
 
     def add(self, obstacle: Obstacle) -> None:
         """Put something into it.
@@ -95,15 +88,7 @@ class RigidSpace:
         robots = [body.outline for body in self._others()]
         if sum(isinstance(other, kind) for other in (*self.obstacles, *robots, *people)) >= SPARE:
             raise InputError(f"obstacle: {SPARE} of kind {kind.__name__.lower()} are in the world: no room for more")
-        self._scene.set_obstacles((*self.obstacles, obstacle))
-
-    def remove(self, obstacle: Obstacle) -> None:
-        """Take it away again.
-
-        Raises:
-            InputError: it is not there.
-        """
-        self._scene.set_obstacles(without(self.obstacles, obstacle))
+        super().add(obstacle)
 
     def set_tilt(self, tilt: TiltConfig) -> None:
         """Lift the robot onto blocks, or put it back onto the ground.
