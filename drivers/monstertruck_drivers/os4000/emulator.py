@@ -142,7 +142,7 @@ class Os4000Emulator:
     async def run(self, end: DeviceEnd) -> None:
         """Stream, and execute commands."""
         self._end = end
-        end.on_plug = self._plugged
+        end.on_plug = lambda plugged: self.power_cycle() if plugged else None  # the port is its supply
         self._boot()
         async with asyncio.TaskGroup() as group:
             group.create_task(self._stream(end))
@@ -203,11 +203,6 @@ class Os4000Emulator:
                 self.host_baud = int(number)
             case _:
                 raise ValueError("unknown")
-
-    def _plugged(self, plugged: bool) -> None:
-        """The port is its supply."""
-        if plugged:
-            self.power_cycle()
 
     # Commands
 

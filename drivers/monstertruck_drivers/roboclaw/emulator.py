@@ -79,7 +79,7 @@ class RoboclawEmulator:
 
     async def run(self, end: DeviceEnd) -> None:
         """Answer until cancelled."""
-        end.on_plug = self._plugged
+        end.on_plug = lambda plugged: self.power_cycle() if plugged else None  # the port is its supply
         buffer, last = b"", 0
         while True:
             data = await end.read()
@@ -91,11 +91,6 @@ class RoboclawEmulator:
                 asked, buffer = buffer[:2], buffer[2:]
                 await self._clock.sleep_until(self._clock.now() + THINKING)
                 self._answer(end, asked)
-
-    def _plugged(self, plugged: bool) -> None:
-        """The port is its supply."""
-        if plugged:
-            self.power_cycle()
 
     def _answer(self, end: DeviceEnd, asked: bytes) -> None:
         address, command = asked

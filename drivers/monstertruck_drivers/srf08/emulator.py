@@ -81,7 +81,7 @@ class Srf08Emulator:
     async def run(self, end: DeviceEnd) -> None:
         """Answer until cancelled."""
         self._end = end
-        end.on_plug = self._plugged
+        end.on_plug = lambda plugged: self.power_cycle() if plugged else None  # the port is the supply of all
         buffer, last = b"", 0
         while True:
             data = await end.read()
@@ -131,11 +131,6 @@ class Srf08Emulator:
                 "dead NAME on|off, stuck NAME on|off, ghost NAME METRES|off, brownout NAME, extra; "
                 f"names: {', '.join(by_name)}"
             ) from error
-
-    def _plugged(self, plugged: bool) -> None:
-        """The port is the supply of all."""
-        if plugged:
-            self.power_cycle()
 
     def _answer(self, command: bytes) -> bytes:
         if command[0] == ISS:

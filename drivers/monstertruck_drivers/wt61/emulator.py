@@ -46,7 +46,7 @@ class Wt61Emulator:
     async def run(self, end: DeviceEnd) -> None:
         """Stream, and take commands."""
         end.baud = BAUD
-        end.on_plug = self._plugged
+        end.on_plug = lambda plugged: self.power_cycle() if plugged else None  # the port is its supply
         self.power_cycle()
         async with asyncio.TaskGroup() as group:
             group.create_task(self._stream(end))
@@ -79,11 +79,6 @@ class Wt61Emulator:
                     f"{self.name}: fault {' '.join((fault, *values))!r} not understood; known: frozen on|off, "
                     "silent on|off, asleep on|off, inverted on|off, bad_checksum N, half_packet"
                 )
-
-    def _plugged(self, plugged: bool) -> None:
-        """The port is its supply."""
-        if plugged:
-            self.power_cycle()
 
     async def _stream(self, end: DeviceEnd) -> None:
         due = self._clock.now()
