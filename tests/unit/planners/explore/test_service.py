@@ -102,7 +102,7 @@ def test_a_map_that_could_not_be_saved_is_not_waited_for():
     assert service._saved() == ("no space left", "")
 
 
-def test_it_is_told_of_failed_services_without_which_it_cannot_drive():
+def test_it_hears_of_failed_services_without_which_it_cannot_drive():
     service = ExplorerService.__new__(ExplorerService)
     rows = [
         ServiceHealth(name=name, state=state, since=0, detail=f"{name} fell")

@@ -71,7 +71,7 @@ def test_the_policy_of_a_step_counts_before_that_of_the_mission():
 
 
 @pytest.mark.parametrize("reason", [Reason.GOAL_BLOCKED, Reason.DISARMED])
-def test_a_way_back_that_fails_too_is_told_with_what_made_it_drive_back(reason: Reason):
+def test_a_way_back_that_fails_too_is_reported_with_what_made_it_drive_back(reason: Reason):
     step = {**GO, "retries": 1, "on_failure": "return"}
     at, _ = after(progress(WAIT, step), StepEnd(Reason.OK))
     for following in ("again", "return"):
@@ -541,7 +541,7 @@ def test_just_restarted_it_waits_for_a_pose_and_for_the_planner(tmp_path: Path):
 
 
 @pytest.mark.parametrize(("code", "reason"), [(errno.ENOSPC, Reason.DISK_FULL), (errno.EIO, Reason.RECORDING_FAILED)])
-def test_progress_that_cannot_be_kept_is_told_apart_by_what_the_disk_says(tmp_path: Path, code: int, reason: Reason):
+def test_progress_that_cannot_be_kept_is_named_by_what_the_disk_says(tmp_path: Path, code: int, reason: Reason):
     async def offload(work):
         raise OSError(code, os.strerror(code))
 
