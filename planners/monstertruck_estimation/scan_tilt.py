@@ -11,6 +11,7 @@ from collections.abc import Iterable
 from typing import Final
 
 from monstertruck_estimation.body_tilt import BodyAcceleration
+from monstertruck_kinematics.elementary import to_body
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.mailbox import Mailbox
 from monstertruck_runtime.ports import Publisher
@@ -45,8 +46,7 @@ def plane_slopes(
     ca, sa, cb, sb = math.cos(joint_pitch), math.sin(joint_pitch), math.cos(joint_roll), math.sin(joint_roll)
     along = up[0] * ca - up[2] * sa
     across = up[0] * sa * sb + up[1] * cb + up[2] * ca * sb
-    c, s = math.cos(yaw), math.sin(yaw)
-    return along * c + across * s, across * c - along * s
+    return to_body(yaw, along, across)
 
 
 class AngleHistory:

@@ -189,7 +189,7 @@ class FrameTree:
 
 
 class TransformService:
-    """Publishes the whole frame tree and answers look-ups.
+    """Publishes the whole frame tree.
 
     Args:
         mounts: fixed poses of the sensors, see ``mount``.

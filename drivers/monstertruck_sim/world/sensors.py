@@ -1,14 +1,14 @@
 """What the devices' sensing elements feel: the physics behind the emulators."""
 
 from collections.abc import Callable
-from math import atan2, cos, degrees, hypot, pi, radians, sin
+from math import atan2, degrees, hypot, pi, radians
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_drivers.emulation import CompassReading, ImuReading, JointSource, MotorReading, PulseSource
-from monstertruck_kinematics.elementary import Array, rotation
+from monstertruck_kinematics.elementary import Array, Real, cos, rotation, sin
 from monstertruck_runtime.clock import SECOND
 from monstertruck_sim.world.board import panel_ranges
 from monstertruck_sim.world.camera import FlatPanel
@@ -314,7 +314,7 @@ class SimulatedCompass:
         field = self._distorted(_to_body(level, pitch, roll))
         forward, left, up = self._plant.acceleration
         force = _to_body((forward / GRAVITY, left / GRAVITY, 1.0 + up / GRAVITY), pitch, roll)
-        x, y, _ = _to_level(field, pitch, roll)
+        x, y, _ = turned(field, pitch, roll)
         pitch, roll = atan2(-force[0], hypot(force[1], force[2])), atan2(force[1], force[2])
         pitch, roll = pitch + self._bias[0] + noise[1], roll + self._bias[1] + noise[2]
         return CompassReading(
@@ -410,11 +410,11 @@ class SimulatedRearWheels:
         self._rolled[1] += forward + self._half * turn
 
 
-def turned(beams: Beams, pitch: Array, roll: Array) -> Beams:
-    """``_to_level`` for many vectors, each turned by angles of its own."""
-    x, y, z = beams
-    y, z = np.cos(roll) * y - np.sin(roll) * z, np.sin(roll) * y + np.cos(roll) * z
-    return np.cos(pitch) * x + np.sin(pitch) * z, y, np.cos(pitch) * z - np.sin(pitch) * x
+def turned(vector: tuple[Real, Real, Real], pitch: Real, roll: Real) -> tuple[Real, Real, Real]:
+    """Inverse of ``_to_body``, for one vector or for many, each turned by angles of its own."""
+    x, y, z = vector
+    y, z = cos(roll) * y - sin(roll) * z, sin(roll) * y + cos(roll) * z
+    return cos(pitch) * x + sin(pitch) * z, y, cos(pitch) * z - sin(pitch) * x
 
 
 def _mounted(config: LidarConfig) -> Beams | None:
@@ -431,10 +431,3 @@ def _to_body(v: Vector, pitch: float, roll: float) -> Vector:
     x = cos(pitch) * v[0] - sin(pitch) * v[2]
     z = sin(pitch) * v[0] + cos(pitch) * v[2]
     return x, cos(roll) * v[1] + sin(roll) * z, cos(roll) * z - sin(roll) * v[1]
-
-
-def _to_level(v: Vector, pitch: float, roll: float) -> Vector:
-    """Inverse of ``_to_body``."""
-    y = cos(roll) * v[1] - sin(roll) * v[2]
-    z = sin(roll) * v[1] + cos(roll) * v[2]
-    return cos(pitch) * v[0] + sin(pitch) * z, y, cos(pitch) * z - sin(pitch) * v[0]

@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable
 from typing import Final
 
+from monstertruck_kinematics.elementary import to_body, to_world
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import InputError
 from monstertruck_sim.world.plant import TruthState
@@ -70,8 +71,6 @@ def _meter(now: TruthState) -> str:
 
 def _moved(mark: TruthState, now: TruthState, x: float, y: float) -> tuple[float, float]:
     """By how much a place of the body has moved, ahead and left, m; x and y from the body's middle, m."""
-    dx, dy = now.x - mark.x, now.y - mark.y
-    c, s = math.cos(mark.yaw), math.sin(mark.yaw)
-    turned = now.yaw - mark.yaw
-    cos, sin = math.cos(turned), math.sin(turned)
-    return c * dx + s * dy + cos * x - sin * y - x, c * dy - s * dx + sin * x + cos * y - y
+    ahead, left = to_body(mark.yaw, now.x - mark.x, now.y - mark.y)
+    now_x, now_y = to_world(now.yaw - mark.yaw, x, y)
+    return ahead + now_x - x, left + now_y - y

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from monstertruck_estimation.points.config import PointsConfig
 from monstertruck_estimation.points.exchange import TagReading, Triple
-from monstertruck_estimation.se2 import Vector, compose
+from monstertruck_estimation.se2 import Vector, between, compose
 from monstertruck_estimation.vision.mount import camera_axes
 from monstertruck_kinematics.elementary import Array
 from monstertruck_schemas.body import Mount
@@ -152,7 +152,7 @@ class PointMap:
             place: to be marked, in map.
             covariance: of the robot's pose, (3, 3).
         """
-        x, y, yaw = (float(v) for v in _between(base, place))
+        x, y, yaw = between(np.array(base), np.array(place)).tolist()
         into = _into_base(base)
         spread = tuple(float(v) for v in (into @ covariance @ into.T + np.eye(3) * MARK_ERROR**2).ravel())
         one = PointSighting(stamp, base, (x, y, 0.0), yaw, spread)
@@ -163,7 +163,7 @@ class PointMap:
         point = self.points[name]
         (old,) = point.sightings
         here = compose(np.array(old.base), np.array((*old.place[:2], old.yaw)))
-        x, y, yaw = _between(base, (float(here[0]), float(here[1]), float(here[2])))
+        x, y, yaw = between(np.array(base), here).tolist()
         turn = _into_base(base) @ _into_base(old.base).T
         spread = turn @ np.array(old.spread).reshape(3, 3) @ turn.T
         new = replace(old, base=base, place=(x, y, old.place[2]), yaw=yaw, spread=tuple(spread.ravel().tolist()))
@@ -317,12 +317,6 @@ def _into_base(base: Vector) -> Array:
     """Turns (x, y, yaw) of map into base's axes, (3, 3)."""
     c, s = math.cos(base[2]), math.sin(base[2])
     return np.array(((c, s, 0.0), (-s, c, 0.0), (0.0, 0.0, 1.0)))
-
-
-def _between(base: Vector, place: Vector) -> tuple[float, float, float]:
-    c, s = math.cos(base[2]), math.sin(base[2])
-    dx, dy = place[0] - base[0], place[1] - base[1]
-    return c * dx + s * dy, -s * dx + c * dy, math.remainder(place[2] - base[2], math.tau)
 
 
 def nearest(trail: Sequence[tuple[int, Vector]], place: Vector) -> tuple[int, Vector]:

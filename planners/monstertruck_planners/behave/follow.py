@@ -12,7 +12,7 @@ from typing import Annotated, Any, ClassVar, Final, Literal, NamedTuple, Self
 
 from pydantic import Field
 
-from monstertruck_kinematics.elementary import KinematicsError
+from monstertruck_kinematics.elementary import KinematicsError, to_body, to_world
 from monstertruck_planners.behave.api import BehaviourBody, BehaviourConfig, BehaviourStep, Inputs, RequestedMotion
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.base import Pose2D
@@ -147,9 +147,7 @@ def length(points: tuple[Point, ...]) -> float:
 
 def along(leader: Peer, me: Pose2D) -> float:
     """Speed with which the leader drives away from the follower, m/s; one that comes nearer has none."""
-    yaw = leader.pose.yaw
-    vx = leader.twist.vx * math.cos(yaw) - leader.twist.vy * math.sin(yaw)
-    vy = leader.twist.vx * math.sin(yaw) + leader.twist.vy * math.cos(yaw)
+    vx, vy = to_world(leader.pose.yaw, leader.twist.vx, leader.twist.vy)
     away = vx * (leader.pose.x - me.x) + vy * (leader.pose.y - me.y)
     return math.hypot(vx, vy) if away > 0.0 else 0.0
 
@@ -165,8 +163,7 @@ def curvature(me: Pose2D, points: tuple[Point, ...], ahead: float) -> float:
             break
         here, left = point, left - step
     dx, dy = target.x - me.x, target.y - me.y
-    c, s = math.cos(me.yaw), math.sin(me.yaw)
-    forward, aside = c * dx + s * dy, c * dy - s * dx
+    forward, aside = to_body(me.yaw, dx, dy)
     apart = max(math.hypot(dx, dy), SPACING)
     if forward < 0.0:
         return math.copysign(2.0 / ahead, aside)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from monstertruck_kinematics.elementary import Array
+from monstertruck_planners.collision import points_relative
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.mailbox import Mailbox
 from monstertruck_runtime.ports import Publisher, Ready
@@ -88,9 +89,7 @@ def sonars_of(scan: LaserScan, mount: tuple[float, float, float], config: LidarS
 
 def _cut(points: Array, joined: NDArray[np.bool_], place: Mount) -> tuple[float, int] | tuple[None, None]:
     """Range at which the axis first cuts the surfaces, m, and the number of the beam before; None = it does not."""
-    c, s = math.cos(place.yaw), math.sin(place.yaw)
-    dx, dy = points[:, 0] - place.x, points[:, 1] - place.y
-    along, aside = c * dx + s * dy, c * dy - s * dx
+    along, aside = points_relative(points, (place.x, place.y, place.yaw)).T
     crossing = joined & (aside[:-1] * aside[1:] <= 0.0) & (aside[:-1] != aside[1:])
     at = crossing.nonzero()[0]
     share = aside[at] / (aside[at] - aside[at + 1])

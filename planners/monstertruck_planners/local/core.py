@@ -11,7 +11,7 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from monstertruck_kinematics.elementary import Array
-from monstertruck_planners.collision import DistanceField
+from monstertruck_planners.collision import DistanceField, points_relative
 from monstertruck_planners.collision_kernels import FieldData, FootprintData, safe_distance
 from monstertruck_planners.local.api import (
     CUSP_REACHED,
@@ -197,10 +197,7 @@ class LocalPlannerCore:
         """Whether the circle around the footprint is ``inset`` inside the window, for each pose."""
         rows, columns = (n - 2 for n in obstacles.data().occupied.shape)
         size = np.array([columns, rows]) * obstacles.resolution
-        x, y, yaw = obstacles.origin
-        dx, dy = poses[:, 0] - x, poses[:, 1] - y
-        c, s = math.cos(yaw), math.sin(yaw)
-        places = np.column_stack((dx * c + dy * s, dy * c - dx * s))
+        places = points_relative(poses, obstacles.origin)
         inset += self.vehicle.footprint.circumscribed_radius
         return np.asarray(((places > inset) & (places < size - inset)).all(axis=1))
 
