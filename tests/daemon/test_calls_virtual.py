@@ -1,0 +1,39 @@
+"""The remote calls of a robot with everything are those of the page on Zenoh."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
+from monstertruck_schemas.roles import AccessRole
+from monstertruckd.bus.rpc import Handler, Rpc
+from monstertruckd.config.load import load_config
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig
+from monstertruckd.tools.simulation.virtual_rig import VirtualRig
+
+pytestmark = [pytest.mark.virtual, pytest.mark.timeout(120)]
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def test_the_page_on_zenoh_lists_every_call_with_its_role(monkeypatch: pytest.MonkeyPatch):
+    served = {"topics": AccessRole.OBSERVER}  # by the bridge, which the virtual clock has not
+    register = Rpc.register
+
+    def note(rpc: Rpc, name: str, handler: Handler, role: AccessRole = AccessRole.PILOT) -> None:
+        served[name] = role
+        register(rpc, name, handler, role)
+
+    monkeypatch.setattr(Rpc, "register", note)
+
+    async def main(clock: VirtualClock) -> None:
+        config, _ = load_config(ROOT / "configs" / "points.yaml", SimulatedTruckConfig)
+        async with VirtualRig(config.model_copy(update={"recorder": None, "blackbox": None}), clock).running():
+            await clock.sleep(0.05)
+
+    run_virtual(main, start=SECOND)
+    page = (ROOT / "docs" / "zenoh.md").read_text(encoding="utf-8")
+    table = re.findall(r"^\| (`.*?) \| (pilot|observer|engineer) \|", page, re.MULTILINE)
+    listed = {name: AccessRole(role) for names, role in table for name in re.findall(r"`(\w+)`", names)}
+    assert listed == served
