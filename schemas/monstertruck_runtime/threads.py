@@ -94,7 +94,10 @@ class ThreadHop(Generic[T]):
                     self._discard(item)
             return
         if self._rank is None:
-            item = items.popleft() if items else None  # whoever makes room leaves one
+            try:  # as ``_pop``, without the call
+                item = items.popleft()
+            except IndexError:
+                item = None
         else:
             with self._lock:
                 item = self._pop()

@@ -4,6 +4,7 @@ import asyncio
 import sys
 import threading
 import time
+from collections import deque
 
 import pytest
 
@@ -223,6 +224,25 @@ async def test_a_full_hop_loses_the_oldest_and_says_how_many():
     hop.put(6)
     await asyncio.sleep(0)
     assert got == [2, 3, 4]
+
+
+@pytest.mark.parametrize("rank", [None, lambda _: 0])
+async def test_a_thread_that_makes_room_late_may_take_the_last_item(rank):
+    class Raced(deque[int]):
+        """The sender has seen more than one item before; it makes room once the loop has found one to take."""
+
+        def __bool__(self) -> bool:
+            if (found := len(self) > 0) and self[0] == 1:
+                self.popleft()
+            return found
+
+    got: list[int] = []
+    hop: ThreadHop[int] = ThreadHop(got.append, 1, lambda _: None, rank)
+    hop._items = Raced()
+    for item in (1, 2):
+        hop.put(item)
+        await asyncio.sleep(0.01)
+    assert got[-1:] == [2]
 
 
 @pytest.mark.parametrize("rank", [None, lambda item: item[0] % 3])
