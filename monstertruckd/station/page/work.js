@@ -99,7 +99,9 @@ export class Work {
 
   async resumeMission(more = {}) {
     const answer = await this.ask("task.mission", { do: "mission", order: "resume", ...more });
-    this.elsewhere = answer.reason === "pose_lost"; // the robot is not where it was interrupted
+    // The robot is not where it was interrupted; one that does not know its place on a saved map has to find it.
+    const placeless = ["searching", "outside"].includes(this.link.newest.slam?.standing);
+    this.elsewhere = answer.reason === "pose_lost" && !placeless;
     this.showTasks();
   }
 

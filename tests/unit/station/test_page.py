@@ -184,6 +184,10 @@ async def a_mission_of_a_robot_that_was_moved_goes_on_once_that_is_said(page: Pa
     assert await page.inner_text("#mission-state") == "interrupted at step 2"
     assert not await page.is_visible("#mission-moved"), "unless the robot asks"
     refused = {"ok": False, "reason": "pose_lost", "text": "its pose is 3.0 m from where round was interrupted"}
+    await say(page, {"kind": "slam", "m": {"standing": "searching", "overlap": 0.0}})
+    await press("#mission-resume", **refused | {"text": "its place on the saved map is not known (searching)"})
+    assert not await page.is_visible("#mission-moved"), "its pose is not right"
+    await say(page, {"kind": "slam", "m": {"standing": "localised", "overlap": 0.9}})
     assert await press("#mission-resume", **refused) == {"do": "mission", "order": "resume"}
     assert "3.0 m from where" in await page.inner_text("#refusal")
     assert await press("#mission-moved", ok=True) == {"do": "mission", "order": "resume", "moved": True}
