@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Final, TypeVar
 
 from monstertruck_runtime.client import TruckClient
-from monstertruck_runtime.errors import NoAnswerError, TruckError
+from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError, TruckError
 from monstertruck_runtime.mailbox import Mailbox, fifo
 from monstertruck_runtime.presence import while_it_runs
 from monstertruck_runtime.requests import Operator
@@ -172,11 +172,9 @@ async def _run(
         NoAnswerError: the robot does not answer, or has been silent for a minute.
     """
     with client.subscribe(topic, fifo(256)) as states:
-        if arm:
-            await client.arm()
         number: int | None = None
         try:
-            number = int((await start())["number"])
+            number = await _started(client, start, arm=arm)
             return await while_it_runs(client, _followed(states, number, show, figures))
         except BaseException as error:
             if not isinstance(error, TruckError) or isinstance(error, NoAnswerError):
@@ -185,6 +183,22 @@ async def _run(
                     if to_its_end and number is not None and isinstance(error, asyncio.CancelledError):
                         return await while_it_runs(client, _followed(states, number, show, figures))
             raise
+
+
+async def _started(client: Operator, start: Callable[[], Awaitable[dict[str, Any]]], *, arm: bool) -> int:
+    """Number of what was started. The robot is armed only when nothing else is in the way: its path would be driven.
+
+    Raises:
+        RequestRefusedError: the start or the arming was refused.
+        NoAnswerError: the robot does not answer.
+    """
+    try:
+        return int((await start())["number"])
+    except RequestRefusedError as refused:
+        if not arm or refused.refusal is not Reason.DISARMED:
+            raise
+    await client.arm()
+    return int((await start())["number"])
 
 
 async def _followed(states: Mailbox[S], number: int, show: Callable[[S], None], figures: tuple[str, ...]) -> RunEnd:

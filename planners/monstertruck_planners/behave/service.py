@@ -173,9 +173,10 @@ class BehaviourService:
             raise RequestRefusedError(
                 Reason.BUSY, f"the behaviour {run.name} of {run.source} is running, stop it first"
             )
+        moves = gate is not None and gate.mode.accepts_motion
         if (other := self._other_planner(now)) is not None:
-            raise RequestRefusedError(Reason.BUSY, other)
-        if gate is None or not gate.mode.accepts_motion:
+            raise RequestRefusedError(Reason.BUSY, other if moves else f"{other} as soon as the robot is armed")
+        if not moves:
             raise does_not_drive(gate)
         if (stale := self._stale(behaviour, now)) is not None:
             raise RequestRefusedError(Reason.INPUT_STALE, stale)

@@ -222,7 +222,14 @@ def test_a_goal_or_a_path_that_is_followed_excludes_it():
         assert "goal 3 of bob" in str(goal)
         bench.say_goal(GoalPhase.IDLE)
         bench.say_tracker(Reason.DRIVING)
-        assert "bend" in str(refused(bench))
+        assert str(refused(bench)) == "the path 'bend' is followed"
+        bench.mode = GateMode.DISARMED
+        await bench.clock.sleep(0.2)
+        bench.say_tracker(Reason.DRIVING)
+        waits = refused(bench)
+        assert (waits.refusal, str(waits)) == (Reason.BUSY, "the path 'bend' is followed as soon as the robot is armed")
+        bench.mode = GateMode.ARMED
+        await bench.clock.sleep(0.2)
         bench.say_tracker(Reason.GOAL_REACHED)
         bench.start()
         bench.say_tracker(Reason.DRIVING)

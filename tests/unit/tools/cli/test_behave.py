@@ -29,8 +29,8 @@ def state(number=1, *, running=True, outcome=Reason.DRIVING, text=""):
 class Robot:
     """Answers with the reports given, one a second."""
 
-    def __init__(self, clock, *reports, refuses=None):
-        self.clock, self.reports, self.refuses = clock, reports, refuses
+    def __init__(self, clock, *reports, refuses=None, armed=True):
+        self.clock, self.reports, self.refuses, self.armed = clock, reports, refuses, armed
         self.orders = []
         self.tasks = []
 
@@ -52,6 +52,7 @@ class Robot:
 
     async def arm(self, *, hold=False):
         self.orders.append("arm")
+        self.armed = True
 
     async def behave(self, order, behaviour="", settings=None, *, own=False):
         assert own is (order is BehaviourOrder.STOP), "nobody else's is stopped"
@@ -59,6 +60,8 @@ class Robot:
         if order is BehaviourOrder.START:
             if self.refuses is not None:
                 raise self.refuses
+            if not self.armed:
+                raise RequestRefusedError(Reason.DISARMED, "the robot does not drive: the truck is disarmed")
             self.tasks.append(asyncio.create_task(self._report()))
         return {"number": 1}
 
@@ -68,9 +71,9 @@ class Robot:
             self.box.put(report)
 
 
-def run(*reports, arm=False, refuses=None, seconds=60.0):
+def run(*reports, arm=False, refuses=None, seconds=60.0, armed=True):
     async def main(clock: VirtualClock):
-        robot = Robot(clock, *reports, refuses=refuses)
+        robot = Robot(clock, *reports, refuses=refuses, armed=armed)
         try:
             async with clock.deadline(seconds):
                 return robot, await run_behaviour(robot, "wall", arm=arm)
@@ -82,9 +85,9 @@ def run(*reports, arm=False, refuses=None, seconds=60.0):
 
 def test_it_ends_with_the_behaviours_own_end():
     done = state(running=False, outcome=Reason.BEHAVIOUR_DONE, text="1 lap")
-    robot, end = run(state(), state(), done, arm=True)
+    robot, end = run(state(), state(), done, arm=True, armed=False)
     assert (end.reason, end.text, end.figures["travelled"]) == (Reason.BEHAVIOUR_DONE, "1 lap", 0.3)
-    assert robot.orders == ["arm", BehaviourOrder.START]
+    assert robot.orders == [BehaviourOrder.START, "arm", BehaviourOrder.START]
     assert end.as_json()["values"] == {"distance": 0.3}
 
 
@@ -106,6 +109,15 @@ def test_a_robot_that_was_started_anew_is_not_asked_to_stop_what_it_can_go_on_wi
     assert isinstance(end, RequestRefusedError)
     assert "restarted" in str(end)
     assert robot.orders == [BehaviourOrder.START]
+
+
+def test_a_robot_that_would_drive_something_else_is_not_armed():
+    robot, end = run(arm=True, armed=False, refuses=RequestRefusedError(Reason.BUSY, "the path 'bend' is followed"))
+    assert end.refusal is Reason.BUSY
+    assert robot.orders == [BehaviourOrder.START]
+    robot, end = run(armed=False)
+    assert end.refusal is Reason.DISARMED
+    assert robot.orders == [BehaviourOrder.START], "without --arm"
 
 
 @pytest.mark.parametrize(

@@ -79,7 +79,7 @@ def test_it_is_followed_to_its_end_and_printed_in_short_lines():
         5.0,
         12.0,
     )
-    assert robot.orders == [("arm",), (ExploreOrder.START, True, 60.0)]
+    assert robot.orders == [(ExploreOrder.START, True, 60.0)], "it is armed"
     assert len(lines) == 3
     assert "to (12.0, -3.0)" in lines[0]
     assert all(len(line) < 80 for line in lines)
