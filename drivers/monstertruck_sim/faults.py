@@ -213,6 +213,11 @@ def command(role: str, *lines: str) -> Action[SimContext]:
     return lambda context: context.command(role, *lines)
 
 
+def monitored(name: str, fault: str, *values: str) -> Action[SimContext]:
+    """Change what a monitor sees."""
+    return lambda context: context.monitored(name, fault, *values)
+
+
 def exchange_cables(one: str, other: str) -> Action[SimContext]:
     """Each device's cable in the other's port; the same again undoes it."""
     return lambda context: context.exchange_cables(one, other)
@@ -583,23 +588,12 @@ def _obstacle(rng: np.random.Generator) -> CatalogFault:
 def _network(rng: np.random.Generator) -> CatalogFault:
     """Interface gone, or no signal."""
     lost, back = (("remove",), ("plug",)) if rng.random() < 0.5 else (("signal", "-95"), ("signal", "-55"))
-
-    def lose(context: SimContext) -> None:
-        context.monitored("link", *lost)
-
-    def give_back(context: SimContext) -> None:
-        context.monitored("link", *back)
-
+    lose, give_back = monitored("link", *lost), monitored("link", *back)
     return _fault(FaultKind.NETWORK, lost[0], lose, give_back, float(rng.uniform(1.5, 3.0)))
 
 
 def _memory(rng: np.random.Generator) -> CatalogFault:
-    def fill(context: SimContext) -> None:
-        context.monitored("host", "memory", "0.01")
-
-    def free(context: SimContext) -> None:
-        context.monitored("host", "memory", "0.6")
-
+    fill, free = monitored("host", "memory", "0.01"), monitored("host", "memory", "0.6")
     return _fault(FaultKind.MEMORY, "", fill, free, float(rng.uniform(1.5, 3.0)))
 
 
