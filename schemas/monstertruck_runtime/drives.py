@@ -83,7 +83,7 @@ async def drive_to(
         async def cancel() -> None:
             await driver.goal_control(GoalOrder.CANCEL, own=True)
 
-        async with _taken_back(cancel):
+        async with taken_back(cancel):
             number = await _taken_on(driver, clock, goal, via, report)
         end = _goal_end(states, number, report)
         return await _watched(driver, clock, stand, arm=arm, end=end, undo=cancel, report=report)
@@ -115,7 +115,7 @@ async def _taken_on(
 
 
 @asynccontextmanager
-async def _taken_back(undo: Callable[[], Awaitable[object]]) -> AsyncIterator[None]:
+async def taken_back(undo: Callable[[], Awaitable[object]]) -> AsyncIterator[None]:
     """``undo`` a request inside that is cancelled or not answered: the robot may carry it out all the same."""
     try:
         yield
@@ -158,7 +158,7 @@ async def follow(driver: TruckClient, clock: Clock, path: Path, *, arm: bool, re
             async with clock.deadline(STAND_TIMEOUT):
                 while (await stand.gate.next()).mode.moving:
                     pass
-        async with _taken_back(driver.stop):
+        async with taken_back(driver.stop):
             await driver.path(path)
             await _accepted(driver, clock, events, present, path.name)
         end = _path_end(clock, states, path.name, report)
@@ -208,7 +208,7 @@ async def _watched(
         if arm and not ((state := stand.gate.latest) is not None and state.mode.active):
             # A truck that is armed already may have set off.
             try:
-                async with _taken_back(driver.disarm):
+                async with taken_back(driver.disarm):
                     await driver.arm()
             except RequestRefusedError as error:
                 raise RequestRefusedError(error.refusal, f"arm refused: {error}") from None

@@ -1,12 +1,12 @@
 """Runs of a wall-following behaviour with gains of the recipe, each from a step of the distance wanted."""
 
-import asyncio
 import math
 from collections.abc import Awaitable, Callable, Generator, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from typing import Any, Final, NamedTuple
 
+from monstertruck_runtime.drives import taken_back
 from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError, TruckError
 from monstertruck_runtime.mailbox import Mailbox, fifo
 from monstertruck_runtime.requests import Operator
@@ -76,12 +76,8 @@ async def tune(
         RequestRefusedError: arming or a start is refused, or the behaviour ended before the run was complete.
         NoAnswerError: the robot does not answer.
     """
-    try:
+    async with taken_back(client.disarm):
         await client.arm()
-    except (NoAnswerError, asyncio.CancelledError):  # it may have armed all the same
-        with suppress(TruckError):
-            await client.disarm()
-        raise
     try:
         return await _tuned(client, name, distance, recipe(first), seconds, pause, report)
     finally:
