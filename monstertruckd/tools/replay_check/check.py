@@ -25,7 +25,7 @@ from monstertruckd.tools.logs.messages import first_offset
 from monstertruckd.tools.replay_check.chain import WORKER, Chain, outputs_of, unseen_ticks, why_no_goals, without_goals
 from monstertruckd.tools.replay_check.comparison import TopicComparison
 from monstertruckd.tools.replay_check.pace import PacedClock
-from monstertruckd.tools.replay_check.recorded import RunLog, Survey, preamble, recorded_config, run_of, survey
+from monstertruckd.tools.replay_check.recorded import RunLog, Survey, recorded_config, run_of, survey
 from monstertruckd.tools.replay_check.result import Check, Unreadable
 
 RESTS_ON_WORKER: Final = frozenset(
@@ -63,7 +63,7 @@ def check_log(
     log, until = run_of(log)
     reader = RunLog(log, until)
     found = survey(reader)
-    attachments, metadata = preamble(reader)
+    attachments = reader.first.attachments()
     own = recorded_config(log, attachments)
     used = own if config is None else load_truck(config)[0]
     left_out = why_no_goals(own, used, found.goals)
@@ -71,7 +71,7 @@ def check_log(
         own, used = without_goals(own), without_goals(used)
     compared = outputs_of(own) | outputs_of(used)
     _refuse_the_middle(log, found, compared)
-    virtual = first_offset(log, metadata) == 0
+    virtual = first_offset(log, reader.first.metadata().get("run", {})) == 0
     loose, shown = (frozenset[str](),) * 2 if virtual else _inexact(own, used)
     comparisons = {
         topic.name: TopicComparison(

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from mcap.records import Attachment, McapRecord, Metadata
 from pydantic import ValidationError
 
 from monstertruck_runtime.errors import ConfigError, InputError, TruckError
@@ -100,9 +99,10 @@ class RunLog:
         """Bytes an iteration has read so far."""
         return self._before + self._reader.position
 
-    def preamble(self) -> Iterator[McapRecord]:
-        """The records before the first message."""
-        return self._readers[0].preamble()
+    @property
+    def first(self) -> LogReader:
+        """Of the first part: what is attached there is of the run."""
+        return self._readers[0]
 
     def __iter__(self) -> Iterator[LogMessage]:
         """What begins a later part that stood in an earlier one, the newest of every retained topic, comes but once."""
@@ -138,14 +138,8 @@ def _alike(one: Identity, other: Identity) -> bool:
 
 
 def _identity(reader: LogReader) -> Identity:
-    run: dict[str, str] = {}
-    attached: dict[str, bytes] = {}
-    for record in reader.preamble():
-        if isinstance(record, Attachment) and record.name in ALIKE:
-            attached[record.name] = record.data
-        elif isinstance(record, Metadata) and record.name == "run":
-            run = dict(record.metadata)
-    return run, attached
+    attached = reader.attachments()
+    return reader.metadata().get("run", {}), {name: attached[name] for name in ALIKE if name in attached}
 
 
 SIMULATION: Final = "sim"
@@ -207,18 +201,6 @@ def _note_ready(entry: LogMessage, ready: dict[str, int]) -> None:
         event = entry.decode()
         if isinstance(event, Event) and event.reason is Reason.DEVICE_READY:
             ready.setdefault(event.source, entry.log_time)
-
-
-def preamble(log: RunLog) -> tuple[dict[str, bytes], dict[str, str]]:
-    """Attachments by name, and what the log says of its run."""
-    attachments: dict[str, bytes] = {}
-    run: dict[str, str] = {}
-    for record in log.preamble():
-        if isinstance(record, Attachment):
-            attachments[record.name] = record.data
-        elif isinstance(record, Metadata) and record.name == "run":
-            run = dict(record.metadata)
-    return attachments, run
 
 
 def recorded_config(log: Path, attachments: Mapping[str, bytes]) -> TruckConfig:

@@ -6,7 +6,7 @@ from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas import topics
 from monstertruckd.recorder.reader import LogMessage
 from monstertruckd.tools.replay_check.chain import unseen_ticks
-from monstertruckd.tools.replay_check.recorded import RunLog, Survey, preamble, recorded_config
+from monstertruckd.tools.replay_check.recorded import RunLog, Survey, recorded_config
 from tests.unit.tools.replay_check.log_surgery import LEVEL
 
 PERIOD = SECOND // 50
@@ -28,7 +28,7 @@ def survey(drive: int, odometry: int) -> Survey:
     ],
 )
 def test_none_comes_between_the_first_reading_and_the_first_output(late: int, expected: list[int]):
-    config = recorded_config(LEVEL, preamble(RunLog(LEVEL))[0])
+    config = recorded_config(LEVEL, RunLog(LEVEL).first.attachments())
     assert config.odometry.rate == 50
     log = survey(SECOND + 81_000_000, SECOND + 100_000_000 + late)
     assert [tick for tick, service in unseen_ticks(config, log) if service == "odometry"] == expected

@@ -19,7 +19,7 @@ from monstertruckd.tools.replay_check import check_log
 from monstertruckd.tools.replay_check.chain import Chain
 from monstertruckd.tools.replay_check.comparison import Kind
 from monstertruckd.tools.replay_check.pace import Pace, PacedClock
-from monstertruckd.tools.replay_check.recorded import RunLog, preamble, recorded_config, survey
+from monstertruckd.tools.replay_check.recorded import RunLog, recorded_config, survey
 from monstertruckd.tools.replay_check.result import ROUNDING
 from tests.unit.tools.replay_check.log_surgery import (
     BY_NAME,
@@ -69,7 +69,7 @@ class NotedTurns(Pace):
 
 def test_ground_is_given_as_recorded_no_pictures_are_read_and_silent_ticks_have_their_turn():
     log = RunLog(GOALS)
-    config = recorded_config(GOALS, preamble(log)[0]).model_copy(update={"points": PointsConfig()})
+    config = recorded_config(GOALS, log.first.attachments()).model_copy(update={"points": PointsConfig()})
     assert config.ground is not None, "it was computed when the log was recorded"
     found = survey(log)
 
