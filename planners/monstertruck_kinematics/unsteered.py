@@ -3,16 +3,34 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 
-from monstertruck_kinematics.drive import TWIST, Twist, refuse, require_limit, scaled_alike, stacked, unpacked
+from monstertruck_kinematics.drive import TWIST, Drive, Twist, refuse, require_limit, scaled_alike, stacked, unpacked
 from monstertruck_kinematics.elementary import Array, KinematicsError, Real, require_finite, require_positive
 from monstertruck_kinematics.wheels import CasterWheel, FixedWheel, SwedishWheel, Wheel, rolling_matrix
 
 
+class UnsteeredDrive(Drive, Protocol):
+    """A drive whose command is its wheels' rates: the twist is linear in them."""
+
+    max_rate: float
+
+    def limited(self, command: Sequence[Real]) -> tuple[Real, ...]:
+        """All rates scaled alike: same path, slower."""
+        return scaled_alike(unpacked(command, self.inputs), self.max_rate)
+
+    def jacobian(self, command: Sequence[Real]) -> Array:
+        """Constant: the twists of single wheels at 1 rad/s."""
+        rates = unpacked(command, self.inputs)
+        alone = np.eye(len(rates)).tolist()
+        columns = [self.forward([on + 0.0 * rate for on, rate in zip(row, rates, strict=True)]) for row in alone]
+        return stacked(list(zip(*columns, strict=True)))
+
+
 @dataclass(frozen=True)
-class Differential:
+class Differential(UnsteeredDrive):
     """Differential drive about the middle of its axle: v = r (w_R + w_L)/2, omega = r (w_R - w_L)/track.
 
     Args:
@@ -51,17 +69,6 @@ class Differential:
         lean = wz * (0.5 * self.track)
         return (vx - lean) / self.radius, (vx + lean) / self.radius
 
-    def limited(self, command: Sequence[Real]) -> tuple[Real, ...]:
-        """Both rates scaled alike: same path, slower."""
-        return scaled_alike(unpacked(command, self.inputs), self.max_rate)
-
-    def jacobian(self, command: Sequence[Real]) -> Array:
-        """Constant."""
-        left, _ = unpacked(command, self.inputs)
-        zero = 0.0 * left
-        half, turn = zero + 0.5 * self.radius, zero + self.radius / self.track
-        return stacked([[half, half], [zero, zero], [-turn, turn]])
-
     def wheels(self, command: Sequence[float]) -> tuple[Wheel, ...]:
         """Two fixed wheels and the roller ball that balances them."""
         unpacked(command, self.inputs)
@@ -74,7 +81,7 @@ class Differential:
 
 
 @dataclass(frozen=True)
-class SkidSteer:
+class SkidSteer(UnsteeredDrive):
     """Skid-steer drive (skid-steer paper, eqs. 1-11, and their extension by ICR parameters).
 
     One model covers four cases. Each side's tread moves as if it turned about its own ICR on the lateral axis: at the
@@ -147,24 +154,6 @@ class SkidSteer:
             (vx - self.icr_right * wz) / (self.gain_right * self.radius),
         )
 
-    def limited(self, command: Sequence[Real]) -> tuple[Real, ...]:
-        """Both rates scaled alike: same path, slower."""
-        return scaled_alike(unpacked(command, self.inputs), self.max_rate)
-
-    def jacobian(self, command: Sequence[Real]) -> Array:
-        """Constant."""
-        left, _ = unpacked(command, self.inputs)
-        zero = 0.0 * left
-        width = self.icr_left - self.icr_right
-        by_left, by_right = self.gain_left * self.radius / width, self.gain_right * self.radius / width
-        return stacked(
-            [
-                [zero - by_left * self.icr_right, zero + by_right * self.icr_left],
-                [zero + by_left * self.icr_x, zero - by_right * self.icr_x],
-                [zero - by_left, zero + by_right],
-            ]
-        )
-
     def wheels(self, command: Sequence[float]) -> tuple[Wheel, ...]:
         """Four fixed wheels where the sides' centres lie: without slip they could only go straight."""
         unpacked(command, self.inputs)
@@ -180,7 +169,7 @@ class SkidSteer:
 
 
 @dataclass(frozen=True)
-class SwedishDrive:
+class SwedishDrive(UnsteeredDrive):
     """Any set of driven Swedish wheels.
 
     With more than three wheels a command may contradict itself; forward is then the least-squares twist.
@@ -225,16 +214,6 @@ class SwedishDrive:
         """Wheel rates for any twist."""
         components = unpacked(twist, TWIST)
         return tuple(_combined(row, components) for row in self.rates_of_twist.tolist())
-
-    def limited(self, command: Sequence[Real]) -> tuple[Real, ...]:
-        """All rates scaled alike: same path, slower."""
-        return scaled_alike(unpacked(command, self.inputs), self.max_rate)
-
-    def jacobian(self, command: Sequence[Real]) -> Array:
-        """Constant."""
-        rates = unpacked(command, self.inputs)
-        rows = self.twist_of_rates.tolist()
-        return stacked([[weight + 0.0 * rate for weight, rate in zip(row, rates, strict=True)] for row in rows])
 
     def wheels(self, command: Sequence[float]) -> tuple[Wheel, ...]:
         """The wheels."""
