@@ -239,7 +239,10 @@ class Station:
                 self._remarks.add(peer, f"{count} connections of {peer}, {count - MOST_CONNECTIONS} are closed")
 
     def _follow(self, feed: RobotFeed | ReplayFeed) -> None:
+        """Follow it, and offer it in every browser."""
         self._following[feed] = asyncio.create_task(feed.run())
+        for viewer in self._viewers:
+            viewer.send(frames.text("robots", names=self.names))
 
     def _drop_replay(self) -> None:
         """Make room for another recording: the oldest that nobody looks at goes.
@@ -286,8 +289,6 @@ class Station:
                 file.unlink(missing_ok=True)
             self.replays[title] = feed
         self._follow(feed)
-        for each in self._viewers:
-            each.send(frames.text("robots", names=self.names))
         return title
 
     def _found(self, address: RobotAddress) -> None:
@@ -297,8 +298,6 @@ class Station:
         log.info("robot %s appeared at %s", address.name, address.endpoint)
         self.feeds[address.name] = RobotFeed(address, self._clock)
         self._follow(self.feeds[address.name])
-        for viewer in self._viewers:
-            viewer.send(frames.text("robots", names=self.names))
 
     def application(self) -> web.Application:
         """All routes."""

@@ -9,7 +9,7 @@ from typing import Final
 
 from monstertruck_estimation.body_tilt import GRAVITY, Tilt
 from monstertruck_estimation.gyro import Gyro, GyroConfig
-from monstertruck_estimation.transforms import Quaternion, Vector, rotate
+from monstertruck_estimation.transforms import Quaternion, Vector, added, rotate
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.mailbox import Mailbox
 from monstertruck_runtime.ports import EventSink
@@ -48,9 +48,9 @@ class InertialTilt:
         if self._up is None or dt > GAP or stamp - self._felt > UNSURE * SECOND:
             up = felt
         else:
-            up = _sum(self._up, _scaled(_cross(self._up, rate), dt))
+            up = added(self._up, _scaled(_cross(self._up, rate), dt))
             if felt is not None:
-                up = _sum(_scaled(up, 1.0 - dt / SETTLE), _scaled(felt, dt / SETTLE))
+                up = added(_scaled(up, 1.0 - dt / SETTLE), _scaled(felt, dt / SETTLE))
         self._up = None if up is None else _scaled(up, 1.0 / math.hypot(*up))
         self._stamp = stamp
 
@@ -90,7 +90,7 @@ class Inertial:
 
     def _in_base(self, vector: Vector3) -> Vector:
         x, y, z = self._axes
-        return _sum(_sum(_scaled(x, vector.x), _scaled(y, vector.y)), _scaled(z, vector.z))
+        return added(added(_scaled(x, vector.x), _scaled(y, vector.y)), _scaled(z, vector.z))
 
 
 class InertialInput:
@@ -130,10 +130,6 @@ class InertialInput:
 
 def _scaled(vector: Vector, by: float) -> Vector:
     return vector[0] * by, vector[1] * by, vector[2] * by
-
-
-def _sum(a: Vector, b: Vector) -> Vector:
-    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
 def _cross(a: Vector, b: Vector) -> Vector:

@@ -84,7 +84,7 @@ def compose(outer: Transform, inner: Transform) -> Transform:
         parent=outer.parent,
         child=inner.child,
         stamp=min(outer.stamp, inner.stamp) or max(outer.stamp, inner.stamp),
-        translation=_sum(outer.translation, shifted),
+        translation=added(outer.translation, shifted),
         rotation=multiply(outer.rotation, inner.rotation),
     )
 
@@ -121,7 +121,8 @@ def planar_pose(transform: Transform) -> Vector:
     return x, y, yaw_of(transform.rotation)
 
 
-def _sum(a: Vector, b: Vector) -> Vector:
+def added(a: Vector, b: Vector) -> Vector:
+    """Sum of two vectors."""
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 

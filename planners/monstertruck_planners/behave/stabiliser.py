@@ -32,7 +32,7 @@ import numpy as np
 from pydantic import Field
 
 from monstertruck_estimation.body_tilt import KEPT, BodyAcceleration, Tilt
-from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.elementary import Array, clip
 from monstertruck_runtime.clock import SECOND, Clock, Schedule
 from monstertruck_runtime.mailbox import Mailbox, fifo, latest
 from monstertruck_runtime.ports import BusPort, Publisher, Ready, Subscription
@@ -108,17 +108,13 @@ def goals(tilt: Tilt | None, before: Joints, dt: float, config: StabiliserConfig
     wanted = SQUARE if tilt is None else level(tilt)
     step = config.max_rate * dt
     return Joints(
-        pitch=_towards(before.pitch, _clip(wanted.pitch, config.pitch_limit), step),
-        roll=_towards(before.roll, _clip(wanted.roll, config.roll_limit), step),
+        pitch=_towards(before.pitch, clip(wanted.pitch, -config.pitch_limit, config.pitch_limit), step),
+        roll=_towards(before.roll, clip(wanted.roll, -config.roll_limit, config.roll_limit), step),
     )
 
 
-def _clip(value: float, limit: float) -> float:
-    return min(max(value, -limit), limit)
-
-
 def _towards(before: float, wanted: float, step: float) -> float:
-    return before + _clip(wanted - before, step)
+    return before + clip(wanted - before, -step, step)
 
 
 class TiltFilter:

@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Final, Literal, NamedTuple
 
 import numpy as np
 
-from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.elementary import Array, clip
 from monstertruck_kinematics.profiles import CubicRamp, TimedRamp, shortest_ramp
 from monstertruck_planners.behave.api import BehaviourStep, Inputs, RequestedMotion
 from monstertruck_planners.behave.wall.config import WallLineConfig
@@ -264,7 +264,7 @@ class WallLine:
             pose=pose,
             travelled=state.travelled + distance,
             turned=state.turned + turn,
-            lag=(_clip(behind[0], LAG[0]), _clip(behind[1], LAG[1])),
+            lag=(clip(behind[0], -LAG[0], LAG[0]), clip(behind[1], -LAG[1], LAG[1])),
             before=t,
             strays=_strays(state.strays, (v, w), (speed, rate - bias), t),
         )
@@ -556,7 +556,7 @@ class WallLine:
             away = math.remainder(state.pose[2] - wall.heading, math.tau)
             stiff = config.stiffness
             target = state.v.at(t) * (max(min(error, stiff), -stiff) / stiff**2 - 2.0 * away / stiff)
-        return state._replace(w=self._ramp(state.w, _clip(target, TURNS), t))
+        return state._replace(w=self._ramp(state.w, clip(target, -TURNS, TURNS), t))
 
     def error(self, state: LineState) -> float:
         """Distance of the side sonar from the wall less the one wanted, m; of a state with a wall."""
@@ -649,10 +649,6 @@ def _between(poses: tuple[tuple[int, Pose, float], ...], stamp: int) -> tuple[Po
             pose = a[0] + part * (b[0] - a[0]), a[1] + part * (b[1] - a[1]), a[2] + part * turn
             return pose, slow + part * (fast - slow)
     return poses[0][1:]
-
-
-def _clip(value: float, limit: float) -> float:
-    return min(max(value, -limit), limit)
 
 
 def _values(state: LineState, error: float | None) -> dict[str, float]:
