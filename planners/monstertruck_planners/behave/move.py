@@ -69,7 +69,7 @@ class MoveConfig(BehaviourConfig):
     """Distance, m, backwards negative; null = the angle says it"""
     angle: float | None = None
     """Turn, rad, counter-clockwise positive; null = the length says it"""
-    bearing: Annotated[float, Field(ge=-math.pi, le=math.pi)] = 0.0
+    bearing: Annotated[float, Field(ge=-math.tau, le=math.tau)] = 0.0
     """Direction of travel in base, rad: 0 = ahead, 1.5708 = sideways to the left"""
     profile: Literal["trapezoid", "cubic", "ramp"] = "trapezoid"
     """Constant acceleration; cubic ramps over time; or cubic ramps from the present speed"""

@@ -6,7 +6,13 @@ import re
 
 import pytest
 
-from monstertruck_kinematics.chassis import Dimensions, differential_chassis, synchro_chassis, truck_chassis
+from monstertruck_kinematics.chassis import (
+    Dimensions,
+    differential_chassis,
+    omni_chassis,
+    synchro_chassis,
+    truck_chassis,
+)
 from monstertruck_kinematics.elementary import KinematicsError, integrate
 from monstertruck_kinematics.truck import DriveTrain
 from monstertruck_planners.behave.api import BehaviourBody, Inputs
@@ -160,6 +166,10 @@ def test_what_the_body_cannot_do_is_refused(body, settings, why):
 def test_settings_that_are_no_move_are_refused(settings, why):
     with pytest.raises(ValueError, match=why):
         MoveConfig(**settings)
+
+
+def test_a_bearing_may_be_half_a_turn_as_a_person_rounds_it():
+    Move(MoveConfig(length=1.0, bearing=3.1416), BehaviourBody(omni_chassis(SIZE), 0.4))
 
 
 def test_a_template_without_a_move_is_a_configuration_but_no_move():
