@@ -22,7 +22,7 @@ from monstertruck_estimation.slam.motion import find_offset
 from monstertruck_estimation.slam.registration import Cloud, register
 from monstertruck_estimation.slam.scans import Scan, ScanGeometry, prepare
 from monstertruck_kinematics.chassis import Chassis
-from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.elementary import Array, sinc
 from monstertruck_kinematics.fitting import FitResult, least_squares
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError, RequestRefusedError
@@ -320,7 +320,7 @@ def seen_motion(parameters: Array, distances: Array, turns: Array, travels: Arra
 def _arc(distance: float, crab: float, turn: float) -> Array:
     """Motion of the body on an arc that it travels at an angle to its axis."""
     half = turn / 2
-    chord = distance * (math.sin(half) / half if abs(half) > 1e-9 else 1.0)
+    chord = distance * sinc(half)
     return np.array((chord * math.cos(half + crab), chord * math.sin(half + crab), turn))
 
 

@@ -15,7 +15,7 @@ from typing import ClassVar, Final
 import numpy as np
 
 from monstertruck_kinematics.chassis import TruckChassis
-from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.elementary import Array, sinc
 from monstertruck_kinematics.fitting import FitResult, least_squares
 from monstertruck_runtime.errors import InputError, RequestRefusedError
 from monstertruck_schemas.reasons import Reason
@@ -257,7 +257,7 @@ class SquareModel:
         sigmas = np.array([math.hypot(leg.sigma, SLIP * math.sqrt(self._model.distance(leg))) for leg in legs])
         sides = np.array([square.side for square in squares])
         rolled = np.array([self._model.distance(square.legs[0]) for square in squares])
-        chords = np.array([_chord(square.legs[0].turn) for square in squares])
+        chords = np.array([sinc(square.legs[0].turn / 2) for square in squares])
         tapes = np.hypot(tape * math.sqrt(2), 0.002 * sides)
         ends = np.array([square.off for square in squares])
         place = np.hypot(PLACE, string * 2.0)
@@ -305,9 +305,3 @@ def intervals(fit: FitResult, measured: int) -> tuple[Interval, Interval, Interv
         raise InputError("the squares are off by more than 30 %: calibrate drive and steering first")
     distance, base, offset = (Interval(float(x), float(h)) for x, h in zip(fit.parameters, halves, strict=True))
     return distance, base, offset
-
-
-def _chord(turn: float) -> float:
-    """Chord of an arc over its length."""
-    half = turn / 2
-    return math.sin(half) / half if abs(half) > 1e-6 else 1.0

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from monstertruck_drivers.ax12.config import Ax12Config, JointConfig
 from monstertruck_drivers.ax12.protocol import STEP
+from monstertruck_estimation.scan_tilt import plane_slopes
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.errors import InputError, RequestRefusedError
 from monstertruck_schemas import topics
@@ -288,12 +289,8 @@ def _on_floor(
 
 def beams_up(body: RollPitch, joints: RollPitch, angles: Array) -> Array:
     """Rise of beams in the level frame, per metre: third row of Ry(p) Rx(r) Ry(a) Rx(b) on (cos, sin, 0); (n,)."""
-    row = np.array((-math.sin(body.pitch), math.sin(body.roll) * math.cos(body.pitch),
-                    math.cos(body.roll) * math.cos(body.pitch)))  # fmt: skip
-    a, b = joints
-    forward = np.array((math.cos(a), 0.0, -math.sin(a)))
-    left = np.array((math.sin(a) * math.sin(b), math.cos(b), math.cos(a) * math.sin(b)))
-    return np.asarray(np.cos(angles) * (row @ forward) + np.sin(angles) * (row @ left))
+    ahead, left = plane_slopes(body.roll, body.pitch, joints.pitch, joints.roll)
+    return np.asarray(np.cos(angles) * ahead + np.sin(angles) * left)
 
 
 def _check_range(name: str, joint: JointConfig, zero: float) -> None:
