@@ -141,7 +141,7 @@ async def _goal_end(states: Mailbox[GoalState], number: int, report: DriveReport
 
 
 async def follow(driver: TruckClient, clock: Clock, path: Path, *, arm: bool, report: DriveReport = SILENT) -> Arrival:
-    """Send a path and wait for its end; cancelled or without an answer, it stops the truck.
+    """Send a path and wait for its end; cancelled or without an answer, it stops the truck, but not on another path.
 
     Raises:
         RequestRefusedError: the path or the arming was refused, or the robot restarted.
@@ -161,8 +161,13 @@ async def follow(driver: TruckClient, clock: Clock, path: Path, *, arm: bool, re
         async with taken_back(driver.stop):
             await driver.path(path)
             await _accepted(driver, clock, events, present, path.name)
-        end = _path_end(clock, states, path.name, report)
-        return await _watched(driver, clock, stand, arm=arm, end=end, undo=driver.stop, report=report)
+
+        async def stop() -> None:
+            if _followed(present, path.name):
+                await driver.stop()
+
+        end = _path_end(clock, states, present, path.name, report)
+        return await _watched(driver, clock, stand, arm=arm, end=end, undo=stop, report=report)
 
 
 async def _accepted(
@@ -179,11 +184,21 @@ async def _accepted(
         raise NoAnswerError(f"the robot did not accept the path within {ACCEPT_TIMEOUT:g} s") from None
 
 
-async def _path_end(clock: Clock, states: Mailbox[TrackerState], name: str, report: DriveReport) -> Arrival:
-    begin = clock.now()
+def _followed(present: Mailbox[Path], name: str) -> bool:
+    """Whether the path of this name is the newest one."""
+    return present.latest is not None and present.latest.name == name
+
+
+async def _path_end(
+    clock: Clock, states: Mailbox[TrackerState], present: Mailbox[Path], name: str, report: DriveReport
+) -> Arrival:
+    begin, length = clock.now(), 0.0
     async for state in states:
+        if not _followed(present, name):
+            return Arrival(Reason.CANCELLED, "another path is followed now", length, (clock.now() - begin) / SECOND)
         if state.path != name:
             continue
+        length = state.length
         report.under_way("along the path", state.along / state.length if state.length else 1.0)
         if state.outcome is not Reason.DRIVING:
             text = f"{state.along:.2f} of {state.length:.2f} m, {state.cross_track:+.3f} m off the path"

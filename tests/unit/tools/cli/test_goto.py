@@ -12,11 +12,12 @@ from monstertruck_runtime.drives import DriveReport, _say_why_it_stands, drive_t
 from monstertruck_runtime.errors import NoAnswerError, NotFoundError, RequestRefusedError
 from monstertruck_runtime.mailbox import Mailbox, fifo, latest
 from monstertruck_runtime.standing import Standing
+from monstertruck_schemas import topics
 from monstertruck_schemas.event import Event, Severity
-from monstertruck_schemas.plan import Path
+from monstertruck_schemas.plan import Path, TrackerState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.state import GateMode, GateState
-from monstertruck_schemas.topics import GATE
+from monstertruck_schemas.topics import GATE, TRACKER
 from monstertruckd.tools.cli import connection
 from monstertruckd.tools.cli.goto_session import on_the_terminal
 from monstertruckd.tools.cli.main import app
@@ -199,6 +200,41 @@ def test_arming_that_is_interrupted_is_taken_back_with_the_goal():
 
 def test_a_path_that_is_interrupted_before_it_is_accepted_stops_the_truck():
     assert interrupted(SilentRobot("none"), along_path) == ["path", "stop"]
+
+
+class FollowingRobot(SilentRobot):
+    """Follows the newest path."""
+
+    def __init__(self):
+        super().__init__("none")
+        self.boxes = {topics.PATH: Mailbox(latest()), TRACKER: Mailbox(fifo(64))}
+
+    def subscribe(self, topic, delivery):
+        return self.boxes.get(topic) or super().subscribe(topic, delivery)
+
+    async def path(self, path, lease=1.0):
+        await super().path(path, lease)
+        self.follow(path.name)
+
+    def follow(self, name):
+        header = {"stamp": 0, "received": 0, "seq": 0, "cross_track": 0.0, "heading_error": 0.0}
+        self.boxes[topics.PATH].put(PATH.model_copy(update={"name": name}))
+        self.boxes[TRACKER].put(TrackerState(**header, path=name, along=0.1, length=1.0, outcome=Reason.DRIVING))
+
+
+def test_a_path_in_whose_place_another_one_is_followed_has_ended_and_that_is_not_stopped():
+    async def main(clock):
+        robot = FollowingRobot()
+        following = asyncio.create_task(follow(robot, clock, PATH, arm=False))
+        await clock.sleep(4.0)
+        assert not following.done()
+        robot.follow("another")
+        await clock.sleep(0.1)
+        return following.result(), robot.asked
+
+    arrival, asked = run_virtual(main)
+    assert (arrival.reason, arrival.text) == (Reason.CANCELLED, "another path is followed now")
+    assert asked == ["path"]
 
 
 class MovingRobot(SilentRobot):
