@@ -89,7 +89,7 @@ class UdevWatcher:
     def __init__(self, monitor: Any) -> None:
         self._monitor = monitor
         self._loop: asyncio.AbstractEventLoop | None = None
-        self._hint: Callable[[], None] = _ignore
+        self._hint: Callable[[], None] = lambda: None
 
     def start(self, hint: Callable[[], None]) -> None:
         """Listen on the running loop."""
@@ -129,10 +129,6 @@ def open_watcher() -> Watcher:
         log.warning("no udev announcements (%s): the USB tree is looked at every few seconds only", error)
         return NoWatcher()
     return UdevWatcher(monitor)
-
-
-def _ignore() -> None:
-    return None
 
 
 async def run_command(arguments: Sequence[str]) -> tuple[int, str]:

@@ -82,7 +82,7 @@ class HubCoordinator:
         self._outages: dict[str, _HubOutage] = {}
         self._looked = False
         self._turn = asyncio.Event()
-        self.on_miss: Callable[[], None] = _nothing
+        self.on_miss: Callable[[], None] = lambda: None
         """Called when a port found nothing plugged in: the tree is worth a look."""
 
     # What a port asks
@@ -359,10 +359,6 @@ def _alike(a: UsbDevice, b: UsbDevice) -> bool:
 
 def _ns(seconds: float) -> int:
     return round(seconds * SECOND)
-
-
-def _nothing() -> None:
-    return None
 
 
 BURST: Final = 0.02

@@ -13,12 +13,13 @@ import numpy as np
 
 from monstertruck_drivers.os4000.attitude import level_field
 from monstertruck_drivers.os4000.config import IronConfig
+from monstertruck_estimation.se2 import wrap
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.fitting import FitResult, least_squares
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas import topics
 from monstertruckd.config.calibration import COMPASS, Estimate, Result, WizardName
-from monstertruckd.tools.calibrate.statistics import NORMAL, Interval, correlation_factor, estimated
+from monstertruckd.tools.calibrate.statistics import NORMAL, Interval, correlation_factor, estimated, mean_angle
 from monstertruckd.tools.calibrate.steps import MoveRecord, MoveStep
 from monstertruckd.tools.calibrate.wizard import CLEAR, WizardContext
 
@@ -150,7 +151,7 @@ def result_of(circle: FieldCircle) -> Result:
     vertical = float(np.abs(circle.z).mean()) * math.sin(TILT)
     ground = GROUND * lasting(fit.residuals)
     bounds = [vertical + ground if name.startswith("hard") else LINEARITY + ground / radius for name in _NAMES]
-    taken_out = np.degrees(np.abs(_wrapped(circle.heading - angle - _mean_angle(circle.heading - angle))).max())
+    taken_out = np.degrees(np.abs(wrap(circle.heading - angle - mean_angle(circle.heading - angle))).max())
     tilt = f"95 % of the readings' noise, {math.degrees(TILT):g} deg of the unit's tilt error, and iron in the ground"
     estimates = [
         Estimate(
@@ -276,11 +277,3 @@ def _check_coverage(angles: Array) -> None:
             f"the robot has not turned all the way round: {math.degrees(gap):.0f} deg of the circle are missing; "
             "calibrate the steering's directions first"
         )
-
-
-def _wrapped(angles: Array) -> Array:
-    return np.asarray((angles + math.pi) % (2 * math.pi) - math.pi)
-
-
-def _mean_angle(angles: Array) -> float:
-    return math.atan2(float(np.sin(angles).mean()), float(np.cos(angles).mean()))

@@ -155,7 +155,8 @@ class LidarWizard:
         await context.confirm(CLEAR)
         chassis = context.chassis
         legs = [LidarLeg.of(await context.move(move), chassis, mount) for move in self._moves(chassis)]
-        weaving = [await context.move(_with_scans(move)) for move in weaves(1)]
+        also = topics.SCAN, topics.ODOMETRY
+        weaving = [await context.move(replace(move, also=also)) for move in weaves(1)]
         crab = crab_error(context)
         offset = context.fit("offset of the clocks", lambda: time_offset(weaving))
         return context.fit("mount", lambda: result_of(legs, mount, crab, offset, level))
@@ -425,10 +426,6 @@ def beam_tilt(heights: Sequence[float], walls: tuple[float, float]) -> tuple[flo
                 f"m away leans by more than {math.degrees(math.asin(MOST_TILT)):.0f} degrees: measure again, in cm"
             )
     return math.asin(falls), math.asin(rises)
-
-
-def _with_scans(move: MoveStep) -> MoveStep:
-    return replace(move, also=(topics.SCAN, topics.ODOMETRY))
 
 
 def time_offset(records: Sequence[MoveRecord]) -> Offset | None:

@@ -220,7 +220,7 @@ class _Run:
                 requests += 1
                 if arming is not None and arming.done():
                     refusal, arming = arming.result(), None
-                elif arming is None and requests >= REST_REQUESTS and self._armable():
+                elif arming is None and requests >= REST_REQUESTS and self.state and not self.state.mode.active:
                     arming = asyncio.create_task(self._try_to_arm())
                 await self._clock.sleep(PERIOD)
                 self._take()
@@ -235,9 +235,6 @@ class _Run:
         except TruckError as error:
             return error
         return None
-
-    def _armable(self) -> bool:
-        return self.state is not None and not self.state.mode.active
 
     def _driving(self) -> bool:
         state = self.state

@@ -10,12 +10,13 @@ centre look like a wall that is turned.
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Final, NamedTuple
+from typing import ClassVar, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_drivers.srf08.config import Srf08Config
+from monstertruck_estimation.se2 import wrap
 from monstertruck_kinematics.chassis import Chassis, TruckChassis
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.fitting import FitResult, least_squares
@@ -23,7 +24,7 @@ from monstertruck_runtime.errors import InputError, RequestRefusedError
 from monstertruck_schemas import topics
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.config.calibration import SONAR, Result, WizardName
-from monstertruckd.tools.calibrate.statistics import Interval, estimated, known_errors
+from monstertruckd.tools.calibrate.statistics import Interval, estimated, known_errors, mean_angle
 from monstertruckd.tools.calibrate.steps import Confirm, MoveRecord, MoveStep, Number
 from monstertruckd.tools.calibrate.wizard import CLEAR, WizardContext
 
@@ -243,7 +244,7 @@ def wall_range(
     distance = (
         wall[0] - (np.sin(wall[1]) * x + np.cos(wall[1]) * y) - (np.sin(turned) * place.x + np.cos(turned) * place.y)
     )
-    off = np.abs(_wrapped(turned + place.yaw - math.pi / 2))
+    off = np.abs(wrap(turned + place.yaw - math.pi / 2))
     past = np.maximum(off - half, 0.0)
     return np.asarray(distance / np.cos(np.minimum(past, 1.2))), past
 
@@ -395,8 +396,8 @@ def _check_places(legs: Sequence[SonarLeg], places: Mapping[str, SonarPose], wal
             continue
         off = {}
         for at, place in places.items():
-            due = np.abs(_wrapped(bearings - place.yaw)) <= half + BEYOND
-            off[at] = abs(_wrapped(_middle(bearings[near]) - _middle(bearings[due]))) if due.any() else math.pi
+            due = np.abs(wrap(bearings - place.yaw)) <= half + BEYOND
+            off[at] = abs(wrap(mean_angle(bearings[near]) - mean_angle(bearings[due]))) if due.any() else math.pi
         nearest = min(off, key=lambda at: off[at])
         if off[name] > ASTRAY and nearest != name:
             wrong.append(f"{name} hears what is due at {nearest}")
@@ -411,14 +412,6 @@ def _bearings(legs: Sequence[SonarLeg], name: str, wall: float) -> tuple[Array, 
     poses = np.concatenate([leg.poses[name] for leg in legs if name in leg.poses] or [np.empty((0, 3))])
     ranges = np.concatenate([leg.ranges[name] for leg in legs if name in leg.poses] or [np.empty(0)])
     return math.pi / 2 - poses[:, 2], np.abs(ranges - (wall - poses[:, 1])) < BODY
-
-
-def _middle(angles: Array) -> float:
-    return math.atan2(float(np.sin(angles).sum()), float(np.cos(angles).sum()))
-
-
-def _wrapped(angles: Any) -> Any:
-    return (angles + math.pi) % (2 * math.pi) - math.pi
 
 
 def _sigma(ranges: Array) -> Array:

@@ -76,6 +76,11 @@ def estimated(name: str, found: Interval, unit: str, samples: int, meaning: str,
     )
 
 
+def mean_angle(angles: Array) -> float:
+    """Middle of directions, rad."""
+    return math.atan2(float(np.sin(angles).mean()), float(np.cos(angles).mean()))
+
+
 def mean_interval(values: ArrayLike, least_error: float = 0.0) -> Interval:
     """Mean of repeated measurements.
 

@@ -75,7 +75,7 @@ def calibration(context: HostContext) -> Iterator[Finding]:
 
 def newest_log(context: HostContext) -> Iterator[Finding]:
     """What the newest log says of supply, clocks, steering and signs of sensors."""
-    newest = max(context.logs().glob("*.mcap"), key=_modified, default=None)
+    newest = max(context.logs().glob("*.mcap"), key=lambda path: path.stat().st_mtime, default=None)
     if newest is None or newest.stat().st_size > MOST_BYTES:
         return
     try:
@@ -160,7 +160,3 @@ def _signs(series: dict[str, Any], log: str) -> Iterator[Finding]:
 
 def _message(entry: Any) -> Any:
     return entry.decode()
-
-
-def _modified(path: Path) -> float:
-    return path.stat().st_mtime

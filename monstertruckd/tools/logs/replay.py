@@ -9,7 +9,6 @@ from typing import Any
 
 from monstertruck_runtime.clock import ReplayClock, run_replay
 from monstertruck_runtime.errors import ConfigError, InputError
-from monstertruck_runtime.ports import Ready
 from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.topics import BY_NAME
 from monstertruckd.bus.local import Bus
@@ -56,7 +55,7 @@ def replay_log(
         bridge = ZenohBridge(robot, bus, ZenohConfig(listen=(endpoint,)), clock, _rpc(clock, reader))
         await bridge.open()
         serving = asyncio.Event()
-        task = asyncio.create_task(bridge.run(_set(serving)))
+        task = asyncio.create_task(bridge.run(serving.set))
         waiting = asyncio.create_task(serving.wait())
         try:
             await asyncio.wait([waiting, task], return_when=asyncio.FIRST_COMPLETED)
@@ -95,7 +94,3 @@ def _rpc(clock: ReplayClock, reader: LogReader) -> Rpc:
 
 async def _answer(value: dict[str, Any], _: dict[str, Any]) -> dict[str, Any]:
     return value
-
-
-def _set(event: asyncio.Event) -> Ready:
-    return event.set

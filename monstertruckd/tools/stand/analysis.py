@@ -4,7 +4,6 @@ An estimate's frame is laid over the stand's by least squares of the poses (rota
 is the shift of time at which the turns of odometry and stand agree best.
 """
 
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -16,7 +15,6 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.fitting import least_squares
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError
-from monstertruck_schemas.plan import TrackerState
 from monstertruck_schemas.topics import ODOMETRY, POSE, STAND_POSE, TRACKER
 from monstertruckd.recorder.reader import open_log
 
@@ -71,7 +69,8 @@ def errors_of(path: Path) -> list[EstimateError]:
 
 def tracker_errors(path: Path) -> dict[str, float] | None:
     """What the tracker itself reported as its distance from the path, m; None where none drove."""
-    off = [abs(message.cross_track) for message in _trackers(path)]
+    reports: list[Any] = [entry.decode() for entry in open_log(path) if entry.topic == TRACKER.name]
+    off = [abs(report.cross_track) for report in reports]
     if not off:
         return None
     return {"reports": float(len(off)), "rms": float(np.sqrt(np.mean(np.square(off)))), "worst": float(max(off))}
@@ -140,11 +139,3 @@ def _array(rows: list[tuple[float, float, float, float]]) -> Array:
         found[:, 0] = found[:, 0] / SECOND
         found = found[np.concatenate(([True], np.diff(found[:, 0]) > 0))]
     return found
-
-
-def _trackers(path: Path) -> Iterator[TrackerState]:
-    for entry in open_log(path):
-        if entry.topic == TRACKER.name:
-            message = entry.decode()
-            assert isinstance(message, TrackerState)
-            yield message
