@@ -147,10 +147,18 @@ class BehaviourService:
         self._configured(name, settings)
 
     def _configured(self, name: str, settings: Mapping[str, Any]) -> tuple[BehaviourConfig, Behaviour]:
+        """The settings of a run, and the behaviour with them. Raises as ``check`` does."""
         if name not in self.configs:
             raise NotFoundError(f"no behaviour {name!r}: expected one of {', '.join(self.configs) or 'none'}")
         config = _with_settings(self.configs[name], settings)
-        return config, self._made(config)
+        implementation = BEHAVIOURS.implementation(config)
+        fit = getattr(implementation, "fit", None)
+        try:
+            return config, implementation(config) if fit is None else fit(config, self._body)
+        except KinematicsError as error:
+            raise RequestRefusedError(Reason.IMPOSSIBLE_MOTION, str(error)) from error
+        except ValueError as error:
+            raise InputError(f"settings: {error}") from error
 
     def take(self, request: BehaviourRequest) -> int:
         """Carry out a request; returns the number of the behaviour it started or stopped.
@@ -186,23 +194,6 @@ class BehaviourService:
         self._events(Reason.BEHAVIOUR_STARTED, Severity.INFO, SOURCE, f"{name} started by {request.source}")
         self._report(now)
         return number
-
-    def _made(self, config: BehaviourConfig) -> Behaviour:
-        """The behaviour of settings.
-
-        Raises:
-            RequestRefusedError: the body cannot do that.
-            InputError: the settings are not complete.
-        """
-        implementation = BEHAVIOURS.implementation(config)
-        fit = getattr(implementation, "fit", None)
-        try:
-            made: Behaviour = implementation(config) if fit is None else fit(config, self._body)
-        except KinematicsError as error:
-            raise RequestRefusedError(Reason.IMPOSSIBLE_MOTION, str(error)) from error
-        except ValueError as error:
-            raise InputError(f"settings: {error}") from error
-        return made
 
     def _stop(self, request: BehaviourRequest, now: int) -> int:
         run = self._run
