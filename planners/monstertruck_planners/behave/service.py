@@ -184,10 +184,10 @@ class BehaviourService:
         moves = gate is not None and gate.mode.accepts_motion
         if (other := self._other_planner(now)) is not None:
             raise RequestRefusedError(Reason.BUSY, other if moves else f"{other} as soon as the robot is armed")
-        if not moves:
-            raise does_not_drive(gate)
         if (stale := self._stale(behaviour, now)) is not None:
             raise RequestRefusedError(Reason.INPUT_STALE, stale)
+        if not moves:  # the last one: for this a client arms it
+            raise does_not_drive(gate)
         number = 1 if run is None else run.number + 1
         self._run = BehaviourRun(number, name, config, behaviour, request.source, now, behaviour.begin())
         self._program, self._pose = request.program, self._odometry.latest

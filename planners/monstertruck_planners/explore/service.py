@@ -159,17 +159,17 @@ class ExplorerService:
         goal = self._in.goal.latest
         if goal is not None and goal.phase is not GoalPhase.IDLE:
             raise RequestRefusedError(Reason.BUSY, f"goal {goal.number} of {goal.source} is pursued, cancel it first")
-        if gate is None or not gate.mode.active:
-            raise does_not_drive(gate)
+        if request.find is not None and self._in.points is None:
+            raise RequestRefusedError(Reason.NOT_SUPPORTED, "this robot keeps no points of interest: section `points`")
         if (pose := self._pose(now)) is None:
             raise RequestRefusedError(
                 Reason.NO_MAP, "no pose in a map yet; `monstertruckd status` shows if slam is ready"
             )
+        if gate is None or not gate.mode.active:  # the last one: for this a client arms it
+            raise does_not_drive(gate)
         self._fresh, self._goal, self._refused, self._saves = True, None, None, None
         self._deciding = None  # of the exploration before: its answer is not one to this
         self._others = 0 if goal is None else goal.number
-        if request.find is not None and self._in.points is None:
-            raise RequestRefusedError(Reason.NOT_SUPPORTED, "this robot keeps no points of interest: section `points`")
         self._program = request.program
         home = self._config.home if request.home is None else request.home
         number = 1 if run is None else run.number + 1

@@ -221,10 +221,10 @@ class MissionService:
             raise RequestRefusedError(Reason.BUSY, f"the mission of {self._source} is running, stop it first")
         if (other := self._other()) is not None:
             raise RequestRefusedError(Reason.BUSY, f"{other}, stop it first")
-        if gate is None or not gate.mode.active:
-            raise does_not_drive(gate)
         progress = self._begin(request)
         self._check(progress.mission)
+        if gate is None or not gate.mode.active:  # the last one: for this a client arms it
+            raise does_not_drive(gate)
         assert self._tasks is not None
         self._number, self._source, self._progress = self._number + 1, request.source, progress
         self._program, self._began, self._end = request.program, now, None

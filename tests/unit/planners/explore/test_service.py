@@ -136,6 +136,26 @@ def test_a_goal_that_has_ended_since_the_newest_report_is_not_cancelled_once_mor
     assert service._goal is None
 
 
+def test_a_robot_is_only_said_to_be_disarmed_if_nothing_else_is_in_the_way(monkeypatch: pytest.MonkeyPatch):
+    service = ExplorerService.__new__(ExplorerService)
+    monkeypatch.setattr("monstertruck_planners.explore.service.refusal", lambda *_: Reason.OK)
+    disarmed = SimpleNamespace(mode=SimpleNamespace(active=False), worst=Reason.DISARMED, why="")
+    pose = (1.0, 2.0, 0.0)
+    service._pose = lambda _: pose
+    service._run, service._clock, service._sequences, service._max_age = None, SimpleNamespace(now=lambda: 0), None, 0.5
+    service._in = SimpleNamespace(gate=SimpleNamespace(latest=disarmed), goal=SimpleNamespace(latest=None), points=None)
+
+    def start(**more: int) -> Reason:
+        with pytest.raises(RequestRefusedError) as refused:
+            service.take(ExploreRequest(**inner_request(1, None, 0, "ann"), order=ExploreOrder.START, **more))
+        return refused.value.refusal
+
+    assert start() is Reason.DISARMED
+    assert start(find=3) is Reason.NOT_SUPPORTED
+    pose = None
+    assert start() is Reason.NO_MAP
+
+
 def test_who_stops_only_its_own_stops_nobody_elses(monkeypatch: pytest.MonkeyPatch):
     service, ended = ExplorerService.__new__(ExplorerService), []
     monkeypatch.setattr("monstertruck_planners.explore.service.refusal", lambda *_: Reason.OK)

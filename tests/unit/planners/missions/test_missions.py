@@ -662,6 +662,25 @@ def test_settings_that_a_behaviour_does_not_take_are_named_before_it_sets_off():
     played(story)
 
 
+def test_a_robot_is_only_said_to_be_disarmed_if_nothing_else_is_in_the_way():
+    wrong = {"do": "behaviour", "name": "wall", "settings": {"distanse": 0.3}}
+
+    async def story(robot: Pretended) -> None:
+        disarmed = {"mode": SimpleNamespace(active=False), "worst": Reason.DISARMED, "why": Reason.DISARMED.text}
+        vars(robot.latest["gate"]).update(disarmed)
+        with pytest.raises(InputError):
+            robot.order(MissionOrder.START, wrong)
+        with pytest.raises(RequestRefusedError) as refused:
+            robot.order(MissionOrder.START, GO)
+        assert refused.value.refusal is Reason.DISARMED
+        robot.placed, robot.latest["pose"] = False, None
+        with pytest.raises(RequestRefusedError) as refused:
+            robot.order(MissionOrder.START, GO)
+        assert refused.value.refusal is Reason.NO_MAP
+
+    played(story)
+
+
 def test_a_robot_without_points_of_interest_is_not_sent_to_look_for_them():
     async def story(robot: Pretended) -> None:
         robot.service._parts = replace(robot.service._parts, explorer=SimpleNamespace())
