@@ -112,6 +112,12 @@ class LocalisationStatus(StrEnum):
     """What is seen fits no place of the saved map: the robot is outside it. The search goes on."""
 
 
+PLACELESS: Final = frozenset({LocalisationStatus.SEARCHING, LocalisationStatus.OUTSIDE})
+"""States in which the pose in map means nothing."""
+NO_PLACE: Final = PLACELESS | {LocalisationStatus.LOST}
+"""States in which no place is to be derived from it."""
+
+
 class OdometryUse(StrEnum):
     """Whether SLAM predicts the motion between scans by odometry."""
 

@@ -26,7 +26,7 @@ from monstertruck_runtime.requests import Sequences, parse_request, refusal
 from monstertruck_runtime.threads import Offload
 from monstertruck_schemas.body import LensConfig, Mount
 from monstertruck_schemas.event import Severity
-from monstertruck_schemas.health import LocalisationStatus, SlamHealth
+from monstertruck_schemas.health import NO_PLACE, SlamHealth
 from monstertruck_schemas.points import PointOfInterest, PointOrder, PointRequest, PointsOfInterest
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.roles import AccessRole, ServiceName
@@ -37,7 +37,6 @@ from monstertruck_schemas.topics import POSE
 TARGET: Final = "monstertruck_estimation.points.reader:ReadingStep"
 START_TIMEOUT: Final = 60.0
 """Real seconds the worker may take to start."""
-NO_PLACE: Final = frozenset({LocalisationStatus.LOST, LocalisationStatus.SEARCHING, LocalisationStatus.OUTSIDE})
 HISTORY: Final = 128
 """Poses kept: 2.5 s at 50 Hz."""
 WAITED: Final = SECOND // 10

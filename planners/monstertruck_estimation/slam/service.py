@@ -31,7 +31,7 @@ from monstertruck_runtime.ports import EventSink, Publisher, Ready
 from monstertruck_schemas.base import Pose2D, Twist2D
 from monstertruck_schemas.body import Mount
 from monstertruck_schemas.event import Severity
-from monstertruck_schemas.health import LocalisationStatus, OdometryUse, SlamHealth
+from monstertruck_schemas.health import PLACELESS, LocalisationStatus, OdometryUse, SlamHealth
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.sensor import LaserScan
@@ -54,8 +54,6 @@ CORRECTIONS: Final = {
     "parted": (Reason.JOIN_UNDONE, Severity.WARNING, "what was seen since then contradicts it"),
 }
 """Event text of a step that has corrected the map; {} is the number of closures."""
-PLACELESS: Final = frozenset({LocalisationStatus.SEARCHING, LocalisationStatus.OUTSIDE})
-"""States in which the pose in map is not valid."""
 MATCHED: Final = frozenset({LocalisationStatus.MAPPING, LocalisationStatus.LOCALISED, LocalisationStatus.DEGENERATE})
 QUIET: Final = 30 * SECOND
 """Least time between two events about scans that leave a direction undetermined, ns: in a corridor they alternate."""

@@ -21,7 +21,7 @@ from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
 from monstertruck_runtime.requests import Sequences, does_not_drive, inner_request, refusal
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.event import Event, Severity
-from monstertruck_schemas.health import HealthTable, LocalisationStatus, ServiceState, SlamHealth
+from monstertruck_schemas.health import NO_PLACE, HealthTable, ServiceState, SlamHealth
 from monstertruck_schemas.plan import ExplorationPhase, ExplorationState, GoalPhase, GoalState
 from monstertruck_schemas.points import PointKind, PointsOfInterest
 from monstertruck_schemas.reasons import Reason
@@ -41,7 +41,6 @@ CHANGES: Final = ("number", "phase", "outcome", "goals", "failures")
 """Fields of the report whose change is reported at once."""
 LOST_FOR: Final = 1.0
 """Seconds without a place in the map after which it counts as lost."""
-NO_PLACE: Final = frozenset({LocalisationStatus.LOST, LocalisationStatus.SEARCHING, LocalisationStatus.OUTSIDE})
 LOW: Final = frozenset({BatteryLevel.LOW, BatteryLevel.CRITICAL})
 TILES: Final = 4096
 """Tiles kept since the newest whole map."""

@@ -8,7 +8,7 @@ from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.collision import Footprint
 from monstertruck_planners.goals.config import PlannerConfig
 from monstertruck_runtime.errors import RequestRefusedError
-from monstertruck_schemas.health import LocalisationStatus, SlamHealth
+from monstertruck_schemas.health import PLACELESS, SlamHealth
 from monstertruck_schemas.plan import Steering
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import LaserScan
@@ -163,7 +163,7 @@ def require_place(slam: SlamHealth | None) -> None:
     Raises:
         RequestRefusedError: it does not: the robot has not found its place on its saved map.
     """
-    if slam is not None and slam.standing in (LocalisationStatus.SEARCHING, LocalisationStatus.OUTSIDE):
+    if slam is not None and slam.standing in PLACELESS:
         text = f"its place on the saved map is not known ({slam.standing})"
         text += ": `monstertruckd drive` it a metre or two there, by which it finds itself"
         raise RequestRefusedError(Reason.POSE_LOST, text)
