@@ -159,7 +159,7 @@ def _read_scan(proto: Any) -> _Fields:
         "range_max": proto.range_max,
         "ranges": _array(proto.ranges),
         "codes": np.frombuffer(proto.codes, np.uint8),
-        "tilt": _array(proto.tilt).tolist()[0] if proto.tilt else None,
+        "tilt": _unpacked(proto.tilt, 1)[0] if proto.tilt else None,
     }
 
 

@@ -272,6 +272,13 @@ def test_invalid_scan_says_why(data, text):
         wire.decode(t.SCAN, data)
 
 
+def test_a_scan_with_two_tilts_is_refused():
+    message = stock(t.SCAN)
+    message.tilt.extend([0.1, 0.2])
+    with pytest.raises(InputError, match="sensor/scan: expected 1 numbers, got 2"):
+        wire.decode(t.SCAN, message.SerializeToString())
+
+
 def test_odometry_of_the_wrong_shape_is_refused():
     message = stock(t.ODOMETRY)
     message.twist2d.extend([1.0, 2.0])
