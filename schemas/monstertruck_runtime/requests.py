@@ -252,8 +252,8 @@ def inner_request(seq: int, gate: GateState | None, now: int, source: str) -> di
     }
 
 
-def refusal(request: Request, gate: GateState | None, sequences: Sequences, now: int, max_age: float | None) -> Reason:
-    """OK, or why a request to the planners is refused; the rules are those of driving.
+def examine(request: Request, gate: GateState | None, sequences: Sequences, now: int, max_age: float | None) -> None:
+    """Refuse a request to the planners by the rules of driving.
 
     Args:
         request: what was asked.
@@ -261,13 +261,17 @@ def refusal(request: Request, gate: GateState | None, sequences: Sequences, now:
         sequences: of this kind of requests.
         now: ns.
         max_age: greatest age of its gate stamp, s; None for a request that moves nothing.
+
+    Raises:
+        RequestRefusedError: the sender may not ask for that, or it is too old.
     """
     reason = Reason.BAD_NONCE if gate is None else sequences.accept(request, gate.nonce, now)
     if reason is Reason.OK and max_age is not None:
         reason = freshness(request, now, max_age)
     if reason is Reason.OK and request.role not in OPERATORS:
         reason = Reason.BAD_ROLE
-    return reason
+    if reason is not Reason.OK:
+        raise RequestRefusedError(reason)
 
 
 def does_not_drive(gate: GateState | None) -> RequestRefusedError:

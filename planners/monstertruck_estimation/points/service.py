@@ -22,7 +22,7 @@ from monstertruck_runtime.clock import SECOND, Clock, Schedule
 from monstertruck_runtime.errors import InputError, NotFoundError, RequestRefusedError, WorkerError, disk_reason
 from monstertruck_runtime.mailbox import Mailbox
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, RpcRegistry, Subscription
-from monstertruck_runtime.requests import Sequences, parse_request, refusal
+from monstertruck_runtime.requests import Sequences, examine, parse_request
 from monstertruck_runtime.threads import Offload
 from monstertruck_schemas.body import LensConfig, Mount
 from monstertruck_schemas.event import Severity
@@ -339,9 +339,7 @@ class PointService:
             NotFoundError: no point has this name.
             InputError: half of a place.
         """
-        reason = refusal(request, self._in.gate.latest, self._sequences, self._clock.now(), None)
-        if reason is not Reason.OK:
-            raise RequestRefusedError(reason)
+        examine(request, self._in.gate.latest, self._sequences, self._clock.now(), None)
         place = None
         if request.order is PointOrder.REMOVE:
             if self._map.points.pop(request.name, None) is None:

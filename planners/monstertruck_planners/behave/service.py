@@ -21,7 +21,7 @@ from monstertruck_runtime.clock import SECOND, Clock, Schedule
 from monstertruck_runtime.errors import InputError, NotFoundError, RequestRefusedError
 from monstertruck_runtime.mailbox import latest
 from monstertruck_runtime.ports import BusPort, EventSink, Publisher, Ready, RpcRegistry, Subscription
-from monstertruck_runtime.requests import Sequences, does_not_drive, planner_request, refusal, register_numbered
+from monstertruck_runtime.requests import Sequences, does_not_drive, examine, planner_request, register_numbered
 from monstertruck_schemas.base import Message, first_mistake
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.plan import BehaviourState, GoalPhase, GoalState, TrackerState
@@ -169,9 +169,7 @@ class BehaviourService:
         """
         now, starts = self._clock.now(), request.order is BehaviourOrder.START
         gate = self._gate.latest
-        reason = refusal(request, gate, self._sequences, now, self._max_age if starts else None)
-        if reason is not Reason.OK:
-            raise RequestRefusedError(reason)
+        examine(request, gate, self._sequences, now, self._max_age if starts else None)
         return self._start(request, gate, now) if starts else self._stop(request, now)
 
     def _start(self, request: BehaviourRequest, gate: GateState | None, now: int) -> int:

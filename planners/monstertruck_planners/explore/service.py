@@ -18,7 +18,7 @@ from monstertruck_runtime.clock import SECOND, Clock, Schedule
 from monstertruck_runtime.errors import RequestRefusedError, TruckError
 from monstertruck_runtime.mailbox import Mailbox
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
-from monstertruck_runtime.requests import Sequences, does_not_drive, inner_request, refusal
+from monstertruck_runtime.requests import Sequences, does_not_drive, examine, inner_request
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.event import Event, Severity
 from monstertruck_schemas.health import NO_PLACE, HealthTable, ServiceState, SlamHealth
@@ -142,9 +142,7 @@ class ExplorerService:
         """
         starts, now, run = request.order is ExploreOrder.START, self._clock.now(), self._run
         gate = self._in.gate.latest
-        reason = refusal(request, gate, self._sequences, now, self._max_age if starts else None)
-        if reason is not Reason.OK:
-            raise RequestRefusedError(reason)
+        examine(request, gate, self._sequences, now, self._max_age if starts else None)
         running = run is not None and run.running
         if not starts:
             if run is None or not running:

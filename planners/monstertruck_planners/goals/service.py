@@ -39,7 +39,7 @@ from monstertruck_runtime.actors.actor import Actor
 from monstertruck_runtime.clock import SECOND, Clock, Schedule
 from monstertruck_runtime.errors import RequestRefusedError, TruckError
 from monstertruck_runtime.ports import Ready, RpcRegistry
-from monstertruck_runtime.requests import Sequences, parse_request, refusal
+from monstertruck_runtime.requests import Sequences, examine, parse_request
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.plan import MAX_COORDINATE, BehaviourState, GoalPhase, GoalState
@@ -226,11 +226,9 @@ class GoalService:
         return state
 
     def _examine(self, request: Request, kind: str, *, moves: bool) -> None:
-        reason = refusal(
+        examine(
             request, self._in.gate.latest, self._sequences[kind], self._clock.now(), self._max_age if moves else None
         )
-        if reason is not Reason.OK:
-            raise RequestRefusedError(reason)
         if moves and (behaviour := self._behaviour()) is not None:
             text = f"the behaviour {behaviour.behaviour} of {behaviour.source} is running, stop it first"
             raise RequestRefusedError(Reason.BUSY, text)

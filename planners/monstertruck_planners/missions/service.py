@@ -26,7 +26,7 @@ from monstertruck_planners.missions.progress import (
 from monstertruck_runtime.clock import SECOND, Clock, Schedule
 from monstertruck_runtime.errors import InputError, NotFoundError, RequestRefusedError, TruckError, disk_reason
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
-from monstertruck_runtime.requests import Sequences, does_not_drive, inner_request, refusal
+from monstertruck_runtime.requests import Sequences, does_not_drive, examine, inner_request
 from monstertruck_runtime.small_files import replace_file, require_file
 from monstertruck_runtime.threads import Offload
 from monstertruck_schemas.base import Pose2D, first_mistake
@@ -203,9 +203,7 @@ class MissionService:
             InputError: a start without a mission, or steps with settings that their behaviours do not take.
         """
         starts, now, gate = request.order is not MissionOrder.STOP, self._clock.now(), self._in.gate.latest
-        reason = refusal(request, gate, self._sequences, now, self._max_age if starts else None)
-        if reason is not Reason.OK:
-            raise RequestRefusedError(reason)
+        examine(request, gate, self._sequences, now, self._max_age if starts else None)
         running = self._task is not None and not self._task.done()
         if not starts:
             if request.own and not (running and request.program == self._program):

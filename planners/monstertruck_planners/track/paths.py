@@ -10,7 +10,7 @@ from monstertruck_planners.track.segments import check_path
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import InputError, RequestRefusedError
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
-from monstertruck_runtime.requests import Sequences, refusal
+from monstertruck_runtime.requests import Sequences, examine
 from monstertruck_runtime.small_files import require_file
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.plan import BehaviourState, Path
@@ -131,9 +131,7 @@ class PathService:
             InputError: the path cannot be tracked.
         """
         gate = self._gate.latest
-        reason = refusal(request, gate, self._sequences, self._clock.now(), self._max_age)
-        if reason is not Reason.OK:
-            raise RequestRefusedError(reason)
+        examine(request, gate, self._sequences, self._clock.now(), self._max_age)
         if gate is not None and gate.mode.moving:
             raise RequestRefusedError(Reason.BUSY, f"the robot is {gate.mode}, stop it first")
         behaviour = self._behaviour.latest

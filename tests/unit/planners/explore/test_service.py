@@ -138,7 +138,7 @@ def test_a_goal_that_has_ended_since_the_newest_report_is_not_cancelled_once_mor
 
 def test_a_robot_is_only_said_to_be_disarmed_if_nothing_else_is_in_the_way(monkeypatch: pytest.MonkeyPatch):
     service = ExplorerService.__new__(ExplorerService)
-    monkeypatch.setattr("monstertruck_planners.explore.service.refusal", lambda *_: Reason.OK)
+    monkeypatch.setattr("monstertruck_planners.explore.service.examine", lambda *_: None)
     disarmed = SimpleNamespace(mode=SimpleNamespace(active=False), worst=Reason.DISARMED, why="")
     pose = (1.0, 2.0, 0.0)
     service._pose = lambda _: pose
@@ -158,7 +158,7 @@ def test_a_robot_is_only_said_to_be_disarmed_if_nothing_else_is_in_the_way(monke
 
 def test_who_stops_only_its_own_stops_nobody_elses(monkeypatch: pytest.MonkeyPatch):
     service, ended = ExplorerService.__new__(ExplorerService), []
-    monkeypatch.setattr("monstertruck_planners.explore.service.refusal", lambda *_: Reason.OK)
+    monkeypatch.setattr("monstertruck_planners.explore.service.examine", lambda *_: None)
     monkeypatch.setattr("monstertruck_planners.explore.service.exploration.stop", lambda _, source, __: source)
     service._run = SimpleNamespace(running=True, source="ann", number=1)
     service._program, service._do = ("ann", "one"), ended.append

@@ -41,7 +41,7 @@ def test_a_goal_that_comes_too_early_is_refused_by_what_is_missing(
 
 def test_a_running_behaviour_excludes_a_goal_and_lets_one_be_cancelled(monkeypatch: pytest.MonkeyPatch):
     service = GoalService.__new__(GoalService)
-    monkeypatch.setattr("monstertruck_planners.goals.service.refusal", lambda *_: Reason.OK)
+    monkeypatch.setattr("monstertruck_planners.goals.service.examine", lambda *_: None)
     running = SimpleNamespace(running=True, behaviour="wall", source="ann")
     service._in = SimpleNamespace(behaviour=SimpleNamespace(latest=running), gate=SimpleNamespace(latest=None))
     service._sequences, service._max_age = {"goal": None}, 0.5
