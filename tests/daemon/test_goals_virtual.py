@@ -51,7 +51,7 @@ def test_waypoints_are_passed_in_their_order_asked_for_by_call_or_by_topic():
         trip.rig.bus.inject(topics.REQ_GOAL, GoalRequest.model_validate_json(json.dumps(goal)))
         assert (await trip.end()).outcome is Reason.GOAL_REACHED
         assert trip.reasons().count(Reason.WAYPOINT_PASSED) == 1
-        with pytest.raises(RequestRefusedError, match="waypoint 1 of 2") as refused:
+        with pytest.raises(RequestRefusedError, match="waypoint 1 of 1: goal") as refused:
             await trip.goal(6.0, 3.9, 0.0, via=[(4.7, 2.5)])
         assert refused.value.refusal is Reason.GOAL_BLOCKED
 

@@ -61,7 +61,8 @@ def plan_through(
             known = statistics.get(name)
             statistics[name] = value if known is None else min(known, value) if name == "margin" else known + value
         if not result.ok:
-            return replace(result, text=f"waypoint {number} of {len(waypoints)}: {result.text}", statistics=statistics)
+            leg = f"waypoint {number} of {len(waypoints) - 1}: " if number < len(waypoints) else ""
+            return replace(result, text=leg + result.text, statistics=statistics)
         legs.append(result)
         cost += result.cost
         here = result.end

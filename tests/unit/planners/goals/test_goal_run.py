@@ -501,7 +501,7 @@ def test_a_route_over_waypoints_passes_them_and_is_kept_only_as_long_as_it_does(
     assert step.step(PlanTask("route", at, goal, none, via=((3.0, 3.0, None),))).kept
     assert step.step(PlanTask("route", at, goal, none, via=((math.nan, 3.0, None),))).reason is Reason.NOT_FINITE
     blocked = step.step(PlanTask("route", at, goal, none, via=((9.0, 3.0, 0.0),)))
-    assert (blocked.reason, "waypoint 1 of 2" in blocked.text) == (Reason.GOAL_OUTSIDE, True)
+    assert (blocked.reason, "waypoint 1 of 1" in blocked.text) == (Reason.GOAL_OUTSIDE, True)
     lattice = Setup(PlannerConfig(route=LatticeConfig()), FourWheelSteering(), Footprint())
     by_lattice = step.step(PlanTask("route", at, goal, none, lattice, grid, via=((3.0, 3.0, None),)))
     assert nearest(by_lattice, 3.0, 3.0) < CONFIG.waypoint_radius
