@@ -11,7 +11,7 @@ from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError, TruckError
 from monstertruck_runtime.mailbox import Mailbox, fifo, latest
 from monstertruck_runtime.presence import while_it_runs
-from monstertruck_runtime.standing import Standing, standing
+from monstertruck_runtime.standstill import StandstillMonitor, monitor_standstill
 from monstertruck_schemas.event import Event, Severity
 from monstertruck_schemas.plan import GoalPhase, GoalState, Path, TrackerState
 from monstertruck_schemas.reasons import Reason
@@ -78,7 +78,7 @@ async def drive_to(
         RequestRefusedError: the goal or the arming was refused, or the robot restarted.
         NoAnswerError: the robot does not answer, or has been silent for a minute.
     """
-    with driver.subscribe(GOAL, fifo(256)) as states, standing(driver) as stand:
+    with driver.subscribe(GOAL, fifo(256)) as states, monitor_standstill(driver) as stand:
 
         async def cancel() -> None:
             await driver.goal_control(GoalOrder.CANCEL, own=True)
@@ -150,7 +150,7 @@ async def follow(driver: TruckClient, clock: Clock, path: Path, *, arm: bool, re
     path = path.model_copy(update={"name": f"{path.name[:96]}-{clock.now():x}"})
     with (
         driver.subscribe(TRACKER, fifo(256)) as states,
-        standing(driver) as stand,
+        monitor_standstill(driver) as stand,
         driver.subscribe(EVENT, fifo(256)) as events,
         driver.subscribe(PATH, latest()) as present,
     ):
@@ -209,7 +209,7 @@ async def _path_end(
 async def _watched(
     driver: TruckClient,
     clock: Clock,
-    stand: Standing,
+    stand: StandstillMonitor,
     *,
     arm: bool,
     end: Awaitable[Arrival],
@@ -240,7 +240,7 @@ async def _watched(
         ending.cancel()
 
 
-async def _say_why_it_stands(stand: Standing, clock: Clock, report: DriveReport) -> None:
+async def _say_why_it_stands(stand: StandstillMonitor, clock: Clock, report: DriveReport) -> None:
     said: set[str] = set()  # what is stale comes and goes while it stands
     while True:
         await clock.sleep(2 * LOOK)

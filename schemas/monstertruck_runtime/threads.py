@@ -94,10 +94,7 @@ class ThreadHop(Generic[T]):
                     self._discard(item)
             return
         if self._rank is None:
-            try:  # as ``_pop``, without the call
-                item = items.popleft()
-            except IndexError:
-                item = None
+            item = self._pop()
         else:
             with self._lock:
                 item = self._pop()

@@ -11,7 +11,7 @@ from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError, Truc
 from monstertruck_runtime.mailbox import Mailbox, fifo
 from monstertruck_runtime.presence import while_it_runs
 from monstertruck_runtime.requests import Operator
-from monstertruck_runtime.standing import Standing, standing
+from monstertruck_runtime.standstill import StandstillMonitor, monitor_standstill
 from monstertruck_schemas.mission import Mission
 from monstertruck_schemas.plan import BehaviourState, ExplorationPhase, ExplorationState, MissionState
 from monstertruck_schemas.reasons import Reason
@@ -80,7 +80,7 @@ async def run_exploration(
             shown, due = now, state.elapsed + EVERY
             report(progress_line(state, stands))
 
-    with standing(client) as stand:
+    with monitor_standstill(client) as stand:
         return await _run(
             client,
             EXPLORE,
@@ -128,7 +128,7 @@ async def run_mission(
         for line in lines:
             report(f"{state.elapsed:6.0f} s  {line}")
 
-    with standing(client) as stand:
+    with monitor_standstill(client) as stand:
         return await _run(
             client,
             MISSION,
@@ -146,7 +146,7 @@ def _failed(before: MissionState, state: MissionState) -> list[str]:
     return [f"it failed: {state.failed}"] if again or state.failures > before.failures else []
 
 
-def _why_it_stands(stand: Standing) -> str:
+def _why_it_stands(stand: StandstillMonitor) -> str:
     """Why the gate lets the robot not drive, and the command that helps; nothing where it does."""
     why, held = stand.why(), stand.gate.latest
     return with_remedy(held.worst, why) if why and held is not None else ""

@@ -11,7 +11,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain
-from math import atan2, floor, pi, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -186,7 +185,7 @@ def _open_node(
         return
     row, column = cell_at(field, nodes.cell, x, y)
     headings = nodes.table.shape[2]
-    heading = floor(yaw / (2 * pi) * headings + 0.5) % headings
+    heading = math.floor(yaw / (2 * math.pi) * headings + 0.5) % headings
     if not (0 <= row < nodes.table.shape[0] and 0 <= column < nodes.table.shape[1]):
         return
     other = nodes.table[row, column, heading] - 1
@@ -216,7 +215,7 @@ def _expansion_target(
     across, along = (column + 0.5) * to_go.cell, (row + 0.5) * to_go.cell
     target[0] = field.x + across * field.cos - along * field.sin
     target[1] = field.y + across * field.sin + along * field.cos
-    target[2] = atan2(ahead_row - row, ahead_column - column) + atan2(field.sin, field.cos)
+    target[2] = math.atan2(ahead_row - row, ahead_column - column) + math.atan2(field.sin, field.cos)
     return True
 
 
@@ -255,7 +254,7 @@ def expand(
         nodes.closed[n] = True
         nodes.counts[EXPANDED] += 1
         pose, cost, direction, cusps = nodes.pose[n], nodes.cost[n], nodes.direction[n], nodes.cusps[n]
-        away = sqrt((goal[0] - pose[0]) ** 2 + (goal[1] - pose[1]) ** 2)
+        away = math.sqrt((goal[0] - pose[0]) ** 2 + (goal[1] - pose[1]) ** 2)
         if away < goal_range and (away < 6.0 * model.radius or nodes.counts[EXPANDED] % 4 == 1):
             many = connect(pose, goal, model.radius, model.crab, model.weights, segments, best, scratch)
             few = cusps + count_cusps(segments, many, direction) <= model.max_cusps

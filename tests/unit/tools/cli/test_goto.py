@@ -11,7 +11,7 @@ from monstertruck_runtime.clock import SECOND, run_virtual
 from monstertruck_runtime.drives import DriveReport, _say_why_it_stands, drive_to, follow
 from monstertruck_runtime.errors import NoAnswerError, NotFoundError, RequestRefusedError
 from monstertruck_runtime.mailbox import Mailbox, fifo, latest
-from monstertruck_runtime.standing import Standing
+from monstertruck_runtime.standstill import StandstillMonitor
 from monstertruck_schemas import topics
 from monstertruck_schemas.event import Event, Severity
 from monstertruck_schemas.plan import Path, TrackerState
@@ -274,7 +274,9 @@ def test_each_reason_for_which_it_stands_is_said_once_until_it_drives():
 
     async def main(clock):
         gate, events = Mailbox(latest()), Mailbox(fifo(64))
-        watching = asyncio.create_task(_say_why_it_stands(Standing(gate, Mailbox(latest()), events), clock, Report()))
+        watching = asyncio.create_task(
+            _say_why_it_stands(StandstillMonitor(gate, Mailbox(latest()), events), clock, Report())
+        )
         for reasons in (off, stale, off, stale, latched, (), off):
             mode = GateMode.DISARMED if reasons else GateMode.DRIVING
             gate.put(gate_state(mode).model_copy(update={"reasons": reasons}))

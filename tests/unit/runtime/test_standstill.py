@@ -3,7 +3,7 @@
 import pytest
 
 from monstertruck_runtime.mailbox import Mailbox, fifo, latest
-from monstertruck_runtime.standing import Standing
+from monstertruck_runtime.standstill import StandstillMonitor
 from monstertruck_schemas.event import Cause, Event, Severity, Stop
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.state import GateMode, GateState
@@ -16,7 +16,7 @@ class Robot:
 
     def __init__(self) -> None:
         self.gates, self.stops, self.events = Mailbox(latest()), Mailbox(latest()), Mailbox(fifo(64))
-        self.standing = Standing(self.gates, self.stops, self.events)
+        self.monitor = StandstillMonitor(self.gates, self.stops, self.events)
         self.now = 0
 
     def gate(self, mode: GateMode, *reasons: Reason) -> str:
@@ -25,7 +25,7 @@ class Robot:
         self.gates.put(
             GateState(stamp=self.now, received=0, seq=0, mode=mode, nonce="n", speed_limit=0.0, reasons=reasons)
         )
-        return self.standing.why()
+        return self.monitor.why()
 
     def event(self, reason: Reason, text: str = "", source: str = "gate") -> None:
         self.now += 1
@@ -48,7 +48,7 @@ class Robot:
 def test_where_it_stood_before_anybody_looked_only_what_holds_it_is_known():
     robot = Robot()
     robot.stop(GateMode.STOPPING, "long ago")
-    assert robot.standing.why() == ""
+    assert robot.monitor.why() == ""
     assert robot.gate(GateMode.DISARMED, Reason.DISARMED, Reason.SCAN_STALE) == f"{OFF}, {Reason.SCAN_STALE.text}"
     assert robot.gate(GateMode.DISARMED) == "the robot is disarmed"
     assert robot.gate(GateMode.DRIVING, Reason.OBSTACLE_SLOW) == ""

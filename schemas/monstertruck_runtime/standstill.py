@@ -21,8 +21,8 @@ ENDS: Final = frozenset({Reason.DISARMED, Reason.FAULTS_REPEAT})
 """Events of the gate whose text says who or what disarmed the robot."""
 
 
-class Standing:
-    """Follows one robot; see ``standing``.
+class StandstillMonitor:
+    """Follows one robot; see ``monitor_standstill``.
 
     Args:
         gate: newest state of the gate.
@@ -82,11 +82,11 @@ def _causes(stop: Stop) -> str:
 
 
 @contextmanager
-def standing(robot: Subscriber) -> Iterator[Standing]:
+def monitor_standstill(robot: Subscriber) -> Iterator[StandstillMonitor]:
     """Follow a robot through its ``subscribe`` while the context lasts."""
     with (
         robot.subscribe(GATE, latest()) as gate,
         robot.subscribe(STOP, latest()) as stops,
         robot.subscribe(EVENT, fifo(256)) as events,
     ):
-        yield Standing(gate, stops, events)
+        yield StandstillMonitor(gate, stops, events)
