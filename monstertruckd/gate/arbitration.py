@@ -239,9 +239,9 @@ class Sources:
             return Reason.BUSY
         return Reason.LOWER_PRIORITY
 
-    def motion_requested(self, now: int, roles: frozenset[Role] = DRIVERS) -> bool:
-        """Whether any source of ``roles`` with a valid lease requests motion."""
-        return any(source.request.role in roles and not source.neutral for source in self.live(now))
+    def requesting_motion(self, now: int, roles: frozenset[Role] = DRIVERS) -> tuple[str, ...]:
+        """Names of the sources of ``roles`` that have a valid lease and request motion."""
+        return tuple(s.request.source for s in self.live(now) if s.request.role in roles and not s.neutral)
 
     def claim(self, role: Role) -> None:
         """``role`` has driven or stopped the truck: lower roles wait for the next ARM order."""

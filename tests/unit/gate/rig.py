@@ -170,9 +170,12 @@ class Rig:
         return (self.gate.planner_request if inside else self.gate.request)(request, self.now)
 
     def order(self, order, source="ann", role=Role.GAMEPAD, **more):
+        return self.decide(order, source, role, **more).reason
+
+    def decide(self, order, source="ann", role=Role.GAMEPAD, **more):
         fields = {**header(self.now, self.seq()), "nonce": NONCE, "gate_stamp": self.now, **more}
         request = ControlRequest(source=source, role=role, lease=1.0, order=order, **fields)
-        return self.gate.control(request, self.now).reason
+        return self.gate.control(request, self.now)
 
     def sense(self):
         """Every sensor that is not silent delivers now."""

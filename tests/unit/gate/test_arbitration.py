@@ -13,6 +13,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order, RequestedTwist, Role
 from monstertruck_schemas.state import GateMode
 from monstertruckd.gate.config import GateConfig
+from monstertruckd.gate.core import Decision
 from tests.unit.gate.rig import ANY_GROUND, CHASSIS, DRIVETRAIN, STEERING, TICK, Rig
 
 
@@ -272,6 +273,24 @@ def test_estop_is_cleared_by_reset_with_neutral_stick_then_arm():
     assert rig.order(Order.RESET) is Reason.OK  # nothing to reset
     rig.tick()
     assert rig.out.mode in (GateMode.ARMED, GateMode.DRIVING)
+
+
+def test_a_refused_reset_says_what_is_not_at_rest():
+    rig = Rig(latched=True)
+    rig.order(Order.ESTOP)
+    rig.speed = 0.1
+    rig.tick()
+    assert rig.decide(Order.RESET) == Decision(Reason.NOT_ARMED_SPEED, "the robot moves at 0.10 m/s")
+    rig.tick(20)
+    rig.drive(speed=0.1, source="bob")
+    text = "bob requests motion: expected a neutral stick"
+    assert rig.decide(Order.RESET, source="eve") == Decision(Reason.NOT_ARMED_SPEED, text)
+    rig.drive(speed=0.0, source="bob")
+    rig.silent = {"drive"}
+    rig.tick(15)
+    refused = rig.decide(Order.RESET)
+    assert refused.reason is Reason.DRIVE_STALE, "whether it is at rest is not known"
+    assert "drive" in refused.text
 
 
 def test_arming_is_refused_while_moving_pushed_or_blocked():

@@ -40,7 +40,7 @@ def test_a_lease_counts_to_its_last_instant_everywhere():
     for at, alive in ((NOW + LEASE, True), (NOW + LEASE + 1, False)):
         assert bool(crowd.live(at)) is alive
         assert (crowd.driving(at) == "ann") is alive
-        assert crowd.motion_requested(at) is alive
+        assert bool(crowd.requesting_motion(at)) is alive
 
 
 def test_a_lease_is_the_shorter_of_what_is_asked_and_granted():
@@ -287,14 +287,14 @@ def test_names_invented_after_a_stop_keep_nobody_standing(name):
 
 def test_motion_is_asked_for_by_the_roles_in_question():
     crowd = Crowd()
-    assert not crowd.motion_requested(NOW)
+    assert crowd.requesting_motion(NOW) == ()
     crowd.heard("ann", speed=0.0)
-    assert not crowd.motion_requested(NOW)
+    assert crowd.requesting_motion(NOW) == ()
     crowd.heard("track", Role.TRACKER, inside=True)
-    assert crowd.motion_requested(NOW)
-    assert not crowd.motion_requested(NOW, OPERATORS)
+    assert crowd.requesting_motion(NOW) == ("track",)
+    assert crowd.requesting_motion(NOW, OPERATORS) == ()
     crowd.heard("bob")
-    assert crowd.motion_requested(NOW, OPERATORS)
+    assert crowd.requesting_motion(NOW, OPERATORS) == ("bob",)
 
 
 def test_planners_that_ask_for_motion_wait():
