@@ -105,9 +105,17 @@ _Fields = dict[str, Any]
 """Of one of our models, by name, not validated yet."""
 
 
+_DOUBLES: Final = {count: struct.Struct(f"<{count}d") for count in (1, 3)}
+"""How so many numbers are packed."""
+
+
+def _bytes(numbers: _Numbers) -> bytes:
+    return numbers if isinstance(numbers, bytes) else np.array(numbers, np.float64).tobytes()
+
+
 def _array(numbers: _Numbers) -> NDArray[np.float64]:
     """Read-only array of a repeated field."""
-    data = numbers if isinstance(numbers, bytes) else np.array(numbers, np.float64).tobytes()
+    data = _bytes(numbers)
     if len(data) % 8:
         msg = f"packed numbers of {len(data)} bytes: expected 8 for each"
         raise InputError(msg)
@@ -115,16 +123,17 @@ def _array(numbers: _Numbers) -> NDArray[np.float64]:
 
 
 def _packed(*numbers: float) -> bytes:
-    return struct.pack(f"<{len(numbers)}d", *numbers)
+    return _DOUBLES[len(numbers)].pack(*numbers)
 
 
-def _unpacked(numbers: _Numbers, count: int) -> list[float]:
+def _unpacked(numbers: _Numbers, count: int) -> tuple[float, ...]:
     """So many numbers."""
-    values: list[float] = _array(numbers).tolist()
-    if len(values) != count:
-        msg = f"expected {count} numbers, got {len(values)}"
-        raise InputError(msg)
-    return values
+    data = _bytes(numbers)
+    try:
+        return _DOUBLES[count].unpack(data)
+    except struct.error:
+        msg = f"expected {count} numbers, got {len(data) / 8:g}"
+        raise InputError(msg) from None
 
 
 def _pose2d(exact: _Numbers, pose: Any) -> Pose2D:
@@ -145,7 +154,7 @@ def _write_scan(scan: LaserScan, proto: Any) -> None:
     proto.ranges = scan.ranges.tobytes()
     proto.codes = scan.codes.tobytes()
     if scan.tilt is not None:
-        proto.tilt = struct.pack("<d", scan.tilt)
+        proto.tilt = _packed(scan.tilt)
 
 
 def _read_scan(proto: Any) -> _Fields:
