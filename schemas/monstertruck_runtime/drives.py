@@ -16,6 +16,7 @@ from monstertruck_schemas.event import Event, Severity
 from monstertruck_schemas.plan import GoalPhase, GoalState, Path, TrackerState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import GoalOrder
+from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.state import GateState
 from monstertruck_schemas.topics import EVENT, GOAL, PATH, TRACKER
 
@@ -75,7 +76,7 @@ async def drive_to(
     """Send a goal and wait for its end; cancelled or without an answer, it cancels the goal, but nobody else's.
 
     Raises:
-        RequestRefusedError: the goal or the arming was refused, or the robot restarted.
+        RequestRefusedError: the goal or the arming was refused, the goal service failed, or the robot restarted.
         NoAnswerError: the robot does not answer, or has been silent for a minute.
     """
     with driver.subscribe(GOAL, fifo(256)) as states, monitor_standstill(driver) as stand:
@@ -86,7 +87,7 @@ async def drive_to(
         async with taken_back(cancel):
             number = await _taken_on(driver, clock, goal, via, report)
         end = _goal_end(states, number, report)
-        return await _watched(driver, clock, stand, arm=arm, end=end, undo=cancel, report=report)
+        return await _watched(driver, clock, stand, ServiceName.GOALS, arm=arm, end=end, undo=cancel, report=report)
 
 
 async def _taken_on(
@@ -144,7 +145,7 @@ async def follow(driver: TruckClient, clock: Clock, path: Path, *, arm: bool, re
     """Send a path and wait for its end; cancelled or without an answer, it stops the truck, but not on another path.
 
     Raises:
-        RequestRefusedError: the path or the arming was refused, or the robot restarted.
+        RequestRefusedError: the path or the arming was refused, the tracker failed, or the robot restarted.
         NoAnswerError: the robot does not answer, or has been silent for a minute.
     """
     path = path.model_copy(update={"name": f"{path.name[:96]}-{clock.now():x}"})
@@ -167,7 +168,7 @@ async def follow(driver: TruckClient, clock: Clock, path: Path, *, arm: bool, re
                 await driver.stop()
 
         end = _path_end(clock, states, present, path.name, report)
-        return await _watched(driver, clock, stand, arm=arm, end=end, undo=stop, report=report)
+        return await _watched(driver, clock, stand, ServiceName.TRACKER, arm=arm, end=end, undo=stop, report=report)
 
 
 async def _accepted(
@@ -210,6 +211,7 @@ async def _watched(
     driver: TruckClient,
     clock: Clock,
     stand: StandstillMonitor,
+    needs: ServiceName,
     *,
     arm: bool,
     end: Awaitable[Arrival],
@@ -218,7 +220,7 @@ async def _watched(
 ) -> Arrival:
     """Wait for the end and report why the truck stands meanwhile; ``undo`` if cancelled or refused."""
     watching = asyncio.create_task(_say_why_it_stands(stand, clock, report))
-    ending = asyncio.ensure_future(while_it_runs(driver, end))
+    ending = asyncio.ensure_future(while_it_runs(driver, end, needs))
     try:
         if arm and not ((state := stand.gate.latest) is not None and state.mode.active):
             # A truck that is armed already may have set off.
@@ -233,7 +235,11 @@ async def _watched(
             await undo()
         raise
     except BaseException:
-        await undo()
+        try:
+            await undo()
+        except RequestRefusedError as refused:
+            if refused.refusal is not Reason.NOT_FOUND:  # it has just ended by itself
+                raise
         raise
     finally:
         watching.cancel()

@@ -1,4 +1,4 @@
-"""A client that waits for what a robot says later: the robot may restart, or fall silent forever, meanwhile."""
+"""A client that waits for what a robot says later: meanwhile it may restart or fall silent, or a service of it fail."""
 
 import asyncio
 from collections.abc import Awaitable
@@ -6,9 +6,11 @@ from typing import Any, Final, NoReturn, Protocol, TypeVar
 
 from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError
 from monstertruck_runtime.mailbox import Delivery, Mailbox, latest
+from monstertruck_schemas.health import HealthTable, ServiceState
 from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.state import GateState
-from monstertruck_schemas.topics import GATE
+from monstertruck_schemas.topics import GATE, HEALTH
 
 T = TypeVar("T")
 
@@ -24,17 +26,17 @@ class Subscriber(Protocol):
         """A mailbox that is a context manager."""
 
 
-async def while_it_runs(robot: Subscriber, work: Awaitable[T]) -> T:
-    """The result of ``work``, which waits for what the robot's present run says.
+async def while_it_runs(robot: Subscriber, work: Awaitable[T], needs: ServiceName) -> T:
+    """The result of ``work``, which waits for what the service ``needs`` of the robot's present run says.
 
     Raises:
-        RequestRefusedError: the robot restarted: its new run knows nothing of it.
+        RequestRefusedError: the service failed, or the robot restarted: its new run knows nothing of it.
         NoAnswerError: it has been silent for ``LOST`` s.
         Exception: what ``work`` raised.
     """
     working = asyncio.ensure_future(work)
-    with robot.subscribe(GATE, latest()) as gate:
-        watching = asyncio.create_task(_until_gone(gate))
+    with robot.subscribe(GATE, latest()) as gate, robot.subscribe(HEALTH, latest()) as health:
+        watching = asyncio.create_task(_until_gone(gate, health, needs))
         try:
             await asyncio.wait((working, watching), return_when=asyncio.FIRST_COMPLETED)
             return working.result() if working.done() else watching.result()
@@ -44,10 +46,13 @@ async def while_it_runs(robot: Subscriber, work: Awaitable[T]) -> T:
             await asyncio.gather(working, watching, return_exceptions=True)
 
 
-async def _until_gone(gate: Mailbox[GateState]) -> NoReturn:
+async def _until_gone(gate: Mailbox[GateState], health: Mailbox[HealthTable], needs: ServiceName) -> NoReturn:
     run: str | None = None
     while (state := await gate.next_within(LOST)) is not None:
         run = run or state.nonce
         if state.nonce != run:
             raise RequestRefusedError(Reason.SHUTDOWN, "the robot's daemon was restarted meanwhile")
+        for service in () if health.latest is None else health.latest.services:
+            if service.name == needs and service.state is ServiceState.FAILED:
+                raise RequestRefusedError(Reason.SERVICE_FAILED, f"{service.name}: {service.detail}")
     raise NoAnswerError(f"the robot has been silent for {LOST:g} s: it may be driving on")

@@ -66,3 +66,25 @@ def test_the_shipped_mission_is_one():
     from monstertruckd.tools.cli.mission import load
 
     assert len(load(Path(__file__).resolve().parents[2] / "configs" / "missions" / "rooms.yaml").steps) == 6
+
+
+@pytest.mark.parametrize("driven", [0.0, 3.0])
+def test_a_robot_with_a_path_of_its_own_waits_where_it_is(tmp_path: Path, driven: float):
+    """Armed for the mission, it would drive along the path meanwhile; one that does already stops."""
+    file = tmp_path / "ahead.csv"
+    file.write_text("x,y,yaw,direction\n" + "".join(f"{1.0 + i / 10},3.95,0,1\n" for i in range(31)))
+    steps = [{"do": "wait", "seconds": 8.0}]
+    mission = Mission.model_validate_json(json.dumps({"version": 2, "name": "stay", "steps": steps}))
+    at: list[float] = []
+
+    async def story(trip: Trip) -> None:
+        if driven:
+            await trip.arm()
+            await trip.clock.sleep(driven)
+        at.append(trip.rig.truth.array()[-1, 1])
+        end = await run_mission(MissionOperator(trip.rig.daemon, trip.clock), mission, arm=True)
+        assert end.reason is Reason.MISSION_DONE, end.text
+
+    rig = travel(story, path={"file": file, "closed": False})
+    assert (at[0] > 1.3) == (driven > 0.0)
+    assert_at(rig, at[0], 3.95, 0.0)

@@ -16,6 +16,7 @@ from monstertruck_schemas.mission import Mission
 from monstertruck_schemas.plan import BehaviourState, ExplorationPhase, ExplorationState, MissionState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import BehaviourOrder, ExploreOrder, MissionOrder
+from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.topics import BEHAVIOUR, EXPLORE, MISSION, Topic
 from monstertruckd.tools.cli.output import progress, with_remedy
 
@@ -47,6 +48,7 @@ async def run_behaviour(client: Operator, name: str, *, arm: bool, settings: Map
         return await _run(
             client,
             BEHAVIOUR,
+            ServiceName.BEHAVIOURS,
             lambda: client.behave(BehaviourOrder.START, name, settings),
             lambda: client.behave(BehaviourOrder.STOP, name, own=True),
             lambda state: bar(state.elapsed, f"{name}: {state.phase or 'begins'}, {state.travelled:.1f} m"),
@@ -84,6 +86,7 @@ async def run_exploration(
         return await _run(
             client,
             EXPLORE,
+            ServiceName.EXPLORER,
             lambda: client.explore(ExploreOrder.START, home=home, budget=budget, find=find),
             lambda: client.explore(ExploreOrder.STOP, own=True),
             show,
@@ -132,6 +135,7 @@ async def run_mission(
         return await _run(
             client,
             MISSION,
+            ServiceName.MISSIONS,
             lambda: client.mission(order, mission, moved=moved),
             lambda: client.mission(MissionOrder.STOP, own=True),
             show,
@@ -155,6 +159,7 @@ def _why_it_stands(stand: StandstillMonitor) -> str:
 async def _run(
     client: Operator,
     topic: Topic[S],
+    needs: ServiceName,
     start: Callable[[], Awaitable[dict[str, Any]]],
     stop: Callable[[], Awaitable[object]],
     show: Callable[[S], None],
@@ -168,20 +173,20 @@ async def _run(
     With ``to_its_end`` one that is cancelled ends as any other does, once the robot has stopped it.
 
     Raises:
-        RequestRefusedError: the start or the arming was refused, or the robot restarted.
+        RequestRefusedError: the start or the arming was refused, the service failed, or the robot restarted.
         NoAnswerError: the robot does not answer, or has been silent for a minute.
     """
     with client.subscribe(topic, fifo(256)) as states:
         number: int | None = None
         try:
             number = await _started(client, start, arm=arm)
-            return await while_it_runs(client, _followed(states, number, show, figures))
+            return await while_it_runs(client, _followed(states, number, show, figures), needs)
         except BaseException as error:
             if not isinstance(error, TruckError) or isinstance(error, NoAnswerError):
                 with suppress(TruckError):
                     await stop()
                     if to_its_end and number is not None and isinstance(error, asyncio.CancelledError):
-                        return await while_it_runs(client, _followed(states, number, show, figures))
+                        return await while_it_runs(client, _followed(states, number, show, figures), needs)
             raise
 
 

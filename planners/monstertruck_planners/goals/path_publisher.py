@@ -146,6 +146,13 @@ class PathPublisher:
         self.brake(name)
         self.followed = None
 
+    def end_other(self, name: str) -> None:
+        """Let a path that another source published, as the configured one, end as soon as the tracker can brake."""
+        path = self._in.path.latest
+        if path is not None and (self.followed is None or path is not self.followed.message):
+            self.followed = _followed(path)
+            self.halt(name)
+
     def stand_still(self) -> None:
         """Ask the gate for standstill, so that the truck stays armed while nothing is driven."""
         gate, now = self._in.gate.latest, self._clock.now()
@@ -177,9 +184,14 @@ class PathPublisher:
             clearance=np.zeros(0) if clearance is None else np.array(clearance),
             name=f"{name}.{self._paths}",
         )
-        steps = np.hypot(*np.diff(poses[:, :2], axis=0).T)
-        self.followed = FollowedPath(message, poses, np.concatenate(([0.0], np.cumsum(steps))), before)
+        self.followed = _followed(message, before)
         self._out.path.put(message)
+
+
+def _followed(path: Path, before: float = 0.0) -> FollowedPath:
+    poses = path.poses.reshape(-1, 3)
+    steps = np.hypot(*np.diff(poses[:, :2], axis=0).T)
+    return FollowedPath(path, poses, np.concatenate(([0.0], np.cumsum(steps))), before)
 
 
 def poses_ahead(poses: Array, travelled: Array, along: float, reach: float, pose: Pose) -> Array:

@@ -203,12 +203,15 @@ class GoalService:
     def hold(self, who: str, *, on: bool) -> None:
         """Keep the truck armed between goals, by requests for standstill; for services that send several goals.
 
-        While a behaviour runs there are none: its own requests keep the truck armed.
+        A path of another source, as the configured one, is not followed any longer. While a behaviour runs there are
+        no such requests: its own keep the truck armed.
 
         Args:
             who: the service.
             on: until it is called with False.
         """
+        if on and who not in self._held:
+            self._paths.end_other("standstill")
         (self._held.add if on else self._held.discard)(who)
 
     async def settled(self, number: int) -> GoalState:

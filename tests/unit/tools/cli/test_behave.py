@@ -13,7 +13,7 @@ from monstertruck_schemas.plan import BehaviourState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import BehaviourOrder
 from monstertruck_schemas.state import GateMode, GateState
-from monstertruck_schemas.topics import BEHAVIOUR
+from monstertruck_schemas.topics import BEHAVIOUR, GATE
 from monstertruckd.tools.cli import behave, runs
 from monstertruckd.tools.cli.main import app
 from monstertruckd.tools.cli.runs import run_behaviour
@@ -39,7 +39,7 @@ class Robot:
         box = Mailbox(delivery)
         if topic is BEHAVIOUR:
             self.box = box
-        else:
+        elif topic is GATE:
             self.tasks.append(asyncio.create_task(self._runs(box)))
         yield box
 

@@ -14,6 +14,7 @@ from monstertruck_runtime.mailbox import Mailbox, fifo, latest
 from monstertruck_runtime.standstill import StandstillMonitor
 from monstertruck_schemas import topics
 from monstertruck_schemas.event import Event, Severity
+from monstertruck_schemas.health import HealthTable, ServiceHealth, ServiceState
 from monstertruck_schemas.plan import Path, TrackerState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.state import GateMode, GateState
@@ -194,6 +195,18 @@ def test_a_goal_that_is_refused_leaves_the_present_one_alone():
     assert interrupted(SilentRobot("goal", refused), to_goal) == ["goal"]
 
 
+def test_a_drive_that_is_interrupted_in_the_instant_of_its_end_is_interrupted():
+    async def main(clock):
+        ended = RequestRefusedError(Reason.NOT_FOUND, "cancel: no goal is being pursued")
+        driving = asyncio.create_task(to_goal(SilentRobot("cancel", ended), clock))
+        await clock.sleep(3.0)
+        driving.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await driving
+
+    run_virtual(main)
+
+
 def test_arming_that_is_interrupted_is_taken_back_with_the_goal():
     assert interrupted(SilentRobot("arm"), to_goal) == ["goal", "arm", "disarm", "cancel"]
 
@@ -330,6 +343,27 @@ def test_nobody_waits_for_a_robot_that_was_restarted_or_stays_silent(said, resta
         assert clock.now() - began == pytest.approx(after * SECOND)
         assert getattr(lost.value, "refusal", Reason.SHUTDOWN) is Reason.SHUTDOWN
         assert robot.asked == ["goal", "arm", "cancel"]  # which it did not understand
+        await living
+
+    run_virtual(main)
+
+
+def test_nobody_waits_for_a_goal_service_that_failed():
+    class Robot(LostRobot):
+        def subscribe(self, topic, delivery):
+            box = super().subscribe(topic, delivery)
+            if topic is topics.HEALTH:
+                rows = [ServiceHealth(name="goals", state=ServiceState.FAILED, since=0, detail="ended by itself")]
+                box.put(HealthTable(stamp=0, received=0, seq=0, services=tuple(rows)))
+            return box
+
+    async def main(clock):
+        robot = Robot(clock, 10, restarts=False)
+        living, began = asyncio.create_task(robot.live()), clock.now()
+        with pytest.raises(RequestRefusedError, match=r"^goals: ended by itself$") as lost:
+            await to_goal(robot, clock)
+        assert lost.value.refusal is Reason.SERVICE_FAILED
+        assert clock.now() - began == pytest.approx(0.1 * SECOND), "with the first report of the gate"
         await living
 
     run_virtual(main)
