@@ -35,8 +35,6 @@ from monstertruckd.gate.config import GateConfig
 PRIORITY: Final = {role: rank for rank, role in enumerate(reversed(Role))}
 """The greater number wins."""
 
-DRIVERS: Final = OPERATORS | {Role.TRACKER}
-
 Key = tuple[bool, str]
 
 MAX_KEYS: Final = 64
@@ -239,9 +237,9 @@ class Sources:
             return Reason.BUSY
         return Reason.LOWER_PRIORITY
 
-    def requesting_motion(self, now: int, roles: frozenset[Role] = DRIVERS) -> tuple[str, ...]:
-        """Names of the sources of ``roles`` that have a valid lease and request motion."""
-        return tuple(s.request.source for s in self.live(now) if s.request.role in roles and not s.neutral)
+    def requesting_motion(self, now: int) -> tuple[str, ...]:
+        """Names of the operators who have a valid lease and request motion; a planner may wait to be let drive."""
+        return tuple(s.request.source for s in self.live(now) if s.request.role in OPERATORS and not s.neutral)
 
     def claim(self, role: Role) -> None:
         """``role`` has driven or stopped the truck: lower roles wait for the next ARM order."""

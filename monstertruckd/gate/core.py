@@ -28,7 +28,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import ControlRequest, DriveForm, DriveRequest, Order, Role
 from monstertruck_schemas.sensor import Attitude, Battery, DriveFeedback, LaserScan, SonarRanges, SteeringFeedback
 from monstertruck_schemas.state import GateMode, Odometry, Peers
-from monstertruckd.gate.arbitration import DRIVERS, EventLog, GateEvent, GateStateMachine, Source, Sources
+from monstertruckd.gate.arbitration import EventLog, GateEvent, GateStateMachine, Source, Sources
 from monstertruckd.gate.config import GateConfig
 from monstertruckd.gate.limiter import CommandLimiter, Motion, ObstacleGuard
 from monstertruckd.gate.peers import PeerGuard
@@ -332,14 +332,14 @@ class Gate:
         causes = self._outages.explain(self._causes.causes(blocks, now, self._known))
         return self._refuse_order(now, blocks[0], request, causes_text(causes, now))
 
-    def _refuse_moving(self, now: int, request: ControlRequest, roles: frozenset[Role]) -> Decision | None:
-        """The refusal while the robot is not known to be at rest or a source of ``roles`` requests motion."""
+    def _refuse_moving(self, now: int, request: ControlRequest) -> Decision | None:
+        """The refusal while the robot is not known to be at rest or an operator requests motion."""
         if not self._sensors.at_rest(now):
             speed = self._sensors.speed(now)
             if speed is None:
                 return self._refuse_blocked(now, (Reason.DRIVE_STALE,), request)
             return self._refuse_order(now, Reason.NOT_ARMED_SPEED, request, f"the robot moves at {speed:.2f} m/s")
-        if sources := self._sources.requesting_motion(now, roles):
+        if sources := self._sources.requesting_motion(now):
             text = f"{', '.join(sources)} requests motion: expected a neutral stick"
             return self._refuse_order(now, Reason.NOT_ARMED_SPEED, request, text)
         return None
@@ -384,7 +384,7 @@ class Gate:
             return self._refuse_blocked(now, blocks, request)
         if self.mode is GateMode.STOPPING:
             return self._refuse_order(now, Reason.NOT_ARMED_SPEED, request, "the robot still stops")
-        if refusal := self._refuse_moving(now, request, OPERATORS):
+        if refusal := self._refuse_moving(now, request):
             return refusal
         self._sources.release(planners=not request.hold)
         self._states.arm(now, request.source)
@@ -419,7 +419,7 @@ class Gate:
     def _reset(self, request: ControlRequest, now: int) -> Decision:
         if self.mode is not GateMode.ESTOPPED:
             return ACCEPTED
-        if refusal := self._refuse_moving(now, request, DRIVERS):
+        if refusal := self._refuse_moving(now, request):
             return refusal
         self._disarm(now, f"emergency stop reset by {request.source}")
         return ACCEPTED

@@ -323,6 +323,15 @@ def test_a_waiting_tracker_does_not_hinder_arming():
     assert rig.out.mode is GateMode.DRIVING
 
 
+def test_a_tracker_that_drove_just_now_does_not_hinder_the_reset():
+    rig = Rig(latched=True)
+    rig.driver = {"speed": 0.2, "source": "track", "role": Role.TRACKER, "inside": True}
+    rig.tick(5)
+    assert rig.order(Order.RESET) is Reason.OK
+    rig.tick()
+    assert rig.out.mode is GateMode.DISARMED
+
+
 def test_disarm_stops_first():
     rig = Rig().driving()
     assert rig.order(Order.DISARM) is Reason.OK

@@ -3,7 +3,7 @@
 import pytest
 
 from monstertruck_runtime.clock import SECOND
-from monstertruck_runtime.requests import MAX_SOURCES, OPERATORS
+from monstertruck_runtime.requests import MAX_SOURCES
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import ControlRequest, DriveRequest, Order, Role
 from monstertruckd.gate.arbitration import Sources
@@ -285,16 +285,14 @@ def test_names_invented_after_a_stop_keep_nobody_standing(name):
 # What is asked for
 
 
-def test_motion_is_asked_for_by_the_roles_in_question():
+def test_motion_is_asked_for_by_operators():
     crowd = Crowd()
     assert crowd.requesting_motion(NOW) == ()
     crowd.heard("ann", speed=0.0)
-    assert crowd.requesting_motion(NOW) == ()
     crowd.heard("track", Role.TRACKER, inside=True)
-    assert crowd.requesting_motion(NOW) == ("track",)
-    assert crowd.requesting_motion(NOW, OPERATORS) == ()
+    assert crowd.requesting_motion(NOW) == ()
     crowd.heard("bob")
-    assert crowd.requesting_motion(NOW, OPERATORS) == ("bob",)
+    assert crowd.requesting_motion(NOW) == ("bob",)
 
 
 def test_planners_that_ask_for_motion_wait():
