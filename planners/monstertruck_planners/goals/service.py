@@ -111,6 +111,8 @@ class GoalService:
         self._reported: GoalState | None = None
         self._planning: asyncio.Task[PlanAnswer] | None = None
         self._actor: Actor | None = None
+        self._trouble: TruckError | None = None
+        """Why the planner did not start the last time."""
         self._tasks: asyncio.TaskGroup | None = None
         self._fresh = True
         self._sent_grid: Grid | None = None
@@ -123,9 +125,17 @@ class GoalService:
         self._changed = asyncio.Event()
 
     async def run(self, ready: Ready) -> None:
-        """Serve goals until cancelled."""
+        """Serve goals until cancelled.
+
+        Raises:
+            TruckError: the planner does not start; until it does, goals are refused for that.
+        """
         async with self._place as actor:
-            await actor.start()
+            try:
+                await actor.start()
+            except TruckError as error:
+                self._trouble = error
+                raise
             async with asyncio.TaskGroup() as tasks:
                 self._actor, self._tasks, self._fresh, self._sent_grid = actor, tasks, True, None
                 if self._deformation is not None:
@@ -163,6 +173,9 @@ class GoalService:
             RequestRefusedError: the sender is not permitted, or the goal is not valid.
         """
         self._examine(request, "goal", moves=True)
+        if self._actor is None and self._trouble is not None:
+            why = str(self._trouble).partition("\n")[0]
+            raise RequestRefusedError(self._trouble.reason, f"the planner does not start: {why}")
         if self._actor is None:
             text = "the planner is starting; the first time after an installation it compiles for a minute or two"
             raise RequestRefusedError(Reason.PLANNER_STARTING, text)

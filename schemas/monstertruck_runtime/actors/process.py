@@ -22,6 +22,8 @@ from typing import Any
 from monstertruck_runtime.errors import WorkerError
 
 NICE = 5
+ENDING = 1.0
+"""Seconds in which a process that has closed its connection ends."""
 _TIMEVAL = struct.Struct("@ll")
 """Seconds and microseconds, see socket(7)."""
 _SINGLE_THREADED = {
@@ -40,6 +42,7 @@ class WorkerProcess:
 
     def __init__(self, name: str, target: str, stall_timeout: float = 30.0) -> None:
         self._name = name
+        self._killed = False
         self.used = 0.0
         """Processor time of the newest step, s."""
         ours, theirs = socket.socketpair()
@@ -76,7 +79,7 @@ class WorkerProcess:
         """Wait for the outputs of a step, or for the message that the worker is built; sets ``used``.
 
         Raises:
-            WorkerError: the process is gone or its code raised; the text holds its traceback.
+            WorkerError: the process is gone, or its code raised; the text begins with why, and holds the traceback.
             TimeoutError: nothing came for ``timeout`` seconds, or the process stopped in the middle of its answer.
         """
         try:
@@ -90,7 +93,8 @@ class WorkerProcess:
         except (EOFError, OSError) as error:
             raise WorkerError(self._gone()) from error
         if not success:
-            raise WorkerError(f"worker {self._name} raised\n{value}")
+            why = next((line for line in reversed(value.splitlines()) if line.strip()), "")
+            raise WorkerError(f"worker {self._name} raised {why}\n{value}")
         return value
 
     def exchange(self, inputs: Any) -> Any:
@@ -103,11 +107,23 @@ class WorkerProcess:
 
         The connection ends with its last user: a thread may still wait for it.
         """
+        self._killed = True
         self._process.kill()
         self._process.wait()
 
     def _gone(self) -> str:
-        return f"worker {self._name} (process {self._process.pid}) is gone"
+        """That the process is gone, and how it ended."""
+        text = f"worker {self._name} (process {self._process.pid}) is gone"
+        if self._killed:
+            return text
+        try:
+            code = self._process.wait(ENDING)
+        except subprocess.TimeoutExpired:
+            return f"{text}: it closed its connection"
+        if code >= 0:
+            return f"{text}: it ended with exit code {code}"
+        short = ", as by a system that is short of memory" if -code == signal.SIGKILL else ""
+        return f"{text}: killed by {signal.Signals(-code).name}{short}"
 
 
 def main() -> int:

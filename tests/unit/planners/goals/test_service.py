@@ -32,11 +32,34 @@ def test_a_goal_that_comes_too_early_is_refused_by_what_is_missing(
 ):
     service = GoalService.__new__(GoalService)
     monkeypatch.setattr(service, "_examine", lambda *_, **__: None)
-    service._actor = actor
+    service._actor, service._trouble = actor, None
     service._in = SimpleNamespace(pose=SimpleNamespace(latest=None), slam=None)
     with pytest.raises(RequestRefusedError, match=text) as refused:
         service.take(None)
     assert refused.value.refusal is reason
+
+
+def test_a_planner_that_cannot_start_is_not_said_to_be_starting(monkeypatch: pytest.MonkeyPatch):
+    error = "worker goals raised ImportError: libLLVM.so: cannot open"
+
+    class Broken:
+        async def __aenter__(self):
+            return self
+
+        async def __aexit__(self, *_):
+            pass
+
+        async def start(self):
+            raise WorkerError(f"{error}\nTraceback (most recent call last):")
+
+    service = GoalService.__new__(GoalService)
+    monkeypatch.setattr(service, "_examine", lambda *_, **__: None)
+    service._place, service._actor, service._trouble = Broken(), None, None
+    with pytest.raises(WorkerError):
+        asyncio.run(service.run(lambda: pytest.fail("it is not ready")))
+    with pytest.raises(RequestRefusedError, match=rf"^the planner does not start: {error}$") as refused:
+        service.take(None)
+    assert refused.value.refusal is Reason.WORKER_DIED
 
 
 def test_a_running_behaviour_excludes_a_goal_and_lets_one_be_cancelled(monkeypatch: pytest.MonkeyPatch):
