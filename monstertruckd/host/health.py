@@ -36,7 +36,8 @@ DEGRADED: Final = frozenset({Reason.SLOW_LINK})
 class HealthBoard:
     """Collects every service's state, publishes the table on change and once a second.
 
-    The first loss and the recovery of a service are events; repeated failures of one outage are not. A device that was
+    The loss and the recovery of a service are events; a repeated failure of one outage is none, unless its cause is
+    another one or the service is given up. A device that was
     unplugged from a hub is reported at its second failure: if the whole hub is gone there is none, as it waits for the
     hub, whose loss is one event for all.
 
@@ -65,7 +66,8 @@ class HealthBoard:
         self._on_hubs = on_hubs
         self._unplugged: set[str] = set()
         self._rows: dict[str, ServiceHealth] = {}
-        self._down: set[str] = set()
+        self._down: dict[str, set[Reason]] = {}
+        """Services that do not work, with the causes that were reported since they did."""
         self._degraded: dict[str, Event] = {}
 
     def observe_event(self, event: Event) -> None:
@@ -84,22 +86,24 @@ class HealthBoard:
         if row.state is ServiceState.STARTING:
             self._degraded.pop(row.name, None)
         elif row.state is ServiceState.READY:
-            returned = row.name in self._down | self._unplugged
-            self._down.discard(row.name)
+            returned = row.name in self._unplugged or row.name in self._down
+            self._down.pop(row.name, None)
             self._unplugged.discard(row.name)
             text = "is back" if returned else "is ready"
             self._events(Reason.DEVICE_READY, Severity.INFO, row.name, text, restarts=row.restarts)
         elif self._may_be_its_hub(row):
             self._unplugged.add(row.name)
-        elif row.state in (ServiceState.BACKOFF, ServiceState.FAILED) and row.name not in self._down:
-            self._down.add(row.name)
-            severity = Severity.ERROR if row.state is ServiceState.FAILED else Severity.WARNING
-            self._events(row.reason, severity, row.name, row.detail, restarts=row.restarts)
+        elif row.state in (ServiceState.BACKOFF, ServiceState.FAILED):
+            given_up, told = row.state is ServiceState.FAILED, self._down.setdefault(row.name, set())
+            if given_up or row.reason not in told:
+                severity = Severity.ERROR if given_up else Severity.WARNING
+                self._events(row.reason, severity, row.name, row.detail, restarts=row.restarts)
+            told.add(row.reason)
         self._publish()
 
     def _may_be_its_hub(self, row: ServiceHealth) -> bool:
         """The first time that a working device on a hub is gone."""
-        first = row.state is ServiceState.BACKOFF and row.name not in self._down | self._unplugged
+        first = row.state is ServiceState.BACKOFF and not (row.name in self._down or row.name in self._unplugged)
         return first and row.reason is Reason.DEVICE_LOST and row.name in self._on_hubs
 
     def rows(self) -> tuple[ServiceHealth, ...]:

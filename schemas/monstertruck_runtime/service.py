@@ -101,6 +101,7 @@ async def supervise(
     """
     session = _Session(service.name, clock, report)
     restarts: deque[int] = deque()
+    told: set[Reason] = set()
     delay = policy.first_delay
     while True:
         session.start()
@@ -129,9 +130,11 @@ async def supervise(
             session.report_state(ServiceState.FAILED, lost.reason, str(lost))
             raise PortBusyError(f"{service.name}: {lost}")
         detail = str(lost) or type(lost).__name__
-        # The first failure of an outage is news, its repetitions are not.
-        first = session.ready_at is not None or session.starts == 1
-        log.log(logging.WARNING if first else logging.DEBUG, "%s: %s", service.name, detail)
+        # The first failure of an outage is news, and another cause of it; repetitions are not.
+        if session.ready_at is not None:
+            told.clear()
+        log.log(logging.DEBUG if lost.reason in told else logging.WARNING, "%s: %s", service.name, detail)
+        told.add(lost.reason)
         now = clock.now()
         restarts.append(now)
         while now - restarts[0] > policy.window * SECOND:

@@ -60,6 +60,26 @@ def test_a_loss_is_worse_and_other_events_are_no_state():
     assert after(READY, event(Reason.DEVICE_FAULT, Severity.WARNING))["drive"][0] is Reason.OK
 
 
+def test_another_cause_of_an_outage_and_its_end_without_success_are_events():
+    """Unplugged, then another device in its place, then the right one with wrong parameters."""
+
+    async def main(clock: VirtualClock) -> list[tuple[Reason, Severity]]:
+        events = Events()
+        board = HealthBoard(clock, Kept(), events)
+        lost, wrong = (row(ServiceState.BACKOFF, reason=it) for it in (Reason.DEVICE_LOST, Reason.DEVICE_WRONG))
+        mismatch = row(ServiceState.FAILED, reason=Reason.DEVICE_MISMATCH)
+        for report in (lost, lost, wrong, lost, wrong, mismatch):
+            board.report(row(ServiceState.STARTING))
+            board.report(report)
+        return [(reason, severity) for reason, severity, *_ in events.kept]
+
+    assert run_virtual(main) == [
+        (Reason.DEVICE_LOST, Severity.WARNING),
+        (Reason.DEVICE_WRONG, Severity.WARNING),
+        (Reason.DEVICE_MISMATCH, Severity.ERROR),
+    ]
+
+
 @pytest.mark.parametrize(
     ("lidar", "expected"),
     [

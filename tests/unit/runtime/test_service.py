@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
-from monstertruck_runtime.errors import DeviceLostError, DeviceMismatchError, PortBusyError
+from monstertruck_runtime.errors import DeviceLostError, DeviceMismatchError, PortBusyError, WrongDeviceError
 from monstertruck_runtime.ports import Ready
 from monstertruck_runtime.service import OnBug, RestartPolicy, scope, supervise
 from monstertruck_schemas.health import ServiceHealth, ServiceState
@@ -65,6 +65,15 @@ def test_a_device_that_is_not_there_at_the_start_is_one_warning(caplog: pytest.L
     run(lost, lost, lost, lambda ready: ready())
     warnings = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
     assert warnings == ["scripted: cable"]
+
+
+def test_another_cause_of_the_same_outage_is_a_warning_too(caplog: pytest.LogCaptureFixture):
+    def wrong(_: Ready) -> None:
+        raise WrongDeviceError("a compass answers")
+
+    run(lost, wrong, lost, wrong, lambda ready: ready())
+    warnings = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    assert warnings == ["scripted: cable", "scripted: a compass answers"]
 
 
 def test_a_session_that_settled_starts_the_delays_anew():
