@@ -175,7 +175,7 @@ class Daemon:
             self._start_drivers(actuators, OnBug.EXIT, Duty.ACTUATOR)
             self._start(gate, self.gate, OnBug.EXIT)
             self._start(gate, self._calibration)
-            self._start(gate, MeterService(self.clock, self.gate, self.recorder, self.bus))
+            self._start(gate, MeterService(self.clock, self.gate, self.recorder, self.bus, self._events))
             if self._seed is None:
                 self._start(gate, StallWatch(self.clock, self.gate.ticks, self.config.state_directory / "stalls"))
             self._start_drivers(sensors, OnBug.FAIL, Duty.SENSOR, Duty.MONITOR)

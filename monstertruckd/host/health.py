@@ -8,7 +8,7 @@ from typing import Final
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.ports import EventSink, Publisher, Ready
 from monstertruck_schemas.event import Event, Severity
-from monstertruck_schemas.health import HealthTable, LoopHealth, ServiceHealth, ServiceState
+from monstertruck_schemas.health import HealthTable, LoopHealth, RecorderHealth, ServiceHealth, ServiceState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.state import ClockOffset
@@ -27,7 +27,7 @@ STEP = SECOND // 20
 
 LASTS: Final = 3
 """Seconds with late ticks after which the log says that the computer is busy: a start has some."""
-SAY_BUSY: Final = 60.0
+SAY_AGAIN: Final = 60.0
 """Seconds until it says so again."""
 DEGRADED: Final = frozenset({Reason.SLOW_LINK})
 """Reasons of a service that works, but badly: its warning says so, its information that it is over."""
@@ -170,7 +170,10 @@ class ClockService:
 
 
 class MeterService:
-    """Publishes the control tick's punctuality and the recorder's state once a second."""
+    """Publishes the control tick's punctuality and the recorder's state once a second.
+
+    A disk too slow for the recorder is an event, at most once in ``SAY_AGAIN``.
+    """
 
     name = ServiceName.METER.value
 
@@ -180,16 +183,21 @@ class MeterService:
         gate: GateService,
         recorder: Recorder | None,
         bus: Bus,
+        events: EventSink,
     ) -> None:
         self._clock = clock
         self._gate = gate
         self._recorder = recorder
+        self._events = events
         self._bus = bus
         self._loop = bus.publisher(LOOP, Writer.DAEMON)
         self._recording = bus.publisher(RECORDER, Writer.DAEMON)
         self._late = 0
         """Seconds with late ticks, less those without."""
         self._said: int | None = None
+        self._lost = 0
+        """Messages that the recorder had lost when that was last reported."""
+        self._lost_said: int | None = None
 
     async def run(self, ready: Ready) -> None:
         """Publish until cancelled."""
@@ -211,15 +219,25 @@ class MeterService:
             self._loop.put(health)
             self._say_busy(health)
             if self._recorder is not None:
-                self._recording.put(self._recorder.health(self._recording.next_seq()))
+                recording = self._recorder.health(self._recording.next_seq())
+                self._recording.put(recording)
+                self._say_lost(recording)
+
+    def _say_lost(self, health: RecorderHealth) -> None:
+        """Report that messages are missing in the log; of a recording that ended, that it did is said by itself."""
+        if not health.lost or health.drops == self._lost or not _again(self._lost_said, health.stamp):
+            return
+        self._events(Reason.MESSAGES_DROPPED, Severity.WARNING, ServiceName.RECORDER.value, health.lost, lost=health.drops)
+        self._lost, self._lost_said = health.drops, health.stamp
 
     def _say_busy(self, health: LoopHealth) -> None:
-        """Log that the computer is busy once it lasts, at most once in ``SAY_BUSY``."""
+        """Log that the computer is busy once it lasts, at most once in ``SAY_AGAIN``."""
         self._late = self._late + 1 if health.busy else max(0, self._late - 1)
-        if (
-            health.busy
-            and self._late >= LASTS
-            and (self._said is None or health.stamp - self._said > SAY_BUSY * SECOND)
-        ):
+        if health.busy and self._late >= LASTS and _again(self._said, health.stamp):
             self._said = health.stamp
             log.warning("%s", health.busy)
+
+
+def _again(said: int | None, now: int) -> bool:
+    """Whether what was said at ``said``, ns, is to be said again."""
+    return said is None or now - said > SAY_AGAIN * SECOND

@@ -92,7 +92,15 @@ class RecorderHealth(Message):
     bytes_written: int = 0
     messages: int = 0
     drops: int = 0
+    """Messages that are not in the log since the start."""
     reason: Reason = Reason.OK
+
+    @property
+    def lost(self) -> str:
+        """That a recording has gaps, in words; empty for one that has none, or has ended."""
+        if not (self.recording and self.drops):
+            return ""
+        return f"{self.drops} messages are missing in the log: the disk takes them too slowly"
 
 
 class LocalisationStatus(StrEnum):

@@ -159,7 +159,7 @@ SYMPTOMS: Final = (
             "clock_unset": "",
             "clock_stepped": "",
             "tick_stalled": "Something else takes the processor.",
-            "messages_dropped": "As above.",
+            "messages_dropped": "As above; of the `recorder`, its disk is too slow.",
             "worker_timeout": "As above.",
             "worker_died": "The journal has its last words.",
         },

@@ -304,6 +304,8 @@ def _services(state: ScreenState, shown: Sequence[ServiceHealth] | None = None) 
         parts.append(Text(f"{sum(row.state is ServiceState.READY for row in services)} of {len(services)} ready"))
     if state.recorder is not None and state.recorder.recording:
         parts.append(Text(f"● recording {state.recorder.bytes_written / 1e6:.1f} MB unpacked", style="red"))
+        if state.recorder.lost:
+            parts.append(Text(state.recorder.lost, style="bold red"))
     elif state.recorder is not None and state.recorder.reason is not Reason.OK:
         parts.append(Text(f"NOT RECORDING: {state.recorder.reason.text}", style="bold red"))
     return Panel(Group(*parts), title="services", border_style="dim")

@@ -144,5 +144,7 @@ def plain(state: ScreenState) -> list[str]:
         late = state.loop
         lines.append(f"tick      late p99 {late.lateness_p99 * 1e3:.2f} ms, max {late.lateness_max * 1e3:.2f} ms")
         lines += [f"busy      {late.busy}"] if late.busy else []
+    if state.recorder is not None and state.recorder.lost:
+        lines.append(f"recorder  {state.recorder.lost}")
     services = state.health.services if state.health is not None else ()
     return lines + [f"service   {s.name:12} {s.state.value:9} restarts {s.restarts} {s.detail}" for s in services]

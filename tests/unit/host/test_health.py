@@ -6,9 +6,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from monstertruck_runtime.clock import VirtualClock, run_virtual
+from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_schemas.event import Event, Severity
-from monstertruck_schemas.health import ServiceHealth, ServiceState
+from monstertruck_schemas.health import RecorderHealth, ServiceHealth, ServiceState
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.host.health import HealthBoard, MeterService
 from tests.unit.drivers.kit import Events, Kept
@@ -133,7 +133,7 @@ def test_a_busy_computer_is_said_in_the_log_once_it_lasts(caplog: pytest.LogCapt
         async def main(clock: VirtualClock) -> None:
             gate = SimpleNamespace(lateness=lambda: SimpleNamespace(ticks=1, p50=0.0, p99=next(rest), max=1.0))
             bus = SimpleNamespace(publisher=lambda *_: Kept(), drops=0)
-            job = asyncio.create_task(MeterService(clock, gate, None, bus).run(lambda: None))  # type: ignore[arg-type]
+            job = asyncio.create_task(MeterService(clock, gate, None, bus, Events()).run(lambda: None))  # type: ignore[arg-type]
             await clock.sleep(len(late) + 0.5)
             job.cancel()
 
@@ -144,3 +144,32 @@ def test_a_busy_computer_is_said_in_the_log_once_it_lasts(caplog: pytest.LogCapt
     words = "the computer is busy: control ticks come 50 ms late; end other programs"
     assert said([0.05] * 50) == [words]
     assert said([0.05] * 90) == [words] * 2
+
+
+def test_a_recorder_that_loses_messages_is_reported_once_a_minute():
+    events = Events()
+
+    async def main(clock: VirtualClock) -> None:
+        gate = SimpleNamespace(lateness=lambda: SimpleNamespace(ticks=1, p50=0.0, p99=0.0, max=0.0))
+        lost = iter([0, 0, 5, 9, *[20] * 100])
+
+        def health(seq: int) -> RecorderHealth:
+            return RecorderHealth(
+                stamp=clock.now(), received=0, seq=seq, recording=clock.now() < 200 * SECOND, drops=next(lost)
+            )
+
+        bus = SimpleNamespace(publisher=lambda *_: Kept(), drops=0)
+        recorder = SimpleNamespace(health=health)
+        job = asyncio.create_task(MeterService(clock, gate, recorder, bus, events).run(lambda: None))  # type: ignore[arg-type]
+        await clock.sleep(100)
+        job.cancel()
+
+    run_virtual(main, start=0)
+    texts = [(reason, text) for reason, _, text, _ in events.kept]
+    words = "messages are missing in the log: the disk takes them too slowly"
+    assert texts == [(Reason.MESSAGES_DROPPED, f"5 {words}"), (Reason.MESSAGES_DROPPED, f"20 {words}")]
+
+
+def test_a_recording_that_ended_is_not_a_slow_disk():
+    ended = RecorderHealth(stamp=0, received=0, seq=0, recording=False, drops=7, reason=Reason.DISK_FULL)
+    assert ended.lost == ""

@@ -190,6 +190,15 @@ def test_a_busy_computer_is_said_in_words():
     assert "the computer is busy" in shown(state, 140, 40).export_text()
 
 
+def test_a_log_with_gaps_is_not_shown_as_a_sound_one():
+    state = full()
+    state.take(RecorderHealth(**HEADER, recording=True, bytes_written=10**6, drops=12))
+    assert "12 messages are missing in the log" in " ".join(plain(state))
+    assert "12 messages are missing" in shown(state, 140, 40).export_text()
+    state.take(RecorderHealth(**HEADER, recording=True, bytes_written=10**6))
+    assert "missing" not in " ".join(plain(state)) + shown(state, 140, 40).export_text()
+
+
 def test_a_disarmed_truck_does_not_drive_its_path():
     state = full()
     state.take(GateState(**HEADER, mode=GateMode.DISARMED, nonce="n", speed_limit=0.0))
