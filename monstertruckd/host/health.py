@@ -227,7 +227,8 @@ class MeterService:
         """Report that messages are missing in the log; of a recording that ended, that it did is said by itself."""
         if not health.lost or health.drops == self._lost or not _again(self._lost_said, health.stamp):
             return
-        self._events(Reason.MESSAGES_DROPPED, Severity.WARNING, ServiceName.RECORDER.value, health.lost, lost=health.drops)
+        source = ServiceName.RECORDER.value
+        self._events(Reason.MESSAGES_DROPPED, Severity.WARNING, source, health.lost, lost=health.drops)
         self._lost, self._lost_said = health.drops, health.stamp
 
     def _say_busy(self, health: LoopHealth) -> None:

@@ -101,7 +101,6 @@ async def supervise(
     """
     session = _Session(service.name, clock, report)
     restarts: deque[int] = deque()
-    told: set[Reason] = set()
     delay = policy.first_delay
     while True:
         session.start()
@@ -130,11 +129,7 @@ async def supervise(
             session.report_state(ServiceState.FAILED, lost.reason, str(lost))
             raise PortBusyError(f"{service.name}: {lost}")
         detail = str(lost) or type(lost).__name__
-        # The first failure of an outage is news, and another cause of it; repetitions are not.
-        if session.ready_at is not None:
-            told.clear()
-        log.log(logging.DEBUG if lost.reason in told else logging.WARNING, "%s: %s", service.name, detail)
-        told.add(lost.reason)
+        session.log_loss(lost.reason, detail)
         now = clock.now()
         restarts.append(now)
         while now - restarts[0] > policy.window * SECOND:
@@ -178,6 +173,8 @@ class _Session:
         self._report = report
         self.starts = 0
         self.ready_at: int | None = None
+        self._told: set[Reason] = set()
+        """Causes of the present outage that were logged as warnings."""
 
     def start(self) -> None:
         self.starts += 1
@@ -187,8 +184,14 @@ class _Session:
     def ready(self) -> None:
         if self.ready_at is None:
             self.ready_at = self._clock.now()
+            self._told.clear()
             self.report_state(ServiceState.READY)
             log.info("%s: ready", self._name)
+
+    def log_loss(self, reason: Reason, detail: str) -> None:
+        """The first loss of an outage is a warning, and one of another cause; repetitions are not."""
+        log.log(logging.DEBUG if reason in self._told else logging.WARNING, "%s: %s", self._name, detail)
+        self._told.add(reason)
 
     def report_state(self, state: ServiceState, reason: Reason = Reason.OK, detail: str = "") -> None:
         self._report(

@@ -122,6 +122,8 @@ class ScreenState:
         """
         self.now = message.stamp
         self.began = message.stamp if self.began is None else self.began
+        if isinstance(message, GateState) and self.gate is not None and message.nonce != self.gate.nonce:
+            self._forget_stop(self.gate.stamp)
         if (name := _FIELDS.get(type(message))) is not None:
             setattr(self, name, message)
         match message:
@@ -133,6 +135,24 @@ class ScreenState:
                 self.events.append((real, message))
             case _:
                 pass
+
+    def _forget_stop(self, until: int) -> None:
+        """The daemon was restarted after ``until``, ns: what stopped its run before is not what holds it now."""
+        if self.stop is not None and self.stop.stamp <= until:
+            self.stop = None
+
+    def old(self, name: str) -> str:
+        """How old the newest message of a field is, in words; empty while it is one of now.
+
+        By the clock of the robot, as its gate told it last: what a restarted computer said before is not of now either.
+        """
+        message, limit = getattr(self, name), SHOWN[name].stale_after
+        if message is None or self.gate is None or limit is None:
+            return ""
+        age = (self.gate.stamp - message.stamp) / SECOND
+        if abs(age) <= max(limit, SILENCE):
+            return ""
+        return f"{age:.0f} s old" if age > 0 else "old"
 
 
 def calibration_badge(health: CalibrationHealth) -> str:
@@ -224,8 +244,8 @@ def _troubled(state: ScreenState) -> list[ServiceHealth]:
     return [row for row in services if row.state is not ServiceState.READY][:4]
 
 
-def _row(table: Table, name: str, value: str | Text) -> None:
-    table.add_row(Text(name, style="dim"), value)
+def _row(table: Table, name: str, value: str | Text, old: str = "") -> None:
+    table.add_row(Text(name, style="dim"), Text(f"{value}, {old}", style=GONE) if old else value)
 
 
 def _truck(state: ScreenState) -> Panel:
@@ -245,14 +265,15 @@ def _truck(state: ScreenState) -> Panel:
             _row(table, "waiting", ", ".join(gate.waiting))
     if odometry is not None:
         speed = math.copysign(math.hypot(odometry.twist.vx, odometry.twist.vy), odometry.twist.vx)
-        _row(table, "speed", f"{speed:+.2f} m/s {math.degrees(odometry.twist.wz):+.0f}°/s")
+        _row(table, "speed", f"{speed:+.2f} m/s {math.degrees(odometry.twist.wz):+.0f}°/s", state.old("odometry"))
     if state.battery is not None:
         volts = "-" if state.battery.voltage is None else f"{state.battery.voltage:.1f} V"
-        _row(table, "battery", f"{volts} {state.battery.level.value}")
+        _row(table, "battery", f"{volts} {state.battery.level.value}", state.old("battery"))
     if state.calibration is not None and state.calibration.wizards:
         _row(table, "calibrated", calibration_badge(state.calibration))
     if odometry is not None:
-        _row(table, "pose", f"{odometry.pose.x:+.2f} {odometry.pose.y:+.2f} m {math.degrees(odometry.pose.yaw):+.0f}°")
+        pose = f"{odometry.pose.x:+.2f} {odometry.pose.y:+.2f} m {math.degrees(odometry.pose.yaw):+.0f}°"
+        _row(table, "pose", pose, state.old("odometry"))
     _tilt(table, state)
     if state.tracker is not None:
         done = _done(state.tracker)
@@ -260,7 +281,8 @@ def _truck(state: ScreenState) -> Panel:
         _row(table, "path", f"{bar:░<16} {done:4.0%}")
         waits = state.tracker.outcome is Reason.DRIVING and gate is not None and not gate.mode.active
         doing = "waits" if waits else state.tracker.outcome.value
-        _row(table, "off path", f"{state.tracker.cross_track * 100:+.1f} cm {doing}")
+        old = state.old("tracker") if state.tracker.outcome is Reason.DRIVING else ""  # at its end it falls silent
+        _row(table, "off path", f"{state.tracker.cross_track * 100:+.1f} cm {doing}", old)
     if state.loop is not None and state.loop.busy:
         _row(table, "busy", Text(state.loop.busy, style="bold yellow"))
     elif state.loop is not None:
@@ -275,9 +297,9 @@ def _tilt(table: Table, state: ScreenState) -> None:
     """Of the body, and of the lidar's plane, as far as they are measured."""
     if state.attitude is not None:
         roll, pitch = (math.degrees(angle) for angle in (state.attitude.roll, state.attitude.pitch))
-        _row(table, "tilt", f"roll {roll:+.1f}° pitch {pitch:+.1f}°")
+        _row(table, "tilt", f"roll {roll:+.1f}° pitch {pitch:+.1f}°", state.old("attitude"))
     if state.scan is not None and state.scan.tilt is not None:
-        _row(table, "lidar", f"{math.degrees(state.scan.tilt):.1f}° off the level")
+        _row(table, "lidar", f"{math.degrees(state.scan.tilt):.1f}° off the level", state.old("scan"))
 
 
 def _done(tracker: TrackerState) -> float:
@@ -331,7 +353,9 @@ _WRAPPING: Final = Console()
 
 
 def _view_title(state: ScreenState) -> str:
-    sensors = ["scan"] * (state.scan is not None or state.sonar is None) + ["sonars"] * (state.sonar is not None)
+    names = {"scan": "scan"} if state.scan is not None or state.sonar is None else {}
+    names |= {} if state.sonar is None else {"sonar": "sonars"}
+    sensors = [f"{word} {old}" if (old := state.old(name)) else word for name, word in names.items()]
     return f"{', '.join(sensors)} and trail, robot frame"
 
 
@@ -346,7 +370,7 @@ class _Braille:
         height: int = getattr(options, "height", None) or 20
         scale = min(width, height * 4 * HORIZON) / VIEW_METRES
         cells = np.zeros((height, width), np.uint8)
-        if self._state.scan is not None:
+        if self._state.scan is not None and not self._state.old("scan"):
             mount = _mount(self._state, self._state.scan.frame) or (0.0, 0.0, 0.0)
             _plot(cells, scan_points(self._state.scan, mount), scale)
         echo_cells, trail_cells = np.zeros_like(cells), np.zeros_like(cells)
@@ -379,7 +403,7 @@ def _mount(state: ScreenState, frame: str) -> tuple[float, float, float] | None:
 def _echo_points(state: ScreenState) -> Array:
     """Points of the arcs on which the echoes lie, as far as the places of the sonars are known, (n, 2), m in base."""
     arcs = [np.empty((0, 2))]
-    if state.sonar is not None:
+    if state.sonar is not None and not state.old("sonar"):
         for echo in state.sonar.sonars:
             place = _mount(state, f"sonar_{echo.name}")
             if echo.answered and echo.range is not None and place is not None:

@@ -199,6 +199,40 @@ def test_a_log_with_gaps_is_not_shown_as_a_sound_one():
     assert "missing" not in " ".join(plain(state)) + shown(state, 140, 40).export_text()
 
 
+def test_what_a_sensor_said_long_ago_is_not_shown_as_of_now():
+    state = full()
+    assert state.gate is not None
+    state.take(state.gate.model_copy(update={"stamp": 31 * 10**9}))
+    text = shown(state, 140, 40).export_text()
+    for words in ("pitch +11.5°, 30 s old", "sensor_fault, 30 s old", "driving, 30 s old"):
+        assert words in truck(text)
+    assert truck(text).count("30 s old") == 6, "speed, pose, battery, tilt, lidar and path"
+    assert "scan 30 s old and trail" in text
+    assert not re.search("[\u2801-\u28ff]", text), "no scan is drawn"
+    state.take(Attitude(**{**HEADER, "stamp": 31 * 10**9}, heading=1.0, roll=0.1, pitch=0.2))
+    state.take(Battery(**{**HEADER, "stamp": 10**15}, raw_voltage=0.0, cells=6, level=BatteryLevel.NORMAL))
+    text = truck(shown(state, 140, 40).export_text())
+    assert "pitch +11.5° lidar" in text
+    assert "normal, old" in text, "of before the computer was restarted"
+
+
+def truck(text: str) -> str:
+    """Words of the screen's left column."""
+    return " ".join(" ".join(line[1:39] for line in text.splitlines()).split())
+
+
+def test_what_stopped_the_run_before_does_not_hold_the_next_one():
+    state = full()
+    assert state.gate is not None
+    still = {"mode": GateMode.DISARMED, "speed_limit": 0.0}
+    cause = Cause(reason=Reason.SCAN_STALE, source="lidar", since=0, text="no fresh lidar scan")
+    state.take(Stop(**HEADER, number=1, reason=cause.reason, mode=GateMode.STOPPING, causes=(cause,), text=""))
+    state.take(state.gate.model_copy(update={**still, "stamp": 2 * 10**9}))
+    assert state.why_stopped
+    state.take(state.gate.model_copy(update={**still, "nonce": "of the next run", "stamp": 9 * 10**9}))
+    assert state.why_stopped == []
+
+
 def test_a_disarmed_truck_does_not_drive_its_path():
     state = full()
     state.take(GateState(**HEADER, mode=GateMode.DISARMED, nonce="n", speed_limit=0.0))
