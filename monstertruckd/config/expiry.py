@@ -18,9 +18,10 @@ import numpy as np
 
 from monstertruck_kinematics.truck import DriveTrain
 from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.errors import disk_reason
 from monstertruck_runtime.mailbox import latest
 from monstertruck_runtime.ports import EventSink, Ready
-from monstertruck_runtime.small_files import replace_file, text_of
+from monstertruck_runtime.small_files import replace_file
 from monstertruck_runtime.threads import Offload
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.health import CalibrationHealth, CalibrationState
@@ -240,17 +241,19 @@ class DistanceCounter:
     written: float = 0.0
 
     def load(self) -> None:
-        """Read it; a missing file begins at 0, and so does a damaged one, which the log says."""
-        self.metres = 0.0
-        text = text_of(self.file) if self.file else None
+        """Read it; a missing file begins at 0, and so does, as the log says, one that cannot be read or is damaged."""
+        self.metres, wrong = 0.0, ""
         try:
-            metres = 0.0 if text is None else float(json.loads(text)["metres"])
+            metres = float(json.loads(self.file.read_text(encoding="utf-8"))["metres"]) if self.file else 0.0
+            self.metres, wrong = (metres, "") if 0.0 <= metres < np.inf else (0.0, "is damaged")
+        except FileNotFoundError:
+            pass
+        except OSError as error:
+            wrong = f"cannot be read: {error.strerror}"
         except (ValueError, LookupError, TypeError, OverflowError, RecursionError):
-            metres = np.nan
-        if 0.0 <= metres < np.inf:
-            self.metres = metres
-        else:
-            log.warning("%s: is damaged: the way driven begins at 0, and no calibration ends by it before", self.file)
+            wrong = "is damaged"
+        if wrong:
+            log.warning("%s: %s: the way driven begins at 0, and no calibration ends by it before", self.file, wrong)
         self.written = self.metres
 
     def save(self) -> None:
@@ -344,7 +347,8 @@ class CalibrationWatch:
         try:
             await self._offload(odometer.save)
         except OSError as error:
-            self._events(Reason.DISK_LOW, Severity.WARNING, self.name, f"{odometer.file}: {error.strerror}")
+            text = f"{odometer.file}: the way driven is not kept: {error.strerror}"
+            self._events(disk_reason(error), Severity.WARNING, self.name, text)
 
     def _look(self) -> None:
         now = self._clock.now()

@@ -10,7 +10,7 @@ from typing import Any, Final, TypeVar, assert_never
 import numpy as np
 
 from monstertruck_runtime.clock import SECOND, Clock, Schedule
-from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError
+from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError, disk_reason
 from monstertruck_runtime.mailbox import fifo
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, RpcRegistry, Subscription
 from monstertruck_runtime.requests import parse_request
@@ -395,7 +395,7 @@ class GateService:
 
     def _report(self, error: OSError) -> None:
         text = f"the emergency stop's latch could not be stored: {error}"
-        self._events(Reason.INTERNAL, Severity.ERROR, self.name, text)
+        self._events(disk_reason(error), Severity.ERROR, self.name, text)
 
 
 class _Feed:

@@ -15,13 +15,13 @@ from monstertruck_estimation.scan_tilt import ScanAngles, plane_slopes
 from monstertruck_estimation.transforms import wrap_angle
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND, Clock, Schedule, VirtualClock
+from monstertruck_runtime.errors import disk_reason
 from monstertruck_runtime.mailbox import Mailbox
 from monstertruck_runtime.ports import EventSink, Publisher, Ready
 from monstertruck_runtime.threads import in_thread
 from monstertruck_schemas.body import Mount
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.health import OdometryHealth
-from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.sensor import Attitude, LaserScan
 from monstertruck_schemas.state import Ground, Odometry
@@ -202,7 +202,7 @@ class GroundService:
             self._save.mkdir(parents=True, exist_ok=True)
             self._grid.save(self._save)
         except OSError as error:
-            self._events(Reason.BAD_INPUT, Severity.WARNING, self.name, f"ground not saved: {error}")
+            self._events(disk_reason(error), Severity.WARNING, self.name, f"ground not saved: {error}")
 
 
 def _spread(length: float, width: float) -> Array:

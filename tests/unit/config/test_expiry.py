@@ -1,6 +1,8 @@
 """Grades and validity of calibrations."""
 
 import asyncio
+import errno
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -104,6 +106,34 @@ def test_a_damaged_odometer_begins_at_nothing_and_says_so(text, tmp_path, caplog
     replace(odometer, metres=12.34).save()
     odometer.load()
     assert odometer.metres == 12.3
+
+
+def test_an_odometer_that_cannot_be_read_is_no_new_robot(tmp_path, caplog):
+    file = tmp_path / "odometer.json"
+    file.symlink_to(file.name)
+    DistanceCounter(file).load()
+    assert caplog.messages[0].startswith(f"{file}: cannot be read: Too many levels of symbolic links: the way driven")
+
+
+@pytest.mark.parametrize(("code", "reason"), [(errno.ENOSPC, Reason.DISK_FULL), (errno.EROFS, Reason.RECORDING_FAILED)])
+def test_an_odometer_that_cannot_be_written_is_reported_by_its_cause(code, reason, tmp_path, monkeypatch):
+    def refuse(_: DistanceCounter) -> None:
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(DistanceCounter, "save", refuse)
+    events: list[tuple[Reason, str]] = []
+
+    async def main(clock: VirtualClock) -> None:
+        file = tmp_path / "odometer.json"
+        sink = lambda *args, **_: events.append((args[0], args[3]))  # noqa: E731
+        watch = CalibrationWatch(TRUCK, {}, Bus(clock), clock, sink, inline, DistanceCounter(file))
+        watch.odometer.metres = 100.0
+        await watch._keep()
+
+    run_virtual(main)
+    ((found, text),) = events
+    assert found is reason
+    assert text.endswith(f"the way driven is not kept: {os.strerror(code)}")
 
 
 def test_a_value_of_zero_has_the_worst_grade_where_its_interval_is_meant_as_a_share_of_it():

@@ -193,7 +193,7 @@ def test_the_latch_is_tried_again_every_second_and_marked_until_it_is_stored():
         assert disk.marks == [False, True, False]
         await bench.clock.sleep(2.0)
         assert len(disk.asked) == 3
-        errors = [text for reason, _, text, _ in bench.events if reason is Reason.INTERNAL]
+        errors = [text for reason, _, text, _ in bench.events if reason is Reason.RECORDING_FAILED]
         assert errors == ["the emergency stop's latch could not be stored: disk"] * 2
 
     on_bench(scenario, disk)

@@ -155,5 +155,5 @@ def test_a_folder_that_cannot_be_written_is_an_event(tmp_path):
         return rig.events
 
     ((reason, _, source, text),) = run_virtual(main)
-    assert (reason, source) == (Reason.BAD_INPUT, "ground")
+    assert (reason, source) == (Reason.RECORDING_FAILED, "ground")
     assert "not saved" in text
