@@ -15,7 +15,7 @@ from zenoh import ext, handlers
 
 from monstertruck_runtime import wire
 from monstertruck_runtime.clock import SECOND, Clock, WallClock
-from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
+from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT, protocol_of
 from monstertruck_runtime.errors import (
     InputError,
     NoAnswerError,
@@ -258,10 +258,14 @@ class TruckClient(Operator):
 
     async def alive(self) -> bool:
         """Whether the robot's daemon serves at this moment."""
+        return bool(await self._seen(self.robot, self._timeout))
+
+    async def _seen(self, name: str, timeout: float) -> list[str]:
+        """Names of the robots that serve at this moment; of one, or of all by ``*``."""
         replies = await self._collect(
-            lambda handler: self._open_session().liveliness().get(alive_key(self.robot), handler, timeout=self._timeout)
+            lambda handler: self._open_session().liveliness().get(alive_key(name), handler, timeout=timeout)
         )
-        return any(reply.ok is not None for reply in replies)
+        return [str(reply.ok.key_expr).split("/")[1] for reply in replies if reply.ok is not None]
 
     # Remote calls
 
@@ -278,7 +282,7 @@ class TruckClient(Operator):
         Raises:
             NotFoundError: no such robot or rpc.
             InputError: the payload was refused.
-            NoAnswerError: no answer in time.
+            NoAnswerError: no answer in time, or none although the robot is there.
             RequestRefusedError: refused; carries the reason.
         """
         answer: dict[str, Any] = json.loads(await self._call(rpc, payload or {}, timeout))
@@ -591,13 +595,17 @@ class TruckClient(Operator):
         await done
         return replies
 
-    async def _absent(self) -> NotFoundError:
-        """That the robot is not there, and which ones are."""
-        replies = await self._collect(
-            lambda handler: self._open_session().liveliness().get(alive_key("*"), handler, timeout=LOOK)
-        )
-        names = sorted({str(reply.ok.key_expr).split("/")[1] for reply in replies if reply.ok is not None})
+    async def _absent(self) -> NotFoundError | NoAnswerError:
+        """That the robot is not there, and which ones are; or that it is, and does not answer."""
+        # One that requires certificates shows itself only to who asks for it by name.
+        seen = await asyncio.gather(self._seen("*", LOOK), self._seen(self.robot, LOOK))
+        names = sorted({name for some in seen for name in some})
+        if self.robot in names:
+            why = f"it is starting or ending, or takes nothing from {self.source!r}"
+            return NoAnswerError(f"robot {self.robot!r} at {self.endpoint} does not answer: {why}")
         there = f"; there {'is' if len(names) == 1 else 'are'} {', '.join(names)} (--robot NAME)" if names else ""
+        if protocol_of(self.endpoint) == "tls":
+            there += f", or it does not know the certificate of {self.source.partition(':')[0]!r} (its `zenoh.tls`)"
         return NotFoundError(f"no robot {self.robot!r} at {self.endpoint}{there}")
 
 

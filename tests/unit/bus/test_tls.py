@@ -10,7 +10,7 @@ import pytest
 
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.early_estop import send_estop
-from monstertruck_runtime.errors import NotFoundError, NotPermittedError, RequestRefusedError
+from monstertruck_runtime.errors import NoAnswerError, NotFoundError, NotPermittedError, RequestRefusedError
 from monstertruck_runtime.mailbox import fifo
 from monstertruck_runtime.stations import TLS_VARIABLE, ClientTls, station_tls
 from monstertruck_schemas.roles import AccessRole
@@ -79,12 +79,14 @@ async def test_who_may_do_what(tmp_path: Path):
             with pytest.raises(RequestRefusedError, match="arm: bob has the role observer, this takes pilot"):
                 await bob.arm()
             await bob.estop()
-            with pytest.raises(NotFoundError):
+            with pytest.raises(
+                NotFoundError, match=r"or it does not know the certificate of 'eve' \(its `zenoh.tls`\)$"
+            ):
                 await eve.get_retained(GATE)
             await bob.drive(9.0, 0.0)
             ann.source = "bob"  # under another's name nothing arrives
             await ann.drive(9.0, 0.0)
-            with pytest.raises(NotFoundError):
+            with pytest.raises(NoAnswerError, match=r"does not answer: .* takes nothing from 'bob'"):
                 await ann.call("topics")
             ann.source = "ann"
             await ann.drive(0.5, 0.0)

@@ -18,6 +18,7 @@ from monstertruck_schemas.plan import Path
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import ControlRequest, GoalRequest, Order, Role
 from monstertruck_schemas.topics import GATE, MAP, POSE, REQ_CONTROL, REQ_DRIVE, REQ_PATH, Writer
+from monstertruckd.bus.zenoh_session import ZenohBridge
 from tests.bus_kit import Robot, free_endpoint, gate_state, odometry, running_robot
 
 
@@ -272,6 +273,13 @@ async def test_it_says_how_long_it_really_waited(monkeypatch):
 async def test_who_asks_for_another_robot_learns_which_one_is_there():
     async with running_robot(robot="sonar") as robot, TruckClient("truck", robot.endpoint, timeout=0.5) as client:
         with pytest.raises(NotFoundError, match=r"no robot 'truck' at tcp/\S+; there is sonar \(--robot NAME\)$"):
+            await client.call("config")
+
+
+async def test_a_robot_that_is_there_and_gives_no_answer_is_not_said_to_be_absent(monkeypatch):
+    monkeypatch.setattr(ZenohBridge, "_serve", lambda *_: None)  # as one that ends: the query is dropped
+    async with running_robot() as robot, TruckClient(endpoint=robot.endpoint, timeout=0.5, source="ann") as client:
+        with pytest.raises(NoAnswerError, match=r"^robot 'truck' at tcp/.* does not answer: it is starting or ending"):
             await client.call("config")
 
 
