@@ -36,6 +36,8 @@ class Path(Message):
     empty = not known."""
     closed: bool = False
     """A closed path is a lap: it ends where it began."""
+    halts: bool = False
+    """It only brings the robot to rest; once that is disarmed nothing is left of it to be followed."""
     name: str = ""
 
 

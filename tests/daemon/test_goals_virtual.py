@@ -16,7 +16,7 @@ from monstertruck_runtime.errors import RequestRefusedError
 from monstertruck_schemas import topics
 from monstertruck_schemas.plan import Path as DrivePath
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import GoalOrder, GoalRequest, PathRequest, Role
+from monstertruck_schemas.req import DriveRequest, GoalOrder, GoalRequest, PathRequest, Role
 from monstertruckd.tools.simulation.operator import LocalOperator
 from tests.daemon.goal_kit import Trip, assert_at, travel
 
@@ -172,6 +172,83 @@ def test_the_commands_follow_a_goal_and_a_path_and_tell_how_they_end(tmp_path: P
         assert (await trip.end()).outcome is Reason.CANCELLED
 
     assert not travel(story).truth.array()[:, 5].any()
+
+
+def own_path(folder: Path) -> Path:
+    file = folder / "ahead.csv"
+    file.write_text("x,y,yaw,direction\n" + "".join(f"{1.0 + i / 10},3.95,0,1\n" for i in range(51)))
+    return file
+
+
+def test_of_a_goal_that_was_cancelled_nothing_is_driven_by_whoever_arms_later():
+    """Driven back by hand, it drove to where it had come to rest as soon as it was armed."""
+    at: list[float] = []
+
+    async def story(trip: Trip) -> None:
+        hand = LocalOperator(trip.rig.daemon, trip.clock, "hand", Role.GAMEPAD)
+        await trip.goal(6.0, 3.9, 0.0)
+        await trip.arm()
+        await trip.clock.sleep(5.0)
+        await trip.order("cancel")
+        await trip.clock.sleep(3.0)
+        await hand.arm()
+        for speed in (-0.12,) * 50 + (0.0,) * 10:
+            request = DriveRequest(**await hand.header(0.25), speed=speed, front=0.0)
+            trip.rig.bus.inject(topics.REQ_DRIVE, request)
+            await trip.clock.sleep(0.05)
+        await trip.clock.sleep(3.0)
+        at.append(trip.rig.truth.array()[-1, 1])
+        await hand.arm()
+        await trip.clock.sleep(3.0)
+
+    rig = travel(story)
+    assert abs(rig.truth.array()[-1, 1] - at[0]) < 0.005
+
+
+def test_a_goal_ends_the_path_that_is_followed_whether_it_is_refused_or_not(tmp_path: Path):
+    file = own_path(tmp_path)
+
+    async def story(trip: Trip) -> None:
+        await trip.arm()
+        await trip.clock.sleep(2.0)
+        with pytest.raises(RequestRefusedError):
+            await trip.goal(4.7, 2.5, 0.0)
+        await trip.clock.sleep(4.0)
+        assert 1.1 < trip.rig.truth.array()[-1, 1] < 1.5
+        path = load_path(file, closed=False, frame="odom").model_copy(update={"halts": True})
+        await trip.goal(4.0, 3.9, 0.0)
+        await LocalDriver(trip).path(path)
+        await trip.clock.sleep(1.0)
+        assert (await trip.end()).outcome is Reason.GOAL_BLOCKED
+        assert (await trip.end()).text == "another path is followed now"
+        assert not trip.rig.bus.newest(topics.PATH).halts, "what others send is a way to drive"
+        await trip.goal(1.8, 3.9, 0.0)
+        await trip.arm()
+        assert (await trip.end()).outcome is Reason.GOAL_REACHED
+
+    assert_at(travel(story, path={"file": file, "closed": False}), 1.8, 3.9, 0.0)
+
+
+def test_an_emergency_stop_ends_a_goal():
+    """Reset and armed by somebody else, it drove on."""
+    at: list[float] = []
+
+    async def story(trip: Trip) -> None:
+        await trip.goal(6.0, 3.9, 0.0)
+        await trip.arm()
+        await trip.clock.sleep(3.0)
+        await trip.operator.estop()
+        assert (await trip.end()).outcome is Reason.ESTOPPED
+        with pytest.raises(RequestRefusedError) as refused:
+            await trip.goal(6.0, 3.9, 0.0)
+        assert refused.value.refusal is Reason.ESTOPPED
+        await trip.clock.sleep(2.0)
+        at.append(trip.rig.truth.array()[-1, 1])
+        await trip.operator.reset()
+        await trip.arm()
+        await trip.clock.sleep(3.0)
+
+    assert abs(travel(story).truth.array()[-1, 1] - at[0]) < 0.005
 
 
 @pytest.mark.parametrize("where", ["worker"])

@@ -154,12 +154,16 @@ class Observed:
     ended_text: str = ""
     displaced: str = ""
     """Who took the goal over."""
+    paused: bool = False
+    """The goal that was sent is paused."""
     answer: ExploreAnswer | None = None
     """To the last question, once."""
     charge: float | None = None
     """Charge of the battery, 0 to 1; None = not measured."""
     low: bool = False
     """The battery's voltage is low."""
+    estopped: bool = False
+    """The emergency stop is latched."""
     critical: bool = False
     """Whether the charge is too low to drive: the gate stops, and an unsaved map may be lost."""
     saved: str | None = None
@@ -280,10 +284,10 @@ def tick(run: Exploration, seen: Observed, config: ExplorerConfig) -> Step:
         return _saving(run, seen)
     if seen.displaced:
         return _end(run, Reason.CANCELLED, f"the goal of {seen.displaced} is pursued now", Save())
-    if seen.critical:
-        return _end(run, Reason.BATTERY_CRITICAL, "it stands where it is", Cancel(), Save())
-    if seen.failed:
-        return _end(run, Reason.SERVICE_FAILED, seen.failed, Cancel(), Save())
+    if (why := _stopped(seen)) is not None:
+        return _end(run, *why, Cancel(), Save())
+    if seen.paused:
+        return run, ()
     if run.phase is ExplorationPhase.LOST:
         return _lost(run, seen, config)
     if seen.pose is None:
@@ -294,6 +298,15 @@ def tick(run: Exploration, seen: Observed, config: ExplorerConfig) -> Step:
     if (why := _enough(run, seen, config)) is not None:
         return _finish(run, *why)
     return _driving(run, seen, config) if run.phase is ExplorationPhase.DRIVING else _looking(run, seen)
+
+
+def _stopped(seen: Observed) -> tuple[Reason, str] | None:
+    """Why it ends where the robot stands."""
+    if seen.estopped:
+        return Reason.ESTOPPED, Reason.ESTOPPED.text
+    if seen.critical:
+        return Reason.BATTERY_CRITICAL, "it stands where it is"
+    return (Reason.SERVICE_FAILED, seen.failed) if seen.failed else None
 
 
 def _moved(run: Exploration, seen: Observed) -> Exploration:

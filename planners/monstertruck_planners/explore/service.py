@@ -28,7 +28,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import ExploreOrder, ExploreRequest, GoalControl, GoalOrder, GoalRequest
 from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.sensor import Battery, BatteryLevel
-from monstertruck_schemas.state import GateState, Grid, Odometry
+from monstertruck_schemas.state import GateMode, GateState, Grid, Odometry
 from monstertruck_schemas.topics import BATTERY, POSE, SLAM
 
 SOURCE: Final = ServiceName.EXPLORER.value
@@ -220,7 +220,8 @@ class ExplorerService:
         answer = None
         if self._deciding is not None and self._deciding.done():
             answer, self._deciding = self._deciding.result(), None
-        ended, text, displaced = self._goal_end()
+        (ended, text, displaced), goal = self._goal_end(), self._in.goal.latest
+        gate = self._in.gate.latest
         battery = self._in.battery.latest
         fresh = battery is not None and now - battery.received <= BATTERY.fresh_for() * SECOND
         return Observed(
@@ -230,6 +231,8 @@ class ExplorerService:
             ended=ended,
             ended_text=text,
             displaced=displaced,
+            estopped=gate is not None and gate.mode is GateMode.ESTOPPED,
+            paused=goal is not None and goal.number == self._goal and goal.phase is GoalPhase.PAUSED,
             answer=answer,
             charge=battery.charge if battery is not None and fresh else None,
             low=battery is not None and fresh and battery.level in LOW,

@@ -100,6 +100,8 @@ class Observations:
     """Metres of the route ahead."""
     blocked: bool = False
     """The newest scan shows something on the way ahead."""
+    estopped: bool = False
+    """The emergency stop is latched."""
     held: str = ""
     """What keeps the truck from being armed, in words."""
 
@@ -186,7 +188,11 @@ def displaced(run: GoalRun, text: str) -> Step:
 def tick(run: GoalRun, observed: Observations, config: PlannerConfig) -> Step:
     """One step with new observations."""
     passed, phase, run = observed.now - run.now, run.phase, replace(run, now=observed.now)
-    if phase is GoalPhase.IDLE or phase is GoalPhase.PAUSED:
+    if phase is GoalPhase.IDLE:
+        return run, ()
+    if observed.estopped:
+        return _end(run, Reason.ESTOPPED, Reason.ESTOPPED.text)
+    if phase is GoalPhase.PAUSED:
         return run, ()
     if observed.armed or phase is GoalPhase.PLANNING:
         run = replace(run, elapsed=run.elapsed + passed, unarmed=0.0)

@@ -123,8 +123,13 @@ class PathPublisher:
         steering = answer.steering if len(answer.steering) == len(answer.poses) else ()
         self._publish(answer.poses, answer.directions, steering, name, before, answer.clearance)
 
-    def brake(self, name: str) -> None:
-        """Let what is followed end as soon as the tracker can brake; of a truck at rest, where it stands."""
+    def brake(self, name: str, *, halts: bool = False) -> None:
+        """Let what is followed end as soon as the tracker can brake; of a truck at rest, where it stands.
+
+        Args:
+            name: of the path that is left.
+            halts: see ``Path``.
+        """
         odometry, followed = self._in.pose.latest, self.followed
         if odometry is None or followed is None:
             return
@@ -136,20 +141,21 @@ class PathPublisher:
             at_rest = stops(path.directions[1:], path.steering[1:])
             kept = kept_poses(followed.travelled, report.along, rest, np.flatnonzero(at_rest) + 1)
             poses, directions = followed.poses[kept], path.directions[kept]
-            self._publish(poses, directions, path.steering[kept], name, driven, path.clearance[kept])
+            steering, clearance = path.steering[kept], path.clearance[kept]
+            self._publish(poses, directions, steering, name, driven, clearance, halts=halts)
         else:
             ahead = np.array([[0.0, 0.0, 0.0], [STANDSTILL_PATH, 0.0, 0.0]])
-            self._publish(placed(ahead, pose_of(odometry)), np.ones(2), (), name, driven)
+            self._publish(placed(ahead, pose_of(odometry)), np.ones(2), (), name, driven, halts=halts)
 
     def halt(self, name: str) -> None:
         """Brake, and follow nothing."""
-        self.brake(name)
+        self.brake(name, halts=True)
         self.followed = None
 
     def end_other(self, name: str) -> None:
         """Let a path that another source published, as the configured one, end as soon as the tracker can brake."""
         path = self._in.path.latest
-        if path is not None and (self.followed is None or path is not self.followed.message):
+        if path is not None and not path.halts and (self.followed is None or path is not self.followed.message):
             self.followed = _followed(path)
             self.halt(name)
 
@@ -169,6 +175,8 @@ class PathPublisher:
         name: str,
         before: float,
         clearance: Array | None = None,
+        *,
+        halts: bool = False,
     ) -> None:
         now, odometry = self._clock.now(), self._in.pose.latest
         assert odometry is not None
@@ -182,6 +190,7 @@ class PathPublisher:
             directions=np.array(directions),
             steering=steering,
             clearance=np.zeros(0) if clearance is None else np.array(clearance),
+            halts=halts,
             name=f"{name}.{self._paths}",
         )
         self.followed = _followed(message, before)

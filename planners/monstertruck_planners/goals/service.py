@@ -47,7 +47,7 @@ from monstertruck_schemas.reasons import Reason, in_words
 from monstertruck_schemas.req import GoalControl, GoalOrder, GoalRequest, Request
 from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.sensor import LaserScan
-from monstertruck_schemas.state import Grid, Ground, Odometry
+from monstertruck_schemas.state import GateMode, GateState, Grid, Ground, Odometry
 from monstertruck_schemas.topics import ODOMETRY, SCAN
 
 REPORT: Final = SECOND // 2
@@ -69,9 +69,10 @@ R = TypeVar("R", bound=Request)
 
 
 class GoalService:
-    """Drives to goals, one at a time; a new one replaces the present one.
+    """Drives to goals, one at a time; a new one replaces the present one, and any path that another source published.
 
-    While a route is planned and none is followed, it requests standstill of the gate, so that the truck stays armed.
+    An emergency stop ends a goal, and none is taken on before its reset. While a route is planned and none is followed,
+    it requests standstill of the gate, so that the truck stays armed.
 
     Args:
         setup: configuration and truck.
@@ -170,7 +171,7 @@ class GoalService:
         """Accept a goal; returns its number. Its route is planned afterwards.
 
         Raises:
-            RequestRefusedError: the sender is not permitted, or the goal is not valid.
+            RequestRefusedError: the sender is not permitted, the goal is not valid, or the emergency stop is latched.
         """
         self._examine(request, "goal", moves=True)
         if self._actor is None and self._trouble is not None:
@@ -193,8 +194,11 @@ class GoalService:
             raise RequestRefusedError(Reason.NOT_FINITE, "goal: expected finite numbers")
         if max(map(abs, numbers)) > MAX_COORDINATE:
             raise RequestRefusedError(Reason.BAD_INPUT, f"goal: expected at most {MAX_COORDINATE:g} m and rad")
+        if _estopped(self._in.gate.latest):
+            raise RequestRefusedError(Reason.ESTOPPED)
         if self._goal is not None and self._goal.active:
             self._do(goal_run.order(self._goal, GoalOrder.CANCEL, request.source, self._seconds()))
+        self._paths.end_other("standstill")
         self._number, self._program = self._number + 1, request.program
         self._do(goal_run.begin(self._number, goal, request.source, self._seconds(), via))
         return self._number
@@ -211,6 +215,8 @@ class GoalService:
         if request.own and request.program != self._program:
             text = f"{request.order}: goal {self._goal.number} of {self._goal.source} is pursued"
             raise RequestRefusedError(Reason.NOT_FOUND, text)
+        if request.order is GoalOrder.RESUME and self._goal.phase is GoalPhase.PAUSED:
+            self._paths.end_other("standstill")
         self._do(goal_run.order(self._goal, request.order, request.source, self._seconds()))
 
     def hold(self, who: str, *, on: bool) -> None:
@@ -282,6 +288,7 @@ class GoalService:
         return Observations(
             now=now / SECOND,
             armed=gate is not None and gate.mode.active and odometry is not None,
+            estopped=_estopped(gate),
             at_rest=odometry is not None and abs(odometry.twist.vx) < AT_REST,
             pose=None if odometry is None else pose_of(odometry),
             answer=answer,
@@ -446,6 +453,10 @@ class GoalService:
 
     def _seconds(self) -> float:
         return self._clock.now() / SECOND
+
+
+def _estopped(gate: GateState | None) -> bool:
+    return gate is not None and gate.mode is GateMode.ESTOPPED
 
 
 def _in_map(points: Array, pose: Pose) -> Array:

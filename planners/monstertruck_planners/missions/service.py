@@ -164,6 +164,8 @@ class MissionService:
         """Why the last attempt at a step failed."""
         self._interrupted: SavedProgress | None = None
         self._writing = asyncio.Lock()
+        self._limit: asyncio.Timeout | None = None
+        """Of the present step."""
         self._noted: Pose | None = None
         """Where the robot was when that was last kept."""
         self._task: asyncio.Task[None] | None = None
@@ -335,10 +337,12 @@ class MissionService:
         if step.limit is None:
             return await self._do(step, progress)
         try:
-            async with self._clock.deadline(step.limit):
+            async with self._clock.deadline(step.limit) as self._limit:
                 return await self._do(step, progress)
         except TimeoutError:
             return StepEnd(Reason.TIMEOUT, f"not done within {step.limit:g} s")
+        finally:
+            self._limit = None
 
     async def _do(self, step: AnyStep, progress: MissionProgress) -> StepEnd:
         try:
@@ -374,6 +378,9 @@ class MissionService:
         while (left := until - self._clock.now()) > 0:
             if (other := self._other()) is not None:
                 return StepEnd(Reason.CANCELLED, other)
+            gate = self._in.gate.latest
+            if gate is None or not gate.mode.active:
+                raise does_not_drive(gate)
             await self._clock.sleep(min(left / SECOND, 1.0 / RATE))
         return StepEnd(Reason.OK)
 
@@ -517,6 +524,7 @@ class MissionService:
         try:
             while (ended := end()) is None:
                 # Counted by checks: while this process stands, as in a suspended computer, nobody can report.
+                self._wait_for_resume()
                 silent = silent + 1 if reports.latest is newest else 0
                 newest = reports.latest
                 if silent > SILENT * RATE:
@@ -527,6 +535,14 @@ class MissionService:
                 with contextlib.suppress(TruckError):
                     stop()
         return ended
+
+    def _wait_for_resume(self) -> None:
+        """Have the step's limit not run while its goal is paused; called with every check."""
+        goal, limit = self._in.goal.latest, self._limit
+        if goal is None or goal.phase is not GoalPhase.PAUSED or limit is None or limit.expired():
+            return
+        if (when := limit.when()) is not None:
+            limit.reschedule(when + 1.0 / RATE)
 
     def _header(self) -> dict[str, Any]:
         self._seq += 1

@@ -141,4 +141,5 @@ class PathService:
 
     def _publish(self, path: Path) -> None:
         now = self._clock.now()
-        self._out.put(path.model_copy(update={"stamp": now, "received": now, "seq": self._out.next_seq()}))
+        header = {"stamp": now, "received": now, "seq": self._out.next_seq()}
+        self._out.put(path.model_copy(update={**header, "halts": False}))

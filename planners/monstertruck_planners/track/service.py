@@ -134,8 +134,9 @@ class _ProgressChecker:
 class TrackingStep:
     """Follows the newest path with the configured tracker.
 
-    Arming after the end of a path starts it again; after a stop before its end the truck continues. Once the path has
-    ended or is lost, or the truck is stuck, the step requests standstill, then nothing.
+    Arming after the end of a path starts it again; after a stop before its end the truck continues. A path that
+    ``halts`` is over once the truck is disarmed: it may be elsewhere when it is armed again. Once a path has ended or
+    is lost, or the truck is stuck, the step requests standstill, then nothing.
 
     Args:
         setup: the tracker and the truck.
@@ -254,6 +255,9 @@ class TrackingStep:
             self._reported = Reason.DRIVING
         elif not armed and not idle:
             self._begun = None
+        if path.halts and not armed:
+            self._followed, self._path = path, None
+            return False
         here = (pose.pose.x, pose.pose.y, pose.pose.yaw)
         if path is self._followed:
             again = idle and (armed or self._moved(here))

@@ -224,6 +224,7 @@ def _write_path(path: Path, proto: Any) -> None:
     proto.steering.extend(path.steering)
     proto.clearance = path.clearance.tobytes()
     proto.closed = path.closed
+    proto.halts = path.halts
     proto.name = path.name
 
 
@@ -236,6 +237,7 @@ def _read_path(proto: Any) -> _Fields:
         "steering": tuple(proto.steering),
         "clearance": _array(proto.clearance),
         "closed": proto.closed,
+        "halts": proto.halts,
         "name": proto.name,
     }
 

@@ -375,3 +375,22 @@ def test_a_pose_that_trembles_is_no_way():
         stepped.pose = (x + 0.005 * k, y, yaw)
         stepped.step()
     assert stepped.run.travelled - began == pytest.approx(0.495, abs=0.03)
+
+
+def test_while_its_goal_is_paused_it_decides_nothing_and_sends_no_other():
+    trip = SteppedExploration(budget=100.0)
+    trip.drive()
+    for _ in range(3):
+        assert trip.step(60.0, paused=True, answer=ExploreAnswer(SECOND, known=5.0)).phase is Phase.DRIVING
+        assert trip.actions == ()
+    assert trip.step().phase is Phase.RETURNING, "resumed, it goes by its budget again"
+
+
+@pytest.mark.parametrize("looking", [True, False])
+def test_an_emergency_stop_ends_it_where_it_is(looking: bool):
+    trip = SteppedExploration()
+    if not looking:
+        trip.drive()
+    trip.step(estopped=True)
+    assert trip.actions == (Cancel(), Save())
+    assert trip.saved().outcome is Reason.ESTOPPED

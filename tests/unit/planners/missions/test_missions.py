@@ -496,6 +496,37 @@ def test_a_step_that_takes_too_long_has_failed_and_its_goal_is_cancelled():
     assert robot.latest["goal"].outcome is Reason.CANCELLED
 
 
+def test_the_limit_of_a_step_does_not_run_while_its_goal_is_paused():
+    async def story(robot: Pretended) -> None:
+        robot.order(MissionOrder.START, {**GO, "limit": 3.0, "on_failure": "continue"}, WAIT)
+        await robot.clock.sleep(1.0)
+        robot.task.cancel()
+        robot._say(GoalPhase.PAUSED, Reason.DRIVING)
+        await robot.clock.sleep(9.0)
+        assert robot.reports[-1].step == 1
+        robot._say(GoalPhase.DRIVING, Reason.DRIVING)
+        await robot.clock.sleep(3.0)
+        assert (robot.reports[-1].step, robot.reports[-1].failed) == (2, "not done within 3 s")
+
+    played(story)
+
+
+@pytest.mark.parametrize("reason", [Reason.DISARMED, Reason.ESTOPPED])
+def test_a_robot_that_is_disarmed_while_it_waits_ends_it(reason: Reason):
+    async def story(robot: Pretended) -> None:
+        robot.order(MissionOrder.START, {**WAIT, "seconds": 9.0}, GO, on_failure="continue")
+        await robot.clock.sleep(1.0)
+        gate = robot.latest["gate"]
+        gate.mode, gate.worst, gate.why = SimpleNamespace(active=False), reason, reason.text
+        await robot.clock.sleep(1.0)
+        gate.mode = SimpleNamespace(active=True)
+        await robot.clock.sleep(9.0)
+
+    robot = played(story)
+    assert robot.reports[-1].outcome is reason
+    assert robot.goals == []
+
+
 def test_after_a_restart_it_can_be_gone_on_with_at_the_step_that_was_interrupted(tmp_path: Path):
     file = tmp_path / "mission.json"
 
