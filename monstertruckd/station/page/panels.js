@@ -5,6 +5,7 @@ import { degrees, number, reason, words } from "./words.js";
 const byId = (id) => document.getElementById(id);
 const KEPT = 300;
 const SILENT = 1.0;
+const OLD = 3.0; // seconds after which a value that the robot no longer says has its age
 const HOT = 80; // degrees of the computer
 const LATE = 0.02; // seconds: one control tick
 
@@ -76,6 +77,13 @@ export class Panels {
     return this.link.newest.pilot?.source ?? null;
   }
 
+  /** A value with its age, if the robot no longer says what it is; a recording that is shown may stand still. */
+  aged(kind, text) {
+    const seconds = this.link.age(kind);
+    if (seconds < OLD || document.body.dataset.replay === "true") return text;
+    return words("old", { value: text, seconds: number(seconds, 0) });
+  }
+
   get alive() {
     return this.link.open && this.link.age("gate") < SILENT;
   }
@@ -91,7 +99,7 @@ export class Panels {
     byId("chip-battery").hidden = !battery;
     if (battery) {
       const look = { normal: "", low: "warn", critical: "bad", overcharged: "warn", sensor_fault: "warn" }[battery.level] ?? "";
-      setText("chip-battery", battery.voltage === null ? "– V" : `${number(battery.voltage, 1)} V`, look);
+      setText("chip-battery", this.aged("battery", battery.voltage === null ? "– V" : `${number(battery.voltage, 1)} V`), look);
       const key = `battery-${battery.level}`;
       if (look && !this.seen.has(key)) this.banner(key, words("banner.battery", { voltage: number(battery.voltage, 1), level: words(`level.${battery.level}`) }), look);
       if (!look) this.drop("battery-");
@@ -248,18 +256,19 @@ export class Panels {
     setText("axles", words("truck.axles", { front: degrees(front), rear: degrees(rear) }));
     const { roll = 0, pitch = 0, tilt_valid = false } = newest.compass ?? {};
     this.ball.setAttribute("transform", `rotate(${(-roll * 180) / Math.PI}) translate(0 ${(-pitch * 180 * 2) / Math.PI})`);
-    setText("tilt", newest.compass ? words("truck.tilted", { roll: degrees(roll, 1), pitch: degrees(pitch, 1) }) : "–", tilt_valid || !newest.compass ? "" : "warn");
+    const tilt = words("truck.tilted", { roll: degrees(roll, 1), pitch: degrees(pitch, 1) });
+    setText("tilt", newest.compass ? this.aged("compass", tilt) : "–", tilt_valid || !newest.compass ? "" : "warn");
     const { pose, battery, gate, tracker, slam, scan } = newest;
     rows("figures", [
-      ["figure.speed", pose ? `${number(pose.twist[0])} m/s` : null],
-      ["figure.turn", pose ? `${degrees(pose.twist[2])} °/s` : null],
-      ["figure.position", pose ? `${number(pose.pose[0])}, ${number(pose.pose[1])} m` : null],
-      ["figure.heading", pose ? `${degrees(pose.pose[2])}°` : null],
-      ["figure.battery", battery ? `${number(battery.voltage, 1)} V, ${words(`level.${battery.level}`)}` : null],
+      ["figure.speed", pose ? this.aged("pose", `${number(pose.twist[0])} m/s`) : null],
+      ["figure.turn", pose ? this.aged("pose", `${degrees(pose.twist[2])} °/s`) : null],
+      ["figure.position", pose ? this.aged("pose", `${number(pose.pose[0])}, ${number(pose.pose[1])} m`) : null],
+      ["figure.heading", pose ? this.aged("pose", `${degrees(pose.pose[2])}°`) : null],
+      ["figure.battery", battery ? this.aged("battery", `${number(battery.voltage, 1)} V, ${words(`level.${battery.level}`)}`) : null],
       ["figure.charge", battery?.charge != null ? `${number(battery.charge * 100, 0)} %` : null],
       ["figure.stopping", gate ? `${number(gate.stopping_distance)} m` : null],
       ["figure.error", tracker && tracker.outcome === "driving" ? `${number(tracker.cross_track * 100, 1)} cm` : null],
-      ["figure.lidar", scan?.tilt != null ? `${degrees(scan.tilt, 1)}°` : null],
+      ["figure.lidar", scan?.tilt != null ? this.aged("scan", `${degrees(scan.tilt, 1)}°`) : null],
       ["figure.map", slam ? `${number(slam.overlap * 100, 0)} %` : null],
     ]);
   }

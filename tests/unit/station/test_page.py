@@ -159,6 +159,18 @@ async def a_robot_without_a_map_is_called_so(page: Page) -> None:
     assert not await page.is_visible("#map-none")
 
 
+async def what_a_sensor_said_long_ago_is_not_shown_as_of_now(page: Page) -> None:
+    battery = {"kind": "battery", "m": {"voltage": 24.8, "level": "normal"}}
+    compass = {"kind": "compass", "m": {"roll": 0.0, "pitch": 0.0, "tilt_valid": True}}
+    await say(page, battery, compass)
+    await asyncio.sleep(0.2)
+    assert await page.inner_text("#chip-battery") == "24.8 V"
+    await asyncio.sleep(2.9)
+    await say(page, compass)
+    await page.wait_for_function("document.querySelector('#chip-battery').textContent === '24.8 V, 3 s old'")
+    assert "old" not in (await page.text_content("#tilt") or "")
+
+
 async def a_stop_is_shown_with_its_chain_of_causes(page: Page) -> None:
     lost = Cause(reason=Reason.DEVICE_LOST, source="lidar", since=9 * 10**8, text="lidar: <b>unplugged</b>")
     stale = Cause(reason=Reason.SCAN_STALE, source="lidar", since=9 * 10**8, text="no fresh lidar scan", because=1)
@@ -213,6 +225,7 @@ async def test_the_page_drives_as_the_hand_does_and_shows_what_is_true(tmp_path:
         await an_unknown_way_is_taken_to_be_slow(page)
         await parts_of_the_map_outlive_the_whole_map_that_they_belong_to(page)
         await a_robot_without_a_map_is_called_so(page)
+        await what_a_sensor_said_long_ago_is_not_shown_as_of_now(page)
         await a_stop_is_shown_with_its_chain_of_causes(page)
         await a_mission_of_a_robot_that_was_moved_goes_on_once_that_is_said(page)
         assert errors == []
