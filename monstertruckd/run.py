@@ -33,6 +33,9 @@ def run_daemon(config_file: Path, *, verbose: bool) -> Reason:
     faulthandler.enable()
     listener = start_logging(verbose=verbose)
     log.info("calibration: %s", tree.calibration or f"none in {config.calibration_folder}")
+    if tree.unused:
+        text = "%s: not used, as the configuration has no such part: %s"
+        log.warning(text, tree.calibration, ", ".join(tree.unused))
     for table in TABLES:
         for broken in table.broken:
             log.warning("plug-in left out: %s", broken)

@@ -385,17 +385,30 @@ def in_order(results: Iterable[Result]) -> list[tuple[Result, int, Estimate]]:
     return sorted(rows, key=lambda row: (row[2].file, "" if row[2].file else row[2].date or row[0].date))
 
 
+def unused(config: TruckConfig, results: Iterable[Result]) -> list[str]:
+    """Keys of calibrated values that ``config`` has no place for: their device is not there, or has another name."""
+    data = config.model_dump()
+    keys = [estimate.key for _, _, estimate in in_order(results) if estimate.key is not None]
+    return [key for key in dict.fromkeys(keys) if _section(data, key) is None]
+
+
 def _set(data: dict[str, Any], estimate: Estimate, result: Result, source: Path | str) -> None:
     assert estimate.key is not None
     if not may_set(result.wizard, estimate.key):
         raise ConfigError(f"{source}: the wizard {result.wizard} may not set {estimate.key}")
-    *way, last = estimate.key.split(".")
-    section: Any = data
-    for part in way:
-        section = section.get(part)
-        if not isinstance(section, dict):
-            return
-    section[last] = estimate.value
+    if (section := _section(data, estimate.key)) is not None:
+        section[estimate.key.rpartition(".")[2]] = estimate.value
+
+
+def _section(data: dict[str, Any], key: str) -> dict[str, Any] | None:
+    """The mapping that holds the value at ``key``; None where the configuration has none there."""
+    section = data
+    for part in key.split(".")[:-1]:
+        inner = section.get(part)
+        if not isinstance(inner, dict):
+            return None
+        section = inner
+    return section
 
 
 def may_set(wizard: WizardName, key: str) -> bool:

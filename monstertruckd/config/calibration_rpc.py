@@ -17,7 +17,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.state import GateMode
 from monstertruckd.bus.rpc import Rpc
-from monstertruckd.config.calibration import CalibrationStore, Result, WizardName, with_values
+from monstertruckd.config.calibration import CalibrationStore, Result, WizardName, unused, with_values
 from monstertruckd.config.truck import TruckConfig
 
 SHOW: Final = "calibration"
@@ -65,12 +65,13 @@ def register(
     async def show(_: dict[str, Any]) -> dict[str, Any]:
         def read() -> dict[str, Any]:
             newest = store.newest()
-            content = None if newest is None else store.load(newest).model_dump(mode="json")
+            file = None if newest is None else store.load(newest)
             return {
                 "folder": str(store.folder),
                 "loaded": None if loaded is None else str(loaded),
                 "newest": None if newest is None else str(newest),
-                "content": content,
+                "content": None if file is None else file.model_dump(mode="json"),
+                "unused": [] if file is None else unused(config, file.results.values()),
             }
 
         return await offload(read)

@@ -28,7 +28,7 @@ from monstertruck_runtime.errors import ConfigError
 from monstertruck_runtime.plugins import models_in
 from monstertruck_runtime.small_files import replace_file, require_file
 from monstertruck_schemas.base import LiveValue, Schema, field_docs, first_mistake, live_settings
-from monstertruckd.config.calibration import CalibrationStore, Result, WizardName, in_order, put_values
+from monstertruckd.config.calibration import CalibrationStore, Result, WizardName, in_order, put_values, unused
 from monstertruckd.config.renamed import RENAMED
 from monstertruckd.config.truck import ROBOT, TruckConfig
 
@@ -79,6 +79,8 @@ class Tree:
     """The file itself, then every file it depends on by relative names; resolved."""
     calibration: Path | None = None
     """Calibration file whose values replace those of the configuration, if there is one."""
+    unused: list[str] = field(default_factory=list)
+    """Keys of values in it for which the configuration has no place."""
 
     def origin(self, key: Key) -> Origin | None:
         """Origin of ``key``, or of its nearest parent that has one."""
@@ -133,7 +135,7 @@ def calibrated(config: T, tree: Tree) -> tuple[T, Tree]:
     path = store.newest()
     if path is None and not settings:
         return config, tree
-    data, origins, sources = config.model_dump(), dict(tree.origins), []
+    data, origins, sources, left = config.model_dump(), dict(tree.origins), list[str](), list[str]()
     if settings:
         saved.put(settings, config, data)
         origins |= {tuple(key.split(".")): Origin(saved.path, line) for key, (_, line) in settings.items()}
@@ -141,13 +143,14 @@ def calibrated(config: T, tree: Tree) -> tuple[T, Tree]:
     if path is not None:
         results = store.load(path).results
         put_values(data, results.values(), path)
+        left = unused(config, results.values())
         origins |= _calibrated_origins(results, load_tree(path).origins)
         sources.append(str(path))
     try:
         changed = type(config).model_validate(data)
     except ValidationError as error:
         raise ConfigError(f"{' with '.join(sources)}: {first_mistake(error)}") from error
-    return changed, Tree(tree.data, origins, tree.files, calibration=path)
+    return changed, Tree(tree.data, origins, tree.files, calibration=path, unused=left)
 
 
 def _calibrated_origins(results: Mapping[WizardName, Result], lines: Mapping[Key, Origin]) -> dict[Key, Origin]:

@@ -26,7 +26,8 @@ if TYPE_CHECKING:
 
     from monstertruck_runtime.client import TruckClient
     from monstertruck_runtime.clock import Clock
-    from monstertruckd.config.calibration import CalibrationFile, Estimate, Result, WizardName
+    from monstertruckd.config.calibration import CalibrationFile, CalibrationStore, Estimate, Result, WizardName
+    from monstertruckd.config.truck import TruckConfig
     from monstertruckd.tools.calibrate.sequence import SequenceStep
     from monstertruckd.tools.calibrate.steps import Panel
     from monstertruckd.tools.calibrate.wizard import Wizard
@@ -345,12 +346,14 @@ def show(
     json_output: JsonOption = False,
 ) -> None:
     """Print what was calibrated, when, how well, and which file the daemon runs on."""
+    from monstertruckd.config.calibration import unused
     from monstertruckd.config.calibration_rpc import SHOW
 
     if config is not None:
-        store = _store(config)
+        loaded, store = _store(config)
         newest, file = store.newest(), store.current()
-        state: dict[str, Any] = {"folder": str(store.folder), "newest": newest, "content": file}
+        left = [] if file is None else unused(loaded, file.results.values())
+        state: dict[str, Any] = {"folder": str(store.folder), "newest": newest, "content": file, "unused": left}
     else:
         state = with_robot(lambda client, _: client.call(SHOW), robot, endpoint, TIMEOUT)
         file = _file(state)
@@ -363,6 +366,8 @@ def show(
     for result in file.results.values():
         _print(result)
     remark(f"file: {state['newest']} ({file.change})")
+    if keys := state.get("unused"):
+        remark(f"not used, as the configuration has no such part: {', '.join(keys)}")
     if "loaded" in state and state["loaded"] != state["newest"]:
         remark(f"the daemon still runs on {state['loaded'] or 'no calibration'}: restart it")
 
@@ -397,7 +402,7 @@ def _undo(name: "WizardName", call: _Call) -> None:
 
     if call.config is not None:
         clock = WallClock()
-        file = str(_store(call.config).undo(name, clock.now() + clock.real_offset()))
+        file = str(_store(call.config)[1].undo(name, clock.now() + clock.real_offset()))
     else:
         file = with_robot(
             lambda client, _: client.call(UNDO, {"wizard": name, "source": client.source}),
@@ -416,13 +421,14 @@ def _client(robot: str, endpoint: str, clock: "Clock") -> "TruckClient":
     return TruckClient(robot, endpoint, clock=clock, timeout=TIMEOUT)
 
 
-def _store(config: Path) -> Any:
+def _store(config: Path) -> "tuple[TruckConfig, CalibrationStore]":
+    """The configuration without calibration, and where its robot's calibration is."""
     from monstertruckd.config.calibration import CalibrationStore
     from monstertruckd.config.load import load_config
     from monstertruckd.config.truck import TruckConfig
 
     loaded, _ = load_config(config, TruckConfig)
-    return CalibrationStore(loaded.calibration_folder, loaded.robot)
+    return loaded, CalibrationStore(loaded.calibration_folder, loaded.robot)
 
 
 def _file(state: dict[str, Any]) -> "CalibrationFile | None":

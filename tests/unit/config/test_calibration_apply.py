@@ -49,6 +49,19 @@ def test_the_measured_turn_deficit_is_the_kinematics(config: Path):
     assert axles.deficit == TurnDeficit(rear_left=0.2, counter_right=-0.1)
 
 
+def test_what_is_measured_of_a_part_that_has_another_name_now_is_not_silently_dropped(
+    config: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    assert load_truck(config)[1].unused == []
+    save(config, DRIVE, result("sonar", devices__sonar__driver__sonars__left__mount__x=0.3))
+    assert load_truck(config)[1].unused == ["devices.sonar.driver.sonars.left.mount.x"]
+    monkeypatch.setattr(sys, "argv", ["monstertruckd", "calibrate", "show", "--config", str(config)])
+    with pytest.raises(SystemExit):
+        main()
+    said = "not used, as the configuration has no such part: devices.sonar.driver.sonars.left.mount.x"
+    assert said in capsys.readouterr().err
+
+
 def test_measured_values_win_and_show_where_they_come_from(config: Path):
     path = save(config, DRIVE, STEERING, COMPASS)
     truck, tree = load_truck(config)
