@@ -1,12 +1,15 @@
 """Other robots: their poses are received over their own Zenoh endpoints, and published on ``state/peers``."""
 
+from typing import Final
+
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import Clock, Schedule
+from monstertruck_runtime.errors import NoAnswerError
 from monstertruck_runtime.mailbox import latest
 from monstertruck_runtime.ports import Publisher, Ready
 from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.state import Odometry, Peer, Peers
-from monstertruck_schemas.topics import PEERS, POSE
+from monstertruck_schemas.topics import GATE, PEERS, POSE
 from monstertruckd.bus.zenoh_config import PeerConfig
 
 
@@ -48,8 +51,12 @@ class PeerService:
             self._out.put(message)
 
 
+SILENT: Final = 5.0
+"""Seconds without a pose after which another robot counts as lost."""
+
+
 class PeerSubscriber:
-    """Receives the poses of one other robot; an open session reconnects by itself.
+    """Receives the poses of one other robot; ready with the first one.
 
     Args:
         robot: its name.
@@ -66,10 +73,14 @@ class PeerSubscriber:
         """Listen until cancelled.
 
         Raises:
-            NotFoundError: nobody is there.
+            NotFoundError: nobody is there, or no robot of this name.
+            NoAnswerError: it has published no pose for ``SILENT`` s.
         """
-        async with TruckClient(self._robot, self._config.endpoint, clock=self._clock) as client:
+        endpoint = self._config.endpoint
+        async with TruckClient(self._robot, endpoint, clock=self._clock) as client:
             with client.subscribe(POSE, latest()) as poses:
-                ready()
-                async for pose in poses:
+                while (pose := await poses.next_within(SILENT)) is not None:
+                    ready()
                     self._peers.hear(self._robot, pose)
+            await client.get_retained(GATE)  # says who is there instead
+            raise NoAnswerError(f"robot {self._robot!r} at {endpoint} has published no pose for {SILENT:g} s")

@@ -6,14 +6,15 @@ from pathlib import Path
 import pytest
 
 from monstertruck_runtime.clock import SECOND, VirtualClock, WallClock, run_virtual
-from monstertruck_runtime.errors import ConfigError, NotFoundError
+from monstertruck_runtime.errors import ConfigError, NoAnswerError, NotFoundError
 from monstertruck_runtime.mailbox import latest
-from monstertruck_schemas.topics import PEERS, POSE, Writer
+from monstertruck_schemas.topics import GATE, PEERS, POSE, Writer
+from monstertruckd.bus import peers
 from monstertruckd.bus.local import Bus
 from monstertruckd.bus.peers import PeerService, PeerSubscriber
 from monstertruckd.bus.zenoh_config import PeerConfig
 from monstertruckd.tools.simulation.config import load_simulated
-from tests.bus_kit import free_endpoint, odometry, running_robot
+from tests.bus_kit import free_endpoint, gate_state, odometry, running_robot
 
 FLEET = Path(__file__).resolve().parents[3] / "configs" / "fleet"
 
@@ -53,13 +54,13 @@ async def test_another_robot_is_heard_over_its_own_endpoint():
         try:
             with bus.subscribe(PEERS, latest()) as heard:
                 async with asyncio.timeout(20):
-                    await ready.wait()
                     while heard.latest is None or not heard.latest.peers:
                         out.put(odometry(out.next_seq(), x=3.0))
                         await asyncio.sleep(0.05)
                 (peer,) = heard.latest.peers
                 assert (peer.robot, peer.pose.x) == ("ann", 3.0)
                 assert 0 <= clock.now() - peer.heard < 5 * SECOND
+                assert ready.is_set()
         finally:
             for task in tasks:
                 task.cancel()
@@ -71,6 +72,26 @@ async def test_a_robot_that_is_not_there_is_an_error_that_is_tried_again():
     service = PeerService(clock, Bus(clock).publisher(PEERS, Writer.ESTIMATION))
     with pytest.raises(NotFoundError):
         await PeerSubscriber("ann", PeerConfig(endpoint=free_endpoint()), clock, service).run(lambda: None)
+
+
+@pytest.mark.parametrize(
+    ("name", "error", "said"),
+    [
+        ("anna", NotFoundError, "no robot 'anna' at .*; there is ann"),
+        ("ann", NoAnswerError, "robot 'ann' at .* has published no pose for 0.2 s"),
+    ],
+)
+async def test_a_robot_of_another_name_or_without_a_pose_is_not_ready(
+    name: str, error: type[Exception], said: str, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(peers, "SILENT", 0.2)
+    clock = WallClock()
+    service = PeerService(clock, Bus(clock).publisher(PEERS, Writer.ESTIMATION))
+    async with running_robot(robot="ann") as ann:
+        ann.bus.publisher(GATE, Writer.GATE).put(gate_state(1))
+        subscriber = PeerSubscriber(name, PeerConfig(endpoint=ann.endpoint), clock, service)
+        with pytest.raises(error, match=said):
+            await subscriber.run(lambda: pytest.fail("nothing was heard"))
 
 
 @pytest.mark.parametrize(
