@@ -20,13 +20,16 @@ from ruamel.yaml.events import AliasEvent
 
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.drives import send_path
 from monstertruck_runtime.errors import InputError, NoAnswerError, NotFoundError, RequestRefusedError, TruckError
+from monstertruck_runtime.mailbox import latest
 from monstertruck_runtime.threads import in_thread
 from monstertruck_schemas.base import first_mistake
 from monstertruck_schemas.mission import Mission
 from monstertruck_schemas.plan import Path
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import UNCONDITIONAL, MissionOrder
+from monstertruck_schemas.topics import PATH
 from monstertruckd.station import frames
 from monstertruckd.station.address import RobotAddress
 from monstertruckd.station.commands import (
@@ -178,7 +181,7 @@ class Pilot:
             why = f"{MOST_ASKED} commands of this browser are under way"
             self._viewer.send(frames.refusal(command.id, RequestRefusedError(Reason.BUSY, why)))
             return
-        task = asyncio.create_task(self._outcome(command.id, _call(client, command)))
+        task = asyncio.create_task(self._outcome(command.id, _call(client, command, self._clock)))
         self._answers.add(task)
         task.add_done_callback(self._answers.discard)
 
@@ -192,7 +195,7 @@ class Pilot:
             self._viewer.send(frames.text("answer", id=number, ok=True, **more))
 
 
-def _call(client: TruckClient, command: Asked) -> Coroutine[Any, Any, Any]:
+def _call(client: TruckClient, command: Asked, clock: Clock) -> Coroutine[Any, Any, Any]:
     match command:
         case GiveOrder():
             return client.order(command.order, hold=command.hold)
@@ -207,7 +210,7 @@ def _call(client: TruckClient, command: Asked) -> Coroutine[Any, Any, Any]:
         case DoMission():
             return _mission(client, command)
         case Track():
-            return _track(client, command)
+            return _track(client, command, clock)
         case _:
             return _other_call(client, command)
 
@@ -233,9 +236,10 @@ def _other_call(client: TruckClient, command: Asked) -> Coroutine[Any, Any, Any]
             raise AssertionError(command)
 
 
-async def _track(client: TruckClient, command: Track) -> Any:
+async def _track(client: TruckClient, command: Track, clock: Clock) -> None:
     path = drawn_path(command.points)
-    return await client.path(path)
+    with client.subscribe(PATH, latest()) as present:
+        await send_path(client, clock, path, present)
 
 
 async def _mission(client: TruckClient, command: DoMission) -> dict[str, Any]:

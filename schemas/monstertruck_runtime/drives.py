@@ -148,11 +148,9 @@ async def follow(driver: TruckClient, clock: Clock, path: Path, *, arm: bool, re
         RequestRefusedError: the path or the arming was refused, the tracker failed, or the robot restarted.
         NoAnswerError: the robot does not answer, or has been silent for a minute.
     """
-    path = path.model_copy(update={"name": f"{path.name[:96]}-{clock.now():x}"})
     with (
         driver.subscribe(TRACKER, fifo(256)) as states,
         monitor_standstill(driver) as stand,
-        driver.subscribe(EVENT, fifo(256)) as events,
         driver.subscribe(PATH, latest()) as present,
     ):
         with suppress(TimeoutError):
@@ -160,15 +158,34 @@ async def follow(driver: TruckClient, clock: Clock, path: Path, *, arm: bool, re
                 while (await stand.gate.next()).mode.moving:
                     pass
         async with taken_back(driver.stop):
-            await driver.path(path)
-            await _accepted(driver, clock, events, present, path.name)
+            name = await send_path(driver, clock, path, present)
 
         async def stop() -> None:
-            if _followed(present, path.name):
+            if _followed(present, name):
                 await driver.stop()
 
-        end = _path_end(clock, states, present, path.name, report)
+        end = _path_end(clock, states, present, name, report)
         return await _watched(driver, clock, stand, ServiceName.TRACKER, arm=arm, end=end, undo=stop, report=report)
+
+
+async def send_path(driver: TruckClient, clock: Clock, path: Path, present: Mailbox[Path]) -> str:
+    """Send a path under a name that no other one has, and wait until it is followed; returns the name.
+
+    Args:
+        driver: who sends it.
+        clock: time.
+        path: what is to be driven.
+        present: the newest path of the robot.
+
+    Raises:
+        RequestRefusedError: the path was refused.
+        NoAnswerError: the robot does not answer.
+    """
+    path = path.model_copy(update={"name": f"{path.name[:96]}-{clock.now():x}"})
+    with driver.subscribe(EVENT, fifo(256)) as events:
+        await driver.path(path)
+        await _accepted(driver, clock, events, present, path.name)
+    return path.name
 
 
 async def _accepted(
@@ -176,7 +193,7 @@ async def _accepted(
 ) -> None:
     try:
         async with clock.deadline(ACCEPT_TIMEOUT):
-            while present.latest is None or present.latest.name != name:
+            while not _followed(present, name):
                 for event in events.drain():
                     if event.source == driver.source and event.severity is Severity.WARNING:
                         raise RequestRefusedError(event.reason, event.text)

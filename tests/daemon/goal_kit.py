@@ -90,6 +90,13 @@ def travel(story: Callable[[Trip], Awaitable[None]], base: str | None = None, **
     return run_virtual(main)
 
 
+def own_path(folder: Path) -> Path:
+    """A path of 5 m straight ahead of where the truck starts."""
+    file = folder / "ahead.csv"
+    file.write_text("x,y,yaw,direction\n" + "".join(f"{1.0 + i / 10},3.95,0,1\n" for i in range(51)))
+    return file
+
+
 def assert_at(rig: VirtualRig, x: float, y: float, yaw: float) -> None:
     truth = rig.truth.array()
     assert not truth[:, 5].any(), "collided"

@@ -18,7 +18,7 @@ from monstertruck_schemas.plan import Path as DrivePath
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import DriveRequest, GoalOrder, GoalRequest, PathRequest, Role
 from monstertruckd.tools.simulation.operator import LocalOperator
-from tests.daemon.goal_kit import Trip, assert_at, travel
+from tests.daemon.goal_kit import Trip, assert_at, own_path, travel
 
 pytestmark = [pytest.mark.virtual, pytest.mark.timeout(300)]
 
@@ -172,12 +172,6 @@ def test_the_commands_follow_a_goal_and_a_path_and_tell_how_they_end(tmp_path: P
         assert (await trip.end()).outcome is Reason.CANCELLED
 
     assert not travel(story).truth.array()[:, 5].any()
-
-
-def own_path(folder: Path) -> Path:
-    file = folder / "ahead.csv"
-    file.write_text("x,y,yaw,direction\n" + "".join(f"{1.0 + i / 10},3.95,0,1\n" for i in range(51)))
-    return file
 
 
 def test_of_a_goal_that_was_cancelled_nothing_is_driven_by_whoever_arms_later():

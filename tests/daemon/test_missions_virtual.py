@@ -1,18 +1,19 @@
 """A mission in the whole daemon: goals, a move, a note, and the way back."""
 
+import asyncio
 import json
 from pathlib import Path
 
 import pytest
 
-from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.errors import InputError, RequestRefusedError
 from monstertruck_runtime.mailbox import fifo
 from monstertruck_schemas import topics
 from monstertruck_schemas.mission import Mission
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.tools.cli.runs import run_mission
 from monstertruckd.tools.simulation.operator import LocalOperator
-from tests.daemon.goal_kit import Trip, assert_at, travel
+from tests.daemon.goal_kit import Trip, assert_at, own_path, travel
 
 pytestmark = [pytest.mark.virtual, pytest.mark.timeout(300)]
 
@@ -71,8 +72,7 @@ def test_the_shipped_mission_is_one():
 @pytest.mark.parametrize("driven", [0.0, 3.0])
 def test_a_robot_with_a_path_of_its_own_waits_where_it_is(tmp_path: Path, driven: float):
     """Armed for the mission, it would drive along the path meanwhile; one that does already stops."""
-    file = tmp_path / "ahead.csv"
-    file.write_text("x,y,yaw,direction\n" + "".join(f"{1.0 + i / 10},3.95,0,1\n" for i in range(31)))
+    file = own_path(tmp_path)
     steps = [{"do": "wait", "seconds": 8.0}]
     mission = Mission.model_validate_json(json.dumps({"version": 2, "name": "stay", "steps": steps}))
     at: list[float] = []
@@ -88,3 +88,38 @@ def test_a_robot_with_a_path_of_its_own_waits_where_it_is(tmp_path: Path, driven
     rig = travel(story, path={"file": file, "closed": False})
     assert (at[0] > 1.3) == (driven > 0.0)
     assert_at(rig, at[0], 3.95, 0.0)
+
+
+class DistantOperator(MissionOperator):
+    """Whose answers take a second."""
+
+    async def call(self, rpc, payload=None):
+        answer = await super().call(rpc, payload)
+        await asyncio.sleep(1.0)
+        return answer
+
+
+@pytest.mark.parametrize("refused", [False, True])
+def test_armed_for_a_mission_it_does_not_drive_its_own_path_before_that_begins(tmp_path: Path, refused: bool):
+    steps = [{"do": "goto", "x": 0.97, "y": 3.95, "yaw": 0.0}, {"do": "wait", "seconds": 1.0}]
+    mission = Mission.model_validate_json(json.dumps({"version": 2, "name": "stay", "steps": steps}))
+
+    async def story(trip: Trip) -> None:
+        client, starts = DistantOperator(trip.rig.daemon, trip.clock), []
+
+        async def start(order, mission=None, *, moved=False, own=False):
+            starts.append(order)
+            if refused and len(starts) == 2:
+                raise RequestRefusedError(Reason.BUSY)
+            return await DistantOperator.mission(client, order, mission, moved=moved, own=own)
+
+        client.mission = start
+        if refused:
+            with pytest.raises(RequestRefusedError):
+                await run_mission(client, mission, arm=True)
+        else:
+            assert (await run_mission(client, mission, arm=True)).reason is Reason.MISSION_DONE
+        await trip.clock.sleep(3.0)
+
+    truth = travel(story, path={"file": own_path(tmp_path), "closed": False}).truth.array()
+    assert abs(truth[:, 1] - 1.0).max() < 0.04

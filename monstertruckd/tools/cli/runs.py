@@ -179,7 +179,7 @@ async def _run(
     with client.subscribe(topic, fifo(256)) as states:
         number: int | None = None
         try:
-            number = await _started(client, start, arm=arm)
+            number = await _started(client, start, stop, arm=arm)
             return await while_it_runs(client, _followed(states, number, show, figures), needs)
         except BaseException as error:
             if not isinstance(error, TruckError) or isinstance(error, NoAnswerError):
@@ -190,8 +190,17 @@ async def _run(
             raise
 
 
-async def _started(client: Operator, start: Callable[[], Awaitable[dict[str, Any]]], *, arm: bool) -> int:
-    """Number of what was started. The robot is armed only when nothing else is in the way: its path would be driven.
+async def _started(
+    client: Operator,
+    start: Callable[[], Awaitable[dict[str, Any]]],
+    stop: Callable[[], Awaitable[object]],
+    *,
+    arm: bool,
+) -> int:
+    """Number of what was started.
+
+    The robot is armed only when nothing else is in the way, and held until it has begun: a path that it has would be
+    driven meanwhile. It is disarmed again if nothing comes of it.
 
     Raises:
         RequestRefusedError: the start or the arming was refused.
@@ -202,8 +211,19 @@ async def _started(client: Operator, start: Callable[[], Awaitable[dict[str, Any
     except RequestRefusedError as refused:
         if not arm or refused.refusal is not Reason.DISARMED:
             raise
-    await client.arm()
-    return int((await start())["number"])
+    try:
+        await client.arm(hold=True)
+        number = int((await start())["number"])
+        try:
+            await client.arm()
+        except RequestRefusedError:
+            await stop()
+            raise
+    except BaseException:
+        with suppress(TruckError):
+            await client.disarm()
+        raise
+    return number
 
 
 async def _followed(states: Mailbox[S], number: int, show: Callable[[S], None], figures: tuple[str, ...]) -> RunEnd:

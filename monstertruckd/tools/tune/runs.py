@@ -77,7 +77,7 @@ async def tune(
         NoAnswerError: the robot does not answer.
     """
     async with taken_back(client.disarm):
-        await client.arm()
+        await client.arm(hold=True)  # until the behaviour runs: a path that the robot has would be driven
     try:
         return await _tuned(client, name, distance, recipe(first), seconds, pause, report)
     finally:
@@ -97,7 +97,7 @@ async def _tuned(
     gains, number = next(trials), 0
     while True:
         before, wanted = (distance + STEP * (n % 2) for n in (number, number + 1))
-        await _run(client, name, {"distance": before}, partial(_calm, before))
+        await _run(client, name, {"distance": before}, partial(_calm, before), held=number == 0)
         await pause()
         samples = await _run(client, name, {**gains._asdict(), "distance": wanted}, partial(_over, wanted, seconds))
         errors = tuple((at, measured - wanted) for at, measured in samples)
@@ -126,11 +126,18 @@ def _over(wanted: float, seconds: float, samples: Samples) -> bool:
     return samples[-1][0] >= seconds or abs(samples[-1][1] - wanted) > LOST
 
 
-async def _run(client: Operator, name: str, settings: Mapping[str, Any], over: Callable[[Samples], bool]) -> Samples:
-    """One start of the behaviour: the first stretch of following that is over; a corner begins another one."""
+async def _run(
+    client: Operator, name: str, settings: Mapping[str, Any], over: Callable[[Samples], bool], *, held: bool = False
+) -> Samples:
+    """One start of the behaviour: the first stretch of following that is over; a corner begins another one.
+
+    A robot that is ``held`` may drive from then on.
+    """
     with client.subscribe(BEHAVIOUR, fifo(1024)) as states:
         try:
             number = int((await client.behave(BehaviourOrder.START, name, settings))["number"])
+            if held:
+                await client.arm()
             return await _followed(states, number, over)
         finally:
             with suppress(TruckError):

@@ -15,6 +15,7 @@ import pytest
 from monstertruck_runtime import recordings
 from monstertruck_runtime.clock import SECOND, WallClock
 from monstertruck_runtime.errors import InputError, NotFoundError, RequestRefusedError
+from monstertruck_runtime.mailbox import Mailbox
 from monstertruck_schemas import topics
 from monstertruck_schemas.base import Pose2D, Twist2D
 from monstertruck_schemas.event import Event, Severity
@@ -71,6 +72,33 @@ async def test_a_path_that_is_refused_by_the_station_is_answered():
     pilot.ask(commands.parse(json.dumps({"do": "track", "id": 7, "points": [[0, 0], [0.1, 0]]})))
     (answer,) = await shown(viewer)
     assert (answer["kind"], answer["id"], answer["ok"]) == ("answer", 7, False)
+
+
+@pytest.mark.parametrize("refused", [True, False])
+async def test_a_drawn_path_is_answered_once_the_robot_follows_it_or_refuses_it(refused: bool):
+    """The page arms after that: refused, the robot would drive along another one."""
+
+    class Truck:
+        source = "page"
+
+        def subscribe(self, topic, delivery):
+            return boxes.setdefault(topic.name, Mailbox(delivery))
+
+        async def path(self, path):
+            head = {"stamp": 0, "received": 0, "seq": 0}
+            if refused:
+                why = {"severity": Severity.WARNING, "reason": Reason.BUSY, "source": "page", "text": "path refused"}
+                boxes[topics.EVENT.name].put(Event(**head, **why))
+            else:
+                boxes[topics.PATH.name].put(path)
+
+    viewer, boxes = Viewer(), {}
+    pilot = Pilot(RobotAddress("truck", "tcp/127.0.0.1:1"), "page", viewer, WallClock())
+    pilot._client = Truck()
+    pilot.ask(commands.parse(json.dumps({"do": "track", "id": 7, "points": [[0, 0], [1, 0]]})))
+    (answer,) = await shown(viewer)
+    assert answer["ok"] is not refused
+    assert not refused or answer["text"] == "path refused"
 
 
 async def test_a_mission_is_resumed_as_the_page_says():

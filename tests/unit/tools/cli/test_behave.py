@@ -51,8 +51,11 @@ class Robot:
             gate.put(GateState(stamp=0, received=0, seq=0, mode=GateMode.DRIVING, nonce=run, speed_limit=0.2))
 
     async def arm(self, *, hold=False):
-        self.orders.append("arm")
+        self.orders.append("hold" if hold else "arm")
         self.armed = True
+
+    async def disarm(self):
+        self.orders.append("disarm")
 
     async def behave(self, order, behaviour="", settings=None, *, own=False):
         assert own is (order is BehaviourOrder.STOP), "nobody else's is stopped"
@@ -87,7 +90,7 @@ def test_it_ends_with_the_behaviours_own_end():
     done = state(running=False, outcome=Reason.BEHAVIOUR_DONE, text="1 lap")
     robot, end = run(state(), state(), done, arm=True, armed=False)
     assert (end.reason, end.text, end.figures["travelled"]) == (Reason.BEHAVIOUR_DONE, "1 lap", 0.3)
-    assert robot.orders == [BehaviourOrder.START, "arm", BehaviourOrder.START]
+    assert robot.orders == [BehaviourOrder.START, "hold", BehaviourOrder.START, "arm"]
     assert end.as_json()["values"] == {"distance": 0.3}
 
 

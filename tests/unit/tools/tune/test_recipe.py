@@ -32,9 +32,11 @@ class Client:
 
     def __init__(self, outcome=Reason.DRIVING):
         self.outcome, self.number, self.running, self.wanted, self.armed = outcome, 0, "", 0.35, None
+        self.held = False
 
-    async def arm(self):
-        self.armed = True
+    async def arm(self, *, hold=False):
+        assert hold is not self.held, "once before the behaviour runs, and once it does"
+        self.armed, self.held = True, hold
 
     async def disarm(self):
         self.armed = False
@@ -111,7 +113,7 @@ def test_a_run_that_ends_early_ends_the_tuning_with_its_reason():
 def test_a_robot_that_was_armed_without_saying_so_is_disarmed(lost):
     client = Client()
 
-    async def arm():
+    async def arm(*, hold):
         client.armed = True
         raise lost
 
@@ -139,7 +141,7 @@ def test_a_start_that_is_not_answered_is_taken_back():
 def test_a_robot_that_refuses_to_be_armed_may_be_driven_by_somebody_else_and_is_left_alone():
     client = Client()
 
-    async def arm():
+    async def arm(*, hold):
         raise RequestRefusedError(Reason.BUSY, "bob drives")
 
     client.arm = arm
