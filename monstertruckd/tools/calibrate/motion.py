@@ -38,6 +38,8 @@ AT_REST: Final = 0.5
 """Seconds of an unchanged drive position that count as rest."""
 SETTLE: Final = 5.0
 """Seconds in which it must come to rest."""
+GONE: Final = 2.0
+"""Seconds without the gate's state, which comes ten times a second, after which the robot is not waited for."""
 DEPTH: Final = 4096
 LATE: Final = (
     "requests came too late: end what else keeps this computer or the link to the robot busy, or run the command on "
@@ -175,6 +177,8 @@ class _Run:
     ) -> None:
         self.track = MoveRecord()
         self.state: GateState | None = None
+        self._heard = clock.now()
+        """When its state came, ns."""
         self._truck = truck
         self._clock = clock
         self._feeds = feeds
@@ -245,6 +249,7 @@ class _Run:
 
         Raises:
             RequestRefusedError: the gate stopped the truck, or another operator drives.
+            NoAnswerError: the robot has been silent for ``GONE`` s.
         """
         end = self._clock.now() + round(seconds * SECOND)
         while self._clock.now() < end:
@@ -301,10 +306,13 @@ class _Run:
         self.track.attitude += [reading for reading in attitude.drain() if not reading.heading_disturbed]
         for name, mailbox in self._also.items():
             self.track.others.setdefault(name, []).extend(mailbox.drain())
-        self.state = next(reversed(gate.drain()), self.state)
+        if states := gate.drain():
+            self.state, self._heard = states[-1], self._clock.now()
 
     def _check(self) -> None:
         state = self.state
+        if self._clock.now() - self._heard > GONE * SECOND:
+            raise NoAnswerError(f"the robot has been silent for {GONE:g} s; it stops by itself, and nothing was saved")
         if state is None or self._driving():
             return
         reasons = state.hindrances

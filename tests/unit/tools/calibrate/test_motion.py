@@ -26,7 +26,7 @@ def gate_state(reasons: tuple[Reason, ...], mode: GateMode) -> GateState:
 
 
 def stopped(*reasons: Reason, mode: GateMode = GateMode.DISARMED) -> RequestRefusedError:
-    run = motion._Run(None, None, (), {})
+    run = motion._Run(None, SimpleNamespace(now=lambda: 0), (), {})
     run.state = gate_state(reasons, mode)
     run._truck = SimpleNamespace(source="wizard")
     with pytest.raises(RequestRefusedError) as refused:
@@ -196,6 +196,22 @@ def test_a_move_that_is_measured_from_a_mark_begins_anew_only_there():
     truck, _, said = hindered(marked, (0.0, Reason.LEASE_EXPIRED, 0.1))
     assert len(said) == 1
     assert truck.x == pytest.approx(1.0, abs=0.05)
+
+
+@pytest.mark.parametrize("place", [0.5, 1.0])
+def test_a_robot_that_vanishes_is_not_said_to_be_stuck_or_restless(place: float):
+    async def main(clock: VirtualClock) -> None:
+        truck = HinderedTruck(clock)
+        publishing = asyncio.create_task(truck.publish())
+        mover = motion.Mover(truck, clock, SimpleNamespace(drivetrain=DriveTrain()))
+        moving = asyncio.create_task(mover.move(STEP, lambda _: None))
+        while truck.x < place - 1e-6:
+            await clock.sleep(0.02)
+        publishing.cancel()
+        with pytest.raises(NoAnswerError, match=r"^the robot has been silent for 2 s"):
+            await moving
+
+    run_virtual(main)
 
 
 def test_a_weaving_move_goes_straight_back():
