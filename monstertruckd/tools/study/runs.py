@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 from monstertruck_runtime.clock import SECOND, Clock
-from monstertruck_runtime.errors import InputError, RequestRefusedError
+from monstertruck_runtime.errors import InputError, NoAnswerError, RequestRefusedError
 from monstertruck_runtime.mailbox import latest
 from monstertruck_runtime.requests import Operator
 from monstertruck_schemas import topics
@@ -16,6 +16,8 @@ PERIOD: Final = 0.05
 LEASE: Final = 0.25
 PAUSE: Final = 0.6
 """Seconds of standstill at a reversal."""
+GONE: Final = 2.0
+"""Seconds without the gate's state, which comes ten times a second, after which the robot is not waited for."""
 SETTLING: Final = 2.0
 """Seconds at the beginning of a run that the analysis leaves out; they are driven besides."""
 
@@ -107,6 +109,7 @@ async def drive(robot: Operator, clock: Clock, config: TruckConfig, plan: Sequen
 
     Raises:
         RequestRefusedError: arming was refused; or the robot stopped on the way, with the gate's reason.
+        NoAnswerError: it has been silent for ``GONE`` s.
         InputError: the body has no sides, or is too slow for what is asked.
     """
     plan = (*plan, Stretch(0.0, 0.0, PAUSE))  # at rest before it is disarmed
@@ -116,7 +119,8 @@ async def drive(robot: Operator, clock: Clock, config: TruckConfig, plan: Sequen
         raise InputError(f"{fastest:.3f} m/s at the wheels: expected at most gate.speed, {config.gate.speed:g}")
     began = clock.now()
     with robot.subscribe(topics.GATE, latest()) as gate:
-        await robot.arm()
+        armed = await robot.arm()
+        seen, heard = armed, clock.now()
         try:
             for stretch, row in zip(plan, rates, strict=True):
                 due = clock.now()
@@ -126,8 +130,12 @@ async def drive(robot: Operator, clock: Clock, config: TruckConfig, plan: Sequen
                     due += round(PERIOD * SECOND)
                     await clock.sleep_until(min(due, end))
                     state = gate.latest
-                    if state is not None and not state.mode.active and state.stamp > began + SECOND:
-                        raise RequestRefusedError(state.worst, f"the robot stopped on the way: {state.why}")
+                    if state is not None and state is not seen:
+                        seen, heard = state, clock.now()
+                    if not seen.mode.active and seen.stamp > armed.stamp:
+                        raise RequestRefusedError(seen.worst, f"the robot stopped on the way: {seen.why}")
+                    if clock.now() - heard > GONE * SECOND:
+                        raise NoAnswerError(f"the robot has been silent for {GONE:g} s")
         finally:
             await robot.disarm()
     return (clock.now() - began) / SECOND

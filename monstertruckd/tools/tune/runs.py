@@ -9,10 +9,12 @@ from typing import Any, Final, NamedTuple
 from monstertruck_runtime.drives import taken_back
 from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError, TruckError
 from monstertruck_runtime.mailbox import Mailbox, fifo
+from monstertruck_runtime.presence import while_it_runs
 from monstertruck_runtime.requests import Operator
 from monstertruck_schemas.plan import BehaviourState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import BehaviourOrder
+from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.topics import BEHAVIOUR
 from monstertruckd.tools.tune.recipe import RunVerdict, WallGains, judged, recipe
 
@@ -73,8 +75,9 @@ async def tune(
         report: called with every run.
 
     Raises:
-        RequestRefusedError: arming or a start is refused, or the behaviour ended before the run was complete.
-        NoAnswerError: the robot does not answer.
+        RequestRefusedError: arming or a start is refused, the behaviour ended before the run was complete, its service
+            failed, or the robot restarted.
+        NoAnswerError: the robot does not answer, or has been silent for a minute.
     """
     async with taken_back(client.disarm):
         await client.arm(hold=True)  # until the behaviour runs: a path that the robot has would be driven
@@ -138,7 +141,7 @@ async def _run(
             number = int((await client.behave(BehaviourOrder.START, name, settings))["number"])
             if held:
                 await client.arm()
-            return await _followed(states, number, over)
+            return await while_it_runs(client, _followed(states, number, over), ServiceName.BEHAVIOURS)
         finally:
             with suppress(TruckError):
                 await client.behave(BehaviourOrder.STOP, name, own=True)

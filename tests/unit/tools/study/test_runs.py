@@ -1,14 +1,21 @@
 """Plans of the study's runs, and the paper's table beside them."""
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
-from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
+from monstertruck_runtime.errors import InputError, TruckError
+from monstertruck_runtime.mailbox import Mailbox, latest
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.state import GateMode, GateState
 from monstertruckd.tools.simulation.config import load_simulated
 from monstertruckd.tools.study import published
-from monstertruckd.tools.study.runs import circle_plan, shaft_rates, straight_plan
+from monstertruckd.tools.study.runs import Stretch, circle_plan, drive, shaft_rates, straight_plan
+from tests.bus_kit import gate_state
 
 CONFIGS = Path(__file__).resolve().parents[4] / "configs"
 STAND = load_simulated(CONFIGS / "robots" / "skid_stand.yaml")
@@ -26,6 +33,57 @@ def test_a_line_goes_to_and_fro():
     plan = straight_plan(STAND, 0.682, 3, 1.57)
     assert [stretch.left for stretch in plan] == [1.57, 0.0, -1.57, 0.0, 1.57, 0.0]
     assert plan[0].seconds == pytest.approx(0.682 / (0.021 * 1.57))
+
+
+class Stopping:
+    """A robot whose gate disarms it, or that vanishes, in the second second; its computer began at another time."""
+
+    def __init__(self, clock: VirtualClock, offset: float, *, vanishes: bool) -> None:
+        self._clock, self._offset, self._vanishes = clock, round(offset * SECOND), vanishes
+        self._box: Mailbox[GateState] = Mailbox(latest())
+        self._mode = GateMode.DISARMED
+        self._box.put(self._state())
+
+    def _state(self) -> GateState:
+        held = (Reason.SCAN_STALE,) if self._mode is GateMode.DISARMED else ()
+        state = gate_state(0, reasons=held)
+        return state.model_copy(update={"stamp": self._clock.now() + self._offset, "mode": self._mode})
+
+    @contextmanager
+    def subscribe(self, *_: object) -> Iterator[Mailbox[GateState]]:
+        yield self._box
+
+    async def arm(self) -> GateState:
+        self._mode, self._armed = GateMode.DRIVING, self._clock.now()
+        await self._clock.sleep(0.02)
+        return self._state()
+
+    async def disarm(self) -> None:
+        pass
+
+    async def drive_shafts(self, *_: float, lease: float) -> None:
+        late = self._clock.now() - self._armed > SECOND
+        if late:
+            self._mode = GateMode.DISARMED
+        if not (late and self._vanishes):
+            self._box.put(self._state())
+
+
+@pytest.mark.parametrize("offset", [-1e6, 0.0, 1e6])
+@pytest.mark.parametrize(
+    ("vanishes", "said"),
+    [(False, "the robot stopped on the way: no fresh lidar scan"), (True, "the robot has been silent for 2 s")],
+)
+def test_a_robot_that_stops_or_vanishes_ends_the_run_whenever_its_computer_was_started(
+    offset: float, vanishes: bool, said: str
+):
+    async def main(clock: VirtualClock) -> float:
+        with pytest.raises(TruckError, match=said):
+            await drive(Stopping(clock, offset, vanishes=vanishes), clock, STAND, [Stretch(1.0, 1.0, 20.0)])
+        return clock.now() / SECOND
+
+    took = run_virtual(main, start=0)
+    assert took == pytest.approx(1.1 + 2.0 * vanishes, abs=0.2)
 
 
 @pytest.mark.parametrize("numbers", [(1.0, 1.57, 1.0), (math.nan, 1.0, 1.0), (2.0, 0.0, 1.0), (2.0, 1.0, math.inf)])

@@ -13,13 +13,16 @@ from monstertruck_planners.behave.wall.published import WallPd
 from monstertruck_runtime import client
 from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError
 from monstertruck_runtime.mailbox import Mailbox
+from monstertruck_schemas.health import HealthTable, ServiceHealth, ServiceState
 from monstertruck_schemas.plan import BehaviourState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import BehaviourOrder
+from monstertruck_schemas.topics import BEHAVIOUR, GATE
 from monstertruckd.tools.cli.main import app
 from monstertruckd.tools.tune.plots import draw
 from monstertruckd.tools.tune.recipe import CALM, MOST, OVERSHOOTS, RunVerdict, judged, recipe
 from monstertruckd.tools.tune.runs import tune
+from tests.bus_kit import gate_state
 from tests.unit.planners.behave.wall_kit import Robot, drive
 
 WALL = [(-50.0, 0.35, 200.0, 0.35)]
@@ -29,6 +32,7 @@ class Client:
     """A robot with ideal wheels whose behaviour is run at once when it is started."""
 
     wild = None
+    failed = False
 
     def __init__(self, outcome=Reason.DRIVING):
         self.outcome, self.number, self.running, self.wanted, self.armed = outcome, 0, "", 0.35, None
@@ -43,8 +47,15 @@ class Client:
 
     @contextmanager
     def subscribe(self, topic, delivery):
-        self.box = Mailbox(delivery)
-        yield self.box
+        box = Mailbox(delivery)
+        if topic is BEHAVIOUR:
+            self.box = box
+        elif topic is GATE:
+            box.put(gate_state(1))
+        elif self.failed:
+            row = ServiceHealth(name="behaviours", state=ServiceState.FAILED, since=0, detail="ended by itself")
+            box.put(HealthTable(stamp=0, received=0, seq=0, services=(row,)))
+        yield box
 
     async def behave(self, order, behaviour="", settings=None, *, own=False):
         if order is BehaviourOrder.STOP:
@@ -58,7 +69,7 @@ class Client:
         self.wanted = settings["distance"]
         head = {"stamp": 0, "received": 0, "seq": 0, "number": self.number, "behaviour": behaviour, "kind": "wall_pd"}
         config = WallPdConfig(offset=0.05, **settings)
-        for i, step in enumerate(drive(WallPd(config), robot, 9.0).steps):
+        for i, step in enumerate(() if self.failed else drive(WallPd(config), robot, 9.0).steps):
             head |= {"running": self.outcome is Reason.DRIVING, "outcome": self.outcome, "elapsed": i * 0.1}
             values = dict(step.values)
             if (config.k_p, config.k_d) == self.wild:
@@ -106,6 +117,15 @@ def test_a_run_that_ends_early_ends_the_tuning_with_its_reason():
         tuned(client, [])
     assert caught.value.refusal is Reason.STUCK
     assert not client.running
+    assert client.armed is False
+
+
+def test_nobody_waits_for_behaviours_whose_service_failed():
+    client = Client()
+    client.failed = True
+    with pytest.raises(RequestRefusedError, match=r"^behaviours: ended by itself$") as caught:
+        tuned(client, [])
+    assert caught.value.refusal is Reason.SERVICE_FAILED
     assert client.armed is False
 
 
