@@ -129,10 +129,11 @@ class Mover:
             await run.hold(0.0, move.front, move.rear, move.rest)
 
     async def _drive(self, run: "_Run", move: MoveStep, report: Callable[[float], None]) -> None:
-        run.track.left = self._clock.now()
+        run.track.left = run.robot_time
         distance, since = 0.0, self._clock.now()
+        began = since
         while True:
-            side = move.side((self._clock.now() - run.track.left) / SECOND)
+            side = move.side((self._clock.now() - began) / SECOND)
             await run.hold(move.speed, side * move.front, side * move.rear, PERIOD)
             new = abs(run.track.distance(self._drivetrain))
             report(new)
@@ -183,6 +184,12 @@ class _Run:
         self._clock = clock
         self._feeds = feeds
         self._also = also
+
+    @property
+    def robot_time(self) -> int:
+        """The newest stamp that was heard, ns: the robot's clock is another one than this computer's."""
+        stamps = [0 if self.state is None else self.state.stamp, *(reading.stamp for reading in self.track.drive[-1:])]
+        return max(stamps)
 
     def begin(self) -> None:
         """Discard what was read so far."""

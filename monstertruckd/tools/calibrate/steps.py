@@ -36,9 +36,9 @@ class MoveRecord:
     others: dict[str, list[Any]] = field(default_factory=dict)
     """What was requested in addition (``MoveStep.also``), by name of the topic"""
     left: int = 0
-    """When the command to set off was given, ns"""
+    """Newest stamp of the robot when the command to set off was given, ns"""
     arrived: int = 0
-    """When it was at rest again, ns"""
+    """When it was at rest again, ns of the robot's clock"""
 
     # Time series
 

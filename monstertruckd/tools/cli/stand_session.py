@@ -2,7 +2,8 @@
 
 import asyncio
 import csv
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -20,6 +21,12 @@ if TYPE_CHECKING:
 
 RETRY = 2.0
 """Seconds after which a robot that is not there is looked for again."""
+GONE = 2.0
+"""Seconds without its gate's state, which comes ten times a second, after which a robot is looked for again."""
+HEARD = 100
+"""Newest messages of a robot by which its clock is known."""
+APART = 200_000_000
+"""Nanoseconds from which a robot's clock is another one than this computer's; messages take less."""
 
 
 async def run(clock: Clock, config: "OverheadConfig", endpoint: str) -> None:
@@ -113,37 +120,53 @@ class RobotLink:
     def __init__(self, robot: str, endpoint: str, clock: Clock) -> None:
         self._robot, self._endpoint, self._clock = robot, endpoint, clock
         self._client: Any = None
+        self._ways: deque[int] = deque(maxlen=HEARD)
+        """This clock's time of receipt less the robot's stamp, of its newest messages, ns."""
         self._count = 0
 
     async def run(self) -> None:
         """Keep the link until cancelled."""
         from monstertruck_runtime.client import TruckClient
+        from monstertruck_runtime.mailbox import latest
+        from monstertruck_schemas.topics import GATE
 
         while True:
             with suppress(NotFoundError):
                 async with TruckClient(self._robot, self._endpoint, clock=self._clock) as client:
-                    self._client = client
-                    try:
-                        while await client.alive():
-                            await self._clock.sleep(RETRY)
-                    finally:
-                        self._client = None
+                    with client.subscribe(GATE, latest()) as gate:
+                        self._client = client
+                        try:
+                            while (state := await gate.next_within(GONE)) is not None:
+                                self._ways.append(self._clock.now() - state.stamp)
+                        finally:
+                            self._client = None
+                            self._ways.clear()
             await self._clock.sleep(RETRY)
 
     def put(self, pose: "RobotPose") -> None:
-        """Publish a pose, if the robot is there."""
-        if self._client is not None:
+        """Publish a pose by the robot's clock, if the robot is there."""
+        if self._client is not None and self._ways:
             self._count += 1
-            self._client.publish_stand_pose(stand_pose(pose, self._clock.now(), self._count))
+            now, apart = self._clock.now(), clocks_apart(self._ways)
+            self._client.publish_stand_pose(stand_pose(pose, now - apart, self._count, pose.stamp - apart))
 
 
-def stand_pose(pose: "RobotPose", now: int, count: int) -> "StandPose":
-    """The message of a pose."""
+def clocks_apart(ways: Iterable[int]) -> int:
+    """Nanoseconds by which the robot's clock is behind this computer's: 0 on the same computer.
+
+    The quickest of ``ways``, from the robot's stamps to their receipt, counts as no time: a millisecond on a network.
+    """
+    least = min(ways)
+    return 0 if abs(least) < APART else least
+
+
+def stand_pose(pose: "RobotPose", now: int, count: int, stamp: int) -> "StandPose":
+    """The message of a pose; times by the robot's clock, ns."""
     from monstertruck_schemas.base import Pose2D
     from monstertruck_schemas.sensor import StandPose
 
     return StandPose(
-        stamp=pose.stamp,
+        stamp=stamp,
         received=now,
         seq=count,
         frame="map",

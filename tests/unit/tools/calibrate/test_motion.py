@@ -77,7 +77,7 @@ def test_a_run_that_is_held_ends_by_what_holds_it(held: tuple[Reason, ...], kind
         async def hold(*_: float) -> None:
             await clock.sleep(motion.PERIOD)
 
-        run = SimpleNamespace(track=record, state=gate_state(held, GateMode.DRIVING), hold=hold)
+        run = SimpleNamespace(track=record, state=gate_state(held, GateMode.DRIVING), hold=hold, robot_time=0)
         await mover._drive(run, STEP, lambda _: None)
 
     with pytest.raises(kind) as ended:
@@ -92,12 +92,14 @@ class HinderedTruck:
     Args:
         clock: time.
         stops: place, m from the start in the direction ahead, reason, and the seconds until that has passed.
+        booted: seconds by which its own clock is behind.
     """
 
     source = "wizard"
 
-    def __init__(self, clock: VirtualClock, *stops: tuple[float, Reason, float]) -> None:
+    def __init__(self, clock: VirtualClock, *stops: tuple[float, Reason, float], booted: float = 0.0) -> None:
         self.x = 0.0
+        self._booted = round(booted * SECOND)
         self.turns: list[float] = []
         """Places where it changed its direction."""
         self._clock = clock
@@ -138,9 +140,9 @@ class HinderedTruck:
             if self._stops and speed > 0.0 and self.x > self._stops[0][0]:
                 _, self._reason, seconds = self._stops.pop(0)
                 self._mode, self._until = GateMode.DISARMED, self._clock.now() + round(seconds * SECOND)
-            now = self._clock.now()
+            now = self._clock.now() - self._booted
             position = drivetrain.motor_angle(self.x)
-            state = gate_state(self._reasons(), self._mode).model_copy(update={"holder": self.source})
+            state = gate_state(self._reasons(), self._mode).model_copy(update={"holder": self.source, "stamp": now})
             for box in self._boxes.get(topics.GATE.name, ()):
                 box.put(state)
             for box in self._boxes.get(topics.DRIVE.name, ()):
@@ -196,6 +198,23 @@ def test_a_move_that_is_measured_from_a_mark_begins_anew_only_there():
     truck, _, said = hindered(marked, (0.0, Reason.LEASE_EXPIRED, 0.1))
     assert len(said) == 1
     assert truck.x == pytest.approx(1.0, abs=0.05)
+
+
+@pytest.mark.parametrize("booted", [-1000.0, 0.0, 1000.0])
+def test_when_it_set_off_is_by_the_robots_clock(booted: float):
+    async def main(clock: VirtualClock) -> None:
+        truck = HinderedTruck(clock, booted=booted)
+        publishing = asyncio.create_task(truck.publish())
+        mover = motion.Mover(truck, clock, SimpleNamespace(drivetrain=DriveTrain()))
+        record = await mover.move(STEP, lambda _: None)
+        publishing.cancel()
+        at_rest = [reading.position for reading in record.drive if reading.stamp < record.left]
+        moving = [reading.position for reading in record.drive if record.left < reading.stamp < record.arrived]
+        assert len(at_rest) > 5
+        assert set(at_rest) == {0.0}
+        assert len(set(moving)) > 100
+
+    run_virtual(main, start=round(5000 * SECOND))
 
 
 @pytest.mark.parametrize("place", [0.5, 1.0])
