@@ -213,7 +213,7 @@ class _Run:
             raise RequestRefusedError(Reason.BUSY, f"the robot is armed already{holder}: disarm it first")
 
     async def arm(self) -> None:
-        """Request standstill for a moment, so that no lower role can drive, and arm.
+        """Request standstill for a moment, and arm without planners, so that nobody else sets off.
 
         Raises:
             RequestRefusedError: the gate refused.
@@ -242,7 +242,7 @@ class _Run:
     async def _try_to_arm(self) -> TruckError | None:
         """None, or why it failed."""
         try:
-            await self._truck.arm()
+            await self._truck.arm(hold=True)
         except TruckError as error:
             return error
         return None

@@ -119,7 +119,7 @@ async def drive(robot: Operator, clock: Clock, config: TruckConfig, plan: Sequen
         raise InputError(f"{fastest:.3f} m/s at the wheels: expected at most gate.speed, {config.gate.speed:g}")
     began = clock.now()
     with robot.subscribe(topics.GATE, latest()) as gate:
-        armed = await robot.arm()
+        armed = await robot.arm(hold=True)  # a planner would drive until the first request arrives
         seen, heard = armed, clock.now()
         try:
             for stretch, row in zip(plan, rates, strict=True):

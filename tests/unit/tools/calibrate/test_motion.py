@@ -113,7 +113,8 @@ class HinderedTruck:
         self._boxes.setdefault(topic.name, []).append(box)
         return box
 
-    async def arm(self, *, hold=False):
+    async def arm(self, *, hold):
+        assert hold, "while its requests are on their way a planner would drive"
         if self._reasons():
             raise RequestRefusedError(self._reasons()[0])
         self._mode = GateMode.DRIVING

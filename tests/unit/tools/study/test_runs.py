@@ -53,7 +53,8 @@ class Stopping:
     def subscribe(self, *_: object) -> Iterator[Mailbox[GateState]]:
         yield self._box
 
-    async def arm(self) -> GateState:
+    async def arm(self, *, hold: bool) -> GateState:
+        assert hold, "a planner would drive until the first request arrives"
         self._mode, self._armed = GateMode.DRIVING, self._clock.now()
         await self._clock.sleep(0.02)
         return self._state()
