@@ -487,7 +487,7 @@ class Gate:
         elif states.mode is GateMode.ARMED and states.disarm_at_rest:
             self._disarm(now, ", ".join(reason.text for reason in blocks))
         elif states.mode is not GateMode.STOPPING and driver is not None:
-            if driver.key != states.holder_key:
+            if driver.key != states.holder_key or not driver.neutral:  # it may have been armed under its hand
                 self._sources.claim(driver.request.role)
             states.drive(now, driver)
         elif states.holder is not None and not blocks and self._released(states.holder, now):

@@ -341,6 +341,21 @@ def test_an_order_to_arm_while_somebody_drives_lets_lower_roles_drive_afterwards
     assert rig.drive(source="low", role=Role.STATION, speed=0.0) is Reason.OK
 
 
+def test_who_drives_after_such_an_order_keeps_them_out_again():
+    rig = Rig().armed()
+    rig.drive(source="high", role=Role.GAMEPAD, speed=0.0)
+    rig.tick()
+    assert rig.order(Order.ARM) is Reason.OK
+    for speed in (0.1, 0.0):
+        for _ in range(30):
+            rig.drive(source="high", role=Role.GAMEPAD, speed=speed, lease=0.1)
+            rig.tick()
+    for _ in range(20):
+        assert rig.drive(source="tracker", role=Role.TRACKER, inside=True) is Reason.LOWER_PRIORITY
+        rig.tick()
+    assert (rig.out.mode, rig.out.holder) == (GateMode.ARMED, None)
+
+
 @pytest.mark.parametrize("role", [Role.GAMEPAD, Role.KEYBOARD, Role.STATION])
 def test_a_lease_runs_to_its_last_instant(role):
     rig = Rig(leases={role.value: 0.2}).armed()
