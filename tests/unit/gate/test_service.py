@@ -373,7 +373,7 @@ def test_a_mark_that_cannot_be_written_is_an_event_each_second_and_the_stop_goes
     latch = Full()
 
     def marks_failed(bench):
-        return len([text for reason, _, text, _ in bench.events if reason is Reason.INTERNAL])
+        return len([text for reason, _, text, _ in bench.events if reason is Reason.DISK_FULL])
 
     async def scenario(bench):
         latch.full = True
@@ -528,7 +528,7 @@ def test_a_latch_that_cannot_be_stored_is_reported_and_tried_again():
         await asyncio.sleep(1.5)
 
     bench = on_bench(scenario, BrokenLatch())
-    complaints = [text for reason, _, text, _ in bench.events if reason is Reason.INTERNAL]
+    complaints = [text for reason, _, text, _ in bench.events if reason is Reason.DISK_FULL]
     assert len(complaints) >= 2  # retried, and once more at the end
     assert "no space left" in complaints[0]
 
