@@ -3,14 +3,13 @@
 import asyncio
 import csv
 from collections import deque
-from collections.abc import Iterable, Iterator
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from monstertruck_runtime.clock import Clock
-from monstertruck_runtime.errors import InputError, NotFoundError
+from monstertruck_runtime.errors import InputError, NotFoundError, TruckError
 from monstertruckd.tools.cli.output import remark
 
 if TYPE_CHECKING:
@@ -33,7 +32,7 @@ async def run(clock: Clock, config: "OverheadConfig", endpoint: str) -> None:
     """Track live, and publish to every robot that is there."""
     from monstertruckd.tools.stand.track import StandRun
 
-    robots = {name: RobotLink(name, endpoint, clock) for name in config.names}
+    robots = {name: RobotLink(name, endpoint, clock, remark) for name in config.names}
     tasks = [asyncio.create_task(link.run(), name=f"robot {name}") for name, link in robots.items()]
     tracker = _tracker(config, clock.now())
     try:
@@ -115,10 +114,18 @@ def print_tags(out: Path, numbers: str, columns: int, rows: int) -> Iterator[Pat
 
 
 class RobotLink:
-    """Link to one robot's daemon, whenever there is one."""
+    """Link to one robot's daemon, whenever there is one; that it is there, or why not, is said once.
 
-    def __init__(self, robot: str, endpoint: str, clock: Clock) -> None:
-        self._robot, self._endpoint, self._clock = robot, endpoint, clock
+    Args:
+        robot: its name.
+        endpoint: where it listens.
+        clock: of this computer.
+        say: gets lines for people.
+    """
+
+    def __init__(self, robot: str, endpoint: str, clock: Clock, say: Callable[[str], object]) -> None:
+        self._robot, self._endpoint, self._clock, self._say = robot, endpoint, clock, say
+        self._said = ""
         self._client: Any = None
         self._ways: deque[int] = deque(maxlen=HEARD)
         """This clock's time of receipt less the robot's stamp, of its newest messages, ns."""
@@ -131,17 +138,28 @@ class RobotLink:
         from monstertruck_schemas.topics import GATE
 
         while True:
-            with suppress(NotFoundError):
+            try:
                 async with TruckClient(self._robot, self._endpoint, clock=self._clock) as client:
                     with client.subscribe(GATE, latest()) as gate:
                         self._client = client
                         try:
                             while (state := await gate.next_within(GONE)) is not None:
                                 self._ways.append(self._clock.now() - state.stamp)
+                                self._tell("gets its poses")
                         finally:
                             self._client = None
                             self._ways.clear()
+                    self._tell("is not there, or silent")
+            except NotFoundError:
+                self._tell(f"no robot answers at {self._endpoint}")
+            except TruckError as error:
+                self._tell(str(error))
             await self._clock.sleep(RETRY)
+
+    def _tell(self, text: str) -> None:
+        if text != self._said:
+            self._said = text
+            self._say(f"robot {self._robot}: {text}")
 
     def put(self, pose: "RobotPose") -> None:
         """Publish a pose by the robot's clock, if the robot is there."""

@@ -9,6 +9,7 @@ import pytest
 
 from monstertruck_runtime import client
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
+from monstertruck_runtime.errors import NotPermittedError
 from monstertruck_runtime.mailbox import Delivery, Mailbox
 from monstertruck_schemas.sensor import StandPose
 from monstertruck_schemas.state import GateState
@@ -50,12 +51,28 @@ class Robot:
         self.poses.append(pose)
 
 
+def test_why_a_robot_gets_no_poses_is_said_once(monkeypatch: pytest.MonkeyPatch):
+    def refuse(*_: object, **__: object) -> None:
+        raise NotPermittedError("station.key: others may read it")
+
+    async def main(clock: VirtualClock) -> None:
+        monkeypatch.setattr(client, "TruckClient", refuse)
+        said: list[str] = []
+        running = asyncio.create_task(RobotLink("truck", "tls/there", clock, said.append).run())
+        await clock.sleep(20.0)
+        running.cancel()
+        assert said == ["robot truck: station.key: others may read it"]
+
+    run_virtual(main)
+
+
 @pytest.mark.parametrize(("behind", "error"), [(5000.0, LATE), (-5000.0, LATE), (0.0, 0.0)])
 def test_poses_are_stamped_by_the_robots_clock(behind: float, error: float, monkeypatch: pytest.MonkeyPatch):
     async def main(clock: VirtualClock) -> None:
         robot = Robot(clock, behind)
         monkeypatch.setattr(client, "TruckClient", lambda *_, **__: robot)
-        link = RobotLink("truck", "tcp/there", clock)
+        said: list[str] = []
+        link = RobotLink("truck", "tcp/there", clock, said.append)
         seen = RobotPose("truck", 0, 1.0, 2.0, 0.5, 0.001, 0.002, ("left",))
         running = asyncio.create_task(link.run())
         link.put(seen)
@@ -68,6 +85,7 @@ def test_poses_are_stamped_by_the_robots_clock(behind: float, error: float, monk
         await clock.sleep(GONE + 0.5)
         link.put(seen)
         assert len(robot.poses) == 1, "it is gone"
+        assert said == ["robot truck: gets its poses", "robot truck: is not there, or silent"]
         running.cancel()
         with suppress(asyncio.CancelledError):
             await running
