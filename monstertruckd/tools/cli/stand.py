@@ -6,10 +6,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
+from monstertruckd.tools.cli.logs import finish_log
 from monstertruckd.tools.cli.options import EndpointOption
 from monstertruckd.tools.cli.output import JsonOption, command_group, needs_extra, print_json, print_table, remark
 
 if TYPE_CHECKING:
+    from monstertruckd.tools.stand.analysis import EstimateError
     from monstertruckd.tools.stand.config import OverheadConfig
 
 app = command_group("The overhead test stand: cameras over a table that say where robots are.")
@@ -109,12 +111,19 @@ def analyse_command(
     json_output: JsonOption = False,
 ) -> None:
     """Errors of odometry, pose in map and tracker against the stand, and the stand's latency."""
+    from monstertruckd.recorder.reader import open_log
     from monstertruckd.tools.stand.analysis import as_values, errors_of, tracker_errors
 
-    found, tracker = errors_of(log), tracker_errors(log)
+    reader = open_log(log)
+    found, tracker = errors_of(reader), tracker_errors(reader)
     if json_output:
         print_json({"estimates": as_values(found), "tracker": tracker})
-        return
+    else:
+        _print_errors(found, tracker)
+    finish_log(log, reader.fault)
+
+
+def _print_errors(found: "list[EstimateError]", tracker: dict[str, float] | None) -> None:
     rows = [
         (
             row.what,

@@ -5,7 +5,6 @@ is the shift of time at which the turns of odometry and stand agree best.
 """
 
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -16,7 +15,7 @@ from monstertruck_kinematics.fitting import least_squares
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.topics import ODOMETRY, POSE, STAND_POSE, TRACKER
-from monstertruckd.recorder.reader import open_log
+from monstertruckd.recorder.reader import LogReader
 
 LEAST: Final = 40
 """Poses in common."""
@@ -42,34 +41,33 @@ class EstimateError:
     """Seconds by which the stand's stamps are late against the estimate's; None: too little turn to determine it"""
 
 
-def errors_of(path: Path) -> list[EstimateError]:
-    """Odometry's and the map pose's error.
+def errors_of(log: LogReader) -> list[EstimateError]:
+    """Odometry's and the map pose's error; of a damaged log up to there.
 
     Raises:
-        NotFoundError: no such file.
-        InputError: it is no log, has no poses of a stand, or none of an estimate.
+        InputError: it has no poses of a stand, or none of an estimate.
     """
     series: dict[str, list[tuple[float, float, float, float]]] = {n.name: [] for n in (STAND_POSE, ODOMETRY, POSE)}
-    for entry in open_log(path):
+    for entry in log:
         if entry.topic in series:
             message: Any = entry.decode()
             series[entry.topic].append((message.stamp, message.pose.x, message.pose.y, message.pose.yaw))
     seen = _array(series[STAND_POSE.name])
     if len(seen) < LEAST:
-        raise InputError(f"{path}: {len(seen)} poses of a stand in it: expected {LEAST}, as with `stand: overhead`")
+        raise InputError(f"{log.path}: {len(seen)} poses of a stand in it: expected {LEAST}, as with `stand: overhead`")
     found = [
         error_of(topic.name, seen, rows)
         for topic in (ODOMETRY, POSE)
         if len(rows := _array(series[topic.name])) >= LEAST
     ]
     if not found:
-        raise InputError(f"{path}: no odometry in it")
+        raise InputError(f"{log.path}: no odometry in it")
     return found
 
 
-def tracker_errors(path: Path) -> dict[str, float] | None:
+def tracker_errors(log: LogReader) -> dict[str, float] | None:
     """What the tracker itself reported as its distance from the path, m; None where none drove."""
-    reports: list[Any] = [entry.decode() for entry in open_log(path) if entry.topic == TRACKER.name]
+    reports: list[Any] = [entry.decode() for entry in log if entry.topic == TRACKER.name]
     off = [abs(report.cross_track) for report in reports]
     if not off:
         return None

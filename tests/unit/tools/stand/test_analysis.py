@@ -1,12 +1,46 @@
 """Estimates against the stand: frames laid over each other, and the latency."""
 
+import json
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError
+from monstertruck_schemas.base import Pose2D
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.sensor import StandPose
+from monstertruck_schemas.topics import ODOMETRY, STAND_POSE
+from monstertruckd.tools.cli.main import app
 from monstertruckd.tools.stand.analysis import error_of, latency_of
+from tests.unit.tools.logs.log_kit import Writer, odometry
+
+
+def test_a_cut_log_is_analysed_as_far_as_it_goes_and_called_so(tmp_path: Path):
+    file = tmp_path / "run.mcap"
+    writer = Writer(file)
+    for seq in range(400):
+        now, pose = SECOND + seq * SECOND // 20, Pose2D(x=0.1 * seq, y=0.0, yaw=0.0)
+        stamps = {"stamp": now, "received": now, "seq": seq}
+        seen = StandPose(**stamps, frame="stand", pose=pose, observer="overhead", position_sigma=0.0, heading_sigma=0.0)
+        writer.put(STAND_POSE, seen)
+        writer.put(ODOMETRY, odometry(now, seq))
+        if seq % 50 == 0:
+            writer.log.flush()
+    writer.log.finish()
+
+    def analyse() -> tuple[int, str, int]:
+        result = CliRunner().invoke(app, ["stand", "analyse", "--json", str(file)])
+        return result.exit_code, result.stderr, json.loads(result.stdout)["estimates"][0]["poses"]
+
+    assert analyse() == (0, "", 400)
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    code, said, poses = analyse()
+    assert (code, 40 < poses < 400) == (Reason.LOG_DAMAGED.exit_code, True)
+    assert "what is before that was used" in said
 
 
 def drive(times):
