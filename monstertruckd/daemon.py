@@ -62,7 +62,7 @@ from monstertruckd.config.truck import TruckConfig
 from monstertruckd.gate.core import Gate
 from monstertruckd.gate.latch import EstopLatch, Latch, MemoryLatch, marks_folder
 from monstertruckd.gate.service import GateInputs, GateOutputs, GateService, register_gate_calls
-from monstertruckd.host.health import ClockService, HealthBoard, MeterService
+from monstertruckd.host.health import ClockService, HealthBoard, MeterService, ServiceCalls
 from monstertruckd.host.journal import published
 from monstertruckd.host.notify import notify_from, status_line
 from monstertruckd.host.stall import StallWatch
@@ -184,14 +184,15 @@ class Daemon:
                 self._start(estimation, service)
             for service in build_planners(self.config, self.bus, self.clock, self._body, self._actors, save_map):
                 self._start(planners, service)
+                calls = ServiceCalls(self.rpc, self._board, service.name)
                 if isinstance(service, GoalService):
-                    register_goal_calls(self.rpc, service, self.clock)
+                    register_goal_calls(calls, service, self.clock)
                 if isinstance(service, ExplorerService):
-                    register_numbered(self.rpc, "explore", ExploreRequest, service.take)
+                    register_numbered(calls, "explore", ExploreRequest, service.take)
                 if isinstance(service, MissionService):
-                    register_numbered(self.rpc, "mission", MissionRequest, service.take)
+                    register_numbered(calls, "mission", MissionRequest, service.take)
                 if isinstance(service, BehaviourService):
-                    register_behaviour_calls(self.rpc, service)
+                    register_behaviour_calls(calls, service)
             if self._notify is not None:
                 self._notify.up()
             await stop.wait()
@@ -209,7 +210,7 @@ class Daemon:
             if isinstance(service, SlamService):
                 save_map = service.save_soon
             if isinstance(service, PointService):
-                register_point_calls(self.rpc, service)
+                register_point_calls(ServiceCalls(self.rpc, self._board, service.name), service)
         return save_map
 
     def _peer_services(self) -> Iterator[Service]:

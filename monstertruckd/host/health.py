@@ -3,14 +3,15 @@
 import logging
 from collections.abc import Callable, Collection
 from itertools import count
-from typing import Final
+from typing import Any, Final
 
 from monstertruck_runtime.clock import SECOND, Clock
-from monstertruck_runtime.ports import EventSink, Publisher, Ready
+from monstertruck_runtime.errors import RequestRefusedError
+from monstertruck_runtime.ports import EventSink, Handler, Publisher, Ready, RpcRegistry
 from monstertruck_schemas.event import Event, Severity
 from monstertruck_schemas.health import HealthTable, LoopHealth, RecorderHealth, ServiceHealth, ServiceState
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.roles import ServiceName
+from monstertruck_schemas.roles import AccessRole, ServiceName
 from monstertruck_schemas.state import ClockOffset
 from monstertruck_schemas.topics import LOOP, RECORDER, Writer
 from monstertruckd.bus.local import Bus
@@ -117,6 +118,16 @@ class HealthBoard:
             return row.model_copy(update={"reason": event.reason, "detail": event.text})
         return row
 
+    def require(self, name: str) -> None:
+        """Refuse what is asked of a service that has failed for good.
+
+        Raises:
+            RequestRefusedError: it has.
+        """
+        row = self._rows.get(name)
+        if row is not None and row.state is ServiceState.FAILED:
+            raise RequestRefusedError(Reason.SERVICE_FAILED, f"{name}: {row.detail}")
+
     async def run(self, ready: Ready) -> None:
         """Publish the table once a second; log what is not ready after the start, and once that all are."""
         ready()
@@ -142,6 +153,30 @@ class HealthBoard:
     def _publish(self) -> None:
         now = self._clock.now()
         self._out.put(HealthTable(stamp=now, received=now, seq=self._out.next_seq(), services=self.rows()))
+
+
+class ServiceCalls:
+    """Registers the remote calls of one service; once that has failed for good they are refused: nothing would follow.
+
+    Args:
+        rpc: where.
+        board: knows its state.
+        service: its name.
+    """
+
+    def __init__(self, rpc: RpcRegistry, board: HealthBoard, service: str) -> None:
+        self._rpc = rpc
+        self._board = board
+        self._service = service
+
+    def register(self, name: str, handler: Handler, role: AccessRole = AccessRole.PILOT) -> None:
+        """Serve ``name``; see ``RpcRegistry``."""
+
+        async def served(payload: dict[str, Any]) -> dict[str, Any]:
+            self._board.require(self._service)
+            return await handler(payload)
+
+        self._rpc.register(name, served, role)
 
 
 class ClockService:
