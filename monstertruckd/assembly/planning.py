@@ -72,6 +72,7 @@ def build_planners(
             bus.subscribe(topics.REQ_PATH, fifo(4)),
             bus.subscribe(topics.GATE, latest()),
             bus.subscribe(topics.BEHAVIOUR, latest()),
+            bus.subscribe(topics.PATH, latest()),
             paths,
             bus.event_sink(),
             config.gate.max_request_age,

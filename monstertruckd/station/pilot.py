@@ -20,7 +20,7 @@ from ruamel.yaml.events import AliasEvent
 
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import SECOND, Clock
-from monstertruck_runtime.drives import send_path
+from monstertruck_runtime.drives import named, send_path
 from monstertruck_runtime.errors import InputError, NoAnswerError, NotFoundError, RequestRefusedError, TruckError
 from monstertruck_runtime.mailbox import latest
 from monstertruck_runtime.threads import in_thread
@@ -237,7 +237,7 @@ def _other_call(client: TruckClient, command: Asked) -> Coroutine[Any, Any, Any]
 
 
 async def _track(client: TruckClient, command: Track, clock: Clock) -> None:
-    path = drawn_path(command.points)
+    path = named(drawn_path(command.points), clock)
     with client.subscribe(PATH, latest()) as present:
         await send_path(client, clock, path, present)
 

@@ -144,10 +144,13 @@ async def _goal_end(states: Mailbox[GoalState], number: int, report: DriveReport
 async def follow(driver: TruckClient, clock: Clock, path: Path, *, arm: bool, report: DriveReport = SILENT) -> Arrival:
     """Send a path and wait for its end; cancelled or without an answer, it stops the truck, but not on another path.
 
+    Then the path is withdrawn: whoever arms the truck later does not have it driven.
+
     Raises:
         RequestRefusedError: the path or the arming was refused, the tracker failed, or the robot restarted.
         NoAnswerError: the robot does not answer, or has been silent for a minute.
     """
+    path = named(path, clock)
     with (
         driver.subscribe(TRACKER, fifo(256)) as states,
         monitor_standstill(driver) as stand,
@@ -158,34 +161,42 @@ async def follow(driver: TruckClient, clock: Clock, path: Path, *, arm: bool, re
                 while (await stand.gate.next()).mode.moving:
                     pass
         async with taken_back(driver.stop):
-            name = await send_path(driver, clock, path, present)
+            await send_path(driver, clock, path, present)
 
         async def stop() -> None:
-            if _followed(present, name):
+            if _followed(present, path.name):
                 await driver.stop()
 
-        end = _path_end(clock, states, present, name, report)
-        return await _watched(driver, clock, stand, ServiceName.TRACKER, arm=arm, end=end, undo=stop, report=report)
+        end = _path_end(clock, states, present, path.name, report)
+        try:
+            return await _watched(driver, clock, stand, ServiceName.TRACKER, arm=arm, end=end, undo=stop, report=report)
+        finally:
+            if _followed(present, path.name):
+                with suppress(TruckError):
+                    await driver.path(path.model_copy(update={"halts": True}))
 
 
-async def send_path(driver: TruckClient, clock: Clock, path: Path, present: Mailbox[Path]) -> str:
-    """Send a path under a name that no other one has, and wait until it is followed; returns the name.
+def named(path: Path, clock: Clock) -> Path:
+    """The path under a name that no other one has."""
+    return path.model_copy(update={"name": f"{path.name[:96]}-{clock.now():x}"})
+
+
+async def send_path(driver: TruckClient, clock: Clock, path: Path, present: Mailbox[Path]) -> None:
+    """Send a path and wait until it is followed.
 
     Args:
         driver: who sends it.
         clock: time.
-        path: what is to be driven.
+        path: what is to be driven, with a name of its own.
         present: the newest path of the robot.
 
     Raises:
         RequestRefusedError: the path was refused.
         NoAnswerError: the robot does not answer.
     """
-    path = path.model_copy(update={"name": f"{path.name[:96]}-{clock.now():x}"})
     with driver.subscribe(EVENT, fifo(256)) as events:
         await driver.path(path)
         await _accepted(driver, clock, events, present, path.name)
-    return path.name
 
 
 async def _accepted(

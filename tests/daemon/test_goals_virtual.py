@@ -209,18 +209,44 @@ def test_a_goal_ends_the_path_that_is_followed_whether_it_is_refused_or_not(tmp_
             await trip.goal(4.7, 2.5, 0.0)
         await trip.clock.sleep(4.0)
         assert 1.1 < trip.rig.truth.array()[-1, 1] < 1.5
-        path = load_path(file, closed=False, frame="odom").model_copy(update={"halts": True})
+        path = load_path(file, closed=False, frame="odom")
         await trip.goal(4.0, 3.9, 0.0)
         await LocalDriver(trip).path(path)
         await trip.clock.sleep(1.0)
         assert (await trip.end()).outcome is Reason.GOAL_BLOCKED
         assert (await trip.end()).text == "another path is followed now"
-        assert not trip.rig.bus.newest(topics.PATH).halts, "what others send is a way to drive"
         await trip.goal(1.8, 3.9, 0.0)
         await trip.arm()
         assert (await trip.end()).outcome is Reason.GOAL_REACHED
 
     assert_at(travel(story, path={"file": file, "closed": False}), 1.8, 3.9, 0.0)
+
+
+@pytest.mark.parametrize("closed", [False, True])
+def test_of_a_path_whose_command_has_ended_nothing_is_driven_by_whoever_arms_later(closed: bool):
+    """Interrupted before its end it was gone on with, and a lap that was done was driven once more."""
+    round_trip = [(1.0, 3.95), (1.3, 3.95)] if closed else [(1.0, 3.95), (4.0, 3.95)]
+    poses = np.array([(*place, 0.0) for place in round_trip]).ravel()
+    directions = np.array([-1.0, 1.0] if closed else [1.0, 1.0])
+    path = DrivePath(stamp=0, received=0, seq=0, frame="odom", poses=poses, directions=directions, closed=closed)
+    at: list[float] = []
+
+    async def story(trip: Trip) -> None:
+        driving = asyncio.create_task(follow(LocalDriver(trip), trip.clock, path, arm=True))
+        if closed:
+            assert (await driving).reason is Reason.GOAL_REACHED
+        else:
+            await trip.clock.sleep(5.0)
+            driving.cancel()
+            await asyncio.wait([driving])
+        await trip.clock.sleep(4.0)
+        at.append(trip.rig.truth.array()[-1, 1])
+        await trip.arm()
+        await trip.clock.sleep(4.0)
+
+    truth = travel(story).truth.array()
+    assert truth[:, 1].max() > 1.25, "it was driven"
+    assert abs(truth[-1, 1] - at[0]) < 0.005
 
 
 def test_an_emergency_stop_ends_a_goal():

@@ -73,12 +73,15 @@ def _numbers(file: FilePath, line: int, row: list[str]) -> list[float]:
 class PathService:
     """Publishes the configured path, and replaces it by any that an operator sends while the truck stands.
 
+    A request for the present path that ``halts`` withdraws it, whether the truck stands or not.
+
     Args:
         drawn: the configured path.
         clock: time.
         requests: ``req/path``.
         gate: state of the gate.
         behaviour: ``plan/behaviour``.
+        present: ``plan/path``, others' paths as well.
         out: ``plan/path``.
         events: where events go.
         max_age: seconds; see ``GateConfig.max_request_age``.
@@ -93,6 +96,7 @@ class PathService:
         requests: Subscription[PathRequest],
         gate: Subscription[GateState],
         behaviour: Subscription[BehaviourState],
+        present: Subscription[Path],
         out: Publisher[Path],
         events: EventSink,
         max_age: float,
@@ -102,6 +106,7 @@ class PathService:
         self._requests = requests
         self._gate = gate
         self._behaviour = behaviour
+        self._present = present
         self._out = out
         self._events = events
         self._max_age = max_age
@@ -115,16 +120,30 @@ class PathService:
         while True:
             request = await self._requests.next()
             try:
-                self._examine(request)
+                path = self._withdrawn(request) if request.path.halts else self._examined(request)
             except RequestRefusedError as error:
                 self._events(error.refusal, Severity.WARNING, request.source, f"path refused: {error}")
             except InputError as error:
                 self._events(Reason.BAD_INPUT, Severity.WARNING, request.source, f"path refused: {error}")
             else:
-                self._publish(request.path)
+                self._publish(path)
 
-    def _examine(self, request: PathRequest) -> None:
-        """Authority as for driving, and only while the truck stands: a path must not turn under it.
+    def _withdrawn(self, request: PathRequest) -> Path:
+        """The present path, to be followed no longer than until the truck is disarmed.
+
+        Raises:
+            RequestRefusedError: the sender may not, or the path has been replaced.
+        """
+        examine(request, self._gate.latest, self._sequences, self._clock.now(), None)
+        present = self._present.latest
+        if present is None or present.name != request.path.name:
+            raise RequestRefusedError(Reason.NOT_FOUND, f"path {request.path.name!r} is not the present one")
+        return present.model_copy(update={"halts": True})
+
+    def _examined(self, request: PathRequest) -> Path:
+        """The path of a request.
+
+        Authority as for driving, and only while the truck stands: a path must not turn under it.
 
         Raises:
             RequestRefusedError: the sender may not, or not now.
@@ -138,8 +157,8 @@ class PathService:
         if behaviour is not None and behaviour.running:
             raise RequestRefusedError(Reason.BUSY, f"the behaviour {behaviour.behaviour} is running, stop it first")
         check_path(request.path)
+        return request.path
 
     def _publish(self, path: Path) -> None:
         now = self._clock.now()
-        header = {"stamp": now, "received": now, "seq": self._out.next_seq()}
-        self._out.put(path.model_copy(update={**header, "halts": False}))
+        self._out.put(path.model_copy(update={"stamp": now, "received": now, "seq": self._out.next_seq()}))

@@ -255,6 +255,8 @@ class TrackingStep:
             self._reported = Reason.DRIVING
         elif not armed and not idle:
             self._begun = None
+        if path.halts and self._followed is not None and path.name == self._followed.name:
+            self._followed = path  # withdrawn
         if path.halts and not armed:
             self._followed, self._path = path, None
             return False

@@ -38,6 +38,7 @@ class Bench:
             self.bus.subscribe(REQ_PATH, fifo(4)),
             self.bus.subscribe(GATE, latest()),
             self.bus.subscribe(BEHAVIOUR, latest()),
+            self.bus.subscribe(PATH, latest()),
             self.bus.publisher(PATH, Writer.PLANNER),
             self.bus.event_sink(),
             0.5,
@@ -101,6 +102,22 @@ def test_the_path_stays_as_it_is_while_the_truck_moves():
             bench.gate(mode)
             moving = mode in (GateMode.DRIVING, GateMode.STOPPING)
             assert await bench.send() is (Reason.BUSY if moving else Reason.OK)
+
+    on_bench(scenario)
+
+
+def test_a_path_is_withdrawn_while_the_truck_moves_but_no_other_one_by_its_name():
+    async def scenario(bench: Bench) -> None:
+        bench.gate(GateMode.ARMED)
+        first, second = (path([[0.0, 0.0], [x, 0.0]]).model_copy(update={"name": f"{x}"}) for x in (1.0, 2.0))
+        assert await bench.send(first) is Reason.OK
+        assert await bench.send(second) is Reason.OK
+        bench.gate(GateMode.DRIVING)
+        withdrawn = {"halts": True, "poses": first.poses}
+        assert await bench.send(first.model_copy(update=withdrawn)) is Reason.NOT_FOUND
+        assert await bench.send(second.model_copy(update=withdrawn)) is Reason.OK
+        newest = bench.bus.newest(PATH)
+        assert (newest.halts, newest.poses.tolist()) == (True, second.poses.tolist())
 
     on_bench(scenario)
 
