@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+from monstertruck_runtime.endpoints import host_of, port_of
 from monstertruck_runtime.errors import InputError, NotFoundError, NotPermittedError
 
 TLS_VARIABLE: Final = "MONSTERTRUCKD_TLS"
@@ -90,6 +91,36 @@ def session_config(endpoint: str, timeout: float, tls: ClientTls | None) -> dict
             }
         }
     return config
+
+
+def link_refusal(endpoint: str, ca: Path, tls: ClientTls | None, timeout: float) -> str:
+    """Why a ``tls/...`` link is refused, by this side or the other, which Zenoh does not say; empty if it is not.
+
+    Args:
+        endpoint: of the robot.
+        ca: certificate of the authority that signed the robot's.
+        tls: this station's; None = without.
+        timeout: seconds for each step.
+
+    Raises:
+        OSError: nobody listens there, or the files cannot be used.
+    """
+    import ssl  # noqa: PLC0415 - only for certificates
+
+    context = ssl.create_default_context(cafile=str(ca))
+    if tls is not None:
+        context.load_cert_chain(tls.certificate, tls.key)
+    try:
+        with (
+            socket.create_connection((host_of(endpoint), port_of(endpoint) or 0), timeout) as raw,
+            context.wrap_socket(raw, server_hostname=host_of(endpoint)) as link,
+        ):
+            link.recv(1)  # in TLS 1.3 the robot judges the certificate after the handshake
+    except TimeoutError:
+        return ""
+    except ssl.SSLError as error:
+        return str(getattr(error, "verify_message", "") or error.reason or error).lower().replace("_", " ")
+    return ""
 
 
 def own_source(owner: str | None = None, program: str = "") -> str:

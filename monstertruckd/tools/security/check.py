@@ -4,7 +4,6 @@ Nothing moves: the order that shows whether orders arrive carries no nonce, so t
 """
 
 import socket
-import ssl
 import tempfile
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
@@ -17,7 +16,7 @@ from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.endpoints import host_of, port_of, protocol_of
 from monstertruck_runtime.errors import InputError, NoAnswerError, NotFoundError, RequestRefusedError, TruckError
 from monstertruck_runtime.mailbox import latest
-from monstertruck_runtime.stations import ClientTls
+from monstertruck_runtime.stations import ClientTls, link_refusal
 from monstertruck_runtime.threads import in_thread
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.roles import AccessRole
@@ -79,8 +78,9 @@ class _Attempt:
 
     async def reachable(self) -> None:
         """Raises NotFoundError where nothing listens."""
+        place = host_of(self._endpoint), port_of(self._endpoint) or 0
         try:
-            (await in_thread(self._connect)).close()
+            (await in_thread(lambda: socket.create_connection(place, TIMEOUT))).close()
         except OSError as error:
             raise NotFoundError(f"nothing listens at {self._endpoint}: {error}") from None
 
@@ -195,24 +195,12 @@ class _Attempt:
         async with made as client:
             yield client
 
-    def _connect(self) -> socket.socket:
-        return socket.create_connection((host_of(self._endpoint), port_of(self._endpoint) or 0), TIMEOUT)
-
     def _handshake(self, tls: ClientTls | None) -> str:
-        """Why a link is refused, which Zenoh does not say; "" if it is not."""
-        context = ssl.create_default_context(cafile=str(self._ca))
-        if tls is not None:
-            context.load_cert_chain(tls.certificate, tls.key)
+        """Why a link is refused; "" if it is not."""
         try:
-            with self._connect() as raw, context.wrap_socket(raw, server_hostname=host_of(self._endpoint)) as link:
-                link.recv(1)  # in TLS 1.3 the robot judges the certificate after the handshake
-        except TimeoutError:
-            return ""
-        except ssl.SSLError as error:
-            return error.reason or str(error)
+            return link_refusal(self._endpoint, self._ca, tls, TIMEOUT)
         except OSError as error:
             return str(error)
-        return ""
 
 
 async def _arrives(call: Awaitable[object]) -> bool:

@@ -101,6 +101,28 @@ async def test_who_may_do_what(tmp_path: Path):
     assert requests.latest is request
 
 
+async def test_a_refused_certificate_is_not_said_to_be_a_robot_that_is_not_there(tmp_path: Path):
+    ours, theirs = tmp_path / "ours", tmp_path / "theirs"
+    for folder in (ours, theirs):
+        folder.mkdir()
+        await asyncio.to_thread(certificates, folder)
+    server = TlsConfig(ca=ours / "ca.pem", certificate=ours / "truck.pem", key=ours / "truck.key", pilots=("ann",))
+    endpoint = free_endpoint("tls")
+    async with running_robot(endpoint, tls=server):
+        for authority, station, why in (
+            (ours, theirs, "unknown ca|decrypt error|bad certificate"),
+            (theirs, ours, "self-signed certificate|unable to get local issuer|certificate signature failure"),
+        ):
+            files = ClientTls(ca=authority / "ca.pem", certificate=station / "ann.pem", key=station / "ann.key")
+            with pytest.raises(NotPermittedError, match=rf"certificate or this station's is refused: .*({why})"):
+                async with TruckClient(endpoint=endpoint, tls=files, timeout=0.5, source="ann"):
+                    pass
+    files = ClientTls(ca=ours / "ca.pem", certificate=ours / "ann.pem", key=ours / "ann.key")
+    with pytest.raises(NotFoundError, match="no robot answers at"):
+        async with TruckClient(endpoint=endpoint, tls=files, timeout=0.3, source="ann"):
+            pass
+
+
 async def test_a_command_finds_the_stations_certificate_by_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     await asyncio.to_thread(certificates, tmp_path)
     for name, file in (("ann.pem", "station.pem"), ("ann.key", "station.key")):

@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import SECOND, WallClock
-from monstertruck_runtime.errors import InputError, NotFoundError, RequestRefusedError
+from monstertruck_runtime.errors import InputError, NotFoundError, NotPermittedError, RequestRefusedError
 from monstertruck_runtime.stations import ClientTls
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Role
@@ -89,7 +89,7 @@ async def test_observers_have_no_place_at_the_pilots_endpoint(folder: Folder):
         async with client(folder, "bob", endpoint):  # takes the only place of all stations
             async with client(folder, "ann", pilots) as ann:
                 assert await ann.get_retained(GATE) == gate_state(1)
-            with pytest.raises(NotFoundError):
+            with pytest.raises(NotPermittedError, match="is refused: tlsv1 alert unknown ca"):
                 async with client(folder, "bob", pilots):
                     pass
 
@@ -108,7 +108,7 @@ async def test_a_renewed_certificate_needs_no_new_robot_and_a_revoked_one_opens_
     folder.revoke("bob")
     endpoint = free_endpoint("tls")
     async with running(folder, endpoint):
-        with pytest.raises(NotFoundError):
+        with pytest.raises(NotPermittedError, match="is refused: "):
             async with TruckClient(endpoint=endpoint, tls=tls, timeout=0.5):
                 pass
 
