@@ -3,10 +3,11 @@
 import asyncio
 import json
 from collections.abc import Callable, Coroutine
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from monstertruck_runtime.clock import Clock, run_wall
-from monstertruck_runtime.errors import NotFoundError
+from monstertruck_runtime.errors import NotFoundError, TruckError
 from monstertruckd.tools.cli.output import remark
 
 if TYPE_CHECKING:
@@ -59,6 +60,19 @@ async def robot_config(client: "TruckClient") -> "TruckConfig":
     running = await client.call("config")
     running.pop("sim", None)
     return TruckConfig.model_validate_json(json.dumps(running))
+
+
+async def not_ready(client: "TruckClient") -> str:
+    """Services of the robot that do not work, and why, to follow what is missing; empty where all do."""
+    from monstertruck_schemas.health import ServiceState
+    from monstertruck_schemas.topics import HEALTH
+
+    table = None
+    with suppress(TruckError):
+        table = await client.get_retained(HEALTH)
+    rows = [row for row in (() if table is None else table.services) if row.state is not ServiceState.READY]
+    named = ", ".join(f"{row.name} ({(row.detail or row.state.value).partition(chr(10))[0]})" for row in rows)
+    return f"; not ready: {named}" if named else ""
 
 
 EXAMPLES = {"explorer": "configs/explore.yaml", "planner": "configs/goals.yaml", "points": "configs/points.yaml"}

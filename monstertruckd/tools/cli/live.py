@@ -10,6 +10,7 @@ import typer
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruck_runtime.errors import NoAnswerError
+from monstertruckd.tools.cli.connection import not_ready
 from monstertruckd.tools.cli.options import EndpointOption, RobotOption, TopicArgument
 from monstertruckd.tools.cli.output import JsonOption, on_terminal, print_json, remark, until_stopped
 
@@ -90,7 +91,8 @@ async def _explain_silence(client: "TruckClient", clock: Clock, topic: "Topic[An
             f"robot {client.robot!r} records {topic.name} where `stand:` is set, and passes it on to nobody; waiting"
         )
     else:
-        remark(f"robot {client.robot!r} is there but publishes no {topic.name} yet; waiting")
+        why = await not_ready(client)
+        remark(f"robot {client.robot!r} is there but publishes no {topic.name} yet; waiting{why}")
 
 
 def shortened(value: Any) -> Any:

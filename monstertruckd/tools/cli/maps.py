@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
-from monstertruckd.tools.cli.connection import with_robot
+from monstertruckd.tools.cli.connection import not_ready, with_robot
 from monstertruckd.tools.cli.logs import finish_log
 from monstertruckd.tools.cli.options import ConfigOption, EndpointOption, RobotOption, with_parameters
 from monstertruckd.tools.cli.output import JsonOption, command_group, needs_extra, print_json, progress, remark
@@ -187,7 +187,7 @@ def save(
                 text = f"{robot} published no map within {timeout:g} s"
                 if (await client.call("config")).get("slam") is None:
                     text += ": its configuration has no section `slam`, as configs/slam.yaml has"
-                raise NoAnswerError(text) from None
+                raise NoAnswerError(text + await not_ready(client)) from None
 
     grid = with_robot(newest, robot, endpoint)
     cells = grid.cells.reshape(grid.height, grid.width)

@@ -8,7 +8,7 @@ import typer
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruck_runtime.errors import InputError, NoAnswerError, NotFoundError
-from monstertruckd.tools.cli.connection import require_section, with_robot
+from monstertruckd.tools.cli.connection import not_ready, require_section, with_robot
 from monstertruckd.tools.cli.goto import ROUTE_TIMEOUT, ArmOption
 from monstertruckd.tools.cli.options import EndpointOption, RobotOption, require_finite
 from monstertruckd.tools.cli.output import JsonOption, command_group, print_end, print_json, print_table, remark
@@ -152,4 +152,5 @@ async def _newest(client: "TruckClient", clock: Clock) -> "list[PointOfInterest]
             async with clock.deadline(WAIT):
                 return list((await box.next()).points)
         except TimeoutError:
-            raise NoAnswerError(f"no list of points of interest within {WAIT:g} s") from None
+            text = f"no list of points of interest within {WAIT:g} s"
+            raise NoAnswerError(text + await not_ready(client)) from None

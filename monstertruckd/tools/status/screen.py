@@ -309,6 +309,11 @@ def _done(tracker: TrackerState) -> float:
     return tracker.along / tracker.length if tracker.length else 0.0
 
 
+def _why(row: ServiceHealth) -> str:
+    """Why a service does not work, or not well; of a traceback the first line."""
+    return "" if row.state is ServiceState.READY and row.reason is Reason.OK else row.detail.partition("\n")[0]
+
+
 def _services(state: ScreenState, shown: Sequence[ServiceHealth] | None = None) -> Panel:
     """All services; or those ``shown``, and how many of all are ready."""
     table = Table.grid(padding=(0, 1))
@@ -322,7 +327,9 @@ def _services(state: ScreenState, shown: Sequence[ServiceHealth] | None = None) 
             Text(f"↻{row.restarts}" if row.restarts else "", style="yellow"),
         )
     parts: list[RenderableType] = [table]
-    if shown is not None and services:
+    if shown is None:
+        parts += [Text(f"{row.name}: {detail}", style="yellow") for row in services if (detail := _why(row))]
+    elif services:
         parts.append(Text(f"{sum(row.state is ServiceState.READY for row in services)} of {len(services)} ready"))
     if state.recorder is not None and state.recorder.recording:
         parts.append(Text(f"● recording {state.recorder.bytes_written / 1e6:.1f} MB unpacked", style="red"))

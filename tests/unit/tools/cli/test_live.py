@@ -7,6 +7,7 @@ from rich.console import Console
 
 from monstertruck_runtime.clock import SECOND, run_virtual
 from monstertruck_schemas import topics
+from monstertruck_schemas.health import HealthTable, ServiceHealth, ServiceState
 from monstertruck_schemas.state import GateMode, GateState
 from monstertruckd.tools.cli.live import _explain_silence, shortened
 from monstertruckd.tools.driving.session import Stream, draw
@@ -23,10 +24,13 @@ def test_long_lists_and_texts_are_cut_and_say_so():
     assert (short["name"], short["pose"]) == ("scan", {"x": 1.0, "of": [1, 2]})
 
 
+BROKEN = "robot 'truck' is there but publishes no sensor/scan yet; waiting; not ready: lidar (/dev/lidar: unplugged)"
+
+
 @pytest.mark.parametrize(
     ("topic", "alive", "said"),
     [
-        (topics.SCAN, True, "robot 'truck' is there but publishes no sensor/scan yet; waiting"),
+        (topics.SCAN, True, BROKEN),
         (topics.SCAN, False, "no robot 'truck' seen at tcp/x:1; waiting for sensor/scan"),
         (
             topics.STAND_POSE,
@@ -41,7 +45,12 @@ def test_a_topic_that_stays_silent_is_explained(
     async def is_alive() -> bool:
         return alive
 
-    client = SimpleNamespace(robot="truck", endpoint="tcp/x:1", alive=is_alive)
+    async def get_retained(_: topics.Topic) -> HealthTable:
+        lidar = ServiceHealth(name="lidar", state=ServiceState.BACKOFF, since=0, detail="/dev/lidar: unplugged\nmore")
+        gate = ServiceHealth(name="gate", state=ServiceState.READY, since=0)
+        return HealthTable(stamp=0, received=0, seq=0, services=(gate, lidar))
+
+    client = SimpleNamespace(robot="truck", endpoint="tcp/x:1", alive=is_alive, get_retained=get_retained)
     run_virtual(lambda clock: _explain_silence(client, clock, topic))
     assert capsys.readouterr().err.splitlines() == [said]
 

@@ -233,6 +233,22 @@ def test_what_stopped_the_run_before_does_not_hold_the_next_one():
     assert state.why_stopped == []
 
 
+def test_a_wide_screen_says_why_a_service_does_not_work():
+    state = full()
+    assert state.health is not None
+    rows = (
+        ServiceHealth(name="lidar", state=ServiceState.BACKOFF, since=0, detail="/dev/lidar: unplugged\nmore"),
+        ServiceHealth(name="drive", state=ServiceState.READY, since=0, reason=Reason.SLOW_LINK, detail="takes 40 ms"),
+        ServiceHealth(name="compass", state=ServiceState.READY, since=0),
+    )
+    state.take(state.health.model_copy(update={"services": rows}))
+    text = shown(state, 140, 40).export_text()
+    assert "lidar: /dev/lidar: unplugged" in text
+    assert "drive: takes 40 ms" in text
+    assert "more" not in text
+    assert "compass:" not in text
+
+
 def test_a_disarmed_truck_does_not_drive_its_path():
     state = full()
     state.take(GateState(**HEADER, mode=GateMode.DISARMED, nonce="n", speed_limit=0.0))
