@@ -148,6 +148,11 @@ class LogFile:
         """Bytes in the file."""
         return self._output.size
 
+    @property
+    def removed(self) -> bool:
+        """Whether somebody removed the file: what is written to it is gone once it is closed."""
+        return self._output.removed
+
     def add(self, entry: LogEntry) -> None:
         """Put a message into the open chunk."""
         before = self._output.size
@@ -206,6 +211,10 @@ class _Output:
 
     def flush(self) -> None:
         """Nothing is buffered."""
+
+    @property
+    def removed(self) -> bool:
+        return os.fstat(self._fd).st_nlink == 0
 
     def sync(self) -> None:
         os.fsync(self._fd)

@@ -55,7 +55,8 @@ _STEP_PERIOD: Final = 10 * SECOND
 class LogWriter:
     """Writes entries into numbered files; a context manager that finishes the last one.
 
-    All dates of a file are by one offset; when the computer's clock is set to another time the next file begins.
+    All dates of a file are by one offset; when the computer's clock is set to another time the next file begins. So
+    it does when somebody removed the file, which is noticed when it is synced.
 
     Args:
         config: sizes, durations and folder.
@@ -86,6 +87,8 @@ class LogWriter:
         """Files that could not be removed."""
         self._retained: dict[str, LogEntry] = {}
         """Newest of every retained topic: the head of the next file, so that each file stands alone."""
+        self._removed = False
+        """The present file was removed."""
         self._file = self._open(start)
         self._synced = start
 
@@ -127,11 +130,14 @@ class LogWriter:
             self._file.sync()
             self._synced = now
             self._keep_quota()
+            if self._file.removed and not self._removed:
+                self._removed = True
+                log.warning("%s was removed while it was written: what it held is lost", self.path)
 
     def _is_complete(self, now: int) -> bool:
         """Whether the next file is due: by size, by age, or because the computer's clock was set."""
         age = now - self._file.start
-        if self._file.size >= self._config.rotate_bytes or age >= self._config.rotate_seconds * SECOND:
+        if self._removed or self._file.size >= self._config.rotate_bytes or age >= self._config.rotate_seconds * SECOND:
             return True
         return age >= _STEP_PERIOD and abs(log_offset(now, self.real_offset) - self._file.offset) > _STEP
 
@@ -153,7 +159,7 @@ class LogWriter:
                 continue
             log.info("recording to %s", path)
             self._others = self._folder.finished(path)
-            self._file = file
+            self._file, self._removed = file, False
             self._keep_quota()
             return file
 

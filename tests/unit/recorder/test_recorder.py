@@ -310,6 +310,25 @@ def test_disk_is_synced_every_few_seconds(config, failures, monkeypatch):
     assert len(synced) == 3 + 1
 
 
+def test_a_file_that_is_removed_while_it_is_written_is_noticed_and_followed_by_another(config, failures, caplog):
+    config = config.model_copy(update={"fsync_seconds": 1.0})
+
+    async def main(clock):
+        async with Recorder(config, clock, failures, deterministic=True) as recorder:
+            await drive(recorder, clock, 6.0)
+            (first,) = logs(config)
+            first.unlink()
+            await drive(recorder, clock, 12.0)
+        return first
+
+    first = run_virtual(main)
+    (path,) = logs(config)
+    assert path.name == "run-000001-001.mcap"
+    assert len(list(open_log(path))) > 300
+    assert f"{first} was removed while it was written: what it held is lost" in caplog.messages
+    assert failures == []
+
+
 def test_topics_that_are_not_logged_are_ignored(config, failures):
     async def main(clock):
         quiet = t.Topic("state/quiet", t.GATE.model, t.Writer.GATE, "not logged", logged=False)
