@@ -241,6 +241,8 @@ class BehaviourService:
         if gate is None or not gate.mode.active:
             error = does_not_drive(gate)
             return error.refusal, str(error)
+        if gate.mode is GateMode.STOPPING and Reason.STOPPED in gate.reasons:
+            return Reason.CANCELLED, "the robot was ordered to stop"
         if (other := self._other_planner(now)) is not None:
             return Reason.BUSY, other
         if (stale := self._stale(run.behaviour, now)) is not None:

@@ -306,6 +306,21 @@ def test_what_does_not_run_cannot_be_stopped(name, said):
     on_bench(scenario)
 
 
+def test_an_order_to_stop_ends_it_so_that_it_does_not_go_on_when_the_robot_is_armed_at_once():
+    async def scenario(bench):
+        bench.start()
+        for reasons, running in (((Reason.SCAN_STALE,), True), ((Reason.STOPPED,), False)):
+            await bench.clock.sleep(0.5)
+            bench.mode, bench.reasons = GateMode.STOPPING, reasons
+            await bench.clock.sleep(0.2)
+            assert bench.state.running is running
+            bench.mode, bench.reasons = GateMode.ARMED, ()
+        await bench.clock.sleep(0.5)
+        assert (bench.state.outcome, any(bench.asked)) == (Reason.CANCELLED, False)
+
+    on_bench(scenario)
+
+
 @pytest.mark.parametrize("way", ["obeys", "blocked"])
 def test_a_gate_that_does_not_let_it_drive_ends_it_with_the_gates_reason(way):
     async def scenario(bench):
