@@ -55,6 +55,8 @@ LEAST_USED: Final = 0.05
 """Share of the charge used from which on the use per metre counts as measured."""
 PASSING: Final = frozenset({Reason.PLANNER_STARTING, Reason.NO_MAP, Reason.LEASE_EXPIRED})
 """Outcomes of a goal that do not depend on its place."""
+BROKEN: Final = frozenset({Reason.WORKER_DIED, Reason.WORKER_TIMEOUT})
+"""Refusals of any goal, by a planner that does not start; of a goal that was planned they may be its place's."""
 HOPELESS: Final = frozenset({Reason.DISARMED, Reason.ESTOPPED, Reason.BUSY})
 """Outcomes of a goal that would be the same at any other place."""
 SAME: Final = 0.5
@@ -152,6 +154,8 @@ class Observed:
     ended: Reason | None = None
     """How the newest goal ended; None = it is pursued, or there was none."""
     ended_text: str = ""
+    refused: bool = False
+    """It was not taken, and did not end."""
     displaced: str = ""
     """Who took the goal over."""
     paused: bool = False
@@ -396,8 +400,10 @@ def _driving(run: Exploration, seen: Observed, config: ExplorerConfig) -> Step:
             return _finish(replace(run, returns=False), seen.ended, seen.ended_text)
         if seen.ended is Reason.CANCELLED:
             return _end(run, Reason.CANCELLED, f"its goal was cancelled: {seen.ended_text}", Save())
-        if seen.ended in PASSING:
-            looking = replace(_enter(run, ExplorationPhase.LOOKING), text=seen.ended.text)
+        broken = seen.refused and seen.ended in BROKEN
+        if seen.ended in PASSING or broken:
+            text = seen.ended_text if broken else seen.ended.text
+            looking = replace(_enter(run, ExplorationPhase.LOOKING), text=text)
             return replace(looking, target=None, backing=False, not_before=run.now + AGAIN), ()
         reached = seen.ended is Reason.GOAL_REACHED
         if run.backing:

@@ -239,6 +239,7 @@ class ExplorerService:
             critical=battery is not None and fresh and battery.level is BatteryLevel.CRITICAL,
             saved=saved,
             save_failure=save_failure,
+            refused=self._refused is not None,
             failed=self._failed(),
             found=self._found(),
         )

@@ -261,6 +261,19 @@ def test_a_planner_that_is_starting_says_nothing_of_the_place():
     assert (stepped.run.phase, stepped.run.attempts.places) == (Phase.LOOKING, ())
 
 
+def test_a_planner_that_does_not_start_leaves_no_place_alone_and_is_named():
+    """All places were left alone one after the other, and what was known then was "explored"."""
+    stepped = SteppedExploration()
+    stepped.drive()
+    stepped.step(ended=Reason.WORKER_DIED, ended_text="the planner does not start: why", refused=True)
+    assert (stepped.run.phase, stepped.run.attempts.places) == (Phase.LOOKING, ())
+    assert stepped.run.text == "the planner does not start: why"
+    stepped = SteppedExploration()
+    stepped.drive()
+    stepped.step(ended=Reason.WORKER_TIMEOUT, ended_text="of this goal")
+    assert stepped.run.attempts.places, "a goal that takes too long to plan may be one of its place"
+
+
 def test_it_says_what_it_waits_for():
     stepped = SteppedExploration()
     stepped.drive()
