@@ -11,7 +11,7 @@ from zenoh import handlers
 
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import InputError, NotFoundError, TruckError
-from monstertruck_runtime.stations import session_config, tls_for
+from monstertruck_runtime.stations import require_certificates, session_config, tls_for
 from monstertruck_runtime.threads import ThreadHop, in_thread
 from monstertruck_schemas.topics import KEY_ROOT, alive_key
 from monstertruckd.station.address import RobotAddress
@@ -40,21 +40,26 @@ class Discovery:
         self._known: set[str] = set()
 
     async def run(self) -> None:
-        """Watch until cancelled."""
+        """Watch until cancelled; why there are no robots from there is logged once."""
+        said = ""
         while True:
             try:
                 session = await in_thread(self._open)
             except TruckError as error:
-                log.info("no robots from %s: %s", self._endpoint, error)
+                if str(error) != said:
+                    said = str(error)
+                    log.warning("no robots from %s: %s", self._endpoint, said)
                 await self._clock.sleep(RETRY)
                 continue
             await self._watch(session)
 
     def _open(self) -> zenoh.Session:
-        config = session_config(self._endpoint, RETRY, tls_for(self._endpoint))
+        tls = tls_for(self._endpoint)
+        config = session_config(self._endpoint, RETRY, tls)
         try:
             return zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
         except zenoh.ZError as error:
+            require_certificates(self._endpoint, tls)
             raise NotFoundError(f"nothing answers at {self._endpoint} within {RETRY} s") from error
 
     async def _watch(self, session: zenoh.Session) -> None:

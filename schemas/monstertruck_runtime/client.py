@@ -7,7 +7,6 @@ import logging
 import secrets
 import threading
 from collections.abc import Callable, Coroutine, Sequence
-from contextlib import suppress
 from functools import partial
 from typing import Any, Final, Generic, Self, TypeVar
 
@@ -27,7 +26,7 @@ from monstertruck_runtime.errors import (
 )
 from monstertruck_runtime.mailbox import Delivery, Mailbox, latest
 from monstertruck_runtime.requests import Operator
-from monstertruck_runtime.stations import ClientTls, link_refusal, own_source, session_config, tls_for
+from monstertruck_runtime.stations import ClientTls, own_source, require_certificates, session_config, tls_for
 from monstertruck_runtime.threads import ThreadHop, in_daemon_thread, in_thread
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.mission import Mission
@@ -70,8 +69,6 @@ _HOP_DEPTH = 1024
 
 LOOK: Final = 0.5
 """Seconds in which the robots that are there answer."""
-HANDSHAKE: Final = 1.0
-"""Seconds for a step of a handshake that is to say why there is no link."""
 ORDER_TIMEOUT: Final = 6.0
 """Seconds to wait for the outcome of an order: the robot itself gives up after 5 s."""
 
@@ -548,24 +545,11 @@ class TruckClient(Operator):
         try:
             self._session = zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
         except zenoh.ZError as error:
-            self._require_link(tls)
+            require_certificates(self.endpoint, tls)
             waited = (self._clock.now() - began) / SECOND  # longer than ``timeout`` where the computer is busy
             msg = f"no robot answers at {self.endpoint} within {waited:.1f} s: is its daemon running there "
             msg += "(`monstertruckd run`, or `simulate --run`), or is it elsewhere (--endpoint)?"
             raise NotFoundError(msg) from error
-
-    def _require_link(self, tls: ClientTls | None) -> None:
-        """Say so if somebody listens there, and a certificate is refused.
-
-        Raises:
-            NotPermittedError: one is.
-        """
-        if tls is None:
-            return
-        with suppress(OSError):
-            if why := link_refusal(self.endpoint, tls.ca, tls, HANDSHAKE):
-                text = "the robot's certificate or this station's is refused"
-                raise NotPermittedError(f"{self.endpoint}: {text}: {why} (`monstertruckd security show` lists dates)")
 
     def _take_name(self, owner: str) -> None:
         if not self._named:

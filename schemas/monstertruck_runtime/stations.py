@@ -9,6 +9,7 @@ import re
 import socket
 import stat
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -18,6 +19,8 @@ from monstertruck_runtime.errors import InputError, NotFoundError, NotPermittedE
 
 TLS_VARIABLE: Final = "MONSTERTRUCKD_TLS"
 """Names the folder of the station's certificate."""
+HANDSHAKE: Final = 1.0
+"""Seconds for a step of a handshake that is to say why there is no link."""
 LONGEST_SOURCE: Final = 64
 """Characters of a source's name."""
 
@@ -121,6 +124,20 @@ def link_refusal(endpoint: str, ca: Path, tls: ClientTls | None, timeout: float)
     except ssl.SSLError as error:
         return str(getattr(error, "verify_message", "") or error.reason or error).lower().replace("_", " ")
     return ""
+
+
+def require_certificates(endpoint: str, tls: ClientTls | None) -> None:
+    """Say so if there is no link because a certificate is refused.
+
+    Raises:
+        NotPermittedError: one is.
+    """
+    if tls is None:
+        return
+    with suppress(OSError):
+        if why := link_refusal(endpoint, tls.ca, tls, HANDSHAKE):
+            text = "its certificate or this station's is refused"
+            raise NotPermittedError(f"{endpoint}: {text}: {why} (`monstertruckd security show` lists dates)")
 
 
 def own_source(owner: str | None = None, program: str = "") -> str:

@@ -114,7 +114,7 @@ async def test_a_refused_certificate_is_not_said_to_be_a_robot_that_is_not_there
             (theirs, ours, "self-signed certificate|unable to get local issuer|certificate signature failure"),
         ):
             files = ClientTls(ca=authority / "ca.pem", certificate=station / "ann.pem", key=station / "ann.key")
-            with pytest.raises(NotPermittedError, match=rf"certificate or this station's is refused: .*({why})"):
+            with pytest.raises(NotPermittedError, match=rf"its certificate or this station's is refused: .*({why})"):
                 async with TruckClient(endpoint=endpoint, tls=files, timeout=0.5, source="ann"):
                     pass
     files = ClientTls(ca=ours / "ca.pem", certificate=ours / "ann.pem", key=ours / "ann.key")
