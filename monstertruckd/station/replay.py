@@ -43,6 +43,10 @@ class RecordedLog(Iterable[Any], Protocol):
     def config(self) -> dict[str, Any]:
         """The configuration it was recorded with."""
 
+    @property
+    def fault(self) -> str | None:
+        """What an iteration to the end found wrong, to follow the log's name; None for a sound log."""
+
 
 LogOpener = Callable[[Path], RecordedLog]
 
@@ -104,6 +108,7 @@ class ReplayFeed:
         self._tracks = {topic.name: RecordedTopic() for topic in (*(row.topic for row in shown), *ways)}
         reader = open_log(file)
         self._begin, self._end = self._fill(reader, file)
+        self._fault = reader.fault
         pose = topics.POSE if self._tracks[topics.POSE.name].times else topics.ODOMETRY
         self._shown = [*((row.topic.name, row) for row in SHOWN), (pose.name, POSE)]
         self._facts = _facts(reader)
@@ -234,6 +239,7 @@ class ReplayFeed:
             length=round((self._end - self._begin) / SECOND, 2),
             playing=self._playing,
             rate=self._rate,
+            fault=self._fault,
         )
 
     def _send_state(self) -> None:

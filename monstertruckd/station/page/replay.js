@@ -46,6 +46,8 @@ export class ReplayBar {
     if (!this.held) bar.value = state.at;
     bar.setAttribute("aria-valuetext", words("replay.time", { at: number(state.at, 0), length: number(state.length, 0) }));
     byId("replay-time").textContent = words("replay.time", { at: number(state.at, 1), length: number(state.length, 0) });
+    byId("replay-fault").hidden = !state.fault;
+    byId("replay-fault").textContent = words("replay.fault", { fault: state.fault ?? "" });
     byId("replay-play").textContent = words(state.playing ? "replay.pause" : "replay.play");
   }
 }

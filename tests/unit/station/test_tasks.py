@@ -242,6 +242,8 @@ class Recorded:
 class RecordedDrive:
     """A log of 10 s: a pose each 0.1 s, a map at 0 and 5 s, a tile at 7 s, an event each second."""
 
+    fault = None
+
     def __init__(self, _=None):
         pass
 
@@ -310,6 +312,14 @@ async def test_a_recording_is_played_paused_and_gone_through_by_its_time_bar():
     state = of(back, "replay")[-1]
     assert (state["at"], state["playing"], state["rate"]) == (1.0, False, 5.0)
     feed.detach(viewer)
+
+
+async def test_a_cut_recording_is_called_so(monkeypatch):
+    for fault in (None, "ends or is damaged after byte 87 of 3000"):
+        monkeypatch.setattr(RecordedDrive, "fault", fault)
+        feed, viewer = ReplayFeed("truck run-1", Path("run-1.mcap"), RecordedDrive, WallClock()), Viewer()
+        feed.attach(viewer)
+        assert of(await shown(viewer), "replay")[0]["fault"] == fault
 
 
 async def test_a_damaged_event_of_a_recording_is_left_out():
