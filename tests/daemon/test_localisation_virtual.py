@@ -57,6 +57,23 @@ def test_before_it_has_found_itself_it_takes_no_goal_and_no_mission():
     travel(story, slam={"mode": "localisation", "map": CONFIGS / "worlds" / "rooms.yaml"})
 
 
+def test_a_goal_ends_when_the_truck_is_carried_to_where_it_does_not_know_its_place():
+    """It drove on by odometry, along a route that was somewhere else."""
+
+    async def story(trip: Trip) -> None:
+        await trip.arm()
+        await trip.operator.behave(BehaviourOrder.START, "move", {"length": 1.1, "speed": 0.2})
+        await trip.clock.sleep(7.5)
+        await trip.goal(6.5, 3.9, 0.0)
+        await trip.arm()
+        await trip.clock.sleep(0.5)
+        trip.rig.world.carry(trip.clock.now(), (6.85, 5.6, 1.57))
+        end = await trip.end(20.0)
+        assert (end.outcome, end.text) == (Reason.POSE_LOST, "its place on the saved map is not known (searching)")
+
+    travel(story, slam={"mode": "localisation", "map": CONFIGS / "worlds" / "rooms.yaml"})
+
+
 def test_the_truck_is_outside_of_another_places_map():
     drive = localised_in("rooms.yaml")
     assert not PLACED & {message.standing for message in drive.health}

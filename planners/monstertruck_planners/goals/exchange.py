@@ -157,16 +157,22 @@ def level(scan: LaserScan, config: PlannerConfig) -> bool:
     return scan.tilt is None or scan.tilt <= config.max_tilt
 
 
+def placeless(slam: SlamHealth | None) -> str:
+    """Why the pose in map means nothing, by the newest state of the mapping; empty if it does, or there is none."""
+    if slam is None or slam.standing not in PLACELESS:
+        return ""
+    return f"its place on the saved map is not known ({slam.standing})"
+
+
 def require_place(slam: SlamHealth | None) -> None:
     """Whether the pose in map means something, by the newest state of the mapping; None = there is none.
 
     Raises:
         RequestRefusedError: it does not: the robot has not found its place on its saved map.
     """
-    if slam is not None and slam.standing in PLACELESS:
-        text = f"its place on the saved map is not known ({slam.standing})"
-        text += ": `monstertruckd drive` it a metre or two there, by which it finds itself"
-        raise RequestRefusedError(Reason.POSE_LOST, text)
+    if why := placeless(slam):
+        hint = "`monstertruckd drive` it a metre or two there, by which it finds itself"
+        raise RequestRefusedError(Reason.POSE_LOST, f"{why}: {hint}")
 
 
 def explained_within(config: PlannerConfig, deviation: float) -> float:

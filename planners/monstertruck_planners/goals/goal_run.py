@@ -102,6 +102,8 @@ class Observations:
     """The newest scan shows something on the way ahead."""
     estopped: bool = False
     """The emergency stop is latched."""
+    placeless: str = ""
+    """Why the pose means nothing."""
     held: str = ""
     """What keeps the truck from being armed, in words."""
 
@@ -194,6 +196,8 @@ def tick(run: GoalRun, observed: Observations, config: PlannerConfig) -> Step:
         return _end(run, Reason.ESTOPPED, Reason.ESTOPPED.text)
     if phase is GoalPhase.PAUSED:
         return run, ()
+    if observed.placeless:
+        return _end(run, Reason.POSE_LOST, observed.placeless)
     if observed.armed or phase is GoalPhase.PLANNING:
         run = replace(run, elapsed=run.elapsed + passed, unarmed=0.0)
     else:
