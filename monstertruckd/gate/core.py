@@ -19,7 +19,7 @@ from monstertruck_kinematics.elementary import KinematicsError
 from monstertruck_planners.collision import Footprint, ScanPoints
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.ports import Value
-from monstertruck_runtime.requests import OPERATORS
+from monstertruck_runtime.requests import OPERATORS, late_text
 from monstertruck_runtime.stop_text import causes_text
 from monstertruck_schemas.cmd import DriveAction
 from monstertruck_schemas.event import Cause, Event, Severity, Stop
@@ -320,13 +320,18 @@ class Gate:
 
     def _refuse(self, now: int, reason: Reason, request: DriveRequest | ControlRequest, text: str = "") -> Reason:
         what = request.order.value if isinstance(request, ControlRequest) else "drive"
+        text = text or self._worded(reason)
         values = {"role": request.role.value, "request": what}
         lasting = reason is Reason.LOWER_PRIORITY  # a tracker goes on asking while somebody drives by hand
         self._events.emit(now, reason, Severity.WARNING, text, values, source=request.source, lasting=lasting)
         return reason
 
     def _refuse_order(self, now: int, reason: Reason, request: ControlRequest, text: str = "") -> Decision:
-        return Decision(self._refuse(now, reason, request, text), text or reason.text)
+        return Decision(self._refuse(now, reason, request, text), text or self._worded(reason))
+
+    def _worded(self, reason: Reason) -> str:
+        """A refusal in words: of a request that came late, that it did, not that its lease had passed."""
+        return late_text(self._config.max_request_age) if reason is Reason.LEASE_EXPIRED else reason.text
 
     def _refuse_blocked(self, now: int, blocks: tuple[Reason, ...], request: ControlRequest) -> Decision:
         causes = self._outages.explain(self._causes.causes(blocks, now, self._known))

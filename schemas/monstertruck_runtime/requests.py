@@ -207,6 +207,11 @@ def freshness(request: Request, now: int, limit: float) -> Reason:
     return Reason.OK if known is not None and 0 <= now - known <= limit * SECOND else Reason.LEASE_EXPIRED
 
 
+def late_text(limit: float) -> str:
+    """Why ``freshness`` refuses a request."""
+    return f"the request came more than {limit:g} s after its sender had heard the gate: the link or a computer is slow"
+
+
 def planner_request(seq: int, gate: GateState, now: int, source: str, lease: float, **motion: Any) -> DriveRequest:
     """A planner's drive request to the gate that ``gate`` is the newest state of.
 
@@ -270,6 +275,8 @@ def examine(request: Request, gate: GateState | None, sequences: Sequences, now:
         reason = freshness(request, now, max_age)
     if reason is Reason.OK and request.role not in OPERATORS:
         reason = Reason.BAD_ROLE
+    if reason is Reason.LEASE_EXPIRED and max_age is not None:
+        raise RequestRefusedError(reason, late_text(max_age))
     if reason is not Reason.OK:
         raise RequestRefusedError(reason)
 

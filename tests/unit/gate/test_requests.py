@@ -149,7 +149,12 @@ def test_a_request_that_was_long_on_its_way_moves_nothing():
     assert rig.out.mode is GateMode.DISARMED
     rig.driver = None
     old = {"gate_stamp": rig.now - 6 * SECOND // 10}
+    rig.tick(100)
+    old = {"gate_stamp": rig.now - 6 * SECOND // 10}
     assert rig.order(Order.ARM, **old) is Reason.LEASE_EXPIRED
+    rig.tick()
+    late = "the request came more than 0.5 s after its sender had heard the gate: the link or a computer is slow"
+    assert rig.reported(Reason.LEASE_EXPIRED)[-1].text == late, "not that no request was fresh"
     assert rig.order(Order.ESTOP, gate_stamp=None) is Reason.OK
     assert rig.order(Order.RESET, **old) is Reason.LEASE_EXPIRED
     assert rig.order(Order.RESET, gate_stamp=rig.now - 4 * SECOND // 10) is Reason.OK

@@ -208,7 +208,9 @@ def test_the_rules_of_requests_hold():
     async def scenario(bench):
         assert refused(bench, nonce="old").refusal is Reason.BAD_NONCE
         assert refused(bench, role=Role.TRACKER).refusal is Reason.BAD_ROLE
-        assert refused(bench, gate_stamp=0).refusal is Reason.LEASE_EXPIRED
+        late = refused(bench, gate_stamp=0)
+        assert late.refusal is Reason.LEASE_EXPIRED
+        assert str(late).startswith("the request came more than 0.5 s after its sender had heard the gate")
         assert refused(bench, seq=1).refusal is Reason.BAD_SEQUENCE
 
     on_bench(scenario)
