@@ -236,7 +236,7 @@ def export_command(
     with _reading("export", log) as done:
         files = export(reader, output, selection, done)
     if not files:
-        remark(f"{log}: no message of these topics and times")
+        remark(f"{log}: {selection.nothing}")
     if json_output:
         print_json(files)
     else:

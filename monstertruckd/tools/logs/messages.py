@@ -63,6 +63,12 @@ class Selection:
         if not self.start < self.end:
             raise InputError(f"from {self.start:g} s to {self.end:g} s: expected an end after the start")
 
+    @property
+    def nothing(self) -> str:
+        """What to say of a log of which it selects no message."""
+        every = not self.topics and self.start == 0.0 and self.end == math.inf
+        return "no message of a topic of this version" if every else "no message of these topics and times"
+
     def of(self, reader: LogReader, progress: Progress | None = None) -> Iterator[tuple[LogMessage, Message]]:
         """The selected messages with their decoded forms; those of other schemas are skipped.
 

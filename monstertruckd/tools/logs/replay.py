@@ -70,6 +70,8 @@ def replay_log(
                 await clock.sleep_until(entry.log_time)
                 bus.hand_over(topic, message)
                 count += 1
+            if not count:
+                raise InputError(f"{reader.path}: {selection.nothing}")
             return count
         finally:
             for job in (waiting, task):

@@ -8,6 +8,7 @@ import os
 from pathlib import Path
 
 import pytest
+from mcap.writer import Writer as McapWriter
 from typer.testing import CliRunner
 
 from monstertruck_runtime.errors import NotFoundError
@@ -15,6 +16,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruckd.tools.cli.main import app
 from monstertruckd.tools.logs import export
 from monstertruckd.tools.logs.messages import Selection
+from tests.bus_kit import free_endpoint
 
 GOLDEN = max((Path(__file__).parents[3] / "data" / "golden").glob("*/run.mcap"))
 
@@ -252,3 +254,19 @@ def test_an_empty_export_is_reported(tmp_path):
     done = run("export", GOLDEN, tmp_path / "out", "--start", 5000)
     assert done.exit_code == 0
     assert "no message of these topics and times" in done.output
+
+
+def test_a_log_of_another_program_is_called_so(tmp_path):
+    """Its times and topics are not to blame, and nothing was replayed."""
+    log = tmp_path / "other.mcap"
+    with log.open("wb") as file:
+        writer = McapWriter(file)
+        writer.start()
+        channel = writer.register_channel("/odom", "json", writer.register_schema("nav.Odom", "jsonschema", b"{}"))
+        for i in range(3):
+            writer.add_message(channel, 10**9 + i, b"{}", 10**9 + i)
+        writer.finish()
+    said = "other.mcap: no message of a topic of this version"
+    assert said in run("export", log, tmp_path / "out").output
+    done = CliRunner().invoke(app, ["replay", str(log), "--endpoint", free_endpoint()])
+    assert (done.exit_code, said in done.output) == (Reason.BAD_INPUT.exit_code, True)
