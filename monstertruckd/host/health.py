@@ -95,11 +95,11 @@ class HealthBoard:
         elif self._may_be_its_hub(row):
             self._unplugged.add(row.name)
         elif row.state in (ServiceState.BACKOFF, ServiceState.FAILED):
-            given_up, told = row.state is ServiceState.FAILED, self._down.setdefault(row.name, set())
-            if given_up or row.reason not in told:
+            given_up, reported = row.state is ServiceState.FAILED, self._down.setdefault(row.name, set())
+            if given_up or row.reason not in reported:
                 severity = Severity.ERROR if given_up else Severity.WARNING
                 self._events(row.reason, severity, row.name, row.detail, restarts=row.restarts)
-            told.add(row.reason)
+            reported.add(row.reason)
         self._publish()
 
     def _may_be_its_hub(self, row: ServiceHealth) -> bool:

@@ -173,7 +173,7 @@ class _Session:
         self._report = report
         self.starts = 0
         self.ready_at: int | None = None
-        self._told: set[Reason] = set()
+        self._warned: set[Reason] = set()
         """Causes of the present outage that were logged as warnings."""
 
     def start(self) -> None:
@@ -184,14 +184,14 @@ class _Session:
     def ready(self) -> None:
         if self.ready_at is None:
             self.ready_at = self._clock.now()
-            self._told.clear()
+            self._warned.clear()
             self.report_state(ServiceState.READY)
             log.info("%s: ready", self._name)
 
     def log_loss(self, reason: Reason, detail: str) -> None:
         """The first loss of an outage is a warning, and one of another cause; repetitions are not."""
-        log.log(logging.DEBUG if reason in self._told else logging.WARNING, "%s: %s", self._name, detail)
-        self._told.add(reason)
+        log.log(logging.DEBUG if reason in self._warned else logging.WARNING, "%s: %s", self._name, detail)
+        self._warned.add(reason)
 
     def report_state(self, state: ServiceState, reason: Reason = Reason.OK, detail: str = "") -> None:
         self._report(

@@ -224,7 +224,7 @@ def test_a_goal_ends_the_path_that_is_followed_whether_it_is_refused_or_not(tmp_
 
 @pytest.mark.parametrize("closed", [False, True])
 def test_of_a_path_whose_command_has_ended_nothing_is_driven_by_whoever_arms_later(closed: bool):
-    """Interrupted before its end it was gone on with, and a lap that was done was driven once more."""
+    """Interrupted before its end it was resumed, and a lap that was done was driven once more."""
     round_trip = [(1.0, 3.95), (1.3, 3.95)] if closed else [(1.0, 3.95), (4.0, 3.95)]
     poses = np.array([(*place, 0.0) for place in round_trip]).ravel()
     directions = np.array([-1.0, 1.0] if closed else [1.0, 1.0])

@@ -144,7 +144,7 @@ class ScreenState:
     def old(self, name: str) -> str:
         """How old the newest message of a field is, in words; empty while it is one of now.
 
-        By the clock of the robot, as its gate told it last: what a restarted computer said before is not of now either.
+        By the clock of the robot, as its gate said last: what a restarted computer said before is not of now either.
         """
         message, limit = getattr(self, name), SHOWN[name].stale_after
         if message is None or self.gate is None or limit is None:
