@@ -8,6 +8,7 @@ from typing import Any, Final
 from monstertruck_runtime.client import TruckClient, Watched
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_schemas import topics
+from monstertruck_schemas.base import Message
 from monstertruck_schemas.sensor import Battery
 from monstertruck_schemas.state import Odometry
 from monstertruckd.station import frames
@@ -17,7 +18,7 @@ from monstertruckd.station.viewer import Viewer
 PERIOD: Final = 0.5
 """Seconds between two checks of all robots."""
 OLD: Final = 2.0
-"""Seconds after which a pose that did not change in time is shown as old."""
+"""Seconds after which a pose that did not change in time is shown as old, and a battery as unknown."""
 
 
 class RobotSnapshot:
@@ -34,21 +35,29 @@ class RobotSnapshot:
         self._stack = ExitStack()
         self._pose: Watched[Odometry] = self._stack.enter_context(client.watch(topics.POSE))
         self._battery: Watched[Battery] = self._stack.enter_context(client.watch(topics.BATTERY))
-        self._stamp = 0
-        self._changed = clock.now()
+        self._changes: dict[str, tuple[int | None, int]] = {}
+        """Newest stamp of each topic, and when it came, ns of the station's clock."""
 
     def row(self) -> dict[str, Any]:
         """What the page shows of it; keys are there whatever the robot says."""
         now, pose, battery = self._clock.now(), self._pose.latest, self._battery.latest
-        if pose is not None and pose.stamp != self._stamp:
-            self._stamp, self._changed = pose.stamp, now
+        old = self._is_old(topics.POSE.name, pose, now)
+        if self._is_old(topics.BATTERY.name, battery, now):
+            battery = None
         return {
             "pose": None if pose is None else [round(v, 3) for v in (pose.pose.x, pose.pose.y, pose.pose.yaw)],
             "speed": None if pose is None else round(pose.twist.vx, 3),
-            "old": (now - self._changed) / SECOND > OLD,
+            "old": old,
             "voltage": None if battery is None else battery.voltage,
             "level": None if battery is None else battery.level.value,
         }
+
+    def _is_old(self, name: str, message: Message | None, now: int) -> bool:
+        """Whether the newest message of a topic has been that for longer than ``OLD``."""
+        stamp = None if message is None else message.stamp
+        before, since = self._changes.get(name, (None, now))
+        self._changes[name] = stamp, now if stamp != before else since
+        return (now - self._changes[name][1]) / SECOND > OLD
 
     def close(self) -> None:
         """End the subscriptions; the session may be gone already."""

@@ -2,20 +2,23 @@
 
 import asyncio
 import json
+from contextlib import contextmanager
 from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from monstertruck_runtime.client import TruckClient
-from monstertruck_runtime.clock import WallClock
+from monstertruck_runtime.clock import VirtualClock, WallClock, run_virtual
 from monstertruck_runtime.errors import NotPermittedError
 from monstertruck_schemas.roles import AccessRole
+from monstertruck_schemas.sensor import Battery, BatteryLevel
 from monstertruck_schemas.topics import GATE, POSE, Writer
 from monstertruckd.station import fleet
 from monstertruckd.station.address import RobotAddress
 from monstertruckd.station.feed import RobotFeed
-from monstertruckd.station.fleet import FleetBoard
+from monstertruckd.station.fleet import FleetBoard, RobotSnapshot
 from monstertruckd.station.viewer import Viewer
 from tests.bus_kit import gate_state, odometry, running_robot
 
@@ -81,6 +84,30 @@ async def test_every_robot_has_a_row_and_one_that_is_gone_keeps_its_last_place(m
             for job in jobs:
                 job.cancel()
             await asyncio.gather(*jobs, return_exceptions=True)
+
+
+def test_a_battery_of_which_nothing_is_heard_any_longer_is_unknown():
+    charged = Battery(stamp=5, received=5, seq=0, voltage=24.8, raw_voltage=24.8, cells=6, level=BatteryLevel.NORMAL)
+    battery = SimpleNamespace(latest=charged)
+
+    class Client:
+        @contextmanager
+        def watch(self, topic):
+            yield SimpleNamespace(latest=None) if topic is POSE else battery
+
+    async def main(clock: VirtualClock) -> None:
+        snapshot = RobotSnapshot(Client(), clock)  # type: ignore[arg-type]
+        assert snapshot.row()["voltage"] == 24.8
+        await clock.sleep(1.0)
+        battery.latest = charged.model_copy(update={"stamp": 6})
+        assert snapshot.row()["voltage"] == 24.8
+        await clock.sleep(1.9)
+        assert snapshot.row()["voltage"] == 24.8
+        await clock.sleep(0.2)
+        row = snapshot.row()
+        assert (row["voltage"], row["level"], row["old"]) == (None, None, True)
+
+    run_virtual(main)
 
 
 async def test_no_session_that_closes_is_offered(monkeypatch: pytest.MonkeyPatch):
