@@ -143,8 +143,10 @@ def fetch_command(
     from monstertruck_runtime.recordings import fetch_recording
 
     if name is None:
-        rows = with_robot(lambda client, _: client.call("recordings"), robot, endpoint)["recordings"]
-        _show_recordings(rows, json_output=json_output)
+        answer = with_robot(lambda client, _: client.call("recordings"), robot, endpoint)
+        _show_recordings(answer["recordings"], json_output=json_output)
+        if left_out := answer.get("left_out"):
+            remark(f"{left_out} older ones are not listed")
         return
     to = output or Path(Path(name).name)
     with progress(f"fetching {name}", 1.0) as shown:

@@ -29,6 +29,7 @@ class RobotWithRecordings:
     """Client of a robot that has one recording."""
 
     DATA = bytes(range(256)) * 3
+    LEFT_OUT = 0
 
     def __init__(self, *_, **__):
         pass
@@ -42,7 +43,7 @@ class RobotWithRecordings:
     async def call(self, name, payload=None):
         if name == "recordings":
             row = {"name": "run-000001-000.mcap", "bytes": 768, "modified": 1.8e9, "kind": "run", "open": True}
-            return {"recordings": [row], "left_out": 0}
+            return {"recordings": [row], "left_out": self.LEFT_OUT}
         if payload["name"] != "run-000001-000.mcap":
             raise NotFoundError("recording: there is none of this name")
         data = self.DATA[payload["offset"] : payload["offset"] + 500]
@@ -53,6 +54,9 @@ def test_recordings_of_a_robot_are_listed_and_fetched_and_a_file_of_something_el
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("monstertruck_runtime.client.TruckClient", RobotWithRecordings)
     assert "2027-01-15 08:00:00  0.00  run, being written  run-000001-000.mcap" in run("fetch").output
+    assert "not listed" not in run("fetch").output
+    monkeypatch.setattr(RobotWithRecordings, "LEFT_OUT", 12)
+    assert "12 older ones are not listed" in run("fetch").stderr
     file = tmp_path / "run-000001-000.mcap"
     file.write_bytes(RobotWithRecordings.DATA[:100])
     assert json.loads(run("fetch", file.name, "--json").stdout)["bytes"] == 768
