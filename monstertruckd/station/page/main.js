@@ -37,13 +37,28 @@ function outcome(what, answer) {
   return answer.ok;
 }
 
+/** End this page's own driving; whether planners may be kept out, as by that. */
+async function stopDriving() {
+  const mine = () => link.newest.gate?.holder === panels.source;
+  const held = mine() || link.newest.gate?.mode !== "driving";
+  drive.letGo();
+  for (let i = 0; i < 20 && mine(); i++) await new Promise((done) => setTimeout(done, 100));
+  return held;
+}
+
+/** Arm, and let planners drive; one that drives already needs no order. */
+async function letPlannersDrive() {
+  const answer = await link.ask({ do: "order", order: "arm" });
+  if (link.newest.gate?.mode !== "driving") outcome("arm", answer);
+}
+
 await loadWords();
 const drive = new Drive(link);
 const map = new MapView(byId("map"), link, aimed);
 const panels = new Panels(link);
 const fleet = new FleetView(link, map, chosen);
 new ReplayBar(link, chosen); // first: the others look at what it says of the page
-new Work(link, outcome, chosen);
+new Work(link, { outcome, order, stopDriving, letPlannersDrive, watch: chosen });
 
 link.on("robots", ({ names }) => {
   const select = byId("robots");
@@ -212,12 +227,12 @@ link.on("robot", showGoal);
 
 byId("goal-go").onclick = async () => {
   const goal = map.pending;
-  const armed = link.newest.gate?.mode !== "disarmed";
+  const held = await stopDriving();
   if (!outcome("map.goal", await link.ask({ do: "goal", goal, via: map.via }))) return;
   map.pending = null;
   map.via = [];
   showGoal();
-  if (!armed) await order("arm");
+  if (held) await letPlannersDrive();
 };
 byId("goal-via").onclick = () => {
   map.via = [...map.via, map.pending.slice(0, 2)];
@@ -226,10 +241,11 @@ byId("goal-via").onclick = () => {
   aim(true);
 };
 byId("path-go").onclick = async () => {
+  const held = await stopDriving();
   if (!outcome("map.draw", await link.ask({ do: "track", points: map.drawn }))) return;
   map.take("drawn", null);
   showGoal();
-  if (link.newest.gate?.mode === "disarmed") await order("arm");
+  if (held) await letPlannersDrive();
 };
 byId("goal-drop").onclick = () => {
   map.drawn = null;

@@ -11,15 +11,13 @@ function button(text, press, look = "") {
 }
 
 export class Work {
-  /** outcome: shows an answer; watch: called with the name of a recording that is to be shown. */
-  constructor(link, outcome, watch) {
-    this.link = link;
-    this.watch = watch;
+  /** page: outcome shows an answer; order, stopDriving, letPlannersDrive; watch is called with the name of a recording that is to be shown. */
+  constructor(link, page) {
+    Object.assign(this, { link, ...page });
     link.on("fetching", ({ name, share }) => {
       const bar = byId("recordings").querySelector(`[data-name="${name}"] progress`);
       if (bar) bar.value = share;
     });
-    this.outcome = outcome;
     for (const kind of ["facts", "robot", "explore", "mission", "behaviour", "hello"]) link.on(kind, () => this.showTasks());
     link.on("robot", () => this.clear());
     link.on("event", ({ reason: why }) => {
@@ -29,7 +27,7 @@ export class Work {
     byId("tab-settings").addEventListener("click", () => this.loadSettings());
     byId("tab-recordings").addEventListener("click", () => this.loadRecordings());
     byId("recordings-again").onclick = () => this.loadRecordings();
-    byId("explore-start").onclick = () => this.ask("task.explore", { do: "explore", order: "start" });
+    byId("explore-start").onclick = () => this.begin("task.explore", { do: "explore", order: "start" });
     byId("explore-stop").onclick = () => this.ask("task.explore", { do: "explore", order: "stop" });
     byId("mission-start").onclick = () => byId("mission-file").click();
     byId("mission-file").onchange = () => this.startMission();
@@ -58,6 +56,21 @@ export class Work {
 
   // Tasks
 
+  /** Start a task and let planners drive. A robot is armed only when nothing else is in the way, and held until the task has begun, for it may have a path of its own. */
+  async begin(what, command) {
+    const held = await this.stopDriving();
+    let answer = await this.link.ask(command);
+    const arms = answer.reason === "disarmed";
+    if (arms) {
+      if (!(await this.order("arm", { hold: true }))) return answer;
+      answer = await this.link.ask(command);
+    }
+    const begun = this.outcome(what, answer);
+    if (begun && held) this.letPlannersDrive();
+    else if (!begun && arms) this.link.ask({ do: "order", order: "disarm" });
+    return answer;
+  }
+
   showTasks() {
     const { facts, explore, mission, behaviour } = this.link.newest;
     const observer = this.link.newest.hello?.role === "observer";
@@ -83,7 +96,8 @@ export class Work {
       byId("behaviours").replaceChildren(...(observer ? [] : names.map((name) => {
         const runs = behaviour?.running && behaviour.behaviour === name;
         return button(words(runs ? "task.behaviour.stop" : "task.behaviour.start", { name: title(name) }),
-          () => this.ask("task.behaviour", { do: "behave", order: runs ? "stop" : "start", behaviour: name }), runs ? "go" : "");
+          () => (runs ? this.ask("task.behaviour", { do: "behave", order: "stop", behaviour: name })
+            : this.begin("task.behaviour", { do: "behave", order: "start", behaviour: name })), runs ? "go" : "");
       })));
     }
     text("behaviour-state", behaviour?.running ? words("task.behaviour.state", { name: title(behaviour.behaviour), phase: behaviour.phase, seconds: number(behaviour.elapsed, 0) })
@@ -94,11 +108,11 @@ export class Work {
   async startMission() {
     const [file] = byId("mission-file").files;
     byId("mission-file").value = "";
-    if (file) this.ask("task.mission", { do: "mission", order: "start", text: await file.text() });
+    if (file) this.begin("task.mission", { do: "mission", order: "start", text: await file.text() });
   }
 
   async resumeMission(more = {}) {
-    const answer = await this.ask("task.mission", { do: "mission", order: "resume", ...more });
+    const answer = await this.begin("task.mission", { do: "mission", order: "resume", ...more });
     // The robot is not where it was interrupted; one that does not know its place on a saved map has to find it.
     const placeless = ["searching", "outside"].includes(this.link.newest.slam?.standing);
     this.elsewhere = answer.reason === "pose_lost" && !placeless;

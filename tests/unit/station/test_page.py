@@ -208,6 +208,37 @@ async def a_mission_of_a_robot_that_was_moved_goes_on_once_that_is_said(page: Pa
     assert not await page.is_visible("#mission-resume")
 
 
+async def a_task_arms_the_robot_and_lets_planners_drive_once_it_has_begun(page: Page) -> None:
+    await say(page, FACTS | {"explores": True})
+    await page.click("#tab-tasks")
+    await page.evaluate("void (window.sent = [])")
+
+    async def asked(**answer: Any) -> dict[str, Any]:
+        pick = "window.sent.find((each) => each.id !== undefined)"
+        await page.wait_for_function(pick)
+        message = await page.evaluate(f"{{ const found = {pick}; window.sent = []; found }}")
+        await say(page, {"kind": "answer", "id": message.pop("id"), **answer})
+        return message
+
+    begin, hold = {"do": "explore", "order": "start"}, {"do": "order", "order": "arm", "hold": True}
+    await page.click("#explore-start")
+    assert await asked(ok=False, reason="disarmed") == begin
+    assert await asked(ok=True) == hold
+    assert await asked(ok=True) == begin
+    assert await asked(ok=True) == {"do": "order", "order": "arm"}
+    await page.click("#explore-start")
+    assert await asked(ok=False, reason="disarmed") == begin
+    assert await asked(ok=True) == hold
+    assert await asked(ok=False, reason="no_map", text="no map yet") == begin
+    assert await asked(ok=True) == {"do": "order", "order": "disarm"}
+    assert "no map yet" in await page.inner_text("#refusal")
+    await say(page, {"kind": "gate", "m": {"mode": "driving", "holder": "track", "reasons": [], "waiting": []}})
+    await page.click("#explore-start")
+    assert await asked(ok=True) == begin
+    await asyncio.sleep(0.1)
+    assert not await page.evaluate("window.sent.some((each) => each.id !== undefined)"), "armed by somebody else"
+
+
 async def test_the_page_drives_as_the_hand_does_and_shows_what_is_true(tmp_path: Path):
     """All in one browser, for it takes seconds to start."""
     async with serving() as (station, _), chromium(tmp_path) as browser:
@@ -228,4 +259,5 @@ async def test_the_page_drives_as_the_hand_does_and_shows_what_is_true(tmp_path:
         await what_a_sensor_said_long_ago_is_not_shown_as_of_now(page)
         await a_stop_is_shown_with_its_chain_of_causes(page)
         await a_mission_of_a_robot_that_was_moved_goes_on_once_that_is_said(page)
+        await a_task_arms_the_robot_and_lets_planners_drive_once_it_has_begun(page)
         assert errors == []
