@@ -14,9 +14,11 @@ from monstertruck_schemas.topics import GATE, HEALTH
 
 T = TypeVar("T")
 
+GONE: Final = 2.0
+"""Seconds without the state of the gate, which comes ten times a second, after which a client that drives gives up."""
 LOST: Final = 60.0
-"""Seconds without the state of the gate, which comes ten times a second, after which waiting ends: links that are lost
-for shorter come back, and the robot drives on by itself meanwhile."""
+"""Seconds without it after which a client that waits gives up: links that are lost for shorter come back, and the robot
+drives on by itself meanwhile."""
 
 
 class Subscriber(Protocol):

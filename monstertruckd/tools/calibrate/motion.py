@@ -11,6 +11,7 @@ from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError, TruckError
 from monstertruck_runtime.mailbox import Mailbox, fifo
+from monstertruck_runtime.presence import GONE
 from monstertruck_schemas import topics
 from monstertruck_schemas.cmd import DriveCommand, SteeringCommand
 from monstertruck_schemas.reasons import Reason, in_words
@@ -38,8 +39,6 @@ AT_REST: Final = 0.5
 """Seconds of an unchanged drive position that count as rest."""
 SETTLE: Final = 5.0
 """Seconds in which it must come to rest."""
-GONE: Final = 2.0
-"""Seconds without the gate's state, which comes ten times a second, after which the robot is not waited for."""
 DEPTH: Final = 4096
 LATE: Final = (
     "requests came too late: end what else keeps this computer or the link to the robot busy, or run the command on "

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
 RETRY = 2.0
 """Seconds after which a robot that is not there is looked for again."""
-GONE = 2.0
-"""Seconds without its gate's state, which comes ten times a second, after which a robot is looked for again."""
 HEARD = 100
 """Newest messages of a robot by which its clock is known."""
 APART = 200_000_000
@@ -135,6 +133,7 @@ class RobotLink:
         """Keep the link until cancelled."""
         from monstertruck_runtime.client import TruckClient
         from monstertruck_runtime.mailbox import latest
+        from monstertruck_runtime.presence import GONE
         from monstertruck_schemas.topics import GATE
 
         while True:
@@ -145,18 +144,18 @@ class RobotLink:
                         try:
                             while (state := await gate.next_within(GONE)) is not None:
                                 self._ways.append(self._clock.now() - state.stamp)
-                                self._tell("gets its poses")
+                                self._report("gets its poses")
                         finally:
                             self._client = None
                             self._ways.clear()
-                    self._tell("is not there, or silent")
+                    self._report("is not there, or silent")
             except NotFoundError:
-                self._tell(f"no robot answers at {self._endpoint}")
+                self._report(f"no robot answers at {self._endpoint}")
             except TruckError as error:
-                self._tell(str(error))
+                self._report(str(error))
             await self._clock.sleep(RETRY)
 
-    def _tell(self, text: str) -> None:
+    def _report(self, text: str) -> None:
         if text != self._said:
             self._said = text
             self._say(f"robot {self._robot}: {text}")

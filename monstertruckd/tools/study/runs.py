@@ -7,6 +7,7 @@ from typing import Final, NamedTuple
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import InputError, NoAnswerError, RequestRefusedError
 from monstertruck_runtime.mailbox import latest
+from monstertruck_runtime.presence import GONE
 from monstertruck_runtime.requests import Operator
 from monstertruck_schemas import topics
 from monstertruckd.config.truck import TruckConfig
@@ -16,8 +17,6 @@ PERIOD: Final = 0.05
 LEASE: Final = 0.25
 PAUSE: Final = 0.6
 """Seconds of standstill at a reversal."""
-GONE: Final = 2.0
-"""Seconds without the gate's state, which comes ten times a second, after which the robot is not waited for."""
 SETTLING: Final = 2.0
 """Seconds at the beginning of a run that the analysis leaves out; they are driven besides."""
 

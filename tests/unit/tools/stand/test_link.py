@@ -11,9 +11,10 @@ from monstertruck_runtime import client
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.errors import NotPermittedError
 from monstertruck_runtime.mailbox import Delivery, Mailbox
+from monstertruck_runtime.presence import GONE
 from monstertruck_schemas.sensor import StandPose
 from monstertruck_schemas.state import GateState
-from monstertruckd.tools.cli.stand_session import GONE, RobotLink
+from monstertruckd.tools.cli.stand_session import RobotLink
 from monstertruckd.tools.stand.poses import RobotPose
 from tests.bus_kit import gate_state
 
