@@ -117,6 +117,7 @@ async def drive(client: TruckClient, clock: Clock, drives: "Drives", *, laps: bo
     while laps:
         lap = await drive_lap(client, clock)
         drives.stops += [reason.value for reason in lap.stops]
+        await clock.sleep(0.2)  # the tracker has to see that the truck was disarmed, or it does not begin again
     with client.subscribe(topics.GATE, latest()) as gate, client.subscribe(topics.STOP, latest()) as stop:
         while True:
             if gate.latest is not None and not gate.latest.mode.active:

@@ -22,6 +22,8 @@ from monstertruckd.daemon import Daemon
 
 M = TypeVar("M", bound=Message)
 
+BEGINS = 1.0
+"""Seconds in which the tracker, once the truck is armed, begins a path whose end it reported before."""
 INTERRUPTIONS = 20
 """Times in a lap that the truck is armed again after a stop; more are a fault, not a busy computer."""
 
@@ -121,7 +123,7 @@ async def drive_lap(operator: Operator, clock: Clock, *, timeout: float = 30.0, 
         operator.subscribe(topics.TRACKER, fifo(256)) as tracker,
     ):
         await _arm(operator, clock, timeout)
-        start = clock.now()
+        start, driven = clock.now(), False
         cross_track: list[float] = []
         stops: dict[int, Reason] = {}
         armed_again = 0
@@ -129,8 +131,9 @@ async def drive_lap(operator: Operator, clock: Clock, *, timeout: float = 30.0, 
             async with clock.deadline(limit):
                 while True:
                     report = await tracker.next()
-                    if report.received < start:
-                        continue
+                    driven |= report.outcome is Reason.DRIVING and report.received >= start
+                    if not driven and report.received < start + BEGINS * SECOND:
+                        continue  # of the path's end before
                     cross_track.append(report.cross_track)
                     stops |= {one.number: one.reason for one in stop.drain() if one.stamp >= start}
                     if report.outcome is not Reason.DRIVING and report.along > 0:
