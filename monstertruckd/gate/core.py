@@ -327,7 +327,8 @@ class Gate:
         return reason
 
     def _refuse_order(self, now: int, reason: Reason, request: ControlRequest, text: str = "") -> Decision:
-        return Decision(self._refuse(now, reason, request, text), text or self._worded(reason))
+        text = text or self._worded(reason)
+        return Decision(self._refuse(now, reason, request, text), text)
 
     def _worded(self, reason: Reason) -> str:
         """A refusal in words: of a request that came late, that it did, not that its lease had passed."""
@@ -345,7 +346,7 @@ class Gate:
                 return self._refuse_blocked(now, (Reason.DRIVE_STALE,), request)
             return self._refuse_order(now, Reason.NOT_ARMED_SPEED, request, f"the robot moves at {speed:.2f} m/s")
         if sources := self._sources.requesting_motion(now):
-            text = f"{', '.join(sources)} requests motion: expected a neutral stick"
+            text = f"motion is requested by {', '.join(sources)}: expected a neutral stick"
             return self._refuse_order(now, Reason.NOT_ARMED_SPEED, request, text)
         return None
 

@@ -283,7 +283,7 @@ def test_a_refused_reset_says_what_is_not_at_rest():
     assert rig.decide(Order.RESET) == Decision(Reason.NOT_ARMED_SPEED, "the robot moves at 0.10 m/s")
     rig.tick(20)
     rig.drive(speed=0.1, source="bob")
-    text = "bob requests motion: expected a neutral stick"
+    text = "motion is requested by bob: expected a neutral stick"
     assert rig.decide(Order.RESET, source="eve") == Decision(Reason.NOT_ARMED_SPEED, text)
     rig.drive(speed=0.0, source="bob")
     rig.silent = {"drive"}
