@@ -5,31 +5,66 @@ from pathlib import Path
 from typing import Any, Final
 
 from ruamel.yaml import YAML
-from ruamel.yaml.error import MarkedYAMLError, YAMLError
+from ruamel.yaml.composer import Composer, ComposerError, MaxDepthExceededError
+from ruamel.yaml.error import MarkedYAMLError
+from ruamel.yaml.events import AliasEvent
 
 from monstertruck_runtime.errors import InputError
-from monstertruck_runtime.small_files import require_file
+from monstertruck_runtime.outside import reading, text_of
 
 MOST_BYTES: Final = 1_000_000
 """Size of one file at most: they are written by hand, or give the origin of a map."""
+MOST_NODES: Final = 20_000
+"""Keys and values of one file at most, those behind aliases counted each time: read in a second."""
+DEEPEST: Final = 50
+"""Nesting of lists and mappings, at most."""
+_EXPECTED: Final = "YAML"
+
+
+class _BoundedComposer(Composer):
+    """Builds the nodes of one document, until they are too many."""
+
+    def __init__(self, loader: Any = None) -> None:
+        super().__init__(loader)
+        self._count = 0
+        self._sizes: dict[int, int] = {}
+        """Nodes in each complete node, by its id."""
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        """One node with all below it."""
+        alias, place = self.parser.check_event(AliasEvent), self.parser.peek_event().start_mark
+        before = self._count
+        self._count += 1
+        node = super().compose_node(parent, index)
+        if alias:
+            if id(node) not in self._sizes:
+                raise ComposerError(None, None, "an alias inside its own anchor", place)
+            self._count += self._sizes[id(node)]
+        else:
+            self._sizes[id(node)] = self._count - before
+        if self._count > MOST_NODES:
+            raise ComposerError(None, None, f"more than {MOST_NODES} keys and values", place)
+        return node
 
 
 def read_yaml(path: Path) -> Any:
     """Content of a file.
 
     Raises:
-        InputError: it cannot be read, or is not YAML.
+        InputError: it cannot be read, is not YAML, or is too long or nested too deeply.
     """
-    try:
-        require_file(path, MOST_BYTES)
-        return YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
-    except MarkedYAMLError as error:
-        line = error.problem_mark.line + 1 if error.problem_mark else 1
-        raise InputError(f"{path}:{line}: not valid YAML: {error.problem}") from error
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
-    except (ValueError, YAMLError, RecursionError) as error:
-        raise InputError(f"{path}: cannot be read as YAML: {error}") from error
+    text = text_of(path, _EXPECTED, MOST_BYTES)
+    yaml = YAML(typ="safe", pure=True)
+    yaml.max_depth = DEEPEST
+    yaml.Composer = _BoundedComposer
+    with reading(path, _EXPECTED):
+        try:
+            return yaml.load(text)
+        except MarkedYAMLError as error:
+            line = error.problem_mark.line + 1 if error.problem_mark else 1
+            too_deep = isinstance(error, MaxDepthExceededError)
+            problem = f"nested more than {DEEPEST} times" if too_deep else error.problem
+            raise InputError(f"{path}:{line}: not valid YAML: {problem}") from error
 
 
 def yaml_text(value: Any) -> str:

@@ -1,0 +1,188 @@
+"""The door for files from outside: maps, pictures, arrays, tables, logs, certificates, files of earlier runs.
+
+A reader opens its file with one of the functions here, or does its work in ``reading``. Whatever fails then, in any
+library, becomes one of our refusals, which names the file, what was expected and what was found instead. Sizes are
+bounded before anything is decompressed or held.
+"""
+
+import gzip
+import warnings
+import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from monstertruck_runtime.errors import InputError, TruckError
+from monstertruck_runtime.small_files import require_file
+from monstertruck_schemas.base import first_mistake
+
+if TYPE_CHECKING:
+    from PIL import Image
+
+MEGABYTE: Final = 1_000_000
+MOST_UNPACKED: Final = 128 * MEGABYTE
+"""Bytes that a compressed file, or a compressed part of one, may hold."""
+MOST_PIXELS: Final = 25 * MEGABYTE
+"""Pixels of a picture: 250 m x 250 m in cells of 5 cm."""
+FORMATS: Final = ("PNG", "PPM", "BMP", "JPEG", "TIFF", "GIF", "WEBP")
+"""Formats of pictures that are read; Pillow decodes others by starting programs."""
+LONGEST: Final = 200
+"""Characters of a library's message that a refusal repeats."""
+
+
+@contextmanager
+def reading(file: Path | str, expected: str, refusal: type[TruckError] = InputError) -> Iterator[None]:
+    """Turn whatever the body raises into a refusal of ``file``; our own errors pass.
+
+    Args:
+        file: path, or path and place in it, as the user is to see it.
+        expected: what the file should be, e.g. "a pose graph".
+        refusal: class of the refusal.
+    """
+    try:
+        yield
+    except TruckError:
+        raise
+    except OSError as error:
+        if error.errno is None:  # a library's, about the content
+            raise refusal(f"{file}: expected {expected}: {cause_of(error)}") from error
+        raise refusal(f"{file}: cannot be read: {error.strerror or error}") from error
+    except Exception as error:
+        raise refusal(f"{file}: expected {expected}: {cause_of(error)}") from error
+
+
+def cause_of(error: BaseException) -> str:
+    """Return one line about an error of a library."""
+    if isinstance(error, ValidationError):
+        return first_mistake(error)
+    if isinstance(error, MemoryError):
+        return "it needs more memory than there is"
+    if isinstance(error, RecursionError):
+        return "it is nested too deeply"
+    text = " ".join(str(error).split())[:LONGEST]
+    if text and isinstance(error, ValueError | OSError):
+        return text
+    return f"{type(error).__name__}: {text}" if text else type(error).__name__
+
+
+def contents(file: Path, expected: str, most: int, refusal: type[TruckError] = InputError) -> bytes:
+    """Read a whole file of at most ``most`` bytes.
+
+    Raises:
+        TruckError: ``refusal``: it cannot be read, is no regular file, or is longer.
+    """
+    with reading(file, expected, refusal):
+        require_file(file, most)
+        with file.open("rb") as stream:
+            return stream.read(most)
+
+
+def text_of(file: Path, expected: str, most: int, refusal: type[TruckError] = InputError) -> str:
+    """Read a whole text file of at most ``most`` bytes: UTF-8, with or without a byte order mark.
+
+    Raises:
+        TruckError: ``refusal``: as for ``contents``, or it is not UTF-8.
+    """
+    return text_from(contents(file, expected, most, refusal), file, expected, refusal)
+
+
+def text_from(data: bytes, file: Path, expected: str, refusal: type[TruckError] = InputError) -> str:
+    """Decode what was read from ``file``: UTF-8, with or without a byte order mark.
+
+    Raises:
+        TruckError: ``refusal``: it is not UTF-8; names the line.
+    """
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        raise refusal(f"{file}:{line}: expected {expected}: not UTF-8 text") from error
+
+
+def lines_of(file: Path, expected: str, most: int = MOST_UNPACKED) -> Iterator[str]:
+    """Yield the lines of a text file, unpacked if its name ends with ``.gz``.
+
+    Raises:
+        InputError: it cannot be read, is not UTF-8, is damaged, or holds more than ``most`` bytes.
+    """
+    with reading(file, expected):
+        require_file(file)
+        packed = file.suffix == ".gz"
+        left, number = most, 0
+        with gzip.open(file) if packed else file.open("rb") as stream:
+            while line := stream.readline(left + 1):
+                left, number = left - len(line), number + 1
+                if left < 0:
+                    text = f"more than {most / MEGABYTE:.0f} MB{' unpacked' if packed else ''}: expected at most that"
+                    raise InputError(f"{file}:{number}: {text}")
+                try:
+                    yield line.decode("utf-8-sig" if number == 1 else "utf-8")
+                except UnicodeDecodeError as error:
+                    raise InputError(f"{file}:{number}: expected {expected}: not UTF-8 text") from error
+
+
+def arrays(
+    file: Path, expected: str, most: int = MOST_UNPACKED, refusal: type[TruckError] = InputError
+) -> dict[str, NDArray[Any]]:
+    """Read all arrays of an npz file, by name.
+
+    Raises:
+        TruckError: ``refusal``: it cannot be read, is damaged, holds objects, or more than ``most`` bytes.
+    """
+    with reading(file, expected, refusal):
+        require_file(file)
+        with zipfile.ZipFile(file) as archive:
+            size = sum(entry.file_size for entry in archive.infolist())
+            if size > most:
+                raise refusal(f"{file}: {size} bytes unpacked: expected at most {most}")
+            found = {}
+            for entry in archive.infolist():
+                if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                    raise refusal(f"{file}: {entry.filename}: expected arrays as NumPy packs them")
+                with archive.open(entry) as stream:
+                    _require_array(stream, entry.file_size)
+                    stream.seek(0)
+                    found[entry.filename.removesuffix(".npy")] = np.lib.format.read_array(stream, allow_pickle=False)
+            return found
+
+
+def _require_array(stream: Any, size: int) -> None:
+    """Refuse the head of an array that does not fit into ``size`` bytes: NumPy would make room for it.
+
+    Raises:
+        ValueError: it is no array, of objects, or too large.
+    """
+    version = np.lib.format.read_magic(stream)
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, kind = read(stream)
+    count = int(np.prod(shape, dtype=object))
+    if min(shape, default=0) < 0 or count * kind.itemsize > size:
+        raise ValueError(f"an array of shape {shape} in {size} bytes")
+
+
+@contextmanager
+def picture(file: Path, expected: str = "a picture", most: int = MOST_PIXELS) -> Iterator["Image.Image"]:
+    """Open a picture of one of ``FORMATS``, whose pixels are decoded when they are wanted.
+
+    Raises:
+        InputError: it cannot be read, is of no known format, or has more than ``most`` pixels; in the body: whatever
+            decoding raises.
+    """
+    from PIL import Image  # noqa: PLC0415 - only for pictures
+
+    with reading(file, expected):
+        require_file(file)
+        try:
+            with warnings.catch_warnings(action="error", category=Image.DecompressionBombWarning):
+                image = Image.open(file, formats=FORMATS)
+        except (Image.DecompressionBombWarning, Image.DecompressionBombError) as error:
+            raise InputError(f"{file}: {error}: expected at most {most} pixels") from error
+        with image:
+            if image.width * image.height > most:
+                raise InputError(f"{file}: {image.width} x {image.height} pixels: expected at most {most}")
+            yield image
