@@ -5,40 +5,53 @@ The array's convention differs from the image's: row 0 is the lowest y, so cell 
 """
 
 import io
-from dataclasses import dataclass
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
+from PIL import Image, TiffImagePlugin, UnidentifiedImageError
 
 from monstertruck_runtime.errors import InputError
-from monstertruck_runtime.small_files import replace_file
+from monstertruck_runtime.small_files import replace_file, require_file
 from monstertruck_runtime.yaml_files import read_yaml, yaml_text
 
 FREE, OCCUPIED, UNKNOWN = 0, 100, -1
 """Cell values, as in an occupancy grid message."""
+OCCUPIED_FROM, FREE_TO = 65, 19
+"""Thresholds of map_server (percent): a cell is occupied from the first on, free up to the second."""
 YAML = "map.yaml"
 """Name of the file in the folder of a saved map."""
+MOST_CELLS: Final = 50_000_000
+"""Cells of a map at most: 350 m a side at 5 cm; decoding them takes less than 500 MB."""
+MOST_IMAGE_BYTES: Final = 400_000_000
 
 _REQUIRED = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh")
 _MODES = ("trinary", "scale", "raw")
+_BAND: Final = 1_000_000
+"""Pixels that are converted at once."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WorldMap:
-    """A ternary occupancy map, axis-aligned with the map frame.
+    """An occupancy map, axis-aligned with the map frame.
 
     Args:
-        cells: int8 (rows, columns) of ``FREE``, ``OCCUPIED`` or ``UNKNOWN``; row 0 is the lowest y; read-only.
+        cells: int8 (rows, columns), ``FREE`` to ``OCCUPIED`` percent or ``UNKNOWN``; row 0 is the lowest y; read-only.
         resolution: side of a cell, m.
         origin: x, y of the outer corner of cell (0, 0), m.
+        others: further keys of its YAML file; ``save_map`` writes them back.
+        remarks: warnings about its files.
     """
 
     cells: NDArray[np.int8]
     resolution: float
     origin: tuple[float, float] = (0.0, 0.0)
+    others: Mapping[str, Any] = field(default_factory=dict)
+    remarks: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         cells = np.array(self.cells, dtype=np.int8, order="C")
@@ -51,50 +64,103 @@ class WorldMap:
         rows, columns = self.cells.shape
         return columns * self.resolution, rows * self.resolution
 
+    def trinary(self) -> "WorldMap":
+        """The map with cells of ``FREE``, ``OCCUPIED`` and ``UNKNOWN`` only."""
+        cells = np.full(self.cells.shape, UNKNOWN, np.int8)
+        cells[self.cells >= OCCUPIED_FROM] = OCCUPIED
+        cells[(self.cells >= 0) & (self.cells <= FREE_TO)] = FREE
+        return replace(self, cells=cells)
+
 
 def load_map(path: Path) -> WorldMap:
-    """Read a map_server YAML file, or the one in a folder of ours, and the image it names (relative to the YAML).
+    """Read a map_server YAML file, or the one in a folder of ours, and the image it names.
 
-    Thresholds apply as in map_server: with p = darkness in 0..1 (lightness if ``negate``), p > occupied_thresh
-    is occupied, p < free_thresh free, the rest unknown. ``mode: raw`` takes the pixel value itself as percent.
-    Colour images count by the mean of their colours; alpha matters only in ``mode: scale``: transparent is unknown.
+    Cells have the values that nav2's map_server publishes. With p = darkness in 0..1 (lightness if ``negate``),
+    p > occupied_thresh is occupied, p < free_thresh free, the rest unknown. ``mode: scale`` spreads the rest over
+    0..100, and makes transparent pixels unknown; ``mode: raw`` takes the lightness in 255ths as percent. Colour counts
+    by the mean of its channels, to which ``mode: trinary`` adds alpha. A yaw of the origin turns the cells into the
+    map frame.
+
+    The image path is relative to the YAML file, absolute, or starts with ``~``. If an absolute path is missing, the
+    file of that name next to the YAML file is read.
 
     Raises:
         InputError: file, key and expectation of whatever is wrong.
     """
     if path.is_dir():
         path /= YAML
-    keys = _read_keys(path)
-    sums, opaque = _read_image(path, path.parent / str(keys["image"]))
-    mode, values = keys["mode"], np.arange(3 * 255 + 1) / 3.0
-    if mode == "raw":
-        darkness = np.where(values <= 100, values / 100.0, np.nan)
-    else:
-        darkness = values / 255.0 if keys["negate"] else (255.0 - values) / 255.0
-    cell_of = np.full(values.shape, UNKNOWN, dtype=np.int8)
-    cell_of[darkness > keys["occupied_thresh"]] = OCCUPIED
-    cell_of[darkness < keys["free_thresh"]] = FREE
-    cells = cell_of[sums]
-    if mode == "scale" and opaque is not None:
-        cells[~opaque] = UNKNOWN
-    return WorldMap(np.flipud(cells), keys["resolution"], (keys["origin"][0], keys["origin"][1]))
+    keys, others = _read_keys(path)
+    cells = np.flipud(_read_image(path, _image_of(path, keys["image"]), keys))
+    (x, y, yaw), resolution = keys["origin"], float(keys["resolution"])
+    origin = (float(x), float(y))
+    if yaw:
+        try:
+            cells, origin = turned(cells, resolution, (*origin, float(yaw)))
+        except ValueError as error:
+            raise InputError(f"{path}: origin: {error}") from error
+    remarks = [f"{path}: {key}: unknown key, left as it is" for key in others]
+    if not (cells >= OCCUPIED_FROM).any():
+        remarks.append(f"{path}: not one occupied cell: check image, negate and the thresholds")
+    return WorldMap(cells, resolution, origin, others, tuple(remarks))
+
+
+def turned(
+    cells: NDArray[np.int8], resolution: float, origin: tuple[float, float, float]
+) -> tuple[NDArray[np.int8], tuple[float, float]]:
+    """Draw a grid whose lower left corner has the pose ``origin`` (x, y, yaw; m, rad) into cells along the map's axes.
+
+    Every cell takes the value of the one that its centre is in; every occupied cell occupies the one that its own
+    centre is in, so that no wall is lost.
+
+    Returns:
+        The new cells, int8 (rows, columns), and x, y of their outer corner, m.
+
+    Raises:
+        ValueError: there would be more than ``MOST_CELLS``.
+    """
+    x, y, yaw = origin
+    along = np.array((math.cos(yaw), math.sin(yaw)))
+    across = np.array((-along[1], along[0]))
+    rows, columns = cells.shape
+    corners = np.array([a * along + b * across for a in (0, columns) for b in (0, rows)])
+    low = np.floor(np.round(corners.min(axis=0), 6))
+    width, height = (np.ceil(np.round(corners.max(axis=0), 6)) - low).astype(int).tolist()
+    if width * height > MOST_CELLS:
+        raise ValueError(f"{width} x {height} cells along the map's axes, expected at most {MOST_CELLS}")
+    new = np.full((height, width), UNKNOWN, np.int8)
+    for first in range(0, height, step := max(_BAND // width, 1)):
+        row, column = np.mgrid[first : min(first + step, height), 0:width]
+        there = np.stack((column + low[0] + 0.5, row + low[1] + 0.5), axis=-1)
+        i, j = np.floor(there @ across).astype(int), np.floor(there @ along).astype(int)
+        inside = (i >= 0) & (i < rows) & (j >= 0) & (j < columns)
+        new[row[inside], column[inside]] = cells[i[inside], j[inside]]
+    i, j = np.nonzero(cells >= OCCUPIED_FROM)
+    to = np.floor((j[:, None] + 0.5) * along + (i[:, None] + 0.5) * across - low).astype(int)
+    np.maximum.at(new, (to[:, 1], to[:, 0]), cells[i, j])
+    return new, (x + float(low[0]) * resolution, y + float(low[1]) * resolution)
 
 
 def save_map(world: WorldMap, path: Path) -> None:
-    """Write ``path`` (YAML) and a grey PNG of the same stem in the same folder; ``load_map`` reads back an equal map.
+    """Write ``path`` (YAML) and a grey PNG of the same stem; ``load_map`` reads back the trinary map.
 
     Raises:
         OSError: a file could not be written; the YAML is the last one.
     """
-    shades = np.full(world.cells.shape, 205, dtype=np.uint8)
-    shades[world.cells == FREE] = 254
-    shades[world.cells == OCCUPIED] = 0
     image = path.with_suffix(".png")
+    text, picture = map_content(world, image.name)
+    replace_file(image, picture)
+    replace_file(path, text)
+
+
+def map_content(world: WorldMap, image: str) -> tuple[str, bytes]:
+    """YAML text of a map whose picture is called ``image``, and the picture (PNG)."""
+    shades = np.full(world.cells.shape, 205, dtype=np.uint8)
+    shades[(world.cells >= 0) & (world.cells <= FREE_TO)] = 254
+    shades[world.cells >= OCCUPIED_FROM] = 0
     picture = io.BytesIO()
     Image.fromarray(np.flipud(shades)).save(picture, "PNG", optimize=True)
-    replace_file(image, picture.getvalue())
     keys = {
-        "image": image.name,
+        "image": image,
         "mode": "trinary",
         "resolution": world.resolution,
         "origin": [*world.origin, 0.0],
@@ -102,10 +168,11 @@ def save_map(world: WorldMap, path: Path) -> None:
         "occupied_thresh": 0.65,
         "free_thresh": 0.196,
     }
-    replace_file(path, yaml_text(keys))
+    return yaml_text(keys | dict(world.others)), picture.getvalue()
 
 
-def _read_keys(path: Path) -> dict[str, Any]:
+def _read_keys(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The keys of map_server, checked, and the others."""
     no_map = f"{path}: no map: expected the folder of a saved map, or a map_server YAML"
     try:
         keys = read_yaml(path)
@@ -115,29 +182,26 @@ def _read_keys(path: Path) -> dict[str, Any]:
         raise
     if not isinstance(keys, dict) or keys.keys().isdisjoint(_REQUIRED):
         raise InputError(f"{no_map} with the keys {', '.join(_REQUIRED)}")
-    if unknown := sorted(str(key) for key in keys.keys() - {*_REQUIRED, "mode"}):
-        raise InputError(f"{path}: {unknown[0]}: unknown key; known are {', '.join(_REQUIRED)}, mode")
+    others = {str(key): value for key, value in keys.items() if key not in {*_REQUIRED, "mode"}}
     for key in _REQUIRED:
         if key not in keys:
             raise InputError(f"{path}: {key}: missing")
     keys.setdefault("mode", "trinary")
     _check_values(path, keys)
-    return keys
+    return keys, others
 
 
 def _check_values(path: Path, keys: dict[str, Any]) -> None:
     def refuse(key: str, expected: str) -> InputError:
         return InputError(f"{path}: {key}: expected {expected}, got {keys[key]!r}")
 
-    if not isinstance(keys["image"], str):
+    if not (isinstance(keys["image"], str) and keys["image"]):
         raise refuse("image", "a file name")
     if not (_is_number(keys["resolution"]) and keys["resolution"] > 0):
         raise refuse("resolution", "metres per cell > 0")
     origin = keys["origin"]
     if not (isinstance(origin, list) and len(origin) == 3 and all(map(_is_number, origin))):
         raise refuse("origin", "[x, y, yaw]")
-    if origin[2] != 0:
-        raise refuse("origin", "yaw 0 (turned maps are not supported)")
     if keys["negate"] not in (0, 1):
         raise refuse("negate", "0 or 1")
     for key in ("occupied_thresh", "free_thresh"):
@@ -153,15 +217,121 @@ def _is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and bool(np.isfinite(value))
 
 
-def _read_image(source: Path, path: Path) -> tuple[NDArray[np.uint16], NDArray[np.bool_] | None]:
-    """Sums of the three colours, each 0..255, and opacity (None: all of it), both (rows, columns), top row first."""
+def _image_of(source: Path, name: str) -> Path:
+    """Path of the image named by a YAML file."""
     try:
+        there = Path(name).expanduser()
+    except RuntimeError:  # no such user
+        there = Path(name)
+    beside = source.parent / there.name
+    if there.is_absolute():
+        return there if there.exists() or not beside.exists() else beside
+    return source.parent / there
+
+
+def _read_image(source: Path, path: Path, keys: Mapping[str, Any]) -> NDArray[np.int8]:
+    """Cells of an image by the rules of map_server, top row first."""
+    try:
+        require_file(path, MOST_IMAGE_BYTES)
         with Image.open(path) as image:
-            if image.mode in ("1", "L") and "transparency" not in image.info:
-                return np.asarray(image.convert("L"), np.uint16) * 3, None
-            pixels = np.asarray(image.convert("RGBA"))
+            width, height = image.size
+            if width * height > MOST_CELLS:
+                raise InputError(f"{source}: image: {path}: {width} x {height} pixels, expected at most {MOST_CELLS}")
+            shades, alpha = pixels(image)
+    except InputError:
+        raise
     except UnidentifiedImageError as error:
         raise InputError(f"{source}: image: {path} is not a known image format") from error
     except OSError as error:
         raise InputError(f"{source}: image: cannot read {path}: {error}") from error
-    return pixels[..., :3].sum(axis=-1, dtype=np.uint16), pixels[..., 3] > 0
+    except Exception as error:
+        raise InputError(f"{source}: image: {path} is damaged, or of an unknown kind: {error}") from error
+    try:
+        return _cells(shades, alpha, keys)
+    except ValueError as error:
+        raise InputError(f"{source}: image: {path}: {error}") from error
+
+
+@dataclass(frozen=True, slots=True)
+class Shades:
+    """Pixels as numbers: lightness = the mean over channels of ``levels / full``."""
+
+    levels: NDArray[Any]
+    """Shape (rows, columns) or (rows, columns, channels)."""
+    full: float
+    """Level of white."""
+
+
+def pixels(image: Image.Image) -> tuple[Shades, NDArray[np.uint8] | None]:
+    """Lightness and alpha of a picture of any of Pillow's modes.
+
+    Returns:
+        Grey levels or colours, and alpha (rows, columns), 0 transparent to 255; None = all is opaque.
+
+    Raises:
+        OSError, ValueError, and others: Pillow cannot decode or convert it.
+    """
+    if image.mode.startswith("I") or image.mode == "F":
+        levels, full = np.asarray(image), _white(image)
+        hidden = image.info.get("transparency")
+        alpha = None if hidden is None else np.where(levels == hidden, 0, 255).astype(np.uint8)
+        tags = image.tag_v2 if isinstance(image, TiffImagePlugin.TiffImageFile) else {}
+        if tags.get(TiffImagePlugin.PHOTOMETRIC_INTERPRETATION) == 0:  # white is zero
+            levels = full - levels.astype(np.float64)
+        return Shades(levels, full), alpha
+    if image.has_transparency_data:
+        seen = np.asarray((image.convert("LA") if image.mode == "La" else image).convert("RGBA"))
+        return Shades(seen[..., :3], 255.0), seen[..., 3]
+    if image.mode in ("1", "L"):
+        return Shades(np.asarray(image.convert("L")), 255.0), None
+    return Shades(np.asarray(image.convert("RGB")), 255.0), None
+
+
+def _white(image: Image.Image) -> float:
+    """Level of white in a picture of one channel of numbers."""
+    if image.mode == "F":
+        return 1.0
+    if not isinstance(image, TiffImagePlugin.TiffImageFile):
+        return 65535.0
+    bits = image.tag_v2.get(TiffImagePlugin.BITSPERSAMPLE, (16,))[0]
+    signed = image.tag_v2.get(TiffImagePlugin.SAMPLEFORMAT, (1,))[0] == 2
+    return float(2 ** (bits - signed) - 1)
+
+
+def _cells(shades: Shades, alpha: NDArray[np.uint8] | None, keys: Mapping[str, Any]) -> NDArray[np.int8]:
+    """Values of nav2's map_server for pixels.
+
+    Raises:
+        ValueError: levels beyond white.
+    """
+    mode, occupied, free = keys["mode"], keys["occupied_thresh"], keys["free_thresh"]
+    rows, columns = shades.levels.shape[:2]
+    cells = np.full((rows, columns), UNKNOWN, np.int8)
+    for first in range(0, rows, step := max(_BAND // max(columns, 1), 1)):
+        band = slice(first, first + step)
+        levels = shades.levels[band].astype(np.float64)
+        if levels.ndim == 2:
+            levels = levels[..., None]
+        if np.nanmax(levels, initial=0.0) > shades.full or np.nanmin(levels, initial=0.0) < 0.0:
+            raise ValueError(f"levels {np.nanmin(levels):g} to {np.nanmax(levels):g}, expected 0 to {shades.full:g}")
+        if alpha is not None and mode == "trinary":
+            if levels.shape[-1] == 1:
+                levels = np.repeat(levels, 3, axis=-1)
+            levels = np.concatenate((levels, alpha[band, :, None] * (shades.full / 255.0)), axis=-1)
+        lightness = levels.sum(axis=-1) / levels.shape[-1] / shades.full
+        into = cells[band]
+        if mode == "raw":
+            percent = np.floor(lightness * 255.0 + 0.5)
+            known = percent <= OCCUPIED
+            into[known] = percent[known].astype(np.int8)
+            continue
+        darkness = lightness if keys["negate"] else 1.0 - lightness
+        if mode == "scale":
+            known = np.isfinite(darkness)
+            between = np.rint((darkness[known] - free) / (occupied - free) * OCCUPIED)
+            into[known] = np.clip(between, FREE, OCCUPIED).astype(np.int8)
+        into[darkness > occupied] = OCCUPIED
+        into[darkness < free] = FREE
+        if mode == "scale" and alpha is not None:
+            into[alpha[band] < 255] = UNKNOWN
+    return cells

@@ -1,5 +1,6 @@
 """One robot in a simulated world, and the physics of its devices."""
 
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -37,6 +38,8 @@ from monstertruck_sim.world.sensors import (
 )
 from monstertruck_sim.world.sonar import SimulatedSonars
 from monstertruck_sim.world.terrain import load_profile, profile_path
+
+log = logging.getLogger(__name__)
 
 
 class World:
@@ -272,5 +275,7 @@ def _find(name: str) -> BuiltIn:
     path = Path(name)
     if path.suffix not in (".yaml", ".yml"):
         raise InputError(f"map: {name!r}: expected one of {', '.join(BUILT_IN)}, or the path of a map's .yaml file")
-    profile = profile_path(path)
-    return BuiltIn(load_map(path), (0.0, 0.0, 0.0), load_profile(profile) if profile.exists() else None)
+    profile, known = profile_path(path), load_map(path)
+    for remark in known.remarks:
+        log.warning("%s", remark)
+    return BuiltIn(known.trinary(), (0.0, 0.0, 0.0), load_profile(profile) if profile.exists() else None)

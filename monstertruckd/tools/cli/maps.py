@@ -17,6 +17,7 @@ from monstertruckd.tools.cli.options import ConfigOption, EndpointOption, RobotO
 from monstertruckd.tools.cli.output import JsonOption, command_group, needs_extra, print_json, progress, remark
 
 if TYPE_CHECKING:
+    from monstertruck_estimation.slam.storage import SavedMap
     from monstertruck_estimation.slam.worker_io import SlamEstimate, WorkerOutput
     from monstertruck_runtime.client import TruckClient
     from monstertruck_runtime.clock import Clock
@@ -129,9 +130,7 @@ def build(
         assert done.trajectory is not None
         facts["trajectory"] = write_tum(trajectory, *done.trajectory, scans)
     if png is not None:
-        from monstertruck_estimation.slam.storage import load
-
-        _draw(png, load(output))
+        _draw(png, _load(output))
     _print(facts, json_output)
     finish_log(log, scans.fault)
 
@@ -140,10 +139,9 @@ def build(
 @needs_extra("slam")
 def show(place: MapPlace, png: Png = None, json_output: JsonOption = False) -> None:
     """Show the facts of a saved map."""
-    from monstertruck_estimation.slam.storage import load
     from monstertruck_runtime.map_files import FREE, OCCUPIED
 
-    saved = load(place)
+    saved = _load(place)
     cells, step = saved.grid.cells, saved.grid.resolution
     facts: dict[str, Any] = {
         "map": place,
@@ -206,13 +204,12 @@ def load_command(
 
     An explorer is left out: it makes maps.
     """
-    from monstertruck_estimation.slam.storage import load
     from monstertruck_runtime.errors import ConfigError, InputError
     from monstertruck_runtime.small_files import whole_file
     from monstertruck_runtime.yaml_files import read_yaml, yaml_text
     from monstertruckd.config.load import VERSION, load_truck
 
-    load(place)
+    _load(place)
     robot, _ = load_truck(config)
     values = {
         "include": str(config.resolve()),
@@ -254,11 +251,10 @@ def localise(
 ) -> None:
     """Localise a log's scans in a saved map, from an unknown start."""
     from monstertruck_estimation.slam.config import SlamConfig
-    from monstertruck_estimation.slam.storage import load
     from monstertruck_estimation.slam.worker import SlamWorker
     from monstertruckd.tools.logs.trajectory import write_tum
 
-    saved, scans = load(place), _read(log, geometry)
+    saved, scans = _load(place), _read(log, geometry)
     facts, estimates = _run(SlamWorker(), scans, SlamConfig(mode="localisation", map=place))
     known = [estimate for estimate in estimates if estimate.status.value in ("localised", "degenerate")]
     facts |= {"map": place, "localised": len(known)}
@@ -273,6 +269,16 @@ def localise(
         _draw(png, saved, [estimate.pose for estimate in known])
     _print(facts, json_output)
     finish_log(log, scans.fault)
+
+
+def _load(place: Path) -> "SavedMap":
+    """Read a saved map and print its remarks."""
+    from monstertruck_estimation.slam.storage import load
+
+    saved = load(place)
+    for text in saved.grid.remarks:
+        remark(text)
+    return saved
 
 
 def _read(path: Path, geometry: "LogGeometry") -> "ScanLog":

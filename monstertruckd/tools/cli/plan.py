@@ -9,7 +9,7 @@ import typer
 
 from monstertruck_runtime.errors import InputError
 from monstertruckd.tools.cli.options import ViaOption, complete_planner, parse_pose
-from monstertruckd.tools.cli.output import JsonOption, finish, print_json
+from monstertruckd.tools.cli.output import JsonOption, finish, print_json, remark
 
 if TYPE_CHECKING:
     from monstertruck_planners.route.api import RouteMap, RoutePlanner, RouteResult, Vehicle
@@ -68,6 +68,8 @@ def plan(
     from monstertruck_runtime.map_files import load_map
 
     world = load_map(map_file)
+    for text in world.remarks:
+        remark(text)
     route_map = RouteMap.from_cells(world.cells, world.resolution, (*world.origin, 0.0), unknown.value)
     vehicle = Vehicle.truck(steering.value)
     settings: Any = ROUTE_PLANNERS.find(planner).settings_class()

@@ -335,6 +335,8 @@ class SlamService:
         if outputs.refused is not None:
             self._skip(outputs.refused)
         self._report_saved(outputs)
+        for remark in outputs.remarks:
+            self._events(Reason.BAD_INPUT, Severity.WARNING, self.name, remark)
         if outputs.bases is not None:
             rows = zip(self._sent_instants, outputs.bases.tolist(), strict=True)
             self._bases = {at: (x, y, yaw) for at, (x, y, yaw) in rows if x == x}  # NaN: not known

@@ -21,15 +21,13 @@ from monstertruck_estimation.slam.scans import SLIDE, Scan
 from monstertruck_estimation.slam.worker_io import GridPatch
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.errors import InputError
-from monstertruck_runtime.map_files import FREE, OCCUPIED, UNKNOWN, YAML, WorldMap, load_map, save_map
+from monstertruck_runtime.map_files import FREE, OCCUPIED, YAML, WorldMap, load_map, save_map
 from monstertruck_runtime.small_files import replace_file
 
 GRAPH: Final = "graph.npz"
 VERSION: Final = 1
 ELEMENTS: Final = tuple(field.name for field in dataclasses.fields(Scan))
 """Arrays of a scan: of a file that was written before there were so many, the others are zeros."""
-OCCUPIED_FROM, FREE_TO = 65, 19
-"""Percent, as in the thresholds of map_server."""
 _SHAPES: Final[dict[str, tuple[int, ...]]] = {
     "stamps": (),
     "poses": (3,),
@@ -96,10 +94,7 @@ def saved_graph(known: KeyframeMap) -> SavedGraph:
 
 def trinary(patch: GridPatch) -> WorldMap:
     """Free, occupied, unknown."""
-    cells = np.full(patch.cells.shape, UNKNOWN, np.int8)
-    cells[patch.cells >= OCCUPIED_FROM] = OCCUPIED
-    cells[(patch.cells >= 0) & (patch.cells <= FREE_TO)] = FREE
-    return WorldMap(cells, patch.resolution, patch.origin)
+    return WorldMap(patch.cells, patch.resolution, patch.origin).trinary()
 
 
 def save(folder: Path, patch: GridPatch, graph: SavedGraph | None) -> None:
@@ -138,9 +133,9 @@ def load(place: Path) -> SavedMap:
         InputError: file, key and expectation of whatever is wrong.
     """
     if not place.is_dir():
-        return SavedMap(load_map(place), None)
+        return SavedMap(load_map(place).trinary(), None)
     graph = place / GRAPH
-    return SavedMap(load_map(place / YAML), _read_graph(graph) if graph.exists() else None)
+    return SavedMap(load_map(place / YAML).trinary(), _read_graph(graph) if graph.exists() else None)
 
 
 def _read_graph(path: Path) -> SavedGraph:

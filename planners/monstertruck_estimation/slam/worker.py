@@ -46,8 +46,7 @@ class SlamWorker:
         Raises:
             InputError: the saved map is not readable, or no start came first.
         """
-        if inputs.start is not None:
-            self._begin(inputs.start)
+        remarks = () if inputs.start is None else self._begin(inputs.start)
         estimator = self._estimator
         if estimator is None:
             raise InputError("estimation: expected a start before anything else")
@@ -73,18 +72,21 @@ class SlamWorker:
         trajectory = estimator.trajectory() if inputs.trajectory else None
         counts = dict(estimator.counts)
         bases = estimator.poses_at(np.array(inputs.instants, np.int64)) if inputs.instants else None
-        return WorkerOutput(made, refused, tuple(tiles), whole, counts, saved, error, trajectory, bases, joint)
+        return WorkerOutput(made, refused, tuple(tiles), whole, counts, saved, error, trajectory, bases, joint, remarks)
 
-    def _begin(self, start: Start) -> None:
+    def _begin(self, start: Start) -> tuple[str, ...]:
+        """Make the estimator; returns remarks on the saved map it reads."""
         config = start.config
         settings = config.mapper
         self._longest = settings.longest
         self._witness = _witness() if config.witness == "kiss" else None
         if config.mode == "localisation":
             assert config.map is not None
-            self._estimator = LocalisationEstimator(storage.load(config.map), settings)
-        else:
-            self._estimator = MappingEstimator(settings, config.grid, matcher_of(config.front), start.pose, start.body)
+            saved = storage.load(config.map)
+            self._estimator = LocalisationEstimator(saved, settings)
+            return saved.grid.remarks
+        self._estimator = MappingEstimator(settings, config.grid, matcher_of(config.front), start.pose, start.body)
+        return ()
 
     def _refusal(self, scan: ScanInput) -> str | None:
         """Why a scan cannot be used; None if it can."""

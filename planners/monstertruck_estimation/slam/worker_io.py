@@ -161,3 +161,5 @@ class WorkerOutput:
     """Shape (n, 3): base in map at the instants requested; NaN where it is not known; None in a saved map."""
     joint: bool | None = None
     """After ``finish``: whether the joint registration was kept, for it agreed better than the graph."""
+    remarks: tuple[str, ...] = ()
+    """Remarks on the saved map read in this step."""

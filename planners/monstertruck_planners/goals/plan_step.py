@@ -7,6 +7,7 @@ An obstacle is kept until a scan sees through its place: a robot that looks ahea
 behind it, so nothing is forgotten by age.
 """
 
+import logging
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -39,6 +40,8 @@ from monstertruck_runtime.map_files import load_map
 from monstertruck_schemas.plan import MAX_COORDINATE, MAX_POSES, MAX_RUNS, Steering
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.state import GROUND_UNKNOWN, ROUGHNESS_STEP, TILT_STEP, Grid, Ground
+
+log = logging.getLogger(__name__)
 
 Cells = NDArray[np.int8]
 
@@ -313,6 +316,8 @@ class PlanningStep:
             self._now = processor_time
         if config.map is not None:
             world = load_map(config.map)
+            for remark in world.remarks:
+                log.warning("%s", remark)
             self._layers = None
             self._map = StaticMap(world.cells, world.resolution, (*world.origin, 0.0))
 
