@@ -116,6 +116,10 @@ class LineFaults:
         """Probability that one bit of a byte is flipped."""
         self.drop_rate = 0.0
         """Probability that a byte is lost."""
+        self.lose_rate = 0.0
+        """Probability that a whole message of the device is lost."""
+        self.double_rate = 0.0
+        """Probability that a whole message of the device is sent twice."""
         self.garbage = b""
         """Sent once before the next bytes."""
         self.short_writes = 0
@@ -130,6 +134,10 @@ class LineFaults:
         """Apply the faults; returns the chunks to deliver."""
         if self.garbage:
             data, self.garbage = self.garbage + data, b""
+        if self.lose_rate > 0 and self._random() < self.lose_rate:
+            return []
+        if self.double_rate > 0 and self._random() < self.double_rate:
+            data += data
         if self.flip_rate or self.drop_rate:
             out = bytearray()
             for byte in data:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_drivers.cable import DeviceEnd, EmulatedPort, MemoryPort
+from monstertruck_drivers.signals import Signals
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.threads import Offload, in_thread
 
@@ -61,7 +62,10 @@ class ReceivedBytes(bytearray):
 
 
 class Emulator(Protocol):
-    """The device side of a protocol, byte for byte, with the device's own persistent state."""
+    """The device side of a protocol, byte for byte, with the device's own persistent state.
+
+    Its attribute ``signals``, a ``Signals``, may be absent: see ``signals_of``.
+    """
 
     name: str
 
@@ -77,6 +81,12 @@ class Emulator(Protocol):
         Raises:
             InputError: unknown fault or bad value; the text lists what is known.
         """
+
+
+def signals_of(emulator: object) -> Signals | None:
+    """Return what an emulator reports and obeys; None if it does not say."""
+    found = getattr(emulator, "signals", None)
+    return found if isinstance(found, Signals) else None
 
 
 class FileEmulator(Protocol):

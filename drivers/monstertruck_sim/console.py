@@ -8,13 +8,14 @@ from dataclasses import dataclass
 from typing import Protocol, TextIO
 
 from monstertruck_drivers.cable import EmulatedPort, LineFaults
-from monstertruck_drivers.emulation import Emulator, FileEmulator
+from monstertruck_drivers.emulation import Emulator, FileEmulator, signals_of
+from monstertruck_drivers.signals import HELP
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.readable import when_readable
 
 CABLE = (
     "of its cable: plug, unplug, power-cycle, line stalled|deaf on|off, line delay SECONDS, line chunk BYTES|off, "
-    "line flip_rate|drop_rate PROBABILITY, line garbage HEX, line short_writes COUNT"
+    "line flip_rate|drop_rate|lose_rate|double_rate PROBABILITY, line garbage HEX, line short_writes COUNT"
 )
 
 
@@ -53,12 +54,14 @@ class Emulated:
                 set_line_fault(self.port.device.faults, name, value)
             case ["line", *_]:
                 raise InputError(CABLE)
+            case ["signal", *rest]:
+                set_signal_fault(self.emulator, rest)
             case _:
                 fault, *values = words or ["help"]
                 try:
                     self.emulator.inject(fault, *values)
                 except InputError as error:
-                    raise InputError(f"{error}; {CABLE}") from None
+                    raise InputError(f"{error}; {CABLE}; {HELP}") from None
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,8 +76,25 @@ class EmulatedFiles:
         Raises:
             InputError: it is unknown; the text lists the known ones.
         """
-        fault, *values = words or ["help"]
-        self.emulator.inject(fault, *values)
+        match words or ["help"]:
+            case ["signal", *rest]:
+                set_signal_fault(self.emulator, rest)
+            case [fault, *values]:
+                self.emulator.inject(fault, *values)
+
+
+def set_signal_fault(emulator: object, words: list[str]) -> None:
+    """Falsify a signal of an emulator from the words NAME FAULT [VALUE].
+
+    Raises:
+        InputError: the emulator names no signals, or the words name none of them or no fault.
+    """
+    signals = signals_of(emulator)
+    if signals is None:
+        raise InputError("the emulator of this device names no signals")
+    if len(words) < 2:
+        raise InputError(f"{HELP}; names: {', '.join(signals.kinds)}")
+    signals.inject(*words)
 
 
 def set_line_fault(faults: LineFaults, name: str, value: str) -> None:
@@ -87,7 +107,7 @@ def set_line_fault(faults: LineFaults, name: str, value: str) -> None:
         match name:
             case "stalled" | "deaf":
                 setattr(faults, name, {"on": True, "off": False}[value])
-            case "delay" | "flip_rate" | "drop_rate":
+            case "delay" | "flip_rate" | "drop_rate" | "lose_rate" | "double_rate":
                 setattr(faults, name, float(value))
             case "chunk":
                 faults.chunk = None if value == "off" else int(value)

@@ -16,8 +16,11 @@ from typing import Final, Generic, Protocol, TypeVar
 import numpy as np
 
 from monstertruck_drivers.config import Devices
+from monstertruck_drivers.emulation import signals_of
+from monstertruck_drivers.signals import Signals
 from monstertruck_drivers.usb.config import UsbPortConfig
 from monstertruck_runtime.clock import Clock, VirtualClock
+from monstertruck_runtime.errors import InputError
 from monstertruck_sim.computer import EmulatedComputer
 from monstertruck_sim.config import DrillConfig, SimConfig
 from monstertruck_sim.console import Emulated
@@ -134,6 +137,17 @@ class SimContext:
     def device(self, role: str) -> Emulated:
         """Emulator and cable of a device."""
         return Emulated(self.robot.emulators[role], self.computer.ports[role])
+
+    def signals(self, role: str) -> Signals:
+        """Return the signals of a device, or of a monitor of the computer.
+
+        Raises:
+            InputError: the robot has no such device, or it names no signals.
+        """
+        signals = signals_of(self.robot.emulators.get(role) or self.robot.monitored.get(role))
+        if signals is None:
+            raise InputError(f"{role}: it names no signals that could be falsified")
+        return signals
 
     def command(self, role: str, *lines: str) -> None:
         """Give commands of the fault console to a device; nothing where the truck has none."""

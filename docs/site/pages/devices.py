@@ -17,7 +17,10 @@ from pages.topics import anchor
 CONFIG = Path(__file__).resolve().parents[3] / "configs" / "truck.yaml"
 
 LINE_FAULTS = """\
-And of the cable: `unplug`, `plug`, `power-cycle`, `line stalled|deaf|delay|chunk|flip_rate|drop_rate|garbage VALUE`.
+And of the cable: `unplug`, `plug`, `power-cycle`,
+`line stalled|deaf|delay|chunk|flip_rate|drop_rate|lose_rate|double_rate|garbage VALUE`.
+And of every signal, that is each value the device reports and each command it obeys: `signal NAME FAULT [VALUE]`,
+`signal NAME off`; `signal help` lists both.
 [`emulate`](../commands/emulate.md) and [`simulate`](../commands/simulate.md) take faults on standard input."""
 
 

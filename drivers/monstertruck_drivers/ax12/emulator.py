@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from monstertruck_drivers.ax12 import protocol as p
 from monstertruck_drivers.ax12.config import Ax12Config, JointConfig
 from monstertruck_drivers.ax12.protocol import Alarm, Ax12Parser, Instruction, Packet
-from monstertruck_drivers.ax12.unit import Load, Unit, Voltage, no_load, steady_voltage
+from monstertruck_drivers.ax12.unit import Load, Unit, Voltage, no_load, steady_voltage, unit_signals
 from monstertruck_drivers.cable import DeviceEnd
 from monstertruck_drivers.emulation import EmulatorSetup, Horn, ReceivedBytes
+from monstertruck_drivers.signals import SignalKind, Signals
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import InputError
 
@@ -89,7 +90,14 @@ class Ax12Bus:
         self._late_s = 0.0
         places = positions or {}
         now = clock.now()
-        self.units = [Unit(ident, places.get(ident, 512), now, load, self._voltage) for ident in ids]
+        kinds: dict[str, SignalKind] = {}
+        for number in range(1, len(ids) + 1):
+            kinds |= unit_signals(number)
+        self.signals = Signals(clock.now, kinds, self._rng)
+        self.units = [
+            Unit(ident, places.get(ident, 512), now, load, self._voltage, self.signals, number)
+            for number, ident in enumerate(ids, 1)
+        ]
 
     # What the world calls
 

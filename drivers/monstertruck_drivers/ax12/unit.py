@@ -2,6 +2,7 @@
 
 from collections import deque
 from collections.abc import Callable
+from functools import partial
 from math import copysign, exp, tau
 from typing import Final
 
@@ -10,12 +11,35 @@ from numpy.typing import NDArray
 
 from monstertruck_drivers.ax12 import protocol as p
 from monstertruck_drivers.ax12.protocol import Alarm, Register
+from monstertruck_drivers.signals import SignalKind, Signals
 from monstertruck_runtime.clock import SECOND
 
 Load = Callable[[int, int], float]
 """Torque, N m, that pushes the shaft of a unit (first argument) at a time, ns; counter-clockwise positive."""
 Voltage = Callable[[int], float]
 """Supply, V, at a time, ns."""
+
+REPORTED: Final = {
+    "position": p.PRESENT_POSITION,
+    "speed": p.PRESENT_SPEED,
+    "load": p.PRESENT_LOAD,
+    "voltage": p.PRESENT_VOLTAGE,
+    "temperature": p.PRESENT_TEMPERATURE,
+    "moving": p.MOVING,
+}
+ORDERED: Final = {
+    p.TORQUE_ENABLE: "torque_enable",
+    p.GOAL_POSITION: "goal_position",
+    p.MOVING_SPEED: "moving_speed",
+    p.TORQUE_LIMIT: "torque_limit",
+}
+
+
+def unit_signals(number: int) -> dict[str, SignalKind]:
+    """Return the signals of a unit; ``number`` is its position on the bus, from 1 on."""
+    kinds = {f"{name}_{number}": SignalKind.NUMBER for name in REPORTED}
+    return kinds | {f"{name}_{number}": SignalKind.ORDER for name in ORDERED.values()}
+
 
 TICK: Final = 2_000_000
 """Nanoseconds of one step of the motion."""
@@ -54,9 +78,22 @@ class Unit:
         time_ns: now.
         load: what pushes the shaft.
         voltage: supply.
+        signals: of the whole bus.
+        number: its position on the bus, from 1 on: its signals end with it.
     """
 
-    def __init__(self, ident: int, position: float, time_ns: int, load: Load, voltage: Voltage) -> None:
+    def __init__(
+        self,
+        ident: int,
+        position: float,
+        time_ns: int,
+        load: Load,
+        voltage: Voltage,
+        signals: Signals,
+        number: int,
+    ) -> None:
+        self._signals = signals
+        self._number = number
         self.blocked = False
         self.frozen = False
         """The position sensor repeats its last value."""
@@ -108,14 +145,23 @@ class Unit:
         if error:
             return error
         self.advance(time_ns)
-        self._table[address : address + len(data)] = data
+        table = self._table.copy()
+        table[address : address + len(data)] = data
         for register in p.REGISTERS:
-            if self._touches(register, address, data):
-                self._values[register.address] = register.decode(self._table)
-        if self._touches(p.TORQUE_LIMIT, address, data) and self.get(p.TORQUE_LIMIT):
+            if not self._touches(register, address, data):
+                continue
+            value, name = register.decode(table), ORDERED.get(register)
+            if name is None:
+                self.put(register, value)
+            else:
+                self._signals.order(f"{name}_{self._number}", value, partial(self._obey, register))
+        return error
+
+    def _obey(self, register: Register, value: int) -> None:
+        self.put(register, min(max(value, 0), register.high))
+        if register is p.TORQUE_LIMIT and self.get(p.TORQUE_LIMIT):
             self._alarms &= ~(Alarm.OVERLOAD | Alarm.OVERHEAT)
             self._overload_for = 0.0
-        return error
 
     def register(self, address: int, data: bytes) -> Alarm:
         """Keep a write for the next ``act``."""
@@ -182,13 +228,20 @@ class Unit:
         """Measurements into the table."""
         if not self.frozen:
             self._sensed = self.position
-        speed = round(self._speed * p.STEP / p.SPEED_UNIT)
-        self.put(p.PRESENT_POSITION, min(max(round(self._sensed), 0), p.POSITION_MAX))
-        self.put(p.PRESENT_SPEED, p.to_sign_bit(speed))
-        self.put(p.PRESENT_LOAD, p.to_sign_bit(round(self._drive / p.LOAD_UNIT)))
-        self.put(p.PRESENT_VOLTAGE, min(max(round(self._volts() / p.VOLT_UNIT), 0), 255))
-        self.put(p.PRESENT_TEMPERATURE, min(max(round(self.temperature), 0), 255))
-        self.put(p.MOVING, int(self._speed != 0))
+        measured = {
+            p.PRESENT_POSITION: min(max(round(self._sensed), 0), p.POSITION_MAX),
+            p.PRESENT_SPEED: round(self._speed * p.STEP / p.SPEED_UNIT),
+            p.PRESENT_LOAD: round(self._drive / p.LOAD_UNIT),
+            p.PRESENT_VOLTAGE: round(self._volts() / p.VOLT_UNIT),
+            p.PRESENT_TEMPERATURE: round(self.temperature),
+            p.MOVING: int(self._speed != 0),
+        }
+        for name, register in REPORTED.items():
+            value = self._signals.report(f"{name}_{self._number}", measured[register])
+            if register in (p.PRESENT_SPEED, p.PRESENT_LOAD):
+                self.put(register, p.to_sign_bit(value))
+            else:
+                self.put(register, min(max(value, 0), register.high))
 
     def error(self, time_ns: int) -> Alarm:
         """Error bits of the unit's state."""

@@ -9,12 +9,15 @@ import numpy as np
 from monstertruck_drivers.battery.config import IioConfig
 from monstertruck_drivers.battery.iio import CONVERTERS
 from monstertruck_drivers.emulation import EmulatorSetup, FileTree
+from monstertruck_drivers.signals import SignalKind, Signals
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import InputError
 
 PERIOD: Final = 0.05
 """Seconds between two conversions."""
 FOLDER: Final = "iio:device0"
+COUNTS: Final = "counts"
+"""Signal: converted voltage, LSB."""
 
 
 class IioEmulator:
@@ -52,6 +55,7 @@ class IioEmulator:
         self._clock = clock
         self._source = source
         self._rng = np.random.default_rng(seed)
+        self.signals = Signals(clock.now, {COUNTS: SignalKind.NUMBER}, self._rng)
         self._stem = f"in_voltage{channel}"
         self._device = device
         self._noise = 1.0
@@ -90,7 +94,7 @@ class IioEmulator:
             return
         if text is None:
             counts = self._source(now) * 1000 + self._noise * float(self._rng.standard_normal())
-            text = str(int(np.clip(round(counts), 0, self.FULL_SCALE)))
+            text = str(int(np.clip(self.signals.report(COUNTS, round(counts)), 0, self.FULL_SCALE)))
         self._files.put(f"{FOLDER}/{self._stem}_raw", text)
 
     def inject(self, fault: str, *values: str) -> None:

@@ -67,6 +67,7 @@ class EposEmulator:
     def __init__(self, clock: Clock, motor: MotorPlant | None = None, *, seed: int = 0, node: int = 1) -> None:
         self.name = "epos"
         self.firmware = Firmware(clock.now, motor or FreeMotor(), np.random.default_rng(seed))
+        self.signals = self.firmware.signals
         self.received: deque[tuple[int, bytes]] = deque(maxlen=4096)
         """Newest bytes from the host, with their instants."""
         self.frames: deque[tuple[int, Frame]] = deque(maxlen=1024)

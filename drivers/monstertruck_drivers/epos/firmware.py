@@ -9,6 +9,7 @@ from monstertruck_drivers.emulation import MotorPlant, MotorReading
 from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos.objects import OBJECTS, ObjectEntry
 from monstertruck_drivers.epos.protocol import FAULTED, OFF, POWERED, Control, State
+from monstertruck_drivers.signals import SignalKind, Signals
 from monstertruck_runtime.clock import SECOND
 
 DEFAULTS: dict[ObjectEntry, int] = {
@@ -35,6 +36,58 @@ DEFAULTS: dict[ObjectEntry, int] = {
     od.THERMAL_TIME: 40,
 }
 """Factory settings that are not 0."""
+
+REPORTED = (
+    od.STATUSWORD,
+    od.POSITION,
+    od.VELOCITY,
+    od.VELOCITY_AVERAGED,
+    od.VELOCITY_DEMAND,
+    od.CURRENT,
+    od.CURRENT_AVERAGED,
+    od.ERROR_COUNT,
+    od.ERROR_REGISTER,
+    od.DIGITAL_INPUTS,
+    od.MODE_DISPLAY,
+)
+"""Objects that change by themselves."""
+
+ORDERED = (
+    od.TARGET_VELOCITY,
+    od.MAX_VELOCITY,
+    od.ACCELERATION,
+    od.DECELERATION,
+    od.QUICK_STOP_DECELERATION,
+    od.MODE,
+)
+"""Objects whose values move the motor."""
+
+POWER_ORDERS = ("disable_voltage", "quick_stop", "halt", "enable", "fault_reset")
+"""What controlwords ask for."""
+
+
+def signal_name(entry: ObjectEntry) -> str:
+    """Return the name of an object's signal."""
+    return entry.name.replace(" ", "_")
+
+
+def power_order(word: int) -> str:
+    """Return which of ``POWER_ORDERS`` a controlword is."""
+    if word & Control.FAULT_RESET:
+        return "fault_reset"
+    if not word & 0x02:
+        return "disable_voltage"
+    if not word & 0x04:
+        return "quick_stop"
+    return "halt" if word & (Control.HALT & ~Control.ENABLE) else "enable"
+
+
+def signals(now: Callable[[], int], rng: np.random.Generator) -> Signals:
+    """Return the signals of a controller."""
+    kinds = dict.fromkeys(map(signal_name, REPORTED), SignalKind.NUMBER)
+    kinds |= dict.fromkeys(map(signal_name, ORDERED), SignalKind.ORDER)
+    return Signals(now, kinds | dict.fromkeys(POWER_ORDERS, SignalKind.SWITCH), rng)
+
 
 VOLATILE = (od.CONTROLWORD, od.TARGET_VELOCITY, od.MODE)
 """Never stored: 0 (mode: its default) after power-up."""
@@ -126,6 +179,7 @@ class Firmware:
     """
 
     def __init__(self, now: Callable[[], int], motor: MotorPlant, rng: np.random.Generator) -> None:
+        self.signals = signals(now, rng)
         self._now = now
         self._motor = motor
         self._rng = rng
@@ -191,9 +245,11 @@ class Firmware:
         entry = self._find(index, sub)
         if entry.access == "wo" or entry.width > 32:
             raise AccessRefusedError(od.READ_OF_WRITE_ONLY if entry.access == "wo" else od.LENGTH_MISMATCH)
-        reading = self.advance()
+        value = self._measured(entry, self.advance())
+        if entry in REPORTED:
+            value = self.signals.report(signal_name(entry), value)
         low, high = entry.limits
-        return entry.encode(min(max(self._measured(entry, reading), low), high))
+        return entry.encode(min(max(value, low), high))
 
     def read_long(self, index: int, sub: int) -> bytes:
         """Bytes of an object for a segmented read.
@@ -220,7 +276,17 @@ class Firmware:
         if value > high:
             raise AccessRefusedError(od.TOO_HIGH)
         self.advance()
-        self._apply(entry, value)
+        if entry in ORDERED:
+            self.signals.order(signal_name(entry), value, lambda given: self._apply(entry, min(max(given, low), high)))
+        elif entry is od.CONTROLWORD:
+            self.signals.order(power_order(value), value, self._obey)
+        else:
+            self._apply(entry, value)
+
+    def _obey(self, word: int) -> None:
+        """A controlword; without supply none is obeyed, however late it is."""
+        if self.state is not State.NOT_READY:
+            self._control(word)
 
     def _find(self, index: int, sub: int) -> ObjectEntry:
         entry = OBJECTS.get((index, sub))
@@ -255,8 +321,6 @@ class Firmware:
 
     def _apply(self, entry: ObjectEntry, value: int) -> None:
         match entry:
-            case od.CONTROLWORD:
-                self._control(value)
             case od.ERROR_COUNT:
                 self._history.clear()
             case od.STORE:

@@ -12,6 +12,7 @@ import asyncio
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Final, Literal
 
 import numpy as np
@@ -30,6 +31,7 @@ from monstertruck_drivers.hokuyo_urg.protocol import (
     line_sum,
     wrap_lines,
 )
+from monstertruck_drivers.signals import SignalKind, Signals
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import InputError
 
@@ -137,6 +139,12 @@ FAULTS: Final = (
     "status 21..98 | deaf [on|off] | fragile [on|off] | cut | laser [on|off] | seri [on|off] | tm [on|off] | "
     "timer MILLISECONDS | drift PPM | cover FROM TO VALUE [SHARE] | cover off | mirror FROM TO"
 )
+ORDERED: Final = {"BM": "laser_on", "MD": "stream", "MS": "stream", "QT": "quit", "RS": "reset", "TM": "adjust"}
+"""Requests that change what it does, with the names of their signals."""
+RANGE: Final = "range"
+"""All distances of a scan, mm."""
+COUNTER: Final = "counter"
+"""Time stamp of a scan, ms."""
 MIRROR: Final = 18
 """Error code of a strongly reflecting object."""
 SPECULAR: Final = 0.2
@@ -185,6 +193,8 @@ class HokuyoEmulator:
         self._clock = clock
         self._source = source
         self._rng = np.random.default_rng(seed)
+        kinds = {RANGE: SignalKind.ARRAY, COUNTER: SignalKind.NUMBER}
+        self.signals = Signals(clock.now, kinds | dict.fromkeys(ORDERED.values(), SignalKind.SWITCH), self._rng)
         self._state: StartState = state
         self._identity = {"SERI": serial, "FIRM": firmware}
         self._rate = 1.0 + drift_ppm * 1e-6
@@ -381,7 +391,8 @@ class HokuyoEmulator:
             self._order, self._laser = None, False
 
     def _data(self, order: ScanOrder, begin: int) -> list[bytes]:
-        return scan_lines(order, self._counter(begin), self._measure(begin))
+        counter = self.signals.report(COUNTER, self._counter(begin)) & COUNTER_MASK
+        return scan_lines(order, counter, np.maximum(self.signals.report(RANGE, self._measure(begin)), 0))
 
     # Requests
 
@@ -449,7 +460,10 @@ class HokuyoEmulator:
         if handler is None or (len(text) > 2 and text[:2] in ("VV", "PP", "II", "BM", "QT", "RS")):
             self._deaf = self._fragile
             return b"" if self._deaf else build_reply(line, "0E")
-        status, lines = handler(text, tag)
+        request = partial(handler, text)
+        name = ORDERED.get(text[:2])
+        done = request(tag) if name is None else self.signals.order(name, tag, request)
+        status, lines = ("00", list[bytes]()) if done is None else done
         reply = build_reply(line, status, lines)
         return reply.replace(b"\nFIRM", b"\n\nFIRM") if text == "VV" and self._seri_quirk else reply
 

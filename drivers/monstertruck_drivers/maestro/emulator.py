@@ -19,6 +19,7 @@ from monstertruck_drivers.maestro.protocol import (
     Error,
     ServoCommand,
 )
+from monstertruck_drivers.signals import SignalKind, Signals
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import InputError
 
@@ -27,6 +28,12 @@ TICK: Final = 10_000_000
 AT_JUNK: Final = b"AT\r\nAT+CGMI\r\nATI\r\n"
 """What modem managers send into a serial port they do not know."""
 
+CHANNEL_ORDERS: Final = {
+    Code.SET_TARGET: "target",
+    Code.SET_SPEED: "speed",
+    Code.SET_ACCELERATION: "acceleration",
+}
+GO_HOME: Final = "go_home"
 CHANNEL_COMMANDS: Final = (Code.SET_TARGET, Code.SET_SPEED, Code.SET_ACCELERATION, Code.GET_POSITION)
 """Commands that name a channel first."""
 
@@ -124,6 +131,10 @@ class MaestroEmulator:
         self._clock = clock
         self._servos = servos
         self._rng = np.random.default_rng(seed)
+        kinds = dict.fromkeys([f"position_{channel}" for channel in range(CHANNELS)] + ["errors"], SignalKind.NUMBER)
+        orders = [f"{name}_{channel}" for name in CHANNEL_ORDERS.values() for channel in range(CHANNELS)]
+        kinds |= dict.fromkeys(orders, SignalKind.ORDER)
+        self.signals = Signals(clock.now, kinds | {GO_HOME: SignalKind.SWITCH}, self._rng)
         self._mode = mode
         self.set_serial_timeout(serial_timeout_s)
         self._home: dict[int, Home] = {
@@ -267,21 +278,19 @@ class MaestroEmulator:
             return b""
         answer = b""
         match code:
-            case Code.SET_TARGET:
-                self._aim(data[0], command.value)
+            case Code.SET_TARGET | Code.SET_SPEED | Code.SET_ACCELERATION:
+                self._order(Code(code), data[0], command.value)
             case Code.MINI_SSC if data[0] < CHANNELS:
                 # Factory neutral 1500 us and range 476.25 us to either side of 127.
-                self._aim(data[0], 6000 + (data[1] - 127) * 15)
-            case Code.SET_SPEED:
-                self._ramps[data[0]].speed = command.value
-            case Code.SET_ACCELERATION:
-                self._ramps[data[0]].acceleration = min(command.value, 255)
+                self._order(Code.SET_TARGET, data[0], 6000 + (data[1] - 127) * 15)
             case Code.GO_HOME:
-                self._go_home()
+                self.signals.order(GO_HOME, self._clock.now(), self._order_home)
             case Code.GET_POSITION:
-                answer = self._position(data[0]).to_bytes(2, "little")
+                position = self.signals.report(f"position_{data[0]}", self._position(data[0]))
+                answer = min(max(position, 0), 0xFFFF).to_bytes(2, "little")
             case Code.GET_ERRORS:
-                answer = int(self._errors).to_bytes(2, "little")
+                errors = self.signals.report("errors", int(self._errors))
+                answer = min(max(errors, 0), 0xFFFF).to_bytes(2, "little")
                 self._errors = Error(0)
             case Code.GET_MOVING_STATE:
                 answer = b"\x00"  # the Micro's firmware fault: says so even while moving
@@ -290,6 +299,29 @@ class MaestroEmulator:
             case _:
                 pass  # script commands: nothing to run
         return answer
+
+    def _order_home(self, asked: int) -> None:
+        if self._clock.now() > asked:
+            self._advance()
+        self._go_home()
+        self._report_outputs()
+
+    def _order(self, code: Code, channel: int, value: int) -> None:
+        asked = self._clock.now()
+
+        def obey(given: int) -> None:
+            if self._clock.now() > asked:
+                self._advance()
+            given = min(max(given, 0), 0x3FFF)
+            if code is Code.SET_TARGET:
+                self._aim(channel, given)
+            elif code is Code.SET_SPEED:
+                self._ramps[channel].speed = given
+            else:
+                self._ramps[channel].acceleration = min(given, 255)
+            self._report_outputs()
+
+        self.signals.order(f"{CHANNEL_ORDERS[code]}_{channel}", value, obey)
 
     def _aim(self, channel: int, quarters: int) -> None:
         if channel in self._inputs or not self._powered:

@@ -3,6 +3,7 @@
 import asyncio
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -23,6 +24,7 @@ from monstertruck_drivers.os4000.protocol import (
     build,
     frame,
 )
+from monstertruck_drivers.signals import SignalKind, Signals
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import InputError
 
@@ -65,6 +67,11 @@ class Settings:
 
 
 VALUE_KEYS: Final = (Key.RATE, Key.FIELDS, Key.FORMAT, Key.FACTORY_BAUD, Key.MOUNTING, Key.TEMPERATURE_OFFSET)
+REPORTED: Final = (
+    *("heading", "pitch", "roll", "temperature"),
+    *("field_x", "field_y", "field_z", "acceleration_x", "acceleration_y", "acceleration_z"),
+)
+"""Numbers of a sentence."""
 CALIBRATION_KEYS: Final = (Key.CALIBRATE_LEVEL, Key.CALIBRATE_VERTICAL)
 
 
@@ -110,6 +117,8 @@ class Os4000Emulator:
         self._clock = clock
         self._source = source
         self._rng = np.random.default_rng(seed)
+        kinds = dict.fromkeys(REPORTED, SignalKind.NUMBER)
+        self.signals = Signals(clock.now, kinds | {key.name.lower(): SignalKind.ORDER for key in VALUE_KEYS}, self._rng)
         self._terminators = terminators
         self._settle = round(settle * SECOND)
         self._pace = pace
@@ -242,7 +251,8 @@ class Os4000Emulator:
 
     def _store(self, command: Key) -> bool:
         try:
-            return self.settings.store(command, int(self._digits))
+            number = int(self._digits)
+            return self.signals.order(command.name.lower(), number, partial(self.settings.store, command)) is not False
         except ValueError:
             return False
 
@@ -290,9 +300,10 @@ class Os4000Emulator:
         return stray + line
 
     def _sentence(self, now: int) -> bytes:
-        reading = self._source.compass(now)
-        heading = round((reading.heading_deg + self._disturbance) * 10) % 3600 / 10
-        pitch, roll = round(reading.pitch_deg, 1) + 0.0, round(reading.roll_deg, 1) + 0.0
+        reading, report = self._source.compass(now), self.signals.report
+        heading = round(report("heading", reading.heading_deg + self._disturbance) * 10) % 3600 / 10
+        pitch = round(report("pitch", reading.pitch_deg), 1) + 0.0
+        roll = round(report("roll", reading.roll_deg), 1) + 0.0
         form = self.settings.format
         if form == 2:
             return frame(f"OHPR,{heading:.1f},{pitch:.1f},{roll:.1f}")
@@ -300,13 +311,13 @@ class Os4000Emulator:
             return frame(f"HCHDT,{heading:.1f},T")
         if form == 8:
             return b"%.1f,%.1f,%.1f\r\n" % (heading, pitch, roll)
-        x, y, z = self._noisy(reading.field, 0.3)
-        ax, ay, az = self._noisy(reading.acceleration, 0.001)
+        x, y, z = self._reported("field", self._noisy(reading.field, 0.3))
+        ax, ay, az = self._reported("acceleration", self._noisy(reading.acceleration, 0.001))
         sentence = Sentence(
             heading=heading,
             pitch=pitch,
             roll=roll,
-            temperature=reading.temperature_c + self.settings.temperature_offset,
+            temperature=report("temperature", reading.temperature_c) + self.settings.temperature_offset,
             field_length=math.hypot(x, y, z),
             field=(x, y, z),
             acceleration_length=math.hypot(ax, ay, az),
@@ -314,6 +325,10 @@ class Os4000Emulator:
         )
         line = build(sentence, mask=Fields(self.settings.fields))
         return _replace_field(line, *self._spoiled) if self._spoiled is not None else line
+
+    def _reported(self, name: str, vector: Vector) -> Vector:
+        x, y, z = (self.signals.report(f"{name}_{axis}", value) for axis, value in zip("xyz", vector, strict=True))
+        return x, y, z
 
     def _noisy(self, vector: Vector, sigma: float) -> Vector:
         dx, dy, dz = self._rng.standard_normal(3).tolist()

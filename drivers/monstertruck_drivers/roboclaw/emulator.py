@@ -7,10 +7,13 @@ Habits of the real thing: it is silent unless asked, and to a request with anoth
 from math import floor, tau
 from typing import Final
 
+import numpy as np
+
 from monstertruck_drivers.cable import DeviceEnd
 from monstertruck_drivers.emulation import EmulatorSetup, ReceivedBytes, WheelSource
 from monstertruck_drivers.roboclaw.config import RoboclawConfig
 from monstertruck_drivers.roboclaw.protocol import PACKET_GAP, RoboclawCommand, counted, signed
+from monstertruck_drivers.signals import SignalKind, Signals
 from monstertruck_runtime.clock import MILLISECOND, SECOND, Clock
 from monstertruck_runtime.errors import InputError
 
@@ -36,6 +39,7 @@ class RoboclawEmulator:
         self.name = "roboclaw"
         self.received = ReceivedBytes()
         """Newest bytes from the host."""
+        self.signals = Signals(clock.now, dict.fromkeys(("left", "right"), SignalKind.NUMBER), np.random.default_rng(0))
         self._clock = clock
         self._source = source
         self._settings = settings or RoboclawConfig()
@@ -100,7 +104,7 @@ class RoboclawEmulator:
             data = VERSION
         elif command == RoboclawCommand.COUNTS:
             self._look()
-            left, right = map(floor, self._counted)
+            left, right = map(self.signals.report, ("left", "right"), map(floor, self._counted))
             data = counted(left, right) if self._settings.left == 1 else counted(right, left)
         else:
             return

@@ -8,6 +8,7 @@ import numpy as np
 
 from monstertruck_drivers.cable import DeviceEnd
 from monstertruck_drivers.emulation import EmulatorSetup, ReceivedBytes, SonarSource
+from monstertruck_drivers.signals import SignalKind, Signals
 from monstertruck_drivers.srf08.config import Srf08Config
 from monstertruck_drivers.srf08.protocol import (
     ABSENT,
@@ -74,6 +75,11 @@ class Srf08Emulator:
         self._clock = clock
         self._source = source
         self._rng = np.random.default_rng(seed)
+        names = [module.name for module in self.modules.values()]
+        kinds = dict.fromkeys([f"echo_{name}" for name in names], SignalKind.NUMBER)
+        kinds |= dict.fromkeys([f"{order}_{name}" for order in ("gain", "range") for name in names], SignalKind.ORDER)
+        kinds |= dict.fromkeys([f"ping_{name}" for name in names], SignalKind.SWITCH)
+        self.signals = Signals(clock.now, kinds, self._rng)
         self._silent = False
         self._i2c = False
         self._end: DeviceEnd | None = None
@@ -153,15 +159,24 @@ class Srf08Emulator:
         return b"\x01"
 
     def _write(self, module: Module, register: int, value: int) -> None:
-        if register == Srf08Register.GAIN:
-            module.gain = min(value, 31)
-        elif register == Srf08Register.RANGE:
-            module.range = value
-        elif register == Srf08Register.COMMAND and value == RANGE_IN_MICROSECONDS:
+        def set_gain(given: int) -> None:
+            module.gain = min(max(given, 0), 31)
+
+        def set_range(given: int) -> None:
+            module.range = min(max(given, 0), 255)
+
+        def ping(_: None) -> None:
             now = self._clock.now()
             self._source.fire(module.name, now)
             module.busy_until = now + round(ranging_time(module.range) * SECOND)
             module.pending = True
+
+        if register == Srf08Register.GAIN:
+            self.signals.order(f"gain_{module.name}", value, set_gain)
+        elif register == Srf08Register.RANGE:
+            self.signals.order(f"range_{module.name}", value, set_range)
+        elif register == Srf08Register.COMMAND and value == RANGE_IN_MICROSECONDS:
+            self.signals.order(f"ping_{module.name}", None, ping)
 
     def _read(self, module: Module) -> bytes:
         if module.pending:
@@ -175,6 +190,7 @@ class Srf08Emulator:
             if module.ghost is not None:
                 module.microseconds = module.ghost + round(JITTER * float(self._rng.standard_normal()))
         echo = module.microseconds if module.stuck is None else module.stuck
+        echo = min(max(self.signals.report(f"echo_{module.name}", echo), 0), 0xFFFF)
         return bytes((REVISION, module.light, echo >> 8 & 0xFF, echo & 0xFF)) + bytes(32)
 
 

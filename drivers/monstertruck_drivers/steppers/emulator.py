@@ -6,11 +6,15 @@ and not those that the rotor made, steps in whole periods of its timer, and begi
 
 import asyncio
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Final
+
+import numpy as np
 
 from monstertruck_drivers.cable import DeviceEnd
 from monstertruck_drivers.emulation import EmulatorSetup, MotorPlant, ReceivedBytes
 from monstertruck_drivers.epos.firmware import FreeMotor
+from monstertruck_drivers.signals import SignalKind, Signals
 from monstertruck_drivers.steppers.protocol import (
     BAUD,
     MAX_RATE,
@@ -68,6 +72,11 @@ class StepperEmulator:
         self.name = "steppers"
         self.received = ReceivedBytes()
         """Newest bytes from the host."""
+        numbers = [f"{what}_{motor}" for what in ("position", "rate") for motor in range(1, motors + 1)]
+        kinds = dict.fromkeys(["state", "bad_lines", "time", *numbers], SignalKind.NUMBER)
+        kinds |= dict.fromkeys([f"run_{motor}" for motor in range(1, motors + 1)], SignalKind.ORDER)
+        kinds |= dict.fromkeys(("stop", "off"), SignalKind.SWITCH)
+        self.signals = Signals(clock.now, kinds, np.random.default_rng(0))
         self._clock = clock
         self._identity = Identity(NAME, VERSION, motors, steps_per_turn, TICK_US)
         self._plants = [*plants, *(FreeMotor() for _ in range(motors - len(plants)))][:motors]
@@ -85,6 +94,8 @@ class StepperEmulator:
         self._acceleration, self._quick, self._watchdog = FACTORY
         self._state = MotorState.OFF
         self._rates = [0.0] * self._identity.motors
+        self._ordered = [0.0] * self._identity.motors
+        """Rates of the newest orders, steps/s."""
         self._counters = [FreeMotor() for _ in self._plants]
         for counter in self._counters:
             counter.reading(now)
@@ -160,7 +171,7 @@ class StepperEmulator:
             code = self._set(line)
             return Line("c", line.seq, line.words) if code is None else Line("e", line.seq, (str(int(code)),))
         code = verbs[line.verb](line) if line.verb in verbs else RefusalCode.UNKNOWN
-        return self._status().line(line.seq) if code is None else Line("e", line.seq, (str(int(code)),))
+        return self._reported().line(line.seq) if code is None else Line("e", line.seq, (str(int(code)),))
 
     @staticmethod
     def _expect(line: Line, count: int) -> None:
@@ -183,13 +194,24 @@ class StepperEmulator:
             return RefusalCode.TRIPPED
         self._state, self._fed = MotorState.RUN, self._clock.now()
         self._fed_again.set()
-        self._turn([_stepped(rate / 1000) for rate in rates], self._acceleration)
+        for i, rate in enumerate(rates):
+            self.signals.order(f"run_{i + 1}", rate, partial(self._order_rate, i))
+        self._turn(self._ordered, self._acceleration)
         return None
+
+    def _order_rate(self, motor: int, rate: int) -> None:
+        self._ordered[motor] = _stepped(min(max(rate, -MAX_RATE), MAX_RATE) / 1000)
+        if self._running:
+            self._turn(self._ordered, self._acceleration)
 
     def _stop(self, line: Line, state: MotorState) -> None:
         self._expect(line, 0)
+        self.signals.order("off" if state is MotorState.OFF else "stop", state, self._order_stop)
+
+    def _order_stop(self, state: MotorState) -> None:
         self._state = state
-        self._turn(None if state is MotorState.OFF else [0.0] * self._identity.motors, self._quick)
+        self._ordered = [0.0] * self._identity.motors
+        self._turn(None if state is MotorState.OFF else self._ordered, self._quick)
 
     def _turn(self, rates: list[float] | None, acceleration: float) -> None:
         """Make the steps of rates, steps/s; None = no current."""
@@ -223,6 +245,18 @@ class StepperEmulator:
             (now - self._booted) // 1_000_000 % (1 << 32),
             tuple(wrapped(int(reading.turns * self._identity.steps_per_turn // 1)) for reading in readings),
             tuple(round(1000 * reading.rpm / self._rpm) for reading in readings),
+        )
+
+    def _reported(self) -> Status:
+        """The status as it is sent."""
+        true, report = self._status(), self.signals.report
+        state = report("state", int(true.state))
+        return Status(
+            MotorState(state) if state in list(MotorState) else true.state,
+            report("bad_lines", true.bad_lines),
+            report("time", true.uptime_ms),
+            tuple(wrapped(report(f"position_{i}", steps)) for i, steps in enumerate(true.positions, 1)),
+            tuple(report(f"rate_{i}", rate) for i, rate in enumerate(true.rates, 1)),
         )
 
     @property

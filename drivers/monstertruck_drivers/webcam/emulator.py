@@ -12,6 +12,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from monstertruck_drivers.cable import DeviceEnd, EmulatedPort
 from monstertruck_drivers.emulation import EmulatorSetup, ViewSource
+from monstertruck_drivers.signals import SignalKind, Signals
 from monstertruck_drivers.webcam.packets import CameraPacket, PacketKind, encode_mode
 from monstertruck_drivers.webcam.source import Mode
 from monstertruck_runtime.clock import SECOND, Clock, Schedule
@@ -44,6 +45,12 @@ SIZES: Final = ((1600, 1200), (1280, 720), (800, 600), (640, 480), (320, 240), (
 """Sizes offered; like a real driver it grants the nearest one."""
 RATE_MAX: Final = 30.0
 LINE_LIMIT: Final = 256
+SIGNALS: Final = {
+    "image": SignalKind.THING,
+    "stamp": SignalKind.NUMBER,
+    "open": SignalKind.SWITCH,
+    "close": SignalKind.SWITCH,
+}
 CHUNK: Final = 4095
 """Bytes written at a time: as many as the reader of a pty gets in one go."""
 CHUNK_PAUSE: Final = 0.0002
@@ -78,6 +85,7 @@ class WebcamEmulator:
     ) -> None:
         self.name = "camera"
         self.usb = usb
+        self.signals = Signals(clock.now, SIGNALS, np.random.default_rng(0))
         self._clock = clock
         self._view = view
         self._offload = offload
@@ -150,9 +158,9 @@ class WebcamEmulator:
                     width, height, rate = (float(number) for number in numbers)
                 except ValueError:
                     return
-                self._open(end, width, height, rate)
+                self.signals.order("open", rate, lambda granted: self._open(end, width, height, granted))
             case [b"CLOSE"]:
-                self._wanted.clear()
+                self.signals.order("close", None, lambda _: self._wanted.clear())
             case _:
                 pass
 
@@ -184,7 +192,8 @@ class WebcamEmulator:
         self._sequence += 1
         if self._uses_up("drop"):
             return
-        draw = self._view.exposure(stamp, self._size)
+        draw = self.signals.report("image", self._view.exposure(stamp, self._size))
+        stamp = self.signals.report("stamp", stamp)
         data = self._damaged(await self._offload(lambda: jpeg(draw(), number)))
         packet = CameraPacket(PacketKind.PICTURE, number, stamp + self._jump, data).encode()
         for at in range(0, len(packet), CHUNK):

@@ -7,6 +7,7 @@ import numpy as np
 
 from monstertruck_drivers.cable import DeviceEnd
 from monstertruck_drivers.emulation import EmulatorSetup, ImuSource, ReceivedBytes
+from monstertruck_drivers.signals import SignalKind, Signals
 from monstertruck_drivers.wt61.protocol import BAUD, RATE, TOGGLE_SLEEP, Wt61Kind, Wt61Packet, build, measured
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import InputError
@@ -15,6 +16,14 @@ BOOT: Final = 300_000_000
 """Nanoseconds from power-up to the first packet."""
 _COUNT_NOISE: Final = 2.0
 """Standard deviation of the converters, in their own counts."""
+
+
+REPORTED: Final = (
+    *(f"{kind.name.lower()}_{axis}" for kind in (Wt61Kind.ACCELERATION, Wt61Kind.ANGULAR_VELOCITY) for axis in "xyz"),
+    "temperature",
+)
+"""Numbers of its packets, in their own counts."""
+SLEEP: Final = "toggle_sleep"
 
 
 class Wt61Emulator:
@@ -37,6 +46,8 @@ class Wt61Emulator:
         self._clock = clock
         self._source = source
         self._rng = np.random.default_rng(seed)
+        kinds = dict.fromkeys(REPORTED, SignalKind.NUMBER) | {SLEEP: SignalKind.SWITCH}
+        self.signals = Signals(clock.now, kinds, self._rng)
         self._faults = {"frozen": False, "silent": False, "inverted": False, "asleep": False}
         self._bad_checksums = 0
         self._torn = True
@@ -53,7 +64,10 @@ class Wt61Emulator:
             while True:
                 self.received.extend(await end.read())
                 if self.received.endswith(TOGGLE_SLEEP):
-                    self._faults["asleep"] = not self._faults["asleep"]
+                    self.signals.order(SLEEP, None, self._toggle_sleep)
+
+    def _toggle_sleep(self, _: None) -> None:
+        self._faults["asleep"] = not self._faults["asleep"]
 
     def power_cycle(self) -> None:
         """Supply off and on: it is awake again."""
@@ -108,8 +122,13 @@ class Wt61Emulator:
         return b"".join(map(build, (self._noisy(force), self._noisy(rate), angle)))
 
     def _noisy(self, packet: Wt61Packet) -> Wt61Packet:
-        x, y, z = np.rint(_COUNT_NOISE * self._rng.standard_normal(3)).astype(int).tolist()
-        return packet._replace(x=_count(packet.x + x), y=_count(packet.y + y), z=_count(packet.z + z))
+        noise = np.rint(_COUNT_NOISE * self._rng.standard_normal(3)).astype(int).tolist()
+        report, name = self.signals.report, packet.kind.name.lower()
+        x, y, z = (
+            _count(report(f"{name}_{axis}", value + error))
+            for axis, value, error in zip("xyz", (packet.x, packet.y, packet.z), noise, strict=True)
+        )
+        return packet._replace(x=x, y=y, z=z, temperature=_count(report("temperature", packet.temperature)))
 
 
 def _count(value: int) -> int:

@@ -47,8 +47,9 @@ def emulate(
     """Emulate one device, byte for byte, alone on a pty: for third-party clients and bench work.
 
     Faults are read from standard input, one per line: `unplug`, `plug`, `power-cycle`,
-    `line stalled|deaf|delay|chunk|flip_rate|drop_rate|garbage VALUE`, or a fault of the device itself
-    (an unknown word lists them).
+    `line stalled|deaf|delay|chunk|flip_rate|drop_rate|garbage VALUE`, `signal NAME FAULT [VALUE]` for a false
+    reading or a command that is not obeyed (`signal help` lists them), or a fault of the device itself (an unknown
+    word lists them).
     """
     from monstertruck_drivers.catalog import DEVICES
     from monstertruck_runtime.endpoints import emulated_ports

@@ -4,15 +4,18 @@ import asyncio
 import os
 import pty
 import sys
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from monstertruck_drivers.cable import MemoryPort
 from monstertruck_drivers.catalog import DEVICES
 from monstertruck_drivers.emulation import EmulatorSetup
+from monstertruck_drivers.signals import SignalKind, Signals
 from monstertruck_runtime.clock import VirtualClock, VirtualLoop
 from monstertruck_runtime.errors import InputError
-from monstertruck_sim.console import CommandedGroup, Emulated, FaultConsole
+from monstertruck_sim.console import CommandedGroup, Emulated, FaultConsole, set_signal_fault
 from monstertruck_sim.world.config import WorldConfig
 from monstertruck_sim.world.world import World
 
@@ -96,3 +99,16 @@ def test_help_is_no_error(line: str, answer: str):
     target = CommandedGroup("device", {"lidar": Refusing(), "drive": Refusing()})
     FaultConsole(target, sys.stdin, said.append).execute(line)
     assert said == [answer]
+
+
+def test_signals_are_falsified_by_name():
+    signals = Signals(lambda: 0, {"heading": SignalKind.NUMBER}, np.random.default_rng(1))
+    emulator = SimpleNamespace(signals=signals)
+    set_signal_fault(emulator, ["heading", "offset", "5"])
+    assert signals.report("heading", 10) == 15
+    set_signal_fault(emulator, ["heading", "off"])
+    assert signals.report("heading", 10) == 10
+    with pytest.raises(InputError, match="names: heading"):
+        set_signal_fault(emulator, ["help"])
+    with pytest.raises(InputError, match="names no signals"):
+        set_signal_fault(object(), ["heading", "off"])
