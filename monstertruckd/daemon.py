@@ -190,7 +190,7 @@ class Daemon:
                 if isinstance(service, ExplorerService):
                     register_numbered(calls, "explore", ExploreRequest, service.take)
                 if isinstance(service, MissionService):
-                    register_numbered(calls, "mission", MissionRequest, service.take)
+                    register_numbered(calls, "mission", MissionRequest, service.take, service.kept)
                 if isinstance(service, BehaviourService):
                     register_behaviour_calls(calls, service)
             if self._notify is not None:

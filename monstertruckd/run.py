@@ -11,10 +11,12 @@ from monstertruck_runtime import wire
 from monstertruck_runtime.clock import Clock, run_wall
 from monstertruck_runtime.errors import PortBusyError
 from monstertruck_runtime.memory import settle
+from monstertruck_runtime.small_files import remove_leftovers
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.topics import TOPICS
 from monstertruckd.assembly.catalogs import TABLES
 from monstertruckd.config.load import load_truck
+from monstertruckd.config.truck import TruckConfig
 from monstertruckd.daemon import Daemon
 from monstertruckd.host.logging_queue import start_logging
 
@@ -36,6 +38,8 @@ def run_daemon(config_file: Path, *, verbose: bool) -> Reason:
     if tree.unused:
         text = "%s: not used, as the configuration has no such part: %s"
         log.warning(text, tree.calibration, ", ".join(tree.unused))
+    for file in (file for folder in _written(config) for file in remove_leftovers(folder)):
+        log.info("%s: removed; a program was killed while it wrote it", file)
     for table in TABLES:
         for broken in table.broken:
             log.warning("plug-in left out: %s", broken)
@@ -60,6 +64,13 @@ def run_daemon(config_file: Path, *, verbose: bool) -> Reason:
     finally:
         listener.stop()
     return Reason.OK
+
+
+def _written(config: TruckConfig) -> tuple[Path, ...]:
+    """Folders of state that a daemon writes."""
+    places = () if config.slam is None else (config.slam.save, config.slam.map)
+    maps = (place if place.is_dir() else place.parent for place in places if place is not None)
+    return (config.state_directory, config.calibration_folder, *maps)
 
 
 def _first(error: BaseException | None) -> BaseException | None:

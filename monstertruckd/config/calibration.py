@@ -19,7 +19,7 @@ from pydantic import AfterValidator, Field, ValidationError
 
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import ConfigError, NotFoundError
-from monstertruck_runtime.small_files import require_file
+from monstertruck_runtime.small_files import make_folder, replace_file, require_file
 from monstertruck_schemas.base import Schema, first_mistake
 from monstertruck_schemas.body import LensConfig, Mount, TurnDeficitConfig
 from monstertruckd.config.renamed import fits, present_key
@@ -299,7 +299,7 @@ class CalibrationStore:
         """
         with self._writing:
             try:
-                self.folder.mkdir(parents=True, exist_ok=True)
+                make_folder(self.folder)
                 folder = os.open(self.folder, os.O_RDONLY | os.O_DIRECTORY)
             except OSError as error:
                 raise ConfigError(f"{self.folder}: calibration cannot be written: {error.strerror}") from error
@@ -323,23 +323,10 @@ class CalibrationStore:
         )
         path = self.folder / f"{number:04d}-{utc(real_ns).replace(':', '')}.json"
         try:
-            self._put(path, file.model_dump_json(indent=1).encode() + b"\n")
+            replace_file(path, file.model_dump_json(indent=1) + "\n")
         except OSError as error:
             raise ConfigError(f"{path}: calibration cannot be written: {error.strerror}") from error
         return path
-
-    def _put(self, path: Path, data: bytes) -> None:
-        draft = path.with_suffix(".new")
-        with draft.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        draft.replace(path)
-        directory = os.open(self.folder, os.O_RDONLY | os.O_DIRECTORY)
-        try:
-            os.fsync(directory)
-        finally:
-            os.close(directory)
 
 
 def _number(path: Path) -> int:

@@ -21,7 +21,7 @@ from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import disk_reason
 from monstertruck_runtime.mailbox import latest
 from monstertruck_runtime.ports import EventSink, Ready
-from monstertruck_runtime.small_files import replace_file
+from monstertruck_runtime.small_files import make_folder, replace_file
 from monstertruck_runtime.threads import Offload
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.health import CalibrationHealth, CalibrationState
@@ -264,7 +264,7 @@ class DistanceCounter:
         """
         if self.file is None:
             return
-        self.file.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(self.file.parent)
         replace_file(self.file, json.dumps({"metres": round(self.metres, 1)}))
         self.written = self.metres
 

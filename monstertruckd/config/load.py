@@ -26,7 +26,7 @@ from ruamel.yaml.reader import ReaderError
 from monstertruck_runtime.endpoints import emulated_ports
 from monstertruck_runtime.errors import ConfigError
 from monstertruck_runtime.plugins import models_in
-from monstertruck_runtime.small_files import replace_file, require_file
+from monstertruck_runtime.small_files import make_folder, replace_file, require_file
 from monstertruck_schemas.base import LiveValue, Schema, field_docs, first_mistake, live_settings
 from monstertruckd.config.calibration import CalibrationStore, Result, WizardName, in_order, put_values, unused
 from monstertruckd.config.renamed import RENAMED
@@ -221,7 +221,7 @@ class SavedSettings:
         out = io.StringIO()
         YAML(typ="rt", pure=True).dump(content, out)
         try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
+            make_folder(self.path.parent)
             replace_file(self.path, out.getvalue())
         except OSError as error:
             raise ConfigError(f"{self.path}: settings cannot be saved: {error.strerror}") from error

@@ -12,6 +12,8 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Final, Protocol
 
+from monstertruck_runtime.small_files import make_folder, remove_file, replace_file, require_place
+
 FREE: Final = b"0"
 MARKED: Final = b"1"
 
@@ -127,9 +129,8 @@ class EstopLatch:
         Raises:
             OSError: the file could not be created, or the mark not be opened.
         """
-        self._path.parent.mkdir(parents=True, exist_ok=True)
-        os.close(self._draft())
-        self._draft_path.unlink()
+        make_folder(self._path.parent)
+        require_place(self._path)
         self._mark = Mark(self._mark_path)
 
     def engaged(self) -> bool:
@@ -163,37 +164,16 @@ class EstopLatch:
         """
         with self._storing:
             if engaged:
-                self._path.parent.mkdir(parents=True, exist_ok=True)
-                with os.fdopen(self._draft(), "wb", buffering=0) as file:
-                    file.write(b"emergency stop latched\n")
-                    os.fsync(file.fileno())
-                self._draft_path.replace(self._path)
+                make_folder(self._path.parent)
+                replace_file(self._path, "emergency stop latched\n", follow_links=False)
             else:
-                self._path.unlink(missing_ok=True)
-            if self._path.parent.exists():
-                self._sync_directory()
+                remove_file(self._path)
 
     def close(self) -> None:
         """Remove the mark."""
         mark, self._mark = self._mark, None
         if mark is not None:
             mark.close()
-
-    @property
-    def _draft_path(self) -> Path:
-        return self._path.with_name(self._path.name + ".new")
-
-    def _draft(self) -> int:
-        """A new file to be written; what was there under its name, a link too, is removed and never followed."""
-        self._draft_path.unlink(missing_ok=True)
-        return os.open(self._draft_path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o644)
-
-    def _sync_directory(self) -> None:
-        directory = os.open(self._path.parent, os.O_RDONLY)
-        try:
-            os.fsync(directory)
-        finally:
-            os.close(directory)
 
 
 def marks_folder(configured: Path | None, environment: Mapping[str, str], system: Path = Path("/")) -> Path:

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from monstertruck_runtime.errors import InputError, NotFoundError, NotPermittedError, TruckError
-from monstertruck_runtime.small_files import replace_file
+from monstertruck_runtime.small_files import make_folder, remove_leftovers, replace_file
 from monstertruck_runtime.threads import in_thread
 from monstertruck_runtime.yaml_files import read_yaml, yaml_text
 from monstertruck_schemas.roles import AccessRole
@@ -204,7 +204,8 @@ def add_user(file: Path, name: str, role: AccessRole, password: str) -> None:
         raise InputError(f"password of {name}: expected at least {SHORTEST} characters")
     rows = _rows(file) if file.exists() else {}
     rows[name] = {"role": role.value, "password": hash_of(password, secrets.token_bytes(LENGTH))}
-    file.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(file.parent)
+    remove_leftovers(file.parent)
     if file.exists():
         file.chmod(0o600)
     replace_file(file, yaml_text(rows), 0o600)

@@ -5,7 +5,7 @@ The gate and the planners check requests by the same rules, whether they come by
 
 import json
 import math
-from collections.abc import Callable, Collection, Coroutine, Mapping
+from collections.abc import Awaitable, Callable, Collection, Coroutine, Mapping
 from typing import Any, Final, Protocol, TypeVar
 
 from pydantic import ValidationError
@@ -136,11 +136,28 @@ def parse_request(model: type[R], payload: dict[str, Any]) -> R:
         raise InputError(text) from None
 
 
-def register_numbered(rpc: RpcRegistry, name: str, model: type[R], take: Callable[[R], int]) -> None:
-    """Serve ``name``, whose payload is a ``model``; it is answered with the ``number`` that ``take`` gives it."""
+def register_numbered(
+    rpc: RpcRegistry,
+    name: str,
+    model: type[R],
+    take: Callable[[R], int],
+    kept: Callable[[], Awaitable[object]] | None = None,
+) -> None:
+    """Serve ``name``, whose payload is a ``model``; the answer is the ``number`` that ``take`` returns.
+
+    Args:
+        rpc: registry of remote calls.
+        name: of the call.
+        model: of its payload.
+        take: carries out the request.
+        kept: returns once the request outlasts a power cut; the call is answered then. None = nothing is kept.
+    """
 
     async def call(payload: dict[str, Any]) -> dict[str, Any]:
-        return {"number": take(parse_request(model, payload))}
+        number = take(parse_request(model, payload))
+        if kept is not None:
+            await kept()
+        return {"number": number}
 
     rpc.register(name, call)
 

@@ -1,12 +1,17 @@
 """Small files: those of /proc and /sys, which may be missing, and files that are replaced as a whole."""
 
 import errno
+import fcntl
 import os
 import stat
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Final
+
+SCRATCH: Final = ".new~"
+"""End of the names of files that are being written; of a killed writer they are left."""
 
 
 def text_of(file: Path) -> str | None:
@@ -60,7 +65,9 @@ def require_place(path: Path) -> None:
 
 
 def replace_file(path: Path, content: str | bytes, mode: int = 0o644, *, follow_links: bool = True) -> None:
-    """Give the file its ``content``, as a whole or not at all; one that was there keeps its mode.
+    """Give the file its ``content``, as a whole or not at all; an existing file keeps its mode.
+
+    File and folder are synced: once this returns, the content outlasts a power cut.
 
     Args:
         path: the file, or a link to it.
@@ -69,7 +76,7 @@ def replace_file(path: Path, content: str | bytes, mode: int = 0o644, *, follow_
         follow_links: a link stays one and its file gets the content; otherwise the file takes the link's place.
 
     Raises:
-        OSError: it could not be written, or is a folder, a device or the like; nothing has changed then.
+        OSError: it could not be written, or is a folder, a device or the like; the file is the old or the new one.
     """
     place = path.resolve() if follow_links else path
     before = place.lstat().st_mode if os.path.lexists(place) else None
@@ -77,24 +84,107 @@ def replace_file(path: Path, content: str | bytes, mode: int = 0o644, *, follow_
         if follow_links or not stat.S_ISLNK(before):
             raise OSError(errno.EINVAL, "Not a regular file", str(place))
         before = None
-    handle, scratch = tempfile.mkstemp(dir=place.parent, prefix=place.name)
-    try:
-        with os.fdopen(handle, "wb") as file:
+    with _scratch(place) as (handle, scratch):
+        with os.fdopen(handle, "wb", closefd=False) as file:
             file.write(content.encode() if isinstance(content, str) else content)
-            file.flush()
-            os.fsync(handle)
-        Path(scratch).chmod(mode if before is None else stat.S_IMODE(before))
-        Path(scratch).replace(place)
-    except BaseException:
-        Path(scratch).unlink(missing_ok=True)
-        raise
+        os.fchmod(handle, mode if before is None else stat.S_IMODE(before))
+        os.fsync(handle)
+        scratch.replace(place)
+    sync_folder(place.parent)
+
+
+def remove_file(path: Path) -> None:
+    """Remove a file, if it is there; once this returns, it stays away after a power cut.
+
+    Raises:
+        OSError: it could not be removed; it may be gone until the next power cut.
+    """
+    path.unlink(missing_ok=True)
+    if path.parent.exists():
+        sync_folder(path.parent)
+
+
+def make_folder(path: Path, mode: int = 0o777) -> None:
+    """Make a folder of this ``mode`` and those above it, where they are missing, and sync the names of the new ones.
+
+    Raises:
+        OSError: one could not be made.
+    """
+    missing = [folder for folder in (path, *path.parents) if not folder.exists()]
+    path.mkdir(mode, parents=True, exist_ok=True)
+    for folder in missing:
+        sync_folder(folder.parent)
+
+
+def sync_folder(folder: Path) -> None:
+    """Write the names in a folder to the disk: a new or renamed file is safe only after this.
+
+    Raises:
+        OSError: the disk failed.
+    """
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(handle)
+    except OSError as error:
+        if error.errno != errno.EINVAL:  # file systems without folders of their own, as those of some networks
+            raise
+    finally:
+        os.close(handle)
+
+
+def remove_leftovers(folder: Path) -> list[Path]:
+    """Remove what killed writers left in a folder; files that are being written stay.
+
+    Returns:
+        The files that were removed.
+
+    Raises:
+        OSError: the folder cannot be read, or a file not be removed.
+    """
+    removed = []
+    for path in sorted(folder.glob(f"*{SCRATCH}")) if folder.is_dir() else ():
+        try:
+            handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+        except OSError as error:
+            if error.errno in (errno.ENOENT, errno.ELOOP):
+                continue
+            raise
+        try:
+            if stat.S_ISREG(os.fstat(handle).st_mode):
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                path.unlink(missing_ok=True)
+                removed.append(path)
+        except BlockingIOError:
+            pass
+        finally:
+            os.close(handle)
+    return removed
+
+
+@contextmanager
+def _scratch(place: Path) -> Iterator[tuple[int, Path]]:
+    """Yield a new, locked file beside ``place`` and its path; if it is not renamed, it is removed at the end."""
+    while True:
+        handle, name = tempfile.mkstemp(dir=place.parent, prefix=f"{place.name}.", suffix=SCRATCH)
+        scratch = Path(name)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX)
+            if os.fstat(handle).st_nlink == 0:  # removed as a leftover before it was locked
+                continue
+            yield handle, scratch
+        except BaseException:
+            scratch.unlink(missing_ok=True)
+            raise
+        finally:
+            os.close(handle)
+        return
 
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """Yields where to write a file of any length: ``.part`` behind its name, which it takes once the body ends.
+    """Yield where to write a file of any length: ``.part`` behind its name, which it takes once the body ends.
 
-    If the body fails, what it wrote is removed, and a file of that name stays as it was.
+    If the body fails, what it wrote is removed, and a file of that name stays as it was. File and folder are synced.
 
     Raises:
         OSError: ``path`` is a folder, a device or the like, or cannot be replaced.
@@ -105,7 +195,10 @@ def whole_file(path: Path) -> Iterator[Path]:
     part = place.with_name(place.name + ".part")
     try:
         yield part
+        with part.open("rb") as file:
+            os.fsync(file.fileno())
         part.replace(place)
     except BaseException:
         part.unlink(missing_ok=True)
         raise
+    sync_folder(place.parent)

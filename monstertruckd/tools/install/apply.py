@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Final
 
 from monstertruck_runtime.errors import CommandFailedError, InputError, NotFoundError, NotPermittedError
-from monstertruck_runtime.small_files import replace_file
+from monstertruck_runtime.small_files import make_folder, remove_file, replace_file
 from monstertruckd.tools.install.plan import (
     AFTER_INSTALL,
     AFTER_REMOVAL,
@@ -107,14 +107,14 @@ def install(plan: InstallPlan, root: Path, *, dry: bool = False, run: Run = run_
     _refuse_masked(root, report)
     with as_permitted():
         if here:
-            unfinished.parent.mkdir(parents=True, exist_ok=True)
+            make_folder(unfinished.parent)
             replace_file(unfinished, "", follow_links=False)
         for file in plan.files:
             if report.changes[file.path] is not Change.SAME:
                 _write(root, file, report)
         for command in report.commands:
             run(command)
-        unfinished.unlink(missing_ok=True)
+        remove_file(unfinished)
     return report
 
 
@@ -180,7 +180,7 @@ def _refuse_masked(root: Path, report: InstallReport) -> None:
 
 def _write(root: Path, file: PlannedFile, report: InstallReport) -> None:
     place = place_of(root, file.path)
-    place.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(place.parent)
     if file.target is not None:
         place.unlink(missing_ok=True)
         place.symlink_to(file.target)

@@ -24,7 +24,7 @@ from typing import Any, Final, Literal, Self, TypeVar
 from pydantic import Field, ValidationError, field_validator, model_validator
 
 from monstertruck_runtime.errors import InputError, NotFoundError
-from monstertruck_runtime.small_files import replace_file
+from monstertruck_runtime.small_files import make_folder, remove_file, remove_leftovers, replace_file
 from monstertruck_runtime.yaml_files import read_yaml, yaml_text
 from monstertruck_schemas.base import Name, Schema, first_mistake
 from monstertruck_schemas.req import Role
@@ -167,7 +167,7 @@ class Folder:
         _validated(CertificateRegister, FIRST | given, self.path)
         if days > AUTHORITY_DAYS:
             raise InputError(f"{days} days: expected at most {AUTHORITY_DAYS}, those of the authority")
-        self.path.mkdir(mode=0o700, parents=True, exist_ok=True)
+        make_folder(self.path, 0o700)
         with self._alone():
             new = not (self.path / "register.yaml").exists()
             if new and (names := sorted(file.stem for file in self.path.glob("issuers/*.pem"))):
@@ -180,7 +180,7 @@ class Folder:
             # A start that was broken off may have left one that is good.
             if new and not self._files("authority")[0].exists():
                 new_authority(f"Authority of {register.robot}", now, AUTHORITY_DAYS).save(*self._files("authority"))
-            self.robot.mkdir(mode=0o700, exist_ok=True)
+            make_folder(self.robot, 0o700)
             authority = self.authority()
             _require_time(authority, now, days)
             issue(authority, register.robot, now, days * DAY, server=register.addresses).save(
@@ -213,14 +213,14 @@ class Folder:
             authority = self.authority()
             _require_time(authority, now, days)
             files = self._files(f"issuers/{name}")
-            files[0].parent.mkdir(mode=0o700, exist_ok=True)
+            make_folder(files[0].parent, 0o700)
             if not files[0].exists():  # written after its key
                 new_issuer(authority, f"Issuer of {name}", now, seconds_left(authority.certificate, now) // DAY).save(
                     *files
                 )
             issuer = load(*files)
             target = self.path / "stations" / name
-            target.mkdir(mode=0o700, parents=True, exist_ok=True)
+            make_folder(target, 0o700)
             issue(issuer, name, now, days * DAY).save(target / "station.pem", target / "station.key", issuer.pem)
             replace_file(target / "ca.pem", self._trusted())
             return self._write(register)
@@ -239,7 +239,7 @@ class Folder:
             kept = register.model_copy(update={"stations": stations})
             self._write_robot(kept)
             for file in self._files(f"issuers/{name}"):
-                file.unlink(missing_ok=True)
+                remove_file(file)
             shutil.rmtree(self.path / "stations" / name, ignore_errors=True)
             self._write(kept)  # last: what was broken off before can be requested again
 
@@ -260,7 +260,7 @@ class Folder:
             replace_file(self.path / ROUTER_FILE, authority)
             for station in register.stations:
                 target = self.path / "stations" / station
-                target.mkdir(mode=0o700, parents=True, exist_ok=True)  # it may have been moved to the station
+                make_folder(target, 0o700)  # it may have been moved to the station
                 replace_file(target / "ca.pem", self._trusted())
             self._write(register)
 
@@ -314,6 +314,8 @@ class Folder:
             raise
         try:
             fcntl.flock(handle, fcntl.LOCK_EX)
+            for folder in (self.path, *(path for path in self.path.rglob("*") if path.is_dir())):
+                remove_leftovers(folder)
             yield
         finally:
             os.close(handle)

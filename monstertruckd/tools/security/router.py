@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from monstertruck_runtime.endpoints import endpoint_of
 from monstertruck_runtime.errors import InputError
-from monstertruck_runtime.small_files import replace_file
+from monstertruck_runtime.small_files import make_folder, replace_file
 from monstertruckd.bus.access import router_rules
 from monstertruckd.tools.security.certificates import DAY, issue, load, new_authority
 from monstertruckd.tools.security.folder import AUTHORITY_DAYS, PORT, ROBOT_DAYS, Folder, require_address
@@ -55,7 +55,7 @@ def make_router(
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise InputError(f"{', '.join(twice)}: expected another name for each robot and station behind one router")
     target = path / "router"
-    target.mkdir(mode=0o700, parents=True, exist_ok=True)
+    make_folder(target, 0o700)
     files = path / "authority.pem", path / "authority.key"
     if not files[0].exists():  # written after its key
         new_authority(f"Authority of {ROUTER}", now, AUTHORITY_DAYS).save(*files)

@@ -18,6 +18,7 @@ from monstertruck_estimation.vision.tags import Picture, Sighting, TagReader
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.fitting import least_squares
 from monstertruck_runtime.errors import ConfigError, InputError
+from monstertruck_runtime.small_files import make_folder, replace_file
 from monstertruck_schemas.base import Schema
 from monstertruckd.tools.stand.camera import PlacedCamera, meet, rotation_matrix
 from monstertruckd.tools.stand.config import MarkConfig, OverheadConfig
@@ -240,10 +241,8 @@ def save(calibration: StandCalibration, path: Path) -> None:
         ConfigError: it cannot be written.
     """
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        draft = path.with_suffix(".new")
-        draft.write_text(calibration.model_dump_json(indent=1) + "\n", encoding="utf-8")
-        draft.replace(path)
+        make_folder(path.parent)
+        replace_file(path, calibration.model_dump_json(indent=1) + "\n")
     except OSError as error:
         raise ConfigError(f"{path}: cannot be written: {error.strerror}") from error
 

@@ -27,7 +27,7 @@ from monstertruck_runtime.clock import SECOND, Clock, Schedule
 from monstertruck_runtime.errors import InputError, NotFoundError, RequestRefusedError, TruckError, disk_reason
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
 from monstertruck_runtime.requests import Sequences, does_not_drive, examine, inner_request
-from monstertruck_runtime.small_files import replace_file, require_file
+from monstertruck_runtime.small_files import remove_file, replace_file, require_file
 from monstertruck_runtime.threads import Offload
 from monstertruck_schemas.base import Pose2D, first_mistake
 from monstertruck_schemas.event import Severity
@@ -164,6 +164,8 @@ class MissionService:
         """Why the last attempt at a step failed."""
         self._interrupted: SavedProgress | None = None
         self._writing = asyncio.Lock()
+        self._keeping: asyncio.Task[None] | None = None
+        """Writes what the newest request changed."""
         self._limit: asyncio.Timeout | None = None
         """Of the present step."""
         self._noted: Pose | None = None
@@ -233,8 +235,14 @@ class MissionService:
         if progress.index > 0:
             text += f", from step {progress.index + 1} on"
         self._events(Reason.MISSION_STARTED, Severity.INFO, SOURCE, text)
+        self._keeping = self._tasks.create_task(self._save(progress))
         self._task = self._tasks.create_task(self._do_all(progress))
         return self._number
+
+    async def kept(self) -> None:
+        """Wait until the newest request outlasts a restart, or could not be written, which an event reports."""
+        if self._keeping is not None:
+            await asyncio.wait([self._keeping])
 
     def _stop(self, task: asyncio.Task[None], source: str) -> None:
         """End the mission that ``task`` does; its end may have been reported already."""
@@ -243,14 +251,14 @@ class MissionService:
             return
         self._finish(StepEnd(Reason.CANCELLED, f"stopped by {source}"))
         task.cancel()
-        self._tasks.create_task(self._forget())
+        self._keeping = self._tasks.create_task(self._forget())
 
     def _drop(self, interrupted: SavedProgress, source: str) -> None:
         """Forget a mission that nobody wants to resume."""
         assert self._tasks is not None
         self._interrupted = None
         self._events(Reason.CANCELLED, Severity.INFO, SOURCE, f"{interrupted.mission.name}: given up by {source}")
-        self._tasks.create_task(self._forget())
+        self._keeping = self._tasks.create_task(self._forget())
         self._report(self._clock.now())
 
     def _begin(self, request: MissionRequest) -> MissionProgress:
@@ -309,7 +317,6 @@ class MissionService:
             while following in ("step", "again", "return"):
                 self._progress, self._waits = progress, ""
                 self._report(self._clock.now())
-                await self._save(progress)
                 step = ReturnStep(do="return") if progress.returning else progress.step
                 at = f"step {progress.index + 1} of {len(progress.mission.steps)}: {progress.doing}"
                 self._events(Reason.MISSION_STEP, Severity.INFO, SOURCE, at)
@@ -318,6 +325,8 @@ class MissionService:
                     self._failed = end.text or end.reason.text
                     self._events(end.reason, Severity.WARNING, SOURCE, f"{at}: {self._failed}")
                 progress, following = after(progress, end)
+                if following in ("step", "again", "return"):
+                    await self._save(progress)
             self._finish(outcome(progress, following))
         except asyncio.CancelledError:
             if self._end is None:  # the daemon ends: the progress stays on the disk
@@ -587,7 +596,7 @@ class MissionService:
         await self._save(progress)
 
     async def _forget(self) -> None:
-        await self._write(lambda file: file.unlink(missing_ok=True))
+        await self._write(remove_file)
 
     async def _write(self, change: Callable[[Path], object]) -> None:
         if (file := self._file) is None:

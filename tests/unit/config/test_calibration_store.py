@@ -1,6 +1,7 @@
 """The folder of calibration files: whole after any crash, the one before kept, undone by a newer one."""
 
 import os
+import tempfile
 import threading
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import pytest
 
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import ConfigError, NotFoundError
+from monstertruckd.config import calibration
 from monstertruckd.config.calibration import CalibrationStore, Estimate, Result, in_order, with_values
 from monstertruckd.config.load import load_config
 from monstertruckd.config.truck import TruckConfig
@@ -132,7 +134,7 @@ def test_nothing_to_undo(store: CalibrationStore):
         store.undo("battery", NOON)
 
 
-@pytest.mark.parametrize("step", ["open", "fsync", "replace"])
+@pytest.mark.parametrize("step", ["mkstemp", "fsync", "replace"])
 def test_a_failure_while_writing_leaves_the_old_file(
     step: str, store: CalibrationStore, monkeypatch: pytest.MonkeyPatch
 ):
@@ -143,7 +145,7 @@ def test_a_failure_while_writing_leaves_the_old_file(
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as broken:
-        broken.setattr(os if step == "fsync" else Path, step, full)
+        broken.setattr({"mkstemp": tempfile, "fsync": os, "replace": Path}[step], step, full)
         with pytest.raises(ConfigError, match="No space left on device"):
             store.save(ratio(650.0), NOON)
     assert {path: path.read_bytes() for path in store.files()} == before
@@ -153,15 +155,16 @@ def test_a_failure_while_writing_leaves_the_old_file(
 def test_two_writers_of_one_folder_keep_what_the_other_measured(
     store: CalibrationStore, monkeypatch: pytest.MonkeyPatch
 ):
-    other, put = CalibrationStore(store.folder, "truck"), store._put
+    other, put = CalibrationStore(store.folder, "truck"), calibration.replace_file
     second = threading.Thread(target=other.save, args=(gain(1.02), NOON))
 
-    def meanwhile(path: Path, data: bytes) -> None:
+    def meanwhile(path: Path, data: str) -> None:
+        monkeypatch.setattr(calibration, "replace_file", put)
         second.start()
         second.join(0.1)
         put(path, data)
 
-    monkeypatch.setattr(store, "_put", meanwhile)
+    monkeypatch.setattr(calibration, "replace_file", meanwhile)
     store.save(ratio(640.0), NOON)
     second.join()
     assert [path.name[:4] for path in store.files()] == ["0001", "0002"]
@@ -170,7 +173,7 @@ def test_two_writers_of_one_folder_keep_what_the_other_measured(
 
 def test_a_torn_draft_is_no_calibration(store: CalibrationStore):
     path = store.save(ratio(640.0), NOON)
-    (store.folder / "0002-2026-11-21T120130Z.new").write_text('{"version": 1, "num')
+    (store.folder / "0002-2026-11-21T120130Z.json.x1.new~").write_text('{"version": 1, "num')
     assert store.newest() == path
     store.save(ratio(650.0), NOON + 90 * SECOND)
     assert value(store) == 650.0

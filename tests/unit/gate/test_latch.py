@@ -181,18 +181,14 @@ def test_every_latch_has_a_mark_of_its_own_whatever_way_leads_to_it(tmp_path, ru
     assert mark_of(tmp_path / "a" / "estop").startswith("monstertruckd-estop-")
 
 
-def test_a_draft_is_written_by_its_user_into_a_new_file_only(latch, tmp_path):
+def test_a_link_in_the_place_of_the_file_is_replaced_and_not_followed(latch, tmp_path):
     folder = tmp_path / "state" / "deep"
     folder.mkdir(parents=True)
-    (folder / "estop.new").symlink_to(tmp_path / "victim")
+    (folder / "estop").symlink_to(tmp_path / "victim")
     latch.store(True)
     assert not (tmp_path / "victim").exists()
-    (folder / "estop.new").write_text("half")
-    latch.store(True)
+    assert not (folder / "estop").is_symlink()
     assert (folder / "estop").read_text() == "emergency stop latched\n"
-    file = latch._draft()
-    assert not os.get_inheritable(file)
-    os.close(file)
 
 
 def test_marks_are_where_they_are_configured_given_or_usual(tmp_path, run):

@@ -10,6 +10,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
+from monstertruck_runtime import small_files
 from monstertruck_runtime.clock import SECOND, WallClock, run_virtual
 from monstertruck_runtime.threads import inline
 from monstertruck_schemas.cmd import DriveAction
@@ -418,10 +419,8 @@ def test_links_in_the_place_of_latch_and_mark_are_not_followed(tmp_path, what):
         with pytest.raises(OSError, match="symbolic"):
             latch.prepare()
     else:
-        draft = tmp_path / "state" / "estop.new"
-        draft.symlink_to(victim)
         latch.prepare()
-        draft.symlink_to(victim)
+        (tmp_path / "state" / "estop").symlink_to(victim)
         latch.store(True)
         assert latch.stored()
         assert not (tmp_path / "state" / "estop").is_symlink()
@@ -462,17 +461,25 @@ class Unsynced(EstopLatch):
     def stored(self):
         return super().stored() if self.readable else None
 
-    def _sync_directory(self):
-        if self.broken:
+
+@pytest.fixture
+def unsynced(tmp_path, monkeypatch):
+    (tmp_path / "run").mkdir()
+    latch, sync = Unsynced(tmp_path / "state" / "estop", tmp_path / "run"), small_files.sync_folder
+    latch.prepare()
+
+    def sync_folder(folder):
+        if latch.broken:
             raise OSError(24, "too many open files")
-        super()._sync_directory()
+        sync(folder)
+
+    monkeypatch.setattr(small_files, "sync_folder", sync_folder)
+    return latch
 
 
 @pytest.mark.parametrize("readable", [True, False])
-def test_a_stop_after_a_reset_whose_folder_could_not_be_synced_is_latched_again(tmp_path, readable):
-    (tmp_path / "run").mkdir()
-    latch = Unsynced(tmp_path / "state" / "estop", tmp_path / "run")
-    latch.prepare()
+def test_a_stop_after_a_reset_whose_folder_could_not_be_synced_is_latched_again(tmp_path, unsynced, readable):
+    latch = unsynced
 
     async def scenario(bench):
         state = bench.out.state
@@ -494,10 +501,8 @@ def test_a_stop_after_a_reset_whose_folder_could_not_be_synced_is_latched_again(
     on_bench(scenario, latch)
 
 
-def test_a_reset_of_a_stop_whose_folder_could_not_be_synced_removes_the_file(tmp_path):
-    (tmp_path / "run").mkdir()
-    latch = Unsynced(tmp_path / "state" / "estop", tmp_path / "run")
-    latch.prepare()
+def test_a_reset_of_a_stop_whose_folder_could_not_be_synced_removes_the_file(unsynced):
+    latch = unsynced
 
     async def scenario(bench):
         latch.broken = True
@@ -619,7 +624,9 @@ def test_the_latch_file_is_synced_and_leaves_no_draft(tmp_path, monkeypatch):
     assert synced == []
     latch.store(True)
     assert latch.engaged()
-    assert synced == [f"{folder}/estop.new", str(folder)], "first the contents, then the name"
+    made, draft, name = synced
+    assert (made, name) == (str(tmp_path), str(folder)), "first the folder and the contents, then the name"
+    assert draft.startswith(f"{folder}/estop.")
     assert [path.name for path in folder.iterdir()] == ["estop"]
     synced.clear()
     latch.store(False)

@@ -624,6 +624,30 @@ def test_an_interrupted_mission_can_be_given_up(tmp_path: Path):
     assert robot.events[-1] == (Reason.CANCELLED, "round: given up by ann")
 
 
+@pytest.mark.parametrize("latency", [0.0, 0.3])
+def test_a_request_is_answered_once_it_outlasts_a_power_cut(tmp_path: Path, latency: float):
+    file, begun = tmp_path / "mission.json", []
+
+    async def story(robot: Pretended) -> None:
+        async def offload(work):
+            begun.append(robot.clock.now())
+            await robot.clock.sleep(latency)
+            return work()
+
+        robot.service._offload = offload
+        await robot.service.kept()
+        for _ in range(2):
+            robot.order(MissionOrder.START, GO, WAIT)
+            await robot.service.kept()
+            assert json.loads(file.read_text())["index"] == 0
+            robot.order(MissionOrder.STOP)
+            await robot.service.kept()
+            assert not file.exists()
+        assert robot.clock.now() - begun[0] == pytest.approx(4 * latency * SECOND, abs=0.01 * SECOND)
+
+    played(story, file)
+
+
 SAVED = SavedProgress.of(progress(GO), "ann").model_dump_json()
 
 
