@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Protocol, Self
 
-from monstertruck_drivers.link import Port, SerialPort
+from monstertruck_drivers.tty import OpenSerial, SerialPort
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import DeviceError
 from monstertruck_runtime.threads import Offload, in_thread
@@ -161,8 +161,8 @@ class Machine:
     dev: Path = Path("/dev")
     offload: Offload = in_thread
     run: Callable[[Sequence[str]], Awaitable[tuple[int, str]]] = run_command
-    serial: Callable[[Path, int], Port] = SerialPort
-    """A serial node and a baud rate to a port."""
+    serial: OpenSerial = SerialPort
+    """Makes the port of a serial node."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -40,6 +40,10 @@ class PortConfig(Schema):
     """Device node, best by hub port: /dev/truck/<role> or /dev/serial/by-path/..."""
     baud: Baud | None = None
     """Bits per second; null = the device's own. USB-CDC devices ignore it"""
+    dtr: bool = True
+    """Level of the line DTR while the port is open; false lets an RPLIDAR's motor turn"""
+    rts: bool = True
+    """Level of the line RTS while the port is open"""
 
 
 def _way(port: Any) -> str:

@@ -1,22 +1,14 @@
-"""Byte links: one receive buffer, one way to lose the peer; serial ports.
+"""Byte links: one receive buffer, one way to lose the peer.
 
 A ``Port`` is a place a device can be plugged into; opening it gives a ``Link``. The host side never sees
 whether the bytes come from a tty, a pty or another coroutine.
 """
 
 import asyncio
-import contextlib
-import errno
-import os
-import termios
 from collections.abc import Callable
-from pathlib import Path
 from typing import Protocol, Self
 
-import serial
-import serial_asyncio
-
-from monstertruck_runtime.errors import DeviceLostError, PortBusyError
+from monstertruck_runtime.errors import DeviceLostError
 
 BAUD = 115200
 """Bits per second of a line whose device takes any."""
@@ -48,7 +40,7 @@ class Link:
         self._transmit = transmit
         self._hang_up = hang_up
         self._buffer = bytearray()
-        self._lost: str | None = None
+        self._lost: DeviceLostError | None = None
         self._waiting: LinkWaiter | None = None
         self._due: float | None = None
         """Loop time at which the present wait has lasted too long."""
@@ -67,11 +59,11 @@ class Link:
         if self._waiting is not None:
             self._waiting.on_bytes()
 
-    def lose(self, why: str) -> None:
-        """The transport is gone; pending and later reads raise ``DeviceLostError``."""
+    def lose(self, why: str, error: type[DeviceLostError] = DeviceLostError) -> None:
+        """The transport is gone; pending and later reads raise ``error``."""
         self._hang_up = _nothing
         if self._lost is None:
-            self._lost = why
+            self._lost = error(f"{self.name}: {why}")
             if self._waiting is not None:
                 self._waiting.on_bytes()
         if self._alarm is not None:
@@ -194,7 +186,7 @@ class Link:
 
     def _require_up(self) -> None:
         if self._lost is not None:
-            raise DeviceLostError(f"{self.name}: {self._lost}")
+            raise type(self._lost)(str(self._lost))
 
     def _set_alarm(self, loop: asyncio.AbstractEventLoop, due: float) -> None:
         if self._alarm is not None:
@@ -259,81 +251,6 @@ class Port(Protocol):
 
         Raises:
             DeviceLostError: nothing is plugged in.
+            DeviceWedgedError: the kernel does not finish opening or closing it.
             PortBusyError: another process holds it.
         """
-
-
-class SerialPort:
-    """A tty by its path (``/dev/truck/lidar``, ``/dev/serial/by-path/...``, a pty).
-
-    Args:
-        path: device node or a symlink to it; resolved again at every open.
-        baud: bits per second; meaningless on USB-CDC and ptys.
-    """
-
-    def __init__(self, path: Path, baud: int = BAUD) -> None:
-        self.name = str(path)
-        self._path = path
-        self._baud = baud
-
-    async def open(self) -> Link:
-        """Open raw and exclusive, with empty buffers.
-
-        Raises:
-            DeviceLostError: the node does not exist or vanished.
-            PortBusyError: another process holds an exclusive lock on it.
-        """
-        if not self._path.exists():
-            raise DeviceLostError(f"{self.name}: not plugged in")
-        try:
-            tty = serial.Serial(str(self._path), baudrate=self._baud, exclusive=True)
-        except serial.SerialException as error:
-            raise self._open_error(error) from error
-        except (OSError, termios.error) as error:
-            raise DeviceLostError(f"{self.name}: {error.args[-1]}") from error
-        with contextlib.suppress(OSError, termios.error):
-            termios.tcflush(tty.fileno(), termios.TCIOFLUSH)
-        return _SerialProtocol(self.name, tty).link
-
-    def _open_error(self, error: serial.SerialException) -> Exception:
-        busy = error.errno in (errno.EBUSY, errno.EWOULDBLOCK, errno.EAGAIN) or "exclusively lock" in str(error)
-        if busy:
-            return PortBusyError(f"{self.name}: held by another process")
-        cause = error.__context__
-        number = cause.args[0] if error.errno is None and isinstance(cause, termios.error) else error.errno
-        if number is None:
-            return DeviceLostError(f"{self.name}: {error}")
-        return DeviceLostError(f"{self.name}: {'no serial port' if number == errno.ENOTTY else os.strerror(number)}")
-
-
-class _SerialProtocol(asyncio.Protocol):
-    """Feeds a ``Link`` from a pyserial-asyncio transport.
-
-    Args:
-        name: for error messages.
-        tty: open and exclusive; closed with the link.
-    """
-
-    def __init__(self, name: str, tty: serial.Serial) -> None:
-        self._fd = tty.fileno()
-        self._transport = serial_asyncio.SerialTransport(asyncio.get_running_loop(), self, tty)
-        # abort(), never close(): close() with a stalled peer never ends.
-        self.link = Link(name, self._send, self._transport.abort, tty.baudrate)
-
-    def _send(self, data: bytes) -> None:
-        """Write at once: a last command before ``close`` must not wait in a buffer that ``abort`` drops."""
-        if self._transport.is_closing():
-            return
-        if self._transport.get_write_buffer_size() == 0:
-            with contextlib.suppress(OSError):  # not one byte fits, or the tty is lost: the transport finds out
-                data = data[os.write(self._fd, data) :]
-        if data:
-            self._transport.write(data)
-
-    def data_received(self, data: bytes) -> None:
-        self.link.feed(data)
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        # An error without a number is pyserial's own guess at why there is nothing to read: the cable is out.
-        number = exc.errno if isinstance(exc, OSError) else None
-        self.link.lose("unplugged" if number is None else f"unplugged ({os.strerror(number)})")

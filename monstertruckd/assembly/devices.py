@@ -6,7 +6,8 @@ from typing import Any
 from monstertruck_drivers.catalog import DEVICES, Duty, RoleSpec
 from monstertruck_drivers.computer import Computer, Machine
 from monstertruck_drivers.config import AnyPort, kind_of
-from monstertruck_drivers.link import BAUD, Port, SerialPort
+from monstertruck_drivers.link import BAUD, Port
+from monstertruck_drivers.tty import SerialPort
 from monstertruck_drivers.usb.config import UsbPortConfig
 from monstertruck_drivers.usb.hub import HubCoordinator, UsbService
 from monstertruck_drivers.usb.port import HubNode, HubPort, PortPower
@@ -62,7 +63,7 @@ class Cabling:
             return self._given[role]
         if isinstance(port, UsbPortConfig):
             return HubPort(port, self._machine, self._events, self._hubs, self._power, role)
-        return SerialPort(port.path, port.baud or BAUD)
+        return SerialPort(port.path, port.baud or BAUD, dtr=port.dtr, rts=port.rts)
 
     def camera(self, role: str) -> FrameSource:
         """Where a camera's pictures come from."""

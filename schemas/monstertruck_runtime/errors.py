@@ -80,6 +80,12 @@ class DeviceLostError(DeviceError):
     reason = Reason.DEVICE_LOST
 
 
+class DeviceWedgedError(DeviceLostError):
+    """The device takes no bytes, or the kernel waits for it when its port is opened or closed."""
+
+    reason = Reason.DEVICE_WEDGED
+
+
 class DeviceRestartedError(DeviceLostError):
     """The device restarted while its link stayed up: its settings are lost."""
 

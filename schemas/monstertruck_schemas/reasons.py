@@ -151,6 +151,7 @@ class Reason(StrEnum):
     PORT_MOVED = "port_moved", 103, "a device was plugged into another port than configured"
     SLOW_LINK = "slow_link", 104, "a device's link is slow"
     PORT_CYCLED = "port_cycled", 105, "a USB port was switched off and on"
+    DEVICE_WEDGED = "device_wedged", 106, "device takes no bytes, or the kernel cannot open or close its port"
 
     # The truck's supply, host and network
     BATTERY_OVERCHARGED = "battery_overcharged", 110, "battery voltage above that of a full pack"

@@ -65,6 +65,7 @@ SYMPTOMS: Final = (
         "`monstertruckd usb` shows hubs, ports and devices; move the cable and look again.",
         {
             "device_lost": "Plug, cable, hub, in this order.",
+            "device_wedged": "Switch it off and on, or replug it; the port is free again after half a minute at most.",
             "device_timeout": "Is it supplied? Is the baud rate right? `monstertruckd probe`.",
             "device_protocol": "As above; long or unshielded cables.",
             "device_wrong": "Two cables were swapped: `monstertruckd find-port`.",

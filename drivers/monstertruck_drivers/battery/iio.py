@@ -36,7 +36,7 @@ class Converter:
     def channels(self) -> list[int]:
         """Numbers of its voltage inputs."""
         return sorted(
-            int(file.name[10:-4]) for file in self.path.glob("in_voltage[0-9]*_raw") if file.name[10:-4].isdigit()
+            int(file.name[10:-4]) for file in self.path.glob("in_voltage[0-9]*_raw") if file.name[10:-4].isdecimal()
         )
 
 

@@ -111,7 +111,7 @@ def parse_meminfo(text: str) -> tuple[int, int]:
     for line in text.splitlines():
         name, _, rest = line.partition(":")
         value, *_ = rest.split() or [""]
-        if value.isdigit():
+        if value.isdecimal():
             rows[name] = int(value) * 1024
     try:
         return rows["MemTotal"], rows["MemAvailable"]

@@ -25,6 +25,10 @@ class UsbPortConfig(Schema):
     """USB interface that is the serial line; a Maestro's commands are 0"""
     baud: Baud | None = None
     """Bits per second; null = the device's own. USB-CDC devices ignore it"""
+    dtr: bool = True
+    """Level of the line DTR while the port is open; false lets an RPLIDAR's motor turn"""
+    rts: bool = True
+    """Level of the line RTS while the port is open"""
     usb_id: Annotated[str, Field(pattern=r"^[0-9a-f]{4}:[0-9a-f]{4}$")] | None = None
     """Expected vendor:product, checked before the first byte; None leaves it to the handshake"""
     latency_ms: Annotated[int, Field(ge=1, le=255)] = 1

@@ -1,10 +1,5 @@
 """A port named by hub and port number: its present node is opened, its adapter made quick, its power switched."""
 
-import fcntl
-import os
-import termios
-from array import array
-from pathlib import Path
 from typing import Final
 
 from monstertruck_drivers.computer import Machine, Sysfs
@@ -13,15 +8,17 @@ from monstertruck_drivers.usb.config import CycleMethod, PowerConfig, UsbPortCon
 from monstertruck_drivers.usb.hub import HubCoordinator
 from monstertruck_drivers.usb.tree import DEVICES, Node, parent_of, place, port_directory, port_of, read_device
 from monstertruck_runtime.clock import SECOND
-from monstertruck_runtime.errors import BusyError, DeviceError, DeviceLostError, PortBusyError, WrongDeviceError
+from monstertruck_runtime.errors import (
+    BusyError,
+    DeviceError,
+    DeviceLostError,
+    DeviceWedgedError,
+    PortBusyError,
+    WrongDeviceError,
+)
 from monstertruck_runtime.ports import EventSink
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
-
-LOW_LATENCY: Final = 0x2000
-"""ASYNC_LOW_LATENCY of ``serial_struct.flags``."""
-_FLAGS: Final = 4
-_STRUCT_INTS: Final = 32
 
 ADVICE: Final = (
     'udev rule: ACTION=="add", SUBSYSTEM=="usb-serial", DRIVER=="ftdi_sio", ATTR{latency_timer}="1" '
@@ -29,43 +26,28 @@ ADVICE: Final = (
 )
 
 
-def set_latency(sysfs: Sysfs, node: Node, device: Path, latency_ms: int) -> int | None:
-    """Lower the latency timer of an adapter as far as permitted. Blocks; the node should be open already.
+def lower_latency(sysfs: Sysfs, node: Node, latency_ms: int) -> bool:
+    """Lower the latency timer of an adapter. Blocks.
 
     Args:
         sysfs: where the adapter's attributes are.
         node: serial node, as just read.
-        device: its path in ``/dev``.
         latency_ms: wanted.
 
     Returns:
-        Milliseconds it has now; None if the chip has no such timer.
+        Whether that is not permitted, and the port has to be opened with low latency instead.
     """
     if node.latency_ms is None or node.latency_ms <= latency_ms:
-        return node.latency_ms
-    attribute = f"{node.path}/latency_timer"
+        return False
     try:
-        sysfs.write(attribute, str(latency_ms))
+        sysfs.write(_timer(node), str(latency_ms))
     except OSError:
-        _set_flag(device)
-    return sysfs.number(attribute)
+        return True
+    return False
 
 
-def _set_flag(device: Path) -> None:
-    """Set the low-latency flag; lines that know none refuse, which is no error."""
-    try:
-        line = os.open(device, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
-    except OSError:
-        return
-    try:
-        settings = array("i", [0] * _STRUCT_INTS)
-        fcntl.ioctl(line, termios.TIOCGSERIAL, settings)
-        settings[_FLAGS] |= LOW_LATENCY
-        fcntl.ioctl(line, termios.TIOCSSERIAL, settings)
-    except OSError:
-        return
-    finally:
-        os.close(line)
+def _timer(node: Node) -> str:
+    return f"{node.path}/latency_timer"
 
 
 FIRST_PAUSE: Final = 1
@@ -255,6 +237,7 @@ class HubPort:
 
         Raises:
             DeviceLostError: nothing is plugged in.
+            DeviceWedgedError: the kernel does not finish opening or closing it.
             WrongDeviceError: another kind of device is plugged in.
             PortBusyError: another process holds it.
         """
@@ -262,9 +245,10 @@ class HubPort:
         give_up = self._machine.clock.now() + round(OPEN_TIMEOUT * SECOND)
         while True:
             node = await self._node.resolve()
-            device = self._machine.dev / node.name
             try:
-                link = await self._machine.serial(device, self._config.baud or BAUD).open()
+                link = await self._open(node)
+            except DeviceWedgedError:
+                raise
             except (DeviceLostError, PortBusyError):
                 if self._machine.clock.now() >= give_up:
                     raise
@@ -273,16 +257,23 @@ class HubPort:
             await self._machine.clock.sleep(RETRY)
         self._opened_at = self._machine.clock.now()
         try:
-            await self._lower_latency(node)
+            await self._judge_latency(node)
         except BaseException:
             link.close()
             raise
         return link
 
-    async def _lower_latency(self, node: Node) -> None:
+    async def _open(self, node: Node) -> Link:
+        config, machine = self._config, self._machine
+        by_flag = await machine.offload(lambda: lower_latency(machine.sysfs, node, config.latency_ms))
+        port = machine.serial(
+            machine.dev / node.name, config.baud or BAUD, dtr=config.dtr, rts=config.rts, low_latency=by_flag
+        )
+        return await port.open()
+
+    async def _judge_latency(self, node: Node) -> None:
         wanted = self._config.latency_ms
-        device = self._machine.dev / node.name
-        latency = await self._machine.offload(lambda: set_latency(self._machine.sysfs, node, device, wanted))
+        latency = await self._machine.offload(lambda: self._machine.sysfs.number(_timer(node)))
         slow = latency is not None and latency > wanted
         if slow and not self._reported_slow:
             text = f"{self.name}: latency stays at {latency} ms instead of {wanted} ms; {ADVICE}"

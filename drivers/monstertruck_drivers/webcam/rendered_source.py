@@ -3,7 +3,8 @@
 from pathlib import Path
 from typing import Final, Self
 
-from monstertruck_drivers.link import BUFFER_LIMIT, Link, Port, SerialPort
+from monstertruck_drivers.link import BUFFER_LIMIT, Link, Port
+from monstertruck_drivers.tty import SerialPort
 from monstertruck_drivers.webcam.packets import CameraPacket, PacketKind, PacketParser, decode_mode
 from monstertruck_drivers.webcam.source import SET_FORMAT, CameraFrame, FrameSource, FrameStream, Mode, device_error
 from monstertruck_drivers.webcam.v4l2_source import V4l2Source

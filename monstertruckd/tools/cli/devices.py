@@ -82,7 +82,8 @@ def probe(
     """Handshake with a device and print its identity, state and first samples. Moves nothing."""
     from monstertruck_drivers.catalog import DEVICES
     from monstertruck_drivers.computer import ROOT, Computer
-    from monstertruck_drivers.link import BAUD, SerialPort
+    from monstertruck_drivers.link import BAUD
+    from monstertruck_drivers.tty import SerialPort
     from monstertruck_runtime.errors import InputError, NotFoundError
 
     kind = DEVICES.named(device)

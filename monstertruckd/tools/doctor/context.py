@@ -73,7 +73,7 @@ def account_of(root: Path, who: str | int) -> Account | None:
     groups = {}
     for line in (text_of(root / "etc/group") or "").splitlines():
         group, _, number, members = (*line.split(":"), "", "", "")[:4]
-        if number.isdigit() and (int(number) == gid or name in members.split(",")):
+        if number.isdecimal() and (int(number) == gid or name in members.split(",")):
             groups[group] = int(number)
     return Account(name, uid, groups)
 

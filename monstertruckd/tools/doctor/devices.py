@@ -142,6 +142,6 @@ async def _probe(
     line = (
         HubPort(port, machine, lambda *_, **__: None, role=role)
         if isinstance(port, UsbPortConfig)
-        else machine.serial(node, port.baud or BAUD)
+        else machine.serial(node, port.baud or BAUD, dtr=port.dtr, rts=port.rts)
     )
     return await kind.probe_function()(line, machine.clock, device.driver)

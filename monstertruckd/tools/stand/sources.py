@@ -11,7 +11,7 @@ from typing import Final
 import cv2
 import numpy as np
 
-from monstertruck_drivers.link import SerialPort
+from monstertruck_drivers.tty import SerialPort
 from monstertruck_drivers.webcam.driver import complete
 from monstertruck_drivers.webcam.rendered_source import RenderedSource
 from monstertruck_drivers.webcam.source import Mode

@@ -10,7 +10,8 @@ import pytest
 
 from monstertruck_drivers import cable
 from monstertruck_drivers.cable import MemoryPort, PtyPort
-from monstertruck_drivers.link import BUFFER_LIMIT, SerialPort
+from monstertruck_drivers.link import BUFFER_LIMIT
+from monstertruck_drivers.tty import SerialPort
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.errors import DeviceLostError, PortBusyError
 from tests.unit.drivers.kit import read_until

@@ -14,7 +14,7 @@ from monstertruck_drivers.ax12.config import Ax12Config
 from monstertruck_drivers.ax12.driver import Ax12Driver
 from monstertruck_drivers.ax12.emulator import Ax12Bus
 from monstertruck_drivers.cable import PtyPort
-from monstertruck_drivers.link import SerialPort
+from monstertruck_drivers.tty import SerialPort
 from monstertruck_runtime.clock import WallClock
 from monstertruck_runtime.mailbox import Mailbox, latest
 from monstertruck_schemas.plan import StabiliserCommand

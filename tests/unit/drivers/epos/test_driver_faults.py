@@ -10,7 +10,7 @@ from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos.config import EposConfig
 from monstertruck_drivers.epos.probe import probe
 from monstertruck_drivers.epos.protocol import Control, Opcode, State
-from monstertruck_drivers.link import SerialPort
+from monstertruck_drivers.tty import SerialPort
 from monstertruck_runtime.clock import VirtualClock, WallClock, run_virtual
 from monstertruck_runtime.errors import (
     DeviceFaultError,

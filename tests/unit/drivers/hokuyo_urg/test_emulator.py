@@ -20,7 +20,8 @@ from monstertruck_drivers.hokuyo_urg.protocol import (
     parse_fields,
     sum_matches,
 )
-from monstertruck_drivers.link import Link, SerialPort
+from monstertruck_drivers.link import Link
+from monstertruck_drivers.tty import SerialPort
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual, run_wall
 from monstertruck_runtime.errors import DeviceLostError, InputError, ProtocolError
 from tests.unit.drivers.hokuyo_urg.rig import Pattern, Rig, bench, talk

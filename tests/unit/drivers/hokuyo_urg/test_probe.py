@@ -9,7 +9,7 @@ import pytest
 
 from monstertruck_drivers.cable import PtyPort
 from monstertruck_drivers.hokuyo_urg.probe import probe
-from monstertruck_drivers.link import SerialPort
+from monstertruck_drivers.tty import SerialPort
 from monstertruck_runtime.clock import VirtualClock, WallClock, run_virtual, run_wall
 from monstertruck_runtime.errors import DeviceTimeoutError
 from tests.unit.drivers.hokuyo_urg.rig import Rig, bench

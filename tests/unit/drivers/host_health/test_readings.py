@@ -4,7 +4,7 @@ import os
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from monstertruck_drivers.computer import ROOT, Computer, disk_of
@@ -43,6 +43,7 @@ def test_memory():
 
 @settings(max_examples=100)
 @given(st.text(max_size=100))
+@example(":²")
 def test_any_text_is_read_or_refused(text: str):
     for parse in (parse_stat, parse_meminfo):
         try:

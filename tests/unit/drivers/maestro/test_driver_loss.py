@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from monstertruck_drivers.cable import DeviceEnd, MemoryPort, PtyPort
-from monstertruck_drivers.link import SerialPort
 from monstertruck_drivers.maestro.config import MaestroConfig
 from monstertruck_drivers.maestro.driver import MaestroDriver
 from monstertruck_drivers.maestro.emulator import MaestroEmulator
 from monstertruck_drivers.maestro.probe import probe
+from monstertruck_drivers.tty import SerialPort
 from monstertruck_runtime.clock import SECOND, VirtualClock, WallClock, run_virtual
 from monstertruck_runtime.errors import (
     DeviceLostError,

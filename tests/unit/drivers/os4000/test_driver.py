@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from monstertruck_drivers.cable import DeviceEnd, MemoryPort, PtyPort
-from monstertruck_drivers.link import SerialPort
 from monstertruck_drivers.os4000.config import Os4000Config
 from monstertruck_drivers.os4000.driver import Os4000Driver
 from monstertruck_drivers.os4000.emulator import Os4000Emulator
 from monstertruck_drivers.os4000.probe import probe
 from monstertruck_drivers.os4000.protocol import frame
+from monstertruck_drivers.tty import SerialPort
 from monstertruck_runtime.clock import SECOND, VirtualClock, WallClock, run_virtual
 from monstertruck_runtime.errors import (
     DeviceLostError,

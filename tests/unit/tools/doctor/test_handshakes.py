@@ -9,7 +9,7 @@ import pytest
 
 from monstertruck_drivers.cable import MemoryPort
 from monstertruck_runtime.clock import VirtualClock, run_virtual
-from monstertruck_runtime.errors import PortBusyError
+from monstertruck_runtime.errors import DeviceError, DeviceWedgedError, PortBusyError
 from monstertruck_runtime.threads import inline
 from monstertruck_schemas.reasons import Reason
 from monstertruck_sim.computer import EmulatedComputer
@@ -111,15 +111,22 @@ def test_other_processes_are_no_daemon(tmp_path: Path):
     see(tmp_path, check, others)
 
 
-def test_a_port_that_another_program_holds(tmp_path: Path):
+@pytest.mark.parametrize(
+    ("error", "fix"),
+    [
+        (PortBusyError("held: held by another process"), "sudo fuser -v "),
+        (DeviceWedgedError("held: does not open"), "/opt/monstertruckd/.venv/bin/python -m monstertruckd probe"),
+    ],
+)
+def test_a_port_that_another_program_holds_or_that_is_wedged(error: DeviceError, fix: str, tmp_path: Path):
     class Held:
         name = "held"
 
         async def open(self) -> None:
-            raise PortBusyError("held: held by another process")
+            raise error
 
     def held(emulated: EmulatedHost) -> None:
-        machine = replace(emulated.context.computer.machine, serial=lambda *_: Held())
+        machine = replace(emulated.context.computer.machine, serial=lambda *_, **__: Held())
         assert emulated.context.config is not None
         devices = emulated.context.config.devices
         only = devices.model_copy(update=dict.fromkeys(set(devices.present()) - {"steering"}))
@@ -128,6 +135,7 @@ def test_a_port_that_another_program_holds(tmp_path: Path):
         emulated.context = replace(emulated.context, config=config, computer=computer)
 
     (found,) = see(tmp_path, handshakes, held).values()
-    assert found.reason is Reason.DEVICE_BUSY
+    assert found.reason is error.reason
+    assert found.seen == str(error)
     assert found.fix is not None
-    assert found.fix.startswith("sudo fuser -v ")
+    assert found.fix.startswith(fix)

@@ -1,0 +1,362 @@
+"""Serial ports of the kernel, opened and closed in threads of their own.
+
+Both may wait for the device: opening makes several USB transfers, of which each takes up to 5 s where the device does
+not answer; closing waits 30 s for a device that takes no bytes. Only reading and writing are done on the event loop.
+"""
+
+import asyncio
+import atexit
+import contextlib
+import errno
+import fcntl
+import os
+import termios
+import threading
+from collections.abc import Callable
+from concurrent import futures
+from concurrent.futures import Future
+from functools import partial
+from pathlib import Path
+from typing import Any, Final, Protocol
+from weakref import WeakValueDictionary
+
+import serial
+import serial_asyncio
+
+from monstertruck_drivers.link import BAUD, Link, Port
+from monstertruck_runtime.errors import DeviceLostError, DeviceWedgedError, PortBusyError
+
+PATIENCE: Final = 2.0
+"""Seconds after which a port that the kernel is still opening or closing is reported as wedged."""
+MAX_AGE: Final = 0.25
+"""Seconds without progress after which unsent bytes are outdated, and their device is wedged: more than a hub takes
+to resume, about as long as the gate drives without feedback."""
+LAST_WORDS: Final = 1.0
+"""Seconds that the end of the program waits for ports to be closed: a closing port sends what was written last."""
+
+_PTY_MAJORS: Final = range(136, 144)
+"""Device numbers of pseudo terminals."""
+
+
+class OpenSerial(Protocol):
+    """Makes a port of a serial node: ``SerialPort``, or an emulated computer's own."""
+
+    def __call__(
+        self, path: Path, baud: int = BAUD, *, dtr: bool = True, rts: bool = True, low_latency: bool = False
+    ) -> Port:
+        """See ``SerialPort``."""
+
+
+class SerialPort:
+    """A tty by its path (``/dev/truck/lidar``, ``/dev/serial/by-path/...``, a pty).
+
+    Args:
+        path: device node or a symlink to it; resolved again at every open.
+        baud: bits per second; meaningless on USB-CDC and ptys.
+        dtr: level of the line DTR while the port is open; the kernel itself raises both lines for a moment on opening.
+        rts: level of the line RTS while the port is open.
+        low_latency: ask the adapter's driver not to gather bytes.
+    """
+
+    def __init__(
+        self, path: Path, baud: int = BAUD, *, dtr: bool = True, rts: bool = True, low_latency: bool = False
+    ) -> None:
+        self.name = str(path)
+        self._path = path
+        self._make = partial(_Tty, str(path), baud, dtr=dtr, rts=rts, low_latency=low_latency)
+
+    async def open(self) -> Link:
+        """Open raw and exclusive, with empty buffers; waits for a link of this process that is being closed.
+
+        Raises:
+            DeviceLostError: the node does not exist or vanished.
+            DeviceWedgedError: the kernel does not finish opening it, or closing it after an earlier use.
+            PortBusyError: another process holds it.
+        """
+        if not self._path.exists():
+            raise DeviceLostError(f"{self.name}: not plugged in")
+        node = _node(self._path)
+        try:
+            tty = await node.open(self.name, partial(self._make, node=node))
+        except serial.SerialException as error:
+            raise self._open_error(error) from error
+        except (OSError, termios.error) as error:
+            raise DeviceLostError(f"{self.name}: {error.args[-1]}") from error
+        return _SerialProtocol(self.name, tty).link
+
+    def _open_error(self, error: serial.SerialException) -> Exception:
+        busy = error.errno in (errno.EBUSY, errno.EWOULDBLOCK, errno.EAGAIN) or "exclusively lock" in str(error)
+        if busy:
+            return PortBusyError(f"{self.name}: held by another process")
+        cause = error.__context__
+        number = cause.args[0] if error.errno is None and isinstance(cause, termios.error) else error.errno
+        if number is None:
+            return DeviceLostError(f"{self.name}: {error}")
+        return DeviceLostError(f"{self.name}: {'no serial port' if number == errno.ENOTTY else os.strerror(number)}")
+
+
+_closing: set[Future[None]] = set()
+"""Work of the threads that close ports."""
+
+
+@atexit.register
+def _await_last_words() -> None:
+    """Let closing ports send what was written last. The end of the process kills the threads of wedged ones."""
+    futures.wait(_closing, LAST_WORDS)
+
+
+class _Node:
+    """One device node of the kernel: its work of opening and closing, done one after the other.
+
+    A node that the kernel does not let go of occupies one thread; the device gets another node when it is enumerated
+    again.
+    """
+
+    def __init__(self) -> None:
+        self._work: list[Future[None]] = []
+        self._overdue: Future[None] | None = None
+        """Work that has been waited for in vain."""
+
+    async def open(self, name: str, make: "Callable[[], _Tty]") -> "_Tty":
+        """Run ``make`` in a thread; what it makes too late, or for a cancelled caller, is closed there.
+
+        Args:
+            name: of the port, for error messages.
+            make: opens the tty.
+
+        Raises:
+            DeviceWedgedError: it has not returned after ``PATIENCE``, or earlier work of this node has not ended.
+            Exception: what ``make`` raised.
+        """
+        await self._previous_work(name)
+        outcome: Future[_Tty] = Future()
+
+        def work() -> None:
+            try:
+                tty = make()
+            except BaseException as error:  # noqa: BLE001  # raised where the result is awaited
+                if outcome.set_running_or_notify_cancel():
+                    outcome.set_exception(error)
+                return
+            if outcome.set_running_or_notify_cancel():
+                outcome.set_result(tty)
+            else:
+                tty.release()
+
+        _start(work, self.begin())
+        try:
+            await _ended(outcome, PATIENCE)
+        except asyncio.CancelledError:
+            if not outcome.cancel() and outcome.exception() is None:
+                outcome.result().close()
+            raise
+        if outcome.cancel():
+            raise DeviceWedgedError(f"{name}: does not open: its device does not answer the kernel")
+        return outcome.result()
+
+    def begin(self) -> Future[None]:
+        """Announce work that must end before the node is opened."""
+        ended: Future[None] = Future()
+        ended.set_running_or_notify_cancel()
+        self._work.append(ended)
+        return ended
+
+    async def _previous_work(self, name: str) -> None:
+        while self._work:
+            work = self._work[0]
+            if work is not self._overdue:
+                await _ended(work, PATIENCE)
+            if not work.done():
+                self._overdue = work
+                raise DeviceWedgedError(
+                    f"{name}: the kernel has not let go of it since its last use: its device takes no bytes or does "
+                    "not answer; switch it off and on, or replug it"
+                )
+            self._work = [work for work in self._work if not work.done()]
+
+
+_nodes: WeakValueDictionary[str, _Node] = WeakValueDictionary()
+"""Nodes that are in use, by their real path."""
+
+
+def _node(path: Path) -> _Node:
+    real = os.path.realpath(path)
+    node = _nodes.get(real)
+    if node is None:
+        node = _nodes[real] = _Node()
+    return node
+
+
+def _start(work: Callable[[], None], ended: Future[None]) -> None:
+    """Do blocking work in a thread that nothing waits for unless it wants to."""
+
+    def run() -> None:
+        try:
+            work()
+        finally:
+            ended.set_result(None)
+
+    threading.Thread(target=run, name="serial port", daemon=True).start()
+
+
+async def _ended(work: "Future[Any]", seconds: float) -> None:
+    """Wait until ``work`` ends, but no longer than ``seconds``."""
+    loop, ended = asyncio.get_running_loop(), asyncio.Event()
+
+    def tell(_: object) -> None:
+        with contextlib.suppress(RuntimeError):  # the loop was closed meanwhile
+            loop.call_soon_threadsafe(ended.set)
+
+    work.add_done_callback(tell)
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(seconds):
+            await ended.wait()
+
+
+class _Tty(serial.Serial):
+    """Pyserial's port, which is closed in a thread and never drained. To be made in a thread.
+
+    Args:
+        path: device node.
+        baud: see ``SerialPort``.
+        node: its work.
+        dtr: see ``SerialPort``.
+        rts: see ``SerialPort``.
+        low_latency: see ``SerialPort``.
+    """
+
+    _ending: Future[None] | None = None
+    _is_handed_over = False
+
+    def __init__(self, path: str, baud: int, *, node: _Node, dtr: bool, rts: bool, low_latency: bool) -> None:
+        super().__init__(None, baudrate=baud, timeout=0, write_timeout=0, exclusive=True)
+        self._node = node
+        self.dtr, self.rts = dtr, rts
+        self.port = path
+        self.open()
+        try:
+            self._take_over(low_latency=low_latency)
+        except BaseException:
+            self.release()
+            raise
+
+    def _take_over(self, *, low_latency: bool) -> None:
+        # A pty keeps the mark as long as the other side has it open, and would refuse the next daemon.
+        if os.major(os.fstat(self.fileno()).st_rdev) not in _PTY_MAJORS:
+            fcntl.ioctl(self.fileno(), termios.TIOCEXCL)
+        with contextlib.suppress(OSError, termios.error):
+            termios.tcflush(self.fileno(), termios.TCIOFLUSH)
+        if low_latency:
+            with contextlib.suppress(ValueError):  # the line has no such flag
+                self.set_low_latency_mode(True)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Skip a time-out that is set once more: pyserial would configure the open port again, by USB transfers."""
+        if not (name in ("timeout", "write_timeout") and self.is_open and value == getattr(self, name)):
+            super().__setattr__(name, value)
+
+    def untaken(self) -> int:
+        """Bytes that the kernel still has for the device."""
+        try:
+            return self.out_waiting
+        except OSError:  # unplugged
+            return 0
+
+    def flush(self) -> None:
+        """Do not drain: that waits for the device, without limit."""
+
+    def begin_closing(self) -> None:
+        """From now on an open of the node waits until this port is closed."""
+        if self._ending is None:
+            self._ending = self._node.begin()
+            _closing.add(self._ending)
+            self._ending.add_done_callback(_closing.discard)
+
+    def close(self) -> None:
+        """Close in a thread; may be called again."""
+        if self.is_open and not self._is_handed_over:
+            self._is_handed_over = True
+            self.begin_closing()
+            assert self._ending is not None
+            _start(self.release, self._ending)
+
+    def release(self) -> None:
+        """Close here; waits for the device as long as the kernel does."""
+        with contextlib.suppress(OSError):
+            fcntl.ioctl(self.fileno(), termios.TIOCNXCL)
+        super().close()
+
+
+class _SerialProtocol(asyncio.Protocol):
+    """Feeds a ``Link`` from a pyserial-asyncio transport.
+
+    Args:
+        name: for error messages.
+        tty: open and exclusive; closed with the link.
+    """
+
+    def __init__(self, name: str, tty: _Tty) -> None:
+        self._tty = tty
+        self._loop = asyncio.get_running_loop()
+        self._transport = serial_asyncio.SerialTransport(self._loop, self, tty)
+        self._moved = 0.0
+        """Loop time at which the device was last seen to have taken bytes."""
+        self._untaken = 0
+        """Bytes that the kernel had for the device after the last write."""
+        self._full_since = 0.0
+        """Loop time since which the kernel has had no room for all bytes; counts while the transport has some."""
+        self._alarm: asyncio.TimerHandle | None = None
+        self.link = Link(name, self._send, self._hang_up, tty.baudrate)
+
+    def _send(self, data: bytes) -> None:
+        """Write at once: a last command before ``close`` must not wait in a buffer that ``abort`` drops."""
+        if self._transport.is_closing():
+            return
+        now, untaken = self._loop.time(), self._tty.untaken()
+        if untaken == 0 or untaken < self._untaken:
+            self._moved = now
+        elif now - self._moved > MAX_AGE:
+            self._give_up()
+            return
+        if self._transport.get_write_buffer_size() == 0:
+            with contextlib.suppress(OSError):  # not one byte fits, or the tty is lost: the transport finds out
+                data = data[os.write(self._tty.fileno(), data) :]
+            self._full_since = now
+        if data:
+            self._transport.write(data)
+            if self._alarm is None:
+                self._alarm = self._loop.call_later(MAX_AGE, self._check_age)
+        self._untaken = self._tty.untaken()
+
+    def _check_age(self) -> None:
+        """Give the device up if its line has been full for too long."""
+        self._alarm = None
+        if self._transport.get_write_buffer_size() == 0 or self._transport.is_closing():
+            return
+        left = self._full_since + MAX_AGE - self._loop.time()
+        if left > 0:
+            self._alarm = self._loop.call_later(left, self._check_age)
+        else:
+            self._give_up()
+
+    def _give_up(self) -> None:
+        """The device takes nothing: what waits for it is outdated."""
+        self.link.lose(f"its device has taken no bytes for {MAX_AGE:g} s", DeviceWedgedError)
+        self._hang_up()
+
+    def _hang_up(self) -> None:
+        """Close without delay; ``close`` of the transport, with a stalled peer, never ends."""
+        if self._alarm is not None:
+            self._alarm.cancel()
+        self._tty.begin_closing()
+        self._transport.abort()
+
+    def data_received(self, data: bytes) -> None:
+        """Bytes came."""
+        self.link.feed(data)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """The port is gone."""
+        # An error without a number is pyserial's own guess at why there is nothing to read: the cable is out.
+        number = exc.errno if isinstance(exc, OSError) else None
+        self.link.lose("unplugged" if number is None else f"unplugged ({os.strerror(number)})")
