@@ -97,6 +97,7 @@ class Reason(StrEnum):
     PEER_UNKNOWN = "peer_unknown", 74, "it is not known where another robot is: speed limited"
     SHAFT_BLOCKED = "shaft_blocked", 72, "a driven shaft does not turn although it is commanded to"
     FAULTS_REPEAT = "faults_repeat", 73, "short faults come again and again"
+    UNCOMMANDED_MOTION = "uncommanded_motion", 75, "a motor turns as nobody commanded"
     WEAKENED = "weakened", 77, "configured less safe than by default"
     ARMED = "armed", 0, "armed"
     DRIVE_ASKED = "drive_asked", 0, "an operator asks the one who drives to hand over"

@@ -55,6 +55,8 @@ SYMPTOMS: Final = (
             "tilt_slow": "",
             "tilt_stop": "Drive it down by hand, or carry it; `gate.tilt` says from where.",
             "clipped": "It was asked for more than allowed, and does less.",
+            "uncommanded_motion": "Switch the motors off by hand. Controller, cable or encoder is broken: "
+            "the event names the shaft; `reset` once it is repaired.",
             "shaft_blocked": "A wheel is held: switch off, free it, look at the clutch.",
             "steering_dead": "Loose horn, reversed servo, or iron: `calibrate steering`.",
             "faults_repeat": "A plug is loose: the events before name the device.",

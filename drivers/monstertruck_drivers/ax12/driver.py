@@ -32,6 +32,9 @@ class Joint:
     once in a while. After a rest, once cool, the unit gets torque again: its goal becomes its present position
     first, or it would jump.
 
+    **Motion without a goal.** A load pushes a joint away from its goal against the unit's torque. A unit whose own
+    torque points away from its goal, and which moves there, does not obey: it loses its torque.
+
     Args:
         name: ``pitch`` or ``roll``.
         joint: calibration.
@@ -69,6 +72,10 @@ class Joint:
         self._hold_at = 0
         self._max_torque = p.MAX_TORQUE.default
         self._outage = False
+        self._goal: int | None = None
+        """Newest goal sent, steps."""
+        self._strays = 0
+        """Newest readings in which it drove itself away from its goal."""
 
     # What is known
 
@@ -78,8 +85,9 @@ class Joint:
         return None if self._present is None else self._joint.angle(self._present.position)
 
     def goal(self, angle: float) -> bytes:
-        """Bytes of the goal register for a joint angle, rad, held within the limits."""
-        return p.GOAL_POSITION.encode(self._joint.position(angle))
+        """Bytes of the goal register for a joint angle, rad, held within the limits; it becomes the goal."""
+        self._goal = self._joint.position(angle)
+        return p.GOAL_POSITION.encode(self._goal)
 
     def feedback(self) -> StabiliserJoint:
         """For the message; signs of the joint angle."""
@@ -138,10 +146,32 @@ class Joint:
                 await self.join(session, retries=0)
             answer = await session.read(self.id, p.PRESENT_POSITION, p.PRESENT_SIZE, retries=0)
             self._misses = 0
-            self._present = Present.decode(answer.data)
-            await self._look_after(session, self._present, answer.error)
+            before, self._present = self._present, Present.decode(answer.data)
+            if before is not None and self._is_straying(before, self._present):
+                await self._stop_straying(session, self._present)
+            else:
+                await self._look_after(session, self._present, answer.error)
         except (DeviceTimeoutError, ProtocolError) as error:
             self._miss(str(error))
+
+    def _is_straying(self, before: Present, present: Present) -> bool:
+        """Whether the unit drives itself away from its goal, in ``STRAYS`` readings one after the other."""
+        if self.torque is not TorqueState.HOLDING or self._goal is None:
+            self._strays = 0
+            return False
+        gap, gap_before = present.position - self._goal, before.position - self._goal
+        driven = present.load * gap > 0 and abs(gap) > max(abs(gap_before), self._config.margin)
+        self._strays = self._strays + 1 if driven else 0
+        return self._strays >= STRAYS
+
+    async def _stop_straying(self, session: Ax12Session, present: Present) -> None:
+        """Take the unit's torque away for the longest rest."""
+        await session.write(self.id, p.TORQUE_ENABLE, b"\x00")
+        self._strays = 0
+        self.torque, self._outage = TorqueState.LIMP, True
+        self._hold_at = self._clock.now() + round(self._config.alarm.rest_max * SECOND)
+        text = f"turned to {present.position} by itself, its goal is {self._goal}: no torque"
+        self._report(Reason.UNCOMMANDED_MOTION, Severity.ERROR, text, position=present.position, goal=self._goal)
 
     async def _look_after(self, session: Ax12Session, present: Present, error: Alarm) -> None:
         now = self._clock.now()
@@ -173,7 +203,7 @@ class Joint:
         if not (enabled and limit):
             self._go_limp()
             return
-        self.torque = TorqueState.HOLDING
+        self.torque, self._goal = TorqueState.HOLDING, goal
         self._held_at = self._clock.now()
         if self._outage:
             self._outage = False
@@ -250,6 +280,8 @@ class Joint:
         self._events(reason, severity, self._source, f"{self._name} joint (unit {self.id}) {text}", **values)
 
 
+STRAYS: Final = 3
+"""Readings in which a unit drives itself away from its goal after which it loses its torque."""
 STRANGE: Final = 3
 """Bytes out of form that show another device; fewer may be disturbances."""
 

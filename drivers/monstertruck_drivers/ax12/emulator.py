@@ -28,8 +28,8 @@ Damage = Literal["late", "double", "truncate", "garble", "mute"]
 
 KNOWN: Final = (
     "vanish ID, return ID, power on|off, block ID on|off, freeze ID on|off, heat ID CELSIUS, voltage VOLTS|source, "
-    "trip ID, reset ID, renumber ID NEW, latch on|off, echo on|off, mute|double|truncate|garble [COUNT], "
-    "late SECONDS [COUNT]"
+    "trip ID, stray ID POSITION|off, reset ID, renumber ID NEW, latch on|off, echo on|off, "
+    "mute|double|truncate|garble [COUNT], late SECONDS [COUNT]"
 )
 
 
@@ -39,9 +39,10 @@ class Ax12Bus:
     The adapter lives from USB, the units from the 12 V rail: unplugging leaves them as they are, ``power off``
     silences all of them while the port stays. Two units with one number both answer, and garble each other's answers.
     Faults (``inject``): ``vanish ID``, ``return ID``, ``power on|off``, ``block ID on|off``, ``freeze ID on|off``
-    (position sensor), ``heat ID CELSIUS``, ``voltage VOLTS|source``, ``trip ID`` (overload now), ``reset ID``
-    (factory), ``renumber ID NEW``, ``latch on|off`` (error bits outlast their cause), ``echo on|off``, and for the
-    next ``COUNT`` (1) answers ``mute``, ``double``, ``truncate``, ``garble`` and ``late SECONDS``.
+    (position sensor), ``heat ID CELSIUS``, ``voltage VOLTS|source``, ``trip ID`` (overload now), ``stray ID
+    POSITION|off`` (turns there instead of to its goal), ``reset ID`` (factory), ``renumber ID NEW``, ``latch on|off``
+    (error bits outlast their cause), ``echo on|off``, and for the next ``COUNT`` (1) answers ``mute``, ``double``,
+    ``truncate``, ``garble`` and ``late SECONDS``.
 
     Args:
         clock: time.
@@ -169,6 +170,8 @@ class Ax12Bus:
                 unit.temperature = float(celsius)
             case "trip", ():
                 unit.trip(Alarm.OVERLOAD)
+            case "stray", (place,):
+                unit.stray = None if place == "off" else float(place)
             case "reset", ():
                 unit.factory_reset()
             case "renumber", (number,):

@@ -97,6 +97,8 @@ class Unit:
         self.blocked = False
         self.frozen = False
         """The position sensor repeats its last value."""
+        self.stray: float | None = None
+        """Position (steps) that the control loop turns to instead of the goal."""
         self.powered = True
         self.present = True
         """False: fallen off the bus."""
@@ -293,6 +295,10 @@ class Unit:
             self._past.append((self._time, self.position))
             self._judge(span / SECOND)
 
+    @property
+    def _aim(self) -> float:
+        return float(self.get(p.GOAL_POSITION)) if self.stray is None else self.stray
+
     def _wanted_drive(self) -> float:
         if not self.powered or not self.get(p.TORQUE_ENABLE):
             return 0.0
@@ -300,7 +306,7 @@ class Unit:
         if self.wheel_mode:
             drive = p.from_sign_bit(self.get(p.MOVING_SPEED)) / 1023
             return copysign(min(abs(drive), limit), drive)
-        left = self.get(p.GOAL_POSITION) - self.position
+        left = self._aim - self.position
         margin, slope = (p.CCW_MARGIN, p.CCW_SLOPE) if left > 0 else (p.CW_MARGIN, p.CW_SLOPE)
         beyond = abs(left) - self.get(margin)
         if beyond <= 0:
@@ -327,7 +333,7 @@ class Unit:
         if self.wheel_mode:
             self.position = (self.position + move) % (tau / p.STEP)
         elif self._speed:
-            left = self.get(p.GOAL_POSITION) - self.position
+            left = self._aim - self.position
             overshoots = self._drive * move > 0 and abs(move) > abs(left)
             before = self.position
             self.position = min(max(before + (left if overshoots else move), 0.0), float(p.POSITION_MAX))

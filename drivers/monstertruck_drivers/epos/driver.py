@@ -1,9 +1,10 @@
 """Drive service: the EPOS 24/1 in profile velocity mode behind ``cmd/drive`` and ``sensor/drive``.
 
 Everything goes through one schedule of exchanges; before each of them the newest command is looked at, so a stop
-waits for at most the exchange in flight. What the controller should do and where its statusword says it is are
-compared every cycle, and one controlword brings it a step closer: enabling, stopping, running again after a quick
-stop and coming back from a fault are one and the same loop.
+waits for at most the exchange in flight. Quick stop and power off are sent again after every velocity that is not
+standstill: a controller that did not take the first one is told again. What the controller should do and where its
+statusword says it is are compared every cycle, and one controlword brings it a step closer: enabling, stopping,
+running again after a quick stop and coming back from a fault are one and the same loop.
 
 The controller keeps its last speed when the host goes silent. So the first bytes of every session are a quick stop,
 and the last ones are a quick stop and power stage off.
@@ -125,12 +126,17 @@ class Odometer:
 
 HANDSHAKE_ATTEMPTS = 2
 """Quick retries: a motor that kept its speed behind a lost link must rest <= 1.2 s after the link is back."""
-SAFE_DEADLINE = 0.3
-"""Seconds a session may take to leave the motor stopped and disabled, from when the controller listens."""
+SAFE_TIME = 0.225
+"""Seconds a session may take to leave the motor stopped and disabled, besides the time of the quick stop itself, from
+when the controller listens."""
+LONGEST_BRAKING = 1.0
+"""Seconds after which a quick stop is not waited for any longer, however slow it is configured."""
 SAFE_ATTEMPTS = 2
 """Attempts with such a time each: the first one may meet the rest of what was damaged."""
 DISABLE_TIME = 0.04
-"""Seconds of ``SAFE_DEADLINE`` kept for the last exchange."""
+"""Seconds of ``SAFE_TIME`` kept for the last exchange."""
+STOPS = {State.QUICK_STOP: Control.QUICK_STOP, State.SWITCH_ON_DISABLED: Control.DISABLE_VOLTAGE}
+"""Controlwords that must not wait, by what they lead to."""
 REENABLE_LIMIT = 0.3
 """Seconds after which running again from a quick stop goes the long way, through power stage off."""
 SLOW_EXCHANGE = 0.03
@@ -229,8 +235,8 @@ class _DriveSession:
         self._rpm = 0
         self._current: float | None = None
         self._fault: int | None = None
-        self._stopping = False
-        """The quick stop that is wanted now was sent."""
+        self._stopping: State | None = None
+        """QUICK_STOP or SWITCH_ON_DISABLED, if it is wanted now and its controlword was sent."""
         self._control_sent: Control | None = None
         """Newest controlword of this host."""
         self._prepared = False
@@ -306,27 +312,33 @@ class _DriveSession:
     async def make_safe(self) -> None:
         """Brake, and switch the power stage off once the motor rests.
 
-        Each of ``SAFE_ATTEMPTS`` gives up after ``SAFE_DEADLINE``, counted from when the controller listens again: it
-        is given the silence that a damaged or late answer before asks for.
+        Each of ``SAFE_ATTEMPTS`` gives up ``SAFE_TIME`` after a quick stop from full speed would have ended, counted
+        from when the controller listens again: it is given the silence that a damaged or late answer before asks for.
         """
+        full_speed = self._config.max_motor_rpm / self._config.quick_stop_deceleration_rpm_s
+        limit = SAFE_TIME + min(full_speed, LONGEST_BRAKING)
         for _ in range(SAFE_ATTEMPTS):
             try:
                 await self._line.finish()
                 await self._line.settle()
-                async with self._clock.deadline(SAFE_DEADLINE):
-                    await self._brake_and_switch_off()
+                async with self._clock.deadline(limit):
+                    await self._brake_and_switch_off(limit - DISABLE_TIME)
             except DeviceLostError:
                 return
             except (DeviceError, TimeoutError):
                 continue
             return
 
-    async def _brake_and_switch_off(self) -> None:
-        end = self._clock.now() + int((SAFE_DEADLINE - DISABLE_TIME) * SECOND)
-        await self._control(Control.QUICK_STOP)
-        while abs(await self._line.read(od.VELOCITY)) > self._config.standstill_rpm:
-            if self._clock.now() > end:
-                return  # a power stage switched off would let it roll
+    async def _brake_and_switch_off(self, within: float) -> None:
+        """Repeat the quick stop until the motor rests, then switch off; ``within`` seconds in any case.
+
+        A motor that has not stopped by then does not obey the quick stop: without its power stage it comes to rest.
+        """
+        end = self._clock.now() + int(within * SECOND)
+        while self._clock.now() <= end:
+            await self._control(Control.QUICK_STOP)
+            if abs(await self._line.read(od.VELOCITY)) <= self._config.standstill_rpm:
+                break
         await self._control(Control.DISABLE_VOLTAGE)
 
     # The schedule
@@ -392,6 +404,8 @@ class _DriveSession:
         def take(value: int) -> bool:
             if entries[len(values)] is od.VELOCITY_AVERAGED:
                 self._rpm = value
+                if self._moves:
+                    self._stopping = None  # what stops it is repeated until standstill is measured
             values.append(value)
             return not self._is_urgent()
 
@@ -420,24 +434,29 @@ class _DriveSession:
     # What to do
 
     def _setpoint(self) -> Setpoint:
-        """What the newest valid command asks for now; a moving motor is braked before it is switched off."""
+        """What the newest valid command asks for now; without one a moving motor is braked, then switched off."""
         command = self._driver.commands.latest
         if command is not None and command.stamp < self._commands_after:
             command = None
-        setpoint = setpoint_of(command, self._clock.now(), self._config)
-        moving = self._state in POWERED and abs(self._rpm) > self._config.standstill_rpm
-        return Setpoint(State.QUICK_STOP) if setpoint.goal is State.SWITCH_ON_DISABLED and moving else setpoint
+        if command is None and self._state in POWERED and self._moves:
+            return Setpoint(State.QUICK_STOP)
+        return setpoint_of(command, self._clock.now(), self._config)
+
+    @property
+    def _moves(self) -> bool:
+        """Whether the newest velocity is that of a moving motor."""
+        return abs(self._rpm) > self._config.standstill_rpm
 
     async def _act(self, *, also_faster: bool = False) -> None:
-        """Send what must not wait: a quick stop, a slower target; at the start of a cycle a faster one too."""
+        """Send what must not wait: a quick stop, power stage off, a slower target; a faster one at a cycle's start."""
         setpoint = self._setpoint()
-        if setpoint.goal is not State.QUICK_STOP:
-            self._stopping = False
-        elif not self._stopping:
-            await self._control(Control.QUICK_STOP)
-            self._stopping = True
+        if setpoint.goal is State.ENABLED:
+            self._stopping = None
+        elif self._is_urgent_stop(setpoint):
+            await self._control(STOPS[setpoint.goal])
+            self._stopping = setpoint.goal
             if self._state in POWERED:
-                self._state = State.QUICK_STOP
+                self._state = setpoint.goal
         rpm = self._target(setpoint)
         if rpm != self._sent_rpm and (also_faster or _slower(rpm, self._sent_rpm)):
             self._sent_rpm = None  # if this fails, whether it arrived is not known
@@ -447,9 +466,13 @@ class _DriveSession:
     def _is_urgent(self) -> bool:
         """Whether there is something that must not wait."""
         setpoint = self._setpoint()
-        return (setpoint.goal is State.QUICK_STOP and not self._stopping) or _slower(
-            self._target(setpoint), self._sent_rpm
-        )
+        return self._is_urgent_stop(setpoint) or _slower(self._target(setpoint), self._sent_rpm)
+
+    def _is_urgent_stop(self, setpoint: Setpoint) -> bool:
+        """Whether a quick stop, or power off for a moving motor, has to be sent now."""
+        if setpoint.goal is self._stopping or setpoint.goal is State.ENABLED:
+            return False
+        return setpoint.goal is State.QUICK_STOP or self._moves
 
     def _target(self, setpoint: Setpoint) -> int:
         return setpoint.rpm if self._state is State.ENABLED else 0
@@ -498,8 +521,7 @@ class _DriveSession:
         control = next_control(self._state, goal)
         if control is Control.SHUTDOWN:
             await self._prepare()
-        at_rest = abs(self._rpm) <= self._config.standstill_rpm
-        if self._state is State.QUICK_STOP and late > REENABLE_LIMIT and at_rest:
+        if self._state is State.QUICK_STOP and late > REENABLE_LIMIT and not self._moves:
             control = Control.DISABLE_VOLTAGE
         if control is not None:
             await self._control(control)

@@ -5,6 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from monstertruck_drivers.disobedience import Runaway
 from monstertruck_drivers.emulation import MotorPlant, MotorReading
 from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos.objects import OBJECTS, ObjectEntry
@@ -191,6 +192,8 @@ class Firmware:
         self.causes: set[int] = set()
         """Injected fault codes whose cause is still present; supply faults come and go by themselves."""
         self.quick_stop_input = False
+        self.runaway: Runaway | None = None
+        """How the power stage departs from the commands."""
         self._live: dict[ObjectEntry, Callable[[MotorReading], int]] = {
             od.STATUSWORD: self._statusword,
             od.POSITION: self._position,
@@ -382,6 +385,8 @@ class Firmware:
             self._set(State.QUICK_STOP)
         elif active and self.state not in FAULTED | OFF | {State.QUICK_STOP}:
             self._set(State.SWITCH_ON_DISABLED)
+        elif self.runaway is not None:
+            self._command_motor()
 
     def fail(self, code: int) -> None:
         """A fault: history, reaction, power stage off."""
@@ -420,6 +425,12 @@ class Firmware:
             self.state = state
             self._command_motor()
 
+    def run_away(self, runaway: Runaway | None) -> None:
+        """Depart from the commands from now on; None = obey again."""
+        self.advance()
+        self.runaway = runaway
+        self._command_motor()
+
     def _target(self) -> int:
         halted = self._values[od.CONTROLWORD] & (Control.HALT & ~Control.ENABLE)
         if halted or self._values[od.MODE] != od.PROFILE_VELOCITY:
@@ -429,13 +440,21 @@ class Firmware:
 
     def _command_motor(self) -> None:
         now = self._now()
+        rpm = self._motor.reading(now).rpm
+        target, ramp = self._demand(rpm)
+        if self.runaway is not None and self.state is not State.NOT_READY:
+            target = self.runaway.target(target, rpm, line=self.quick_stop_input)
+            ramp = ramp or self._values[od.ACCELERATION]
+        self._motor.command(now, target, float(ramp))
+
+    def _demand(self, rpm: float) -> tuple[float | None, int]:
+        """Commanded speed (None = power stage off), and its ramp, rpm/s."""
         match self.state:
             case State.ENABLED:
-                target, rpm = self._target(), self._motor.reading(now).rpm
+                target = self._target()
                 speeding = abs(target) > abs(rpm) and target * rpm >= 0
-                ramp = self._values[od.ACCELERATION if speeding else od.DECELERATION]
-                self._motor.command(now, float(target), float(ramp))
+                return float(target), self._values[od.ACCELERATION if speeding else od.DECELERATION]
             case State.QUICK_STOP | State.FAULT_REACTION_ENABLED:
-                self._motor.command(now, 0.0, float(self._values[od.QUICK_STOP_DECELERATION]))
+                return 0.0, self._values[od.QUICK_STOP_DECELERATION]
             case _:
-                self._motor.command(now, None, 0.0)
+                return None, 0

@@ -4,7 +4,7 @@ One exchange a cycle: the set-points of all shafts go out, the status comes back
 shafts have one state together: the most careful of their commands counts, and the oldest.
 
 The controller's watchdog stops the motors when the host is silent. The first request of every session is a quick stop,
-the last ones are a quick stop and, once the motors rest, coils off.
+the last ones are quick stops until the motors rest, and coils off, whether they rest or not.
 """
 
 import contextlib
@@ -124,6 +124,8 @@ class StepperDriver:
         """Counted over sessions and restarts of the controller."""
         self._last: tuple[Status, int] | None = None
         """Newest status, and when it came."""
+        self._asked = MotorState.OFF
+        """What the controller was asked for last."""
 
     async def run(self, ready: Ready) -> None:
         """One session, from the stop of motors that may still turn to the stop at its end.
@@ -199,9 +201,9 @@ class StepperDriver:
         return setpoint_of([commands.latest for commands in self._commands], self._clock.now(), self._config)
 
     def _is_urgent(self) -> bool:
-        """Whether the motors run and are to stop."""
-        running = self._last is not None and self._last[0].state is MotorState.RUN
-        return running and self._setpoint().state is not MotorState.RUN
+        """Whether the motors are to stop, or to lose their current, and have not been told yet."""
+        wanted = self._setpoint().state
+        return wanted is not MotorState.RUN and wanted is not self._asked
 
     async def _until(self, due: int) -> None:
         """Wait for the next cycle, or for a command that stops running motors; the last shaft's is the newest."""
@@ -211,9 +213,9 @@ class StepperDriver:
                 return
 
     async def _exchange(self, session: StepperSession, motors: int, setpoint: MotorSetpoints) -> Status:
+        self._asked = setpoint.state
         if setpoint.state is MotorState.OFF:
-            verb = "D" if self._last is not None and not any(self._last[0].rates) else "Q"
-            status = await session.status(verb, motors)
+            status = await session.status("D", motors)
         elif setpoint.state is MotorState.STOPPED:
             status = await session.status("Q", motors)
         else:
@@ -269,7 +271,8 @@ class StepperDriver:
         with contextlib.suppress(DeviceError, TimeoutError):
             async with self._clock.deadline(SAFE_DEADLINE):
                 motors = (await session.identify()).motors if self._last is None else len(self._last[0].positions)
-                while any((await session.status("Q", motors, attempts=ATTEMPTS)).rates):
+                end = self._clock.now() + round((SAFE_DEADLINE - ATTEMPTS * self._config.answer_timeout) * SECOND)
+                while any((await session.status("Q", motors, attempts=ATTEMPTS)).rates) and self._clock.now() < end:
                     await self._clock.sleep(0.02)
                 await session.status("D", motors, attempts=ATTEMPTS)
             return

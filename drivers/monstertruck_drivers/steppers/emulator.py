@@ -12,6 +12,7 @@ from typing import Final
 import numpy as np
 
 from monstertruck_drivers.cable import DeviceEnd
+from monstertruck_drivers.disobedience import USAGE, Runaway
 from monstertruck_drivers.emulation import EmulatorSetup, MotorPlant, ReceivedBytes
 from monstertruck_drivers.epos.firmware import FreeMotor
 from monstertruck_drivers.signals import SignalKind, Signals
@@ -52,7 +53,7 @@ class StepperEmulator:
 
     Faults (``inject``): ``overload MOTOR on|off`` (the rotor stands), ``silent on|off`` (gives no answers), ``late
     SECONDS [COUNT]`` (answers), ``reset`` (the processor restarts in the middle of whatever it does), ``noise COUNT``
-    (so many answers have a wrong byte).
+    (so many answers have a wrong byte), ``runaway`` (the firmware disobeys with all motors, see ``Runaway``).
 
     Args:
         clock: time.
@@ -84,6 +85,7 @@ class StepperEmulator:
         self._silent = False
         self._late: list[float] = []
         self._noise = 0
+        self._runaway: Runaway | None = None
         self._fed_again = asyncio.Event()
         self._boot()
 
@@ -126,12 +128,15 @@ class StepperEmulator:
                     self._noise = int(count)
                 case "reset", ():
                     self.power_cycle()
+                case "runaway", words:
+                    self._runaway = Runaway.parse(*words)
+                    self._turn(self._asked, self._acceleration)
                 case _:
                     raise ValueError(fault)
         except (ValueError, IndexError, TypeError) as error:
             raise InputError(
                 f"{self.name}: fault {' '.join((fault, *values))!r} not understood; known: overload MOTOR on|off, "
-                "silent on|off, late SECONDS [COUNT], noise COUNT, reset"
+                f"silent on|off, late SECONDS [COUNT], noise COUNT, reset, runaway {USAGE}"
             ) from error
 
     async def run(self, end: DeviceEnd) -> None:
@@ -215,12 +220,26 @@ class StepperEmulator:
 
     def _turn(self, rates: list[float] | None, acceleration: float) -> None:
         """Make the steps of rates, steps/s; None = no current."""
+        self._asked = rates
+        rates = self._disobeyed(rates)
         self._powered, self._ramp = rates is not None, acceleration * self._rpm
         self._rates = rates or [0.0] * self._identity.motors
         now = self._clock.now()
         for counter, rate in zip(self._counters, self._rates, strict=True):
             counter.command(now, rate * self._rpm, self._ramp if self._powered else COASTING)
         self._drive()
+
+    def _disobeyed(self, rates: list[float] | None) -> list[float] | None:
+        """What the firmware makes of commanded rates."""
+        if (runaway := self._runaway) is None:
+            return rates
+        now, asked = self._clock.now(), [None] * self._identity.motors if rates is None else rates
+        made = [
+            runaway.target(None if rate is None else rate * self._rpm, counter.reading(now).rpm)
+            for rate, counter in zip(asked, self._counters, strict=True)
+        ]
+        turning = [rpm / self._rpm for rpm in made if rpm is not None]
+        return turning or None
 
     def _drive(self) -> None:
         """Let the rotors follow, as far as their torque goes."""

@@ -10,7 +10,7 @@ import pytest
 
 from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos.config import EposConfig
-from monstertruck_drivers.epos.driver import RAD_S_PER_RPM, SAFE_ATTEMPTS, SAFE_DEADLINE
+from monstertruck_drivers.epos.driver import RAD_S_PER_RPM, SAFE_ATTEMPTS, SAFE_TIME
 from monstertruck_drivers.epos.exchange import QUIET
 from monstertruck_drivers.epos.protocol import Control, Opcode, State
 from monstertruck_runtime.clock import SECOND
@@ -18,6 +18,9 @@ from monstertruck_schemas.cmd import DriveAction
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import DriveMode
 from tests.unit.drivers.epos.rig import Rig, controls, on_bench, targets
+
+BRAKING = 0.075
+"""Seconds of a quick stop from full speed."""
 
 # Driving
 
@@ -141,7 +144,8 @@ def test_a_quick_stop_waits_for_one_exchange_at_most(phase: int):
             said = rig.clock.now()
             rig.gate.say(DriveAction.QUICK_STOP)
             await rig.until(lambda: rig.shaft_rpm == 0)
-            sent = next(instant for instant, value in rig.writes(od.CONTROLWORD)[::-1] if value == Control.QUICK_STOP)
+            stops = [at for at, value in rig.writes(od.CONTROLWORD) if value == Control.QUICK_STOP and at >= said]
+            sent = stops[0]
             assert (sent - said) / SECOND < 0.020, "frame complete at the controller"
             assert (rig.clock.now() - said) / SECOND < 0.21
             await rig.settle(0.2)
@@ -170,14 +174,13 @@ def test_a_slower_target_jumps_the_queue_too(rpm: float):
     on_bench(test)
 
 
-def test_disable_brakes_first_and_switches_off_at_rest():
+def test_disable_switches_off_at_once_whatever_turns():
     async def test(rig: Rig) -> None:
         async with rig.driving():
             await rig.drive(10_000)
             rig.gate.say(DriveAction.DISABLE)
-            await rig.until(lambda: rig.emulator.state is State.QUICK_STOP, 0.05)
-            await rig.until(lambda: rig.emulator.state is State.SWITCH_ON_DISABLED, 0.4)
-            assert abs(rig.shaft_rpm) < 60
+            await rig.until(lambda: rig.emulator.state is State.SWITCH_ON_DISABLED, 0.05)
+            assert abs(rig.shaft_rpm) > 9_000
             await rig.settle(0.15)
             assert rig.newest.mode is DriveMode.DISABLED
             await rig.drive(1_000)
@@ -244,23 +247,75 @@ def test_cancelling_leaves_the_motor_stopped_and_disabled(rpm: int):
                 task.cancel()
                 with contextlib.suppress(asyncio.CancelledError):
                     await task
-            assert (rig.clock.now() - start) / SECOND <= SAFE_DEADLINE
+            assert (rig.clock.now() - start) / SECOND <= SAFE_TIME + BRAKING
             assert rig.emulator.state is State.SWITCH_ON_DISABLED
             assert abs(rig.shaft_rpm) < 60
 
     on_bench(test)
 
 
-def test_a_motor_that_brakes_too_slowly_is_left_braking_not_rolling():
+def test_a_motor_that_brakes_slowly_is_given_the_time_of_its_ramp_and_switched_off_at_rest():
     async def test(rig: Rig) -> None:
         async with rig.driving():
             await rig.drive(18_000)
-        assert rig.emulator.state is State.QUICK_STOP
+            began = rig.clock.now()
+        assert (rig.clock.now() - began) / SECOND == pytest.approx(18_000 / 20_000, abs=0.05)
         assert rig.driver._quiet_until == 0, "no exchange was cut"
-        await rig.settle(0.7)
-        assert rig.shaft_rpm == 0
+        assert rig.emulator.state is State.SWITCH_ON_DISABLED
+        assert abs(rig.shaft_rpm) <= 60
 
     on_bench(test, EposConfig(quick_stop_deceleration_rpm_s=20_000))
+
+
+@pytest.mark.parametrize("disobeys", ["ignore", "creep 5000", "run -9000", "reverse"])
+def test_a_motor_that_ignores_the_quick_stop_loses_its_power_stage_at_the_end_of_the_session(disobeys: str):
+    async def test(rig: Rig) -> None:
+        async with rig.driving():
+            await rig.drive(18_000)
+            rig.emulator.inject("runaway", *disobeys.split())
+            ended = rig.clock.now()
+        assert rig.clock.now() - ended <= 0.3 * SECOND
+        assert rig.emulator.state is State.SWITCH_ON_DISABLED
+        await rig.settle(1.0)
+        assert rig.shaft_rpm == 0
+
+    on_bench(test)
+
+
+def test_a_quick_stop_is_sent_again_after_every_velocity_until_standstill_is_measured():
+    async def test(rig: Rig) -> None:
+        async with rig.driving():
+            await rig.drive(18_000)
+            rig.emulator.inject("runaway", "ignore")
+            rig.gate.say(DriveAction.QUICK_STOP)
+            await rig.settle(0.5)
+            sent = controls(rig).count(Control.QUICK_STOP)
+            rig.emulator.inject("runaway", "off")
+            await rig.until(lambda: rig.shaft_rpm == 0, 0.2)
+            await rig.settle(0.1)
+            before = controls(rig).count(Control.QUICK_STOP)
+            await rig.settle(0.5)
+            assert sent >= 10, "20 velocities a second"
+            assert controls(rig).count(Control.QUICK_STOP) == before, "it rests"
+            assert rig.newest.velocity == pytest.approx(0.0, abs=1.0)
+
+    on_bench(test)
+
+
+def test_power_off_overtakes_a_quick_stop_that_does_not_help():
+    async def test(rig: Rig) -> None:
+        async with rig.driving():
+            await rig.drive(18_000)
+            rig.emulator.inject("runaway", "ignore")
+            rig.gate.say(DriveAction.QUICK_STOP)
+            await rig.settle(0.3)
+            assert abs(rig.shaft_rpm) > 17_000
+            rig.gate.say(DriveAction.DISABLE)
+            await rig.until(lambda: rig.emulator.state is State.SWITCH_ON_DISABLED, 0.04)
+            await rig.until(lambda: rig.newest.mode is DriveMode.DISABLED, 0.1)
+            await rig.until(lambda: rig.shaft_rpm == 0, 1.0)
+
+    on_bench(test)
 
 
 @pytest.mark.parametrize("wait", [0.02, 0.12, 0.28, 0.33])
@@ -295,7 +350,7 @@ def test_cancelling_a_silent_line_takes_no_longer_than_the_deadlines():
             start = rig.clock.now()
             task.cancel()
             await asyncio.wait([task])
-            assert (rig.clock.now() - start) / SECOND <= SAFE_ATTEMPTS * (QUIET + SAFE_DEADLINE) + 0.001
+            assert (rig.clock.now() - start) / SECOND <= SAFE_ATTEMPTS * (QUIET + SAFE_TIME + BRAKING) + 0.001
 
     on_bench(test)
 

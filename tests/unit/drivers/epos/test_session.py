@@ -182,26 +182,16 @@ def test_feedback_has_the_robots_sign_and_its_current_at_its_own_period():
     on_bench(test)
 
 
-def test_a_moving_motor_is_braked_before_it_is_switched_off_and_never_rolls():
-    async def test(rig: Rig) -> None:
-        async with rig.driving():
-            await rig.drive(12_000)
-            before = len(controls(rig))
-            rig.gate.say(DriveAction.DISABLE)
-            await rig.until(lambda: Control.DISABLE_VOLTAGE in controls(rig)[before:])
-            assert controls(rig)[before] == Control.QUICK_STOP
-            assert abs(rig.shaft_rpm) <= 60
-
-    on_bench(test)
-
-
 def test_the_end_of_a_session_brakes_and_switches_off_within_its_time():
     async def test(rig: Rig) -> None:
         async with rig.driving():
             await rig.drive(12_000)
             ended = rig.clock.now()
             before = len(controls(rig))
-        assert controls(rig)[before:] == [Control.QUICK_STOP, Control.DISABLE_VOLTAGE]
+        *stops, last = controls(rig)[before:]
+        assert stops
+        assert set(stops) == {Control.QUICK_STOP}
+        assert last == Control.DISABLE_VOLTAGE
         assert rig.clock.now() - ended <= 300 * MS
         assert abs(rig.shaft_rpm) <= 60
 

@@ -176,6 +176,44 @@ def test_a_session_ends_with_motors_at_rest_and_off():
     on_bench(test)
 
 
+@pytest.mark.parametrize("disobeys", ["ignore", "creep 30", "run -40", "reverse"])
+def test_motors_that_ignore_the_quick_stop_lose_their_current_at_the_end_of_the_session(disobeys):
+    async def test(rig):
+        async with rig.driving():
+            rig.run_at(1.57, 1.57, 1.57, 1.57)
+            await rig.settle(0.5)
+            rig.emulator.inject("runaway", *disobeys.split())
+            await rig.settle(0.2)
+            assert rig.rotor(0) != 0
+            began = rig.clock.now()
+        assert rig.clock.now() - began <= 0.4 * SECOND
+        await rig.settle(0.1)
+        assert rig.emulator._state is MotorState.OFF
+        assert all(rig.rotor(i) == 0 for i in range(4))
+
+    on_bench(test)
+
+
+def test_current_off_overtakes_a_quick_stop_that_does_not_help():
+    async def test(rig):
+        async with rig.driving():
+            rig.run_at(1.57, 1.57, 1.57, 1.57)
+            await rig.settle(0.5)
+            rig.emulator.inject("runaway", "ignore")
+            rig.action = DriveAction.QUICK_STOP
+            await rig.settle(0.5)
+            assert rig.rotor(0) > 10
+            assert rig.outs[0].kept[-1].velocity > 1
+            rig.action = DriveAction.DISABLE
+            await rig.settle(0.06)
+            assert rig.rotor(0) == 0
+            await rig.settle(0.1)
+            assert rig.outs[0].kept[-1].mode is DriveMode.DISABLED
+            assert rig.outs[0].kept[-1].velocity == 0
+
+    on_bench(test)
+
+
 def test_a_host_that_comes_back_stops_what_still_turns_first():
     async def test(rig):
         async with await rig.port.open() as link:

@@ -1,0 +1,90 @@
+"""Emulated motor controllers that disobey: what such a controller makes of the targets it is commanded."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Self
+
+
+class Disobedience(StrEnum):
+    """How a controller departs from its targets."""
+
+    IGNORE = "ignore"
+    """Slower and opposite targets are not taken: the motor keeps its speed."""
+    CREEP = "creep"
+    """The motor never turns slower than a given speed."""
+    RUN = "run"
+    """The motor runs at a given speed, whatever is commanded."""
+    REVERSE = "reverse"
+    """Targets are taken with the opposite sign."""
+
+
+class StoppedBy(StrEnum):
+    """The first of the ways to stop a motor that still works; those after it work too."""
+
+    STAGE = "stage"
+    """Power stage off."""
+    LINE = "line"
+    """A hardware input for a quick stop."""
+    SUPPLY = "supply"
+    """Only the loss of the controller's supply."""
+
+
+WITH_SPEED = frozenset({Disobedience.CREEP, Disobedience.RUN})
+USAGE = "ignore|reverse|creep RPM|run RPM [stage|line|supply], or off"
+
+
+@dataclass(frozen=True, slots=True)
+class Runaway:
+    """A controller's present disobedience.
+
+    Args:
+        kind: how it disobeys.
+        rpm: motor speed of CREEP and RUN, rpm, controller's own sign.
+        stopped_by: what still stops the motor.
+    """
+
+    kind: Disobedience
+    rpm: float = 0.0
+    stopped_by: StoppedBy = StoppedBy.STAGE
+
+    @classmethod
+    def parse(cls, *words: str) -> Self | None:
+        """Read the words of a fault command; ``off`` is None.
+
+        Raises:
+            ValueError: expected ``USAGE``.
+        """
+        if words == ("off",):
+            return None
+        kind, *rest = words
+        disobedience = Disobedience(kind)
+        rpm = float(rest.pop(0)) if disobedience in WITH_SPEED and rest else 0.0
+        if (disobedience in WITH_SPEED and rpm == 0.0) or len(rest) > 1:
+            raise ValueError(words)
+        return cls(disobedience, rpm, StoppedBy(rest[0]) if rest else StoppedBy.STAGE)
+
+    def target(self, asked: float | None, present: float, *, line: bool = False) -> float | None:
+        """What the motor is driven to.
+
+        Args:
+            asked: commanded speed, rpm; None = power stage off.
+            present: motor speed, rpm.
+            line: the hardware input asks for a quick stop.
+
+        Returns:
+            Speed, rpm; None = power stage off.
+        """
+        if asked is None and self.stopped_by is StoppedBy.STAGE:
+            return None
+        if line and self.stopped_by is not StoppedBy.SUPPLY:
+            return asked
+        wanted = asked or 0.0
+        match self.kind:
+            case Disobedience.IGNORE:
+                return wanted if abs(wanted) >= abs(present) and wanted * present >= 0 else present
+            case Disobedience.CREEP:
+                return wanted if abs(wanted) >= abs(self.rpm) else self.rpm
+            case Disobedience.RUN:
+                return self.rpm
+            case Disobedience.REVERSE:
+                return -wanted
