@@ -18,6 +18,7 @@ from typing import Any, Final, Self
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import disk_reason
 from monstertruck_runtime.ports import EventSink
+from monstertruck_runtime.small_files import make_folder, sync_folder
 from monstertruck_runtime.stop_text import causes_text
 from monstertruck_runtime.threads import Offload, in_daemon_thread
 from monstertruck_schemas.event import Severity, Stop
@@ -85,7 +86,7 @@ class BlackBoxFolder:
 
     def scan(self) -> None:
         """Go on with the numbers of earlier runs, and remove what they left unfinished."""
-        self.directory.mkdir(parents=True, exist_ok=True)
+        make_folder(self.directory)
         self._number = max(self._number, *(box.number for box in black_boxes(self.directory)), 0)
         for path in self.directory.glob(f"*{PART}"):
             try:
@@ -104,7 +105,7 @@ class BlackBoxFolder:
 
         It is taken if the folder could not be read at the start, or if another daemon writes there as well.
         """
-        self.directory.mkdir(parents=True, exist_ok=True)
+        make_folder(self.directory)
         while self._is_taken(name):
             _, number, reason = name.removesuffix(".mcap").split("-")
             self._number = max(self._number, int(number), *(box.number for box in black_boxes(self.directory))) + 1
@@ -118,11 +119,7 @@ class BlackBoxFolder:
     def finish(self, name: str) -> None:
         """Give the complete box its name, durably, and remove old ones beyond the quota."""
         self.part(name).replace(self.directory / name)
-        folder = os.open(self.directory, os.O_RDONLY | os.O_DIRECTORY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
+        sync_folder(self.directory)
         self._keep_quota()
 
     def _is_taken(self, name: str) -> bool:

@@ -14,6 +14,7 @@ from mcap.writer import CompressionType, Writer
 
 from monstertruck_runtime import wire
 from monstertruck_runtime.clock import is_date
+from monstertruck_runtime.small_files import make_folder, sync_folder
 from monstertruck_schemas.topics import Topic
 from monstertruckd import __version__
 from monstertruckd.recorder.config import Compression
@@ -124,6 +125,8 @@ class LogFile:
         self.offset = offset
         self.open_since: int | None = None
         """When the oldest message came that is not in the file yet, ns of daemon time."""
+        self._named = False
+        """The disk has the file's name."""
         self._output = _Output(path)
         try:
             self._writer = Writer(
@@ -176,6 +179,9 @@ class LogFile:
     def sync(self) -> None:
         """Wait until the disk has it: it survives a power cut."""
         self._output.sync()
+        if not self._named:
+            sync_folder(self.path.parent)
+            self._named = True
 
     def finish(self) -> None:
         """Write the index and close."""
@@ -230,7 +236,7 @@ class LogFolder:
 
     def __init__(self, directory: Path) -> None:
         self.directory = directory
-        directory.mkdir(parents=True, exist_ok=True)
+        make_folder(directory)
         self._run = (
             max(
                 (int(name[1]) for name in (NAME.fullmatch(path.name) for path in directory.iterdir()) if name),
