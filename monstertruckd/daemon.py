@@ -45,7 +45,7 @@ from monstertruck_schemas.health import ServiceHealth, ServiceState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import ExploreRequest, GoalRequest, MissionRequest
 from monstertruck_schemas.roles import AccessRole
-from monstertruck_schemas.topics import DRIVES, TOPICS, Topic, Writer
+from monstertruck_schemas.topics import TOPICS, Topic, Writer
 from monstertruckd.assembly.devices import Cabling, build_drivers, measures_battery, of_duty, sensor_services
 from monstertruckd.assembly.estimation import Body, build_estimation
 from monstertruckd.assembly.planning import build_planners
@@ -61,7 +61,7 @@ from monstertruckd.config.load import Tree, resolved
 from monstertruckd.config.truck import TruckConfig
 from monstertruckd.gate.core import Gate
 from monstertruckd.gate.latch import EstopLatch, Latch, MemoryLatch, marks_folder
-from monstertruckd.gate.service import GateInputs, GateOutputs, GateService, register_gate_calls
+from monstertruckd.gate.service import GateOutputs, GateService, register_gate_calls
 from monstertruckd.host.health import ClockService, HealthBoard, MeterService, ServiceCalls
 from monstertruckd.host.journal import published
 from monstertruckd.host.notify import notify_from, status_line
@@ -368,16 +368,7 @@ class Daemon:
             gate,
             config.gate.rate,
             self.clock,
-            GateInputs(
-                scan=bus.subscribe(topics.SCAN, latest()),
-                attitude=bus.subscribe(topics.COMPASS, latest()),
-                drives=tuple(bus.subscribe(topic, latest()) for topic in DRIVES[:shafts]),
-                steering=bus.subscribe(topics.STEERING, latest()),
-                battery=bus.subscribe(topics.BATTERY, latest()),
-                sonar=bus.subscribe(topics.SONAR, latest()) if self._body.sonars else None,
-                peers=bus.subscribe(topics.PEERS, latest()) if config.peers else None,
-                pose=bus.subscribe(topics.POSE, latest()) if config.peers else None,
-            ),
+            {topic: bus.subscribe(topic, latest()) for topic in gate.reads},
             GateOutputs(
                 drives, steering, bus.publisher(topics.GATE, Writer.GATE), bus.publisher(topics.STOP, Writer.GATE)
             ),

@@ -30,7 +30,7 @@ from monstertruck_schemas.sensor import (
 )
 from monstertruck_schemas.state import GateMode
 from monstertruckd.gate.core import GateOutput
-from tests.unit.gate.rig import BODIES, Robot
+from tests.unit.gate.rig import BODIES, Robot, show
 
 NUMBERS: Final = (
     *(0.0, 5e-324, 1e-310, 1e-200, 1e-100, 1e-17, 1e-9, 1e-6, 1e-3, 0.1, 0.2, 0.436, 1.57, math.pi / 2, 3.2),
@@ -180,15 +180,15 @@ def _sense(robot: Robot, what: str, values: dict[str, Any]) -> None:
             case "feedback":
                 shaft = more.pop("shaft")
                 feedback = DriveFeedback(**head, **more)
-                robot.gate.observe_drive(feedback, shaft)
+                show(robot.gate, feedback, shaft)
             case "steering":
-                robot.gate.observe_steering(SteeringFeedback(**head, **more))
+                show(robot.gate, SteeringFeedback(**head, **more))
             case "attitude":
-                robot.gate.observe_attitude(Attitude(**head, **more))
+                show(robot.gate, Attitude(**head, **more))
             case "battery":
-                robot.gate.observe_battery(Battery(**head, **more, cells=6))
+                show(robot.gate, Battery(**head, **more, cells=6))
             case _:
-                robot.gate.observe_scan(_scan(head, **more))
+                show(robot.gate, _scan(head, **more))
     except ValidationError:
         return
 

@@ -25,7 +25,7 @@ from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.topics import Writer
 from monstertruckd.bus.local import Bus
 from monstertruckd.config.truck import TruckConfig
-from monstertruckd.gate.sensors import STALE_TOPICS
+from monstertruckd.gate.samples import STALE_TOPICS
 
 
 class Cabling:

@@ -228,6 +228,17 @@ class GateConfig(Schema):
         return self
 
 
+class InForce:
+    """The limits in force: whoever may set them replaces ``config`` between two ticks.
+
+    Args:
+        config: the first ones.
+    """
+
+    def __init__(self, config: GateConfig) -> None:
+        self.config = config
+
+
 SIGHT: Final = 4.0
 """Distance at which the scanner is sure to see an obstacle, m (URG-04LX, data sheet)."""
 

@@ -11,30 +11,42 @@ source may continue; a fault longer than ``disarm_after``, or one of ``DISARMING
 
 import math
 from collections import deque
-from collections.abc import Mapping
-from typing import Final, NamedTuple, assert_never
+from collections.abc import Iterator, Mapping
+from typing import Any, Final, NamedTuple, assert_never
 
 from monstertruck_kinematics.chassis import Chassis
 from monstertruck_kinematics.elementary import KinematicsError
 from monstertruck_planners.collision import Footprint, ScanPoints
 from monstertruck_runtime.clock import SECOND
-from monstertruck_runtime.ports import Value
 from monstertruck_runtime.requests import OPERATORS, late_text
 from monstertruck_runtime.stop_text import causes_text
+from monstertruck_schemas.base import Message
 from monstertruck_schemas.cmd import DriveAction
-from monstertruck_schemas.event import Cause, Event, Severity, Stop
-from monstertruck_schemas.health import HealthTable
+from monstertruck_schemas.event import Cause, Severity, Stop
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import ControlRequest, DriveForm, DriveRequest, Order, Role
-from monstertruck_schemas.sensor import Attitude, Battery, DriveFeedback, LaserScan, SonarRanges, SteeringFeedback
-from monstertruck_schemas.state import GateMode, Odometry, Peers
+from monstertruck_schemas.state import GateMode
+from monstertruck_schemas.topics import BATTERY, COMPASS, DRIVES, SCAN, STEERING, Topic
 from monstertruckd.gate.arbitration import EventLog, GateEvent, GateStateMachine, Source, Sources
-from monstertruckd.gate.config import GateConfig
-from monstertruckd.gate.limiter import CommandLimiter, Motion, ObstacleGuard
-from monstertruckd.gate.peers import PeerGuard
-from monstertruckd.gate.sensors import DRIVE_LOSSES, STALE_SENSORS, Assessment, SensorMonitor, ShaftCheck, SteeringCheck
-from monstertruckd.gate.sonars import SonarGuard
-from monstertruckd.gate.stops import CauseBuilder, Outages, StopLog
+from monstertruckd.gate.checks import Check, Checks, GateView, Tick
+from monstertruckd.gate.config import GateConfig, InForce
+from monstertruckd.gate.following import ShaftCheck, SteeringCheck
+from monstertruckd.gate.limiter import CommandLimiter
+from monstertruckd.gate.motion import Motion
+from monstertruckd.gate.obstacles import ObstacleCheck
+from monstertruckd.gate.peers import PeerCheck
+from monstertruckd.gate.samples import STALE_SENSORS, Samples
+from monstertruckd.gate.sensors import (
+    DRIVE_LOSSES,
+    BatteryCheck,
+    DriveFaultCheck,
+    ServiceCheck,
+    StalenessCheck,
+    TickCheck,
+    TiltCheck,
+)
+from monstertruckd.gate.sonars import SonarCheck
+from monstertruckd.gate.stops import Outages, StopLog, lease_cause
 
 URGENT: Final = frozenset(
     {Reason.DRIVE_STALE, Reason.DRIVE_FAULT, Reason.TICK_STALLED, Reason.SERVICE_FAILED, Reason.SHUTDOWN}
@@ -55,6 +67,40 @@ DISARMING: Final = frozenset(
 
 HALTS: Final = frozenset({Reason.OBSTACLE_STOP, Reason.LIDAR_BLIND, Reason.SONAR_STALE, Reason.SONAR_BLIND})
 """Speed limits of zero: the truck stands, and its driver stays in control."""
+
+
+def sensor_checks(view: GateView, *, battery_measured: bool) -> Iterator[Check]:
+    """Checks that do not depend on where the robot drives, worst reasons first.
+
+    Args:
+        view: what they may look at.
+        battery_measured: something is there to measure the battery.
+    """
+    config = view.config
+    yield TickCheck(view)
+    if config.turning is not None:
+        yield SteeringCheck(view, config.turning)
+    if config.blocked is not None:
+        yield ShaftCheck(view, config.blocked)
+    yield DriveFaultCheck(view)
+    yield ServiceCheck(view)
+    yield StalenessCheck(view)
+    yield TiltCheck(view)
+    yield BatteryCheck(view, measured=battery_measured)
+
+
+def obstacle_checks(
+    view: GateView,
+    points: ScanPoints,
+    sonars: Mapping[str, tuple[float, float, float]] | None,
+    peers: Mapping[str, Footprint] | None,
+) -> Iterator[Check]:
+    """Checks of the way ahead; arguments as of ``Gate``."""
+    lidar = None if sonars else ObstacleCheck(view, points)
+    sonar = SonarCheck(view, sonars) if sonars else None
+    yield from (check for check in (lidar, sonar) if check is not None)
+    if peers:
+        yield PeerCheck(view, peers, None if lidar is None else lidar.guard, None if sonar is None else sonar.guard)
 
 
 class Decision(NamedTuple):
@@ -137,28 +183,29 @@ class Gate:
         sonars: Mapping[str, tuple[float, float, float]] | None = None,
         peers: Mapping[str, Footprint] | None = None,
     ) -> None:
-        self._config = config
+        self._limits = InForce(config)
         self._chassis = chassis
         self._sources = Sources(nonce, config)
-        self._sensors = SensorMonitor(config, chassis, services, battery_measured=battery_measured)
-        self._outages = Outages(services)
-        self._obstacles = ObstacleGuard(config, footprint, points)
-        self._sonars = SonarGuard(config, footprint, sonars) if sonars else None
-        self._peers = PeerGuard(config, footprint, peers) if peers else None
-        self._motion = Motion(config, chassis)
-        self._limiter = CommandLimiter(config, self._motion, self._obstacles, self._sensors, self._sonars, self._peers)
-        self._steering_check = SteeringCheck(config.turning) if config.turning is not None else None
-        self._shaft_check = ShaftCheck(config.blocked) if config.blocked is not None else None
-        self._causes = CauseBuilder(config, self._sensors, self._limiter, self._steering_check, self._shaft_check)
         self._events = EventLog(config.event_interval)
-        self._stops = StopLog(self._outages)
         self._states = GateStateMachine(self._events, latched=latched)
+        self._samples = Samples(self._limits, chassis, services)
+        self._motion = Motion(self._limits, chassis)
+        view = GateView(self._limits, chassis, footprint, self._samples, self._motion, self._states)
+        self._limiter = CommandLimiter(view)
+        self._checks = Checks(
+            (
+                *sensor_checks(view, battery_measured=battery_measured),
+                self._limiter,
+                *obstacle_checks(view, points, sonars, peers),
+            )
+        )
+        self._outages = Outages(services)
+        self._stops = StopLog(self._outages)
         self._known: dict[Reason, int] = {}
         """What stops or slows the truck, and since when (ns)."""
         self._short_faults: deque[int] = deque()
         """When the truck stopped for stale sensors since it was armed, ns."""
         self._ticked: int | None = None
-        self._stalled_until = 0
         self._shut_down = False
 
     def configure(self, config: GateConfig) -> None:
@@ -166,9 +213,11 @@ class Gate:
 
         A truck that drives slows down to lesser ones by its ramp.
         """
-        self._config = config
-        self._limiter.configure(config)
-        self._causes.configure(config)
+        self._limits.config = config
+
+    @property
+    def _config(self) -> GateConfig:
+        return self._limits.config
 
     @property
     def mode(self) -> GateMode:
@@ -180,62 +229,22 @@ class Gate:
         """Nonce of this run."""
         return self._sources.nonce
 
-    # Observations
+    @property
+    def reads(self) -> tuple[Topic[Any], ...]:
+        """Topics whose newest message is to be shown to it before every tick, in this order."""
+        drives = DRIVES[: len(self._chassis.shafts)]
+        return tuple(dict.fromkeys((SCAN, COMPASS, *drives, STEERING, BATTERY, *self._checks.reads)))
 
-    def observe_scan(self, scan: LaserScan) -> None:
-        """Take the newest scan."""
-        if self._sensors.observe_scan(scan):
-            self._obstacles.observe(scan)
+    def observe(self, message: Message, topic: Topic[Any]) -> None:
+        """Take the newest message of a topic; of health tables every one, for a later one may hide a restart.
 
-    def observe_sonar(self, ranges: SonarRanges) -> None:
-        """Take the newest round of the sonars."""
-        if self._sonars is not None:
-            self._sonars.observe(ranges)
-
-    def observe_peers(self, peers: Peers) -> None:
-        """Take the newest poses of other robots."""
-        if self._peers is not None:
-            self._peers.observe(peers)
-
-    def observe_pose(self, pose: Odometry) -> None:
-        """Take the newest pose in map, the frame of the other robots' poses."""
-        if self._peers is not None:
-            self._peers.observe_pose(pose)
-
-    def observe_attitude(self, attitude: Attitude) -> None:
-        """Take the newest attitude."""
-        self._sensors.observe_attitude(attitude)
-        if self._steering_check is not None:
-            now = attitude.received
-            trusted = attitude.tilt_valid and not attitude.heading_disturbed and self._sensors.steering_fresh(now)
-            heading = attitude.heading if trusted and self._states.active else None
-            self._steering_check.observe(
-                attitude.stamp, heading, self._sensors.speed(now), self._sensors.turn_rate(now)
-            )
-
-    def observe_drive(self, feedback: DriveFeedback, shaft: int = 0) -> None:
-        """Take the newest feedback of a driven shaft."""
-        self._sensors.observe_drive(feedback, shaft)
-        if self._shaft_check is not None:
-            measured = self._chassis.drivetrain.speed(feedback.velocity)
-            self._shaft_check.observe(feedback, shaft, self._motion.shaft_speeds[shaft], measured)
-
-    def observe_steering(self, feedback: SteeringFeedback) -> None:
-        """Take the newest steering feedback."""
-        self._sensors.observe_steering(feedback)
-
-    def observe_battery(self, battery: Battery) -> None:
-        """Take the newest battery reading."""
-        self._sensors.observe_battery(battery)
-
-    def observe_health(self, table: HealthTable) -> None:
-        """Take a health table; every one, for a later one of the same tick may hide a restart of the drive."""
-        self._sensors.observe_health(table)
-        self._outages.observe_health(table)
-
-    def observe_event(self, event: Event) -> None:
-        """Take any service's event: it may be the cause of a stop."""
-        self._outages.observe_event(event)
+        Args:
+            message: of a sensor, of other robots, of the services' health, or an event of any service.
+            topic: its topic.
+        """
+        self._samples.observe(message, topic)
+        self._checks.observe(message, topic)
+        self._outages.observe(message)
 
     # Requests
 
@@ -269,7 +278,7 @@ class Gate:
             return reason  # Its turn comes when the driving planner ends.
         if reason is not Reason.OK:
             return self._refuse(now, reason, request)
-        return next(iter(self._blocks(self._sensors.assess(now), now)), Reason.OK)
+        return next(iter(self._blocks(now)), Reason.OK)
 
     def _impossible(self, request: DriveRequest) -> str | None:
         """Why the body cannot do this motion; None if it can, or nearly."""
@@ -335,13 +344,13 @@ class Gate:
         return late_text(self._config.max_request_age) if reason is Reason.LEASE_EXPIRED else reason.text
 
     def _refuse_blocked(self, now: int, blocks: tuple[Reason, ...], request: ControlRequest) -> Decision:
-        causes = self._outages.explain(self._causes.causes(blocks, now, self._known))
+        causes = self._outages.explain(self._checks.describe(blocks, now, self._known))
         return self._refuse_order(now, blocks[0], request, causes_text(causes, now))
 
     def _refuse_moving(self, now: int, request: ControlRequest) -> Decision | None:
         """The refusal while the robot is not known to be at rest or an operator requests motion."""
-        if not self._sensors.at_rest(now):
-            speed = self._sensors.speed(now)
+        if not self._samples.at_rest(now):
+            speed = self._samples.speed(now)
             if speed is None:
                 return self._refuse_blocked(now, (Reason.DRIVE_STALE,), request)
             return self._refuse_order(now, Reason.NOT_ARMED_SPEED, request, f"the robot moves at {speed:.2f} m/s")
@@ -386,7 +395,7 @@ class Gate:
     def _arm(self, request: ControlRequest, now: int) -> Decision:
         if self.mode is GateMode.ESTOPPED:
             return self._refuse_order(now, Reason.ESTOPPED, request, self._stops.summary(now))
-        if blocks := self._blocks(self._sensors.assess(now), now):
+        if blocks := self._blocks(now):
             return self._refuse_blocked(now, blocks, request)
         if self.mode is GateMode.STOPPING:
             return self._refuse_order(now, Reason.NOT_ARMED_SPEED, request, "the robot still stops")
@@ -437,49 +446,37 @@ class Gate:
         period = SECOND / self._config.rate
         elapsed = period if self._ticked is None else now - self._ticked
         self._ticked = now
-        if elapsed > self._config.tick_stall * SECOND:
-            self._stalled_until = now + round(self._config.stall_dwell * SECOND)
-            self._causes.pause = elapsed / SECOND
         dt = min(elapsed, 2 * period) / SECOND
 
-        # A truck that is not armed may be carried.
-        self._obstacles.move(now, self._sensors.twist(now) if self._states.active else None, elapsed / SECOND)
-        assessment = self._sensors.assess(now)
-        blocks = self._blocks(assessment, now)
-        self._report(now, blocks, assessment.values, always=self.mode is GateMode.DRIVING)
+        self._checks.observe(Tick(now, elapsed), None)
+        blocks = self._blocks(now)
+        self._report(now, blocks, always=self.mode is GateMode.DRIVING)
         self._advance(now, blocks)
-        self._sensors.judged()
-        limits = assessment.limits
-        if self._states.holder is not None:
-            self._limiter.update(now, dt, self._states.holder.request, limits)
+        holder = self._states.holder
+        courses = self._limiter.aim(now, dt, None if holder is None else holder.request)
+        limits = self._checks.limits(now, courses)
+        self._limiter.advance(dt, limits)
+        if holder is not None:
             halts = [reason for reason in limits if reason in HALTS and reason not in self._known]
-            if halts and not self._sensors.at_rest(now):
-                self._trip(now, self.mode, self._causes.causes(halts, now, {}))
-        else:
-            self._limiter.halt()
-        self._report(now, tuple(limits), assessment.values, always=False)
+            if halts and not self._samples.at_rest(now):
+                self._trip(now, self.mode, self._checks.describe(halts, now, {}))
+        self._report(now, tuple(limits), always=False)
         self._known = {reason: self._known.get(reason, now) for reason in (*blocks, *limits)}
         return self._output(now, blocks, limits)
 
     def neutral(self, now: int) -> GateOutput:
         """Last output before the daemon ends: quick stop. The gate never drives again after it."""
         self._shut_down = True
-        self._limiter.halt()
+        self._motion.halt()
         if self._states.active:
-            if self.mode is GateMode.DRIVING or not self._sensors.at_rest(now):
-                self._trip(now, GateMode.DISARMED, self._causes.causes([Reason.SHUTDOWN], now, {}))
+            if self.mode is GateMode.DRIVING or not self._samples.at_rest(now):
+                self._trip(now, GateMode.DISARMED, self._checks.describe([Reason.SHUTDOWN], now, {}))
             self._disarm(now, Reason.SHUTDOWN.text)
         return self._output(now, (Reason.SHUTDOWN,), {})
 
-    def _blocks(self, assessment: Assessment, now: int) -> tuple[Reason, ...]:
-        own = [Reason.SHUTDOWN] if self._shut_down else []
-        if now < self._stalled_until:
-            own.append(Reason.TICK_STALLED)
-        if self._steering_check is not None and self._steering_check.dead:
-            own.append(Reason.STEERING_DEAD)
-        if self._shaft_check is not None and self._shaft_check.blocked is not None:
-            own.append(Reason.SHAFT_BLOCKED)
-        return (*own, *assessment.blocks)
+    def _blocks(self, now: int) -> tuple[Reason, ...]:
+        """Why the truck may not move, worst first."""
+        return (*((Reason.SHUTDOWN,) if self._shut_down else ()), *self._checks.blocks(now))
 
     def _advance(self, now: int, blocks: tuple[Reason, ...]) -> None:
         """At most one transition per tick."""
@@ -488,7 +485,7 @@ class Gate:
             return
         states.disarm_at_rest |= not DISARMING.isdisjoint(blocks)
         driver = None if blocks else self._sources.driver(now, states.holder_key)
-        if states.mode is GateMode.STOPPING and self._sensors.at_rest(now, states.since):
+        if states.mode is GateMode.STOPPING and self._samples.at_rest(now, states.since):
             states.rest(now)
         elif states.mode is GateMode.ARMED and states.disarm_at_rest:
             self._disarm(now, ", ".join(reason.text for reason in blocks))
@@ -501,14 +498,14 @@ class Gate:
         elif states.holder is not None:
             if not blocks:
                 self._emit_transition(now, Reason.LEASE_EXPIRED, f"no fresh request from {states.holder_name}")
-            lapsed = [self._causes.lease(states.holder, now)]
-            self._stop(now, self._causes.causes(blocks, now, self._known) or lapsed)
+            lapsed = [lease_cause(states.holder, now)]
+            self._stop(now, self._checks.describe(blocks, now, self._known) or lapsed)
         elif now - states.driven > self._config.disarm_after * SECOND:
             self._disarm(now, f"no driver for {self._config.disarm_after:g} s")
 
     def _released(self, holder: Source, now: int) -> bool:
         """Whether the holder's last request was standstill, and the truck has been at rest since."""
-        return holder.neutral and self._motion.standing and self._sensors.at_rest(now, holder.arrived)
+        return holder.neutral and self._motion.standing and self._samples.at_rest(now, holder.arrived)
 
     def _stop(self, now: int, causes: list[Cause], *, ordered: bool = False) -> None:
         if not STALE_SENSORS.keys().isdisjoint(cause.reason for cause in causes):
@@ -536,9 +533,9 @@ class Gate:
             mode,
             causes,
             ordered=ordered,
-            quick=mode is GateMode.ESTOPPED or self._limiter.emergency or not URGENT.isdisjoint(reasons),
+            quick=mode is GateMode.ESTOPPED or self._checks.urgent or not URGENT.isdisjoint(reasons),
             driver=None if holder is None else holder.request,
-            speed=self._sensors.speed(now),
+            speed=self._samples.speed(now),
             stopping_distance=self._limiter.stopping_distance(now),
         )
 
@@ -546,28 +543,25 @@ class Gate:
         self._events.emit(now, reason, Severity.WARNING, text, always=True)
 
     def _disarm(self, now: int, text: str) -> None:
-        if self._steering_check is not None:
-            self._steering_check.reset()  # only driving can show whether it works again
-        if self._shaft_check is not None:
-            self._shaft_check.reset()
+        self._checks.reset()
         self._short_faults.clear()
         self._states.disarm(now, text)
 
-    def _report(self, now: int, reasons: tuple[Reason, ...], values: Mapping[str, Value], *, always: bool) -> None:
+    def _report(self, now: int, reasons: tuple[Reason, ...], *, always: bool) -> None:
         """Emit an event for each reason that did not apply at the last tick."""
         if not self._states.active:
             return
         for reason in reasons:
             if reason not in self._known:
-                text = f"{reason.text}: {', '.join(self._sensors.failed)}" if reason is Reason.SERVICE_FAILED else ""
+                text, values = self._checks.text(reason), self._samples.values(now)
                 self._events.emit(now, reason, Severity.WARNING, text, values, always=always)
 
     def _action(self, now: int, reasons: tuple[Reason, ...]) -> DriveAction:
-        if self.mode is GateMode.ESTOPPED or self._limiter.emergency or not URGENT.isdisjoint(reasons):
+        if self.mode is GateMode.ESTOPPED or self._checks.urgent or not URGENT.isdisjoint(reasons):
             return DriveAction.QUICK_STOP
         if self.mode is GateMode.DISARMED:
             # A motor that still turns, as after a daemon that died, must not coast.
-            return DriveAction.DISABLE if self._sensors.at_rest(now) else DriveAction.QUICK_STOP
+            return DriveAction.DISABLE if self._samples.at_rest(now) else DriveAction.QUICK_STOP
         return DriveAction.RUN
 
     def _output(self, now: int, blocks: tuple[Reason, ...], limits: dict[Reason, float]) -> GateOutput:

@@ -8,8 +8,8 @@ robot may be anywhere (``unknown``), and so may one whose pose is less certain t
 """
 
 import math
-from collections.abc import Callable, Iterable, Mapping
-from typing import Final
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,9 +17,17 @@ from numpy.typing import NDArray
 from monstertruck_kinematics.elementary import Array, integrate
 from monstertruck_planners.collision import Footprint, UnitTwist, free_distance, on_body, placed, points_relative
 from monstertruck_runtime.clock import SECOND
-from monstertruck_schemas.base import Pose2D, Twist2D
+from monstertruck_schemas.base import Message, Pose2D, Twist2D
+from monstertruck_schemas.event import Measurement
+from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.state import Odometry, Peer, Peers
-from monstertruckd.gate.config import GateConfig
+from monstertruck_schemas.topics import PEERS, POSE, Topic
+from monstertruckd.gate.approach import Approach, comfortable_speed, reach, stopping
+from monstertruckd.gate.checks import Check, GateView, Limit, Tick
+from monstertruckd.gate.config import InForce
+from monstertruckd.gate.motion import AHEAD, Course
+from monstertruckd.gate.obstacles import ObstacleGuard
+from monstertruckd.gate.sonars import SonarGuard
 
 HORIZON: Final = (0.0, 0.5, 1.0)
 """Times to which the motion of another robot is predicted, s."""
@@ -45,21 +53,17 @@ class PeerGuard:
     """Sweeps the footprint along a motion against other robots.
 
     Args:
-        config: the gate's limits.
+        limits: the gate's, in force.
         footprint: the body's outline.
         outlines: of the others by name.
     """
 
-    def __init__(self, config: GateConfig, footprint: Footprint, outlines: Mapping[str, Footprint]) -> None:
-        self._config = config
+    def __init__(self, limits: InForce, footprint: Footprint, outlines: Mapping[str, Footprint]) -> None:
+        self._limits = limits
         self._footprint = footprint
         self._edges = {name: _edges(body) for name, body in outlines.items()}
         self._own: Odometry | None = None
         self._heard: dict[str, Peer] = {}
-
-    def configure(self, config: GateConfig) -> None:
-        """Take other limits, between two ticks."""
-        self._config = config
 
     def observe_pose(self, pose: Odometry) -> None:
         """Take the robot's own newest pose in the map."""
@@ -93,7 +97,7 @@ class PeerGuard:
         twists, place = tuple(twists), _moved(own.pose, own.twist, _age(own.stamp, now))
         for peer in self._heard.values():
             unsure = DEVIATIONS * min(_deviation(own, peer), UNSURE)
-            clearance = self._config.obstacle.side_clearance + unsure
+            clearance = self._limits.config.obstacle.side_clearance + unsure
             points = self._outline(peer, place, now, reach, clearance)
             if seen is not None:
                 points = points[~seen(points)]
@@ -124,6 +128,76 @@ class PeerGuard:
                 break  # predicted to reach this robot, which may have left by then
             found.append(outline)
         return np.concatenate(found)
+
+
+class PeerCheck(Check):
+    """The swept footprint must not meet another robot; where a lidar looks they are left to its scan.
+
+    Args:
+        view: what it may look at.
+        outlines: of the other robots by name.
+        lidar: the check of a lidar; None without one.
+        sonars: the check of sonars; None without them.
+    """
+
+    reasons = (Reason.OBSTACLE_STOP, Reason.OBSTACLE_SLOW, Reason.PEER_UNKNOWN)
+    reads = (PEERS, POSE)
+
+    def __init__(
+        self,
+        view: GateView,
+        outlines: Mapping[str, Footprint],
+        lidar: ObstacleGuard | None,
+        sonars: SonarGuard | None,
+    ) -> None:
+        super().__init__(view)
+        self._guard = PeerGuard(view.limits, view.footprint, outlines)
+        self._lidar = lidar
+        self._sonars = sonars
+        self._approach = Approach(view)
+
+    @property
+    def urgent(self) -> bool:
+        """See ``Check.urgent``."""
+        return self._approach.emergency
+
+    def observe(self, seen: Message | Tick, topic: Topic[Any] | None) -> None:
+        """Take the robot's own pose in the map, the frame of the others' poses, and theirs."""
+        if isinstance(seen, Odometry) and topic is POSE:
+            self._guard.observe_pose(seen)
+        elif isinstance(seen, Peers):
+            self._guard.observe(seen)
+
+    def limit(self, now: int, courses: Sequence[Course] | None) -> Iterator[Limit]:
+        """Sweep along the motions."""
+        if courses is None:
+            self._approach.forget()
+        elif courses:
+            yield from self._along(now, courses)
+
+    def _along(self, now: int, courses: Sequence[Course]) -> Iterator[Limit]:
+        config = self.view.config
+        lidar = self._lidar if self.view.samples.scan_fresh(now) else None
+        delay = config.reaction + (0.0 if self._sonars is None else self._sonars.delay(now))
+        far = reach(config, delay)
+        if lidar is not None:
+            delay, far = lidar.delay(now), lidar.reach
+        twists, slow = [twist for twist, _ in courses], config.obstacle.unseen_speed
+        looked = self._sonars is not None or lidar is not None
+        if self._guard.unknown(now) and any(
+            pace > slow and not (looked and twist[0] >= AHEAD) for twist, pace in courses
+        ):
+            yield Limit(Reason.PEER_UNKNOWN, slow)
+        seen = None if lidar is None else lidar.looks_at
+        free = self._guard.free_distance(twists, far, now, seen)
+        allowed = comfortable_speed(free - config.obstacle.ahead, delay, config.obstacle.deceleration)
+        yield from self._approach.limits(free, allowed, max(pace for _, pace in courses))
+        self._approach.judge(now, twists, lambda speed: free < stopping(speed, delay, config.deceleration))
+
+    def figures(self, reason: Reason, now: int) -> Iterator[Measurement]:
+        """Free distance."""
+        if reason is Reason.OBSTACLE_STOP:
+            yield self._approach.free_distance(None)
 
 
 def _age(stamp: int, now: int) -> float:

@@ -1,482 +1,213 @@
-"""Sensor monitoring: freshness and plausibility of every sensor, judged at each tick.
+"""Checks of the sensors: silent devices, failed services, faults of the drive, tilt and battery."""
 
-``SteeringCheck`` finds servos without supply. Hobby servos report nothing, and a servo controller on USB power keeps
-answering when the servos' own supply is lost; but then the compass heading departs from the one that follows from
-speed and commanded axle angles.
-"""
+from collections.abc import Iterator, Sequence
+from typing import Any, Final
 
-import math
-from collections import deque
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, Final, NamedTuple
-
-from monstertruck_kinematics.chassis import Chassis, Speeds
-from monstertruck_kinematics.drive import Twist
 from monstertruck_runtime.clock import SECOND
-from monstertruck_runtime.ports import Value
-from monstertruck_schemas import topics
 from monstertruck_schemas.base import Message
-from monstertruck_schemas.event import Measurement
+from monstertruck_schemas.event import Cause, Measurement
 from monstertruck_schemas.health import HealthTable, ServiceState
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.roles import DeviceRole
-from monstertruck_schemas.sensor import (
-    VALID_BEAM,
-    Attitude,
-    Battery,
-    BatteryLevel,
-    DriveFeedback,
-    DriveMode,
-    LaserScan,
-    SteeringFeedback,
-)
+from monstertruck_schemas.sensor import Attitude, BatteryLevel
 from monstertruck_schemas.topics import Topic
-from monstertruckd.gate.config import GateConfig, SensorLimit, ShaftCheckConfig, SteeringCheckConfig, TiltLimits
-
-STALE_TOPICS: Final[Mapping[Topic[Any], Reason]] = {
-    topics.SCAN: Reason.SCAN_STALE,
-    topics.COMPASS: Reason.ATTITUDE_STALE,
-    **dict.fromkeys(topics.DRIVES, Reason.DRIVE_STALE),
-    topics.STEERING: Reason.STEERING_STALE,
-}
-"""Topics whose samples are stale as soon as the service that writes them reports its loss."""
-
-STALE_SENSORS: Final = {
-    Reason.SCAN_STALE: DeviceRole.LIDAR,
-    Reason.ATTITUDE_STALE: DeviceRole.COMPASS,
-    Reason.DRIVE_STALE: DeviceRole.DRIVE,
-    Reason.STEERING_STALE: DeviceRole.STEERING,
-    Reason.BATTERY_STALE: DeviceRole.BATTERY,
-}
-"""Which sensor is stale, by reason."""
+from monstertruckd.gate.checks import Check, GateView, Limit, Tick
+from monstertruckd.gate.motion import Course
+from monstertruckd.gate.samples import STALE_SENSORS, age
 
 DRIVE_LOSSES: Final = (Reason.DEVICE_RESTARTED, Reason.DEVICE_STOPPED)
 """Why a drive's service may have ended that makes arming necessary, however short the loss."""
 
-MEASURED: Final = frozenset(BatteryLevel) - {BatteryLevel.UNKNOWN, BatteryLevel.SENSOR_FAULT}
+
+class TickCheck(Check):
+    """A pause between two ticks stops the robot until the ticks have been punctual for a while."""
+
+    reasons = (Reason.TICK_STALLED,)
+
+    def __init__(self, view: GateView) -> None:
+        super().__init__(view)
+        self._stalled_until = 0
+        self._pause = 0.0
+        """Newest excessive pause between two ticks, s."""
+
+    def observe(self, seen: Message | Tick, topic: Topic[Any] | None) -> None:
+        """Measure the time between ticks."""
+        if isinstance(seen, Tick) and seen.elapsed > self.view.config.tick_stall * SECOND:
+            self._stalled_until = seen.now + round(self.view.config.stall_dwell * SECOND)
+            self._pause = seen.elapsed / SECOND
+
+    def reason(self, now: int) -> Iterator[Reason]:
+        """A recent pause."""
+        if now < self._stalled_until:
+            yield Reason.TICK_STALLED
+
+    def figures(self, reason: Reason, now: int) -> Iterator[Measurement]:
+        """The pause."""
+        yield Measurement(name="pause", value=self._pause, unit="s", limit=self.view.config.tick_stall)
 
 
-ENABLED_WITHIN: Final = 1.5
-"""Seconds in which a drive controller that is commanded to turn its shaft is enabled: it takes 0.6."""
+class DriveFaultCheck(Check):
+    """A drive controller reports a fault, or its service has ended for a reason that makes arming necessary."""
 
-JUMP: Final = 1.5
-"""A heading that changes faster than this, rad/s, is a disturbed compass, not a turn."""
+    reasons = (Reason.DRIVE_FAULT, *DRIVE_LOSSES)
 
-GAP: Final = SECOND // 2
-"""Headings further apart than this are not compared, ns."""
+    def __init__(self, view: GateView) -> None:
+        super().__init__(view)
+        self._losses: set[Reason] = set()
+        """Losses for which a drive's service is down."""
+        self._reported: set[Reason] = set()
+        """Losses reported since the newest tick."""
+        self._judged: set[Reason] = set()
+        """Losses reported before it, which that tick has to judge even if they are over."""
+
+    def observe(self, seen: Message | Tick, topic: Topic[Any] | None) -> None:
+        """Take what services report of drives."""
+        if isinstance(seen, Tick):
+            self._judged, self._reported = self._reported, set()
+        elif isinstance(seen, HealthTable):
+            self._losses = {
+                service.reason
+                for service in seen.services
+                if service.reason in DRIVE_LOSSES and self.view.samples.gives(service.name) is Reason.DRIVE_STALE
+            }
+            self._reported |= self._losses
+
+    def reason(self, now: int) -> Iterator[Reason]:
+        """Faults and losses."""
+        if self.view.samples.faults:
+            yield Reason.DRIVE_FAULT
+        losses = self._losses | self._reported | self._judged
+        yield from (reason for reason in DRIVE_LOSSES if reason in losses)
+
+    def figures(self, reason: Reason, now: int) -> Iterator[Measurement]:
+        """Fault codes."""
+        if reason is Reason.DRIVE_FAULT:
+            for drive in self.view.samples.faults:
+                code = drive.fault_code
+                yield Measurement(name="fault code", value=None if code is None else float(code), age=age(drive, now))
 
 
-class Assessment(NamedTuple):
-    """What the sensors allow at one tick."""
+class ServiceCheck(Check):
+    """A service that the robot needs has failed."""
 
-    blocks: tuple[Reason, ...]
-    """Reasons to stand still, worst first."""
-    limits: dict[Reason, float]
-    """Reasons to go slowly, with the speed each allows, m/s."""
-    values: dict[str, Value]
-    """Measurements behind it, for the event."""
+    reasons = (Reason.SERVICE_FAILED,)
 
-
-@dataclass(frozen=True, slots=True)
-class Staleness:
-    """A sensor without a valid sample."""
-
-    since: int | None
-    """When its newest valid sample became stale, ns; None = there never was one."""
-    age: float | None
-    """Of its newest valid sample, s."""
-    limit: float
-    """S."""
-    refused: Measurement | None
-    """Why its newest sample since was not valid."""
-
-
-class SensorMonitor:
-    """Newest valid sample of every sensor, assessed at each tick.
-
-    Args:
-        config: limits.
-        chassis: kinematics of the body.
-        services: what is stale at once when a service reports its loss.
-        battery_measured: something is there to measure the battery.
-    """
-
-    def __init__(
-        self, config: GateConfig, chassis: Chassis, services: Mapping[str, Reason], *, battery_measured: bool
-    ) -> None:
-        self._config = config
-        self._battery_measured = battery_measured
-        self._services = services
-        self._chassis = chassis
-        self.scan: LaserScan | None = None
-        self.drives: list[DriveFeedback | None] = [None] * len(chassis.shafts)
-        self.steering: SteeringFeedback | None = None
-        self.attitude: Attitude | None = None
-        self.battery: Battery | None = None
+    def __init__(self, view: GateView) -> None:
+        super().__init__(view)
         self._failed: tuple[str, ...] = ()
-        self._drive_losses: set[Reason] = set()
-        """Losses of ``DRIVE_LOSSES`` for which a drive's service is down."""
-        self._unjudged_losses: set[Reason] = set()
-        """Losses of ``DRIVE_LOSSES`` reported since the last tick."""
-        self._lost: dict[Reason, int] = {}
-        self._refused: dict[Reason, Measurement] = {}
-        self._critical = _critical(config, steered=chassis.steered)
-        self._tilt = _Tilt(config.tilt)
-        self._speed: tuple[int, float | None] | None = None
-        """Time (ns) and result of the newest ``speed``, until the next sample."""
-        self.angles = chassis.straight
-        """Steering angles by the newest steering feedback, rad."""
 
-    def configure(self, config: GateConfig) -> None:
-        """Take other limits, between two ticks."""
-        self._config = config
-        self._tilt.limits = config.tilt
+    def observe(self, seen: Message | Tick, topic: Topic[Any] | None) -> None:
+        """Take the services' health."""
+        if isinstance(seen, HealthTable):
+            tolerated = self.view.config.tolerated_failures
+            failed = (service.name for service in seen.services if service.state is ServiceState.FAILED)
+            self._failed = tuple(name for name in failed if name not in tolerated)
 
-    def observe_scan(self, scan: LaserScan) -> bool:
-        """Take a scan; False if it is not valid: by its age, the tilt of its plane, or without a single range."""
-        valid = self._valid(scan, Reason.SCAN_STALE)
-        if valid and not (self._config.obstacle.open_ground or (scan.codes == VALID_BEAM).any()):
-            valid = False
-            self._refused[Reason.SCAN_STALE] = Measurement(name="beams with a range", value=0.0, limit=1.0)
-        if valid and scan.tilt is not None and scan.tilt > self._config.scan_tilt:
-            valid = False
-            self._refused[Reason.SCAN_STALE] = Measurement(
-                name="scan plane tilt", value=scan.tilt, unit="rad", limit=self._config.scan_tilt
-            )
-        if valid:
-            self.scan = scan
-        return valid
+    def reason(self, now: int) -> Iterator[Reason]:
+        """Failed services."""
+        if self._failed:
+            yield Reason.SERVICE_FAILED
 
-    def observe_drive(self, feedback: DriveFeedback, shaft: int = 0) -> None:
-        """Take feedback of a driven shaft."""
-        if self._valid(feedback, Reason.DRIVE_STALE):
-            self.drives[shaft] = feedback
-            self._speed = None
+    def text(self, reason: Reason) -> str:
+        """Names the services."""
+        return f"{reason.text}: {', '.join(self._failed)}"
 
-    def observe_steering(self, feedback: SteeringFeedback) -> None:
-        """Take steering feedback; not valid unless the servo controller trusts it."""
-        if self._valid(feedback, Reason.STEERING_STALE) and feedback.trusted:
-            self.steering = feedback
-            self.angles = self._chassis.steering(*feedback.servos)
+    def describe(self, reason: Reason, now: int, since: int) -> Iterator[Cause]:
+        """One cause for each failed service."""
+        for name in self._failed:
+            yield Cause(reason=reason, source=name, since=since, text=f"{reason.text}: {name}")
 
-    def observe_attitude(self, attitude: Attitude) -> None:
-        """Take an attitude; not valid without a valid tilt."""
-        if self._valid(attitude, Reason.ATTITUDE_STALE) and attitude.tilt_valid:
-            self.attitude = attitude
-            self._tilt.update(math.acos(math.cos(attitude.roll) * math.cos(attitude.pitch)))
 
-    def observe_battery(self, battery: Battery) -> None:
-        """Take a battery reading; not valid without a level."""
-        if self._valid(battery, Reason.BATTERY_STALE) and battery.level in MEASURED:
-            self.battery = battery
+class StalenessCheck(Check):
+    """A critical sensor has no fresh valid sample."""
 
-    def observe_health(self, table: HealthTable) -> None:
-        """Take the services' health: samples from before the loss of a service become stale."""
-        for service in table.services:
-            if service.state is not ServiceState.READY and (stale := self._services.get(service.name)) is not None:
-                self._lost[stale] = max(service.since, self._lost.get(stale, service.since))
-                self._speed = None
-        self._drive_losses = {
-            service.reason
-            for service in table.services
-            if service.reason in DRIVE_LOSSES and self._services.get(service.name) is Reason.DRIVE_STALE
-        }
-        self._unjudged_losses |= self._drive_losses
-        self._failed = tuple(
-            service.name
-            for service in table.services
-            if service.state is ServiceState.FAILED and service.name not in self._config.tolerated_failures
+    reasons = tuple(STALE_SENSORS)
+
+    def reason(self, now: int) -> Iterator[Reason]:
+        """Stale critical sensors, worst first."""
+        view = self.view
+        fresh = view.samples.fresh(now)
+        for reason, limit in view.samples.sensor_limits().items():
+            steered = view.chassis.steered or reason is not Reason.STEERING_STALE
+            if limit.critical and steered and not fresh[reason]:
+                yield reason
+
+    def describe(self, reason: Reason, now: int, since: int) -> Iterator[Cause]:
+        """The silent sensor, with the age of its newest valid sample."""
+        staleness = self.view.samples.staleness(reason, now)
+        figures = [Measurement(name="age", value=staleness.age, unit="s", limit=staleness.limit)]
+        if staleness.refused is not None:
+            figures.append(staleness.refused)
+        yield Cause(
+            reason=reason,
+            source=STALE_SENSORS[reason].value,
+            since=since if staleness.since is None else staleness.since,
+            text=reason.text,
+            measurements=tuple(figures),
         )
 
-    def _valid(self, message: Message, stale: Reason) -> bool:
-        latency = abs(message.received - message.stamp) / SECOND
-        if latency <= self._config.max_latency:
-            self._refused.pop(stale, None)
-            return True
-        self._refused[stale] = Measurement(name="latency", value=latency, unit="s", limit=self._config.max_latency)
-        return False
 
-    def _fresh(self, message: Message | None, limit: SensorLimit, now: int, stale: Reason) -> bool:
-        if message is None or message.received <= self._lost.get(stale, -1):
-            return False
-        return now - message.received <= limit.stale_after * SECOND
+class TiltCheck(Check):
+    """A tilted robot goes slowly or stops; both limits have a hysteresis."""
 
-    def scan_fresh(self, now: int) -> bool:
-        """Whether the scan is fresh."""
-        return self._fresh(self.scan, self._config.scan, now, Reason.SCAN_STALE)
+    reasons = (Reason.TILT_STOP, Reason.TILT_SLOW)
 
-    def steering_fresh(self, now: int) -> bool:
-        """Whether the steering feedback is fresh."""
-        return self._fresh(self.steering, self._config.steering, now, Reason.STEERING_STALE)
+    def __init__(self, view: GateView) -> None:
+        super().__init__(view)
+        self._slow = False
+        self._stop = False
 
-    def speed(self, now: int) -> float | None:
-        """Measured speed of the fastest wheel over ground, m/s; None without fresh feedback of every shaft."""
-        if self._speed is None or self._speed[0] != now:
-            rolling = self.shaft_speeds(now)
-            self._speed = now, self._chassis.fastest_wheel_speed(rolling) if rolling else None
-        return self._speed[1]
+    def observe(self, seen: Message | Tick, topic: Topic[Any] | None) -> None:
+        """Compare the tilt of a valid attitude."""
+        if isinstance(seen, Attitude) and seen is self.view.samples.attitude:
+            tilt, limits = self.view.samples.tilt, self.view.config.tilt
+            self._slow = tilt >= limits.slow - (limits.hysteresis if self._slow else 0.0)
+            self._stop = tilt >= limits.stop - (limits.hysteresis if self._stop else 0.0)
 
-    def shaft_speeds(self, now: int) -> Speeds:
-        """Measured wheel speed over ground of every driven shaft, m/s; empty without fresh feedback of all of them."""
-        return tuple([self._chassis.drivetrain.speed(drive.velocity) for drive in self._fresh_drives(now)])
+    def reason(self, now: int) -> Iterator[Reason]:
+        """Too much tilt."""
+        if self._stop and self.view.samples.attitude_fresh(now):
+            yield Reason.TILT_STOP
 
-    def twist(self, now: int) -> Twist[float] | None:
-        """Velocity of the base by the measured shaft speeds and the newest steering angles; None without the former."""
-        rolling, angles = self.shaft_speeds(now), self.angles
-        return self._chassis.twist(self._chassis.input_speeds(rolling, *angles), *angles) if rolling else None
+    def limit(self, now: int, courses: Sequence[Course] | None) -> Iterator[Limit]:
+        """Much tilt."""
+        if self._slow and not self._stop and self.view.samples.attitude_fresh(now):
+            yield Limit(Reason.TILT_SLOW, self.view.config.tilt.slow_speed)
 
-    def turn_rate(self, now: int) -> float:
-        """Yaw rate of ``twist``, rad/s; 0 without it."""
-        twist = self.twist(now)
-        return 0.0 if twist is None else twist[2]
-
-    def _fresh_drives(self, now: int) -> list[DriveFeedback]:
-        """Feedback of all shafts; empty unless all of it is fresh."""
-        limit = self._config.drive
-        drives = [d for d in self.drives if d is not None and self._fresh(d, limit, now, Reason.DRIVE_STALE)]
-        return drives if len(drives) == len(self.drives) else []
-
-    def _all_fresh(self, now: int) -> dict[Reason, bool]:
-        """Which sensors are fresh, by the reason of the stale ones."""
-        config = self._config
-        return {
-            Reason.DRIVE_STALE: bool(self._fresh_drives(now)),
-            Reason.STEERING_STALE: self.steering_fresh(now),
-            Reason.SCAN_STALE: self.scan_fresh(now),
-            Reason.ATTITUDE_STALE: self._fresh(self.attitude, config.attitude, now, Reason.ATTITUDE_STALE),
-            Reason.BATTERY_STALE: self._fresh(self.battery, config.battery, now, Reason.BATTERY_STALE),
-        }
-
-    def at_rest(self, now: int, since: int = 0) -> bool:
-        """Whether the truck is known to be at rest, by a sample not older than ``since``, ns.
-
-        A truck without a critical drive counts as at rest.
-        """
-        speed = self.speed(now)
-        if speed is None:
-            return not self._config.drive.critical
-        sampled = min(drive.stamp for drive in self._fresh_drives(now))
-        return sampled >= since and abs(speed) < self._config.standstill
-
-    def assess(self, now: int) -> Assessment:
-        """What stops or slows the truck at ``now``, ns."""
-        config = self._config
-        blocks: list[Reason] = []
-        limits: dict[Reason, float] = {}
-        values: dict[str, Value] = {}
-        for drive in self.drives:
-            if drive is not None and drive.mode is DriveMode.FAULT:
-                values["drive_fault_code"] = drive.fault_code
-        if values:
-            blocks.append(Reason.DRIVE_FAULT)
-        blocks += [reason for reason in DRIVE_LOSSES if reason in self._drive_losses | self._unjudged_losses]
-        if self._failed:
-            blocks.append(Reason.SERVICE_FAILED)
-        fresh = self._all_fresh(now)
-        blocks += [reason for reason in self._critical if not fresh[reason]]
-        if fresh[Reason.ATTITUDE_STALE]:
-            values["tilt"] = self._tilt.angle
-            if self._tilt.stop:
-                blocks.append(Reason.TILT_STOP)
-            elif self._tilt.slow:
-                limits[Reason.TILT_SLOW] = config.tilt.slow_speed
-        self._assess_battery(fresh[Reason.BATTERY_STALE], blocks, limits, values)
-        return Assessment(tuple(blocks), limits, values)
-
-    def judged(self) -> None:
-        """A tick has acted on the assessment: what was reported and taken back since the tick before is forgotten."""
-        self._unjudged_losses.clear()
-
-    def _assess_battery(
-        self, fresh: bool, blocks: list[Reason], limits: dict[Reason, float], values: dict[str, Value]
-    ) -> None:
-        battery = self.battery
-        if battery is not None:
-            values["battery_voltage"] = battery.voltage
-            # A pack that was critical stays so when its sensor becomes stale.
-            if battery.level is BatteryLevel.CRITICAL:
-                blocks.append(Reason.BATTERY_CRITICAL)
-            elif battery.level is BatteryLevel.LOW:
-                limits[Reason.BATTERY_LOW] = self._config.battery_low_speed
-        known = self._battery_measured or battery is not None
-        if known and not fresh and not self._config.battery.critical:
-            limits[Reason.BATTERY_STALE] = self._config.battery_low_speed
-
-    def staleness(self, stale: Reason, now: int) -> Staleness:
-        """Details of the stale sensor behind the reason ``stale``; with several shafts, of the oldest sample."""
-        samples: tuple[Message | None, ...]
-        samples, limit = {
-            Reason.SCAN_STALE: ((self.scan,), self._config.scan),
-            Reason.ATTITUDE_STALE: ((self.attitude,), self._config.attitude),
-            Reason.DRIVE_STALE: (tuple(self.drives), self._config.drive),
-            Reason.STEERING_STALE: ((self.steering,), self._config.steering),
-            Reason.BATTERY_STALE: ((self.battery,), self._config.battery),
-        }[stale]
-        received = [sample.received for sample in samples if sample is not None]
-        lost = self._lost.get(stale)
-        refused = self._refused.get(stale)
-        if len(received) < len(samples):
-            return Staleness(lost, None, limit.stale_after, refused)
-        oldest = min(received)
-        since = min(now, oldest + round(limit.stale_after * SECOND))
-        if lost is not None and lost >= oldest:
-            since = min(since, lost)
-        return Staleness(since, (now - oldest) / SECOND, limit.stale_after, refused)
-
-    @property
-    def tilt(self) -> float:
-        """Angle between the truck's z axis and the vertical, rad, by the newest valid attitude."""
-        return self._tilt.angle
-
-    @property
-    def failed(self) -> tuple[str, ...]:
-        """Names of the services whose failure stops the truck."""
-        return self._failed
+    def figures(self, reason: Reason, now: int) -> Iterator[Measurement]:
+        """The tilt."""
+        samples, limit = self.view.samples, self.view.config.tilt.stop
+        yield Measurement(name="tilt", value=samples.tilt, unit="rad", limit=limit, age=age(samples.attitude, now))
 
 
-def _critical(config: GateConfig, *, steered: bool) -> tuple[Reason, ...]:
-    """Sensors whose staleness stops the truck, worst first."""
-    limits = {
-        Reason.DRIVE_STALE: config.drive,
-        Reason.STEERING_STALE: config.steering,
-        Reason.SCAN_STALE: config.scan,
-        Reason.ATTITUDE_STALE: config.attitude,
-        Reason.BATTERY_STALE: config.battery,
-    }
-    return tuple(r for r, limit in limits.items() if limit.critical and (steered or r is not Reason.STEERING_STALE))
-
-
-class _Tilt:
-    """Tilt limits with hysteresis."""
-
-    def __init__(self, limits: TiltLimits) -> None:
-        self.limits = limits
-        self.angle = 0.0
-        self.slow = False
-        self.stop = False
-
-    def update(self, angle: float) -> None:
-        """Take a tilt angle, rad."""
-        self.angle = angle
-        limits = self.limits
-        self.slow = angle >= limits.slow - (limits.hysteresis if self.slow else 0.0)
-        self.stop = angle >= limits.stop - (limits.hysteresis if self.stop else 0.0)
-
-
-class SteeringCheck:
-    """Compares the turn commanded with the turn measured over a sliding window; ``dead`` stays until ``reset``.
+class BatteryCheck(Check):
+    """A low battery, or a silent sensor of it, slows the robot; a critical battery stops it.
 
     Args:
-        config: window and tolerance.
+        view: what it may look at.
+        measured: something is there to measure the battery.
     """
 
-    def __init__(self, config: SteeringCheckConfig) -> None:
-        self.config = config
-        self._window: deque[tuple[int, float, float]] = deque()
-        """(ns, turn by the commands, turn by the compass) since a common origin, rad, left positive."""
-        self._heading = 0.0
-        self.dead = False
-        """The steering does not follow its commands."""
-        self.difference = 0.0
-        """Turn measured less turn commanded over the window, rad."""
+    reasons = (Reason.BATTERY_CRITICAL, Reason.BATTERY_LOW, Reason.BATTERY_STALE)
 
-    def reset(self) -> None:
-        """Start over."""
-        self._window.clear()
-        self.dead = False
-        self.difference = 0.0
+    def __init__(self, view: GateView, *, measured: bool) -> None:
+        super().__init__(view)
+        self._measured = measured
 
-    def observe(self, stamp: int, heading: float | None, speed: float | None, rate: float) -> None:
-        """Take a heading, and what wheels and steering say at that time.
+    def reason(self, now: int) -> Iterator[Reason]:
+        """A critical battery stays so when its sensor becomes stale."""
+        if (battery := self.view.samples.battery) is not None and battery.level is BatteryLevel.CRITICAL:
+            yield Reason.BATTERY_CRITICAL
 
-        Args:
-            stamp: of the measurement, ns.
-            heading: clockwise, rad; None = the compass is disturbed.
-            speed: of the wheels over ground, m/s; None = not known.
-            rate: yaw rate that follows from the wheels' speeds and the commanded steering angles, rad/s, left positive.
-        """
-        if heading is None or speed is None or abs(speed) < self.config.speed:
-            self._window.clear()
-            return
-        if not self._window or stamp - self._window[-1][0] > GAP:
-            self._begin(stamp, heading)
-            return
-        before, commanded, measured = self._window[-1]
-        dt = (stamp - before) / SECOND
-        turned = -math.remainder(heading - self._heading, 2 * math.pi)
-        if abs(turned) > JUMP * dt:
-            self._begin(stamp, heading)
-            return
-        commanded += rate * dt
-        self._window.append((stamp, commanded, measured + turned))
-        self._heading = heading
-        while self._window[-1][0] - self._window[0][0] > self.config.window * SECOND:
-            self._window.popleft()
-        self._compare()
+    def limit(self, now: int, courses: Sequence[Course] | None) -> Iterator[Limit]:
+        """A low battery, or one whose voltage is not known any longer."""
+        config, battery = self.view.config, self.view.samples.battery
+        if battery is not None and battery.level is BatteryLevel.LOW:
+            yield Limit(Reason.BATTERY_LOW, config.battery_low_speed)
+        known = self._measured or battery is not None
+        if known and not config.battery.critical and not self.view.samples.battery_fresh(now):
+            yield Limit(Reason.BATTERY_STALE, config.battery_low_speed)
 
-    def _begin(self, stamp: int, heading: float) -> None:
-        self._window.clear()
-        self._window.append((stamp, 0.0, 0.0))
-        self._heading = heading
-
-    def _compare(self) -> None:
-        _, commanded_then, measured_then = self._window[0]
-        _, commanded_now, measured_now = self._window[-1]
-        commanded, measured = commanded_now - commanded_then, measured_now - measured_then
-        self.difference = measured - commanded
-        allowed = self.config.tolerance + self.config.share * max(abs(commanded), abs(measured))
-        self.dead |= abs(self.difference) > allowed
-
-
-class ShaftCheck:
-    """Compares each driven shaft's speed with its command; ``blocked`` stays until ``reset``.
-
-    A blocked shaft draws current up to the controller's limit and heats motor and clutch, and the controller reports
-    no fault.
-
-    Args:
-        config: time and tolerance.
-    """
-
-    def __init__(self, config: ShaftCheckConfig) -> None:
-        self._config = config
-        self._since: dict[tuple[int, bool], int] = {}
-        """Since when each shaft has not turned, and its controller been enabled or not, ns."""
-        self._current: dict[int, float] = {}
-        """Newest measured current of each, A."""
-        self.blocked: int | None = None
-        """The shaft that does not turn."""
-
-    def reset(self) -> None:
-        """Start over."""
-        self._since.clear()
-        self.blocked = None
-
-    def observe(self, feedback: DriveFeedback, shaft: int, commanded: float, measured: float) -> None:
-        """Take feedback of a shaft.
-
-        Args:
-            feedback: the message.
-            shaft: which.
-            commanded: wheel speed over ground, m/s.
-            measured: same.
-        """
-        if feedback.current is not None:
-            self._current[shaft] = feedback.current
-        limits = self._config
-        enabled = feedback.mode is DriveMode.ENABLED
-        self._since.pop((shaft, not enabled), None)
-        asked = feedback.mode is not DriveMode.FAULT and abs(commanded) >= limits.speed
-        if not asked or measured * math.copysign(1.0, commanded) >= limits.share * abs(commanded):
-            self._since.pop((shaft, enabled), None)
-            return
-        since = self._since.setdefault((shaft, enabled), feedback.received)
-        within = limits.within if enabled else ENABLED_WITHIN
-        if self.blocked is None and feedback.received - since >= within * SECOND:
-            self.blocked = shaft
-
-    @property
-    def current(self) -> float | None:
-        """Newest measured current of the blocked shaft, A."""
-        return None if self.blocked is None else self._current.get(self.blocked)
+    def figures(self, reason: Reason, now: int) -> Iterator[Measurement]:
+        """The voltage."""
+        if (battery := self.view.samples.battery) is not None:
+            yield Measurement(name="voltage", value=battery.voltage, unit="V", age=age(battery, now))

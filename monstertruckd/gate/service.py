@@ -2,7 +2,7 @@
 
 import asyncio
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final, TypeVar, assert_never
@@ -22,9 +22,8 @@ from monstertruck_schemas.health import HealthTable
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import STARTING, ControlRequest, DriveRequest, Order
 from monstertruck_schemas.roles import AccessRole, ServiceName
-from monstertruck_schemas.sensor import Attitude, Battery, DriveFeedback, LaserScan, SonarRanges, SteeringFeedback
-from monstertruck_schemas.state import GateMode, GateState, Odometry, Peers
-from monstertruck_schemas.topics import GATE, REQ_CONTROL
+from monstertruck_schemas.state import GateMode, GateState
+from monstertruck_schemas.topics import EVENT, GATE, HEALTH, REQ_CONTROL, Topic
 from monstertruckd.bus.local import Bus
 from monstertruckd.gate.config import GateConfig
 from monstertruckd.gate.core import Decision, Gate, GateOutput
@@ -80,24 +79,6 @@ class TickMeter:
 
 
 @dataclass(frozen=True, slots=True)
-class GateInputs:
-    """Topics whose newest message is read at every tick; requests, events and health are passed on as they arrive."""
-
-    scan: Subscription[LaserScan]
-    attitude: Subscription[Attitude]
-    drives: tuple[Subscription[DriveFeedback], ...]
-    """One per driven shaft."""
-    steering: Subscription[SteeringFeedback]
-    battery: Subscription[Battery]
-    sonar: Subscription[SonarRanges] | None = None
-    """Of a robot that has sonars."""
-    peers: Subscription[Peers] | None = None
-    """Of a robot with peers."""
-    pose: Subscription[Odometry] | None = None
-    """Of a robot with peers, in map."""
-
-
-@dataclass(frozen=True, slots=True)
 class GateOutputs:
     """Topics the gate writes; it holds the only write ends of the first two."""
 
@@ -130,7 +111,7 @@ class GateService:
         gate: Gate,
         rate: float,
         clock: Clock,
-        inputs: GateInputs,
+        inputs: Mapping[Topic[Any], Subscription[Any]],
         outputs: GateOutputs,
         events: EventSink,
         latch: Latch,
@@ -161,16 +142,7 @@ class GateService:
         self._bug: Exception | None = None
         self._published: tuple[object, ...] = ()
         self._published_at = 0
-        self._feeds: list[_Feed] = [
-            _Feed(inputs.scan, gate.observe_scan),
-            _Feed(inputs.attitude, gate.observe_attitude),
-            *(_Feed(drive, partial(gate.observe_drive, shaft=i)) for i, drive in enumerate(inputs.drives)),
-            _Feed(inputs.steering, gate.observe_steering),
-            _Feed(inputs.battery, gate.observe_battery),
-            *(() if inputs.sonar is None else (_Feed(inputs.sonar, gate.observe_sonar),)),
-            *(() if inputs.peers is None else (_Feed(inputs.peers, gate.observe_peers),)),
-            *(() if inputs.pose is None else (_Feed(inputs.pose, gate.observe_pose),)),
-        ]
+        self._feeds = [_Feed(topic, subscription, gate.observe) for topic, subscription in inputs.items()]
 
     def configure(self, config: GateConfig, weakened: tuple[str, ...]) -> None:
         """Take other limits, which count from the next tick on; see ``Gate.configure``."""
@@ -217,12 +189,12 @@ class GateService:
         return self._guarded(Reason.INTERNAL, self._gate.planner_request, request, self._clock.now())
 
     def observe_event(self, event: Event) -> None:
-        """Take any service's event at once; see ``Gate.observe_event``."""
-        self._guarded(None, self._gate.observe_event, event)
+        """Take any service's event at once; see ``Gate.observe``."""
+        self._guarded(None, self._gate.observe, event, EVENT)
 
     def observe_health(self, table: HealthTable) -> None:
-        """Take a health table at once; see ``Gate.observe_health``."""
-        self._guarded(None, self._gate.observe_health, table)
+        """Take a health table at once; see ``Gate.observe``."""
+        self._guarded(None, self._gate.observe, table, HEALTH)
 
     def shut_down(self) -> None:
         """Command neutral from now on; the ticks go on until ``run`` is cancelled."""
@@ -401,7 +373,10 @@ class GateService:
 class _Feed:
     """Passes each message of a latest-only subscription on once."""
 
-    def __init__(self, subscription: Subscription[Any], observe: Callable[[Any], None]) -> None:
+    def __init__(
+        self, topic: Topic[Any], subscription: Subscription[Any], observe: Callable[[Any, Topic[Any]], None]
+    ) -> None:
+        self._topic = topic
         self._subscription = subscription
         self._observe = observe
         self._seen: object = None
@@ -410,7 +385,7 @@ class _Feed:
         message = self._subscription.latest
         if message is not self._seen:
             self._seen = message
-            self._observe(message)
+            self._observe(message, self._topic)
 
 
 STANDSTILL: Final = 4.0

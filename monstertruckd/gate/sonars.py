@@ -13,16 +13,23 @@ slows it, and so does a direction of travel without a sonar.
 
 import math
 from collections import deque
-from collections.abc import Mapping
-from typing import Final, NamedTuple
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.collision import Footprint, UnitTwist, free_distance
 from monstertruck_runtime.clock import SECOND
+from monstertruck_schemas.base import Message
+from monstertruck_schemas.event import Measurement
+from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import SonarRanges
-from monstertruckd.gate.config import GateConfig
+from monstertruck_schemas.topics import SONAR, Topic
+from monstertruckd.gate.approach import Approach, comfortable_speed, reach
+from monstertruckd.gate.checks import Check, GateView, Limit, Tick
+from monstertruckd.gate.config import InForce
+from monstertruckd.gate.motion import Course
 
 ALIGNED: Final = 0.3
 """Greatest angle between the axis of a sonar and the direction of travel for it to look ahead, rad."""
@@ -52,13 +59,13 @@ class SonarGuard:
     """Sweeps the footprint along a motion against the echoes.
 
     Args:
-        config: the gate's limits.
+        limits: the gate's, in force.
         footprint: the body's outline.
         mounts: pose (x, y, yaw) of every sonar in base by name, m, m, rad.
     """
 
-    def __init__(self, config: GateConfig, footprint: Footprint, mounts: Mapping[str, Place]) -> None:
-        self._config = config
+    def __init__(self, limits: InForce, footprint: Footprint, mounts: Mapping[str, Place]) -> None:
+        self._limits = limits
         self._footprint = footprint
         self._mounts = mounts
         self._rounds: deque[SonarRanges] = deque(maxlen=ROUNDS)
@@ -67,20 +74,16 @@ class SonarGuard:
         self.view = SonarView(math.inf, (), False)
         """View of the newest motion that was checked."""
 
-    def configure(self, config: GateConfig) -> None:
-        """Take other limits, between two ticks."""
-        self._config = config
-
     def observe(self, ranges: SonarRanges) -> None:
         """Take a round of pings; one that is too late is left out."""
-        if abs(ranges.received - ranges.stamp) > self._config.max_latency * SECOND:
+        if abs(ranges.received - ranges.stamp) > self._limits.config.max_latency * SECOND:
             return
         self._rounds.append(ranges)
         self._answered |= {sonar.name: ranges.received for sonar in ranges.sonars if sonar.answered}
 
     def fresh(self, now: int) -> bool:
         """Whether there is a round that is not too old."""
-        return bool(self._rounds) and now - self._rounds[-1].received <= self._config.sonar.stale_after * SECOND
+        return bool(self._rounds) and now - self._rounds[-1].received <= self._limits.config.sonar.stale_after * SECOND
 
     def look(self, twist: UnitTwist, reach: float, now: int) -> SonarView:
         """Sweep a motion.
@@ -91,10 +94,10 @@ class SonarGuard:
             now: ns.
         """
         ahead = self._ahead(twist)
-        oldest = now - round(self._config.sonar.stale_after * SECOND)
+        oldest = now - round(self._limits.config.sonar.stale_after * SECOND)
         silent = [name for name in self._mounts if self._answered.get(name, -1) < oldest]
         points = self._points(ahead, now)
-        free = free_distance(self._footprint, twist, points, reach, STEP, self._config.obstacle.side_clearance)
+        free = free_distance(self._footprint, twist, points, reach, STEP, self._limits.config.obstacle.side_clearance)
         dead = tuple(name for name in silent if name in ahead)
         unknown = len(silent) > len(dead) or (not ahead and math.hypot(twist[0], twist[1]) >= TURNING)
         self.view = SonarView(free, dead, unknown)
@@ -117,14 +120,68 @@ class SonarGuard:
         """Points of all arcs in base, (n, 2), m."""
         arcs = [np.empty((0, 2))]
         for ranges in self._rounds:
-            if now - ranges.received > self._config.sonar.stale_after * SECOND:
+            if now - ranges.received > self._limits.config.sonar.stale_after * SECOND:
                 continue
             for sonar in ranges.sonars:
                 if sonar.range is not None and sonar.answered and sonar.name in self._mounts:
                     half = ranges.field_of_view / 2
-                    half = half if sonar.name in ahead else min(half, self._config.sonar.core)
+                    half = half if sonar.name in ahead else min(half, self._limits.config.sonar.core)
                     arcs.append(arc(self._mounts[sonar.name], sonar.range, half))
         return np.concatenate(arcs)
+
+
+class SonarCheck(Check):
+    """The swept footprint must not meet the echoes of the sonars of a robot without a lidar.
+
+    Args:
+        view: what it may look at.
+        mounts: pose (x, y, yaw) of every sonar in base by name, m, m, rad.
+    """
+
+    reasons = (
+        Reason.OBSTACLE_STOP,
+        Reason.OBSTACLE_SLOW,
+        Reason.SONAR_STALE,
+        Reason.SONAR_BLIND,
+        Reason.SONAR_SLOW,
+    )
+    reads = (SONAR,)
+
+    def __init__(self, view: GateView, mounts: Mapping[str, Place]) -> None:
+        super().__init__(view)
+        self.guard = SonarGuard(view.limits, view.footprint, mounts)
+        self._approach = Approach(view)
+
+    def observe(self, seen: Message | Tick, topic: Topic[Any] | None) -> None:
+        """Take rounds of pings."""
+        if isinstance(seen, SonarRanges):
+            self.guard.observe(seen)
+
+    def limit(self, now: int, courses: Sequence[Course] | None) -> Iterator[Limit]:
+        """Sweep along the motions."""
+        if courses is None:
+            self._approach.forget()
+        elif courses and self.guard.fresh(now):
+            yield from self._along(now, courses)
+        elif courses:
+            yield Limit(Reason.SONAR_STALE, 0.0)
+
+    def _along(self, now: int, courses: Sequence[Course]) -> Iterator[Limit]:
+        config = self.view.config
+        delay = self.guard.delay(now) + config.reaction
+        views = [self.guard.look(twist, reach(config, delay), now) for twist, _ in courses]
+        free = min(view.free for view in views)
+        allowed = comfortable_speed(free - config.obstacle.ahead, delay, config.obstacle.deceleration)
+        yield from self._approach.limits(free, allowed, max(pace for _, pace in courses))
+        if any(view.dead for view in views):
+            yield Limit(Reason.SONAR_BLIND, 0.0)
+        elif any(view.unknown for view in views):
+            yield Limit(Reason.SONAR_SLOW, config.sonar.unseen_speed)
+
+    def figures(self, reason: Reason, now: int) -> Iterator[Measurement]:
+        """Free distance."""
+        if reason in (Reason.OBSTACLE_STOP, Reason.SONAR_BLIND):
+            yield self._approach.free_distance(None)
 
 
 def arc(place: Place, distance: float, half: float) -> Array:

@@ -1,6 +1,6 @@
 """Why the truck was stopped: causes with measurements, lost devices behind them, and the numbered log of stops."""
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Final
@@ -12,16 +12,10 @@ from monstertruck_schemas.event import Cause, Event, Measurement, Severity, Stop
 from monstertruck_schemas.health import HealthTable, ServiceHealth, ServiceState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import DriveRequest
-from monstertruck_schemas.roles import DeviceRole, ServiceName
-from monstertruck_schemas.sensor import DriveMode
+from monstertruck_schemas.roles import DeviceRole
 from monstertruck_schemas.state import GateMode
 from monstertruckd.gate.arbitration import Source
-from monstertruckd.gate.config import GateConfig
-from monstertruckd.gate.limiter import CommandLimiter
-from monstertruckd.gate.sensors import STALE_SENSORS, SensorMonitor, ShaftCheck, SteeringCheck
-
-GATE: Final = ServiceName.GATE.value
-"""Source of causes that only the gate itself knows."""
+from monstertruckd.gate.samples import STALE_SENSORS
 
 HUB_WINDOW: Final = SECOND
 """A hub's loss is reported once all its devices are gone, at most this long before or after theirs, ns."""
@@ -33,150 +27,27 @@ EXPLAINED_WITHIN: Final = 3 * SECOND
 """So long after a stop later reports may still extend its causes, ns."""
 
 
-class CauseBuilder:
-    """Turns reasons into causes with measurements; used only when the truck is stopped or an order is refused.
-
-    Args:
-        config: limits.
-        sensors: newest samples.
-        limiter: obstacle state.
-        check: compass against steering; None = not checked.
-        shafts: commanded against measured speeds of the driven shafts; None = not checked.
-    """
-
-    def __init__(
-        self,
-        config: GateConfig,
-        sensors: SensorMonitor,
-        limiter: CommandLimiter,
-        check: SteeringCheck | None,
-        shafts: ShaftCheck | None,
-    ) -> None:
-        self._config = config
-        self._sensors = sensors
-        self._limiter = limiter
-        self._check = check
-        self._shafts = shafts
-        self.pause = 0.0
-        """Newest excessive pause between two ticks, s."""
-        self._measurements: Mapping[Reason, Callable[[int], Iterator[Measurement]]] = {
-            Reason.DRIVE_FAULT: self._fault,
-            Reason.TILT_STOP: self._tilt,
-            Reason.BATTERY_CRITICAL: self._voltage,
-            Reason.TICK_STALLED: self._stall,
-            Reason.STEERING_DEAD: self._turn,
-            Reason.OBSTACLE_STOP: self._obstacle,
-            Reason.LIDAR_BLIND: self._unseen,
-            Reason.SONAR_BLIND: self._obstacle,
-            Reason.SHAFT_BLOCKED: self._blocked_shaft,
-        }
-
-    def configure(self, config: GateConfig) -> None:
-        """Take other limits, between two ticks."""
-        self._config = config
-
-    def causes(self, reasons: Iterable[Reason], now: int, since: Mapping[Reason, int]) -> list[Cause]:
-        """One cause per reason, and one per failed service.
-
-        Args:
-            reasons: worst first.
-            now: ns.
-            since: when the gate first saw each of them, ns.
-        """
-        causes = []
-        for reason in reasons:
-            began = since.get(reason, now)
-            if reason is Reason.SERVICE_FAILED:
-                causes += [
-                    Cause(reason=reason, source=name, since=began, text=f"{reason.text}: {name}")
-                    for name in self._sensors.failed
-                ]
-            elif reason in STALE_SENSORS:
-                causes.append(self._staleness(reason, now, began))
-            else:
-                figures = tuple(self._measurements.get(reason, _none)(now))
-                causes.append(Cause(reason=reason, source=GATE, since=began, text=reason.text, measurements=figures))
-        return causes
-
-    def lease(self, source: Source, now: int) -> Cause:
-        """The cause of a stop for an expired lease."""
-        request = source.request
-        figures = [
-            Measurement(
-                name="request age",
-                value=(now - source.arrived) / SECOND,
-                unit="s",
-                limit=(source.deadline - source.arrived) / SECOND,
-            )
-        ]
-        if not source.inside and request.gate_stamp is not None:
-            # From the gate state its sender had to the request's arrival: both directions and the sender's own delay.
-            figures.append(
-                Measurement(name="round trip", value=(source.arrived - request.gate_stamp) / SECOND, unit="s")
-            )
-        return Cause(
-            reason=Reason.LEASE_EXPIRED,
-            source=request.source,
-            since=min(source.deadline, now),
-            text=f"lease of {request.source} expired",
-            measurements=tuple(figures),
+def lease_cause(source: Source, now: int) -> Cause:
+    """The cause of a stop for the expired lease of ``source``."""
+    request = source.request
+    figures = [
+        Measurement(
+            name="request age",
+            value=(now - source.arrived) / SECOND,
+            unit="s",
+            limit=(source.deadline - source.arrived) / SECOND,
         )
-
-    def _staleness(self, reason: Reason, now: int, began: int) -> Cause:
-        staleness = self._sensors.staleness(reason, now)
-        figures = [Measurement(name="age", value=staleness.age, unit="s", limit=staleness.limit)]
-        if staleness.refused is not None:
-            figures.append(staleness.refused)
-        return Cause(
-            reason=reason,
-            source=STALE_SENSORS[reason].value,
-            since=began if staleness.since is None else staleness.since,
-            text=reason.text,
-            measurements=tuple(figures),
-        )
-
-    def _fault(self, now: int) -> Iterator[Measurement]:
-        for drive in self._sensors.drives:
-            if drive is not None and drive.mode is DriveMode.FAULT:
-                code = drive.fault_code
-                yield Measurement(name="fault code", value=None if code is None else float(code), age=_age(drive, now))
-
-    def _tilt(self, now: int) -> Iterator[Measurement]:
-        attitude, limit = self._sensors.attitude, self._config.tilt.stop
-        yield Measurement(name="tilt", value=self._sensors.tilt, unit="rad", limit=limit, age=_age(attitude, now))
-
-    def _voltage(self, now: int) -> Iterator[Measurement]:
-        battery = self._sensors.battery
-        if battery is not None:
-            yield Measurement(name="voltage", value=battery.voltage, unit="V", age=_age(battery, now))
-
-    def _stall(self, _now: int) -> Iterator[Measurement]:
-        yield Measurement(name="pause", value=self.pause, unit="s", limit=self._config.tick_stall)
-
-    def _turn(self, _now: int) -> Iterator[Measurement]:
-        if (check := self._check) is not None:
-            limit = check.config.tolerance
-            yield Measurement(name="yaw difference", value=check.difference, unit="rad", limit=limit)
-
-    def _obstacle(self, now: int) -> Iterator[Measurement]:
-        age = _age(self._sensors.scan, now)
-        keep = self._config.obstacle.ahead
-        yield Measurement(name="free distance", value=self._limiter.free, unit="m", limit=keep, age=age)
-
-    def _blocked_shaft(self, _now: int) -> Iterator[Measurement]:
-        if self._shafts is not None:
-            yield Measurement(name="motor current", value=self._shafts.current, unit="A")
-
-    def _unseen(self, _now: int) -> Iterator[Measurement]:
-        yield Measurement(name="unseen", value=self._limiter.unseen, unit="s", limit=self._config.scan.stale_after)
-
-
-def _age(message: Message | None, now: int) -> float | None:
-    return None if message is None else (now - message.received) / SECOND
-
-
-def _none(_now: int) -> Iterator[Measurement]:
-    return iter(())
+    ]
+    if not source.inside and request.gate_stamp is not None:
+        # From the gate state its sender had to the request's arrival: both directions and the sender's own delay.
+        figures.append(Measurement(name="round trip", value=(source.arrived - request.gate_stamp) / SECOND, unit="s"))
+    return Cause(
+        reason=Reason.LEASE_EXPIRED,
+        source=request.source,
+        since=min(source.deadline, now),
+        text=f"lease of {request.source} expired",
+        measurements=tuple(figures),
+    )
 
 
 @dataclass(slots=True)
@@ -202,8 +73,14 @@ class Outages:
         self._hubs: dict[str, Event] = {}
         self._link: Event | None = None
 
-    def observe_health(self, table: HealthTable) -> None:
-        """Take the services' health."""
+    def observe(self, message: Message) -> None:
+        """Take the services' health, and events of any service."""
+        if isinstance(message, HealthTable):
+            self._observe_health(message)
+        elif isinstance(message, Event):
+            self._observe_event(message)
+
+    def _observe_health(self, table: HealthTable) -> None:
         for service in table.services:
             outage = self._outages.get(service.name)
             if service.state in (ServiceState.BACKOFF, ServiceState.FAILED):
@@ -212,8 +89,7 @@ class Outages:
             elif service.state is ServiceState.READY and outage is not None and outage.end is None:
                 outage.end = service.since
 
-    def observe_event(self, event: Event) -> None:
-        """Take any service's event."""
+    def _observe_event(self, event: Event) -> None:
         if event.source == DeviceRole.LINK:
             self._link = event if event.severity is not Severity.INFO else None
         if event.reason in HUB_EVENTS:

@@ -6,9 +6,10 @@ from contextlib import asynccontextmanager
 
 from monstertruck_runtime.clock import run_virtual
 from monstertruck_runtime.threads import in_thread, inline
+from monstertruck_schemas import topics
 from monstertruck_schemas.req import ControlRequest, DriveRequest, Role
 from monstertruckd.gate.latch import MemoryLatch
-from monstertruckd.gate.service import GateInputs, GateOutputs, GateService
+from monstertruckd.gate.service import GateOutputs, GateService
 from tests.unit.gate.rig import NONCE, attitude, battery, feedback, header, health, make_gate, scan, servos
 
 
@@ -54,13 +55,13 @@ class Bench:
         self.events = []
         self.readies = 0
         self.speed = 0.0
-        inputs = GateInputs(
-            self.scan,
-            self.attitude,
-            (self.drive,),
-            self.steering,
-            self.battery,
-        )
+        inputs = {
+            topics.SCAN: self.scan,
+            topics.COMPASS: self.attitude,
+            topics.DRIVE: self.drive,
+            topics.STEERING: self.steering,
+            topics.BATTERY: self.battery,
+        }
         gate = make_gate(self.latch.engaged())
         self.boxes = []
         self.service = GateService(

@@ -1,6 +1,7 @@
 """A truck around the gate: fresh sensors on request and a motor that obeys."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,8 +19,10 @@ from monstertruck_kinematics.chassis import (
 from monstertruck_kinematics.truck import DriveTrain, FourWheelSteering
 from monstertruck_planners.collision import Footprint, ScanPoints
 from monstertruck_runtime.clock import SECOND
+from monstertruck_schemas import topics
 from monstertruck_schemas.base import servo_fields
 from monstertruck_schemas.cmd import DriveAction
+from monstertruck_schemas.event import Event
 from monstertruck_schemas.health import HealthTable, ServiceHealth, ServiceState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import ControlRequest, DriveRequest, Order, RequestedTwist, Role
@@ -30,11 +33,16 @@ from monstertruck_schemas.sensor import (
     DriveFeedback,
     DriveMode,
     LaserScan,
+    SonarRanges,
     SteeringFeedback,
 )
-from monstertruck_schemas.state import GateMode
-from monstertruckd.gate.config import GateConfig
-from monstertruckd.gate.core import Gate
+from monstertruck_schemas.state import GateMode, Odometry, Peers
+from monstertruckd.gate.arbitration import GateStateMachine
+from monstertruckd.gate.checks import Checks, GateView, Tick
+from monstertruckd.gate.config import GateConfig, InForce
+from monstertruckd.gate.core import Gate, sensor_checks
+from monstertruckd.gate.motion import Motion
+from monstertruckd.gate.samples import Samples
 
 TICK = SECOND // 50
 NONCE = "run-1"
@@ -67,6 +75,62 @@ def make_gate(
         latched=latched,
         peers=peers,
     )
+
+
+SHOWN = {
+    LaserScan: topics.SCAN,
+    Attitude: topics.COMPASS,
+    SteeringFeedback: topics.STEERING,
+    Battery: topics.BATTERY,
+    SonarRanges: topics.SONAR,
+    Peers: topics.PEERS,
+    Odometry: topics.POSE,
+    HealthTable: topics.HEALTH,
+    Event: topics.EVENT,
+}
+
+
+def show(gate, message, shaft=0):
+    """Show a gate a message under its topic."""
+    gate.observe(message, topics.DRIVES[shaft] if isinstance(message, DriveFeedback) else SHOWN[type(message)])
+
+
+class Assessment(NamedTuple):
+    """What samples and their checks say at one time."""
+
+    blocks: tuple
+    limits: dict
+    values: dict
+
+
+class Monitor:
+    """The newest samples and the checks of sensors, without the rest of the gate."""
+
+    def __init__(self, chassis=CHASSIS, *, battery_measured=True, services=SERVICES, **config):
+        limits = InForce(GateConfig(**config))
+        self.samples = Samples(limits, chassis, services)
+        view = GateView(
+            limits, chassis, Footprint(), self.samples, Motion(limits, chassis), GateStateMachine(None, latched=False)
+        )
+        self._checks = Checks(sensor_checks(view, battery_measured=battery_measured))
+
+    def __getattr__(self, name):
+        return getattr(self.samples, name)
+
+    def observe(self, message, topic):
+        self.samples.observe(message, topic)
+        self._checks.observe(message, topic)
+
+    def tick(self, now):
+        self._checks.observe(Tick(now, TICK), None)
+
+    def assess(self, now):
+        return Assessment(self._checks.blocks(now), self._checks.limits(now, None), self.samples.values(now))
+
+
+def check_of(gate, kind):
+    """The gate's check of a class."""
+    return next(check for check in gate._checks if isinstance(check, kind))
 
 
 def header(now, seq=0, **more):
@@ -181,11 +245,11 @@ class Rig:
         """Every sensor that is not silent delivers now."""
         mode = DriveMode.FAULT if self.fault else DriveMode.ENABLED
         samples = {
-            "scan": lambda: self.gate.observe_scan(scan(self.now, *self.obstacles, unknown=self.unknown)),
-            "attitude": lambda: self.gate.observe_attitude(attitude(self.now, roll=self.tilt)),
-            "drive": lambda: self.gate.observe_drive(feedback(self.now, self.speed, mode)),
-            "steering": lambda: self.gate.observe_steering(servos(self.now)),
-            "battery": lambda: self.gate.observe_battery(battery(self.now, self.level)),
+            "scan": lambda: show(self.gate, scan(self.now, *self.obstacles, unknown=self.unknown)),
+            "attitude": lambda: show(self.gate, attitude(self.now, roll=self.tilt)),
+            "drive": lambda: show(self.gate, feedback(self.now, self.speed, mode)),
+            "steering": lambda: show(self.gate, servos(self.now)),
+            "battery": lambda: show(self.gate, battery(self.now, self.level)),
         }
         for name, send in samples.items():
             if name not in self.silent:
@@ -261,13 +325,13 @@ class Robot(Rig):
         """The body does what its wheels say."""
 
     def sense(self):
-        self.gate.observe_scan(scan(self.now, *self.obstacles))
+        show(self.gate, scan(self.now, *self.obstacles))
         heading = -self.turned % (2 * math.pi) if self.turns else 0.0
-        self.gate.observe_attitude(attitude(self.now).model_copy(update={"heading": heading}))
+        show(self.gate, attitude(self.now).model_copy(update={"heading": heading}))
         for shaft, speed in enumerate(self.shafts):
-            self.gate.observe_drive(feedback(self.now, speed), shaft)
+            show(self.gate, feedback(self.now, speed), shaft)
         if self.chassis.steered:
-            self.gate.observe_steering(SteeringFeedback(**header(self.now), **servo_fields(self.servos)))
+            show(self.gate, SteeringFeedback(**header(self.now), **servo_fields(self.servos)))
 
     def _obey(self):
         self.shafts, self.servos = list(self.out.speeds), self.out.servos

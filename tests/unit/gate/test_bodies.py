@@ -9,7 +9,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order
 from monstertruck_schemas.sensor import DriveMode
 from monstertruck_schemas.state import GateMode
-from tests.unit.gate.rig import DRIVETRAIN, Rig, attitude, feedback, health, make_gate, scan
+from tests.unit.gate.rig import DRIVETRAIN, Rig, attitude, feedback, health, make_gate, scan, show
 
 DIFFERENTIAL = differential_chassis(Dimensions(DRIVETRAIN))
 
@@ -25,14 +25,12 @@ class TwoWheels(Rig):
         self.broken = set()
 
     def sense(self):
-        self.gate.observe_scan(scan(self.now))
-        self.gate.observe_attitude(attitude(self.now))
+        show(self.gate, scan(self.now))
+        show(self.gate, attitude(self.now))
         for shaft, speed in enumerate(self.speeds):
             if shaft not in self.dead:
                 mode = DriveMode.FAULT if shaft in self.broken else DriveMode.ENABLED
-                self.gate.observe_drive(
-                    feedback(self.now, speed, mode, 0x2310 if shaft in self.broken else None), shaft
-                )
+                show(self.gate, feedback(self.now, speed, mode, 0x2310 if shaft in self.broken else None), shaft)
 
     def _obey(self):
         self.speeds = list(self.out.speeds) if self.out.action is DriveAction.RUN else [0.0, 0.0]
@@ -98,7 +96,7 @@ def test_it_stands_only_when_both_wheels_do():
 
 def test_a_lost_second_shaft_counts_until_it_delivers_again():
     rig = TwoWheels().driving(speed=0.15)
-    rig.gate.observe_health(health(rig.now, ServiceState.BACKOFF, "drive_2"))
+    show(rig.gate, health(rig.now, ServiceState.BACKOFF, "drive_2"))
     rig.tick(sense=False)
     assert Reason.DRIVE_STALE in rig.out.reasons
     rig.tick(2)

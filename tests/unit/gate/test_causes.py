@@ -9,8 +9,8 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Role
 from monstertruck_schemas.sensor import BatteryLevel, DriveMode
 from monstertruck_schemas.state import GateMode
-from monstertruckd.gate.stops import HUB_EVENTS, Outages, StopLog
-from tests.unit.gate.rig import SERVICES, Rig, feedback, header, health
+from monstertruckd.gate.stops import HUB_EVENTS, Outages, StopLog, lease_cause
+from tests.unit.gate.rig import SERVICES, Rig, feedback, header, health, show
 
 NOW = 100 * SECOND
 MS = SECOND // 1000
@@ -28,7 +28,7 @@ def event(reason, source="usb", severity=Severity.WARNING, at=NOW, text="", **va
 def outages(*tables):
     found = Outages(SERVICES)
     for name, state, since, more in tables:
-        found.observe_health(
+        found.observe(
             HealthTable(**header(NOW), services=(ServiceHealth(name=name, state=state, since=since, **more),))
         )
     return found
@@ -103,20 +103,20 @@ def test_hubs_and_their_current_explain_the_loss_of_what_they_name():
     assert {Reason.HUB_LOST, Reason.OVER_CURRENT} == HUB_EVENTS
     for reason in HUB_EVENTS:
         found = outages(LOST)
-        found.observe_event(event(reason, roles="camera,lidar", text="hub 1"))
+        found.observe(event(reason, roles="camera,lidar", text="hub 1"))
         assert behind(found)[2] == (reason, "usb", None)
         assert found.explain((cause(),))[2].text == "hub 1"
     found = outages(LOST)
-    found.observe_event(event(Reason.HUB_LOST, roles="camera"))
-    found.observe_event(event(Reason.DEVICE_LOST, roles="lidar"))
-    found.observe_event(event(Reason.HUB_LOST))
+    found.observe(event(Reason.HUB_LOST, roles="camera"))
+    found.observe(event(Reason.DEVICE_LOST, roles="lidar"))
+    found.observe(event(Reason.HUB_LOST))
     assert len(behind(found)) == 2
 
 
 @pytest.mark.parametrize(("at", "counts"), [(-SECOND - SECOND, True), (-SECOND - SECOND - 1, False), (0, True)])
 def test_a_hub_explains_what_was_lost_at_about_its_time(at, counts):
     found = outages(LOST)
-    found.observe_event(event(Reason.HUB_LOST, at=NOW + at, roles="lidar"))
+    found.observe(event(Reason.HUB_LOST, at=NOW + at, roles="lidar"))
     assert (len(behind(found)) == 3) is counts
 
 
@@ -124,19 +124,19 @@ def test_a_link_explains_a_lapsed_lease_and_nothing_else():
     found = outages()
     lapsed = cause(Reason.LEASE_EXPIRED, "ann")
     assert len(behind(found, lapsed)) == 1
-    found.observe_event(event(Reason.LINK_DOWN, "link"))
+    found.observe(event(Reason.LINK_DOWN, "link"))
     assert behind(found, lapsed) == [(Reason.LEASE_EXPIRED, "ann", 1), (Reason.LINK_DOWN, "link", None)]
     assert found.explain((lapsed,))[1].text == Reason.LINK_DOWN.text
     assert len(behind(found)) == 1
-    found.observe_event(event(Reason.LINK_DOWN, "usb", Severity.INFO))
+    found.observe(event(Reason.LINK_DOWN, "usb", Severity.INFO))
     assert len(behind(found, lapsed)) == 2
-    found.observe_event(event(Reason.OK, "link", Severity.INFO))
+    found.observe(event(Reason.OK, "link", Severity.INFO))
     assert len(behind(found, lapsed)) == 1
 
 
 def test_causes_that_share_what_is_behind_them_are_linked_to_one():
     found = outages(LOST)
-    found.observe_event(event(Reason.HUB_LOST, roles="lidar"))
+    found.observe(event(Reason.HUB_LOST, roles="lidar"))
     twice = (cause(), cause(Reason.ATTITUDE_STALE, "compass"), cause())
     assert [each.because for each in found.explain(twice)] == [3, None, 3, 4, None]
 
@@ -176,7 +176,7 @@ def test_a_stop_is_read_before_what_became_known_of_it():
     found = outages()
     log = StopLog(found)
     add(log)
-    found.observe_health(LIDAR_LOST)
+    found.observe(LIDAR_LOST)
     assert [len(trip.causes) for _ in range(3) for trip in log.drain(NOW, SILENT)] == [1, 2]
 
 
@@ -186,7 +186,7 @@ def test_what_becomes_known_soon_after_a_stop_is_added_to_it_once(later, reporte
     log = StopLog(found)
     add(log)
     log.drain(NOW, SILENT)
-    found.observe_health(LIDAR_LOST)
+    found.observe(LIDAR_LOST)
     again = log.drain(NOW + later, SILENT)
     assert [(trip.number, len(trip.causes)) for trip in again] == ([(1, 2)] if reported else [])
     assert log.drain(NOW + later, SILENT) == ()
@@ -207,7 +207,7 @@ def figures(found):
 
 
 def causes(rig, *reasons, since=None):
-    return rig.gate._causes.causes(reasons, rig.now, since or {})
+    return rig.gate._checks.describe(reasons, rig.now, since or {})
 
 
 def test_a_cause_counts_from_when_the_gate_saw_it():
@@ -221,13 +221,14 @@ def test_a_cause_counts_from_when_the_gate_saw_it():
 
 def test_one_cause_for_every_failed_service():
     rig = Rig()
-    rig.gate.observe_health(
+    show(
+        rig.gate,
         HealthTable(
             **header(rig.now),
             services=tuple(
                 ServiceHealth(name=name, state=ServiceState.FAILED, since=0) for name in ("slam", "recorder", "plan")
             ),
-        )
+        ),
     )
     found = causes(rig, Reason.SERVICE_FAILED, since={Reason.SERVICE_FAILED: 5})
     assert [(each.source, each.since) for each in found] == [("slam", 5), ("plan", 5)]
@@ -246,7 +247,7 @@ def test_a_lease_that_has_not_lapsed_yet_counts_from_now(offset, since):
     rig.tick()
     source = rig.gate._states.holder
     at = source.arrived + offset
-    found = rig.gate._causes.lease(source, at)
+    found = lease_cause(source, at)
     assert found.since == source.arrived + since
     assert found.text == "lease of ann expired"
     assert figures(found)["request age"].value == pytest.approx(offset / SECOND)
@@ -258,15 +259,15 @@ def test_a_request_without_a_stamp_of_the_gate_has_no_round_trip():
     rig.tick()
     source = rig.gate._states.holder
     source.request = source.request.model_copy(update={"gate_stamp": None})
-    assert set(figures(rig.gate._causes.lease(source, rig.now))) == {"request age"}
+    assert set(figures(lease_cause(source, rig.now))) == {"request age"}
 
 
 def test_figures_of_faults_battery_tilt_current_and_turn():
     rig = Rig().armed()
-    rig.gate.observe_drive(feedback(rig.now - 20 * MS, 0.0, DriveMode.FAULT, 0x2310))
+    show(rig.gate, feedback(rig.now - 20 * MS, 0.0, DriveMode.FAULT, 0x2310))
     fault = figures(causes(rig, Reason.DRIVE_FAULT)[0])["fault code"]
     assert (fault.value, fault.age) == (float(0x2310), pytest.approx(0.02))
-    rig.gate.observe_drive(feedback(rig.now))
+    show(rig.gate, feedback(rig.now))
     assert figures(causes(rig, Reason.DRIVE_FAULT)[0]) == {}
     rig.level = BatteryLevel.CRITICAL
     rig.sense()
@@ -288,7 +289,7 @@ def test_figures_of_faults_battery_tilt_current_and_turn():
 
 def test_the_driver_of_a_stop_is_named_with_its_role():
     rig = Rig().driving(source="bob", role=Role.STATION)
-    rig.gate.observe_health(health(rig.now, ServiceState.FAILED, "slam"))
+    show(rig.gate, health(rig.now, ServiceState.FAILED, "slam"))
     rig.tick()
     assert (rig.trips[-1].holder, rig.trips[-1].role) == ("bob", Role.STATION)
     assert rig.trips[-1].stopping_distance == pytest.approx(0.2 * 0.08 + 0.2**2 / 2, rel=0.05)

@@ -12,7 +12,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import DriveForm, Order, Role
 from monstertruck_schemas.sensor import BatteryLevel
 from monstertruck_schemas.state import GateMode
-from tests.unit.gate.rig import TICK, Rig, Robot, health
+from tests.unit.gate.rig import TICK, Rig, Robot, health, show
 
 TRACK = {"source": "track", "role": Role.TRACKER, "inside": True}
 GOALS = {"source": "goals", "role": Role.TRACKER, "inside": True}
@@ -300,7 +300,7 @@ def test_nothing_is_reported_of_a_disarmed_truck():
 
 def test_a_failed_service_is_named_in_its_event():
     rig = Rig().driving()
-    rig.gate.observe_health(health(rig.now, ServiceState.FAILED, "slam"))
+    show(rig.gate, health(rig.now, ServiceState.FAILED, "slam"))
     rig.tick()
     assert rig.reported(Reason.SERVICE_FAILED)[0].text == f"{Reason.SERVICE_FAILED.text}: slam"
     rig.driver = None

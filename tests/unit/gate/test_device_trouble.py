@@ -10,9 +10,10 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order
 from monstertruck_schemas.sensor import DriveMode
 from monstertruck_schemas.state import GateMode
+from monstertruck_schemas.topics import DRIVES
 from monstertruckd.gate.config import ShaftCheckConfig
-from monstertruckd.gate.sensors import ShaftCheck
-from tests.unit.gate.rig import Rig, Robot, feedback, health
+from monstertruckd.gate.following import ShaftCheck, ShaftComparison
+from tests.unit.gate.rig import Rig, Robot, check_of, feedback, health, show
 
 
 def held(rig, ticks):
@@ -37,12 +38,12 @@ def test_a_blocked_shaft_stops_and_disarms_within_a_second(speed):
 def test_a_shaft_whose_controller_never_enables_is_blocked(mode, monkeypatch):
     """With another one that drives, the body would turn on the spot."""
     robot = Robot("differential").driving(ticks=2, speed=0.2)
-    observe = robot.gate.observe_drive
+    observe = robot.gate.observe
 
-    def second_never_enables(message, shaft=0):
-        observe(message if shaft == 0 else feedback(robot.now, 0.0, mode=mode), shaft)
+    def second_never_enables(message, topic):
+        observe(feedback(robot.now, 0.0, mode=mode) if topic is DRIVES[1] else message, topic)
 
-    monkeypatch.setattr(robot.gate, "observe_drive", second_never_enables)
+    monkeypatch.setattr(robot.gate, "observe", second_never_enables)
     robot.tick(70)
     assert robot.trips == []
     robot.tick(20)
@@ -69,7 +70,7 @@ def test_a_slow_shaft_is_not_blocked():
 
 def test_the_blocked_shafts_current_is_in_the_stops_causes():
     rig = Rig().driving(speed=0.2)
-    rig.gate.observe_drive(feedback(rig.now, 0.0).model_copy(update={"current": 2.0}))
+    show(rig.gate, feedback(rig.now, 0.0).model_copy(update={"current": 2.0}))
     held(rig, 50)
     figures = {figure.name: figure.value for figure in rig.trips[0].causes[0].measurements}
     assert figures["motor current"] == 2.0
@@ -78,9 +79,9 @@ def test_the_blocked_shafts_current_is_in_the_stops_causes():
 @pytest.mark.parametrize("reason", [Reason.DEVICE_RESTARTED, Reason.DEVICE_STOPPED])
 def test_a_drive_controller_that_restarted_or_was_stopped_by_another_disarms(reason):
     rig = Rig().driving(speed=0.2)
-    rig.gate.observe_health(health(rig.now, ServiceState.BACKOFF, "drive", reason=reason))
+    show(rig.gate, health(rig.now, ServiceState.BACKOFF, "drive", reason=reason))
     rig.tick(3)
-    rig.gate.observe_health(health(rig.now, ServiceState.READY, "drive"))
+    show(rig.gate, health(rig.now, ServiceState.READY, "drive"))
     rig.tick(60)
     assert rig.out.mode is GateMode.DISARMED
     assert reason in {trip.reason for trip in rig.trips} | {cause.reason for trip in rig.trips for cause in trip.causes}
@@ -90,8 +91,8 @@ def test_a_drive_controller_that_restarted_or_was_stopped_by_another_disarms(rea
 @pytest.mark.parametrize("reason", [Reason.DEVICE_RESTARTED, Reason.DEVICE_STOPPED])
 def test_it_disarms_although_its_service_is_started_again_before_the_next_tick(reason, state):
     rig = Rig().driving(speed=0.2)
-    rig.gate.observe_health(health(rig.now, ServiceState.BACKOFF, "drive", reason=reason))
-    rig.gate.observe_health(health(rig.now, state, "drive"))
+    show(rig.gate, health(rig.now, ServiceState.BACKOFF, "drive", reason=reason))
+    show(rig.gate, health(rig.now, state, "drive"))
     rig.tick(60)
     assert reason in {cause.reason for cause in rig.trips[0].causes}
     assert rig.out.mode is GateMode.DISARMED
@@ -102,9 +103,9 @@ def test_it_disarms_although_its_service_is_started_again_before_the_next_tick(r
 
 def test_one_that_was_unplugged_for_a_moment_does_not():
     rig = Rig().driving(speed=0.2)
-    rig.gate.observe_health(health(rig.now, ServiceState.BACKOFF, "drive", reason=Reason.DEVICE_LOST))
+    show(rig.gate, health(rig.now, ServiceState.BACKOFF, "drive", reason=Reason.DEVICE_LOST))
     rig.tick(3)
-    rig.gate.observe_health(health(rig.now, ServiceState.READY, "drive"))
+    show(rig.gate, health(rig.now, ServiceState.READY, "drive"))
     rig.tick(60)
     assert rig.out.mode is GateMode.DRIVING
 
@@ -145,7 +146,7 @@ def shown(check, at, shaft=0, commanded=0.2, measured=0.0, mode=DriveMode.ENABLE
 
 
 def shafts(**config):
-    return ShaftCheck(ShaftCheckConfig(**config))
+    return ShaftComparison(ShaftCheckConfig(**config))
 
 
 @pytest.mark.parametrize("sign", [1, -1])
@@ -250,5 +251,5 @@ def test_of_two_shafts_the_second_one_alone_stops_the_robot():
     robot._obey = held_second
     robot.tick(40)
     assert robot.reported(Reason.SHAFT_BLOCKED)
-    assert robot.gate._shaft_check.blocked in (1, None)
+    assert check_of(robot.gate, ShaftCheck)._shafts.blocked in (1, None)
     assert robot.trips[-1].reason is Reason.SHAFT_BLOCKED

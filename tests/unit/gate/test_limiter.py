@@ -12,9 +12,10 @@ from monstertruck_schemas.cmd import DriveAction
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import DriveRequest, RequestedTwist, Role
 from monstertruck_schemas.state import GateMode
-from monstertruckd.gate.config import GateConfig
-from monstertruckd.gate.limiter import Motion, ObstacleGuard, _same
-from tests.unit.gate.rig import BODIES, CHASSIS, NONCE, TICK, Rig, Robot, header, scan
+from monstertruckd.gate.config import GateConfig, InForce
+from monstertruckd.gate.motion import Motion, _same
+from monstertruckd.gate.obstacles import ObstacleCheck, ObstacleGuard
+from tests.unit.gate.rig import BODIES, CHASSIS, NONCE, TICK, Rig, Robot, check_of, header, scan
 
 MS = SECOND // 1000
 NOW = 10 * SECOND
@@ -28,7 +29,7 @@ COVERED = ((-30.0, 30.0, 6),)
 
 
 def guard(**config):
-    return ObstacleGuard(GateConfig(**config), FOOTPRINT, ScanPoints((0.14, 0.0, 0.0)))
+    return ObstacleGuard(InForce(GateConfig(**config)), FOOTPRINT, ScanPoints((0.14, 0.0, 0.0)))
 
 
 def looked(checked, *obstacles, at=NOW, ways=AHEAD, unknown=()):
@@ -152,7 +153,7 @@ def test_at_the_very_distance_of_an_ordinary_stop_it_is_not_too_near():
 
 
 def motion(chassis=CHASSIS, **config):
-    return Motion(GateConfig(**config), chassis)
+    return Motion(InForce(GateConfig(**config)), chassis)
 
 
 def asked(speed=0.1, front=0.0, rear=0.0, twist=None):
@@ -321,21 +322,26 @@ def test_a_motion_of_the_same_pace_in_another_direction_is_reached_by_braking():
 # All of it, in the gate
 
 
+def ahead(rig):
+    """What the gate knows of the way ahead."""
+    return check_of(rig.gate, ObstacleCheck)._approach
+
+
 def wall(distance):
     return tuple((FRONT + distance, y / 100) for y in range(-15, 16, 3))
 
 
 def test_before_a_way_was_checked_nothing_stops_the_truck():
-    limiter = Rig().gate._limiter
-    assert (limiter.blocked, limiter.blind, limiter.emergency, limiter.free) == (False, False, False, None)
+    way = ahead(Rig())
+    assert (way.blocked, way.emergency, way.free) == (False, False, None)
 
 
 def test_standstill_forgets_what_stopped_the_truck():
-    limiter = Rig().gate._limiter
-    limiter.blocked = limiter.blind = limiter.emergency = True
-    limiter.free = 0.1
-    limiter.halt()
-    assert (limiter.blocked, limiter.blind, limiter.emergency, limiter.free) == (False, False, False, None)
+    way = ahead(Rig())
+    way.blocked = way.emergency = True
+    way.free = 0.1
+    way.forget()
+    assert (way.blocked, way.emergency, way.free) == (False, False, None)
 
 
 def test_a_truck_at_rest_before_a_wall_does_not_set_off():
@@ -370,8 +376,9 @@ def test_what_stops_a_slow_truck_in_time_is_no_quick_stop():
 def test_a_limit_at_the_present_pace_limits_nothing(monkeypatch):
     rig = Rig().driving(speed=0.2)
     rig.obstacles = wall(0.3)
+    guard = check_of(rig.gate, ObstacleCheck).guard
     for allowed, limited in ((0.2, False), (0.199, True)):
-        monkeypatch.setattr(rig.gate._obstacles, "allowed_speed", lambda _free, _now, allowed=allowed: allowed)
+        monkeypatch.setattr(guard, "allowed_speed", lambda _free, _now, allowed=allowed: allowed)
         rig.speed = rig.out.speeds[0]
         rig.tick()
         assert (Reason.OBSTACLE_SLOW in rig.out.reasons) is limited
@@ -381,8 +388,9 @@ def test_a_limit_at_the_present_pace_limits_nothing(monkeypatch):
 def test_a_truck_that_was_stopped_by_an_obstacle_goes_on_at_twice_the_speed_below_which_it_stops(monkeypatch):
     rig = Rig().driving(speed=0.2)
     rig.obstacles = wall(0.3)
+    guard = check_of(rig.gate, ObstacleCheck).guard
     for allowed, blocked in ((0.0201, False), (0.0199, True), (0.0399, True), (0.0401, False), (0.0201, False)):
-        monkeypatch.setattr(rig.gate._obstacles, "allowed_speed", lambda _free, _now, allowed=allowed: allowed)
+        monkeypatch.setattr(guard, "allowed_speed", lambda _free, _now, allowed=allowed: allowed)
         rig.tick()
         assert (Reason.OBSTACLE_STOP in rig.out.reasons) is blocked
         assert (Reason.OBSTACLE_SLOW in rig.out.reasons) is not blocked
@@ -403,10 +411,10 @@ def test_a_truck_at_rest_and_one_of_unknown_speed_need_no_distance_to_stop():
 
 def test_without_an_obstacle_no_distance_is_reported_for_it():
     rig = Rig().driving(speed=0.1)
-    assert rig.gate._limiter.free is None
+    assert ahead(rig).free is None
     rig.obstacles = [(0.6, 0.0)]
     rig.tick(10)
-    assert rig.gate._limiter.free == pytest.approx(0.6 - FOOTPRINT.half_length - FOOTPRINT.offset, abs=0.05)
+    assert ahead(rig).free == pytest.approx(0.6 - FOOTPRINT.half_length - FOOTPRINT.offset, abs=0.05)
 
 
 def test_what_appears_before_a_truck_that_brakes_is_a_quick_stop():

@@ -10,9 +10,9 @@ from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.base import Pose2D, Twist2D
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.state import Odometry, Peer, Peers
-from monstertruckd.gate.config import GateConfig
+from monstertruckd.gate.config import GateConfig, InForce
 from monstertruckd.gate.peers import PeerGuard
-from tests.unit.gate.rig import ANY_GROUND, TICK, Rig, make_gate
+from tests.unit.gate.rig import ANY_GROUND, TICK, Rig, make_gate, show
 
 AHEAD, BACK, SPOT = (1.0, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 4.0)
 BODY = Footprint(0.48, 0.34, padding=0.0)
@@ -36,7 +36,7 @@ def heard(x, y, yaw=0.0, vx=0.0, robot="ann", now=HEARD, deviation=0.0):
 
 def free(way, peers, *, own=None, after=0.0, seen=None):
     now = HEARD + round(after * SECOND)
-    guard = PeerGuard(GateConfig(), BODY, {"ann": BODY})
+    guard = PeerGuard(InForce(GateConfig()), BODY, {"ann": BODY})
     guard.observe_pose(pose(now=now) if own is None else own)
     guard.observe(peers)
     return guard.free_distance([way], 0.5, now, seen)
@@ -69,7 +69,7 @@ def test_poses_that_are_not_sure_keep_robots_further_apart():
 
 
 def test_poses_that_tell_no_place_make_the_robot_slow_and_close_no_more_ground():
-    guard = PeerGuard(GateConfig(), BODY, {"ann": BODY})
+    guard = PeerGuard(InForce(GateConfig()), BODY, {"ann": BODY})
     guard.observe_pose(pose(deviation=0.2))
     guard.observe(heard(-9.0, 0.0, deviation=0.2))
     assert not guard.unknown(HEARD)
@@ -110,7 +110,7 @@ def test_both_robots_are_where_their_motion_has_taken_them_since():
 
 
 def test_without_a_fresh_pose_of_its_own_nobody_has_a_place_and_may_be_anywhere():
-    guard = PeerGuard(GateConfig(), BODY, {"ann": BODY})
+    guard = PeerGuard(InForce(GateConfig()), BODY, {"ann": BODY})
     guard.observe(heard(-0.8, 0.0))
     for own, known in ((None, False), (pose(now=HEARD - 6 * SECOND // 10), False), (pose(), True)):
         if own is not None:
@@ -122,7 +122,7 @@ def test_without_a_fresh_pose_of_its_own_nobody_has_a_place_and_may_be_anywhere(
 @pytest.mark.parametrize(("after", "unknown"), [(0.4, False), (0.6, True), (100.0, True)])
 def test_one_that_is_silent_may_be_anywhere_until_it_is_heard_again(after, unknown):
     now = HEARD + round(after * SECOND)
-    guard = PeerGuard(GateConfig(), BODY, {"ann": BODY})
+    guard = PeerGuard(InForce(GateConfig()), BODY, {"ann": BODY})
     guard.observe_pose(pose(now=now))
     assert guard.unknown(now), "never heard"
     guard.observe(heard(-9.0, 0.0))
@@ -140,9 +140,9 @@ def peer_rig(**config):
 def beside(rig, x=None, ticks=40):
     """Drive for some ticks, hearing another robot ahead or behind; None = nobody."""
     for _ in range(ticks):
-        rig.gate.observe_pose(pose(now=rig.now + TICK))
+        show(rig.gate, pose(now=rig.now + TICK))
         if x is not None:
-            rig.gate.observe_peers(heard(x, 0.0, now=rig.now + TICK))
+            show(rig.gate, heard(x, 0.0, now=rig.now + TICK))
         rig.tick()
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from monstertruck_kinematics.profiles import CubicRamp
-from monstertruckd.gate.limiter import Motion
+from monstertruckd.gate.motion import Motion
 from monstertruckd.tools.simulation.config import load_robot
 
 FILE = Path(__file__).resolve().parents[3] / "configs" / "robots" / "sonar.yaml"

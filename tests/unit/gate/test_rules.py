@@ -12,23 +12,27 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order, Role
 from monstertruck_schemas.sensor import BatteryLevel, DriveMode
 from monstertruck_schemas.state import GateMode
-from monstertruckd.gate.config import GateConfig, TiltLimits
-from monstertruckd.gate.limiter import ObstacleGuard
-from monstertruckd.gate.sensors import SensorMonitor, _Tilt
+from monstertruck_schemas.topics import COMPASS
+from monstertruckd.gate.config import GateConfig, InForce, TiltLimits
+from monstertruckd.gate.following import SteeringCheck
+from monstertruckd.gate.obstacles import ObstacleGuard
+from monstertruckd.gate.sensors import TiltCheck
 from tests.unit.gate.rig import (
     ANY_GROUND,
     BODIES,
     CHASSIS,
-    SERVICES,
     TICK,
+    Monitor,
     Rig,
     Robot,
     attitude,
     battery,
+    check_of,
     feedback,
     health,
     scan,
     servos,
+    show,
 )
 
 MS = SECOND // 1000
@@ -39,11 +43,11 @@ GOALS = {**TRACK, "source": "goals"}
 
 
 def fail_a_service(rig):
-    rig.gate.observe_health(health(rig.now, ServiceState.FAILED, "slam"))
+    show(rig.gate, health(rig.now, ServiceState.FAILED, "slam"))
 
 
 def repair_it(rig):
-    rig.gate.observe_health(health(rig.now, ServiceState.READY, "slam"))
+    show(rig.gate, health(rig.now, ServiceState.READY, "slam"))
 
 
 def set_to(**values):
@@ -55,7 +59,7 @@ def set_to(**values):
 
 
 def kill_the_steering(rig):
-    rig.gate._steering_check.dead = True
+    check_of(rig.gate, SteeringCheck)._turns.dead = True
 
 
 def stall(rig):
@@ -108,14 +112,14 @@ def test_an_armed_truck_is_disarmed_by_the_same_faults(reason):
 
 
 def monitor(chassis=CHASSIS, **config):
-    return SensorMonitor(GateConfig(**config), chassis, SERVICES, battery_measured=True)
+    return Monitor(chassis, **config)
 
 
 SAMPLES = {
-    Reason.SCAN_STALE: (lambda m, at: m.observe_scan(scan(at)), 250),
-    Reason.ATTITUDE_STALE: (lambda m, at: m.observe_attitude(attitude(at)), 250),
-    Reason.STEERING_STALE: (lambda m, at: m.observe_steering(servos(at)), 250),
-    Reason.DRIVE_STALE: (lambda m, at: m.observe_drive(feedback(at)), 200),
+    Reason.SCAN_STALE: (lambda m, at: show(m, scan(at)), 250),
+    Reason.ATTITUDE_STALE: (lambda m, at: show(m, attitude(at)), 250),
+    Reason.STEERING_STALE: (lambda m, at: show(m, servos(at)), 250),
+    Reason.DRIVE_STALE: (lambda m, at: show(m, feedback(at)), 200),
 }
 
 
@@ -144,32 +148,32 @@ def test_the_newest_sample_counts_from_when_it_arrived(reason):
 def test_a_sample_may_be_so_late_and_no_later(late, valid):
     sensors = monitor()
     message = scan(10 * SECOND).model_copy(update={"received": 10 * SECOND + late * MS})
-    assert sensors.observe_scan(message) is valid
+    show(sensors, message)
     assert (sensors.scan is message) is valid
 
 
 def test_a_sample_of_the_instant_of_the_loss_is_from_before_it():
     sensors = monitor()
-    sensors.observe_scan(scan(SECOND))
-    sensors.observe_health(health(SECOND, ServiceState.BACKOFF, "lidar"))
+    show(sensors, scan(SECOND))
+    show(sensors, health(SECOND, ServiceState.BACKOFF, "lidar"))
     assert Reason.SCAN_STALE in sensors.assess(SECOND).blocks
-    sensors.observe_health(health(SECOND, ServiceState.READY, "lidar"))
-    sensors.observe_scan(scan(SECOND + 1))
+    show(sensors, health(SECOND, ServiceState.READY, "lidar"))
+    show(sensors, scan(SECOND + 1))
     assert Reason.SCAN_STALE not in sensors.assess(SECOND + 1).blocks
 
 
 def test_an_earlier_loss_does_not_replace_a_later_one():
     sensors = monitor(BODIES["differential"])
     for shaft in range(2):
-        sensors.observe_drive(feedback(3 * SECOND), shaft)
-    sensors.observe_health(health(3 * SECOND, ServiceState.BACKOFF, "drive"))
-    sensors.observe_health(health(2 * SECOND, ServiceState.BACKOFF, "drive_2"))
+        show(sensors, feedback(3 * SECOND), shaft)
+    show(sensors, health(3 * SECOND, ServiceState.BACKOFF, "drive"))
+    show(sensors, health(2 * SECOND, ServiceState.BACKOFF, "drive_2"))
     assert sensors.speed(3 * SECOND) is None
 
 
 def test_what_stops_the_truck_is_reported_in_this_order():
     sensors = monitor(battery={"stale_after": 1.0, "critical": True})
-    sensors.observe_health(health(0, ServiceState.FAILED, "slam"))
+    show(sensors, health(0, ServiceState.FAILED, "slam"))
     assert sensors.assess(SECOND).blocks == (
         Reason.SERVICE_FAILED,
         Reason.DRIVE_STALE,
@@ -182,11 +186,11 @@ def test_what_stops_the_truck_is_reported_in_this_order():
 
 def test_standstill_is_a_sample_slower_than_its_limit_taken_since():
     sensors = monitor()
-    sensors.observe_drive(feedback(SECOND, 0.0099))
+    show(sensors, feedback(SECOND, 0.0099))
     assert sensors.at_rest(SECOND, SECOND)
     assert not sensors.at_rest(SECOND, SECOND + 1)
     for speed in (0.0101, -0.0101):
-        sensors.observe_drive(feedback(SECOND, speed))
+        show(sensors, feedback(SECOND, speed))
         assert not sensors.at_rest(SECOND)
 
 
@@ -198,7 +202,7 @@ def test_a_tilt_counts_from_its_limit_on_and_until_it_is_less_by_the_hysteresis(
     sensors = monitor()
 
     def tilted(angle):
-        sensors.observe_attitude(attitude(SECOND, pitch=-angle))
+        show(sensors, attitude(SECOND, pitch=-angle))
         found = sensors.assess(SECOND)
         return reason in found.blocks or reason in found.limits
 
@@ -211,16 +215,19 @@ def test_a_tilt_counts_from_its_limit_on_and_until_it_is_less_by_the_hysteresis(
 
 @pytest.mark.parametrize("name", ["slow", "stop"])
 def test_a_tilt_at_its_very_limit_counts(name):
-    limits = TiltLimits()
-    tilt, limit = _Tilt(limits), getattr(limits, name)
+    limits, sensors = TiltLimits(), monitor()
+    show(sensors, attitude(SECOND))
+    limit, reason = getattr(limits, name), Reason[f"TILT_{name.upper()}"]
     for angle, counts in (
         (math.nextafter(limit, 0.0), False),
         (limit, True),
         (limit - limits.hysteresis, True),
         (math.nextafter(limit - limits.hysteresis, 0.0), False),
     ):
-        tilt.update(angle)
-        assert getattr(tilt, name) is counts
+        sensors.samples.tilt = angle
+        check_of(sensors, TiltCheck).observe(sensors.attitude, COMPASS)
+        found = sensors.assess(SECOND)
+        assert (reason in found.blocks or reason in found.limits) is counts
 
 
 # Requests
@@ -486,17 +493,17 @@ def test_a_pause_is_a_stall_beyond_its_limit_and_lasts_its_dwell():
 
 def test_every_shaft_counts_for_speed_rest_and_faults():
     sensors = monitor(BODIES["differential"])
-    sensors.observe_drive(feedback(SECOND, 0.1), 0)
+    show(sensors, feedback(SECOND, 0.1), 0)
     assert sensors.speed(SECOND) is None
-    sensors.observe_drive(feedback(SECOND - 10 * MS, -0.2), 1)
+    show(sensors, feedback(SECOND - 10 * MS, -0.2), 1)
     assert sensors.speed(SECOND) == pytest.approx(-0.2)
     assert sensors.shaft_speeds(SECOND) == pytest.approx((0.1, -0.2))
-    sensors.observe_drive(feedback(SECOND, 0.0), 0)
+    show(sensors, feedback(SECOND, 0.0), 0)
     assert not sensors.at_rest(SECOND)
-    sensors.observe_drive(feedback(SECOND - 10 * MS, 0.0), 1)
+    show(sensors, feedback(SECOND - 10 * MS, 0.0), 1)
     assert sensors.at_rest(SECOND, SECOND - 10 * MS)
     assert not sensors.at_rest(SECOND, SECOND - 9 * MS), "the oldest sample counts"
-    sensors.observe_drive(feedback(SECOND, 0.0, DriveMode.FAULT, 0x1000), 1)
+    show(sensors, feedback(SECOND, 0.0, DriveMode.FAULT, 0x1000), 1)
     assert sensors.assess(SECOND).blocks[0] is Reason.DRIVE_FAULT
     assert sensors.assess(SECOND).values["drive_fault_code"] == 0x1000
 
@@ -504,8 +511,8 @@ def test_every_shaft_counts_for_speed_rest_and_faults():
 @pytest.mark.parametrize("shaft", [0, 1])
 def test_the_age_of_the_drive_is_that_of_its_oldest_shaft(shaft):
     sensors = monitor(BODIES["differential"])
-    sensors.observe_drive(feedback(SECOND), shaft)
-    sensors.observe_drive(feedback(SECOND + 150 * MS), 1 - shaft)
+    show(sensors, feedback(SECOND), shaft)
+    show(sensors, feedback(SECOND + 150 * MS), 1 - shaft)
     assert sensors.staleness(Reason.DRIVE_STALE, SECOND + 250 * MS).age == pytest.approx(0.25)
     assert Reason.DRIVE_STALE in sensors.assess(SECOND + 201 * MS).blocks
 
@@ -518,7 +525,7 @@ STRAIGHT = ((1.0, 0.0, 0.0),)
 
 
 def guard(**config):
-    return ObstacleGuard(GateConfig(**config), FOOTPRINT, ScanPoints((0.14, 0.0, 0.0)))
+    return ObstacleGuard(InForce(GateConfig(**config)), FOOTPRINT, ScanPoints((0.14, 0.0, 0.0)))
 
 
 def free_to(wall, now=SECOND, **config):
@@ -610,7 +617,7 @@ def test_driving_on_needs_twice_the_speed_at_which_it_stopped():
 
 def test_a_motor_that_claims_any_speed_does_not_end_the_gate():
     rig = Rig().armed()
-    rig.gate.observe_drive(feedback(rig.now).model_copy(update={"velocity": 1e300}))
+    show(rig.gate, feedback(rig.now).model_copy(update={"velocity": 1e300}))
     rig.tick(sense=False)
     assert math.isfinite(rig.out.stopping_distance)
 
@@ -678,7 +685,7 @@ def test_servos_follow_the_linkage():
 
 def test_a_battery_that_is_low_or_critical_at_its_very_sample():
     sensors = monitor()
-    sensors.observe_battery(battery(SECOND, BatteryLevel.LOW, 21.5))
+    show(sensors, battery(SECOND, BatteryLevel.LOW, 21.5))
     found = sensors.assess(SECOND)
     assert (found.limits, found.values["battery_voltage"]) == ({Reason.BATTERY_LOW: 0.1}, 21.5)
     assert Reason.BATTERY_STALE not in sensors.assess(3 * SECOND).limits

@@ -11,8 +11,9 @@ from monstertruck_schemas.cmd import DriveAction
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order
 from monstertruck_schemas.state import GateMode
-from monstertruckd.gate.config import GateConfig
-from monstertruckd.gate.limiter import DRIFT, ObstacleGuard, ScanMemory, spaced
+from monstertruckd.gate.config import GateConfig, InForce
+from monstertruckd.gate.obstacles import ObstacleGuard
+from monstertruckd.gate.scan_memory import DRIFT, ScanMemory, spaced
 from tests.unit.gate.rig import TICK, Rig, scan
 
 FOOTPRINT = Footprint()
@@ -274,14 +275,14 @@ def test_of_an_outline_points_are_remembered_that_are_two_centimetres_apart():
 
 @pytest.mark.parametrize(("share", "known"), [(0.5, math.inf), (0.495, 0.0)])
 def test_ways_less_than_half_forwards_are_held_against_what_is_known(share, known):
-    guard = ObstacleGuard(GateConfig(), FOOTPRINT, ScanPoints(MOUNT))
+    guard = ObstacleGuard(InForce(GateConfig()), FOOTPRINT, ScanPoints(MOUNT))
     guard.free_distance(((share, math.sqrt(1.0 - share**2), 0.0),))
     assert guard.known == known
 
 
 @pytest.mark.parametrize(("beside", "behind"), [(0.5, 0.35), (0.35, 0.5)])
 def test_sideways_the_nearer_of_what_is_seen_and_what_is_remembered_counts(beside, behind):
-    guard = ObstacleGuard(GateConfig(), FOOTPRINT, ScanPoints(MOUNT))
+    guard = ObstacleGuard(InForce(GateConfig()), FOOTPRINT, ScanPoints(MOUNT))
     guard.observe(scan(SECOND, (0.3, behind)))
     now = SECOND
     for _ in range(120):
@@ -294,7 +295,7 @@ def test_sideways_the_nearer_of_what_is_seen_and_what_is_remembered_counts(besid
 
 @pytest.mark.parametrize(("aside", "stopped"), [(0.275, True), (0.295, False)])
 def test_a_turn_grazes_nothing_that_the_lidar_has_left_behind(aside, stopped):
-    guard = ObstacleGuard(GateConfig(), FOOTPRINT, ScanPoints(MOUNT))
+    guard = ObstacleGuard(InForce(GateConfig()), FOOTPRINT, ScanPoints(MOUNT))
     now = SECOND
     for x in np.arange(0.35, -0.05, -0.004):
         now += TICK
@@ -310,7 +311,7 @@ def test_a_turn_grazes_nothing_that_the_lidar_has_left_behind(aside, stopped):
 
 def test_what_stands_beside_the_way_in_guards_the_way_out_again():
     """A truck passed a door, and touched its jamb when it backed out: 1.5 m travelled lay between."""
-    guard = ObstacleGuard(GateConfig(), FOOTPRINT, ScanPoints(MOUNT))
+    guard = ObstacleGuard(InForce(GateConfig()), FOOTPRINT, ScanPoints(MOUNT))
     guard.observe(scan(SECOND, (0.35, 0.3)))
     now = SECOND
     for speed, seconds in ((0.2, 5.0), (-0.1, 5.5)):
@@ -336,7 +337,7 @@ def test_a_turn_stops_before_the_side_of_somebody_that_the_lidar_does_not_see():
         for points in (person(*somebody, np.linspace(0.0, math.tau, 200)), seen)
     ]
     assert contacts[0] < contacts[1] - 0.01, "it is the side that is not seen"
-    guard = ObstacleGuard(GateConfig(), FOOTPRINT, ScanPoints(MOUNT))
+    guard = ObstacleGuard(InForce(GateConfig()), FOOTPRINT, ScanPoints(MOUNT))
     guard.observe(scan(SECOND, *seen))
     assert guard.free_distance((turn,)) < contacts[0]
     for twist in ((-1.0, 0.0, 0.0), (0.0, 1.0, 0.0)):
@@ -351,7 +352,7 @@ def test_ground_that_nobody_has_seen_is_not_turned_onto_next_to_something(apart,
     post = corner * (1.0 + apart / np.hypot(*corner))
     ahead = np.add(post, (0.6, 0.0))
     bearing = math.degrees(math.atan2(ahead[1], ahead[0] - 0.14))
-    guard = ObstacleGuard(GateConfig(), FOOTPRINT, ScanPoints(MOUNT))
+    guard = ObstacleGuard(InForce(GateConfig()), FOOTPRINT, ScanPoints(MOUNT))
     now = SECOND
     guard.observe(scan(now, tuple(ahead), unknown=((-120, bearing - 1, 3), (bearing + 1, 120, 3))))
     for _ in range(150):

@@ -9,7 +9,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order
 from monstertruck_schemas.sensor import BatteryLevel
 from monstertruck_schemas.state import GateMode
-from tests.unit.gate.rig import Rig, attitude, battery, health, make_gate, scan, servos
+from tests.unit.gate.rig import Rig, attitude, battery, health, make_gate, scan, servos, show
 
 STALE = {
     "scan": Reason.SCAN_STALE,
@@ -64,11 +64,11 @@ def test_a_sensor_that_stays_away_disarms(sensor):
 def test_a_sensor_reported_lost_stops_at_once_until_it_delivers_again(service, sensor):
     rig = Rig().driving()
     rig.silent = {sensor}
-    rig.gate.observe_health(health(rig.now, ServiceState.BACKOFF, service))
+    show(rig.gate, health(rig.now, ServiceState.BACKOFF, service))
     rig.tick()
     assert rig.out.mode is GateMode.STOPPING
     assert rig.out.reasons == (STALE[sensor],)
-    rig.gate.observe_health(health(rig.now - SECOND // 100, ServiceState.STARTING, service))
+    show(rig.gate, health(rig.now - SECOND // 100, ServiceState.STARTING, service))
     rig.silent = set()
     rig.tick(30)
     assert rig.out.mode is GateMode.DRIVING
@@ -79,10 +79,10 @@ def test_the_loss_of_a_sensor_counts_under_the_name_of_the_role_that_writes_its_
     rig.gate = make_gate(services={"imu": Reason.ATTITUDE_STALE})
     rig.driving()
     rig.silent = {"attitude"}
-    rig.gate.observe_health(health(rig.now, ServiceState.BACKOFF, "compass"))
+    show(rig.gate, health(rig.now, ServiceState.BACKOFF, "compass"))
     rig.tick()
     assert rig.out.mode is GateMode.DRIVING, "not this robot's compass"
-    rig.gate.observe_health(health(rig.now, ServiceState.BACKOFF, "imu", reason=Reason.DEVICE_LOST))
+    show(rig.gate, health(rig.now, ServiceState.BACKOFF, "imu", reason=Reason.DEVICE_LOST))
     rig.tick()
     assert rig.out.mode is GateMode.STOPPING
     assert rig.out.reasons == (Reason.ATTITUDE_STALE,)
@@ -100,7 +100,7 @@ def test_late_samples_are_no_good_samples():
     rig.silent = {"scan"}
     for _ in range(14):
         late = scan(rig.now - SECOND).model_copy(update={"received": rig.now})
-        rig.gate.observe_scan(late)
+        show(rig.gate, late)
         rig.tick()
     assert rig.out.reasons == (Reason.SCAN_STALE,)
 
@@ -109,7 +109,7 @@ def test_untrusted_pulses_are_no_good_samples():
     rig = Rig().driving()
     rig.silent = {"steering"}
     for _ in range(14):
-        rig.gate.observe_steering(servos(rig.now, trusted=False))
+        show(rig.gate, servos(rig.now, trusted=False))
         rig.tick()
     assert rig.out.reasons == (Reason.STEERING_STALE,)
 
@@ -118,7 +118,7 @@ def test_attitudes_without_a_valid_tilt_are_no_good_samples():
     rig = Rig().driving()
     rig.silent = {"attitude"}
     for _ in range(14):
-        rig.gate.observe_attitude(attitude(rig.now, roll=1.0, tilt_valid=False))
+        show(rig.gate, attitude(rig.now, roll=1.0, tilt_valid=False))
         rig.tick()
     assert rig.out.reasons == (Reason.ATTITUDE_STALE,)
 
@@ -156,7 +156,7 @@ def test_tilt_slows_then_stops_with_hysteresis():
 def test_roll_and_pitch_add_up():
     rig = Rig().driving()
     rig.silent = {"attitude"}
-    rig.gate.observe_attitude(attitude(rig.now, roll=0.16, pitch=-0.16))
+    show(rig.gate, attitude(rig.now, roll=0.16, pitch=-0.16))
     rig.tick()
     assert rig.out.reasons == (Reason.TILT_SLOW,)
     assert math.acos(math.cos(0.16) ** 2) > 0.21
@@ -201,7 +201,7 @@ def test_a_battery_that_was_never_measured_slows_until_it_is():
     rig.driving()
     assert rig.out.reasons == (Reason.BATTERY_STALE,)
     assert rig.out.speed_limit == rig.out.speeds[0] == pytest.approx(0.1)
-    rig.gate.observe_battery(battery(rig.now, BatteryLevel.UNKNOWN))
+    show(rig.gate, battery(rig.now, BatteryLevel.UNKNOWN))
     rig.tick()
     assert rig.out.reasons == (Reason.BATTERY_STALE,), "a reading without a level is none"
     rig.silent = set()
@@ -214,7 +214,7 @@ def test_a_faulty_battery_sensor_counts_as_silence():
     rig = Rig(battery={"stale_after": 0.5, "critical": True}).driving()
     rig.silent = {"battery"}
     for _ in range(30):
-        rig.gate.observe_battery(battery(rig.now, BatteryLevel.SENSOR_FAULT, None))
+        show(rig.gate, battery(rig.now, BatteryLevel.SENSOR_FAULT, None))
         rig.tick()
     assert rig.out.reasons == (Reason.BATTERY_STALE,)
     assert rig.out.speeds[0] == 0.0
@@ -251,13 +251,13 @@ def test_a_fault_while_armed_disarms():
 
 def test_a_failed_service_stops_unless_it_is_tolerated():
     rig = Rig().driving()
-    rig.gate.observe_health(health(rig.now, ServiceState.FAILED, "recorder"))
+    show(rig.gate, health(rig.now, ServiceState.FAILED, "recorder"))
     rig.tick()
     assert rig.out.mode is GateMode.DRIVING
-    rig.gate.observe_health(health(rig.now, ServiceState.BACKOFF, "scan"))
+    show(rig.gate, health(rig.now, ServiceState.BACKOFF, "scan"))
     rig.tick()
     assert rig.out.mode is GateMode.DRIVING
-    rig.gate.observe_health(health(rig.now, ServiceState.FAILED, "odometry"))
+    show(rig.gate, health(rig.now, ServiceState.FAILED, "odometry"))
     rig.tick()
     assert (rig.out.mode, rig.out.action) == (GateMode.STOPPING, DriveAction.QUICK_STOP)
     assert "odometry" in rig.reported(Reason.SERVICE_FAILED)[0].text
@@ -336,12 +336,12 @@ def test_the_sweep_also_follows_the_angles_the_servos_have():
     rig.obstacles = ((0.33, 0.25), (0.34, 0.26), (0.35, 0.27))
     rig.silent = {"steering"}
     for _ in range(2):
-        rig.gate.observe_steering(servos(rig.now, 9.0, -0.6))
+        show(rig.gate, servos(rig.now, 9.0, -0.6))
         rig.tick()
     rig.order(Order.ARM)
     rig.driver = {"speed": 0.2}
     for _ in range(20):
-        rig.gate.observe_steering(servos(rig.now, 9.0, -0.6))
+        show(rig.gate, servos(rig.now, 9.0, -0.6))
         rig.tick()
     assert {Reason.OBSTACLE_SLOW, Reason.OBSTACLE_STOP} & set(rig.out.reasons)
 
@@ -354,7 +354,7 @@ def test_an_old_scan_asks_for_more_room():
         rig.silent = {"scan"}
         for _ in range(60):
             seen = scan(rig.now - round(age * SECOND), *wall(0.245 + 0.2))
-            rig.gate.observe_scan(seen.model_copy(update={"received": rig.now}))
+            show(rig.gate, seen.model_copy(update={"received": rig.now}))
             rig.tick()
         speeds.append(rig.out.speeds[0])
     assert speeds[1] < speeds[0] < 0.2
@@ -366,7 +366,7 @@ def test_a_scan_from_a_tilted_plane_does_not_count(tilt, counts):
     rig.driving()
     rig.silent = {"scan"}
     for _ in range(30):
-        rig.gate.observe_scan(scan(rig.now, tilt=tilt))
+        show(rig.gate, scan(rig.now, tilt=tilt))
         rig.tick()
     assert (Reason.SCAN_STALE in rig.out.reasons) is not counts
 

@@ -155,6 +155,10 @@ def test_shutting_down_stops_at_once_and_for_good():
     on_bench(scenario)
 
 
+def raise_bug(*_):
+    raise AttributeError
+
+
 def test_a_bug_in_taking_a_message_ends_the_service_and_not_its_sender():
     async def main(clock):
         for name, default in (
@@ -166,6 +170,7 @@ def test_a_bug_in_taking_a_message_ends_the_service_and_not_its_sender():
             bench = Bench(clock)
             task = asyncio.create_task(bench.service.run(bench.ready))
             await clock.sleep(0.1)
+            bench.service._gate.observe = raise_bug
             answer = getattr(bench.service, name)(None)
             assert getattr(answer, "reason", answer) is default
             begin = clock.now()
@@ -181,7 +186,7 @@ def test_a_bug_in_taking_a_message_ends_the_service_and_not_its_sender():
 def test_a_bug_ends_the_service_with_neutral_commands():
     async def main(clock):
         bench = Bench(clock)
-        bench.scan.latest = "not a scan"
+        bench.service._gate.tick = raise_bug
         with pytest.raises(ExceptionGroup):
             await bench.service.run(bench.ready)
         assert bench.out.drives[0].last.action is DriveAction.QUICK_STOP

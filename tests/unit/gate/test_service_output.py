@@ -6,13 +6,14 @@ from itertools import pairwise
 import pytest
 
 from monstertruck_runtime.clock import SECOND, run_virtual
+from monstertruck_schemas import topics
 from monstertruck_schemas.cmd import DriveAction
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order, Role
 from monstertruck_schemas.state import GateMode
 from monstertruckd.gate.config import GateConfig
 from monstertruckd.gate.latch import MemoryLatch
-from monstertruckd.gate.service import METER_DEPTH, GateInputs, GateOutputs, GateService, TickMeter
+from monstertruckd.gate.service import METER_DEPTH, GateOutputs, GateService, TickMeter
 from tests.unit.gate.bench import Bench, Inbox, Outbox, on_bench
 from tests.unit.gate.rig import BODIES, make_gate
 
@@ -113,18 +114,18 @@ def test_events_and_stops_go_out_under_the_gates_name():
 def test_every_shaft_gets_its_own_command():
     async def main(clock):
         outputs = GateOutputs((Outbox(), Outbox()), Outbox(), Outbox(), Outbox())
-        inputs = GateInputs(Inbox(), Inbox(), (Inbox(), Inbox()), Inbox(), Inbox())
+        inputs = {topic: Inbox() for topic in topics.DRIVES[:2]}
         gate = make_gate(chassis=BODIES["differential"])
         taken = []
-        gate.observe_drive = lambda message, shaft: taken.append((message, shaft))
+        gate.observe = lambda message, topic: taken.append((message, topic))
         service = GateService(gate, 50, clock, inputs, outputs, lambda *_, **__: None, MemoryLatch())
-        for shaft, inbox in enumerate(inputs.drives):
+        for shaft, inbox in enumerate(inputs.values()):
             inbox.latest = shaft
         task = asyncio.create_task(service.run(lambda: None))
         await clock.sleep(0.1)
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)
-        assert taken == [(0, 0), (1, 1)], "each once"
+        assert taken == list(enumerate(topics.DRIVES[:2])), "each once"
         assert len(outputs.drives[0].messages) == len(outputs.drives[1].messages) > 3
 
     run_virtual(main)
@@ -150,7 +151,13 @@ def test_settings_that_weaken_are_reported_at_the_start_and_in_every_state(caplo
 
 
 def _inputs(bench):
-    return GateInputs(bench.scan, bench.attitude, (bench.drive,), bench.steering, bench.battery)
+    return {
+        topics.SCAN: bench.scan,
+        topics.COMPASS: bench.attitude,
+        topics.DRIVE: bench.drive,
+        topics.STEERING: bench.steering,
+        topics.BATTERY: bench.battery,
+    }
 
 
 class Disk(MemoryLatch):

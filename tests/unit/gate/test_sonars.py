@@ -8,8 +8,8 @@ from monstertruck_kinematics.chassis import STILL
 from monstertruck_planners.collision import Footprint
 from monstertruck_schemas.sensor import SonarEcho, SonarRanges
 from monstertruck_sim.world.config import FIVE_SONARS
-from monstertruckd.gate.config import GateConfig
-from monstertruckd.gate.limiter import Motion
+from monstertruckd.gate.config import GateConfig, InForce
+from monstertruckd.gate.motion import Motion
 from monstertruckd.gate.sonars import SonarGuard
 from tests.unit.gate.rig import CHASSIS
 
@@ -20,7 +20,7 @@ BODY = Footprint(0.32, 0.30)
 
 
 def guard(now=1000 * MS, dead=(), **ranges):
-    made = SonarGuard(GateConfig(), BODY, MOUNTS)
+    made = SonarGuard(InForce(GateConfig()), BODY, MOUNTS)
     for _ in range(2):
         made.observe(rounds(now, dead, **ranges))
     return made
@@ -75,7 +75,7 @@ def test_one_missed_answer_is_no_loss_and_one_missed_echo_frees_no_way():
 
 
 def test_what_is_late_or_old_does_not_count():
-    made = SonarGuard(GateConfig(), BODY, MOUNTS)
+    made = SonarGuard(InForce(GateConfig()), BODY, MOUNTS)
     made.observe(rounds(1000 * MS, late=900 * MS))
     assert not made.fresh(1000 * MS)
     assert guard().fresh(1290 * MS)
@@ -83,7 +83,7 @@ def test_what_is_late_or_old_does_not_count():
 
 
 def test_the_yaw_rate_grows_within_its_limit():
-    motion = Motion(GateConfig(yaw_acceleration=0.5), CHASSIS)
+    motion = Motion(InForce(GateConfig(yaw_acceleration=0.5)), CHASSIS)
     motion.steer((0.4, -0.4), 10.0)
     target = motion.along((0.2, 0.0, 0.5))
     before = STILL

@@ -10,8 +10,8 @@ from monstertruck_schemas.req import Order
 from monstertruck_schemas.sensor import Attitude
 from monstertruck_schemas.state import GateMode
 from monstertruckd.gate.config import SteeringCheckConfig
-from monstertruckd.gate.sensors import SteeringCheck
-from tests.unit.gate.rig import Rig, Robot, header, servos
+from monstertruckd.gate.following import SteeringCheck, TurnComparison
+from tests.unit.gate.rig import Rig, Robot, check_of, header, servos, show
 
 PERIOD = SECOND // 20
 SPEED = 0.18
@@ -32,7 +32,7 @@ def drive(check, seconds, *, turning=1.0, speed=SPEED, heading=0.0, rate=RATE, s
 
 @pytest.fixture
 def check():
-    return SteeringCheck(SteeringCheckConfig())
+    return TurnComparison(SteeringCheckConfig())
 
 
 @pytest.mark.parametrize("turning", [0.8, 1.0, 1.2])
@@ -101,14 +101,14 @@ def turned(check, commanded, measured, seconds=0.4, speed=SPEED):
 def test_the_difference_tolerated_is_a_fixed_part_and_a_share_of_the_larger_turn(sign, commanded, measured):
     outwards = 1e-6 if measured > commanded else -1e-6
     config = SteeringCheckConfig()
-    assert turned(SteeringCheck(config), sign * commanded, sign * (measured + outwards))
-    assert not turned(check := SteeringCheck(config), sign * commanded, sign * (measured - outwards))
+    assert turned(TurnComparison(config), sign * commanded, sign * (measured + outwards))
+    assert not turned(check := TurnComparison(config), sign * commanded, sign * (measured - outwards))
     assert check.difference == pytest.approx(sign * (measured - commanded), abs=2e-6)
 
 
 def test_a_heading_may_change_by_a_radian_and_a_half_a_second_before_it_counts_as_a_jump(check):
     assert turned(check, 0.0, 0.599)
-    assert not turned(SteeringCheck(SteeringCheckConfig()), 0.0, 0.601)
+    assert not turned(TurnComparison(SteeringCheckConfig()), 0.0, 0.601)
 
 
 def test_the_window_begins_anew_at_a_jump(check):
@@ -137,7 +137,7 @@ def test_what_lies_before_a_jump_is_not_compared_with_what_comes_after(check):
 
 def test_headings_half_a_second_apart_are_compared_and_no_further(check):
     assert turned(check, 0.0, 0.4, 0.5)
-    check = SteeringCheck(SteeringCheckConfig())
+    check = TurnComparison(SteeringCheckConfig())
     assert not turned(check, 0.0, 0.4, 0.5 + 2e-9)
     check.observe(round(0.9 * SECOND), 1.0 - 0.4 - 0.1, SPEED, 0.0)
     assert check.difference == pytest.approx(0.1)
@@ -145,8 +145,8 @@ def test_headings_half_a_second_apart_are_compared_and_no_further(check):
 
 @pytest.mark.parametrize("sign", [1, -1])
 def test_a_truck_is_checked_from_its_least_speed_on(sign):
-    assert turned(SteeringCheck(SteeringCheckConfig()), 0.0, 0.5, speed=sign * 0.03)
-    assert not turned(SteeringCheck(SteeringCheckConfig()), 0.0, 0.5, speed=sign * 0.0299)
+    assert turned(TurnComparison(SteeringCheckConfig()), 0.0, 0.5, speed=sign * 0.03)
+    assert not turned(TurnComparison(SteeringCheckConfig()), 0.0, 0.5, speed=sign * 0.0299)
 
 
 def test_what_lies_before_a_heading_that_is_not_known_is_forgotten(check):
@@ -189,7 +189,7 @@ class Straight(Rig):
     def sense(self):
         super().sense()
         if self.out is not None:
-            self.gate.observe_steering(servos(self.now, *self.out.servos))
+            show(self.gate, servos(self.now, *self.out.servos))
 
 
 def test_the_gate_stops_for_dead_steering_and_has_to_be_armed_again():
@@ -220,7 +220,7 @@ def test_a_disarmed_truck_may_be_carried_or_pushed_about(speed):
     for step in range(100):
         rig.speed = speed
         rig.tick()
-        rig.gate.observe_attitude(Attitude(**header(rig.now), heading=step * 0.02, roll=0.0, pitch=0.0))
+        show(rig.gate, Attitude(**header(rig.now), heading=step * 0.02, roll=0.0, pitch=0.0))
     rig.silent, rig.speed = set(), 0.0
     rig.sense()
     assert rig.order(Order.ARM) == "ok"
@@ -245,8 +245,9 @@ def test_a_heading_is_judged_if_it_and_the_steering_are_known_while_the_truck_is
     if not steering:
         rig.now += SECOND
     headings = []
-    monkeypatch.setattr(rig.gate._steering_check, "observe", lambda _stamp, heading, *_: headings.append(heading))
-    rig.gate.observe_attitude(Attitude(**header(rig.now), **({"heading": 0.5, "roll": 0.0, "pitch": 0.0} | changes)))
+    turns = check_of(rig.gate, SteeringCheck)._turns
+    monkeypatch.setattr(turns, "observe", lambda _stamp, heading, *_: headings.append(heading))
+    show(rig.gate, Attitude(**header(rig.now), **({"heading": 0.5, "roll": 0.0, "pitch": 0.0} | changes)))
     assert headings == ([0.5] if judged and armed else [None])
 
 

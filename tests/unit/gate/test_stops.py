@@ -10,7 +10,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order, Role
 from monstertruck_schemas.sensor import BatteryLevel
 from monstertruck_schemas.state import GateMode
-from tests.unit.gate.rig import TICK, Rig, header, health, scan
+from tests.unit.gate.rig import TICK, Rig, header, health, scan, show
 
 
 def event(now, reason, source, text="", severity=Severity.WARNING, **values):
@@ -90,7 +90,7 @@ def test_late_samples_are_why_there_is_no_good_one():
     rig.silent = {"scan"}
     before = len(rig.trips)
     while len(rig.trips) == before:
-        rig.gate.observe_scan(scan(rig.now - SECOND).model_copy(update={"received": rig.now}))
+        show(rig.gate, scan(rig.now - SECOND).model_copy(update={"received": rig.now}))
         rig.tick()
     latency = figures(rig.trips[-1].causes[0])["latency"]
     assert (latency.value, latency.limit) == (1.0, 0.4)
@@ -104,9 +104,7 @@ def test_a_lost_hub_is_behind_the_lost_lidar_behind_the_stop():
     rig = Rig().driving()
     rig.silent = {"scan"}
     lost = rig.now
-    rig.gate.observe_health(
-        health(lost, ServiceState.BACKOFF, "lidar", reason=Reason.DEVICE_LOST, detail="port vanished")
-    )
+    show(rig.gate, health(lost, ServiceState.BACKOFF, "lidar", reason=Reason.DEVICE_LOST, detail="port vanished"))
     trip = stopped(rig)
     assert [cause.reason for cause in trip.causes] == [Reason.SCAN_STALE, Reason.DEVICE_LOST]
     assert trip.causes[0].because == 1
@@ -114,9 +112,7 @@ def test_a_lost_hub_is_behind_the_lost_lidar_behind_the_stop():
     rig.tick(5)
     assert len(rig.trips) == 1, "no news"
     reported = rig.now
-    rig.gate.observe_event(
-        event(reported, Reason.HUB_LOST, "usb", "hub 1-2 vanished: lidar, camera", roles="lidar,camera")
-    )
+    show(rig.gate, event(reported, Reason.HUB_LOST, "usb", "hub 1-2 vanished: lidar, camera", roles="lidar,camera"))
     rig.tick()
     better = rig.trips[-1]
     assert (better.number, better.stamp) == (trip.number, trip.stamp)
@@ -130,7 +126,7 @@ def test_a_lost_hub_is_behind_the_lost_lidar_behind_the_stop():
         "because hub 1-2 vanished: lidar, camera"
     )
     rig.tick(200)
-    rig.gate.observe_event(event(rig.now, Reason.HUB_LOST, "usb", "again", roles="lidar"))
+    show(rig.gate, event(rig.now, Reason.HUB_LOST, "usb", "again", roles="lidar"))
     rig.tick()
     assert len(rig.trips) == 2, "long after a stop nothing is added to it"
 
@@ -138,9 +134,9 @@ def test_a_lost_hub_is_behind_the_lost_lidar_behind_the_stop():
 def test_one_hub_behind_two_sensors_comes_once():
     rig = Rig().driving()
     rig.silent = {"drive", "steering"}
-    rig.gate.observe_event(event(rig.now, Reason.HUB_LOST, "usb", "hub 1-1 vanished", roles="drive,steering"))
+    show(rig.gate, event(rig.now, Reason.HUB_LOST, "usb", "hub 1-1 vanished", roles="drive,steering"))
     for name in ("drive", "steering"):
-        rig.gate.observe_health(health(rig.now, ServiceState.BACKOFF, name, reason=Reason.DEVICE_LOST))
+        show(rig.gate, health(rig.now, ServiceState.BACKOFF, name, reason=Reason.DEVICE_LOST))
     trip = stopped(rig)
     assert [(cause.source, cause.because) for cause in trip.causes] == [
         ("drive", 2),
@@ -154,8 +150,8 @@ def test_one_hub_behind_two_sensors_comes_once():
 
 def test_an_outage_that_is_over_is_not_behind_a_later_silence():
     rig = Rig().driving()
-    rig.gate.observe_health(health(rig.now, ServiceState.BACKOFF, "lidar", reason=Reason.DEVICE_LOST))
-    rig.gate.observe_health(health(rig.now, ServiceState.READY, "lidar"))
+    show(rig.gate, health(rig.now, ServiceState.BACKOFF, "lidar", reason=Reason.DEVICE_LOST))
+    show(rig.gate, health(rig.now, ServiceState.READY, "lidar"))
     rig.tick(60)
     rig.silent = {"scan"}
     assert [cause.reason for cause in stopped(rig).causes] == [Reason.SCAN_STALE]
@@ -168,7 +164,7 @@ def test_what_befell_a_device_after_it_had_been_heard_again_is_not_behind_its_si
     first = stopped(rig)
     rig.silent = set() if fresh else {"scan"}
     rig.tick(20)
-    rig.gate.observe_health(health(rig.now, ServiceState.BACKOFF, "lidar", reason=Reason.DEVICE_RESTARTED))
+    show(rig.gate, health(rig.now, ServiceState.BACKOFF, "lidar", reason=Reason.DEVICE_RESTARTED))
     rig.tick(5)
     found = [cause.reason for cause in rig.trips[-1].causes]
     assert rig.trips[-1].number == first.number
@@ -179,14 +175,14 @@ def test_only_the_first_failure_of_an_outage_is_behind_it():
     rig = Rig().driving()
     rig.silent = {"scan"}
     for reason in (Reason.DEVICE_LOST, Reason.DEVICE_TIMEOUT):
-        rig.gate.observe_health(health(rig.now, ServiceState.BACKOFF, "lidar", reason=reason))
+        show(rig.gate, health(rig.now, ServiceState.BACKOFF, "lidar", reason=reason))
     assert [cause.reason for cause in stopped(rig).causes] == [Reason.SCAN_STALE, Reason.DEVICE_LOST]
 
 
 def test_a_failed_service_is_named_with_what_it_failed_of():
     rig = Rig().driving()
-    rig.gate.observe_health(
-        health(rig.now, ServiceState.FAILED, "tracker", reason=Reason.INTERNAL, detail="unexpected exception")
+    show(
+        rig.gate, health(rig.now, ServiceState.FAILED, "tracker", reason=Reason.INTERNAL, detail="unexpected exception")
     )
     trip = stopped(rig)
     assert [(cause.reason, cause.source, cause.because) for cause in trip.causes] == [
@@ -201,10 +197,10 @@ def test_a_failed_service_is_named_with_what_it_failed_of():
 
 def test_a_link_that_is_down_is_behind_a_lapsed_lease_until_it_is_fine():
     rig = Rig().driving()
-    rig.gate.observe_event(event(rig.now, Reason.LINK_DOWN, "link", "wlan0: link is down"))
+    show(rig.gate, event(rig.now, Reason.LINK_DOWN, "link", "wlan0: link is down"))
     rig.driver = None
     assert [cause.reason for cause in stopped(rig).causes] == [Reason.LEASE_EXPIRED, Reason.LINK_DOWN]
-    rig.gate.observe_event(event(rig.now, Reason.OK, "link", "wlan0: link is good", Severity.INFO))
+    show(rig.gate, event(rig.now, Reason.OK, "link", "wlan0: link is good", Severity.INFO))
     rig.tick(80)
     rig.driving()
     rig.driver = None
@@ -303,9 +299,7 @@ def test_a_refused_arming_says_what_is_missing():
     rig = Rig()
     rig.tick(2)
     rig.silent = {"scan"}
-    rig.gate.observe_health(
-        health(rig.now, ServiceState.BACKOFF, "lidar", reason=Reason.DEVICE_LOST, detail="unplugged")
-    )
+    show(rig.gate, health(rig.now, ServiceState.BACKOFF, "lidar", reason=Reason.DEVICE_LOST, detail="unplugged"))
     rig.tick(50)
     assert rig.order(Order.ARM) is Reason.SCAN_STALE
     assert rig.tick().events[0].text == (

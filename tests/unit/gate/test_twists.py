@@ -10,8 +10,8 @@ from monstertruck_schemas.cmd import DriveAction
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import DriveForm
 from monstertruck_schemas.state import GateMode
-from monstertruckd.gate.config import GateConfig
-from monstertruckd.gate.limiter import Motion
+from monstertruckd.gate.config import GateConfig, InForce
+from monstertruckd.gate.motion import Motion
 from tests.unit.gate.rig import ANY_GROUND, BODIES, Rig, Robot
 
 SPOT, SIDE = {"wz": 0.5}, {"vy": 0.1}
@@ -228,7 +228,7 @@ def test_neutral_twists_release_the_truck():
 
 @pytest.mark.parametrize("kind", ["ackermann", "truck", "synchro"])
 def test_a_change_of_rounding_in_the_turn_alone_is_no_motion_of_its_own(kind: str):
-    motion = Motion(GateConfig(), BODIES[kind])
+    motion = Motion(InForce(GateConfig()), BODIES[kind])
     motion.twist = motion.along((0.1, 0.0, 0.0))
     vx, vy, wz = motion.twist
     target = (vx, vy + 1e-18, wz + 1e-17)

@@ -10,8 +10,9 @@ from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order
 from monstertruck_schemas.state import GateMode
-from monstertruckd.gate.limiter import OUTLINE, SECTOR, SECTORS, Visibility, ground_ahead
-from tests.unit.gate.rig import Rig, scan
+from monstertruckd.gate.obstacles import OUTLINE, ObstacleCheck, ground_ahead
+from monstertruckd.gate.visibility import SECTOR, SECTORS, Visibility
+from tests.unit.gate.rig import Rig, check_of, scan
 
 FOOTPRINT = Footprint()
 MOUNT = (0.14, 0.0, 0.0)
@@ -159,7 +160,7 @@ def test_a_way_not_seen_for_the_scans_limit_itself_is_driven_slowly():
     rig = Rig(scan={"stale_after": 0.24}).driving(speed=0.2)
     rig.unknown = ((-119.0, 120.0, 7),)
     rig.tick(12)
-    assert rig.gate._obstacles.unseen == 0.24
+    assert check_of(rig.gate, ObstacleCheck).guard.unseen == 0.24
     assert Reason.LIDAR_SLOW in rig.out.reasons
     rig.tick()
     assert Reason.LIDAR_BLIND in rig.out.reasons

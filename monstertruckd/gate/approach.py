@@ -1,0 +1,77 @@
+"""How fast the robot may approach what is ahead: limits by the free distance, with a hysteresis, and the emergency."""
+
+import math
+from collections.abc import Callable, Iterable, Iterator
+
+from monstertruck_planners.collision import UnitTwist
+from monstertruck_schemas.event import Measurement
+from monstertruck_schemas.reasons import Reason
+from monstertruckd.gate.checks import GateView, Limit
+from monstertruckd.gate.config import GateConfig
+
+
+def comfortable_speed(room: float, delay: float, deceleration: float) -> float:
+    """Greatest speed from which a body that brakes after ``delay`` s stands within ``room`` metres, m/s."""
+    return deceleration * (math.sqrt(delay**2 + 2 * max(room, 0.0) / deceleration) - delay)
+
+
+def stopping(speed: float, delay: float, deceleration: float) -> float:
+    """Distance in which a body stands that brakes from ``speed`` (m/s) after ``delay`` s, m."""
+    return speed * delay + speed**2 / (2 * deceleration)
+
+
+def reach(config: GateConfig, delay: float) -> float:
+    """Distance to be swept against obstacles seen ``delay`` s ago, m."""
+    return config.obstacle.ahead + stopping(config.speed, delay, config.obstacle.deceleration)
+
+
+class Approach:
+    """State of the approach to obstacles of one kind.
+
+    Args:
+        view: limits, samples and motion.
+    """
+
+    def __init__(self, view: GateView) -> None:
+        self._view = view
+        self.blocked = False
+        """An obstacle ahead allows no motion."""
+        self.emergency = False
+        """An obstacle is so near that only the quick stop avoids contact."""
+        self.free: float | None = None
+        """Distance the footprint can travel, m; None = no obstacle within the distance checked."""
+
+    def forget(self) -> None:
+        """Nobody drives."""
+        self.blocked = self.emergency = False
+        self.free = None
+
+    def limits(self, free: float, allowed: float, fastest: float) -> Iterator[Limit]:
+        """Limit for ``free`` metres ahead, which allow a pace of ``allowed`` m/s, for motions up to ``fastest`` m/s."""
+        crawl = self._view.config.obstacle.crawl
+        self.free = free if math.isfinite(free) else None
+        self.blocked = allowed < (2 * crawl if self.blocked else crawl)
+        if self.blocked:
+            yield Limit(Reason.OBSTACLE_STOP, 0.0)
+        elif allowed < fastest:
+            yield Limit(Reason.OBSTACLE_SLOW, allowed)
+
+    def judge(self, now: int, twists: Iterable[UnitTwist], too_near: Callable[[float], bool]) -> None:
+        """Update ``emergency``.
+
+        Args:
+            now: ns.
+            twists: motions of the base per metre of pace.
+            too_near: whether an ordinary stop from a pace, m/s, needs more than the free distance.
+        """
+        view = self._view
+        measured = view.samples.shaft_speeds(now)
+        speed = max(view.motion.progress(measured, twist) for twist in twists) if measured else 0.0
+        approaching = speed > view.config.standstill
+        self.emergency = approaching and (self.emergency or (self.blocked and too_near(speed)))
+
+    def free_distance(self, age: float | None) -> Measurement:
+        """The free distance as a figure; ``age`` (s) is that of what it was measured by."""
+        return Measurement(
+            name="free distance", value=self.free, unit="m", limit=self._view.config.obstacle.ahead, age=age
+        )

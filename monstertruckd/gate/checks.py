@@ -1,0 +1,233 @@
+"""What a check of the gate is: one rule that may slow the robot or keep it at rest, and never more than that.
+
+The gate keeps an ordered list of checks, worst reasons first. Every check sees all messages that the gate receives and
+every tick (``observe``). At each tick the gate asks it why the robot may not move at all (``reason``) and how fast it
+may go along the motions in question (``limit``); ``describe`` puts a reason into words with its figures. The gate takes
+the union of all reasons and the least of all limits, so that one more check can only make it stricter.
+"""
+
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any, ClassVar, Final, NamedTuple
+
+from monstertruck_kinematics.chassis import Chassis
+from monstertruck_planners.collision import Footprint
+from monstertruck_schemas.base import Message
+from monstertruck_schemas.event import Cause, Measurement
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.roles import ServiceName
+from monstertruck_schemas.state import GateMode
+from monstertruck_schemas.topics import Topic
+from monstertruckd.gate.arbitration import GateStateMachine
+from monstertruckd.gate.config import GateConfig, InForce
+from monstertruckd.gate.motion import Course, Motion
+from monstertruckd.gate.samples import Samples
+
+GATE: Final = ServiceName.GATE.value
+"""Source of causes that only the gate itself knows."""
+
+
+class Tick(NamedTuple):
+    """A tick of the gate begins; checks observe it as they do messages."""
+
+    now: int
+    """Ns."""
+    elapsed: float
+    """Time since the previous tick, ns."""
+
+
+class Limit(NamedTuple):
+    """A speed limit with its reason."""
+
+    reason: Reason
+    pace: float
+    """Greatest pace (m/s); 0 = the robot stands, and its driver stays in control."""
+
+
+class GateView:
+    """What a check may look at, and not change: limits, newest samples, commanded motion and mode of the gate.
+
+    Args:
+        limits: in force.
+        chassis: kinematics of the body.
+        footprint: the body's outline.
+        samples: newest valid sample of every sensor.
+        motion: commanded motion.
+        states: the gate's state machine.
+    """
+
+    def __init__(
+        self,
+        limits: InForce,
+        chassis: Chassis,
+        footprint: Footprint,
+        samples: Samples,
+        motion: Motion,
+        states: GateStateMachine,
+    ) -> None:
+        self.limits = limits
+        self.chassis = chassis
+        self.footprint = footprint
+        self.samples = samples
+        self.motion = motion
+        self._states = states
+
+    @property
+    def config(self) -> GateConfig:
+        """Limits in force."""
+        return self.limits.config
+
+    @property
+    def mode(self) -> GateMode:
+        """Present mode."""
+        return self._states.mode
+
+
+class Check:
+    """One rule of the gate; a subclass overrides what it needs.
+
+    Args:
+        view: what it may look at.
+    """
+
+    reasons: ClassVar[tuple[Reason, ...]] = ()
+    """Reasons it may give."""
+    reads: ClassVar[tuple[Topic[Any], ...]] = ()
+    """Topics it needs besides those that the gate reads anyway."""
+
+    def __init__(self, view: GateView) -> None:
+        self.view = view
+
+    @property
+    def urgent(self) -> bool:
+        """Whether only a quick stop avoids contact."""
+        return False
+
+    def observe(self, seen: Message | Tick, topic: Topic[Any] | None) -> None:
+        """Take a message, or the beginning of a tick; ``view.samples`` holds the message already if it is valid.
+
+        Args:
+            seen: message or tick.
+            topic: of a message; None = a tick.
+        """
+
+    def reason(self, now: int) -> Iterable[Reason]:
+        """Why the robot may not move at ``now`` (ns), worst first; called at ticks and for orders in between."""
+        return ()
+
+    def limit(self, now: int, courses: Sequence[Course] | None) -> Iterable[Limit]:
+        """Limits of the pace at a tick.
+
+        Args:
+            now: ns.
+            courses: motions asked for and commanded; empty = standstill, None = nobody drives.
+        """
+        return ()
+
+    def text(self, reason: Reason) -> str:
+        """A reason of this check in words, for its event."""
+        return reason.text
+
+    def figures(self, reason: Reason, now: int) -> Iterable[Measurement]:
+        """Measurements behind a reason of this check."""
+        return ()
+
+    def describe(self, reason: Reason, now: int, since: int) -> Iterable[Cause]:
+        """Causes of a stop for a reason of this check.
+
+        Args:
+            reason: one of ``reasons``.
+            now: ns.
+            since: when the gate first saw it, ns.
+        """
+        yield Cause(
+            reason=reason,
+            source=GATE,
+            since=since,
+            text=self.text(reason),
+            measurements=tuple(self.figures(reason, now)),
+        )
+
+    def reset(self) -> None:
+        """Forget a finding that stays until the gate disarms."""
+
+
+class Checks:
+    """The gate's ordered list of checks: the union of their reasons, the least of their limits.
+
+    Args:
+        checks: worst reasons first.
+    """
+
+    def __init__(self, checks: Iterable[Check]) -> None:
+        self._checks = tuple(checks)
+        self._givers: dict[Reason, Check] = {}
+        """The check that gave a reason most recently; before that, the first one that may."""
+        for check in self._checks:
+            for reason in check.reasons:
+                self._givers.setdefault(reason, check)
+
+    def __iter__(self) -> Iterator[Check]:
+        return iter(self._checks)
+
+    def observe(self, seen: Message | Tick, topic: Topic[Any] | None) -> None:
+        """Show every check a message or the beginning of a tick; see ``Check.observe``."""
+        for check in self._checks:
+            check.observe(seen, topic)
+
+    def blocks(self, now: int) -> tuple[Reason, ...]:
+        """Reasons to stand still at ``now`` (ns), worst first."""
+        found: dict[Reason, Check] = {}
+        for check in self._checks:
+            for reason in check.reason(now):
+                found.setdefault(reason, check)
+        self._givers |= found
+        return tuple(found)
+
+    def limits(self, now: int, courses: Sequence[Course] | None) -> dict[Reason, float]:
+        """Reasons to go slowly with the least pace for each, m/s; arguments as of ``Check.limit``."""
+        found: dict[Reason, float] = {}
+        for check in self._checks:
+            for reason, pace in check.limit(now, courses):
+                allowed = pace if pace > 0 else 0.0  # also instead of a pace that is not a number
+                if allowed < found.get(reason, math.inf):
+                    found[reason] = allowed
+                    self._givers[reason] = check
+        return found
+
+    @property
+    def reads(self) -> tuple[Topic[Any], ...]:
+        """Topics that the checks need besides those that the gate reads anyway."""
+        return tuple(dict.fromkeys(topic for check in self._checks for topic in check.reads))
+
+    @property
+    def urgent(self) -> bool:
+        """Whether only a quick stop avoids contact."""
+        return any(check.urgent for check in self._checks)
+
+    def text(self, reason: Reason) -> str:
+        """A reason in words, for its event."""
+        giver = self._givers.get(reason)
+        return reason.text if giver is None else giver.text(reason)
+
+    def describe(self, reasons: Iterable[Reason], now: int, since: Mapping[Reason, int]) -> list[Cause]:
+        """Causes of a stop, in words with their figures.
+
+        Args:
+            reasons: worst first.
+            now: ns.
+            since: when the gate first saw each of them, ns.
+        """
+        causes: list[Cause] = []
+        for reason in reasons:
+            giver, began = self._givers.get(reason), since.get(reason, now)
+            if giver is None:
+                causes.append(Cause(reason=reason, source=GATE, since=began, text=reason.text))
+            else:
+                causes += giver.describe(reason, now, began)
+        return causes
+
+    def reset(self) -> None:
+        """The gate disarms: findings that stay until then end."""
+        for check in self._checks:
+            check.reset()

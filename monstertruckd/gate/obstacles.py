@@ -1,0 +1,321 @@
+"""Obstacles by the lidar: the swept footprint against the newest scan, and what earlier scans saw behind the body."""
+
+import math
+from collections.abc import Iterator, Sequence
+from functools import lru_cache
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_kinematics.drive import Twist
+from monstertruck_kinematics.elementary import Array
+from monstertruck_planners.collision import (
+    Footprint,
+    ScanPoints,
+    UnitTwist,
+    first_contact,
+    on_body,
+    swept_poses,
+)
+from monstertruck_runtime.clock import SECOND
+from monstertruck_schemas.base import Message
+from monstertruck_schemas.event import Measurement
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.sensor import LaserScan
+from monstertruck_schemas.topics import Topic
+from monstertruckd.gate.approach import Approach, comfortable_speed, reach, stopping
+from monstertruckd.gate.checks import Check, GateView, Limit, Tick
+from monstertruckd.gate.config import GateConfig, InForce
+from monstertruckd.gate.motion import AHEAD, Course
+from monstertruckd.gate.samples import age
+from monstertruckd.gate.scan_memory import ScanMemory
+from monstertruckd.gate.visibility import Sectors, Visibility
+
+POSES: Final = 20
+"""Poses checked along the swept path, at least: a corner that turns faster than the base travels has more of them."""
+
+TWIST_STEP: Final = 0.005
+"""Rounding of unit twists before the sweep, m/m and rad/m: most sweeps are cached, with an error of 2 mm at the end."""
+
+GROUND_STEP: Final = 2
+"""The ground is checked at every second pose."""
+
+SWEEPS: Final = 256
+"""Sweeps cached."""
+
+LEAVING: Final = 0.1
+"""A body nearer to an obstacle than the side clearance may only drive motions that take it this much further away per
+metre, m/m: a translation of 0.33 rad away from a wall does (0.34 m/m), a straight line along it does not."""
+
+DEPTH: Final = 0.2
+"""Ground that no scan has seen, nearer than this to a measured point, is not turned onto, m: what stands there is seen
+from one side only. Somebody who stands is about as deep."""
+
+OUTLINE: Final = 12
+"""Points on each edge of the footprint from which the directions of travel are found."""
+
+TOUCH: Final = 1e-6
+"""A point that enters the footprint by less is on its edge, m."""
+
+
+def ground_ahead(body: Footprint, edges: Array, poses: Array) -> Array:
+    """Points of the ground that a motion covers and that its pose before did not cover.
+
+    Args:
+        body: the footprint.
+        edges: points on its edges, shape (k, 2), m.
+        poses: of base at equal steps of one twist, the present one first, shape (m, 3), m, m, rad.
+
+    Returns:
+        Shape (m - 1, n, 2), m: the same points of the outline at all poses after the first.
+    """
+    (step,) = _at(edges, poses[1:2])
+    return _at(edges[~on_body(body, step, TOUCH)], poses[1:])
+
+
+def _at(points: Array, poses: Array) -> Array:
+    """Points (n, 2) of a body at every pose (m, 3), shape (m, n, 2)."""
+    c, s = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
+    x, y = points.T
+    return np.stack((poses[:, :1] + c * x - s * y, poses[:, 1:2] + s * x + c * y), axis=2)
+
+
+class _Sweep(NamedTuple):
+    """The poses and the ground that a motion covers."""
+
+    distances: Array
+    """Of its poses, shape (m,), m."""
+    poses: Array
+    """Of base, shape (m, 3)."""
+    ground: Array
+    """Points that the body does not stand on, shape (n, 2), m."""
+    before: Array
+    """Distance of the pose before the one that reaches each of them, shape (n,), m."""
+    sectors: Sectors
+    """Around the lidar."""
+
+
+class ObstacleGuard:
+    """Swept footprint against the newest scan.
+
+    The truck may have moved since the scan was taken: its age becomes a part of the stopping distance.
+
+    Args:
+        limits: in force.
+        footprint: the body's outline.
+        points: of scans, in base.
+    """
+
+    def __init__(self, limits: InForce, footprint: Footprint, points: ScanPoints) -> None:
+        self._limits = limits
+        self._footprint = footprint
+        self._scan_points = points
+        self._visibility = Visibility(footprint, points.mount, limits.config.obstacle.seen)
+        self._memory = ScanMemory(footprint, points.mount, limits.config.obstacle.memory_distance)
+        self._points = np.empty((0, 2))
+        self._stamp = 0
+        self.unseen: float | None = 0.0
+        """Age of the oldest view of a sector of travel at the newest scan, s; None = one was never seen."""
+        self.known = math.inf
+        """Distance along the newest motions to ground that no scan has seen, m; +inf if none is within reach."""
+        self._checked: frozenset[tuple[int, int, int]] | None = None
+        self._free = math.inf
+        self._outline = footprint.edge_points(OUTLINE, OUTLINE)
+        self._near = 0.0
+        self._adopted: GateConfig | None = None
+        self._follow_limits()
+
+    def _follow_limits(self) -> None:
+        """Take the limits in force; points beyond the range kept so far count as not seen."""
+        config = self._limits.config
+        if config is self._adopted:
+            return
+        self._adopted = config
+        self._keep = round(config.scan.stale_after * SECOND)
+        delay = config.scan.stale_after + config.max_latency + config.reaction
+        self._reach = reach(config, delay)
+        before = self._near
+        self._near = self._reach + self._footprint.circumscribed_radius + config.obstacle.side_clearance
+        if self._near > before:
+            self._memory.forget()
+        self._sweep = lru_cache(SWEEPS)(self._swept)
+        self._checked = None
+
+    @property
+    def reach(self) -> float:
+        """Distance swept, m."""
+        return self._reach
+
+    def looks_at(self, points: Array) -> NDArray[np.bool_]:
+        """Which of the points (n, 2) in base, m, lie in the lidar's field."""
+        return self._visibility.covers(points)
+
+    def move(self, now: int, twist: Twist[float] | None, dt: float) -> None:
+        """The body moved with ``twist`` for the ``dt`` s until ``now``, ns; None = it is not known how."""
+        self._follow_limits()
+        if twist is None:
+            self._memory.forget()
+        else:
+            self._memory.move(now, twist, dt)
+
+    def observe(self, scan: LaserScan) -> None:
+        """Take a scan."""
+        points = self._scan_points.of(scan)
+        self._visibility.observe(scan, points)
+        near = points[np.hypot(points[:, 0], points[:, 1]) < self._near]
+        age = self._visibility.age(self._points, scan.stamp)
+        # What was seen in a sector stays while the sector is not seen, until that is too old.
+        self._points = np.concatenate((near, self._points[(age > 0) & (age <= self._keep)]))
+        self._memory.observe(scan, near)
+        self._stamp = min(scan.stamp, scan.received)  # a sensor's clock may run ahead; nothing arrives before it is
+        self._checked = None
+
+    def free_distance(self, twists: tuple[UnitTwist, ...]) -> float:
+        """Distance the footprint can travel from where the scan was taken, m; +inf if no obstacle is within reach.
+
+        Args:
+            twists: the shortest distance of all of them counts.
+        """
+        self._follow_limits()
+        rounded = frozenset((round(x / TWIST_STEP), round(y / TWIST_STEP), round(a / TWIST_STEP)) for x, y, a in twists)
+        if self._checked != rounded:
+            self._checked = rounded
+            self._update_unseen(rounded)
+            hidden = [twist for twist in rounded if twist[0] * TWIST_STEP < AHEAD]
+            behind = self._memory.points() if hidden else None
+            self._free = min(self._free_distance(*twist, behind) for twist in rounded)
+            self.known = math.inf
+            if behind is not None:
+                self._check_ground(hidden, np.concatenate((self._points, behind)))
+        return self._free
+
+    def _update_unseen(self, twists: frozenset[tuple[int, int, int]]) -> None:
+        """Update ``unseen`` from the sectors of travel within the lidar's field."""
+        seen = np.concatenate([self._visibility.last_seen(self._sweep(*twist).sectors) for twist in twists])
+        oldest = int(seen.min(initial=self._stamp))
+        self.unseen = (self._stamp - oldest) / SECOND if oldest > 0 else None
+
+    def _swept(self, x: int, y: int, turn: int) -> _Sweep:
+        """Sweep of a twist in steps of ``TWIST_STEP``; between two poses corners move no further than the base."""
+        twist = (x * TWIST_STEP, y * TWIST_STEP, turn * TWIST_STEP)
+        distances = np.linspace(0.0, self._reach, math.ceil(POSES * max(self._footprint.corner_speed(twist), 1.0)))
+        poses = swept_poses(twist, distances)
+        ground = ground_ahead(self._footprint, self._outline, poses[::GROUND_STEP])
+        before = np.repeat(distances[::GROUND_STEP][:-1], ground.shape[1])
+        ground = ground.reshape(-1, 2)
+        return _Sweep(distances, poses, ground, before, self._visibility.travelled(ground))
+
+    def _free_distance(self, x: int, y: int, turn: int, remembered: Array | None) -> float:
+        sweep = self._sweep(x, y, turn)
+        clearance = self._limits.config.obstacle.side_clearance
+        leaving = LEAVING * sweep.distances
+        contacts = [first_contact(self._footprint, sweep.poses, self._points, clearance, leaving)]
+        if remembered is not None:
+            # Without a clearance, as their places may be off by as much.
+            contacts.append(first_contact(self._footprint, sweep.poses, remembered, -self._footprint.padding))
+        return min(
+            (float(sweep.distances[contact - 1]) for contact in contacts if contact is not None), default=math.inf
+        )
+
+    def _check_ground(self, twists: list[tuple[int, int, int]], measured: Array) -> None:
+        """Update ``known``, and shorten the free distance of turns on the spot.
+
+        Args:
+            twists: in steps of ``TWIST_STEP``.
+            measured: points in base, shape (n, 2), m.
+        """
+        sweeps = [self._sweep(*twist) for twist in twists]
+        ground = np.concatenate([sweep.ground for sweep in sweeps])
+        before = np.concatenate([sweep.before for sweep in sweeps])
+        turns = [math.hypot(*twist[:2]) * TWIST_STEP < AHEAD for twist in twists]
+        turning = np.repeat(turns, [len(sweep.ground) for sweep in sweeps])
+        hidden = ~self._memory.seen(ground)
+        self.known = float(before[hidden].min(initial=math.inf))
+        reached = hidden & turning & (before < self._free)
+        near = on_body(self._footprint, measured, self._reach + DEPTH) & ~on_body(self._footprint, measured, 0.0)
+        apart = ((ground[reached][:, None] - measured[near]) ** 2).sum(axis=2).min(axis=1, initial=math.inf)
+        self._free = float(before[reached][apart < DEPTH**2].min(initial=self._free))
+
+    def allowed_speed(self, free: float, now: int) -> float:
+        """Greatest pace from which the body stops comfortably within ``free`` metres, m/s."""
+        limits = self._limits.config.obstacle
+        return comfortable_speed(free - limits.ahead, self.delay(now), limits.deceleration)
+
+    def too_near(self, free: float, speed: float, now: int) -> bool:
+        """Whether an ordinary stop from the pace ``speed`` needs more than ``free`` metres."""
+        return free < stopping(abs(speed), self.delay(now), self._limits.config.deceleration)
+
+    def delay(self, now: int) -> float:
+        """Time from the newest view of the way to the reaction, s."""
+        return max(now - self._stamp, 0) / SECOND + (self.unseen or 0.0) + self._limits.config.reaction
+
+
+class ObstacleCheck(Check):
+    """The swept footprint must not meet what the lidar sees or has seen; nothing is limited without a fresh scan.
+
+    Args:
+        view: what it may look at.
+        points: of scans, in base.
+    """
+
+    reasons = (
+        Reason.OBSTACLE_STOP,
+        Reason.OBSTACLE_SLOW,
+        Reason.LIDAR_BLIND,
+        Reason.LIDAR_SLOW,
+        Reason.UNSEEN_SLOW,
+    )
+
+    def __init__(self, view: GateView, points: ScanPoints) -> None:
+        super().__init__(view)
+        self.guard = ObstacleGuard(view.limits, view.footprint, points)
+        self._approach = Approach(view)
+
+    @property
+    def urgent(self) -> bool:
+        """See ``Check.urgent``."""
+        return self._approach.emergency
+
+    def observe(self, seen: Message | Tick, topic: Topic[Any] | None) -> None:
+        """Take valid scans, and the motion of the body at every tick."""
+        view = self.view
+        if isinstance(seen, Tick):
+            # A robot that is not armed may be carried.
+            twist = view.samples.twist(seen.now) if view.mode.active else None
+            self.guard.move(seen.now, twist, seen.elapsed / SECOND)
+        elif isinstance(seen, LaserScan) and seen is view.samples.scan:
+            self.guard.observe(seen)
+
+    def limit(self, now: int, courses: Sequence[Course] | None) -> Iterator[Limit]:
+        """Sweep along the motions, and along those of the measured steering angles."""
+        if courses is None:
+            self._approach.forget()
+        elif courses and self.view.samples.scan_fresh(now):
+            yield from self._along(now, list(courses))
+
+    def _along(self, now: int, courses: list[Course]) -> Iterator[Limit]:
+        guard, view = self.guard, self.view
+        fastest = max(pace for _, pace in courses)
+        if view.samples.steering_fresh(now):
+            courses.append((view.motion.along(courses[0][0], view.samples.angles), 0.0))
+        twists = tuple(twist for twist, _ in courses)
+        free = guard.free_distance(twists)
+        yield from self._approach.limits(free, guard.allowed_speed(free, now), fastest)
+        unseen, slow = guard.unseen, view.config.obstacle.unseen_speed
+        if unseen is None or unseen > view.config.scan.stale_after:
+            yield Limit(Reason.LIDAR_BLIND, 0.0)
+        elif unseen:
+            yield Limit(Reason.LIDAR_SLOW, slow)
+        allowed = max(guard.allowed_speed(guard.known, now), slow)
+        if allowed < fastest:
+            yield Limit(Reason.UNSEEN_SLOW, allowed)
+        self._approach.judge(now, twists, lambda speed: guard.too_near(free, speed, now))
+
+    def figures(self, reason: Reason, now: int) -> Iterator[Measurement]:
+        """Free distance, or how long the lidar has not seen the way."""
+        config = self.view.config
+        if reason is Reason.LIDAR_BLIND:
+            yield Measurement(name="unseen", value=self.guard.unseen, unit="s", limit=config.scan.stale_after)
+        elif reason is Reason.OBSTACLE_STOP:
+            yield self._approach.free_distance(age(self.view.samples.scan, now))

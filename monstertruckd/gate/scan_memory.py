@@ -1,0 +1,164 @@
+"""What earlier scans saw around the body, for motions towards where the lidar does not look."""
+
+import math
+from collections import deque
+from collections.abc import Iterable, Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_kinematics.chassis import STILL
+from monstertruck_kinematics.drive import Twist
+from monstertruck_kinematics.elementary import Array, integrate
+from monstertruck_planners.collision import Footprint, beyond, on_body, placed, points_relative, relative
+from monstertruck_runtime.clock import SECOND
+from monstertruck_schemas.sensor import NO_ECHO, VALID_BEAM, LaserScan
+
+MEMORY: Final = 30 * SECOND
+"""Age up to which scans are kept, ns: people may step onto ground that was free, or take an obstacle away."""
+MEMORY_STEP: Final = 0.1
+"""Travelled distance between two remembered scans, m."""
+MEMORY_SCANS: Final = 20
+SPACING: Final = 0.02
+"""Distance between remembered points along the line of the beams, m: less than their drift."""
+VIEW_STEP: Final = 0.3
+"""Distance (m) plus turn (rad) between two of the scans that are kept to know which ground is free: each sees further
+than a truck's length in half of all directions, and ground that none of them saw only slows the truck."""
+VIEWS: Final = 7
+DRIFT: Final = 0.03
+"""Ground this near to where the body stood counts as free, m: the error of dead reckoning."""
+FIELD_EDGE: Final = 0.1
+"""Remembered points this near to the edge of the lidar's field are kept, rad: the error of the dead-reckoned yaw."""
+POSES_KEPT: Final = 64
+"""Ticks whose pose is kept, to place a scan where it was taken."""
+
+Pose = tuple[float, float, float]
+
+
+class _Taken(NamedTuple):
+    """A scan, and where it was taken."""
+
+    scan: LaserScan
+    pose: Pose
+    """Of base, in the frame of the memory."""
+    lidar: Pose
+    """Of the lidar, in the frame of the memory."""
+    travelled: float
+    """m."""
+    points: Array
+    """Its returns near the body in the frame of the memory, shape (n, 2), m."""
+    free: Array
+    """Free distance of every beam, m; padded with a 0 before the first and after the last."""
+
+
+class ScanMemory:
+    """What earlier scans saw around the body, in a frame in which the wheels' dead reckoning gives its pose.
+
+    Args:
+        footprint: the body's outline.
+        mount: pose of the lidar in base, m, m, rad.
+        distance: travelled distance for which points are remembered, m.
+    """
+
+    def __init__(self, footprint: Footprint, mount: Pose, distance: float) -> None:
+        self._footprint = footprint
+        self._mount = mount
+        self._distance = distance
+        self.forget()
+
+    def forget(self) -> None:
+        """Start again: it is not known how the body has moved."""
+        self._pose: Pose = (0.0, 0.0, 0.0)
+        self._travelled = 0.0
+        self._ticks: deque[tuple[int, Pose, float]] = deque(maxlen=POSES_KEPT)
+        self._newest: _Taken | None = None
+        self._taken: deque[_Taken] = deque(maxlen=MEMORY_SCANS)
+        self._views: deque[_Taken] = deque(maxlen=VIEWS)
+
+    def move(self, now: int, twist: Twist[float], dt: float) -> None:
+        """The body moved with ``twist``, m/s and rad/s, for the ``dt`` s until ``now``, ns."""
+        if twist != STILL:
+            self._pose = integrate(self._pose, *twist, dt)
+            self._travelled += self._footprint.corner_speed(twist) * dt
+        self._ticks.append((now, self._pose, self._travelled))
+
+    def observe(self, scan: LaserScan, points: Array) -> None:
+        """Take a scan.
+
+        Args:
+            scan: the revolution.
+            points: its returns near the body in base, shape (n, 2), m.
+        """
+        present = scan.stamp, self._pose, self._travelled
+        _, pose, travelled = min(self._ticks, key=lambda tick: abs(tick[0] - scan.stamp), default=present)
+        points = spaced(points, SPACING)
+        there = placed(np.column_stack((points, np.zeros(len(points)))), pose)[:, :2]
+        (lidar,) = placed(np.array([self._mount]), pose).tolist()
+        free = np.where((scan.codes == VALID_BEAM) | (scan.codes <= NO_ECHO), scan.ranges, 0.0)
+        self._newest = _Taken(scan, pose, tuple(lidar), travelled, there, np.pad(free, 1))
+        if not self._taken or travelled - self._taken[-1].travelled >= MEMORY_STEP:
+            self._taken.append(self._newest)
+        if not self._views or _apart(pose, self._views[-1].pose) >= VIEW_STEP:
+            self._views.append(self._newest)
+
+    def points(self) -> Array:
+        """Remembered points where the newest scan does not look, in base as of that scan, shape (n, 2), m."""
+        newest = self._newest
+        if newest is None:
+            return np.empty((0, 2))
+        kept = [
+            taken.points for taken in _fresh(self._taken, newest) if newest.travelled - taken.travelled < self._distance
+        ]
+        there = np.concatenate((newest.points[:0], *kept))
+        beams = _beams((newest,), there)[0][0]
+        edge = FIELD_EDGE / abs(newest.scan.angle_increment or math.tau)
+        looked = (beams >= edge) & (beams < len(newest.scan.ranges) - edge)
+        points = points_relative(there[~looked], newest.pose)
+        return points[~on_body(self._footprint, points, 0.0)]
+
+    def seen(self, points: Array) -> NDArray[np.bool_]:
+        """Which of the points (n, 2), in base as of the newest scan, m, lie on ground that was seen free."""
+        newest = self._newest
+        if newest is None:
+            return np.zeros(len(points), np.bool_)
+        there = placed(np.column_stack((points, np.zeros(len(points)))), newest.pose)[:, :2]
+        taken = newest, *_fresh(self._views, newest)
+        beams, distances = _beams(taken, there)
+        ends = np.cumsum([len(scan.free) for scan in taken])[:, None]
+        starts = np.concatenate(([[0]], ends[:-1]))
+        free = np.concatenate([scan.free for scan in taken])[np.clip(starts + 1 + beams, starts, ends - 1)]
+        beyond_x, beyond_y = beyond(self._footprint, np.array([scan.pose for scan in taken]), there)
+        seen = (free > distances) | ((beyond_x < DRIFT) & (beyond_y < DRIFT))
+        return np.asarray(seen.any(axis=0))
+
+
+def spaced(points: Array, spacing: float) -> Array:
+    """Of points (n, 2) in the order of the beams, one on every ``spacing`` of the line along them, m."""
+    along = np.cumsum(np.hypot(*np.diff(points, axis=0, prepend=points[:1]).T))
+    return points[np.diff(along // spacing, prepend=-1.0) > 0]
+
+
+def _apart(one: Pose, other: Pose) -> float:
+    """Distance (m) and turn (rad) together."""
+    return math.dist(one[:2], other[:2]) + abs(one[2] - other[2])
+
+
+def _fresh(kept: Iterable[_Taken], newest: _Taken) -> list[_Taken]:
+    return [taken for taken in kept if newest.scan.stamp - taken.scan.stamp < MEMORY]
+
+
+def _beams(scans: Sequence[_Taken], points: Array) -> tuple[NDArray[np.intp], Array]:
+    """Number of every scan's beam towards each point, beyond the scan's where it has none; distance, m.
+
+    Args:
+        scans: m of them.
+        points: in the frame of the memory, shape (n, 2), m.
+
+    Returns:
+        Two of shape (m, n).
+    """
+    x, y = relative(points, np.array([scan.lidar for scan in scans]))
+    first = np.array([scan.scan.start_angle for scan in scans])
+    step = np.array([scan.scan.angle_increment or math.tau for scan in scans])
+    return np.rint((np.arctan2(y, x) - first[:, None]) / step[:, None]).astype(np.intp), np.hypot(x, y)

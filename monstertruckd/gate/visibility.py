@@ -1,0 +1,91 @@
+"""What the lidar sees: a beam without a range may be free ground, or a covered or dazzled sensor."""
+
+import math
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_kinematics.elementary import Array
+from monstertruck_planners.collision import Footprint, on_body
+from monstertruck_schemas.sensor import NO_ECHO, VALID_BEAM, LaserScan
+
+SECTORS: Final = 36
+"""Sectors around the lidar: 0.1 m wide at the end of the distance the gate checks, less than the width of the body."""
+SECTOR: Final = 2 * math.pi / SECTORS
+PRESENT: Final = 0.5
+"""Share of a sector's beams that a scan must have for the sector to be in the lidar's field."""
+MARGIN: Final = 0.005
+"""Ground this near to the body counts as under it, m."""
+
+Sectors = NDArray[np.intp]
+
+
+class Visibility:
+    """When each sector around the lidar was last seen.
+
+    A beam sees if it measured a range that ends outside the body, or met nothing within the sensor's range. A sector
+    is seen if a share of its beams sees: single beams fail on edges and dark surfaces.
+
+    Args:
+        footprint: the body's outline.
+        mount: pose (x, y, yaw) of the lidar in base, m, m, rad.
+        share: of a sector's beams that must see, 0..1.
+    """
+
+    def __init__(self, footprint: Footprint, mount: tuple[float, float, float], share: float) -> None:
+        self._footprint = footprint
+        self._mount = mount
+        self._share = share
+        self._geometry: tuple[float, float, int] | None = None
+        self._sector_of_beam: Sectors = np.empty(0, np.intp)
+        self._beams: Array = np.zeros(SECTORS)
+        self._field: NDArray[np.bool_] = np.zeros(SECTORS, np.bool_)
+        self._seen_at: NDArray[np.int64] = np.zeros(SECTORS, np.int64)
+
+    def observe(self, scan: LaserScan, points: Array) -> None:
+        """Take a scan.
+
+        Args:
+            scan: the revolution.
+            points: its valid returns in base, ``scan_points``, shape (n, 2), m.
+        """
+        geometry = scan.start_angle, scan.angle_increment, len(scan.ranges)
+        if geometry != self._geometry:
+            self._geometry = geometry
+            start, increment, count = geometry
+            self._sector_of_beam = _sector(start + increment * np.arange(count, dtype=np.float64))
+            self._beams = np.bincount(self._sector_of_beam, minlength=SECTORS).astype(float)
+            self._field = self._beams * abs(increment) > PRESENT * SECTOR
+        sees = scan.codes <= NO_ECHO
+        sees[((scan.codes == VALID_BEAM) & np.isfinite(scan.ranges)).nonzero()[0]] = ~on_body(
+            self._footprint, points, 0.0
+        )
+        seen = np.bincount(self._sector_of_beam, weights=sees, minlength=SECTORS) >= self._share * self._beams
+        self._seen_at[seen & self._field] = scan.stamp
+
+    def sectors_of(self, points: Array) -> Sectors:
+        """Sector of every point (n, 2) in base, m."""
+        x, y, yaw = self._mount
+        return _sector(np.arctan2(points[:, 1] - y, points[:, 0] - x) - yaw)
+
+    def covers(self, points: Array) -> NDArray[np.bool_]:
+        """Which of the points (n, 2) in base, m, lie in the lidar's field."""
+        return self._field[self.sectors_of(points)]
+
+    def travelled(self, ground: Array) -> Sectors:
+        """Sectors of the points (n, 2) in base, m, that the body does not stand on."""
+        sectors = self.sectors_of(ground[~on_body(self._footprint, ground, MARGIN)])
+        return np.bincount(sectors, minlength=SECTORS).nonzero()[0]
+
+    def last_seen(self, sectors: Sectors) -> NDArray[np.int64]:
+        """When each of the sectors was seen, ns, 0 for never; those outside the lidar's field are left out."""
+        return self._seen_at[sectors[self._field[sectors]]]
+
+    def age(self, points: Array, now: int) -> NDArray[np.int64]:
+        """How long ago the sector of every point (n, 2) in base was seen, ns."""
+        return now - self._seen_at[self.sectors_of(points)]
+
+
+def _sector(bearings: Array) -> Sectors:
+    return ((bearings + math.pi) // SECTOR).astype(np.intp) % SECTORS
