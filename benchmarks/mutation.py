@@ -52,7 +52,10 @@ from benchmarks.mutation_parts.runner import (
 TARGETS = {
     **{
         f"monstertruckd/gate/{name}.py": ("tests/unit/gate",)
-        for name in ("arbitration", "config", "core", "latch", "limiter", "rpc", "sensors", "service", "stops")
+        for name in (
+            *("approach", "arbitration", "checks", "config", "core", "following", "latch", "limiter", "motion"),
+            *("obstacles", "peers", "samples", "scan_memory", "sensors", "service", "sonars", "stops", "visibility"),
+        )
     },
     **{
         f"drivers/monstertruck_drivers/{device}/{name}.py": (f"tests/unit/drivers/{device}",)
