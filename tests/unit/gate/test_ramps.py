@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from monstertruck_kinematics.profiles import CubicRamp
+from monstertruckd.gate.config import InForce
 from monstertruckd.gate.motion import Motion
 from monstertruckd.tools.simulation.config import load_robot
 
@@ -14,7 +15,7 @@ UP, DOWN, FLAT = CubicRamp(0.0, 0.2, 0.5), CubicRamp(0.2, 0.0, 0.5), CubicRamp(0
 
 def clipped(config, chassis, *moves):
     """Whether any tick's twist is another one than the ramps'; ``moves``: ramp of speed, ramp of yaw rate, its sign."""
-    motion = Motion(config, chassis)
+    motion = Motion(InForce(config), chassis)
     for speed, yaw, sign in moves:
         for tick in range(1, round(0.5 * config.rate) + 1):
             wanted = speed.speed(tick / config.rate), 0.0, sign * yaw.speed(tick / config.rate)
