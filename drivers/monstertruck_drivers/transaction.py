@@ -4,7 +4,8 @@ A handshake byte by byte costs a coroutine a wake-up of its task per byte; here 
 """
 
 import asyncio
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
+from contextlib import contextmanager
 from types import TracebackType
 from typing import Final, Generic, NamedTuple, TypeVar
 
@@ -63,7 +64,8 @@ class Transaction(Generic[T]):
         self._error: BaseException | None = None
         self._waiters: list[asyncio.Future[None]] = []
         self._loop = asyncio.get_running_loop()
-        self._advance(None)
+        with self._ending_by_any_error():
+            self._advance(None)
 
     async def result(self) -> T:
         """Wait for the end; a cancelled wait does not end the transaction.
@@ -87,32 +89,47 @@ class Transaction(Generic[T]):
         """Break it off."""
         if not self.ended:
             self._link.end_wait()
-            self._steps.close()
-            self._finish(None, asyncio.CancelledError())
+            try:
+                self._steps.close()
+            finally:
+                self._finish(None, asyncio.CancelledError())
 
     def on_bytes(self) -> None:
         """See ``link.LinkWaiter``."""
-        if not self._size:
-            if not self._link.is_lost:
-                return
-            data: bytes | None = b""
-        else:
-            try:
-                data = self._link.take(self._size)
-            except DeviceLostError as error:
-                self._throw(error)
-                return
-        if data is not None:
-            self._link.end_wait()
-            self._advance(data)
+        with self._ending_by_any_error():
+            if not self._size:
+                if not self._link.is_lost:
+                    return
+                data: bytes | None = b""
+            else:
+                try:
+                    data = self._link.take(self._size)
+                except DeviceLostError as error:
+                    self._throw(error)
+                    return
+            if data is not None:
+                self._link.end_wait()
+                self._advance(data)
 
     def on_timeout(self) -> None:
         """See ``link.LinkWaiter``."""
-        if self._size:
-            self._throw(TimeoutError())
-        else:
-            self._link.end_wait()
-            self._advance(b"")
+        with self._ending_by_any_error():
+            if self._size:
+                self._throw(TimeoutError())
+            else:
+                self._link.end_wait()
+                self._advance(b"")
+
+    @contextmanager
+    def _ending_by_any_error(self) -> Iterator[None]:
+        """End with an error outside ``Exception``, which a signal may raise anywhere: whoever waits must not hang."""
+        try:
+            yield
+        except BaseException as error:
+            if not self.ended:
+                self._link.end_wait()
+                self._finish(None, error)
+            raise
 
     def _throw(self, error: Exception) -> None:
         self._link.end_wait()

@@ -15,6 +15,7 @@ import heapq
 import itertools
 import selectors
 import signal
+import sys
 import threading
 import time
 from abc import ABC, abstractmethod
@@ -37,6 +38,14 @@ _FIRST_DATE: Final = 946_684_800 * SECOND
 
 MANY_TIMERS: Final = 100
 """Number of timers from which on cancelled ones are removed."""
+
+GUARD: Final = 300.0
+"""Seconds of processor time, or of waiting for another thread, that one virtual second may take: kernels that are
+compiled take a minute or two."""
+GUARDED_TURNS: Final = 1024
+"""Iterations of a virtual loop between two looks at the processor time."""
+ENDING: Final = 600.0
+"""Virtual seconds that all tasks may take to end once a run is over."""
 
 
 def is_date(real: int) -> bool:
@@ -103,17 +112,23 @@ class WallClock(Clock):
         return real - (before + time.monotonic_ns()) // 2
 
 
+class HungError(RuntimeError):
+    """Virtual time does not advance, or tasks do not end; their stacks were written to standard error."""
+
+
 class VirtualLoop(asyncio.SelectorEventLoop):
     """Event loop whose time jumps to the next timer when nothing is ready.
 
-    Timers of one instant fire in the order in which they were set, so that nothing but the seed decides a run.
+    Timers of one instant fire in the order in which they were set, so that nothing but the seed decides a run. An
+    exception outside ``Exception`` in a callback, such as a test's time-out, ends the run.
 
     Args:
         start: first instant, ns.
         rate: greatest speed relative to real time; ``None`` runs as fast as it can.
+        guard: see ``GUARD``.
     """
 
-    def __init__(self, start: int = 0, rate: float | None = None) -> None:
+    def __init__(self, start: int = 0, rate: float | None = None, guard: float = GUARD) -> None:
         self.instant = start
         """Virtual nanoseconds."""
         self.woken = False
@@ -125,6 +140,12 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         """A heap."""
         self._timers_set = 0
         self._most_timers = MANY_TIMERS
+        self._guard = guard
+        self._turns = 0
+        self._guarded_second = -1
+        self._used = 0.0
+        """Processor time at which the guarded second began, s."""
+        self._end_by: int | None = None
         super().__init__(_VirtualSelector(self))
 
     def time(self) -> float:
@@ -153,6 +174,50 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         self.woken = True
         return handle
 
+    def call_exception_handler(self, context: dict[str, Any]) -> None:
+        """As in asyncio, but an exception outside ``Exception`` is raised by what runs the loop."""
+        error = context.get("exception")
+        if error is not None and not isinstance(error, Exception | asyncio.CancelledError):
+            raise error
+        super().call_exception_handler(context)
+
+    def end_soon(self) -> None:
+        """The run is over: its tasks have ``ENDING`` to end."""
+        self._end_by = self.instant + round(ENDING * SECOND)
+
+    def watch(self) -> None:
+        """Check that virtual time advances; called in every iteration.
+
+        Raises:
+            HungError: it does not.
+        """
+        self._turns += 1
+        if self._turns % GUARDED_TURNS:
+            return
+        second, used = self.instant // SECOND, time.process_time()
+        if second != self._guarded_second:
+            self._guarded_second, self._used = second, used
+        elif used - self._used > self._guard:
+            raise self._hung(f"virtual second {second} has taken {used - self._used:.0f} s of processor time")
+
+    def wait(self, select: Callable[[float], T]) -> T:
+        """Wait for another thread or a file: nothing is ready, and no timer is set.
+
+        Raises:
+            HungError: nothing comes.
+        """
+        for _ in range(max(1, round(self._guard))):
+            if events := select(min(1.0, self._guard)):
+                return events
+        raise self._hung(f"all tasks have waited for {self._guard:.0f} s without a timer")
+
+    def _hung(self, what: str) -> HungError:
+        """Write the stacks of all tasks to standard error."""
+        tasks = sorted(asyncio.all_tasks(self), key=lambda task: task.get_name())
+        for task in tasks:
+            task.print_stack(file=sys.stderr)
+        return HungError(f"{what}; {len(tasks)} tasks, see their stacks")
+
     def next_timer(self) -> float | None:
         """Seconds until the next timer that is not cancelled; None without one."""
         while self._timers and self._timers[0].handle.cancelled():
@@ -165,6 +230,9 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         One nanosecond is added because the loop compares timers in float seconds.
         """
         self.instant += round(seconds * SECOND) + 1
+        if self._end_by is not None and self.instant > self._end_by:
+            self._end_by = None
+            raise self._hung(f"tasks have not ended within {ENDING:.0f} virtual seconds")
         if self._rate is not None:
             due = self._real_start + int((self.instant - self._start) / self._rate)
             time.sleep(max(0, due - time.monotonic_ns()) / SECOND)
@@ -220,9 +288,13 @@ class _VirtualSelector(selectors.DefaultSelector):
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
         """Events of files; without any, an idle loop's time jumps."""
         loop = self._loop
+        loop.watch()
         idle, wait = timeout is None, loop.next_timer()
         events: list[tuple[selectors.SelectorKey, int]] = []
-        if loop.woken or self._files > 1 or (idle and wait is None):
+        if idle and wait is None:
+            loop.woken = False
+            events = loop.wait(super().select)
+        elif loop.woken or self._files > 1:
             loop.woken = False
             events = super().select(timeout if wait is None else 0)
         if wait is None:
@@ -264,7 +336,11 @@ class ReplayClock(VirtualClock):
 
 
 def run_virtual(
-    main: Callable[[VirtualClock], Coroutine[Any, Any, T]], *, start: int = SECOND, rate: float | None = None
+    main: Callable[[VirtualClock], Coroutine[Any, Any, T]],
+    *,
+    start: int = SECOND,
+    rate: float | None = None,
+    guard: float = GUARD,
 ) -> T:
     """Run ``main(clock)`` to its end on a virtual loop of its own.
 
@@ -272,21 +348,27 @@ def run_virtual(
         main: coroutine function that gets the clock.
         start: first instant, ns.
         rate: greatest speed relative to real time; ``None`` = unlimited.
+        guard: see ``GUARD``.
+
+    Raises:
+        HungError: virtual time does not advance, or tasks do not end.
     """
-    with asyncio.Runner(loop_factory=lambda: VirtualLoop(start, rate)) as runner:
-        loop = runner.get_loop()
-        assert isinstance(loop, VirtualLoop)
-        return runner.run(main(VirtualClock(loop)))
+    return _run(VirtualLoop(start, rate, guard), lambda loop: main(VirtualClock(loop)))
 
 
 def run_replay(
     main: Callable[[ReplayClock], Coroutine[Any, Any, T]], *, start: int, real_offset: int, rate: float | None
 ) -> T:
     """Run ``main(clock)`` on a loop that starts at ``start`` and is paced to ``rate`` times real time."""
-    with asyncio.Runner(loop_factory=lambda: VirtualLoop(start, rate)) as runner:
-        loop = runner.get_loop()
-        assert isinstance(loop, VirtualLoop)
-        return runner.run(main(ReplayClock(loop, real_offset)))
+    return _run(VirtualLoop(start, rate), lambda loop: main(ReplayClock(loop, real_offset)))
+
+
+def _run(loop: VirtualLoop, main: Callable[[VirtualLoop], Coroutine[Any, Any, T]]) -> T:
+    with asyncio.Runner(loop_factory=lambda: loop) as runner:
+        try:
+            return runner.run(main(loop))
+        finally:
+            loop.end_soon()
 
 
 def run_wall(main: Callable[[WallClock], Coroutine[Any, Any, T]]) -> T:

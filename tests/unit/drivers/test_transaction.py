@@ -139,3 +139,72 @@ def test_two_readers_are_refused():
         transaction.cancel()
 
     on_link(scenario)
+
+
+class TimeOutOfTestError(BaseException):
+    """What a test's alarm raises, wherever the program is."""
+
+
+@pytest.mark.parametrize("come", [b"x", None], ids=["by bytes", "by time"])
+def test_an_error_outside_exception_ends_it_too(come):
+    def steps():
+        try:
+            yield WaitFor(1, 0.5)
+        finally:
+            raise TimeOutOfTestError
+
+    transactions = []
+
+    async def scenario(link, _, clock):
+        transaction = Transaction(link, steps())
+        transactions.append(transaction)
+        waiting = asyncio.create_task(transaction.end())
+        await asyncio.sleep(0)
+        if come is not None:
+            with pytest.raises(TimeOutOfTestError):
+                link.feed(come)
+            await waiting
+            link.feed(b"y")
+            assert await link.exactly(1, 0.1) == b"y", "the link is free"
+            with pytest.raises(TimeOutOfTestError):
+                await transaction.result()
+        await clock.sleep(1.0)
+
+    if come is not None:
+        on_link(scenario)
+    else:
+        with pytest.raises(TimeOutOfTestError):
+            on_link(scenario)
+    assert transactions[0].ended
+
+
+def test_an_alarm_between_bytes_and_steps_ends_it(monkeypatch):
+    async def scenario(link, _, __):
+        transaction = Transaction(link, greet(link))
+
+        def alarm(_):
+            raise TimeOutOfTestError
+
+        monkeypatch.setattr(link, "take", alarm)
+        with pytest.raises(TimeOutOfTestError):
+            link.feed(b"ann")
+        assert transaction.ended
+
+    on_link(scenario)
+
+
+def test_it_ends_though_its_steps_cannot_be_closed():
+    def steps():
+        while True:
+            try:
+                yield WaitFor(1, 1.0)
+            except GeneratorExit:
+                yield WaitFor(1, 1.0)
+
+    async def scenario(link, _, __):
+        transaction = Transaction(link, steps())
+        with pytest.raises(RuntimeError, match="ignored GeneratorExit"):
+            transaction.cancel()
+        await transaction.end()
+
+    on_link(scenario)

@@ -7,7 +7,17 @@ import weakref
 
 import pytest
 
-from monstertruck_runtime.clock import SECOND, ReplayClock, VirtualClock, WallClock, run_replay, run_virtual, run_wall
+from monstertruck_runtime import clock as clocks
+from monstertruck_runtime.clock import (
+    SECOND,
+    HungError,
+    ReplayClock,
+    VirtualClock,
+    WallClock,
+    run_replay,
+    run_virtual,
+    run_wall,
+)
 
 
 def test_an_hour_of_sleep_takes_no_time_and_wakes_on_time():
@@ -163,3 +173,83 @@ def test_a_second_interrupt_does_not_disturb_the_end_of_the_first_and_a_third_br
         run_wall(main)
     assert bool(ends) is ended
     assert signal.getsignal(signal.SIGINT) is before
+
+
+# A hang is a failure, with a dump
+
+
+class TimeOutOfTestError(BaseException):
+    """What a test's alarm raises, wherever the program is."""
+
+
+def alarm() -> None:
+    raise TimeOutOfTestError
+
+
+def test_a_time_out_inside_a_callback_ends_the_run():
+    """asyncio reports it to the exception handler and goes on: one run went on for 52 000 virtual seconds."""
+    ticks = 0
+
+    async def main(clock: VirtualClock) -> None:
+        nonlocal ticks
+        asyncio.get_running_loop().call_later(1.0, alarm)
+        while True:
+            await clock.sleep(0.5)
+            ticks += 1
+
+    with pytest.raises(TimeOutOfTestError):
+        run_virtual(main)
+    assert ticks <= 2
+
+
+def test_time_that_stands_is_a_failure_that_names_the_task(capsys: pytest.CaptureFixture[str]):
+    async def spin() -> None:
+        while True:
+            await asyncio.sleep(0)
+
+    async def main(clock: VirtualClock) -> None:
+        spinning = asyncio.create_task(spin(), name="spinning")
+        await clock.sleep(1.0)
+        await spinning
+
+    with pytest.raises(HungError, match=r"has taken .* of processor time; 2 tasks"):
+        run_virtual(main, guard=0.3)
+    assert "await asyncio.sleep(0)" in capsys.readouterr().err
+
+
+def test_waiting_for_a_thread_that_never_answers_is_a_failure(capsys: pytest.CaptureFixture[str]):
+    async def main(_: VirtualClock) -> None:
+        await asyncio.get_running_loop().create_future()
+
+    with pytest.raises(HungError, match=r"waited for .* without a timer"):
+        run_virtual(main, guard=0.2)
+    assert "create_future" in capsys.readouterr().err
+
+
+def test_tasks_that_do_not_end_are_a_failure(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    monkeypatch.setattr(clocks, "ENDING", 10.0)
+    seen = []
+
+    async def stubborn(clock: VirtualClock) -> None:
+        while True:
+            try:
+                await clock.sleep(0.5)
+            except asyncio.CancelledError:
+                seen.append(clock.now())
+
+    async def main(clock: VirtualClock) -> None:
+        seen.append(asyncio.create_task(stubborn(clock)))
+        await clock.sleep(1.0)
+
+    with pytest.raises(HungError, match="not ended within 10 virtual seconds"):
+        run_virtual(main)
+    assert "stubborn" in capsys.readouterr().err
+    seen.clear()
+
+
+def test_a_long_run_of_many_virtual_seconds_is_no_hang():
+    async def main(clock: VirtualClock) -> None:
+        for _ in range(20_000):
+            await clock.sleep(0.3)
+
+    run_virtual(main, guard=0.2)
