@@ -17,6 +17,7 @@ import tracemalloc
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import perf_counter, thread_time
+from typing import Any
 
 import numpy as np
 
@@ -101,7 +102,7 @@ def fill(box: BlackBox, clock: Played, messages: Traffic, first: int) -> tuple[i
     return count, spent
 
 
-async def waits(during: "asyncio.Future[None] | None", seconds: float) -> float:
+async def waits(during: "asyncio.Future[Any] | None", seconds: float) -> float:
     """99th percentile of a millisecond timer's lateness, ms."""
     late = []
     end = perf_counter() + seconds

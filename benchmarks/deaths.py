@@ -81,9 +81,9 @@ class Way:
 
 
 WAYS = {
-    "killed, deadman line": Way(kill, DEADMAN_LINE, 0.75),
+    "killed, deadman line": Way(kill, dict(DEADMAN_LINE), 0.75),
     "killed, no line, stop script": Way(kill_and_stop, {}, 2.0),
-    "frozen, deadman line": Way(freeze, DEADMAN_LINE, 0.75),
+    "frozen, deadman line": Way(freeze, dict(DEADMAN_LINE), 0.75),
     "frozen 1.5 s, no line, then continued": Way(freeze_and_continue, {}, 1.0),
     "asked to end": Way(terminate, {}, 0.6),
 }

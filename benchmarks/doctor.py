@@ -81,7 +81,7 @@ def driven(seed: int, wrong: str | None) -> list[Finding]:
             rig = VirtualRig(config, clock)
             async with rig.running():
                 await clock.sleep(START_UP)
-                mover = Mover(LocalTruck(rig.daemon, clock, "doctor"), clock, config.chassis())
+                mover = Mover(LocalTruck(rig.daemon, clock, "doctor"), clock, config.chassis())  # type: ignore[arg-type]
                 return await signs(
                     lambda step: mover.move(step, lambda _: None), config, lambda *words: " ".join(words)
                 )

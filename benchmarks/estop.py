@@ -43,6 +43,7 @@ import numpy as np
 from benchmarks.estop_parts.processes import (
     ORDER_TIMEOUT,
     OtherLoad,
+    on_stderr,
     order,
     process,
     processor_seconds,
@@ -107,7 +108,7 @@ class TappedPort(PtyPort):
 def serve(config: Path) -> None:
     """``monstertruckd simulate`` with a tap on the drive's wire."""
     simulate.PtyPort = TappedPort  # type: ignore[attr-defined, misc]
-    run_wall(lambda clock: simulate.serve(clock, (load_simulated(config),), None))
+    run_wall(lambda clock: simulate.serve(clock, (load_simulated(config),), on_stderr))
 
 
 # Flooder

@@ -60,7 +60,7 @@ CLEAR = 0.34
 """Metres from walls at which the truck may stand anyhow."""
 SIGMA, SIGMA_YAW, SLOW = 0.015, math.radians(0.4), 20.0
 """Of the pose's error, and its time constant, s."""
-LENS = {"k1": -0.12, "k2": 0.02}
+LENS: dict[str, Any] = {"k1": -0.12, "k2": 0.02}
 Pose = tuple[float, float, float]
 
 
@@ -131,7 +131,7 @@ def tags_on_walls(name: str, rng: np.random.Generator) -> tuple[TagConfig, ...]:
     return tuple(found)
 
 
-def world_of(name: str, engine: str, tags: tuple[TagConfig, ...], seed: int) -> World:
+def world_of(name: str, engine: Any, tags: tuple[TagConfig, ...], seed: int) -> World:
     """With the tags, and a camera of a lens with distortion and noise."""
     camera = CameraConfig(noise=3.0, rendered=engine == "mujoco", **LENS)
     return World(WorldConfig(map=name, engine=engine, tags=tags, camera=camera), seed)

@@ -58,7 +58,7 @@ Mix = list[tuple[Topic, bytes]]
 def mix() -> Mix:
     """A second's messages in the order of their times, encoded."""
     rng = np.random.default_rng(1)
-    header = {"stamp": SECOND, "received": SECOND, "seq": 1}
+    header: dict[str, Any] = {"stamp": SECOND, "received": SECOND, "seq": 1}
     pose = Odometry(
         **header,
         frame="map",

@@ -92,7 +92,8 @@ def wall_distances(
 ) -> Array:
     """Distance of every occupied cell of a grid (rows, columns) from the nearest true wall, m."""
     rows, columns = np.nonzero(cells >= 65)
-    return truth.lookup((np.column_stack((columns, rows)) + 0.5) * resolution + origin)
+    middle: Array = (np.column_stack((columns, rows)) + 0.5) * resolution + origin
+    return truth.lookup(middle)
 
 
 def map_error(
@@ -105,7 +106,7 @@ def map_error(
     """
     off = wall_distances(cells, origin, resolution, truth)
     rows, columns = np.nonzero((cells >= 0) & (cells < 50))
-    middle = (np.column_stack((columns, rows)) + 0.5) * resolution + origin
+    middle: Array = (np.column_stack((columns, rows)) + 0.5) * resolution + origin
     through = truth.lookup(middle) < 0.25 * resolution
     return {
         "wall_mean_m": float(off.mean()) if len(off) else math.inf,
@@ -120,7 +121,7 @@ def wall_iou(
 ) -> float:
     """Share in common of the walls of grid and world, both widened by ``within`` m, where the grid knows."""
     rows, columns = np.indices(cells.shape)
-    middle = (np.column_stack((columns.ravel(), rows.ravel())) + 0.5) * resolution + origin
+    middle: Array = (np.column_stack((columns.ravel(), rows.ravel())) + 0.5) * resolution + origin
     true = truth.lookup(middle).reshape(cells.shape) <= within
     mine = distance_transform_edt(cells < 65) * resolution <= within
     known = cells >= 0

@@ -101,7 +101,7 @@ class Wire:
 
     def reported(self, control: Control) -> float | None:
         """Instant of the first such control word, s."""
-        words = (at for at, index, value in written(self, 0) if (index, value) == (od.CONTROLWORD.index, control))
+        words = (at for at, index, value in written(self) if (index, value) == (od.CONTROLWORD.index, control))
         return next((at / SECOND for at in words), None)
 
     def stood(self) -> float | None:

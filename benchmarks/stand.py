@@ -29,6 +29,7 @@ import numpy as np
 from monstertruck_estimation.vision.blobs import Blob
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND, WallClock
+from monstertruck_schemas.board import Colour
 from monstertruckd.tools.stand.camera import PlacedCamera
 from monstertruckd.tools.stand.config import BlobRobot, FileSource
 from monstertruckd.tools.stand.poses import RobotPose
@@ -60,7 +61,7 @@ GOALS = {
 CROSSING = 10.0
 """Seconds that five robots cross, 25 pictures each."""
 HALF = PictureQuality(light=0.5)
-LOOK = "red", "blue"
+LOOK: tuple[Colour, Colour] = "red", "blue"
 """Of every robot with discs."""
 APART = 0.1
 PERIOD = 20.0
@@ -209,7 +210,7 @@ def crossing(stand: Any, kind: str, seconds: float, rng: np.random.Generator) ->
             for name in renderers
         }
         again: list[RobotPose] = []
-        colours = LOOK if colour else ()
+        colours: tuple[Colour, ...] = LOOK if colour else ()
         run = StandRun(
             tracker(stand, kind, starts), streams, 25.0, WallClock(), again.append, print, live=False, colours=colours
         )

@@ -91,7 +91,8 @@ class Interrupted:
     async def measure(self, wizard: DriveWizard) -> Result:
         """Run the wizard to its end, or to what ends it."""
         panel = SimulatedOperator(self.rig, np.random.default_rng(1))
-        result, _ = await calibrate(wizard, self.truck, panel, self.clock, self.rig.config, {})
+        truck: Any = self.truck
+        result, _ = await calibrate(wizard, truck, panel, self.clock, self.rig.config, {})
         return result
 
     def files(self) -> dict[Path, bytes]:

@@ -84,7 +84,7 @@ def closing_error(config: SimulatedTruckConfig) -> float:
         async with rig.running():
             await clock.sleep(START_UP)
             operator = LocalTruck(rig.daemon, clock)
-            mover = Mover(operator, clock, config.chassis())
+            mover = Mover(operator, clock, config.chassis())  # type: ignore[arg-type]
             corner = math.pi / 2 / config.chassis().bicycle.curvature(ANGLE, -ANGLE)
             side = MoveStep("side", SPEED, metres=PATH / 4 - corner, also=(topics.ODOMETRY,))
             arc = MoveStep("corner", SPEED, ANGLE, -ANGLE, 2.0 * corner, done=turned, also=(topics.ODOMETRY,))

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from playwright.async_api import Page
 
-from benchmarks.estop_parts.processes import ORDER_TIMEOUT, order, process
+from benchmarks.estop_parts.processes import ORDER_TIMEOUT, on_stderr, order, process
 from monstertruck_drivers.cable import PtyPort
 from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos.protocol import FrameError, Opcode, decode_body, join
@@ -101,7 +101,7 @@ class WirePort(PtyPort):
 def serve(config: Path) -> None:
     """``monstertruckd simulate`` with taps on both wires."""
     simulate.PtyPort = WirePort  # type: ignore[attr-defined, misc]
-    run_wall(lambda clock: simulate.serve(clock, (load_simulated(config),), None))
+    run_wall(lambda clock: simulate.serve(clock, (load_simulated(config),), on_stderr))
 
 
 class Wires:

@@ -18,6 +18,11 @@ ORDER_TIMEOUT = 40.0
 """Seconds for which an order that is refused is given again."""
 
 
+def on_stderr(line: str) -> None:
+    """Print a line of the simulator where nothing that a benchmark reads is printed."""
+    print(line, file=sys.stderr, flush=True)
+
+
 @asynccontextmanager
 async def process(core: int | None, output: Path, *arguments: str) -> AsyncIterator[asyncio.subprocess.Process]:
     """A Python process while the context lasts; on one core, if one is named."""

@@ -79,7 +79,7 @@ class Arena:
         """Sensor (2,), returns (n, 2) and ends of beams that met nothing (k, 2), all in map, with the maker's noise."""
         c, s = np.cos(pose[2]), np.sin(pose[2])
         sensor = np.array((pose[0] + c * MOUNT[0], pose[1] + s * MOUNT[0]))
-        angles = pose[2] + FIRST + STEP * np.arange(BEAMS)
+        angles: Array = pose[2] + FIRST + STEP * np.arange(BEAMS)
         xs, ys = (np.full(BEAMS, v) for v in sensor)
         none = np.empty((0, 3)), np.empty((0, 4))
         ranges = cast_rays(self.clear, self.resolution, *self.origin, xs, ys, angles, reach, *none)

@@ -7,6 +7,7 @@ the true one. The decisions are those of the exploration service: asked for ever
 import math
 import time
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -75,7 +76,7 @@ class Rover:
     """
 
     def __init__(
-        self, arena: Arena, config: ExplorerConfig, seed: int, start: Pose | None = None, steering: str = "4ws"
+        self, arena: Arena, config: ExplorerConfig, seed: int, start: Pose | None = None, steering: Any = "4ws"
     ) -> None:
         self.arena, self.config = arena, config
         self.pose: Pose = arena.start(seed) if start is None else start

@@ -62,7 +62,7 @@ def run(options: Options) -> Part:
     twice, once = (2, 2) if options.quick else (RUNS, FURTHER)
     for number in range(twice + once):
         rng = np.random.default_rng([2, number])
-        goal = random_goal(truth, np.array(world.origin), world.size, rng)
+        goal = random_goal(truth, np.array(world.origin), np.array(world.size), rng)
         surprise = number < twice and number % 2 == 1
         row = drive(goal, number, surprise=surprise)
         row["equal"] = number >= twice or row["digest"] == drive(goal, number, surprise=surprise)["digest"]

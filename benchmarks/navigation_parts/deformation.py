@@ -8,6 +8,7 @@ author's for teb) if it arrives where that fails, or both arrive and it is not s
 import json
 import math
 import time
+from typing import Any
 
 import numpy as np
 
@@ -29,8 +30,14 @@ from navigation_parts.deformation_world import (
     World,
 )
 
-STRATEGIES = ("start_to_end", "start_to_next", "point_to_point", "skip_failures", "start_to_receding_end")
-CARS = ("2ws", "4ws")
+STRATEGIES: tuple[Any, ...] = (
+    "start_to_end",
+    "start_to_next",
+    "point_to_point",
+    "skip_failures",
+    "start_to_receding_end",
+)
+CARS: tuple[Any, ...] = ("2ws", "4ws")
 LIMIT, TIMEOUT = 90.0, 12.0
 ANGLE = 0.4
 """Greatest axle angle of a plan, rad."""
@@ -65,7 +72,7 @@ def run(options: Options) -> Part:
     return part
 
 
-def drive(scenario: Scenario, car: str, config: LocalPlannerConfig, limit: float = LIMIT) -> dict:
+def drive(scenario: Scenario, car: Any, config: LocalPlannerConfig, limit: float = LIMIT) -> dict:
     """One run in closed loop."""
     vehicle = Vehicle.truck(car)
     route, world, window = scenario.route(vehicle), World(scenario), Window()

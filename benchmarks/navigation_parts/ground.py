@@ -10,6 +10,7 @@ import numpy as np
 
 from monstertruck_planners.goals.config import PlannerConfig
 from monstertruck_planners.route.api import RouteMap, Vehicle, warm_up
+from monstertruck_planners.route.config import HybridConfig
 from monstertruck_planners.route.hybrid import HybridPlanner
 from navigation_parts import Options, Part
 
@@ -29,6 +30,7 @@ WAY = round(1.2 / CELL)
 def run(_options: Options) -> Part:
     part = Part()
     config = PlannerConfig()
+    assert isinstance(config.route, HybridConfig)
     planner = HybridPlanner(Vehicle.truck(config.steering, angle=config.angle), config.route)
     warm_up(planner)
     driven, longest, missed = 0, 0.0, 0

@@ -88,6 +88,7 @@ def random_pose(where: Place, rng: np.random.Generator) -> Pose:
 def drive(where: Place, answer: PlanAnswer, pose: Pose) -> tuple[Pose, bool, float]:
     """Follow a route; returns the last pose, whether it collided, and the seconds it took."""
     assert answer.poses is not None
+    assert answer.directions is not None
     path = DrivePath(
         stamp=0, received=0, seq=0, frame="map", poses=answer.poses.ravel(), directions=answer.directions,
         steering=answer.steering, clearance=np.zeros(0) if answer.clearance is None else answer.clearance,

@@ -5,6 +5,8 @@ configured, with 0, 50 and 150 ms of dead time configured, and with what is righ
 the same axles, which is given no delay either.
 """
 
+from typing import Any
+
 import numpy as np
 
 from navigation_parts import Options, Part
@@ -12,7 +14,7 @@ from navigation_parts.tracking import RESPONSES, built_in, drive, from_data
 
 KINDS = ("stanley", "lqr", "mpc")
 SPEEDS = (0.5, 1.0, 1.5)
-CONFIGURED = {
+CONFIGURED: dict[str, dict[str, Any]] = {
     "nothing": {"dead_time": None, "lag": None},
     "none": {"dead_time": 0.0, "lag": 0.0},
     "50_ms": {"dead_time": 0.05, "lag": 0.0},

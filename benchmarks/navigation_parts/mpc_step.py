@@ -15,6 +15,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.track.config import MpcConfig
@@ -90,7 +91,7 @@ class CasadiMpc(PathTracker[MpcConfig]):
         self._periods = min(max(math.ceil(config.preview * config.rate), 2), MOST_PERIODS)
         self._per = max(math.ceil(self.period / FINE - 1e-9), 1)
         self._h = self.period / self._per
-        self._middles = (np.arange(self._periods * self._per) + 0.5) * self._h
+        self._middles: NDArray[np.float64] = (np.arange(self._periods * self._per) + 0.5) * self._h
         self._gains = GainTable(config, geometry, 1)
         self._plan = np.zeros(self._periods)
         self._multipliers = np.zeros(self._periods), np.zeros(self._periods)

@@ -13,6 +13,7 @@ import numpy as np
 from monstertruck_planners.collision import DiscFootprint
 from monstertruck_planners.goals.config import PlannerConfig
 from monstertruck_planners.route.api import RouteMap, Vehicle, warm_up
+from monstertruck_planners.route.config import HybridConfig
 from monstertruck_planners.route.hybrid import HybridPlanner
 from monstertruck_planners.route.lattice import LatticePlanner
 from monstertruck_schemas.reasons import Reason
@@ -70,6 +71,7 @@ def run(options: Options) -> Part:
 def turn_round(part: Part) -> None:
     """Cusps of the daemon's own planner in corridors 0.80 m wide."""
     config = PlannerConfig()
+    assert isinstance(config.route, HybridConfig)
     planner = HybridPlanner(Vehicle.truck(config.steering, angle=config.angle), config.route)
     cells = np.zeros((34, 260), np.int8)
     cells[[0, -1]] = 100

@@ -193,7 +193,8 @@ def route(points: np.ndarray, version: str, steering: str = "") -> Path:
     else:
         directions = [1.0 if version == "forward" else -1.0] * len(points)
     poses = np.column_stack((points, np.zeros(len(points))))
-    return Path(stamp=0, received=0, seq=0, frame="odom", poses=poses.ravel(), directions=directions, name=version)
+    ways = np.array(directions)
+    return Path(stamp=0, received=0, seq=0, frame="odom", poses=poses.ravel(), directions=ways, name=version)
 
 
 def drive(

@@ -26,7 +26,7 @@ def main(config: Path, lines: Path) -> None:
         async def serve(clock: Clock) -> None:
             simulate.PtyPort = lambda path: tapped(path, clock, out)  # type: ignore[attr-defined]
             simulate.TruthLog = lambda world, _: Speeds(world, clock, out)
-            await simulate.serve(clock, (load_simulated(config),), lines.with_suffix(".npz"))
+            await simulate.serve(clock, (load_simulated(config),), print, lines.with_suffix(".npz"))
 
         run_wall(serve)
 

@@ -73,6 +73,7 @@ def played(folder: Path) -> tuple[list[LaserScan], np.ndarray, np.ndarray, float
     """Scans as the daemon saw them; stamps (n,) and poses (n, 3) that it reported; seconds of real time per second."""
     config, _ = load_config(CONFIG, SimulatedTruckConfig)
     config = config.model_copy(update={"recorder": None, "slam": SlamConfig(save=folder)})
+    assert config.sim.recording is not None
     recording = RecordedRanges.load(config.sim.recording)
     seconds = recording.times[-1] / SECOND
 
@@ -248,6 +249,7 @@ def run(picture: Path | None = None) -> tuple[dict[str, float], dict[str, float]
         means = [other[key].mean() for other in luck]
         figures[f"exp2_{key}_dithered"], figures[f"exp2_{key}_dithered_std"] = np.mean(means), np.std(means)
     recording = load_config(CONFIG, SimulatedTruckConfig)[0].sim.recording
+    assert recording is not None
     for name, track in tracks.items():
         turn, way, scale = against_wheels(recording, interpolate(*track, at))
         figures |= {f"exp2_{name}_wheels_turn": turn, f"exp2_{name}_wheels_way": way, f"exp2_{name}_scale": scale}

@@ -89,7 +89,8 @@ def lap(behaviour: str, side: str, seed: int, model: str) -> DaemonLap:
     """
     arena, rng = study(), np.random.default_rng(seed)
     walls = arena.walls if side == "left" else mirrored(arena.walls)[:, [2, 3, 0, 1]]
-    start = (*(float(v) for v in rng.uniform(-0.5, 0.5, 2)), float(rng.uniform(-math.pi, math.pi)))
+    x, y = rng.uniform(-0.5, 0.5, 2).tolist()
+    start = (x, y, float(rng.uniform(-math.pi, math.pi)))
     name = f"{behaviour}_{side}"
     own = {"lap_length": LAP[0], "lap_radius": LAP[1], **({"beam": model == "beam"} if behaviour == "line" else {})}
     with TemporaryDirectory() as folder:

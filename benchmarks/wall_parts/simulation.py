@@ -264,7 +264,7 @@ def _inputs(
 ) -> Inputs:
     v, w = body.driven
     x, y, yaw = body.believed
-    head = {"stamp": now, "received": now, "seq": 0}
+    head: dict[str, Any] = {"stamp": now, "received": now, "seq": 0}
     odometry = Odometry(
         **head, frame="odom", pose=Pose2D(x=x, y=y, yaw=yaw), twist=Twist2D(vx=v, vy=0.0, wz=w),
         pose_covariance=COVARIANCE, twist_covariance=COVARIANCE, age=0.0,

@@ -7,11 +7,11 @@ operator's orders. A hundred times a second each rule says what is unsafe in an 
 import math
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Final
+from typing import Final, Protocol
 
 import numpy as np
 
@@ -109,7 +109,15 @@ class WireTap:
             self.heard = now
 
 
-def written(tap: WireTap, since: int = 0) -> list[tuple[int, int, int]]:
+class Received(Protocol):
+    """Bytes that reached a device."""
+
+    @property
+    def to_device(self) -> Sequence[tuple[int, bytes]]:
+        """(ns, bytes)."""
+
+
+def written(tap: Received, since: int = 0) -> list[tuple[int, int, int]]:
     """Objects the host wrote to an EPOS: (ns, index, raw value); whatever is not a whole frame is skipped."""
     return _writes(item for item in tap.to_device if item[0] >= since)
 
