@@ -108,6 +108,8 @@ class Daemon:
         self._seed = seed
         self._offload: Offload = in_thread if seed is None else inline
         self._rng = np.random.default_rng(seed)
+        self._nonce = secrets.token_hex(8) if seed is None else self._rng.bytes(8).hex()
+        """Identity of this run: carried by requests and by saved maps."""
         self._tree = tree
         self._events = self.bus.event_sink()
         self._computer = computer or Computer.at(config.machine, clock)
@@ -205,7 +207,7 @@ class Daemon:
     def _start_estimation(self, estimation: Scope) -> Callable[[], bool] | None:
         """Start estimation; returns the function that saves the map, None if no map is made."""
         save_map: Callable[[], bool] | None = None
-        for service in build_estimation(self.config, self.bus, self.clock, self._body):
+        for service in build_estimation(self.config, self.bus, self.clock, self._body, self._nonce):
             self._start(estimation, service)
             if isinstance(service, SlamService):
                 save_map = service.save_soon
@@ -349,14 +351,13 @@ class Daemon:
     def _build_gate(self, environment: Mapping[str, str]) -> GateService:
         config, bus = self.config, self.bus
         latch = self._build_latch(environment)
-        nonce = secrets.token_hex(8) if self._seed is None else self._rng.bytes(8).hex()
         gate = Gate(
             config.gate,
             chassis=self._body.chassis,
             footprint=self._body.footprint,
             points=self._body.points,
             services=sensor_services(config),
-            nonce=nonce,
+            nonce=self._nonce,
             battery_measured=measures_battery(config),
             latched=latch.engaged(),
             sonars=self._body.sonars,

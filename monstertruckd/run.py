@@ -10,6 +10,7 @@ from pathlib import Path
 from monstertruck_runtime import wire
 from monstertruck_runtime.clock import Clock, run_wall
 from monstertruck_runtime.errors import PortBusyError
+from monstertruck_runtime.map_folders import tidy
 from monstertruck_runtime.memory import settle
 from monstertruck_runtime.small_files import remove_leftovers
 from monstertruck_schemas.reasons import Reason
@@ -40,6 +41,8 @@ def run_daemon(config_file: Path, *, verbose: bool) -> Reason:
         log.warning(text, tree.calibration, ", ".join(tree.unused))
     for file in (file for folder in _written(config) for file in remove_leftovers(folder)):
         log.info("%s: removed; a program was killed while it wrote it", file)
+    if config.slam is not None and config.slam.save is not None:
+        tidy(config.slam.save)
     for table in TABLES:
         for broken in table.broken:
             log.warning("plug-in left out: %s", broken)
@@ -68,9 +71,7 @@ def run_daemon(config_file: Path, *, verbose: bool) -> Reason:
 
 def _written(config: TruckConfig) -> tuple[Path, ...]:
     """Folders of state that a daemon writes."""
-    places = () if config.slam is None else (config.slam.save, config.slam.map)
-    maps = (place if place.is_dir() else place.parent for place in places if place is not None)
-    return (config.state_directory, config.calibration_folder, *maps)
+    return (config.state_directory, config.calibration_folder)
 
 
 def _first(error: BaseException | None) -> BaseException | None:

@@ -3,11 +3,11 @@
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Final, Self
 
 from monstertruck_drivers.catalog import DEVICES
 from monstertruck_estimation.catalog import ODOMETRY
-from monstertruck_estimation.ground.grid import GroundGrid
 from monstertruck_estimation.ground.service import GroundService
 from monstertruck_estimation.odometry import OdometryContext
 from monstertruck_estimation.points.config import PointsConfig
@@ -77,14 +77,14 @@ def sensor_mounts(config: TruckConfig) -> dict[str, Mount]:
     return mounts
 
 
-def build_estimation(config: TruckConfig, bus: Bus, clock: Clock, body: Body) -> Iterator[Service]:
-    """Transforms always; odometry where the robot can drive and steer."""
+def build_estimation(config: TruckConfig, bus: Bus, clock: Clock, body: Body, run: str = "") -> Iterator[Service]:
+    """Transforms always; odometry where the robot can drive and steer. ``run`` names this run in saved maps."""
     mounts = {name: mount(name, (m.x, m.y, m.z), (m.roll, m.pitch, m.yaw)) for name, m in sensor_mounts(config).items()}
     joints = mounts.pop(DeviceRole.STABILISER, None)
     if joints is not None and DeviceRole.LIDAR in mounts:
         lidar = mounts[DeviceRole.LIDAR]
         mounts[DeviceRole.LIDAR] = compose(invert(joints), lidar)
-    slam = _build_slam(config, bus, clock)
+    slam = _build_slam(config, bus, clock, run)
     yield TransformService(
         list(mounts.values()),
         clock,
@@ -104,21 +104,21 @@ def build_estimation(config: TruckConfig, bus: Bus, clock: Clock, body: Body) ->
         body.chassis, clock, bus, compass=compass, slam=config.slam is not None, imu=turned, encoders=encoders
     )
     yield ODOMETRY.implementation(config.odometry)(config.odometry, context)
-    ground = _build_ground(config, bus, clock)
+    ground = _build_ground(config, bus, clock, run)
     if ground is not None:
         yield ground
     if config.points is not None:
-        yield _build_points(config, config.points, bus, clock, None if slam is None else slam.bases_at)
+        ask = None if slam is None else slam.bases_at
+        yield _build_points(config, config.points, bus, clock, ask, run)
 
 
-def _build_ground(config: TruckConfig, bus: Bus, clock: Clock) -> GroundService | None:
+def _build_ground(config: TruckConfig, bus: Bus, clock: Clock, run: str) -> GroundService | None:
     """Where routes are planned by a robot that feels its tilt."""
     devices, slam = config.devices, config.slam
     if config.ground is None or config.planner is None or devices.compass is None:
         return None
     lidar = devices.lidar
     known = slam.map if slam is not None else config.planner.map
-    folder = known.parent if known is not None and known.suffix else known
     geometry = config.geometry
     return GroundService(
         config.ground,
@@ -133,13 +133,19 @@ def _build_ground(config: TruckConfig, bus: Bus, clock: Clock) -> GroundService 
         slip=bus.subscribe(topics.FUSION, latest()),
         out=bus.publisher(topics.GROUND, Writer.ESTIMATION),
         events=bus.event_sink(),
-        grid=GroundGrid() if folder is None else GroundGrid.load(folder),
-        save=slam.save if slam is not None and slam.mode == "mapping" else None,
+        offload=inline if isinstance(clock, VirtualClock) else in_thread,
+        load=_folder(known),
+        save=(slam.save, run) if slam is not None and slam.save is not None and slam.mode == "mapping" else None,
     )
 
 
+def _folder(known: Path | None) -> Path | None:
+    """Folder of a map; the configuration names the folder or the YAML file."""
+    return known if known is None or known.is_dir() else known.parent
+
+
 def _build_points(
-    config: TruckConfig, points: PointsConfig, bus: Bus, clock: Clock, ask: PoseAsker | None
+    config: TruckConfig, points: PointsConfig, bus: Bus, clock: Clock, ask: PoseAsker | None, run: str
 ) -> PointService:
     camera, slam = config.devices.camera, config.slam
     if camera is not None and find_spec("cv2") is None:
@@ -148,7 +154,7 @@ def _build_points(
             "in a checkout: python3 -m monstertruckd.bootstrap sync)"
         )
     known = slam.map if slam is not None else None if config.planner is None else config.planner.map
-    folder = known if known is None or not known.suffix else known.parent
+    folder = _folder(known)
     mapping = slam is not None and slam.mode == "mapping"
     return PointService(
         points,
@@ -168,14 +174,16 @@ def _build_points(
         out=bus.publisher(topics.POINTS, Writer.ESTIMATION),
         events=bus.event_sink(),
         folders=PointFolders(
-            load=None if mapping else folder, save=slam.save if slam is not None and mapping else folder
+            load=None if mapping else folder,
+            save=slam.save if slam is not None and mapping else folder,
+            run=run if mapping else None,
         ),
         offload=inline if isinstance(clock, VirtualClock) else in_thread,
         max_age=config.gate.max_request_age,
     )
 
 
-def _build_slam(config: TruckConfig, bus: Bus, clock: Clock) -> SlamService | None:
+def _build_slam(config: TruckConfig, bus: Bus, clock: Clock, run: str) -> SlamService | None:
     devices = config.devices
     if config.slam is None or devices.lidar is None:
         return None
@@ -184,6 +192,7 @@ def _build_slam(config: TruckConfig, bus: Bus, clock: Clock) -> SlamService | No
         devices.lidar.mount,
         clock,
         body=(config.geometry.length, config.geometry.width) if config.slam.grid.free_footprint else None,
+        run=run,
         scan=bus.subscribe(topics.SCAN, fifo(SCANS)),
         odometry=bus.subscribe(topics.ODOMETRY, fifo(ODOMETRIES)) if config.missing_actuators() is None else None,
         angles=scan_angles(config, bus, fifo(ODOMETRIES)),

@@ -25,6 +25,8 @@ from ruamel.yaml.reader import ReaderError
 
 from monstertruck_runtime.endpoints import emulated_ports
 from monstertruck_runtime.errors import ConfigError
+from monstertruck_runtime.map_folders import SAVES, folder_of
+from monstertruck_runtime.map_folders import YAML as MAP_YAML
 from monstertruck_runtime.plugins import models_in
 from monstertruck_runtime.small_files import make_folder, replace_file, require_file
 from monstertruck_schemas.base import LiveValue, Schema, field_docs, first_mistake, live_settings
@@ -654,8 +656,10 @@ def _locate_files(tree: Tree, keys: tuple[tuple[str, ...], ...]) -> None:
             continue
         origin = tree.origins[key]
         file = (origin.file.parent / name).resolve()
-        if file.is_dir() and key[-1] == "map":  # of a saved map, as `plan` and `map show` take it
-            file /= "map.yaml"
+        saved = folder_of(file) if key[-1] == "map" else None
+        if saved is not None and ((saved / SAVES).is_dir() or (saved / MAP_YAML).is_file()):
+            section[key[-1]] = str(saved)
+            continue
         if not file.is_file():
             problem = "expected a file, found a folder" if file.is_dir() else "no such file"
             raise ConfigError(f"{origin}: {'.'.join(key)}: {problem}: {file}")

@@ -13,21 +13,20 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, TiffImagePlugin, UnidentifiedImageError
+from PIL import Image, TiffImagePlugin
 
 from monstertruck_runtime.errors import InputError
-from monstertruck_runtime.small_files import replace_file, require_file
+from monstertruck_runtime.map_folders import YAML, MapSave, folder_of, opened
+from monstertruck_runtime.outside import picture
+from monstertruck_runtime.small_files import replace_file
 from monstertruck_runtime.yaml_files import read_yaml, yaml_text
 
 FREE, OCCUPIED, UNKNOWN = 0, 100, -1
 """Cell values, as in an occupancy grid message."""
 OCCUPIED_FROM, FREE_TO = 65, 19
 """Thresholds of map_server (percent): a cell is occupied from the first on, free up to the second."""
-YAML = "map.yaml"
-"""Name of the file in the folder of a saved map."""
-MOST_CELLS: Final = 50_000_000
-"""Cells of a map at most: 350 m a side at 5 cm; decoding them takes less than 500 MB."""
-MOST_IMAGE_BYTES: Final = 400_000_000
+MOST_CELLS: Final = 25_000_000
+"""Cells of a map at most: 250 m a side at 5 cm."""
 
 _REQUIRED = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh")
 _MODES = ("trinary", "scale", "raw")
@@ -73,7 +72,7 @@ class WorldMap:
 
 
 def load_map(path: Path) -> WorldMap:
-    """Read a map_server YAML file, or the one in a folder of ours, and the image it names.
+    """Read a map_server YAML file and the image it names, or the newest whole save in the folder of a map.
 
     Cells have the values that nav2's map_server publishes. With p = darkness in 0..1 (lightness if ``negate``),
     p > occupied_thresh is occupied, p < free_thresh free, the rest unknown. ``mode: scale`` spreads the rest over
@@ -87,8 +86,24 @@ def load_map(path: Path) -> WorldMap:
     Raises:
         InputError: file, key and expectation of whatever is wrong.
     """
-    if path.is_dir():
-        path /= YAML
+    folder = folder_of(path)
+    if folder is None:
+        return _load(path)
+    with opened(folder) as save:
+        return load_saved(save)
+
+
+def load_saved(save: MapSave) -> WorldMap:
+    """Read the grid of an open save; its remarks are among those of the map.
+
+    Raises:
+        InputError: see ``load_map``.
+    """
+    world = _load(save.file(YAML))
+    return replace(world, remarks=save.remarks + world.remarks)
+
+
+def _load(path: Path) -> WorldMap:
     keys, others = _read_keys(path)
     cells = np.flipud(_read_image(path, _image_of(path, keys["image"]), keys))
     (x, y, yaw), resolution = keys["origin"], float(keys["resolution"])
@@ -232,24 +247,10 @@ def _image_of(source: Path, name: str) -> Path:
 def _read_image(source: Path, path: Path, keys: Mapping[str, Any]) -> NDArray[np.int8]:
     """Cells of an image by the rules of map_server, top row first."""
     try:
-        require_file(path, MOST_IMAGE_BYTES)
-        with Image.open(path) as image:
-            width, height = image.size
-            if width * height > MOST_CELLS:
-                raise InputError(f"{source}: image: {path}: {width} x {height} pixels, expected at most {MOST_CELLS}")
-            shades, alpha = pixels(image)
-    except InputError:
-        raise
-    except UnidentifiedImageError as error:
-        raise InputError(f"{source}: image: {path} is not a known image format") from error
-    except OSError as error:
-        raise InputError(f"{source}: image: cannot read {path}: {error}") from error
-    except Exception as error:
-        raise InputError(f"{source}: image: {path} is damaged, or of an unknown kind: {error}") from error
-    try:
-        return _cells(shades, alpha, keys)
-    except ValueError as error:
-        raise InputError(f"{source}: image: {path}: {error}") from error
+        with picture(path, "the picture of a map", MOST_CELLS) as image:
+            return _cells(*pixels(image), keys)
+    except InputError as error:
+        raise InputError(f"{source}: image: {error}") from error
 
 
 @dataclass(frozen=True, slots=True)

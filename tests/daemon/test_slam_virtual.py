@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from monstertruck_runtime.map_folders import opened
 from monstertruck_schemas import topics
 from monstertruck_schemas.health import LocalisationStatus
 from monstertruck_schemas.state import Transforms
@@ -54,4 +55,5 @@ def test_health_tiles_and_the_saved_map(drive: Drive, folder: Path):
     tiles = drive.said["state/map_tiles"]
     assert tiles
     assert all((tile.width, tile.height) == (64, 64) for tile in tiles)
-    assert {path.name for path in folder.iterdir()} == {"map.yaml", "map.png", "graph.npz"}
+    with opened(folder) as save:
+        assert {path.name for path in save.folder.iterdir()} == {"map.yaml", "map.png", "graph.npz", "manifest.json"}

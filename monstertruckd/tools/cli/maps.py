@@ -140,8 +140,13 @@ def build(
 def show(place: MapPlace, png: Png = None, json_output: JsonOption = False) -> None:
     """Show the facts of a saved map."""
     from monstertruck_runtime.map_files import FREE, OCCUPIED
+    from monstertruck_runtime.map_folders import YAML, folder_of, opened
 
     saved = _load(place)
+    folder = folder_of(place)
+    if folder is not None:
+        with opened(folder) as save_read:
+            place = save_read.file(YAML)
     cells, step = saved.grid.cells, saved.grid.resolution
     facts: dict[str, Any] = {
         "map": place,

@@ -127,10 +127,9 @@ def _points(folder: Path | None, robot: str, endpoint: str) -> "list[PointOfInte
     if folder is not None:
         from monstertruck_estimation.points.files import FILE, load
 
-        if not (folder / FILE).is_file():
+        if not (points := [point for point, _ in load(folder)]):
             raise NotFoundError(f"{folder}: no {FILE} in it")
-        return [point for point, _ in load(folder)]
-
+        return points
     return with_robot(_newest, robot, endpoint)
 
 

@@ -1,7 +1,6 @@
 """Tilt and roughness of the ground by cells, from what the robot felt driving over it and what tilted scans hit."""
 
 import io
-import zipfile
 from pathlib import Path
 from typing import Final
 
@@ -10,7 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.errors import InputError
-from monstertruck_runtime.small_files import replace_file
+from monstertruck_runtime.map_folders import opened, write_save
+from monstertruck_runtime.outside import arrays, reading
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.state import GROUND_UNKNOWN, ROUGHNESS_STEP, TILT_STEP, Ground
 
@@ -89,8 +89,8 @@ class GroundGrid:
             roughness=self._quantised[1].reshape(-1),
         )
 
-    def save(self, folder: Path) -> None:
-        """Write the grid next to a saved map.
+    def save(self, folder: Path, run: str) -> None:
+        """Add the grid to the saved map of a run.
 
         Raises:
             OSError: it could not be written.
@@ -98,7 +98,7 @@ class GroundGrid:
         content = io.BytesIO()
         tilt, roughness = self._layers
         np.savez_compressed(content, corner=self._corner, counts=self._counts, tilt=tilt, roughness=roughness)
-        replace_file(folder / FILE, content.getvalue())
+        write_save(folder, {FILE: content.getvalue()}, run=run)
 
     @classmethod
     def load(cls, folder: Path) -> "GroundGrid":
@@ -107,22 +107,22 @@ class GroundGrid:
         Raises:
             InputError: the file is damaged.
         """
-        grid, path = cls(), folder / FILE
-        if not path.exists():
-            return grid
-        try:
-            with np.load(path, allow_pickle=False) as file:
-                corner, counts, tilt, roughness = (file[name] for name in ("corner", "counts", "tilt", "roughness"))
-        except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
-            raise InputError(f"{path}: not a grid of the ground: {error}") from error
-        shapes = {counts.shape, tilt.shape, roughness.shape}
-        if corner.shape != (2,) or counts.ndim != 2 or len(shapes) != 1 or max(counts.shape) > LARGEST:
-            raise InputError(f"{path}: layers of shapes {sorted(shapes)}: expected one of at most {LARGEST} a side")
-        if not (np.isfinite(tilt).all() and np.isfinite(roughness).all()):
-            raise InputError(f"{path}: expected finite tilt and roughness")
-        grid._corner, grid._counts = corner.astype(np.int64), counts.astype(np.uint8)
-        grid._layers = np.stack((tilt, roughness)).astype(np.float32)
-        grid._quantised = np.where(grid._counts > 0, quantised(grid._layers), np.uint8(GROUND_UNKNOWN))
+        grid = cls()
+        with opened(folder) as save:
+            path = save.file(FILE)
+            if not path.exists():
+                return grid
+            found = arrays(path, "a grid of the ground")
+        with reading(path, "a grid of the ground"):
+            corner, counts, tilt, roughness = (found[name] for name in ("corner", "counts", "tilt", "roughness"))
+            shapes = {counts.shape, tilt.shape, roughness.shape}
+            if corner.shape != (2,) or counts.ndim != 2 or len(shapes) != 1 or max(counts.shape) > LARGEST:
+                raise InputError(f"{path}: layers of shapes {sorted(shapes)}: expected one of at most {LARGEST} a side")
+            if not (np.isfinite(tilt).all() and np.isfinite(roughness).all()):
+                raise InputError(f"{path}: expected finite tilt and roughness")
+            grid._corner, grid._counts = corner.astype(np.int64), counts.astype(np.uint8)
+            grid._layers = np.stack((tilt, roughness)).astype(np.float32)
+            grid._quantised = np.where(grid._counts > 0, quantised(grid._layers), np.uint8(GROUND_UNKNOWN))
         return grid
 
     def _grow(self, low: Cells, high: Cells) -> bool:

@@ -14,14 +14,15 @@ from monstertruck_estimation.ground.terrain import TerrainEstimator
 from monstertruck_estimation.scan_tilt import ScanAngles, plane_slopes
 from monstertruck_estimation.transforms import wrap_angle
 from monstertruck_kinematics.elementary import Array
-from monstertruck_runtime.clock import SECOND, Clock, Schedule, VirtualClock
-from monstertruck_runtime.errors import disk_reason
+from monstertruck_runtime.clock import SECOND, Clock, Schedule
+from monstertruck_runtime.errors import InputError, disk_reason
 from monstertruck_runtime.mailbox import Mailbox
 from monstertruck_runtime.ports import EventSink, Publisher, Ready
-from monstertruck_runtime.threads import in_thread
+from monstertruck_runtime.threads import Offload
 from monstertruck_schemas.body import Mount
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.health import OdometryHealth
+from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.sensor import Attitude, LaserScan
 from monstertruck_schemas.state import Ground, Odometry
@@ -63,8 +64,9 @@ class GroundService:
         slip: what the odometry says of it.
         out: ``state/ground``.
         events: where failures to load or save are reported.
-        grid: what is known of the ground at the start.
-        save: folder the grid is saved to; None = nowhere.
+        offload: where files are read and written.
+        load: folder of the map that is known at the start; None = there is none.
+        save: folder the grid is saved to, and the run that makes the map; None = nowhere.
     """
 
     name = ServiceName.GROUND.value
@@ -84,12 +86,14 @@ class GroundService:
         slip: Mailbox[OdometryHealth],
         out: Publisher[Ground],
         events: EventSink,
-        grid: GroundGrid,
-        save: Path | None = None,
+        offload: Offload,
+        load: Path | None = None,
+        save: tuple[Path, str] | None = None,
     ) -> None:
         self._config, self._clock, self._wheelbase, self._mount = config, clock, wheelbase, mount
         self._compass, self._angles, self._pose, self._scan, self._slip = compass, angles, pose, scan, slip
-        self._out, self._events, self._grid, self._save = out, events, grid, save
+        self._out, self._events, self._grid, self._save = out, events, GroundGrid(), save
+        self._offload, self._load = offload, load
         self._cells = _spread(*footprint)
         self._terrain = TerrainEstimator(WINDOW)
         self._moved = BodyAcceleration()
@@ -103,7 +107,7 @@ class GroundService:
 
     async def run(self, ready: Ready) -> None:
         """Observe until cancelled, then save."""
-        self._changed = not self._grid.empty
+        await self._begin()
         ready()
         schedule, now = Schedule(self._clock, RATE), self._clock.now()
         due = {"message": now, "fit": now, "save": now + round(self._config.save_period * SECOND)}
@@ -120,12 +124,19 @@ class GroundService:
                     self._publish(now)
                 if now >= due["save"]:
                     due["save"] = now + round(self._config.save_period * SECOND)
-                    if isinstance(self._clock, VirtualClock):
-                        self._write()
-                    else:
-                        await in_thread(self._write)
+                    await self._keep()
         finally:
-            self._write()
+            await self._keep()
+
+    async def _begin(self) -> None:
+        """Read the grid of the known map."""
+        if (folder := self._load) is None:
+            return
+        try:
+            self._grid = await self._offload(lambda: GroundGrid.load(folder))
+        except InputError as error:
+            self._events(Reason.BAD_INPUT, Severity.WARNING, self.name, f"{error}; the ground counts as unknown")
+        self._changed = not self._grid.empty
 
     def _observe(self, now: int) -> None:
         for moved in self._pose.drain():
@@ -195,12 +206,12 @@ class GroundService:
         if pose is not None and not self._grid.empty:
             self._out.put(self._grid.message(now, self._out.next_seq(), pose.frame))
 
-    def _write(self) -> None:
+    async def _keep(self) -> None:
         if self._save is None or self._grid.empty:
             return
+        folder, run = self._save
         try:
-            self._save.mkdir(parents=True, exist_ok=True)
-            self._grid.save(self._save)
+            await self._offload(lambda: self._grid.save(folder, run))
         except OSError as error:
             self._events(disk_reason(error), Severity.WARNING, self.name, f"ground not saved: {error}")
 

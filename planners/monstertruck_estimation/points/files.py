@@ -1,15 +1,16 @@
-"""Points of interest in a map's folder: ``points.json``, and a picture of each."""
+"""Points of interest of a saved map: ``points.json``, and a picture of each."""
 
 from pathlib import Path
 from typing import Final
 
 import numpy as np
-from pydantic import TypeAdapter, ValidationError
+from pydantic import TypeAdapter
 
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.errors import InputError
-from monstertruck_runtime.small_files import replace_file, require_file
-from monstertruck_schemas.base import first_mistake
+from monstertruck_runtime.map_folders import opened, write_save
+from monstertruck_runtime.outside import contents, reading
+from monstertruck_runtime.small_files import require_file
 from monstertruck_schemas.plan import MAX_COORDINATE
 from monstertruck_schemas.points import PointOfInterest
 
@@ -25,40 +26,40 @@ def picture_name(point: str) -> str:
     return f"point-{point}.jpg"
 
 
-def save(folder: Path, points: list[tuple[PointOfInterest, bytes]]) -> None:
-    """Write points and pictures, then the list; pictures of other points go.
+def save(folder: Path, points: list[tuple[PointOfInterest, bytes]], run: str | None = None) -> None:
+    """Save points and pictures with a map; where neither were saved before, no points write nothing.
+
+    Args:
+        folder: of the map.
+        points: with their pictures, JPEG; empty = none.
+        run: that makes the map; None = they belong to the map that is there.
 
     Raises:
         OSError: a file could not be written.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    for point, picture in points:
-        file = folder / picture_name(point.name)
-        if picture and not (file.is_file() and file.read_bytes() == picture):
-            replace_file(file, picture)
-    replace_file(folder / FILE, _POINTS.dump_json([point for point, _ in points], indent=1))
-    pictured = {picture_name(point.name) for point, picture in points if picture}
-    for file in folder.glob(picture_name("*")):
-        if file.name not in pictured:
-            file.unlink(missing_ok=True)
+    parts = {picture_name(point.name): picture for point, picture in points if picture}
+    if points or (run is None and load(folder)):
+        parts[FILE] = _POINTS.dump_json([point for point, _ in points], indent=1)
+    write_save(folder, parts, (FILE, picture_name("*")), run, new=False)
 
 
 def load(folder: Path) -> list[tuple[PointOfInterest, bytes]]:
-    """Points of a map's folder, with their pictures; none if it has none.
+    """Points of a saved map, with their pictures; none if it has none.
 
     Raises:
         InputError: the file is not what it should be.
     """
-    file = folder / FILE
-    if not file.is_file():
-        return []
-    try:
-        require_file(file, MOST_BYTES)
-        points = _POINTS.validate_json(file.read_bytes())
-    except OSError as error:
-        raise InputError(f"{file}: not readable as points of interest: {error.strerror or error}") from error
-    except ValidationError as error:
-        raise InputError(f"{file}: not readable as points of interest: {first_mistake(error)}") from error
+    with opened(folder) as found:
+        file = found.file(FILE)
+        if not file.is_file():
+            return []
+        return [(point, _picture(file.with_name(picture_name(point.name)))) for point in _read(file)]
+
+
+def _read(file: Path) -> list[PointOfInterest]:
+    expected = "points of interest"
+    with reading(file, expected):
+        points = _POINTS.validate_json(contents(file, expected, MOST_BYTES))
     names = [point.name for point in points]
     for point in points:
         if names.count(point.name) > 1:
@@ -69,7 +70,7 @@ def load(folder: Path) -> list[tuple[PointOfInterest, bytes]]:
             least, most = VARIANCES
             text = f"expected a symmetric matrix of variances from {least:g} to {most:g}"
             raise InputError(f"{file}: {point.name}: covariance: {text}")
-    return [(point, _picture(folder / picture_name(point.name))) for point in points]
+    return points
 
 
 def _is_covariance(matrix: Array) -> bool:

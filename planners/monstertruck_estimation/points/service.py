@@ -3,7 +3,6 @@
 import asyncio
 import base64
 import math
-import threading
 from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,7 +26,7 @@ from monstertruck_runtime.threads import Offload
 from monstertruck_schemas.body import LensConfig, Mount
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.health import NO_PLACE, SlamHealth
-from monstertruck_schemas.points import PointOfInterest, PointOrder, PointRequest, PointsOfInterest
+from monstertruck_schemas.points import PointOrder, PointRequest, PointsOfInterest
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.roles import AccessRole, ServiceName
 from monstertruck_schemas.sensor import Attitude, CompressedImage
@@ -86,6 +85,8 @@ class PointFolders:
     load: Path | None = None
     """Folder of the map that is known at the start."""
     save: Path | None = None
+    run: str | None = None
+    """Run that makes the map; None = it is known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,7 +146,7 @@ class PointService:
         self._looked: tuple[Vector, int] | None = None
         """Where pictures were read last, and how many."""
         self._unreadable = False
-        self._writing = threading.Lock()
+        self._writing = asyncio.Lock()
         self._unanchored: dict[str, int] = {}
         """Marks whose place in the map is known, but not yet where the robot was then by the map of today: instants."""
 
@@ -267,7 +268,7 @@ class PointService:
                 self._publish(now)
             if self._unsaved and now - saved >= SAVE_PERIOD:
                 saved, self._unsaved = now, False
-                if not await self._save():
+                if await self._save() is not Reason.OK:
                     self._unsaved = True
 
     def _correct(self) -> None:
@@ -310,23 +311,35 @@ class PointService:
                 self._folders = PointFolders(folder)
         self._dirty = dict.fromkeys(self._map.points)
 
-    async def _save(self) -> bool:
-        """Write them where they are kept; returns False if that failed."""
-        folder, rows = self._folders.save, self._map.pictured()
-        if folder is None or not (rows or (folder / files.FILE).exists()):
-            return True
-        try:
-            await self._offload(lambda: self._write(folder, rows))
-        except OSError as error:
-            self._events(disk_reason(error), Severity.WARNING, self.name, f"points not saved: {error}")
-            return False
-        return True
-
-    def _write(self, folder: Path, rows: list[tuple[PointOfInterest, bytes]]) -> None:
-        with self._writing:  # at the end one may be under way
-            files.save(folder, rows)
+    async def _save(self) -> Reason:
+        """Save them with the map; returns ``OK``, or why that failed."""
+        folder, run = self._folders.save, self._folders.run
+        if folder is None:
+            return Reason.OK
+        async with self._writing:
+            rows = self._map.pictured()
+            try:
+                await self._offload(lambda: files.save(folder, rows, run))
+            except (OSError, InputError) as error:
+                reason = disk_reason(error) if isinstance(error, OSError) else error.reason
+                self._events(reason, Severity.WARNING, self.name, f"points not saved: {error}")
+                return reason
+        return Reason.OK
 
     # Requests
+
+    async def kept(self) -> None:
+        """Save what is known now, as an answered request has to outlast a power cut.
+
+        Raises:
+            RequestRefusedError: it cannot be written; it is tried again.
+        """
+        await self._refresh()
+        reason = await self._save()
+        self._unsaved = reason is not Reason.OK
+        if self._unsaved:
+            text = f"done, but a power cut would undo it: {reason.text}; the robot goes on trying to save it"
+            raise RequestRefusedError(reason, text)
 
     def take(self, request: PointRequest) -> Vector | None:
         """Mark a place, or forget a point.
@@ -413,6 +426,7 @@ def register_point_calls(rpc: RpcRegistry, service: PointService) -> None:
 
     async def points(payload: dict[str, Any]) -> dict[str, Any]:
         place = service.take(parse_request(PointRequest, payload))
+        await service.kept()
         return {} if place is None else dict(zip(("x", "y", "yaw"), place, strict=True))
 
     async def point_picture(payload: dict[str, Any]) -> dict[str, Any]:

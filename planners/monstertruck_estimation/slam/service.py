@@ -66,6 +66,7 @@ class SlamService:
         config: mapping, and where the map is saved.
         mount: of the lidar.
         body: length and width of the robot, m.
+        run: this run, for saved maps.
         clock: time.
         scan: lidar, bounded and counted.
         odometry: pose in odom; None = no odometry: the pose is published once per scan.
@@ -87,6 +88,7 @@ class SlamService:
         clock: Clock,
         *,
         body: tuple[float, float] | None = None,
+        run: str = "",
         scan: Mailbox[LaserScan],
         odometry: Mailbox[Odometry] | None,
         angles: ScanAngles | None,
@@ -97,7 +99,7 @@ class SlamService:
         health: Publisher[SlamHealth],
         events: EventSink,
     ) -> None:
-        self._config, self._mount, self._body, self._clock = config, mount, body, clock
+        self._config, self._mount, self._body, self._run, self._clock = config, mount, body, run, clock
         self._scan, self._odometry, self._angles = scan, odometry, angles
         self._motions = motion
         self._pose, self._whole, self._tiles, self._health, self._events = pose, whole, tiles, health, events
@@ -232,7 +234,7 @@ class SlamService:
                 self._skip(reason)
                 continue
             inputs = self._inputs(scan)
-            start = None if self._started else Start(self._config, self._start(inputs.odom), self._body)
+            start = None if self._started else Start(self._config, self._start(inputs.odom), self._body, self._run)
             async with self._one_step:
                 outputs = await self._step(worker, self._work(inputs, start))
             self._started = True

@@ -1,13 +1,12 @@
-"""Saved maps: a folder with the grid (map_server: ``map.yaml``, ``map.png``) and the pose graph (``graph.npz``).
+"""Saved maps: the grid (map_server: ``map.yaml``, ``map.png``) and the pose graph (``graph.npz``) of a save.
 
-The graph holds keyframes, their poses and the edges between them as plain arrays, no pickles. Every file is replaced
-atomically, the YAML last.
+The graph holds keyframes, their poses and the edges between them as plain arrays, no pickles.
 """
 
 import dataclasses
+import hashlib
 import io
 import itertools
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -21,10 +20,13 @@ from monstertruck_estimation.slam.scans import SLIDE, Scan
 from monstertruck_estimation.slam.worker_io import GridPatch
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.errors import InputError
-from monstertruck_runtime.map_files import FREE, OCCUPIED, YAML, WorldMap, load_map, save_map
-from monstertruck_runtime.small_files import replace_file
+from monstertruck_runtime.map_files import FREE, OCCUPIED, WorldMap, load_map, load_saved, map_content
+from monstertruck_runtime.map_folders import YAML, folder_of, opened, write_save
+from monstertruck_runtime.outside import arrays as arrays_of
+from monstertruck_runtime.outside import reading
 
 GRAPH: Final = "graph.npz"
+PICTURE: Final = "map.png"
 VERSION: Final = 1
 ELEMENTS: Final = tuple(field.name for field in dataclasses.fields(Scan))
 """Arrays of a scan: of a file that was written before there were so many, the others are zeros."""
@@ -40,6 +42,7 @@ _SHAPES: Final[dict[str, tuple[int, ...]]] = {
     "edge_spread": (2,),
     "edge_loop": (),
 }
+EDGES: Final = tuple(name for name in _SHAPES if name.startswith("edge_"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,8 +100,14 @@ def trinary(patch: GridPatch) -> WorldMap:
     return WorldMap(patch.cells, patch.resolution, patch.origin).trinary()
 
 
-def save(folder: Path, patch: GridPatch, graph: SavedGraph | None) -> None:
-    """Write a map.
+def save(folder: Path, patch: GridPatch, graph: SavedGraph | None, run: str = "") -> None:
+    """Write a save of a map.
+
+    Args:
+        folder: of the map.
+        patch: the whole grid.
+        graph: keyframes; None or empty = the grid alone.
+        run: that made the map: what else it has saved here stays. Empty = a run of its own.
 
     Raises:
         InputError: there is nothing to save yet.
@@ -106,7 +115,8 @@ def save(folder: Path, patch: GridPatch, graph: SavedGraph | None) -> None:
     """
     if not patch.cells.size:
         raise InputError(f"{folder}: nothing is mapped yet")
-    folder.mkdir(parents=True, exist_ok=True)
+    text, picture = map_content(trinary(patch), PICTURE)
+    parts = {YAML: text.encode(), PICTURE: picture}
     if graph is not None and graph.scans:
         counts = [len(scan) for scan in graph.scans]
         every: dict[str, Any] = {
@@ -122,8 +132,9 @@ def save(folder: Path, patch: GridPatch, graph: SavedGraph | None) -> None:
             starts=np.concatenate(([0], np.cumsum(counts, dtype=np.int64))),
             **every,
         )
-        replace_file(folder / GRAPH, data.getvalue())
-    save_map(trinary(patch), folder / YAML)
+        parts[GRAPH] = data.getvalue()
+    digest = hashlib.sha256(b"".join(parts.values())).hexdigest()
+    write_save(folder, parts, (YAML, PICTURE, GRAPH), run or digest[:16])
 
 
 def load(place: Path) -> SavedMap:
@@ -132,34 +143,53 @@ def load(place: Path) -> SavedMap:
     Raises:
         InputError: file, key and expectation of whatever is wrong.
     """
-    if not place.is_dir():
+    folder = folder_of(place)
+    if folder is None:
         return SavedMap(load_map(place).trinary(), None)
-    graph = place / GRAPH
-    return SavedMap(load_map(place / YAML).trinary(), _read_graph(graph) if graph.exists() else None)
+    with opened(folder) as found:
+        grid, path = load_saved(found).trinary(), found.file(GRAPH)
+        if not path.exists():
+            return SavedMap(grid, None)
+        try:
+            return SavedMap(grid, _read_graph(path))
+        except InputError as error:
+            remarks = (*grid.remarks, f"{error}; the map is used without keyframes")
+            return SavedMap(dataclasses.replace(grid, remarks=remarks), None)
 
 
 def _read_graph(path: Path) -> SavedGraph:
-    try:
-        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(f"{path}: not a graph: {error}") from error
-    if arrays.get("version") is None or int(arrays["version"]) != VERSION:
-        raise InputError(f"{path}: version: expected {VERSION}, got {arrays.get('version')}")
+    arrays = arrays_of(path, "a pose graph")
+    with reading(path, "a pose graph"):
+        return _graph_of(path, arrays)
+
+
+def _graph_of(path: Path, arrays: dict[str, NDArray[Any]]) -> SavedGraph:
+    version = arrays.get("version")
+    if version is None or version.shape != () or version != VERSION:
+        raise InputError(f"{path}: version: expected {VERSION}, got {version}")
     for name, shape in {**_SHAPES, "starts": ()}.items():
         if name not in arrays or arrays[name].shape[1:] != shape or arrays[name].ndim != len(shape) + 1:
             found = arrays[name].shape if name in arrays else "nothing"
             raise InputError(f"{path}: {name}: expected rows of shape {shape}, got {found}")
-    starts, count = arrays["starts"], len(arrays["poses"])
+        if not np.isfinite(arrays[name]).all():
+            raise InputError(f"{path}: {name}: expected finite numbers")
+    starts, count = arrays["starts"].astype(np.int64), len(arrays["poses"])
     whole = len(starts) == count + 1 and starts[0] == 0 and (np.diff(starts) >= 0).all()
     if not whole or starts[-1] != len(arrays["points"]) or len(arrays["stamps"]) != count:
         raise InputError(f"{path}: starts: expected {count + 1} rising numbers from 0 to {len(arrays['points'])}")
     every = {name: arrays[name].astype(np.float64) for name in ELEMENTS if name in arrays}
+    edges = {name: values for name, values in arrays.items() if name in EDGES}
+    for group in (every, edges):
+        lengths = {name: len(values) for name, values in group.items()}
+        if len(set(lengths.values())) > 1:
+            raise InputError(f"{path}: expected rows of one number, got {lengths}")
+    ends = edges["edge_ends"] = edges["edge_ends"].astype(np.int64)
+    if ends.size and not (ends.min() >= 0 and ends.max() < count):
+        raise InputError(f"{path}: edge_ends: expected numbers of {count} keyframes")
     scans = tuple(
         elements(**{name: values[a:b] for name, values in every.items()}) for a, b in itertools.pairwise(starts)
     )
-    edges = {name: values for name, values in arrays.items() if name.startswith("edge_")}
-    return SavedGraph(arrays["stamps"], arrays["poses"], scans, edges)
+    return SavedGraph(arrays["stamps"].astype(np.int64), arrays["poses"].astype(np.float64), scans, edges)
 
 
 NORMAL_REACH: Final = 0.2

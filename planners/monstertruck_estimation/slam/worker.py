@@ -38,6 +38,7 @@ class SlamWorker:
         self._longest = np.inf
         self._geometry: tuple[float, ...] | None = None
         self._newest: int | None = None
+        self._run = ""
         _warm_up()
 
     def step(self, inputs: WorkerInput) -> WorkerOutput:
@@ -78,6 +79,7 @@ class SlamWorker:
         """Make the estimator; returns remarks on the saved map it reads."""
         config = start.config
         settings = config.mapper
+        self._run = start.run
         self._longest = settings.longest
         self._witness = _witness() if config.witness == "kiss" else None
         if config.mode == "localisation":
@@ -105,7 +107,7 @@ class SlamWorker:
         if inputs.save is None:
             return None, None
         try:
-            storage.save(inputs.save, estimator.patch(), estimator.graph())
+            storage.save(inputs.save, estimator.patch(), estimator.graph(), self._run)
         except (OSError, InputError) as error:
             return None, str(error)
         return str(inputs.save), None

@@ -80,6 +80,8 @@ class Start:
     """Base in map at the first scan."""
     body: tuple[float, float] | None = None
     """Length and width of the robot, m: where it stands the ground is free; None = not known."""
+    run: str = ""
+    """Run that makes the map, for its saves; empty = every save is of a run of its own."""
 
 
 @dataclass(frozen=True, slots=True)

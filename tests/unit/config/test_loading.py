@@ -64,9 +64,14 @@ def test_a_good_file(tmp_path: Path):
 
 def test_a_map_may_be_the_folder_of_a_saved_one(tmp_path: Path):
     (tmp_path / "saved").mkdir()
-    (tmp_path / "saved" / "map.yaml").touch()
-    config, _ = load_config(write(tmp_path, "version: 2\nname: t\nmap: saved\n"), Root)
-    assert config.map == tmp_path / "saved" / "map.yaml"
+    file = write(tmp_path, "version: 2\nname: t\nmap: saved\n")
+    with pytest.raises(ConfigError, match="expected a file, found a folder"):
+        load_config(file, Root)
+    for name in ("map.yaml", "saves/000001/map.yaml"):
+        (tmp_path / "saved" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "saved" / name).touch()
+        assert load_config(file, Root)[0].map == tmp_path / "saved"
+        (tmp_path / "saved" / name).unlink()
 
 
 @pytest.mark.parametrize(

@@ -66,14 +66,14 @@ def test_it_is_saved_with_the_map_and_read_again(tmp_path):
     assert GroundGrid.load(tmp_path).empty
     grid = GroundGrid()
     grid.observe(np.random.default_rng(1).uniform(-2, 2, (50, 2)), 0.1, 0.01)
-    grid.save(tmp_path)
+    grid.save(tmp_path, "run")
     assert GroundGrid.load(tmp_path).message(1, 2, "map") == grid.message(1, 2, "map")
 
 
 @pytest.mark.parametrize(
     ("content", "expected"),
     [
-        ({}, "not a grid of the ground"),
+        ({}, "expected a grid of the ground"),
         ({"corner": np.zeros(3)}, "expected one of at most"),
         ({"tilt": np.zeros((2, 3))}, "expected one of at most"),
         ({"tilt": np.full((2, 2), np.nan)}, "expected finite"),

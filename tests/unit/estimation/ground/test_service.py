@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 
 from monstertruck_estimation.ground.config import GroundConfig
-from monstertruck_estimation.ground.grid import GroundGrid
+from monstertruck_estimation.ground.grid import FILE
 from monstertruck_estimation.ground.service import GroundService
 from monstertruck_estimation.scan_tilt import ScanAngles
 from monstertruck_runtime.clock import run_virtual
 from monstertruck_runtime.mailbox import Delivery, Mailbox, latest
+from monstertruck_runtime.threads import inline
 from monstertruck_schemas.base import Pose2D, Twist2D
 from monstertruck_schemas.body import Mount
 from monstertruck_schemas.health import OdometryHealth
@@ -41,7 +42,7 @@ class Rig:
         self.service = GroundService(
             GroundConfig(), clock, footprint=(0.47, 0.34), wheelbase=0.32, mount=MOUNT, compass=self.compass,
             angles=ScanAngles(self.beside, None), pose=self.pose, scan=self.scan, slip=self.slip, out=self.out,
-            events=lambda *args, **values: self.events.append(args), **{"grid": GroundGrid()} | options,
+            events=lambda *args, **values: self.events.append(args), offload=inline, **options,
         )  # fmt: skip
 
     async def drive(
@@ -141,16 +142,29 @@ def test_tilted_scans_show_the_ground_before_the_robot():
 
 def test_it_is_saved_at_the_end_and_begins_with_what_was_saved(tmp_path):
     place = tmp_path / "map"
-    driven(8, lambda _: -0.1, options={"save": place})
-    again = driven(1, options={"grid": GroundGrid.load(place)})
+    driven(8, lambda _: -0.1, options={"save": (place, "run")})
+    again = driven(1, options={"load": place})
     assert layer(again, "tilt", 0.8) == pytest.approx(0.1, abs=0.01)
+
+
+def test_a_damaged_grid_is_an_event_and_the_ground_unknown(tmp_path):
+    (tmp_path / FILE).write_bytes(b"PK nothing")
+
+    async def main(clock):
+        rig = Rig(clock, load=tmp_path)
+        await rig.drive(2)
+        return rig.events
+
+    ((reason, _, source, text),) = run_virtual(main)
+    assert (reason, source) == (Reason.BAD_INPUT, "ground")
+    assert text.endswith("; the ground counts as unknown")
 
 
 def test_a_folder_that_cannot_be_written_is_an_event(tmp_path):
     (tmp_path / "file").write_text("")
 
     async def main(clock):
-        rig = Rig(clock, save=tmp_path / "file" / "map")
+        rig = Rig(clock, save=(tmp_path / "file" / "map", "run"))
         await rig.drive(2)
         return rig.events
 

@@ -219,10 +219,11 @@ def test_files_are_written_by_a_thread_and_failures_are_reported_by_the_loop(tmp
         rig.service._offload = offload
         rig.service._events = lambda reason, *args, **_: rig.events.append((len(inside), args[-1]))
         await rig.drive(1.0, show=b"")
-        await rig.ask(PointOrder.MARK, "dock")
+        with pytest.raises(RequestRefusedError, match="a power cut would undo it"):
+            await rig.ask(PointOrder.MARK, "dock")
 
     rig = run_scenario(story, tmp_path / "file" / "folder")
-    assert [by for by, text in rig.events if "points not saved" in text] == [0]
+    assert [by for by, text in rig.events if "points not saved" in text] == [0, 0], "when asked, and at the end"
 
 
 def test_points_that_were_not_saved_are_saved_later_though_nothing_changes(tmp_path):
@@ -230,7 +231,9 @@ def test_points_that_were_not_saved_are_saved_later_though_nothing_changes(tmp_p
 
     async def story(rig: Rig) -> None:
         await rig.drive(1.0, show=b"")
-        await rig.ask(PointOrder.MARK, "dock")
+        with pytest.raises(RequestRefusedError) as refused:
+            await rig.ask(PointOrder.MARK, "dock")
+        assert refused.value.refusal is Reason.RECORDING_FAILED
         await rig.drive(14.0, show=b"")
         assert any(reason is Reason.RECORDING_FAILED and "points not saved" in text for reason, text in rig.events)
         (tmp_path / "file").unlink()
@@ -248,11 +251,24 @@ def test_points_not_saved_for_want_of_space_say_so(tmp_path, monkeypatch):
 
     async def story(rig: Rig) -> None:
         await rig.drive(1.0, show=b"")
-        await rig.ask(PointOrder.MARK, "dock")
+        with pytest.raises(RequestRefusedError) as refused:
+            await rig.ask(PointOrder.MARK, "dock")
+        assert refused.value.refusal is Reason.DISK_FULL
         await rig.drive(11.0, show=b"")
 
     rig = run_scenario(story, tmp_path)
     assert {reason for reason, text in rig.events if "not saved" in text} == {Reason.DISK_FULL}
+
+
+def test_an_answered_request_is_on_the_disk(tmp_path):
+    async def story(rig: Rig) -> None:
+        await rig.drive(1.0, show=b"")
+        await rig.ask(PointOrder.MARK, "dock")
+        assert [point.name for point, _ in files.load(tmp_path)] == ["dock"]
+        await rig.ask(PointOrder.REMOVE, "dock")
+        assert files.load(tmp_path) == []
+
+    run_scenario(story, tmp_path)
 
 
 def test_a_robot_that_is_lost_marks_no_place_of_its_own_and_reads_no_tags(tmp_path):

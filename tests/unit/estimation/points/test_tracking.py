@@ -2,6 +2,7 @@
 
 import json
 import math
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +14,7 @@ from monstertruck_estimation.points.files import load, save
 from monstertruck_estimation.points.tracking import KEPT, PointMap
 from monstertruck_estimation.vision.mount import camera_axes
 from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.map_folders import SAVES, opened
 from monstertruck_schemas.body import Mount
 from monstertruck_schemas.points import PointKind
 
@@ -132,9 +134,12 @@ def test_a_mark_moves_with_the_map_near_it_and_what_is_saved_comes_back(tmp_path
         assert new.kind is old.kind
     assert again.points["tag-7"].picture == b"\xff\xd8x"
     save(tmp_path, [row for row in points.pictured() if row[0].name == "dock"])
-    assert [file.name for file in tmp_path.iterdir()] == ["points.json"], "no picture of what was forgotten is left"
+    with opened(tmp_path) as kept:
+        left = {file.name for file in kept.folder.iterdir()}
+    assert left == {"points.json", "manifest.json"}, "no picture of what was forgotten is left"
+    shutil.rmtree(tmp_path / SAVES)
     (tmp_path / "points.json").write_text("[{}]")
-    with pytest.raises(InputError, match=r"points\.json: not readable"):
+    with pytest.raises(InputError, match=r"points\.json: expected points of interest"):
         load(tmp_path)
 
 
@@ -179,7 +184,9 @@ def test_a_file_of_points_that_is_wrong_is_refused_with_the_place(tmp_path, chan
     points.mark("dock", SECOND, (1.0, 0.0, 0.0), (1.5, 0.5, 1.0), STILL)
     shown(points, name="dock")
     save(tmp_path, points.pictured())
-    (row,) = json.loads((tmp_path / "points.json").read_text())
+    with opened(tmp_path) as kept:
+        (row,) = json.loads(kept.file("points.json").read_text())
+    shutil.rmtree(tmp_path / SAVES)
     (tmp_path / "points.json").write_text(json.dumps([row | change] if change else [row, row]))
     with pytest.raises(InputError, match=f"points.json: .*{said}"):
         load(tmp_path)

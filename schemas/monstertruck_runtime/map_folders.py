@@ -1,0 +1,301 @@
+"""Folders of saved maps: every save is a folder of its own, whole or not there at all.
+
+``saves/NNNNNN`` below a map's folder holds one save: grid, pose graph, ground and points of interest, and a manifest
+with their checksums. It is written under another name, synced and renamed. What a writer does not replace is taken
+over from the save before, if both are of one run; another run makes another map, with another origin. Readers take
+the newest whole save.
+
+Folders of earlier versions, and of other programs, hold their files without a manifest.
+"""
+
+import errno
+import fcntl
+import hashlib
+import os
+import re
+import shutil
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Annotated, Final, Literal
+
+from pydantic import Field
+
+from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.outside import contents, reading
+from monstertruck_runtime.small_files import SCRATCH, make_folder, sync_folder
+from monstertruck_schemas.base import Schema
+
+YAML: Final = "map.yaml"
+"""File of the grid, in map_server's format."""
+SAVES: Final = "saves"
+"""Folder of the saves in that of a map."""
+MANIFEST: Final = "manifest.json"
+MOST_MANIFEST: Final = 1_000_000
+"""Size of a manifest at most, bytes."""
+_NUMBER: Final = re.compile(r"\d{6,}")
+_LOOSE: Final = (YAML, "map.png", "graph.npz", "ground.npz", "points.json", "point-*.jpg")
+"""Files of earlier versions, which had no manifest; a new map takes their place."""
+
+
+class _Part(Schema):
+    """One file of a save."""
+
+    size: Annotated[int, Field(ge=0)]
+    sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+
+
+class _Manifest(Schema):
+    """What a save holds."""
+
+    version: Literal[1] = 1
+    run: str
+    """Run that made the map; empty for a map without a manifest."""
+    parts: dict[Annotated[str, Field(pattern=r"^[\w-][\w.-]*$")], _Part]
+
+
+@dataclass(frozen=True, slots=True)
+class MapSave:
+    """One save, as long as it is open."""
+
+    folder: Path
+    run: str = ""
+    """Run that made the map; empty for a map without a manifest."""
+    remarks: tuple[str, ...] = ()
+    """Newer saves that are damaged."""
+    beside: Path | None = None
+    """Newest save of what was added to a map without a manifest."""
+
+    def file(self, name: str) -> Path:
+        """Path of a file of the save, which need not be there."""
+        if self.beside is not None and (self.beside / name).exists():
+            return self.beside / name
+        return self.folder / name
+
+
+def folder_of(place: Path) -> Path | None:
+    """The folder of a saved map at ``place``, which may name its ``map.yaml``; None for a map_server YAML elsewhere."""
+    if place.is_dir():
+        return place
+    return place.parent if place.name == YAML and (place.parent / SAVES).is_dir() else None
+
+
+@contextmanager
+def opened(folder: Path) -> Iterator[MapSave]:
+    """Yield the newest whole save of a map's folder; it stays until the body ends.
+
+    Raises:
+        InputError: all saves are damaged; names file and damage of each.
+    """
+    if not (folder / SAVES).is_dir():
+        yield MapSave(folder)
+        return
+    with _locked(folder / SAVES, fcntl.LOCK_SH):
+        yield _newest(folder)
+
+
+def write_save(
+    folder: Path, parts: Mapping[str, bytes], owned: Sequence[str] = (), run: str | None = None, *, new: bool = True
+) -> Path | None:
+    """Write a save with ``parts``, and with what the save before it holds and is not ``owned``.
+
+    Once this returns, the save outlasts a power cut. The save before, and the one before with a grid, are kept.
+
+    Args:
+        folder: of the map.
+        parts: content by file name.
+        owned: patterns of the names that the caller answers for: those not among ``parts`` are left out.
+        run: that made the map; None = the run of the map that is there.
+        new: write even if there are neither ``parts`` nor owned files to leave out.
+
+    Returns:
+        The folder of the save; None if there was nothing to write.
+
+    Raises:
+        OSError: a file could not be written; the newest save is the one before.
+    """
+    saves = folder / SAVES
+    make_folder(saves)
+    with _locked(saves, fcntl.LOCK_EX):
+        _remove_leftovers(saves)
+        run = _run(folder, run)
+        before, known = _base(saves, run)
+        kept = {n: p for n, p in known.items() if n not in parts and not any(fnmatchcase(n, o) for o in owned)}
+        if not new and not parts and len(kept) == len(known):
+            return None
+        manifest = _Manifest(run=run, parts=kept | {name: _part(data) for name, data in parts.items()})
+        fresh = Path(tempfile.mkdtemp(dir=saves, suffix=SCRATCH))
+        try:
+            fresh.chmod(0o755)
+            for name, part in manifest.parts.items():
+                if before is not None and known.get(name) == part:
+                    _take_over(before / name, fresh / name)
+                else:
+                    _write(fresh / name, parts[name])
+            _write(fresh / MANIFEST, manifest.model_dump_json(indent=1).encode() + b"\n")
+            sync_folder(fresh)
+            number = max((int(path.name) for path in _numbered(saves)), default=0) + 1
+            place = saves / f"{number:06d}"
+            fresh.rename(place)
+        except BaseException:
+            shutil.rmtree(fresh, ignore_errors=True)
+            raise
+        sync_folder(saves)
+        _prune(saves)
+        if YAML in parts:
+            _remove_loose(folder)
+        return place
+
+
+def tidy(folder: Path) -> None:
+    """Remove what killed writers left in a map's folder.
+
+    Raises:
+        OSError: it cannot be removed.
+    """
+    if (folder / SAVES).is_dir():
+        with _locked(folder / SAVES, fcntl.LOCK_EX):
+            _remove_leftovers(folder / SAVES)
+
+
+@contextmanager
+def _locked(saves: Path, how: int) -> Iterator[None]:
+    handle = os.open(saves, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        fcntl.flock(handle, how)
+        yield
+    finally:
+        os.close(handle)
+
+
+def _numbered(saves: Path) -> list[Path]:
+    """Saves, newest first."""
+    found = (path for path in saves.iterdir() if _NUMBER.fullmatch(path.name))
+    return sorted(found, key=lambda path: int(path.name), reverse=True)
+
+
+def _newest(folder: Path) -> MapSave:
+    """The newest whole save with a grid; without one, the newest whole save.
+
+    Raises:
+        InputError: all are damaged.
+    """
+    remarks, others = list[str](), list[MapSave]()
+    for path in _numbered(folder / SAVES):
+        try:
+            manifest = _check(path)
+        except InputError as error:
+            remarks.append(f"{error}; an older save is read")
+            continue
+        if YAML in manifest.parts:
+            return MapSave(path, manifest.run, tuple(remarks))
+        others.append(MapSave(path, manifest.run))
+    if (folder / YAML).exists():
+        beside = next((save.folder for save in others if not save.run), None)
+        return MapSave(folder, remarks=tuple(remarks), beside=beside)
+    if remarks and not others:
+        raise InputError("; ".join(remark.partition("; an older")[0] for remark in remarks))
+    found = others[0] if others else MapSave(folder)
+    return MapSave(found.folder, found.run, tuple(remarks))
+
+
+def _run(folder: Path, run: str | None) -> str:
+    """``run``, or that of the map that is there."""
+    if run is not None:
+        return run
+    try:
+        return _newest(folder).run
+    except InputError:
+        return ""
+
+
+def _base(saves: Path, run: str) -> tuple[Path | None, Mapping[str, _Part]]:
+    """Newest whole save of a run, and what it holds."""
+    for path in _numbered(saves):
+        try:
+            manifest = _check(path)
+        except InputError:
+            continue
+        if manifest.run == run:
+            return path, manifest.parts
+    return None, {}
+
+
+def _check(save: Path) -> _Manifest:
+    """Compare a save with its manifest.
+
+    Raises:
+        InputError: a file is damaged, missing or of another save.
+    """
+    manifest = _manifest(save)
+    for name, part in manifest.parts.items():
+        with reading(save / name, "a file of this save"), (save / name).open("rb") as file:
+            size = os.fstat(file.fileno()).st_size
+            if size != part.size:
+                raise InputError(f"{save / name}: {size} bytes, expected {part.size} as in {MANIFEST}")
+            if hashlib.file_digest(file, "sha256").hexdigest() != part.sha256:
+                raise InputError(f"{save / name}: its checksum is not that of {MANIFEST}: damaged, or of another save")
+    return manifest
+
+
+def _manifest(save: Path) -> _Manifest:
+    """What a save should hold.
+
+    Raises:
+        InputError: that is not known.
+    """
+    path, expected = save / MANIFEST, "the manifest of a saved map"
+    with reading(path, expected):
+        return _Manifest.model_validate_json(contents(path, expected, MOST_MANIFEST))
+
+
+def _part(data: bytes) -> _Part:
+    return _Part(size=len(data), sha256=hashlib.sha256(data).hexdigest())
+
+
+def _write(path: Path, data: bytes) -> None:
+    with path.open("xb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _take_over(old: Path, new: Path) -> None:
+    """Give a file of another save a name in this one; it is copied where files have only one name."""
+    try:
+        new.hardlink_to(old)
+    except OSError as error:
+        if error.errno not in (errno.EPERM, errno.EOPNOTSUPP, errno.EMLINK):
+            raise
+        _write(new, old.read_bytes())
+
+
+def _prune(saves: Path) -> None:
+    """Remove all saves but the newest two, and the newest two with a grid."""
+    grids = 0
+    for age, path in enumerate(_numbered(saves)):
+        try:
+            grid = YAML in _manifest(path).parts
+        except InputError:
+            grid = False
+        grids += grid
+        if age >= 2 and not (grid and grids <= 2):
+            doomed = path.rename(path.with_name(f"{path.name}{SCRATCH}"))  # no reader sees half a save
+            shutil.rmtree(doomed)
+
+
+def _remove_leftovers(saves: Path) -> None:
+    """Remove unfinished saves; the folder is locked, so nobody writes one."""
+    for path in saves.glob(f"*{SCRATCH}"):
+        shutil.rmtree(path)
+
+
+def _remove_loose(folder: Path) -> None:
+    """Remove the files of a map without a manifest."""
+    for pattern in _LOOSE:
+        for path in folder.glob(pattern):
+            if path.is_file():
+                path.unlink()
