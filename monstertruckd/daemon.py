@@ -28,6 +28,7 @@ from monstertruck_planners.explore.service import ExplorerService
 from monstertruck_planners.goals.service import GoalService, register_goal_calls
 from monstertruck_planners.missions.service import MissionService
 from monstertruck_planners.steps import CODEC
+from monstertruck_planners.track.paths import PathService, register_path_calls
 from monstertruck_runtime.actors.actor import ActorFactory
 from monstertruck_runtime.actors.remote import RPC as REMOTE_STEP
 from monstertruck_runtime.actors.remote import RemoteWorkQueue
@@ -187,6 +188,8 @@ class Daemon:
             for service in build_planners(self.config, self.bus, self.clock, self._body, self._actors, save_map):
                 self._start(planners, service)
                 calls = ServiceCalls(self.rpc, self._board, service.name)
+                if isinstance(service, PathService):
+                    register_path_calls(calls, service)
                 if isinstance(service, GoalService):
                     register_goal_calls(calls, service, self.clock)
                 if isinstance(service, ExplorerService):

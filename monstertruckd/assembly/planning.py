@@ -68,6 +68,7 @@ def build_planners(
             drawn = load_path(config.path.file, closed=config.path.closed, frame=frame)
         yield PathService(
             drawn,
+            config.emulated,
             clock,
             bus.subscribe(topics.REQ_PATH, fifo(4)),
             bus.subscribe(topics.GATE, latest()),

@@ -31,6 +31,7 @@ from monstertruck_runtime.plugins import models_in
 from monstertruck_runtime.small_files import make_folder, replace_file, require_file
 from monstertruck_schemas.base import LiveValue, Schema, field_docs, first_mistake, live_settings
 from monstertruckd.config.calibration import CalibrationStore, Result, WizardName, in_order, put_values, unused
+from monstertruckd.config.real_ports import mixed
 from monstertruckd.config.renamed import RENAMED
 from monstertruckd.config.truck import ROBOT, TruckConfig
 
@@ -631,9 +632,19 @@ def validated(tree: Tree, path: Path, model: type[S]) -> tuple[S, Tree]:
     except ValueError as error:
         raise ConfigError(f"{path}: {error}") from error
     try:
-        return model.model_validate_json(text), tree
+        config = model.model_validate_json(text)
     except ValidationError as error:
         raise ConfigError("\n".join(_explain(tree, path, model, error))) from error
+    if isinstance(config, TruckConfig) and (lines := list(_mixtures(config, tree, path))):
+        raise ConfigError("\n".join(lines))
+    return config, tree
+
+
+def _mixtures(config: TruckConfig, tree: Tree, path: Path) -> Iterator[str]:
+    """A line for each key of a simulation in the configuration of a robot with real ports."""
+    for key, port, remedy in mixed(config):
+        where, other = (tree.origin(place) or f"{path}:1" for place in (key, port))
+        yield f"{where}: {'.'.join(key)}: a simulation mixed with the real port {'.'.join(port)} ({other}): {remedy}"
 
 
 def _require_kind(data: dict[str, Any], path: Path, model: type[Schema]) -> None:

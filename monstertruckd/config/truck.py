@@ -84,7 +84,7 @@ class Geometry(Schema):
 
 
 class PathConfig(Schema):
-    """A path drawn beforehand, to be tracked as soon as the truck is armed."""
+    """A path drawn beforehand: started by name, or by arming alone where the robot is emulated."""
 
     file: Path
     """CSV with the header x,y,yaw,direction: metres, metres, radians, +1 or -1"""
@@ -187,6 +187,11 @@ class TruckConfig(Schema):
             dimensions = replace(dimensions, servo_ranges=ranges)
         chassis: Chassis = build_chassis(self.body, dimensions)
         return chassis
+
+    @property
+    def emulated(self) -> bool:
+        """Whether every device is emulated. The section ``sim`` decides; with real ports it is refused."""
+        return self.sim is not None
 
     @property
     def calibration_folder(self) -> Path:

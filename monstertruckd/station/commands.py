@@ -129,6 +129,13 @@ class Track(Asked):
     points: Annotated[tuple[tuple[Number, Number], ...], Field(min_length=2, max_length=400)]
 
 
+class StartPath(Asked):
+    """Drive the configured path."""
+
+    do: Literal["start_path"]
+    path: Annotated[str, Field(max_length=128)]
+
+
 class AskToDrive(Asked):
     """Ask whoever drives to hand over."""
 
@@ -205,6 +212,7 @@ AnyCommand = (
     | Explore
     | DoMission
     | Track
+    | StartPath
     | AskToDrive
     | HandOver
     | Acknowledge

@@ -7,6 +7,7 @@ its head (uint32, little-endian), the head (JSON, with the ``kind``), then the p
 import json
 import struct
 import zlib
+from pathlib import PurePath
 from typing import Any, Final
 
 import numpy as np
@@ -106,6 +107,7 @@ def facts(config: dict[str, Any], versions: dict[str, str]) -> str:
         mapping=config.get("slam") is not None,
         explores=config.get("explorer") is not None,
         tracks=config.get("tracker") is not None,
+        path=PurePath(drawn["file"]).stem if (drawn := config.get("path")) else None,
         behaviours=sorted(config.get("behaviours") or {}),
         versions=versions,
     )

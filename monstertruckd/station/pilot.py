@@ -48,6 +48,7 @@ from monstertruckd.station.commands import (
     ListRecordings,
     ListSettings,
     SetGoal,
+    StartPath,
     Track,
 )
 from monstertruckd.station.viewer import Viewer
@@ -211,6 +212,8 @@ def _call(client: TruckClient, command: Asked, clock: Clock) -> Coroutine[Any, A
             return _mission(client, command)
         case Track():
             return _track(client, command, clock)
+        case StartPath():
+            return client.start_path(command.path)
         case _:
             return _other_call(client, command)
 

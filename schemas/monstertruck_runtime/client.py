@@ -468,6 +468,16 @@ class TruckClient(Operator):
         wanted = {"order": order, "mission": steps, "moved": moved, "own": own}
         return await self.call("mission", {**await self.header(), **wanted})
 
+    async def start_path(self, name: str) -> str:
+        """Have the armed robot drive the path of its configuration once; returns the name under which it is followed.
+
+        Raises:
+            RequestRefusedError: why it does not start.
+            NotFoundError: the robot is not there, or has no such path.
+            NoAnswerError: no answer in time.
+        """
+        return str((await self.call("start_path", {**await self.header(), "path": name}))["path"])
+
     async def path(self, path: DrivePath, lease: float = 1.0) -> None:
         """Request to follow a path computed here. Raises as ``drive`` does."""
         self._put(REQ_PATH, PathRequest(**await self.header(lease), frame=path.frame, path=path))

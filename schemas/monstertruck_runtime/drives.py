@@ -1,7 +1,7 @@
 """One drive to a goal or along a path, as a client of the robot: from the request to how it ended."""
 
 import asyncio
-from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Sequence
 from contextlib import asynccontextmanager, suppress
 from dataclasses import asdict, dataclass
 from typing import Any, Final
@@ -11,6 +11,7 @@ from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError, TruckError
 from monstertruck_runtime.mailbox import Mailbox, fifo, latest
 from monstertruck_runtime.presence import while_it_runs
+from monstertruck_runtime.requests import Operator
 from monstertruck_runtime.standstill import StandstillMonitor, monitor_standstill
 from monstertruck_schemas.event import Event, Severity
 from monstertruck_schemas.plan import GoalPhase, GoalState, Path, TrackerState
@@ -176,6 +177,79 @@ async def follow(driver: TruckClient, clock: Clock, path: Path, *, arm: bool, re
                     await driver.path(path.model_copy(update={"halts": True}))
 
 
+async def drive_configured(
+    driver: TruckClient, clock: Clock, name: str, *, arm: bool, report: DriveReport = SILENT
+) -> Arrival:
+    """Start the path of the robot's configuration and wait for its end; cancelled or without an answer, stop the robot.
+
+    Raises:
+        RequestRefusedError: the start or the arming was refused, the tracker failed, or the robot restarted.
+        NotFoundError: the configuration has no path of this name.
+        NoAnswerError: the robot does not answer, or has been silent for a minute.
+    """
+    with (
+        driver.subscribe(TRACKER, fifo(256)) as states,
+        monitor_standstill(driver) as stand,
+        driver.subscribe(PATH, latest()) as present,
+    ):
+
+        async def start() -> dict[str, Any]:
+            return {"path": await driver.start_path(name)}
+
+        async with taken_back(driver.stop):
+            followed = str((await begun(driver, start, driver.stop, arm=arm))["path"])
+            await _until_followed(clock, present, followed)
+
+        async def stop() -> None:
+            if _followed(present, followed):
+                await driver.stop()
+
+        end = _first(_path_end(clock, states, present, followed, report), _disarmed(clock, stand))
+        return await _watched(driver, clock, stand, ServiceName.TRACKER, arm=False, end=end, undo=stop, report=report)
+
+
+async def begun(
+    driver: Operator,
+    start: Callable[[], Awaitable[dict[str, Any]]],
+    undo: Callable[[], Awaitable[object]],
+    *,
+    arm: bool,
+) -> dict[str, Any]:
+    """Start a task; returns the robot's answer.
+
+    The robot is armed only when nothing else is in the way, and held until the task has begun: a path that it has would
+    be driven meanwhile. It is disarmed again if nothing comes of it.
+
+    Args:
+        driver: who starts it.
+        start: asks the robot for it.
+        undo: ends it.
+        arm: arm a robot that is disarmed.
+
+    Raises:
+        RequestRefusedError: the start or the arming was refused.
+        NoAnswerError: the robot does not answer.
+    """
+    try:
+        return await start()
+    except RequestRefusedError as refused:
+        if not arm or refused.refusal is not Reason.DISARMED:
+            raise
+    try:
+        await driver.arm(hold=True)
+        answer = await start()
+        try:
+            await driver.arm()
+        except RequestRefusedError:
+            await undo()
+            raise
+    except BaseException:
+        with suppress(TruckError):
+            await driver.disarm()
+        raise
+    return answer
+
+
 def named(path: Path, clock: Clock) -> Path:
     """The path under a name that no other one has."""
     return path.model_copy(update={"name": f"{path.name[:96]}-{clock.now():x}"})
@@ -211,6 +285,34 @@ async def _accepted(
                 await clock.sleep(0.05)
     except TimeoutError:
         raise NoAnswerError(f"the robot did not accept the path within {ACCEPT_TIMEOUT:g} s") from None
+
+
+async def _until_followed(clock: Clock, present: Mailbox[Path], name: str) -> None:
+    try:
+        async with clock.deadline(ACCEPT_TIMEOUT):
+            while not _followed(present, name):
+                await present.next()
+    except TimeoutError:
+        raise NoAnswerError(f"the path {name!r} did not come within {ACCEPT_TIMEOUT:g} s") from None
+
+
+async def _disarmed(clock: Clock, stand: StandstillMonitor) -> Arrival:
+    """The end of a path that is over once the robot is disarmed."""
+    begin = clock.now()
+    while (state := stand.gate.latest) is None or state.mode.active:
+        await clock.sleep(LOOK)
+    return Arrival(state.worst, f"disarmed on the way: {state.why}", 0.0, (clock.now() - begin) / SECOND)
+
+
+async def _first(*ends: Coroutine[Any, Any, Arrival]) -> Arrival:
+    """The end that comes first."""
+    tasks = [asyncio.create_task(end) for end in ends]
+    try:
+        done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        return next(task for task in tasks if task in done).result()
+    finally:
+        for task in tasks:
+            task.cancel()
 
 
 def _followed(present: Mailbox[Path], name: str) -> bool:

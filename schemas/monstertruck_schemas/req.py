@@ -272,3 +272,10 @@ class PathRequest(Request):
     """A path computed off board, to be tracked."""
 
     path: Path
+
+
+class PathStart(Request):
+    """Drive the path of the configuration once, until its end or until the robot is disarmed."""
+
+    path: Annotated[str, Field(min_length=1, max_length=128)]
+    """Its name: that of the file, without the ending."""

@@ -1,4 +1,4 @@
-"""Worlds drawn by code: a loop with its lap, rooms, a maze of corridors, a ramp, an open yard, a table, and a hall.
+"""Worlds drawn by code: a loop with its lap, rooms, a maze of corridors, a ramp, a yard, a table, a hall, a workshop.
 
 ``python -m monstertruck_sim.world.built_in configs`` writes them as map_server files, and the lap of ``loop``.
 """
@@ -159,6 +159,19 @@ def hall() -> BuiltIn:
     return BuiltIn(canvas.map(), (0.0, 0.0, 0.0))
 
 
+def workshop() -> BuiltIn:
+    """A room, 5 m x 4 m, with a store behind a door of 1.1 m: small enough to be explored in a few minutes."""
+    canvas = _Canvas((-2.4, 6.1), (-2.4, 2.4))
+    canvas.free = canvas.rectangle(-2.0, -2.0, 3.0, 2.0) | canvas.rectangle(3.2, -1.5, 5.7, 1.5)
+    canvas.free |= canvas.rectangle(2.9, -0.6, 3.3, 0.5)
+    for niche in ((-1.2, 1.9, -0.5, 2.2), (0.6, -2.3, 1.5, -1.9), (4.2, 1.4, 4.8, 1.8)):
+        canvas.free |= canvas.rectangle(*niche)
+    for box in ((-2.0, -2.0, -1.5, -1.6), (2.6, 1.5, 3.0, 2.0), (5.3, -1.5, 5.7, -1.0)):
+        canvas.free &= ~canvas.rectangle(*box)
+    canvas.free &= ~canvas.disc(2.0, -1.85, 0.12)
+    return BuiltIn(canvas.map(), (0.0, 0.0, 0.0))
+
+
 TABLE = 3.0
 """Side of the test stand's table, m."""
 
@@ -179,6 +192,7 @@ BUILT_IN: dict[str, Callable[[], BuiltIn]] = {
     "yard": yard,
     "table": table,
     "hall": hall,
+    "workshop": workshop,
 }
 
 

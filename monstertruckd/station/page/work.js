@@ -29,6 +29,7 @@ export class Work {
     byId("recordings-again").onclick = () => this.loadRecordings();
     byId("explore-start").onclick = () => this.begin("task.explore", { do: "explore", order: "start" });
     byId("explore-stop").onclick = () => this.ask("task.explore", { do: "explore", order: "stop" });
+    byId("path-start").onclick = () => this.begin("task.path", { do: "start_path", path: this.link.newest.facts.path });
     byId("mission-start").onclick = () => byId("mission-file").click();
     byId("mission-file").onchange = () => this.startMission();
     byId("mission-resume").onclick = () => this.resumeMission();
@@ -81,6 +82,9 @@ export class Work {
     byId("explore-stop").hidden = !exploring || observer;
     text("explore-state", exploring ? words("task.explore.state", { frontiers: explore.frontiers, known: number(explore.known, 0), metres: number(explore.travelled, 0) })
       : explore?.number ? explore.text || reason(explore.outcome) : words("task.none"));
+    byId("task-path").hidden = !facts?.path;
+    byId("path-start").hidden = observer;
+    text("path-start", words("task.path.start", { name: facts?.path ?? "" }));
     byId("task-mission").hidden = !facts?.goals;
     byId("mission-start").hidden = mission?.running || observer;
     byId("mission-stop").hidden = !mission?.running || observer;
@@ -102,7 +106,7 @@ export class Work {
     }
     text("behaviour-state", behaviour?.running ? words("task.behaviour.state", { name: title(behaviour.behaviour), phase: behaviour.phase, seconds: number(behaviour.elapsed, 0) })
       : behaviour?.number ? behaviour.text || reason(behaviour.outcome) : words("task.none"));
-    byId("tasks-none").hidden = Boolean(facts?.explores || facts?.goals || names.length);
+    byId("tasks-none").hidden = Boolean(facts?.explores || facts?.path || facts?.goals || names.length);
   }
 
   async startMission() {

@@ -1,4 +1,4 @@
-"""``goto`` and ``track``: send the robot to a pose or along a path, and follow it there."""
+"""``goto``, ``track`` and ``path``: send the robot to a pose or along a path, and follow it there."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
@@ -9,7 +9,7 @@ from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruckd.tools.cli.connection import require_section, with_robot
 from monstertruckd.tools.cli.options import EndpointOption, RobotOption, ViaOption, parse_pose, require_finite
-from monstertruckd.tools.cli.output import JsonOption, print_end
+from monstertruckd.tools.cli.output import JsonOption, print_end, print_json
 
 if TYPE_CHECKING:
     from monstertruck_runtime.client import TruckClient
@@ -77,3 +77,34 @@ def track(
 
     end = with_robot(main, robot, endpoint, ROUTE_TIMEOUT)
     print_end(end.reason, end.text, end.as_json(), json_output=json_output)
+
+
+def path(
+    name: Annotated[
+        str | None, typer.Argument(help="Name of the configured path; left out: print it.", show_default=False)
+    ] = None,
+    arm: ArmOption = False,
+    robot: RobotOption = "truck",
+    endpoint: EndpointOption = DEFAULT_ENDPOINT,
+    json_output: JsonOption = False,
+) -> None:
+    """Start the path of the robot's configuration by its name, and follow how it is driven.
+
+    A robot with real ports drives it by this command or the page's button only, never by `arm` alone. Ends at the
+    path's end, when it is lost, or when the robot is disarmed, with the reason's exit code. Ctrl-C stops the robot.
+    """
+    from monstertruck_runtime.drives import drive_configured
+    from monstertruckd.tools.cli.goto_session import on_the_terminal
+
+    async def main(client: "TruckClient", clock: Clock) -> "Arrival | str":
+        configured = Path((await require_section(client, "path", "has no path"))["file"]).stem
+        if name is None:
+            return configured
+        with on_the_terminal() as report:
+            return await drive_configured(client, clock, name, arm=arm, report=report)
+
+    end = with_robot(main, robot, endpoint, ROUTE_TIMEOUT)
+    if isinstance(end, str):
+        print_json({"path": end}) if json_output else typer.echo(end)
+    else:
+        print_end(end.reason, end.text, end.as_json(), json_output=json_output)

@@ -80,6 +80,7 @@ app.command("reset")(orders.reset)
 app.command("plan", context_settings={"ignore_unknown_options": True})(plan.plan)  # "-1,2,0" is a pose
 app.command("goto", context_settings={"ignore_unknown_options": True})(goto.goto)
 app.command("track")(goto.track)
+app.command("path")(goto.path)
 app.command("move")(move.move)
 app.command("get")(settings.get)
 app.command("set", context_settings={"ignore_unknown_options": True})(settings.set_value)

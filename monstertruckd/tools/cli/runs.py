@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from typing import Any, Final, TypeVar
 
 from monstertruck_runtime.client import TruckClient
-from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError, TruckError
+from monstertruck_runtime.drives import begun
+from monstertruck_runtime.errors import NoAnswerError, TruckError
 from monstertruck_runtime.mailbox import Mailbox, fifo
 from monstertruck_runtime.presence import while_it_runs
 from monstertruck_runtime.requests import Operator
@@ -179,7 +180,7 @@ async def _run(
     with client.subscribe(topic, fifo(256)) as states:
         number: int | None = None
         try:
-            number = await _started(client, start, stop, arm=arm)
+            number = int((await begun(client, start, stop, arm=arm))["number"])
             return await while_it_runs(client, _followed(states, number, show, figures), needs)
         except BaseException as error:
             if not isinstance(error, TruckError) or isinstance(error, NoAnswerError):
@@ -188,42 +189,6 @@ async def _run(
                     if to_its_end and number is not None and isinstance(error, asyncio.CancelledError):
                         return await while_it_runs(client, _followed(states, number, show, figures), needs)
             raise
-
-
-async def _started(
-    client: Operator,
-    start: Callable[[], Awaitable[dict[str, Any]]],
-    stop: Callable[[], Awaitable[object]],
-    *,
-    arm: bool,
-) -> int:
-    """Number of what was started.
-
-    The robot is armed only when nothing else is in the way, and held until it has begun: a path that it has would be
-    driven meanwhile. It is disarmed again if nothing comes of it.
-
-    Raises:
-        RequestRefusedError: the start or the arming was refused.
-        NoAnswerError: the robot does not answer.
-    """
-    try:
-        return int((await start())["number"])
-    except RequestRefusedError as refused:
-        if not arm or refused.refusal is not Reason.DISARMED:
-            raise
-    try:
-        await client.arm(hold=True)
-        number = int((await start())["number"])
-        try:
-            await client.arm()
-        except RequestRefusedError:
-            await stop()
-            raise
-    except BaseException:
-        with suppress(TruckError):
-            await client.disarm()
-        raise
-    return number
 
 
 async def _followed(states: Mailbox[S], number: int, show: Callable[[S], None], figures: tuple[str, ...]) -> RunEnd:

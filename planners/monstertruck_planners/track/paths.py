@@ -2,20 +2,20 @@
 
 import csv
 from pathlib import Path as FilePath
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
 from monstertruck_planners.track.segments import check_path
 from monstertruck_runtime.clock import Clock
-from monstertruck_runtime.errors import InputError, RequestRefusedError
-from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
-from monstertruck_runtime.requests import Sequences, examine
+from monstertruck_runtime.errors import InputError, NotFoundError, RequestRefusedError
+from monstertruck_runtime.ports import EventSink, Publisher, Ready, RpcRegistry, Subscription
+from monstertruck_runtime.requests import Sequences, does_not_drive, examine, parse_request
 from monstertruck_runtime.small_files import require_file
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.plan import BehaviourState, Path
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import PathRequest
+from monstertruck_schemas.req import PathRequest, PathStart, Request
 from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.state import GateState
 
@@ -73,10 +73,12 @@ def _numbers(file: FilePath, line: int, row: list[str]) -> list[float]:
 class PathService:
     """Publishes the configured path, and replaces it by any that an operator sends while the truck stands.
 
-    A request for the present path that ``halts`` withdraws it, whether the truck stands or not.
+    A request for the present path that ``halts`` withdraws it, whether the truck stands or not. Started by name, the
+    configured path is driven once: a truck that was disarmed on the way does not go on when it is armed again.
 
     Args:
         drawn: the configured path.
+        at_once: follow it as soon as the truck is armed, without a start by name.
         clock: time.
         requests: ``req/path``.
         gate: state of the gate.
@@ -92,6 +94,7 @@ class PathService:
     def __init__(
         self,
         drawn: Path | None,
+        at_once: bool,
         clock: Clock,
         requests: Subscription[PathRequest],
         gate: Subscription[GateState],
@@ -102,6 +105,7 @@ class PathService:
         max_age: float,
     ) -> None:
         self._drawn = drawn
+        self._at_once = at_once
         self._clock = clock
         self._requests = requests
         self._gate = gate
@@ -111,10 +115,11 @@ class PathService:
         self._events = events
         self._max_age = max_age
         self._sequences = Sequences(max_age)
+        self._start_sequences = Sequences(max_age)
 
     async def run(self, ready: Ready) -> None:
         """Publish, then serve requests until cancelled."""
-        if self._drawn is not None:
+        if self._drawn is not None and self._at_once:
             self._publish(self._drawn)
         ready()
         while True:
@@ -127,6 +132,24 @@ class PathService:
                 self._events(Reason.BAD_INPUT, Severity.WARNING, request.source, f"path refused: {error}")
             else:
                 self._publish(path)
+
+    def start(self, request: PathStart) -> str:
+        """Have the armed truck drive the configured path from here on; returns the name under which it is followed.
+
+        Raises:
+            NotFoundError: the configuration has no path of this name.
+            RequestRefusedError: the sender may not, or not now.
+        """
+        drawn, gate = self._drawn, self._gate.latest
+        if drawn is None or drawn.name != request.path:
+            there = "no path" if drawn is None else f"the path {drawn.name!r}"
+            raise NotFoundError(f"no path {request.path!r}: the configuration has {there}")
+        self._examine(request, self._start_sequences)
+        if gate is None or not gate.mode.active:
+            raise does_not_drive(gate)
+        name = f"{drawn.name[:96]}-{self._clock.now():x}"
+        self._publish(drawn.model_copy(update={"name": name, "halts": True}))
+        return name
 
     def _withdrawn(self, request: PathRequest) -> Path:
         """The present path, to be followed no longer than until the truck is disarmed.
@@ -143,22 +166,37 @@ class PathService:
     def _examined(self, request: PathRequest) -> Path:
         """The path of a request.
 
-        Authority as for driving, and only while the truck stands: a path must not turn under it.
-
         Raises:
             RequestRefusedError: the sender may not, or not now.
             InputError: the path cannot be tracked.
         """
+        self._examine(request, self._sequences)
+        check_path(request.path)
+        return request.path
+
+    def _examine(self, request: Request, sequences: Sequences) -> None:
+        """Require authority as for driving, and a truck that stands: a path must not turn under it.
+
+        Raises:
+            RequestRefusedError: the sender may not, or not now.
+        """
         gate = self._gate.latest
-        examine(request, gate, self._sequences, self._clock.now(), self._max_age)
+        examine(request, gate, sequences, self._clock.now(), self._max_age)
         if gate is not None and gate.mode.moving:
             raise RequestRefusedError(Reason.BUSY, f"the robot is {gate.mode}, stop it first")
         behaviour = self._behaviour.latest
         if behaviour is not None and behaviour.running:
             raise RequestRefusedError(Reason.BUSY, f"the behaviour {behaviour.behaviour} is running, stop it first")
-        check_path(request.path)
-        return request.path
 
     def _publish(self, path: Path) -> None:
         now = self._clock.now()
         self._out.put(path.model_copy(update={"stamp": now, "received": now, "seq": self._out.next_seq()}))
+
+
+def register_path_calls(rpc: RpcRegistry, service: PathService) -> None:
+    """Serve ``start_path``, whose payload is a ``PathStart``; the answer has the ``path`` that is followed."""
+
+    async def start_path(payload: dict[str, Any]) -> dict[str, Any]:
+        return {"path": service.start(parse_request(PathStart, payload))}
+
+    rpc.register("start_path", start_path)

@@ -101,7 +101,7 @@ def test_check_config_names_file_and_line(
 def test_devices_that_are_not_there_are_left_out(config: Path):
     save(config, STEERING, COMPASS)
     text = config.read_text()
-    config.write_text(text + "devices: {steering: null, compass: null}\n")
+    config.write_text(text + "devices: {steering: null, compass: null}\ntracker: null\nplanner: null\nexplorer: null\n")
     assert load_truck(config)[0].devices.compass is None
 
 

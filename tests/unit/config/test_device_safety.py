@@ -79,8 +79,8 @@ HARMLESS = {
 
 
 def truck(name: str = "", value: Any = None) -> TruckConfig:
-    """The whole truck with one setting of another value."""
-    data = load_truck(CONFIGS / "truck.yaml")[0].model_dump()
+    """The whole truck at the default limits, with one setting of another value."""
+    data = load_truck(CONFIGS / "full.yaml")[0].model_dump()
     if name:
         *sections, key = name.split(".")
         place = data

@@ -139,6 +139,20 @@ INSTEAD = {
     "monstertruckd emulate ranger --link /tmp/ranger": Instead(None, OWN_DEVICE),
     "monstertruckd probe ranger --port /tmp/ranger": Instead(None, OWN_DEVICE),
 }
+FIRST_DAY = "tests/daemon/test_first_day_virtual.py runs it on the twin"
+DEVICES = ("drive", "steering", "compass", "stabiliser", "camera")
+INSTEAD |= {
+    f"monstertruckd {line}": Instead(None, FIRST_DAY)
+    for line in (
+        *(f"find-port {role} --write configs/truck.yaml" for role in DEVICES),
+        "explore --arm --find 3 --home",
+        "points list",
+        "points goto tag-1 --arm",
+        "points export tags.csv",
+        "goto 0 0 0 --arm",
+        "map save first.yaml",
+    )
+}
 INSTEAD |= {
     f"monstertruckd study {run}": Instead(None, "drives for minutes; tests/daemon/test_study_virtual.py does it")
     for run in (
@@ -179,11 +193,19 @@ def lines() -> tuple[Line, ...]:
     """Every command line in a code block, each once."""
     found: dict[str, Line] = {}
     for page in PAGES:
-        for number, text in _code(page.read_text(encoding="utf-8")):
-            if SHELL.fullmatch(text):
-                plain = re.sub(rf"^(?:sudo )?({PROGRAMS})", lambda m: Path(m[1]).name, text.partition("  #")[0].strip())
-                found.setdefault(plain, Line(f"{page.relative_to(ROOT)}:{number}", plain))
+        for line in lines_of(page):
+            found.setdefault(line.text, line)
     return tuple(found.values())
+
+
+def lines_of(page: Path) -> list[Line]:
+    """The command lines in the code blocks of one page, in their order."""
+    found = []
+    for number, text in _code(page.read_text(encoding="utf-8")):
+        if SHELL.fullmatch(text):
+            plain = re.sub(rf"^(?:sudo )?({PROGRAMS})", lambda m: Path(m[1]).name, text.partition("  #")[0].strip())
+            found.append(Line(f"{page.relative_to(ROOT)}:{number}", plain))
+    return found
 
 
 def _code(text: str) -> Iterator[tuple[int, str]]:

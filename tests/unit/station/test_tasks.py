@@ -39,6 +39,7 @@ from monstertruckd.tools.demo.runs import free_endpoint
         ({"do": "explore", "order": "start"}, AccessRole.PILOT),
         ({"do": "mission", "order": "start", "text": "steps: []"}, AccessRole.PILOT),
         ({"do": "track", "points": [[0, 0], [1, 0]]}, AccessRole.PILOT),
+        ({"do": "start_path", "path": "loop"}, AccessRole.PILOT),
         ({"do": "ask"}, AccessRole.PILOT),
         ({"do": "hand_over", "to": "bob"}, AccessRole.PILOT),
         ({"do": "acknowledge", "text": "seen"}, AccessRole.PILOT),

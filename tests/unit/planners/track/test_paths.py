@@ -9,12 +9,12 @@ import pytest
 
 from monstertruck_planners.track.paths import PathService, load_path
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
-from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.errors import InputError, NotFoundError, RequestRefusedError
 from monstertruck_runtime.mailbox import Mailbox, fifo, latest
 from monstertruck_schemas.event import Event
 from monstertruck_schemas.plan import MAX_POSES, BehaviourState, Path
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import PathRequest, Role
+from monstertruck_schemas.req import PathRequest, PathStart, Role
 from monstertruck_schemas.state import GateMode, GateState
 from monstertruck_schemas.topics import BEHAVIOUR, EVENT, GATE, PATH, REQ_PATH, Writer
 from monstertruckd.bus.local import Bus
@@ -26,14 +26,15 @@ ROUTE = path(straight(1.0))
 class Bench:
     """A path service and a gate that says what it is given."""
 
-    def __init__(self, clock: VirtualClock) -> None:
+    def __init__(self, clock: VirtualClock, drawn: Path | None = None, *, at_once: bool = False) -> None:
         self.clock = clock
         self.bus = Bus(clock)
         self.published: Mailbox[Path] = self.bus.subscribe(PATH, fifo(20))
         self.events: Mailbox[Event] = self.bus.subscribe(EVENT, fifo(20))
         self.state = self.bus.publisher(GATE, Writer.GATE)
         self.service = PathService(
-            None,
+            drawn,
+            at_once,
             clock,
             self.bus.subscribe(REQ_PATH, fifo(4)),
             self.bus.subscribe(GATE, latest()),
@@ -43,11 +44,18 @@ class Bench:
             self.bus.event_sink(),
             0.5,
         )
-        self.seq = 0
+        self.seq, self.at_once = 0, at_once
 
     def gate(self, mode: GateMode) -> None:
         now = self.clock.now()
         self.state.put(GateState(stamp=now, received=now, seq=0, mode=mode, nonce="n1", speed_limit=0.2))
+
+    def start(self, name: str, **more: Any) -> str:
+        """Start the configured path; returns the name under which it is published."""
+        now = self.clock.now()
+        self.seq += 1
+        fields = {"seq": self.seq, "source": "ann", "role": Role.STATION, "nonce": "n1", "gate_stamp": now, **more}
+        return self.service.start(PathStart(stamp=now, received=now, lease=1.0, path=name, **fields))
 
     async def send(self, route: Path = ROUTE, **more: Any) -> Reason:
         """OK if the path was published."""
@@ -61,9 +69,9 @@ class Bench:
         return events[0].reason if events else Reason.OK
 
 
-def on_bench(scenario: Any) -> None:
+def on_bench(scenario: Any, **setup: Any) -> None:
     async def main(clock: VirtualClock) -> None:
-        bench = Bench(clock)
+        bench = Bench(clock, **setup)
         running = asyncio.create_task(bench.service.run(lambda: None))
         await clock.sleep(1.0)
         try:
@@ -118,6 +126,60 @@ def test_a_path_is_withdrawn_while_the_truck_moves_but_no_other_one_by_its_name(
         assert await bench.send(second.model_copy(update=withdrawn)) is Reason.OK
         newest = bench.bus.newest(PATH)
         assert (newest.halts, newest.poses.tolist()) == (True, second.poses.tolist())
+
+    on_bench(scenario)
+
+
+DRAWN = ROUTE.model_copy(update={"name": "lap"})
+
+
+def test_a_configured_path_is_driven_by_arming_alone_only_where_it_is_followed_at_once():
+    async def scenario(bench: Bench) -> None:
+        bench.gate(GateMode.ARMED)
+        await bench.clock.sleep(1.0)
+        assert [one.name for one in bench.published.drain()] == (["lap"] if bench.at_once else [])
+
+    for at_once in (True, False):
+        on_bench(scenario, drawn=DRAWN, at_once=at_once)
+
+
+def test_an_operator_starts_the_configured_path_by_name():
+    async def scenario(bench: Bench) -> None:
+        with pytest.raises(RequestRefusedError) as refused:
+            bench.start("lap")
+        assert refused.value.refusal is Reason.BAD_NONCE  # no gate yet
+        for mode, reason in (
+            (GateMode.DISARMED, Reason.DISARMED),
+            (GateMode.DRIVING, Reason.BUSY),
+        ):
+            bench.gate(mode)
+            with pytest.raises(RequestRefusedError) as refused:
+                bench.start("lap")
+            assert refused.value.refusal is reason
+        bench.gate(GateMode.ARMED)
+        with pytest.raises(NotFoundError, match="no path 'loop': the configuration has the path 'lap'"):
+            bench.start("loop")
+        with pytest.raises(RequestRefusedError) as refused:
+            bench.start("lap", role=Role.TRACKER)
+        assert refused.value.refusal is Reason.BAD_ROLE
+        assert not bench.published.drain()
+        names = []
+        for _ in range(2):
+            names.append(bench.start("lap"))
+            await bench.clock.sleep(0.1)
+            (path,) = bench.published.drain()
+            assert path.name == names[-1]
+            assert path.halts, "it is over once the robot is disarmed"
+        assert names[0] != names[1], "driven again, not withdrawn"
+
+    on_bench(scenario, drawn=DRAWN)
+
+
+def test_without_a_configured_path_there_is_none_to_start():
+    async def scenario(bench: Bench) -> None:
+        bench.gate(GateMode.ARMED)
+        with pytest.raises(NotFoundError, match="no path 'lap': the configuration has no path"):
+            bench.start("lap")
 
     on_bench(scenario)
 

@@ -24,14 +24,22 @@ def tree(root: Path) -> dict[str, str]:
     }
 
 
+CONFIGURATION = (
+    "etc/monstertruckd/parts/chassis.yaml",
+    "etc/monstertruckd/parts/equipment.yaml",
+    "etc/monstertruckd/parts/first_day.yaml",
+    "etc/monstertruckd/parts/navigation.yaml",
+    "etc/monstertruckd/truck.yaml",
+)
+
+
 def test_everything_is_where_systemd_and_udev_look(tmp_path: Path):
     report = install(truck_plan(tmp_path), tmp_path)
     assert set(report.changes.values()) == {Change.NEW}
     assert report.commands == [], "a system elsewhere is only written"
     assert list(tree(tmp_path)) == [
         "etc/modules-load.d/monstertruckd.conf",
-        "etc/monstertruckd/parts/chassis.yaml",
-        "etc/monstertruckd/truck.yaml",
+        *CONFIGURATION,
         "etc/systemd/system/monstertruckd.service",
         "etc/systemd/system/multi-user.target.wants/monstertruckd.service",
         "etc/sysusers.d/monstertruckd.conf",
@@ -103,7 +111,7 @@ def test_taking_out_leaves_the_configuration_and_may_be_repeated(tmp_path: Path)
     install(truck_plan(tmp_path), tmp_path)
     report = uninstall(tmp_path)
     assert set(report.changes.values()) == {Change.REMOVED}
-    assert list(tree(tmp_path)) == ["etc/monstertruckd/parts/chassis.yaml", "etc/monstertruckd/truck.yaml"]
+    assert tuple(tree(tmp_path)) == CONFIGURATION
     assert not uninstall(tmp_path).changed
 
 
@@ -192,7 +200,7 @@ def test_files_of_a_configuration_keep_their_places(tmp_path: Path):
     main = tmp_path / "robots" / "mine.yaml"
     main.write_text(f"include: [{TRUCK}, ../parts/a.yaml]\npath: {{file: ../lap.csv}}\n")
     (tmp_path / "parts").mkdir()
-    (tmp_path / "parts" / "a.yaml").write_text("version: 1\nplanner: null\n")
+    (tmp_path / "parts" / "a.yaml").write_text("version: 1\nplanner: null\nexplorer: null\n")
     (tmp_path / "lap.csv").write_text("x,y,yaw,direction\n")
     copied = [planned.path for planned in truck_plan(tmp_path / "root", main).files if planned.keep_previous]
     places = [str(path.relative_to("/etc/monstertruckd")) for path in copied]

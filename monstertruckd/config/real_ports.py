@@ -1,0 +1,58 @@
+"""Real ports: which devices hang on this computer itself, and what such a robot may not have.
+
+A robot is either emulated, with a section ``sim`` and every device behind an emulator, or real. A mixture would drive
+the real motor by a simulation's start pose, path and timing.
+"""
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+from monstertruck_drivers.usb.config import UsbPortConfig
+from monstertruckd.config.truck import TruckConfig
+
+PSEUDO: Final = (Path("/dev/pts"), Path("/dev/shm"))  # noqa: S108 - nothing is put there
+"""Folders below /dev whose entries are no devices: pseudo terminals, which emulators serve, and memory."""
+
+
+def real_ports(config: TruckConfig) -> tuple[str, ...]:
+    """Roles of the devices whose port belongs to this computer: by hub on its own USB tree, or by a node below /dev.
+
+    Links are followed. A port that does not exist yet is judged by its name.
+    """
+    own_tree = _resolved(config.machine) == Path("/")
+    return tuple(
+        role
+        for role, device in config.devices.present().items()
+        if (own_tree if isinstance(device.port, UsbPortConfig) else _is_device(device.port.path))
+    )
+
+
+def mixed(config: TruckConfig) -> Iterator[tuple[tuple[str, ...], tuple[str, ...], str]]:
+    """Keys that describe a simulation although a device has a real port.
+
+    Yields:
+        The key, the key of the first real port, and what to do.
+    """
+    roles = real_ports(config)
+    if not roles:
+        return
+    port = ("devices", roles[0], "port")
+    if config.sim is not None:
+        yield (
+            ("sim",),
+            port,
+            "leave out what has `sim`, or give every device an emulated port, as configs/truck_emulated.yaml does",
+        )
+    if config.stand == "simulator":
+        yield ("stand",), port, "expected none or overhead of a real robot"
+
+
+def _is_device(path: Path) -> bool:
+    node = _resolved(path)
+    return node.is_relative_to("/dev") and not any(node.is_relative_to(folder) for folder in PSEUDO)
+
+
+def _resolved(path: Path) -> Path:
+    return Path(os.path.realpath(path))
