@@ -103,6 +103,26 @@ class Check:
         """Whether only a quick stop avoids contact."""
         return False
 
+    @property
+    def moves(self) -> bool:
+        """Whether a motor moves the robot, although the drives' velocities may not show it."""
+        return False
+
+    @property
+    def findings(self) -> int:
+        """Motions so far that demanded an emergency stop."""
+        return 0
+
+    @property
+    def power_off(self) -> bool:
+        """Whether only switching the power stages off helps."""
+        return False
+
+    @property
+    def port_off(self) -> bool:
+        """Whether only switching the drives' ports off helps."""
+        return False
+
     def observe(self, seen: Message | Tick, topic: Topic[Any] | None) -> None:
         """Take a message, or the beginning of a tick; ``view.samples`` holds the message already if it is valid.
 
@@ -204,6 +224,26 @@ class Checks:
     def urgent(self) -> bool:
         """Whether only a quick stop avoids contact."""
         return any(check.urgent for check in self._checks)
+
+    @property
+    def moves(self) -> bool:
+        """Whether a motor moves the robot."""
+        return any(check.moves for check in self._checks)
+
+    @property
+    def findings(self) -> int:
+        """Motions so far that demanded an emergency stop."""
+        return sum(check.findings for check in self._checks)
+
+    @property
+    def power_off(self) -> bool:
+        """Whether the power stages must be off."""
+        return any(check.power_off for check in self._checks)
+
+    @property
+    def port_off(self) -> bool:
+        """Whether the drives' ports must be off."""
+        return any(check.port_off for check in self._checks)
 
     def text(self, reason: Reason) -> str:
         """A reason in words, for its event."""

@@ -129,6 +129,17 @@ class ShaftCheckConfig(Schema):
     """A shaft slower than this share of its command does not turn."""
 
 
+class RunawayConfig(Schema):
+    """When a motor turns as nobody commanded."""
+
+    distance: Annotated[float, Field(gt=0, le=0.05)] = 0.01
+    """Distance that a shaft may turn beyond what its orders and its drive's ramps explain, m."""
+    body_distance: Annotated[float, Field(gt=0, le=0.2)] = 0.05
+    """Distance that free wheels or the turning body may move after all drives were to rest, m: gears unwind."""
+    idle_current: Annotated[float, Field(gt=0, le=0.5)] = 0.05
+    """Motor current below which a power stage that is off turns nothing, A: the robot is pushed, or it rolls."""
+
+
 class GateConfig(Schema):
     """Settings of the safety gate."""
 
@@ -194,6 +205,8 @@ class GateConfig(Schema):
     """Compass against steering, finds servos without supply; null = off."""
     blocked: ShaftCheckConfig | None = ShaftCheckConfig()
     """Commanded against measured speed of each driven shaft, finds blocked ones; null = off."""
+    runaway: RunawayConfig | None = RunawayConfig()
+    """Measured against commanded motion, finds motors that do not obey; null = off."""
     short_faults: Annotated[int, Field(ge=2, le=10)] = 4
     """Stops for stale sensors within ``short_faults_within`` after which the truck disarms."""
     short_faults_within: Positive = 10.0
@@ -383,6 +396,9 @@ WEAKER_ABOVE: Final = (
     "sonar.unseen_speed",
     "blocked.within",
     "blocked.speed",
+    "runaway.distance",
+    "runaway.body_distance",
+    "runaway.idle_current",
     "short_faults",
 )
 """Settings of the gate that are weaker the greater they are."""
@@ -417,6 +433,8 @@ def weakened(config: GateConfig) -> tuple[str, ...]:
         texts.append("gate.turning null: servos without supply are not noticed")
     if config.blocked is None:
         texts.append("gate.blocked null: a blocked shaft is not noticed")
+    if config.runaway is None:
+        texts.append("gate.runaway null: a motor that does not obey is not noticed")
     if config.obstacle.open_ground:
         texts.append("gate.obstacle.open_ground true: a scan without any range counts as free ground")
     if more := sorted(set(config.tolerated_failures) - set(default.tolerated_failures)):

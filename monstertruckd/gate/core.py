@@ -35,6 +35,7 @@ from monstertruckd.gate.limiter import CommandLimiter
 from monstertruckd.gate.motion import Motion
 from monstertruckd.gate.obstacles import ObstacleCheck
 from monstertruckd.gate.peers import PeerCheck
+from monstertruckd.gate.runaway import RunawayCheck
 from monstertruckd.gate.samples import STALE_SENSORS, Samples
 from monstertruckd.gate.sensors import (
     DRIVE_LOSSES,
@@ -77,6 +78,8 @@ def sensor_checks(view: GateView, *, battery_measured: bool) -> Iterator[Check]:
         battery_measured: something is there to measure the battery.
     """
     config = view.config
+    if config.runaway is not None:
+        yield RunawayCheck(view, config.runaway)
     yield TickCheck(view)
     if config.turning is not None:
         yield SteeringCheck(view, config.turning)
@@ -151,6 +154,10 @@ class GateOutput(NamedTuple):
     """Operator to whom the drive was handed over in this tick."""
     events: tuple[GateEvent, ...]
     trips: tuple[Stop, ...]
+    stopping: bool
+    """The truck may not move, and its standstill is not measured yet."""
+    port_off: bool
+    """Only switching the drives' ports off stops the truck."""
 
 
 class Gate:
@@ -207,6 +214,10 @@ class Gate:
         """When the truck stopped for stale sensors since it was armed, ns."""
         self._ticked: int | None = None
         self._shut_down = False
+        self._findings = 0
+        """Findings of the checks that have been acted on."""
+        self._unconfirmed = False
+        """The truck may have moved since its standstill was measured last."""
 
     def configure(self, config: GateConfig) -> None:
         """Take other limits between two ticks; of those that differ only settings marked live take effect at once.
@@ -214,6 +225,10 @@ class Gate:
         A truck that drives slows down to lesser ones by its ramp.
         """
         self._limits.config = config
+
+    def _at_rest(self, now: int, since: int = 0) -> bool:
+        """Whether the truck is known to be at rest, by a sample not older than ``since`` (ns) and by every check."""
+        return self._samples.at_rest(now, since) and not self._checks.moves
 
     @property
     def _config(self) -> GateConfig:
@@ -349,10 +364,13 @@ class Gate:
 
     def _refuse_moving(self, now: int, request: ControlRequest) -> Decision | None:
         """The refusal while the robot is not known to be at rest or an operator requests motion."""
-        if not self._samples.at_rest(now):
+        if not self._at_rest(now):
             speed = self._samples.speed(now)
             if speed is None:
                 return self._refuse_blocked(now, (Reason.DRIVE_STALE,), request)
+            if self._samples.at_rest(now):
+                text = "the drive reads standstill, but the robot moves"
+                return self._refuse_order(now, Reason.UNCOMMANDED_MOTION, request, text)
             return self._refuse_order(now, Reason.NOT_ARMED_SPEED, request, f"the robot moves at {speed:.2f} m/s")
         if sources := self._sources.requesting_motion(now):
             text = f"motion is requested by {', '.join(sources)}: expected a neutral stick"
@@ -451,25 +469,48 @@ class Gate:
         self._checks.observe(Tick(now, elapsed), None)
         blocks = self._blocks(now)
         self._report(now, blocks, always=self.mode is GateMode.DRIVING)
+        self._stop_runaway(now)
         self._advance(now, blocks)
+        self._confirm(now)
         holder = self._states.holder
         courses = self._limiter.aim(now, dt, None if holder is None else holder.request)
         limits = self._checks.limits(now, courses)
         self._limiter.advance(dt, limits)
         if holder is not None:
             halts = [reason for reason in limits if reason in HALTS and reason not in self._known]
-            if halts and not self._samples.at_rest(now):
+            if halts and not self._at_rest(now):
                 self._trip(now, self.mode, self._checks.describe(halts, now, {}))
         self._report(now, tuple(limits), always=False)
         self._known = {reason: self._known.get(reason, now) for reason in (*blocks, *limits)}
         return self._output(now, blocks, limits)
+
+    def _stop_runaway(self, now: int) -> None:
+        """Latch the emergency stop for a motion that nobody commanded; every finding is reported, latched or not."""
+        if self._checks.findings == self._findings:
+            return
+        self._findings = self._checks.findings
+        causes = self._checks.describe([Reason.UNCOMMANDED_MOTION], now, self._known)
+        self._trip(now, GateMode.ESTOPPED, causes)
+        if self.mode is not GateMode.ESTOPPED:
+            self._states.latch(now)
+        self._motion.halt()
+        text = self._checks.text(Reason.UNCOMMANDED_MOTION)
+        values = {**self._samples.values(now), **{figure.name: figure.value for figure in causes[0].measurements}}
+        self._events.emit(now, Reason.UNCOMMANDED_MOTION, Severity.ERROR, text, values, always=True)
+
+    def _confirm(self, now: int) -> None:
+        """Note whether the truck may move, or does; forget it once its standstill is measured."""
+        if self.mode.accepts_motion or self._checks.moves:
+            self._unconfirmed = True
+        elif self._at_rest(now, self._states.since):
+            self._unconfirmed = False
 
     def neutral(self, now: int) -> GateOutput:
         """Last output before the daemon ends: quick stop. The gate never drives again after it."""
         self._shut_down = True
         self._motion.halt()
         if self._states.active:
-            if self.mode is GateMode.DRIVING or not self._samples.at_rest(now):
+            if self.mode is GateMode.DRIVING or not self._at_rest(now):
                 self._trip(now, GateMode.DISARMED, self._checks.describe([Reason.SHUTDOWN], now, {}))
             self._disarm(now, Reason.SHUTDOWN.text)
         return self._output(now, (Reason.SHUTDOWN,), {})
@@ -485,7 +526,7 @@ class Gate:
             return
         states.disarm_at_rest |= not DISARMING.isdisjoint(blocks)
         driver = None if blocks else self._sources.driver(now, states.holder_key)
-        if states.mode is GateMode.STOPPING and self._samples.at_rest(now, states.since):
+        if states.mode is GateMode.STOPPING and self._at_rest(now, states.since):
             states.rest(now)
         elif states.mode is GateMode.ARMED and states.disarm_at_rest:
             self._disarm(now, ", ".join(reason.text for reason in blocks))
@@ -505,7 +546,7 @@ class Gate:
 
     def _released(self, holder: Source, now: int) -> bool:
         """Whether the holder's last request was standstill, and the truck has been at rest since."""
-        return holder.neutral and self._motion.standing and self._samples.at_rest(now, holder.arrived)
+        return holder.neutral and self._motion.standing and self._at_rest(now, holder.arrived)
 
     def _stop(self, now: int, causes: list[Cause], *, ordered: bool = False) -> None:
         if not STALE_SENSORS.keys().isdisjoint(cause.reason for cause in causes):
@@ -557,11 +598,13 @@ class Gate:
                 self._events.emit(now, reason, Severity.WARNING, text, values, always=always)
 
     def _action(self, now: int, reasons: tuple[Reason, ...]) -> DriveAction:
+        if self._checks.power_off:
+            return DriveAction.DISABLE
         if self.mode is GateMode.ESTOPPED or self._checks.urgent or not URGENT.isdisjoint(reasons):
             return DriveAction.QUICK_STOP
         if self.mode is GateMode.DISARMED:
             # A motor that still turns, as after a daemon that died, must not coast.
-            return DriveAction.DISABLE if self._samples.at_rest(now) else DriveAction.QUICK_STOP
+            return DriveAction.DISABLE if self._at_rest(now) else DriveAction.QUICK_STOP
         return DriveAction.RUN
 
     def _output(self, now: int, blocks: tuple[Reason, ...], limits: dict[Reason, float]) -> GateOutput:
@@ -592,6 +635,8 @@ class Gate:
             handed_to=self._sources.handed_to(now),
             events=self._events.drain(),
             trips=self._stops.drain(now, (*blocks, *limits)),
+            stopping=self._unconfirmed and not self.mode.accepts_motion,
+            port_off=self._checks.port_off,
         )
 
 

@@ -287,7 +287,8 @@ class GateService:
             self._outputs.stops.put(stop)
             log.log(logging.INFO if stop.ordered else logging.WARNING, "%s", stop.text)
         asked = output.asking, output.handed_to
-        visible = (output.mode, output.holder, output.reasons, output.waiting, asked, self._latched)
+        whole = output.mode, output.stopping
+        visible = (whole, output.holder, output.reasons, output.waiting, asked, self._latched)
         if visible != self._published or now - self._published_at >= STATE_PERIOD:
             self._published, self._published_at = visible, now
             self._outputs.state.put(self._state(output, now))
@@ -321,6 +322,7 @@ class GateService:
             waiting=output.waiting,
             asking=output.asking,
             handed_to=output.handed_to,
+            stopping=output.stopping,
         )
 
     def _mark_latch(self) -> None:
@@ -423,28 +425,35 @@ async def _carry_out(bus: Bus, clock: Clock, order: Order, payload: dict[str, An
             async with clock.deadline(STANDSTILL):
                 while True:
                     state = await states.next()
-                    if _is_carried_out(order, state.mode):
+                    if _is_carried_out(order, state):
                         return state.model_dump(mode="json")
                     if order not in GRADUAL:
                         raise RequestRefusedError(state.worst)
         except TimeoutError:
-            msg = f"{order.value} accepted, but standstill is not confirmed after {STANDSTILL:g} s"
+            msg = (
+                f"{order.value} accepted, but standstill is not confirmed after {STANDSTILL:g} s: {_why(states.latest)}"
+            )
             raise NoAnswerError(msg) from None
 
 
-def _is_carried_out(order: Order, mode: GateMode) -> bool:
-    """Whether ``mode`` shows that ``order`` has been carried out."""
+def _why(state: GateState | None) -> str:
+    return "the gate is silent" if state is None else state.why
+
+
+def _is_carried_out(order: Order, state: GateState) -> bool:
+    """Whether the gate's state shows that ``order`` has been carried out."""
+    mode = state.mode
     match order:
         case Order.ARM:
             return mode.active
         case Order.DISARM:
-            return not mode.active
+            return not mode.active and not state.stopping
         case Order.ESTOP:
             return mode is GateMode.ESTOPPED
         case Order.RESET:
             return mode is not GateMode.ESTOPPED
         case Order.STOP:
-            return not mode.moving
+            return not mode.moving and not state.stopping
         case Order.ASK | Order.HAND_OVER:
             return True
         case _:

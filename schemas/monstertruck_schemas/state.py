@@ -195,6 +195,8 @@ class GateState(Message):
     """Planners that ask for motion while nobody drives: they set off as soon as the truck is armed without ``hold``."""
     asking: tuple[str, ...] = ()
     """Operators who have asked the one who drives to hand over, the newest last."""
+    stopping: bool = False
+    """The robot may not move, and its standstill has not been measured since; in mode ``stopping`` always."""
     handed_to: str | None = None
     """Operator to whom the drive was handed over just now: others of that priority wait a moment."""
 

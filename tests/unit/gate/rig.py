@@ -171,9 +171,12 @@ def attitude(now, roll=0.0, pitch=0.0, tilt_valid=True):
     return Attitude(**header(now), heading=0.0, roll=roll, pitch=pitch, tilt_valid=tilt_valid)
 
 
-def feedback(now, speed=0.0, mode=DriveMode.ENABLED, fault_code=None):
-    rate = DRIVETRAIN.motor_rate(speed)
-    return DriveFeedback(**header(now), position=0.0, velocity=rate, mode=mode, fault_code=fault_code)
+def feedback(now, speed=0.0, mode=DriveMode.ENABLED, fault_code=None, current=None, position=0.0):
+    """Feedback at a speed (m/s) and a travelled distance (m)."""
+    rate, angle = DRIVETRAIN.motor_rate(speed), DRIVETRAIN.motor_angle(position)
+    return DriveFeedback(
+        **header(now), position=angle, velocity=rate, mode=mode, fault_code=fault_code, current=current
+    )
 
 
 def servos(now, front=0.0, rear=0.0, trusted=True):
@@ -206,6 +209,8 @@ class Rig:
         self.events = []
         self.trips = []
         self.travelled = 0.0
+        self.mode, self.current = DriveMode.ENABLED, None
+        """Power state of the drive, and the current that it measures, A."""
         self.driver = None
         self._seq = 0
 
@@ -243,11 +248,11 @@ class Rig:
 
     def sense(self):
         """Every sensor that is not silent delivers now."""
-        mode = DriveMode.FAULT if self.fault else DriveMode.ENABLED
+        mode = DriveMode.FAULT if self.fault else self.mode
         samples = {
             "scan": lambda: show(self.gate, scan(self.now, *self.obstacles, unknown=self.unknown)),
             "attitude": lambda: show(self.gate, attitude(self.now, roll=self.tilt)),
-            "drive": lambda: show(self.gate, feedback(self.now, self.speed, mode)),
+            "drive": lambda: show(self.gate, feedback(self.now, self.speed, mode, current=self.current)),
             "steering": lambda: show(self.gate, servos(self.now)),
             "battery": lambda: show(self.gate, battery(self.now, self.level)),
         }

@@ -100,7 +100,7 @@ def test_who_lets_go_of_a_truck_at_rest_does_not_stop_it():
 
 
 def test_who_falls_silent_while_the_truck_still_rolls_stops_it():
-    rig = Rig().driving()
+    rig = Rig(runaway=None).driving()
     for tick in range(70):
         rig.driver = {"speed": 0.0} if tick < 50 else None
         rig.speed = 0.1

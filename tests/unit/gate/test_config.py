@@ -46,6 +46,7 @@ DELIVERED = {
         "memory_distance": 2.0,
         "open_ground": False,
     },
+    "runaway": {"distance": 0.01, "body_distance": 0.05, "idle_current": 0.05},
     "sonar": {"stale_after": 0.3, "core": 0.2, "unseen_speed": 0.1},
     "yaw_acceleration": 6.0,
     "event_interval": 1.0,

@@ -7,7 +7,7 @@ import pytest
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order
-from monstertruck_schemas.sensor import Attitude
+from monstertruck_schemas.sensor import Attitude, DriveMode
 from monstertruck_schemas.state import GateMode
 from monstertruckd.gate.config import SteeringCheckConfig
 from monstertruckd.gate.following import SteeringCheck, TurnComparison
@@ -217,6 +217,7 @@ def test_it_can_be_configured_not_to_look():
 def test_a_disarmed_truck_may_be_carried_or_pushed_about(speed):
     rig = Rig()
     rig.silent = {"attitude"}
+    rig.mode, rig.current = DriveMode.DISABLED, 0.0
     for step in range(100):
         rig.speed = speed
         rig.tick()

@@ -150,7 +150,7 @@ def test_wheels_turn_at_standstill_before_they_drive_elsewhere():
 
 
 def test_wheels_do_not_turn_aside_under_a_body_that_still_rolls():
-    robot = Robot("wheels").driving(vx=0.15, ticks=60)
+    robot = Robot("wheels", runaway=None).driving(vx=0.15, ticks=60)
     robot.driver = SIDE
     robot.tick()
     while any(robot.out.speeds):

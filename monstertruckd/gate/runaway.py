@@ -1,0 +1,435 @@
+"""Motion that nobody commanded: what the drives measure against what their orders let them do.
+
+An order bounds what a shaft can do: from the moment of the order it may turn at most as fast as the fastest order that
+is in force. An order is in force until the drive has been heard once more after the reaction time: a drive that does
+not answer may not have received anything either. From a faster speed the bound comes down by the least deceleration of
+the drive's own ramp. ``ShaftBounds`` holds these two speeds, forward and backward. What decides is the distance
+that a shaft turns beyond them: a short overshoot moves nothing, a slow creep that lasts does.
+
+Only a motor's motion counts. A power stage that is off and without current turns nothing: somebody pushes the robot,
+or it rolls. Of a drive that does not measure its current, every motion counts.
+"""
+
+import math
+from collections import deque
+from collections.abc import Iterator
+from enum import IntEnum, StrEnum
+from typing import Any, Final, NamedTuple
+
+from monstertruck_runtime.clock import SECOND
+from monstertruck_schemas.base import Message
+from monstertruck_schemas.event import Measurement
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.roles import DeviceRole
+from monstertruck_schemas.sensor import DriveFeedback, DriveMode, Imu, WheelEncoders
+from monstertruck_schemas.state import GateMode
+from monstertruck_schemas.topics import DRIVES, ENCODERS, IMU, Topic
+from monstertruckd.gate.checks import Check, GateView, Tick
+from monstertruckd.gate.config import RunawayConfig
+
+POWERED: Final = frozenset({DriveMode.ENABLED, DriveMode.QUICK_STOP})
+"""Modes of a drive whose power stage is on."""
+MAX_ORDERS: Final = 64
+"""Orders that are kept apart; older ones are merged into their bounds."""
+LEAK: Final = 0.1
+"""Share of the standstill speed at which a shaft that is ordered to stand may drift for ever."""
+
+
+class RunawayKind(StrEnum):
+    """How a shaft departs from its orders; the value says so in words."""
+
+    NO_ORDER = "turns without an order"
+    DOES_NOT_STOP = "does not stop"
+    TOO_FAST = "turns faster than ordered"
+    OPPOSITE = "turns against its order"
+    VELOCITY_LIES = "turns by its position while its velocity reads 0"
+    BODY_MOVES = "stands by its own measure while the body moves"
+
+
+class Runaway(NamedTuple):
+    """A motion that nobody commanded."""
+
+    kind: RunawayKind
+    source: str
+    """Drive or other sensor that measured it."""
+    measured: float
+    """Speed over ground, m/s."""
+    low: float
+    """Least speed that its orders allowed, m/s."""
+    high: float
+    """Greatest one, m/s."""
+
+
+class _Order(NamedTuple):
+    """Speeds ordered from an instant on, m/s; one, or the bounds of several that were merged."""
+
+    since: int
+    low: float
+    high: float
+
+
+class ShaftBounds:
+    """Speeds that a shaft's orders allow, forward positive, m/s; ``low`` <= 0 <= ``high``."""
+
+    def __init__(self) -> None:
+        self.low = 0.0
+        self.high = 0.0
+        self._orders: deque[_Order] = deque([_Order(0, 0.0, 0.0)])
+
+    @property
+    def ordered(self) -> float:
+        """Newest order, m/s."""
+        newest = self._orders[-1]
+        return newest.high if newest.high > 0.0 else newest.low
+
+    def order(self, now: int, speed: float) -> None:
+        """Take the speed that is ordered at ``now`` (ns)."""
+        newest, orders = self._orders[-1], self._orders
+        if (newest.low, newest.high) == (speed, speed):
+            return
+        orders.append(_Order(now, speed, speed))
+        if len(orders) > MAX_ORDERS:
+            first, second = orders.popleft(), orders.popleft()
+            orders.appendleft(_Order(first.since, min(first.low, second.low), max(first.high, second.high)))
+
+    def follow(self, before: int, stamp: int, reaction: float, deceleration: float) -> None:
+        """Move on from one measurement to the next.
+
+        Args:
+            before: stamp of the measurement before, ns.
+            stamp: of this one, ns.
+            reaction: time from an order to its effect, s.
+            deceleration: least one of the drive's ramps, m/s^2.
+        """
+        heard = before - round(reaction * SECOND)
+        while len(self._orders) > 1 and self._orders[1].since <= heard:
+            self._orders.popleft()
+        change = deceleration * (stamp - before) / SECOND
+        self.high = max(0.0, self.high - change, *(order.high for order in self._orders))
+        self.low = min(0.0, self.low + change, *(order.low for order in self._orders))
+
+    def begin(self, speed: float) -> None:
+        """Start from a measured speed, m/s: where it comes from does not matter."""
+        self.high, self.low = max(speed, 0.0), min(speed, 0.0)
+
+
+class ShaftWatch:
+    """Compares one shaft's feedback with its orders.
+
+    Args:
+        name: of the drive.
+    """
+
+    def __init__(self, name: str) -> None:
+        self.bounds = ShaftBounds()
+        self.moves = False
+        """Whether velocity or position show motion, by the newest feedback."""
+        self.driven = False
+        """Whether the newest feedback shows a motor that may turn the shaft."""
+        self._name = name
+        self._before: DriveFeedback | None = None
+        self._measures_current = False
+        self._current: float | None = None
+        """Newest current in the present mode, A."""
+        self._rested = False
+        """Whether the shaft has rested since it was last ordered to turn."""
+        self._over = 0.0
+        """How much faster than allowed the shaft turned at the newest feedback, m/s."""
+        self._travel = {RunawayKind.DOES_NOT_STOP: 0.0, RunawayKind.NO_ORDER: 0.0, RunawayKind.VELOCITY_LIES: 0.0}
+        """Distance beyond what is allowed: by the velocity, by the position at rest, by the position alone; m."""
+
+    def observe(
+        self,
+        feedback: DriveFeedback,
+        metres: float,
+        config: RunawayConfig,
+        reaction: float,
+        deceleration: float,
+        standstill: float,
+    ) -> Runaway | None:
+        """Take feedback; returns what nobody commanded, once.
+
+        Args:
+            feedback: of the shaft.
+            metres: distance over ground in one radian of the motor.
+            config: limits.
+            reaction: time from an order to its effect, s.
+            deceleration: least one of the drive's ramps, m/s^2.
+            standstill: speed below which a shaft rests, m/s.
+        """
+        before, self._before = self._before, feedback
+        velocity = feedback.velocity * metres
+        self._take_current(feedback, before)
+        driven = self.driven = self._is_driven(feedback, config)
+        if before is None or feedback.stamp <= before.stamp:
+            self._begin(velocity)
+            self.moves = abs(velocity) >= standstill
+            return None
+        dt = (feedback.stamp - before.stamp) / SECOND
+        step = (feedback.position - before.position) * metres
+        self.moves = max(abs(velocity), abs(step) / dt) >= standstill
+        if not driven:
+            self._begin(velocity)
+            return None
+        self.bounds.follow(before.stamp, feedback.stamp, reaction, deceleration)
+        if self.bounds.ordered:
+            self._rested = False
+        elif not self.moves:
+            self._rested = True
+        return self._judge(velocity, before.velocity * metres, step, dt, config.distance, standstill)
+
+    def pulls(self, config: RunawayConfig, *, fresh: bool) -> bool:
+        """Whether the motor may be what moves the body, even if the shaft reads standstill.
+
+        Args:
+            config: limits.
+            fresh: the drive is heard.
+        """
+        if not fresh or not self._measures_current:
+            return self._before is not None and self._before.mode in POWERED
+        return self._current is not None and abs(self._current) > config.idle_current
+
+    def _take_current(self, feedback: DriveFeedback, before: DriveFeedback | None) -> None:
+        if before is None or before.mode is not feedback.mode:
+            self._current = None
+        if feedback.current is not None:
+            self._measures_current, self._current = True, feedback.current
+
+    def _is_driven(self, feedback: DriveFeedback, config: RunawayConfig) -> bool:
+        """Whether the motor may turn the shaft; a current that is not measured yet in this mode does not show it."""
+        if feedback.mode in POWERED or not self._measures_current:
+            return True
+        return self._current is not None and abs(self._current) > config.idle_current
+
+    def _begin(self, velocity: float) -> None:
+        self.bounds.begin(velocity)
+        self._over = 0.0
+        self._travel = dict.fromkeys(self._travel, 0.0)
+
+    def _judge(
+        self, velocity: float, before: float, step: float, dt: float, distance: float, standstill: float
+    ) -> Runaway | None:
+        bounds, travel = self.bounds, self._travel
+        over, was = max(velocity - bounds.high, bounds.low - velocity) - standstill, self._over
+        self._over = over
+        travel[RunawayKind.DOES_NOT_STOP] += max(min(over, was), 0.0) * dt
+        if over <= 0.0:
+            travel[RunawayKind.DOES_NOT_STOP] = 0.0
+        reads_rest = max(abs(velocity), abs(before)) < standstill
+        if bounds.low == bounds.high == 0.0:
+            leak = LEAK * standstill * dt
+            drift = travel[RunawayKind.NO_ORDER] + step
+            travel[RunawayKind.NO_ORDER] = max(drift - leak, 0.0) if drift > 0.0 else min(drift + leak, 0.0)
+        else:
+            travel[RunawayKind.NO_ORDER] = 0.0
+        unread = abs(step) if reads_rest and abs(step) > standstill * dt else 0.0
+        travel[RunawayKind.VELOCITY_LIES] = travel[RunawayKind.VELOCITY_LIES] + unread if unread else 0.0
+        if max(map(abs, travel.values())) <= distance:
+            return None
+        measured = step / dt if reads_rest else velocity
+        found = Runaway(self._kind(measured, reads_rest=reads_rest), self._name, measured, bounds.low, bounds.high)
+        self._begin(measured)
+        return found
+
+    def _kind(self, measured: float, *, reads_rest: bool) -> RunawayKind:
+        ordered = self.bounds.ordered
+        if reads_rest and self._travel[RunawayKind.VELOCITY_LIES]:
+            return RunawayKind.VELOCITY_LIES
+        if ordered == 0.0:
+            return RunawayKind.NO_ORDER if self._rested else RunawayKind.DOES_NOT_STOP
+        return RunawayKind.OPPOSITE if measured * ordered < 0.0 else RunawayKind.TOO_FAST
+
+
+class BodyWatch:
+    """Motion of the body by a sensor that does not depend on the drives, while all of them are ordered to stand.
+
+    Args:
+        source: role of the sensor.
+    """
+
+    def __init__(self, source: str) -> None:
+        self._source = source
+        self._stamp: int | None = None
+        self._travel = 0.0
+        self.runs = False
+        """Whether the newest sample shows motion that a motor may make."""
+
+    def observe(
+        self, stamp: int, speed: float, config: RunawayConfig, standstill: float, *, standing: bool, driven: bool
+    ) -> Runaway | None:
+        """Take a speed; returns what nobody commanded, once.
+
+        Args:
+            stamp: of the sample, ns.
+            speed: of the body or a free wheel, m/s.
+            config: limits.
+            standstill: speed below which the robot rests, m/s.
+            standing: all orders are to stand, and every drive has had the time to obey.
+            driven: a motor may be what moves the robot.
+        """
+        before, self._stamp = self._stamp, stamp
+        self.runs = driven and abs(speed) >= standstill
+        if before is None or not standing or not self.runs:
+            self._travel = 0.0
+            return None
+        self._travel += abs(speed) * (stamp - before) / SECOND
+        if self._travel <= config.body_distance:
+            return None
+        self._travel = 0.0
+        return Runaway(RunawayKind.BODY_MOVES, self._source, speed, 0.0, 0.0)
+
+
+class Step(IntEnum):
+    """What is done against a runaway, each step after the one before it has not helped."""
+
+    NONE = 0
+    QUICK_STOP = 1
+    """Quick stop on every exchange, the deadman line falls, the emergency stop latches."""
+    POWER_OFF = 2
+    """Power stages off."""
+    PORT_OFF = 3
+    """Power of the drives' USB ports off, where that is configured."""
+
+
+class RunawayCheck(Check):
+    """A motor turns as nobody commanded, in any mode. The finding stays until an operator resets the emergency stop.
+
+    Every finding takes the next step: the bounds start again from the measured speed, and a step that works keeps the
+    shaft within them.
+
+    Args:
+        view: what it may look at.
+        config: limits.
+    """
+
+    reasons = (Reason.UNCOMMANDED_MOTION,)
+    reads = (IMU, ENCODERS)
+
+    def __init__(self, view: GateView, config: RunawayConfig) -> None:
+        super().__init__(view)
+        self._config = config
+        self._shafts = [ShaftWatch(topic.name.rpartition("/")[2]) for topic in DRIVES[: len(view.chassis.shafts)]]
+        self._wheels = BodyWatch(DeviceRole.ENCODERS.value)
+        self._gyro = BodyWatch(DeviceRole.IMU.value)
+        self._encoders: WheelEncoders | None = None
+        self._commanded = 0
+        """When motion was commanded last, ns."""
+        self._halted = 0
+        """Since when every command has been a quick stop, ns."""
+        self._step = Step.NONE
+        self._found: Runaway | None = None
+        self._count = 0
+
+    # What it sees
+
+    def observe(self, seen: Message | Tick, topic: Topic[Any] | None) -> None:
+        """Take a command of the newest tick, or a measure of motion."""
+        match seen:
+            case Tick():
+                self._command(seen.now)
+            case DriveFeedback() if topic is not None:
+                self._take_drive(seen, DRIVES.index(topic))
+            case WheelEncoders():
+                self._take_encoders(seen)
+            case Imu():
+                rate = seen.angular_velocity
+                turning = math.hypot(rate.x, rate.y, rate.z)
+                self._take_body(self._gyro, seen, turning * self.view.footprint.half_width)
+
+    def _command(self, now: int) -> None:
+        if self.view.mode.active:
+            self._halted = now
+        for watch, speed in zip(self._shafts, self.view.motion.shaft_speeds, strict=True):
+            watch.bounds.order(now, speed)
+            if speed:
+                self._commanded = now
+
+    def _take_drive(self, feedback: DriveFeedback, shaft: int) -> None:
+        watch, limits = self._shafts[shaft], self.view.config
+        watch.bounds.order(feedback.received, self.view.motion.shaft_speeds[shaft])
+        metres = self.view.chassis.drivetrain.distance(1.0)
+        found = watch.observe(feedback, metres, self._config, limits.reaction, limits.deceleration, limits.standstill)
+        self._take(found, feedback.received)
+
+    def _take_encoders(self, encoders: WheelEncoders) -> None:
+        before, self._encoders = self._encoders, encoders
+        if before is None or encoders.stamp <= before.stamp:
+            return
+        turned = max(abs(encoders.left - before.left), abs(encoders.right - before.right))
+        rate = turned / ((encoders.stamp - before.stamp) / SECOND)
+        self._take_body(self._wheels, encoders, rate * self.view.chassis.drivetrain.wheel_radius)
+
+    def _take_body(self, watch: BodyWatch, seen: Message, speed: float) -> None:
+        limits, now = self.view.config, seen.received
+        obeyed = self._commanded + round((limits.reaction + limits.speed / limits.deceleration) * SECOND)
+        found = watch.observe(
+            seen.stamp, speed, self._config, limits.standstill, standing=now > obeyed, driven=self._pulled(now)
+        )
+        self._take(found, now)
+
+    def _pulled(self, now: int) -> bool:
+        fresh = bool(self.view.samples.shaft_speeds(now))
+        return any(watch.pulls(self._config, fresh=fresh) for watch in self._shafts)
+
+    def _take(self, found: Runaway | None, now: int) -> None:
+        if found is None or self._step is Step.PORT_OFF:
+            return
+        self._found = found
+        self._count += 1
+        stopped = now - self._halted > self.view.config.reaction * SECOND
+        least = Step.POWER_OFF if stopped else Step.QUICK_STOP
+        self._step = Step(min(max(self._step + 1, least), Step.PORT_OFF))
+
+    # What it says
+
+    def reason(self, now: int) -> Iterator[Reason]:
+        """A finding that no operator has cleared."""
+        if self._found is not None:
+            yield Reason.UNCOMMANDED_MOTION
+
+    @property
+    def moves(self) -> bool:
+        """Whether a motor turns a shaft, or the body."""
+        return any(watch.moves and watch.driven for watch in self._shafts) or self._body_moves
+
+    @property
+    def _body_moves(self) -> bool:
+        return self._wheels.runs or self._gyro.runs
+
+    @property
+    def findings(self) -> int:
+        """Findings so far."""
+        return self._count
+
+    @property
+    def power_off(self) -> bool:
+        """Whether quick stops do not help."""
+        return self._step >= Step.POWER_OFF
+
+    @property
+    def port_off(self) -> bool:
+        """Whether switching the power stages off does not help either."""
+        return self._step >= Step.PORT_OFF
+
+    def text(self, reason: Reason) -> str:
+        """Who turns, and what was done."""
+        found = self._found
+        if found is None:
+            return reason.text
+        done = {
+            Step.QUICK_STOP: "quick stop",
+            Step.POWER_OFF: "quick stop does not help: power stage off",
+            Step.PORT_OFF: "nothing helps: switch the motors off by hand",
+        }
+        return f"{found.source} {found.kind} at {found.measured:.3f} m/s; {done[self._step]}"
+
+    def figures(self, reason: Reason, now: int) -> Iterator[Measurement]:
+        """Measured speed and what the orders allowed."""
+        if (found := self._found) is not None:
+            limit = found.high if found.measured >= 0.0 else found.low
+            yield Measurement(name="speed", value=found.measured, unit="m/s", limit=limit)
+
+    def reset(self) -> None:
+        """An operator says that the cause is gone."""
+        if self.view.mode is GateMode.ESTOPPED:
+            self._found, self._step = None, Step.NONE

@@ -1,0 +1,407 @@
+"""Motion that nobody commanded: what is found, what is not, and what the gate does about it."""
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from monstertruck_runtime.clock import SECOND
+from monstertruck_schemas import topics
+from monstertruck_schemas.cmd import DriveAction
+from monstertruck_schemas.event import Severity
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import Order
+from monstertruck_schemas.sensor import DriveMode, Imu, Vector3, WheelEncoders
+from monstertruck_schemas.state import GateMode
+from monstertruckd.gate.config import GateConfig, RunawayConfig
+from monstertruckd.gate.runaway import MAX_ORDERS, RunawayKind, ShaftBounds, ShaftWatch
+from tests.unit.gate.rig import DRIVETRAIN, Rig, feedback, header
+
+CONFIG, GATE = RunawayConfig(), GateConfig()
+TICK, PERIOD = SECOND // 50, SECOND // 20
+METRES = DRIVETRAIN.distance(1.0)
+
+
+class Shaft:
+    """A shaft with its controller: takes orders after a while, ramps, is read every 50 ms."""
+
+    def __init__(self, reaction=0.05, deceleration=2.0, current=0.1):
+        self.watch = ShaftWatch("drive")
+        self.now = SECOND
+        self.speed = self.position = self.target = 0.0
+        self.mode, self.current = DriveMode.ENABLED, current
+        self.disobeys = lambda target, _speed: target
+        self.reads = lambda speed: speed
+        self.found = []
+        self._reaction, self._deceleration = reaction, deceleration
+        self._orders = []
+        self._read_at = 0
+
+    def run(self, seconds, order=0.0, period=PERIOD):
+        """Order a speed for a time; returns what was found, with the seconds since the beginning."""
+        began = self.now
+        for _ in range(round(seconds * SECOND / TICK)):
+            self.now += TICK
+            self.watch.bounds.order(self.now, order)
+            self._orders.append((self.now + round(self._reaction * SECOND), order))
+            while self._orders and self._orders[0][0] <= self.now:
+                self.target = self._orders.pop(0)[1]
+            self._move(TICK / SECOND)
+            if self.now - self._read_at >= period:
+                self._read_at = self.now
+                self._read(began)
+        return self.found
+
+    def _move(self, dt):
+        if self.mode is DriveMode.ENABLED:
+            wanted = self.disobeys(self.target, self.speed)
+            change = wanted - self.speed
+            step = self._deceleration * dt
+            self.speed += min(max(change, -step), step)
+        self.position += self.speed * dt
+
+    def _read(self, began):
+        read = feedback(self.now, self.reads(self.speed), self.mode, current=self.current, position=self.position)
+        found = self.watch.observe(read, METRES, CONFIG, GATE.reaction, GATE.deceleration, GATE.standstill)
+        if found is not None:
+            self.found.append((found.kind, round((self.now - began) / SECOND, 3)))
+
+
+# Bounds
+
+
+def test_an_order_is_in_force_until_the_drive_was_heard_after_the_reaction_time():
+    bounds = ShaftBounds()
+    bounds.order(0, 0.2)
+    bounds.order(SECOND, 0.0)
+    bounds.follow(SECOND, SECOND + PERIOD, 0.08, 1.0)
+    assert (bounds.low, bounds.high) == (0.0, 0.2)
+    bounds.follow(SECOND + PERIOD, 3 * SECOND, 0.08, 1.0)
+    assert bounds.high == 0.2, "what was not heard for two seconds may not have received anything"
+    bounds.follow(3 * SECOND, 3 * SECOND + PERIOD, 0.08, 1.0)
+    assert bounds.high == pytest.approx(0.2 - 0.05)
+    bounds.follow(3 * SECOND + PERIOD, 4 * SECOND, 0.08, 1.0)
+    assert (bounds.low, bounds.high) == (0.0, 0.0)
+
+
+def test_an_order_backwards_leaves_the_way_down_to_the_ramp():
+    bounds = ShaftBounds()
+    bounds.begin(0.2)
+    bounds.order(SECOND, -0.1)
+    bounds.follow(2 * SECOND, 2 * SECOND + PERIOD, 0.08, 1.0)
+    assert (bounds.low, bounds.high) == pytest.approx((-0.1, 0.15))
+    assert bounds.ordered == -0.1
+
+
+def test_orders_that_pile_up_while_the_drive_is_silent_are_merged_and_lose_nothing():
+    bounds = ShaftBounds()
+    for step in range(10 * MAX_ORDERS):
+        bounds.order(step * TICK, 0.2 if step == 3 else -0.001 * (step % 7))
+    assert len(bounds._orders) == MAX_ORDERS
+    bounds.follow(0, 10 * MAX_ORDERS * TICK, 0.08, 1.0)
+    assert (bounds.low, bounds.high) == pytest.approx((-0.006, 0.2))
+
+
+# Runaways
+
+
+@pytest.mark.parametrize("ordered", [0.3, 0.15, -0.15])
+def test_a_shaft_that_ignores_slower_targets_is_found_within_half_a_second(ordered):
+    shaft = Shaft()
+    assert shaft.run(2.0, ordered) == []
+    shaft.disobeys = lambda target, speed: target if abs(target) > abs(speed) else speed
+    (first, *_) = shaft.run(0.6, 0.0)
+    assert first[0] is RunawayKind.DOES_NOT_STOP
+    assert first[1] <= 0.45
+
+
+@pytest.mark.parametrize("creep", [0.03, 0.12, -0.12])
+def test_a_shaft_that_creeps_is_found_within_half_a_second(creep):
+    shaft = Shaft()
+    shaft.run(1.0)
+    shaft.disobeys = lambda _target, _speed: creep
+    (first, *_) = shaft.run(0.6)
+    assert first[0] is RunawayKind.NO_ORDER
+    assert first[1] <= 0.45
+
+
+def test_a_creep_too_slow_for_the_velocity_is_found_by_the_position():
+    shaft = Shaft()
+    shaft.run(1.0)
+    shaft.disobeys = lambda _target, _speed: 0.005
+    ((kind, at), *_) = shaft.run(4.0)
+    assert kind is RunawayKind.NO_ORDER
+    assert at == pytest.approx(CONFIG.distance / 0.004, abs=0.2)
+
+
+@pytest.mark.parametrize(
+    ("ordered", "made", "kind"),
+    [
+        (0.1, 0.2, RunawayKind.TOO_FAST),
+        (0.1, -0.1, RunawayKind.OPPOSITE),
+        (-0.1, 0.05, RunawayKind.OPPOSITE),
+    ],
+)
+def test_a_shaft_that_turns_faster_or_the_other_way_is_found_within_half_a_second(ordered, made, kind):
+    shaft = Shaft()
+    shaft.run(1.0, ordered)
+    shaft.disobeys = lambda _target, _speed: made
+    (first, *_) = shaft.run(0.6, ordered)
+    assert first[0] is kind
+    assert first[1] <= 0.45
+
+
+@pytest.mark.parametrize("ordered", [0.0, 0.15])
+def test_a_position_that_runs_while_the_velocity_reads_zero_is_found(ordered):
+    shaft = Shaft()
+    shaft.run(1.0, ordered)
+    shaft.reads = lambda _speed: 0.0
+    shaft.disobeys = lambda target, _speed: target or 0.12
+    (first, *_) = shaft.run(0.6, ordered)
+    assert first[0] is RunawayKind.VELOCITY_LIES
+    assert first[1] <= 0.45
+
+
+def test_a_motor_that_is_off_and_draws_no_current_is_pushed_not_running_away():
+    shaft = Shaft()
+    shaft.run(1.0)
+    shaft.mode, shaft.current, shaft.speed = DriveMode.DISABLED, 0.01, 0.4
+    assert shaft.run(3.0) == []
+    assert not shaft.watch.driven
+
+
+@pytest.mark.parametrize("current", [0.08, -0.3, None])
+def test_a_motor_that_is_off_but_draws_current_or_may_do_so_is_running_away(current):
+    shaft = Shaft(current=current)
+    shaft.mode, shaft.speed = DriveMode.DISABLED, 0.2
+    assert shaft.run(1.0)
+
+
+def test_the_current_of_another_mode_shows_nothing():
+    shaft = Shaft(current=0.4)
+    shaft.run(1.0, 0.2)
+    shaft.mode, shaft.current = DriveMode.FAULT, None
+    assert shaft.run(1.0) == [], "it coasts, and its current has not been read yet"
+
+
+# What is none
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    orders=st.lists(st.tuples(st.floats(-0.3, 0.3), st.floats(0.05, 1.5)), min_size=1, max_size=8),
+    reaction=st.floats(0.0, 0.08),
+    deceleration=st.floats(1.0, 6.0),
+    period=st.integers(1, 20),
+)
+def test_an_obedient_shaft_is_never_found(orders, reaction, deceleration, period):
+    shaft = Shaft(reaction, deceleration)
+    for order, seconds in orders:
+        shaft.run(seconds, order, period * TICK)
+    shaft.run(1.0, 0.0, period * TICK)
+    assert shaft.found == []
+
+
+def test_a_shaft_that_turns_slower_than_ordered_or_stands_is_no_runaway():
+    shaft = Shaft()
+    shaft.disobeys = lambda target, _speed: 0.3 * target
+    shaft.run(2.0, 0.2)
+    shaft.disobeys = lambda _target, _speed: 0.0
+    shaft.run(2.0, 0.2)
+    assert shaft.found == []
+
+
+def test_a_motor_found_turning_by_a_new_daemon_has_its_ramp_to_stop():
+    shaft = Shaft()
+    shaft.speed = 0.2
+    assert shaft.run(2.0) == []
+
+
+# The gate
+
+
+def runaway(rig, speed=0.15, ticks=40):
+    """The drive keeps a speed, whatever it is told; ticks until the gate says so."""
+    rig.driver = None
+    for tick in range(ticks):
+        rig.speed = speed
+        rig.tick()
+        if rig.reported(Reason.UNCOMMANDED_MOTION):
+            return (tick + 1) / 50
+    return None
+
+
+def test_a_drive_that_does_not_stop_after_an_emergency_stop_loses_its_power_stage():
+    rig = Rig().driving()
+    rig.order(Order.ESTOP)
+    took = runaway(rig)
+    assert took <= 0.5
+    (event,) = rig.reported(Reason.UNCOMMANDED_MOTION)
+    assert event.severity is Severity.ERROR
+    assert "power stage off" in event.text
+    assert event.values["speed"] == pytest.approx(0.15)
+    assert rig.out.action is DriveAction.DISABLE
+    assert rig.trips[-1].reason is Reason.UNCOMMANDED_MOTION
+    assert rig.out.reasons[:2] == (Reason.ESTOPPED, Reason.UNCOMMANDED_MOTION)
+    assert not rig.out.port_off
+
+
+def test_a_drive_that_still_turns_without_its_power_stage_loses_its_port():
+    rig = Rig().driving()
+    rig.order(Order.ESTOP)
+    runaway(rig)
+    rig.events.clear()
+    assert runaway(rig) <= 0.5
+    assert rig.out.port_off
+    assert "by hand" in rig.reported(Reason.UNCOMMANDED_MOTION)[0].text
+
+
+def test_a_drive_that_runs_by_itself_while_driving_gets_a_quick_stop_first_and_the_emergency_stop_latches():
+    rig = Rig().driving()
+    rig.driver = {"speed": 0.1}
+    rig.tick(100)
+    for _ in range(25):
+        rig.speed = 0.2
+        rig.tick()
+        if rig.out.mode is GateMode.ESTOPPED:
+            break
+    assert (rig.out.mode, rig.out.action, rig.out.speeds) == (GateMode.ESTOPPED, DriveAction.QUICK_STOP, (0.0,))
+    rig.driver = None
+    rig.tick(1)
+    rig.speed = 0.0
+    rig.tick(50)
+    assert rig.out.action is DriveAction.QUICK_STOP, "it obeyed"
+
+
+@pytest.mark.parametrize("mode", [GateMode.DISARMED, GateMode.ARMED, GateMode.STOPPING])
+def test_it_is_found_in_every_mode(mode):
+    rig = Rig()
+    if mode is not GateMode.DISARMED:
+        rig.armed()
+    if mode is GateMode.STOPPING:
+        rig.driver = {"speed": 0.2}
+        rig.tick(60)
+        rig.order(Order.STOP)
+    rig.tick(0 if mode is GateMode.STOPPING else 20)
+    assert rig.out is None or rig.out.mode is not GateMode.ESTOPPED
+    assert runaway(rig, 0.2) <= 0.5
+    assert rig.out.mode is GateMode.ESTOPPED
+
+
+def test_arming_waits_for_an_operator_who_clears_it_and_clearing_for_standstill():
+    rig = Rig().driving()
+    rig.order(Order.ESTOP)
+    runaway(rig)
+    assert rig.order(Order.RESET) is Reason.NOT_ARMED_SPEED
+    assert rig.order(Order.ARM) is Reason.ESTOPPED
+    rig.mode, rig.current, rig.speed = DriveMode.DISABLED, 0.0, 0.0
+    rig.tick(20)
+    assert rig.out.action is DriveAction.DISABLE
+    assert rig.order(Order.RESET) == "ok"
+    rig.tick(2)
+    assert rig.out.reasons == (Reason.DISARMED,)
+    assert rig.order(Order.ARM) == "ok"
+
+
+def test_a_stop_is_over_only_when_standstill_is_measured():
+    rig = Rig().driving()
+    rig.driver = None
+    rig.order(Order.ESTOP)
+    rig.speed = 0.2
+    rig.tick()
+    assert rig.out.mode is GateMode.ESTOPPED
+    assert rig.out.stopping
+    rig.speed = 0.005
+    rig.tick()
+    assert not rig.out.stopping
+
+
+def test_a_disarmed_truck_whose_drive_falls_silent_is_still_stopping():
+    rig = Rig().armed()
+    rig.silent = {"drive"}
+    rig.tick(2)
+    rig.order(Order.DISARM)
+    rig.tick(100)
+    assert rig.out.mode is GateMode.DISARMED
+    assert rig.out.stopping
+    rig.silent = set()
+    rig.tick()
+    assert not rig.out.stopping
+
+
+def test_a_truck_that_was_never_armed_is_not_stopping_nor_is_one_that_is_pushed():
+    rig = Rig()
+    rig.mode, rig.current = DriveMode.DISABLED, 0.0
+    for speed in (0.0, 0.3, 0.0):
+        rig.speed = speed
+        rig.tick(20)
+        assert not rig.out.stopping
+    assert rig.out.mode is GateMode.DISARMED
+
+
+# The second source
+
+
+def turned(rig, wheel, wz=0.0):
+    """Free wheels turn by an angle (rad), and the body at a rate (rad/s)."""
+    angle = {"left": wheel, "right": wheel}
+    rig.gate.observe(WheelEncoders(**header(rig.now), **angle), topics.ENCODERS)
+    rate, force = Vector3(x=0.01, y=0.0, z=wz), Vector3(x=0.0, y=0.0, z=9.81)
+    imu = Imu(**header(rig.now), angular_velocity=rate, linear_acceleration=force)
+    rig.gate.observe(imu, topics.IMU)
+
+
+def moved(rig, speed, wz=0.0, ticks=60):
+    """Seconds until motion of the body is found."""
+    for tick in range(ticks):
+        turned(rig, (tick + 1) * speed / 50 / 0.075, wz)
+        rig.tick()
+        if rig.out.mode is GateMode.ESTOPPED and rig.reported(Reason.UNCOMMANDED_MOTION):
+            return (tick + 1) / 50
+    return None
+
+
+@pytest.mark.parametrize(("speed", "wz"), [(0.2, 0.0), (-0.2, 0.0), (0.0, 1.0)])
+def test_a_body_that_moves_while_its_drive_reads_standstill_is_found(speed, wz):
+    rig = Rig().armed()
+    rig.current = 0.3
+    rig.driver = {"speed": 0.0}
+    rig.tick(30)
+    assert moved(rig, speed, wz) <= 0.5
+    assert "stands by its own measure" in rig.reported(Reason.UNCOMMANDED_MOTION)[0].text
+
+
+def test_a_body_that_moves_after_a_stop_while_the_drive_is_lost_is_found():
+    rig = Rig().driving()
+    rig.current = 0.3
+    rig.tick(5)
+    rig.silent = {"drive"}
+    rig.order(Order.ESTOP)
+    assert moved(rig, 0.2) <= 1.0
+
+
+def test_an_emergency_stopped_truck_whose_motor_draws_no_current_may_be_carried():
+    rig = Rig().driving()
+    rig.current = 0.0
+    rig.driver = None
+    rig.order(Order.ESTOP)
+    rig.tick(50)
+    assert moved(rig, 0.5, 2.0) is None
+
+
+def test_free_wheels_that_roll_as_ordered_and_unwind_after_a_stop_are_none():
+    rig = Rig().driving()
+    rig.current = 0.3
+    angle = 0.0
+    for tick in range(150):
+        speed = 0.2 if tick < 100 else max(0.0, 0.2 - 0.02 * (tick - 100))
+        rig.driver = {"speed": 0.2} if tick < 100 else {"speed": 0.0}
+        angle += speed / 50 / 0.075
+        turned(rig, angle)
+        rig.tick()
+    assert not rig.reported(Reason.UNCOMMANDED_MOTION)
+
+
+def test_it_can_be_configured_not_to_look():
+    rig = Rig(runaway=None).driving()
+    rig.order(Order.ESTOP)
+    assert runaway(rig) is None
