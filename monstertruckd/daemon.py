@@ -381,6 +381,7 @@ class Daemon:
             black_box=lambda trip: None if self.black_box is None else self.black_box.trip(trip),
             offload=self._offload,
             weakened=config.weakened(),
+            cut_ports=self._cabling.cut,
         )
 
     def _build_calibration(self) -> CalibrationWatch:

@@ -15,11 +15,13 @@ from monstertruck_drivers.webcam.rendered_source import PathSource, RenderedSour
 from monstertruck_drivers.webcam.source import FrameSource, FrameStream, Mode
 from monstertruck_estimation.scan_tilt import ScanAngles, TiltStamper
 from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.errors import DeviceError
 from monstertruck_runtime.mailbox import Delivery, latest
 from monstertruck_runtime.ports import Publisher
 from monstertruck_runtime.service import Service
 from monstertruck_schemas import topics
 from monstertruck_schemas.base import Schema
+from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.topics import Writer
@@ -49,6 +51,7 @@ class Cabling:
         self.on_hubs = frozenset(places)
         """Roles of the devices that hang by hub and port."""
         self._hubs = HubCoordinator(config.usb, places, self._machine.clock, self._events)
+        self._cut = config.usb.power.cut
         self._power = PortPower(config.usb.power, self._machine, self._events)
         self.service: UsbService | None = None
         """Watches the tree; None where no device hangs by hub and port."""
@@ -73,6 +76,17 @@ class Cabling:
         if isinstance(port, UsbPortConfig):
             return HubCamera(HubNode(port, self._machine, self._hubs, role, "video4linux"), self._machine)
         return PathSource(str(port.path), self._machine.clock)
+
+    async def cut(self) -> None:
+        """Switch off the ports of ``usb.power.cut``; one that refuses is reported, and the next one is tried."""
+        for role in self._cut:
+            port = self._ports.get(role)
+            if not isinstance(port, UsbPortConfig):
+                continue
+            try:
+                await self._power.switch_off(port.device)
+            except DeviceError as error:
+                self._events(Reason.DEVICE_FAULT, Severity.ERROR, role, str(error))
 
     def waiting(self, role: str) -> str | None:
         """What the device of ``role`` waits for before it may start; None if it does not wait."""

@@ -155,7 +155,7 @@ class GateOutput(NamedTuple):
     events: tuple[GateEvent, ...]
     trips: tuple[Stop, ...]
     stopping: bool
-    """The truck may not move, and its standstill is not measured yet."""
+    """The truck is to stand, and its standstill is not measured yet."""
     port_off: bool
     """Only switching the drives' ports off stops the truck."""
 
@@ -505,6 +505,12 @@ class Gate:
         elif self._at_rest(now, self._states.since):
             self._unconfirmed = False
 
+    def _is_stopping(self, now: int) -> bool:
+        """Whether the truck is to stand, and its standstill has not been measured since."""
+        if self.mode.accepts_motion:
+            return self.mode is GateMode.ARMED and not self._at_rest(now)
+        return self._unconfirmed
+
     def neutral(self, now: int) -> GateOutput:
         """Last output before the daemon ends: quick stop. The gate never drives again after it."""
         self._shut_down = True
@@ -635,7 +641,7 @@ class Gate:
             handed_to=self._sources.handed_to(now),
             events=self._events.drain(),
             trips=self._stops.drain(now, (*blocks, *limits)),
-            stopping=self._unconfirmed and not self.mode.accepts_motion,
+            stopping=self._is_stopping(now),
             port_off=self._checks.port_off,
         )
 

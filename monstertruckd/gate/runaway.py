@@ -245,10 +245,12 @@ class BodyWatch:
 
     Args:
         source: role of the sensor.
+        fresh_for: age from which on its newest sample shows nothing, s.
     """
 
-    def __init__(self, source: str) -> None:
+    def __init__(self, source: str, fresh_for: float) -> None:
         self._source = source
+        self._fresh_for = round(fresh_for * SECOND)
         self._stamp: int | None = None
         self._travel = 0.0
         self.runs = False
@@ -277,6 +279,11 @@ class BodyWatch:
             return None
         self._travel = 0.0
         return Runaway(RunawayKind.BODY_MOVES, self._source, speed, 0.0, 0.0)
+
+    def expire(self, now: int) -> None:
+        """Forget the motion of a sample that is too old at ``now``, ns."""
+        if self._stamp is not None and now - self._stamp > self._fresh_for:
+            self.runs = False
 
 
 class Step(IntEnum):
@@ -309,8 +316,8 @@ class RunawayCheck(Check):
         super().__init__(view)
         self._config = config
         self._shafts = [ShaftWatch(topic.name.rpartition("/")[2]) for topic in DRIVES[: len(view.chassis.shafts)]]
-        self._wheels = BodyWatch(DeviceRole.ENCODERS.value)
-        self._gyro = BodyWatch(DeviceRole.IMU.value)
+        self._wheels = BodyWatch(DeviceRole.ENCODERS.value, ENCODERS.fresh_for())
+        self._gyro = BodyWatch(DeviceRole.IMU.value, IMU.fresh_for())
         self._encoders: WheelEncoders | None = None
         self._commanded = 0
         """When motion was commanded last, ns."""
@@ -337,6 +344,8 @@ class RunawayCheck(Check):
                 self._take_body(self._gyro, seen, turning * self.view.footprint.half_width)
 
     def _command(self, now: int) -> None:
+        self._wheels.expire(now)
+        self._gyro.expire(now)
         if self.view.mode.active:
             self._halted = now
         for watch, speed in zip(self._shafts, self.view.motion.shaft_speeds, strict=True):

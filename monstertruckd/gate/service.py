@@ -2,7 +2,7 @@
 
 import asyncio
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final, TypeVar, assert_never
@@ -102,6 +102,7 @@ class GateService:
         black_box: called with every stop as it happens; returns the file that will hold the minute before, if any.
         offload: runs the storing of the latch, which blocks.
         weakened: settings less safe than the defaults, shown to everybody.
+        cut_ports: takes the power from the drives' ports.
     """
 
     name = ServiceName.GATE.value
@@ -118,8 +119,12 @@ class GateService:
         black_box: Callable[[Stop], str | None] = lambda _: None,
         offload: Offload = in_thread,
         weakened: tuple[str, ...] = (),
+        cut_ports: Callable[[], Awaitable[None]] | None = None,
     ) -> None:
         self._gate = gate
+        self._cut_ports = cut_ports
+        self._nothing_helps = asyncio.Event()
+        self._port_off = False
         self._weakened = weakened
         self._rate = rate
         self._clock = clock
@@ -227,12 +232,21 @@ class GateService:
             async with asyncio.TaskGroup() as group:
                 group.create_task(self._keep_latch(), name="gate latch")
                 group.create_task(self._fail(), name="gate bug")
+                group.create_task(self._cut(), name="gate ports")
                 try:
                     await self._tick_forever(ready)
                 finally:
                     self.shut_down()  # before waiting for the disk
         finally:
             await self._store_latch()
+
+    async def _cut(self) -> None:
+        """Cut the ports each time that nothing else stops the robot."""
+        while True:
+            await self._nothing_helps.wait()
+            self._nothing_helps.clear()
+            if self._cut_ports is not None:
+                await self._cut_ports()
 
     async def close(self) -> None:
         """Store the latch once more and remove its mark, when no more orders can arrive; does not raise ``OSError``."""
@@ -294,6 +308,9 @@ class GateService:
             self._outputs.state.put(self._state(output, now))
         if (output.mode is GateMode.ESTOPPED) != self._latched:
             self._latch_differs.set()
+        if output.port_off and not self._port_off:
+            self._nothing_helps.set()
+        self._port_off = output.port_off
 
     def _stop(self, trip: Stop, now: int) -> Stop:
         if trip.number != self._boxed[0]:

@@ -124,6 +124,7 @@ class FleetBoard:
             "old": seen["old"] or not feed.alive,
             "round_trip": None if feed.round_trip is None else round(feed.round_trip, 4),
             "mode": None if gate is None else gate.mode.value,
+            "stopping": gate is not None and gate.stopping,
             "holder": None if gate is None else gate.holder,
             "reasons": [] if gate is None else [reason.value for reason in gate.reasons],
         }

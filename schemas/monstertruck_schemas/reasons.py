@@ -152,6 +152,7 @@ class Reason(StrEnum):
     PORT_MOVED = "port_moved", 103, "a device was plugged into another port than configured"
     SLOW_LINK = "slow_link", 104, "a device's link is slow"
     PORT_CYCLED = "port_cycled", 105, "a USB port was switched off and on"
+    PORT_OFF = "port_off", 107, "a USB port was switched off, for a motor that nothing else stopped"
     DEVICE_WEDGED = "device_wedged", 106, "device takes no bytes, or the kernel cannot open or close its port"
 
     # The truck's supply, host and network

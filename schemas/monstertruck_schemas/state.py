@@ -196,9 +196,15 @@ class GateState(Message):
     asking: tuple[str, ...] = ()
     """Operators who have asked the one who drives to hand over, the newest last."""
     stopping: bool = False
-    """The robot may not move, and its standstill has not been measured since; in mode ``stopping`` always."""
+    """The robot is to stand, and its standstill has not been measured since."""
     handed_to: str | None = None
     """Operator to whom the drive was handed over just now: others of that priority wait a moment."""
+
+    @property
+    def mode_text(self) -> str:
+        """Mode in words; with ``stopping`` while standstill has not been measured."""
+        still = self.stopping and self.mode is not GateMode.STOPPING
+        return f"{self.mode.value}, stopping" if still else self.mode.value
 
     @property
     def worst(self) -> Reason:

@@ -60,11 +60,16 @@ class PowerConfig(Schema):
     """Short sessions in a row after which a port is cycled unasked; None = only on request"""
     off_time: Annotated[float, Field(ge=0.1, le=30)] = 2.0
     """Seconds without power"""
+    cut: Annotated[tuple[str, ...], Field(strict=False)] = ()
+    """Roles of devices whose port is switched off, and stays off, when a motor turns and neither quick stop nor power
+    stage off stops it: where the port feeds the motor's controller, or a relay in its supply"""
 
     @model_validator(mode="after")
     def _method_known(self) -> Self:
         if self.after is not None and self.method is None:
             raise ValueError("after: ports can be cycled unasked only by a method")
+        if self.cut and self.method not in (CycleMethod.PORT, CycleMethod.UHUBCTL):
+            raise ValueError("cut: expected method port or uhubctl, which switch a port's power")
         return self
 
 

@@ -100,6 +100,22 @@ class PortPower:
             Reason.PORT_CYCLED, Severity.WARNING, "usb", f"{place(name)} was switched off and on", method=method.value
         )
 
+    async def switch_off(self, name: str) -> None:
+        """Take the power from the port ``name`` hangs on, until it is cycled.
+
+        Raises:
+            DeviceError: the machine refused.
+        """
+        machine = self._machine
+        try:
+            if self.config.method is CycleMethod.UHUBCTL:
+                await self._uhubctl(name, "off")
+            else:
+                await machine.offload(lambda: machine.sysfs.write(f"{port_directory(name)}/disable", "1"))
+        except OSError as error:
+            raise DeviceError(f"{place(name)} cannot be switched off: {error}") from error
+        self._events(Reason.PORT_OFF, Severity.WARNING, "usb", f"{place(name)} was switched off, and stays off")
+
     def _pace(self, name: str) -> None:
         now = self._machine.clock.now()
         count, last = self._cycles.get(name, (0, now))

@@ -1,7 +1,7 @@
 // All robots at a glance: a map of where they are, and a table by which the page switches to one of them.
 import { compose, outline } from "./geometry.js";
 import { element } from "./panels.js";
-import { number, reason, words } from "./words.js";
+import { modeText, number, reason, words } from "./words.js";
 
 const byId = (id) => document.getElementById(id);
 const LOOKS = { disarmed: "", armed: "warn", driving: "good", stopping: "warn", estopped: "bad" };
@@ -59,10 +59,10 @@ export class FleetView {
   }
 
   fill(row, robot) {
-    const { alive, mode, holder, reasons, voltage, level, round_trip, pose, old } = robot;
-    const gate = [words(`mode.${mode ?? "unknown"}`), ...(holder ? [words("holder", { name: holder })] : []), ...reasons.slice(0, 1).map(reason)];
+    const { alive, mode, stopping, holder, reasons, voltage, level, round_trip, pose, old } = robot;
+    const gate = [modeText(mode, stopping), ...(holder ? [words("holder", { name: holder })] : []), ...reasons.slice(0, 1).map(reason)];
     const cells = [
-      [gate.join(" · "), LOOKS[mode] ?? "bad"],
+      [gate.join(" · "), stopping ? "bad" : LOOKS[mode] ?? "bad"],
       [level ? `${voltage === null ? "–" : number(voltage, 1)} V` : "–", LEVELS[level] ?? ""],
       [alive ? words("link.value", { delay: number(1000 * round_trip, 0) }) : words("link.absent"), alive ? "" : "bad"],
       [pose ? words(old ? "fleet.was" : "fleet.at", { x: number(pose[0], 1), y: number(pose[1], 1) }) : "–", old ? "warn" : ""],

@@ -1,6 +1,6 @@
 // The panels beside the map: safety gate, truck, system, events, banners.
 import { wheelAngles } from "./geometry.js";
-import { degrees, number, reason, words } from "./words.js";
+import { degrees, modeText, number, reason, words } from "./words.js";
 
 const byId = (id) => document.getElementById(id);
 const KEPT = 300;
@@ -138,9 +138,10 @@ export class Panels {
 
   showGate(gate) {
     const mode = gate?.mode ?? "unknown";
-    setText("mode-name", words(`mode.${mode}`));
+    const named = modeText(gate?.mode, gate?.stopping);
+    setText("mode-name", named);
     byId("authority").dataset.mode = mode;
-    setText("chip-mode", words(`mode.${mode}`), LOOKS[mode] ?? "bad");
+    setText("chip-mode", named, gate?.stopping ? "bad" : LOOKS[mode] ?? "bad");
     setText("mode-limit", gate && gate.mode !== "disarmed" && gate.mode !== "estopped" ? words("limit", { speed: number(gate.speed_limit) }) : "");
     const list = (gate?.reasons ?? []).map(reason);
     if (byId("reasons").dataset.shown !== list.join()) {
@@ -153,7 +154,7 @@ export class Panels {
     byId("lease").hidden = !gate?.holder;
     byId("lease").value = gate?.lease_left ?? 0;
     const moving = ["armed", "driving", "stopping"].includes(mode);
-    byId("arm").disabled = mode !== "disarmed";
+    byId("arm").disabled = mode !== "disarmed" || gate.stopping;
     byId("disarm").disabled = !moving;
     byId("stop").disabled = mode !== "driving";
     byId("reset").hidden = mode !== "estopped";

@@ -15,6 +15,12 @@ export function words(key, values = {}) {
   return (table[key] ?? key).replace(/\{(\w+)\}/g, (whole, name) => values[name] ?? whole);
 }
 
+// The gate's mode, and that the robot has not come to rest yet.
+export function modeText(mode, stopping) {
+  const text = words(`mode.${mode ?? "unknown"}`);
+  return stopping && mode !== "stopping" ? `${text}, ${words("mode.stopping").toLowerCase()}` : text;
+}
+
 export const reason = (code) => words(`reason.${code}`);
 export const number = (value, digits = 2) => (Number.isFinite(value) ? value.toFixed(digits).replace(/^-(0\.?0*)$/, "$1") : "–");
 export const degrees = (radians, digits = 0) => number((radians * 180) / Math.PI, digits);

@@ -124,7 +124,7 @@ def _run(name: str, robot: str, endpoint: str, *, json_output: bool, hold: bool 
 
 
 def _state_texts(state: "GateState") -> Iterator[str]:
-    yield state.mode.value
+    yield state.mode_text
     if state.holder is not None:
         yield f"{state.holder} drives"
     elif state.waiting:

@@ -252,7 +252,7 @@ def _truck(state: ScreenState) -> Panel:
     table = Table.grid(padding=(0, 1))
     gate, odometry = state.gate, state.odometry
     if gate is not None:
-        _row(table, "gate", Text(gate.mode.value.upper(), style=MODE_STYLE[gate.mode]))
+        _row(table, "gate", Text(gate.mode_text.upper(), style=MODE_STYLE[gate.mode]))
         role = f" ({gate.role.value})" if gate.role and gate.role.value != gate.holder else ""
         _row(table, "driver", f"{gate.holder or '-'}{role}")
         if gate.form is not None and gate.twist is not None:

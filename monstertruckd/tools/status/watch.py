@@ -126,7 +126,7 @@ def plain(state: ScreenState) -> list[str]:
     lines = []
     if state.gate is not None:
         reasons = ", ".join(reason.value for reason in state.gate.reasons) or "-"
-        lines.append(f"gate      {state.gate.mode.value}, driver {state.gate.holder or '-'}, why {reasons}")
+        lines.append(f"gate      {state.gate.mode_text}, driver {state.gate.holder or '-'}, why {reasons}")
         lines += [f"waiting   {name}" for name in state.gate.waiting]
         lines += [f"weakened  {setting}" for setting in state.gate.weakened]
     lines += [f"stop      {line}" for line in state.why_stopped]

@@ -10,7 +10,7 @@ import pytest
 from monstertruck_runtime import wire
 from monstertruck_runtime.clock import SECOND, run_virtual
 from monstertruck_runtime.errors import InputError, NoAnswerError, RequestRefusedError
-from monstertruck_runtime.mailbox import fifo
+from monstertruck_runtime.mailbox import fifo, latest
 from monstertruck_runtime.requests import parse_request
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import ControlRequest, Order, Role
@@ -30,6 +30,7 @@ class CalledBench(Bench):
     def __init__(self, clock):
         self.bus = Bus(clock)
         super().__init__(clock, state=self.bus.publisher(GATE, Writer.GATE))
+        self.states = self.bus.subscribe(GATE, latest())
         self.bus.listen(REQ_CONTROL, self.service.control)
         self.rpc = Rpc(clock)
         register_gate_calls(self.rpc, self.bus, clock)
@@ -92,6 +93,27 @@ def test_disarm_is_answered_once_the_truck_stands():
             assert bench.service.mode is GateMode.STOPPING
             bench.speed = 0.0
             assert await answer == "disarmed"
+
+    called(scenario)
+
+
+@pytest.mark.parametrize("order", ["stop", "disarm"])
+@pytest.mark.parametrize("armed", [True, False])
+def test_an_order_to_stop_a_truck_that_still_moves_is_not_done_and_says_so_after_4_s(order, armed):
+    async def scenario(bench):
+        if armed:
+            await bench.call("arm")
+        bench.speed = 0.15
+        began = bench.clock.now()
+        await bench.clock.sleep(0.1)
+        with pytest.raises(NoAnswerError, match=r"not confirmed after 4 s: .*a motor turns as nobody commanded"):
+            await bench.call(order)
+        assert bench.clock.now() - began >= 4 * SECOND
+        state = bench.states.latest
+        assert state.stopping
+        assert state.mode_text == "estopped, stopping"
+        bench.speed = 0.0
+        assert await bench.call(order) == "estopped"
 
     called(scenario)
 

@@ -265,3 +265,29 @@ def test_that_short_faults_repeat_is_logged_too(caplog):
         assert "4 stops for stale sensors within 10 s: disarmed" in logged
 
     on_bench(scenario)
+
+
+def test_the_drives_ports_are_cut_once_when_neither_quick_stop_nor_power_off_helps():
+    cuts = []
+
+    async def main(clock):
+        bench = Bench(clock)
+
+        async def cut():
+            cuts.append((clock.now(), bench.out.drives[0].last.action))
+
+        bench.service._cut_ports = cut
+        async with bench.running():
+            bench.order(Order.ARM)
+            await clock.sleep(0.1)
+            bench.speed = 0.2
+            await clock.sleep(3.0)
+        return bench
+
+    bench = run_virtual(main)
+    actions = [command.action for command in bench.out.drives[0].messages]
+    order = [action for action, before in zip(actions[1:], actions, strict=False) if action is not before]
+    assert order[-3:] == [DriveAction.RUN, DriveAction.QUICK_STOP, DriveAction.DISABLE]
+    assert [action for _, action in cuts] == [DriveAction.DISABLE]
+    assert bench.boxes.count(Reason.UNCOMMANDED_MOTION) == 3
+    assert not bench.out.steering.last.deadman

@@ -38,6 +38,29 @@ def test_the_device_vanishes_and_comes_back(tmp_path: Path, method: CycleMethod)
     assert bench.usb.commands == (commands if method is CycleMethod.UHUBCTL else [])
 
 
+@pytest.mark.parametrize("method", [CycleMethod.PORT, CycleMethod.UHUBCTL])
+def test_a_port_that_is_switched_off_stays_off_until_it_is_cycled(tmp_path: Path, method: CycleMethod):
+    async def scene(bench: Bench) -> None:
+        link = await bench.ports["lidar"].open()
+        await bench.power.switch_off("1-1.1")
+        await bench.clock.sleep(30)
+        assert link.is_lost
+        assert not bench.usb.present("1-1.1")
+        await bench.power.cycle("1-1.1")
+        assert bench.usb.present("1-1.1")
+
+    bench = play(tmp_path, scene, by(method))
+    [(severity, _, text, _)] = bench.events.of(Reason.PORT_OFF)
+    assert severity is Severity.WARNING
+    assert "hub 1-1 port 1" in text
+
+
+@pytest.mark.parametrize("method", [None, CycleMethod.AUTHORIZED])
+def test_only_a_way_that_switches_power_can_cut_a_port(method: CycleMethod | None):
+    with pytest.raises(ValidationError, match="cut: expected method port or uhubctl"):
+        PowerConfig(method=method, cut=("drive",))
+
+
 def test_power_stays_off_for_its_time_and_comes_back_when_cancelled(tmp_path: Path):
     async def scene(bench: Bench) -> None:
         attribute = f"{port_directory('1-1.1')}/disable"
