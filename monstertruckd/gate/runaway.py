@@ -82,6 +82,11 @@ class ShaftBounds:
         newest = self._orders[-1]
         return newest.high if newest.high > 0.0 else newest.low
 
+    @property
+    def steady(self) -> bool:
+        """Whether one order alone has been in force between the newest two measurements."""
+        return len(self._orders) == 1
+
     def order(self, now: int, speed: float) -> None:
         """Take the speed that is ordered at ``now`` (ns)."""
         newest, orders = self._orders[-1], self._orders
@@ -222,7 +227,7 @@ class ShaftWatch:
             travel[RunawayKind.NO_ORDER] = max(drift - leak, 0.0) if drift > 0.0 else min(drift + leak, 0.0)
         else:
             travel[RunawayKind.NO_ORDER] = 0.0
-        unread = abs(step) if reads_rest and abs(step) > standstill * dt else 0.0
+        unread = abs(step) if reads_rest and bounds.steady and abs(step) > standstill * dt else 0.0
         travel[RunawayKind.VELOCITY_LIES] = travel[RunawayKind.VELOCITY_LIES] + unread if unread else 0.0
         if max(map(abs, travel.values())) <= distance:
             return None

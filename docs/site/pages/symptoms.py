@@ -87,7 +87,7 @@ SYMPTOMS: Final = (
             "autosuspend": "`monstertruckd install-service` keeps ports awake.",
             "port_moved": "Plug it back, or `monstertruckd find-port`.",
             "slow_link": "A USB 1 cable or hub on the way.",
-            "port_off": "Switch the motors off by hand, repair the drive, then `monstertruckd usb cycle`.",
+            "port_off": "Switch the motors off by hand, repair the drive, then `uhubctl -a on`.",
             "port_cycled": "The daemon has switched that port off and on.",
             "clock_drift": "The lidar's clock is wrong: switch it off and on.",
         },
