@@ -210,7 +210,8 @@ class Daemon:
     def _start_estimation(self, estimation: Scope) -> Callable[[], bool] | None:
         """Start estimation; returns the function that saves the map, None if no map is made."""
         save_map: Callable[[], bool] | None = None
-        for service in build_estimation(self.config, self.bus, self.clock, self._body, self._nonce):
+        estimators = build_estimation(self.config, self.bus, self.clock, self._body, self._actors, self._nonce)
+        for service in estimators:
             self._start(estimation, service)
             if isinstance(service, SlamService):
                 save_map = service.save_soon
@@ -365,6 +366,7 @@ class Daemon:
             latched=latch.engaged(),
             sonars=self._body.sonars,
             peers=self._body.peers,
+            compared=True,
         )
         shafts = len(self._body.chassis.shafts)
         drives, steering = bus.actuators(shafts)

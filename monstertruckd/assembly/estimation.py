@@ -8,7 +8,13 @@ from typing import Final, Self
 
 from monstertruck_drivers.catalog import DEVICES
 from monstertruck_estimation.catalog import ODOMETRY
+from monstertruck_estimation.consistency.config import ConsistencyConfig
+from monstertruck_estimation.consistency.service import START_TIMEOUT as SCANS_START
+from monstertruck_estimation.consistency.service import TARGET as SCAN_ODOMETRY
+from monstertruck_estimation.consistency.service import ConsistencyInputs, ConsistencyService, ScanSetup
 from monstertruck_estimation.ground.service import GroundService
+from monstertruck_estimation.gyro import GyroConfig
+from monstertruck_estimation.inertial import Inertial
 from monstertruck_estimation.odometry import OdometryContext
 from monstertruck_estimation.points.config import PointsConfig
 from monstertruck_estimation.points.service import START_TIMEOUT as READER_START
@@ -19,7 +25,7 @@ from monstertruck_estimation.slam.service import SlamService
 from monstertruck_estimation.transforms import TransformService, compose, invert, mount, quaternion_from_rpy
 from monstertruck_kinematics.chassis import Chassis
 from monstertruck_planners.collision import Footprint, ScanPoints
-from monstertruck_runtime.actors.actor import WorkerActor
+from monstertruck_runtime.actors.actor import ActorFactory, Placement, WorkerActor
 from monstertruck_runtime.clock import Clock, VirtualClock
 from monstertruck_runtime.errors import NotInstalledError
 from monstertruck_runtime.mailbox import fifo, latest
@@ -29,7 +35,7 @@ from monstertruck_schemas import topics
 from monstertruck_schemas.body import LensConfig, Mount
 from monstertruck_schemas.roles import DeviceRole
 from monstertruck_schemas.topics import Writer
-from monstertruckd.assembly.devices import scan_angles
+from monstertruckd.assembly.devices import measures_battery, scan_angles
 from monstertruckd.bus.local import Bus
 from monstertruckd.config.truck import TruckConfig
 
@@ -77,7 +83,9 @@ def sensor_mounts(config: TruckConfig) -> dict[str, Mount]:
     return mounts
 
 
-def build_estimation(config: TruckConfig, bus: Bus, clock: Clock, body: Body, run: str = "") -> Iterator[Service]:
+def build_estimation(
+    config: TruckConfig, bus: Bus, clock: Clock, body: Body, actors: ActorFactory, run: str = ""
+) -> Iterator[Service]:
     """Transforms always; odometry where the robot can drive and steer. ``run`` names this run in saved maps."""
     mounts = {name: mount(name, (m.x, m.y, m.z), (m.roll, m.pitch, m.yaw)) for name, m in sensor_mounts(config).items()}
     joints = mounts.pop(DeviceRole.STABILISER, None)
@@ -104,12 +112,56 @@ def build_estimation(config: TruckConfig, bus: Bus, clock: Clock, body: Body, ru
         body.chassis, clock, bus, compass=compass, slam=config.slam is not None, imu=turned, encoders=encoders
     )
     yield ODOMETRY.implementation(config.odometry)(config.odometry, context)
+    if config.consistency is not None:
+        yield _build_consistency(config, config.consistency, bus, clock, body, actors)
     ground = _build_ground(config, bus, clock, run)
     if ground is not None:
         yield ground
     if config.points is not None:
         ask = None if slam is None else slam.bases_at
         yield _build_points(config, config.points, bus, clock, ask, run)
+
+
+def _build_consistency(
+    config: TruckConfig, consistency: ConsistencyConfig, bus: Bus, clock: Clock, body: Body, actors: ActorFactory
+) -> ConsistencyService:
+    devices, chassis = config.devices, body.chassis
+    scans = None
+    if consistency.scans is not None and devices.lidar is not None and find_spec("numba") is not None:
+        # On the virtual clock nothing runs meanwhile: a process of its own would only take time to start.
+        placement: Placement = "loop" if isinstance(clock, VirtualClock) else "worker"
+        actor = actors.actor(
+            placement,
+            ConsistencyService.name,
+            SCAN_ODOMETRY,
+            latency=consistency.latency,
+            deadline=consistency.deadline,
+            start_timeout=SCANS_START,
+        )
+        scans = ScanSetup(actor, devices.lidar.mount, scan_angles(config, bus, fifo(ODOMETRIES)))
+    imu = devices.imu
+    axes = None if imu is None else quaternion_from_rpy(imu.mount.roll, imu.mount.pitch, imu.mount.yaw)
+    return ConsistencyService(
+        consistency,
+        chassis,
+        clock,
+        inputs=ConsistencyInputs(
+            drives=[bus.subscribe(topic, latest()) for topic in topics.DRIVES[: len(chassis.shafts)]],
+            steering=bus.subscribe(topics.STEERING, latest()) if chassis.steered else None,
+            gate=bus.subscribe(topics.GATE, latest()),
+            scan=None if scans is None else bus.subscribe(topics.SCAN, fifo(SCANS)),
+            compass=None if devices.compass is None else bus.subscribe(topics.COMPASS, fifo(ODOMETRIES)),
+            imu=None if imu is None else bus.subscribe(topics.IMU, fifo(ODOMETRIES)),
+            encoders=None if devices.encoders is None else bus.subscribe(topics.ENCODERS, fifo(ODOMETRIES)),
+            battery=bus.subscribe(topics.BATTERY, fifo(SCANS)) if measures_battery(config) else None,
+            camera=None if devices.camera is None else bus.subscribe(topics.CAMERA, fifo(SCANS)),
+        ),
+        scans=scans,
+        inertial=None if axes is None else Inertial(GyroConfig(), axes),
+        out=bus.publisher(topics.CONSISTENCY, Writer.ESTIMATION),
+        events=bus.event_sink(),
+        wheels=DeviceRole.DRIVE if devices.wheels is None else DeviceRole.WHEELS,
+    )
 
 
 def _build_ground(config: TruckConfig, bus: Bus, clock: Clock, run: str) -> GroundService | None:

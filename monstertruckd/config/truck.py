@@ -12,6 +12,7 @@ from monstertruck_drivers.maestro.config import MaestroConfig
 from monstertruck_drivers.shafts import MotorLimits, motor_limits
 from monstertruck_drivers.usb.config import UsbConfig
 from monstertruck_estimation.catalog import AnyOdometry
+from monstertruck_estimation.consistency.config import ConsistencyConfig
 from monstertruck_estimation.ground.config import GroundConfig
 from monstertruck_estimation.odometry import OdometryConfig
 from monstertruck_estimation.points.config import PointsConfig
@@ -144,6 +145,8 @@ class TruckConfig(Schema):
     map: MapRender | None = None
     slam: SlamConfig | None = None
     """Mapping, or localisation in a saved map, by the lidar; null = the pose in map is odometry"""
+    consistency: ConsistencyConfig | None = ConsistencyConfig()
+    """Comparison of the sensors' measures of motion, by which sensors that lie are found; null = none"""
     ground: GroundConfig | None = GroundConfig()
     """Tilt and roughness of the ground, for the routes of a robot with a compass; null = not estimated"""
     points: PointsConfig | None = None

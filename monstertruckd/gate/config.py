@@ -215,6 +215,8 @@ class GateConfig(Schema):
     """Speed limit with a low battery, or a stale battery voltage, m/s."""
     obstacle: ObstacleLimits = ObstacleLimits()
     sonar: SonarLimits = SonarLimits()
+    unwitnessed: Annotated[float, Field(gt=0, le=1), LIVE] = 0.5
+    """Share of the speed limits that holds while no second, independent sensor measures the robot's motion."""
     event_interval: NotNegative = 1.0
     """Least seconds between two equal events."""
 
@@ -394,6 +396,7 @@ WEAKER_ABOVE: Final = (
     "obstacle.unseen_speed",
     "sonar.stale_after",
     "sonar.unseen_speed",
+    "unwitnessed",
     "blocked.within",
     "blocked.speed",
     "runaway.distance",

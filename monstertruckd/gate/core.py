@@ -30,6 +30,7 @@ from monstertruck_schemas.topics import BATTERY, COMPASS, DRIVES, SCAN, STEERING
 from monstertruckd.gate.arbitration import EventLog, GateEvent, GateStateMachine, Source, Sources
 from monstertruckd.gate.checks import Check, Checks, GateView, Tick
 from monstertruckd.gate.config import GateConfig, InForce
+from monstertruckd.gate.consistency import ConsistencyCheck
 from monstertruckd.gate.following import ShaftCheck, SteeringCheck
 from monstertruckd.gate.limiter import CommandLimiter
 from monstertruckd.gate.motion import Motion
@@ -62,6 +63,7 @@ DISARMING: Final = frozenset(
         Reason.SERVICE_FAILED,
         Reason.STEERING_DEAD,
         Reason.SHAFT_BLOCKED,
+        Reason.SENSORS_DISAGREE,
     }
 )
 """After these the truck must be armed again, even if they were short."""
@@ -70,12 +72,13 @@ HALTS: Final = frozenset({Reason.OBSTACLE_STOP, Reason.LIDAR_BLIND, Reason.SONAR
 """Speed limits of zero: the truck stands, and its driver stays in control."""
 
 
-def sensor_checks(view: GateView, *, battery_measured: bool) -> Iterator[Check]:
+def sensor_checks(view: GateView, *, battery_measured: bool, compared: bool = False) -> Iterator[Check]:
     """Checks that do not depend on where the robot drives, worst reasons first.
 
     Args:
         view: what they may look at.
         battery_measured: something is there to measure the battery.
+        compared: the robot compares its measures of motion, or should.
     """
     config = view.config
     if config.runaway is not None:
@@ -88,6 +91,8 @@ def sensor_checks(view: GateView, *, battery_measured: bool) -> Iterator[Check]:
     yield DriveFaultCheck(view)
     yield ServiceCheck(view)
     yield StalenessCheck(view)
+    if compared:
+        yield ConsistencyCheck(view)
     yield TiltCheck(view)
     yield BatteryCheck(view, measured=battery_measured)
 
@@ -174,6 +179,7 @@ class Gate:
         latched: whether the emergency stop was latched when the daemon last ran.
         sonars: pose (x, y, yaw) of every sonar in base by name, of a robot that has no lidar; m, m, rad.
         peers: outlines of other robots whose poses are received, by name.
+        compared: whether the robot has to compare its measures of motion.
     """
 
     def __init__(
@@ -189,6 +195,7 @@ class Gate:
         latched: bool,
         sonars: Mapping[str, tuple[float, float, float]] | None = None,
         peers: Mapping[str, Footprint] | None = None,
+        compared: bool = False,
     ) -> None:
         self._limits = InForce(config)
         self._chassis = chassis
@@ -201,7 +208,7 @@ class Gate:
         self._limiter = CommandLimiter(view)
         self._checks = Checks(
             (
-                *sensor_checks(view, battery_measured=battery_measured),
+                *sensor_checks(view, battery_measured=battery_measured, compared=compared),
                 self._limiter,
                 *obstacle_checks(view, points, sonars, peers),
             )

@@ -84,9 +84,13 @@ class Inertial:
 
     def observe(self, imu: Imu) -> None:
         """Take a measurement."""
+        self.gyro.observe(imu.stamp, self.turn_rate(imu))
+
+    def turn_rate(self, imu: Imu) -> float:
+        """Take a measurement; the rate of the heading with the gyroscope's bias, rad/s."""
         rate, force = self._in_base(imu.angular_velocity), self._in_base(imu.linear_acceleration)
         self.vertical.observe(imu.stamp, rate, force)
-        self.gyro.observe(imu.stamp, self.vertical.yaw_rate(rate))
+        return self.vertical.yaw_rate(rate)
 
     def _in_base(self, vector: Vector3) -> Vector:
         x, y, z = self._axes

@@ -39,6 +39,7 @@ class ServiceName(StrEnum):
     BLACKBOX = "blackbox"
     CALIBRATION = "calibration"
     CLOCK = "clock"
+    CONSISTENCY = "consistency"
     EXPLORER = "explorer"
     GATE = "gate"
     GOALS = "goals"

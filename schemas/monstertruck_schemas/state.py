@@ -139,6 +139,50 @@ class ClockOffset(Message):
     """Size of the step since the message before; 0 when none."""
 
 
+class DoubtKind(StrEnum):
+    """What is wrong with a sensor."""
+
+    MOTION = "motion"
+    """It measures another motion than another sensor."""
+    DELAY = "delay"
+    """Its content is older than its stamps."""
+    REPEATS = "repeats"
+    """It repeats its values to the digit."""
+
+    @property
+    def lasting(self) -> bool:
+        """Whether it lasts until the robot is armed again: a robot that stands shows nothing about motion."""
+        return self is not DoubtKind.REPEATS
+
+
+class Doubt(Schema):
+    """A sensor that cannot be right, or one of two of which one cannot be."""
+
+    sensor: str
+    """Role of the device."""
+    kind: DoubtKind
+    since: Nanoseconds
+    """When it was found."""
+    text: str
+    """Which two disagree and by how much, in words."""
+    against: str | None = None
+    """Role of the other device."""
+    difference: float = 0.0
+    """m, rad, s or number of equal values."""
+    limit: float = 0.0
+    """Tolerated difference, in the same unit."""
+
+
+class Consistency(Message):
+    """Comparison of the robot's independent measures of motion. Retained."""
+
+    measures: tuple[str, ...]
+    """Measures in use: wheels, scans, gyro, compass, encoders."""
+    doubts: tuple[Doubt, ...] = ()
+    scans: str | None = None
+    """Scan odometry in use: kiss or own; None = none."""
+
+
 class GateMode(StrEnum):
     """States of the safety gate."""
 

@@ -52,7 +52,17 @@ from monstertruck_schemas.sensor import (
     SteeringFeedback,
     WheelEncoders,
 )
-from monstertruck_schemas.state import ClockOffset, GateState, Grid, Ground, Odometry, Peers, ScanMotion, Transforms
+from monstertruck_schemas.state import (
+    ClockOffset,
+    Consistency,
+    GateState,
+    Grid,
+    Ground,
+    Odometry,
+    Peers,
+    ScanMotion,
+    Transforms,
+)
 from monstertruck_schemas.usb import UsbTree
 
 M = TypeVar("M", bound=Message)
@@ -219,6 +229,15 @@ PEERS: Final = Topic(
     "state/peers", Peers, W.ESTIMATION, "Poses that other robots say of themselves, with when each came in", 10,
     stale_after=0.5,
 )  # fmt: skip
+CONSISTENCY: Final = Topic(
+    "state/consistency",
+    Consistency,
+    W.ESTIMATION,
+    "Comparison of the sensors' measures of motion: which are in use, and which sensor cannot be right",
+    1,
+    stale_after=3.0,
+    retained=True,
+)
 GATE: Final = Topic(
     "state/gate", GateState, W.GATE, "Safety gate: mode, holder, limits, reasons", 10, stale_after=0.5, retained=True
 )

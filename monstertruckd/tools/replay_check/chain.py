@@ -334,8 +334,9 @@ class Chain:
 
     def _build(self, config: TruckConfig) -> Iterator[Service]:
         body = Body.of(config)
-        yield from build_estimation(config, self.bus, self._clock, body)
         places = ReplayedActors(self._clock, self._goal_record, self._book)
+        compared = config.model_copy(update={"consistency": None})  # what it finds depends on no other output
+        yield from build_estimation(compared, self.bus, self._clock, body, places)
         planners = build_planners(config, self.bus, self._clock, body, places)
         wanted = TICKS.keys() if config.planner is None else {*TICKS, PathService.name}
         yield from (service for service in planners if service.name in wanted)

@@ -9,12 +9,9 @@ from collections import deque
 from typing import Final
 
 import numpy as np
-from kiss_icp.config import KISSConfig
-from kiss_icp.mapping import VoxelHashMap
-from kiss_icp.registration import get_registration
 
 from monstertruck_estimation.se2 import between, compose
-from monstertruck_estimation.slam.kiss_matcher import KERNEL, MAX_CORRECTION, PER_VOXEL, REACH, VOXEL, matrix, spatial
+from monstertruck_estimation.slam.kiss_map import KissMap
 from monstertruck_estimation.slam.scans import Scan
 from monstertruck_estimation.slam.worker_io import SlamEstimate
 from monstertruck_kinematics.elementary import Array
@@ -35,31 +32,18 @@ class KissWitness:
     """Compares the estimate's motion with that by kiss-icp alone."""
 
     def __init__(self) -> None:
-        config = KISSConfig()
-        config.registration.max_num_threads = 1
-        self._registration = get_registration(config)
-        self._map = VoxelHashMap(VOXEL, MAX_CORRECTION, PER_VOXEL)
+        self._map = KissMap()
         self._pose, self._motion = np.zeros(3), np.zeros(3)
         self._poses: deque[tuple[int, Array, Array]] = deque()
         """Stamp, pose by kiss-icp, pose of the estimate."""
 
     def compare(self, scan: Scan, estimate: SlamEstimate) -> float | None:
         """Take a scan with the estimate of its pose; how far both motions are apart, m, if that is too much."""
-        points = spatial(scan.points)
         guess = compose(self._pose, self._motion)
-        found = matrix(guess)
-        if not self._map.empty():
-            found = self._registration.align_points_to_map(
-                points=points,
-                voxel_map=self._map,
-                initial_guess=matrix(guess),
-                max_correspondance_distance=REACH,
-                kernel=KERNEL,
-            )
-        if not np.isfinite(found).all():
-            found = matrix(guess)
-        self._map.update(points, found)
-        pose = np.array((found[0, 3], found[1, 3], math.atan2(found[1, 0], found[0, 0])))
+        pose = self._map.align(scan.points, guess)
+        if not np.isfinite(pose).all():
+            pose = guess
+        self._map.update(scan.points, pose)
         self._motion, self._pose = between(self._pose, pose), pose
         if estimate.status not in COMPARABLE or JUMPS.intersection(estimate.events):
             self._poses.clear()

@@ -119,6 +119,14 @@ def measure(scan: Scan, cloud: Cloud, pose: Array) -> Fit:
     return register(scan, cloud, pose, iterations=0)
 
 
+def fitting(scan: Scan, cloud: Cloud, pose: Array) -> NDArray[np.bool_]:
+    """Which of the points (n,) of ``scan`` find a fitting partner at ``pose``; see ``Fit.overlap``."""
+    pose = np.ascontiguousarray(pose, dtype=np.float64)
+    found = np.zeros(len(scan), np.bool_)
+    _fitting(pose, *_elements(scan, cloud), CELL, found)
+    return found
+
+
 def normal_equations(scan: Scan, cloud: Cloud, pose: Array, reach: float = CELL) -> tuple[Array, Array, int]:
     """Information (3, 3) and gradient (3,) of a registration at ``pose``, and the number of fitting pairs."""
     h, g, stats = accumulate(np.ascontiguousarray(pose), *_elements(scan, cloud), min(reach, CELL), EDGE)
@@ -234,6 +242,20 @@ def accumulate(
     h[1, 0], h[2, 0], h[2, 1] = h[0, 1], h[0, 2], h[1, 2]
     stats[2] *= CORRELATION
     return h * CORRELATION, g * CORRELATION, stats
+
+
+@njit(cache=True)
+def _fitting(
+    pose: Array, points: Array, normals: Array, variances: Array, map_points: Array, map_normals: Array,
+    map_variances: Array, map_extents: Array, starts: Index, order: Index, reach: float, found: NDArray[np.bool_],
+) -> None:  # fmt: skip
+    for i in range(points.shape[0]):
+        one = slice(i, i + 1)
+        stats = accumulate(
+            pose, points[one], normals[one], variances[one], map_points, map_normals, map_variances, map_extents,
+            starts, order, reach, EDGE,
+        )[2]  # fmt: skip
+        found[i] = stats[0] > 0.0
 
 
 @njit(cache=True)

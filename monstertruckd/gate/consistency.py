@@ -1,0 +1,100 @@
+"""Sensors that cannot be right count as lost: what the comparison of the robot's measures of motion has found."""
+
+from collections.abc import Iterator, Sequence
+from typing import Any, Final
+
+from monstertruck_runtime.clock import SECOND
+from monstertruck_schemas.base import Message
+from monstertruck_schemas.event import Cause, Measurement
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.roles import DeviceRole
+from monstertruck_schemas.state import Consistency, Doubt, DoubtKind
+from monstertruck_schemas.topics import CONSISTENCY, Topic
+from monstertruckd.gate.checks import Check, GateView, Limit, Tick
+from monstertruckd.gate.motion import AHEAD, Course
+
+ENOUGH: Final = 2
+"""Independent measures of motion with which a sensor that lies shows."""
+
+
+class ConsistencyCheck(Check):
+    """A sensor in doubt stops the robot where its silence would; without a second measure the robot goes slowly.
+
+    A doubt about motion stops a robot that is armed, and must have come up since it was: who arms the robot again lets
+    it try again.
+    """
+
+    reasons = (Reason.SENSORS_DISAGREE, Reason.SENSOR_FROZEN, Reason.UNWITNESSED)
+    reads = (CONSISTENCY,)
+
+    def __init__(self, view: GateView) -> None:
+        super().__init__(view)
+        self._newest: Consistency | None = None
+        self._settled = 0
+        """Doubts about motion from before are over, ns."""
+
+    def observe(self, seen: Message | Tick, topic: Topic[Any] | None) -> None:
+        """Take the newest comparison; a robot that is not armed is not stopped for its motion."""
+        if isinstance(seen, Consistency):
+            self._newest = seen
+        elif isinstance(seen, Tick) and not self.view.mode.active:
+            self._settled = seen.now
+
+    def reason(self, now: int) -> Iterator[Reason]:
+        """Doubts about sensors whose silence stops the robot."""
+        doubts = [doubt for doubt in self._doubts() if self._stops(doubt.sensor)]
+        yield from dict.fromkeys(_reason(doubt) for doubt in doubts)
+
+    def limit(self, now: int, courses: Sequence[Course] | None) -> Iterator[Limit]:
+        """Limits of a frozen battery voltage, and of a robot with a single measure of its motion."""
+        config = self.view.config
+        if any(doubt.sensor == DeviceRole.BATTERY for doubt in self._doubts()) and not config.battery.critical:
+            yield Limit(Reason.SENSOR_FROZEN, config.battery_low_speed)
+        if courses and not self._witnessed(now):
+            ahead = all(twist[0] >= AHEAD for twist, _ in courses)
+            yield Limit(Reason.UNWITNESSED, config.unwitnessed * (config.speed if ahead else config.reverse_speed))
+
+    def describe(self, reason: Reason, now: int, since: int) -> Iterator[Cause]:
+        """One cause for each doubt, which names both sensors and their difference."""
+        found = [doubt for doubt in self._doubts() if _reason(doubt) is reason]
+        if not found:
+            yield from super().describe(reason, now, since)
+        for doubt in found:
+            figure = Measurement(name="difference", value=doubt.difference, limit=doubt.limit)
+            text = f"{doubt.sensor}: {doubt.text}"
+            yield Cause(reason=reason, source=doubt.sensor, since=doubt.since, text=text, measurements=(figure,))
+
+    def text(self, reason: Reason) -> str:
+        """Names both sensors and their difference."""
+        texts = [f"{doubt.sensor}: {doubt.text}" for doubt in self._doubts() if _reason(doubt) is reason]
+        return "; ".join(texts) or reason.text
+
+    def _doubts(self) -> Iterator[Doubt]:
+        if self._newest is None:
+            return
+        active = self.view.mode.active
+        for doubt in self._newest.doubts:
+            if not doubt.kind.lasting or (active and doubt.since > self._settled):
+                yield doubt
+
+    def _witnessed(self, now: int) -> bool:
+        newest = self._newest
+        if newest is None or now - newest.received > CONSISTENCY.fresh_for() * SECOND:
+            return False
+        return len(newest.measures) >= ENOUGH
+
+    def _stops(self, sensor: str) -> bool:
+        """Whether the robot stops when this sensor is silent."""
+        config = self.view.config
+        limits = {
+            DeviceRole.LIDAR.value: config.scan,
+            DeviceRole.COMPASS.value: config.attitude,
+            DeviceRole.DRIVE.value: config.drive,
+            DeviceRole.WHEELS.value: config.drive,
+            DeviceRole.BATTERY.value: config.battery,
+        }
+        return sensor in limits and limits[sensor].critical
+
+
+def _reason(doubt: Doubt) -> Reason:
+    return Reason.SENSOR_FROZEN if doubt.kind is DoubtKind.REPEATS else Reason.SENSORS_DISAGREE

@@ -1,0 +1,213 @@
+"""Measures of one motion compared in pairs, in units of the errors that each of them states; the odd one out.
+
+Every measure states the greatest error that it makes while it works: a share of the distance or turn and a constant.
+Two disagree if they differ by more than both errors together and what a tolerated delay explains.
+"""
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from itertools import combinations
+from typing import NamedTuple
+
+from monstertruck_estimation.consistency.config import ConsistencyConfig
+from monstertruck_estimation.consistency.tracks import Vector
+from monstertruck_runtime.clock import SECOND
+
+
+class Measure(StrEnum):
+    """Independent measures of the robot's motion."""
+
+    WHEELS = "wheels"
+    SCANS = "scans"
+    GYRO = "gyro"
+    COMPASS = "compass"
+    ENCODERS = "encoders"
+
+
+class Quantity(StrEnum):
+    """Compared quantities."""
+
+    WAY = "way"
+    TURN = "turn"
+
+
+@dataclass(frozen=True, slots=True)
+class Errors:
+    """Greatest errors of a measure that works."""
+
+    way: tuple[float, float] | None
+    """Of the distance: share of the greater one, and constant (m); None = it does not measure ways."""
+    turn: tuple[float, float]
+    """Of the turn: share of the greater one, and constant (rad)."""
+    less: float | None = None
+    """The share of the distance where it is this measure that shows less; None = the same."""
+    aside: float = 0.0
+    """Sideways, as a share of the distance."""
+    bend: float = 0.0
+    """Turn per metre, rad."""
+    drift: float = 0.0
+    """Turn per second, rad."""
+
+
+def errors_of(config: ConsistencyConfig) -> dict[Measure, Errors]:
+    """Errors that each measure states.
+
+    Wheels slip, and their steering angles are those that were commanded. Scan odometry errs by the noise of ranges. A
+    gyroscope's bias changes by less than 0.01 rad/s between two rests. A compass deviates near iron by some tenths.
+    """
+    slip = config.slip
+    return {
+        Measure.WHEELS: Errors(way=(slip, 0.02), turn=(slip, 0.05), less=config.slide, aside=0.12, bend=0.15),
+        Measure.SCANS: Errors(way=(0.03, 0.04), turn=(0.03, 0.04), aside=0.03),
+        Measure.GYRO: Errors(way=None, turn=(0.05, 0.02), drift=0.01),
+        Measure.COMPASS: Errors(way=None, turn=(0.1, 0.35)),
+        Measure.ENCODERS: Errors(way=(0.1, 0.03), turn=(0.1, 0.05), aside=0.12, bend=0.1),
+    }
+
+
+class Motions(NamedTuple):
+    """What all measures say of the motion between two instants."""
+
+    since: int
+    """Ns."""
+    stamp: int
+    """Ns."""
+    motions: Mapping[Measure, Vector]
+    """Base at ``stamp`` in base at ``since``; only the yaw counts of those that measure turns alone."""
+    pace: tuple[float, float]
+    """Greatest speed (m/s) and turn rate (rad/s) at either end by any measure: what a delay may cost."""
+
+
+class Difference(NamedTuple):
+    """Two measures differ by more than their errors explain."""
+
+    quantity: Quantity
+    one: Measure
+    other: Measure
+    by_one: float
+    """Distance (m) or turn (rad)."""
+    by_other: float
+    difference: float
+    """Between both motions, m or rad."""
+    limit: float
+    """What their errors and the tolerated delay explain, m or rad."""
+
+    @property
+    def text(self) -> str:
+        """In words."""
+        unit, word = ("m", "moved") if self.quantity is Quantity.WAY else ("rad", "turned")
+        form = ".2f" if self.quantity is Quantity.WAY else "+.2f"
+        return (
+            f"by the {self.one} the robot {word} {self.by_one:{form}} {unit}, by the {self.other} "
+            f"{self.by_other:{form}} {unit}: {self.difference:.2f} {unit} apart, {self.limit:.2f} {unit} tolerated"
+        )
+
+
+def turn_difference(
+    motions: Motions, one: Measure, other: Measure, errors: Mapping[Measure, Errors], delay: float
+) -> tuple[float, float]:
+    """Difference of two turns and what errors and delay explain of it, rad."""
+    greatest = max(abs(motions.motions[measure][2]) for measure in (one, other))
+    seconds, way = (motions.stamp - motions.since) / SECOND, _way(motions)
+    limit = math.fsum(
+        error.turn[0] * greatest + error.turn[1] + error.bend * way + error.drift * seconds
+        for error in (errors[one], errors[other])
+    )
+    return abs(motions.motions[one][2] - motions.motions[other][2]), limit + delay * motions.pace[1]
+
+
+def way_difference(
+    motions: Motions, one: Measure, other: Measure, errors: Mapping[Measure, Errors], delay: float
+) -> tuple[float, float, float]:
+    """Difference of two ways (m) and what errors and delay explain of it, in the direction in which it is less likely.
+
+    Along the way it is a difference of lengths, across it one of directions.
+    """
+    (x1, y1, _), (x2, y2, _) = motions.motions[one], motions.motions[other]
+    longest, mean = max(math.hypot(x1, y1), math.hypot(x2, y2)), (x1 + x2, y1 + y2)
+    norm = math.hypot(*mean)
+    if norm < 1e-6:
+        mean = (x1 - x2, y1 - y2)
+        norm = math.hypot(*mean) or 1.0
+    ux, uy = mean[0] / norm, mean[1] / norm
+    dx, dy = x1 - x2, y1 - y2
+    along, across = abs(dx * ux + dy * uy), abs(dy * ux - dx * uy)
+    _, turn_limit = turn_difference(motions, one, other, errors, delay)
+    lengthwise = way_limit(motions, one, other, errors, delay)
+    constant = math.fsum(error.way[1] for error in (errors[one], errors[other]) if error.way is not None)
+    sideways = errors[one].aside + errors[other].aside + turn_limit / 2
+    limits = lengthwise, constant + delay * motions.pace[0] + sideways * longest
+    if along / limits[0] >= across / limits[1]:
+        return along, limits[0], math.hypot(dx, dy)
+    return across, limits[1], math.hypot(dx, dy)
+
+
+def way_limit(motions: Motions, one: Measure, other: Measure, errors: Mapping[Measure, Errors], delay: float) -> float:
+    """What errors and delay explain of a difference of lengths, m."""
+    lengths = {measure: math.hypot(*motions.motions[measure][:2]) for measure in (one, other)}
+    longest, limit = max(lengths.values()), delay * motions.pace[0]
+    for measure, length in lengths.items():
+        error = errors[measure]
+        if error.way is not None:
+            share = error.less if error.less is not None and length < longest else error.way[0]
+            limit += error.way[1] + share * longest
+    return limit
+
+
+def differences(
+    motions: Motions, errors: Mapping[Measure, Errors], delay: float
+) -> tuple[list[Difference], dict[Quantity, set[frozenset[Measure]]]]:
+    """Pairs that differ by more than they may, and those that agree, by quantity."""
+    found: list[Difference] = []
+    agreeing: dict[Quantity, set[frozenset[Measure]]] = {Quantity.WAY: set(), Quantity.TURN: set()}
+    for one, other in combinations(motions.motions, 2):
+        off, limit = turn_difference(motions, one, other, errors, delay)
+        turns = motions.motions[one][2], motions.motions[other][2]
+        if off > limit:
+            found.append(Difference(Quantity.TURN, one, other, *turns, off, limit))
+        else:
+            agreeing[Quantity.TURN].add(frozenset((one, other)))
+        if errors[one].way is None or errors[other].way is None:
+            continue
+        way, limit, apart = way_difference(motions, one, other, errors, delay)
+        lengths = math.hypot(*motions.motions[one][:2]), math.hypot(*motions.motions[other][:2])
+        if way > limit:
+            found.append(Difference(Quantity.WAY, one, other, *lengths, apart, limit))
+        else:
+            agreeing[Quantity.WAY].add(frozenset((one, other)))
+    return found, agreeing
+
+
+def suspects(
+    found: Iterable[Difference], agreeing: Mapping[Quantity, Iterable[frozenset[Measure]]]
+) -> dict[Measure, Difference]:
+    """Measures that may lie, each with its greatest difference.
+
+    A measure that agrees with another one does not. Of those that remain, what the turns say decides about the ways.
+    """
+    found = list(found)
+    by_quantity: dict[Quantity, dict[Measure, Difference]] = {}
+    for quantity in Quantity:
+        partnered = set().union(*agreeing[quantity])
+        rows = [row for row in found if row.quantity is quantity]
+        doubtful = {measure for row in rows for measure in (row.one, row.other)} - partnered
+        if Measure.COMPASS in doubtful and len(doubtful) > 1:
+            # Iron nearby turns a needle further than its error: it accuses no other measure alone.
+            rows = [row for row in rows if Measure.COMPASS not in (row.one, row.other)]
+            doubtful &= {measure for row in rows for measure in (row.one, row.other)}
+        by_quantity[quantity] = {
+            measure: max(
+                (row for row in rows if measure in (row.one, row.other)), key=lambda row: row.difference / row.limit
+            )
+            for measure in doubtful
+        }
+    ways, turns = by_quantity[Quantity.WAY], by_quantity[Quantity.TURN]
+    if len(ways) > 1 and len(turns) == 1 and (named := ways.keys() & turns.keys()):
+        return {measure: ways[measure] for measure in named}
+    return turns | ways
+
+
+def _way(motions: Motions) -> float:
+    return max((math.hypot(x, y) for x, y, _ in motions.motions.values()), default=0.0)

@@ -1,0 +1,79 @@
+"""Inputs and outputs of the scan odometry's worker; without numba, so that the daemon can import them."""
+
+from dataclasses import dataclass
+from typing import Final
+
+from monstertruck_estimation.consistency.tracks import Vector
+from monstertruck_estimation.slam.worker_io import ScanInput
+
+
+@dataclass(frozen=True, slots=True)
+class Claim:
+    """A motion that another measure claims, to be judged by the scans at both of its ends."""
+
+    since: int
+    """Stamp of the earlier scan, ns."""
+    way: tuple[float, float] | None
+    """Place of base at the newest scan in base at the earlier one, m; None = as by the scans."""
+    turn: float
+    """Turn, rad."""
+    errors: tuple[float, float]
+    """How far, m and rad, the true motion may be from it if the measure works."""
+
+
+@dataclass(frozen=True, slots=True)
+class StepInput:
+    """One scan."""
+
+    scan: ScanInput
+    front: str
+    """Scan odometry, see ``ConsistencyConfig.scans``."""
+    anew: bool = False
+    """Forget the scans before."""
+    claim: Claim | None = None
+
+
+REFUTING: Final = 12
+"""Points that fit the scans' own motion alone with which a claim is refuted at least."""
+OUTWEIGHED: Final = 4
+"""Their number for every point that fits the claim alone."""
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """How a claimed motion and the scans' own explain the newest scan: points that fit one of them alone.
+
+    Both are refined, the claimed one within its errors: what counts is whether any motion near it fits.
+    """
+
+    claimed: int
+    own: int
+    misfits: int
+    """Points that do not fit the scans' own motion."""
+
+    @property
+    def refuted(self) -> bool:
+        """Whether the scans contradict the claim.
+
+        Where nothing constrains the motion (a corridor, an open field), no point fits one alone. Among people who walk,
+        some fit either, and many neither.
+        """
+        return self.own >= max(REFUTING + OUTWEIGHED * self.claimed, self.misfits)
+
+
+@dataclass(frozen=True, slots=True)
+class StepOutput:
+    """Result of one scan."""
+
+    stamp: int
+    """Ns."""
+    since: int | None
+    """Stamp of the scan before; None = there is a gap: the motion since then is not known."""
+    motion: Vector = (0.0, 0.0, 0.0)
+    """Base at ``stamp`` in base at ``since``."""
+    overlap: float = 0.0
+    """Share of the points that fit the scan before."""
+    verdict: Verdict | None = None
+    """Of the claim; None without one, and where the earlier scan is not known any more."""
+    front: str = ""
+    """Scan odometry that is used."""

@@ -1,0 +1,352 @@
+"""The pure core of the consistency check: takes what the sensors say, and names those that cannot be right.
+
+Motions are compared at every scan, over windows of half a second to some seconds; without a lidar at every reading of
+the wheels. A difference must last for two comparisons, and where the scans take part in it, they must refute the other
+motion: see ``Verdict``. A finding about motion lasts until the robot is armed again, for a robot that stands shows
+nothing; one about a repeated value ends with the repetition.
+"""
+
+import math
+from collections import deque
+from collections.abc import Iterator
+from typing import Final, NamedTuple
+
+from monstertruck_estimation.consistency.comparison import (
+    Difference,
+    Measure,
+    Motions,
+    differences,
+    errors_of,
+    suspects,
+    turn_difference,
+    way_limit,
+)
+from monstertruck_estimation.consistency.config import ConsistencyConfig
+from monstertruck_estimation.consistency.delay import scan_delay
+from monstertruck_estimation.consistency.exchange import Claim, StepOutput
+from monstertruck_estimation.consistency.repeats import Repeats, WholeRepeats
+from monstertruck_estimation.consistency.tracks import STILL, Track, Vector
+from monstertruck_estimation.transforms import wrap_angle
+from monstertruck_estimation.wheel_motion import WheelIncrement
+from monstertruck_runtime.clock import SECOND
+from monstertruck_schemas.state import Doubt, DoubtKind
+
+WINDOWS: Final = (0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 5.0, 8.0, 12.0, 20.0)
+"""Times over which motions are compared, s, up to the configured one."""
+AGAIN: Final = SECOND // 2
+"""Least time between two motions that the scans are asked about, ns."""
+DELAY_PERIOD: Final = SECOND // 4
+"""Time between two looks at the delay of the scans, ns."""
+DELAY_OVER: Final = 7 * SECOND
+"""Time over which it is determined, ns."""
+GAP: Final = SECOND // 2
+"""Headings and rates further apart are not joined, ns."""
+IN_USE: Final = 2 * SECOND
+"""A measure without a sample for so long is not in use, ns."""
+INTERVALS: Final = 10
+"""Intervals between scans of which the longest counts."""
+TURNED_ALONE: Final = 0.15
+"""How far the way may change with a claimed turn, m."""
+REST: Final = SECOND // 2
+"""Time at rest after which the bias of a gyroscope is known, ns."""
+MAX_BIAS: Final = 0.1
+"""A mean rate at rest above this is no bias, rad/s."""
+
+
+class _Pending(NamedTuple):
+    """A difference that the scans are to judge."""
+
+    since: int
+    found: dict[Measure, Difference]
+    claimant: Measure
+    errors: tuple[float, float]
+    """That the claimant states over the window, m and rad."""
+
+
+class ConsistencyMonitor:
+    """Collects the measures of one robot.
+
+    Args:
+        config: what is tolerated.
+        sensors: which sensor each of the robot's measures is of.
+    """
+
+    def __init__(self, config: ConsistencyConfig, sensors: dict[Measure, str]) -> None:
+        self._config, self._sensors = config, sensors
+        self._errors = errors_of(config)
+        self._tracks = {measure: Track() for measure in sensors}
+        self._sampled: dict[Measure, int] = {}
+        self._heading: tuple[int, float] | None = None
+        self._rate: tuple[int, float] | None = None
+        self._bias: float | None = None
+        self._rest: list[float] = []
+        self._rest_since: int | None = None
+        self._scans: deque[int] = deque(maxlen=256)
+        """Stamps of scans whose motion is known."""
+        self._intervals: deque[float] = deque([0.0], maxlen=INTERVALS)
+        """Between the newest scans, s."""
+        self._steps: deque[tuple[int, int, float, float]] = deque()
+        self._delayed_at, self._delays = 0, 0
+        self._active_since: int | None = None
+        self._doubted: frozenset[Measure] = frozenset()
+        """At the comparison before."""
+        self._pending: _Pending | None = None
+        self._asked = 0
+        self._found: dict[str, Doubt] = {}
+        self._values: dict[str, dict[str, Repeats]] = {}
+        self._wholes: dict[str, WholeRepeats] = {}
+        self._whole_moved: dict[str, int] = {}
+        self._frozen: dict[str, Doubt] = {}
+
+    # What the sensors say
+
+    def observe_wheels(self, roll: WheelIncrement) -> None:
+        """Take the motion of the wheels between two readings."""
+        self._sampled[Measure.WHEELS] = roll.stamp
+        track = self._tracks[Measure.WHEELS]
+        if roll.lost:
+            track.begin(roll.stamp)
+            return
+        vx, vy, wz = roll.twist
+        turn = wz * roll.dt
+        c, s = math.cos(turn / 2), math.sin(turn / 2)
+        track.add(roll.stamp, ((c * vx - s * vy) * roll.dt, (s * vx + c * vy) * roll.dt, turn))
+        if Measure.SCANS not in self._sensors:
+            self._compare(roll.stamp)
+
+    def observe_encoders(self, stamp: int, motion: Vector) -> None:
+        """Take the motion of free wheels since their reading before, m and rad; ``stamp`` in ns."""
+        self._sampled[Measure.ENCODERS] = stamp
+        self._tracks[Measure.ENCODERS].add(stamp, motion)
+
+    def observe_heading(self, stamp: int, yaw: float | None) -> None:
+        """Take a heading, counter-clockwise, rad; None = the compass says itself that it is disturbed."""
+        before, self._heading = self._heading, None if yaw is None else (stamp, yaw)
+        self._sampled[Measure.COMPASS] = stamp
+        track = self._tracks[Measure.COMPASS]
+        if yaw is None or before is None or not 0 < stamp - before[0] <= GAP:
+            track.begin(stamp)
+        else:
+            track.add(stamp, (0.0, 0.0, float(wrap_angle(yaw - before[1]))))
+
+    def observe_rate(self, stamp: int, rate: float) -> None:
+        """Take a yaw rate, rad/s; its bias is learned while the wheels stand."""
+        before, self._rate = self._rate, (stamp, rate)
+        self._sampled[Measure.GYRO] = stamp
+        self._learn_bias(stamp, rate)
+        track = self._tracks[Measure.GYRO]
+        if self._bias is None or before is None or not 0 < stamp - before[0] <= GAP:
+            track.begin(stamp)
+        else:
+            turn = (rate + before[1]) / 2 - self._bias
+            track.add(stamp, (0.0, 0.0, turn * (stamp - before[0]) / SECOND))
+
+    def observe_scan(self, output: StepOutput) -> None:
+        """Take the motion between two scans, and what the scans say of a claim."""
+        before = self._sampled.get(Measure.SCANS, output.stamp)
+        self._intervals.append((output.stamp - before) / SECOND)
+        self._sampled[Measure.SCANS] = output.stamp
+        track = self._tracks[Measure.SCANS]
+        if output.since is None:
+            track.begin(output.stamp)
+            self._scans.clear()
+            self._steps.clear()
+            self._pending, self._doubted = None, frozenset()
+        else:
+            track.add(output.stamp, output.motion)
+            self._steps.append((output.since, output.stamp, output.motion[0], output.motion[2]))
+            while output.stamp - self._steps[0][0] > DELAY_OVER:
+                self._steps.popleft()
+        self._scans.append(output.stamp)
+        if output.verdict is not None and self._pending is not None:
+            if output.verdict.refuted:
+                self._accuse(output.stamp, self._pending.found)
+            self._pending = None
+        self._compare(output.stamp)
+        self._look_for_delay(output.stamp)
+
+    def observe_value(self, sensor: str, field: str, stamp: int, value: float) -> None:
+        """Take a number that a sensor has measured; ``stamp`` in ns."""
+        repeats = self._values.setdefault(sensor, {}).setdefault(field, Repeats())
+        repeats.observe(value, still=self.still(stamp))
+        self._note_frozen(sensor, field, stamp, repeats.row, frozen=repeats.frozen)
+
+    def observe_whole(self, sensor: str, stamp: int, whole: bytes | None) -> None:
+        """Take all that a sensor saw at once, as bytes; None = too little to be compared."""
+        repeats = self._wholes.setdefault(sensor, WholeRepeats())
+        before, self._whole_moved[sensor] = self._whole_moved.get(sensor, stamp), stamp
+        if whole is None:
+            repeats.pause()
+        else:
+            repeats.observe(whole, moved=self._moved(before, stamp))
+        self._note_frozen(sensor, "content", stamp, repeats.row, frozen=repeats.frozen)
+
+    # What follows from it
+
+    def activate(self, now: int | None) -> None:
+        """The robot was armed at ``now`` (ns): findings about motion end. None: disarmed, nothing is compared."""
+        self._active_since = now
+        self._pending, self._doubted, self._delays = None, frozenset(), 0
+        self._steps.clear()
+        if now is not None:
+            self._found.clear()
+
+    def claim(self, stamp: int) -> Claim | None:
+        """The motion up to the next scan, at ``stamp`` (ns), that the scans are to judge."""
+        pending = self._pending
+        if pending is None:
+            return None
+        motion = self._tracks[pending.claimant].motion(pending.since, stamp)
+        if motion is None:
+            self._pending = None
+            return None
+        ways = self._errors[pending.claimant].way is not None
+        return Claim(pending.since, motion[:2] if ways else None, motion[2], pending.errors)
+
+    def findings(self) -> tuple[Doubt, ...]:
+        """What is wrong at present."""
+        return (*self._found.values(), *self._frozen.values())
+
+    def in_use(self, now: int) -> tuple[Measure, ...]:
+        """Measures with samples of late."""
+        return tuple(one for one in self._sensors if now - self._sampled.get(one, -IN_USE) < IN_USE)
+
+    def still(self, stamp: int) -> bool:
+        """Whether the wheels stood shortly before ``stamp``, ns."""
+        track = self._tracks.get(Measure.WHEELS)
+        if track is None or track.newest is None:
+            return False
+        speed, rate = track.pace(min(stamp, track.newest))
+        return speed < STILL[0] and rate < STILL[1]
+
+    def _moved(self, since: int, stamp: int) -> float:
+        """Distance or turn by the wheels, m or rad: whichever is more; 0 while they stand."""
+        track = self._tracks.get(Measure.WHEELS)
+        if track is None or track.newest is None or self.still(stamp):
+            return 0.0
+        motion = track.motion(since, min(stamp, track.newest))
+        return 0.0 if motion is None else max(math.hypot(motion[0], motion[1]), abs(motion[2]))
+
+    def _learn_bias(self, stamp: int, rate: float) -> None:
+        if not self.still(stamp):
+            self._rest, self._rest_since = [], None
+            return
+        self._rest_since = stamp if self._rest_since is None else self._rest_since
+        self._rest.append(rate)
+        if stamp - self._rest_since >= REST:
+            mean = math.fsum(self._rest) / len(self._rest)
+            self._bias = mean if abs(mean) <= MAX_BIAS else self._bias
+            self._rest, self._rest_since = [], None
+
+    def _compare(self, stamp: int) -> None:
+        """Compare all measures over all windows that end at ``stamp``, ns."""
+        if self._active_since is None:
+            return
+        worst: dict[Measure, Difference] = {}
+        begun, errors = stamp, (0.0, 0.0)
+        delay = max(self._config.delay, *self._intervals)  # stamps of sparse scans, or of bursts, are no better
+        for since in self._starts(stamp):
+            motions = {m: motion for m, track in self._tracks.items() if (motion := track.motion(since, stamp))}
+            if len(motions) < 2:
+                continue
+            paces = [track.pace(at) for m, track in self._tracks.items() if m in motions for at in (since, stamp)]
+            pace = max(pace[0] for pace in paces), max(pace[1] for pace in paces)
+            window = Motions(since, stamp, motions, pace)
+            for measure, found in suspects(*differences(window, self._errors, delay)).items():
+                if measure not in worst:
+                    worst[measure], begun = found, since
+                    errors = self._tolerated(window, found, delay)
+        before, self._doubted = self._doubted, frozenset(worst)
+        lasting = {measure: found for measure, found in worst.items() if measure in before}
+        if not lasting:
+            return
+        claimant = _claimant(lasting)
+        if claimant is None:
+            self._accuse(stamp, lasting)
+        elif self._pending is None and stamp - self._asked >= AGAIN:
+            self._pending, self._asked = _Pending(begun, lasting, claimant, errors), stamp
+
+    def _tolerated(self, window: Motions, found: Difference, delay: float) -> tuple[float, float]:
+        """How far the true motion may be from the claimed one, m and rad."""
+        claimant = _claimant({found.one: found})
+        if claimant is None:
+            return 0.0, 0.0
+        pair = Measure.SCANS, claimant
+        _, turn = turn_difference(window, *pair, self._errors, delay)
+        if self._errors[claimant].way is None:
+            return TURNED_ALONE, turn
+        return way_limit(window, *pair, self._errors, delay), turn
+
+    def _starts(self, stamp: int) -> Iterator[int]:
+        """Beginnings of the windows that end at ``stamp``, ns: at scans, if there are any."""
+        assert self._active_since is not None
+        windows = [round(window * SECOND) for window in WINDOWS if window <= self._config.window]
+        if Measure.SCANS not in self._sensors:
+            yield from (stamp - window for window in windows if stamp - window >= self._active_since)
+            return
+        scans, at = list(self._scans), len(self._scans) - 1
+        for window in windows:
+            while at > 0 and stamp - scans[at] < window:
+                at -= 1
+            if at < 0 or stamp - scans[at] < window or scans[at] < self._active_since:
+                return
+            yield scans[at]
+
+    def _look_for_delay(self, stamp: int) -> None:
+        if self._active_since is None or stamp - self._delayed_at < DELAY_PERIOD:
+            return
+        self._delayed_at = stamp
+        steps = [step for step in self._steps if step[0] >= self._active_since]
+        delay = scan_delay(steps, self._tracks[Measure.WHEELS], self._config.delay)
+        self._delays = 0 if delay is None else self._delays + 1
+        if delay is None or self._delays < 2:
+            return
+        lidar, wheels = self._sensors[Measure.SCANS], self._sensors[Measure.WHEELS]
+        text = f"what the scans show lags {delay.seconds:.1f} s behind the wheels: {self._config.delay:g} s tolerated"
+        self._found.setdefault(
+            lidar,
+            Doubt(
+                sensor=lidar,
+                kind=DoubtKind.DELAY,
+                since=stamp,
+                text=text,
+                against=wheels,
+                difference=delay.seconds,
+                limit=self._config.delay,
+            ),
+        )
+
+    def _accuse(self, stamp: int, found: dict[Measure, Difference]) -> None:
+        for measure, difference in found.items():
+            other = difference.other if measure is difference.one else difference.one
+            sensor = self._sensors[measure]
+            self._found.setdefault(
+                sensor,
+                Doubt(
+                    sensor=sensor,
+                    kind=DoubtKind.MOTION,
+                    since=stamp,
+                    text=difference.text,
+                    against=self._sensors[other],
+                    difference=difference.difference,
+                    limit=difference.limit,
+                ),
+            )
+
+    def _note_frozen(self, sensor: str, field: str, stamp: int, row: int, *, frozen: bool) -> None:
+        known = self._frozen.get(sensor)
+        if frozen and known is None:
+            text = f"its {field} repeats to the digit: {row} times in a row"
+            self._frozen[sensor] = Doubt(
+                sensor=sensor, kind=DoubtKind.REPEATS, since=stamp, text=text, difference=float(row), limit=1.0
+            )
+        elif known is not None and not any(one.frozen for one in self._values.get(sensor, {}).values()) and not frozen:
+            del self._frozen[sensor]
+
+
+def _claimant(found: dict[Measure, Difference]) -> Measure | None:
+    """The measure whose motion the scans are to judge; None where they are in no difference."""
+    for difference in found.values():
+        if Measure.SCANS in (difference.one, difference.other):
+            return difference.other if difference.one is Measure.SCANS else difference.one
+    return None

@@ -1,0 +1,113 @@
+"""Values that repeat to the digit for longer than their noise allows.
+
+A sensor whose noise has a standard deviation of at least ``ENOUGH`` digits gives its most frequent value with a
+probability of at most 0.6 (normal distribution): 40 equal values in a row happen once in 10^9. How much noise a value
+has is learned while the robot stands; one without noise, which may stay the same for hours, is never accused.
+"""
+
+import math
+from collections import deque
+from typing import Final
+
+ENOUGH: Final = 0.6
+"""Least standard deviation of a value's noise, in digits, with which it is judged."""
+LEAST_ROW: Final = 40
+"""Equal values in a row that such noise does not give."""
+ROW: Final = 10
+"""A longer row may be that of a frozen value, and says nothing about the noise."""
+LONGER: Final = 8
+"""Factor on the longest row seen before: quantisation and filters make rows of their own."""
+WINDOW: Final = 20
+"""Values over which the noise is measured."""
+WINDOWS: Final = 2
+"""Windows after which it is known."""
+
+
+class Repeats:
+    """One number of a sensor."""
+
+    def __init__(self) -> None:
+        self._last: float | None = None
+        self._row = 0
+        self._longest = 0
+        self._digit = math.inf
+        self._still: deque[float] = deque(maxlen=WINDOW)
+        self._noise = math.inf
+        """Of the quietest window."""
+        self._windows = 0
+
+    @property
+    def frozen(self) -> bool:
+        """Whether the value repeats longer than its noise allows."""
+        known = self._windows >= WINDOWS and self._noise >= ENOUGH * self._digit
+        return known and self._row >= max(LEAST_ROW, LONGER * self._longest)
+
+    @property
+    def row(self) -> int:
+        """Equal values in a row."""
+        return self._row
+
+    def observe(self, value: float, *, still: bool) -> None:
+        """Take a value, and whether the robot stands."""
+        if value == self._last:
+            self._row += 1
+        else:
+            if self._last is not None:
+                self._digit = min(self._digit, abs(value - self._last))
+                if not self.frozen:
+                    self._longest = max(self._longest, self._row)
+            self._last, self._row = value, 1
+        if not still or self._row > ROW:
+            self._still.clear()
+            return
+        self._still.append(value)
+        if len(self._still) == WINDOW:
+            mean = math.fsum(self._still) / WINDOW
+            spread = math.sqrt(math.fsum((one - mean) ** 2 for one in self._still) / WINDOW)
+            self._noise, self._windows = min(self._noise, spread), self._windows + 1
+            self._still.clear()
+
+
+PROOF: Final = 10
+"""Different ones in a row while the robot stands after which noise is known to change each."""
+EQUAL: Final = 3
+"""Equal ones in a row that are no chance then."""
+MOVED: Final = 0.15
+"""Distance (m) or turn (rad) after which equal ones are no chance without noise either."""
+
+
+class WholeRepeats:
+    """A scan or a picture: hundreds of values.
+
+    They are never all the same twice, unless nothing moves and nothing is noisy, as in a simulation.
+    """
+
+    def __init__(self) -> None:
+        self._last: bytes | None = None
+        self._row = 1
+        self._different = 0
+        self._noisy = False
+        self._moved = 0.0
+        self.frozen = False
+
+    @property
+    def row(self) -> int:
+        """Equal ones in a row."""
+        return self._row
+
+    def observe(self, whole: bytes, *, moved: float) -> None:
+        """Take a whole, and how far the robot has moved by another measure since the one before, m or rad."""
+        before, self._last = self._last, whole
+        if whole != before:
+            self._row, self._moved, self.frozen = 1, 0.0, False
+            self._different = self._different + 1 if moved == 0.0 and before is not None else 0
+            self._noisy |= self._different >= PROOF
+            return
+        self._row += 1
+        self._different = 0
+        self._moved += moved
+        self.frozen |= self._row >= EQUAL and (self._noisy or self._moved >= MOVED)
+
+    def pause(self) -> None:
+        """The next whole does not follow the last one, or says too little to be compared."""
+        self._last, self._row, self._moved, self.frozen = None, 1, 0.0, False

@@ -1,0 +1,192 @@
+"""Worker of the consistency check: scan odometry, which knows no wheels, no compass and no map of the robot's.
+
+``monstertruck_estimation.consistency.scan_odometry:ScanOdometry``; a step's input is a ``StepInput``, its output a
+``StepOutput``. kiss-icp (Vizzo et al. 2023) registers each scan to its own voxel map, starting at the motion before;
+without it ours registers the scan to the last one that was kept.
+"""
+
+import math
+from collections import deque
+from importlib.util import find_spec
+from typing import Final, Protocol
+
+import numpy as np
+
+from monstertruck_estimation.consistency.exchange import Claim, StepInput, StepOutput, Verdict
+from monstertruck_estimation.consistency.tracks import KEPT
+from monstertruck_estimation.se2 import between, compose
+from monstertruck_estimation.slam.registration import Cloud, fitting, measure, register
+from monstertruck_estimation.slam.scans import Scan, prepare_input
+from monstertruck_kinematics.elementary import Array
+from monstertruck_runtime.clock import SECOND
+
+MIN_POINTS: Final = 30
+"""A scan with fewer points says nothing of the motion."""
+LONGEST_RANGE: Final = 30.0
+"""Longer ranges are not used, m."""
+GAP: Final = 1.5
+"""Scans further apart in time are not compared, s."""
+FITS: Final = 0.5
+"""Least overlap with the scan before of a motion that counts."""
+THINNED: Final = 0.06
+"""About one point per square of this edge is registered, m."""
+MOST_POINTS: Final = 300
+KEEP_WAY: Final = 0.3
+"""Distance after which our own odometry keeps another scan, m."""
+KEEP_TURN: Final = 0.35
+"""Turn after which it does, rad."""
+STEPS: Final = 10
+"""Steps by which a motion over a window is refined: scan odometry drifts."""
+REMEMBERED: Final = 128
+"""Scans kept for claims."""
+
+
+class Front(Protocol):
+    """A scan odometry."""
+
+    def begin(self, scan: Scan, pose: Array) -> None:
+        """Forget everything, and begin with ``scan`` at ``pose``."""
+
+    def match(self, scan: Scan, guess: Array) -> Array:
+        """Pose of the next scan, shape (3,), from a guess."""
+
+    def keep(self, scan: Scan, pose: Array) -> None:
+        """Take the scan, whose pose is accepted, into the map."""
+
+
+class OwnFront:
+    """Registers each scan to the last one kept; a scan is kept when the robot has moved on."""
+
+    def __init__(self) -> None:
+        self._cloud: Cloud | None = None
+        self._pose = np.zeros(3)
+
+    def begin(self, scan: Scan, pose: Array) -> None:
+        """See ``Front``."""
+        self._cloud, self._pose = Cloud.of(scan), pose
+
+    def match(self, scan: Scan, guess: Array) -> Array:
+        """See ``Front``."""
+        assert self._cloud is not None
+        return compose(self._pose, register(scan, self._cloud, between(self._pose, guess)).pose)
+
+    def keep(self, scan: Scan, pose: Array) -> None:
+        """See ``Front``."""
+        moved = between(self._pose, pose)
+        if math.hypot(moved[0], moved[1]) > KEEP_WAY or abs(moved[2]) > KEEP_TURN:
+            self.begin(scan, pose)
+
+
+class KissFront:
+    """kiss-icp's registration to its own voxel map."""
+
+    def __init__(self) -> None:
+        from monstertruck_estimation.slam.kiss_map import KissMap  # noqa: PLC0415  # its library is for this only
+
+        self._map = KissMap()
+
+    def begin(self, scan: Scan, pose: Array) -> None:
+        """See ``Front``."""
+        self._map.clear()
+        self._map.update(scan.points, pose)
+
+    def match(self, scan: Scan, guess: Array) -> Array:
+        """See ``Front``."""
+        return self._map.align(scan.points, guess)
+
+    def keep(self, scan: Scan, pose: Array) -> None:
+        """See ``Front``."""
+        self._map.update(scan.points, pose)
+
+
+def front_of(kind: str) -> tuple[str, Front]:
+    """The scan odometry of this name, or ours where kiss-icp is not installed, with its name."""
+    if kind == "kiss" and find_spec("kiss_icp") is not None:
+        return "kiss", KissFront()
+    return "own", OwnFront()
+
+
+class ScanOdometry:
+    """Motion from scan to scan."""
+
+    def __init__(self) -> None:
+        self._front: tuple[str, Front] | None = None
+        self._pose = np.zeros(3)
+        self._motion, self._seconds = np.zeros(3), 0.0
+        """Newest motion and the time it took."""
+        self._last: tuple[int, Cloud] | None = None
+        self._kept: deque[tuple[int, Scan, Array]] = deque(maxlen=REMEMBERED)
+        """Stamp, scan and its pose."""
+
+    def step(self, inputs: StepInput) -> StepOutput:
+        """Take one scan."""
+        if self._front is None:
+            self._front = front_of(inputs.front)
+        name, front = self._front
+        stamp, last = inputs.scan.stamp, None if inputs.anew else self._last
+        dt = math.inf if last is None else (stamp - last[0]) / SECOND
+        share = dt / self._seconds if 0.0 < dt < GAP and self._seconds > 0 else 0.0
+        lasting = self._motion * share
+        twist = lasting / dt if share else np.zeros(3)
+        vx, vy, wz = twist.tolist()
+        whole = prepare_input(inputs.scan, LONGEST_RANGE, (vx, vy, wz))
+        scan = whole.downsampled(THINNED, MOST_POINTS)
+        if len(whole) < MIN_POINTS:
+            self._last = None
+            return StepOutput(stamp, None, front=name)
+        found = None
+        if last is not None and 0.0 < dt < GAP:
+            found = self._found(front, scan, whole, last[1], lasting)
+        cloud = Cloud.of(whole)
+        self._last = stamp, cloud
+        if found is None or last is None:
+            front.begin(scan, self._pose)
+            self._motion, self._seconds = np.zeros(3), 0.0
+            self._kept.clear()
+            self._kept.append((stamp, whole, self._pose))
+            return StepOutput(stamp, None, front=name)
+        motion, overlap = found
+        self._pose = compose(self._pose, motion)
+        front.keep(scan, self._pose)
+        self._motion, self._seconds = motion, dt
+        self._kept.append((stamp, whole, self._pose))
+        while stamp - self._kept[0][0] > KEPT:
+            self._kept.popleft()
+        verdict = None if inputs.claim is None else self._judged(whole, inputs.claim)
+        x, y, yaw = motion.tolist()
+        return StepOutput(stamp, last[0], (x, y, yaw), overlap, verdict, name)
+
+    def _found(
+        self, front: Front, scan: Scan, whole: Scan, before: Cloud, lasting: Array
+    ) -> tuple[Array, float] | None:
+        """Motion since the scan before, and its overlap; None where no motion fits."""
+        motion = between(self._pose, front.match(scan, compose(self._pose, lasting)))
+        overlap = measure(whole, before, motion).overlap if np.isfinite(motion).all() else 0.0
+        if overlap < FITS:
+            # The velocity did not last, or the map holds what is no longer there.
+            tries = [register(whole, before, start) for start in (np.zeros(3), lasting)]
+            best = max(tries, key=lambda fit: fit.overlap)
+            motion, overlap = best.pose, best.overlap
+            if overlap < FITS:
+                return None
+            front.begin(scan, compose(self._pose, motion))
+        return motion, overlap
+
+    def _judged(self, scan: Scan, claim: Claim) -> Verdict | None:
+        earlier = next((kept for kept in self._kept if kept[0] == claim.since), None)
+        if earlier is None:
+            return None
+        cloud = Cloud.of(earlier[1])
+        own = between(earlier[2], self._pose)
+        claimed = np.array((*(own[:2] if claim.way is None else claim.way), claim.turn))
+        refined = [register(scan, cloud, start, iterations=STEPS).pose for start in (own, claimed)]
+        fits_own = fitting(scan, cloud, refined[0])
+        near = [pose for pose in refined if _is_near(pose, claimed, claim.errors)]
+        fits = max((fitting(scan, cloud, pose) for pose in (claimed, *near)), key=np.count_nonzero)
+        alone, own_alone, misfits = map(np.count_nonzero, (fits & ~fits_own, fits_own & ~fits, ~fits_own))
+        return Verdict(claimed=int(alone), own=int(own_alone), misfits=int(misfits))
+
+
+def _is_near(pose: Array, claimed: Array, errors: tuple[float, float]) -> bool:
+    off = between(claimed, pose)
+    return math.hypot(off[0], off[1]) <= errors[0] and abs(float(off[2])) <= errors[1]

@@ -1,0 +1,105 @@
+"""Motion by one measure, kept for some seconds and read between any two instants."""
+
+from bisect import bisect_left
+from math import cos, sin
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_kinematics.elementary import Array
+from monstertruck_runtime.clock import SECOND
+
+Vector = tuple[float, float, float]
+"""x, y (m) and yaw (rad)."""
+
+KEPT: Final = 12 * SECOND
+"""Time for which motion is kept, ns."""
+AHEAD: Final = SECOND // 10
+"""A motion may be read so far beyond the newest sample, ns; the robot is taken to go on."""
+PACE: Final = SECOND // 4
+"""Time over which a speed is taken, ns."""
+STILL: Final = 0.02, 0.02
+"""Speed (m/s) and turn rate (rad/s) up to which the robot stands."""
+
+
+def between(origin: Vector, target: Vector) -> Vector:
+    """Pose ``target`` in the frame of ``origin``; the yaw is not wrapped."""
+    c, s = cos(origin[2]), sin(origin[2])
+    dx, dy = target[0] - origin[0], target[1] - origin[1]
+    return c * dx + s * dy, c * dy - s * dx, target[2] - origin[2]
+
+
+class Track:
+    """Poses by one measure in a frame of its own, without a gap."""
+
+    def __init__(self) -> None:
+        self._stamps: list[int] = []
+        self._poses: list[Vector] = []
+
+    def begin(self, stamp: int) -> None:
+        """Forget what was before ``stamp``, ns: there is a gap."""
+        self._stamps, self._poses = [stamp], [(0.0, 0.0, 0.0)]
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self._stamps, self._poses = [], []
+
+    def add(self, stamp: int, motion: Vector) -> None:
+        """Take the motion since the newest sample, in the base frame of that; not later than it: passed over."""
+        if not self._stamps:
+            self.begin(stamp)
+        if stamp <= self._stamps[-1]:
+            return
+        x, y, yaw = self._poses[-1]
+        c, s = cos(yaw), sin(yaw)
+        self._stamps.append(stamp)
+        self._poses.append((x + c * motion[0] - s * motion[1], y + s * motion[0] + c * motion[1], yaw + motion[2]))
+        if stamp - self._stamps[0] > 2 * KEPT:
+            old = bisect_left(self._stamps, stamp - KEPT)
+            del self._stamps[:old], self._poses[:old]
+
+    @property
+    def newest(self) -> int | None:
+        """Stamp of the newest sample, ns."""
+        return self._stamps[-1] if self._stamps else None
+
+    def covers(self, since: int, stamp: int) -> bool:
+        """Whether the motion between two instants, ns, is known."""
+        stamps = self._stamps
+        return len(stamps) > 1 and stamps[0] <= since and stamp <= stamps[-1] + AHEAD
+
+    def motion(self, since: int, stamp: int) -> Vector | None:
+        """Pose of base at ``stamp`` in base at ``since``, both ns; None where it is not known."""
+        return between(self._at(since), self._at(stamp)) if self.covers(since, stamp) else None
+
+    def motions(self, since: NDArray[np.int64], stamps: NDArray[np.int64]) -> Array:
+        """Motions between many pairs of covered instants, ns, of any shape; that shape with a last axis of 3."""
+        known, zero = np.array(self._stamps), self._stamps[0]
+        poses = np.array(self._poses)
+        begin, end = (
+            np.stack([np.interp(at - zero, known - zero, column) for column in poses.T], axis=-1)
+            for at in (since, stamps)
+        )
+        c, s = np.cos(begin[..., 2]), np.sin(begin[..., 2])
+        dx, dy, turn = np.moveaxis(end - begin, -1, 0)
+        return np.stack((c * dx + s * dy, c * dy - s * dx, turn), axis=-1)
+
+    def pace(self, at: int) -> tuple[float, float]:
+        """Speed (m/s) and turn rate (rad/s), neither negative, before the instant ``at``, ns; 0 where not known."""
+        if not self._stamps:
+            return 0.0, 0.0
+        since = max(at - PACE, self._stamps[0])
+        motion = self.motion(since, at)
+        if motion is None or at <= since:
+            return 0.0, 0.0
+        seconds = (at - since) / SECOND
+        return (motion[0] ** 2 + motion[1] ** 2) ** 0.5 / seconds, abs(motion[2]) / seconds
+
+    def _at(self, stamp: int) -> Vector:
+        stamps, poses = self._stamps, self._poses
+        after = min(max(bisect_left(stamps, stamp), 1), len(stamps) - 1)
+        begin, end = stamps[after - 1], stamps[after]
+        (x, y, yaw), (x1, y1, yaw1) = poses[after - 1], poses[after]
+        share = (stamp - begin) / (end - begin)
+        return x + share * (x1 - x), y + share * (y1 - y), yaw + share * (yaw1 - yaw)

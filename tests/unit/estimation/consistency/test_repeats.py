@@ -1,0 +1,68 @@
+"""Values that repeat to the digit: accused only where their noise does not allow it."""
+
+import numpy as np
+import pytest
+
+from monstertruck_estimation.consistency.repeats import LEAST_ROW, Repeats, WholeRepeats
+
+
+def shown(values, digit):
+    return (np.round(np.asarray(values) / digit) * digit).tolist()
+
+
+def first_accused(values, still=True):
+    repeats = Repeats()
+    for k, value in enumerate(values):
+        repeats.observe(value, still=still)
+        if repeats.frozen:
+            return k
+    return None
+
+
+@pytest.mark.parametrize("noise", [1.0, 2.0, 5.0])
+def test_a_frozen_value_with_noise_is_accused_soon(noise):
+    rng = np.random.default_rng(4)
+    values = shown(rng.normal(20.0, noise, 200), 1.0)
+    accused = first_accused([*values, *[values[-1]] * 300])
+    assert accused is not None
+    assert 200 + LEAST_ROW - 3 <= accused <= 200 + 80
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.1, 0.3, 0.5, 0.7, 1.0, 3.0])
+def test_a_value_that_lives_is_never_accused(noise):
+    rng = np.random.default_rng(5)
+    for middle in (0.0, 0.25, 0.5):
+        assert first_accused(shown(rng.normal(middle, noise, 50_000), 1.0)) is None
+
+
+def test_a_voltage_that_settles_into_one_digit_is_not_accused():
+    """It flickered between two digits before: noise of less than one."""
+    rng = np.random.default_rng(6)
+    values = [*rng.normal(0.5, 0.3, 2000), *rng.normal(0.0, 0.1, 20_000)]
+    assert first_accused(shown(values, 1.0)) is None
+
+
+def test_noise_is_learned_while_the_robot_stands_alone():
+    rng = np.random.default_rng(7)
+    values = shown(rng.normal(0.0, 3.0, 200), 1.0)
+    assert first_accused([*values, *[0.0] * 500], still=False) is None
+
+
+def test_a_repeated_scan_is_accused_where_noise_changed_each():
+    scans, repeats = WholeRepeats(), []
+    for k in range(40):
+        scans.observe(bytes([min(k, 20)]), moved=0.0)
+        repeats.append(scans.frozen)
+    assert repeats.index(True) == 22
+    scans.observe(b"other", moved=0.0)
+    assert not scans.frozen
+
+
+def test_without_noise_a_repeated_scan_is_accused_only_once_the_robot_moves():
+    scans = WholeRepeats()
+    for _ in range(1000):
+        scans.observe(b"same", moved=0.0)
+    assert not scans.frozen
+    for _ in range(6):
+        scans.observe(b"same", moved=0.03)
+    assert scans.frozen
