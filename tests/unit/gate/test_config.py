@@ -49,6 +49,7 @@ DELIVERED = {
     "runaway": {"distance": 0.01, "body_distance": 0.05, "idle_current": 0.05},
     "sonar": {"stale_after": 0.3, "core": 0.2, "unseen_speed": 0.1},
     "yaw_acceleration": 6.0,
+    "unwitnessed": 0.5,
     "event_interval": 1.0,
 }
 
