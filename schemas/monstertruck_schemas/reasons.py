@@ -130,7 +130,7 @@ class Reason(StrEnum):
     HEADING_DISTURBED = "heading_disturbed", 95, "the compass is disturbed: its headings are left out"
     WITNESS_DISAGREES = "witness_disagrees", 98, "another scan odometry measures another motion than the map's"
     IMU_DISAGREES = "imu_disagrees", 99, "the IMU and the wheels measure different turns"
-    SENSORS_DISAGREE = "sensors_disagree", 107, "two sensors measure motions of which one must be wrong"
+    SENSORS_DISAGREE = "sensors_disagree", 125, "two sensors measure motions of which one must be wrong"
     SENSOR_FROZEN = "sensor_frozen", 108, "a sensor repeats its values to the digit"
     UNWITNESSED = "unwitnessed", 109, "no second sensor measures the robot's motion: speed limited"
     SENSORS_AGREE = "sensors_agree", 0, "the sensors agree again"
