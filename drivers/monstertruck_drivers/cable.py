@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import contextvars
 import fcntl
 import os
 import tty
@@ -78,6 +79,10 @@ class DeviceEnd:
             self._received.feed(data)
 
 
+CABLE: Final = contextvars.Context()
+"""Of bytes under way: they arrive whatever their sender does meanwhile."""
+
+
 class _Direction:
     """One direction of the line. Timers may ring in any order; bytes arrive in that in which they were sent."""
 
@@ -94,7 +99,7 @@ class _Direction:
         # Apart by 0.1 us, lest two of them arrive in one turn of the virtual loop.
         self._free = max(self._free + 1e-7, loop.time() + delay) + duration
         self._sent.append(arrive)
-        loop.call_at(self._free, self._arrive)
+        loop.call_at(self._free, self._arrive, context=CABLE)
 
     def _arrive(self) -> None:
         self._sent.popleft()()

@@ -116,6 +116,18 @@ class HungError(RuntimeError):
     """Virtual time does not advance, or tasks do not end; their stacks were written to standard error."""
 
 
+ON_COMPUTER: Final[contextvars.ContextVar[bool]] = contextvars.ContextVar("on_computer", default=False)
+"""True in what runs on the robot's computer, whose loop can stall while world and devices go on: see
+``VirtualLoop.stall``."""
+
+
+def on_computer() -> contextvars.Context:
+    """Return a context for tasks and callbacks of the robot's computer; what they start belongs to it, too."""
+    context = contextvars.copy_context()
+    context.run(ON_COMPUTER.set, True)
+    return context
+
+
 class VirtualLoop(asyncio.SelectorEventLoop):
     """Event loop whose time jumps to the next timer when nothing is ready.
 
@@ -140,6 +152,8 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         """A heap."""
         self._timers_set = 0
         self._most_timers = MANY_TIMERS
+        self._held: list[asyncio.Handle] | None = None
+        """What waits for the end of a stall; None while there is none."""
         self._guard = guard
         self._turns = 0
         self._guarded_second = -1
@@ -217,6 +231,43 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         for task in tasks:
             task.print_stack(file=sys.stderr)
         return HungError(f"{what}; {len(tasks)} tasks, see their stacks")
+
+    def stall(self, seconds: float) -> None:
+        """Run nothing of the robot's computer for so long, as behind a computation; all else goes on.
+
+        What comes due meanwhile runs afterwards, in its order. A stall during a stall changes nothing.
+
+        Args:
+            seconds: from now on.
+        """
+        if self._held is not None:
+            return
+        self._held, skipped = [], asyncio.Handle(lambda: None, (), self, contextvars.Context())
+        skipped.cancel()
+        ready: Any = self._ready  # type: ignore[attr-defined]
+        for i, handle in enumerate(ready):
+            if handle._context.get(ON_COMPUTER, False):  # noqa: SLF001 - as BaseEventLoop does
+                self._held.append(handle)
+                ready[i] = skipped
+        self.call_soon = self._call_soon_stalled  # type: ignore[method-assign]
+        self.call_at(self.time() + seconds, self._go_on, context=contextvars.Context())
+
+    def _call_soon_stalled(
+        self, callback: Callable[[*Ts], object], *args: *Ts, context: contextvars.Context | None = None
+    ) -> asyncio.Handle:
+        """As in asyncio, but what belongs to the robot's computer waits."""
+        context = contextvars.copy_context() if context is None else context
+        if self._held is None or not context.get(ON_COMPUTER, False):
+            return super().call_soon(callback, *args, context=context)
+        handle = asyncio.Handle(callback, args, self, context)
+        self._held.append(handle)
+        return handle
+
+    def _go_on(self) -> None:
+        """End a stall."""
+        held, self._held = self._held or [], None
+        del self.call_soon
+        self._ready.extend(held)  # type: ignore[attr-defined]
 
     def next_timer(self) -> float | None:
         """Seconds until the next timer that is not cancelled; None without one."""
@@ -325,6 +376,10 @@ class VirtualClock(Clock):
     def spend(self, seconds: float) -> None:
         """Let time pass at once: what is due meanwhile comes late, as behind a computation."""
         self._loop.instant += round(seconds * SECOND)
+
+    def stall(self, seconds: float) -> None:
+        """Stall the robot's computer, see ``VirtualLoop.stall``."""
+        self._loop.stall(seconds)
 
     def step_real(self, seconds: float) -> None:
         """Set the real time forwards or back, as an operator or a time server does."""

@@ -11,7 +11,7 @@ from typing import Final
 
 from monstertruck_drivers.cable import MemoryPort
 from monstertruck_drivers.usb.config import UsbPortConfig
-from monstertruck_runtime.clock import VirtualClock
+from monstertruck_runtime.clock import VirtualClock, on_computer
 from monstertruck_runtime.threads import inline
 from monstertruck_schemas.sensor import StandPose
 from monstertruck_schemas.topics import STAND_POSE
@@ -156,7 +156,9 @@ class VirtualRig:
         return Daemon(self.config, self.clock, ports=by_path, computer=computer, tree=self._tree, seed=seed)
 
     def _start_daemon(self) -> None:
-        self._daemon_task = asyncio.create_task(self.daemon.run(self._stop), name="daemon")
+        self._daemon_task = asyncio.create_task(
+            self.daemon.run(self._stop), name="daemon", context=on_computer()
+        )
 
     @property
     def daemon_ended(self) -> bool:
