@@ -66,6 +66,7 @@ class FaultKind(StrEnum):
     SUPPLY_DIP = "supply dip"
     BLOCKED_SHAFT = "blocked shaft"
     CLOCK_JUMP = "clock jump"
+    LOOP_STALL = "loop stalled"
     DISK_FULL = "disk full"
     RAIL_12V = "12 V lost"
     RAIL_SERVOS = "servo 5 V lost"
@@ -354,6 +355,8 @@ class FaultCatalog:
         if len(guarded) > 1:
             yield FaultKind.WRONG_DEVICE, lambda rng: _wrong(rng, guarded, vital)
         yield FaultKind.CLOCK_JUMP, _clock_jump
+        if self._all_hubs and self._guarded == self._roles:
+            yield FaultKind.LOOP_STALL, _loop_stall
         if "lidar" in self._roles:
             yield FaultKind.OBSTACLE, _obstacle
         if "steering" in self._roles:
@@ -584,6 +587,17 @@ def _clock_jump(rng: np.random.Generator) -> CatalogFault:
             context.clock.step_real(seconds)
 
     return _fault(FaultKind.CLOCK_JUMP, f"{seconds:+.3g} s", jump, nothing, _hold(rng))
+
+
+def _loop_stall(rng: np.random.Generator) -> CatalogFault:
+    """The computer computes something else; devices, cables and world go on."""
+    seconds = float(10 ** rng.uniform(-1.3, 0.5))
+
+    def stall(context: SimContext) -> None:
+        if isinstance(context.clock, VirtualClock):  # this computer itself is not stalled
+            context.clock.stall(seconds)
+
+    return _fault(FaultKind.LOOP_STALL, f"{seconds:.2f} s", stall, nothing, seconds + float(rng.uniform(0.0, 1.0)))
 
 
 def _disk_full(rng: np.random.Generator) -> CatalogFault:

@@ -205,13 +205,55 @@ class _StepperWire(MotorWire):
                     yield from ((instant, shaft, 0.0) for shaft in range(len(self._speeds)))
 
 
-def _motor_wires(config: SimulatedTruckConfig, taps: Mapping[str, WireTap]) -> list[MotorWire]:
+class _ObeyedOrders(MotorWire):
+    """Shafts of a controller whose protocol is not known here: what it asks its motors for, by the world.
+
+    Args:
+        tap: the controller's cable.
+        world: of the motors.
+        shafts: that it drives, by index.
+        rpm: of a motor at 1 m/s, in the controller's sign.
+        clock: time.
+    """
+
+    def __init__(self, tap: WireTap, world: World, shafts: Sequence[int], rpm: float, clock: Clock) -> None:
+        super().__init__(tap)
+        self._world, self._shafts, self._rpm, self._clock = world, shafts, rpm, clock
+        self._newest = dict.fromkeys(shafts, 0.0)
+
+    def read(self) -> Iterator[tuple[int, int, float]]:
+        """See ``MotorWire``; the instant is that of the call."""
+        self.forget()
+        now = self._clock.now()
+        for shaft in self._shafts:
+            speed = self._world.motors[shaft].reading(now).demand_rpm / self._rpm
+            if speed != self._newest[shaft]:
+                self._newest[shaft] = speed
+                yield now, shaft, speed
+
+
+def _motor_wires(
+    config: SimulatedTruckConfig, taps: Mapping[str, WireTap], world: World, clock: Clock
+) -> list[MotorWire]:
     truck = config.sim.world.truck
     drivetrain = DriveTrain(truck.motor.ratio, truck.wheel_radius)
     rpm = drivetrain.motor_rate(1.0) * 30 / math.pi * (-1 if truck.motor.inverted else 1)
-    wires: list[MotorWire] = [_EposWire(taps[role], i, rpm) for i, role in enumerate(SHAFTS) if role in taps]
-    if config.devices.wheels is not None:
-        wires.append(_StepperWire(taps[DeviceRole.WHEELS], config.devices.wheels.driver, drivetrain))
+    wires: list[MotorWire] = []
+    for role, device in config.devices.present().items():
+        if role in SHAFTS:
+            shaft = SHAFTS.index(DeviceRole(role))
+            known = device.driver.kind == "epos"
+            wires.append(
+                _EposWire(taps[role], shaft, rpm) if known else _ObeyedOrders(taps[role], world, [shaft], rpm, clock)
+            )
+        elif role == DeviceRole.WHEELS:
+            shafts = range(len(truck.chassis().shafts))
+            known = device.driver.kind == "steppers"
+            wires.append(
+                _StepperWire(taps[role], device.driver, drivetrain)
+                if known
+                else _ObeyedOrders(taps[role], world, shafts, rpm, clock)
+            )
     return wires
 
 
@@ -617,7 +659,7 @@ class Observer:
         self._clock = clock
         taps: dict[str, WireTap] = {r: WireTap(ports[r], clock) for r in WIRES if r in ports}
         self._taps = taps
-        self._motors = _motor_wires(config, taps)
+        self._motors = _motor_wires(config, taps, world, clock)
         self._fresh: list[tuple[int, int, float]] = []
         """Targets that no rule has seen yet."""
         self._stops: dict[int, int] = {}

@@ -17,7 +17,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Final, TypeVar
+from typing import Any, Final, Generic, TypeVar
 
 import numpy as np
 from pydantic import TypeAdapter
@@ -30,7 +30,7 @@ from monstertruck_schemas.event import Event, Severity
 from monstertruck_schemas.health import HealthTable
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order
-from monstertruck_schemas.roles import SHAFTS, DeviceRole
+from monstertruck_schemas.roles import SHAFTS
 from monstertruck_schemas.state import GateState
 from monstertruck_sim.faults import CatalogFault, FaultCatalog, FaultKind, apply
 from monstertruckd import __version__
@@ -40,6 +40,7 @@ from monstertruckd.tools.simulation.config import DEADMAN_LINE, SimulatedTruckCo
 
 T = TypeVar("T")
 U = TypeVar("U")
+Outcome = TypeVar("Outcome")
 
 CONNECT: Final = 10.0
 """Seconds in which the scheduler of a cluster must answer."""
@@ -68,12 +69,8 @@ DEADMAN: Final[dict[str, Any]] = {"map": None, **DEADMAN_LINE}
 """Overlay of a truck: the deadman line, and no map; see ``wired``."""
 TRACKER_IN_WORKER: Final[dict[str, Any]] = {"placement": {"tracker": "worker"}}
 """Overlay of every second truck."""
-KNOWN: Final = {
-    **dict.fromkeys(map(str, SHAFTS), "epos"),
-    DeviceRole.WHEELS.value: "steppers",
-    DeviceRole.STEERING.value: "maestro",
-}
-"""Kinds of devices whose wires the observer reads, by role."""
+SERVOS: Final = "maestro"
+"""Kind of servo controller whose wire the observer reads."""
 STILL_STOPS: Final = 0.05
 """True speed of a truck that may not be armed yet, m/s."""
 
@@ -213,6 +210,16 @@ class DrillLeg:
     """Version of the program; another one would give another report."""
 
 
+def check_drivable(config: SimulatedTruckConfig) -> None:
+    """Refuse a robot without motors.
+
+    Raises:
+        InputError: its body lacks what drives or steers it.
+    """
+    if (lack := config.missing_actuators()) is not None:
+        raise InputError(f"{config.robot} cannot drive: its body needs {lack}")
+
+
 class Drill:
     """``count`` faults of one seed.
 
@@ -227,14 +234,12 @@ class Drill:
     """
 
     def __init__(self, seed: int, count: int, config: SimulatedTruckConfig, *, leg: int = LEG) -> None:
-        if (lack := config.missing_actuators()) is not None:
-            raise InputError(f"{config.robot} cannot drive: its body needs {lack}")
-        for role, device in config.devices.present().items():
-            if role in KNOWN and device.driver.kind not in KNOWN[role]:
-                expected = " or ".join(KNOWN[role])
-                raise InputError(
-                    f"devices.{role}: the observer reads the wire of {expected}, not of {device.driver.kind}"
-                )
+        check_drivable(config)
+        steering = config.devices.steering
+        if steering is not None and steering.driver.kind != SERVOS:
+            raise InputError(
+                f"devices.steering: the observer reads the wire of {SERVOS}, not of {steering.driver.kind}"
+            )
         if config.tracker is not None and config.path is None:
             raise InputError(f"path: {config.robot} has none: expected one that its tracker follows; or no tracker")
         self.seed = seed
@@ -273,7 +278,7 @@ class Drill:
             NoAnswerError, WorkerError: see ``on_cluster``.
         """
         legs = self.legs()
-        file = None if resume is None else LegFile(resume, legs[0])
+        file = None if resume is None else LegFile(resume, legs[0], _OUTCOMES)
         known = {} if file is None else {leg.number: found for leg in legs if (found := file.outcomes(leg))}
         outcomes: list[FaultOutcome] = []
         with self._parts([leg for leg in legs if leg.number not in known], jobs, cluster) as parts:
@@ -299,21 +304,23 @@ class Drill:
                 yield pool.map(run_leg, legs)
 
 
-class LegFile:
+class LegFile(Generic[Outcome]):
     """Outcomes of the finished legs of a drill, one JSON object a line, so that an interrupted drill goes on.
 
     Args:
         path: the file; made where there is none.
         leg: any one of the drill.
+        adapter: of a leg's outcomes.
 
     Raises:
         InputError: it cannot be read or written, or is of another drill or program.
     """
 
-    def __init__(self, path: Path, leg: DrillLeg) -> None:
+    def __init__(self, path: Path, leg: DrillLeg, adapter: TypeAdapter[list[Outcome]]) -> None:
+        self._adapter = adapter
         self._path = path
         self._header = {"seed": leg.seed, "program": _digest(leg.config)}
-        self._found: dict[tuple[int, int], list[FaultOutcome]] = {}
+        self._found: dict[tuple[int, int], list[Outcome]] = {}
         self._end = 0
         """Bytes of whole lines: an interrupted program leaves part of one."""
         try:
@@ -330,7 +337,7 @@ class LegFile:
         try:
             row = json.loads(line)
             header = {key: row[key] for key in self._header}
-            outcomes = _OUTCOMES.validate_python(row["outcomes"], strict=False)
+            outcomes = self._adapter.validate_python(row["outcomes"], strict=False)
             leg = int(row["leg"]), int(row["count"])
         except (ValueError, TypeError, KeyError) as error:
             raise InputError(f"{self._path}: line {number} is no leg of a drill") from error
@@ -339,18 +346,18 @@ class LegFile:
             raise InputError(f"{text}: expected seed {self._header['seed']} and the same program")
         self._found[leg] = outcomes
 
-    def outcomes(self, leg: DrillLeg) -> list[FaultOutcome] | None:
+    def outcomes(self, leg: DrillLeg) -> list[Outcome] | None:
         """Those of a finished leg; None if it has to be run."""
         return self._found.get((leg.number, leg.count))
 
-    def add(self, leg: DrillLeg, outcomes: list[FaultOutcome]) -> None:
+    def add(self, leg: DrillLeg, outcomes: list[Outcome]) -> None:
         """Append a finished leg.
 
         Raises:
             InputError: the file cannot be written.
         """
         row = {**self._header, "leg": leg.number, "count": leg.count}
-        line = json.dumps(row | {"outcomes": _OUTCOMES.dump_python(outcomes, mode="json")}).encode() + b"\n"
+        line = json.dumps(row | {"outcomes": self._adapter.dump_python(outcomes, mode="json")}).encode() + b"\n"
         try:
             with self._path.open("r+b") as file:
                 file.seek(self._end)
@@ -392,22 +399,37 @@ _ALONE: Final = threading.Lock()
 """A leg silences the log of its process; a worker of a cluster may have several threads."""
 
 
+@contextmanager
+def leg_alone() -> Iterator[None]:
+    """One leg at a time in this process, without its log."""
+    with _ALONE:
+        quiet = logging.root.manager.disable
+        logging.disable(logging.CRITICAL)
+        try:
+            yield
+        finally:
+            logging.disable(quiet)
+
+
+def check_version(leg: DrillLeg) -> None:
+    """Refuse a leg of another version of the program.
+
+    Raises:
+        InputError: another version made it.
+    """
+    if leg.version != __version__:
+        raise InputError(f"a drill of version {leg.version} was sent to a worker with version {__version__}")
+
+
 def run_leg(leg: DrillLeg) -> list[FaultOutcome]:
     """All faults of one leg, on the virtual clock.
 
     Raises:
         InputError: it comes from another version of the program.
     """
-    if leg.version != __version__:
-        raise InputError(f"a drill of version {leg.version} was sent to a worker with version {__version__}")
-    with _ALONE:
-        quiet = logging.root.manager.disable
-        logging.disable(logging.CRITICAL)
-        try:
-            with TemporaryDirectory(prefix="monstertruck-") as folder:
-                return run_virtual(lambda clock: _LegRun(leg, clock, folder).run())
-        finally:
-            logging.disable(quiet)
+    check_version(leg)
+    with leg_alone(), TemporaryDirectory(prefix="monstertruck-") as folder:
+        return run_virtual(lambda clock: _LegRun(leg, clock, folder).run())
 
 
 class _LegRun:
@@ -494,7 +516,7 @@ async def _react(truck: DrillTruck, fault: CatalogFault, cruise: float, order: O
     await stopping
     await clock.sleep(STOPS_WITHIN / 2)
     standstill = observer.standstill_after()
-    reason = next((reason for report in truck.reports() for reason in _reasons(report)), None)
+    reason = next((reason for report in truck.reports() for reason in reasons_of(report)), None)
     ended = clock.now()
     await apply(fault.end, context)
     truck.listen()
@@ -529,8 +551,8 @@ async def _drive(truck: DrillTruck) -> bool:
     return await truck.until(truck.drives, TIMEOUT, Order.ARM)
 
 
-def _reasons(report: Event | GateState | HealthTable) -> Iterator[Reason]:
-    """Reasons that explain a stop."""
+def reasons_of(report: Event | GateState | HealthTable) -> Iterator[Reason]:
+    """Return the reasons that explain a stop."""
     match report:
         case Event():
             named: Iterable[Reason] = (report.reason,) if report.severity is not Severity.INFO else ()

@@ -6,7 +6,9 @@ from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, suppress
 from typing import Final, Self
 
-from monstertruck_runtime.clock import SECOND, VirtualClock
+import numpy as np
+
+from monstertruck_runtime.clock import SECOND, VirtualClock, on_computer
 from monstertruck_runtime.errors import TruckError
 from monstertruck_runtime.mailbox import fifo, latest
 from monstertruck_schemas import topics
@@ -16,6 +18,7 @@ from monstertruck_schemas.req import DriveRequest, Order, Role
 from monstertruck_schemas.state import GateMode, GateState
 from monstertruckd.bus.local import Bus
 from monstertruckd.daemon import Daemon
+from monstertruckd.tools.drill.judge import WorldJudge
 from monstertruckd.tools.drill.observer import Observer
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 from monstertruckd.tools.simulation.operator import LocalOperator
@@ -48,6 +51,8 @@ class DrivingStation:
     def __init__(self, bus: Bus, clock: VirtualClock, speed: float = 0.18, front: float = 0.0) -> None:
         self.speed = speed
         self.front = front
+        self.rear = 0.0
+        """Angle of its rear axle, rad."""
         self._clock = clock
         self._seq = 0
         self.attach(bus)
@@ -82,8 +87,55 @@ class DrivingStation:
             gate_stamp=gate.stamp if gate is not None else None,
             speed=self.speed,
             front=self.front,
+            rear=self.rear,
         )
-        self._bus.inject(topics.REQ_DRIVE, request)
+        inject = self._bus.inject
+        asyncio.get_running_loop().call_soon(lambda: inject(topics.REQ_DRIVE, request), context=on_computer())
+
+
+STEERING: Final = ("front", "counter", "crab", "free")
+"""Ways of a wanderer to steer: front axle alone, both against each other, both alike, each by itself."""
+LEG_TIME: Final = (0.4, 2.0)
+"""Seconds for which a wanderer keeps a speed and its angles."""
+
+
+class Wanderer(DrivingStation):
+    """A station that drives at random, in both directions and with all ways to steer.
+
+    Args:
+        bus: of the daemon.
+        clock: time.
+        config: limits of the robot.
+        rng: randomness.
+    """
+
+    def __init__(self, bus: Bus, clock: VirtualClock, config: SimulatedTruckConfig, rng: np.random.Generator) -> None:
+        super().__init__(bus, clock)
+        self._rng = rng
+        self._limits = config.gate.reverse_speed, config.gate.speed
+        self._angle = config.gate.angle
+        self._rear_steers = len(config.sim.world.truck.chassis().straight) > 1
+        self._until = 0
+        self.backwards: bool | None = None
+        """Only backwards or forwards from now on; None = either."""
+
+    def choose(self, *, backwards: bool | None = None) -> None:
+        """Choose another motion, and for how long; ``backwards`` as the attribute, for it and those that follow."""
+        rng = self._rng
+        self.backwards = backwards
+        back = bool(rng.random() < 0.5) if backwards is None else backwards
+        self.speed = float(rng.uniform(0.4, 1.0)) * self._limits[not back] * (-1 if back else 1)
+        self.front = float(rng.uniform(-1.0, 1.0)) * self._angle
+        steering = STEERING[rng.integers(len(STEERING))] if self._rear_steers else "front"
+        free = float(rng.uniform(-1.0, 1.0)) * self._angle
+        self.rear = {"front": 0.0, "counter": -self.front, "crab": self.front, "free": free}[steering]
+        self._until = self._clock.now() + round(float(rng.uniform(*LEG_TIME)) * SECOND)
+
+    def send(self) -> None:
+        """One request, unless it is silent; now and then of another motion."""
+        if self._clock.now() >= self._until:
+            self.choose(backwards=self.backwards)
+        super().send()
 
 
 class DrillTruck:
@@ -92,19 +144,42 @@ class DrillTruck:
     Args:
         rig: not running yet.
         by_station: a station drives it, in a circle.
+        wander: randomness of a station that drives it at random instead.
+        judged: only the world's truth is looked at, by a ``WorldJudge``.
     """
 
-    def __init__(self, rig: VirtualRig, *, by_station: bool = False) -> None:
+    def __init__(
+        self,
+        rig: VirtualRig,
+        *,
+        by_station: bool = False,
+        wander: np.random.Generator | None = None,
+        judged: bool = False,
+    ) -> None:
         self.rig = rig
         self.clock = rig.clock
-        self.observer = Observer(rig.config, rig.world, rig.ports, rig.clock)
+        self.judge = WorldJudge(rig.world, rig.clock) if judged else None
+        self._observer = None if judged else Observer(rig.config, rig.world, rig.ports, rig.clock)
         self.station: DrivingStation | None = None
         self._cruise = min(CRUISE, rig.config.gate.speed / 2)
         self._heard: Daemon | None = None
         self.listen()
-        if by_station:
+        if wander is not None:
+            self.station = Wanderer(rig.bus, rig.clock, rig.config, wander)
+        elif by_station:
             angle = min(math.atan(rig.config.geometry.wheelbase / CIRCLE), rig.config.gate.angle)
             self.station = DrivingStation(rig.bus, rig.clock, STATION_SPEED * rig.config.gate.speed, angle)
+
+    @property
+    def observer(self) -> Observer:
+        """The observer of a truck that is not judged by the world alone."""
+        assert self._observer is not None
+        return self._observer
+
+    @property
+    def speed(self) -> float:
+        """True speed, m/s."""
+        return self.observer.speed if self.judge is None else self.judge.speed
 
     def listen(self) -> None:
         """Listen to the rig's daemon where it is another one than before."""
@@ -123,7 +198,13 @@ class DrillTruck:
     @classmethod
     @asynccontextmanager
     async def running(
-        cls, config: SimulatedTruckConfig, clock: VirtualClock, *, by_station: bool = False
+        cls,
+        config: SimulatedTruckConfig,
+        clock: VirtualClock,
+        *,
+        by_station: bool = False,
+        wander: np.random.Generator | None = None,
+        judged: bool = False,
     ) -> AsyncIterator[Self]:
         """World, daemon and observer run while the context lasts; arguments as of the class.
 
@@ -131,9 +212,10 @@ class DrillTruck:
             BaseException: what ended the daemon early.
         """
         rig = VirtualRig(config, clock)
-        truck = cls(rig, by_station=by_station)
+        truck = cls(rig, by_station=by_station, wander=wander, judged=judged)
+        watching = truck.observer if truck.judge is None else truck.judge
         async with rig.running():
-            observing = asyncio.create_task(truck.observer.run(), name="observer")
+            observing = asyncio.create_task(watching.run(), name="observer")
             asking = None if truck.station is None else asyncio.create_task(truck.station.run(), name="station")
             try:
                 yield truck
@@ -172,14 +254,18 @@ class DrillTruck:
         return condition()
 
     async def order(self, order: Order) -> None:
-        """Give an order, if the daemon runs; a refused one is not an error."""
+        """Give an order, if the daemon runs; a refused one is not an error.
+
+        It arrives on the robot's computer, and waits there as long as that is stalled.
+        """
         if not self.rig.daemon_ended:
+            giving = asyncio.get_running_loop().create_task(self.operator.order(order), context=on_computer())
             with suppress(TruckError):
-                await self.operator.order(order)
+                await giving
 
     def drives(self) -> bool:
         """Whether it moves at a speed worth stopping."""
-        return abs(self.observer.speed) > self._cruise
+        return abs(self.speed) > self._cruise
 
     def reports(self) -> list[DaemonReport]:
         """Events, gate states and health tables since the last call, by time."""

@@ -156,9 +156,7 @@ class VirtualRig:
         return Daemon(self.config, self.clock, ports=by_path, computer=computer, tree=self._tree, seed=seed)
 
     def _start_daemon(self) -> None:
-        self._daemon_task = asyncio.create_task(
-            self.daemon.run(self._stop), name="daemon", context=on_computer()
-        )
+        self._daemon_task = asyncio.create_task(self.daemon.run(self._stop), name="daemon", context=on_computer())
 
     @property
     def daemon_ended(self) -> bool:

@@ -1,0 +1,123 @@
+"""The judge of a drill of families: it sees nothing but the world's truth and the operator's orders.
+
+No fault can deceive it, and it knows no wire, so that it judges any robot with any devices.
+"""
+
+import math
+from typing import Final
+
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_sim.world.world import World
+from monstertruckd.tools.drill.observer import AT_REST, Violation
+
+PERIOD: Final = SECOND // 50
+MAY_TRAVEL: Final = 0.3
+"""Distance that a robot may travel while nothing permits motion, m."""
+MAY_MOVE: Final = 1.0
+"""Seconds for which a robot may still move once nothing permits motion."""
+STANDS_FOR: Final = 0.2
+"""Seconds without motion after which a robot stands: braked, it rocks on its tyres."""
+
+
+class WorldJudge:
+    """Watches one robot.
+
+    Motion is permitted from the operator's order to arm until one to disarm or stop. Three things are unsafe: contact
+    with anything, motion that is not permitted beyond ``MAY_TRAVEL`` or ``MAY_MOVE``, and what a fault leaves behind.
+
+    Args:
+        world: the simulated world.
+        clock: time.
+    """
+
+    def __init__(self, world: World, clock: Clock) -> None:
+        self.speed = 0.0
+        """True speed, m/s, negative backwards."""
+        self._world = world
+        self._clock = clock
+        self._began = clock.now()
+        self._violations: dict[str, Violation] = {}
+        self._forbidden: int | None = None
+        self._stood: int | None = None
+        """When it stood after motion was forbidden, ns."""
+        self._still_since: int | None = None
+        self._travelled = 0.0
+        self._place: tuple[float, float] | None = None
+
+    async def run(self) -> None:
+        """Look fifty times a second until cancelled."""
+        due = self._clock.now()
+        while True:
+            self.look()
+            due += PERIOD
+            await self._clock.sleep_until(due)
+
+    # What the operator does
+
+    def arm(self) -> None:
+        """Motion is permitted."""
+        self._forbidden = None
+
+    def forbid(self) -> None:
+        """The operator disarms or stops: motion is no longer permitted."""
+        if self._forbidden is None:
+            self._forbidden, self._stood, self._travelled = self._clock.now(), None, 0.0
+
+    def begin(self) -> None:
+        """A trial begins."""
+        self._began = self._clock.now()
+        self._violations.clear()
+
+    # What came of it
+
+    @property
+    def violations(self) -> tuple[Violation, ...]:
+        """What was unsafe since ``begin``: the first case of each kind."""
+        return tuple(self._violations.values())
+
+    @property
+    def travelled(self) -> float:
+        """Distance travelled since motion was forbidden, m."""
+        return self._travelled
+
+    @property
+    def standstill(self) -> float | None:
+        """Seconds from the forbidding of motion to standstill; None: it moves, or may."""
+        if self._stood is None or self._forbidden is None:
+            return None
+        return max(0, self._stood - self._forbidden) / SECOND
+
+    def look(self) -> None:
+        """Compare the world with what is permitted."""
+        now = self._clock.now()
+        truth = self._world.truth(now)
+        moved = 0.0 if self._place is None else math.dist(self._place, (truth.x, truth.y))
+        self._place, self.speed = (truth.x, truth.y), truth.v
+        twist = self._world.plant.twist
+        moves = math.hypot(*twist[:2]) > AT_REST or abs(twist[2]) > 10 * AT_REST
+        self._still_since = None if moves else self._still_since or now
+        if truth.stuck:
+            self._blame("contact", f"ran into something at ({truth.x:.2f}, {truth.y:.2f}) m")
+        if self._forbidden is None:
+            return
+        if self._stood is None and self._still_since is not None:
+            if now - self._still_since >= STANDS_FOR * SECOND:
+                self._stood = self._still_since
+        elif self._stood is not None and moves:
+            self._stood = None
+        self._travelled += moved
+        since = (now - self._forbidden) / SECOND
+        if self._travelled > MAY_TRAVEL:
+            self._blame("motion", f"travelled {self._travelled:.2f} m after motion was forbidden {since:.2f} s ago")
+        if moves and since > MAY_MOVE:
+            self._blame("motion", f"{truth.v:.3f} m/s though motion was forbidden {since:.2f} s ago")
+
+    def check_left(self) -> None:
+        """A fault is over and motion is forbidden: nothing may ask a motor to turn."""
+        for shaft, motor in enumerate(self._world.motors):
+            demand = motor.reading(self._clock.now()).demand_rpm
+            if demand != 0.0:
+                self._blame("left behind", f"motor {shaft + 1} is still asked for {demand:.0f} rpm")
+
+    def _blame(self, rule: str, text: str) -> None:
+        self._violations.setdefault(rule, Violation((self._clock.now() - self._began) / SECOND, rule, text))

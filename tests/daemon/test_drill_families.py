@@ -1,0 +1,299 @@
+"""Drills of families: the judge flags runs that are known to be unsafe, and trials end as they should."""
+
+import asyncio
+import contextlib
+import math
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from monstertruck_runtime.clock import VirtualClock, run_virtual
+from monstertruck_runtime.errors import InputError
+from monstertruck_schemas.req import Order
+from monstertruck_schemas.state import GateMode
+from monstertruck_sim.families import families
+from monstertruck_sim.world.obstacles import Disc
+from monstertruck_sim.world.world import World
+from monstertruckd.config.load import load_config
+from monstertruckd.tools.drill.campaign import LEG, Campaign, TrialOutcome, run_trials
+from monstertruckd.tools.drill.judge import WorldJudge
+from monstertruckd.tools.drill.random_drill import wired
+from monstertruckd.tools.drill.truck import DrillTruck, Wanderer
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
+
+pytestmark = [pytest.mark.virtual, pytest.mark.timeout(120)]
+
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+
+
+@cache
+def demo() -> SimulatedTruckConfig:
+    config = load_config(CONFIGS / "demo.yaml", SimulatedTruckConfig)[0]
+    return config.model_copy(update={"recorder": None, "blackbox": None})
+
+
+# The judge: worlds without a daemon, moved by the test
+
+
+class Scene:
+    """A world, its judge, and time that the test lets pass."""
+
+    def __init__(self, clock: VirtualClock) -> None:
+        self.clock = clock
+        self.world = World(demo().sim.world, seed=1)
+        self.judge = WorldJudge(self.world, clock)
+
+    def motor(self, rpm: float | None, ramp: float = 1e5) -> None:
+        """Forwards positive; None switches off."""
+        self.world.motors[0].command(self.clock.now(), None if rpm is None else -rpm, ramp)
+
+    def post(self, gap: float, *, behind: bool = False) -> None:
+        truth = self.world.truth(self.clock.now())
+        away = (demo().sim.world.truck.length / 2 + gap + 0.1) * (-1 if behind else 1)
+        x, y = truth.x + away * math.cos(truth.yaw), truth.y + away * math.sin(truth.yaw)
+        self.world.add(self.clock.now(), Disc(x, y, 0.1))
+
+
+async def cruise(scene: Scene) -> None:
+    scene.judge.arm()
+    scene.motor(10_000)
+    await scene.clock.sleep(1.0)
+
+
+async def drives_on(scene: Scene) -> None:
+    """An order to stop that nothing obeys."""
+    await cruise(scene)
+    scene.judge.forbid()
+    await scene.clock.sleep(1.5)
+
+
+async def creeps(scene: Scene) -> None:
+    """So slowly that only time tells."""
+    scene.judge.forbid()
+    scene.motor(900)
+    await scene.clock.sleep(1.5)
+
+
+async def rolls_fast(scene: Scene) -> None:
+    """It stands within a second, but too far away."""
+    scene.judge.arm()
+    scene.motor(60_000, 1e6)
+    await scene.clock.sleep(1.0)
+    scene.judge.forbid()
+    await scene.clock.sleep(0.4)
+    scene.motor(0, 1e6)
+    await scene.clock.sleep(0.5)
+
+
+async def sets_off_again(scene: Scene) -> None:
+    """It stood, as it should, and sets off again though still forbidden."""
+    await cruise(scene)
+    scene.judge.forbid()
+    scene.motor(0)
+    await scene.clock.sleep(2.0)
+    scene.motor(5_000)
+    await scene.clock.sleep(1.0)
+
+
+async def hits_ahead(scene: Scene) -> None:
+    scene.judge.arm()
+    scene.post(0.2)
+    scene.motor(10_000)
+    await scene.clock.sleep(2.5)
+
+
+async def hits_behind(scene: Scene) -> None:
+    scene.judge.arm()
+    scene.post(0.2, behind=True)
+    scene.motor(-10_000)
+    await scene.clock.sleep(2.5)
+
+
+async def leaves_a_target(scene: Scene) -> None:
+    """Held by hand it stands; the motor still wants to turn."""
+    scene.judge.forbid()
+    scene.world.block_shaft(scene.clock.now(), 0, on=True)
+    scene.motor(5_000)
+    await scene.clock.sleep(1.0)
+    scene.judge.check_left()
+
+
+async def stops(scene: Scene) -> None:
+    await cruise(scene)
+    scene.judge.forbid()
+    scene.motor(0)
+    await scene.clock.sleep(3.0)
+    scene.judge.check_left()
+
+
+async def coasts(scene: Scene) -> None:
+    await cruise(scene)
+    scene.judge.forbid()
+    scene.motor(None)
+    await scene.clock.sleep(3.0)
+    scene.judge.check_left()
+
+
+async def drives_while_permitted(scene: Scene) -> None:
+    scene.judge.forbid()
+    scene.judge.arm()
+    scene.motor(-5_000)
+    await scene.clock.sleep(2.0)
+
+
+async def stands_beside_something(scene: Scene) -> None:
+    scene.post(0.01)
+    scene.judge.forbid()
+    await scene.clock.sleep(2.0)
+
+
+def judged(run: Callable[[Scene], object]) -> WorldJudge:
+    async def main(clock: VirtualClock) -> WorldJudge:
+        scene = Scene(clock)
+        watching = asyncio.create_task(scene.judge.run())
+        await run(scene)  # type: ignore[misc]
+        watching.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await watching
+        return scene.judge
+
+    return run_virtual(main)
+
+
+@pytest.mark.parametrize(
+    ("run", "rules"),
+    [
+        (drives_on, {"motion"}),
+        (creeps, {"motion"}),
+        (rolls_fast, {"motion"}),
+        (sets_off_again, {"motion"}),
+        (hits_ahead, {"contact"}),
+        (hits_behind, {"contact"}),
+        (leaves_a_target, {"left behind"}),
+        (stops, set()),
+        (coasts, set()),
+        (drives_while_permitted, set()),
+        (stands_beside_something, set()),
+    ],
+)
+def test_the_judge_flags_what_is_unsafe_and_nothing_else(run: Callable[[Scene], object], rules: set[str]) -> None:
+    assert {violation.rule for violation in judged(run).violations} == rules
+
+
+def test_the_judge_measures_travel_and_standstill_from_the_order() -> None:
+    judge = judged(stops)
+    assert judge.standstill is not None
+    assert 0 < judge.standstill < 0.5
+    assert 0 < judge.travelled < 0.1
+
+
+# The operator
+
+
+def test_a_wanderer_drives_in_both_directions_and_steers_in_every_way() -> None:
+    async def main(clock: VirtualClock) -> None:
+        config = with_overlay(wired(demo()), {"tracker": None, "path": None})
+        async with DrillTruck.running(config, clock, wander=np.random.default_rng(2), judged=True) as truck:
+            station = truck.station
+            assert isinstance(station, Wanderer)
+            seen = set()
+            for _ in range(200):
+                station.choose()
+                rear = 0 if station.rear == 0 else math.copysign(1, station.rear * station.front)
+                seen.add((station.speed > 0, rear))
+                assert -config.gate.reverse_speed <= station.speed <= config.gate.speed
+                assert max(abs(station.front), abs(station.rear)) <= config.gate.angle
+            assert seen == {(forward, rear) for forward in (True, False) for rear in (0, 1, -1)}
+            assert await truck.until(truck.drives, 15.0, Order.ARM)
+            station.choose(backwards=True)
+            assert await truck.until(lambda: truck.speed < -0.03, 5.0, Order.ARM)
+
+    run_virtual(main)
+
+
+# A stalled computer
+
+
+def test_devices_keep_their_own_time_while_the_computer_is_stalled() -> None:
+    async def main(clock: VirtualClock) -> None:
+        async with DrillTruck.running(wired(demo()), clock, judged=True) as truck:
+            assert await truck.until(truck.drives, 15.0, Order.ARM)
+            firmware = truck.rig.robot.emulators["drive"].firmware  # type: ignore[attr-defined]
+            began = clock.now()
+            clock.stall(1.0)
+            stopping = asyncio.create_task(truck.order(Order.DISARM))
+            await clock.sleep(0.4)
+            assert firmware.quick_stop_input, "the deadman line"
+            await clock.sleep(0.4)
+            assert abs(truck.speed) < 0.01
+            assert truck.gate is not None
+            assert truck.gate.stamp <= began
+            assert truck.gate.mode is GateMode.DRIVING
+            assert not stopping.done()
+            await clock.sleep(0.3)
+            assert stopping.done()
+            assert truck.gate.mode is GateMode.DISARMED
+
+    run_virtual(main)
+
+
+# Trials
+
+
+def campaign(count: int = LEG, first: int = 0) -> Campaign:
+    return Campaign(5, count, demo(), first=first)
+
+
+def test_parts_of_a_drill_add_up_and_are_not_run_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def quick(leg) -> list[TrialOutcome]:  # type: ignore[no-untyped-def]
+        ran.append(leg.number)
+        numbers = range(leg.number * LEG, leg.number * LEG + leg.count)
+        return [TrialOutcome(number, ("a",), ("a",), False, False, recovered_s=0.5) for number in numbers]
+
+    monkeypatch.setattr("monstertruckd.tools.drill.campaign.run_trials", quick)
+    ran: list[int] = []
+    one, other, whole = (tmp_path / name for name in ("one", "other", "whole"))
+    campaign(2 * LEG).run(resume=one)
+    campaign(3 * LEG + 5, first=2 * LEG).run(resume=other)
+    assert ran == [0, 1, 2, 3]
+    whole.write_bytes(one.read_bytes() + other.read_bytes())
+    report = campaign(3 * LEG + 5).run(resume=whole)
+    assert ran == [0, 1, 2, 3]
+    assert [o.number for o in report.outcomes] == list(range(3 * LEG + 5))
+    assert report.figures()["trials"] == 3 * LEG + 5
+
+
+def test_a_beginning_inside_a_leg_is_refused() -> None:
+    with pytest.raises(InputError, match=f"expected a multiple of {LEG}"):
+        campaign(first=LEG - 1)
+
+
+def test_trials_have_pairs_both_directions_and_families_of_every_device() -> None:
+    outcomes = run_trials(Campaign(3, 6, demo()).legs()[0])
+    assert [outcome.number for outcome in outcomes] == list(range(6))
+    assert {len(outcome.faults) for outcome in outcomes} == {1, 2}
+    assert not any(outcome.stuck for outcome in outcomes), outcomes
+    again = run_trials(Campaign(3, 6, demo()).legs()[0])
+    assert again == outcomes
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["skid_steer", "sonar", "differential", "skid_stand", "mecanum", "ackermann"])
+def test_any_robot_can_be_drilled(name: str) -> None:
+    config = load_config(CONFIGS / "robots" / f"{name}.yaml", SimulatedTruckConfig)[0]
+    outcomes = run_trials(Campaign(3, 2, config.model_copy(update={"recorder": None})).legs()[0])
+    assert [outcome.stuck for outcome in outcomes] == [(), ()]
+
+
+def test_the_families_of_a_running_truck_are_those_of_signals_in_use() -> None:
+    async def main(clock: VirtualClock) -> None:
+        async with DrillTruck.running(wired(demo()), clock, judged=True) as truck:
+            assert await truck.until(truck.drives, 15.0, Order.ARM)
+            found = {family.name for family in families(truck.rig.robot, used=True)}
+            assert {"drive target_velocity ignored", "lidar range frozen", "steering target_0 late"} <= found
+            assert "drive velocity_demand frozen" not in found, "the driver never reads it"
+
+    run_virtual(main)
