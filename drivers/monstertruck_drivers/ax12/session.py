@@ -46,6 +46,8 @@ class Ax12Session:
         self.baud = link.baud or protocol.BAUD
         """Bits per second of the line."""
         self._quiet_until = 0
+        self._behind: dict[int, int] = {}
+        """Data bytes of an answer to a read that may still come, by unit: it would look like that to the next one."""
 
     async def find_echo(self, *units: int) -> None:
         """Find out whether the adapter echoes; any of ``units`` may be absent.
@@ -108,11 +110,17 @@ class Ax12Session:
         self._quiet_until = self._clock.now() + round((len(packet) * 10 / self.baud + GAP) * SECOND)
 
     async def _ask(self, unit: int, request: bytes, count: int, retries: int) -> Answer:
+        def wanted(packet: Packet) -> bool:
+            refused = not packet.params and packet.code
+            return packet.unit == unit and (len(packet.params) == count or bool(refused))
+
         for attempt in range(1 + retries):
-            packet = await self._exchange(
-                request, count, lambda packet: packet.unit == unit and len(packet.params) in (count, 0)
-            )
+            if unit in self._behind and not await self._catch_up(unit):
+                continue
+            packet = await self._exchange(request, count, wanted)
             if packet is None:
+                if count:
+                    self._behind[unit] = count
                 continue
             error = Alarm(packet.code)
             if packet.code and Alarm.CHECKSUM in error and attempt < retries:
@@ -121,6 +129,17 @@ class Ax12Session:
                 raise ProtocolError(f"{self._link.name}: unit {unit} gave no data: {alarm_names(error)} error")
             return Answer(error, packet.params)
         raise DeviceTimeoutError(f"{self._link.name}: unit {unit}: no correct answer")
+
+    async def _catch_up(self, unit: int) -> bool:
+        """Ping, whose answer has no data: answers come in order, so what was late has come before it."""
+
+        def wanted(packet: Packet) -> bool:
+            return packet.unit == unit and not packet.params
+
+        if await self._exchange(protocol.ping(unit), self._behind[unit], wanted) is None:
+            return False
+        del self._behind[unit]
+        return True
 
     async def _exchange(self, request: bytes, count: int, wanted: Callable[[Packet], bool]) -> Packet | None:
         """Send a request; the first wanted packet, or None when time is up.

@@ -37,15 +37,15 @@ ACKNOWLEDGE_TIMEOUT = 0.1
 ANSWER_TIMEOUT = 0.25
 QUIET = 0.55
 """Seconds of silence after which a controller as delivered has surely dropped a half frame."""
-FRAME_TIMEOUT_MS = 120
-"""Time-out of a half frame that the host sets: more than it waits for an acknowledge, so that only damage meets it."""
-BRIEF_QUIET = 0.17
-"""Seconds of silence after which a controller with that time-out has surely dropped a half frame."""
-LEAST_QUIET = 0.02
-"""Seconds in which bytes that an adapter or this host holds back come in."""
 QUICK_ANSWER = 0.05
-"""Longest of the newest exchanges, s, up to which an answer that has not come within ``ANSWER_TIMEOUT`` is lost, not
+"""Longest of the newest exchanges (s) up to which a line is quick: a byte that has not come by then is lost, not
 late."""
+QUICK_FRAME_TIMEOUT_MS = 50
+"""Timeout of a half frame that the host sets on a quick line: no good frame takes longer."""
+FRAME_TIMEOUT_MS = 120
+"""The same on other lines: more than the host waits for an acknowledge, so that only damage meets it."""
+HELD_BACK = 0.01
+"""Seconds in which bytes that an adapter or this host holds back come in."""
 RECENT = 32
 """Exchanges whose duration is judged."""
 QUIET_LIMIT = 1.1
@@ -110,12 +110,16 @@ class Exchanger:
         """Instant of the last byte of the newest complete exchange."""
         self.durations: deque[int] = deque(maxlen=RECENT)
         """Of the newest complete exchanges, ns."""
-        self._brief = False
-        """The controller drops half frames as soon as ``FRAME_TIMEOUT_MS`` says."""
+        self._frame_timeout: float | None = None
+        """Seconds after which the controller drops a half frame, as set by the host; None = as delivered."""
         self._answer_awaited = False
         """The request is with the controller: what comes late now is its answer."""
         self._failed = False
         """The newest exchange failed."""
+        self._silence = QUIET
+        """Seconds of silence that the newest failure asks for."""
+        self._touched = 0
+        """Instant of the newest byte of either side."""
 
     async def read(self, entry: ObjectEntry, attempts: int = 1) -> int:
         """Value of an object.
@@ -152,9 +156,11 @@ class Exchanger:
         Raises:
             DeviceTimeoutError, ProtocolError, DeviceLostError: as ``read``.
         """
+        quick = max(self.durations, default=SECOND) <= QUICK_ANSWER * SECOND
+        milliseconds = QUICK_FRAME_TIMEOUT_MS if quick else FRAME_TIMEOUT_MS
         with suppress(ObjectError):
-            await self.write(od.RS232_TIMEOUT, FRAME_TIMEOUT_MS, ATTEMPTS)
-            self._brief = True
+            await self.write(od.RS232_TIMEOUT, milliseconds, ATTEMPTS)
+            self._frame_timeout = milliseconds / 1000
 
     async def read_long(self, entry: ObjectEntry) -> bytes:
         """Raw bytes of an object of more than 32 bits, by segments.
@@ -230,22 +236,28 @@ class Exchanger:
             with suppress(TimeoutError):
                 async with self._clock.deadline(left / SECOND):
                     self.strange = await self._link.read()
-                    self.quiet_until = self._quiet()
+                    self.quiet_until = self._clock.now() + int(self._silence * SECOND)
         self._link.discard()
 
-    def _quiet(self, *, waited: bool = False) -> int:
-        """Until when to be silent: briefly after damage; longer after it again, and after no answer that may be late.
+    def _be_silent(self, *, waited: bool) -> None:
+        """After a failure, let the controller drop its half frame, whose time runs from the last byte of either side.
 
-        After one that is lost the line was silent long enough if it was ``waited`` for.
+        Briefly, if the controller drops half frames soon. As long as for a controller as delivered after a second
+        failure, and when an answer may still come: on a quick line, one that was not ``waited`` for. There the
+        controller has said its last byte by the time that an exchange takes.
         """
-        if not self._brief or self._failed or (self._answer_awaited and not (waited and self._is_quick())):
-            silence = QUIET
+        quick = self._is_quick()
+        last = self._touched if quick else self._clock.now()
+        may_come = self._answer_awaited and not (waited and quick)
+        if self._frame_timeout is None or self._failed or may_come:
+            self._silence, last = QUIET, self._clock.now()
         else:
-            silence = LEAST_QUIET if self._answer_awaited else BRIEF_QUIET
-        return self._clock.now() + int(silence * SECOND)
+            rest = max(self.durations) / SECOND + HELD_BACK if quick else QUICK_ANSWER
+            self._silence = self._frame_timeout + rest
+        self.quiet_until = last + round(self._silence * SECOND)
 
     def _is_quick(self) -> bool:
-        """Whether an answer that did not come in time is lost, not late as on a slow link."""
+        """Whether a byte that did not come in time is lost, not late as on a slow link."""
         return len(self.durations) == RECENT and max(self.durations) <= QUICK_ANSWER * SECOND
 
     def _run_row(self, entries: Sequence[ObjectEntry], take: Callable[[int], bool]) -> Steps[None]:
@@ -265,7 +277,7 @@ class Exchanger:
         except (_BusyError, _HeldUpError) as error:
             raise DeviceTimeoutError(str(error)) from None
         except BaseException as error:
-            self.quiet_until = self._quiet(waited=isinstance(error, DeviceTimeoutError))
+            self._be_silent(waited=isinstance(error, DeviceTimeoutError))
             self._failed = True
             self._link.discard()  # what came of it is no sign that the controller still speaks
             raise
@@ -285,7 +297,7 @@ class Exchanger:
     def _send(self, request: Frame) -> Steps[None]:
         for _ in range(2):
             yield from self._ask(request)
-            self._link.write(request.body)
+            self._write(request.body)
             if (yield from self._acknowledge()) == READY:
                 return
         raise ProtocolError(f"{self._link.name}: frame refused twice")
@@ -294,7 +306,7 @@ class Exchanger:
         for attempt in range(1 + BUSY_RETRIES):
             if attempt:
                 yield WaitFor(0, BUSY_PAUSE)
-            self._link.write(request.head)
+            self._write(request.head)
             if (yield from self._acknowledge()) == READY:
                 return
         raise _BusyError(f"{self._link.name}: controller stays busy")
@@ -312,26 +324,27 @@ class Exchanger:
     def _receive(self, lengths: frozenset[int] | None) -> Steps[Frame | None]:
         """Answer frame; None = damaged, and the controller has forgotten it: ask again."""
         self._answer_awaited = True
-        byte = yield from self._exactly(1, ANSWER_TIMEOUT)
+        skipped = b""
+        while (byte := (yield from self._exactly(1, ANSWER_TIMEOUT)))[0] != ANSWER:
+            self.strange = skipped = skipped + byte
+            if len(skipped) > STRAY_LIMIT:
+                raise ProtocolError(f"{self._link.name}: {skipped.hex(' ')} instead of an answer")
         self._answer_awaited = False
-        if byte[0] != ANSWER:
-            self.strange = byte
-            raise ProtocolError(f"{self._link.name}: {byte.hex()} instead of an answer")
-        self._link.write(bytes((READY,)))
+        self._write(bytes((READY,)))
         frame: Frame | None
         try:
             frame = yield from self._frame(lengths)
         except FrameError:
             frame = yield from self._repeated(lengths)
         if frame is not None:
-            self._link.write(bytes((READY,)))
+            self._write(bytes((READY,)))
         return frame
 
     def _repeated(self, lengths: frozenset[int] | None) -> Steps[Frame | None]:
         """Refuse a damaged answer. Undocumented whether the controller repeats it or forgets it: listen which."""
         yield WaitFor(0, REST_OF_FRAME)
         self._link.discard()
-        self._link.write(bytes((REFUSED,)))
+        self._write(bytes((REFUSED,)))
         try:
             return (yield from self._frame(lengths, REPEAT_WAIT))
         except DeviceTimeoutError:
@@ -347,14 +360,21 @@ class Exchanger:
         left = within - (self._clock.now() - begin) / SECOND if within else ACKNOWLEDGE_TIMEOUT
         return decode_body(ANSWER, head + (yield from self._exactly(body_size(head[0]), left)))
 
+    def _write(self, data: bytes) -> None:
+        self._link.write(data)
+        self._touched = self._clock.now()
+
     def _exactly(self, count: int, timeout: float) -> Steps[bytes]:
         asked = self._clock.now()
+        if self._is_quick():
+            timeout = min(timeout, QUICK_ANSWER)
         try:
             data = yield WaitFor(count, timeout)
         except TimeoutError:
             self._check_held_up(asked)
             raise DeviceTimeoutError(f"{self._link.name}: no answer within {timeout} s") from None
         self._check_held_up(asked)
+        self._touched = self._clock.now()
         return data
 
     def _check_held_up(self, asked: int) -> None:

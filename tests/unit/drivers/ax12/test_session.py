@@ -1,5 +1,6 @@
 """One exchange: what is retried, what is refused, whose answers count."""
 
+import asyncio
 import contextlib
 from collections.abc import AsyncIterator
 
@@ -101,7 +102,37 @@ def test_an_answer_that_came_too_late_is_thrown_away():
         await clock.sleep(0.01)
         assert (await session.read(1, p.PRESENT_POSITION, 8)).data == bytes(range(8))
 
-    scripted([b"", status(0, bytes(range(8)))], test)
+    scripted([b"", status(), status(0, bytes(range(8)))], test)
+
+
+@pytest.mark.parametrize("delayed", [0.001, 0.004, 0.006, 0.009])
+def test_a_late_answer_of_the_same_size_is_not_taken_for_the_next_one(delayed: float):
+    """It gave the old position a new stamp."""
+
+    async def test(session: Ax12Session, script: Script, clock: VirtualClock) -> None:
+        old, new = status(0, bytes(8)), status(0, bytes(range(8)))
+        with pytest.raises(DeviceTimeoutError):
+            await session.read(1, p.PRESENT_POSITION, 8, retries=0)
+        loop = asyncio.get_running_loop()
+        for nth, answer in enumerate((old, status(), new, status(), new, status(), new)):
+            loop.call_later(delayed + 0.0005 * nth, script.say, answer)
+        with contextlib.suppress(DeviceTimeoutError):
+            assert (await session.read(1, p.PRESENT_POSITION, 8)).data == bytes(range(8))
+
+    scripted([], test)
+
+
+def test_a_unit_that_is_behind_keeps_no_other_waiting_and_is_in_step_after_a_ping():
+    async def test(session: Ax12Session, script: Script, _clock) -> None:
+        with pytest.raises(DeviceTimeoutError):
+            await session.read(1, p.PRESENT_POSITION, 8, retries=0)
+        await session.read(2, p.PRESENT_POSITION, 8)
+        assert (await session.read(1, p.PRESENT_POSITION, 8)).data == bytes(range(8))
+        await session.read(1, p.PRESENT_POSITION, 8)
+        assert [request[4] for request in script.requests] == [2, 2, p.Instruction.PING, 2, 2]
+
+    late = status(0, bytes(8))
+    scripted([b"", status(0, bytes(8), 2), late + status(), status(0, bytes(range(8))), late], test)
 
 
 def test_silence_is_asked_three_times():

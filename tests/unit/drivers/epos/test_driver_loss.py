@@ -49,9 +49,9 @@ def test_small_disturbances_cost_less_than_a_tenth_of_a_second(fault: str):
     on_bench(test)
 
 
-@pytest.mark.parametrize(("fault", "least", "most"), [("delay 600 1", 0.6, 1.3), ("silent", 0.2, 0.4)])
+@pytest.mark.parametrize(("fault", "least", "most"), [("delay 600 1", 0.6, 1.3), ("silent", 0.2, 0.8)])
 def test_an_answer_that_is_600_ms_late_or_missing_costs_one_silence(fault: str, least: float, most: float):
-    """A long one while an answer may still come, a brief one after a request that was not acknowledged."""
+    """A long one while an answer may still come, and after a second request that was not acknowledged."""
 
     async def test(rig: Rig) -> None:
         async with rig.driving():
@@ -342,20 +342,26 @@ def test_a_restart_inside_an_exchange_is_noticed_and_the_odometer_does_not_jump(
     on_bench(test)
 
 
+GAP = 0.05 + 0.15
+"""Seconds between two messages around one damaged byte: the usual 50 ms and at most 150 ms more; the gate's limit is
+200 ms."""
+
+
 @pytest.mark.parametrize("damage", ["acknowledge", "length", "flip", "stray"])
-def test_one_damaged_byte_costs_less_than_three_tenths_of_a_second(damage: str):
+def test_one_damaged_byte_costs_at_most_150_ms(damage: str):
     """The host shortens the controller's own time-out for half frames (object 0x2005)."""
 
     async def test(rig: Rig) -> None:
         async with rig.driving():
             await rig.drive(6_000)
+            await rig.settle(1.0)
             for _ in range(10):
                 await rig.settle(0.3 + 0.013)
                 began = len(rig.out.kept) - 1
                 rig.emulator.inject(damage, "1")
                 await rig.settle(0.5)
                 times = [feedback.stamp for feedback in rig.out.kept[began:]]
-                assert max(b - a for a, b in itertools.pairwise(times)) < (0.3 + 0.05) * SECOND
+                assert max(b - a for a, b in itertools.pairwise(times)) < GAP * SECOND
         assert len(rig.ready_at) == 1
 
     on_bench(test)
@@ -373,22 +379,24 @@ def strike(device: DeviceEnd, way: str, nth: int, change: Callable[[int], bytes]
 
 
 @pytest.mark.parametrize("way", ["_emit", "_accept"], ids=["to the host", "to the controller"])
-@pytest.mark.parametrize("change", [lambda _: b"", lambda byte: bytes((byte ^ 0x80,))], ids=["lost", "flipped"])
-def test_any_byte_may_be_lost_or_flipped_for_less_than_three_tenths_of_a_second(
-    way: str, change: Callable[[int], bytes]
-):
+@pytest.mark.parametrize(
+    "change",
+    [lambda _: b"", lambda byte: bytes((byte ^ 0x80,)), lambda byte: bytes((0x55, byte))],
+    ids=["lost", "flipped", "stray"],
+)
+def test_any_byte_may_be_lost_or_flipped_or_strange_for_at_most_150_ms(way: str, change: Callable[[int], bytes]):
     async def test(rig: Rig, nth: int) -> None:
         async with rig.driving():
             await rig.drive(6_000)
-            await rig.settle(0.313)
+            await rig.settle(1.313)
             began = len(rig.out.kept) - 1
             strike(rig.port.device, way, nth, change)
             await rig.settle(1.0)
             times = [feedback.stamp for feedback in rig.out.kept[began:]]
-            assert max(b - a for a, b in itertools.pairwise(times)) < (0.3 + 0.05) * SECOND, nth
+            assert max(b - a for a, b in itertools.pairwise(times)) < GAP * SECOND, nth
         assert len(rig.ready_at) == 1
 
-    for nth in range(14):
+    for nth in range(30):
         on_bench(partial(test, nth=nth))
 
 

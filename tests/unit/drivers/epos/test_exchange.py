@@ -9,8 +9,8 @@ import pytest
 from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos.emulator import EposEmulator
 from monstertruck_drivers.epos.exchange import (
-    BRIEF_QUIET,
-    LEAST_QUIET,
+    HELD_BACK,
+    QUICK_ANSWER,
     QUIET,
     RECENT,
     Exchanger,
@@ -253,19 +253,19 @@ def test_a_repeated_answer_that_is_damaged_too_is_an_error():
 
 
 @pytest.mark.parametrize("strays", [1, 2, 3])
-def test_stray_bytes_before_an_acknowledge_are_skipped(strays: int):
+def test_stray_bytes_before_an_acknowledge_or_an_answer_are_skipped(strays: int):
     async def test(peer: Peer, line: Exchanger) -> None:
         assert await line.read(od.STATUSWORD) == DISABLED
 
     junk = b"\xa5\x00\xff"[:strays]
-    with_peer(junk + O, junk + O + b"\0", ANSWER)(test)
+    with_peer(junk + O, junk + O + junk.replace(b"\0", b"\1") + b"\0", ANSWER)(test)
 
 
 @pytest.mark.parametrize(
     ("replies", "message"),
     [
         ((b"$C12",), "24 43 31 32 instead of an acknowledge"),
-        ((O, O + b"\x55"), "55 instead of an answer"),
+        ((O, O + b"\x55\x56\x57\x58"), "55 56 57 58 instead of an answer"),
         ((O, O + b"\0", answer().body), "answer of 2 words"),
         ((O,), "no answer within 0.1 s"),
         ((O, O), "no answer within 0.25 s"),
@@ -295,31 +295,33 @@ def test_after_a_timeout_nothing_is_sent_for_550_ms():
 @pytest.mark.parametrize(
     ("replies", "failed_before", "silence"),
     [
-        ((), False, BRIEF_QUIET),
+        ((), False, 0.12 + QUICK_ANSWER),
         ((), True, QUIET),
         ((O, O), False, QUIET),
-        ((O, O + b"\x07"), False, BRIEF_QUIET),
-        ((O, O + b"\0", ANSWER[:5]), False, BRIEF_QUIET),
+        ((O, O + b"\0", ANSWER[:5]), False, 0.12 + QUICK_ANSWER),
     ],
 )
 def test_a_controller_that_drops_half_frames_soon_needs_silence_for_a_late_answer_or_a_second_failure(
     replies: tuple[bytes, ...], failed_before: bool, silence: float
 ):
     async def test(peer: Peer, line: Exchanger) -> None:
-        line._brief, line._failed = True, failed_before
+        line._frame_timeout, line._failed = 0.12, failed_before
         with pytest.raises((DeviceTimeoutError, ProtocolError)):
             await line.read(od.STATUSWORD)
-        assert line.quiet_until - line._clock.now() == round(silence * SECOND)
+        assert (line.quiet_until - line._clock.now()) / SECOND == pytest.approx(silence, abs=1e-6)
 
     with_peer(*replies)(test)
 
 
-@pytest.mark.parametrize(("brief", "silence"), [(True, BRIEF_QUIET), (False, QUIET)])
-def test_a_byte_into_the_silence_at_a_beginning_prolongs_it_by_what_the_controller_needs(brief: bool, silence: float):
+@pytest.mark.parametrize(("frame_timeout", "silence"), [(0.12, 0.12 + QUICK_ANSWER), (None, QUIET)])
+def test_a_byte_into_the_silence_prolongs_it_by_what_the_controller_needs(frame_timeout: float | None, silence: float):
+    """It was the silence of a second failure: a stray byte cost 0.56 s."""
+
     async def test(peer: Peer, line: Exchanger) -> None:
-        line._brief = brief
+        line._frame_timeout = frame_timeout
+        with pytest.raises(DeviceTimeoutError):
+            await line.read(od.STATUSWORD)
         began = line._clock.now()
-        line.quiet_until = began + SECOND // 10
         asyncio.get_running_loop().call_later(0.05, peer.link.feed, b"\x55")
         await line.settle()
         assert (line._clock.now() - began) / SECOND == pytest.approx(0.05 + silence, abs=1e-3)
@@ -329,19 +331,41 @@ def test_a_byte_into_the_silence_at_a_beginning_prolongs_it_by_what_the_controll
 
 
 @pytest.mark.parametrize(
-    ("slowest", "count", "silence"),
-    [(QUICK, RECENT, LEAST_QUIET), (QUICK + 1, RECENT, QUIET), (QUICK, RECENT - 1, QUIET)],
+    ("slowest", "count", "waited", "silence"),
+    [
+        (QUICK, RECENT, QUICK_ANSWER, 0.05 + QUICK_ANSWER + HELD_BACK),
+        (QUICK // 5, RECENT, QUICK_ANSWER, 0.05 + QUICK_ANSWER / 5 + HELD_BACK),
+        (QUICK + 1, RECENT, 0.25, 0.25 + QUIET),
+        (QUICK, RECENT - 1, 0.25, 0.25 + QUIET),
+    ],
 )
-def test_an_answer_that_does_not_come_is_lost_if_all_the_newest_were_quick(slowest: int, count: int, silence: float):
+def test_an_answer_that_does_not_come_is_lost_if_all_the_newest_were_quick(
+    slowest: int, count: int, waited: float, silence: float
+):
+    """The silence is counted from the last byte: that much of it has passed when the wait ends."""
+
     async def test(peer: Peer, line: Exchanger) -> None:
-        line._brief = True
+        line._frame_timeout = 0.05
         line.durations.extend([slowest, *[QUICK // 5] * (count - 1)])
+        began = line._clock.now()
         with pytest.raises(DeviceTimeoutError):
             await line.read(od.STATUSWORD)
-        assert line.quiet_until - line._clock.now() == round(silence * SECOND)
+        assert (line._clock.now() - began) / SECOND == pytest.approx(waited, abs=1e-3)
+        assert (line.quiet_until - began) / SECOND == pytest.approx(silence, abs=1e-3)
         assert line._flight is None, "nothing keeps the error and whoever waited for it"
 
     with_peer(O, O)(test)
+
+
+@pytest.mark.parametrize(("duration", "milliseconds"), [(0.01, 50), (0.05, 50), (0.051, 120), (None, 120)])
+def test_the_time_of_a_half_frame_is_set_by_how_quick_the_line_is(duration: float | None, milliseconds: int):
+    async def test(peer: Peer, line: Exchanger) -> None:
+        line.durations.extend([] if duration is None else [round(duration * SECOND)])
+        await line.shorten_silence()
+        assert peer.written[1][1][5:7] == milliseconds.to_bytes(2, "little")
+        assert line._frame_timeout == milliseconds / 1000
+
+    with_peer(O, O + b"\0", WRITTEN)(test)
 
 
 def test_outside_the_schedule_an_exchange_is_tried_three_times():
@@ -379,7 +403,7 @@ def test_bytes_that_a_process_finds_after_it_stood_still_are_no_answer(stood: fl
 
 def test_a_byte_instead_of_an_answer_is_kept_as_strange():
     async def test(peer: Peer, line: Exchanger) -> None:
-        with pytest.raises(ProtocolError, match="07 instead of an answer"):
+        with pytest.raises(DeviceTimeoutError):
             await line.read(od.STATUSWORD)
         assert line.strange == b"\x07"
 
