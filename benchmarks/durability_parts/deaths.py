@@ -12,11 +12,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from benchmarks.durability_parts import recordings
+from benchmarks.durability_parts import maps, recordings, state
 from benchmarks.durability_parts.disk import ACKNOWLEDGED, Disk, compiled, events, traced
 from benchmarks.durability_parts.subject import Death, Subject
 
-SUBJECTS: Final[tuple[Subject, ...]] = (recordings.SUBJECT,)
+SUBJECTS: Final[tuple[Subject, ...]] = (recordings.SUBJECT, maps.SUBJECT, *state.SUBJECTS)
 SHOWN: Final = 5
 """Faults of a subject that are printed."""
 TRACES: Final = 8

@@ -1,0 +1,24 @@
+"""Maps and state of a robot through kills and power cuts; ``benchmarks/durability.py`` does more of them."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from benchmarks.durability_parts import maps, state
+from benchmarks.durability_parts.deaths import cuts, kills
+from benchmarks.durability_parts.subject import Subject
+
+SUBJECTS = (maps.SUBJECT, *state.SUBJECTS)
+
+
+@pytest.mark.parametrize("subject", SUBJECTS, ids=lambda subject: subject.name)
+def test_nothing_acknowledged_is_lost_by_a_power_cut_and_nothing_is_mixed(tmp_path: Path, subject: Subject):
+    if shutil.which("cc") is None:
+        pytest.skip("there is no C compiler")
+    assert cuts([subject], 16, 3, tmp_path) == {subject.name: {"cuts": 16, "faults": 0}}
+
+
+@pytest.mark.parametrize("subject", SUBJECTS, ids=lambda subject: subject.name)
+def test_nothing_acknowledged_is_lost_by_a_kill_and_nothing_is_mixed(tmp_path: Path, subject: Subject):
+    assert kills([subject], 3, 5, tmp_path) == {subject.name: {"kills": 3, "faults": 0}}
