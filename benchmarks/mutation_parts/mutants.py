@@ -86,19 +86,19 @@ class Mutant:
 
 def mutants(file: str, source: bytes) -> list[Mutant]:
     """All mutants of a source, in the order of their lines."""
-    finder = _Finder(file, source)
+    finder = Finder(file, source)
     finder.visit(ast.parse(source))
     return sorted(finder.found, key=lambda mutant: (mutant.line, mutant.span, mutant.after))
 
 
-class _Finder(ast.NodeVisitor):
+class Finder(ast.NodeVisitor):
     def __init__(self, file: str, source: bytes) -> None:
         self.found: list[Mutant] = []
         self._file = file
         self._source = source
         lines = source.splitlines(keepends=True)
         self._starts = [sum(map(len, lines[:i])) for i in range(len(lines) + 1)]
-        self._path: list[str] = []
+        self.path: list[str] = []
         self._scope = range(1, len(lines) + 1)
         self._statement = 0
 
@@ -116,34 +116,34 @@ class _Finder(ast.NodeVisitor):
         begin = self._starts[node.lineno - 1] + node.col_offset
         return begin, self._starts[node.end_lineno - 1] + node.end_col_offset
 
-    def _text(self, node: ast.expr | ast.stmt) -> str:
+    def text(self, node: ast.expr | ast.stmt) -> str:
         begin, end = self._span(node)
         return self._source[begin:end].decode()
 
-    def _add(self, operator: str, node: ast.expr | ast.stmt, after: str) -> None:
-        before = self._text(node)
+    def add(self, operator: str, node: ast.expr | ast.stmt, after: str) -> None:
+        before = self.text(node)
         if after == before:
             return
         after = after if isinstance(node, ast.stmt) or after.isidentifier() else f"({after})"
-        where = ".".join(self._path) or "module"
+        where = ".".join(self.path) or "module"
         place = self._file, node.lineno, self._statement
         self.found.append(Mutant(*place, operator, where, before, after, self._span(node), self._scope))
 
     # Statements
 
-    def _named(self, node: ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef) -> None:
+    def named(self, node: ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef) -> None:
         assert node.end_lineno is not None
         outer, self._scope = self._scope, range(node.lineno, node.end_lineno + 1)
-        self._path.append(node.name)
+        self.path.append(node.name)
         for statement in node.body:
             self.visit(statement)
         if not isinstance(node, ast.ClassDef):
             for default in (*node.args.defaults, *(d for d in node.args.kw_defaults if d is not None)):
                 self.visit(default)
-        self._path.pop()
+        self.path.pop()
         self._scope = outer
 
-    visit_FunctionDef = visit_AsyncFunctionDef = visit_ClassDef = _named  # noqa: N815
+    visit_FunctionDef = visit_AsyncFunctionDef = visit_ClassDef = named  # noqa: N815
 
     def visit_AnnAssign(self, node: ast.AnnAssign) -> None:
         if node.value is not None:
@@ -151,37 +151,37 @@ class _Finder(ast.NodeVisitor):
             self.visit(node.value)
 
     def visit_Assign(self, node: ast.Assign) -> None:
-        if isinstance(node.value, ast.Subscript) and self._text(node.value).startswith("Annotated"):
+        if isinstance(node.value, ast.Subscript) and self.text(node.value).startswith("Annotated"):
             return
         self._assigned(node, node.targets[0])
         self.visit(node.value)
 
     def _assigned(self, node: ast.Assign | ast.AnnAssign, target: ast.expr) -> None:
-        if self._path[-1:] != ["__init__"] and isinstance(target, (ast.Attribute, ast.Subscript)):
-            self._add("left out", node, "pass")
+        if self.path[-1:] != ["__init__"] and isinstance(target, (ast.Attribute, ast.Subscript)):
+            self.add("left out", node, "pass")
 
     def visit_AugAssign(self, node: ast.AugAssign) -> None:
-        self._add("left out", node, "pass")
+        self.add("left out", node, "pass")
         if (other := ARITHMETIC.get(type(node.op))) is not None:
-            self._add("arithmetic", node, f"{self._text(node.target)} {other}= {self._text(node.value)}")
+            self.add("arithmetic", node, f"{self.text(node.target)} {other}= {self.text(node.value)}")
         self.visit(node.value)
 
     def visit_Expr(self, node: ast.Expr) -> None:
         value = node.value
-        if isinstance(value, ast.Constant) or self._text(node).startswith(SILENT):
+        if isinstance(value, ast.Constant) or self.text(node).startswith(SILENT):
             return
         if isinstance(value, (ast.Call, ast.Await)):
-            self._add("left out", node, "pass")
+            self.add("left out", node, "pass")
         self.visit(value)
 
     def visit_Raise(self, node: ast.Raise) -> None:
-        self._add("left out", node, "pass")
+        self.add("left out", node, "pass")
 
     def visit_Break(self, node: ast.Break) -> None:
-        self._add("left out", node, "pass")
+        self.add("left out", node, "pass")
 
     def visit_Continue(self, node: ast.Continue) -> None:
-        self._add("left out", node, "pass")
+        self.add("left out", node, "pass")
 
     def visit_Assert(self, node: ast.Assert) -> None:
         """States an invariant; checks nothing."""
@@ -195,10 +195,10 @@ class _Finder(ast.NodeVisitor):
         """Words for people."""
 
     def _conditional(self, node: ast.If | ast.While | ast.IfExp) -> None:
-        if "TYPE_CHECKING" not in self._text(node.test) and not isinstance(node.test, ast.Constant):
+        if "TYPE_CHECKING" not in self.text(node.test) and not isinstance(node.test, ast.Constant):
             always = () if isinstance(node, ast.While) else ("True",)
             for value in (*always, "False"):
-                self._add("condition", node.test, value)
+                self.add("condition", node.test, value)
         self.generic_visit(node)
 
     visit_If = visit_While = visit_IfExp = _conditional  # noqa: N815
@@ -211,9 +211,9 @@ class _Finder(ast.NodeVisitor):
             for operator, other in COMPARISONS[type(op)]:
                 signs = [SYMBOLS[type(each)] for each in node.ops]
                 signs[index] = other
-                texts = [self._text(part) if isinstance(part, ATOMS) else f"({self._text(part)})" for part in parts]
+                texts = [self.text(part) if isinstance(part, ATOMS) else f"({self.text(part)})" for part in parts]
                 rest = "".join(f" {sign} {text}" for sign, text in zip(signs, texts[1:], strict=True))
-                self._add(operator, node, texts[0] + rest)
+                self.add(operator, node, texts[0] + rest)
         for part in node.comparators:
             if isinstance(part, ast.Tuple):
                 self._drop(part)
@@ -221,70 +221,70 @@ class _Finder(ast.NodeVisitor):
 
     def visit_BoolOp(self, node: ast.BoolOp) -> None:
         here, other = ("and", "or") if isinstance(node.op, ast.And) else ("or", "and")
-        texts = [f"({self._text(value)})" for value in node.values]
-        self._add("connective", node, f" {other} ".join(texts))
+        texts = [f"({self.text(value)})" for value in node.values]
+        self.add("connective", node, f" {other} ".join(texts))
         for index in range(len(texts)):
-            self._add("dropped", node, f" {here} ".join(texts[:index] + texts[index + 1 :]))
+            self.add("dropped", node, f" {here} ".join(texts[:index] + texts[index + 1 :]))
         self.generic_visit(node)
 
     def visit_UnaryOp(self, node: ast.UnaryOp) -> None:
         if isinstance(node.op, (ast.Not, ast.USub)):
-            self._add("sign", node, self._text(node.operand))
+            self.add("sign", node, self.text(node.operand))
         self.generic_visit(node)
 
     def visit_BinOp(self, node: ast.BinOp) -> None:
         if (other := ARITHMETIC.get(type(node.op))) is not None and not isinstance(node.left, ast.JoinedStr):
-            self._add("arithmetic", node, f"({self._text(node.left)}) {other} ({self._text(node.right)})")
+            self.add("arithmetic", node, f"({self.text(node.left)}) {other} ({self.text(node.right)})")
         self.generic_visit(node)
 
     def visit_Constant(self, node: ast.Constant) -> None:
         value = node.value
         if isinstance(value, bool):
-            self._add("flag", node, str(not value))
+            self.add("flag", node, str(not value))
         elif isinstance(value, int):
-            self._add("number", node, str(value + 1))
+            self.add("number", node, str(value + 1))
         elif isinstance(value, float):
-            self._add("number", node, repr(value * 2 or 1.0))
+            self.add("number", node, repr(value * 2 or 1.0))
 
     def visit_Call(self, node: ast.Call) -> None:
         name = node.func.id if isinstance(node.func, ast.Name) else ""
-        if name == "Field" or self._text(node.func).startswith(SILENT):
+        if name == "Field" or self.text(node.func).startswith(SILENT):
             return
         if name in SWAPPED:
-            self._add("swapped", node, SWAPPED[name] + self._text(node)[len(name) :])
+            self.add("swapped", node, SWAPPED[name] + self.text(node)[len(name) :])
         if name in ("min", "max") and len(node.args) > 1:
-            texts = [self._text(argument) for argument in node.args]
-            rest = [self._text(keyword.value) for keyword in node.keywords]
+            texts = [self.text(argument) for argument in node.args]
+            rest = [self.text(keyword.value) for keyword in node.keywords]
             named = [f"{k.arg}={text}" for k, text in zip(node.keywords, rest, strict=True)]
             for index in range(len(texts)):
                 kept = texts[:index] + texts[index + 1 :]
                 alone = len(kept) == 1 and not kept[0].startswith("*") and not named
-                self._add("dropped", node, kept[0] if alone else f"{name}({', '.join(kept + named)})")
+                self.add("dropped", node, kept[0] if alone else f"{name}({', '.join(kept + named)})")
         self.generic_visit(node)
 
     def _drop(self, node: ast.Set | ast.Tuple) -> None:
-        texts = [self._text(element) for element in node.elts]
+        texts = [self.text(element) for element in node.elts]
         if len(texts) < 2:
             return
         for index in range(len(texts)):
             inner = ", ".join(texts[:index] + texts[index + 1 :])
-            self._add("dropped", node, f"{{{inner}}}" if isinstance(node, ast.Set) else f"{inner},")
+            self.add("dropped", node, f"{{{inner}}}" if isinstance(node, ast.Set) else f"{inner},")
 
     def visit_Set(self, node: ast.Set) -> None:
         self._drop(node)
         self.generic_visit(node)
 
     def visit_Dict(self, node: ast.Dict) -> None:
-        keys = [f"{self._text(key)}: " if key is not None else "**" for key in node.keys]
-        texts = [key + self._text(value) for key, value in zip(keys, node.values, strict=True)]
+        keys = [f"{self.text(key)}: " if key is not None else "**" for key in node.keys]
+        texts = [key + self.text(value) for key, value in zip(keys, node.values, strict=True)]
         if len(texts) > 1:
             for index in range(len(texts)):
-                self._add("dropped", node, "{" + ", ".join(texts[:index] + texts[index + 1 :]) + "}")
+                self.add("dropped", node, "{" + ", ".join(texts[:index] + texts[index + 1 :]) + "}")
         self.generic_visit(node)
 
     def visit_comprehension(self, node: ast.comprehension) -> None:
         for test in node.ifs:
-            self._add("dropped", test, "True")
+            self.add("dropped", test, "True")
         self.generic_visit(node)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from monstertruck_runtime import wire
-from monstertruck_runtime.clock import SECOND, WallClock
+from monstertruck_runtime.clock import SECOND, VirtualClock, WallClock, run_virtual
 from monstertruck_runtime.mailbox import fifo
 from monstertruck_schemas.base import Message, Pose2D
 from monstertruck_schemas.plan import Path
@@ -20,7 +20,17 @@ from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.state import GateMode
 from monstertruck_schemas.topics import ESTOP_WAY, EVENT, REQ_CONTROL, REQ_DRIVE, REQ_GOAL, REQ_PATH, Topic
 from monstertruckd.bus.access import EVERYTHING, OBSERVING, Grant, Sender
-from monstertruckd.bus.intake import DEPTH, LIMITS, MAX_OWNERS, MAX_REPEATS, ORDER_RATE, REPEAT, STOP_RATE, Intake
+from monstertruckd.bus.intake import (
+    DEPTH,
+    LIMITS,
+    MAX_OWNERS,
+    MAX_REPEATS,
+    ORDER_RATE,
+    REPEAT,
+    STOP_RATE,
+    Intake,
+    Refusals,
+)
 from monstertruckd.bus.local import Bus
 from tests.unit.gate.rig import make_gate
 
@@ -417,3 +427,37 @@ async def test_programs_of_one_owner_share_its_rate_and_cost_no_other_owner_anyt
     entrance.send((REQ_GOAL, goal(1)))
     await entrance.settle()
     assert got == ["eve:0", "eve:2", "eve:4", "ann"]
+
+
+def test_refusals_that_wait_for_a_busy_loop_become_one_event_with_the_newest_of_them():
+    async def main(clock: VirtualClock) -> None:
+        bus = Bus(clock)
+        refusals = Refusals(bus, clock, "zenoh")
+        with bus.subscribe(EVENT, fifo(8)) as events:
+            refusals.add(Reason.BAD_INPUT, "ann", "first")
+            clock.spend(1.5)
+            refusals.add(Reason.BAD_INPUT, "bob", "second")
+            await clock.sleep(0.1)
+            assert [(event.text, event.values["count"]) for event in events.drain()] == [("second", 1)]
+            for name in ("ann", "bob", "cy"):
+                refusals.add(Reason.BAD_INPUT, name, name)
+            await clock.sleep(1.0)
+            refusals.add(Reason.BAD_INPUT, "ann", "later")
+            await clock.sleep(0.1)
+            assert [(event.text, event.values["count"]) for event in events.drain()] == [("later", 4)]
+        refusals.close()
+
+    run_virtual(main)
+
+
+def test_the_first_refusal_is_reported_at_once_as_one():
+    async def main(clock: VirtualClock) -> None:
+        bus = Bus(clock)
+        refusals = Refusals(bus, clock, "zenoh")
+        with bus.subscribe(EVENT, fifo(8)) as events:
+            refusals.add(Reason.BAD_INPUT, "ann", "first")
+            await clock.sleep(0.1)
+            assert [(event.text, event.values["count"]) for event in events.drain()] == [("first", 1)]
+        refusals.close()
+
+    run_virtual(main)

@@ -5,6 +5,7 @@ import pytest
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order, Role
 from monstertruck_schemas.state import GateMode
+from monstertruckd.gate.arbitration import ASKING
 from tests.unit.gate.rig import Rig
 
 ANN = {"source": "ann", "role": Role.STATION}
@@ -113,3 +114,25 @@ def test_who_asks_is_forgotten_and_many_names_take_no_room():
     assert rig.out.asking == ("b", "c", "d", "e")
     rig.tick(50 * 20 + 1)
     assert rig.out.asking == ()
+
+
+@pytest.mark.parametrize(("role", "drives"), [(Role.GAMEPAD, True), (Role.KEYBOARD, True), (Role.STATION, False)])
+def test_who_outranks_the_former_driver_need_not_wait_for_the_one_it_was_handed_to(role: Role, drives: bool):
+    rig = asked()
+    assert rig.order(Order.HAND_OVER, **ANN, to="bob") is Reason.OK
+    rig.tick()
+    rig.driver = {"source": "eve", "role": role}
+    rig.tick(20)
+    assert (rig.out.holder == "eve") is drives
+
+
+def test_who_asks_is_shown_to_the_last_instant_of_twenty_seconds():
+    rig = asked()
+    rig.order(Order.ASK, source="eve", role=Role.STATION)
+    sources, until = rig.gate._sources, rig.now + ASKING
+    assert sources.asking(until) == ("bob", "eve") or sources.asking(until) == ("eve",)
+    assert sources.asking(until + 1) == ()
+    sources.ask("kim", until)
+    assert "eve" in sources.asking(until)
+    sources.ask("leo", until + 1)
+    assert "eve" not in sources.asking(until - 1), "forgotten, not only hidden"

@@ -177,3 +177,10 @@ def test_a_robot_without_range_sensors_goes_by_what_it_hears_all_around(place, r
     beside(rig, place)
     assert rig.out.reasons == reasons
     assert rig.speed == pytest.approx(speed)
+
+
+@pytest.mark.parametrize("away", [0.37, 0.42, 0.47])
+def test_a_robot_that_is_there_now_never_vanishes_however_near(away):
+    """Only where it is predicted to come too near the prediction ends."""
+    for vx in (0.0, 0.3):
+        assert free(BACK, heard(-away, 0.0, vx=vx)) == 0.0

@@ -1,6 +1,7 @@
 """What the gate's service publishes at each tick, and when."""
 
 import asyncio
+import logging
 from itertools import pairwise
 
 import pytest
@@ -84,6 +85,25 @@ def test_an_order_that_stops_is_published_at_the_next_tick_though_it_changes_not
         state = bench.out.state.last
         assert state.mode is GateMode.DISARMED
         assert before < ordered <= state.stamp < before + 5 * PERIOD, "who knows this state may arm"
+
+    on_bench(scenario)
+
+
+def test_a_stop_that_was_ordered_is_news_and_any_other_a_warning(caplog):
+    async def scenario(bench):
+        caplog.set_level(logging.INFO)
+        for ordered in (True, False):
+            bench.order(Order.ARM)
+            await bench.clock.sleep(0.05)
+            bench.ask(bench.service.request, Role.STATION)
+            await bench.clock.sleep(0.05)
+            if ordered:
+                bench.order(Order.STOP)
+            await bench.clock.sleep(1.0)
+            stop = bench.out.stops.last
+            assert stop.ordered is ordered
+            levels = {record.levelno for record in caplog.records if record.getMessage() == stop.text}
+            assert levels == {logging.INFO if ordered else logging.WARNING}
 
     on_bench(scenario)
 
