@@ -239,6 +239,18 @@ async def a_task_arms_the_robot_and_lets_planners_drive_once_it_has_begun(page: 
     assert not await page.evaluate("window.sent.some((each) => each.id !== undefined)"), "armed by somebody else"
 
 
+async def the_configured_path_is_started_by_its_name(page: Page) -> None:
+    await say(page, FACTS)
+    assert not await page.is_visible("#path-start"), "this robot has none"
+    await say(page, FACTS | {"path": "lap"})
+    assert await page.inner_text("#path-start") == "Start lap"
+    await page.evaluate("void (window.sent = [])")
+    await page.click("#path-start")
+    asked = await page.evaluate("window.sent.find((each) => each.id !== undefined)")
+    assert {key: asked[key] for key in ("do", "path")} == {"do": "start_path", "path": "lap"}
+    await say(page, {"kind": "answer", "id": asked["id"], "ok": True, "value": {"path": "lap-1"}})
+
+
 async def test_the_page_drives_as_the_hand_does_and_shows_what_is_true(tmp_path: Path):
     """All in one browser, for it takes seconds to start."""
     async with serving() as (station, _), chromium(tmp_path) as browser:
@@ -260,4 +272,5 @@ async def test_the_page_drives_as_the_hand_does_and_shows_what_is_true(tmp_path:
         await a_stop_is_shown_with_its_chain_of_causes(page)
         await a_mission_of_a_robot_that_was_moved_goes_on_once_that_is_said(page)
         await a_task_arms_the_robot_and_lets_planners_drive_once_it_has_begun(page)
+        await the_configured_path_is_started_by_its_name(page)
         assert errors == []
