@@ -46,6 +46,7 @@ from monstertruckd.bus.access import ANONYMOUS, OBSERVING, Sender, in_groups
 from monstertruckd.bus.call_limits import ESTOP, ORDERS, ROOM, TOO_MANY, CallLimits, may_be_served
 from monstertruckd.bus.intake import Intake, Refusals, StandIntake
 from monstertruckd.bus.local import Bus
+from monstertruckd.bus.port_holder import holder_of
 from monstertruckd.bus.replies import Replies, Reply
 from monstertruckd.bus.rpc import Rpc, failure, topic_rows
 from monstertruckd.bus.zenoh_config import Listener, ZenohConfig, listeners, session_config
@@ -194,8 +195,10 @@ class ZenohBridge:
         except zenoh.ZError as error:
             text = _SOURCE_PLACE.sub("", str(error))
             if "in use" in text or "EAGAIN" in text:
-                msg = f"{where} is in use: another daemon is running here; a second robot needs zenoh.listen of its own"
-                raise BusyError(msg) from error
+                holder = holder_of(listener.listen)
+                raise BusyError(
+                    f"{where} is in use by {holder}; a second robot needs zenoh.listen of its own"
+                ) from error
             msg = f"zenoh cannot open {where}: {text}"
             raise ConfigError(msg) from error
         except OSError as error:

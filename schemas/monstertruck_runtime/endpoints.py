@@ -15,6 +15,8 @@ UNIX: Final = "unixsock-stream/"
 _ADDRESSED: Final = ("tcp", "tls", "udp", "quic", "ws")
 """Protocols whose addresses are a host and a port."""
 _OTHERS: Final = ("unixsock-stream", "unixpipe", "vsock", "serial")
+ANSWERS_WITHIN: Final = 0.2
+"""Timeout of a connection to a program on this machine (s)."""
 _LAST_PORT: Final = 65_535
 
 
@@ -81,6 +83,34 @@ def nearest(endpoint: str, environment: Mapping[str, str] = os.environ) -> str:
     return endpoint
 
 
+def local_endpoints(environment: Mapping[str, str] = os.environ) -> list[str]:
+    """Endpoints of the daemons that answer on this machine: the default port, then Unix sockets by port.
+
+    Sockets are those of this user and of the service; a daemon of another user is found at the default port only.
+    """
+    ports = {path.stem for folder in (runtime_folder(environment), SERVICE_FOLDER) for path in folder.glob("*.sock")}
+    usual = port_of(DEFAULT_ENDPOINT)
+    others = sorted(int(port) for port in ports if port.isdecimal() and int(port) != usual)
+    found = [nearest(endpoint_of("tcp", LOCAL_HOSTS[0], port), environment) for port in others]
+    first = nearest(DEFAULT_ENDPOINT, environment)
+    there = first.startswith(UNIX) or _listens(LOCAL_HOSTS[0], usual or 0)
+    return [*([first] if there else []), *(endpoint for endpoint in found if endpoint.startswith(UNIX))]
+
+
+def public(endpoint: str) -> str:
+    """An endpoint as a user writes it: the port of a Unix socket as an address of this machine."""
+    if not endpoint.startswith(UNIX):
+        return endpoint
+    port = Path(endpoint.removeprefix(UNIX)).stem
+    return endpoint_of("tcp", LOCAL_HOSTS[0], int(port)) if port.isdecimal() else endpoint
+
+
+def robot_on_host(robot: str, endpoint: str) -> str:
+    """Robot and computer for messages, such as ``truck on rover``."""
+    host = host_of(endpoint) if protocol_of(endpoint) in _ADDRESSED else LOCAL_HOSTS[0]
+    return f"{robot} on {socket.gethostname() if host in LOCAL_HOSTS else host}"
+
+
 def make_private(folder: Path) -> None:
     """Make the folder of sockets and ports; one that is there must be this user's own and nobody else's to write.
 
@@ -93,9 +123,17 @@ def make_private(folder: Path) -> None:
         raise OSError(f"{folder}: expected a folder that only its owner may write, owned by user {os.getuid()}")
 
 
+def _listens(host: str, port: int) -> bool:
+    try:
+        with socket.create_connection((host, port), ANSWERS_WITHIN):
+            return True
+    except OSError:
+        return False
+
+
 def _answers(path: Path) -> bool:
     with socket.socket(socket.AF_UNIX) as probe:
-        probe.settimeout(0.2)
+        probe.settimeout(ANSWERS_WITHIN)
         try:
             if path.parent != SERVICE_FOLDER and path.parent.lstat().st_uid != os.getuid():
                 return False

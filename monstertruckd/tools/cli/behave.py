@@ -61,7 +61,7 @@ def start_command(
             raise NotFoundError(f"no behaviour {name!r}: expected one of {', '.join(known)}")
         return await run_behaviour(client, name, arm=arm)
 
-    end = with_robot(main, robot, endpoint)
+    end = with_robot(main, robot, endpoint, orders=True)
     print_end(end.reason, end.text, end.as_json(), json_output=json_output)
 
 
@@ -74,4 +74,4 @@ def stop_command(robot: RobotOption = "truck", endpoint: EndpointOption = DEFAUL
         await require_section(client, "behaviours", WITHOUT)
         await client.behave(BehaviourOrder.STOP)
 
-    with_robot(main, robot, endpoint)
+    with_robot(main, robot, endpoint, orders=True)

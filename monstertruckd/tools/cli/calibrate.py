@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
-from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
+from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT, robot_on_host
 from monstertruckd.tools.cli.connection import robot_config, with_robot
 from monstertruckd.tools.cli.options import EndpointOption, RobotOption, complete_config, with_parameters
 from monstertruckd.tools.cli.output import (
@@ -390,6 +390,7 @@ async def _run_wizard(wizard: "Wizard", call: _Call, clock: "Clock", panel: "Pan
     from monstertruckd.tools.calibrate.wizard import calibrate
 
     async with _client(call.robot, call.endpoint, clock) as client:
+        remark(f"robot: {robot_on_host(call.robot, call.endpoint)}")
         config = await robot_config(client)
         file = _file(await client.call(SHOW))
         known = {} if file is None else file.results

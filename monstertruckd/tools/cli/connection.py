@@ -7,6 +7,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from monstertruck_runtime.clock import Clock, run_wall
+from monstertruck_runtime.endpoints import robot_on_host
 from monstertruck_runtime.errors import NotFoundError, TruckError
 from monstertruckd.tools.cli.output import remark
 
@@ -21,7 +22,12 @@ SOON: Final = 0.7
 
 
 def with_robot(
-    main: "Callable[[TruckClient, Clock], Coroutine[Any, Any, T]]", robot: str, endpoint: str, timeout: float = 2.5
+    main: "Callable[[TruckClient, Clock], Coroutine[Any, Any, T]]",
+    robot: str,
+    endpoint: str,
+    timeout: float = 2.5,
+    *,
+    orders: bool = False,
 ) -> T:
     """Connect, run ``main(client, clock)``, and return what it returns; a link that takes long is said to be awaited.
 
@@ -30,6 +36,7 @@ def with_robot(
         robot: its name.
         endpoint: where it listens.
         timeout: seconds to wait for the link and for answers.
+        orders: ``main`` gives an order; print the name and host of the robot first.
 
     Raises:
         NotFoundError: no robot answers there.
@@ -41,6 +48,8 @@ def with_robot(
         try:
             async with TruckClient(robot, endpoint, clock=clock, timeout=timeout) as client:
                 waiting.cancel()
+                if orders:
+                    remark(f"robot: {robot_on_host(robot, endpoint)}")
                 return await main(client, clock)
         finally:
             waiting.cancel()

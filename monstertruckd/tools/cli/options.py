@@ -4,13 +4,17 @@ import inspect
 import math
 from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 import typer
 
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT, is_endpoint, nearest
 from monstertruck_runtime.errors import InputError
 from monstertruckd.tools.cli.output import WHICH_ROBOT
+from monstertruckd.tools.cli.places import only_robot
+
+ALWAYS: Final = "estop"
+"""Command that is never refused because several robots answer: it goes to the default port at once."""
 
 
 def complete_topic(incomplete: str) -> Iterator[tuple[str, str]]:
@@ -57,12 +61,19 @@ def _noted(context: typer.Context, option: typer.CallbackParam, value: str) -> s
 
 
 def _nearest(context: typer.Context, option: typer.CallbackParam, value: str) -> str:
+    if not _typed(context, option.name) and context.info_name != ALWAYS:
+        return only_robot(context.params.get("robot") if _typed(context, "robot") else None)
     endpoint = _noted(context, option, value)
     if not is_endpoint(endpoint):
         raise InputError(
             f"--endpoint {endpoint!r}: expected tcp/HOST:PORT or tls/HOST:PORT, such as {DEFAULT_ENDPOINT}"
         )
     return nearest(endpoint)
+
+
+def _typed(context: typer.Context, name: str | None) -> bool:
+    source = context.get_parameter_source(name or "")
+    return source is not None and source.name != "DEFAULT"
 
 
 RobotOption = Annotated[str, typer.Option("--robot", "-r", help="Name of the robot.", callback=_noted)]

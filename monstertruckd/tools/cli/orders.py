@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from monstertruck_runtime.clock import Clock
-from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
+from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT, local_endpoints, robot_on_host
 from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError, TruckError
 from monstertruck_schemas.reasons import Reason, in_words
 from monstertruckd.tools.cli.connection import with_robot
 from monstertruckd.tools.cli.options import EndpointOption, RobotOption
 from monstertruckd.tools.cli.output import JsonOption, finish, print_json, remark
+from monstertruckd.tools.cli.places import options_for, robots_here
 
 if TYPE_CHECKING:
     from monstertruck_runtime.client import TruckClient
@@ -116,11 +117,22 @@ def _run(name: str, robot: str, endpoint: str, *, json_output: bool, hold: bool 
         return await give(client, order, hold=hold)
 
     outcome = with_robot(main, robot, endpoint)
+    place = robot_on_host(robot, endpoint)
     if json_output:
-        print_json(outcome.as_json())
+        print_json(outcome.as_json() | {"robot": place})
     elif outcome.reason is Reason.OK:
-        print("; ".join(_state_texts(outcome.state)))
-    finish(outcome.reason, f"{name} refused: {outcome.text}")
+        print(f"{place}: {'; '.join(_state_texts(outcome.state))}")
+    if order is Order.ESTOP:
+        _name_others(robot, endpoint)
+    finish(outcome.reason, f"{place}: {name} refused: {outcome.text}")
+
+
+def _name_others(robot: str, endpoint: str) -> None:
+    """Name the robots of this computer that an emergency stop did not go to."""
+    if len(local_endpoints()) > 1:
+        for other in robots_here():
+            if other != (robot, endpoint):
+                remark(f"not stopped: {other[0]}: monstertruckd estop {options_for(*other)}")
 
 
 def _state_texts(state: "GateState") -> Iterator[str]:

@@ -88,7 +88,7 @@ def goto_command(
         with on_the_terminal() as report:
             return await drive_to(client, clock, (pose.x, pose.y, pose.yaw), [], arm=arm, report=report)
 
-    end = with_robot(main, robot, endpoint, ROUTE_TIMEOUT)
+    end = with_robot(main, robot, endpoint, ROUTE_TIMEOUT, orders=True)
     print_end(end.reason, end.text, end.as_json(), json_output=json_output)
 
 
@@ -138,7 +138,7 @@ def _order(order: "PointOrder", robot: str, endpoint: str, *what: Any) -> dict[s
         await require_section(client, "points", WITHOUT)
         return await client.point(order, *what)
 
-    return with_robot(main, robot, endpoint)
+    return with_robot(main, robot, endpoint, orders=True)
 
 
 async def _newest(client: "TruckClient", clock: Clock) -> "list[PointOfInterest]":

@@ -57,7 +57,7 @@ def set_value(
     it is forgotten when the daemon ends.
     """
     change = {"values": {key: _parsed(key, value)}, "save": save}
-    answer = with_robot(lambda client, _: client.call("set", change), robot, endpoint)
+    answer = with_robot(lambda client, _: client.call("set", change), robot, endpoint, orders=True)
     if json_output:
         print_json(answer)
     else:

@@ -5,12 +5,14 @@ from pathlib import Path
 
 import pytest
 
+from monstertruck_runtime import endpoints
 from monstertruck_runtime.client import TruckClient
-from monstertruck_runtime.endpoints import nearest
+from monstertruck_runtime.endpoints import local_endpoints, nearest
 from monstertruck_runtime.errors import NotFoundError
 from monstertruck_runtime.mailbox import fifo
 from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.topics import GATE, Writer
+from monstertruckd.bus.port_holder import holder_of, robots_at
 from tests.bus_kit import free_endpoint, gate_state, running_robot
 from tests.unit.bus.test_zenoh_session import raw_session
 
@@ -64,3 +66,20 @@ async def test_a_socket_left_over_is_taken_again():
     path.touch()
     async with running_robot(endpoint):
         assert nearest(endpoint).startswith("unixsock-stream/")
+
+
+async def test_two_daemons_on_one_computer_are_both_found(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
+    async with running_robot() as first, running_robot(robot="second") as second:
+        monkeypatch.setattr(endpoints, "DEFAULT_ENDPOINT", first.endpoint)
+        found = local_endpoints()
+        assert found == [nearest(first.endpoint), nearest(second.endpoint)]
+        assert [await asyncio.to_thread(robots_at, endpoint) for endpoint in found] == [["truck"], ["second"]]
+        assert (await asyncio.to_thread(holder_of, found)).startswith("robot 'truck', robot 'second', process ")
+        other = free_endpoint()
+        monkeypatch.setattr(endpoints, "DEFAULT_ENDPOINT", other)
+        assert len(local_endpoints()) == 2, "nobody answers at the default port"
+    assert local_endpoints() == []
+    async with running_robot(local_socket=False) as foreign:
+        monkeypatch.setattr(endpoints, "DEFAULT_ENDPOINT", foreign.endpoint)
+        assert local_endpoints() == [foreign.endpoint], "of another user, without a socket for this one"

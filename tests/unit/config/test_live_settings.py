@@ -102,7 +102,7 @@ def test_who_makes_the_robot_less_safe_than_by_default_is_warned(
     robot = Robot(config)
     assert robot.set({"gate.tilt.stop": 0.3})["weakened"] == []
     client = SimpleNamespace(call=lambda name, payload: robot.set(**payload))
-    monkeypatch.setattr(settings, "with_robot", lambda main, *_: main(client, None))
+    monkeypatch.setattr(settings, "with_robot", lambda main, *_, **__: main(client, None))
     settings.set_value("gate.tilt.stop", "0.4")
     said = capsys.readouterr()
     assert said.out == "gate.tilt.stop is 0.4 until the daemon ends\n"

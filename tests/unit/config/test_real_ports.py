@@ -99,7 +99,7 @@ def test_the_truck_can_do_what_it_was_built_for():
     assert config.slam is not None
     assert config.slam.mode == "mapping"
     assert config.slam.save is not None
-    for section in ("tracker", "planner", "explorer", "points", "recorder", "blackbox"):
+    for section in ("tracker", "planner", "explorer", "points", "recorder", "blackbox", "consistency"):
         assert getattr(config, section) is not None, section
     assert config.devices.camera is not None
     assert config.devices.stabiliser is not None

@@ -157,7 +157,7 @@ def test_the_bar_says_what_the_robot_does_and_how_far_it_went(monkeypatch):
     ],
 )
 def test_the_command_that_a_refusal_names_reaches_the_same_robot(monkeypatch, options, command):
-    def refused(*_):
+    def refused(*_, **__):
         raise RequestRefusedError(Reason.DISARMED)
 
     monkeypatch.setattr(behave, "with_robot", refused)

@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import socket
 from collections.abc import Callable
 from typing import Any
 
@@ -19,6 +20,7 @@ from monstertruck_schemas.topics import CALIBRATION, GATE, TRACKER, Topic
 from monstertruckd.tools.cli import orders
 from monstertruckd.tools.cli.orders import OrderOutcome, give
 
+HERE = f"truck on {socket.gethostname()}"
 HEADER = {"stamp": 1, "received": 1, "seq": 0}
 
 
@@ -130,10 +132,10 @@ def shown(
 def test_what_is_printed_and_the_exit_code(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
     done = OrderOutcome(Order.ARM, Reason.OK, "", state(GateMode.ARMED, Reason.BATTERY_LOW))
     assert shown(monkeypatch, orders.arm, done) == 0
-    assert capsys.readouterr().out == "armed; battery low: speed limited\n"
+    assert capsys.readouterr().out == f"{HERE}: armed; battery low: speed limited\n"
     refused = OrderOutcome(Order.RESET, Reason.NOT_ARMED_SPEED, "it moves", state(GateMode.ESTOPPED))
     assert shown(monkeypatch, orders.reset, refused) == Reason.NOT_ARMED_SPEED.exit_code
-    assert capsys.readouterr() == ("", "reset refused: it moves\n")
+    assert capsys.readouterr() == ("", f"{HERE}: reset refused: it moves\n")
     assert shown(monkeypatch, orders.reset, refused, json_output=True) == Reason.NOT_ARMED_SPEED.exit_code
     assert json.loads(capsys.readouterr().out) == {
         "order": "reset",
@@ -144,6 +146,7 @@ def test_what_is_printed_and_the_exit_code(monkeypatch: pytest.MonkeyPatch, caps
         "holder": None,
         "waiting": [],
         "limited_by": [],
+        "robot": HERE,
     }
 
 
@@ -152,7 +155,7 @@ def test_arming_says_who_drives_or_waits(monkeypatch: pytest.MonkeyPatch, capsys
     held = state(GateMode.ARMED).model_copy(update={"waiting": ("tracker",)})
     for after, words in ((driven, "driving; tracker drives\n"), (held, "armed; tracker waits to drive\n")):
         assert shown(monkeypatch, orders.arm, OrderOutcome(Order.ARM, Reason.OK, "", after)) == 0
-        assert capsys.readouterr().out == words
+        assert capsys.readouterr().out == f"{HERE}: {words}"
 
 
 def test_who_sets_off_is_said_before_arming(capsys: pytest.CaptureFixture[str]):

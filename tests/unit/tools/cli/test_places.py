@@ -1,0 +1,96 @@
+"""Commands that name no endpoint: with several robots on this computer they say which there are, and reach none."""
+
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT, public, robot_on_host
+from monstertruck_runtime.errors import InputError
+from monstertruck_schemas.reasons import Reason
+from monstertruckd.tools.cli import options, orders, places
+from monstertruckd.tools.cli.main import app
+
+SOCKETS = {"truck": "unixsock-stream//run/x/7447.sock", "second": "unixsock-stream//run/x/7448.sock"}
+
+
+@pytest.fixture
+def reached(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str]]:
+    """Two robots on this computer; what commands reach is kept, and nothing is done."""
+    found: list[tuple[str, str]] = []
+    monkeypatch.setattr(places, "local_endpoints", lambda: list(SOCKETS.values()))
+    monkeypatch.setattr(orders, "local_endpoints", lambda: list(SOCKETS.values()))
+    for module in (places, options):
+        monkeypatch.setattr(
+            module, "nearest", lambda endpoint: SOCKETS["truck"] if endpoint == DEFAULT_ENDPOINT else endpoint
+        )
+    monkeypatch.setattr(places, "robots_here", lambda: list(SOCKETS.items()))
+    monkeypatch.setattr(orders, "robots_here", lambda: list(SOCKETS.items()))
+
+    def stop(_: Any, robot: str, endpoint: str, *__: Any, **___: Any) -> None:
+        found.append((robot, endpoint))
+        raise InputError("reached")
+
+    for module in ("orders", "goto", "explore", "settings"):
+        monkeypatch.setattr(f"monstertruckd.tools.cli.{module}.with_robot", stop)
+    return found
+
+
+@pytest.mark.parametrize(
+    "line", ["arm", "disarm", "reset", "goto 1 2 0", "path lap", "explore --arm", "set gate.speed 0.1"]
+)
+def test_a_command_that_could_mean_two_robots_is_refused_with_the_list(line: str, reached: list):
+    done = CliRunner().invoke(app, line.split())
+    assert done.exit_code == Reason.BAD_INPUT.exit_code
+    assert " ".join(done.output.split()) == (
+        "2 robots answer on this computer; choose one: --robot truck --endpoint tcp/127.0.0.1:7447, "
+        "--robot second --endpoint tcp/127.0.0.1:7448"
+    )
+    assert reached == []
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["--robot", "second"], ("second", SOCKETS["second"])),
+        (["--robot", "truck"], ("truck", SOCKETS["truck"])),
+        (["--robot", "nobody"], ("nobody", SOCKETS["truck"])),
+        (["--endpoint", "tcp/127.0.0.1:7450"], ("truck", "tcp/127.0.0.1:7450")),
+    ],
+)
+def test_a_name_or_an_endpoint_tells_them_apart(words: list[str], expected: tuple[str, str], reached: list):
+    CliRunner().invoke(app, ["disarm", *words])
+    assert reached == [expected]
+
+
+def test_robots_of_one_name_are_told_apart_by_their_endpoint(reached: list, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(places, "robots_here", lambda: [("truck", endpoint) for endpoint in SOCKETS.values()])
+    done = CliRunner().invoke(app, ["disarm", "--robot", "truck"])
+    assert "--robot truck --endpoint tcp/127.0.0.1:7448" in " ".join(done.output.split())
+    assert reached == []
+
+
+def test_one_robot_needs_no_name_and_no_question(reached: list, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(places, "local_endpoints", lambda: [SOCKETS["truck"]])
+    monkeypatch.setattr(places, "robots_here", lambda: pytest.fail("asked for nothing"))
+    CliRunner().invoke(app, ["disarm"])
+    assert reached == [("truck", SOCKETS["truck"])]
+
+
+def test_an_emergency_stop_is_never_refused_and_names_who_was_not_stopped(
+    reached: list, capsys: pytest.CaptureFixture[str]
+):
+    CliRunner().invoke(app, ["estop"])
+    assert reached == [("truck", SOCKETS["truck"])]
+    orders._name_others("truck", SOCKETS["truck"])
+    assert capsys.readouterr().err == (
+        "not stopped: second: monstertruckd estop --robot second --endpoint tcp/127.0.0.1:7448\n"
+    )
+
+
+def test_where_a_robot_is():
+    assert robot_on_host("truck", "tls/rover.local:7447") == "truck on rover.local"
+    here = robot_on_host("truck", DEFAULT_ENDPOINT)
+    assert here == robot_on_host("truck", SOCKETS["truck"])
+    assert here != "truck on 127.0.0.1"
+    assert public("tcp/10.0.0.3:7447") == "tcp/10.0.0.3:7447"
