@@ -6,6 +6,7 @@ The array's convention differs from the image's: row 0 is the lowest y, so cell 
 
 import io
 import math
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -17,7 +18,7 @@ from PIL import Image, TiffImagePlugin
 
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.map_folders import YAML, MapSave, folder_of, opened
-from monstertruck_runtime.outside import picture
+from monstertruck_runtime.outside import picture, reading
 from monstertruck_runtime.small_files import replace_file
 from monstertruck_runtime.yaml_files import read_yaml, yaml_text
 
@@ -88,7 +89,7 @@ def load_map(path: Path) -> WorldMap:
     """
     folder = folder_of(path)
     if folder is None:
-        return _load(path)
+        return _guarded(path)
     with opened(folder) as save:
         return load_saved(save)
 
@@ -99,8 +100,13 @@ def load_saved(save: MapSave) -> WorldMap:
     Raises:
         InputError: see ``load_map``.
     """
-    world = _load(save.file(YAML))
+    world = _guarded(save.file(YAML))
     return replace(world, remarks=save.remarks + world.remarks)
+
+
+def _guarded(path: Path) -> WorldMap:
+    with reading(path, "a map"):
+        return _load(path)
 
 
 def _load(path: Path) -> WorldMap:
@@ -229,7 +235,7 @@ def _check_values(path: Path, keys: dict[str, Any]) -> None:
 
 
 def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and bool(np.isfinite(value))
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
 
 
 def _image_of(source: Path, name: str) -> Path:

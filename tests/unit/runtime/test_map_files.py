@@ -67,6 +67,8 @@ def test_scale_knows_transparent_from_white(tmp_path):
         ({"image": 3}, "image"),
         ({"resolution": 0}, "resolution"),
         ({"resolution": "fine"}, "resolution"),
+        ({"resolution": 10**400}, "resolution"),
+        ({"resolution": float("inf")}, "resolution"),
         ({"origin": [0, 0]}, "origin"),
         ({"negate": 2}, "negate"),
         ({"occupied_thresh": 65}, "occupied_thresh"),
