@@ -36,6 +36,11 @@ class Channels:
         """Number of the topic's channel."""
         return self._channels.get(topic.name) or self._register(topic)
 
+    @property
+    def numbers(self) -> dict[str, str]:
+        """Topic of every channel so far, by number."""
+        return {str(number): topic for topic, number in self._channels.items()}
+
     def _register(self, topic: Topic[Any]) -> int:
         schema = wire.schema(topic)
         if schema.name not in self._schemas:
@@ -49,6 +54,10 @@ class Channels:
 
 NAME: Final = re.compile(r"run-(\d{6,})-(\d{3,})\.mcap")
 """Name of a log: run and part."""
+DAMAGED: Final = ".damaged"
+"""Appended to the name of a log that was repaired, and of an attachment whose checksum is wrong."""
+DAMAGED_NAME: Final = re.compile(re.escape(DAMAGED) + r"(-\d+)?$")
+"""End of the name of a damaged original: the second one of a log is NAME.damaged-2."""
 
 _COMPRESSION: Final = {
     Compression.NONE: CompressionType.NONE,
@@ -61,6 +70,10 @@ TIMES: Final = "times"
 """Metadata record that says of which clock the file's times are."""
 LOG_OFFSET: Final = "log_offset_ns"
 """Its entry with what was added to daemon times for the file's log times, ns."""
+
+
+CHANNELS: Final = "channels"
+"""Metadata record with the topic of every channel so far, by number; repeated at every sync, for ``log recover``."""
 
 
 RUN_LOG: Final = "log"
@@ -178,6 +191,11 @@ class LogFile:
 
     def sync(self) -> None:
         """Wait until the disk has it: it survives a power cut."""
+        if self._channels.numbers:
+            self._writer.add_metadata(CHANNELS, self._channels.numbers)
+        self._settle()
+
+    def _settle(self) -> None:
         self._output.sync()
         if not self._named:
             sync_folder(self.path.parent)
@@ -187,7 +205,7 @@ class LogFile:
         """Write the index and close."""
         try:
             self._writer.finish()  # type: ignore[no-untyped-call]
-            self.sync()
+            self._settle()
         finally:
             self._output.close()
 
@@ -258,14 +276,18 @@ class LogFolder:
         self._part = 0
 
     def finished(self, current: Path) -> dict[Path, int]:
-        """Size of every log but ``current``, oldest first; what has a log's name without being a file is none."""
+        """Size of every log but ``current``, oldest first, each after the damaged originals that ``repair`` kept of it.
+
+        What has a log's name without being a file is none.
+        """
         found = []
         for path in self.directory.iterdir():
-            name = NAME.fullmatch(path.name)
+            name = NAME.fullmatch(DAMAGED_NAME.sub("", path.name))
             if name is None or path == current:
                 continue
             with suppress(FileNotFoundError):  # removed meanwhile
                 status = path.lstat()
                 if stat.S_ISREG(status.st_mode):
-                    found.append((int(name[1]), int(name[2]), path, status.st_size))
-        return {path: size for _, _, path, size in sorted(found)}
+                    repaired = path.name == name[0]
+                    found.append((int(name[1]), int(name[2]), repaired, path, status.st_size))
+        return {path: size for _, _, _, path, size in sorted(found)}

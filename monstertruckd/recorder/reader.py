@@ -18,14 +18,15 @@ from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, Header, McapRecord, Metadata, Schema, Statistics
 from mcap.records import Message as McapMessage
-from mcap.stream_reader import breakup_chunk
 
 from monstertruck_runtime import wire
 from monstertruck_runtime.errors import ConfigError, InputError, NotFoundError
+from monstertruck_runtime.outside import MEGABYTE, MOST_UNPACKED
 from monstertruck_runtime.small_files import require_file
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.topics import BY_NAME
-from monstertruckd.recorder.log_file import LOG_OFFSET, TIMES
+from monstertruckd.recorder.chunks import LIMIT, records_in, unpacked
+from monstertruckd.recorder.log_file import DAMAGED, LOG_OFFSET, TIMES
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 
@@ -92,6 +93,7 @@ def read_frame(file: BinaryIO, size: int) -> tuple[int, bytes, bytes]:
 
     Raises:
         EndOfFile: it is not all there.
+        McapError: it is longer than ``MOST_UNPACKED``.
     """
     head = file.read(_HEAD.size)
     if len(head) < _HEAD.size:
@@ -99,6 +101,8 @@ def read_frame(file: BinaryIO, size: int) -> tuple[int, bytes, bytes]:
     opcode, length = _HEAD.unpack(head)
     if length > size - file.tell():
         raise EndOfFile
+    if length > MOST_UNPACKED:
+        raise McapError(f"a record of {length / MEGABYTE:.0f} MB: {LIMIT}")
     return opcode, head, file.read(length)
 
 
@@ -115,10 +119,8 @@ def read_statistics(file: BinaryIO, size: int) -> Statistics | None:
 
 CONFIG: Final = "config.json"
 """The attachment with the daemon's configuration."""
-DAMAGED: Final = ".damaged"
-"""Appended to the name of an attachment whose checksum is wrong, so that it is not mistaken for a valid one."""
 
-_PRIVATE: Final = 0x80
+PRIVATE: Final = 0x80
 """Opcodes from here on are private ones; unknown ones below are damage."""
 _PLAIN: Final[dict[int, Any]] = {
     Opcode.HEADER: Header,
@@ -126,6 +128,19 @@ _PLAIN: Final[dict[int, Any]] = {
     Opcode.CHANNEL: Channel,
     Opcode.METADATA: Metadata,
 }
+
+
+def checked_attachment(record: Attachment, content: bytes) -> Attachment:
+    """Return an attachment, renamed if its checksum, which mcap does not verify, is wrong.
+
+    Args:
+        record: the attachment.
+        content: of its record in the file.
+    """
+    (expected,) = CHECKSUM.unpack(content[-CHECKSUM.size :])
+    if expected in (0, zlib.crc32(content[: -CHECKSUM.size])):
+        return record
+    return replace(record, name=record.name + DAMAGED, media_type="application/octet-stream")
 
 
 def spare_log(output: Path) -> None:
@@ -138,6 +153,24 @@ def spare_log(output: Path) -> None:
         with output.open("rb") as file:
             if file.read(len(MAGIC)) == MAGIC:
                 raise InputError(f"{output}: is a log, which is not overwritten; name another file")
+
+
+def open_file(path: Path) -> BinaryIO:
+    """Open a log for reading, whatever is in it.
+
+    Raises:
+        NotFoundError: no such file.
+        InputError: it is a folder, or cannot be read.
+    """
+    try:
+        require_file(path)
+        return path.open("rb")
+    except FileNotFoundError:
+        raise NotFoundError(f"{path}: no such log") from None
+    except IsADirectoryError:
+        raise InputError(f"{path}: a folder; `monstertruckd log list {path}` lists the logs in it") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,16 +221,8 @@ class LogReader:
         """Bytes an iteration has read so far, for progress bars."""
         self.log_offset = 0
         """The file's log times minus daemon times, ns, once an iteration has passed the metadata."""
-        try:
-            require_file(path)
-            with path.open("rb") as file:
-                head = file.read(len(MAGIC))
-        except FileNotFoundError:
-            raise NotFoundError(f"{path}: no such log") from None
-        except IsADirectoryError:
-            raise InputError(f"{path}: a folder; `monstertruckd log list {path}` lists the logs in it") from None
-        except OSError as error:
-            raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+        with open_file(path) as file:
+            head = file.read(len(MAGIC))
         if not MAGIC.startswith(head):
             raise InputError(f"{path}: not an MCAP log")
 
@@ -264,7 +289,7 @@ class LogReader:
         stream = ReadDataStream(BytesIO(content))
         match opcode:
             case Opcode.CHUNK:
-                return breakup_chunk(Chunk.read(stream), validate_crc=True)
+                return records_in(unpacked(Chunk.read(stream)))
             case Opcode.MESSAGE:
                 return (McapMessage.read(stream, len(content)),)
             case Opcode.ATTACHMENT:
@@ -273,17 +298,15 @@ class LogReader:
                 return (_PLAIN[opcode].read(stream),)
         if opcode == 0:  # no opcode: the zeros of a file that a power cut left without its content
             raise McapError("zeros")
-        if opcode != Opcode.MESSAGE_INDEX and opcode < _PRIVATE:
+        if opcode != Opcode.MESSAGE_INDEX and opcode < PRIVATE:
             self.flaws.append(f"holds a damaged record at byte {self.position}")
         return ()
 
     def _checked(self, record: Attachment, content: bytes) -> Attachment:
-        """An attachment, renamed if its checksum, which mcap does not verify, is wrong."""
-        (expected,) = CHECKSUM.unpack(content[-CHECKSUM.size :])
-        if expected in (0, zlib.crc32(content[: -CHECKSUM.size])):
-            return record
-        self.flaws.append(f"holds a damaged {record.name}")
-        return replace(record, name=record.name + DAMAGED, media_type="application/octet-stream")
+        checked = checked_attachment(record, content)
+        if checked is not record:
+            self.flaws.append(f"holds a damaged {record.name}")
+        return checked
 
     def _end(
         self, file: BinaryIO, size: int, content: bytes, summed: int, given: Mapping[type[McapRecord], int]

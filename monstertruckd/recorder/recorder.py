@@ -20,7 +20,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.topics import TOPICS, Topic
 from monstertruckd.recorder.config import RecorderConfig
-from monstertruckd.recorder.log_file import LogEntry, LogFile, LogFolder, log_offset
+from monstertruckd.recorder.log_file import DAMAGED_NAME, LogEntry, LogFile, LogFolder, log_offset
 from monstertruckd.recorder.repair import in_use, start_repair
 
 _DIGEST_FRAME = struct.Struct("<qII")
@@ -184,7 +184,8 @@ class LogWriter:
                     log.warning("%s cannot be removed, though logs exceed the quota: %s", path, error.strerror)
                 continue
             else:
-                log.info("removed %s: logs exceed %d bytes", path, self._config.quota_bytes)
+                what = "the damaged original of a repaired log" if DAMAGED_NAME.search(path.name) else "the oldest log"
+                log.warning("removed %s, %s: logs exceed %d bytes", path, what, self._config.quota_bytes)
             del self._others[path]
             excess -= size
 

@@ -20,6 +20,7 @@ from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.roles import AccessRole
 from monstertruckd.bus.rpc import Rpc
+from monstertruckd.recorder.log_file import DAMAGED_NAME
 from monstertruckd.recorder.repair import in_use
 
 LIST: Final = "recordings"
@@ -32,7 +33,8 @@ RATE: Final = 1_000_000.0
 """Bytes a second that all downloads take together."""
 TURN: Final = 5.0
 """Seconds without a chunk after which another source may download."""
-NAME: Final = re.compile(r"[A-Za-z0-9_.-]{1,120}\.mcap")
+NAME: Final = re.compile(r"[A-Za-z0-9_.-]{1,120}\.mcap(\.damaged(-\d{1,3})?)?")
+DAMAGED_KIND: Final = "damaged"
 MOST: Final = 500
 """Recordings listed; the newest."""
 
@@ -46,7 +48,7 @@ class Recording:
     modified: float
     """Real time of the last change, s since 1970."""
     kind: str
-    """``run``, or ``blackbox``: the minute before a stop."""
+    """``run``, ``blackbox`` (the minute before a stop), or ``damaged``: the original of a log that was repaired."""
     open: bool
     """It is being written: by this daemon, or by another one or a repair that has it locked."""
 
@@ -92,14 +94,16 @@ class Recordings:
     def _files(self) -> Iterable[tuple[Path, Recording]]:
         current = self._current()
         for kind, folder in self._folders.items():
-            for path in folder.glob("*.mcap") if folder.is_dir() else ():
+            for path in folder.glob("*.mcap*") if folder.is_dir() else ():
                 if path.is_symlink() or not path.is_file() or not NAME.fullmatch(path.name):
                     continue
                 try:
                     status = path.stat()
                 except FileNotFoundError:  # the quota of the logs, or another caller, took it
                     continue
-                yield path, Recording(path.name, status.st_size, status.st_mtime, kind, path == current)
+                damaged = DAMAGED_NAME.search(path.name)
+                shown = DAMAGED_KIND if damaged else kind
+                yield path, Recording(path.name, status.st_size, status.st_mtime, shown, path == current)
 
     def _find(self, payload: dict[str, Any]) -> tuple[Path, Recording]:
         name = payload.get("name")

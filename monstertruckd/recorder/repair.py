@@ -5,24 +5,34 @@ this as a process of its own: a thread would compete with the control loop for t
 """
 
 import fcntl
+import itertools
 import logging
 import os
 import subprocess
 import sys
 import threading
-from dataclasses import dataclass
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import BinaryIO, Final
 
-from mcap.records import Attachment, Channel, Header, Message, Metadata, Schema
+from mcap.records import Attachment, Header, Metadata
 from mcap.writer import Writer
 
+from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError, TruckError
-from monstertruckd.recorder.reader import LogReader, is_finished
+from monstertruck_runtime.outside import reading
+from monstertruck_runtime.small_files import sync_folder
+from monstertruckd.recorder.log_file import CHANNELS, DAMAGED
+from monstertruckd.recorder.reader import is_finished, open_file
+from monstertruckd.recorder.salvage import ChannelFacts, Salvage
 
 log = logging.getLogger(__name__)
 
 _PART: Final = ".part"
+RECOVERED: Final = "recovered"
+"""Metadata record of a repaired log: of which log it is, and what is lost."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,10 +40,35 @@ class Recovery:
     """Outcome of one repair."""
 
     path: Path
-    """The repaired file."""
+    """The repaired file; the log itself if it was sound."""
     messages: int
-    damage: str | None
+    """Kept."""
+    lost: int = 0
+    """Messages that are lost."""
+    counted: bool = True
+    """``lost`` is all; if not, the log has no sound index, and more may be lost."""
+    spans: tuple[tuple[float, float | None], ...] = ()
+    """Times in which messages are lost, s after the log's first message; None = to its end."""
+    repeated: int = 0
+    """Chunks that the log held twice."""
+    damage: str | None = None
     """What was wrong with the original; None when it was sound."""
+    original: Path | None = None
+    """Where the damaged log is kept; None when it was sound, or is where it was."""
+
+    def __str__(self) -> str:
+        if self.damage is None:
+            return f"{self.path}: {self.messages} messages kept, was sound"
+        least = "" if self.counted else "at least "
+        text = f"{self.path}: {self.messages} messages kept, {least}{self.lost} lost"
+        if self.spans:
+            text += " (" + ", ".join(_span_text(*span) for span in self.spans) + " after its begin)"
+        text += f"; it {self.damage}"
+        return text if self.original is None else f"{text}; the original is {self.original}"
+
+
+def _span_text(start: float, end: float | None) -> str:
+    return f"from {start:.1f} s on" if end is None else f"{start:.1f} to {end:.1f} s"
 
 
 def in_use(path: Path) -> bool:
@@ -43,10 +78,10 @@ def in_use(path: Path) -> bool:
 
 
 def recover(source: str | Path, target: str | Path, stop: threading.Event | None = None) -> Recovery:
-    """Rewrite everything up to the first error of ``source`` as a finished log ``target``.
+    """Rewrite every whole chunk of ``source`` as a finished log ``target``.
 
-    One streaming pass; ``target`` appears complete or not at all, and may be ``source`` itself, which is left as it is
-    if it is sound.
+    ``target`` appears complete or not at all. It may be ``source`` itself: a sound log stays as it is; a damaged one
+    is kept, unchanged, as NAME.mcap.damaged, and the repaired one takes its name.
 
     Args:
         source: the damaged log.
@@ -58,30 +93,55 @@ def recover(source: str | Path, target: str | Path, stop: threading.Event | None
         NotFoundError: no such file.
     """
     source, target = Path(source), Path(target)
-    reader = LogReader(source)
-    part = target.with_name(target.name + _PART)
-    with source.open("rb") as original:
+    with open_file(source) as original:
         if not _lock(original, fcntl.LOCK_EX):
             raise InputError(f"{source}: is being written")
         in_place = target.exists()
         if in_place and not target.samefile(source):
             raise InputError(f"{target}: exists already; name a new file")
-        try:
+        with reading(source, "an MCAP log"):
+            salvage = Salvage(original)
+        if salvage.strange:
+            raise InputError(f"{source}: not an MCAP log")
+        with _written(target) as part:
             with part.open("wb") as output:
-                messages = _copy(reader, output, stop)
+                done = _copy(salvage, source, output, stop)
                 output.flush()
                 os.fsync(output.fileno())
-            if in_place and reader.fault is None:
+            if in_place and done.damage is None:
                 part.unlink()
-            else:
-                part.replace(target)
-        except OSError as error:
-            part.unlink(missing_ok=True)
-            raise InputError(f"{target}: cannot be written: {error.strerror}") from error
-        except BaseException:
-            part.unlink(missing_ok=True)
-            raise
-    return Recovery(target, messages, reader.fault)
+                return replace(done, path=source)
+            kept = _keep(source) if in_place else None
+            part.replace(target)
+            sync_folder(target.parent)
+    return replace(done, path=target, original=kept)
+
+
+@contextmanager
+def _written(target: Path) -> Iterator[Path]:
+    """Yield where to write ``target`` until it is complete; what is there if the body fails is removed."""
+    part = target.with_name(target.name + _PART)
+    try:
+        yield part
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise InputError(f"{target}: cannot be written: {error.strerror}") from error
+    except BaseException:
+        part.unlink(missing_ok=True)
+        raise
+
+
+def _keep(source: Path) -> Path:
+    """Give a damaged log a second name, under which it stays; a repair that was cut off may have done so."""
+    for number in itertools.count(1):
+        kept = source.with_name(source.name + DAMAGED + (f"-{number}" if number > 1 else ""))
+        if not os.path.lexists(kept):
+            kept.hardlink_to(source)
+            sync_folder(source.parent)
+            return kept
+        if kept.samefile(source):
+            return kept
+    raise AssertionError
 
 
 def recover_directory(directory: Path, stop: threading.Event | None = None) -> list[Recovery]:
@@ -95,7 +155,7 @@ def recover_directory(directory: Path, stop: threading.Event | None = None) -> l
         except (TruckError, OSError) as error:
             log.warning("not repaired: %s", error)
         else:
-            log.info("repaired %s: %d messages", path, recovery.messages)
+            log.log(logging.WARNING if recovery.lost else logging.INFO, "repaired %s", recovery)
             done.append(recovery)
         if stop is not None and stop.is_set():
             break
@@ -119,40 +179,95 @@ def _lock(file: BinaryIO, how: int) -> bool:
     return True
 
 
-def _copy(reader: LogReader, output: BinaryIO, stop: threading.Event | None) -> int:
-    """Copy all records; returns the number of messages."""
+def _copy(salvage: Salvage, source: Path, output: BinaryIO, stop: threading.Event | None) -> Recovery:
+    """Copy all whole records and note in the metadata ``recovered`` what is lost."""
     writer = Writer(output)
-    schemas = {0: 0}
-    channels: dict[int, int] = {}
-    messages = 0
+    registered = _Registered(writer)
+    first: int | None = None
     started = False
-    for record in reader.records():
+    for record in salvage.records():
         if stop is not None and stop.is_set():
-            raise InputError(f"{reader.path}: repair abandoned")
+            raise InputError(f"{source}: repair abandoned")
         if not started:
             header = record if isinstance(record, Header) else Header("", "")
             writer.start(header.profile, header.library)
             started = True
-        if isinstance(record, Schema) and record.id not in schemas:
-            schemas[record.id] = writer.register_schema(record.name, record.encoding, record.data)
-        elif isinstance(record, Channel) and record.id not in channels:
-            schema = schemas.get(record.schema_id, 0)
-            channels[record.id] = writer.register_channel(
-                record.topic, record.message_encoding, schema, dict(record.metadata)
-            )
-        elif isinstance(record, Message):
-            writer.add_message(
-                channels[record.channel_id], record.log_time, record.data, record.publish_time, record.sequence
-            )
-            messages += 1
+        if isinstance(record, tuple):
+            message, facts = record
+            first = message.log_time if first is None else min(first, message.log_time)
+            channel = registered.channel(message.channel_id, facts)
+            writer.add_message(channel, message.log_time, message.data, message.publish_time, message.sequence)
         elif isinstance(record, Attachment):
             writer.add_attachment(record.create_time, record.log_time, record.name, record.media_type, record.data)
-        elif isinstance(record, Metadata):
+        elif isinstance(record, Metadata) and record.name != CHANNELS:
             writer.add_metadata(record.name, dict(record.metadata))
     if not started:
         writer.start()
+    done = _judged(salvage, source, first)
+    if done.damage is not None:
+        notes = {"log": source.name, "damage": done.damage, "kept": done.messages, "lost": done.lost}
+        spans = ", ".join(_span_text(*span) for span in done.spans)
+        writer.add_metadata(RECOVERED, {name: str(value) for name, value in notes.items()} | {"spans": spans})
     writer.finish()  # type: ignore[no-untyped-call]
-    return messages
+    return done
+
+
+class _Registered:
+    """Channels and schemas of a new file, each once."""
+
+    def __init__(self, writer: Writer) -> None:
+        self._writer = writer
+        self._schemas: dict[tuple[str, str, bytes] | None, int] = {None: 0}
+        self._channels: dict[tuple[int, ChannelFacts], int] = {}
+
+    def channel(self, number: int, facts: ChannelFacts) -> int:
+        """Number in the new file of a channel of the old one."""
+        if (number, facts) not in self._channels:
+            if facts.schema not in self._schemas and facts.schema is not None:
+                self._schemas[facts.schema] = self._writer.register_schema(*facts.schema)
+            schema = self._schemas[facts.schema]
+            self._channels[number, facts] = self._writer.register_channel(
+                facts.topic, facts.message_encoding, schema, dict(facts.metadata)
+            )
+        return self._channels[number, facts]
+
+
+def _judged(salvage: Salvage, source: Path, first: int | None) -> Recovery:
+    """What is kept and lost, after all records were given.
+
+    Args:
+        salvage: of the log.
+        source: the log.
+        first: log time of the first message that is kept, ns.
+    """
+    spans = salvage.spans()
+    begin = min((time for time in (first, *(span.start for span in spans)) if time is not None), default=0)
+    damage = list(salvage.flaws)
+    if salvage.gaps:
+        damage.append(f"cannot be read in {salvage.gaps} place{'s' if salvage.gaps > 1 else ''}")
+    if salvage.repeated:
+        damage.append(f"holds {salvage.repeated} chunk{'s' if salvage.repeated > 1 else ''} twice")
+    if not salvage.ended:
+        damage.append("has no end")
+    elif not salvage.indexed:
+        damage.append("has a damaged index")
+    elif salvage.lost:
+        damage.append(f"holds {salvage.messages} of {salvage.messages + salvage.lost} messages")
+    elif salvage.lacking:
+        damage.append("lacks an attachment or metadata")
+    return Recovery(
+        source,
+        salvage.messages,
+        salvage.lost,
+        salvage.counted,
+        tuple((_seconds(span.start, begin) or 0.0, _seconds(span.end, begin)) for span in spans),
+        salvage.repeated,
+        ", ".join(damage) or None,
+    )
+
+
+def _seconds(time: int | None, begin: int) -> float | None:
+    return None if time is None else (time - begin) / SECOND
 
 
 NICENESS = 15

@@ -184,17 +184,17 @@ def _show_recordings(rows: "list[dict[str, Any]]", *, json_output: bool) -> None
 @app.command("recover")
 def recover_command(
     log: LogArgument,
-    output: Annotated[Path | None, typer.Option("--output", "-o", help="Default: repaired in place.")] = None,
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="Default: the log's own name.")] = None,
     json_output: JsonOption = False,
 ) -> None:
-    """Repair an unfinished or truncated log: everything up to the first error is kept."""
+    """Repair an unfinished or damaged log: every whole chunk is kept; the original stays as LOG.damaged."""
     from monstertruckd.recorder.repair import recover
 
     done = recover(log, output or log)
     if json_output:
         print_json(asdict(done))
     else:
-        print(f"{done.path}: {done.messages} messages kept" + (f"; it {done.damage}" if done.damage else ", was sound"))
+        print(done)
 
 
 @app.command("report")

@@ -195,6 +195,27 @@ def test_quota_removes_the_oldest_files_only(config, failures):
     assert (Path(config.directory) / "notes.txt").exists()
 
 
+def test_quota_removes_damaged_originals_in_their_order_and_says_so(config, failures, caplog):
+    folder = Path(config.directory)
+    folder.mkdir()
+    names = (
+        "run-000001-000.mcap",
+        "run-000001-000.mcap.damaged",
+        "run-000001-000.mcap.damaged-2",
+        "run-000002-000.mcap",
+    )
+    for name in names:
+        (folder / name).write_bytes(b"x" * 50_000)
+    (folder / "mine.mcap.damaged").write_bytes(b"x" * 50_000)
+    record(config.model_copy(update={"quota_bytes": 130_000}), 0.1, failures)
+    kept = sorted(path.name for path in folder.iterdir())
+    assert kept == ["mine.mcap.damaged", "run-000001-000.mcap", "run-000002-000.mcap", "run-000003-000.mcap"]
+    said = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    assert [
+        f"{name}, the damaged original of a repaired log" in text for name, text in zip(names[1:3], said, strict=True)
+    ]
+
+
 def test_quota_is_kept_while_one_file_grows(config, failures):
     folder = Path(config.directory)
     folder.mkdir()

@@ -1,0 +1,71 @@
+"""Chunks of an MCAP file, opened within bounds: what a chunk says of its size is not believed."""
+
+import zlib
+from collections.abc import Iterator
+from io import BytesIO
+from typing import Final
+
+import lz4.frame
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, McapRecord, Message, Schema
+
+from monstertruck_runtime.outside import MEGABYTE, MOST_UNPACKED
+
+LIMIT: Final = f"expected at most {MOST_UNPACKED // MEGABYTE} MB"
+
+
+def unpacked(chunk: Chunk) -> bytes:
+    """Content of a chunk, decompressed and checked.
+
+    Raises:
+        McapError: it is larger than ``MOST_UNPACKED``, than it says, or not what its checksum says.
+        RuntimeError: damaged lz4 data.
+        zstandard.ZstdError: damaged zstd data.
+    """
+    size = chunk.uncompressed_size
+    if size > MOST_UNPACKED:
+        raise McapError(f"a chunk of {size / MEGABYTE:.0f} MB: {LIMIT}")
+    match chunk.compression:
+        case "":
+            data = chunk.data
+        case "zstd":
+            bounded = zstandard.ZstdDecompressor(max_window_size=MOST_UNPACKED)
+            with bounded.stream_reader(chunk.data) as stream:
+                data = stream.read(size + 1)
+        case "lz4":
+            data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=size + 1)
+        case other:
+            raise McapError(f"a chunk compressed by {other[:20]!r}: expected lz4, zstd or none")
+    if len(data) != size:
+        raise McapError(f"a chunk of {'more' if len(data) > size else 'less'} than the {size} bytes it says")
+    if chunk.uncompressed_crc not in (0, zlib.crc32(data)):
+        raise McapError("checksum of a chunk")
+    return data
+
+
+def records_in(content: bytes) -> Iterator[McapRecord]:
+    """Schemas, channels and messages of a chunk, one after the other.
+
+    Raises:
+        McapError: a record is longer than the chunk.
+        mcap.exceptions.EndOfFile, ValueError: a record is damaged.
+    """
+    stream = ReadDataStream(BytesIO(content))
+    while stream.count < len(content):
+        opcode, length = stream.read1(), stream.read8()
+        end = stream.count + length
+        if end > len(content):
+            raise McapError("a record longer than its chunk")
+        match opcode:
+            case Opcode.MESSAGE:
+                yield Message.read(stream, length)
+            case Opcode.CHANNEL:
+                yield Channel.read(stream)
+            case Opcode.SCHEMA:
+                yield Schema.read(stream)
+        if stream.count > end:
+            raise McapError("a record longer than it says")
+        stream.read(end - stream.count)

@@ -1,0 +1,526 @@
+"""What of a damaged log is whole: every chunk whose checksum holds, wherever in the file it is.
+
+The file is read from its begin to its end, record by record. Where a record does not fit, the next one that does is
+looked for, byte by byte; a chunk fits by its checksum, another record by lengths that add up. Whatever lies between is
+a gap. Channels are those of the chunks, of the index, and of the metadata that the recorder repeats (``CHANNELS``), so
+that a message outlasts the chunk in which its channel was introduced.
+"""
+
+import errno
+import os
+import re
+import struct
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from hashlib import blake2b
+from io import BytesIO
+from typing import Any, BinaryIO, Final, NamedTuple
+
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import (
+    Attachment,
+    AttachmentIndex,
+    Channel,
+    Chunk,
+    ChunkIndex,
+    Header,
+    McapRecord,
+    Message,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+)
+
+from monstertruck_runtime import wire
+from monstertruck_runtime.outside import MOST_UNPACKED
+from monstertruck_schemas.topics import BY_NAME
+from monstertruckd.recorder.chunks import records_in, unpacked
+from monstertruckd.recorder.log_file import CHANNELS
+from monstertruckd.recorder.reader import DAMAGE, MAGIC, PRIVATE, checked_attachment, index_is_sound
+
+_HEAD: Final = struct.Struct("<BQ")
+_CANDIDATE: Final = re.compile(rb"[\x01-\x0f].{5}\x00\x00\x00", re.DOTALL)
+"""A known opcode, and a length below 1 TB."""
+_CHUNK_CANDIDATE: Final = re.compile(rb"(?=\x06.{5}\x00\x00\x00)", re.DOTALL)
+_CHUNK_HEAD: Final = struct.Struct("<QQQII")
+"""First and last log time, size unpacked, checksum, length of the compression's name."""
+_TIMES: Final = 16
+"""Bytes of its two times."""
+_SIZE: Final = struct.Struct("<Q")
+_INDEX_HEAD: Final = struct.Struct("<HI")
+_INDEX_ENTRY: Final = 16
+"""Bytes: log time and offset of a message."""
+_LEAST_MESSAGE: Final = 22
+"""Bytes of a message without its data."""
+_LENGTHS: Final[dict[int, int]] = {Opcode.DATA_END: 4, Opcode.FOOTER: 20, Opcode.SUMMARY_OFFSET: 17}
+"""Of records whose content has one length."""
+_READERS: Final[dict[int, Any]] = {
+    Opcode.HEADER: Header,
+    Opcode.SCHEMA: Schema,
+    Opcode.CHANNEL: Channel,
+    Opcode.CHUNK: Chunk,
+    Opcode.ATTACHMENT: Attachment,
+    Opcode.METADATA: Metadata,
+    Opcode.CHUNK_INDEX: ChunkIndex,
+    Opcode.ATTACHMENT_INDEX: AttachmentIndex,
+    Opcode.METADATA_INDEX: MetadataIndex,
+    Opcode.STATISTICS: Statistics,
+}
+_WINDOW: Final = 1 << 20
+"""Bytes searched at once."""
+_SECTOR: Final = 4096
+"""Bytes that a disk refuses together."""
+UNKNOWN: Final = "unknown/channel-{}"
+"""Topic of messages whose channel is lost."""
+
+
+class Span(NamedTuple):
+    """A time in which messages are lost, in log times (ns); None = from the begin, or to the end."""
+
+    start: int | None
+    end: int | None
+
+
+class ChannelFacts(NamedTuple):
+    """What a channel is, without the numbers of its file."""
+
+    topic: str
+    message_encoding: str
+    metadata: tuple[tuple[str, str], ...]
+    schema: tuple[str, str, bytes] | None
+    """Name, encoding and data."""
+
+
+class _Bytes:
+    """A file's bytes; those that the disk refuses are zeros.
+
+    Args:
+        file: opened for reading.
+    """
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._descriptor = file.fileno()
+        self.size = os.fstat(self._descriptor).st_size
+
+    def at(self, begin: int, size: int) -> bytes:
+        """Return ``size`` bytes from ``begin``, fewer at the end."""
+        try:
+            return os.pread(self._descriptor, size, begin)
+        except OSError as error:
+            if error.errno != errno.EIO:
+                raise
+            if size <= _SECTOR:
+                return bytes(min(size, self.size - begin))
+            middle = (begin + size // 2) // _SECTOR * _SECTOR
+            middle = middle if begin < middle < begin + size else begin + size // 2
+            return self.at(begin, middle - begin) + self.at(middle, begin + size - middle)
+
+    def is_magic(self, at: int) -> bool:
+        """Whether the mark of begin and end is there."""
+        return self.at(at, len(MAGIC)) == MAGIC
+
+    def next_candidate(self, at: int) -> int:
+        """Return where a record may begin, from ``at`` on; the end if nowhere."""
+        while at < self.size:
+            found = _CANDIDATE.search(self.at(at, _WINDOW + _HEAD.size))
+            if found is not None:
+                return at + found.start()
+            at += _WINDOW
+        return self.size
+
+
+class Salvage:
+    """The whole records of a log, in order, each chunk once.
+
+    Args:
+        file: the log, opened for reading; it must stay open.
+    """
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._data = _Bytes(file)
+        self.indexed = _is_indexed(file)
+        """The index at the file's end is sound."""
+        self.ended = self._data.size > len(MAGIC) and self._data.is_magic(self._data.size - len(MAGIC))
+        """The file ends as a finished log does."""
+        self.messages = 0
+        """Messages given so far."""
+        self.flaws: list[str] = []
+        """Damage that costs no message, found so far."""
+        self._spans: list[Span] = []
+        self._found = _Scan(self._data, trusted=self.indexed).run()
+
+    @property
+    def strange(self) -> bool:
+        """Whether this is no log at all: another begin, and nothing of a log behind it."""
+        return not MAGIC.startswith(self._data.at(0, len(MAGIC))) and not any(self._found.parts)
+
+    @property
+    def gaps(self) -> int:
+        """Places at which something cannot be read."""
+        return self._found.parts.count(None)
+
+    @property
+    def repeated(self) -> int:
+        """Chunks that are there more than once, and are given once."""
+        return self._found.repeated
+
+    @property
+    def counted(self) -> bool:
+        """Whether ``lost`` is all; without an index it is the least."""
+        return self._found.statistics is not None
+
+    @property
+    def lost(self) -> int:
+        """Messages that are lost, as far as the file says; after ``records``."""
+        statistics = self._found.statistics
+        return self._found.indexed if statistics is None else max(statistics.message_count - self.messages, 0)
+
+    @property
+    def lacking(self) -> bool:
+        """Whether an attachment or metadata is lost, as far as the file says."""
+        statistics, kinds = self._found.statistics, [part.opcode for part in self._found.parts if part]
+        return statistics is not None and (
+            kinds.count(Opcode.ATTACHMENT) < statistics.attachment_count
+            or kinds.count(Opcode.METADATA) < statistics.metadata_count
+        )
+
+    def spans(self) -> list[Span]:
+        """Return the times of lost messages, in order; after ``records``."""
+        if self._found.statistics is None:
+            return self._spans
+        return self._missing() if self.lost else []
+
+    def _missing(self) -> list[Span]:
+        """Spans of chunks that the index names and that are not there, neighbours as one."""
+        there = Counter(self._found.chunks)
+        spans: list[Span] = []
+        alone = True
+        for index in sorted(self._found.expected, key=lambda index: index.message_start_time):
+            key = (index.message_start_time, index.message_end_time, index.uncompressed_size)
+            if there[key]:
+                there[key] -= 1
+                alone = True
+            else:
+                start = index.message_start_time if alone else spans.pop().start
+                spans.append(Span(start, index.message_end_time))
+                alone = False
+        return spans
+
+    def records(self) -> Iterator[tuple[Message, ChannelFacts] | Attachment | Metadata | Header]:
+        """Yield headers, attachments, metadata, and messages with their channel, in the order of the file."""
+        newest: int | None = None
+        gap = False
+        for part in self._found.parts:
+            if part is None:
+                gap = True
+                continue
+            for record in self._opened(part):
+                if isinstance(record, Message):
+                    if gap:
+                        self._spans.append(Span(newest, record.log_time))
+                        gap = False
+                    newest = max(record.log_time, newest or 0)
+                    self.messages += 1
+                    yield record, self._facts(record.channel_id)
+                elif isinstance(record, Header | Attachment | Metadata):
+                    yield record
+        if gap or not self.ended:
+            self._spans.append(Span(newest, None))
+
+    def _opened(self, part: "_Part") -> Iterator[McapRecord]:
+        record = part.read(self._data)
+        if isinstance(record, Chunk):
+            yield from records_in(unpacked(record))
+        elif isinstance(record, Attachment):
+            checked = checked_attachment(record, part.content(self._data))
+            if checked is not record:
+                self.flaws.append(f"holds a damaged {record.name}")
+            yield checked
+        else:
+            yield record
+
+    def _facts(self, number: int) -> ChannelFacts:
+        channel, name = self._found.sealed.channels.get(number), self._found.names.get(number)
+        if channel is None and name not in BY_NAME:
+            channel = self._found.spare.channels.get(number)
+        topic = BY_NAME.get(name or "") if channel is None else BY_NAME.get(channel.topic)
+        ours = None if topic is None else wire.schema(topic)
+        if channel is not None:
+            sealed, spare = (it.schemas.get(channel.schema_id) for it in (self._found.sealed, self._found.spare))
+            found = sealed or spare or ours
+            schema = (found.name, found.encoding, found.data) if found and channel.schema_id else None
+            return ChannelFacts(channel.topic, channel.message_encoding, tuple(channel.metadata.items()), schema)
+        if topic is None or ours is None:
+            return ChannelFacts(UNKNOWN.format(number), "", (), None)
+        metadata = (("encoding", wire.encoding(topic)),)
+        return ChannelFacts(topic.name, ours.message_encoding, metadata, (ours.name, ours.encoding, ours.data))
+
+
+def _is_indexed(file: BinaryIO) -> bool:
+    try:
+        return index_is_sound(file)
+    except OSError:
+        return False
+
+
+class _Part(NamedTuple):
+    """A record that is whole."""
+
+    offset: int
+    opcode: int
+    length: int
+    """Of its content."""
+
+    @property
+    def end(self) -> int:
+        """Offset of what follows."""
+        return self.offset + _HEAD.size + self.length
+
+    def content(self, data: _Bytes) -> bytes:
+        """Its content in the file."""
+        return data.at(self.offset + _HEAD.size, self.length)
+
+    def read(self, data: _Bytes) -> Any:
+        """The record, whose lengths add up.
+
+        Raises:
+            McapError: they do not; or one of ``DAMAGE``.
+        """
+        content = self.content(data)
+        stream = ReadDataStream(BytesIO(content))
+        if self.opcode == Opcode.MESSAGE:
+            return Message.read(stream, self.length)
+        record = _READERS[self.opcode].read(stream)
+        if stream.count != self.length:
+            raise McapError("lengths that do not add up")
+        return record
+
+
+@dataclass(slots=True)
+class _Known:
+    """Schemas and channels by number; the first one of a number stands."""
+
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    channels: dict[int, Channel] = field(default_factory=dict)
+
+    def learn(self, record: McapRecord) -> None:
+        """Note a schema or channel."""
+        if isinstance(record, Schema):
+            self.schemas.setdefault(record.id, record)
+        elif isinstance(record, Channel):
+            self.channels.setdefault(record.id, record)
+
+
+@dataclass(slots=True)
+class _Found:
+    """What the first pass learns of a file."""
+
+    parts: list[_Part | None] = field(default_factory=list)
+    """Whole records of the data section; None = a gap."""
+    sealed: _Known = field(default_factory=_Known)
+    """Of whole chunks, and of a sound index."""
+    spare: _Known = field(default_factory=_Known)
+    """Of records without a checksum."""
+    names: dict[int, str] = field(default_factory=dict)
+    """Topics by channel, from the recorder's metadata."""
+    chunks: list[tuple[int, int, int]] = field(default_factory=list)
+    """First and last log time, and size, of whole chunks."""
+    expected: list[ChunkIndex] = field(default_factory=list)
+    """Chunks that a sound index names."""
+    statistics: Statistics | None = None
+    """Of a sound index."""
+    indexed: int = 0
+    """Messages that the message indexes of lost chunks name."""
+    repeated: int = 0
+
+
+class _Scan:
+    """The first pass over a file.
+
+    Args:
+        data: the file.
+        trusted: its index is sound.
+    """
+
+    def __init__(self, data: _Bytes, *, trusted: bool) -> None:
+        self._data, self._trusted = data, trusted
+        self._found = _Found()
+        self._seen: set[bytes] = set()
+        self._behind = False
+        """The data section is over: damage there costs no message."""
+        self._sure = True
+        """No gap since the begin or the last chunk: a message index is that of this chunk."""
+        self._loose = False
+        """The log has messages outside of chunks, behind no gap."""
+
+    def run(self) -> _Found:
+        """Find all whole records."""
+        at, in_step = 0, True
+        while at < self._data.size:
+            if self._data.is_magic(at):
+                at += len(MAGIC)
+            elif (part := self._part(at, in_step=in_step)) is None:
+                if in_step:
+                    self._note_gap()
+                in_step, at = False, self._data.next_candidate(at + 1)
+            elif self._is_sealed(part):
+                self._take(part)
+                in_step, at = True, part.end
+            else:
+                in_step, at = self._take_unsealed(part)
+        found, parts = self._found, self._found.parts
+        loose = found.statistics is not None and not found.statistics.chunk_count
+        if None in parts and not (loose or self._loose):  # what looks like messages is inside of broken chunks
+            self._found.parts = [part for part in parts if part is None or part.opcode != Opcode.MESSAGE]
+        return self._found
+
+    def _take_unsealed(self, part: _Part) -> tuple[bool, int]:
+        """Note a record without a valid checksum, which may be cut off, or overwritten by a chunk.
+
+        Returns:
+            Whether what follows is in step, and where it begins.
+        """
+        content = part.content(self._data)
+        for found in _CHUNK_CANDIDATE.finditer(content):
+            chunk = self._part(part.offset + _HEAD.size + found.start(), in_step=False)
+            if chunk is not None and self._is_sealed(chunk):
+                self._note_gap()
+                return False, chunk.offset
+        self._take(part)
+        if self._is_followed(part):
+            return True, part.end
+        self._note_gap()
+        return False, part.offset + _HEAD.size
+
+    def _note_gap(self) -> None:
+        self._sure = False
+        if not self._behind and self._found.parts[-1:] != [None]:
+            self._found.parts.append(None)
+
+    def _part(self, at: int, *, in_step: bool) -> _Part | None:
+        """The record that begins there, if it is whole."""
+        head = self._data.at(at, _HEAD.size)
+        if len(head) < _HEAD.size:
+            return None
+        part = _Part(at, *_HEAD.unpack(head))
+        if part.end > self._data.size or part.length > MOST_UNPACKED:
+            return None
+        match part.opcode:
+            case Opcode.MESSAGE_INDEX:
+                whole = self._is_message_index(part) and self._is_followed(part)
+            case Opcode.MESSAGE:
+                whole = part.length >= _LEAST_MESSAGE and self._is_followed(part)
+            case opcode if opcode in _LENGTHS:
+                whole = part.length == _LENGTHS[opcode]
+            case Opcode.CHUNK:
+                whole = self._adds_up(part) and self._is_whole(part, in_step=in_step)
+            case opcode if opcode in _READERS:
+                whole = self._is_whole(part, in_step=in_step)
+            case opcode:
+                whole = opcode >= PRIVATE and in_step and self._is_followed(part)
+        return part if whole else None
+
+    def _is_message_index(self, part: _Part) -> bool:
+        if part.length < _INDEX_HEAD.size:
+            return False
+        _, size = _INDEX_HEAD.unpack(self._data.at(part.offset + _HEAD.size, _INDEX_HEAD.size))
+        return bool(size == part.length - _INDEX_HEAD.size and size % _INDEX_ENTRY == 0)
+
+    def _adds_up(self, part: _Part) -> bool:
+        """Whether the lengths of a chunk add up, looked at before all of it is read."""
+        head = self._data.at(part.offset + _HEAD.size, _CHUNK_HEAD.size)
+        if len(head) < _CHUNK_HEAD.size:
+            return False
+        _, _, _, _, named = _CHUNK_HEAD.unpack(head)
+        size = self._data.at(part.offset + _HEAD.size + _CHUNK_HEAD.size + named, _SIZE.size)
+        return len(size) == _SIZE.size and _CHUNK_HEAD.size + named + _SIZE.size + _SIZE.unpack(size)[0] == part.length
+
+    def _is_followed(self, part: _Part) -> bool:
+        """Whether the end of the file, or the head of another record, follows."""
+        rest = self._data.size - part.end
+        if rest == 0 or self._data.is_magic(part.end):
+            return True
+        if rest < _HEAD.size:
+            return False
+        opcode, length = _HEAD.unpack(self._data.at(part.end, _HEAD.size))
+        return bool(0 < opcode <= Opcode.DATA_END or opcode >= PRIVATE) and length <= rest - _HEAD.size
+
+    def _is_whole(self, part: _Part, *, in_step: bool) -> bool:
+        try:
+            record = part.read(self._data)
+            if isinstance(record, Chunk):
+                content = unpacked(record)
+                if not record.uncompressed_crc:
+                    for _ in records_in(content):
+                        pass
+        except DAMAGE:
+            return False
+        return in_step or part.opcode != Opcode.ATTACHMENT or self._is_sealed(part)
+
+    def _is_sealed(self, part: _Part) -> bool:
+        """Whether a whole record is what its own checksum says."""
+        if part.opcode != Opcode.ATTACHMENT:
+            return part.opcode == Opcode.CHUNK
+        record = part.read(self._data)
+        return checked_attachment(record, part.content(self._data)) is record
+
+    def _take(self, part: _Part) -> None:
+        """Note a whole record."""
+        found = self._found
+        match part.opcode:
+            case Opcode.DATA_END:
+                self._behind = True
+            case Opcode.STATISTICS | Opcode.CHUNK_INDEX:
+                self._behind = True
+                self._take_index(part.read(self._data))
+            case Opcode.SCHEMA | Opcode.CHANNEL:
+                (found.sealed if self._behind and self._trusted else found.spare).learn(part.read(self._data))
+            case Opcode.MESSAGE_INDEX:
+                if not self._sure:
+                    found.indexed += (part.length - _INDEX_HEAD.size) // _INDEX_ENTRY
+            case Opcode.CHUNK:
+                self._behind, self._sure = False, True
+                self._take_chunk(part)
+            case Opcode.MESSAGE:
+                self._behind = False
+                self._loose |= self._sure
+                found.parts.append(part)
+            case Opcode.HEADER | Opcode.METADATA | Opcode.ATTACHMENT:
+                self._behind = False
+                self._take_once(part)
+
+    def _take_index(self, record: McapRecord) -> None:
+        """Note a record of an index."""
+        if isinstance(record, Statistics) and self._trusted:
+            self._found.statistics = record
+        elif isinstance(record, ChunkIndex) and self._trusted:
+            self._found.expected.append(record)
+
+    def _take_once(self, part: _Part) -> None:
+        if not self._is_new(part):
+            return
+        self._found.parts.append(part)
+        record = part.read(self._data)
+        if isinstance(record, Metadata) and record.name == CHANNELS:
+            self._found.names |= {int(number): topic for number, topic in record.metadata.items() if number.isdecimal()}
+
+    def _take_chunk(self, part: _Part) -> None:
+        if not self._is_new(part):
+            self._found.repeated += 1
+            return
+        self._found.parts.append(part)
+        chunk = part.read(self._data)
+        self._found.chunks.append((chunk.message_start_time, chunk.message_end_time, chunk.uncompressed_size))
+        for record in records_in(unpacked(chunk)):
+            self._found.sealed.learn(record)
+
+    def _is_new(self, part: _Part) -> bool:
+        begin = _TIMES if part.opcode == Opcode.CHUNK else 0  # no checksum covers a chunk's times
+        digest = blake2b(part.content(self._data)[begin:], digest_size=16).digest()
+        new = digest not in self._seen
+        self._seen.add(digest)
+        return new
