@@ -4,8 +4,10 @@ The array's convention differs from the image's: row 0 is the lowest y, so cell 
 ``origin + resolution * ([column, column + 1], [row, row + 1])``.
 """
 
+import hashlib
 import io
 import math
+import re
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -19,7 +21,7 @@ from PIL import Image, TiffImagePlugin
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.map_folders import YAML, MapSave, folder_of, opened
 from monstertruck_runtime.outside import picture, reading
-from monstertruck_runtime.small_files import replace_file
+from monstertruck_runtime.small_files import remove_file, replace_file
 from monstertruck_runtime.yaml_files import read_yaml, yaml_text
 
 FREE, OCCUPIED, UNKNOWN = 0, 100, -1
@@ -164,13 +166,30 @@ def turned(
 def save_map(world: WorldMap, path: Path) -> None:
     """Write ``path`` (YAML) and a grey PNG of the same stem; ``load_map`` reads back the trinary map.
 
+    The YAML file is replaced last, so it never names the picture of another map: if a different picture has the PNG's
+    name, the new one gets another name, and the former picture is removed at the end.
+
     Raises:
-        OSError: a file could not be written; the YAML is the last one.
+        OSError: a file could not be written; the map is the one before.
     """
+    _, picture = map_content(world, "")
     image = path.with_suffix(".png")
-    text, picture = map_content(world, image.name)
+    if image.exists() and image.read_bytes() != picture:
+        image = path.with_name(f"{path.stem}-{hashlib.sha256(picture).hexdigest()[:8]}.png")
+    before = _picture_of(path)
     replace_file(image, picture)
-    replace_file(path, text)
+    replace_file(path, map_content(world, image.name)[0])
+    if before is not None and before != image.name:
+        remove_file(path.with_name(before))
+
+
+def _picture_of(path: Path) -> str | None:
+    """Name of the picture that ``save_map`` wrote for a YAML file; None if it wrote none."""
+    try:
+        name = str(_read_keys(path)[0]["image"])
+    except InputError:
+        return None
+    return name if re.fullmatch(rf"{re.escape(path.stem)}(-[0-9a-f]{{8}})?\.png", name) else None
 
 
 def map_content(world: WorldMap, image: str) -> tuple[str, bytes]:

@@ -57,12 +57,13 @@ def export_command(
     endpoint: EndpointOption = DEFAULT_ENDPOINT,
 ) -> None:
     """Write all points of interest to a file, whose ending says how."""
+    from monstertruck_runtime.small_files import replace_file
     from monstertruckd.tools.cli.points_files import FORMATS, text_of
 
     if file.suffix not in FORMATS:
         raise InputError(f"{file}: expected a name that ends with one of {', '.join(FORMATS)}")
     points = _points(map_folder, robot, endpoint)
-    file.write_text(text_of(points, file.suffix), encoding="utf-8")
+    replace_file(file, text_of(points, file.suffix))
     remark(f"wrote {len(points)} points to {file}")
 
 

@@ -286,3 +286,31 @@ def test_a_map_of_percents_becomes_trinary():
     world = WorldMap(np.array([[0, 19, 20, 64, 65, 100, -1]]), 0.1)
     assert world.trinary().cells.tolist() == [[0, 0, -1, -1, 100, 100, -1]]
     assert turned(world.cells, 0.1, (0.0, 0.0, 0.0))[0].tolist() == world.cells.tolist()
+
+
+def test_a_yaml_never_names_the_picture_of_another_map(tmp_path, monkeypatch):
+    old, new = (WorldMap(np.full((3, 4), value), 0.1, (float(value), 0.0)) for value in (FREE, OCCUPIED))
+    path = tmp_path / "hall.yaml"
+    (tmp_path / "hall-mine.png").write_bytes(b"mine")
+    save_map(old, path)
+    write_file, steps = map_files.replace_file, []
+
+    def step(file, content):
+        world = load_map(path)
+        assert world.origin == (float(world.cells[0, 0]), 0.0), "of one map at every moment"
+        write_file(file, content)
+        steps.append(file.name)
+
+    monkeypatch.setattr(map_files, "replace_file", step)
+    for world in (new, new, old):
+        save_map(world, path)
+        assert load_map(path).cells.tolist() == world.cells.tolist()
+        assert len(list(tmp_path.iterdir())) == 3, "the former picture is gone, other files stay"
+    first, second, third = steps[::2]
+    assert steps[1::2] == ["hall.yaml"] * 3
+    assert second == "hall.png"
+    assert first != third
+    monkeypatch.undo()
+    path.write_text(yaml_text(KEYS | {"image": "hall-mine.png"}))
+    save_map(new, path)
+    assert (tmp_path / "hall-mine.png").exists(), "a picture of the user's"
