@@ -9,6 +9,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
+from types import MappingProxyType
 from typing import Any, Final, TypeVar
 
 import numpy as np
@@ -149,6 +150,17 @@ def _swapped(context: Context) -> Distortion:
     return other
 
 
+def _sparing(distort: Distortion, least: float) -> Distortion:
+    """Leave the values of an array below ``least``, which are codes, as they are."""
+
+    def spare(value: Any, now: int) -> Any:
+        shown = np.array(distort(value, now))
+        shown[value < least] = value[value < least]
+        return shown
+
+    return spare
+
+
 def _shifted(_: Context, places: float) -> Distortion:
     return lambda value, _now: np.roll(value, round(places))
 
@@ -238,10 +250,18 @@ class Signals:
         now: returns the time, ns.
         kinds: of the signals, by name; the order decides which are neighbours.
         rng: the device's randomness; the faults' own is spawned from it.
+        codes: arrays in which values below a least one are codes: faults that calculate leave them as they are.
     """
 
-    def __init__(self, now: Callable[[], int], kinds: Mapping[str, SignalKind], rng: np.random.Generator) -> None:
+    def __init__(
+        self,
+        now: Callable[[], int],
+        kinds: Mapping[str, SignalKind],
+        rng: np.random.Generator,
+        codes: Mapping[str, float] = MappingProxyType({}),
+    ) -> None:
         self.kinds = dict(kinds)
+        self._codes = dict(codes)
         self._now = now
         self._rng = rng.spawn(1)[0]
         self._newest: dict[str, Any] = {}
@@ -285,6 +305,8 @@ class Signals:
             distortion = known.make(context, *map(float, values))
         except (TypeError, ValueError) as error:
             raise InputError(f"signal {name} {fault}: cannot read {' '.join(values)!r}; {HELP}") from error
+        if name in self._codes and known.kinds == ARITHMETIC:
+            distortion = _sparing(distortion, self._codes[name])
         self._active.setdefault(name, []).append(distortion)
 
     def report(self, name: str, value: T) -> T:

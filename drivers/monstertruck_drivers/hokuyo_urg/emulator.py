@@ -194,7 +194,8 @@ class HokuyoEmulator:
         self._source = source
         self._rng = np.random.default_rng(seed)
         kinds = {RANGE: SignalKind.ARRAY, COUNTER: SignalKind.NUMBER}
-        self.signals = Signals(clock.now, kinds | dict.fromkeys(ORDERED.values(), SignalKind.SWITCH), self._rng)
+        kinds |= dict.fromkeys(ORDERED.values(), SignalKind.SWITCH)
+        self.signals = Signals(clock.now, kinds, self._rng, codes={RANGE: LEAST_MM})
         self._state: StartState = state
         self._identity = {"SERI": serial, "FIRM": firmware}
         self._rate = 1.0 + drift_ppm * 1e-6

@@ -76,8 +76,8 @@ class Motions(NamedTuple):
     """Ns."""
     motions: Mapping[Measure, Vector]
     """Base at ``stamp`` in base at ``since``; only the yaw counts of those that measure turns alone."""
-    pace: tuple[float, float]
-    """Greatest speed (m/s) and turn rate (rad/s) at either end by any measure: what a delay may cost."""
+    slack: tuple[float, float]
+    """What tolerated delays and errors of the stamps explain, m and rad."""
 
 
 class Difference(NamedTuple):
@@ -106,7 +106,7 @@ class Difference(NamedTuple):
 
 
 def turn_difference(
-    motions: Motions, one: Measure, other: Measure, errors: Mapping[Measure, Errors], delay: float
+    motions: Motions, one: Measure, other: Measure, errors: Mapping[Measure, Errors]
 ) -> tuple[float, float]:
     """Difference of two turns and what errors and delay explain of it, rad."""
     greatest = max(abs(motions.motions[measure][2]) for measure in (one, other))
@@ -115,11 +115,11 @@ def turn_difference(
         error.turn[0] * greatest + error.turn[1] + error.bend * way + error.drift * seconds
         for error in (errors[one], errors[other])
     )
-    return abs(motions.motions[one][2] - motions.motions[other][2]), limit + delay * motions.pace[1]
+    return abs(motions.motions[one][2] - motions.motions[other][2]), limit + motions.slack[1]
 
 
 def way_difference(
-    motions: Motions, one: Measure, other: Measure, errors: Mapping[Measure, Errors], delay: float
+    motions: Motions, one: Measure, other: Measure, errors: Mapping[Measure, Errors]
 ) -> tuple[float, float, float]:
     """Difference of two ways (m) and what errors and delay explain of it, in the direction in which it is less likely.
 
@@ -134,20 +134,20 @@ def way_difference(
     ux, uy = mean[0] / norm, mean[1] / norm
     dx, dy = x1 - x2, y1 - y2
     along, across = abs(dx * ux + dy * uy), abs(dy * ux - dx * uy)
-    _, turn_limit = turn_difference(motions, one, other, errors, delay)
-    lengthwise = way_limit(motions, one, other, errors, delay)
+    _, turn_limit = turn_difference(motions, one, other, errors)
+    lengthwise = way_limit(motions, one, other, errors)
     constant = math.fsum(error.way[1] for error in (errors[one], errors[other]) if error.way is not None)
     sideways = errors[one].aside + errors[other].aside + turn_limit / 2
-    limits = lengthwise, constant + delay * motions.pace[0] + sideways * longest
+    limits = lengthwise, constant + motions.slack[0] + sideways * longest
     if along / limits[0] >= across / limits[1]:
         return along, limits[0], math.hypot(dx, dy)
     return across, limits[1], math.hypot(dx, dy)
 
 
-def way_limit(motions: Motions, one: Measure, other: Measure, errors: Mapping[Measure, Errors], delay: float) -> float:
+def way_limit(motions: Motions, one: Measure, other: Measure, errors: Mapping[Measure, Errors]) -> float:
     """What errors and delay explain of a difference of lengths, m."""
     lengths = {measure: math.hypot(*motions.motions[measure][:2]) for measure in (one, other)}
-    longest, limit = max(lengths.values()), delay * motions.pace[0]
+    longest, limit = max(lengths.values()), motions.slack[0]
     for measure, length in lengths.items():
         error = errors[measure]
         if error.way is not None:
@@ -157,13 +157,13 @@ def way_limit(motions: Motions, one: Measure, other: Measure, errors: Mapping[Me
 
 
 def differences(
-    motions: Motions, errors: Mapping[Measure, Errors], delay: float
+    motions: Motions, errors: Mapping[Measure, Errors]
 ) -> tuple[list[Difference], dict[Quantity, set[frozenset[Measure]]]]:
     """Pairs that differ by more than they may, and those that agree, by quantity."""
     found: list[Difference] = []
     agreeing: dict[Quantity, set[frozenset[Measure]]] = {Quantity.WAY: set(), Quantity.TURN: set()}
     for one, other in combinations(motions.motions, 2):
-        off, limit = turn_difference(motions, one, other, errors, delay)
+        off, limit = turn_difference(motions, one, other, errors)
         turns = motions.motions[one][2], motions.motions[other][2]
         if off > limit:
             found.append(Difference(Quantity.TURN, one, other, *turns, off, limit))
@@ -171,7 +171,7 @@ def differences(
             agreeing[Quantity.TURN].add(frozenset((one, other)))
         if errors[one].way is None or errors[other].way is None:
             continue
-        way, limit, apart = way_difference(motions, one, other, errors, delay)
+        way, limit, apart = way_difference(motions, one, other, errors)
         lengths = math.hypot(*motions.motions[one][:2]), math.hypot(*motions.motions[other][:2])
         if way > limit:
             found.append(Difference(Quantity.WAY, one, other, *lengths, apart, limit))

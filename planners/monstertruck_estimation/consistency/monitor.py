@@ -8,7 +8,7 @@ nothing; one about a repeated value ends with the repetition.
 
 import math
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Final, NamedTuple
 
 from monstertruck_estimation.consistency.comparison import (
@@ -33,7 +33,7 @@ from monstertruck_schemas.state import Doubt, DoubtKind
 
 WINDOWS: Final = (0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 5.0, 8.0, 12.0, 20.0)
 """Times over which motions are compared, s, up to the configured one."""
-AGAIN: Final = SECOND // 2
+AGAIN: Final = SECOND // 5
 """Least time between two motions that the scans are asked about, ns."""
 DELAY_PERIOD: Final = SECOND // 4
 """Time between two looks at the delay of the scans, ns."""
@@ -43,6 +43,8 @@ GAP: Final = SECOND // 2
 """Headings and rates further apart are not joined, ns."""
 IN_USE: Final = 2 * SECOND
 """A measure without a sample for so long is not in use, ns."""
+STAMP: Final = 0.05
+"""Error of a stamp, s."""
 INTERVALS: Final = 10
 """Intervals between scans of which the longest counts."""
 TURNED_ALONE: Final = 0.15
@@ -244,18 +246,15 @@ class ConsistencyMonitor:
             return
         worst: dict[Measure, Difference] = {}
         begun, errors = stamp, (0.0, 0.0)
-        delay = max(self._config.delay, *self._intervals)  # stamps of sparse scans, or of bursts, are no better
         for since in self._starts(stamp):
             motions = {m: motion for m, track in self._tracks.items() if (motion := track.motion(since, stamp))}
             if len(motions) < 2:
                 continue
-            paces = [track.pace(at) for m, track in self._tracks.items() if m in motions for at in (since, stamp)]
-            pace = max(pace[0] for pace in paces), max(pace[1] for pace in paces)
-            window = Motions(since, stamp, motions, pace)
-            for measure, found in suspects(*differences(window, self._errors, delay)).items():
+            window = Motions(since, stamp, motions, self._slack(motions, since, stamp))
+            for measure, found in suspects(*differences(window, self._errors)).items():
                 if measure not in worst:
                     worst[measure], begun = found, since
-                    errors = self._tolerated(window, found, delay)
+                    errors = self._tolerated(window, found)
         before, self._doubted = self._doubted, frozenset(worst)
         lasting = {measure: found for measure, found in worst.items() if measure in before}
         if not lasting:
@@ -266,16 +265,31 @@ class ConsistencyMonitor:
         elif self._pending is None and stamp - self._asked >= AGAIN:
             self._pending, self._asked = _Pending(begun, lasting, claimant, errors), stamp
 
-    def _tolerated(self, window: Motions, found: Difference, delay: float) -> tuple[float, float]:
+    def _slack(self, motions: Iterable[Measure], since: int, stamp: int) -> tuple[float, float]:
+        """What delays and errors of the stamps explain of a difference, m and rad.
+
+        A constant delay costs what the speed has changed; an error of a stamp, the distance travelled meanwhile. Stamps
+        of sparse scans, or of scans in bursts, are no better than the interval between them.
+        """
+        interval, delay = max(self._intervals), self._config.delay
+        error = interval if interval > delay else STAMP
+        paces = [(self._tracks[measure].pace(since), self._tracks[measure].pace(stamp)) for measure in motions]
+        way, turn = (
+            max(delay * abs(end[axis] - begin[axis]) + error * max(begin[axis], end[axis]) for begin, end in paces)
+            for axis in (0, 1)
+        )
+        return way, turn
+
+    def _tolerated(self, window: Motions, found: Difference) -> tuple[float, float]:
         """How far the true motion may be from the claimed one, m and rad."""
         claimant = _claimant({found.one: found})
         if claimant is None:
             return 0.0, 0.0
         pair = Measure.SCANS, claimant
-        _, turn = turn_difference(window, *pair, self._errors, delay)
+        _, turn = turn_difference(window, *pair, self._errors)
         if self._errors[claimant].way is None:
             return TURNED_ALONE, turn
-        return way_limit(window, *pair, self._errors, delay), turn
+        return way_limit(window, *pair, self._errors), turn
 
     def _starts(self, stamp: int) -> Iterator[int]:
         """Beginnings of the windows that end at ``stamp``, ns: at scans, if there are any."""

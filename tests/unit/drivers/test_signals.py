@@ -190,3 +190,12 @@ def test_one_seed_gives_one_noise(time: Time) -> None:
 
     assert noise(lambda: np.random.default_rng(1)) == noise(lambda: np.random.default_rng(1))
     assert noise(lambda: np.random.default_rng(1)) != noise(lambda: np.random.default_rng(2))
+
+
+def test_codes_in_an_array_are_spared_by_faults_that_calculate():
+    signals = Signals(lambda: 0, {"range": SignalKind.ARRAY}, np.random.default_rng(1), codes={"range": 20})
+    signals.inject("range", "scaled", "2")
+    assert signals.report("range", np.array((0, 19, 20, 500))).tolist() == [0, 19, 40, 1000]
+    signals.inject("range", "off")
+    signals.inject("range", "mirrored")
+    assert signals.report("range", np.array((0, 19, 20, 500))).tolist() == [500, 20, 19, 0]

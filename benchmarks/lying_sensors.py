@@ -1,0 +1,378 @@
+"""Plausible sensors that lie: noticed before contact, and no false alarm.
+
+    python benchmarks/lying_sensors.py [--seeds 5] [--case NAME ...] [--world NAME ...]
+    python benchmarks/lying_sensors.py --quiet [--seconds 60]
+    python benchmarks/lying_sensors.py --logs FOLDER
+
+On the virtual clock an operator drives the emulated truck straight ahead by hand, at its greatest speed, towards a post
+that is 0.9 m before its bumper when the lie begins; with some seeds it begins before the truck is armed, with others
+while it drives. In the cases of the compass and of the wheels' slip the truck follows the demo's lap. Judged by the
+world alone: contact is an outline in a wall or in the post, noticed is a stop or a refusal to arm with
+``sensors_disagree`` or ``sensor_frozen``.
+
+    repeated   one revolution again and again, with fresh stamps
+    noisy      the same, with new noise
+    late       scans as they were 0.8 s ago
+    doubled    all ranges twice as long; halved: half as long
+    half-odometry   the drive counts half of the distance
+    turned     the lidar is mounted 0.5 rad off; mirrored: left and right are exchanged
+    compass    all values of the compass repeat
+
+``--quiet`` drives shipped configurations without a fault, and with wheels that slip by 30 %, and counts alarms.
+``--logs`` replays recorded logs (``.npz`` with t, ranges and odom) through the pure core. The last line is JSON.
+"""
+
+import argparse
+import json
+import math
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from monstertruck_estimation.consistency.comparison import Measure
+from monstertruck_estimation.consistency.config import ConsistencyConfig
+from monstertruck_estimation.consistency.exchange import StepInput
+from monstertruck_estimation.consistency.monitor import ConsistencyMonitor
+from monstertruck_estimation.consistency.scan_odometry import ScanOdometry
+from monstertruck_estimation.se2 import between
+from monstertruck_estimation.slam.worker_io import ScanInput
+from monstertruck_estimation.wheel_motion import WheelIncrement
+from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
+from monstertruck_runtime.errors import RequestRefusedError
+from monstertruck_runtime.mailbox import fifo
+from monstertruck_schemas import topics
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import DriveRequest
+from monstertruck_sim.faults import SimContext, place_obstacle
+from monstertruck_sim.world.built_in import BUILT_IN
+from monstertruckd.config.load import load_config
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
+from monstertruckd.tools.simulation.operator import LocalOperator
+from monstertruckd.tools.simulation.virtual_rig import VirtualRig
+
+CONFIGS: Final = Path(__file__).resolve().parents[1] / "configs"
+NOTICED: Final = (Reason.SENSORS_DISAGREE, Reason.SENSOR_FROZEN)
+GAP: Final = 0.9
+"""Distance of the post from the bumper when the lie begins, m."""
+LONGEST: Final = 14.0
+"""Seconds of a trial."""
+PERIOD: Final = 0.05
+WORLDS: Final = ("loop", "rooms", "corridor_maze", "workshop")
+
+Lie = Callable[[SimContext], None]
+
+
+def falsified(role: str, *faults: tuple[str, ...]) -> Lie:
+    """A lie of signals of an emulated device: (signal, fault, argument) each."""
+
+    def start(context: SimContext) -> None:
+        for signal, fault, *values in faults:
+            context.signals(role).inject(signal, fault, *values)
+
+    return start
+
+
+def commanded(role: str, line: str) -> Lie:
+    """A lie that an emulator's own console knows."""
+    return lambda context: context.command(role, line)
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """One way to lie."""
+
+    start: Lie | None = None
+    overlay: dict[str, Any] | None = None
+    """What is wrong in the world from the beginning."""
+    lap: bool = False
+    """The truck follows the demo's lap; there is no post."""
+    settled: bool = False
+    """It begins long before the truck is armed: its own beginning does not give it away."""
+
+
+SHAFT: Final = ("position_actual", "velocity_actual", "velocity_averaged")
+"""What the drive controller says of its shaft."""
+CASES: Final = {
+    "repeated": Case(falsified("lidar", ("range", "frozen"))),
+    "noisy": Case(falsified("lidar", ("range", "frozen"), ("range", "noisy", "6"))),
+    "late": Case(falsified("lidar", ("range", "delayed", "0.8")), settled=True),
+    "doubled": Case(falsified("lidar", ("range", "scaled", "2"))),
+    "halved": Case(falsified("lidar", ("range", "scaled", "0.5"))),
+    "half-odometry": Case(falsified("drive", *((signal, "scaled", "0.5") for signal in SHAFT))),
+    "turned": Case(overlay={"sim": {"world": {"lidar": {"yaw": 0.5}}}}),
+    "mirrored": Case(falsified("lidar", ("range", "mirrored")), lap=True),
+    "compass": Case(commanded("compass", "frozen on"), lap=True),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """One trial."""
+
+    contact: bool
+    noticed: float | None
+    """Seconds after the lie began, None = never."""
+    driven: float
+    """Distance travelled meanwhile, or until the end, m."""
+    reason: str = ""
+
+
+def trial(case: Case, world: str, seed: int) -> Outcome:
+    """Drive towards a post, or along the lap, with a sensor that lies."""
+    rng = np.random.default_rng(seed)
+    name = "demo.yaml" if world == "loop" else "goals.yaml"
+    config = load_config(CONFIGS / name, SimulatedTruckConfig)[0]
+    x, y, yaw = BUILT_IN[world]().start
+    start = {"x": x + float(rng.uniform(0, 0.1)), "y": y + float(rng.uniform(-0.04, 0.04)), "yaw": yaw}
+    overlay: dict[str, Any] = {
+        "recorder": None,
+        "map": None,
+        "odometry": {"start": start},
+        "sim": {"seed": seed + 1, "world": {"map": world}},
+    }
+    if not case.lap:
+        overlay |= {"path": None, "tracker": None, "planner": None}
+    config = with_overlay(with_overlay(config, overlay), case.overlay or {})
+
+    async def main(clock: VirtualClock) -> Outcome:
+        rig = VirtualRig(config, clock)
+        return await _Driver(rig, clock, case, early=seed % 2 == 0).run()
+
+    return run_virtual(main, start=SECOND)
+
+
+class _Driver:
+    """The operator of one trial, and its judge."""
+
+    def __init__(self, rig: VirtualRig, clock: VirtualClock, case: Case, *, early: bool) -> None:
+        self._rig, self._clock, self._case, self._early = rig, clock, case, early
+        config = rig.config
+        self._context = SimContext(config.sim, config.devices, rig.robot, rig.computer, clock)
+        self._operator = LocalOperator(rig.daemon, clock)
+        self._gate = rig.bus.subscribe(topics.GATE, fifo(4096))
+
+    async def run(self) -> Outcome:
+        """Arm, drive, watch."""
+        rig, clock = self._rig, self._clock
+        async with rig.running():
+            await clock.sleep(2.5)
+            began = clock.now()
+            if self._early or self._case.settled:
+                self._lie()
+                await clock.sleep(2.0 if self._case.settled else 0.4)
+                began = clock.now() if self._case.settled else began
+            try:
+                await self._operator.arm()
+            except RequestRefusedError as refused:
+                noticed = refused.refusal in NOTICED
+                return Outcome(
+                    contact=False,
+                    noticed=(clock.now() - began) / SECOND if noticed else None,
+                    driven=0.0,
+                    reason=refused.refusal.value,
+                )
+            if not self._early and not self._case.settled:
+                await self._drive(1.5)
+                began = clock.now()
+                self._lie()
+            return await self._watch(began)
+
+    def _lie(self) -> None:
+        self._gate.drain()
+        if self._case.start is not None:
+            self._case.start(self._context)
+        if not self._case.lap:
+            place_obstacle(GAP)(self._context)
+
+    async def _drive(self, seconds: float) -> None:
+        until = self._clock.now() + round(seconds * SECOND)
+        while self._clock.now() < until:
+            await self._ask()
+            await self._clock.sleep(PERIOD)
+
+    async def _ask(self) -> None:
+        if self._case.lap:
+            return
+        request = DriveRequest(**await self._operator.header(0.25), speed=0.3, front=0.0, rear=0.0)
+        self._rig.bus.inject(topics.REQ_DRIVE, request)
+
+    async def _watch(self, began: int) -> Outcome:
+        clock, before, driven = self._clock, self._rig.world.truth(self._clock.now()), 0.0
+        while clock.now() - began < LONGEST * SECOND:
+            await self._ask()
+            await clock.sleep(PERIOD)
+            truth = self._rig.world.truth(clock.now())
+            driven += math.hypot(truth.x - before.x, truth.y - before.y)
+            before = truth
+            seen = [
+                reason
+                for state in self._gate.drain()
+                if state.stamp >= began
+                for reason in state.reasons
+                if reason in NOTICED
+            ]
+            if seen:
+                await self._drive(1.0)
+                return Outcome(
+                    self._rig.world.truth(clock.now()).stuck,
+                    (clock.now() - began) / SECOND - 1.0,
+                    driven,
+                    seen[0].value,
+                )
+            if self._rig.world.truth(clock.now()).stuck:
+                return Outcome(contact=True, noticed=None, driven=driven)
+        return Outcome(self._rig.world.truth(clock.now()).stuck, None, driven)
+
+
+QUIET: Final[dict[str, dict[str, Any]]] = {
+    "demo.yaml": {},
+    "slam.yaml": {},
+    "kiss.yaml": {},
+    "fusion.yaml": {},
+    "full.yaml": {},
+    "ramp.yaml": {},
+    "full3d.yaml": {},
+    **{f"robots/{path.name}": {} for path in sorted((CONFIGS / "robots").glob("*.yaml")) if path.stem != "hall"},
+}
+"""Shipped configurations that drive by themselves once they are armed, and what is changed in them."""
+SLIP: Final = {"sim": {"world": {"truck": {"motor": {"ratio": 644.0 / 0.7}}}}}
+"""Wheels of which the robot moves 0.7 of the distance."""
+
+
+@dataclass(frozen=True, slots=True)
+class Quiet:
+    """A drive without a fault."""
+
+    alarms: tuple[str, ...]
+    measures: tuple[str, ...]
+    driven: float
+
+
+def quiet(name: str, seconds: float, overlay: dict[str, Any]) -> Quiet:
+    """Let a shipped configuration drive, without a fault."""
+    config = load_config(CONFIGS / name, SimulatedTruckConfig)[0]
+    config = with_overlay(with_overlay(config, {"recorder": None, "map": None}), overlay)
+
+    async def main(clock: VirtualClock) -> Quiet:
+        rig = VirtualRig(config, clock)
+        compared = rig.bus.subscribe(topics.CONSISTENCY, fifo(1 << 16))
+        operator, driven = LocalOperator(rig.daemon, clock), 0.0
+        async with rig.running():
+            await clock.sleep(2.0)
+            await operator.arm()
+            before = rig.world.truth(clock.now())
+            until, number = clock.now() + round(seconds * SECOND), 0
+            while clock.now() < until:
+                if config.tracker is None and config.path is None:
+                    number += 1
+                    ask = {"speed": 0.2, "front": 0.2 * math.sin(number / 40), "rear": 0.0}
+                    rig.bus.inject(topics.REQ_DRIVE, DriveRequest(**await operator.header(0.25), **ask))
+                await clock.sleep(PERIOD)
+                truth = rig.world.truth(clock.now())
+                driven += math.hypot(truth.x - before.x, truth.y - before.y)
+                before = truth
+        said = compared.drain()
+        alarms = dict.fromkeys(f"{doubt.sensor}: {doubt.text}" for message in said for doubt in message.doubts)
+        return Quiet(tuple(alarms), said[-1].measures, driven)
+
+    return run_virtual(main, start=SECOND)
+
+
+def replayed(path: Path) -> tuple[int, float, float]:
+    """Alarms of a recorded log, its duration and how much of it was compared, s."""
+    log = np.load(path)
+    stamps, ranges, odom = log["t"] - log["t"][0] + 1.0, log["ranges"].astype(float), log["odom"]
+    count = ranges.shape[1]
+    step = math.pi / 180 if count == 180 else math.pi / (count - 1)
+    longest = float(np.max(ranges)) * 0.98
+    monitor = ConsistencyMonitor(ConsistencyConfig(), {Measure.WHEELS: "drive", Measure.SCANS: "lidar"})
+    odometry, alarms, compared, last = ScanOdometry(), 0, 0.0, 0
+    monitor.activate(0)
+    for k, seconds in enumerate(stamps):
+        stamp = int(seconds * SECOND)
+        if stamp <= last:
+            continue
+        if k:
+            dt, (x, y, turn) = (stamp - last) / SECOND, between(odom[k - 1], odom[k]).tolist()
+            c, s = math.cos(turn / 2), math.sin(turn / 2)
+            twist = (c * x + s * y) / dt, (c * y - s * x) / dt, turn / dt
+            monitor.observe_wheels(WheelIncrement(last, stamp, twist, abs(x), (), ()))
+        last = stamp
+        shown = np.where(ranges[k] < longest, ranges[k], np.inf)
+        scan = ScanInput(stamp, shown, -math.pi / 2, step, 0.02, longest)
+        output = odometry.step(StepInput(scan, "kiss", claim=monitor.claim(stamp)))
+        compared += 0.0 if output.since is None else (output.stamp - output.since) / SECOND
+        monitor.observe_scan(output)
+        if monitor.findings():
+            alarms += 1
+            monitor.activate(stamp)
+    return alarms, float(stamps[-1] - stamps[0]), compared
+
+
+def _say(text: str) -> None:
+    sys.stdout.write(text + "\n")
+    sys.stdout.flush()
+
+
+def lies(cases: list[str], worlds: list[str], seeds: int) -> dict[str, Any]:
+    """All trials; figures by case."""
+    figures: dict[str, Any] = {}
+    for name in cases:
+        case = CASES[name]
+        outcomes = [trial(case, world, seed) for world in (["loop"] if case.lap else worlds) for seed in range(seeds)]
+        times = [one.noticed for one in outcomes if one.noticed is not None]
+        figures[name] = {
+            "trials": len(outcomes),
+            "noticed": len(times),
+            "contacts": sum(one.contact for one in outcomes),
+            "seconds_max": round(max(times, default=math.nan), 2),
+            "metres_max": round(max(one.driven for one in outcomes), 2),
+        }
+        _say(f"{name:14} {figures[name]}")
+    return figures
+
+
+def main() -> None:
+    """Run what was asked for."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--case", action="append", choices=CASES)
+    parser.add_argument("--world", action="append", choices=WORLDS)
+    parser.add_argument("--quiet", action="store_true", help="shipped configurations without a fault")
+    parser.add_argument("--seconds", type=float, default=60.0, help="of each of them")
+    parser.add_argument("--only", action="append", help="of the shipped configurations, by name")
+    parser.add_argument("--logs", type=Path, help="folder of recorded logs")
+    args = parser.parse_args()
+    began, figures = time.monotonic(), {}
+    if args.logs is not None:
+        for path in sorted(args.logs.glob("*.npz")):
+            alarms, duration, compared = replayed(path)
+            figures[path.stem] = {"alarms": alarms, "seconds": round(duration), "compared": round(compared)}
+            _say(f"{path.stem:20} {figures[path.stem]}")
+        met = not any(one["alarms"] for one in figures.values())
+        goals = {"alarms": 0}
+    elif args.quiet:
+        names = [name for name in QUIET if not args.only or name in args.only]
+        runs = [(name, QUIET[name], "") for name in names]
+        runs += [(name, SLIP, " slip 30 %") for name in ("demo.yaml", "slam.yaml") if name in names]
+        for name, overlay, label in runs:
+            found = quiet(name, args.seconds, overlay)
+            figures[name + label] = {"alarms": len(found.alarms), "driven_m": round(found.driven, 2)}
+            _say(f"{name + label:28} {figures[name + label]} {', '.join(found.measures)} {'; '.join(found.alarms)}")
+        met = not any(one["alarms"] for one in figures.values())
+        goals = {"alarms": 0}
+    else:
+        figures = lies(args.case or list(CASES), args.world or list(WORLDS), args.seeds)
+        met = all(one["noticed"] == one["trials"] and one["contacts"] == 0 for one in figures.values())
+        goals = {"noticed": "all", "contacts": 0}
+    figures["seconds_of_work"] = round(time.monotonic() - began)
+    _say(json.dumps({"bench": "lying_sensors", "figures": figures, "goals": goals, "met": met}))
+
+
+if __name__ == "__main__":
+    main()
