@@ -270,8 +270,9 @@ def quiet(name: str, seconds: float, overlay: dict[str, Any]) -> Quiet:
             while clock.now() < until:
                 if config.tracker is None and config.path is None:
                     number += 1
-                    ask = {"speed": 0.2, "front": 0.2 * math.sin(number / 40), "rear": 0.0}
-                    rig.bus.inject(topics.REQ_DRIVE, DriveRequest(**await operator.header(0.25), **ask))
+                    front = 0.2 * math.sin(number / 40)
+                    request = DriveRequest(**await operator.header(0.25), speed=0.2, front=front, rear=0.0)
+                    rig.bus.inject(topics.REQ_DRIVE, request)
                 await clock.sleep(PERIOD)
                 truth = rig.world.truth(clock.now())
                 driven += math.hypot(truth.x - before.x, truth.y - before.y)
@@ -348,14 +349,15 @@ def main() -> None:
     parser.add_argument("--only", action="append", help="of the shipped configurations, by name")
     parser.add_argument("--logs", type=Path, help="folder of recorded logs")
     args = parser.parse_args()
-    began, figures = time.monotonic(), {}
+    began = time.monotonic()
+    figures: dict[str, Any] = {}
     if args.logs is not None:
         for path in sorted(args.logs.glob("*.npz")):
             alarms, duration, compared = replayed(path)
             figures[path.stem] = {"alarms": alarms, "seconds": round(duration), "compared": round(compared)}
             _say(f"{path.stem:20} {figures[path.stem]}")
         met = not any(one["alarms"] for one in figures.values())
-        goals = {"alarms": 0}
+        goals: dict[str, Any] = {"alarms": 0}
     elif args.quiet:
         names = [name for name in QUIET if not args.only or name in args.only]
         runs = [(name, QUIET[name], "") for name in names]
@@ -371,7 +373,8 @@ def main() -> None:
         met = all(one["noticed"] == one["trials"] and one["contacts"] == 0 for one in figures.values())
         goals = {"noticed": "all", "contacts": 0}
     figures["seconds_of_work"] = round(time.monotonic() - began)
-    _say(json.dumps({"bench": "lying_sensors", "figures": figures, "goals": goals, "met": met}))
+    said: dict[str, Any] = {"bench": "lying_sensors", "figures": figures, "goals": goals, "met": met}
+    _say(json.dumps(said))
 
 
 if __name__ == "__main__":

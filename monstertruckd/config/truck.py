@@ -1,6 +1,7 @@
 """The configuration of one robot or experiment: the root of the YAML file."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final, Literal, Self
@@ -37,12 +38,14 @@ from monstertruck_schemas.body import Metres, TruckBody
 from monstertruck_schemas.roles import SHAFTS, DeviceRole
 from monstertruckd.bus.zenoh_config import PeerConfig, ZenohConfig
 from monstertruckd.config.device_safety import beyond_devices, unattended_times, weakened_devices
-from monstertruckd.gate.config import SIGHT, BodyLimits, GateConfig, impossible_settings, weakened
+from monstertruckd.gate.config import SIGHT, BodyLimits, GateConfig, impossible_settings, weakened, weaker
 from monstertruckd.recorder.config import BlackBoxConfig, MapRender, RecorderConfig
 
 ROBOT: Final = "truck"
 """A robot's name where none is given."""
 BLIND: Final = "devices: no range sensor: nothing stops the robot before an obstacle"
+
+UNCOMPARED: Final = "consistency null: sensors that lie are not found"
 
 MOVE: Final = "move"
 """Name of the behaviour that every robot has."""
@@ -228,7 +231,15 @@ class TruckConfig(Schema):
         opened = (f"zenoh.insecure: anybody who reaches {end} may drive" for end in self.zenoh.open_endpoints)
         sees = self.devices.lidar is not None or self.devices.sonar is not None
         blind = () if sees or self.gate.scan.critical else (BLIND,)
-        return (*weakened(self.gate), *blind, *weakened_devices(self.devices, self.monitors), *opened)
+        devices = weakened_devices(self.devices, self.monitors)
+        return (*weakened(self.gate), *blind, *self._weakened_comparison(), *devices, *opened)
+
+    def _weakened_comparison(self) -> Iterator[str]:
+        usual, above = ConsistencyConfig(), ("slip", "slide", "delay")
+        if self.consistency is None:
+            yield UNCOMPARED
+        else:
+            yield from weaker("consistency", self.consistency, usual, above, ())
 
     def missing_actuators(self) -> str | None:
         """What the body needs to drive and steer, if some of it is not there."""

@@ -17,6 +17,7 @@ async def examine(context: HostContext, *, ask_devices: bool = True) -> list[Fin
         *software.python(context),
         *software.packages(context),
         *software.configuration(context),
+        *software.motion(context),
         *[finding async for finding in software.service(context)],
         *software.rules(context),
         *software.rights(context),

@@ -64,6 +64,33 @@ def configuration(context: HostContext) -> Iterator[Finding]:
         yield warn("safety", Reason.WEAKENED, "; ".join(weaker), show)
 
 
+def motion(context: HostContext) -> Iterator[Finding]:
+    """Which independent sensors measure the robot's motion, and what is missing to find one that lies."""
+    config = context.config
+    if config is None or config.missing_actuators() is not None:
+        return
+    devices, compared = config.devices, config.consistency
+    scans = None if devices.lidar is None or compared is None else compared.scans
+    ways = [name for name, there in (("scans", scans), ("free wheels", devices.encoders)) if there is not None]
+    turns = [name for name, there in (("compass", devices.compass), ("gyroscope", devices.imu)) if there is not None]
+    if compared is None or not (ways or turns):
+        seen = "only the wheels measure the motion: half of the speed limits; add a lidar, a compass or an IMU"
+        yield warn("motion", Reason.UNWITNESSED, seen)
+        return
+    seen = f"measured by wheels, {', '.join((*ways, *turns))}"
+    if not ways:
+        seen += "; distances by the wheels alone: a lidar or encoders of free wheels would find wheels that lie"
+    elif not turns:
+        seen += "; of two that disagree none can be named: a compass or an IMU would tell"
+    yield fine("motion", seen)
+    if scans == "kiss" and context.versions("kiss-icp") is None:
+        text = "kiss-icp is not installed: this repository's own scan odometry measures the motion"
+        yield warn("scan odometry", Reason.NOT_INSTALLED, text, _install_command(context))
+    if scans is not None and context.versions("numba") is None:
+        text = "numba is not installed: the motion by scans is not measured"
+        yield warn("scan odometry", Reason.NOT_INSTALLED, text, _install_command(context))
+
+
 def _missing(context: HostContext, requirements: list[str]) -> dict[str, list[str]]:
     """Absent distributions by extra; "" = needed always."""
     missing: dict[str, list[str]] = {}

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.tools.doctor.context import Account, HostContext, Level, account_of, inspect
-from monstertruckd.tools.doctor.software import configuration, packages, python, rights, rules, service
+from monstertruckd.tools.doctor.software import configuration, motion, packages, python, rights, rules, service
 from monstertruckd.tools.install.plan import RULES, UNIT
 from tests.unit.tools.doctor.kit import EmulatedHost, bad, see
 from tests.unit.tools.install.kit import PROGRAM, ROOT, TRUCK
@@ -172,3 +172,12 @@ def test_accounts_are_read_from_the_systems_own_files(tmp_path: Path):
     pi = Account("pi", 1000, {"pi": 1000, "dialout": 20})
     assert account_of(tmp_path, "pi") == account_of(tmp_path, 1000) == pi
     assert account_of(tmp_path, "eva") is None
+
+
+def test_measures_of_the_motion_and_what_is_missing(tmp_path: Path):
+    found = see(tmp_path / "a", motion, without())
+    assert bad(found) == {}
+    assert found["motion"].seen == "measured by wheels, scans, compass"
+    assert bad(see(tmp_path / "b", motion, without("kiss-icp"))).keys() == {"scan odometry"}
+    alone = see(tmp_path / "c", motion, lambda emulated: emulated.change(consistency=None))["motion"]
+    assert (alone.level, alone.reason) == (Level.WARN, Reason.UNWITNESSED)
