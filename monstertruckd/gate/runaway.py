@@ -68,12 +68,29 @@ class _Order(NamedTuple):
     high: float
 
 
+class _Beyond(NamedTuple):
+    """Distance beyond what the orders allow so far, m."""
+
+    velocity: float = 0.0
+    """By the velocity."""
+    position: float = 0.0
+    """By the position."""
+    drift: float = 0.0
+    """By the position of a shaft that is ordered to stand; a slow drift does not count."""
+    unread: float = 0.0
+    """By the position, while the velocity reads 0."""
+
+
 class ShaftBounds:
     """Speeds that a shaft's orders allow, forward positive, m/s; ``low`` <= 0 <= ``high``."""
 
     def __init__(self) -> None:
         self.low = 0.0
         self.high = 0.0
+        self.furthest = 0.0
+        """Greatest speed allowed at any time between the newest two measurements, m/s."""
+        self.rearmost = 0.0
+        """Least one, m/s."""
         self._orders: deque[_Order] = deque([_Order(0, 0.0, 0.0)])
 
     @property
@@ -110,8 +127,10 @@ class ShaftBounds:
         while len(self._orders) > 1 and self._orders[1].since <= heard:
             self._orders.popleft()
         change = deceleration * (stamp - before) / SECOND
-        self.high = max(0.0, self.high - change, *(order.high for order in self._orders))
-        self.low = min(0.0, self.low + change, *(order.low for order in self._orders))
+        high, low = self.high, self.low
+        self.high = max(0.0, high - change, *(order.high for order in self._orders))
+        self.low = min(0.0, low + change, *(order.low for order in self._orders))
+        self.furthest, self.rearmost = max(high, self.high), min(low, self.low)
 
     def begin(self, speed: float) -> None:
         """Start from a measured speed, m/s: where it comes from does not matter."""
@@ -140,8 +159,7 @@ class ShaftWatch:
         """Whether the shaft has rested since it was last ordered to turn."""
         self._over = 0.0
         """How much faster than allowed the shaft turned at the newest feedback, m/s."""
-        self._travel = {RunawayKind.DOES_NOT_STOP: 0.0, RunawayKind.NO_ORDER: 0.0, RunawayKind.VELOCITY_LIES: 0.0}
-        """Distance beyond what is allowed: by the velocity, by the position at rest, by the position alone; m."""
+        self._beyond = _Beyond()
 
     def observe(
         self,
@@ -209,36 +227,38 @@ class ShaftWatch:
     def _begin(self, velocity: float) -> None:
         self.bounds.begin(velocity)
         self._over = 0.0
-        self._travel = dict.fromkeys(self._travel, 0.0)
+        self._beyond = _Beyond()
 
     def _judge(
         self, velocity: float, before: float, step: float, dt: float, distance: float, standstill: float
     ) -> Runaway | None:
-        bounds, travel = self.bounds, self._travel
+        bounds, so_far = self.bounds, self._beyond
         over, was = max(velocity - bounds.high, bounds.low - velocity) - standstill, self._over
         self._over = over
-        travel[RunawayKind.DOES_NOT_STOP] += max(min(over, was), 0.0) * dt
-        if over <= 0.0:
-            travel[RunawayKind.DOES_NOT_STOP] = 0.0
-        reads_rest = max(abs(velocity), abs(before)) < standstill
+        further = max(step - bounds.furthest * dt, bounds.rearmost * dt - step) - standstill * dt
+        drift = 0.0
         if bounds.low == bounds.high == 0.0:
             leak = LEAK * standstill * dt
-            drift = travel[RunawayKind.NO_ORDER] + step
-            travel[RunawayKind.NO_ORDER] = max(drift - leak, 0.0) if drift > 0.0 else min(drift + leak, 0.0)
-        else:
-            travel[RunawayKind.NO_ORDER] = 0.0
-        unread = abs(step) if reads_rest and bounds.steady and abs(step) > standstill * dt else 0.0
-        travel[RunawayKind.VELOCITY_LIES] = travel[RunawayKind.VELOCITY_LIES] + unread if unread else 0.0
-        if max(map(abs, travel.values())) <= distance:
+            drift = so_far.drift + step
+            drift = max(drift - leak, 0.0) if drift > 0.0 else min(drift + leak, 0.0)
+        reads_rest = max(abs(velocity), abs(before)) < standstill
+        unread = reads_rest and bounds.steady and abs(step) > standstill * dt
+        self._beyond = found = _Beyond(
+            velocity=so_far.velocity + max(min(over, was), 0.0) * dt if over > 0.0 else 0.0,
+            position=so_far.position + further if further > 0.0 else 0.0,
+            drift=drift,
+            unread=so_far.unread + abs(step) if unread else 0.0,
+        )
+        if max(map(abs, found)) <= distance:
             return None
         measured = step / dt if reads_rest else velocity
-        found = Runaway(self._kind(measured, reads_rest=reads_rest), self._name, measured, bounds.low, bounds.high)
+        runaway = Runaway(self._kind(measured), self._name, measured, bounds.low, bounds.high)
         self._begin(measured)
-        return found
+        return runaway
 
-    def _kind(self, measured: float, *, reads_rest: bool) -> RunawayKind:
+    def _kind(self, measured: float) -> RunawayKind:
         ordered = self.bounds.ordered
-        if reads_rest and self._travel[RunawayKind.VELOCITY_LIES]:
+        if self._beyond.unread:
             return RunawayKind.VELOCITY_LIES
         if ordered == 0.0:
             return RunawayKind.NO_ORDER if self._rested else RunawayKind.DOES_NOT_STOP

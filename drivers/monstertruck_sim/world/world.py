@@ -192,6 +192,11 @@ class World:
         self._plant.advance(time_ns)
         self._plant.servo_supply = on
 
+    def powered(self, time_ns: int) -> tuple[bool, ...]:
+        """Which driven shafts have a motor whose power stage is on."""
+        self._plant.advance(time_ns)
+        return tuple(shaft.powered for shaft in self._plant.shafts)
+
     def block_shaft(self, time_ns: int, shaft: int = 0, *, on: bool) -> None:
         """Hold a driven shaft, or let it go."""
         self._plant.advance(time_ns)

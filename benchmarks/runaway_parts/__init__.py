@@ -1,0 +1,1 @@
+"""What ``runaway.py`` and the tests of the whole daemon share."""
