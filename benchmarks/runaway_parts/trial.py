@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from functools import cache
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.errors import RequestRefusedError, TruckError
@@ -16,7 +16,6 @@ from monstertruck_schemas import topics
 from monstertruck_schemas.event import Event, Stop
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import DriveRequest, Order
-from monstertruck_schemas.sensor import DriveFeedback, DriveMode
 from monstertruck_schemas.state import GateMode, GateState
 from monstertruckd.config.load import load_config
 from monstertruckd.tools.drill.random_drill import wired
@@ -82,7 +81,7 @@ class Outcome:
     boxed: float | None
     """When its stop with a black box was published, s."""
     safe: float | None
-    """When the world showed standstill for good, or the drive its power stage off, s."""
+    """When the world showed standstill for good, or all power stages off, s."""
     travelled: float
     """Distance travelled until the world showed standstill, m."""
     mode: GateMode
@@ -109,6 +108,21 @@ def configured(robot: Robot, *, line: bool = False, seed: int = 0) -> SimulatedT
     return wired(config) if line else config
 
 
+class Look(NamedTuple):
+    """What the world showed at one instant."""
+
+    at: float
+    """S since the beginning."""
+    x: float
+    """M."""
+    y: float
+    """M."""
+    speed: float
+    """M/s."""
+    powered: bool
+    """A motor has its power stage on."""
+
+
 class Trial:
     """A robot that drives, disobeys and is watched.
 
@@ -124,27 +138,23 @@ class Trial:
         self.states: list[GateState] = []
         self.events: list[Event] = []
         self.stops: list[Stop] = []
-        self.modes: list[DriveFeedback] = []
         bus = rig.bus
         self._gates = bus.subscribe(topics.GATE, fifo(8192))
         self._reports = bus.subscribe(topics.EVENT, fifo(8192))
         self._trips = bus.subscribe(topics.STOP, fifo(512))
-        self._drives = bus.subscribe(topics.DRIVE, fifo(8192))
         self._requests: asyncio.Task[None] | None = None
-        self.path: list[tuple[float, float, float, float]] = []
-        """Seconds since the beginning, x, y (m) and speed (m/s)."""
+        self.path: list[Look] = []
 
     def listen(self) -> None:
         """Take what came in."""
         self.states += self._gates.drain()
         self.events += self._reports.drain()
         self.stops += self._trips.drain()
-        self.modes += self._drives.drain()
 
     def forget(self) -> None:
         """Take what came in, and drop it."""
         self.listen()
-        for kept in (self.states, self.events, self.stops, self.modes):
+        for kept in (self.states, self.events, self.stops):
             kept.clear()  # type: ignore[attr-defined]
 
     async def arm(self) -> None:
@@ -193,7 +203,8 @@ class Trial:
         end = self.clock.now() + round(seconds * SECOND)
         while self.clock.now() < end:
             truth = self.rig.world.truth(self.clock.now())
-            self.path.append(((self.clock.now() - began) / SECOND, truth.x, truth.y, truth.v))
+            powered = any(self.rig.world.powered(self.clock.now()))
+            self.path.append(Look((self.clock.now() - began) / SECOND, truth.x, truth.y, truth.v, powered))
             await self.clock.sleep(STEP)
 
 
@@ -237,21 +248,20 @@ def _outcome(trial: Trial, began: int, answer: str) -> Outcome:
 
     events = [since(event.stamp) for event in trial.events if event.reason is Reason.UNCOMMANDED_MOTION]
     boxes = [since(stop.stamp) for stop in trial.stops if stop.reason is Reason.UNCOMMANDED_MOTION]
-    moving = [i for i, (_, _, _, speed) in enumerate(trial.path) if abs(speed) > STILL]
-    last = moving[-1] + 1 if moving else 0
-    stands = trial.path[last][0] if last < len(trial.path) else None
-    off = [since(read.stamp) for read in trial.modes if read.mode is DriveMode.DISABLED and since(read.stamp) > 0]
-    safe = [at for at in (stands, min(off, default=None)) if at is not None]
+    moving = [i for i, look in enumerate(trial.path) if abs(look.speed) > STILL]
+    driven = [i for i in moving if trial.path[i].powered]
+    last, over = (indices[-1] + 1 if indices else 0 for indices in (moving, driven))
+    safe = trial.path[over].at if over < len(trial.path) else None
     travelled = sum(
-        math.hypot(there[1] - here[1], there[2] - here[2])
+        math.hypot(there.x - here.x, there.y - here.y)
         for here, there in zip(trial.path[:last], trial.path[1 : last + 1], strict=False)
     )
     shown = [since(state.stamp) for state in trial.states if state.stopping]
     return Outcome(
-        speed=trial.path[0][3] if trial.path else 0.0,
+        speed=trial.path[0].speed if trial.path else 0.0,
         event=min(events, default=None),
         boxed=min(boxes, default=None),
-        safe=min(safe, default=None),
+        safe=safe,
         travelled=travelled,
         mode=trial.states[-1].mode if trial.states else GateMode.DISARMED,
         stopping=(shown[0], shown[-1]) if shown else (),
