@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from monstertruck_drivers.cable import MemoryPort
 from monstertruck_runtime.clock import VirtualClock, run_virtual
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.req import Order
@@ -20,6 +21,7 @@ from monstertruck_sim.world.world import World
 from monstertruckd.config.load import load_config
 from monstertruckd.tools.drill.campaign import LEG, Campaign, TrialOutcome, run_trials
 from monstertruckd.tools.drill.judge import WorldJudge
+from monstertruckd.tools.drill.observer import Observer
 from monstertruckd.tools.drill.random_drill import wired
 from monstertruckd.tools.drill.truck import DrillTruck, Wanderer
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
@@ -233,7 +235,7 @@ def test_devices_keep_their_own_time_while_the_computer_is_stalled() -> None:
             assert truck.gate.stamp <= began
             assert truck.gate.mode is GateMode.DRIVING
             assert not stopping.done()
-            await clock.sleep(0.3)
+            await clock.sleep(1.0)
             assert stopping.done()
             assert truck.gate.mode is GateMode.DISARMED
 
@@ -295,5 +297,47 @@ def test_the_families_of_a_running_truck_are_those_of_signals_in_use() -> None:
             found = {family.name for family in families(truck.rig.robot, used=True)}
             assert {"drive target_velocity ignored", "lidar range frozen", "steering target_0 late"} <= found
             assert "drive velocity_demand frozen" not in found, "the driver never reads it"
+
+    run_virtual(main)
+
+
+# A motor controller of a kind of one's own
+
+
+def own_drive() -> SimulatedTruckConfig:
+    """The demo's truck with a motor controller whose protocol nobody here knows."""
+    config = demo()
+    assert config.devices.drive is not None
+    driver = config.devices.drive.driver.model_copy(update={"kind": "own"})
+    drive = config.devices.drive.model_copy(update={"driver": driver})
+    return config.model_copy(update={"devices": config.devices.model_copy(update={"drive": drive})})
+
+
+def test_a_motor_controller_of_any_kind_is_judged_by_what_its_motors_do() -> None:
+    config = own_drive()
+
+    async def main(clock: VirtualClock) -> None:
+        world = World(config.sim.world, seed=1)
+        ports = {role: MemoryPort(role) for role in config.devices.present()}
+        observer = Observer(config, world, ports, clock)
+        watching = asyncio.create_task(observer.run())
+        world.motors[0].command(clock.now(), -10_000, 5e4)
+        await clock.sleep(1.0)
+        observer.begin(stops=True)
+        assert observer.stop_bytes_after() is None
+        await clock.sleep(0.2)
+        world.motors[0].command(clock.now(), 0.0, 5e4)
+        await clock.sleep(0.5)
+        after = observer.stop_bytes_after()
+        assert after is not None
+        assert 0.2 < after < 0.5
+        assert observer.violations() == ()
+        observer.disarm()
+        world.motors[0].command(clock.now(), -10_000, 5e4)
+        await clock.sleep(1.0)
+        assert "disarmed" in {violation.rule for violation in observer.violations()}
+        watching.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await watching
 
     run_virtual(main)

@@ -273,7 +273,7 @@ class _Leg:
         if not await truck.until(lambda: not truck.blockers(), TIMEOUT) or not await _arm(truck):
             return
         usual = set(
-            QUIET | OBSTACLE | {Reason.ESTOP_REQUESTED, Reason.LEASE_EXPIRED}
+            QUIET | OBSTACLE | {Reason.ESTOP_REQUESTED, Reason.ESTOPPED, Reason.LEASE_EXPIRED}
         )  # what is said while nothing is wrong
         draw = _Draw(truck, self._rng, self._workers)
         while len(self._outcomes) < self._leg.count:
