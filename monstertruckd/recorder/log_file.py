@@ -10,6 +10,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
+from mcap.data_stream import RecordBuilder
+from mcap.records import ChunkIndex
 from mcap.writer import CompressionType, Writer
 
 from monstertruck_runtime import wire
@@ -147,6 +149,7 @@ class LogFile:
                 chunk_size=chunk_size,
                 compression=_COMPRESSION[compression],
             )
+            _pack_indexes(self._writer)
             self._channels = Channels(self._writer)
             self._writer.start(library=f"monstertruckd {__version__}")
             self._writer.add_metadata("run", dict(metadata))
@@ -212,6 +215,44 @@ class LogFile:
     def abandon(self) -> None:
         """Close without an index; the file is repaired at the next start."""
         self._output.close()
+
+
+class _PackedIndex:
+    """The index of one chunk, as the bytes that end the file.
+
+    Args:
+        index: as the writer makes it.
+    """
+
+    __slots__ = ("_record",)
+
+    def __init__(self, index: ChunkIndex) -> None:
+        builder = RecordBuilder()
+        index.write(builder)
+        self._record: bytes = builder.end()  # type: ignore[no-untyped-call]
+
+    def write(self, builder: RecordBuilder) -> None:
+        """Put it into the summary."""
+        builder.write(self._record)
+
+
+class _PackedIndexes(list[_PackedIndex]):
+    """Indexes of chunks, packed when they are appended.
+
+    As the writer's objects those of two chunks a second with forty channels each grow by 0.34 MB a minute until the
+    recording ends; packed, by 0.06 MB.
+    """
+
+    def append(self, index: Any) -> None:
+        """Keep the bytes of an index."""
+        super().append(_PackedIndex(index))
+
+
+def _pack_indexes(writer: Writer) -> None:
+    """Let a writer keep its chunks' indexes packed until it writes them."""
+    name = "_Writer__chunk_indices"  # the writer offers no other way
+    assert getattr(writer, name) == []
+    setattr(writer, name, _PackedIndexes())
 
 
 class _Output:
