@@ -370,8 +370,7 @@ async def _try(
     ended = clock.now()
     await stopping
     reason, reason_s = _first_reason(truck, set(usual), began)
-    answered = Order.RESET if order is Order.ESTOP else None
-    recovered = await truck.until(lambda: not truck.blockers(), TIMEOUT, answered)
+    recovered = await truck.until(lambda: not truck.blockers(), TIMEOUT, Order.RESET)  # the gate may have stopped it
     seconds = (clock.now() - ended) / SECOND
     judge.look()
     judge.check_left()
