@@ -24,6 +24,10 @@ class InputError(TruckError):
     reason = Reason.BAD_INPUT
 
 
+class DamagedFileError(InputError):
+    """A file that a service stands on cannot be read; retrying cannot help."""
+
+
 class NotFoundError(TruckError):
     """A named file, key or robot does not exist."""
 

@@ -102,7 +102,7 @@ def write_save(
 ) -> Path | None:
     """Write a save with ``parts``, and with what the save before it holds and is not ``owned``.
 
-    Once this returns, the save outlasts a power cut. The save before, and the one before with a grid, are kept.
+    Once this returns, the save outlasts a power cut. The save before is kept, and one with the grid before.
 
     Args:
         folder: of the map.
@@ -130,11 +130,11 @@ def write_save(
         fresh = Path(tempfile.mkdtemp(dir=saves, suffix=SCRATCH))
         try:
             fresh.chmod(0o755)
-            for name, part in manifest.parts.items():
-                if before is not None and known.get(name) == part:
-                    _take_over(before / name, fresh / name)
-                else:
+            for name in manifest.parts:
+                if name in parts or before is None:
                     _write(fresh / name, parts[name])
+                else:
+                    _take_over(before / name, fresh / name)
             _write(fresh / MANIFEST, manifest.model_dump_json(indent=1).encode() + b"\n")
             sync_folder(fresh)
             number = max((int(path.name) for path in _numbered(saves)), default=0) + 1
@@ -274,15 +274,13 @@ def _take_over(old: Path, new: Path) -> None:
 
 
 def _prune(saves: Path) -> None:
-    """Remove all saves but the newest two, and the newest two with a grid."""
-    grids = 0
+    """Remove all saves but the newest two, and the newest ones of two grids that share no file."""
+    grids = set[int]()
     for age, path in enumerate(_numbered(saves)):
-        try:
-            grid = YAML in _manifest(path).parts
-        except InputError:
-            grid = False
-        grids += grid
-        if age >= 2 and not (grid and grids <= 2):
+        grid = {(path / YAML).stat().st_ino} if (path / YAML).exists() else set[int]()
+        another = len(grids) < 2 and not grid <= grids
+        grids |= grid
+        if age >= 2 and not another:
             doomed = path.rename(path.with_name(f"{path.name}{SCRATCH}"))  # no reader sees half a save
             shutil.rmtree(doomed)
 

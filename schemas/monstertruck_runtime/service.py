@@ -23,7 +23,7 @@ import numpy as np
 from pydantic import Field
 
 from monstertruck_runtime.clock import SECOND, Clock
-from monstertruck_runtime.errors import DeviceMismatchError, PortBusyError, TruckError
+from monstertruck_runtime.errors import DamagedFileError, DeviceMismatchError, PortBusyError, TruckError
 from monstertruck_runtime.ports import Ready
 from monstertruck_schemas.base import Schema
 from monstertruck_schemas.health import ServiceHealth, ServiceState
@@ -135,7 +135,7 @@ async def supervise(
         while now - restarts[0] > policy.window * SECOND:
             restarts.popleft()
         exhausted = policy.budget is not None and len(restarts) > policy.budget
-        if exhausted or isinstance(lost, DeviceMismatchError):
+        if exhausted or isinstance(lost, DeviceMismatchError | DamagedFileError):
             session.report_state(ServiceState.FAILED, lost.reason, detail)
             log.error("%s: given up: %s", service.name, detail)
             return

@@ -1,13 +1,22 @@
 """Localisation through the whole daemon: found on the right map by a second look, and outside of the wrong one."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from monstertruck_estimation.slam.storage import save
+from monstertruck_estimation.slam.worker_io import GridPatch
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import RequestRefusedError
-from monstertruck_schemas.health import LocalisationStatus
+from monstertruck_runtime.mailbox import latest
+from monstertruck_runtime.map_files import load_map
+from monstertruck_runtime.map_folders import SAVES
+from monstertruck_schemas import topics
+from monstertruck_schemas.health import LocalisationStatus, ServiceState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import BehaviourOrder
+from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 from tests.daemon.goal_kit import Trip, travel
 from tests.daemon.slam_kit import CONFIGS, Drive, driven, lap
 
@@ -33,6 +42,35 @@ def test_the_truck_finds_itself_on_its_map():
     reasons = {event.reason for event in drive.events}
     assert Reason.POSE_FOUND in reasons
     assert Reason.OUTSIDE_MAP not in reasons
+
+
+@pytest.mark.parametrize("harmed", [1, 2])
+def test_a_damaged_save_is_named_and_the_one_before_is_read_if_it_is_whole(tmp_path: Path, harmed: int):
+    world = load_map(CONFIGS / "worlds" / "loop.yaml")
+    for _ in range(2):
+        save(tmp_path, GridPatch(world.cells, world.origin, world.resolution), None)
+    for number in ("000002", "000001")[:harmed]:
+        (tmp_path / SAVES / number / "map.png").write_bytes(b"x")
+    said = []
+
+    async def story(rig: VirtualRig) -> None:
+        await rig.clock.sleep(2.0)
+        with rig.bus.subscribe(topics.HEALTH, latest()) as health:
+            await rig.clock.sleep(1.5)
+            assert health.latest is not None
+            said.extend(row for row in health.latest.services if row.name == "slam")
+
+    drive = driven("slam.yaml", story, slam={"mode": "localisation", "map": tmp_path})
+    (slam,) = said
+    if harmed == 1:
+        (text,) = {event.text for event in drive.events if event.reason is Reason.BAD_INPUT}
+        assert text.endswith("expected 1138 as in manifest.json; an older save is read")
+        assert drive.health
+        assert slam.state is ServiceState.READY
+    else:
+        assert (slam.state, slam.restarts, slam.reason) == (ServiceState.FAILED, 0, Reason.BAD_INPUT)
+        assert slam.detail.count("as in manifest.json") == 2
+        assert "Traceback" not in slam.detail
 
 
 def test_before_it_has_found_itself_it_takes_no_goal_and_no_mission():

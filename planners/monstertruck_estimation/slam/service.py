@@ -25,7 +25,7 @@ from monstertruck_estimation.transforms import planar
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.actors.actor import WorkerActor
 from monstertruck_runtime.clock import SECOND, Clock
-from monstertruck_runtime.errors import WorkerError
+from monstertruck_runtime.errors import DamagedFileError, WorkerError
 from monstertruck_runtime.mailbox import Mailbox
 from monstertruck_runtime.ports import EventSink, Publisher, Ready
 from monstertruck_schemas.base import Pose2D, Twist2D
@@ -156,6 +156,7 @@ class SlamService:
 
         Raises:
             WorkerError: the worker failed, hung or died; the next session begins a new map where the robot is now.
+            DamagedFileError: the saved map cannot be read.
         """
         config = self._config
         worker = WorkerActor(
@@ -176,7 +177,7 @@ class SlamService:
                     tasks.create_task(self._save_unscanned(worker))
                     if self._odometry is not None:
                         tasks.create_task(self._follow(self._odometry))
-            except* WorkerError as group:
+            except* (WorkerError, DamagedFileError) as group:
                 raise group.exceptions[0] from None
             finally:
                 await self._end(worker)
@@ -237,6 +238,8 @@ class SlamService:
             start = None if self._started else Start(self._config, self._start(inputs.odom), self._body, self._run)
             async with self._one_step:
                 outputs = await self._step(worker, self._work(inputs, start))
+            if outputs.unreadable is not None:
+                raise DamagedFileError(outputs.unreadable)
             self._started = True
             self._take(outputs, scan)
 

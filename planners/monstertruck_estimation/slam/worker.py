@@ -45,9 +45,12 @@ class SlamWorker:
         """Do one step's work.
 
         Raises:
-            InputError: the saved map is not readable, or no start came first.
+            InputError: no start came first.
         """
-        remarks = () if inputs.start is None else self._begin(inputs.start)
+        try:
+            remarks = () if inputs.start is None else self._begin(inputs.start)
+        except InputError as problem:
+            return WorkerOutput(unreadable=str(problem))
         estimator = self._estimator
         if estimator is None:
             raise InputError("estimation: expected a start before anything else")

@@ -165,3 +165,5 @@ class WorkerOutput:
     """After ``finish``: whether the joint registration was kept, for it agreed better than the graph."""
     remarks: tuple[str, ...] = ()
     """Remarks on the saved map read in this step."""
+    unreadable: str | None = None
+    """Why the saved map cannot be read; nothing else was done then."""

@@ -268,6 +268,8 @@ class PlanningStep:
     def __init__(self) -> None:
         self._setup: Setup | None = None
         self._map: StaticMap | None = None
+        self._without = Reason.NO_MAP, "no map yet"
+        """Why there is no map."""
         self._ground: Ground | None = None
         self._layers: tuple[Array, Array] | None = None
         """Tilt and roughness of the map's cells."""
@@ -280,7 +282,7 @@ class PlanningStep:
         """Do one task.
 
         Raises:
-            InputError: no setup came first, or the configured map is not readable.
+            InputError: no setup came first.
         """
         if task.setup is not None:
             self._set_up(task.setup)
@@ -291,7 +293,7 @@ class PlanningStep:
         if task.ground is not None:
             self._ground, self._layers = task.ground, None
         if self._map is None:
-            return PlanAnswer(Reason.NO_MAP, "no map yet")
+            return PlanAnswer(*self._without)
         places = [value for place in task.via for value in place if value is not None]
         numbers = np.array((*task.pose, *task.goal, *places))
         if not np.isfinite(numbers).all():
@@ -315,7 +317,11 @@ class PlanningStep:
         if setup.timed:
             self._now = processor_time
         if config.map is not None:
-            world = load_map(config.map)
+            try:
+                world = load_map(config.map)
+            except InputError as error:
+                self._without = error.reason, str(error)
+                return
             for remark in world.remarks:
                 log.warning("%s", remark)
             self._layers = None

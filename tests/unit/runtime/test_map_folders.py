@@ -46,17 +46,20 @@ def test_a_save_takes_over_what_its_run_saved_before_and_nothing_of_another_one(
     assert read(tmp_path) == {name: f"{name} b" for name in GRID} | {"ground.npz": "hard"}
 
 
-def test_parts_that_are_left_out_go_and_equal_ones_are_not_written_again(tmp_path: Path):
+def test_parts_that_are_left_out_go_and_those_taken_over_are_not_written_again(tmp_path: Path):
+    def file(number: int) -> int:
+        return (tmp_path / SAVES / f"{number:06d}" / YAML).stat().st_ino
+
     write_save(tmp_path, grid("a"), GRID, "one")
-    first = (tmp_path / SAVES / "000001" / YAML).stat().st_ino
+    write_save(tmp_path, {"points.json": b"[]"}, POINTS, "one")
+    assert file(2) == file(1)
     parts = grid("a")
     del parts["graph.npz"]
-    place = write_save(tmp_path, parts, GRID, "one")
-    assert place == tmp_path / SAVES / "000002"
-    assert (place / YAML).stat().st_ino == first
-    assert set(read(tmp_path)) == {YAML, "map.png"}
+    assert write_save(tmp_path, parts, GRID, "one") == tmp_path / SAVES / "000003"
+    assert file(3) != file(2), "damage to one does not harm the other"
+    assert set(read(tmp_path)) == {YAML, "map.png", "points.json"}
+    write_save(tmp_path, {}, POINTS, "one")
     assert write_save(tmp_path, {}, POINTS, "one", new=False) is None
-    assert saves(tmp_path) == ["000001", "000002"]
 
 
 def test_the_save_before_and_the_last_two_maps_are_kept(tmp_path: Path):
@@ -67,6 +70,9 @@ def test_the_save_before_and_the_last_two_maps_are_kept(tmp_path: Path):
         write_save(tmp_path, {"points.json": b"[]"}, POINTS, "d")
     assert saves(tmp_path) == ["000002", "000003", "000005", "000006"]
     assert read(tmp_path)[YAML] == f"{YAML} c"
+    for _ in range(3):
+        write_save(tmp_path, {"points.json": b"[]"}, POINTS)
+    assert saves(tmp_path) == ["000002", "000008", "000009"], "one whose grid is another file"
 
 
 @pytest.mark.parametrize("name", [*GRID, MANIFEST])

@@ -9,7 +9,14 @@ import numpy as np
 import pytest
 
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
-from monstertruck_runtime.errors import DeviceLostError, DeviceMismatchError, PortBusyError, WrongDeviceError
+from monstertruck_runtime.errors import (
+    DamagedFileError,
+    DeviceLostError,
+    DeviceMismatchError,
+    PortBusyError,
+    TruckError,
+    WrongDeviceError,
+)
 from monstertruck_runtime.ports import Ready
 from monstertruck_runtime.service import OnBug, RestartPolicy, scope, supervise
 from monstertruck_schemas.health import ServiceHealth, ServiceState
@@ -86,14 +93,17 @@ def test_a_session_that_settled_starts_the_delays_anew():
     assert starts == pytest.approx([0, 1, 3, 24, 26])
 
 
-def test_a_mismatch_is_never_retried():
-    def mismatch(_: Ready) -> None:
-        raise DeviceMismatchError("motor type 10, expected 1")
+@pytest.mark.parametrize(
+    ("error", "reason"), [(DeviceMismatchError, Reason.DEVICE_MISMATCH), (DamagedFileError, Reason.BAD_INPUT)]
+)
+def test_a_mismatch_and_a_damaged_file_are_never_retried(error: type[TruckError], reason: Reason):
+    def refuse(_: Ready) -> None:
+        raise error("motor type 10, expected 1")
 
-    health, starts = run(mismatch)
+    health, starts = run(refuse)
     assert len(starts) == 1
     assert health[-1].state is ServiceState.FAILED
-    assert health[-1].reason is Reason.DEVICE_MISMATCH
+    assert health[-1].reason is reason
 
 
 def test_an_exhausted_budget_gives_up():

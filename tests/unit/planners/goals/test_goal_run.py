@@ -1,6 +1,7 @@
 """Decisions about goals, backing out, the way ahead, and the planning step."""
 
 import math
+import pathlib
 from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
@@ -435,6 +436,15 @@ def test_a_valid_route_is_kept():
     assert again.kept
     assert again.poses is not None
     assert np.allclose(again.poses[0], (1.5, 1.52, 0.02))
+
+
+def test_a_map_that_cannot_be_read_is_named_until_there_is_another_one(tmp_path: pathlib.Path):
+    (tmp_path / "map.yaml").write_text("image: [")
+    step = PlanningStep()
+    answer = step.step(task(setup=setup(map=tmp_path / "map.yaml")))
+    assert (answer.reason, answer.poses) == (Reason.BAD_INPUT, None)
+    assert str(tmp_path / "map.yaml") in answer.text
+    assert step.step(task(grid=hall())).reason is Reason.OK
 
 
 def test_goals_without_a_way_and_what_is_missing():
