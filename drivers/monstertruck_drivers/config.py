@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Generic, Self, TypeVar
 from pydantic import Discriminator, Field, Tag, create_model, model_validator
 
 from monstertruck_drivers.catalog import DEVICES, DeviceKind, Duty, RoleSpec
+from monstertruck_drivers.computer import Sysfs
 from monstertruck_drivers.link import BAUD
 from monstertruck_drivers.usb.config import Baud, UsbPortConfig
 from monstertruck_drivers.usb.tree import place
@@ -89,6 +90,19 @@ class _Devices(Schema):
     def present(self) -> dict[str, Device[Any]]:
         """The devices that are configured, by role."""
         return dict(_present(self))
+
+    def ports(self, sysfs: Sysfs) -> dict[str, AnyPort]:
+        """Ports by role; of those by hub, the hub by the kernel's present name."""
+        return {
+            role: device.port.at_this_boot(sysfs) if isinstance(device.port, UsbPortConfig) else device.port
+            for role, device in self.present().items()
+        }
+
+    def at_this_boot(self, sysfs: Sysfs) -> Self:
+        """The same with the ports of ``ports``."""
+        ports = self.ports(sysfs)
+        moved = {role: device.model_copy(update={"port": ports[role]}) for role, device in self.present().items()}
+        return self.model_copy(update=moved)
 
     def shafts(self) -> dict[str, Device[Any]]:
         """The controllers of the driven shafts, by shaft; one may be there for several."""

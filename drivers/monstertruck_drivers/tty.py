@@ -319,8 +319,14 @@ class _SerialProtocol(asyncio.Protocol):
             self._give_up()
             return
         if self._transport.get_write_buffer_size() == 0:
-            with contextlib.suppress(OSError):  # not one byte fits, or the tty is lost: the transport finds out
+            try:
                 data = data[os.write(self._tty.fileno(), data) :]
+            except BlockingIOError:  # not one byte fits
+                pass
+            except OSError as error:  # the transport would call it a fatal error of ours
+                self.link.lose(f"unplugged ({error.strerror})")
+                self._hang_up()
+                return
             self._full_since = now
         if data:
             self._transport.write(data)

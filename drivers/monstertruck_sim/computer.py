@@ -1,16 +1,17 @@
 """The emulated computer of a simulated truck: hubs, ports and nodes as its configuration names them."""
 
 import asyncio
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from itertools import count
 from pathlib import Path
 
 from monstertruck_drivers.cable import DeviceEnd, EmulatedPort
 from monstertruck_drivers.catalog import UsbIdentity
 from monstertruck_drivers.computer import Computer, Disk
-from monstertruck_drivers.config import Devices
+from monstertruck_drivers.config import AnyPort, Devices
 from monstertruck_drivers.usb.config import UsbPortConfig
 from monstertruck_drivers.usb.emulated import EmulatedUsb
-from monstertruck_drivers.usb.tree import ancestors
+from monstertruck_drivers.usb.tree import ancestors, is_topology, sort_key
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import InputError
 
@@ -55,6 +56,23 @@ class UsbCable:
         self._usb.unplug(self._where)
 
 
+def _buses(ports: Iterable[AnyPort]) -> dict[str, int]:
+    """Numbers of buses that no kernel's name uses, by the controllers of names by topology."""
+    hubs = [port.hub for port in ports if isinstance(port, UsbPortConfig)]
+    controllers = sorted({hub.rpartition("-usb-0:")[0] for hub in hubs if is_topology(hub)})
+    taken = {sort_key(hub)[0] for hub in hubs if not is_topology(hub)}
+    return dict(zip(controllers, (bus for bus in count(1) if bus not in taken), strict=False))
+
+
+def _by_kernel(port: UsbPortConfig, buses: Mapping[str, int]) -> UsbPortConfig:
+    """A port by the names that the emulated kernel gives."""
+    if not is_topology(port.hub):
+        return port
+    controller, _, ports = port.hub.rpartition("-usb-0:")
+    bus = buses[controller]
+    return port.model_copy(update={"hub": f"usb{bus}" if ports == "0" else f"{bus}-{ports}"})
+
+
 class EmulatedComputer:
     """The USB tree of every device that hangs by hub and port.
 
@@ -72,8 +90,10 @@ class EmulatedComputer:
         self.usb = EmulatedUsb(folder)
         self.ports: dict[str, EmulatedPort] = dict(cables)
         """Cables that are plugged and pulled, by role."""
+        buses = _buses(device.port for device in devices.present().values())
+        self.usb.controllers |= {bus: controller.partition("-")[2] for controller, bus in buses.items()}
         places = {
-            role: (device.port, device.kind)
+            role: (_by_kernel(device.port, buses), device.kind)
             for role, device in devices.present().items()
             if isinstance(device.port, UsbPortConfig)
         }

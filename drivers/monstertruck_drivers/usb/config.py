@@ -6,7 +6,8 @@ from typing import Annotated, Self
 from pydantic import Field, model_validator
 
 from monstertruck_drivers.catalog import start_order, started_apart
-from monstertruck_drivers.usb.tree import device_name
+from monstertruck_drivers.computer import Sysfs
+from monstertruck_drivers.usb.tree import at_this_boot, device_name, parent_of, port_of
 from monstertruck_schemas.base import Schema
 
 Seconds = Annotated[float, Field(ge=0, le=60)]
@@ -17,8 +18,11 @@ Baud = Annotated[int, Field(ge=4800, le=1_000_000)]
 class UsbPortConfig(Schema):
     """A device by hub and port: the place stays when ttyUSB numbers change."""
 
-    hub: Annotated[str, Field(pattern=r"^(usb[0-9]+|[0-9]+-[0-9]+(\.[0-9]+)*)$")]
-    """Kernel's name of the hub (``monstertruckd usb`` shows it): "1-1", or "usb1" for a root hub"""
+    hub: Annotated[
+        str, Field(pattern=r"^(usb[0-9]+|[0-9]+-[0-9]+(\.[0-9]+)*|[a-zA-Z][^\s/\"]*-usb-0:(0|[0-9]+(\.[0-9]+)*))$")
+    ]
+    """The hub by topology, as ``find-port`` writes it: "pci-0000:00:14.0-usb-0:1", with "usb-0:0" for a root hub; or \
+its kernel's name, which may change with the next boot: "1-1", or "usb1" for a root hub"""
     port: Annotated[int, Field(ge=1, le=31)]
     """Port of that hub"""
     interface: Annotated[int, Field(ge=0, le=31)] = 0
@@ -38,6 +42,13 @@ class UsbPortConfig(Schema):
     def device(self) -> str:
         """Kernel's name of whatever is plugged in there."""
         return device_name(self.hub, self.port)
+
+    def at_this_boot(self, sysfs: Sysfs) -> Self:
+        """The same place by the kernel's present names; itself if its controller is not there."""
+        name = at_this_boot(sysfs, self.device)
+        if name == self.device:
+            return self
+        return self.model_copy(update={"hub": str(parent_of(name)), "port": port_of(name)})
 
 
 class CycleMethod(StrEnum):

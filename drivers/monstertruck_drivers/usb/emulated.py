@@ -80,6 +80,8 @@ class EmulatedUsb:
         """Attributes that may not be written, as for a user without rights: ``latency_timer`` ..."""
         self.busy_numbers: set[int] = set()
         """Node numbers still taken by a process that has a vanished node open."""
+        self.controllers: dict[int, str] = {}
+        """Controllers of buses, as root hubs give them for their serial number."""
         self.commands: list[Sequence[str]] = []
         """Programs that were run."""
         self._devices: dict[str, _HubOrDevice] = {}
@@ -95,10 +97,7 @@ class EmulatedUsb:
 
     def add_hub(self, name: str, *, ports: int = 4) -> None:
         """Create a hub and plug it in; root hubs come by themselves."""
-        hub = parent_of(name)
-        if hub is not None and hub.startswith("usb") and hub not in self._devices:
-            self._devices[hub] = _HubOrDevice(hub, "1d6b:0002", "xHCI Host Controller", None, ports=8)
-            self.plug(hub)
+        self._add_root(parent_of(name))
         self._devices[name] = _HubOrDevice(name, "05e3:0608", "USB2.0 Hub", None, ports=ports)
         self.plug(name)
 
@@ -124,8 +123,16 @@ class EmulatedUsb:
             serial: serial number.
             cable: what a serial node leads to.
         """
+        self._add_root(parent_of(name))
         self._devices[name] = _HubOrDevice(name, usb_id, title, serial, node=node, interface=interface, cable=cable)
         self.plug(name)
+
+    def _add_root(self, hub: str | None) -> None:
+        """Create a root hub that is not there yet."""
+        if hub is not None and hub.startswith("usb") and hub not in self._devices:
+            controller = self.controllers.get(int(hub.removeprefix("usb")))
+            self._devices[hub] = _HubOrDevice(hub, "1d6b:0002", "xHCI Host Controller", controller, ports=8)
+            self.plug(hub)
 
     def knows(self, name: str) -> bool:
         """Whether such a hub or device exists, plugged in or not."""
@@ -200,6 +207,15 @@ class EmulatedUsb:
         device.name = to
         self._devices[to] = device
         self.plug(to)
+
+    def claim(self, name: str) -> None:
+        """A program takes the interface of a device's node through usbfs, as brltty does: the node goes."""
+        device = self._devices[name]
+        self._unbind(device)
+        interface = f"{name}:1.{device.interface}"
+        self._write(f"{DEVICES}/{interface}", {"uevent": "DEVTYPE=usb_interface\nDRIVER=usbfs"})
+        (self.sysfs.root / DEVICES / name / interface).symlink_to(Path("..") / interface)
+        self.watcher.announce()
 
     def over_current(self, name: str) -> None:
         """The port ``name`` hangs on draws too much and says so."""

@@ -6,7 +6,16 @@ from monstertruck_drivers.computer import Machine, Sysfs
 from monstertruck_drivers.link import BAUD, Link
 from monstertruck_drivers.usb.config import CycleMethod, PowerConfig, UsbPortConfig
 from monstertruck_drivers.usb.hub import HubCoordinator
-from monstertruck_drivers.usb.tree import DEVICES, Node, parent_of, place, port_directory, port_of, read_device
+from monstertruck_drivers.usb.tree import (
+    DEVICES,
+    Node,
+    UsbDevice,
+    parent_of,
+    place,
+    port_directory,
+    port_of,
+    read_device,
+)
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import (
     BusyError,
@@ -91,9 +100,9 @@ class PortPower:
             if method is CycleMethod.UHUBCTL:
                 await self._cycle_by_uhubctl(name)
             elif method is CycleMethod.PORT:
-                await self._toggle(f"{port_directory(name)}/disable", "1", "0", self.config.off_time)
+                await self._toggle(await self._halves(name), "1", "0", self.config.off_time)
             else:
-                await self._toggle(f"{DEVICES}/{name}/authorized", "0", "1", SETTLED)
+                await self._toggle([f"{DEVICES}/{name}/authorized"], "0", "1", SETTLED)
         except OSError as error:
             raise DeviceError(f"{place(name)} cannot be switched by {method.value!r}: {error}") from error
         self._events(
@@ -106,12 +115,11 @@ class PortPower:
         Raises:
             DeviceError: the machine refused.
         """
-        machine = self._machine
         try:
             if self.config.method is CycleMethod.UHUBCTL:
                 await self._uhubctl(name, "off")
             else:
-                await machine.offload(lambda: machine.sysfs.write(f"{port_directory(name)}/disable", "1"))
+                await self._write_all(await self._halves(name), "1")
         except OSError as error:
             raise DeviceError(f"{place(name)} cannot be switched off: {error}") from error
         self._events(Reason.PORT_OFF, Severity.WARNING, "usb", f"{place(name)} was switched off, and stays off")
@@ -128,13 +136,28 @@ class PortPower:
                 raise BusyError(f"{place(name)} was switched just now; again in {left:.1f} s")
         self._cycles[name] = (min(count + 1, LONGEST_PAUSE), now)
 
-    async def _toggle(self, attribute: str, off: str, on: str, seconds: float) -> None:
-        machine = self._machine
-        await machine.offload(lambda: machine.sysfs.write(attribute, off))
+    async def _halves(self, name: str) -> list[str]:
+        """Attributes of the port: a USB 3 hub is two hubs to the kernel, and power is off once both ports are."""
+        sysfs, port = self._machine.sysfs, port_directory(name)
+        peer = f"{port}/peer/disable"
+        there = await self._machine.offload(lambda: sysfs.text(peer))
+        return [f"{port}/disable", *([peer] if there is not None else [])]
+
+    async def _write_all(self, attributes: list[str], value: str) -> None:
+        sysfs = self._machine.sysfs
+
+        def write() -> None:
+            for attribute in attributes:
+                sysfs.write(attribute, value)
+
+        await self._machine.offload(write)
+
+    async def _toggle(self, attributes: list[str], off: str, on: str, seconds: float) -> None:
+        await self._write_all(attributes, off)
         try:
-            await machine.clock.sleep(seconds)
+            await self._machine.clock.sleep(seconds)
         finally:
-            await machine.offload(lambda: machine.sysfs.write(attribute, on))
+            await self._write_all(attributes, on)
 
     async def _cycle_by_uhubctl(self, name: str) -> None:
         """Off and on by one run each: its own ``cycle``, ended between them, would leave the port without power."""
@@ -149,6 +172,20 @@ class PortPower:
         code, output = await self._machine.run(["uhubctl", "-l", hub, "-p", str(port_of(name)), "-a", action])
         if code:
             raise DeviceError(f"{place(name)}: uhubctl failed with {code}: {output}")
+
+
+BRAILLE: Final = frozenset(("0403:6001", "10c4:ea60", "1a86:7523"))
+"""Adapters that brltty of Ubuntu 22.04 takes for braille displays."""
+
+
+def why_no_node(device: UsbDevice, kind: str, interface: int) -> str:
+    """Why a device that is plugged in has no node, in words."""
+    who = f"{device.usb_id} {device.title}".rstrip()
+    if interface not in device.held:
+        return f"{who} has no {kind} at interface {interface}"
+    text = f"{who}: a program holds interface {interface} through usbfs, so that it has no {kind}"
+    brltty = "; brltty does that with such adapters, and install-service prevents it"
+    return text + brltty * (device.usb_id in BRAILLE)
 
 
 OPEN_TIMEOUT: Final = 2.0
@@ -210,9 +247,7 @@ class HubNode:
             )
         node = device.find(self._kind, config.interface)
         if node is None:
-            raise DeviceLostError(
-                f"{self.name}: {device.usb_id} {device.title} has no {self._kind} at interface {config.interface}"
-            )
+            raise DeviceLostError(f"{self.name}: {why_no_node(device, self._kind, config.interface)}")
         return node
 
 

@@ -2,6 +2,9 @@
 
 Names are the kernel's: ``usb1`` is the root hub of bus 1, ``1-2`` hangs on its port 2, ``1-2.3`` on port 3 of the
 hub there; ``1-2.3:1.0`` is interface 0 of that device in configuration 1, and ``1-2:1.0/1-2-port3`` the port itself.
+
+Numbers of buses follow the order in which their controllers were found, which may differ between two boots. Names by
+topology do not change: udev's ``ID_PATH`` names the controller instead, as in ``pci-0000:00:14.0-usb-0:2.3``.
 """
 
 import re
@@ -15,6 +18,8 @@ HUB_CLASS = 0x09
 
 _ROOT = re.compile(r"usb(\d+)")
 _DEVICE = re.compile(r"(\d+)-(\d+(?:\.\d+)*)")
+_PCI = re.compile(r"[0-9a-f]{4,}:[0-9a-f]{2}:[0-9a-f]{2}\.[0-9a-f]")
+_BY_TOPOLOGY = re.compile(r"(?P<controller>[^ ]+)-usb-0:(?P<ports>0|[0-9]+(?:\.[0-9]+)*)")
 _INTERFACE = re.compile(r"(?P<device>\d+-\d+(?:\.\d+)*):\d+\.(?P<number>\d+)")
 _USB_SERIAL = re.compile(r"ttyUSB\d+")
 _PORT = re.compile(r".+-port(\d+)")
@@ -48,6 +53,8 @@ class UsbDevice:
     serial: str | None
     autosuspend: bool
     nodes: tuple[Node, ...]
+    held: frozenset[int] = frozenset()
+    """Interfaces that a program has taken from the kernel's drivers, through usbfs."""
 
     def find(self, kind: str, interface: int = 0) -> Node | None:
         """First node of ``kind`` on ``interface``."""
@@ -71,11 +78,18 @@ class TreeSnapshot:
 def device_name(hub: str, port: int) -> str:
     """Name of whatever hangs on ``port`` of ``hub``."""
     root = _ROOT.fullmatch(hub)
+    if topology := _BY_TOPOLOGY.fullmatch(hub):
+        ports = str(port) if topology["ports"] == "0" else f"{topology['ports']}.{port}"
+        return f"{topology['controller']}-usb-0:{ports}"
     return f"{root[1]}-{port}" if root else f"{hub}.{port}"
 
 
 def parent_of(name: str) -> str | None:
     """Name of the hub ``name`` hangs on; None for a root hub."""
+    if topology := _BY_TOPOLOGY.fullmatch(name):
+        if topology["ports"] == "0":
+            return None
+        return f"{topology['controller']}-usb-0:{topology['ports'].rpartition('.')[0] or '0'}"
     bus, dash, ports = name.partition("-")
     if not dash:
         return None
@@ -92,7 +106,7 @@ def ancestors(name: str) -> Iterator[str]:
 
 def port_of(name: str) -> int:
     """Port of the parent that ``name`` hangs on; 0 for a root hub."""
-    return int(re.split(r"[.-]", name)[-1]) if "-" in name else 0
+    return int(re.split(r"[.:-]", name)[-1]) if "-" in name else 0
 
 
 def place(name: str) -> str:
@@ -118,18 +132,52 @@ def sort_key(name: str) -> tuple[int, ...]:
     return tuple(int(number) for number in re.findall(r"\d+", name))
 
 
+def is_topology(name: str) -> bool:
+    """Whether a name is one by topology, not the kernel's."""
+    return _BY_TOPOLOGY.fullmatch(name) is not None
+
+
+def topology_of(sysfs: Sysfs, name: str) -> str:
+    """The name by topology of a place; the kernel's where its controller is unknown."""
+    root = next((hub for hub in ancestors(name) if _ROOT.fullmatch(hub)), name)
+    controller = sysfs.text(f"{DEVICES}/{root}/serial")
+    if not controller:
+        return name
+    kind = "pci" if _PCI.fullmatch(controller) else "platform"
+    return f"{kind}-{controller}-usb-0:{'0' if root == name else name.partition('-')[2]}"
+
+
+def at_this_boot(sysfs: Sysfs, name: str) -> str:
+    """The kernel's present name of a place that is named by topology; ``name`` itself where it is none, or not there.
+
+    A controller of USB 3 has two root hubs: the one where something is there, else the one of USB 2.
+    """
+    topology = _BY_TOPOLOGY.fullmatch(name)
+    if topology is None:
+        return name
+    roots = [
+        (sysfs.number(f"{DEVICES}/{root}/speed") or 0, root)
+        for root in sysfs.names(DEVICES)
+        if _ROOT.fullmatch(root) and f"-{topology['controller']}".endswith(f"-{sysfs.text(f'{DEVICES}/{root}/serial')}")
+    ]
+    ports = topology["ports"]
+    places = [root if ports == "0" else f"{root[3:]}-{ports}" for _, root in sorted(roots)]
+    there = (place for place in places if sysfs.text(f"{DEVICES}/{place}/devnum") is not None)
+    return next(there, places[0] if places else name)
+
+
 def read_tree(sysfs: Sysfs) -> TreeSnapshot:
     """Read every hub and device. Devices that vanish while being read are left out."""
     entries = sysfs.names(DEVICES)
-    interfaces: dict[str, list[Node]] = {}
+    interfaces: dict[str, list[str]] = {}
     for entry in entries:
         if match := _INTERFACE.fullmatch(entry):
-            interfaces.setdefault(match["device"], []).extend(_nodes(sysfs, entry, int(match["number"])))
+            interfaces.setdefault(match["device"], []).append(entry)
     names = [entry for entry in entries if _ROOT.fullmatch(entry) or _DEVICE.fullmatch(entry)]
     devices = {}
     over_current: dict[str, int] = {}
     for name in sorted(names, key=sort_key):
-        device = _read_device(sysfs, name, tuple(interfaces.get(name, ())))
+        device = _read_device(sysfs, name, interfaces.get(name, []))
         if device is not None:
             devices[name] = device
             if device.hub:
@@ -139,14 +187,11 @@ def read_tree(sysfs: Sysfs) -> TreeSnapshot:
 
 def read_device(sysfs: Sysfs, name: str) -> UsbDevice | None:
     """Read one device; None if there is none."""
-    nodes: list[Node] = []
-    for entry in sysfs.names(f"{DEVICES}/{name}"):
-        if match := _INTERFACE.fullmatch(entry):
-            nodes += _nodes(sysfs, entry, int(match["number"]))
-    return _read_device(sysfs, name, tuple(nodes))
+    entries = sysfs.names(f"{DEVICES}/{name}")
+    return _read_device(sysfs, name, [entry for entry in entries if _INTERFACE.fullmatch(entry)])
 
 
-def _read_device(sysfs: Sysfs, name: str, nodes: tuple[Node, ...]) -> UsbDevice | None:
+def _read_device(sysfs: Sysfs, name: str, interfaces: list[str]) -> UsbDevice | None:
     path = f"{DEVICES}/{name}"
     devnum = sysfs.number(f"{path}/devnum")
     vendor, product = sysfs.text(f"{path}/idVendor"), sysfs.text(f"{path}/idProduct")
@@ -160,8 +205,17 @@ def _read_device(sysfs: Sysfs, name: str, nodes: tuple[Node, ...]) -> UsbDevice 
         title=sysfs.text(f"{path}/product") or "",
         serial=sysfs.text(f"{path}/serial"),
         autosuspend=sysfs.text(f"{path}/power/control") == "auto",
-        nodes=nodes,
+        nodes=tuple(node for entry in interfaces for node in _nodes(sysfs, entry, _number(entry))),
+        held=frozenset(
+            _number(entry)
+            for entry in interfaces
+            if "DRIVER=usbfs" in (sysfs.text(f"{DEVICES}/{entry}/uevent") or "").splitlines()
+        ),
     )
+
+
+def _number(interface: str) -> int:
+    return int(interface.rpartition(".")[2])
 
 
 def _nodes(sysfs: Sysfs, entry: str, interface: int) -> Iterator[Node]:

@@ -7,7 +7,16 @@ from typing import Final
 from monstertruck_drivers.catalog import DEVICES
 from monstertruck_drivers.computer import Machine
 from monstertruck_drivers.usb.config import UsbPortConfig
-from monstertruck_drivers.usb.tree import TreeSnapshot, UsbDevice, parent_of, place, port_of, read_device, read_tree
+from monstertruck_drivers.usb.tree import (
+    TreeSnapshot,
+    UsbDevice,
+    parent_of,
+    place,
+    port_of,
+    read_device,
+    read_tree,
+    topology_of,
+)
 from monstertruck_runtime.errors import ConfigError, InputError, NoAnswerError
 from monstertruck_runtime.small_files import replace_file
 from monstertruckd.config.load import YamlText
@@ -45,9 +54,10 @@ async def find_cable(role: str, machine: Machine, say: Callable[[str], None], ti
         say("still not plugged in there; the port counts all the same")
     node = device.nodes[0]
     kinds = DEVICES.of_role(role)
+    name = await machine.offload(lambda: topology_of(machine.sysfs, device.name))
     return UsbPortConfig(
-        hub=str(parent_of(device.name)),
-        port=port_of(device.name),
+        hub=str(parent_of(name)),
+        port=port_of(name),
         interface=node.interface,
         baud=kinds[0].baud if kinds else None,
         usb_id=device.usb_id,

@@ -180,7 +180,8 @@ class HostContext:
         if not isinstance(port, UsbPortConfig):
             path = self.at(port.path)
             return path if path.exists() else None
-        device = read_device(self.computer.machine.sysfs, port.device)
+        sysfs = self.computer.machine.sysfs
+        device = read_device(sysfs, port.at_this_boot(sysfs).device)
         found = device.find("video4linux" if camera else "tty", port.interface) if device is not None else None
         return self.computer.machine.dev / found.name if found is not None else None
 

@@ -9,7 +9,7 @@ from monstertruck_drivers.catalog import DeviceKind
 from monstertruck_drivers.config import AnyPort, Device
 from monstertruck_drivers.link import BAUD
 from monstertruck_drivers.usb.config import UsbPortConfig
-from monstertruck_drivers.usb.port import HubPort
+from monstertruck_drivers.usb.port import HubPort, why_no_node
 from monstertruck_drivers.usb.tree import DEVICES, Node, TreeSnapshot, UsbDevice, ancestors, place, read_tree
 from monstertruck_runtime.errors import DeviceError, PortBusyError, WrongDeviceError
 from monstertruck_schemas.base import Schema
@@ -27,8 +27,9 @@ def wiring(context: HostContext) -> Iterator[Finding]:
     """Every configured device: its port, latency and power saving."""
     if context.config is None:
         return
-    tree = read_tree(context.computer.machine.sysfs)
-    devices = context.config.devices.present()
+    sysfs = context.computer.machine.sysfs
+    tree = read_tree(sysfs)
+    devices = context.config.devices.at_this_boot(sysfs).present()
     taken = {device.port.device for device in devices.values() if isinstance(device.port, UsbPortConfig)}
     for role, device in devices.items():
         if isinstance(device.port, UsbPortConfig):
@@ -64,11 +65,21 @@ def _by_hub(
         yield fail(role, Reason.DEVICE_WRONG, seen, context.find_port_command(role))
     elif (node := found.find("video4linux" if video else "tty", port.interface)) is None:
         module = "uvcvideo" if video else MODULES.get(found.usb_id[:4], "cdc_acm")
-        seen = f"{where}: {found.usb_id} {found.title} has no node at interface {port.interface}"
-        yield fail(role, Reason.DEVICE_LOST, seen, f"sudo modprobe {module}")
+        seen = f"{where}: {why_no_node(found, 'node', port.interface)}"
+        if port.interface in found.held:
+            yield fail(role, Reason.DEVICE_BUSY, seen, _holder(context, found))
+        else:
+            yield fail(role, Reason.DEVICE_LOST, seen, f"sudo modprobe {module}")
     else:
         yield fine(role, f"{where}: {found.usb_id} {found.title} as {node.name}")
         yield from _settings(role, port, found, node)
+
+
+def _holder(context: HostContext, device: UsbDevice) -> str:
+    """Command that gets rid of, or shows, the program that holds a device through usbfs."""
+    if context.runs("brltty"):
+        return "sudo apt-get remove brltty"
+    return f"sudo fuser -v /dev/bus/usb/{int(device.name.partition('-')[0]):03d}/{device.devnum:03d}"
 
 
 def _absent(context: HostContext, tree: TreeSnapshot, role: str, port: UsbPortConfig, taken: set[str]) -> Finding:
@@ -107,7 +118,7 @@ async def handshakes(context: HostContext) -> AsyncIterator[Finding]:
         return
     plugged = {
         role: (device, node)
-        for role, device in context.config.devices.present().items()
+        for role, device in context.config.devices.at_this_boot(context.computer.machine.sysfs).present().items()
         if (node := context.node(device.port, camera=device.kind.opens == "video")) is not None
     }
     for found in await asyncio.gather(*(_handshake(context, role, *ends) for role, ends in plugged.items())):

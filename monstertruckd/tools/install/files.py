@@ -10,7 +10,7 @@ from typing import Final, Self
 from monstertruck_drivers.config import AnyPort
 from monstertruck_drivers.epos.config import EposConfig
 from monstertruck_drivers.usb.config import CycleMethod, UsbPortConfig
-from monstertruck_drivers.usb.tree import place, port_directory
+from monstertruck_drivers.usb.tree import is_topology, place, port_directory
 from monstertruck_runtime.errors import InputError, NotFoundError
 from monstertruckd.config.truck import TruckConfig
 from monstertruckd.tools.shipped import shipped
@@ -169,26 +169,42 @@ def _devices(config: TruckConfig) -> Iterator[str]:
 
 def _device(role: str, port: UsbPortConfig, method: CycleMethod | None, *, camera: bool) -> Iterator[str]:
     """Rules of one device; by its interface's name, as a hub in its port must not pass for it."""
-    whole = f'SUBSYSTEM=="usb", ENV{{DEVTYPE}}=="usb_device", KERNEL=="{port.device}"'
-    interface = f'KERNELS=="{port.device}:*.{port.interface}"'
+    device, by_topology = port.device, is_topology(port.device)
+    # What stands before the controller in udev's name depends on the board; the bus is no part of it.
+    itself, key = (
+        (f'ENV{{ID_PATH}}=="*{device}"', "ENV{ID_PATH}") if by_topology else (f'KERNEL=="{device}"', "KERNELS")
+    )
+    any_interface = f'{key}=="{"*" * by_topology}{device}:*"'
+    interface = any_interface.replace(":*", f":*.{port.interface}")
+    whole = f'SUBSYSTEM=="usb", ENV{{DEVTYPE}}=="usb_device", {itself}'
     identity = ""
     if port.usb_id is not None:
         vendor, product = port.usb_id.split(":")
         identity = f', ENV{{ID_VENDOR_ID}}=="{vendor}", ENV{{ID_MODEL_ID}}=="{product}"'
-    yield f'{whole}, ENV{{ID_MM_DEVICE_IGNORE}}="1", ATTR{{power/control}}="on"'
+    yield f'{whole}, ENV{{ID_MM_DEVICE_IGNORE}}="1", ENV{{PRODUCT}}="truck/{role}", ATTR{{power/control}}="on"'
     if camera:
         # A camera has several nodes; the first one gives the pictures.
         yield f'SUBSYSTEM=="video4linux", {interface}, ATTR{{index}}=="0"{identity}, SYMLINK+="truck/{role}"'
     else:
-        yield f'SUBSYSTEM=="tty", KERNELS=="{port.device}:*", ENV{{ID_MM_PORT_IGNORE}}="1"'
+        yield f'SUBSYSTEM=="tty", {any_interface}, ENV{{ID_MM_PORT_IGNORE}}="1"'
         yield f'SUBSYSTEM=="tty", {interface}{identity}, SYMLINK+="truck/{role}"'
         latency = f'SUBSYSTEM=="usb-serial", DRIVER=="ftdi_sio", {interface}'
         yield f'{latency}, ATTR{{latency_timer}}="{port.latency_ms}", {_writable("latency_timer")}'
     if method is CycleMethod.AUTHORIZED:
         yield f"{whole}, {_writable('authorized')}"
     elif method is CycleMethod.PORT:
-        *_, hub, switch = port_directory(port.device).split("/")
-        yield f'SUBSYSTEM=="usb", ENV{{DEVTYPE}}=="usb_interface", KERNEL=="{hub}", {_writable(f"{switch}/disable")}'
+        yield from _switch(port)
+
+
+def _switch(port: UsbPortConfig) -> Iterator[str]:
+    """Rules by which the daemon may switch a port off: those of its hub, and of the other half of a USB 3 hub."""
+    hub = f'ENV{{ID_PATH}}=="*{port.hub}:1.0"'
+    if not is_topology(port.device):
+        hub = f'KERNEL=="{port_directory(port.device).split("/")[-2]}"'
+    whole = f'SUBSYSTEM=="usb", ENV{{DEVTYPE}}=="usb_interface", {hub}'
+    for switch in (f"*-port{port.port}/disable", f"*-port{port.port}/peer/disable"):
+        command = f"for file in /sys%p/{switch}; do chgrp {GROUP} $$file; chmod g+w $$file; done"
+        yield f"""{whole}, RUN+="/bin/sh -c '{command}'\""""
 
 
 def _writable(attribute: str) -> str:

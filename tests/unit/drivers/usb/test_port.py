@@ -9,7 +9,7 @@ from monstertruck_drivers.cable import MemoryPort, PtyPort
 from monstertruck_drivers.usb.config import CycleMethod, PowerConfig, UsbConfig, UsbPortConfig
 from monstertruck_drivers.usb.emulated import EmulatedUsb
 from monstertruck_drivers.usb.port import OPEN_TIMEOUT, HubNode, HubPort
-from monstertruck_runtime.clock import SECOND, WallClock
+from monstertruck_runtime.clock import SECOND, VirtualClock, WallClock, run_virtual
 from monstertruck_runtime.errors import DeviceLostError, PortBusyError, WrongDeviceError
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
@@ -216,3 +216,20 @@ async def test_on_the_wall_clock_over_ptys(tmp_path: Path):
         link.write(b"again")
         assert await cable.device.read() == b"again"
     usb.unplug("1-1.3")
+
+
+@pytest.mark.parametrize(("usb_id", "brltty"), [("0403:6001", True), ("067b:2303", False)])
+def test_an_adapter_that_a_program_holds_through_usbfs_is_said_to_be(tmp_path: Path, usb_id: str, brltty: bool):
+    """As brltty does on Ubuntu 22.04; it was said to have no tty, and to need a module."""
+    usb = EmulatedUsb(tmp_path)
+    usb.add_hub("1-1")
+    usb.add_device("1-1.4", usb_id, "USB Serial", node="ttyUSB")
+    usb.claim("1-1.4")
+
+    async def main(clock: VirtualClock) -> None:
+        port = HubPort(UsbPortConfig(hub="1-1", port=4), usb.machine(clock), Events())
+        with pytest.raises(DeviceLostError, match="a program holds interface 0 through usbfs") as refused:
+            await port.open()
+        assert ("brltty" in str(refused.value)) is brltty
+
+    run_virtual(main)

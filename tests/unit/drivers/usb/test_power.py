@@ -153,3 +153,27 @@ async def test_programs_run_without_a_shell():
     assert (code, output) == (3, "$HOME;ls")
     with pytest.raises(FileNotFoundError):
         await run_command(["no-such-program-here"])
+
+
+@pytest.mark.parametrize("cut", [False, True])
+def test_both_halves_of_a_usb_3_hub_are_switched(tmp_path: Path, cut: bool):
+    """The port of one half alone leaves the power on."""
+    written: list[tuple[str, str]] = []
+
+    async def scene(bench: Bench) -> None:
+        sysfs = bench.machine.sysfs
+        peer = sysfs.root / port_directory("1-1.1") / "peer"
+        peer.mkdir()
+        (peer / "disable").write_text("0\n")
+        really = sysfs.write
+
+        def write(path: str, text: str) -> None:
+            written.append((path.removeprefix(port_directory("1-1.1")), text))
+            really(path, text)
+
+        sysfs.write = write  # type: ignore[method-assign]
+        await (bench.power.switch_off("1-1.1") if cut else bench.power.cycle("1-1.1"))
+
+    play(tmp_path, scene, by(CycleMethod.PORT))
+    off = [("/disable", "1"), ("/peer/disable", "1")]
+    assert written == (off if cut else [*off, ("/disable", "0"), ("/peer/disable", "0")])

@@ -133,6 +133,25 @@ def test_the_cable_that_is_pulled_is_found(tmp_path: Path):
     assert said[1] == "drive: hub 1-1 port 3, 0403:6001 FT232R USB UART"
 
 
+def test_the_cable_is_named_by_topology_where_the_controller_is_known(tmp_path: Path):
+    said: list[str] = []
+
+    async def scene(bench: Bench) -> None:
+        serial = bench.machine.sysfs.root / "bus/usb/devices/usb1/serial"
+        serial.write_text("0000:00:14.0\n")
+        finding = find(bench, "drive", said)
+        await bench.clock.sleep(5)
+        bench.usb.unplug("1-1.3")
+        await bench.clock.sleep(5)
+        bench.usb.plug("1-1.3")
+        port = await finding
+        assert (port.hub, port.port) == ("pci-0000:00:14.0-usb-0:1", 3)
+        assert port.at_this_boot(bench.machine.sysfs).device == "1-1.3"
+        assert 'hub: "pci-0000:00:14.0-usb-0:1", port: 3' in config_line(port)
+
+    play(tmp_path, scene, watched=False)
+
+
 def test_a_hub_several_cables_or_a_stick_are_not_taken(tmp_path: Path):
     said: list[str] = []
 

@@ -75,6 +75,20 @@ def test_a_device_without_its_kernel_module(role: str, place: str, usb_id: str, 
     assert see(tmp_path, wiring, change)[role].fix == f"sudo modprobe {module}"
 
 
+@pytest.mark.parametrize("runs", [True, False])
+def test_an_adapter_that_brltty_or_another_program_holds(runs: bool, tmp_path: Path):
+    def change(emulated: EmulatedHost) -> None:
+        emulated.computer.usb.claim("1-1.1")
+        if runs:
+            emulated.put("proc/77/comm", "brltty\n")
+
+    found = see(tmp_path, wiring, change)["drive"]
+    assert found.reason is Reason.DEVICE_BUSY
+    assert "a program holds interface 0 through usbfs" in found.seen
+    assert found.fix is not None
+    assert found.fix.startswith("sudo apt-get remove brltty" if runs else "sudo fuser -v /dev/bus/usb/001/")
+
+
 def test_slow_sleepy_and_greedy_ports(tmp_path: Path):
     def change(emulated: EmulatedHost) -> None:
         emulated.latencies[0].write_text("16")

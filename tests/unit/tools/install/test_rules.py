@@ -15,6 +15,10 @@ from tests.unit.tools.install.kit import TRUCK
 UDEVADM = shutil.which("udevadm")
 
 
+PCI = "pci-0000:00:14.0-usb-0"
+SWITCH = "RUN+=\"/bin/sh -c 'for file in /sys%p/*-port1/{}; do chgrp dialout $$file; chmod g+w $$file; done'\""
+
+
 def rules_of(config: Path = TRUCK) -> str:
     return rules_text(load_truck(config)[0])
 
@@ -27,13 +31,28 @@ def section(text: str, role: str) -> list[str]:
 def test_a_serial_device_by_hub_and_port():
     assert section(rules_of(), "drive") == [
         'SUBSYSTEM=="usb", ENV{DEVTYPE}=="usb_device", KERNEL=="1-1.1", ENV{ID_MM_DEVICE_IGNORE}="1", '
-        'ATTR{power/control}="on"',
+        'ENV{PRODUCT}="truck/drive", ATTR{power/control}="on"',
         'SUBSYSTEM=="tty", KERNELS=="1-1.1:*", ENV{ID_MM_PORT_IGNORE}="1"',
         'SUBSYSTEM=="tty", KERNELS=="1-1.1:*.0", ENV{ID_VENDOR_ID}=="0403", ENV{ID_MODEL_ID}=="6001", '
         'SYMLINK+="truck/drive"',
         'SUBSYSTEM=="usb-serial", DRIVER=="ftdi_sio", KERNELS=="1-1.1:*.0", ATTR{latency_timer}="1", '
         'RUN+="/bin/chgrp dialout /sys%p/latency_timer", RUN+="/bin/chmod g+w /sys%p/latency_timer"',
     ]
+
+
+def test_a_device_by_topology_is_found_whatever_the_number_of_its_bus(tmp_path: Path):
+    file = tmp_path / "truck.yaml"
+    drive = {"port": {"hub": f"{PCI}:1", "port": 2}, "driver": {"kind": "epos"}}
+    file.write_text(yaml_text({"version": 2, "devices": {"drive": drive}}))
+    assert section(rules_of(file), "drive") == [
+        f'SUBSYSTEM=="usb", ENV{{DEVTYPE}}=="usb_device", ENV{{ID_PATH}}=="*{PCI}:1.2", '
+        'ENV{ID_MM_DEVICE_IGNORE}="1", ENV{PRODUCT}="truck/drive", ATTR{power/control}="on"',
+        f'SUBSYSTEM=="tty", ENV{{ID_PATH}}=="*{PCI}:1.2:*", ENV{{ID_MM_PORT_IGNORE}}="1"',
+        f'SUBSYSTEM=="tty", ENV{{ID_PATH}}=="*{PCI}:1.2:*.0", SYMLINK+="truck/drive"',
+        f'SUBSYSTEM=="usb-serial", DRIVER=="ftdi_sio", ENV{{ID_PATH}}=="*{PCI}:1.2:*.0", ATTR{{latency_timer}}="1", '
+        'RUN+="/bin/chgrp dialout /sys%p/latency_timer", RUN+="/bin/chmod g+w /sys%p/latency_timer"',
+    ]
+    assert 'IMPORT{builtin}="path_id"' in rules_of(file)
 
 
 def test_the_camera_is_its_first_node():
@@ -55,8 +74,11 @@ def test_every_role_has_one_link_and_paths_have_none(tmp_path: Path):
     ("hub", "method", "expected"),
     [
         ("1-1", "authorized", 'KERNEL=="1-1.1", RUN+="/bin/chgrp dialout /sys%p/authorized"'),
-        ("1-1", "port", 'KERNEL=="1-1:1.0", RUN+="/bin/chgrp dialout /sys%p/1-1-port1/disable"'),
-        ("usb3", "port", 'KERNEL=="3-0:1.0", RUN+="/bin/chgrp dialout /sys%p/usb3-port1/disable"'),
+        ("1-1", "port", f'KERNEL=="1-1:1.0", {SWITCH.format("disable")}'),
+        ("1-1", "port", f'KERNEL=="1-1:1.0", {SWITCH.format("peer/disable")}'),
+        ("usb3", "port", f'KERNEL=="3-0:1.0", {SWITCH.format("disable")}'),
+        (f"{PCI}:1.2", "port", f'ENV{{ID_PATH}}=="*{PCI}:1.2:1.0", {SWITCH.format("disable")}'),
+        (f"{PCI}:0", "port", f'ENV{{ID_PATH}}=="*{PCI}:0:1.0", {SWITCH.format("peer/disable")}'),
         ("1-1", None, None),
     ],
 )

@@ -1,0 +1,1 @@
+"""Parts of ``benchmarks/usb_kernel.py``: the virtual machine, and what runs inside it."""

@@ -1,0 +1,570 @@
+"""The situations: drivers, USB service, udev rules and doctor on the kernel's own devices."""
+
+import asyncio
+import contextlib
+import fcntl
+import os
+import struct
+import subprocess
+import sys
+import termios
+import time
+import tty
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from monstertruck_drivers.cable import DeviceEnd
+from monstertruck_drivers.computer import ROOT, Machine, open_watcher
+from monstertruck_drivers.epos.config import EposConfig
+from monstertruck_drivers.epos.driver import EposDriver
+from monstertruck_drivers.maestro.config import MaestroConfig
+from monstertruck_drivers.maestro.driver import MaestroDriver
+from monstertruck_drivers.maestro.emulator import MaestroEmulator
+from monstertruck_drivers.tty import MAX_AGE, SerialPort
+from monstertruck_drivers.usb.config import CycleMethod, PowerConfig, UsbConfig, UsbPortConfig
+from monstertruck_drivers.usb.hub import HubCoordinator, UsbService
+from monstertruck_drivers.usb.port import HubPort, PortPower
+from monstertruck_drivers.usb.tree import at_this_boot, parent_of, port_directory, port_of, read_tree, topology_of
+from monstertruck_runtime.clock import WallClock
+from monstertruck_runtime.errors import DeviceError, DeviceLostError, PortBusyError
+from monstertruck_runtime.mailbox import Mailbox, latest
+from monstertruck_runtime.service import RestartPolicy, Service, supervise
+from monstertruck_schemas.health import ServiceHealth, ServiceState
+from monstertruck_schemas.reasons import Reason
+from monstertruckd.config.load import load_config
+from monstertruckd.config.truck import TruckConfig
+from monstertruckd.tools.doctor.context import HostContext, inspect
+from monstertruckd.tools.doctor.devices import handshakes, wiring
+from monstertruckd.tools.install.files import Program, rules_text
+from usb_kernel_parts.inside import Loop, ask, situation, until
+
+CLOCK = WallClock()
+MACHINE = Machine(CLOCK)
+RETURN = 30.0
+"""Seconds of the machine, which is some ten times slower than a computer, until a device must be back."""
+USBDEVFS_DISCONNECT_CLAIM = 0x8108551B
+GADGET = "0525:a4a7"
+"""Kind of the CDC-ACM device."""
+DEVICE_SIDE = Path("/dev/ttyGS0")
+
+
+def by_serial(serial: str) -> str:
+    """Place of the device with that serial number."""
+    return next(name for name, device in read_tree(MACHINE.sysfs).devices.items() if device.serial == serial)
+
+
+def by_id(usb_id: str) -> str:
+    """Place of the device of that kind."""
+    return next(name for name, device in read_tree(MACHINE.sysfs).devices.items() if device.usb_id == usb_id)
+
+
+def place(name: str, **more: Any) -> UsbPortConfig:
+    """Settings of a port, by the kernel's name of what is there."""
+    return UsbPortConfig(hub=str(parent_of(name)), port=port_of(name), **more)
+
+
+def tty_of(name: str) -> Path | None:
+    """Node of what is there."""
+    device = read_tree(MACHINE.sysfs).devices.get(name)
+    return Path("/dev", device.tty.name) if device is not None and device.tty is not None else None
+
+
+class Kept:
+    """Keeps what is published."""
+
+    def __init__(self) -> None:
+        self.kept: list[Any] = []
+
+    def put(self, message: Any) -> None:
+        """Keep."""
+        self.kept.append(message)
+
+    def next_seq(self) -> int:
+        """Number of the next message."""
+        return len(self.kept)
+
+
+class Events:
+    """Keeps reasons."""
+
+    def __init__(self) -> None:
+        self.reasons: list[Reason] = []
+
+    def __call__(self, reason: Reason, *_: Any, **__: Any) -> None:
+        """Keep the reason."""
+        self.reasons.append(reason)
+
+
+class Robot:
+    """Drive and steering by hub and port, and the service that watches the tree."""
+
+    def __init__(self) -> None:
+        self.events, self.tree = Events(), Kept()
+        self.rows: dict[str, list[ServiceHealth]] = {"drive": [], "steering": []}
+        self.ports = {"drive": place(by_serial("SNs1")), "steering": place(by_id(GADGET))}
+        config = UsbConfig()
+        self.hubs = HubCoordinator(config, self.ports, CLOCK, self.events)
+        self.usb = UsbService(config, MACHINE, self.hubs, open_watcher(), self.tree, self.events)
+        ends = {role: HubPort(port, MACHINE, self.events, self.hubs, None, role) for role, port in self.ports.items()}
+        self.drive, self.steering = Kept(), Kept()
+        self.drivers: dict[str, Service] = {
+            "drive": EposDriver(EposConfig(), ends["drive"], CLOCK, Mailbox(latest()), self.drive, self.events),
+            "steering": MaestroDriver(
+                MaestroConfig(), ends["steering"], CLOCK, Mailbox(latest()), self.steering, None, self.events
+            ),
+        }
+
+    def ready(self, role: str) -> bool:
+        """Whether the service works."""
+        return bool(self.rows[role]) and self.rows[role][-1].state is ServiceState.READY
+
+    @asynccontextmanager
+    async def running(self) -> AsyncIterator[None]:
+        """All services."""
+        rng = np.random.default_rng(1)
+        tasks = [asyncio.create_task(self.usb.run(lambda: None))]
+        for role, driver in self.drivers.items():
+            tasks.append(
+                asyncio.create_task(supervise(driver, RestartPolicy(max_delay=0.5), CLOCK, self.rows[role].append, rng))
+            )
+        try:
+            yield
+        finally:
+            for task in reversed(tasks):
+                task.cancel()
+                await asyncio.wait([task])
+
+
+class DeviceSide:
+    """The device's side of the CDC-ACM port; opened again whenever the host was gone.
+
+    Args:
+        end: gets and gives the bytes.
+    """
+
+    def __init__(self, end: DeviceEnd) -> None:
+        self._end = end
+        self._line = -1
+        end.connect(self._write)
+
+    async def run(self) -> None:
+        """Until cancelled."""
+        loop = asyncio.get_running_loop()
+        try:
+            while True:
+                with contextlib.suppress(OSError):
+                    self._line = await asyncio.to_thread(os.open, DEVICE_SIDE, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+                    await asyncio.to_thread(tty.setraw, self._line, termios.TCSANOW)
+                    gone = asyncio.Event()
+                    loop.add_reader(self._line, self._read, gone)
+                    await gone.wait()
+                await self._close()
+                await asyncio.sleep(0.2)
+        finally:
+            await self._close()
+
+    def _read(self, gone: asyncio.Event) -> None:
+        try:
+            data = os.read(self._line, 4096)
+        except BlockingIOError:
+            return
+        except OSError:
+            data = b""
+        if data:
+            self._end.take(data)
+        else:
+            gone.set()
+
+    def _write(self, data: bytes) -> None:
+        with contextlib.suppress(OSError):
+            os.write(self._line, data)
+
+    async def _close(self) -> None:
+        line, self._line = self._line, -1
+        if line >= 0:
+            asyncio.get_running_loop().remove_reader(line)
+            await asyncio.to_thread(os.close, line)
+
+
+@asynccontextmanager
+async def servo_controller() -> AsyncIterator[None]:
+    """A Maestro at the device's side of the CDC-ACM port."""
+    end = DeviceEnd("device")
+    tasks = [asyncio.create_task(MaestroEmulator(CLOCK).run(end)), asyncio.create_task(DeviceSide(end).run())]
+    try:
+        yield
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.wait(tasks)
+
+
+async def tree() -> dict[str, Any]:
+    """Every device is there, with its node; the joystick too."""
+    with contextlib.suppress(TimeoutError):
+        await until(Path("/dev/input/js0").exists, 30)
+    devices = read_tree(MACHINE.sysfs).devices
+    nodes = sorted(node.name for device in devices.values() for node in device.nodes)
+    hubs = [name for name, device in devices.items() if device.hub]
+    return {
+        "ok": nodes == ["ttyACM0", "ttyUSB0", "ttyUSB1", "ttyUSB2"] and Path("/dev/input/js0").exists(),
+        "nodes": nodes,
+        "hubs": hubs,
+        "joystick": MACHINE.sysfs.text(f"bus/usb/devices/{by_id('1d6b:0104')}:1.0/uevent"),
+        "latency_ms": sorted({node.latency_ms for device in devices.values() for node in device.nodes} - {None}),
+    }
+
+
+def control_lines(node: Path) -> tuple[bool, bool]:
+    """DTR and RTS as this process has them set; another open would raise both."""
+    for entry in Path("/proc/self/fd").iterdir():
+        with contextlib.suppress(OSError):
+            if str(entry.readlink()) == str(node):
+                (state,) = struct.unpack("I", fcntl.ioctl(int(entry.name), termios.TIOCMGET, b"\0" * 4))
+                return bool(state & termios.TIOCM_DTR), bool(state & termios.TIOCM_RTS)
+    raise LookupError(node)
+
+
+async def switch(name: str, *, on: bool) -> None:
+    """Pull the cable at a place, as the kernel sees it, or plug it in."""
+    await asyncio.to_thread(MACHINE.sysfs.write, f"{port_directory(name)}/disable", "0" if on else "1")
+
+
+async def open_and_close() -> dict[str, Any]:
+    """Every adapter, ten times; the control lines as set."""
+    lines = {}
+    for serial in ("SNs1", "SNs2", "SNs3"):
+        for nth in range(10):
+            node = tty_of(by_serial(serial))
+            assert node is not None
+            async with await SerialPort(node, dtr=nth % 2 == 0, rts=nth % 3 == 0).open() as link:
+                link.write(b"hello")
+                lines[nth] = control_lines(node)
+    wanted = {nth: (nth % 2 == 0, nth % 3 == 0) for nth in range(10)}
+    return {"ok": lines == wanted, "lines": lines}
+
+
+async def deaf() -> dict[str, Any]:
+    """A device that takes nothing: its link ends, its port is wedged, and opens again once the kernel lets go."""
+    node = tty_of(by_id(GADGET))
+    assert node is not None
+    port = SerialPort(node)
+    link = await port.open()
+    begin, sent = time.monotonic(), 0
+    while not link.is_lost and time.monotonic() - begin < 10:
+        link.write(b"\x84\x00\x70\x2e")
+        sent += 1
+        await asyncio.sleep(0.02)
+    gave_up = time.monotonic() - begin
+    reasons: list[str] = []
+    begin = time.monotonic()
+    while time.monotonic() - begin < 60:
+        try:
+            (await port.open()).close()
+        except DeviceError as error:
+            reasons.append(error.reason.value)
+            await asyncio.sleep(0.5)
+        else:
+            break
+    free_after = time.monotonic() - begin
+    ok = link.is_lost and gave_up < 1.0 and set(reasons) == {"device_wedged"} and free_after < 45
+    return {"ok": ok, "gave_up_s": gave_up, "sent": sent, "free_after_s": free_after, "refused": len(reasons)}
+
+
+async def listens_again() -> dict[str, Any]:
+    """A deaf device that listens again gets at most what was sent within the age limit."""
+    node = tty_of(by_id(GADGET))
+    assert node is not None
+    link = await SerialPort(node).open()
+    sent = 0
+    begin = time.monotonic()
+    while time.monotonic() - begin < 3.0:
+        with contextlib.suppress(DeviceLostError):
+            link.write(b"\x84\x00\x70\x2e")
+            sent += 1
+        await asyncio.sleep(0.02)
+    heard: list[bytes] = []
+    end = DeviceEnd("listener")
+    end.on_bytes = lambda to_device, data: heard.append(data) if to_device else None
+    listening = asyncio.create_task(DeviceSide(end).run())
+    await asyncio.sleep(2)
+    await until(lambda: not closing(), 45)
+    listening.cancel()
+    await asyncio.wait([listening])
+    count = len(b"".join(heard))
+    return {"ok": 0 < count <= 4 * 2 * MAX_AGE / 0.02, "heard_bytes": count, "written": sent}
+
+
+def closing() -> bool:
+    """Whether any port is still being closed."""
+    import threading  # noqa: PLC0415
+
+    return any(thread.name == "serial port" for thread in threading.enumerate())
+
+
+async def drivers() -> dict[str, Any]:
+    """Drive on an FTDI adapter, steering on CDC-ACM; then the steering's cable is pulled while it writes."""
+    robot = Robot()
+    async with servo_controller(), robot.running():
+        ready = await until(lambda: robot.ready("drive") and robot.ready("steering"), 60)
+        before = len(robot.drive.kept), len(robot.steering.kept)
+        await asyncio.sleep(3)
+        rates = [(len(kept.kept) - b) / 3 for kept, b in zip((robot.drive, robot.steering), before, strict=True)]
+        name = by_id(GADGET)
+        await switch(name, on=False)
+        await until(lambda: not robot.ready("steering"), 20)
+        await switch(name, on=True)
+        back = await until(lambda: robot.ready("steering"), RETURN)
+        assert robot.ready("drive")
+    return {"ok": min(rates) > 1, "ready_s": ready, "drive_hz": rates[0], "steering_hz": rates[1], "back_s": back}
+
+
+async def hub_pulled() -> dict[str, Any]:
+    """A hub with two adapters is pulled while the drive works, and comes back with other node numbers."""
+    robot = Robot()
+    async with servo_controller(), robot.running():
+        await until(lambda: robot.ready("drive"), 60)
+        for name in ("s1", "s2", "h1"):
+            await ask("device_del", id=name)
+        await until(lambda: Reason.HUB_LOST in robot.events.reasons, 20)
+        await asyncio.sleep(1)
+        await ask("device_add", driver="usb-hub", id="h1", bus="x.0", port="1", **{"port-power": True})
+        for name, port in (("s2", "1.2"), ("s1", "1.1")):
+            line = {"chardev": f"c-{name}", "serial": f"SN{name}", "always-plugged": True}
+            await ask("device_add", driver="usb-serial", id=name, port=port, **line)
+            await until(lambda port=port: tty_of(f"1-{port}") is not None, 20)
+        back = await until(lambda: Reason.HUB_RETURNED in robot.events.reasons and robot.ready("drive"), RETURN)
+    nodes = {name: str(tty_of(by_serial(f"SN{name}"))) for name in ("s1", "s2")}
+    return {"ok": nodes == {"s1": "/dev/ttyUSB1", "s2": "/dev/ttyUSB0"}, "back_s": back, "nodes": nodes}
+
+
+async def unplugged_in_mid_write() -> dict[str, Any]:
+    """An adapter vanishes under a writer; its port opens again at the same place."""
+    name = by_serial("SNs3")
+    port = HubPort(place(name), MACHINE, Events())
+    link = await port.open()
+
+    async def write() -> None:
+        with contextlib.suppress(DeviceLostError):
+            while True:
+                link.write(b"0123456789" * 100)
+                await asyncio.sleep(0.005)
+
+    writing = asyncio.create_task(write())
+    await asyncio.sleep(0.5)
+    await ask("device_del", id="s3")
+    await asyncio.wait([writing], timeout=10)
+    lost = link.is_lost
+    await until(lambda: tty_of(name) is None, 20)
+    await ask(
+        "device_add",
+        driver="usb-serial",
+        id="s3",
+        chardev="c-s3",
+        port="2.1",
+        serial="SNs3",
+        **{"always-plugged": True},
+    )
+    begin = time.monotonic()
+    while time.monotonic() - begin < RETURN:
+        try:
+            (await port.open()).close()
+        except DeviceError:
+            await asyncio.sleep(0.2)
+        else:
+            break
+    return {"ok": lost and tty_of(name) is not None, "back_s": time.monotonic() - begin}
+
+
+async def reopened_by_another_name() -> dict[str, Any]:
+    """The deaf device is enumerated again while its old port still hangs in the kernel."""
+    node = tty_of(by_id(GADGET))
+    assert node is not None
+    link = await SerialPort(node).open()
+    while not link.is_lost:
+        link.write(b"x" * 64)
+        await asyncio.sleep(0.02)
+    name = by_id(GADGET)
+    await switch(name, on=False)
+    await until(lambda: name not in read_tree(MACHINE.sysfs).devices, 20)
+    hung = closing()
+    await switch(name, on=True)
+    port, begin = HubPort(place(name), MACHINE, Events()), time.monotonic()
+    async with servo_controller():
+        while True:
+            try:
+                (await port.open()).close()
+                break
+            except DeviceError:
+                await asyncio.sleep(0.2)
+        back = time.monotonic() - begin
+    return {"ok": back < RETURN, "back_s": back, "hung": hung, "node": str(tty_of(name)), "before": str(node)}
+
+
+async def port_power() -> dict[str, Any]:
+    """A port is switched off and on by the kernel's attribute."""
+    name = by_serial("SNs3")
+    number = read_tree(MACHINE.sysfs).devices[name].devnum
+    power = PortPower(PowerConfig(method=CycleMethod.PORT, off_time=1.0), MACHINE, Events())
+    await power.cycle(name)
+    back = await until(lambda: tty_of(name) is not None, RETURN)
+    return {"ok": read_tree(MACHINE.sysfs).devices[name].devnum != number, "back_s": back}
+
+
+OPENER = """
+import os, sys
+os.setgid(20); os.setuid(65534)
+try:
+    os.open(sys.argv[1], os.O_RDWR | os.O_NONBLOCK | os.O_NOCTTY)
+except OSError as error:
+    print(error.errno)
+else:
+    print(0)
+"""
+
+
+async def printed(*command: str) -> str:
+    """What a program prints."""
+    process = await asyncio.create_subprocess_exec(*command, stdout=asyncio.subprocess.PIPE)
+    return (await process.communicate())[0].decode().strip()
+
+
+async def tried(node: Path) -> str:
+    """Number of the error with which another user's program opens a node; 0 if it may."""
+    return await printed(sys.executable, "-c", OPENER, str(node))
+
+
+async def foreign_opener() -> dict[str, Any]:
+    """A program that knows no lock and has no root rights, as a modem manager of a user, is refused."""
+    node = tty_of(by_serial("SNs3"))
+    assert node is not None
+    Path(node).chmod(0o666)
+    free = await tried(node)
+    async with await SerialPort(node).open():
+        found = await tried(node)
+        try:
+            await SerialPort(node).open()
+            again = "opened"
+        except PortBusyError:
+            again = "busy"
+    seen = (free, found, again)
+    return {"ok": seen == ("0", "16", "busy"), "seen": seen}
+
+
+def truck() -> TruckConfig:
+    """A configuration whose ports are those of the machine."""
+    chosen = {"drive": by_serial("SNs1"), "compass": by_serial("SNs2"), "imu": by_serial("SNs3")}
+    chosen |= {"steering": by_id(GADGET), "lidar": "1-7"}
+    devices = ""
+    for role, name in chosen.items():
+        driver = ", driver: { kind: wt61 }" if role == "imu" else ""
+        devices += f'  {role}: {{ port: {{ hub: "{parent_of(name)}", port: {port_of(name)} }}{driver} }}\n'
+    folder = Path("/run/truck")
+    folder.mkdir(exist_ok=True)
+    root = Path(__file__).resolve().parents[2]
+    file = folder / "truck.yaml"
+    file.write_text(f"include: {root}/configs/parts/chassis.yaml\nversion: 2\ndevices:\n{devices}\n")
+    return load_config(file, TruckConfig)[0]
+
+
+async def udev_rules() -> dict[str, Any]:
+    """Rules of install-service: links by role, modem managers kept off, adapters quick."""
+    Path("/run/udev/rules.d/70-monstertruckd.rules").write_text(rules_text(truck()))
+    for command in (["control", "--reload"], ["trigger", "--action=add"], ["settle"]):
+        await asyncio.to_thread(subprocess.run, ["udevadm", *command], check=True)
+    links = {entry.name: str(entry.readlink()) for entry in Path("/dev/truck").iterdir()}
+    node = tty_of(by_serial("SNs1"))
+    shown = await printed("udevadm", "info", f"--name={node}")
+    ok = set(links) == {"drive", "compass", "imu", "steering"} and Path("/dev", links["drive"]).name == node.name
+    return {"ok": ok and "ID_MM_PORT_IGNORE=1" in shown, "links": links}
+
+
+BRLTTY = """
+SUBSYSTEM=="usb", KERNEL!="*:*", ENV{PRODUCT}=="403/6001/*", ENV{BRLTTY_BRAILLE_DRIVER}="hd"
+"""
+"""What such a rule of brltty's matches."""
+
+
+async def brltty() -> dict[str, Any]:
+    """A program takes an adapter as brltty does: driver and doctor say so; the rules keep brltty off."""
+    name = by_serial("SNs3")
+    device = read_tree(MACHINE.sysfs).devices[name]
+    bus = int(name.partition("-")[0])
+    line = os.open(f"/dev/bus/usb/{bus:03d}/{device.devnum:03d}", os.O_RDWR)
+    claim = bytearray(struct.pack("II256s", 0, 0, b""))
+    await asyncio.to_thread(fcntl.ioctl, line, USBDEVFS_DISCONNECT_CLAIM, claim)
+    await until(lambda: tty_of(name) is None, 10)
+    said = ""
+    try:
+        await HubPort(place(name), MACHINE, Events()).open()
+    except DeviceError as error:
+        said = str(error)
+    seen = [found.seen for found in wiring(doctors_context()) if found.check == "imu"]
+    await asyncio.to_thread(os.close, line)
+    await switch(name, on=False)
+    await switch(name, on=True)
+    await until(lambda: tty_of(name) is not None, RETURN)
+    Path("/run/udev/rules.d/85-brltty.rules").write_text(BRLTTY)
+    for command in (["control", "--reload"], ["trigger", "--action=add"], ["settle"]):
+        await asyncio.to_thread(subprocess.run, ["udevadm", *command], check=True)
+    taken = "BRLTTY_BRAILLE_DRIVER" in await printed("udevadm", "info", f"/sys/bus/usb/devices/{name}")
+    ok = "through usbfs" in said and any("through usbfs" in text for text in seen) and not taken
+    return {"ok": ok, "said": said, "doctor": seen, "taken": taken}
+
+
+def doctors_context() -> HostContext:
+    """What a check of the doctor gets."""
+    truck()
+    return inspect(ROOT, Program.present(), Path("/run/truck/truck.yaml"), 0, CLOCK)
+
+
+async def doctor() -> dict[str, Any]:
+    """The doctor's handshake names a wedged port."""
+    node = tty_of(by_id(GADGET))
+    assert node is not None
+    link = await SerialPort(node).open()
+    while not link.is_lost:
+        link.write(b"x" * 64)
+        await asyncio.sleep(0.02)
+    found = {one.check: one.reason.value async for one in handshakes(doctors_context())}
+    await until(lambda: not closing(), 45)
+    return {"ok": found.get("steering handshake") == "device_wedged", "found": found}
+
+
+async def topology() -> dict[str, Any]:
+    """Names by topology lead to the same places, whatever the numbers of the buses."""
+    names = {name: topology_of(MACHINE.sysfs, name) for name in read_tree(MACHINE.sysfs).devices if "-" in name}
+    shown = await printed("udevadm", "info", f"/sys/bus/usb/devices/{by_serial('SNs1')}")
+    ok = all(at_this_boot(MACHINE.sysfs, long) == name for name, long in names.items())
+    return {"ok": ok and f"ID_PATH={names[by_serial('SNs1')]}" in shown, "names": names}
+
+
+async def noise() -> dict[str, Any]:
+    """What the figure is where the kernel makes nothing wait: another thread computes, and calls return at once."""
+    end = time.monotonic() + 3
+    computing = asyncio.create_task(asyncio.to_thread(compute, end))
+    read, write = os.pipe()
+    while time.monotonic() < end:
+        asyncio.get_running_loop().call_soon(Loop.touch, write)
+        await asyncio.sleep(0.01)
+        os.read(read, 4096)
+    await computing
+    return {"ok": True}
+
+
+def compute(end: float) -> None:
+    """Keep the interpreter busy."""
+    while time.monotonic() < end:
+        sum(range(1000))
+
+
+async def run_all() -> None:
+    """One after the other."""
+    acts = (noise, tree, topology, open_and_close, udev_rules, foreign_opener, brltty, drivers, hub_pulled)
+    acts += (unplugged_in_mid_write, port_power, deaf, listens_again, doctor, reopened_by_another_name)
+    for act in acts:
+        await situation(act.__name__, act)
