@@ -14,9 +14,13 @@ from typing import TextIO
 
 from monstertruck_drivers.cable import PtyPort
 from monstertruck_runtime.clock import SECOND, Clock, run_wall
+from monstertruck_sim.config import SimConfig
+from monstertruck_sim.world.config import WorldConfig
 from monstertruck_sim.world.world import World
+from monstertruckd.config.load import load_config
+from monstertruckd.config.truck import TruckConfig
 from monstertruckd.tools.simulation import simulate
-from monstertruckd.tools.simulation.config import load_simulated
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 
 
 def main(config: Path, lines: Path) -> None:
@@ -26,9 +30,15 @@ def main(config: Path, lines: Path) -> None:
         async def serve(clock: Clock) -> None:
             simulate.PtyPort = lambda path: tapped(path, clock, out)  # type: ignore[attr-defined]
             simulate.TruthLog = lambda world, _: Speeds(world, clock, out)
-            await simulate.serve(clock, (load_simulated(config),), print, lines.with_suffix(".npz"))
+            await simulate.serve(clock, (emulated(config),), print, lines.with_suffix(".npz"))
 
         run_wall(serve)
+
+
+def emulated(config: Path) -> SimulatedTruckConfig:
+    """The truck of a configuration with real ports, which these emulators serve in place of the devices."""
+    truck = load_config(config, TruckConfig)[0]
+    return SimulatedTruckConfig.model_validate(truck.model_dump() | {"sim": SimConfig(world=WorldConfig(map="loop"))})
 
 
 def tapped(path: Path, clock: Clock, out: TextIO) -> PtyPort:

@@ -15,6 +15,7 @@ import pytest
 
 from benchmarks.fuzz_requests import call_names
 from monstertruck_runtime.client import TruckClient
+from monstertruck_runtime.endpoints import robot_on_host
 from monstertruck_runtime.errors import RequestRefusedError, TruckError
 from monstertruck_runtime.mailbox import Mailbox, fifo, latest
 from monstertruck_schemas import topics
@@ -184,6 +185,7 @@ async def test_the_keyboard_and_a_client_turn_a_robot_on_the_spot_by_twist(tmp_p
 
 async def _orders(endpoint: str) -> None:
     """Every order answered by the gate; asked again where a busy machine made a sample stale."""
+    place = robot_on_host("truck", endpoint)
     for order, code, words in (
         ("disarm", 0, "disarmed"),
         ("arm", 0, "armed"),
@@ -194,7 +196,7 @@ async def _orders(endpoint: str) -> None:
         answers = []
         while (code, words) not in answers:
             done = await command(order, "--endpoint", endpoint)
-            answers.append((done.returncode, done.stdout.strip()))
+            answers.append((done.returncode, done.stdout.strip().removeprefix(f"{place}: ")))
             assert len(answers) < 5, f"{order}: {answers}, {done.stderr}"
     done = await command("arm", "--robot", "nobody", "--endpoint", endpoint)
     assert done.returncode == Reason.NOT_FOUND.exit_code
