@@ -1,6 +1,7 @@
 """The page "First day with the truck": every command line of it, by the command itself, on the emulated twin."""
 
 import asyncio
+import csv
 import math
 import shutil
 from collections.abc import Callable, Coroutine
@@ -231,8 +232,8 @@ def test_the_day_ends_with_a_map_and_all_tags_at_home(tmp_path: Path, monkeypatc
     saved = load(tmp_path / "runs" / "map")
     assert saved.graph is not None
     assert (tmp_path / "first.yaml").is_file()
-    rows = (tmp_path / "tags.csv").read_text().splitlines()[1:]
-    places = {row.split(",")[0]: tuple(map(float, row.split(",")[1:3])) for row in rows}
+    with (tmp_path / "tags.csv").open(newline="") as stream:
+        places = {row["name"]: (float(row["x_m"]), float(row["y_m"])) for row in csv.DictReader(stream)}
     tags = {f"tag-{tag.tag}": (tag.x, tag.y) for tag in day.rig.config.sim.world.tags}
     assert places.keys() == tags.keys()
     origin = truth[0, 1:3]
