@@ -39,10 +39,7 @@ def run_daemon(config_file: Path, *, verbose: bool) -> Reason:
     if tree.unused:
         text = "%s: not used, as the configuration has no such part: %s"
         log.warning(text, tree.calibration, ", ".join(tree.unused))
-    for file in (file for folder in _written(config) for file in remove_leftovers(folder)):
-        log.info("%s: removed; a program was killed while it wrote it", file)
-    if config.slam is not None and config.slam.save is not None:
-        tidy(config.slam.save)
+    clean_up(config)
     for table in TABLES:
         for broken in table.broken:
             log.warning("plug-in left out: %s", broken)
@@ -69,9 +66,17 @@ def run_daemon(config_file: Path, *, verbose: bool) -> Reason:
     return Reason.OK
 
 
-def _written(config: TruckConfig) -> tuple[Path, ...]:
-    """Folders of state that a daemon writes."""
-    return (config.state_directory, config.calibration_folder)
+def clean_up(config: TruckConfig) -> None:
+    """Remove the unfinished files of killed programs from the folders of state; what cannot be removed stays."""
+    folders = [(remove_leftovers, config.state_directory), (remove_leftovers, config.calibration_folder)]
+    if config.slam is not None and config.slam.save is not None:
+        folders.append((tidy, config.slam.save))
+    for clean, folder in folders:
+        try:
+            for file in clean(folder):
+                log.info("%s: removed; a program was killed while it wrote it", file)
+        except OSError as error:
+            log.warning("%s: files of killed programs cannot be removed: %s", folder, error.strerror)
 
 
 def _first(error: BaseException | None) -> BaseException | None:

@@ -150,15 +150,16 @@ def write_save(
         return place
 
 
-def tidy(folder: Path) -> None:
-    """Remove what killed writers left in a map's folder.
+def tidy(folder: Path) -> list[Path]:
+    """Remove and return what killed writers left in a map's folder.
 
     Raises:
         OSError: it cannot be removed.
     """
-    if (folder / SAVES).is_dir():
-        with _locked(folder / SAVES, fcntl.LOCK_EX):
-            _remove_leftovers(folder / SAVES)
+    if not (folder / SAVES).is_dir():
+        return []
+    with _locked(folder / SAVES, fcntl.LOCK_EX):
+        return _remove_leftovers(folder / SAVES)
 
 
 @contextmanager
@@ -274,7 +275,7 @@ def _take_over(old: Path, new: Path) -> None:
 
 
 def _prune(saves: Path) -> None:
-    """Remove all saves but the newest two, and the newest ones of two grids that share no file."""
+    """Remove old saves: not the newest two, and not the newest of two grids that share no file."""
     grids = set[int]()
     for age, path in enumerate(_numbered(saves)):
         grid = {(path / YAML).stat().st_ino} if (path / YAML).exists() else set[int]()
@@ -285,10 +286,12 @@ def _prune(saves: Path) -> None:
             shutil.rmtree(doomed)
 
 
-def _remove_leftovers(saves: Path) -> None:
-    """Remove unfinished saves; the folder is locked, so nobody writes one."""
-    for path in saves.glob(f"*{SCRATCH}"):
+def _remove_leftovers(saves: Path) -> list[Path]:
+    """Remove unfinished saves; the folder is locked, so no writer is at one."""
+    found = list(saves.glob(f"*{SCRATCH}"))
+    for path in found:
         shutil.rmtree(path)
+    return found
 
 
 def _remove_loose(folder: Path) -> None:

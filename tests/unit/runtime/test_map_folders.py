@@ -202,12 +202,12 @@ def test_what_a_killed_writer_left_is_removed(tmp_path: Path):
         (left / YAML).write_text("half")
         assert read(tmp_path)[YAML] == f"{YAML} a"
         if number:
-            tidy(tmp_path)
+            assert tidy(tmp_path) == [left]
         else:
             write_save(tmp_path, grid("b"), GRID, "one")
         assert not left.exists()
         shutil.rmtree(tmp_path / SAVES / "000002", ignore_errors=True)
-    tidy(tmp_path / "nowhere")
+    assert tidy(tmp_path / "nowhere") == []
 
 
 def test_a_save_that_is_read_stays_until_it_is_read(tmp_path: Path):
