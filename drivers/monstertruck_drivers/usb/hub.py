@@ -237,11 +237,16 @@ class HubCoordinator:
             for name in outage.members:
                 self._slots[name].free_at = now
             starting = [name for name in back if name in self._roles]
-            turns = accumulate(name != starting[0] and self._loads(name) for name in starting)
-            for turn, name in zip(turns, starting, strict=True):
-                self._slots[name].free_at = now + turn * _ns(self._config.stagger)
+            for hub in dict.fromkeys(map(parent_of, starting)):
+                self._stagger([name for name in starting if parent_of(name) == hub], now)
             if outage.announced or starting:
                 self._report_returned(outage, back, now)
+
+    def _stagger(self, starting: list[str], now: int) -> None:
+        """Start the devices of one hub, each that loads it apart from the one before: hubs do not load each other."""
+        turns = accumulate(name != starting[0] and self._loads(name) for name in starting)
+        for turn, name in zip(turns, starting, strict=True):
+            self._slots[name].free_at = now + turn * _ns(self._config.stagger)
 
     def _loads(self, name: str) -> bool:
         return self._roles.get(name) in self._config.start_apart

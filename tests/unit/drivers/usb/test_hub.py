@@ -269,6 +269,27 @@ def test_a_hub_that_flickers_starts_nobody_until_it_is_still(tmp_path: Path):
     assert bench.events.reasons == [Reason.HUB_LOST, Reason.HUB_RETURNED]
 
 
+def test_devices_of_two_hubs_that_were_lost_together_are_not_staggered_against_each_other(tmp_path: Path):
+    async def scene(bench: Bench) -> None:
+        async with bench.drivers() as starts:
+            await bench.clock.sleep(3)
+            bench.usb.lose_hub("1-1")
+            bench.usb.lose_hub("1-2")
+            await bench.clock.sleep(2)
+            returned = bench.clock.now() / SECOND
+            await asyncio.gather(*(bench.usb.return_hub(hub, bench.clock) for hub in ("1-1", "1-2")))
+            await bench.clock.sleep(8)
+            restarts = {role: times[1] - returned for role, times in starts.items()}
+            assert restarts["lidar"] - restarts["drive"] == pytest.approx(0.3, abs=0.01), "it loads their hub"
+            assert restarts["compass"] == pytest.approx(restarts["drive"], abs=0.01), "it loads another one"
+
+    play(
+        tmp_path,
+        scene,
+        UsbConfig(start_apart=("lidar", "compass"), start_order=("drive", "steering", "lidar", "compass")),
+    )
+
+
 def test_a_hub_lost_again_during_the_staggered_start(tmp_path: Path):
     async def scene(bench: Bench) -> None:
         async with bench.drivers(*FIRST) as starts:
