@@ -13,8 +13,8 @@ class ConsistencyConfig(Schema):
     """Comparison of the robot's independent measures of motion."""
 
     scans: Literal["kiss", "own"] | None = "kiss"
-    """Scan odometry: kiss-icp (where it is not installed, `own`), or this repository's own, which takes a fifth of the
-    processor time; null = the motion by scans is not measured"""
+    """Scan odometry: kiss-icp (where it is not installed, `own`), or this repository's own, which takes three quarters of
+    the processor time; null = the motion by scans is not measured"""
     slip: Share = 0.3
     """Tolerated slip: share of the wheels' distance or turn by which the robot moves less"""
     slide: Share = 0.2
@@ -22,7 +22,7 @@ class ConsistencyConfig(Schema):
     configured"""
     delay: Positive = 0.2
     """Tolerated delay of one sensor's content against another's, s"""
-    window: Annotated[float, Field(ge=1, le=20)] = 5.0
+    window: Annotated[float, Field(ge=1, le=8)] = 5.0
     """Longest time over which motions are compared, s"""
     latency: Annotated[float, Field(gt=0, le=1)] = 0.02
     """Seconds after which a step of the worker counts on the virtual clock"""

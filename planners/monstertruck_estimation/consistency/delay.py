@@ -12,9 +12,9 @@ from monstertruck_estimation.consistency.tracks import Track
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND
 
-SHIFT: Final = SECOND // 20
+SHIFT: Final = SECOND // 10
 """Step of the delays that are tried, ns."""
-LONGEST: Final = 24
+LONGEST: Final = 12
 """Greatest delay that is tried, in ``SHIFT``."""
 NOISE: Final = (0.006, 0.006)
 """Standard deviation of a step by the scans, m and rad."""

@@ -31,13 +31,13 @@ from monstertruck_estimation.wheel_motion import WheelIncrement
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.state import Doubt, DoubtKind
 
-WINDOWS: Final = (0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 5.0, 8.0, 12.0, 20.0)
+WINDOWS: Final = (0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 5.0, 8.0)
 """Times over which motions are compared, s, up to the configured one."""
 AGAIN: Final = SECOND // 5
 """Least time between two motions that the scans are asked about, ns."""
 DELAY_PERIOD: Final = SECOND // 4
 """Time between two looks at the delay of the scans, ns."""
-DELAY_OVER: Final = 7 * SECOND
+DELAY_OVER: Final = 4 * SECOND
 """Time over which it is determined, ns."""
 GAP: Final = SECOND // 2
 """Headings and rates further apart are not joined, ns."""
@@ -165,7 +165,6 @@ class ConsistencyMonitor:
                 self._accuse(output.stamp, self._pending.found)
             self._pending = None
         self._compare(output.stamp)
-        self._look_for_delay(output.stamp)
 
     def observe_value(self, sensor: str, field: str, stamp: int, value: float) -> None:
         """Take a number that a sensor has measured; ``stamp`` in ns."""
@@ -306,7 +305,9 @@ class ConsistencyMonitor:
                 return
             yield scans[at]
 
-    def _look_for_delay(self, stamp: int) -> None:
+    def look_for_delay(self) -> None:
+        """Compare the content of the newest scans with earlier motion of the wheels: to be called now and then."""
+        stamp = self._sampled.get(Measure.SCANS, 0)
         if self._active_since is None or stamp - self._delayed_at < DELAY_PERIOD:
             return
         self._delayed_at = stamp

@@ -156,6 +156,7 @@ class ConsistencyService:
         self._take_gate()
         self._take_wheels()
         self._take_others()
+        self.monitor.look_for_delay()
         self._publish()
 
     def _take_gate(self) -> None:

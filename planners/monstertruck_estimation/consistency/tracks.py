@@ -13,8 +13,8 @@ from monstertruck_runtime.clock import SECOND
 Vector = tuple[float, float, float]
 """x, y (m) and yaw (rad)."""
 
-KEPT: Final = 12 * SECOND
-"""Time for which motion is kept, ns."""
+KEPT: Final = 9 * SECOND
+"""Time for which motion is kept at least, ns; half as long again at most."""
 AHEAD: Final = SECOND // 10
 """A motion may be read so far beyond the newest sample, ns; the robot is taken to go on."""
 PACE: Final = SECOND // 4
@@ -55,7 +55,7 @@ class Track:
         c, s = cos(yaw), sin(yaw)
         self._stamps.append(stamp)
         self._poses.append((x + c * motion[0] - s * motion[1], y + s * motion[0] + c * motion[1], yaw + motion[2]))
-        if stamp - self._stamps[0] > 2 * KEPT:
+        if stamp - self._stamps[0] > 3 * KEPT // 2:
             old = bisect_left(self._stamps, stamp - KEPT)
             del self._stamps[:old], self._poses[:old]
 
