@@ -309,6 +309,7 @@ def replayed(path: Path) -> tuple[int, float, float]:
         output = odometry.step(StepInput(scan, "kiss", claim=monitor.claim(stamp)))
         compared += 0.0 if output.since is None else (output.stamp - output.since) / SECOND
         monitor.observe_scan(output)
+        monitor.look_for_delay()
         if monitor.findings():
             alarms += 1
             monitor.activate(stamp)

@@ -13,8 +13,8 @@ class ConsistencyConfig(Schema):
     """Comparison of the robot's independent measures of motion."""
 
     scans: Literal["kiss", "own"] | None = "kiss"
-    """Scan odometry: kiss-icp (where it is not installed, `own`), or this repository's own, which takes three quarters of
-    the processor time; null = the motion by scans is not measured"""
+    """Scan odometry: kiss-icp (`own` where it is not installed), or this repository's own, with three quarters of its
+    processor time; null = the motion by scans is not measured"""
     slip: Share = 0.3
     """Tolerated slip: share of the wheels' distance or turn by which the robot moves less"""
     slide: Share = 0.2

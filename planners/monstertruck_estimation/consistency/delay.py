@@ -24,10 +24,10 @@ SCALE: Final = (0.6, 1.4)
 """Limits of the scale."""
 FEWEST: Final = 12
 """Steps that are compared at least."""
-CLEARLY: Final = 0.3
+CLEARLY: Final = 0.7
 """Share of the squared error without a delay beyond the tolerated one below which that with a delay is clear."""
-EXCESS: Final = 40.0
-"""Least difference of both, in variances."""
+EXCESS: Final = 25.0
+"""Least difference of both, in mean squared errors of a step that the delay leaves, or variances of its noise."""
 
 
 class Delay(NamedTuple):
@@ -59,7 +59,8 @@ def scan_delay(steps: list[tuple[int, int, float, float]], track: Track, tolerat
     allowed = int(tolerated * SECOND / SHIFT) + 1
     best = int(np.argmin(errors))
     least = float(errors[:allowed].min())
-    if best < allowed or errors[best] > CLEARLY * least or least - errors[best] < EXCESS:
+    left = float(errors[best])
+    if best < allowed or left > CLEARLY * least or least - left < EXCESS * max(left / len(usable), 1.0):
         return None
     return Delay(best * SHIFT / SECOND, float(errors[best]) / least)
 

@@ -312,7 +312,9 @@ class ConsistencyMonitor:
             return
         self._delayed_at = stamp
         steps = [step for step in self._steps if step[0] >= self._active_since]
-        delay = scan_delay(steps, self._tracks[Measure.WHEELS], self._config.delay)
+        interval, tolerated = max(self._intervals), self._config.delay
+        tolerated += interval if interval > tolerated else 0.0  # stamps of sparse scans are no better
+        delay = scan_delay(steps, self._tracks[Measure.WHEELS], tolerated)
         self._delays = 0 if delay is None else self._delays + 1
         if delay is None or self._delays < 2:
             return
