@@ -25,6 +25,8 @@ from monstertruck_drivers.epos.protocol import BAUD, Frame, FrameError, decode_b
 TIMEOUT = 5.0
 FRAME_TIMEOUT = 0.55
 """The controller forgets a half-received frame after 500 ms of silence."""
+ATTEMPT = 3.0
+"""Longest time of one attempt on a port that works, s: ten waits for bytes of 0.25 s each, and braking."""
 BRAKING = 0.4
 """Seconds from full speed to rest, with room to spare."""
 OKAY = b"O"
@@ -40,11 +42,13 @@ def main(arguments: list[str]) -> int:
     """Entry point; returns the exit code."""
     drives = [drive(argument) for argument in arguments]
     stopped: list[str] = []
-    threads = [threading.Thread(target=insist, args=(*one, stopped)) for one in drives]
+    # Daemons: the kernel may hold a port whose device takes no bytes for half a minute.
+    threads = [threading.Thread(target=insist, args=(*one, stopped), daemon=True) for one in drives]
+    end = time.monotonic() + TIMEOUT + ATTEMPT
     for thread in threads:
         thread.start()
     for thread in threads:
-        thread.join()
+        thread.join(max(0.0, end - time.monotonic()))
     return 0 if drives and len(stopped) == len(drives) else 1
 
 

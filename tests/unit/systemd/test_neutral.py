@@ -291,6 +291,21 @@ def test_the_codec_is_looked_for_in_a_checkout_and_in_an_installation(neutral):
     assert sys.path[-2:] == [str(SCRIPT.parents[1] / "drivers"), str(SCRIPT.parents[2])]
 
 
+def test_a_port_that_the_kernel_does_not_let_go_of_does_not_keep_the_script(neutral, monkeypatch):
+    controller, lets_go = Controller(0, 0), threading.Event()
+    monkeypatch.setattr(neutral, "os", SimpleNamespace(**vars(os) | {"close": lambda _: lets_go.wait(30)}))
+    monkeypatch.setattr(neutral, "TIMEOUT", 0.2)
+    monkeypatch.setattr(neutral, "ATTEMPT", 1.0)
+    waiting = threading.Thread(target=neutral.main, args=([f"{controller.path}=3"],))
+    waiting.start()
+    waiting.join(10)
+    still = waiting.is_alive()
+    lets_go.set()
+    waiting.join()
+    assert not still
+    assert len(controller.frames) == 2, "both commands were given"
+
+
 def ended(monkeypatch, *arguments):
     """Exit code of the script run as a program."""
     monkeypatch.setattr(sys, "argv", [str(SCRIPT), *arguments])
