@@ -4,7 +4,7 @@ import asyncio
 import fcntl
 import json
 import os
-import resource
+import re
 import select
 import subprocess
 import sys
@@ -12,7 +12,6 @@ import termios
 import threading
 import time
 import traceback
-from asyncio import events
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any, ClassVar
@@ -25,70 +24,85 @@ CALLS = {
     select: ("select",),
 }
 """Calls that may wait for a device."""
-PORTS = ("/monstertruck_drivers/", "/serial/", "/serial_asyncio/")
+SYSTEM_CALLS = ("openat", "close", "read", "write", "ioctl", "flock", "fcntl", "pselect6", "select")
+"""What the kernel traces of them."""
+TRACE = Path("/sys/kernel/tracing")
+TRACED = re.compile(r"\] \S+ +(?P<time>[0-9.]+): sys_\w+(?:\(| (?P<exit>->))")
+"""Line of the trace."""
+PORTS = ("/monstertruck_drivers/", "/site-packages/serial/", "/site-packages/serial_asyncio/")
 """Whose calls count."""
 RESULTS: dict[str, Any] = {}
 
 
 class Loop:
-    """How long one callback of the event loop is inside the kernel by what drivers and libraries of ports call.
+    """How long the event loop's thread is inside the kernel by what drivers and libraries of ports call.
 
-    The machine computes some thirty times slower than a computer, and stands while this computer does something else.
-    So only calls count in which the thread slept: of the others it is not the kernel that was waited for.
+    The machine computes some thirty times slower than a computer, so how long a callback computes says nothing; and
+    after a call the thread waits for the interpreter, which other threads hold. So the kernel itself traces when the
+    thread enters and leaves it, and whether it put it to sleep: other calls are long because this computer did
+    something else meanwhile.
     """
 
-    longest = 0.0
-    worst = ""
-    _inside = 0.0
-    _calls: ClassVar[list[str]] = []
+    _calls: ClassVar[list[tuple[float, float, str]]] = []
+    """Begin and end, s of CLOCK_MONOTONIC, and the name."""
 
     @classmethod
     def measure(cls) -> None:
         """From now on; call in the loop's thread."""
-        sys.setswitchinterval(0.0005)  # a call's end waits for the interpreter, which threads of ports use too
         for module, names in CALLS.items():
             for name in names:
                 setattr(module, name, cls._timed(getattr(module, name)))
-        really = events.Handle._run  # noqa: SLF001  # asyncio has no other place to measure at
-
-        def run(handle: Any) -> None:
-            cls._inside, cls._calls = 0.0, []
-            really(handle)
-            if cls._inside > cls.longest:
-                cls.longest, cls.worst = cls._inside, ", ".join(cls._calls[-20:])
-
-        events.Handle._run = run  # type: ignore[method-assign]  # noqa: SLF001
+        (TRACE / "trace_clock").write_text("mono")
+        (TRACE / "set_event_pid").write_text(str(threading.get_native_id()))
+        (TRACE / "buffer_size_kb").write_text("8192")
+        (TRACE / "events/sched/sched_switch/enable").write_text("1")
+        for name in SYSTEM_CALLS:
+            for way in ("enter", "exit"):
+                (TRACE / f"events/syscalls/sys_{way}_{name}/enable").write_text("1")
 
     @classmethod
-    def _timed(cls, call: Callable[..., Any], *, always: bool = False) -> Callable[..., Any]:
+    def _timed(cls, call: Callable[..., Any]) -> Callable[..., Any]:
         main = threading.get_ident()
 
         def timed(*arguments: Any, **named: Any) -> Any:
             caller = sys._getframe(1).f_code.co_filename  # noqa: SLF001
-            if threading.get_ident() != main or not (always or any(part in caller for part in PORTS)):
+            if threading.get_ident() != main or not any(part in caller for part in PORTS):
                 return call(*arguments, **named)
-            begin, sleeps = time.perf_counter(), resource.getrusage(resource.RUSAGE_THREAD).ru_nvcsw
+            begin = time.monotonic()
             try:
                 return call(*arguments, **named)
             finally:
-                took = time.perf_counter() - begin
-                if resource.getrusage(resource.RUSAGE_THREAD).ru_nvcsw > sleeps:
-                    cls._inside += took
-                    cls._calls.append(f"{call.__name__} {took * 1000:.2f} ms")
+                cls._calls.append((begin, time.monotonic(), call.__name__))
 
         return timed
 
     @classmethod
-    def touch(cls, line: int) -> None:
-        """One call that returns at once."""
-        cls._timed(os.write, always=True)(line, b"x")
-
-    @classmethod
     def take(cls) -> dict[str, Any]:
         """What was found since the last time."""
-        figures = {"in_kernel_ms": cls.longest * 1000, "calls": cls.worst}
-        cls.longest, cls.worst = 0.0, ""
-        return figures
+        (TRACE / "tracing_on").write_text("0")  # reading would be traced, without end
+        text = (TRACE / "trace").read_text()
+        (TRACE / "trace").write_text("")
+        (TRACE / "tracing_on").write_text("1")
+        asleep, entered, slept, traced = [], 0.0, False, 0
+        leaves = f"prev_pid={threading.get_native_id()} "
+        for line in text.splitlines():
+            if leaves in line:
+                slept |= "prev_state=R" not in line
+            elif match := TRACED.search(line):
+                if match["exit"] is None:
+                    entered, slept = float(match["time"]), False
+                elif slept:
+                    asleep.append((entered, float(match["time"])))
+                traced += match["exit"] is not None
+        found = [
+            (1000 * (left - come), name)
+            for come, left in asleep
+            for begin, end, name in cls._calls
+            if begin <= come and left <= end
+        ]
+        calls, cls._calls = len(cls._calls), []
+        longest, name = max(found, default=(0.0, ""))
+        return {"in_kernel_ms": longest, "calls": name, "slept": len(found), "counted": calls, "traced": traced}
 
 
 _asked = 0

@@ -48,6 +48,7 @@ for each in proc sys dev; do mount -o move /$each /root/$each; done
 mount -t tmpfs tmpfs /root/run; mkdir -p /root/run/share /root/run/udev/rules.d /root/run/lock
 mount -o move /share /root/run/share
 mount -t tmpfs tmpfs /root/var/tmp; mount -t tmpfs tmpfs /root/home
+mount -t tracefs trace /root/sys/kernel/tracing
 mount -t configfs config /root/sys/kernel/config
 mkdir -p /root/dev/pts; mount -t devpts pts /root/dev/pts
 ip link set lo up

@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import fcntl
 import os
+import pty
 import struct
 import subprocess
 import sys
@@ -16,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import serial
 
 from monstertruck_drivers.cable import DeviceEnd
 from monstertruck_drivers.computer import ROOT, Machine, open_watcher
@@ -40,7 +42,7 @@ from monstertruckd.config.truck import TruckConfig
 from monstertruckd.tools.doctor.context import HostContext, inspect
 from monstertruckd.tools.doctor.devices import handshakes, wiring
 from monstertruckd.tools.install.files import Program, rules_text
-from usb_kernel_parts.inside import Loop, ask, situation, until
+from usb_kernel_parts.inside import ask, situation, until
 
 CLOCK = WallClock()
 MACHINE = Machine(CLOCK)
@@ -237,9 +239,9 @@ async def switch(name: str, *, on: bool) -> None:
 async def open_and_close() -> dict[str, Any]:
     """Every adapter, ten times; the control lines as set."""
     lines = {}
-    for serial in ("SNs1", "SNs2", "SNs3"):
+    for number in ("SNs1", "SNs2", "SNs3"):
         for nth in range(10):
-            node = tty_of(by_serial(serial))
+            node = tty_of(by_serial(number))
             assert node is not None
             async with await SerialPort(node, dtr=nth % 2 == 0, rts=nth % 3 == 0).open() as link:
                 link.write(b"hello")
@@ -543,28 +545,19 @@ async def topology() -> dict[str, Any]:
     return {"ok": ok and f"ID_PATH={names[by_serial('SNs1')]}" in shown, "names": names}
 
 
-async def noise() -> dict[str, Any]:
-    """What the figure is where the kernel makes nothing wait: another thread computes, and calls return at once."""
-    end = time.monotonic() + 3
-    computing = asyncio.create_task(asyncio.to_thread(compute, end))
-    read, write = os.pipe()
-    while time.monotonic() < end:
-        asyncio.get_running_loop().call_soon(Loop.touch, write)
-        await asyncio.sleep(0.01)
-        os.read(read, 4096)
-    await computing
+async def control() -> dict[str, Any]:
+    """A call of a library that sleeps for 50 ms on the loop: the measurement has to see it."""
+    master, slave = pty.openpty()
+    with serial.Serial(os.ttyname(slave), timeout=0.05) as line:
+        line.read(1)
+    os.close(master)
+    os.close(slave)
     return {"ok": True}
-
-
-def compute(end: float) -> None:
-    """Keep the interpreter busy."""
-    while time.monotonic() < end:
-        sum(range(1000))
 
 
 async def run_all() -> None:
     """One after the other."""
-    acts = (noise, tree, topology, open_and_close, udev_rules, foreign_opener, brltty, drivers, hub_pulled)
+    acts = (control, tree, topology, open_and_close, udev_rules, foreign_opener, brltty, drivers, hub_pulled)
     acts += (unplugged_in_mid_write, port_power, deaf, listens_again, doctor, reopened_by_another_name)
     for act in acts:
         await situation(act.__name__, act)

@@ -9,10 +9,6 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 
-BLOCKED_MS = 500.0
-"""A port that keeps the kernel waiting does so for seconds. The benchmark's own goal is 2 ms, which a machine that is
-computed for can miss on a busy computer: the interpreter's lock is waited for, too."""
-
 pytestmark = [pytest.mark.wall, pytest.mark.long, pytest.mark.timeout(800)]
 
 
@@ -25,5 +21,6 @@ def test_every_situation_on_a_real_kernel():
     situations = found["figures"]["situations"]
     assert found["figures"]["exit"] == 0, done.stdout
     assert [name for name, one in situations.items() if not one["ok"]] == [], done.stdout
-    longest = {name: one["calls"] for name, one in situations.items() if one["in_kernel_ms"] > BLOCKED_MS}
-    assert longest == {}
+    slept = {name: one["calls"] for name, one in situations.items() if one["in_kernel_ms"] > 2.0}
+    assert slept == {}
+    assert found["met"]
