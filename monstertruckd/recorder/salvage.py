@@ -354,6 +354,8 @@ class _Scan:
         """The data section is over: damage there costs no message."""
         self._sure = True
         """No gap since the begin or the last chunk: a message index is that of this chunk."""
+        self._broken = False
+        """There is a gap, perhaps in the index."""
         self._loose = False
         """The log has messages outside of chunks, behind no gap."""
 
@@ -374,7 +376,7 @@ class _Scan:
                 in_step, at = self._take_unsealed(part)
         found, parts = self._found, self._found.parts
         loose = found.statistics is not None and not found.statistics.chunk_count
-        if None in parts and not (loose or self._loose):  # what looks like messages is inside of broken chunks
+        if self._broken and not (loose or self._loose):  # what looks like messages is inside of broken chunks
             self._found.parts = [part for part in parts if part is None or part.opcode != Opcode.MESSAGE]
         return self._found
 
@@ -397,7 +399,7 @@ class _Scan:
         return False, part.offset + _HEAD.size
 
     def _note_gap(self) -> None:
-        self._sure = False
+        self._sure, self._broken = False, True
         if not self._behind and self._found.parts[-1:] != [None]:
             self._found.parts.append(None)
 
@@ -487,7 +489,7 @@ class _Scan:
                 self._take_chunk(part)
             case Opcode.MESSAGE:
                 self._behind = False
-                self._loose |= self._sure
+                self._loose |= not self._broken
                 found.parts.append(part)
             case Opcode.HEADER | Opcode.METADATA | Opcode.ATTACHMENT:
                 self._behind = False
