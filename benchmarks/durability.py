@@ -1,10 +1,11 @@
 """Kills, power cuts and damaged files: nothing that was acknowledged is lost, nothing is mixed, nothing is a traceback.
 
-    python -m benchmarks.durability [--kills 1000] [--cuts 200] [--logs 2000] [--seed 1] [PART ...]
+    python -m benchmarks.durability [--kills 1000] [--cuts 200] [--logs 2000] [--files 20000] [--seed 1] [PART ...]
 
 Parts: ``kills`` ends the writers of all subjects (``durability_parts/deaths.py``) by SIGKILL at any moment; ``cuts``
 plays the traces of their writes to a disk that forgets what was not synced, and cuts its power at any point; ``logs``
-damages recordings and repairs them (``damage.py``).
+damages recordings and repairs them (``damage.py``); ``files`` mutates files of every kind that users hand in
+(``files.py``).
 """
 
 import argparse
@@ -15,11 +16,11 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from benchmarks.durability_parts import damage, deaths
+from benchmarks.durability_parts import damage, deaths, files
 from benchmarks.durability_parts.subject import Subject
 
-GOALS = {"kills": 1000, "cuts": 200, "logs": 2000, "faults": 0}
-PARTS = ("kills", "cuts", "logs")
+GOALS = {"kills": 1000, "cuts": 200, "logs": 2000, "files": 20_000, "faults": 0}
+PARTS = ("kills", "cuts", "logs", "files")
 
 
 def main() -> int:
@@ -29,6 +30,7 @@ def main() -> int:
     options.add_argument("--kills", type=int, default=GOALS["kills"])
     options.add_argument("--cuts", type=int, default=GOALS["cuts"])
     options.add_argument("--logs", type=int, default=GOALS["logs"])
+    options.add_argument("--files", type=int, default=GOALS["files"])
     options.add_argument("--seed", type=int, default=1)
     options.add_argument("--subject", action="append", help="kill and cut writers of these subjects only")
     given = options.parse_args()
@@ -42,6 +44,8 @@ def main() -> int:
             figures["cuts"] = _cuts(subjects, given.cuts, given.seed, Path(name) / "cuts")
         if "logs" in parts:
             figures["logs"] = {"damaged": damage.run(given.logs, given.seed, Path(name) / "logs")}
+        if "files" in parts:
+            figures["files"] = files.run_apart(given.files, given.seed, Path(name) / "files")
     print(json.dumps({"bench": "durability", "figures": figures, "goals": GOALS, "met": _met(figures)}))
     return 0 if _met(figures) else 1
 

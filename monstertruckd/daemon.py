@@ -41,7 +41,7 @@ from monstertruck_runtime.service import OnBug, RestartPolicy, Scope, Service, s
 from monstertruck_runtime.slowness import SlowComputer, factor_of
 from monstertruck_runtime.threads import Offload, in_daemon_thread, in_thread, inline
 from monstertruck_schemas import topics
-from monstertruck_schemas.event import Severity
+from monstertruck_schemas.event import CALL_TEXT, Call, Severity
 from monstertruck_schemas.health import ServiceHealth, ServiceState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import ExploreRequest, GoalRequest, MissionRequest
@@ -305,7 +305,7 @@ class Daemon:
             self._start(where, driver, on_bug, devices[role].restart if role in devices else None)
 
     def _build_rpc(self) -> Rpc:
-        rpc = Rpc(self.clock)
+        rpc = Rpc(self.clock, record=recording(self.bus, self.clock))
 
         live = LiveConfig(self.config, self._reconfigure, self._events, self._offload)
 
@@ -315,12 +315,12 @@ class Daemon:
         async def versions(_: dict[str, Any]) -> dict[str, Any]:
             return dict(running_versions())
 
-        rpc.register("config", config, AccessRole.OBSERVER)
-        rpc.register("versions", versions, AccessRole.OBSERVER)
+        rpc.register("config", config, AccessRole.OBSERVER, recorded=False)
+        rpc.register("versions", versions, AccessRole.OBSERVER, recorded=False)
         live.register(rpc)
         rpc.register("acknowledge", acknowledging(self._events))
         self._recordings().register(rpc)
-        rpc.register(REMOTE_STEP, self._remote_steps.serve)
+        rpc.register(REMOTE_STEP, self._remote_steps.serve, recorded=False)
         register_gate_calls(rpc, self.bus, self.clock)
         loaded = self._tree.calibration if self._tree is not None else None
         calibration_rpc.register(
@@ -432,6 +432,28 @@ class Daemon:
             offload=in_daemon_thread if self._seed is None else inline,
             log=lambda: None if self.recorder is None else self.recorder.path,
         )
+
+
+def recording(bus: Bus, clock: Clock) -> Callable[[str, str, str, Reason, str], None]:
+    """Return what publishes every call that was answered as ``event/call``."""
+    out = bus.publisher(topics.CALL, Writer.DAEMON)
+
+    def record(name: str, source: str, payload: str, reason: Reason, answer: str) -> None:
+        now = clock.now()
+        asked, answered = payload[:CALL_TEXT], answer[:CALL_TEXT]
+        call = Call(
+            stamp=now,
+            received=now,
+            seq=out.next_seq(),
+            name=name,
+            source=source,
+            payload=asked,
+            reason=reason,
+            answer=answered,
+        )
+        out.put(call)
+
+    return record
 
 
 def acknowledging(events: EventSink) -> Handler:

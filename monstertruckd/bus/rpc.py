@@ -5,6 +5,7 @@ Handlers find the caller under ``source`` and the priority it may claim under ``
 
 import json
 import logging
+from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
@@ -27,16 +28,25 @@ class Rpc:
     Args:
         clock: time of the deadlines.
         deadline: seconds a handler may take.
+        record: gets name, source, payload, reason and answer of every call from outside that is recorded.
     """
 
-    def __init__(self, clock: Clock, deadline: float = 5.0) -> None:
+    def __init__(
+        self, clock: Clock, deadline: float = 5.0, record: Callable[[str, str, str, Reason, str], object] | None = None
+    ) -> None:
         self._clock = clock
+        self._record = record
+        self._unrecorded: set[str] = set()
         self._deadline = deadline
         self._handlers: dict[str, Handler] = {}
         self._needed: dict[str, AccessRole] = {}
 
-    def register(self, name: str, handler: Handler, role: AccessRole = AccessRole.PILOT) -> None:
+    def register(
+        self, name: str, handler: Handler, role: AccessRole = AccessRole.PILOT, *, recorded: bool = True
+    ) -> None:
         """Serve ``name`` by ``handler`` for callers that have ``role``, or one that may do more.
+
+        Calls that only read, or come many times a second, are not ``recorded``.
 
         Raises:
             RuntimeError: the name is taken.
@@ -46,6 +56,8 @@ class Rpc:
             raise RuntimeError(msg)
         self._handlers[name] = handler
         self._needed[name] = role
+        if not recorded:
+            self._unrecorded.add(name)
 
     def serves(self, name: str) -> bool:
         """Whether a handler is registered."""
@@ -82,18 +94,25 @@ class Rpc:
             name: of the call.
             payload: JSON object.
         """
+        reason, answered = await self._answer(sender, name, payload)
+        if self._record is not None and name not in self._unrecorded:
+            self._record(name, sender.source, payload.decode(errors="replace"), reason, answered.decode())
+        return reason is Reason.OK, answered
+
+    async def _answer(self, sender: Sender, name: str, payload: bytes) -> tuple[Reason, bytes]:
+        """``OK`` and the answer, or why not and the error reply."""
         needed = self._needed.get(name, AccessRole.OBSERVER)
         if not sender.may(needed):
-            return False, failure(Reason.NOT_PERMITTED, f"{name}: {sender.refusal(needed)}")
+            return Reason.NOT_PERMITTED, failure(Reason.NOT_PERMITTED, f"{name}: {sender.refusal(needed)}")
         try:
             answer = await self.call(name, _of_sender(sender, _parse(payload)))
-            return True, json.dumps(answer, allow_nan=False).encode()
+            return Reason.OK, json.dumps(answer, allow_nan=False).encode()
         except TruckError as error:
             reason = error.refusal if isinstance(error, RequestRefusedError) else error.reason
-            return False, failure(reason, str(error))
+            return reason, failure(reason, str(error))
         except Exception:
             log.exception("rpc %s: bug", name)
-            return False, failure(Reason.INTERNAL, Reason.INTERNAL.text)
+            return Reason.INTERNAL, failure(Reason.INTERNAL, Reason.INTERNAL.text)
 
 
 def topic_rows(robot: str) -> list[dict[str, Any]]:

@@ -93,7 +93,7 @@ class ZenohBridge:
         self._clock = clock
         self._rpc = rpc
         self._sessions: list[tuple[Listener, zenoh.Session]] = []
-        rpc.register("topics", self._topics, AccessRole.OBSERVER)
+        rpc.register("topics", self._topics, AccessRole.OBSERVER, recorded=False)
 
     async def open(self) -> None:
         """Open the sessions and claim the robot's name; ``run`` does so as well, a daemon calls it first to fail early.

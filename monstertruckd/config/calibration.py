@@ -19,6 +19,7 @@ from pydantic import AfterValidator, Field, ValidationError
 
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import ConfigError, NotFoundError
+from monstertruck_runtime.outside import cause_of
 from monstertruck_runtime.small_files import make_folder, replace_file, require_file
 from monstertruck_schemas.base import Schema, first_mistake
 from monstertruck_schemas.body import LensConfig, Mount, TurnDeficitConfig
@@ -240,8 +241,8 @@ class CalibrationStore:
         try:
             require_file(path, MOST_BYTES)
             file = CalibrationFile.model_validate_json(path.read_bytes())
-        except (OSError, ValidationError) as error:
-            what = error.strerror if isinstance(error, OSError) else first_mistake(error)
+        except Exception as error:
+            what = error.strerror if isinstance(error, OSError) else cause_of(error)
             msg = f"{path}: no usable calibration: {what}; move it away to go back to the one before"
             raise ConfigError(msg) from error
         if file.robot != self._robot:

@@ -94,7 +94,7 @@ def register(
         path = await offload(lambda: store.undo(wizard, real_time()))
         return announced(path, f"calibration of {wizard} undone", payload.get("source"))
 
-    rpc.register(SHOW, show, AccessRole.OBSERVER)
+    rpc.register(SHOW, show, AccessRole.OBSERVER, recorded=False)
     rpc.register(SAVE, save, AccessRole.ENGINEER)
     rpc.register(UNDO, undo, AccessRole.ENGINEER)
 

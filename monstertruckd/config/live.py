@@ -74,7 +74,7 @@ class LiveConfig:
 
     def register(self, rpc: Rpc) -> None:
         """Serve ``settings`` and ``set``."""
-        rpc.register(LIST, self._list, AccessRole.OBSERVER)
+        rpc.register(LIST, self._list, AccessRole.OBSERVER, recorded=False)
         rpc.register(SET, self._set, AccessRole.ENGINEER)
 
     async def _list(self, _: dict[str, Any]) -> dict[str, Any]:

@@ -169,14 +169,16 @@ class ServiceCalls:
         self._board = board
         self._service = service
 
-    def register(self, name: str, handler: Handler, role: AccessRole = AccessRole.PILOT) -> None:
+    def register(
+        self, name: str, handler: Handler, role: AccessRole = AccessRole.PILOT, *, recorded: bool = True
+    ) -> None:
         """Serve ``name``; see ``RpcRegistry``."""
 
         async def served(payload: dict[str, Any]) -> dict[str, Any]:
             self._board.require(self._service)
             return await handler(payload)
 
-        self._rpc.register(name, served, role)
+        self._rpc.register(name, served, role, recorded=recorded)
 
 
 class ClockService:

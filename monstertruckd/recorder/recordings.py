@@ -87,8 +87,8 @@ class Recordings:
 
     def register(self, rpc: Rpc) -> None:
         """Serve ``recordings``, ``recording_read`` and ``recording_delete``."""
-        rpc.register(LIST, self._list, AccessRole.OBSERVER)
-        rpc.register(READ, self._read, AccessRole.PILOT)
+        rpc.register(LIST, self._list, AccessRole.OBSERVER, recorded=False)
+        rpc.register(READ, self._read, AccessRole.PILOT, recorded=False)
         rpc.register(DELETE, self._delete, AccessRole.ENGINEER)
 
     def _files(self) -> Iterable[tuple[Path, Recording]]:

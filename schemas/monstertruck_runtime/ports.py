@@ -81,5 +81,10 @@ Handler = Callable[[dict[str, Any]], Awaitable[dict[str, Any]]]
 class RpcRegistry(Protocol):
     """Where handlers of remote calls are registered."""
 
-    def register(self, name: str, handler: Handler, role: AccessRole = AccessRole.PILOT) -> None:
-        """Serve ``name`` by ``handler`` for callers that have ``role``, or one that may do more."""
+    def register(
+        self, name: str, handler: Handler, role: AccessRole = AccessRole.PILOT, *, recorded: bool = True
+    ) -> None:
+        """Serve ``name`` by ``handler`` for callers that have ``role``, or one that may do more.
+
+        Calls that only read, or come many times a second, are not ``recorded``.
+        """

@@ -15,7 +15,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from monstertruck_runtime.endpoints import host_of, port_of
-from monstertruck_runtime.errors import InputError, NotFoundError, NotPermittedError
+from monstertruck_runtime.errors import NotFoundError, NotPermittedError
+from monstertruck_runtime.outside import MEGABYTE, contents, reading
 
 TLS_VARIABLE: Final = "MONSTERTRUCKD_TLS"
 """Names the folder of the station's certificate."""
@@ -43,11 +44,10 @@ class ClientTls:
         from cryptography import x509  # noqa: PLC0415 - only for certificates
         from cryptography.x509.oid import NameOID  # noqa: PLC0415
 
-        try:
-            certificate = x509.load_pem_x509_certificate(self.certificate.read_bytes())
+        expected = "a certificate with a common name"
+        with reading(self.certificate, expected):
+            certificate = x509.load_pem_x509_certificate(contents(self.certificate, expected, MEGABYTE))
             return str(certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)[0].value)
-        except (OSError, ValueError, IndexError) as error:
-            raise InputError(f"{self.certificate}: expected a certificate with a common name: {error}") from None
 
 
 def station_tls(environment: Mapping[str, str] = os.environ) -> ClientTls:

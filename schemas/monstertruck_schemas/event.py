@@ -31,6 +31,25 @@ class Event(Message):
     """Measurements behind the decision."""
 
 
+class Call(Message):
+    """A remote call that was answered: who asked for what, and the answer."""
+
+    name: str
+    """What was called, e.g. ``goal``."""
+    source: str
+    """Who called, by the key."""
+    payload: str
+    """JSON object, cut after ``CALL_TEXT`` characters."""
+    reason: Reason
+    """``ok``, or why it was refused."""
+    answer: str
+    """JSON object, or the text of the refusal; cut likewise."""
+
+
+CALL_TEXT = 4096
+"""Characters of a call's payload and of its answer that are recorded: a hundred waypoints."""
+
+
 class Measurement(Schema):
     """One figure behind a stop."""
 

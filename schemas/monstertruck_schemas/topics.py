@@ -17,7 +17,7 @@ from typing import Any, Final, Generic, TypeVar
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.cmd import DriveCommand, SteeringCommand
 from monstertruck_schemas.entry_points import ExtensibleTable
-from monstertruck_schemas.event import Event, LogRecord, Stop
+from monstertruck_schemas.event import Call, Event, LogRecord, Stop
 from monstertruck_schemas.health import (
     CalibrationHealth,
     HealthTable,
@@ -305,6 +305,7 @@ USB: Final = Topic("health/usb", UsbTree, W.DAEMON, "USB hubs, ports and devices
 
 EVENT: Final = Topic("event/event", Event, W.DAEMON, "Decisions, faults and recoveries")
 STOP: Final = Topic("event/stop", Stop, W.GATE, "Why the robot was stopped, with the chain of causes", retained=True)
+CALL: Final = Topic("event/call", Call, W.DAEMON, "Remote calls that change something: who, what, answer")
 LOG: Final = Topic("event/log", LogRecord, W.DAEMON, "The daemon's journal", foxglove="foxglove.Log")
 
 REQ_DRIVE: Final = Topic(

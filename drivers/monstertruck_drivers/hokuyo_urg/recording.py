@@ -1,7 +1,6 @@
 """A recorded drive served by the emulated scanner, every scan at its recorded time, once."""
 
 import asyncio
-import gzip
 from pathlib import Path
 from typing import Any, Final, Self
 
@@ -11,6 +10,7 @@ from numpy.typing import NDArray
 from monstertruck_drivers.hokuyo_urg.emulator import HokuyoEmulator, StartState
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.outside import lines_of, reading
 
 COLUMNS: Final = 707
 TIME_COLUMN: Final = 0
@@ -49,19 +49,16 @@ class RecordedRanges:
         Raises:
             InputError: the file does not exist or a line is not of this form.
         """
-        opener = gzip.open if path.suffix == ".gz" else open
         times: list[int] = []
         rows: list[NDArray[np.int32]] = []
-        try:
-            with opener(path, "rt", encoding="ascii") as lines:
-                for number, line in enumerate(lines, start=1):
-                    time, row = _parse(line, f"{path}:{number}")
-                    if times and time <= times[-1]:
-                        raise InputError(f"{path}:{number}: time {time} does not increase")
-                    times.append(time)
-                    rows.append(row)
-        except (OSError, EOFError, UnicodeDecodeError) as error:
-            raise InputError(f"{path}: expected a recording of {COLUMNS} numbers a line: {error}") from error
+        expected = f"a recording of {COLUMNS} numbers a line"
+        with reading(path, expected):
+            for number, line in enumerate(lines_of(path, expected), start=1):
+                time, row = _parse(line, f"{path}:{number}")
+                if times and time <= times[-1]:
+                    raise InputError(f"{path}:{number}: time {time} does not increase")
+                times.append(time)
+                rows.append(row)
         if not rows:
             raise InputError(f"{path}: holds no scans")
         return cls((np.array(times, np.int64) - times[0]) * 1000, np.array(rows, np.int32))

@@ -7,10 +7,10 @@ from typing import Final
 from xml.etree import ElementTree as ET
 
 import numpy as np
-from PIL import Image, UnidentifiedImageError
 
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.outside import MEGABYTE, contents, picture, reading
 from monstertruck_sim.world.config import (
     Ditch,
     GroundFeature,
@@ -27,6 +27,8 @@ from monstertruck_sim.world.terrain import LEVEL, Profile, Terrain
 from monstertruck_sim.world3d.heights import HeightGrid
 from monstertruck_sim.world3d.model import Block
 
+MOST_XML: Final = 10 * MEGABYTE
+"""Bytes of an MJCF file."""
 HEIGHT_STEP: Final = 0.05
 """Distance of the points of the height field, m."""
 _MARGIN: Final = 1.0
@@ -95,12 +97,9 @@ def _hills(feature: Hills, x: Array, y: Array, starts: Sequence[Pose]) -> Array:
 
 
 def _pictured(config: HeightImage) -> HeightGrid:
-    try:
-        with Image.open(config.file) as image:
-            grey = np.asarray(image.convert("I" if image.mode.startswith("I") else "L"), dtype=np.float64)
-            white = 65535.0 if image.mode.startswith("I") else 255.0
-    except (OSError, UnidentifiedImageError, Image.DecompressionBombError) as error:
-        raise InputError(f"sim.world.height_image: {config.file}: {error}") from error
+    with picture(config.file, "a picture of heights (sim.world.height_image)") as image:
+        grey = np.asarray(image.convert("I" if image.mode.startswith("I") else "L"), dtype=np.float64)
+        white = 65535.0 if image.mode.startswith("I") else 255.0
     return HeightGrid(np.ascontiguousarray(grey[::-1]) / white * config.height, config.resolution, (config.x, config.y))
 
 
@@ -143,10 +142,12 @@ def scenery(path: Path) -> tuple[list[ET.Element], list[ET.Element]]:
         InputError: it is no MJCF file, something in it moves, or it has what is not taken over: classes of defaults,
             another sequence of Euler angles.
     """
-    try:
-        root = ET.parse(path).getroot()  # noqa: S314  # a file that the user names himself
-    except (OSError, ET.ParseError) as error:
-        raise InputError(f"sim.world.mjcf: {path}: {error}") from error
+    expected = "MJCF (sim.world.mjcf)"
+    text = contents(path, expected, MOST_XML)
+    with reading(path, expected):
+        if b"<!ENTITY" in text:
+            raise InputError(f"sim.world.mjcf: {path}: <!ENTITY: expected XML without entities")
+        root = ET.fromstring(text)  # noqa: S314  # a file that the user names himself, without entities
     if root.tag != "mujoco":
         raise InputError(f"sim.world.mjcf: {path}: expected <mujoco>, found <{root.tag}>")
     for tag in ("joint", "freejoint", "flexcomp", "composite", "actuator", "include"):

@@ -293,6 +293,7 @@ def _read_wheels(path: Path) -> "tuple[Wheel, ...]":
     """Wheels from YAML: a list of mappings with `kind` (fixed, steered, caster, swedish) and the wheel's fields."""
     from monstertruck_kinematics.wheels import CasterWheel, FixedWheel, SteeredWheel, SwedishWheel, checked
     from monstertruck_runtime.errors import InputError
+    from monstertruck_runtime.outside import reading
     from monstertruck_runtime.yaml_files import read_yaml
 
     kinds: dict[str, type[Wheel]] = {
@@ -304,7 +305,7 @@ def _read_wheels(path: Path) -> "tuple[Wheel, ...]":
     rows = read_yaml(path)
     if not isinstance(rows, list):
         raise InputError(f"{path}: expected a list of wheels")
-    wheels = []
+    wheels: list[Wheel] = []
     for number, row in enumerate(rows, start=1):
         if not isinstance(row, dict) or row.get("kind") not in kinds:
             raise InputError(f"{path}: wheel {number}: expected a mapping with kind {', '.join(kinds)}")
@@ -313,10 +314,14 @@ def _read_wheels(path: Path) -> "tuple[Wheel, ...]":
             if name not in ("name", "group") and not isinstance(value, int | float):
                 raise InputError(f"{path}: wheel {number}: {name} is {value!r}: expected a number")
         try:
-            wheels.append(kinds[row["kind"]](**fields))
-        except TypeError as error:
-            raise InputError(f"{path}: wheel {number}: {str(error).partition('__init__() ')[2]}") from error
-    return checked(wheels)
+            with reading(f"{path}: wheel {number}", "a wheel"):
+                wheels.append(kinds[row["kind"]](**fields))
+        except InputError as error:
+            if not isinstance(cause := error.__cause__, TypeError):
+                raise
+            raise InputError(f"{path}: wheel {number}: {str(cause).partition('__init__() ')[2]}") from cause
+    with reading(path, "wheels"):
+        return checked(wheels)
 
 
 def _draw_wheels(path: Path, wheels: "tuple[Wheel, ...]", icr: tuple[float, float] | None) -> None:
@@ -431,21 +436,15 @@ def _read_trajectory(path: Path) -> "NDArray[Any]":
     import numpy as np
 
     from monstertruck_runtime.errors import InputError
-    from monstertruck_runtime.small_files import require_file
+    from monstertruck_runtime.outside import MOST_UNPACKED
+    from monstertruck_runtime.tables import read_table
 
-    try:
-        require_file(path)
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        why = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
-        raise InputError(f"{path}: cannot be read: {why}") from error
     rows = []
-    for number, line in enumerate(lines, start=1):
-        cells = line.split(",")
+    for index, (number, cells) in enumerate(read_table(path, "a table of six numbers", MOST_UNPACKED)):
         try:
             rows.append([float(cell) for cell in cells])
         except ValueError as error:
-            if number > 1:
+            if index:
                 raise InputError(f"{path}:{number}: {error}") from error
             continue
         if len(cells) != 6:

@@ -313,9 +313,17 @@ def finish_log(log: Path, fault: str | None) -> None:
 
 @contextmanager
 def _reading(what: str, log: Path) -> "Iterator[Progress]":
-    """Progress over the bytes of a log."""
+    """Progress over the bytes of a log, and the door for whatever is in it."""
+    from monstertruck_runtime.outside import reading
+
     with progress(what, log.stat().st_size if log.is_file() else None) as done:
-        yield done
+        try:
+            yield done
+        except (OSError, ImportError, typer.Exit):  # of the output, of an extra, of the command
+            raise
+        except Exception as error:
+            with reading(log, f"a log of this program, to {what}"):
+                raise error
 
 
 def _exporter(form: ExportFormat) -> "Callable[[LogReader, Path, Selection, Progress], dict[str, Path]]":

@@ -1,9 +1,6 @@
 """Scans with odometry from logs of several formats: our MCAP, CARMEN text, arrays in npz, URG text."""
 
-import gzip
-import io
 import math
-import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -17,6 +14,8 @@ from monstertruck_estimation.slam.worker_io import ScanInput
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError, NotFoundError
+from monstertruck_runtime.outside import arrays as arrays_of
+from monstertruck_runtime.outside import lines_of, reading
 from monstertruck_runtime.small_files import require_file
 from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.state import Odometry
@@ -97,6 +96,11 @@ def read_scans(path: Path, geometry: LogGeometry | None = None) -> ScanLog:
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error
     given = {} if geometry is None else geometry.known
+    with reading(path, "a log with scans"):
+        return _read(path, head, given)
+
+
+def _read(path: Path, head: bytes, given: dict[str, Any]) -> ScanLog:
     if head.startswith(MAGIC):
         reader = open_log(path)
         log = ScanLog("mcap", list(_mcap(reader)), fault=reader.fault)
@@ -141,11 +145,7 @@ def _mcap(reader: LogReader) -> Iterator[ScanInput]:
 
 def _arrays(path: Path, given: dict[str, Any]) -> ScanLog:
     """An npz log; its geometry is what is ``given``, else its arrays of the same names, else assumed."""
-    try:
-        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(f"{path}: expected arrays t, ranges and perhaps odom: {error}") from error
+    arrays = arrays_of(path, "arrays t, ranges and perhaps odom")
     ranges = _array(path, arrays, "ranges", (-1, -1))
     times = _array(path, arrays, "t", (len(ranges),))
     odom = _array(path, arrays, "odom", (len(ranges), 3)) if "odom" in arrays else None
@@ -207,31 +207,24 @@ def _missing(known: dict[str, Any]) -> tuple[str, ...]:
 
 
 def _carmen(path: Path, given: dict[str, Any]) -> ScanLog:
-    opener: Any = gzip.open if path.suffix == ".gz" else open
     _check(path, given)
     begin: float | None = None
     scans: list[ScanInput] = []
-    try:
-        with opener(path, "rt", encoding="ascii") as lines:
-            for number, line in enumerate(lines, start=1):
-                words = line.split()
-                if not words or words[0] != "FLASER":
-                    continue
-                try:
-                    count = int(words[1])
-                    ranges = np.array(words[2 : 2 + count], np.float64)
-                    rest = words[2 + count :]
-                    odom = (float(rest[3]), float(rest[4]), float(rest[5]))
-                    time = float(rest[6])
-                    begin = time if begin is None else begin
-                    stamp = BEGIN + round((time - begin) * SECOND)
-                except (ValueError, IndexError, OverflowError) as error:
-                    raise InputError(f"{path}:{number}: expected FLASER n, n ranges, 6 numbers, time") from error
-                scans.append(_sick(stamp, ranges, odom, {"range_max": LONGEST_RANGE} | given))
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: not a log with scans: neither MCAP, npz nor text") from error
-    except (OSError, EOFError) as error:
-        raise InputError(f"{path}: not a log with scans: {error}") from error
+    for number, line in enumerate(lines_of(path, "a log with scans (MCAP, npz or text)"), start=1):
+        words = line.split()
+        if not words or words[0] != "FLASER":
+            continue
+        with reading(f"{path}:{number}", "FLASER n, n ranges, 6 numbers, time"):
+            count = int(words[1])
+            if not 0 <= count <= len(words):
+                raise ValueError(f"{count} ranges")
+            ranges = np.array(words[2 : 2 + count], np.float64)
+            rest = words[2 + count :]
+            odom = (float(rest[3]), float(rest[4]), float(rest[5]))
+            time = float(rest[6])
+            begin = time if begin is None else begin
+            stamp = BEGIN + round((time - begin) * SECOND)
+            scans.append(_sick(stamp, ranges, odom, {"range_max": LONGEST_RANGE} | given))
     return ScanLog("carmen", scans, (begin or 0.0) - BEGIN / SECOND, _missing(given))
 
 

@@ -17,6 +17,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.outside import MEGABYTE, contents, reading
 from monstertruck_runtime.small_files import replace_file
 
 DAY: Final = 86_400
@@ -62,10 +63,8 @@ def load(certificate: Path, key: Path) -> Certificate:
         InputError: one is not there, or no certificate or key of this kind.
     """
     loaded = read_certificate(certificate)
-    try:
-        private = serialization.load_pem_private_key(key.read_bytes(), None)
-    except (OSError, ValueError, TypeError) as error:
-        raise InputError(f"{key}: expected a private key: {error}") from None
+    with reading(key, "a private key"):
+        private = serialization.load_pem_private_key(contents(key, "a private key", MEGABYTE), None)
     if not isinstance(private, ec.EllipticCurvePrivateKey):
         raise InputError(f"{key}: expected a key of an elliptic curve")
     return Certificate(loaded, private)
@@ -86,10 +85,8 @@ def read_certificates(path: Path) -> list[x509.Certificate]:
     Raises:
         InputError: there is none, or one is damaged.
     """
-    try:
-        return x509.load_pem_x509_certificates(path.read_bytes())
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: expected a certificate: {error}") from None
+    with reading(path, "a certificate"):
+        return x509.load_pem_x509_certificates(contents(path, "a certificate", MEGABYTE))
 
 
 def common_name(certificate: x509.Certificate) -> str:

@@ -10,7 +10,7 @@ from typing import Annotated, Final, Literal
 
 import cv2
 import numpy as np
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from monstertruck_estimation.vision.board import BoardReader
 from monstertruck_estimation.vision.lens import Lens, LensFit, lens_from_pictures
@@ -18,6 +18,7 @@ from monstertruck_estimation.vision.tags import Picture, Sighting, TagReader
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.fitting import least_squares
 from monstertruck_runtime.errors import ConfigError, InputError
+from monstertruck_runtime.outside import MEGABYTE, contents, reading
 from monstertruck_runtime.small_files import make_folder, replace_file
 from monstertruck_schemas.base import Schema
 from monstertruckd.tools.stand.camera import PlacedCamera, meet, rotation_matrix
@@ -228,10 +229,9 @@ def load(path: Path) -> StandCalibration:
     Raises:
         ConfigError: there is none, or it is damaged.
     """
-    try:
-        return StandCalibration.model_validate_json(path.read_bytes())
-    except (OSError, ValidationError) as error:
-        raise ConfigError(f"{path}: no usable calibration of the stand: run `stand calibrate` ({error})") from error
+    expected = "a calibration of the stand (`stand calibrate` makes one)"
+    with reading(path, expected, ConfigError):
+        return StandCalibration.model_validate_json(contents(path, expected, MEGABYTE, ConfigError))
 
 
 def save(calibration: StandCalibration, path: Path) -> None:

@@ -434,4 +434,4 @@ def register_point_calls(rpc: RpcRegistry, service: PointService) -> None:
         return {"jpeg": base64.b64encode(data).decode("ascii")}
 
     rpc.register("points", points)
-    rpc.register("point_picture", point_picture, AccessRole.OBSERVER)
+    rpc.register("point_picture", point_picture, AccessRole.OBSERVER, recorded=False)

@@ -366,4 +366,4 @@ def register_behaviour_calls(rpc: RpcRegistry, service: BehaviourService) -> Non
         }
 
     register_numbered(rpc, "behave", BehaviourRequest, service.take)
-    rpc.register("behaviours", behaviours, AccessRole.OBSERVER)
+    rpc.register("behaviours", behaviours, AccessRole.OBSERVER, recorded=False)

@@ -8,8 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, assert_never
 
-from pydantic import ValidationError
-
 from monstertruck_planners.behave.service import BehaviourService
 from monstertruck_planners.explore.service import ExplorerService
 from monstertruck_planners.goals.exchange import Pose, pose_of, require_place
@@ -25,11 +23,12 @@ from monstertruck_planners.missions.progress import (
 )
 from monstertruck_runtime.clock import SECOND, Clock, Schedule
 from monstertruck_runtime.errors import InputError, NotFoundError, RequestRefusedError, TruckError, disk_reason
+from monstertruck_runtime.outside import contents, reading
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
 from monstertruck_runtime.requests import Sequences, does_not_drive, examine, inner_request
-from monstertruck_runtime.small_files import remove_file, replace_file, require_file
+from monstertruck_runtime.small_files import remove_file, replace_file
 from monstertruck_runtime.threads import Offload
-from monstertruck_schemas.base import Pose2D, first_mistake
+from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.health import SlamHealth
 from monstertruck_schemas.mission import (
@@ -572,15 +571,11 @@ class MissionService:
             InputError: the file is not what it should be.
         """
         file = self._file
-        try:
+        expected = "the progress of a mission"
+        with reading(str(file), expected):
             if file is None or not file.exists():
                 return None
-            require_file(file, MOST_BYTES)
-            return SavedProgress.model_validate_json(file.read_text(encoding="utf-8"))
-        except ValidationError as error:
-            raise InputError(f"{file}: not readable: {first_mistake(error)}") from error
-        except (OSError, ValueError) as error:
-            raise InputError(f"{file}: not readable: {error}") from error
+            return SavedProgress.model_validate_json(contents(file, expected, MOST_BYTES))
 
     async def _save(self, progress: MissionProgress) -> None:
         self._noted = self._pose() or self._noted

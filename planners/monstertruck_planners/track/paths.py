@@ -1,6 +1,5 @@
 """Paths drawn beforehand or sent from outside, published for the trackers."""
 
-import csv
 from pathlib import Path as FilePath
 from typing import Any, Final
 
@@ -9,9 +8,10 @@ import numpy as np
 from monstertruck_planners.track.segments import check_path
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import InputError, NotFoundError, RequestRefusedError
+from monstertruck_runtime.outside import LONGEST
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, RpcRegistry, Subscription
 from monstertruck_runtime.requests import Sequences, does_not_drive, examine, parse_request
-from monstertruck_runtime.small_files import require_file
+from monstertruck_runtime.tables import read_table
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.plan import BehaviourState, Path
 from monstertruck_schemas.reasons import Reason
@@ -27,20 +27,17 @@ MOST_BYTES: Final = 10_000_000
 def load_path(file: FilePath, *, closed: bool, frame: str = "odom") -> Path:
     """Read a path in ``frame`` from CSV: header ``x,y,yaw,direction``; metres, metres, radians, +1 or -1.
 
+    The table may have semicolons or tabs instead of commas, comments and empty lines (see ``read_table``).
+
     Raises:
         InputError: naming file and line, and what was expected.
     """
-    try:
-        require_file(file, MOST_BYTES)
-        with file.open(newline="", encoding="utf-8") as stream:
-            rows = list(csv.reader(stream))
-    except OSError as error:
-        raise InputError(f"{file}: cannot be read: {error.strerror}") from error
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{file}: cannot be read: {error}") from error
-    if not rows or [name.strip() for name in rows[0]] != HEADER:
-        raise InputError(f"{file}:1: expected the header {','.join(HEADER)}")
-    values = np.array([_numbers(file, line, row) for line, row in enumerate(rows[1:], start=2)])
+    rows = read_table(file, f"a table {','.join(HEADER)}", MOST_BYTES)
+    if not rows or rows[0][1] != HEADER:
+        line, met = rows[0] if rows else (1, [])
+        found = f"found {','.join(met)[:LONGEST]}" if rows else "the file is empty"
+        raise InputError(f"{file}:{line}: expected the header {','.join(HEADER)}, {found}")
+    values = np.array([_numbers(file, line, row) for line, row in rows[1:]])
     if len(values) < 2:
         raise InputError(f"{file}: expected at least two poses, found {len(values)}")
     path = Path(
@@ -64,9 +61,9 @@ def _numbers(file: FilePath, line: int, row: list[str]) -> list[float]:
     try:
         numbers = [float(cell) for cell in row]
     except ValueError as error:
-        raise InputError(f"{file}:{line}: expected four numbers, found {','.join(row)}") from error
+        raise InputError(f"{file}:{line}: expected four numbers, found {','.join(row)[:LONGEST]}") from error
     if len(numbers) != len(HEADER) or not np.isfinite(numbers).all() or numbers[3] not in (1.0, -1.0):
-        raise InputError(f"{file}:{line}: expected x,y,yaw and a direction of 1 or -1, found {','.join(row)}")
+        raise InputError(f"{file}:{line}: expected x,y,yaw and a direction of 1 or -1, found {','.join(row)[:LONGEST]}")
     return numbers
 
 

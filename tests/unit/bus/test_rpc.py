@@ -34,6 +34,31 @@ def test_a_name_has_one_handler():
     assert run_virtual(main) == {"echo": {"a": 1}}
 
 
+def test_calls_are_recorded_with_who_what_and_the_answer():
+    async def refuse(payload):
+        raise RequestRefusedError(Reason.BUSY, "driving")
+
+    async def main(clock: VirtualClock) -> list[tuple[str, str, str, Reason, str]]:
+        recorded: list[tuple[str, str, str, Reason, str]] = []
+        rpc = Rpc(clock, record=lambda *call: recorded.append(call))
+        rpc.register("goal", echo)
+        rpc.register("arm", refuse)
+        rpc.register("config", echo, recorded=False)
+        await rpc.answer(ANN, "goal", b'{"x": 1.5}')
+        await rpc.answer(ANN, "arm", b"")
+        await rpc.answer(ANN, "config", b"")
+        await rpc.answer(ANN, "nope", b"\xff")
+        await rpc.answer(Sender("bob", Grant(AccessRole.OBSERVER, Role.STATION)), "goal", b"{}")
+        return recorded
+
+    goal, arm, nope, bob = run_virtual(main)
+    assert goal == ("goal", "ann", '{"x": 1.5}', Reason.OK, '{"echo": {"x": 1.5, "source": "ann"}}')
+    assert arm == ("arm", "ann", "", Reason.BUSY, '{"reason": "busy", "text": "driving"}')
+    assert nope[0] == "nope"
+    assert nope[3] is not Reason.OK
+    assert bob[1::2] == ("bob", Reason.NOT_PERMITTED)
+
+
 def test_a_slow_handler_is_cancelled_at_its_deadline():
     async def main(clock: VirtualClock) -> float:
         rpc = Rpc(clock, deadline=2.0)

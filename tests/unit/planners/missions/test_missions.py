@@ -656,7 +656,7 @@ SAVED = SavedProgress.of(progress(GO), "ann").model_dump_json()
     [
         ("{", "Invalid JSON"),
         (SAVED.replace(":0", ":7"), "expected one of 1 steps"),
-        (SAVED.replace('"source"', '"sauce"'), "not readable: source: Field required"),
+        (SAVED.replace('"source"', '"sauce"'), "expected the progress of a mission: source: Field required"),
         (SAVED + " " * 1_000_000, "expected at most 1000000"),
     ],
 )

@@ -1,0 +1,33 @@
+"""Tables of other programs: CSV with commas, semicolons or tabs."""
+
+import csv
+from pathlib import Path
+from typing import Final
+
+from monstertruck_runtime.outside import reading, text_of
+
+DELIMITERS: Final = ",;\t"
+COMMENT: Final = "#"
+
+
+def read_table(file: Path, expected: str, most: int) -> list[tuple[int, list[str]]]:
+    """Read a table of at most ``most`` bytes: each row's line and its cells, without white space around them.
+
+    A byte order mark, empty lines and lines that begin with ``#`` are left out. The delimiter is the one of comma,
+    semicolon and tab that the first row has most of.
+
+    Raises:
+        InputError: it cannot be read, is too long, is not UTF-8, or is no table; names the line where there is one.
+    """
+    text = text_of(file, expected, most)
+    rows = [(number, line) for number, line in enumerate(text.splitlines(), start=1) if _counts(line)]
+    delimiter = max(DELIMITERS, key=rows[0][1].count) if rows else DELIMITERS[0]
+    found = []
+    for number, line in rows:
+        with reading(f"{file}:{number}", expected):
+            found.append((number, [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter))]))
+    return found
+
+
+def _counts(line: str) -> bool:
+    return bool(line.strip(" \t;,")) and not line.lstrip().startswith(COMMENT)
