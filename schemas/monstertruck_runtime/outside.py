@@ -181,7 +181,8 @@ def picture(file: Path, expected: str = "a picture", most: int = MOST_PIXELS) ->
             with warnings.catch_warnings(action="error", category=Image.DecompressionBombWarning):
                 image = Image.open(file, formats=FORMATS)
         except (Image.DecompressionBombWarning, Image.DecompressionBombError) as error:
-            raise InputError(f"{file}: {error}: expected at most {most} pixels") from error
+            size = str(error).partition(" exceeds")[0]
+            raise InputError(f"{file}: {size}: expected at most {most} pixels") from error
         with image:
             if image.width * image.height > most:
                 raise InputError(f"{file}: {image.width} x {image.height} pixels: expected at most {most}")
