@@ -12,6 +12,7 @@ from typing import Any, ClassVar, Final, NamedTuple
 
 from monstertruck_kinematics.chassis import Chassis
 from monstertruck_planners.collision import Footprint
+from monstertruck_runtime.requests import OPERATORS
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.event import Cause, Measurement
 from monstertruck_schemas.reasons import Reason
@@ -81,6 +82,12 @@ class GateView:
     def mode(self) -> GateMode:
         """Present mode."""
         return self._states.mode
+
+    @property
+    def confirmed(self) -> bool:
+        """Whether an operator drives who holds the second control, to drive into unseen ground."""
+        holder = self._states.holder
+        return holder is not None and not holder.inside and holder.request.role in OPERATORS and holder.request.unseen
 
 
 class Check:

@@ -8,7 +8,7 @@ wheels slip. Lengths m, angles rad, times s, speeds m/s.
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Annotated, Any, Final, Self
+from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -100,7 +100,13 @@ class ObstacleLimits(Schema):
     lidar's range. A recorded URG-04LX has 0.95 to 1.0, and less than half in one of 800 sectors."""
     unseen_speed: LivePositive = 0.1
     """Speed limit while a sector of travel is not seen, m/s; one not seen for ``scan.stale_after`` stops the truck.
-    Where the lidar does not look it is the limit onto ground that no scan of the last 30 s has seen."""
+    Also the limit for a body that turns on the spot onto ground that no scan has seen lately."""
+    unseen: Literal["stop", "slow"] = "stop"
+    """What to do before ground that no scan has seen lately, in reverse or sideways; slow: ``unseen_speed``."""
+    confirmed_speed: Annotated[float, Field(gt=0, le=0.05), LIVE] = 0.05
+    """Speed limit into such ground for an operator who holds the second control, m/s."""
+    memory_time: Annotated[float, Field(gt=0, le=120)] = 30.0
+    """Age up to which earlier scans count, s: people may step onto ground that was free."""
     memory_distance: NotNegative = 2.0
     """Travelled distance for which the points of earlier scans guard the truck where its lidar does not look, m."""
     open_ground: bool = False
@@ -394,6 +400,7 @@ WEAKER_ABOVE: Final = (
     "battery_low_speed",
     "obstacle.deceleration",
     "obstacle.unseen_speed",
+    "obstacle.memory_time",
     "sonar.stale_after",
     "sonar.unseen_speed",
     "unwitnessed",
@@ -438,6 +445,8 @@ def weakened(config: GateConfig) -> tuple[str, ...]:
         texts.append("gate.blocked null: a blocked shaft is not noticed")
     if config.runaway is None:
         texts.append("gate.runaway null: a motor that does not obey is not noticed")
+    if config.obstacle.unseen == "slow":
+        texts.append("gate.obstacle.unseen slow: the robot drives into ground that no sensor has seen")
     if config.obstacle.open_ground:
         texts.append("gate.obstacle.open_ground true: a scan without any range counts as free ground")
     if more := sorted(set(config.tolerated_failures) - set(default.tolerated_failures)):

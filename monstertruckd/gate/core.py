@@ -68,7 +68,9 @@ DISARMING: Final = frozenset(
 )
 """After these the truck must be armed again, even if they were short."""
 
-HALTS: Final = frozenset({Reason.OBSTACLE_STOP, Reason.LIDAR_BLIND, Reason.SONAR_STALE, Reason.SONAR_BLIND})
+HALTS: Final = frozenset(
+    {Reason.OBSTACLE_STOP, Reason.UNSEEN_STOP, Reason.LIDAR_BLIND, Reason.SONAR_STALE, Reason.SONAR_BLIND}
+)
 """Speed limits of zero: the truck stands, and its driver stays in control."""
 
 

@@ -112,13 +112,17 @@ class ObstacleGuard:
         self._footprint = footprint
         self._scan_points = points
         self._visibility = Visibility(footprint, points.mount, limits.config.obstacle.seen)
-        self._memory = ScanMemory(footprint, points.mount, limits.config.obstacle.memory_distance)
+        self._memory = ScanMemory(
+            footprint, points.mount, limits.config.obstacle.memory_distance, limits.config.obstacle.memory_time
+        )
         self._points = np.empty((0, 2))
         self._stamp = 0
         self.unseen: float | None = 0.0
         """Age of the oldest view of a sector of travel at the newest scan, s; None = one was never seen."""
         self.known = math.inf
         """Distance along the newest motions to ground that no scan has seen, m; +inf if none is within reach."""
+        self.known_turning = math.inf
+        """The same of turns on the spot."""
         self._checked: frozenset[tuple[int, int, int]] | None = None
         self._free = math.inf
         self._outline = footprint.edge_points(OUTLINE, OUTLINE)
@@ -185,7 +189,7 @@ class ObstacleGuard:
             hidden = [twist for twist in rounded if twist[0] * TWIST_STEP < AHEAD]
             behind = self._memory.points() if hidden else None
             self._free = min(self._free_distance(*twist, behind) for twist in rounded)
-            self.known = math.inf
+            self.known = self.known_turning = math.inf
             if behind is not None:
                 self._check_ground(hidden, np.concatenate((self._points, behind)))
         return self._free
@@ -219,7 +223,7 @@ class ObstacleGuard:
         )
 
     def _check_ground(self, twists: list[tuple[int, int, int]], measured: Array) -> None:
-        """Update ``known``, and shorten the free distance of turns on the spot.
+        """Update ``known`` and ``known_turning``, and shorten the free distance of turns on the spot.
 
         Args:
             twists: in steps of ``TWIST_STEP``.
@@ -231,7 +235,8 @@ class ObstacleGuard:
         turns = [math.hypot(*twist[:2]) * TWIST_STEP < AHEAD for twist in twists]
         turning = np.repeat(turns, [len(sweep.ground) for sweep in sweeps])
         hidden = ~self._memory.seen(ground)
-        self.known = float(before[hidden].min(initial=math.inf))
+        self.known = float(before[hidden & ~turning].min(initial=math.inf))
+        self.known_turning = float(before[hidden & turning].min(initial=math.inf))
         reached = hidden & turning & (before < self._free)
         near = on_body(self._footprint, measured, self._reach + DEPTH) & ~on_body(self._footprint, measured, 0.0)
         apart = ((ground[reached][:, None] - measured[near]) ** 2).sum(axis=2).min(axis=1, initial=math.inf)
@@ -264,6 +269,8 @@ class ObstacleCheck(Check):
         Reason.OBSTACLE_SLOW,
         Reason.LIDAR_BLIND,
         Reason.LIDAR_SLOW,
+        Reason.UNSEEN_STOP,
+        Reason.UNSEEN_DRIVE,
         Reason.UNSEEN_SLOW,
     )
 
@@ -271,6 +278,8 @@ class ObstacleCheck(Check):
         super().__init__(view)
         self.guard = ObstacleGuard(view.limits, view.footprint, points)
         self._approach = Approach(view)
+        self._before_unseen = False
+        """Stands before ground that was not seen."""
 
     @property
     def urgent(self) -> bool:
@@ -291,6 +300,7 @@ class ObstacleCheck(Check):
         """Sweep along the motions, and along those of the measured steering angles."""
         if courses is None:
             self._approach.forget()
+            self._before_unseen = False
         elif courses and self.view.samples.scan_fresh(now):
             yield from self._along(now, list(courses))
 
@@ -307,15 +317,39 @@ class ObstacleCheck(Check):
             yield Limit(Reason.LIDAR_BLIND, 0.0)
         elif unseen:
             yield Limit(Reason.LIDAR_SLOW, slow)
-        allowed = max(guard.allowed_speed(guard.known, now), slow)
-        if allowed < fastest:
-            yield Limit(Reason.UNSEEN_SLOW, allowed)
+        turning = max(guard.allowed_speed(guard.known_turning, now), slow)
+        if turning < fastest:
+            yield Limit(Reason.UNSEEN_SLOW, turning)
+        yield from self._into_unseen(guard.allowed_speed(guard.known, now), fastest)
         self._approach.judge(now, twists, lambda speed: guard.too_near(free, speed, now))
+
+    def _into_unseen(self, allowed: float, fastest: float) -> Iterator[Limit]:
+        """Limits before ground that was not seen, which allows a pace of ``allowed``, for motions up to ``fastest``."""
+        config = self.view.config.obstacle
+        if config.unseen == "slow":
+            allowed = max(allowed, config.unseen_speed)
+        elif self.view.confirmed and allowed < config.confirmed_speed:
+            self._before_unseen = False
+            yield Limit(Reason.UNSEEN_DRIVE, config.confirmed_speed)
+            return
+        self._before_unseen = allowed < (2 * config.crawl if self._before_unseen else config.crawl)
+        if self._before_unseen:
+            yield Limit(Reason.UNSEEN_STOP, 0.0)
+        elif allowed < fastest:
+            yield Limit(Reason.UNSEEN_SLOW, allowed)
 
     def figures(self, reason: Reason, now: int) -> Iterator[Measurement]:
         """Free distance, or how long the lidar has not seen the way."""
         config = self.view.config
         if reason is Reason.LIDAR_BLIND:
             yield Measurement(name="unseen", value=self.guard.unseen, unit="s", limit=config.scan.stale_after)
+        elif reason is Reason.UNSEEN_STOP:
+            keep = config.obstacle.ahead
+            yield Measurement(name="seen distance", value=_finite(self.guard.known), unit="m", limit=keep)
         elif reason is Reason.OBSTACLE_STOP:
             yield self._approach.free_distance(age(self.view.samples.scan, now))
+
+
+def _finite(value: float) -> float | None:
+    """A number; None for an infinite one."""
+    return value if math.isfinite(value) else None

@@ -64,6 +64,7 @@ class Heartbeat(_Command):
     front: Number = 0.0
     rear: Number = 0.0
     twist: tuple[Number, Number, Number] | None = None
+    unseen: bool = False
 
     @property
     def role(self) -> Role:

@@ -165,9 +165,9 @@ class Pilot:
         client.role = motion.role
         try:
             if motion.twist is None:
-                await client.drive(motion.speed, motion.front, motion.rear, lease=LEASE)
+                await client.drive(motion.speed, motion.front, motion.rear, lease=LEASE, unseen=motion.unseen)
             else:
-                await client.drive_twist(*motion.twist, lease=LEASE)
+                await client.drive_twist(*motion.twist, lease=LEASE, unseen=motion.unseen)
         except TruckError as error:
             self._viewer.send(frames.text("trouble", text=str(error)))
 

@@ -297,25 +297,31 @@ class TruckClient(Operator):
 
     # Requests
 
-    async def drive(self, speed: float, front: float, rear: float = 0.0, lease: float = 0.3) -> None:
+    async def drive(
+        self, speed: float, front: float, rear: float = 0.0, lease: float = 0.3, *, unseen: bool = False
+    ) -> None:
         """Request a speed (m/s) and axle angles (rad, left positive) for ``lease`` seconds.
 
         It goes by topic, for speed; whether it is granted shows in ``state/gate`` (holder, last_seq) and in events.
+        ``unseen`` confirms that an operator drives into ground that no sensor has seen, slowly.
 
         Raises:
             NoAnswerError: the robot's nonce did not come in time.
         """
         header = await self.header(lease)
-        self._put(REQ_DRIVE, DriveRequest(**header, speed=speed, front=front, rear=rear))
+        self._put(REQ_DRIVE, DriveRequest(**header, speed=speed, front=front, rear=rear, unseen=unseen))
 
-    async def drive_twist(self, vx: float, vy: float = 0.0, wz: float = 0.0, lease: float = 0.3) -> None:
+    async def drive_twist(
+        self, vx: float, vy: float = 0.0, wz: float = 0.0, lease: float = 0.3, *, unseen: bool = False
+    ) -> None:
         """Request a velocity of the base, forward, to the left (m/s) and turning (rad/s), for ``lease`` seconds.
 
-        What the body cannot do is refused by the robot with an event ``impossible_motion``. Raises as ``drive`` does.
+        What the body cannot do is refused by the robot with an event ``impossible_motion``. ``unseen`` as in ``drive``,
+        which raises the same.
         """
         header = await self.header(lease)
         twist = RequestedTwist(vx=vx, vy=vy, wz=wz)
-        self._put(REQ_DRIVE, DriveRequest(**header, speed=0.0, front=0.0, twist=twist))
+        self._put(REQ_DRIVE, DriveRequest(**header, speed=0.0, front=0.0, twist=twist, unseen=unseen))
 
     async def drive_shafts(self, *rates: float, lease: float = 0.3) -> None:
         """Request the rate of the wheels on every driven shaft, rad/s, for ``lease`` seconds: open loop, for engineers.

@@ -91,6 +91,8 @@ class Reason(StrEnum):
     LIDAR_SLOW = "lidar_slow", 70, "the lidar does not see where the robot is to go: speed limited"
     LIDAR_BLIND = "lidar_blind", 71, "the lidar has not seen for too long where the robot is to go"
     UNSEEN_SLOW = "unseen_slow", 76, "ground that no scan has seen lately: speed limited"
+    UNSEEN_STOP = "unseen_stop", 16, "ground ahead that no sensor has seen lately: hold the second control to drive on"
+    UNSEEN_DRIVE = "unseen_drive", 17, "driving into unseen ground"
     SONAR_STALE = "sonar_stale", 78, "no fresh ranges of the sonars"
     SONAR_BLIND = "sonar_blind", 79, "the sonar that looks where the robot goes does not answer"
     SONAR_SLOW = "sonar_slow", 69, "no sonar sees all of where the robot goes: speed limited"

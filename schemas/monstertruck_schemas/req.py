@@ -98,6 +98,8 @@ class DriveRequest(Request):
     shafts: Annotated[tuple[AnyNumber, ...], Field(min_length=1, max_length=MAX_SHAFTS)] | None = None
     """Rate of the wheels on every driven shaft in the body's order, rad/s, forward positive; speed and angles are 0
     then."""
+    unseen: bool = False
+    """The operator holds a second control to drive into ground that no sensor has seen; planners cannot."""
 
     @model_validator(mode="after")
     def _one_form(self) -> Self:

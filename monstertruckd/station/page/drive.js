@@ -11,6 +11,8 @@ const LEASE = 0.25;
 const UNKNOWN = 1500; // ms that the way to the robot and back is taken to be until it is measured
 const MODES = ["front", "rear", "counter", "crab", "twist"];
 const KEYS = { w: [0, 1], s: [0, -1], a: [-1, 0], d: [1, 0] };
+const UNSEEN = "v"; // held: drives into ground that no sensor has seen
+const UNSEEN_WAIT = 10000; // ms for which the button waits for the hand
 const ARROWS = { ArrowUp: "w", ArrowDown: "s", ArrowLeft: "a", ArrowRight: "d" };
 
 export class Drive {
@@ -21,6 +23,8 @@ export class Drive {
     this.rest = 0;
     this.last = "stick";
     this.grace = 0;
+    this.unseen = 0; // until then, or while the hand then drives on, the button counts
+    this.unseenKey = false;
     this.byId = (id) => document.getElementById(id);
     this.steering = this.byId("steering");
     this.speed = this.byId("speed");
@@ -75,11 +79,13 @@ export class Drive {
     for (const end of ["focusin", "mousedown"]) window.addEventListener(end, (event) => typing(event) && this.held.clear());
     document.addEventListener("visibilitychange", () => document.hidden && this.letGo());
     this.speed.addEventListener("input", () => this.showSpeed());
+    this.byId("unseen").addEventListener("click", () => (this.unseen = this.unseen ? 0 : performance.now() + UNSEEN_WAIT));
   }
 
   key(event, down) {
     const name = ARROWS[event.key] && document.activeElement?.id === "stick" ? ARROWS[event.key] : event.key.toLowerCase();
     // By its place: with Shift or AltGr a key that is released has another name than when it was pressed.
+    if (name === UNSEEN) this.unseenKey = down && !typing(event) && !event.ctrlKey && !event.altKey && !event.metaKey;
     if (!down) return void this.held.delete(event.code);
     // While Meta is held, no release of another key is seen.
     if (event.ctrlKey || event.altKey || event.metaKey) return void this.held.clear();
@@ -96,7 +102,8 @@ export class Drive {
   letGo() {
     this.held.clear();
     this.stick = this.pointer = null;
-    this.grace = 0;
+    this.grace = this.unseen = 0;
+    this.unseenKey = false;
   }
 
   /** Keep a truck armed while the hand moves to the stick. */
@@ -122,6 +129,11 @@ export class Drive {
     return null;
   }
 
+  /** Whether the operator confirms, by button, key or gamepad, that the truck drives into unseen ground. */
+  confirms() {
+    return this.unseen > 0 || this.unseenKey || Boolean(this.pad?.buttons[4]?.pressed);
+  }
+
   /** Speed allowed by the slider and by the delay: lease and round trip together cost BLIND metres at most. */
   limit() {
     const delay = this.link.roundTrip() ?? UNKNOWN;
@@ -135,8 +147,10 @@ export class Drive {
       this.rest = REST;
       this.grace = 0;
       this.last = hand[0];
+      if (this.unseen) this.unseen = Infinity; // as long as this hand drives
       this.send(hand);
     } else if (this.rest > 0) {
+      if (this.unseen === Infinity) this.unseen = 0;
       this.rest--;
       this.send([this.last, 0, 0]);
     } else if (performance.now() < this.grace) this.send(["stick", 0, 0]);
@@ -149,7 +163,7 @@ export class Drive {
     const steer = -x * (this.facts?.gate.angle ?? 0.36);
     const heard = this.link.heard(performance.now());
     if (!heard) return;
-    const motion = { do: "drive", ...heard, input };
+    const motion = { do: "drive", ...heard, input, unseen: this.confirms() };
     switch (this.steering.value) {
       case "front": Object.assign(motion, { speed, front: steer, rear: 0 }); break;
       case "rear": Object.assign(motion, { speed, front: 0, rear: -steer }); break;
@@ -165,6 +179,8 @@ export class Drive {
     const radius = this.byId("stick").clientWidth / 2 - 32;
     knob.style.transform = hand ? `translate(${hand[1] * radius}px, ${-hand[2] * radius}px)` : "";
     this.byId("stick").classList.toggle("held", Boolean(hand));
+    if (this.unseen && this.unseen < performance.now()) this.unseen = 0;
+    this.byId("unseen").setAttribute("aria-pressed", String(this.confirms()));
     const left = Math.ceil((this.grace - performance.now()) / 1000);
     const text = hand ? words(`input.${hand[0]}`)
       : left > 0 ? words("input.grace", { seconds: left })

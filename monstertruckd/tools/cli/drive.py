@@ -36,10 +36,12 @@ def drive(
     `Enter` arms, `W A S D` or the arrow keys drive, `space` stops, `e` is the emergency stop and
     `r` resets it, `1` to `5` choose front, rear, counter, crab or hybrid steering, `z` and `c`
     the drift of the last, `x` straightens the wheels, `+` and `-` change the speed, `q` ends.
+    `v`, held in place of `s`, drives in reverse into ground that no sensor has seen, at 0.05 m/s at most.
     `6` drives by twist: `A` and `D` turn, also on the spot, `z` and `c` move left and right.
 
-    With `--gamepad`: the robot moves only while the right shoulder button or trigger is held; left stick,
-    start arms, A stops, B is the emergency stop, X resets it, Y or the cross change steering and speed.
+    With `--gamepad`: the robot moves only while the right shoulder button or trigger is held, into unseen ground
+    while the left shoulder button is held as well; left stick, start arms, A stops, B is the emergency stop,
+    X resets it, Y or the cross change steering and speed.
     """
     from monstertruck_runtime.errors import InputError
     from monstertruckd.tools.driving.gamepad import PadMapping, read_mapping

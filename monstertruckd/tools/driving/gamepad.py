@@ -106,6 +106,8 @@ class PadMapping(Schema):
     """Axes that count the other way; without this, up is ahead and left is left"""
     deadman: Annotated[tuple[Button, ...], Field(strict=False, min_length=1)] = ("right_shoulder", "right_trigger")
     """Buttons of which one has to be held for the truck to move"""
+    unseen: tuple[Button, ...] = Field(("left_shoulder",), strict=False)
+    """Buttons of which one has to be held, too, to drive into unseen ground; deadman buttons do not count"""
     buttons: dict[Button, Action] = Field(default_factory=lambda: dict(USUAL))
 
     def fits(self, name: str) -> bool:
@@ -171,7 +173,10 @@ class Pad:
 
     @property
     def _deadman(self) -> bool:
-        names = self.mapping.deadman
+        return self._any_of(self.mapping.deadman)
+
+    def _any_of(self, names: tuple[Button, ...]) -> bool:
+        """Whether one of some buttons is held."""
         held = any(BUTTONS[name] in self._pressed for name in names)
         return held or any(self._axes.get(AXES[name], -1.0) > HALF for name in names if name in AXES)
 
@@ -190,11 +195,12 @@ class Pad:
         """
         if not self.held:
             return TeleopRequest(0.0, 0.0, 0.0, (0.0, 0.0, 0.0) if mode is SteeringMode.TWIST else None)
+        unseen = self._any_of(tuple(name for name in self.mapping.unseen if name not in self.mapping.deadman))
         ahead, steer, side = (-self._stick(name) for name in ("speed", "steer", "side"))
         if mode is SteeringMode.TWIST:
-            return TeleopRequest(0.0, 0.0, 0.0, (ahead * speed, side * speed, steer * speed / TURN_RADIUS))
+            return TeleopRequest(0.0, 0.0, 0.0, (ahead * speed, side * speed, steer * speed / TURN_RADIUS), unseen)
         front, rear = axles(mode, steer * angle, side * angle)
-        return TeleopRequest(ahead * speed, front, math.copysign(min(abs(rear), angle), rear))
+        return TeleopRequest(ahead * speed, front, math.copysign(min(abs(rear), angle), rear), unseen=unseen)
 
     def _stick(self, what: Literal["speed", "steer", "side"]) -> float:
         axis: Axis = getattr(self.mapping, what)

@@ -243,9 +243,9 @@ class DriveSession:
         client.role = role
         try:
             if request.twist is None:
-                await client.drive(request.speed, request.front, request.rear, lease=LEASE)
+                await client.drive(request.speed, request.front, request.rear, lease=LEASE, unseen=request.unseen)
             else:
-                await client.drive_twist(*request.twist, lease=LEASE)
+                await client.drive_twist(*request.twist, lease=LEASE, unseen=request.unseen)
         except TruckError as error:  # shown: the robot may come back
             self._stream.trouble = str(error)
         else:

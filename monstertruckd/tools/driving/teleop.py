@@ -41,6 +41,8 @@ THROTTLE: Final = {"up": 1, "w": 1, "down": -1, "s": -1}
 STEERING: Final = {"left": 1, "a": 1, "right": -1, "d": -1}
 DRIFTING: Final = {"z": 1, "c": -1}
 CENTRE: Final = "x"
+UNSEEN: Final = "v"
+"""Drives on, by default in reverse, into ground that no sensor has seen."""
 ORDERS: Final = {"enter": Order.ARM, "space": Order.STOP, "escape": Order.STOP, "e": Order.ESTOP, "r": Order.RESET}
 ENDS: Final = frozenset({"q", "end"})
 
@@ -123,6 +125,8 @@ class TeleopRequest:
     rear: float
     twist: tuple[float, float, float] | None = None
     """Velocity of the base, vx, vy, wz (m/s, m/s, rad/s), in place of the others."""
+    unseen: bool = False
+    """The operator drives into unseen ground knowingly."""
 
 
 def axles(mode: SteeringMode, steer: float, drift: float) -> tuple[float, float]:
@@ -175,6 +179,8 @@ class Teleop:
     _resting: int = 0
     """Until then standstill is requested without a key."""
     _asking: bool = False
+    _unseen: bool = False
+    """The newest driving key was that for unseen ground."""
 
     @property
     def speed(self) -> float:
@@ -196,7 +202,7 @@ class Teleop:
         if key in ENDS:
             self.release()
             return "end"
-        if key in THROTTLE or key in STEERING or key in DRIFTING or key == CENTRE:
+        if key in THROTTLE or key in STEERING or key in DRIFTING or key in (CENTRE, UNSEEN):
             self._drive(key, now)
         elif key in MODE_KEYS:
             self.mode = MODE_KEYS[key]
@@ -228,6 +234,9 @@ class Teleop:
         if key == CENTRE:
             self._steer = self._drift = self._turn = self._side = 0
         self._throttle = THROTTLE.get(key, self._throttle if standing else 0)
+        self._unseen = key == UNSEEN
+        if self._unseen and not (self._throttle or self._turn or self._side):
+            self._throttle = -1
         seconds = self.hold if standing and key == self._last else self.first_hold
         self._until = max(self._until, now + round(seconds * SECOND))
         self._last = key
@@ -235,6 +244,7 @@ class Teleop:
     def release(self) -> None:
         """Release all keys."""
         self._until = self._resting = self._throttle = self._turn = self._side = 0
+        self._unseen = False
 
     def request(self, now: int) -> TeleopRequest | None:
         """The present request: the keys' motion, one standstill after it, then none."""
@@ -243,6 +253,7 @@ class Teleop:
             return self._motion()
         asked, self._asking = self._asking, now <= self._resting
         self._throttle = self._turn = self._side = 0
+        self._unseen = False
         return self._motion() if asked or self._asking else None
 
     def _motion(self) -> TeleopRequest:
@@ -250,9 +261,9 @@ class Teleop:
         ahead = self._throttle * self.speed
         if self.mode is SteeringMode.TWIST:
             twist = (ahead, self._side * self.speed, self._turn * self.speed / TURN_RADIUS)
-            return TeleopRequest(0.0, 0.0, 0.0, twist)
+            return TeleopRequest(0.0, 0.0, 0.0, twist, self._unseen)
         front, rear = axles(self.mode, self.steer, self.drift)
-        return TeleopRequest(ahead, front, math.copysign(min(abs(rear), self.angle), rear))
+        return TeleopRequest(ahead, front, math.copysign(min(abs(rear), self.angle), rear), unseen=self._unseen)
 
 
 def _stepped(steps: int, by: int) -> int:

@@ -57,7 +57,7 @@ SERVICES = {
     "steering": Reason.STEERING_STALE,
 }
 CHASSIS = truck_chassis(Dimensions(DRIVETRAIN))
-ANY_GROUND = {"unseen_speed": 1.0}
+ANY_GROUND = {"unseen_speed": 1.0, "unseen": "slow"}
 """Settings for obstacles that take ground no scan has seen for seen."""
 
 

@@ -29,10 +29,11 @@ TIMES = (
 )
 APART = {
     *(f"{sensor}.critical" for sensor in ("scan", "drive", "steering", "attitude")),
-    *("tolerated_failures", "remote_trackers", "obstacle.open_ground"),
+    *("tolerated_failures", "remote_trackers", "obstacle.open_ground", "obstacle.unseen"),
 }
 """Settings that are no figures, with a text of their own where they weaken."""
 HARMLESS = {
+    "obstacle.confirmed_speed": "its model allows no more than the default",
     "battery.critical": "a battery that is not measured is slow in any case; critical stops the truck as well",
     "event_interval": "events that are left out are in state/gate and in the stops",
 }

@@ -13,7 +13,7 @@ from monstertruck_schemas.state import GateMode
 from monstertruck_schemas.topics import DRIVES
 from monstertruckd.gate.config import ShaftCheckConfig
 from monstertruckd.gate.following import ShaftCheck, ShaftComparison
-from tests.unit.gate.rig import Rig, Robot, check_of, feedback, health, show
+from tests.unit.gate.rig import ANY_GROUND, Rig, Robot, check_of, feedback, health, show
 
 
 def held(rig, ticks):
@@ -25,7 +25,7 @@ def held(rig, ticks):
 
 @pytest.mark.parametrize("speed", [0.2, -0.1])
 def test_a_blocked_shaft_stops_and_disarms_within_a_second(speed):
-    rig = Rig().driving(speed=speed)
+    rig = Rig(obstacle=ANY_GROUND).driving(speed=speed)
     held(rig, 50)
     assert rig.trips[0].reason is Reason.SHAFT_BLOCKED
     assert rig.out.mode is GateMode.DISARMED

@@ -15,7 +15,7 @@ from monstertruck_schemas.state import GateMode
 from monstertruckd.gate.config import GateConfig, InForce
 from monstertruckd.gate.motion import Motion, _same
 from monstertruckd.gate.obstacles import ObstacleCheck, ObstacleGuard
-from tests.unit.gate.rig import BODIES, CHASSIS, NONCE, TICK, Rig, Robot, check_of, header, scan
+from tests.unit.gate.rig import ANY_GROUND, BODIES, CHASSIS, NONCE, TICK, Rig, Robot, check_of, header, scan
 
 MS = SECOND // 1000
 NOW = 10 * SECOND
@@ -492,7 +492,7 @@ def test_the_lidar_may_be_blind_for_as_long_as_a_scan_counts():
 
 
 def test_a_sideways_body_turns_its_wheels_before_it_moves_and_only_at_rest():
-    robot = Robot("wheels").armed()
+    robot = Robot("wheels", obstacle=ANY_GROUND).armed()
     robot.driver = {"vx": 0.1}
     robot.tick(20)
     ahead = robot.out.servos

@@ -160,7 +160,7 @@ def test_the_gate_stops_before_a_robot_behind_that_no_scan_has_seen():
 
 @pytest.mark.parametrize(("speed", "slow"), [(-0.14, 0.1), (-0.09, None), (0.2, None)])
 def test_the_gate_is_slow_where_the_lidar_does_not_look_while_another_robot_is_silent(speed, slow):
-    rig = peer_rig()
+    rig = peer_rig(obstacle={"unseen": "slow"})
     rig.driving(ticks=1, speed=speed)
     beside(rig)
     assert (Reason.PEER_UNKNOWN in rig.out.reasons) is (slow is not None)

@@ -9,7 +9,7 @@ from monstertruck_planners.collision import Footprint, ScanPoints, first_contact
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.cmd import DriveAction
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import Order
+from monstertruck_schemas.req import Order, Role
 from monstertruck_schemas.state import GateMode
 from monstertruckd.gate.config import GateConfig, InForce
 from monstertruckd.gate.obstacles import ObstacleGuard
@@ -22,7 +22,7 @@ MOUNT = (0.14, 0.0, 0.0)
 
 
 def memory(distance=2.0):
-    return ScanMemory(FOOTPRINT, MOUNT, distance)
+    return ScanMemory(FOOTPRINT, MOUNT, distance, 30.0)
 
 
 def drive(remembered, metres, turn=0.0, now=SECOND, speed=0.2):
@@ -185,8 +185,7 @@ def test_ground_is_known_by_a_few_scans_of_the_way_here():
         see(remembered, now)
         now = drive(remembered, 0.1, now=now)
     see(remembered, now)
-    assert all(seen(remembered, *np.arange(-1.2, 1.0, 0.01)))
-    assert not any(seen(remembered, -3.0, -3.2, -4.8)), "longer ago than the few scans reach"
+    assert all(seen(remembered, *np.arange(-4.5, 1.0, 0.01))), "all that was driven over lately"
 
 
 def test_ground_that_the_corners_of_a_turning_truck_pass_is_known():
@@ -212,7 +211,7 @@ def fan(stamp, beams, bearing=0.0, increment=0.1, reach=1.0):
 
 
 def test_a_scan_sees_as_far_as_its_beams_reach_and_as_wide_as_they_are():
-    remembered = ScanMemory(FOOTPRINT, (0.0, 0.0, 0.0), 2.0)
+    remembered = ScanMemory(FOOTPRINT, (0.0, 0.0, 0.0), 2.0, 30.0)
     remembered.observe(fan(SECOND, 11), np.empty((0, 2)))
 
     def sees(bearing, distance):
@@ -230,7 +229,7 @@ def test_a_scan_sees_as_far_as_its_beams_reach_and_as_wide_as_they_are():
     ("mount", "point"), [((0.2, 0.1, math.pi / 2), (0.2, 1.0)), ((-0.2, 0.1, math.pi), (-1.1, 0.1))]
 )
 def test_a_scan_is_seen_from_where_its_lidar_is_mounted(mount, point):
-    remembered = ScanMemory(FOOTPRINT, mount, 2.0)
+    remembered = ScanMemory(FOOTPRINT, mount, 2.0, 30.0)
     remembered.observe(fan(SECOND, 3), np.empty((0, 2)))
     (x, y), (ahead_x, ahead_y) = point, (math.cos(mount[2]), math.sin(mount[2]))
     here, beyond, aside = (x, y), (x + 0.2 * ahead_x, y + 0.2 * ahead_y), (x + 0.3 * ahead_y, y + 0.3 * ahead_x)
@@ -239,14 +238,14 @@ def test_a_scan_is_seen_from_where_its_lidar_is_mounted(mount, point):
 
 @pytest.mark.parametrize("code", range(21))
 def test_beams_that_met_nothing_see_free_ground_and_those_that_say_nothing_do_not(code):
-    remembered = ScanMemory(FOOTPRINT, (0.0, 0.0, 0.0), 2.0)
+    remembered = ScanMemory(FOOTPRINT, (0.0, 0.0, 0.0), 2.0, 30.0)
     message = fan(SECOND, 11, reach=math.inf)
     remembered.observe(message.model_copy(update={"codes": np.full(11, code, np.uint8)}), np.empty((0, 2)))
     assert seen(remembered, 0.9) is (code <= 2)
 
 
 def test_scans_of_different_geometry_are_remembered_each_by_its_own():
-    remembered = ScanMemory(FOOTPRINT, (0.0, 0.0, 0.0), 2.0)
+    remembered = ScanMemory(FOOTPRINT, (0.0, 0.0, 0.0), 2.0, 30.0)
     for second, (beams, bearing) in enumerate([(21, 2.0), (5, 0.0), (11, math.pi / 2)], 1):
         now = second * SECOND
         remembered.observe(fan(now, beams, bearing), np.empty((0, 2)))
@@ -382,19 +381,40 @@ def surround(rig, *obstacles):
     return rig
 
 
-def test_reverse_is_slow_onto_ground_that_no_scan_has_seen_and_quicker_where_the_truck_came_from():
+def test_in_reverse_the_truck_drives_where_it_came_from_and_stops_before_ground_that_no_scan_has_seen():
     rig = surround(Rig()).driving(speed=-0.15)
-    assert rig.out.reasons == (Reason.UNSEEN_SLOW,)
-    assert rig.out.speeds[0] == pytest.approx(-0.1)
+    assert rig.out.reasons == (Reason.UNSEEN_STOP,)
+    assert rig.out.speeds[0] == 0.0
     rig = surround(Rig(disarm_after=5.0)).driving(ticks=200, speed=0.2)
     rig.driver = {"speed": -0.15}
     rig.tick(40)
     assert rig.out.reasons == ()
     assert rig.out.speeds[0] == pytest.approx(-0.15)
-    while rig.x > 0.02:
-        rig.tick()
-    assert Reason.UNSEEN_SLOW in rig.out.reasons, "before the place where it began"
-    assert rig.out.speeds[0] == pytest.approx(-0.1, abs=0.005)
+    rig.tick(400)
+    assert rig.out.reasons == (Reason.UNSEEN_STOP,), "before the place where it began"
+    assert 0.0 < rig.x < 0.1
+    assert rig.trips[-1].reason is Reason.UNSEEN_STOP
+    figure = rig.trips[-1].causes[0].measurements[0]
+    assert (figure.name, figure.unit, figure.limit) == ("seen distance", "m", 0.05)
+    rig.driver = {"speed": -0.15, "unseen": True}
+    rig.tick(100)
+    assert rig.out.reasons == (Reason.UNSEEN_DRIVE,)
+    assert rig.out.speeds[0] == pytest.approx(-0.05), "the operator holds the second control"
+    assert rig.x < 0.0
+
+
+def test_ground_may_only_slow_the_truck_where_that_is_configured():
+    rig = surround(Rig(obstacle={"unseen": "slow"})).driving(speed=-0.15)
+    assert rig.out.reasons == (Reason.UNSEEN_SLOW,)
+    assert rig.out.speeds[0] == pytest.approx(-0.1)
+
+
+def test_the_second_control_is_for_operators_alone():
+    rig = surround(Rig()).armed()
+    rig.driver = {"speed": -0.15, "unseen": True, "source": "path", "role": Role.TRACKER, "inside": True}
+    rig.tick(40)
+    assert rig.out.reasons == (Reason.UNSEEN_STOP,)
+    assert rig.out.speeds[0] == 0.0
 
 
 @pytest.mark.parametrize(("side", "slows"), [(1.0, True), (-1.0, False)])
@@ -418,4 +438,4 @@ def test_a_truck_that_is_not_armed_may_have_been_carried():
     rig.driver = {"speed": -0.15}
     rig.tick(40)
     assert rig.out.action is DriveAction.RUN
-    assert rig.out.reasons == (Reason.UNSEEN_SLOW,)
+    assert rig.out.reasons == (Reason.UNSEEN_STOP,)

@@ -96,7 +96,7 @@ def test_numbers_that_are_not_finite_are_refused_by_name(number):
 
 @pytest.mark.parametrize(("kind", "fastest"), [("mecanum", 0.15), ("wheels", 0.21)])
 def test_huge_twists_are_clipped_in_their_direction(kind, fastest):
-    robot = Robot(kind).driving(vx=1e308, vy=1e308, wz=-1e308, ticks=400)
+    robot = Robot(kind, obstacle=ANY_GROUND).driving(vx=1e308, vy=1e308, wz=-1e308, ticks=400)
     assert Reason.CLIPPED in robot.out.reasons
     # Mecanum wheels push against each other: the forward part is less than half of their speed.
     assert max(map(abs, robot.out.speeds)) == pytest.approx(fastest, rel=1e-3)
@@ -113,7 +113,7 @@ def test_no_wheel_is_faster_than_allowed_on_the_spot_and_sideways():
 
 @pytest.mark.parametrize("kind", ["differential", "omni", "mecanum", "wheels"])
 def test_no_wheel_accelerates_faster_than_allowed_from_any_motion_to_any_other(kind):
-    robot, rng = Robot(kind).armed(), np.random.default_rng(5)
+    robot, rng = Robot(kind, obstacle=ANY_GROUND).armed(), np.random.default_rng(5)
     before = np.array(robot.out.speeds)
     for _ in range(12):
         vx, vy, wz = rng.uniform((-0.1, -0.1, -0.5), (0.2, 0.1, 0.5)).tolist()
@@ -138,7 +138,7 @@ def test_a_reversal_of_turning_passes_through_standstill():
 
 
 def test_wheels_turn_at_standstill_before_they_drive_elsewhere():
-    robot = Robot("wheels").driving(vx=0.15, ticks=60)
+    robot = Robot("wheels", obstacle=ANY_GROUND).driving(vx=0.15, ticks=60)
     robot.driver = SIDE
     moved = []
     for _ in range(150):
@@ -150,7 +150,7 @@ def test_wheels_turn_at_standstill_before_they_drive_elsewhere():
 
 
 def test_wheels_do_not_turn_aside_under_a_body_that_still_rolls():
-    robot = Robot("wheels", runaway=None).driving(vx=0.15, ticks=60)
+    robot = Robot("wheels", runaway=None, obstacle=ANY_GROUND).driving(vx=0.15, ticks=60)
     robot.driver = SIDE
     robot.tick()
     while any(robot.out.speeds):
@@ -183,7 +183,7 @@ def test_the_limit_of_reverse_holds_from_the_first_tick():
 
 
 def test_wheels_turn_no_further_than_they_must():
-    robot = Robot("wheels").driving(vx=0.001, vy=0.1, ticks=200)
+    robot = Robot("wheels", obstacle=ANY_GROUND).driving(vx=0.001, vy=0.1, ticks=200)
     assert all(angle == pytest.approx(1.5608, abs=1e-3) for angle in robot.servos)
     robot.driver = {"vx": -0.001, "vy": 0.1}
     robot.tick(20)
@@ -206,7 +206,7 @@ def test_an_obstacle_that_a_corner_would_touch_stops_turning_on_the_spot(kind):
 
 @pytest.mark.parametrize("side", [1, -1])
 def test_an_obstacle_to_one_side_stops_sideways_motion_to_that_side_only(side):
-    robot = Robot("mecanum").armed()
+    robot = Robot("mecanum", obstacle=ANY_GROUND).armed()
     robot.obstacles = ((0.2, 0.25 * side),)
     robot.driver = {"vy": 0.1 * side}
     robot.tick(100)

@@ -301,7 +301,7 @@ class Orders:
         self.given.append(order)
         return asyncio.Event().wait()
 
-    async def drive(self, *motion, lease):
+    async def drive(self, *motion, lease, unseen):
         self.given.append(Order.ARM)
 
 

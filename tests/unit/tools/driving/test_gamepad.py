@@ -69,6 +69,22 @@ def test_sticks_ask_for_the_motion_of_the_steering_mode_while_the_deadman_button
     assert not hand.held
 
 
+@pytest.mark.parametrize(
+    ("mapping", "confirms"),
+    [({}, True), ({"unseen": ()}, False), ({"deadman": ("right_shoulder", "left_shoulder")}, False)],
+)
+def test_a_second_button_confirms_a_drive_into_unseen_ground(mapping, confirms):
+    hand = pad(**mapping)
+    hand.feed(axis("left_y", -32768) + key("right_shoulder"))
+    for mode in (SteeringMode.FRONT, SteeringMode.TWIST):
+        assert not hand.motion(mode, 0.2, 0.4).unseen
+    hand.feed(key("left_shoulder"))
+    for mode in (SteeringMode.FRONT, SteeringMode.TWIST):
+        assert hand.motion(mode, 0.2, 0.4).unseen is confirms
+    hand.feed(key("left_shoulder", 0))
+    assert not hand.motion(SteeringMode.FRONT, 0.2, 0.4).unseen
+
+
 def test_the_middle_is_the_middle_and_a_trigger_is_a_deadman_too():
     hand = pad(deadman=("right_trigger",))
     hand.feed(axis("left_y", 900) + axis("right_trigger", 100))

@@ -55,16 +55,16 @@ class Driven(Robot):
         super().__init__()
         self.requests = []
 
-    async def drive(self, *motion, lease):
-        self.requests.append(("axles", *motion))
+    async def drive(self, *motion, lease, unseen):
+        self.requests.append(("axles", *motion, unseen))
 
-    async def drive_twist(self, *motion, lease):
-        self.requests.append(("twist", *motion))
+    async def drive_twist(self, *motion, lease, unseen):
+        self.requests.append(("twist", *motion, unseen))
 
 
 async def test_each_mode_sends_its_form_of_request():
     robot = Driven()
     session = DriveSession(None, WallClock(), None, io.StringIO())
     await session._request(robot, TeleopRequest(0.1, 0.2, 0.0))
-    await session._request(robot, TeleopRequest(0.0, 0.0, 0.0, (0.0, 0.1, 0.5)))
-    assert robot.requests == [("axles", 0.1, 0.2, 0.0), ("twist", 0.0, 0.1, 0.5)]
+    await session._request(robot, TeleopRequest(0.0, 0.0, 0.0, (0.0, 0.1, 0.5), unseen=True))
+    assert robot.requests == [("axles", 0.1, 0.2, 0.0, False), ("twist", 0.0, 0.1, 0.5, True)]

@@ -140,6 +140,20 @@ def test_no_mode_asks_for_more_than_full_lock():
     assert teleop.request(START) == TeleopRequest(0.0, -0.4, 0.4)
 
 
+def test_the_second_control_reverses_or_drives_on_into_unseen_ground_while_it_is_held():
+    teleop = Teleop(angle=0.4)
+    teleop.press("v", START)
+    assert teleop.request(START) == TeleopRequest(-0.1, 0.0, 0.0, unseen=True)
+    teleop.press("s", after(0.1))
+    assert teleop.request(after(0.1)) == TeleopRequest(-0.1, 0.0, 0.0), "another key ends it"
+    teleop.press("v", after(0.2))
+    assert teleop.request(after(0.9)) == TeleopRequest(0.0, 0.0, 0.0), "no key does either"
+    teleop.press("6", after(1.0))
+    teleop.press("z", after(1.0))
+    teleop.press("v", after(1.1))
+    assert teleop.request(after(1.1)) == TeleopRequest(0.0, 0.0, 0.0, (0.0, 0.1, 0.0), unseen=True)
+
+
 def test_keys_choose_mode_and_speed():
     teleop = Teleop()
     for key, mode in MODE_KEYS.items():

@@ -1,0 +1,233 @@
+"""Random drives by hand in both directions and four worlds; contacts are judged by the simulated world alone.
+
+    python benchmarks/hand_drives.py [--count 200] [--seed 1] [--confirm 0.0] [--worlds loop rooms ...]
+
+Each drive lasts a minute and begins at a random place, the truck put down by hand. The operator asks for a random speed
+forward or in reverse, with a random steering mode and angle, and changes all of them every 0.5 to 4 s, whatever is in
+the way. With a share of --confirm of these motions the operator holds the second action that lets the truck drive into
+unseen ground; contacts then are counted apart, with the time until the truck was told to move away from the obstacle.
+
+A contact is one of the world's own footprint with its walls, whatever the gate sees. That they are avoided must not be
+bought by standing still: the distance travelled and the share of the time that the truck was kept standing are printed.
+"""
+
+import argparse
+import json
+import math
+import random
+import sys
+from collections import Counter, defaultdict
+from collections.abc import Iterable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+
+from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
+from monstertruck_runtime.errors import InputError, RequestRefusedError
+from monstertruck_runtime.mailbox import latest
+from monstertruck_runtime.map_files import FREE
+from monstertruck_schemas import topics
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import DriveRequest, Order, Role
+from monstertruck_sim.world.built_in import BUILT_IN
+from monstertruckd.config.load import load_config
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
+from monstertruckd.tools.simulation.operator import LocalOperator
+from monstertruckd.tools.simulation.virtual_rig import VirtualRig
+
+ROOT = Path(__file__).resolve().parents[1]
+WORLDS = ("loop", "rooms", "corridor_maze", "hall")
+MODES = {"straight": (0, 0), "front": (1, 0), "rear": (0, 1), "counter": (1, -1), "parallel": (1, 1)}
+"""Signs of the axle angles."""
+ANGLE = 0.436
+"""Greatest angle asked for, rad."""
+SPEEDS = (0.03, 0.25)
+"""Speeds asked for, m/s: up to more than the gate allows."""
+CHANGES = (0.5, 4.0)
+"""Seconds between two changes of the operator's mind."""
+PERIOD = 0.05
+"""Seconds between two requests."""
+DRIVE = 60.0
+"""Seconds of a drive."""
+PER_TRUCK = 5
+"""Drives of one daemon, with a carry in between."""
+
+
+@dataclass
+class Drive:
+    """What came of one drive."""
+
+    world: str
+    number: int
+    forward: float = 0.0
+    """Distance travelled (m)."""
+    reverse: float = 0.0
+    contacts: list[str] = field(default_factory=list)
+    confirmed: list[float] = field(default_factory=list)
+    """Contacts during a confirmed drive: seconds until the gate commanded another direction or standstill."""
+    kept: float = 0.0
+    """Seconds for which motion was asked for and the truck was kept standing."""
+    reasons: Counter[str] = field(default_factory=Counter)
+    """Ticks of 50 ms with each reason while it was kept standing."""
+
+
+def truck(world: str, seed: int) -> SimulatedTruckConfig:
+    """The emulated truck with nothing that drives by itself."""
+    config = load_config(ROOT / "configs" / "demo.yaml", SimulatedTruckConfig)[0]
+    config = config.model_copy(update={"recorder": None, "tracker": None, "path": None, "map": None})
+    return with_overlay(config, {"sim": {"seed": seed, "world": {"map": world}}})
+
+
+async def put(rig: VirtualRig, clock: VirtualClock, rng: random.Random) -> None:
+    """Carry the truck to a random free place."""
+    known = BUILT_IN[rig.config.sim.world.map]().map
+    rows, columns = np.nonzero(known.cells == FREE)
+    while True:
+        cell = rng.randrange(len(rows))
+        x, y = known.origin[0] + columns[cell] * known.resolution, known.origin[1] + rows[cell] * known.resolution
+        try:
+            rig.world.carry(clock.now(), (float(x), float(y), rng.uniform(-math.pi, math.pi)))
+        except InputError:
+            continue
+        return
+
+
+async def drive(
+    rig: VirtualRig, clock: VirtualClock, hand: LocalOperator, rng: random.Random, confirm: float, out: Drive
+) -> None:
+    """Drive for a minute; counts what happens."""
+    gate = rig.bus.subscribe(topics.GATE, latest())
+    change, speed, front, rear, unseen, name = 0, 0.0, 0.0, 0.0, False, ""
+    end = clock.now() + round(DRIVE * SECOND)
+    touched: int | None = None
+    last = rig.world.truth(clock.now())
+    stuck = last.stuck
+    while clock.now() < end:
+        now = clock.now()
+        if now >= change:
+            name, (of_front, of_rear) = rng.choice(list(MODES.items()))
+            angle = rng.uniform(-ANGLE, ANGLE)
+            speed = rng.choice((-1, 1)) * rng.uniform(*SPEEDS)
+            front, rear = angle * of_front, angle * of_rear
+            unseen = rng.random() < confirm
+            change = now + round(rng.uniform(*CHANGES) * SECOND)
+        state = gate.latest
+        if state is not None and not state.mode.active:
+            try:
+                await hand.order(Order.ARM)
+            except RequestRefusedError as refused:
+                out.reasons[f"not armed: {refused.reason}"] += 1
+        request = DriveRequest(**await hand.header(0.25), speed=speed, front=front, rear=rear, unseen=unseen)
+        rig.bus.inject(topics.REQ_DRIVE, request)
+        await clock.sleep_until(now + round(PERIOD * SECOND))
+        true = rig.world.truth(clock.now())
+        way = math.dist((true.x, true.y), (last.x, last.y))
+        if true.v >= 0:
+            out.forward += way
+        else:
+            out.reverse += way
+        state = gate.latest
+        if state is not None and way < 0.005 * PERIOD:
+            out.kept += PERIOD
+            out.reasons.update(reason.value for reason in state.reasons)
+        if true.stuck and not stuck:
+            why = f"{out.world} {out.number}: {name} at {speed:.2f} m/s, truly {last.v:.3f}"
+            if unseen or (state is not None and Reason.UNSEEN_DRIVE in state.reasons):
+                touched = clock.now()
+            else:
+                out.contacts.append(why)
+        if touched is not None and state is not None and (state.twist.vx * speed <= 0):
+            out.confirmed.append((clock.now() - touched) / SECOND)
+            touched = None
+        stuck, last = true.stuck, true
+    rig.bus.inject(topics.REQ_DRIVE, DriveRequest(**await hand.header(0.25), speed=0.0, front=0.0, rear=0.0))
+
+
+def leg(world: str, first: int, count: int, seed: int, confirm: float) -> list[Drive]:
+    """Some drives of one truck."""
+
+    async def main(clock: VirtualClock) -> list[Drive]:
+        drives = []
+        rng = random.Random(f"{seed} {world} {first}")
+        rig = VirtualRig(truck(world, seed + first), clock)
+        async with rig.running():
+            await clock.sleep(3.0)
+            hand = LocalOperator(rig.daemon, clock, "hand", Role.GAMEPAD)
+            for number in range(first, first + count):
+                drives.append(Drive(world, number))
+                await put(rig, clock, rng)
+                await clock.sleep(1.0)
+                await drive(rig, clock, hand, rng, confirm, drives[-1])
+                await clock.sleep(1.0)
+                await hand.order(Order.DISARM)
+                await clock.sleep(1.0)
+        return drives
+
+    return run_virtual(main, start=SECOND)
+
+
+def legs(worlds: Iterable[str], count: int) -> Iterable[tuple[str, int, int]]:
+    """World, first number and count of every leg, evenly over the worlds."""
+    worlds = tuple(worlds)
+    for index, world in enumerate(worlds):
+        total = count // len(worlds) + (index < count % len(worlds))
+        for first in range(0, total, PER_TRUCK):
+            yield world, first, min(PER_TRUCK, total - first)
+
+
+def main() -> int:
+    """Drive; 0 = no contact that nobody confirmed."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--count", type=int, default=200)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--confirm", type=float, default=0.0)
+    parser.add_argument("--worlds", nargs="+", default=WORLDS, choices=sorted(BUILT_IN))
+    parser.add_argument("--jobs", type=int, default=1)
+    arguments = parser.parse_args()
+    began = perf_counter()
+    drives: list[Drive] = []
+    with ProcessPoolExecutor(arguments.jobs) as pool:
+        work = [
+            pool.submit(leg, world, first, count, arguments.seed, arguments.confirm)
+            for world, first, count in legs(arguments.worlds, arguments.count)
+        ]
+        for done in work:
+            drives += done.result()
+    print("| world | drives | forward m | reverse m | kept standing | contacts | confirmed contacts |")
+    print("|---|---:|---:|---:|---:|---:|---:|")
+    by_world: dict[str, list[Drive]] = defaultdict(list)
+    for one in drives:
+        by_world[one.world].append(one)
+    for world, ones in by_world.items():
+        kept = sum(one.kept for one in ones) / (len(ones) * DRIVE)
+        print(
+            f"| {world} | {len(ones)} | {sum(o.forward for o in ones):.1f} | {sum(o.reverse for o in ones):.1f} | "
+            f"{kept:.0%} | {sum(len(o.contacts) for o in ones)} | {sum(len(o.confirmed) for o in ones)} |"
+        )
+    for one in drives:
+        for contact in one.contacts:
+            print(contact)
+    reasons: Counter[str] = sum((one.reasons for one in drives), Counter())
+    print("kept standing by:", ", ".join(f"{name} {count * PERIOD:.0f} s" for name, count in reasons.most_common(8)))
+    noticed = [seconds for one in drives for seconds in one.confirmed]
+    figures = {
+        "drives": len(drives),
+        "contacts": sum(len(one.contacts) for one in drives),
+        "forward_m": round(sum(one.forward for one in drives), 1),
+        "reverse_m": round(sum(one.reverse for one in drives), 1),
+        "kept_standing": round(sum(one.kept for one in drives) / (len(drives) * DRIVE), 3),
+        "confirmed_contacts": len(noticed),
+        "noticed_max_s": round(max(noticed), 2) if noticed else None,
+        "real_s": round(perf_counter() - began, 1),
+    }
+    goals = {"contacts": 0, "noticed_max_s": 0.3}
+    met = figures["contacts"] == 0 and max(noticed, default=0.0) <= goals["noticed_max_s"]
+    print(json.dumps({"bench": "hand_drives", "figures": figures, "goals": goals, "met": met}))
+    return 0 if met else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
