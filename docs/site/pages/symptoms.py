@@ -48,7 +48,7 @@ SYMPTOMS: Final = (
             "obstacle_slow": "",
             "lidar_slow": "Clean the lidar's window; shiny and black walls give no echo.",
             "lidar_blind": "As above; something hangs before it?",
-            "unseen_stop": "No sensor has seen the ground there lately: drive forward first, or hold the second control.",
+            "unseen_stop": "No sensor has seen the ground there lately: drive forward, or hold the second control.",
             "unseen_drive": "",
             "unseen_slow": "It drives where no sensor looks: turn it round.",
             "sonar_slow": "",
