@@ -367,6 +367,7 @@ class Daemon:
             sonars=self._body.sonars,
             peers=self._body.peers,
             compared=True,
+            own=config.checks,
         )
         shafts = len(self._body.chassis.shafts)
         drives, steering = bus.actuators(shafts)

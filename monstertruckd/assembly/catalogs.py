@@ -15,6 +15,7 @@ from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.plugins import Plugin
 from monstertruck_schemas.entry_points import OURS, ExtensibleTable
 from monstertruck_schemas.topics import BY_NAME
+from monstertruckd.gate.catalog import GATE_CHECKS
 
 TABLES: Final[tuple[ExtensibleTable[Any], ...]] = (
     DEVICES,
@@ -26,6 +27,7 @@ TABLES: Final[tuple[ExtensibleTable[Any], ...]] = (
     EXPLORERS,
     BEHAVIOURS,
     LEVELLING,
+    GATE_CHECKS,
     BY_NAME,
 )
 

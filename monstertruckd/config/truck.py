@@ -39,6 +39,7 @@ from monstertruck_schemas.roles import SHAFTS, DeviceRole
 from monstertruckd.bus.zenoh_config import PeerConfig, ZenohConfig
 from monstertruckd.config.device_safety import beyond_devices, unattended_times, weakened_devices
 from monstertruckd.gate.config import SIGHT, BodyLimits, GateConfig, impossible_settings, weakened, weaker
+from monstertruckd.gate.catalog import AnyCheck
 from monstertruckd.recorder.config import BlackBoxConfig, MapRender, RecorderConfig
 
 ROBOT: Final = "truck"
@@ -130,6 +131,8 @@ class TruckConfig(Schema):
     levelling: AnyLevelling = StabiliserConfig()
     """How the stabiliser follows the compass, where there are both"""
     gate: GateConfig = GateConfig()
+    checks: dict[Name, AnyCheck] = Field(default_factory=dict)
+    """Checks by name that make the safety gate stricter"""
     odometry: AnyOdometry = OdometryConfig()
     """Dead reckoning, or the fusion of wheels, compass and scans"""
     tracker: AnyTracker | None = None

@@ -8,7 +8,7 @@ the union of all reasons and the least of all limits, so that one more check can
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Any, ClassVar, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from monstertruck_kinematics.chassis import Chassis
 from monstertruck_planners.collision import Footprint
@@ -97,9 +97,9 @@ class Check:
         view: what it may look at.
     """
 
-    reasons: ClassVar[tuple[Reason, ...]] = ()
+    reasons: tuple[Reason, ...] = ()
     """Reasons it may give."""
-    reads: ClassVar[tuple[Topic[Any], ...]] = ()
+    reads: tuple[Topic[Any], ...] = ()
     """Topics it needs besides those that the gate reads anyway."""
 
     def __init__(self, view: GateView) -> None:

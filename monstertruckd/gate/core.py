@@ -12,6 +12,7 @@ source may continue; a fault longer than ``disarm_after``, or one of ``DISARMING
 import math
 from collections import deque
 from collections.abc import Iterator, Mapping
+from types import MappingProxyType
 from typing import Any, Final, NamedTuple, assert_never
 
 from monstertruck_kinematics.chassis import Chassis
@@ -28,6 +29,7 @@ from monstertruck_schemas.req import ControlRequest, DriveForm, DriveRequest, Or
 from monstertruck_schemas.state import GateMode
 from monstertruck_schemas.topics import BATTERY, COMPASS, DRIVES, SCAN, STEERING, Topic
 from monstertruckd.gate.arbitration import EventLog, GateEvent, GateStateMachine, Source, Sources
+from monstertruckd.gate.catalog import CheckConfig
 from monstertruckd.gate.checks import Check, Checks, GateView, Tick
 from monstertruckd.gate.config import GateConfig, InForce
 from monstertruckd.gate.consistency import ConsistencyCheck
@@ -35,6 +37,7 @@ from monstertruckd.gate.following import ShaftCheck, SteeringCheck
 from monstertruckd.gate.limiter import CommandLimiter
 from monstertruckd.gate.motion import Motion
 from monstertruckd.gate.obstacles import ObstacleCheck
+from monstertruckd.gate.own_checks import OwnCheck
 from monstertruckd.gate.peers import PeerCheck
 from monstertruckd.gate.runaway import RunawayCheck
 from monstertruckd.gate.samples import STALE_SENSORS, Samples
@@ -69,7 +72,14 @@ DISARMING: Final = frozenset(
 """After these the truck must be armed again, even if they were short."""
 
 HALTS: Final = frozenset(
-    {Reason.OBSTACLE_STOP, Reason.UNSEEN_STOP, Reason.LIDAR_BLIND, Reason.SONAR_STALE, Reason.SONAR_BLIND}
+    {
+        Reason.OBSTACLE_STOP,
+        Reason.UNSEEN_STOP,
+        Reason.LIDAR_BLIND,
+        Reason.SONAR_STALE,
+        Reason.SONAR_BLIND,
+        Reason.OWN_CHECK,
+    }
 )
 """Speed limits of zero: the truck stands, and its driver stays in control."""
 
@@ -182,6 +192,7 @@ class Gate:
         sonars: pose (x, y, yaw) of every sonar in base by name, of a robot that has no lidar; m, m, rad.
         peers: outlines of other robots whose poses are received, by name.
         compared: whether the robot has to compare its measures of motion.
+        own: settings of the checks that the configuration adds, by name.
     """
 
     def __init__(
@@ -198,6 +209,7 @@ class Gate:
         sonars: Mapping[str, tuple[float, float, float]] | None = None,
         peers: Mapping[str, Footprint] | None = None,
         compared: bool = False,
+        own: Mapping[str, CheckConfig] = MappingProxyType({}),
     ) -> None:
         self._limits = InForce(config)
         self._chassis = chassis
@@ -213,6 +225,7 @@ class Gate:
                 *sensor_checks(view, battery_measured=battery_measured, compared=compared),
                 self._limiter,
                 *obstacle_checks(view, points, sonars, peers),
+                *(OwnCheck(view, name, settings) for name, settings in own.items()),
             )
         )
         self._outages = Outages(services)

@@ -70,11 +70,11 @@ def ground_ahead(body: Footprint, edges: Array, poses: Array) -> Array:
     Returns:
         Shape (m - 1, n, 2), m: the same points of the outline at all poses after the first.
     """
-    (step,) = _at(edges, poses[1:2])
-    return _at(edges[~on_body(body, step, TOUCH)], poses[1:])
+    (step,) = at_poses(edges, poses[1:2])
+    return at_poses(edges[~on_body(body, step, TOUCH)], poses[1:])
 
 
-def _at(points: Array, poses: Array) -> Array:
+def at_poses(points: Array, poses: Array) -> Array:
     """Points (n, 2) of a body at every pose (m, 3), shape (m, n, 2)."""
     c, s = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
     x, y = points.T

@@ -96,6 +96,7 @@ class Reason(StrEnum):
     SONAR_STALE = "sonar_stale", 78, "no fresh ranges of the sonars"
     SONAR_BLIND = "sonar_blind", 79, "the sonar that looks where the robot goes does not answer"
     SONAR_SLOW = "sonar_slow", 69, "no sonar sees all of where the robot goes: speed limited"
+    OWN_CHECK = "own_check", 18, "a check that the configuration adds does not allow the motion"
     PEER_UNKNOWN = "peer_unknown", 74, "it is not known where another robot is: speed limited"
     SHAFT_BLOCKED = "shaft_blocked", 72, "a driven shaft does not turn although it is commanded to"
     FAULTS_REPEAT = "faults_repeat", 73, "short faults come again and again"

@@ -58,12 +58,16 @@ class Moved:
 
 
 def in_yard(name: str, **overlay: Any) -> SimulatedTruckConfig:
-    """A robot of configs/robots without tracker, in the middle of the yard."""
+    """A robot of configs/robots without tracker, in the middle of the yard, whose ground counts as free unseen."""
     config, _ = load_config(FOLDER / f"{name}.yaml", SimulatedTruckConfig)
     config = config.model_copy(update={"recorder": None, "tracker": None, "path": None})
     x, y, yaw = START
     start = {"x": x, "y": y, "yaw": yaw}
-    here = {"odometry": {"start": start}, "sim": {"world": {"map": "yard", "start": start}}}
+    here = {
+        "odometry": {"start": start},
+        "sim": {"world": {"map": "yard", "start": start}},
+        "gate": {"obstacle": {"unseen": "slow"}},
+    }
     return with_overlay(with_overlay(config, here), overlay)
 
 

@@ -52,6 +52,7 @@ SYMPTOMS: Final = (
             "unseen_drive": "",
             "unseen_slow": "It drives where no sensor looks: turn it round.",
             "sonar_slow": "",
+            "own_check": "A check of section `checks` holds it: the event names the check.",
             "peer_unknown": "A robot of `peers` is silent, or this one has no pose: see `echo state/peers`.",
             "sonar_blind": "A sonar does not answer: check its plug.",
             "tilt_slow": "",

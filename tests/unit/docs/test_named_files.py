@@ -14,7 +14,7 @@ THERE = [
 ]
 PEERS = {"gym/f110_gym/envs/laser_models.py"}
 """Files of other projects."""
-OWN_PACKAGES = {"writing-a-driver.md", "writing-a-planner.md", "writing-a-robot-body.md"}
+OWN_PACKAGES = {"writing-a-driver.md", "writing-a-planner.md", "writing-a-robot-body.md", "writing-a-gate-check.md"}
 """Pages whose code blocks make packages with files of their own."""
 
 

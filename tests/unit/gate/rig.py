@@ -62,7 +62,14 @@ ANY_GROUND = {"unseen_speed": 1.0, "unseen": "slow"}
 
 
 def make_gate(
-    latched=False, nonce=NONCE, chassis=CHASSIS, services=SERVICES, battery_measured=False, peers=None, **config
+    latched=False,
+    nonce=NONCE,
+    chassis=CHASSIS,
+    services=SERVICES,
+    battery_measured=False,
+    peers=None,
+    own=None,
+    **config,
 ):
     return Gate(
         GateConfig(**config),
@@ -74,6 +81,7 @@ def make_gate(
         battery_measured=battery_measured,
         latched=latched,
         peers=peers,
+        own=own or {},
     )
 
 

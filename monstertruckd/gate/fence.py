@@ -1,0 +1,106 @@
+"""Fence: the outline of the robot must stay inside a polygon of the map."""
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_kinematics.elementary import Array
+from monstertruck_planners.collision import UnitTwist, placed, swept_poses
+from monstertruck_runtime.clock import SECOND
+from monstertruck_schemas.base import Message
+from monstertruck_schemas.event import Measurement
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.state import Odometry
+from monstertruck_schemas.topics import POSE, Topic
+from monstertruckd.gate.approach import comfortable_speed, reach
+from monstertruckd.gate.catalog import FenceConfig
+from monstertruckd.gate.checks import Check, GateView, Limit, Tick
+from monstertruckd.gate.motion import Course
+from monstertruckd.gate.obstacles import OUTLINE, at_poses
+
+FRESH: Final = 0.5
+"""Age up to which a pose counts, s."""
+STEP: Final = 0.02
+"""Distance between the poses of a sweep, m."""
+
+
+class FenceCheck(Check):
+    """Stops the robot before more of its outline leaves the fence; one that is outside may come back.
+
+    Args:
+        config: the fence.
+        view: what it may look at.
+    """
+
+    reasons = (Reason.OWN_CHECK,)
+    reads = (POSE,)
+
+    def __init__(self, config: FenceConfig, view: GateView) -> None:
+        super().__init__(view)
+        self._corners = np.array(config.corners)
+        self._edges = view.footprint.edge_points(OUTLINE, OUTLINE)
+        self._pose: Odometry | None = None
+        self._free: float | None = None
+
+    def observe(self, seen: Message | Tick, topic: Topic[Any] | None) -> None:
+        """Take the newest pose in map."""
+        if isinstance(seen, Odometry) and topic is POSE:
+            self._pose = seen
+
+    def limit(self, now: int, courses: Sequence[Course] | None) -> Iterator[Limit]:
+        """Slow down towards the fence; without a fresh pose the robot stands."""
+        if not courses:
+            return
+        age = math.inf if self._pose is None else (now - self._pose.stamp) / SECOND
+        if age > FRESH:
+            self._free = None
+            yield Limit(Reason.OWN_CHECK, 0.0)
+            return
+        config = self.view.config
+        delay = age + config.reaction
+        free = min(self._distance(twist, reach(config, delay)) for twist, _ in courses)
+        self._free = free
+        allowed = comfortable_speed(free - config.obstacle.ahead, delay, config.obstacle.deceleration)
+        if allowed < max(pace for _, pace in courses):
+            yield Limit(Reason.OWN_CHECK, allowed if allowed >= config.obstacle.crawl else 0.0)
+
+    def _distance(self, twist: UnitTwist, far: float) -> float:
+        """Distance along a motion up to where more of the outline is outside than now, m; +inf beyond ``far``."""
+        assert self._pose is not None
+        pose = self._pose.pose
+        distances = np.arange(0.0, far + STEP, STEP)
+        poses = placed(swept_poses(twist, distances), (pose.x, pose.y, pose.yaw))
+        outside = (~inside(at_poses(self._edges, poses), self._corners)).sum(axis=1)
+        (further,) = (outside > outside[0]).nonzero()
+        return float(distances[further[0] - 1]) if len(further) else math.inf
+
+    def text(self, reason: Reason) -> str:
+        """Names the fence."""
+        return "the fence is ahead" if self._free is not None else "no fresh pose to keep inside the fence"
+
+    def figures(self, reason: Reason, now: int) -> Iterator[Measurement]:
+        """Distance to the fence."""
+        if self._free is not None and math.isfinite(self._free):
+            limit = self.view.config.obstacle.ahead
+            yield Measurement(name="distance to the fence", value=self._free, unit="m", limit=limit)
+
+
+def inside(points: Array, corners: Array) -> NDArray[np.bool_]:
+    """Which points lie inside a polygon, by the crossings of a ray (even-odd rule).
+
+    Args:
+        points: shape (..., 2), m.
+        corners: shape (n, 2), m.
+
+    Returns:
+        Shape (...,).
+    """
+    x, y = points[..., 0, None], points[..., 1, None]
+    (x0, y0), (x1, y1) = corners.T, np.roll(corners, -1, axis=0).T
+    crosses = (y0 > y) != (y1 > y)
+    rise = np.where(y1 == y0, 1.0, y1 - y0)
+    left = x < x0 + (y - y0) / rise * (x1 - x0)
+    return np.asarray((crosses & left).sum(axis=-1) % 2 == 1)
