@@ -120,9 +120,9 @@ class ObstacleGuard:
         self.unseen: float | None = 0.0
         """Age of the oldest view of a sector of travel at the newest scan, s; None = one was never seen."""
         self.known = math.inf
-        """Distance along the newest motions to ground that no scan has seen, m; +inf if none is within reach."""
-        self.known_turning = math.inf
-        """The same of turns on the spot."""
+        """Distance along the newest motions backwards to ground that no scan has seen, m; +inf = none within reach."""
+        self.known_aside = math.inf
+        """The same of motions sideways and on the spot."""
         self._checked: frozenset[tuple[int, int, int]] | None = None
         self._free = math.inf
         self._outline = footprint.edge_points(OUTLINE, OUTLINE)
@@ -189,7 +189,7 @@ class ObstacleGuard:
             hidden = [twist for twist in rounded if twist[0] * TWIST_STEP < AHEAD]
             behind = self._memory.points() if hidden else None
             self._free = min(self._free_distance(*twist, behind) for twist in rounded)
-            self.known = self.known_turning = math.inf
+            self.known = self.known_aside = math.inf
             if behind is not None:
                 self._check_ground(hidden, np.concatenate((self._points, behind)))
         return self._free
@@ -223,7 +223,7 @@ class ObstacleGuard:
         )
 
     def _check_ground(self, twists: list[tuple[int, int, int]], measured: Array) -> None:
-        """Update ``known`` and ``known_turning``, and shorten the free distance of turns on the spot.
+        """Update ``known`` and ``known_aside``, and shorten the free distance of turns on the spot.
 
         Args:
             twists: in steps of ``TWIST_STEP``.
@@ -235,8 +235,9 @@ class ObstacleGuard:
         turns = [math.hypot(*twist[:2]) * TWIST_STEP < AHEAD for twist in twists]
         turning = np.repeat(turns, [len(sweep.ground) for sweep in sweeps])
         hidden = ~self._memory.seen(ground)
-        self.known = float(before[hidden & ~turning].min(initial=math.inf))
-        self.known_turning = float(before[hidden & turning].min(initial=math.inf))
+        back = np.repeat([twist[0] < 0 for twist in twists], [len(sweep.ground) for sweep in sweeps]) & ~turning
+        self.known = float(before[hidden & back].min(initial=math.inf))
+        self.known_aside = float(before[hidden & ~back].min(initial=math.inf))
         reached = hidden & turning & (before < self._free)
         near = on_body(self._footprint, measured, self._reach + DEPTH) & ~on_body(self._footprint, measured, 0.0)
         apart = ((ground[reached][:, None] - measured[near]) ** 2).sum(axis=2).min(axis=1, initial=math.inf)
@@ -317,9 +318,9 @@ class ObstacleCheck(Check):
             yield Limit(Reason.LIDAR_BLIND, 0.0)
         elif unseen:
             yield Limit(Reason.LIDAR_SLOW, slow)
-        turning = max(guard.allowed_speed(guard.known_turning, now), slow)
-        if turning < fastest:
-            yield Limit(Reason.UNSEEN_SLOW, turning)
+        aside = max(guard.allowed_speed(guard.known_aside, now), slow)
+        if aside < fastest:
+            yield Limit(Reason.UNSEEN_SLOW, aside)
         yield from self._into_unseen(guard.allowed_speed(guard.known, now), fastest)
         self._approach.judge(now, twists, lambda speed: guard.too_near(free, speed, now))
 

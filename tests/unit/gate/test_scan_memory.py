@@ -276,6 +276,13 @@ def test_of_an_outline_points_are_remembered_that_are_two_centimetres_apart():
 def test_ways_less_than_half_forwards_are_held_against_what_is_known(share, known):
     guard = ObstacleGuard(InForce(GateConfig()), FOOTPRINT, ScanPoints(MOUNT))
     guard.free_distance(((share, math.sqrt(1.0 - share**2), 0.0),))
+    assert (guard.known, guard.known_aside) == (math.inf, known)
+
+
+@pytest.mark.parametrize(("backwards", "known"), [(0.01, 0.0), (0.0, math.inf)])
+def test_what_goes_backwards_at_all_is_held_against_unseen_ground_behind(backwards, known):
+    guard = ObstacleGuard(InForce(GateConfig()), FOOTPRINT, ScanPoints(MOUNT))
+    guard.free_distance(((-backwards, math.sqrt(1.0 - backwards**2), 0.0),))
     assert guard.known == known
 
 
@@ -340,8 +347,8 @@ def test_a_turn_stops_before_the_side_of_somebody_that_the_lidar_does_not_see():
     guard.observe(scan(SECOND, *seen))
     assert guard.free_distance((turn,)) < contacts[0]
     for twist in ((-1.0, 0.0, 0.0), (0.0, 1.0, 0.0)):
-        assert guard.free_distance((twist,)) == math.inf, "in reverse and sideways such ground only slows"
-        assert guard.known == 0.0
+        assert guard.free_distance((twist,)) == math.inf, "in reverse and sideways such ground is no obstacle"
+        assert min(guard.known, guard.known_aside) == 0.0
 
 
 @pytest.mark.parametrize(("apart", "stopped"), [(0.16, True), (0.2, False)])
