@@ -50,9 +50,9 @@ def test_the_page_on_zenoh_lists_every_call_with_its_role(monkeypatch: pytest.Mo
     served = {"topics": AccessRole.OBSERVER}  # by the bridge, which the virtual clock has not
     register = Rpc.register
 
-    def note(rpc: Rpc, name: str, handler: Handler, role: AccessRole = AccessRole.PILOT) -> None:
+    def note(rpc: Rpc, name: str, handler: Handler, role: AccessRole = AccessRole.PILOT, **more: bool) -> None:
         served[name] = role
-        register(rpc, name, handler, role)
+        register(rpc, name, handler, role, **more)
 
     monkeypatch.setattr(Rpc, "register", note)
 

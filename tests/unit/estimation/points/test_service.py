@@ -47,7 +47,7 @@ class Kept(list):
 
 
 class Calls(dict):
-    def register(self, name, handler, role=None) -> None:
+    def register(self, name, handler, role=None, *, recorded=True) -> None:
         self[name] = handler
 
 
