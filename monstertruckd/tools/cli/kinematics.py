@@ -307,7 +307,7 @@ def _read_wheels(path: Path) -> "tuple[Wheel, ...]":
         raise InputError(f"{path}: expected a list of wheels")
     wheels: list[Wheel] = []
     for number, row in enumerate(rows, start=1):
-        if not isinstance(row, dict) or row.get("kind") not in kinds:
+        if not isinstance(row, dict) or str(row.get("kind")) not in kinds:
             raise InputError(f"{path}: wheel {number}: expected a mapping with kind {', '.join(kinds)}")
         fields = {"name": str(number)} | {name: value for name, value in row.items() if name != "kind"}
         for name, value in fields.items():
@@ -315,7 +315,7 @@ def _read_wheels(path: Path) -> "tuple[Wheel, ...]":
                 raise InputError(f"{path}: wheel {number}: {name} is {value!r}: expected a number")
         try:
             with reading(f"{path}: wheel {number}", "a wheel"):
-                wheels.append(kinds[row["kind"]](**fields))
+                wheels.append(kinds[str(row["kind"])](**fields))
         except InputError as error:
             if not isinstance(cause := error.__cause__, TypeError):
                 raise
