@@ -111,7 +111,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--count", type=int, help="1000; 10000 of families")
-    parser.add_argument("--families", action="store_true", help="falsify whatever devices say and are told")
+    parser.add_argument("--families", action="store_true", help="falsify signals of devices and commands to them")
     parser.add_argument("--from", type=int, default=0, dest="first", metavar="N", help="of families: first trial")
     parser.add_argument("--robot", metavar="NAME", help="of families: of configs/robots instead of configs/full.yaml")
     parser.add_argument("--jobs", type=int, default=default_jobs())

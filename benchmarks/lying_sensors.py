@@ -38,7 +38,7 @@ from monstertruck_estimation.consistency.comparison import Measure
 from monstertruck_estimation.consistency.config import ConsistencyConfig
 from monstertruck_estimation.consistency.exchange import StepInput
 from monstertruck_estimation.consistency.monitor import ConsistencyMonitor
-from monstertruck_estimation.consistency.scan_odometry import ScanOdometry
+from monstertruck_estimation.consistency.scan_odometry import ScanMotionStep
 from monstertruck_estimation.se2 import between
 from monstertruck_estimation.slam.worker_io import ScanInput
 from monstertruck_estimation.wheel_motion import WheelIncrement
@@ -292,7 +292,7 @@ def replayed(path: Path) -> tuple[int, float, float]:
     step = math.pi / 180 if count == 180 else math.pi / (count - 1)
     longest = float(np.max(ranges)) * 0.98
     monitor = ConsistencyMonitor(ConsistencyConfig(), {Measure.WHEELS: "drive", Measure.SCANS: "lidar"})
-    odometry, alarms, compared, last = ScanOdometry(), 0, 0.0, 0
+    odometry, alarms, compared, last = ScanMotionStep(), 0, 0.0, 0
     monitor.activate(0)
     for k, seconds in enumerate(stamps):
         stamp = int(seconds * SECOND)

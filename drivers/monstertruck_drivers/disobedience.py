@@ -34,7 +34,7 @@ USAGE = "ignore|reverse|creep RPM|run RPM [stage|line|supply], or off"
 
 
 @dataclass(frozen=True, slots=True)
-class Runaway:
+class DisobedientMotor:
     """A controller's present disobedience.
 
     Args:

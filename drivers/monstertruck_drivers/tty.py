@@ -105,7 +105,7 @@ def _await_last_words() -> None:
     futures.wait(_closing, LAST_WORDS)
 
 
-class _Node:
+class _PortNode:
     """One device node of the kernel: its work of opening and closing, done one after the other.
 
     A node that the kernel does not let go of occupies one thread; the device gets another node when it is enumerated
@@ -115,7 +115,7 @@ class _Node:
     def __init__(self) -> None:
         self._work: list[Future[None]] = []
         self._overdue: Future[None] | None = None
-        """Work that has been waited for in vain."""
+        """Work that did not end in time."""
 
     async def open(self, name: str, make: "Callable[[], _Tty]") -> "_Tty":
         """Run ``make`` in a thread; what it makes too late, or for a cancelled caller, is closed there.
@@ -175,15 +175,15 @@ class _Node:
             self._work = [work for work in self._work if not work.done()]
 
 
-_nodes: WeakValueDictionary[str, _Node] = WeakValueDictionary()
+_nodes: WeakValueDictionary[str, _PortNode] = WeakValueDictionary()
 """Nodes that are in use, by their real path."""
 
 
-def _node(path: Path) -> _Node:
+def _node(path: Path) -> _PortNode:
     real = os.path.realpath(path)
     node = _nodes.get(real)
     if node is None:
-        node = _nodes[real] = _Node()
+        node = _nodes[real] = _PortNode()
     return node
 
 
@@ -228,7 +228,7 @@ class _Tty(serial.Serial):
     _ending: Future[None] | None = None
     _is_handed_over = False
 
-    def __init__(self, path: str, baud: int, *, node: _Node, dtr: bool, rts: bool, low_latency: bool) -> None:
+    def __init__(self, path: str, baud: int, *, node: _PortNode, dtr: bool, rts: bool, low_latency: bool) -> None:
         super().__init__(None, baudrate=baud, timeout=0, write_timeout=0, exclusive=True)
         self._node = node
         self.dtr, self.rts = dtr, rts

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator
 from monstertruck_planners.collision import UnitTwist
 from monstertruck_schemas.event import Measurement
 from monstertruck_schemas.reasons import Reason
-from monstertruckd.gate.checks import GateView, Limit
+from monstertruckd.gate.checks import GateView, PaceLimit
 from monstertruckd.gate.config import GateConfig
 
 
@@ -46,15 +46,15 @@ class Approach:
         self.blocked = self.emergency = False
         self.free = None
 
-    def limits(self, free: float, allowed: float, fastest: float) -> Iterator[Limit]:
+    def limits(self, free: float, allowed: float, fastest: float) -> Iterator[PaceLimit]:
         """Limit for ``free`` metres ahead, which allow a pace of ``allowed`` m/s, for motions up to ``fastest`` m/s."""
         crawl = self._view.config.obstacle.crawl
         self.free = free if math.isfinite(free) else None
         self.blocked = allowed < (2 * crawl if self.blocked else crawl)
         if self.blocked:
-            yield Limit(Reason.OBSTACLE_STOP, 0.0)
+            yield PaceLimit(Reason.OBSTACLE_STOP, 0.0)
         elif allowed < fastest:
-            yield Limit(Reason.OBSTACLE_SLOW, allowed)
+            yield PaceLimit(Reason.OBSTACLE_SLOW, allowed)
 
     def judge(self, now: int, twists: Iterable[UnitTwist], too_near: Callable[[float], bool]) -> None:
         """Update ``emergency``.

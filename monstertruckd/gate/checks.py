@@ -37,7 +37,7 @@ class Tick(NamedTuple):
     """Time since the previous tick, ns."""
 
 
-class Limit(NamedTuple):
+class PaceLimit(NamedTuple):
     """A speed limit with its reason."""
 
     reason: Reason
@@ -142,7 +142,7 @@ class Check:
         """Why the robot may not move at ``now`` (ns), worst first; called at ticks and for orders in between."""
         return ()
 
-    def limit(self, now: int, courses: Sequence[Course] | None) -> Iterable[Limit]:
+    def limit(self, now: int, courses: Sequence[Course] | None) -> Iterable[PaceLimit]:
         """Limits of the pace at a tick.
 
         Args:

@@ -10,7 +10,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.roles import DeviceRole
 from monstertruck_schemas.state import Consistency, Doubt, DoubtKind
 from monstertruck_schemas.topics import CONSISTENCY, Topic
-from monstertruckd.gate.checks import Check, GateView, Limit, Tick
+from monstertruckd.gate.checks import Check, GateView, PaceLimit, Tick
 from monstertruckd.gate.motion import AHEAD, Course
 
 ENOUGH: Final = 2
@@ -45,14 +45,14 @@ class ConsistencyCheck(Check):
         doubts = [doubt for doubt in self._doubts() if self._stops(doubt.sensor)]
         yield from dict.fromkeys(_reason(doubt) for doubt in doubts)
 
-    def limit(self, now: int, courses: Sequence[Course] | None) -> Iterator[Limit]:
+    def limit(self, now: int, courses: Sequence[Course] | None) -> Iterator[PaceLimit]:
         """Limits of a frozen battery voltage, and of a robot with a single measure of its motion."""
         config = self.view.config
         if any(doubt.sensor == DeviceRole.BATTERY for doubt in self._doubts()) and not config.battery.critical:
-            yield Limit(Reason.SENSOR_FROZEN, config.battery_low_speed)
+            yield PaceLimit(Reason.SENSOR_FROZEN, config.battery_low_speed)
         if courses and not self._witnessed(now):
             ahead = all(twist[0] >= AHEAD for twist, _ in courses)
-            yield Limit(Reason.UNWITNESSED, config.unwitnessed * (config.speed if ahead else config.reverse_speed))
+            yield PaceLimit(Reason.UNWITNESSED, config.unwitnessed * (config.speed if ahead else config.reverse_speed))
 
     def describe(self, reason: Reason, now: int, since: int) -> Iterator[Cause]:
         """One cause for each doubt, which names both sensors and their difference."""

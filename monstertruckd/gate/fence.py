@@ -17,7 +17,7 @@ from monstertruck_schemas.state import Odometry
 from monstertruck_schemas.topics import POSE, Topic
 from monstertruckd.gate.approach import comfortable_speed, reach
 from monstertruckd.gate.catalog import FenceConfig
-from monstertruckd.gate.checks import Check, GateView, Limit, Tick
+from monstertruckd.gate.checks import Check, GateView, PaceLimit, Tick
 from monstertruckd.gate.motion import Course
 from monstertruckd.gate.obstacles import OUTLINE, at_poses
 
@@ -50,14 +50,14 @@ class FenceCheck(Check):
         if isinstance(seen, Odometry) and topic is POSE:
             self._pose = seen
 
-    def limit(self, now: int, courses: Sequence[Course] | None) -> Iterator[Limit]:
+    def limit(self, now: int, courses: Sequence[Course] | None) -> Iterator[PaceLimit]:
         """Slow down towards the fence; without a fresh pose the robot stands."""
         if not courses:
             return
         age = math.inf if self._pose is None else (now - self._pose.stamp) / SECOND
         if age > FRESH:
             self._free = None
-            yield Limit(Reason.OWN_CHECK, 0.0)
+            yield PaceLimit(Reason.OWN_CHECK, 0.0)
             return
         config = self.view.config
         delay = age + config.reaction
@@ -65,7 +65,7 @@ class FenceCheck(Check):
         self._free = free
         allowed = comfortable_speed(free - config.obstacle.ahead, delay, config.obstacle.deceleration)
         if allowed < max(pace for _, pace in courses):
-            yield Limit(Reason.OWN_CHECK, allowed if allowed >= config.obstacle.crawl else 0.0)
+            yield PaceLimit(Reason.OWN_CHECK, allowed if allowed >= config.obstacle.crawl else 0.0)
 
     def _distance(self, twist: UnitTwist, far: float) -> float:
         """Distance along a motion up to where more of the outline is outside than now, m; +inf beyond ``far``."""

@@ -8,7 +8,7 @@ from monstertruck_kinematics.drive import Twist
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import DriveRequest
 from monstertruckd.gate.approach import stopping
-from monstertruckd.gate.checks import Check, GateView, Limit
+from monstertruckd.gate.checks import Check, GateView, PaceLimit
 from monstertruckd.gate.motion import ROUNDING, Course, Target, scaled
 
 FASTEST: Final = 1e6
@@ -74,14 +74,14 @@ class CommandLimiter(Check):
         courses = ((wanted, pace), (motion.twist, motion.present_pace))
         return tuple((scaled(twist, 1.0 / pace), pace) for twist, pace in courses if twist != STILL and pace >= LEAST)
 
-    def limit(self, now: int, courses: Sequence[Course] | None) -> Iterator[Limit]:
+    def limit(self, now: int, courses: Sequence[Course] | None) -> Iterator[PaceLimit]:
         """Servos that do not reach as far, and requests beyond the configured limits."""
         if (aim := self._aim) is None:
             return
         if aim.target.saturated:
-            yield Limit(Reason.SERVO_LIMIT, aim.max_pace)
+            yield PaceLimit(Reason.SERVO_LIMIT, aim.max_pace)
         if aim.target.clipped or aim.pace > aim.max_pace * (1 + ROUNDING):
-            yield Limit(Reason.CLIPPED, aim.max_pace)
+            yield PaceLimit(Reason.CLIPPED, aim.max_pace)
 
     def advance(self, dt: float, limits: dict[Reason, float]) -> None:
         """Change the commanded motion for ``dt`` s towards the aim, within ``limits``, m/s."""

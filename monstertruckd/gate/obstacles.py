@@ -25,7 +25,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.topics import Topic
 from monstertruckd.gate.approach import Approach, comfortable_speed, reach, stopping
-from monstertruckd.gate.checks import Check, GateView, Limit, Tick
+from monstertruckd.gate.checks import Check, GateView, PaceLimit, Tick
 from monstertruckd.gate.config import GateConfig, InForce
 from monstertruckd.gate.motion import AHEAD, Course
 from monstertruckd.gate.samples import age
@@ -297,7 +297,7 @@ class ObstacleCheck(Check):
         elif isinstance(seen, LaserScan) and seen is view.samples.scan:
             self.guard.observe(seen)
 
-    def limit(self, now: int, courses: Sequence[Course] | None) -> Iterator[Limit]:
+    def limit(self, now: int, courses: Sequence[Course] | None) -> Iterator[PaceLimit]:
         """Sweep along the motions, and along those of the measured steering angles."""
         if courses is None:
             self._approach.forget()
@@ -305,7 +305,7 @@ class ObstacleCheck(Check):
         elif courses and self.view.samples.scan_fresh(now):
             yield from self._along(now, list(courses))
 
-    def _along(self, now: int, courses: list[Course]) -> Iterator[Limit]:
+    def _along(self, now: int, courses: list[Course]) -> Iterator[PaceLimit]:
         guard, view = self.guard, self.view
         fastest = max(pace for _, pace in courses)
         if view.samples.steering_fresh(now):
@@ -315,29 +315,29 @@ class ObstacleCheck(Check):
         yield from self._approach.limits(free, guard.allowed_speed(free, now), fastest)
         unseen, slow = guard.unseen, view.config.obstacle.unseen_speed
         if unseen is None or unseen > view.config.scan.stale_after:
-            yield Limit(Reason.LIDAR_BLIND, 0.0)
+            yield PaceLimit(Reason.LIDAR_BLIND, 0.0)
         elif unseen:
-            yield Limit(Reason.LIDAR_SLOW, slow)
+            yield PaceLimit(Reason.LIDAR_SLOW, slow)
         aside = max(guard.allowed_speed(guard.known_aside, now), slow)
         if aside < fastest:
-            yield Limit(Reason.UNSEEN_SLOW, aside)
+            yield PaceLimit(Reason.UNSEEN_SLOW, aside)
         yield from self._into_unseen(guard.allowed_speed(guard.known, now), fastest)
         self._approach.judge(now, twists, lambda speed: guard.too_near(free, speed, now))
 
-    def _into_unseen(self, allowed: float, fastest: float) -> Iterator[Limit]:
+    def _into_unseen(self, allowed: float, fastest: float) -> Iterator[PaceLimit]:
         """Limits before ground that was not seen, which allows a pace of ``allowed``, for motions up to ``fastest``."""
         config = self.view.config.obstacle
         if config.unseen == "slow":
             allowed = max(allowed, config.unseen_speed)
         elif self.view.confirmed and allowed < config.confirmed_speed:
             self._before_unseen = False
-            yield Limit(Reason.UNSEEN_DRIVE, config.confirmed_speed)
+            yield PaceLimit(Reason.UNSEEN_DRIVE, config.confirmed_speed)
             return
         self._before_unseen = allowed < (2 * config.crawl if self._before_unseen else config.crawl)
         if self._before_unseen:
-            yield Limit(Reason.UNSEEN_STOP, 0.0)
+            yield PaceLimit(Reason.UNSEEN_STOP, 0.0)
         elif allowed < fastest:
-            yield Limit(Reason.UNSEEN_SLOW, allowed)
+            yield PaceLimit(Reason.UNSEEN_SLOW, allowed)
 
     def figures(self, reason: Reason, now: int) -> Iterator[Measurement]:
         """Free distance, or how long the lidar has not seen the way."""

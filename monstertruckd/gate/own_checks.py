@@ -9,7 +9,7 @@ from monstertruck_schemas.event import Cause, Measurement
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.topics import Topic
 from monstertruckd.gate.catalog import GATE_CHECKS, CheckConfig
-from monstertruckd.gate.checks import Check, GateView, Limit, Tick
+from monstertruckd.gate.checks import Check, GateView, PaceLimit, Tick
 from monstertruckd.gate.motion import Course
 
 log = logging.getLogger(__name__)
@@ -51,11 +51,11 @@ class OwnCheck(Check):
         given: list[Reason] = self._guarded(lambda: list(map(_known, self._check.reason(now))), default=[])
         return given if self._error is None else [Reason.OWN_CHECK]
 
-    def limit(self, now: int, courses: Sequence[Course] | None) -> Iterable[Limit]:
+    def limit(self, now: int, courses: Sequence[Course] | None) -> Iterable[PaceLimit]:
         """See ``Check.limit``."""
         return self._guarded(
-            lambda: [Limit(_known(reason), float(pace)) for reason, pace in self._check.limit(now, courses)],
-            default=[Limit(Reason.OWN_CHECK, 0.0)],
+            lambda: [PaceLimit(_known(reason), float(pace)) for reason, pace in self._check.limit(now, courses)],
+            default=[PaceLimit(Reason.OWN_CHECK, 0.0)],
         )
 
     def text(self, reason: Reason) -> str:

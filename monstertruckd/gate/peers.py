@@ -23,7 +23,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.state import Odometry, Peer, Peers
 from monstertruck_schemas.topics import PEERS, POSE, Topic
 from monstertruckd.gate.approach import Approach, comfortable_speed, reach, stopping
-from monstertruckd.gate.checks import Check, GateView, Limit, Tick
+from monstertruckd.gate.checks import Check, GateView, PaceLimit, Tick
 from monstertruckd.gate.config import InForce
 from monstertruckd.gate.motion import AHEAD, Course
 from monstertruckd.gate.obstacles import ObstacleGuard
@@ -168,14 +168,14 @@ class PeerCheck(Check):
         elif isinstance(seen, Peers):
             self._guard.observe(seen)
 
-    def limit(self, now: int, courses: Sequence[Course] | None) -> Iterator[Limit]:
+    def limit(self, now: int, courses: Sequence[Course] | None) -> Iterator[PaceLimit]:
         """Sweep along the motions."""
         if courses is None:
             self._approach.forget()
         elif courses:
             yield from self._along(now, courses)
 
-    def _along(self, now: int, courses: Sequence[Course]) -> Iterator[Limit]:
+    def _along(self, now: int, courses: Sequence[Course]) -> Iterator[PaceLimit]:
         config = self.view.config
         lidar = self._lidar if self.view.samples.scan_fresh(now) else None
         delay = config.reaction + (0.0 if self._sonars is None else self._sonars.delay(now))
@@ -187,7 +187,7 @@ class PeerCheck(Check):
         if self._guard.unknown(now) and any(
             pace > slow and not (looked and twist[0] >= AHEAD) for twist, pace in courses
         ):
-            yield Limit(Reason.PEER_UNKNOWN, slow)
+            yield PaceLimit(Reason.PEER_UNKNOWN, slow)
         seen = None if lidar is None else lidar.looks_at
         free = self._guard.free_distance(twists, far, now, seen)
         allowed = comfortable_speed(free - config.obstacle.ahead, delay, config.obstacle.deceleration)

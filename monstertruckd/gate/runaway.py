@@ -311,7 +311,7 @@ class BodyWatch:
             self.runs = False
 
 
-class Step(IntEnum):
+class Escalation(IntEnum):
     """What is done against a runaway, each step after the one before it has not helped."""
 
     NONE = 0
@@ -348,7 +348,7 @@ class RunawayCheck(Check):
         """When motion was commanded last, ns."""
         self._halted = 0
         """Since when every command has been a quick stop, ns."""
-        self._step = Step.NONE
+        self._step = Escalation.NONE
         self._found: Runaway | None = None
         self._count = 0
 
@@ -406,13 +406,13 @@ class RunawayCheck(Check):
         return any(watch.pulls(self._config, fresh=fresh) for watch in self._shafts)
 
     def _take(self, found: Runaway | None, now: int) -> None:
-        if found is None or self._step is Step.PORT_OFF:
+        if found is None or self._step is Escalation.PORT_OFF:
             return
         self._found = found
         self._count += 1
         stopped = now - self._halted > self.view.config.reaction * SECOND
-        least = Step.POWER_OFF if stopped else Step.QUICK_STOP
-        self._step = Step(min(max(self._step + 1, least), Step.PORT_OFF))
+        least = Escalation.POWER_OFF if stopped else Escalation.QUICK_STOP
+        self._step = Escalation(min(max(self._step + 1, least), Escalation.PORT_OFF))
 
     # What it says
 
@@ -438,12 +438,12 @@ class RunawayCheck(Check):
     @property
     def power_off(self) -> bool:
         """Whether quick stops do not help."""
-        return self._step >= Step.POWER_OFF
+        return self._step >= Escalation.POWER_OFF
 
     @property
     def port_off(self) -> bool:
         """Whether switching the power stages off does not help either."""
-        return self._step >= Step.PORT_OFF
+        return self._step >= Escalation.PORT_OFF
 
     def text(self, reason: Reason) -> str:
         """Who turns, and what was done."""
@@ -451,9 +451,9 @@ class RunawayCheck(Check):
         if found is None:
             return reason.text
         done = {
-            Step.QUICK_STOP: "quick stop",
-            Step.POWER_OFF: "quick stop does not help: power stage off",
-            Step.PORT_OFF: "nothing helps: switch the motors off by hand",
+            Escalation.QUICK_STOP: "quick stop",
+            Escalation.POWER_OFF: "quick stop does not help: power stage off",
+            Escalation.PORT_OFF: "nothing helps: switch the motors off by hand",
         }
         return f"{found.source} {found.kind} at {found.measured:.3f} m/s; {done[self._step]}"
 
@@ -466,4 +466,4 @@ class RunawayCheck(Check):
     def reset(self) -> None:
         """An operator says that the cause is gone."""
         if self.view.mode is GateMode.ESTOPPED:
-            self._found, self._step = None, Step.NONE
+            self._found, self._step = None, Escalation.NONE

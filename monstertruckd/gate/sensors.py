@@ -10,7 +10,7 @@ from monstertruck_schemas.health import HealthTable, ServiceState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import Attitude, BatteryLevel
 from monstertruck_schemas.topics import Topic
-from monstertruckd.gate.checks import Check, GateView, Limit, Tick
+from monstertruckd.gate.checks import Check, GateView, PaceLimit, Tick
 from monstertruckd.gate.motion import Course
 from monstertruckd.gate.samples import STALE_SENSORS, age
 
@@ -168,10 +168,10 @@ class TiltCheck(Check):
         if self._stop and self.view.samples.attitude_fresh(now):
             yield Reason.TILT_STOP
 
-    def limit(self, now: int, courses: Sequence[Course] | None) -> Iterator[Limit]:
+    def limit(self, now: int, courses: Sequence[Course] | None) -> Iterator[PaceLimit]:
         """Much tilt."""
         if self._slow and not self._stop and self.view.samples.attitude_fresh(now):
-            yield Limit(Reason.TILT_SLOW, self.view.config.tilt.slow_speed)
+            yield PaceLimit(Reason.TILT_SLOW, self.view.config.tilt.slow_speed)
 
     def figures(self, reason: Reason, now: int) -> Iterator[Measurement]:
         """The tilt."""
@@ -198,14 +198,14 @@ class BatteryCheck(Check):
         if (battery := self.view.samples.battery) is not None and battery.level is BatteryLevel.CRITICAL:
             yield Reason.BATTERY_CRITICAL
 
-    def limit(self, now: int, courses: Sequence[Course] | None) -> Iterator[Limit]:
+    def limit(self, now: int, courses: Sequence[Course] | None) -> Iterator[PaceLimit]:
         """A low battery, or one whose voltage is not known any longer."""
         config, battery = self.view.config, self.view.samples.battery
         if battery is not None and battery.level is BatteryLevel.LOW:
-            yield Limit(Reason.BATTERY_LOW, config.battery_low_speed)
+            yield PaceLimit(Reason.BATTERY_LOW, config.battery_low_speed)
         known = self._measured or battery is not None
         if known and not config.battery.critical and not self.view.samples.battery_fresh(now):
-            yield Limit(Reason.BATTERY_STALE, config.battery_low_speed)
+            yield PaceLimit(Reason.BATTERY_STALE, config.battery_low_speed)
 
     def figures(self, reason: Reason, now: int) -> Iterator[Measurement]:
         """The voltage."""

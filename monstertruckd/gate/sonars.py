@@ -27,7 +27,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import SonarRanges
 from monstertruck_schemas.topics import SONAR, Topic
 from monstertruckd.gate.approach import Approach, comfortable_speed, reach
-from monstertruckd.gate.checks import Check, GateView, Limit, Tick
+from monstertruckd.gate.checks import Check, GateView, PaceLimit, Tick
 from monstertruckd.gate.config import InForce
 from monstertruckd.gate.motion import Course
 
@@ -157,16 +157,16 @@ class SonarCheck(Check):
         if isinstance(seen, SonarRanges):
             self.guard.observe(seen)
 
-    def limit(self, now: int, courses: Sequence[Course] | None) -> Iterator[Limit]:
+    def limit(self, now: int, courses: Sequence[Course] | None) -> Iterator[PaceLimit]:
         """Sweep along the motions."""
         if courses is None:
             self._approach.forget()
         elif courses and self.guard.fresh(now):
             yield from self._along(now, courses)
         elif courses:
-            yield Limit(Reason.SONAR_STALE, 0.0)
+            yield PaceLimit(Reason.SONAR_STALE, 0.0)
 
-    def _along(self, now: int, courses: Sequence[Course]) -> Iterator[Limit]:
+    def _along(self, now: int, courses: Sequence[Course]) -> Iterator[PaceLimit]:
         config = self.view.config
         delay = self.guard.delay(now) + config.reaction
         views = [self.guard.look(twist, reach(config, delay), now) for twist, _ in courses]
@@ -174,9 +174,9 @@ class SonarCheck(Check):
         allowed = comfortable_speed(free - config.obstacle.ahead, delay, config.obstacle.deceleration)
         yield from self._approach.limits(free, allowed, max(pace for _, pace in courses))
         if any(view.dead for view in views):
-            yield Limit(Reason.SONAR_BLIND, 0.0)
+            yield PaceLimit(Reason.SONAR_BLIND, 0.0)
         elif any(view.unknown for view in views):
-            yield Limit(Reason.SONAR_SLOW, config.sonar.unseen_speed)
+            yield PaceLimit(Reason.SONAR_SLOW, config.sonar.unseen_speed)
 
     def figures(self, reason: Reason, now: int) -> Iterator[Measurement]:
         """Free distance."""

@@ -231,7 +231,7 @@ class Salvage:
         if gap or not self.ended:
             self._spans.append(Span(newest, None))
 
-    def _opened(self, part: "_Part") -> Iterator[McapRecord]:
+    def _opened(self, part: "_WholeRecord") -> Iterator[McapRecord]:
         record = part.read(self._data)
         if isinstance(record, Chunk):
             yield from records_in(unpacked(record))
@@ -267,7 +267,7 @@ def _is_indexed(file: BinaryIO) -> bool:
         return False
 
 
-class _Part(NamedTuple):
+class _WholeRecord(NamedTuple):
     """A record that is whole."""
 
     offset: int
@@ -301,7 +301,7 @@ class _Part(NamedTuple):
 
 
 @dataclass(slots=True)
-class _Known:
+class _KnownChannels:
     """Schemas and channels by number; the first one of a number stands."""
 
     schemas: dict[int, Schema] = field(default_factory=dict)
@@ -319,11 +319,11 @@ class _Known:
 class _Found:
     """What the first pass learns of a file."""
 
-    parts: list[_Part | None] = field(default_factory=list)
+    parts: list[_WholeRecord | None] = field(default_factory=list)
     """Whole records of the data section; None = a gap."""
-    sealed: _Known = field(default_factory=_Known)
+    sealed: _KnownChannels = field(default_factory=_KnownChannels)
     """Of whole chunks, and of a sound index."""
-    spare: _Known = field(default_factory=_Known)
+    spare: _KnownChannels = field(default_factory=_KnownChannels)
     """Of records without a checksum."""
     names: dict[int, str] = field(default_factory=dict)
     """Topics by channel, from the recorder's metadata."""
@@ -380,7 +380,7 @@ class _Scan:
             self._found.parts = [part for part in parts if part is None or part.opcode != Opcode.MESSAGE]
         return self._found
 
-    def _take_unsealed(self, part: _Part) -> tuple[bool, int]:
+    def _take_unsealed(self, part: _WholeRecord) -> tuple[bool, int]:
         """Note a record without a valid checksum, which may be cut off, or overwritten by a chunk.
 
         Returns:
@@ -403,12 +403,12 @@ class _Scan:
         if not self._behind and self._found.parts[-1:] != [None]:
             self._found.parts.append(None)
 
-    def _part(self, at: int, *, in_step: bool) -> _Part | None:
+    def _part(self, at: int, *, in_step: bool) -> _WholeRecord | None:
         """The record that begins there, if it is whole."""
         head = self._data.at(at, _HEAD.size)
         if len(head) < _HEAD.size:
             return None
-        part = _Part(at, *_HEAD.unpack(head))
+        part = _WholeRecord(at, *_HEAD.unpack(head))
         if part.end > self._data.size or part.length > MOST_UNPACKED:
             return None
         match part.opcode:
@@ -426,13 +426,13 @@ class _Scan:
                 whole = opcode >= PRIVATE and in_step and self._is_followed(part)
         return part if whole else None
 
-    def _is_message_index(self, part: _Part) -> bool:
+    def _is_message_index(self, part: _WholeRecord) -> bool:
         if part.length < _INDEX_HEAD.size:
             return False
         _, size = _INDEX_HEAD.unpack(self._data.at(part.offset + _HEAD.size, _INDEX_HEAD.size))
         return bool(size == part.length - _INDEX_HEAD.size and size % _INDEX_ENTRY == 0)
 
-    def _adds_up(self, part: _Part) -> bool:
+    def _adds_up(self, part: _WholeRecord) -> bool:
         """Whether the lengths of a chunk add up, looked at before all of it is read."""
         head = self._data.at(part.offset + _HEAD.size, _CHUNK_HEAD.size)
         if len(head) < _CHUNK_HEAD.size:
@@ -441,7 +441,7 @@ class _Scan:
         size = self._data.at(part.offset + _HEAD.size + _CHUNK_HEAD.size + named, _SIZE.size)
         return len(size) == _SIZE.size and _CHUNK_HEAD.size + named + _SIZE.size + _SIZE.unpack(size)[0] == part.length
 
-    def _is_followed(self, part: _Part) -> bool:
+    def _is_followed(self, part: _WholeRecord) -> bool:
         """Whether the end of the file, or the head of another record, follows."""
         rest = self._data.size - part.end
         if rest == 0 or self._data.is_magic(part.end):
@@ -451,7 +451,7 @@ class _Scan:
         opcode, length = _HEAD.unpack(self._data.at(part.end, _HEAD.size))
         return bool(0 < opcode <= Opcode.DATA_END or opcode >= PRIVATE) and length <= rest - _HEAD.size
 
-    def _is_whole(self, part: _Part, *, in_step: bool) -> bool:
+    def _is_whole(self, part: _WholeRecord, *, in_step: bool) -> bool:
         try:
             record = part.read(self._data)
             if isinstance(record, Chunk):
@@ -463,14 +463,14 @@ class _Scan:
             return False
         return in_step or part.opcode != Opcode.ATTACHMENT or self._is_sealed(part)
 
-    def _is_sealed(self, part: _Part) -> bool:
+    def _is_sealed(self, part: _WholeRecord) -> bool:
         """Whether a whole record is what its own checksum says."""
         if part.opcode != Opcode.ATTACHMENT:
             return part.opcode == Opcode.CHUNK
         record = part.read(self._data)
         return checked_attachment(record, part.content(self._data)) is record
 
-    def _take(self, part: _Part) -> None:
+    def _take(self, part: _WholeRecord) -> None:
         """Note a whole record."""
         found = self._found
         match part.opcode:
@@ -502,7 +502,7 @@ class _Scan:
         elif isinstance(record, ChunkIndex) and self._trusted:
             self._found.expected.append(record)
 
-    def _take_once(self, part: _Part) -> None:
+    def _take_once(self, part: _WholeRecord) -> None:
         if not self._is_new(part):
             return
         self._found.parts.append(part)
@@ -510,7 +510,7 @@ class _Scan:
         if isinstance(record, Metadata) and record.name == CHANNELS:
             self._found.names |= {int(number): topic for number, topic in record.metadata.items() if number.isdecimal()}
 
-    def _take_chunk(self, part: _Part) -> None:
+    def _take_chunk(self, part: _WholeRecord) -> None:
         if not self._is_new(part):
             self._found.repeated += 1
             return
@@ -520,7 +520,7 @@ class _Scan:
         for record in records_in(unpacked(chunk)):
             self._found.sealed.learn(record)
 
-    def _is_new(self, part: _Part) -> bool:
+    def _is_new(self, part: _WholeRecord) -> bool:
         begin = _TIMES if part.opcode == Opcode.CHUNK else 0  # no checksum covers a chunk's times
         digest = blake2b(part.content(self._data)[begin:], digest_size=16).digest()
         new = digest not in self._seen

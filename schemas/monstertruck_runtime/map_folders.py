@@ -41,7 +41,7 @@ _LOOSE: Final = (YAML, "map.png", "graph.npz", "ground.npz", "points.json", "poi
 """Files of earlier versions, which had no manifest; a new map takes their place."""
 
 
-class _Part(Schema):
+class _SavedFile(Schema):
     """One file of a save."""
 
     size: Annotated[int, Field(ge=0)]
@@ -54,7 +54,7 @@ class _Manifest(Schema):
     version: Literal[1] = 1
     run: str
     """Run that made the map; empty for a map without a manifest."""
-    parts: dict[Annotated[str, Field(pattern=r"^[\w-][\w.-]*$")], _Part]
+    parts: dict[Annotated[str, Field(pattern=r"^[\w-][\w.-]*$")], _SavedFile]
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,7 +213,7 @@ def _run(folder: Path, run: str | None) -> str:
         return ""
 
 
-def _base(saves: Path, run: str) -> tuple[Path | None, Mapping[str, _Part]]:
+def _base(saves: Path, run: str) -> tuple[Path | None, Mapping[str, _SavedFile]]:
     """Newest whole save of a run, and what it holds."""
     for path in _numbered(saves):
         try:
@@ -253,8 +253,8 @@ def _manifest(save: Path) -> _Manifest:
         return _Manifest.model_validate_json(contents(path, expected, MOST_MANIFEST))
 
 
-def _part(data: bytes) -> _Part:
-    return _Part(size=len(data), sha256=hashlib.sha256(data).hexdigest())
+def _part(data: bytes) -> _SavedFile:
+    return _SavedFile(size=len(data), sha256=hashlib.sha256(data).hexdigest())
 
 
 def _write(path: Path, data: bytes) -> None:

@@ -47,6 +47,14 @@ class _BoundedComposer(Composer):
         return node
 
 
+def bounded_yaml() -> YAML:
+    """Reader of one document of plain data that refuses what is nested too deeply or has too many nodes."""
+    yaml = YAML(typ="safe", pure=True)
+    yaml.max_depth = DEEPEST
+    yaml.Composer = _BoundedComposer
+    return yaml
+
+
 def read_yaml(path: Path) -> Any:
     """Content of a file.
 
@@ -54,9 +62,7 @@ def read_yaml(path: Path) -> Any:
         InputError: it cannot be read, is not YAML, or is too long or nested too deeply.
     """
     text = text_of(path, _EXPECTED, MOST_BYTES)
-    yaml = YAML(typ="safe", pure=True)
-    yaml.max_depth = DEEPEST
-    yaml.Composer = _BoundedComposer
+    yaml = bounded_yaml()
     with reading(path, _EXPECTED):
         try:
             return yaml.load(text)

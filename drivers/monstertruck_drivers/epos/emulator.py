@@ -11,7 +11,7 @@ from contextlib import suppress
 import numpy as np
 
 from monstertruck_drivers.cable import DeviceEnd
-from monstertruck_drivers.disobedience import USAGE, Runaway
+from monstertruck_drivers.disobedience import USAGE, DisobedientMotor
 from monstertruck_drivers.emulation import EmulatorSetup, MotorPlant
 from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos.firmware import AccessRefusedError, Firmware, FreeMotor
@@ -105,7 +105,7 @@ class EposEmulator:
             "strict": ("on|off", self._inject_strict),
             "repeat": ("on|off", self._inject_repeat),
             "latch": ("on|off", self._inject_latch),
-            "runaway": (USAGE, lambda *words: self.firmware.run_away(Runaway.parse(*words))),
+            "runaway": (USAGE, lambda *words: self.firmware.run_away(DisobedientMotor.parse(*words))),
         }
 
     # Faults and switches
@@ -129,7 +129,7 @@ class EposEmulator:
         ``delay MS [COUNT]``: late answers. ``silent``, ``power``, ``line`` (quick stop input),
         ``strict`` (impossible controlwords are errors), ``repeat`` (refused answers come again), ``latch`` (quick stop
         is left through power stage off only): ``on|off``.
-        ``supply_limit VOLTS``: over-voltage above that. ``runaway``: the power stage disobeys, see ``Runaway``.
+        ``supply_limit VOLTS``: over-voltage above that. ``runaway``: see ``DisobedientMotor``.
 
         Raises:
             InputError: unknown fault or bad value.

@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from monstertruck_drivers.disobedience import Runaway
+from monstertruck_drivers.disobedience import DisobedientMotor
 from monstertruck_drivers.emulation import MotorPlant, MotorReading
 from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos.objects import OBJECTS, ObjectEntry
@@ -192,7 +192,7 @@ class Firmware:
         self.causes: set[int] = set()
         """Injected fault codes whose cause is still present; supply faults come and go by themselves."""
         self.quick_stop_input = False
-        self.runaway: Runaway | None = None
+        self.runaway: DisobedientMotor | None = None
         """How the power stage departs from the commands."""
         self._live: dict[ObjectEntry, Callable[[MotorReading], int]] = {
             od.STATUSWORD: self._statusword,
@@ -425,7 +425,7 @@ class Firmware:
             self.state = state
             self._command_motor()
 
-    def run_away(self, runaway: Runaway | None) -> None:
+    def run_away(self, runaway: DisobedientMotor | None) -> None:
         """Depart from the commands from now on; None = obey again."""
         self.advance()
         self.runaway = runaway

@@ -201,7 +201,7 @@ class StepperDriver:
         return setpoint_of([commands.latest for commands in self._commands], self._clock.now(), self._config)
 
     def _is_urgent(self) -> bool:
-        """Whether the motors are to stop, or to lose their current, and have not been told yet."""
+        """Whether a stop, or switching off the current, is still to be sent to the motors."""
         wanted = self._setpoint().state
         return wanted is not MotorState.RUN and wanted is not self._asked
 

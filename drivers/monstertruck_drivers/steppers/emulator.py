@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from monstertruck_drivers.cable import DeviceEnd
-from monstertruck_drivers.disobedience import USAGE, Runaway
+from monstertruck_drivers.disobedience import USAGE, DisobedientMotor
 from monstertruck_drivers.emulation import EmulatorSetup, MotorPlant, ReceivedBytes
 from monstertruck_drivers.epos.firmware import FreeMotor
 from monstertruck_drivers.signals import SignalKind, Signals
@@ -53,7 +53,7 @@ class StepperEmulator:
 
     Faults (``inject``): ``overload MOTOR on|off`` (the rotor stands), ``silent on|off`` (gives no answers), ``late
     SECONDS [COUNT]`` (answers), ``reset`` (the processor restarts in the middle of whatever it does), ``noise COUNT``
-    (so many answers have a wrong byte), ``runaway`` (the firmware disobeys with all motors, see ``Runaway``).
+    (so many answers have a wrong byte), ``runaway`` (the firmware disobeys with all motors, see ``DisobedientMotor``).
 
     Args:
         clock: time.
@@ -85,7 +85,7 @@ class StepperEmulator:
         self._silent = False
         self._late: list[float] = []
         self._noise = 0
-        self._runaway: Runaway | None = None
+        self._runaway: DisobedientMotor | None = None
         self._fed_again = asyncio.Event()
         self._boot()
 
@@ -129,7 +129,7 @@ class StepperEmulator:
                 case "reset", ():
                     self.power_cycle()
                 case "runaway", words:
-                    self._runaway = Runaway.parse(*words)
+                    self._runaway = DisobedientMotor.parse(*words)
                     self._turn(self._asked, self._acceleration)
                 case _:
                     raise ValueError(fault)

@@ -13,7 +13,7 @@ from monstertruckd.tools.cli.output import JsonOption, finish, print_json, print
 
 if TYPE_CHECKING:
     from monstertruckd.tools.replay_check.comparison import GreatestDifference, TopicComparison
-    from monstertruckd.tools.replay_check.result import Check
+    from monstertruckd.tools.replay_check.result import CheckedReplay
 
 CHECK = "Compute the log's outputs again from its sensors and compare them."
 CONFIG = "With --check: compute with this configuration and show what it changes."
@@ -68,7 +68,7 @@ def _check(log: Path, config: Path | None, tolerance: float | None, *, json_outp
     finish(result.reason, _verdict(result))
 
 
-def _show(result: "Check") -> None:
+def _show(result: "CheckedReplay") -> None:
     whose = "the log's own configuration" if result.config is None else str(result.config)
     parts = f" (a run of {len(result.parts)} parts)" if len(result.parts) > 1 else ""
     print(f"{result.log}{parts}  {result.duration:.1f} s with {whose}")
@@ -124,7 +124,7 @@ def _amount(one: "GreatestDifference") -> str:
             return f"{one.field} {one.value:.2g}"
 
 
-def _verdict(result: "Check") -> str:
+def _verdict(result: "CheckedReplay") -> str:
     from monstertruck_schemas.reasons import Reason
 
     if result.reason is Reason.LOG_DAMAGED:

@@ -1,4 +1,4 @@
-"""A drill of families: whatever any device says may be false, whatever it is told may be ignored; judged by the world.
+"""A drill of families: any signal of a device may be falsified, any command ignored; judged by the world.
 
 An operator drives at random, in both directions and with all ways to steer, or a tracker follows its path. A trial has
 one fault, or two, the second while the robot recovers from the first. Faults are drawn from the families that the

@@ -2,6 +2,6 @@
 
 from monstertruckd.tools.replay_check.check import check_log
 from monstertruckd.tools.replay_check.recorded import parts_of, run_of
-from monstertruckd.tools.replay_check.result import Check
+from monstertruckd.tools.replay_check.result import CheckedReplay
 
-__all__ = ["Check", "check_log", "parts_of", "run_of"]
+__all__ = ["CheckedReplay", "check_log", "parts_of", "run_of"]

@@ -32,7 +32,7 @@ from monstertruckd.bus.local import Bus
 from monstertruckd.config.truck import PlacementConfig, TruckConfig
 from monstertruckd.recorder.reader import LogMessage
 from monstertruckd.tools.replay_check.answers import ComputedPaths, ReplayedActors
-from monstertruckd.tools.replay_check.goals import TOGETHER, Call, GoalRecord, asks_standstill, is_deformed
+from monstertruckd.tools.replay_check.goals import TOGETHER, GoalRecord, RecordedCall, asks_standstill, is_deformed
 from monstertruckd.tools.replay_check.pace import Pace, PacedClock, RecordedTurns
 from monstertruckd.tools.replay_check.recorded import Survey
 
@@ -293,7 +293,7 @@ class Chain:
         near = _near(self._goal_ticks, output.stamp) if service == GoalService.name else None
         return output.stamp if near is None else near
 
-    async def _call(self, call: Call, instant: int) -> None:
+    async def _call(self, call: RecordedCall, instant: int) -> None:
         """A request reached the goal service, at ``instant``, ns; earlier turns go first."""
         await asyncio.sleep(0)
         gate = self.bus.newest(topics.GATE)

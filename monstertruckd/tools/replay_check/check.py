@@ -26,7 +26,7 @@ from monstertruckd.tools.replay_check.chain import WORKER, Chain, outputs_of, un
 from monstertruckd.tools.replay_check.comparison import TopicComparison
 from monstertruckd.tools.replay_check.pace import PacedClock
 from monstertruckd.tools.replay_check.recorded import RunLog, Survey, recorded_config, run_of, survey
-from monstertruckd.tools.replay_check.result import Check, Unreadable
+from monstertruckd.tools.replay_check.result import CheckedReplay, Unreadable
 
 RESTS_ON_WORKER: Final = frozenset(
     topic.name for topic in (topics.POSE, topics.TRANSFORMS, topics.TRACKER, topics.PLAN_DRIVE)
@@ -45,7 +45,7 @@ def check_log(
     config: Path | None = None,
     tolerance: float | None = None,
     progress: Callable[[float], None] = lambda _: None,
-) -> Check:
+) -> CheckedReplay:
     """Compute the outputs of ``log`` again and compare them.
 
     Args:
@@ -101,7 +101,7 @@ def check_log(
         assert isinstance(loop, VirtualLoop)
         runner.run(main(PacedClock(loop)))
     end = max((found.newest[name].log_time for name in compared & found.newest.keys()), default=found.end)
-    return Check(
+    return CheckedReplay(
         log,
         reader.parts,
         config,

@@ -34,7 +34,7 @@ TOGETHER: Final = SECOND // 50
 
 
 @dataclass(frozen=True, slots=True)
-class Call:
+class RecordedCall:
     """A remote call, as the report on the goal shows it."""
 
     source: str
@@ -127,12 +127,12 @@ class GoalRecord:
                     found.append(min(instant, newest.stamp + REPORT - 1))
         return found
 
-    def calls(self, period: int) -> dict[int, Call]:
+    def calls(self, period: int) -> dict[int, RecordedCall]:
         """What came by remote call, by the number of the report that shows it.
 
         What comes by topic is in the log itself, and shows within two ticks.
         """
-        found: dict[int, Call] = {}
+        found: dict[int, RecordedCall] = {}
         for before, after in itertools.pairwise(self.reports):
             stamp = after.state.stamp
             if any(0 <= stamp - asked <= 2 * period for asked in self.asked):
@@ -177,15 +177,15 @@ def _answered(before: GoalState, after: GoalState) -> bool:
     return before.phase is GoalPhase.PLANNING and before.number == after.number and not same
 
 
-def _call(before: GoalState, after: GoalState) -> Call | None:
+def _call(before: GoalState, after: GoalState) -> RecordedCall | None:
     if after.number != before.number and after.goal is not None:
-        return Call(after.source, after.frame, after.goal)
+        return RecordedCall(after.source, after.frame, after.goal)
     if before.phase is after.phase:
         return None
     if before.phase is GoalPhase.PAUSED and after.phase is GoalPhase.PLANNING:
-        return Call(after.source, after.frame, GoalOrder.RESUME)
+        return RecordedCall(after.source, after.frame, GoalOrder.RESUME)
     if after.phase is GoalPhase.PAUSED:
-        return Call(after.source, after.frame, GoalOrder.PAUSE)
+        return RecordedCall(after.source, after.frame, GoalOrder.PAUSE)
     if after.outcome is Reason.CANCELLED and after.text.startswith(CANCELLED_BY):
-        return Call(after.text.removeprefix(CANCELLED_BY), after.frame, GoalOrder.CANCEL)
+        return RecordedCall(after.text.removeprefix(CANCELLED_BY), after.frame, GoalOrder.CANCEL)
     return None

@@ -23,7 +23,7 @@ class Unreadable:
 
 
 @dataclass(frozen=True, slots=True)
-class Check:
+class CheckedReplay:
     """What came out."""
 
     log: Path

@@ -80,7 +80,7 @@ class Motions(NamedTuple):
     """What tolerated delays and errors of the stamps explain, m and rad."""
 
 
-class Difference(NamedTuple):
+class Disagreement(NamedTuple):
     """Two measures differ by more than their errors explain."""
 
     quantity: Quantity
@@ -108,7 +108,7 @@ class Difference(NamedTuple):
 def turn_difference(
     motions: Motions, one: Measure, other: Measure, errors: Mapping[Measure, Errors]
 ) -> tuple[float, float]:
-    """Difference of two turns and what errors and delay explain of it, rad."""
+    """Disagreement of two turns and what errors and delay explain of it, rad."""
     greatest = max(abs(motions.motions[measure][2]) for measure in (one, other))
     seconds, way = (motions.stamp - motions.since) / SECOND, _way(motions)
     limit = math.fsum(
@@ -121,7 +121,7 @@ def turn_difference(
 def way_difference(
     motions: Motions, one: Measure, other: Measure, errors: Mapping[Measure, Errors]
 ) -> tuple[float, float, float]:
-    """Difference of two ways (m) and what errors and delay explain of it, in the direction in which it is less likely.
+    """How far two measures are apart (m), and what errors and delay explain of it, in the less likely direction.
 
     Along the way it is a difference of lengths, across it one of directions.
     """
@@ -158,15 +158,15 @@ def way_limit(motions: Motions, one: Measure, other: Measure, errors: Mapping[Me
 
 def differences(
     motions: Motions, errors: Mapping[Measure, Errors]
-) -> tuple[list[Difference], dict[Quantity, set[frozenset[Measure]]]]:
+) -> tuple[list[Disagreement], dict[Quantity, set[frozenset[Measure]]]]:
     """Pairs that differ by more than they may, and those that agree, by quantity."""
-    found: list[Difference] = []
+    found: list[Disagreement] = []
     agreeing: dict[Quantity, set[frozenset[Measure]]] = {Quantity.WAY: set(), Quantity.TURN: set()}
     for one, other in combinations(motions.motions, 2):
         off, limit = turn_difference(motions, one, other, errors)
         turns = motions.motions[one][2], motions.motions[other][2]
         if off > limit:
-            found.append(Difference(Quantity.TURN, one, other, *turns, off, limit))
+            found.append(Disagreement(Quantity.TURN, one, other, *turns, off, limit))
         else:
             agreeing[Quantity.TURN].add(frozenset((one, other)))
         if errors[one].way is None or errors[other].way is None:
@@ -174,21 +174,21 @@ def differences(
         way, limit, apart = way_difference(motions, one, other, errors)
         lengths = math.hypot(*motions.motions[one][:2]), math.hypot(*motions.motions[other][:2])
         if way > limit:
-            found.append(Difference(Quantity.WAY, one, other, *lengths, apart, limit))
+            found.append(Disagreement(Quantity.WAY, one, other, *lengths, apart, limit))
         else:
             agreeing[Quantity.WAY].add(frozenset((one, other)))
     return found, agreeing
 
 
 def suspects(
-    found: Iterable[Difference], agreeing: Mapping[Quantity, Iterable[frozenset[Measure]]]
-) -> dict[Measure, Difference]:
+    found: Iterable[Disagreement], agreeing: Mapping[Quantity, Iterable[frozenset[Measure]]]
+) -> dict[Measure, Disagreement]:
     """Measures that may lie, each with its greatest difference.
 
     A measure that agrees with another one does not. Of those that remain, what the turns say decides about the ways.
     """
     found = list(found)
-    by_quantity: dict[Quantity, dict[Measure, Difference]] = {}
+    by_quantity: dict[Quantity, dict[Measure, Disagreement]] = {}
     for quantity in Quantity:
         partnered = set().union(*agreeing[quantity])
         rows = [row for row in found if row.quantity is quantity]

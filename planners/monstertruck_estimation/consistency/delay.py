@@ -8,7 +8,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from monstertruck_estimation.consistency.tracks import Track
+from monstertruck_estimation.consistency.tracks import MotionTrack
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND
 
@@ -38,7 +38,7 @@ class Delay(NamedTuple):
     """Share of the squared error that it leaves."""
 
 
-def scan_delay(steps: list[tuple[int, int, float, float]], track: Track, tolerated: float) -> Delay | None:
+def scan_delay(steps: list[tuple[int, int, float, float]], track: MotionTrack, tolerated: float) -> Delay | None:
     """Delay of the scans against ``track``, where it is clearly more than ``tolerated`` (s).
 
     Args:

@@ -40,7 +40,7 @@ OUTWEIGHED: Final = 4
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class ScanVerdict:
     """How a claimed motion and the scans' own explain the newest scan: points that fit one of them alone.
 
     Both are refined, the claimed one within its errors: what counts is whether any motion near it fits.
@@ -73,7 +73,7 @@ class StepOutput:
     """Base at ``stamp`` in base at ``since``."""
     overlap: float = 0.0
     """Share of the points that fit the scan before."""
-    verdict: Verdict | None = None
+    verdict: ScanVerdict | None = None
     """Of the claim; None without one, and where the earlier scan is not known any more."""
     front: str = ""
     """Scan odometry that is used."""

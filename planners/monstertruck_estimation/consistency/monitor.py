@@ -2,7 +2,7 @@
 
 Motions are compared at every scan, over windows of half a second to some seconds; without a lidar at every reading of
 the wheels. A difference must last for two comparisons, and where the scans take part in it, they must refute the other
-motion: see ``Verdict``. A finding about motion lasts until the robot is armed again, for a robot that stands shows
+motion: see ``ScanVerdict``. A finding about motion lasts until the robot is armed again, for a robot that stands shows
 nothing; one about a repeated value ends with the repetition.
 """
 
@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator
 from typing import Final, NamedTuple
 
 from monstertruck_estimation.consistency.comparison import (
-    Difference,
+    Disagreement,
     Measure,
     Motions,
     differences,
@@ -24,8 +24,8 @@ from monstertruck_estimation.consistency.comparison import (
 from monstertruck_estimation.consistency.config import ConsistencyConfig
 from monstertruck_estimation.consistency.delay import scan_delay
 from monstertruck_estimation.consistency.exchange import Claim, StepOutput
-from monstertruck_estimation.consistency.repeats import Repeats, WholeRepeats
-from monstertruck_estimation.consistency.tracks import STILL, Track, Vector
+from monstertruck_estimation.consistency.repeats import RepeatDetector, WholeRepeats
+from monstertruck_estimation.consistency.tracks import STILL, MotionTrack, Vector
 from monstertruck_estimation.transforms import wrap_angle
 from monstertruck_estimation.wheel_motion import WheelIncrement
 from monstertruck_runtime.clock import SECOND
@@ -55,11 +55,11 @@ MAX_BIAS: Final = 0.1
 """A mean rate at rest above this is no bias, rad/s."""
 
 
-class _Pending(NamedTuple):
+class _OpenDisagreement(NamedTuple):
     """A difference that the scans are to judge."""
 
     since: int
-    found: dict[Measure, Difference]
+    found: dict[Measure, Disagreement]
     claimant: Measure
     errors: tuple[float, float]
     """That the claimant states over the window, m and rad."""
@@ -76,7 +76,7 @@ class ConsistencyMonitor:
     def __init__(self, config: ConsistencyConfig, sensors: dict[Measure, str]) -> None:
         self._config, self._sensors = config, sensors
         self._errors = errors_of(config)
-        self._tracks = {measure: Track() for measure in sensors}
+        self._tracks = {measure: MotionTrack() for measure in sensors}
         self._sampled: dict[Measure, int] = {}
         self._heading: tuple[int, float] | None = None
         self._rate: tuple[int, float] | None = None
@@ -92,10 +92,10 @@ class ConsistencyMonitor:
         self._active_since: int | None = None
         self._doubted: frozenset[Measure] = frozenset()
         """At the comparison before."""
-        self._pending: _Pending | None = None
+        self._pending: _OpenDisagreement | None = None
         self._asked = 0
         self._found: dict[str, Doubt] = {}
-        self._values: dict[str, dict[str, Repeats]] = {}
+        self._values: dict[str, dict[str, RepeatDetector]] = {}
         self._wholes: dict[str, WholeRepeats] = {}
         self._whole_moved: dict[str, int] = {}
         self._frozen: dict[str, Doubt] = {}
@@ -168,7 +168,7 @@ class ConsistencyMonitor:
 
     def observe_value(self, sensor: str, field: str, stamp: int, value: float) -> None:
         """Take a number that a sensor has measured; ``stamp`` in ns."""
-        repeats = self._values.setdefault(sensor, {}).setdefault(field, Repeats())
+        repeats = self._values.setdefault(sensor, {}).setdefault(field, RepeatDetector())
         repeats.observe(value, still=self.still(stamp))
         self._note_frozen(sensor, field, stamp, repeats.row, frozen=repeats.frozen)
 
@@ -243,7 +243,7 @@ class ConsistencyMonitor:
         """Compare all measures over all windows that end at ``stamp``, ns."""
         if self._active_since is None:
             return
-        worst: dict[Measure, Difference] = {}
+        worst: dict[Measure, Disagreement] = {}
         begun, errors = stamp, (0.0, 0.0)
         for since in self._starts(stamp):
             motions = {m: motion for m, track in self._tracks.items() if (motion := track.motion(since, stamp))}
@@ -262,7 +262,7 @@ class ConsistencyMonitor:
         if claimant is None:
             self._accuse(stamp, lasting)
         elif self._pending is None and stamp - self._asked >= AGAIN:
-            self._pending, self._asked = _Pending(begun, lasting, claimant, errors), stamp
+            self._pending, self._asked = _OpenDisagreement(begun, lasting, claimant, errors), stamp
 
     def _slack(self, motions: Iterable[Measure], since: int, stamp: int) -> tuple[float, float]:
         """What delays and errors of the stamps explain of a difference, m and rad.
@@ -279,7 +279,7 @@ class ConsistencyMonitor:
         )
         return way, turn
 
-    def _tolerated(self, window: Motions, found: Difference) -> tuple[float, float]:
+    def _tolerated(self, window: Motions, found: Disagreement) -> tuple[float, float]:
         """How far the true motion may be from the claimed one, m and rad."""
         claimant = _claimant({found.one: found})
         if claimant is None:
@@ -333,7 +333,7 @@ class ConsistencyMonitor:
             ),
         )
 
-    def _accuse(self, stamp: int, found: dict[Measure, Difference]) -> None:
+    def _accuse(self, stamp: int, found: dict[Measure, Disagreement]) -> None:
         for measure, difference in found.items():
             other = difference.other if measure is difference.one else difference.one
             sensor = self._sensors[measure]
@@ -361,7 +361,7 @@ class ConsistencyMonitor:
             del self._frozen[sensor]
 
 
-def _claimant(found: dict[Measure, Difference]) -> Measure | None:
+def _claimant(found: dict[Measure, Disagreement]) -> Measure | None:
     """The measure whose motion the scans are to judge; None where they are in no difference."""
     for difference in found.values():
         if Measure.SCANS in (difference.one, difference.other):

@@ -23,7 +23,7 @@ WINDOWS: Final = 2
 """Windows after which it is known."""
 
 
-class Repeats:
+class RepeatDetector:
     """One number of a sensor."""
 
     def __init__(self) -> None:

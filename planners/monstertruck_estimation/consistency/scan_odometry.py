@@ -1,6 +1,6 @@
 """Worker of the consistency check: scan odometry, which knows no wheels, no compass and no map of the robot's.
 
-``monstertruck_estimation.consistency.scan_odometry:ScanOdometry``; a step's input is a ``StepInput``, its output a
+``monstertruck_estimation.consistency.scan_odometry:ScanMotionStep``; a step's input is a ``StepInput``, its output a
 ``StepOutput``. kiss-icp (Vizzo et al. 2023) registers each scan to its own voxel map, starting at the motion before;
 without it ours registers the scan to the last one that was kept.
 """
@@ -12,7 +12,7 @@ from typing import Final, Protocol
 
 import numpy as np
 
-from monstertruck_estimation.consistency.exchange import Claim, StepInput, StepOutput, Verdict
+from monstertruck_estimation.consistency.exchange import Claim, ScanVerdict, StepInput, StepOutput
 from monstertruck_estimation.consistency.tracks import KEPT
 from monstertruck_estimation.se2 import between, compose
 from monstertruck_estimation.slam.registration import Cloud, fitting, measure, register
@@ -106,7 +106,7 @@ def front_of(kind: str) -> tuple[str, Front]:
     return "own", OwnFront()
 
 
-class ScanOdometry:
+class ScanMotionStep:
     """Motion from scan to scan."""
 
     def __init__(self) -> None:
@@ -172,7 +172,7 @@ class ScanOdometry:
             front.begin(scan, compose(self._pose, motion))
         return motion, overlap
 
-    def _judged(self, scan: Scan, claim: Claim) -> Verdict | None:
+    def _judged(self, scan: Scan, claim: Claim) -> ScanVerdict | None:
         earlier = next((kept for kept in self._kept if kept[0] == claim.since), None)
         if earlier is None:
             return None
@@ -184,7 +184,7 @@ class ScanOdometry:
         near = [pose for pose in refined if _is_near(pose, claimed, claim.errors)]
         fits = max((fitting(scan, cloud, pose) for pose in (claimed, *near)), key=np.count_nonzero)
         alone, own_alone, misfits = map(np.count_nonzero, (fits & ~fits_own, fits_own & ~fits, ~fits_own))
-        return Verdict(claimed=int(alone), own=int(own_alone), misfits=int(misfits))
+        return ScanVerdict(claimed=int(alone), own=int(own_alone), misfits=int(misfits))
 
 
 def _is_near(pose: Array, claimed: Array, errors: tuple[float, float]) -> bool:

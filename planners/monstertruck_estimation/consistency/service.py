@@ -37,7 +37,7 @@ from monstertruck_schemas.sensor import (
 )
 from monstertruck_schemas.state import Consistency, Doubt, DoubtKind, GateState
 
-TARGET: Final = "monstertruck_estimation.consistency.scan_odometry:ScanOdometry"
+TARGET: Final = "monstertruck_estimation.consistency.scan_odometry:ScanMotionStep"
 START_TIMEOUT: Final = 180.0
 """Real seconds the worker may take to start: numba compiles at the first start."""
 RATE: Final = 25.0
@@ -72,7 +72,7 @@ class ScanSetup:
     """What scans are compared with."""
 
     actor: Actor
-    """Takes the steps of ``ScanOdometry``."""
+    """Takes the steps of ``ScanMotionStep``."""
     mount: Mount
     """Of the lidar."""
     angles: ScanAngles | None

@@ -30,7 +30,7 @@ def between(origin: Vector, target: Vector) -> Vector:
     return c * dx + s * dy, c * dy - s * dx, target[2] - origin[2]
 
 
-class Track:
+class MotionTrack:
     """Poses by one measure in a frame of its own, without a gap."""
 
     def __init__(self) -> None:

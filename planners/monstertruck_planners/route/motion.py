@@ -79,7 +79,7 @@ def _sample_poses(start: Array, segments: Array, step: float) -> tuple[Array, ND
 
 
 @dataclass(frozen=True, slots=True)
-class Samples:
+class MotionSamples:
     """Points along a path; a value is that of the segment leading to the point (to the first: the first segment)."""
 
     poses: Array
@@ -165,7 +165,7 @@ class MotionPath:
         """Last pose of the reference point, shape (3,)."""
         return np.asarray(self.ends[-1])
 
-    def sample(self, step: float) -> Samples:
+    def sample(self, step: float) -> MotionSamples:
         """Points at most ``step`` metres apart; the end of each segment is among them.
 
         Raises:
@@ -175,7 +175,7 @@ class MotionPath:
             raise InputError(f"sampling step {step} m: expected above 0")
         poses, index = _sample_poses(self.start, self.segments, step)
         segments = self.segments[index] if len(self.segments) else np.array([[1.0, 0.0, 0.0]])
-        return Samples(poses[:, :3], poses[:, 3], segments[:, 1], segments[:, 2], np.sign(segments[:, 0]), index)
+        return MotionSamples(poses[:, :3], poses[:, 3], segments[:, 1], segments[:, 2], np.sign(segments[:, 0]), index)
 
     def base_poses(self, step: float) -> Array:
         """Poses of the base at the sampled points, shape (m, 3)."""

@@ -2,7 +2,7 @@
 
 import pytest
 
-from monstertruck_drivers.disobedience import Disobedience, Runaway, StoppedBy
+from monstertruck_drivers.disobedience import Disobedience, DisobedientMotor, StoppedBy
 
 
 @pytest.mark.parametrize(
@@ -23,7 +23,7 @@ from monstertruck_drivers.disobedience import Disobedience, Runaway, StoppedBy
 def test_a_controller_makes_of_its_target_what_its_fault_says(
     words: str, asked: float | None, present: float, target: float | None
 ):
-    runaway = Runaway.parse(*words.split())
+    runaway = DisobedientMotor.parse(*words.split())
     assert runaway is not None
     assert runaway.target(asked, present) == target
 
@@ -33,12 +33,12 @@ def test_a_controller_makes_of_its_target_what_its_fault_says(
     [("stage", False, True), ("line", False, False), ("line", True, True), ("supply", True, False)],
 )
 def test_each_way_to_stop_it_works_from_the_one_named_on(stopped_by: str, line: bool, stops: bool):
-    runaway = Runaway(Disobedience.RUN, 900.0, StoppedBy(stopped_by))
+    runaway = DisobedientMotor(Disobedience.RUN, 900.0, StoppedBy(stopped_by))
     assert (runaway.target(None, 900.0, line=line) is None) is stops
 
 
 def test_off_is_no_fault_and_anything_else_unknown_is_refused():
-    assert Runaway.parse("off") is None
+    assert DisobedientMotor.parse("off") is None
     for words in ("creep", "run 0", "ignore stage more", "walk", ""):
         with pytest.raises(ValueError, match=words.split(" ")[0] or "''"):
-            Runaway.parse(*words.split(" "))
+            DisobedientMotor.parse(*words.split(" "))

@@ -13,7 +13,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order
 from monstertruck_schemas.state import GateMode, Odometry
 from monstertruckd.gate.catalog import CheckConfig, FenceConfig
-from monstertruckd.gate.checks import Check, Checks, Limit
+from monstertruckd.gate.checks import Check, Checks, PaceLimit
 from monstertruckd.gate.fence import inside
 from tests.unit.gate.rig import Rig, header, make_gate, show
 
@@ -50,14 +50,15 @@ def own_rig(monkeypatch, check, **config):
     ("pace", "speed"), [(math.inf, 0.2), (5.0, 0.2), (0.05, 0.05), (-1.0, 0.0), (0.0, 0.0), (math.nan, 0.0)]
 )
 def test_a_check_can_only_slow_the_truck(pace, speed, monkeypatch):
-    rig = own_rig(monkeypatch, type("Mine", (Saying,), {"says": (Limit(Reason.OWN_CHECK, pace),)})).armed()
+    rig = own_rig(monkeypatch, type("Mine", (Saying,), {"says": (PaceLimit(Reason.OWN_CHECK, pace),)})).armed()
     rig.driver = {"speed": 0.2}
     rig.tick(60)
     assert rig.out.speeds[0] == pytest.approx(speed)
 
 
 def test_the_least_limit_of_all_checks_with_one_reason_counts():
-    low, high = (type("Mine", (Saying,), {"says": (Limit(Reason.TILT_SLOW, pace),)})(None, None) for pace in (0.1, 0.2))
+    mine = [type("Mine", (Saying,), {"says": (PaceLimit(Reason.TILT_SLOW, pace),)}) for pace in (0.1, 0.2)]
+    low, high = (check(None, None) for check in mine)
     for order in ((low, high), (high, low)):
         assert Checks(order).limits(0, None) == {Reason.TILT_SLOW: 0.1}
 
@@ -91,7 +92,7 @@ def test_a_check_that_raises_stops_the_truck_for_good(method, monkeypatch):
     assert rig.decide(Order.ARM).text.startswith("mine failed"), "until the daemon is restarted"
 
 
-@pytest.mark.parametrize("says", [("fast",), (Limit("fast", 1.0),), (Limit(Reason.OWN_CHECK, "fast"),)])
+@pytest.mark.parametrize("says", [("fast",), (PaceLimit("fast", 1.0),), (PaceLimit(Reason.OWN_CHECK, "fast"),)])
 def test_a_truck_whose_check_says_nonsense_is_not_armed(says, monkeypatch):
     rig = own_rig(monkeypatch, type("Mine", (Saying,), {"says": says}))
     rig.tick(2)

@@ -220,7 +220,7 @@ def test_a_motor_found_turning_by_a_new_daemon_has_its_ramp_to_stop():
 
 
 def runaway(rig, speed=0.15, ticks=40):
-    """The drive keeps a speed, whatever it is told; ticks until the gate says so."""
+    """The drive keeps a speed despite all commands; ticks until the gate reports it."""
     rig.driver = None
     for tick in range(ticks):
         rig.speed = speed

@@ -9,7 +9,7 @@ from monstertruck_estimation.consistency.comparison import Measure
 from monstertruck_estimation.consistency.config import ConsistencyConfig
 from monstertruck_estimation.consistency.exchange import StepInput
 from monstertruck_estimation.consistency.monitor import ConsistencyMonitor
-from monstertruck_estimation.consistency.scan_odometry import ScanOdometry
+from monstertruck_estimation.consistency.scan_odometry import ScanMotionStep
 from monstertruck_estimation.se2 import between, compose
 from monstertruck_estimation.slam.worker_io import ScanInput
 from monstertruck_estimation.wheel_motion import WheelIncrement
@@ -53,7 +53,7 @@ def drive(walls, poses, lies=None, front="own", sensors=SENSORS, config=None, gy
     """Drive along the poses; ends when something is found."""
     lies = lies or Lies()
     rng, monitor, odometry = np.random.default_rng(3), ConsistencyMonitor(config or ConsistencyConfig(), sensors), None
-    odometry, trial, way, seen = ScanOdometry(), Trial(), 0.0, []
+    odometry, trial, way, seen = ScanMotionStep(), Trial(), 0.0, []
     for k, pose in enumerate(poses):
         stamp = SECOND + k * PERIOD
         if k == armed:

@@ -5,7 +5,7 @@ import math
 import pytest
 
 from monstertruck_estimation.consistency.delay import scan_delay
-from monstertruck_estimation.consistency.tracks import Track
+from monstertruck_estimation.consistency.tracks import MotionTrack
 from monstertruck_runtime.clock import SECOND
 
 STEP = SECOND // 10
@@ -17,7 +17,7 @@ def swinging(at):
 
 
 def delay_of(seconds, slip=1.0, turn=swinging, tolerated=0.2):
-    track, steps = Track(), []
+    track, steps = MotionTrack(), []
     for k in range(120):
         at = k / 10
         track.add(SECOND + k * STEP, (0.02, 0.0, turn(at) - turn(at - 0.1)))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from monstertruck_estimation.consistency.repeats import LEAST_ROW, Repeats, WholeRepeats
+from monstertruck_estimation.consistency.repeats import LEAST_ROW, RepeatDetector, WholeRepeats
 
 
 def shown(values, digit):
@@ -11,7 +11,7 @@ def shown(values, digit):
 
 
 def first_accused(values, still=True):
-    repeats = Repeats()
+    repeats = RepeatDetector()
     for k, value in enumerate(values):
         repeats.observe(value, still=still)
         if repeats.frozen:

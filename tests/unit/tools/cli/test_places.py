@@ -63,7 +63,7 @@ def test_a_name_or_an_endpoint_tells_them_apart(words: list[str], expected: tupl
     assert reached == [expected]
 
 
-def test_robots_of_one_name_are_told_apart_by_their_endpoint(reached: list, monkeypatch: pytest.MonkeyPatch):
+def test_robots_of_one_name_are_listed_with_their_endpoints(reached: list, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(places, "robots_here", lambda: [("truck", endpoint) for endpoint in SOCKETS.values()])
     done = CliRunner().invoke(app, ["disarm", "--robot", "truck"])
     assert "--robot truck --endpoint tcp/127.0.0.1:7448" in " ".join(done.output.split())

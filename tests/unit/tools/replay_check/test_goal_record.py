@@ -7,7 +7,7 @@ from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.plan import GoalPhase, GoalState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import GoalOrder
-from monstertruckd.tools.replay_check.goals import Call, GoalRecord, GoalReport
+from monstertruckd.tools.replay_check.goals import GoalRecord, GoalReport, RecordedCall
 
 PERIOD = SECOND // 10
 GOAL = Pose2D(x=1.0, y=2.0, yaw=0.0)
@@ -63,11 +63,11 @@ def test_calls_show_in_the_reports_they_caused():
         (7.0, 2, GoalPhase.IDLE, {"outcome": Reason.CANCELLED, "text": "another path is followed now"}),
     )
     assert log.calls(PERIOD) == {
-        1: Call("me", "base", GOAL),
-        3: Call("me", "base", GoalOrder.PAUSE),
-        4: Call("me", "base", GoalOrder.RESUME),
-        5: Call("you", "base", GoalOrder.CANCEL),
-        6: Call("me", "base", GOAL),
+        1: RecordedCall("me", "base", GOAL),
+        3: RecordedCall("me", "base", GoalOrder.PAUSE),
+        4: RecordedCall("me", "base", GoalOrder.RESUME),
+        5: RecordedCall("you", "base", GoalOrder.CANCEL),
+        6: RecordedCall("me", "base", GOAL),
     }
     assert not log.unknown_waypoints(PERIOD)
 
