@@ -257,8 +257,8 @@ class Exchanger:
         self.quiet_until = last + round(self._silence * SECOND)
 
     def _is_quick(self) -> bool:
-        """Whether a byte that did not come in time is lost, not late as on a slow link."""
-        return len(self.durations) == RECENT and max(self.durations) <= QUICK_ANSWER * SECOND
+        """Whether a byte that did not come in time is lost, not late as on a slow link. The retry finds out which."""
+        return not self._failed and len(self.durations) == RECENT and max(self.durations) <= QUICK_ANSWER * SECOND
 
     def _run_row(self, entries: Sequence[ObjectEntry], take: Callable[[int], bool]) -> Steps[None]:
         self._hurried = False
