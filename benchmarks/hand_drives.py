@@ -5,7 +5,7 @@
 Each drive lasts a minute and begins at a random place, the truck put down by hand. The operator asks for a random speed
 forward or in reverse, with a random steering mode and angle, and changes all of them every 0.5 to 4 s, whatever is in
 the way. With a share of --confirm of these motions the operator holds the second action that lets the truck drive into
-unseen ground; contacts then are counted apart, with the time until the truck was told to move away from the obstacle.
+unseen ground; contacts then are counted apart, with the time until the gate moves the truck away from the obstacle.
 
 A contact is one of the world's own footprint with its walls, whatever the gate sees. That they are avoided must not be
 bought by standing still: the distance travelled and the share of the time that the truck was kept standing are printed.

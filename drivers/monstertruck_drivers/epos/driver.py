@@ -2,7 +2,7 @@
 
 Everything goes through one schedule of exchanges; before each of them the newest command is looked at, so a stop
 waits for at most the exchange in flight. Quick stop and power off are sent again after every velocity that is not
-standstill: a controller that did not take the first one is told again. What the controller should do and where its
+standstill: a controller that did not take the first one gets it again. What the controller should do and where its
 statusword says it is are compared every cycle, and one controlword brings it a step closer: enabling, stopping,
 running again after a quick stop and coming back from a fault are one and the same loop.
 
