@@ -18,7 +18,7 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap
-from ruamel.yaml.composer import MaxDepthExceededError
+from ruamel.yaml.composer import Composer, ComposerError, MaxDepthExceededError
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.nodes import CollectionNode, MappingNode, Node, ScalarNode, SequenceNode
 from ruamel.yaml.reader import ReaderError
@@ -29,7 +29,6 @@ from monstertruck_runtime.map_folders import SAVES, folder_of
 from monstertruck_runtime.map_folders import YAML as MAP_YAML
 from monstertruck_runtime.plugins import models_in
 from monstertruck_runtime.small_files import make_folder, replace_file, require_file
-from monstertruck_runtime.yaml_files import DEEPEST, bounded_yaml
 from monstertruck_schemas.base import LiveValue, Schema, field_docs, first_mistake, live_settings
 from monstertruckd.config.calibration import CalibrationStore, Result, WizardName, in_order, put_values, unused
 from monstertruckd.config.real_ports import mixed
@@ -47,6 +46,11 @@ HEAD: Final = (
 )
 MOST_BYTES: Final = 1_000_000
 """Size of one file at most."""
+DEEPEST: Final = 50
+"""Nesting of sections and lists, at most."""
+MOST_NODES: Final = 5_000
+"""Keys and values in the text of one file, at most: read in a quarter of a second; a full configuration has some
+hundreds."""
 MOST_VALUES = 20_000
 """Values of one file at most; a full configuration has a few hundred."""
 MOST_MISTAKES = 50
@@ -359,7 +363,7 @@ class _Builder:
 
     path: Path
     origins: dict[Key, Origin]
-    scalar: Callable[[Node], Any] = field(default_factory=lambda: bounded_yaml().constructor.construct_object)
+    scalar: Callable[[Node], Any] = field(default_factory=lambda: reader().constructor.construct_object)
     """Constructs the value of a scalar node."""
     around: list[Node] = field(default_factory=list)
     """Nodes that contain the present one."""
@@ -407,6 +411,28 @@ def _build_mapping(node: Node, builder: _Builder, key: Key) -> dict[str, Any]:
 # YAML text
 
 
+class _CountingComposer(Composer):
+    """Builds the nodes of one document, until there are too many."""
+
+    count = 0
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        """One node with all below it."""
+        self.count += 1
+        if self.count > MOST_NODES:
+            place = self.parser.peek_event().start_mark
+            raise ComposerError(None, None, f"more than {MOST_NODES} keys and values", place)
+        return super().compose_node(parent, index)
+
+
+def reader() -> YAML:
+    """Reads one document of plain data."""
+    yaml = YAML(typ="safe", pure=True)
+    yaml.max_depth = DEEPEST
+    yaml.Composer = _CountingComposer
+    return yaml
+
+
 def node_kind(node: Node) -> str:
     """Description of a node for error messages."""
     kinds = ((MappingNode, "a mapping"), (SequenceNode, "a list"))
@@ -416,7 +442,7 @@ def node_kind(node: Node) -> str:
 def _compose(text: str, path: Path) -> MappingNode | None:
     _check_directives(text, path)
     try:
-        node = bounded_yaml().compose(text)
+        node = reader().compose(text)
     except ReaderError as error:
         line = text.count("\n", 0, error.position) + 1
         raise ConfigError(

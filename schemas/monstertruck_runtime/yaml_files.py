@@ -47,14 +47,6 @@ class _BoundedComposer(Composer):
         return node
 
 
-def bounded_yaml() -> YAML:
-    """Reader of one document of plain data that refuses what is nested too deeply or has too many nodes."""
-    yaml = YAML(typ="safe", pure=True)
-    yaml.max_depth = DEEPEST
-    yaml.Composer = _BoundedComposer
-    return yaml
-
-
 def read_yaml(path: Path) -> Any:
     """Content of a file.
 
@@ -62,7 +54,9 @@ def read_yaml(path: Path) -> Any:
         InputError: it cannot be read, is not YAML, or is too long or nested too deeply.
     """
     text = text_of(path, _EXPECTED, MOST_BYTES)
-    yaml = bounded_yaml()
+    yaml = YAML(typ="safe", pure=True)
+    yaml.max_depth = DEEPEST
+    yaml.Composer = _BoundedComposer
     with reading(path, _EXPECTED):
         try:
             return yaml.load(text)
