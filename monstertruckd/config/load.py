@@ -672,7 +672,8 @@ def _locate_files(tree: Tree, keys: tuple[tuple[str, ...], ...]) -> None:
             section[key[-1]] = str(saved)
             continue
         if not file.is_file():
-            problem = "expected a file, found a folder" if file.is_dir() else "no such file"
+            in_folder = "expected a file, found a folder" if saved is None else "no saved map in this folder"
+            problem = in_folder if file.is_dir() else "no such file"
             raise ConfigError(f"{origin}: {'.'.join(key)}: {problem}: {file}")
         section[key[-1]] = str(file)
         if origin.file.resolve() in tree.files and not Path(name).is_absolute():

@@ -117,7 +117,7 @@ WRONG = (
     ("zenoh: {mode: boss}", "zenoh.mode: input should be 'router' or 'peer', found 'boss'"),
     ("path: {file: nowhere.csv}", "path.file: no such file"),
     ("path: {file: .}", "path.file: expected a file, found a folder: "),
-    ("planner: {map: .}", "planner.map: no such file: "),
+    ("planner: {map: .}", "planner.map: no saved map in this folder: "),
     ("path: {closed: true, file: 3}", "path.file: input should be a valid string, found 3"),
     ("tracker: {kind: crystal_ball}", "tracker: no kind 'crystal_ball'; expected one of"),
     ("tracker: {kind: stanley, lookahead: 1}", "tracker.lookahead: unknown key; known here"),
