@@ -65,7 +65,7 @@ def test_a_good_file(tmp_path: Path):
 def test_a_map_may_be_the_folder_of_a_saved_one(tmp_path: Path):
     (tmp_path / "saved").mkdir()
     file = write(tmp_path, "version: 2\nname: t\nmap: saved\n")
-    with pytest.raises(ConfigError, match="expected a file, found a folder"):
+    with pytest.raises(ConfigError, match="no saved map in this folder"):
         load_config(file, Root)
     for name in ("map.yaml", "saves/000001/map.yaml"):
         (tmp_path / "saved" / name).parent.mkdir(parents=True, exist_ok=True)
