@@ -85,10 +85,10 @@ class SilentTruck(LocalTruck):
         if not self.silent:
             await super().drive(speed, front, rear, lease)
 
-    async def order(self, order: Order, *, hold: bool = False) -> GateState:
+    async def order(self, order: Order, *, hold: bool = False, calibrates: bool = False) -> GateState:
         if self.silent:
             raise NoAnswerError("silent")
-        return await super().order(order)
+        return await super().order(order, hold=hold, calibrates=calibrates)
 
 
 @dataclass(frozen=True, slots=True)

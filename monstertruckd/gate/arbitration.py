@@ -377,11 +377,17 @@ class GateStateMachine:
         self.disarm_at_rest = False
         """Disarm as soon as the truck is at rest."""
         self._stopped_by: tuple[Reason, ...] = ()
+        self._calibrates = False
 
     @property
     def active(self) -> bool:
         """Whether the truck is armed, drives, or is being stopped."""
         return self.mode.active
+
+    @property
+    def calibrates(self) -> bool:
+        """Whether the truck is armed to calibrate sensors; see ``ControlRequest``."""
+        return self._calibrates and self.active
 
     @property
     def reasons(self) -> tuple[Reason, ...]:
@@ -398,9 +404,10 @@ class GateStateMachine:
         """Name of the driving source."""
         return None if self.holder is None else self.holder.request.source
 
-    def arm(self, now: int, by: str) -> None:
+    def arm(self, now: int, by: str, *, calibrates: bool = False) -> None:
         """Arm; on an armed truck this restarts the time until it disarms by itself."""
         self.driven = now
+        self._calibrates = calibrates
         if self.mode is GateMode.DISARMED:
             self._enter(GateMode.ARMED, now)
             self.disarm_at_rest = False

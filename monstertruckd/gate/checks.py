@@ -84,6 +84,11 @@ class GateView:
         return self._states.mode
 
     @property
+    def calibrates(self) -> bool:
+        """Whether an operator has armed the robot to calibrate sensors, on ground kept clear."""
+        return self._states.calibrates
+
+    @property
     def confirmed(self) -> bool:
         """Whether an operator drives who holds the second control, to drive into unseen ground."""
         holder = self._states.holder

@@ -42,17 +42,21 @@ class ConsistencyCheck(Check):
 
     def reason(self, now: int) -> Iterator[Reason]:
         """Doubts about sensors whose silence stops the robot."""
-        doubts = [doubt for doubt in self._doubts() if self._stops(doubt.sensor)]
+        doubts = [doubt for doubt in self._doubts() if self._stops(doubt.sensor) and not self._is_expected(doubt)]
         yield from dict.fromkeys(_reason(doubt) for doubt in doubts)
 
     def limit(self, now: int, courses: Sequence[Course] | None) -> Iterator[PaceLimit]:
-        """Limits of a frozen battery voltage, and of a robot with a single measure of its motion."""
+        """Limits of a frozen battery voltage, and of a robot whose motion a second measure does not confirm."""
         config = self.view.config
         if any(doubt.sensor == DeviceRole.BATTERY for doubt in self._doubts()) and not config.battery.critical:
             yield PaceLimit(Reason.SENSOR_FROZEN, config.battery_low_speed)
-        if courses and not self._witnessed(now):
+        if courses:
             ahead = all(twist[0] >= AHEAD for twist, _ in courses)
-            yield PaceLimit(Reason.UNWITNESSED, config.unwitnessed * (config.speed if ahead else config.reverse_speed))
+            slow = config.unwitnessed * (config.speed if ahead else config.reverse_speed)
+            if not self._witnessed(now):
+                yield PaceLimit(Reason.UNWITNESSED, slow)
+            if any(map(self._is_expected, self._doubts())):
+                yield PaceLimit(Reason.SENSORS_DISAGREE, slow)
 
     def describe(self, reason: Reason, now: int, since: int) -> Iterator[Cause]:
         """One cause for each doubt, which names both sensors and their difference."""
@@ -76,6 +80,10 @@ class ConsistencyCheck(Check):
         for doubt in self._newest.doubts:
             if not doubt.kind.lasting or (active and doubt.since > self._settled):
                 yield doubt
+
+    def _is_expected(self, doubt: Doubt) -> bool:
+        """Whether a robot that is armed to calibrate its sensors goes on in spite of this doubt."""
+        return self.view.calibrates and _reason(doubt) is Reason.SENSORS_DISAGREE
 
     def _witnessed(self, now: int) -> bool:
         newest = self._newest

@@ -442,7 +442,7 @@ class Gate:
         if refusal := self._refuse_moving(now, request):
             return refusal
         self._sources.release(planners=not request.hold)
-        self._states.arm(now, request.source)
+        self._states.arm(now, request.source, calibrates=request.calibrates)
         return ACCEPTED
 
     def _ask(self, request: ControlRequest, now: int) -> Decision:

@@ -327,7 +327,7 @@ class ObstacleCheck(Check):
     def _into_unseen(self, allowed: float, fastest: float) -> Iterator[PaceLimit]:
         """Limits before ground that was not seen, which allows a pace of ``allowed``, for motions up to ``fastest``."""
         config = self.view.config.obstacle
-        if config.unseen == "slow":
+        if config.unseen == "slow" or self.view.calibrates:
             allowed = max(allowed, config.unseen_speed)
         elif self.view.confirmed and allowed < config.confirmed_speed:
             self._before_unseen = False

@@ -336,7 +336,7 @@ class TruckClient(Operator):
             STAND_POSE.key(self.robot), wire.encode(STAND_POSE, pose), encoding=wire.encoding(STAND_POSE)
         )
 
-    def order(self, order: Order, *, hold: bool = False) -> Coroutine[Any, Any, GateState]:
+    def order(self, order: Order, *, hold: bool = False, calibrates: bool = False) -> Coroutine[Any, Any, GateState]:
         """Give an order; the coroutine waits until it is carried out and returns the gate's state then.
 
         An emergency stop or stop is published by this call itself, whatever is known of the robot and whether or not
@@ -345,6 +345,7 @@ class TruckClient(Operator):
         Args:
             order: what.
             hold: of an order to arm: planners do not drive until the truck is armed without it.
+            calibrates: of an order to arm: see ``ControlRequest``.
 
         Raises:
             RequestRefusedError: refused, or overtaken by a stop; carries the reason.
@@ -355,7 +356,8 @@ class TruckClient(Operator):
             self._overtaking += 1
             request = ControlRequest(**self._header(1.0), order=order)
             self._put(REQ_CONTROL, request, estop_key if order is Order.ESTOP else REQ_CONTROL.key)
-        return self._outcome(order, self._overtaking, {"hold": True} if hold else {})
+        flags = {"hold": hold, "calibrates": calibrates}
+        return self._outcome(order, self._overtaking, {name: True for name, wanted in flags.items() if wanted})
 
     async def ask_to_drive(self) -> GateState:
         """Ask the operator who drives to hand over: it shows in ``asking`` of the gate's state. Raises as ``order``."""

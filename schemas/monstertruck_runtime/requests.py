@@ -53,12 +53,13 @@ class Operator(Protocol):
     async def header(self, lease: float = 1.0) -> dict[str, Any]:
         """Header of the next request, as plain data."""
 
-    def order(self, order: Order, *, hold: bool = False) -> Coroutine[Any, Any, GateState]:
+    def order(self, order: Order, *, hold: bool = False, calibrates: bool = False) -> Coroutine[Any, Any, GateState]:
         """Give an order; the coroutine waits until it is carried out and returns the gate's state then.
 
         Args:
             order: what.
             hold: of an order to arm: planners do not drive until the truck is armed without it.
+            calibrates: of an order to arm: see ``ControlRequest``.
 
         Raises:
             RequestRefusedError: refused; carries the reason.
@@ -66,9 +67,9 @@ class Operator(Protocol):
             NotFoundError: the robot is not there.
         """
 
-    async def arm(self, *, hold: bool = False) -> GateState:
+    async def arm(self, *, hold: bool = False, calibrates: bool = False) -> GateState:
         """Allow driving, unless ``hold`` by planners too; answered once armed. Raises as ``order`` does."""
-        return await self.order(Order.ARM, hold=hold)
+        return await self.order(Order.ARM, hold=hold, calibrates=calibrates)
 
     async def disarm(self) -> GateState:
         """Stop and forbid driving; answered once disarmed. Raises as ``order`` does."""

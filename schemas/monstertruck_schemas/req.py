@@ -171,6 +171,9 @@ class ControlRequest(Request):
     order: Order
     hold: bool = False
     """Of an order to arm: planners do not drive until the truck is armed without it."""
+    calibrates: bool = False
+    """Of an order to arm: sensors are calibrated on ground that an operator keeps clear. Until the robot is disarmed,
+    measures of motion that disagree, and ground that no sensor has seen, slow it instead of stopping it."""
     to: Annotated[str, Field(max_length=64)] | None = None
     """Of a hand-over: source that may drive then."""
 

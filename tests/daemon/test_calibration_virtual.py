@@ -268,9 +268,9 @@ def test_a_wizard_that_falls_silent_is_stopped_by_its_lease(tmp_path: Path):
 class Distant(LocalTruck):
     """Orders take a while to arrive."""
 
-    async def order(self, order: Order, *, hold: bool = False) -> GateState:
+    async def order(self, order: Order, *, hold: bool = False, calibrates: bool = False) -> GateState:
         await self._clock.sleep(0.2)
-        return await super().order(order)
+        return await super().order(order, hold=hold, calibrates=calibrates)
 
 
 def test_the_end_of_a_move_is_not_taken_for_the_begin_of_the_next(tmp_path: Path):

@@ -241,7 +241,7 @@ class _Run:
     async def _try_to_arm(self) -> TruckError | None:
         """None, or why it failed."""
         try:
-            await self._truck.arm(hold=True)
+            await self._truck.arm(hold=True, calibrates=True)
         except TruckError as error:
             return error
         return None

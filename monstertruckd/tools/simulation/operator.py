@@ -47,12 +47,12 @@ class LocalOperator(Operator):
         """Call ``rpc`` of the daemon."""
         return await self._daemon.rpc.call(rpc, payload or {})
 
-    async def order(self, order: Order, *, hold: bool = False) -> GateState:
+    async def order(self, order: Order, *, hold: bool = False, calibrates: bool = False) -> GateState:
         """Give an order as ``TruckClient.order`` does."""
         if order in UNCONDITIONAL:
             request = ControlRequest.model_validate_json(json.dumps({**await self.header(), "order": order}))
             self._daemon.bus.inject(topics.REQ_CONTROL, request)
-        answer = await self.call(order.value, {**await self.header(), "hold": hold})
+        answer = await self.call(order.value, {**await self.header(), "hold": hold, "calibrates": calibrates})
         return wire.decode(topics.GATE, json.dumps(answer).encode())
 
     async def drive_shafts(self, *rates: float, lease: float = 0.25) -> None:

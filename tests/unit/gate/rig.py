@@ -291,9 +291,9 @@ class Rig:
         self.speed += min(max(target - self.speed, -step), step)
         self.travelled += abs(self.speed) * 0.02
 
-    def armed(self):
+    def armed(self, **more):
         self.tick(2)
-        assert self.order(Order.ARM) == "ok"
+        assert self.order(Order.ARM, **more) == "ok"
         self.tick()
         assert self.out.mode is GateMode.ARMED
         return self

@@ -105,3 +105,23 @@ def test_without_a_second_measure_the_speed_limits_are_halved():
     rig.say()
     assert rig.limits() == {}
     assert rig.limits(at=NOW + 4 * SECOND) == {Reason.UNWITNESSED: config.speed / 2}
+
+
+def test_a_robot_armed_to_calibrate_is_slowed_by_measures_that_disagree_and_stopped_by_frozen_ones():
+    rig = Rig(speed=0.2, unwitnessed=0.5)
+    rig.arm(NOW - SECOND)
+    rig.states.arm(NOW - SECOND, "ann", calibrates=True)
+    rig.say(doubt("drive"))
+    assert rig.reasons() == ()
+    assert rig.limits() == {Reason.SENSORS_DISAGREE: pytest.approx(0.1)}
+    rig.say(doubt("drive", DoubtKind.REPEATS))
+    assert rig.reasons() == (Reason.SENSOR_FROZEN,)
+
+
+def test_the_next_order_to_arm_ends_a_calibration():
+    rig = Rig()
+    rig.arm(NOW - SECOND)
+    rig.states.arm(NOW - SECOND, "ann", calibrates=True)
+    rig.states.arm(NOW - SECOND, "ann")
+    rig.say(doubt("drive"))
+    assert rig.reasons() == (Reason.SENSORS_DISAGREE,)

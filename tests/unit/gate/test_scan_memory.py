@@ -416,6 +416,14 @@ def test_ground_may_only_slow_the_truck_where_that_is_configured():
     assert rig.out.speeds[0] == pytest.approx(-0.1)
 
 
+def test_ground_only_slows_a_truck_that_is_armed_to_calibrate():
+    rig = surround(Rig()).armed(calibrates=True)
+    rig.driver = {"speed": -0.15}
+    rig.tick(40)
+    assert rig.out.reasons == (Reason.UNSEEN_SLOW,)
+    assert rig.out.speeds[0] == pytest.approx(-0.1)
+
+
 def test_the_second_control_is_for_operators_alone():
     rig = surround(Rig()).armed()
     rig.driver = {"speed": -0.15, "unseen": True, "source": "path", "role": Role.TRACKER, "inside": True}
