@@ -16,7 +16,6 @@ from typing import Any, Final
 
 from monstertruck_runtime.endpoints import host_of, port_of
 from monstertruck_runtime.errors import NotFoundError, NotPermittedError
-from monstertruck_runtime.outside import MEGABYTE, contents, reading
 
 TLS_VARIABLE: Final = "MONSTERTRUCKD_TLS"
 """Names the folder of the station's certificate."""
@@ -43,6 +42,8 @@ class ClientTls:
         """
         from cryptography import x509  # noqa: PLC0415 - only for certificates
         from cryptography.x509.oid import NameOID  # noqa: PLC0415
+
+        from monstertruck_runtime.outside import MEGABYTE, contents, reading  # noqa: PLC0415
 
         expected = "a certificate with a common name"
         with reading(self.certificate, expected):

@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[4]
 WRONG = (
     ("track /nonexistent.csv", 3, "/nonexistent.csv: cannot be read: No such file or directory"),
     ("calibrate camera --square 30 --marker 40", 3, "--marker 40: expected less than --square 30, in which it lies"),
-    ("track configs/truck.yaml", 3, "configs/truck.yaml:1: "),
+    ("track configs/truck.yaml", 3, "configs/truck.yaml:3: expected the header x,y,yaw,direction, found include:"),
     ("statu", 2, "Error: No such command 'statu'. Did you mean 'status', 'station', 'study'? Try '"),
     (
         "arm -e nonsense",
@@ -207,7 +207,11 @@ WRONG = (
         "configs/stands/overhead.yaml:1: another kind of file: expected",
     ),
     ("stand print /nonexistent --tags 5-2", 3, "tags '5-2': expected numbers such as 0-3,100"),
-    ("map build docs/pictures/lap.png", 3, "docs/pictures/lap.png: not a log with scans: neither MCAP, npz nor text"),
+    (
+        "map build docs/pictures/lap.png",
+        3,
+        "docs/pictures/lap.png:1: expected a log with scans (MCAP, npz or text): not UTF-8 text",
+    ),
     ("plan docs 0,0,0 1,1,0", 3, "docs/map.yaml: cannot be read: No such file or directory"),
     ("log animate README.md", 2, "Error: Missing argument 'output'."),
     ("kinematics nope", 2, "Error: No such command 'nope'."),
