@@ -230,7 +230,7 @@ async def test_a_second_daemon_is_refused_clearly(tmp_path: Path):
             second = await asyncio.to_thread(_run, truck.config)
             assert second.returncode == Reason.BUSY.exit_code
             assert truck.endpoint.removeprefix("tcp/") in second.stderr
-            assert "another daemon" in second.stderr
+            assert "in use by" in second.stderr
             assert "Traceback" not in second.stderr
             # Another robot name and endpoint, but the same ports: refused before anything is touched.
             other = tmp_path / "other.yaml"

@@ -2,10 +2,11 @@
 
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Final, NamedTuple
 
 from monstertruck_runtime.clock import SECOND, Clock
-from monstertruck_runtime.errors import InputError, NoAnswerError, RequestRefusedError
+from monstertruck_runtime.errors import InputError, NoAnswerError, RequestRefusedError, TruckError
 from monstertruck_runtime.mailbox import latest
 from monstertruck_runtime.presence import GONE
 from monstertruck_runtime.requests import Operator
@@ -135,6 +136,9 @@ async def drive(robot: Operator, clock: Clock, config: TruckConfig, plan: Sequen
                         raise RequestRefusedError(seen.worst, f"the robot stopped on the way: {seen.why}")
                     if clock.now() - heard > GONE * SECOND:
                         raise NoAnswerError(f"the robot has been silent for {GONE:g} s")
-        finally:
-            await robot.disarm()
+        except BaseException:
+            with suppress(TruckError):  # what ended the run is the cause to report
+                await robot.disarm()
+            raise
+        await robot.disarm()
     return (clock.now() - began) / SECOND
