@@ -84,8 +84,8 @@ class ConsistencyCheck(Check):
     def _only_slows(self, doubt: Doubt) -> bool:
         """Whether the robot goes on slowly in spite of this doubt.
 
-        Scans that seem late are no proof: a robot that slips as it starts shows the same. A robot that is armed to
-        calibrate its sensors is expected to have wrong ones.
+        A delay of the scans is too uncertain to stop for: it has been found with sensors that were right, on straight
+        moves from rest. A robot that is armed to calibrate its sensors is expected to have wrong ones.
         """
         return doubt.kind is DoubtKind.DELAY or (self.view.calibrates and doubt.kind is DoubtKind.MOTION)
 
