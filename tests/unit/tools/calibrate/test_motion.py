@@ -113,7 +113,7 @@ class HinderedTruck:
         self._boxes.setdefault(topic.name, []).append(box)
         return box
 
-    async def arm(self, *, hold):
+    async def arm(self, *, hold, calibrates):
         assert hold, "while its requests are on their way a planner would drive"
         if self._reasons():
             raise RequestRefusedError(self._reasons()[0])

@@ -40,7 +40,7 @@ class Truck:
     async def drive(self, speed, front, rear=0.0, lease=0.3):
         raise AssertionError("nothing moves here")
 
-    async def order(self, order, lease=1.0, *, hold=False):
+    async def order(self, order, lease=1.0, *, hold=False, calibrates=False):
         raise AssertionError("nothing moves here")
 
     async def call(self, rpc, payload=None):

@@ -42,7 +42,7 @@ class Robot:
         assert topic is TRACKER
         return self.tracker
 
-    async def order(self, order: Order, *, hold: bool = False) -> GateState:
+    async def order(self, order: Order, *, hold: bool = False, calibrates: bool = False) -> GateState:
         self.orders.append(order)
         if isinstance(self.answer, TruckError):
             raise self.answer
@@ -60,7 +60,7 @@ class SlowRobot(Robot):
         super().__init__(state(GateMode.DISARMED))
         self.error = error
 
-    async def order(self, order: Order, *, hold: bool = False) -> GateState:
+    async def order(self, order: Order, *, hold: bool = False, calibrates: bool = False) -> GateState:
         self.orders.append(order)
         if order is not Order.ARM:
             return self.answer

@@ -31,7 +31,7 @@ class Robot:
     def __init__(self) -> None:
         self.published: list[Order] = []
 
-    def order(self, order: Order, *, hold: bool = False):
+    def order(self, order: Order, *, hold: bool = False, calibrates: bool = False):
         self.published.append(order)
         return self._outcome()
 
