@@ -237,7 +237,7 @@ class ShaftWatch:
         self._over = over
         further = max(step - bounds.furthest * dt, bounds.rearmost * dt - step) - standstill * dt
         drift = 0.0
-        if bounds.low == bounds.high == 0.0:
+        if bounds.rearmost == bounds.furthest == 0.0:
             leak = LEAK * standstill * dt
             drift = so_far.drift + step
             drift = max(drift - leak, 0.0) if drift > 0.0 else min(drift + leak, 0.0)

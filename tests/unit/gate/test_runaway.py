@@ -1,7 +1,7 @@
 """Motion that nobody commanded: what is found, what is not, and what the gate does about it."""
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from monstertruck_runtime.clock import SECOND
@@ -193,6 +193,7 @@ def test_the_current_of_another_mode_shows_nothing():
     deceleration=st.floats(1.0, 6.0),
     period=st.integers(1, 20),
 )
+@example(orders=[(0.0, 0.75)] * 2 + [(0.0, 0.71875), (0.28125, 1.0625)], reaction=0.0, deceleration=1.0, period=17)
 def test_an_obedient_shaft_is_never_found(orders, reaction, deceleration, period):
     shaft = Shaft(reaction, deceleration)
     for order, seconds in orders:
