@@ -15,13 +15,18 @@ from monstertruck_runtime.errors import DeviceLostError, DeviceTimeoutError, Pro
 T = TypeVar("T")
 
 MISSES: Final = 3
-"""Exchanges in a row without a usable answer that end a session."""
+"""Exchanges in a row without a usable answer that end a session, unless a driver says otherwise."""
 
 
 class Misses:
-    """Context of one exchange after the other: suppresses errors of the answer, but not of the last of ``MISSES``."""
+    """Context of one exchange after the other: suppresses errors of the answer, but not of the last of ``limit``.
 
-    def __init__(self) -> None:
+    Args:
+        limit: exchanges in a row without a usable answer that end a session.
+    """
+
+    def __init__(self, limit: int = MISSES) -> None:
+        self._limit = limit
         self.count = 0
         """Failed exchanges in a row; 0 after one that succeeded."""
 
@@ -33,7 +38,7 @@ class Misses:
     ) -> bool:
         failed = isinstance(error, (DeviceTimeoutError, ProtocolError))
         self.count = self.count + 1 if failed else 0
-        return failed and self.count < MISSES
+        return failed and self.count < self._limit
 
 
 class WaitFor(NamedTuple):

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos.config import EposConfig
-from monstertruck_drivers.epos.exchange import ATTEMPTS, RECENT, Exchanger, ObjectError, read_identity
+from monstertruck_drivers.epos.exchange import ATTEMPTS, BRIEF_SILENCES, RECENT, Exchanger, ObjectError, read_identity
 from monstertruck_drivers.epos.objects import ObjectEntry
 from monstertruck_drivers.epos.protocol import FAULTED, OFF, POWERED, Control, State, next_control, state_of
 from monstertruck_drivers.link import Port
@@ -346,7 +346,7 @@ class _DriveSession:
     async def serve(self, ready: Ready) -> None:
         """Cycle after cycle until cancelled; a failed exchange is followed by the most urgent one."""
         schedule = Schedule(self._clock, self._config.rate, POLLING)
-        misses, reported_ready = Misses(), False
+        misses, reported_ready = Misses(BRIEF_SILENCES + 2), False  # the last one follows a long silence
         while True:
             with misses:
                 await self._cycle()

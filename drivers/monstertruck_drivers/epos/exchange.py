@@ -61,6 +61,10 @@ STRAY_LIMIT = 3
 """Unknown bytes skipped before an acknowledge."""
 ATTEMPTS = 3
 """Attempts at an exchange outside the schedule."""
+BRIEF_SILENCES = 2
+"""Failures in a row after which a brief silence is enough. The second one most likely met what disturbed the first,
+after which the request is repeated within some 130 ms; a controller that lost the time-out set by the host needs a
+long silence."""
 
 _ANSWER_LENGTHS: dict[int, frozenset[int]] = {Opcode.READ: frozenset((1, 3)), Opcode.WRITE: frozenset((1,))}
 
@@ -114,8 +118,8 @@ class Exchanger:
         """Seconds after which the controller drops a half frame, as set by the host; None = as delivered."""
         self._answer_awaited = False
         """The request is with the controller: what comes late now is its answer."""
-        self._failed = False
-        """The newest exchange failed."""
+        self._failures = 0
+        """Exchanges in a row that failed."""
         self._silence = QUIET
         """Seconds of silence that the newest failure asks for."""
         self._touched = 0
@@ -242,14 +246,14 @@ class Exchanger:
     def _be_silent(self, *, waited: bool) -> None:
         """After a failure, let the controller drop its half frame, whose time runs from the last byte of either side.
 
-        Briefly, if the controller drops half frames soon. As long as for a controller as delivered after a second
-        failure, and when an answer may still come: on a quick line, one that was not ``waited`` for. There the
-        controller has said its last byte by the time that an exchange takes.
+        Briefly, if the controller drops half frames soon. As long as for a controller as delivered after more failures
+        than ``BRIEF_SILENCES``, and when an answer may still come: on a quick line, one that was not ``waited`` for.
+        There the controller has said its last byte by the time that an exchange takes.
         """
         quick = self._is_quick()
         last = self._touched if quick else self._clock.now()
         may_come = self._answer_awaited and not (waited and quick)
-        if self._frame_timeout is None or self._failed or may_come:
+        if self._frame_timeout is None or self._failures >= BRIEF_SILENCES or may_come:
             self._silence, last = QUIET, self._clock.now()
         else:
             rest = max(self.durations) / SECOND + HELD_BACK if quick else QUICK_ANSWER
@@ -258,7 +262,7 @@ class Exchanger:
 
     def _is_quick(self) -> bool:
         """Whether a byte that did not come in time is lost, not late as on a slow link. The retry finds out which."""
-        return not self._failed and len(self.durations) == RECENT and max(self.durations) <= QUICK_ANSWER * SECOND
+        return not self._failures and len(self.durations) == RECENT and max(self.durations) <= QUICK_ANSWER * SECOND
 
     def _run_row(self, entries: Sequence[ObjectEntry], take: Callable[[int], bool]) -> Steps[None]:
         self._hurried = False
@@ -278,10 +282,10 @@ class Exchanger:
             raise DeviceTimeoutError(str(error)) from None
         except BaseException as error:
             self._be_silent(waited=isinstance(error, DeviceTimeoutError))
-            self._failed = True
+            self._failures += 1
             self._link.discard()  # what came of it is no sign that the controller still speaks
             raise
-        self._failed = False
+        self._failures = 0
         self.ended = self._clock.now()
         self.durations.append(self.ended - self.began)
         return frame

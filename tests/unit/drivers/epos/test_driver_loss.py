@@ -42,16 +42,16 @@ def test_small_disturbances_cost_less_than_a_tenth_of_a_second(fault: str):
         async with rig.driving():
             await rig.drive(6_000)
             rig.emulator.inject(*fault.split())
-            assert max(await driven_through(rig, 1.0)) < 0.25
+            assert max(await driven_through(rig, 1.0)) < 0.15
             assert rig.shaft_rpm == -6_000
             assert rig.newest.velocity == pytest.approx(6_000 * RAD_S_PER_RPM, rel=1e-3)
 
     on_bench(test)
 
 
-@pytest.mark.parametrize(("fault", "least", "most"), [("delay 600 1", 0.6, 1.3), ("silent", 0.2, 0.8)])
+@pytest.mark.parametrize(("fault", "least", "most"), [("delay 600 1", 0.6, 1.3), ("silent", 0.2, 0.4)])
 def test_an_answer_that_is_600_ms_late_or_missing_costs_one_silence(fault: str, least: float, most: float):
-    """A long one while an answer may still come, and after a second request that was not acknowledged."""
+    """A long one only while an answer may still come."""
 
     async def test(rig: Rig) -> None:
         async with rig.driving():

@@ -295,17 +295,18 @@ def test_after_a_timeout_nothing_is_sent_for_550_ms():
 @pytest.mark.parametrize(
     ("replies", "failed_before", "silence"),
     [
-        ((), False, 0.12 + QUICK_ANSWER),
-        ((), True, QUIET),
-        ((O, O), False, QUIET),
-        ((O, O + b"\0", ANSWER[:5]), False, 0.12 + QUICK_ANSWER),
+        ((), 0, 0.12 + QUICK_ANSWER),
+        ((), 1, 0.12 + QUICK_ANSWER),
+        ((), 2, QUIET),
+        ((O, O), 0, QUIET),
+        ((O, O + b"\0", ANSWER[:5]), 1, 0.12 + QUICK_ANSWER),
     ],
 )
-def test_a_controller_that_drops_half_frames_soon_needs_silence_for_a_late_answer_or_a_second_failure(
-    replies: tuple[bytes, ...], failed_before: bool, silence: float
+def test_a_controller_that_drops_half_frames_soon_needs_silence_for_a_late_answer_or_a_third_failure(
+    replies: tuple[bytes, ...], failed_before: int, silence: float
 ):
     async def test(peer: Peer, line: Exchanger) -> None:
-        line._frame_timeout, line._failed = 0.12, failed_before
+        line._frame_timeout, line._failures = 0.12, failed_before
         with pytest.raises((DeviceTimeoutError, ProtocolError)):
             await line.read(od.STATUSWORD)
         assert (line.quiet_until - line._clock.now()) / SECOND == pytest.approx(silence, abs=1e-6)
@@ -315,7 +316,7 @@ def test_a_controller_that_drops_half_frames_soon_needs_silence_for_a_late_answe
 
 @pytest.mark.parametrize(("frame_timeout", "silence"), [(0.12, 0.12 + QUICK_ANSWER), (None, QUIET)])
 def test_a_byte_into_the_silence_prolongs_it_by_what_the_controller_needs(frame_timeout: float | None, silence: float):
-    """It was the silence of a second failure: a stray byte cost 0.56 s."""
+    """It was the silence of repeated failures: a stray byte cost 0.56 s."""
 
     async def test(peer: Peer, line: Exchanger) -> None:
         line._frame_timeout = frame_timeout

@@ -16,9 +16,8 @@ from monstertruck_drivers.epos.driver import (
     _slower,
     settled,
 )
-from monstertruck_drivers.epos.exchange import RECENT
+from monstertruck_drivers.epos.exchange import BRIEF_SILENCES, RECENT
 from monstertruck_drivers.epos.protocol import OFF, Control, State, write_request
-from monstertruck_drivers.transaction import MISSES
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import DeviceFaultError, DeviceTimeoutError, ProtocolError
 from monstertruck_schemas.cmd import DriveAction
@@ -232,7 +231,7 @@ def test_so_many_failures_in_a_row_end_a_session_and_fewer_do_not():
     async def test(rig: Rig) -> None:
         async with rig.driving():
             await rig.drive(3_000)
-            for _ in range(2 * MISSES):
+            for _ in range(2 * (BRIEF_SILENCES + 2)):
                 rig.emulator.inject("delay", "600", "1")
                 await rig.settle(2.5)
             assert rig.newest.mode is DriveMode.ENABLED
@@ -243,7 +242,7 @@ def test_so_many_failures_in_a_row_end_a_session_and_fewer_do_not():
 
 @pytest.mark.parametrize("error", [DeviceTimeoutError("silence"), ProtocolError("rubbish")])
 @pytest.mark.parametrize(("between", "ends"), [(99, True), (2, False)])
-def test_three_failures_in_a_row_end_a_session(
+def test_four_failures_in_a_row_end_a_session(
     monkeypatch: pytest.MonkeyPatch, error: Exception, between: int, ends: bool
 ):
     cycle, cycles = _DriveSession._cycle, 0
@@ -262,7 +261,7 @@ def test_three_failures_in_a_row_end_a_session(
         if ends:
             with pytest.raises(type(error)):
                 await rig.session()
-            assert cycles == 3
+            assert cycles == BRIEF_SILENCES + 2
         else:
             async with rig.driving():
                 await rig.settle(1.0)
