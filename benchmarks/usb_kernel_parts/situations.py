@@ -30,7 +30,7 @@ from monstertruck_drivers.tty import MAX_AGE, SerialPort
 from monstertruck_drivers.usb.config import CycleMethod, PowerConfig, UsbConfig, UsbPortConfig
 from monstertruck_drivers.usb.hub import HubCoordinator, UsbService
 from monstertruck_drivers.usb.port import HubPort, PortPower
-from monstertruck_drivers.usb.tree import at_this_boot, parent_of, port_directory, port_of, read_tree, topology_of
+from monstertruck_drivers.usb.tree import at_present, parent_of, port_directory, port_of, read_tree, topology_of
 from monstertruck_runtime.clock import WallClock
 from monstertruck_runtime.errors import DeviceError, DeviceLostError, PortBusyError
 from monstertruck_runtime.mailbox import Mailbox, latest
@@ -541,7 +541,7 @@ async def topology() -> dict[str, Any]:
     """Names by topology lead to the same places, whatever the numbers of the buses."""
     names = {name: topology_of(MACHINE.sysfs, name) for name in read_tree(MACHINE.sysfs).devices if "-" in name}
     shown = await printed("udevadm", "info", f"/sys/bus/usb/devices/{by_serial('SNs1')}")
-    ok = all(at_this_boot(MACHINE.sysfs, long) == name for name, long in names.items())
+    ok = all(at_present(MACHINE.sysfs, long) == name for name, long in names.items())
     return {"ok": ok and f"ID_PATH={names[by_serial('SNs1')]}" in shown, "names": names}
 
 

@@ -243,7 +243,7 @@ class DeviceKind(Plugin):
         return cast("Probe", load(self.probe))
 
 
-RESERVED: Final = frozenset({*map(str, ServiceName), "at_this_boot", "ports", "present", "shafts"})
+RESERVED: Final = frozenset({*map(str, ServiceName), "at_present", "present", "shafts"})
 """Names that no role of another distribution may have: of the services that are no device, and of what a section of the
 configuration has besides its roles (a test compares)."""
 

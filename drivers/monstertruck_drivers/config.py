@@ -91,17 +91,13 @@ class _Devices(Schema):
         """The devices that are configured, by role."""
         return dict(_present(self))
 
-    def ports(self, sysfs: Sysfs) -> dict[str, AnyPort]:
-        """Ports by role; of those by hub, the hub by the kernel's present name."""
-        return {
-            role: device.port.at_this_boot(sysfs) if isinstance(device.port, UsbPortConfig) else device.port
+    def at_present(self, sysfs: Sysfs) -> Self:
+        """The same with the hubs of ports by the kernel's names of this moment."""
+        moved = {
+            role: device.model_copy(update={"port": device.port.at_present(sysfs)})
             for role, device in self.present().items()
+            if isinstance(device.port, UsbPortConfig)
         }
-
-    def at_this_boot(self, sysfs: Sysfs) -> Self:
-        """The same with the ports of ``ports``."""
-        ports = self.ports(sysfs)
-        moved = {role: device.model_copy(update={"port": ports[role]}) for role, device in self.present().items()}
         return self.model_copy(update=moved)
 
     def shafts(self) -> dict[str, Device[Any]]:

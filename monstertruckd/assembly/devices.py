@@ -41,7 +41,7 @@ class Cabling:
     """
 
     def __init__(self, config: TruckConfig, computer: Computer, bus: Bus, given: Mapping[str, Port]) -> None:
-        self._ports: dict[str, AnyPort] = config.devices.ports(computer.machine.sysfs)
+        self._ports: dict[str, AnyPort] = {role: device.port for role, device in config.devices.present().items()}
         self._given = given
         self._machine = computer.machine
         self._events = bus.event_sink()

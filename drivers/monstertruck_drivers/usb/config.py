@@ -7,7 +7,7 @@ from pydantic import Field, model_validator
 
 from monstertruck_drivers.catalog import start_order, started_apart
 from monstertruck_drivers.computer import Sysfs
-from monstertruck_drivers.usb.tree import at_this_boot, device_name, parent_of, port_of
+from monstertruck_drivers.usb.tree import at_present, device_name, parent_of, port_of
 from monstertruck_schemas.base import Schema
 
 Seconds = Annotated[float, Field(ge=0, le=60)]
@@ -43,9 +43,9 @@ its kernel's name, which may change with the next boot: "1-1", or "usb1" for a r
         """Kernel's name of whatever is plugged in there."""
         return device_name(self.hub, self.port)
 
-    def at_this_boot(self, sysfs: Sysfs) -> Self:
-        """The same place by the kernel's present names; itself if its controller is not there."""
-        name = at_this_boot(sysfs, self.device)
+    def at_present(self, sysfs: Sysfs) -> Self:
+        """The same place by the kernel's names of this moment; itself if its controller is not there."""
+        name = at_present(sysfs, self.device)
         if name == self.device:
             return self
         return self.model_copy(update={"hub": str(parent_of(name)), "port": port_of(name)})

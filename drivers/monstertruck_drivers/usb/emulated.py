@@ -6,7 +6,7 @@ nodes lead to emulated ports; so everything above runs as on a robot, on either 
 
 import errno
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path
@@ -16,7 +16,7 @@ from monstertruck_drivers.cable import EmulatedPort, MemoryPort, PtyPort
 from monstertruck_drivers.computer import Machine, Sysfs
 from monstertruck_drivers.link import BAUD, Port
 from monstertruck_drivers.tty import SerialPort
-from monstertruck_drivers.usb.tree import DEVICES, ancestors, parent_of, port_directory, port_of, sort_key
+from monstertruck_drivers.usb.tree import DEVICES, ancestors, parent_of, port_directory, port_of, renumbered, sort_key
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.threads import inline
 
@@ -207,6 +207,26 @@ class EmulatedUsb:
         device.name = to
         self._devices[to] = device
         self.plug(to)
+
+    def renumber(self, buses: Mapping[str, str]) -> None:
+        """Controllers restart: all behind them is enumerated again, with other numbers of the buses.
+
+        Args:
+            buses: new number by old one.
+        """
+        for bus in buses:
+            self._vanish(f"usb{bus}")
+        controllers = {int(buses.get(str(bus), bus)): name for bus, name in self.controllers.items()}
+        self.controllers.clear()
+        self.controllers.update(controllers)
+        devices = {renumbered(name, buses): device for name, device in self._devices.items()}
+        self._devices.clear()
+        self._devices.update(devices)
+        for name, device in devices.items():
+            device.name = name
+        for name in sorted(devices, key=sort_key):
+            if str(sort_key(name)[0]) in buses.values() and devices[name].plugged:
+                self.plug(name)
 
     def claim(self, name: str) -> None:
         """A program takes the interface of a device's node through usbfs, as brltty does: the node goes."""

@@ -24,6 +24,7 @@ from monstertruck_drivers.usb.tree import (
     parent_of,
     place,
     read_tree,
+    renumbered,
     sort_key,
 )
 from monstertruck_runtime.clock import SECOND, Clock
@@ -74,13 +75,19 @@ class HubCoordinator:
     def __init__(self, config: UsbConfig, ports: Mapping[str, UsbPortConfig], clock: Clock, events: EventSink) -> None:
         self._config = config
         self._ports = ports
-        self._roles = {port.device: role for role, port in ports.items()}
+        self._places: dict[str, str] = {}
+        """Names of the places by role; those by topology as the kernel's once they were looked up."""
+        self._roles: dict[str, str] = {}
+        """The same, the other way round."""
+        self._locate(lambda name: name)
         self._clock = clock
         self._events = events
         self._slots: dict[str, _Slot] = {}
         self._judging: dict[str, int] = {}
         self._outages: dict[str, _HubOutage] = {}
         self._looked = False
+        self._roots: dict[tuple[str, int], str] = {}
+        """Root hubs by controller and speed, as last seen."""
         self._turn = asyncio.Event()
         self.on_miss: Callable[[], None] = lambda: None
         """Called when a port found nothing plugged in: the tree is worth a look."""
@@ -89,8 +96,7 @@ class HubCoordinator:
 
     async def wait_to_start(self, role: str) -> None:
         """Wait until the device of ``role`` may start; returns at once for roles without a USB port."""
-        port = self._ports.get(role)
-        slot = self._slots.get(port.device) if port is not None else None
+        slot = self._slots.get(self._places.get(role, ""))
         while slot is not None and self._waits(slot):
             if slot.free_at is None:
                 await self._turn.wait()
@@ -100,19 +106,19 @@ class HubCoordinator:
     @property
     def waiting(self) -> frozenset[str]:
         """Roles that may not start at this moment."""
-        slots = ((role, self._slots.get(device)) for device, role in self._roles.items())
+        slots = ((role, self._slots.get(name)) for role, name in self._places.items())
         return frozenset(role for role, slot in slots if slot is not None and self._waits(slot))
 
     def waits_for(self, role: str) -> str | None:
         """What keeps the device of ``role`` from starting, in words; None if it may start."""
-        port = self._ports.get(role)
-        slot = self._slots.get(port.device) if port is not None else None
-        if port is None or slot is None or not self._waits(slot):
+        name = self._places.get(role, "")
+        slot = self._slots.get(name)
+        if slot is None or not self._waits(slot):
             return None
         if slot.held_until > self._clock.now():
-            return f"held after over-current at {place(port.device)}"
-        outage = self._outage_of(port.device)
-        return f"waits for hub {outage.hub if outage is not None else parent_of(port.device)}"
+            return f"held after over-current at {place(name)}"
+        outage = self._outage_of(name)
+        return f"waits for hub {outage.hub if outage is not None else parent_of(name)}"
 
     def _waits(self, slot: _Slot) -> bool:
         return slot.free_at is None or max(slot.free_at, slot.held_until) > self._clock.now()
@@ -122,6 +128,8 @@ class HubCoordinator:
     def update(self, snapshot: TreeSnapshot) -> None:
         """Take a new snapshot of the tree into account, and whatever has come due since the last one."""
         now = self._clock.now()
+        self._follow_buses(snapshot)
+        self._locate(snapshot.at_present)
         for name in sorted(self._slots.keys() | snapshot.devices.keys(), key=sort_key):
             slot = self._slots.setdefault(name, _Slot())
             seen = snapshot.devices.get(name)
@@ -156,8 +164,43 @@ class HubCoordinator:
 
     def tree(self) -> tuple[UsbNode, ...]:
         """Everything there, and every configured device that is not; parents before children."""
-        names = sorted(self._slots.keys() | self._roles.keys(), key=sort_key)
+        names = sorted({*self._slots, *self._places.values()}, key=sort_key)
         return tuple(node for name in names if (node := self._node(name)) is not None)
+
+    # Where the roles are
+
+    def _locate(self, at_present: Callable[[str], str]) -> None:
+        self._places = {role: at_present(port.device) for role, port in self._ports.items()}
+        self._roles = {name: role for role, name in self._places.items()}
+
+    def _follow_buses(self, snapshot: TreeSnapshot) -> None:
+        """Keep what is known of the places behind a controller whose buses came back with other numbers."""
+        roots = {(root.controller, root.speed): root.name for root in snapshot.roots()}
+        buses = {
+            before.removeprefix("usb"): root.removeprefix("usb")
+            for key, root in roots.items()
+            if (before := self._roots.get(key, root)) != root
+        }
+        self._roots = {key: root for key, root in self._roots.items() if root not in roots.values()} | roots
+        if not buses:
+            return
+        gone = {name for name in self._slots if _bus(name) not in buses and _bus(name) in buses.values()}
+        for name in gone:
+            self._forget(name)
+        self._slots = {renumbered(name, buses): slot for name, slot in self._slots.items()}
+        self._judging = {renumbered(name, buses): since for name, since in self._judging.items()}
+        for outage in self._outages.values():
+            outage.hub = renumbered(outage.hub, buses)
+            outage.members = {renumbered(name, buses) for name in outage.members}
+        self._outages = {outage.hub: outage for outage in self._outages.values()}
+
+    def _forget(self, name: str) -> None:
+        """Of a place whose name another place got."""
+        del self._slots[name]
+        self._judging.pop(name, None)
+        self._outages.pop(name, None)
+        for outage in self._outages.values():
+            outage.members.discard(name)
 
     # Arrivals and losses
 
@@ -360,6 +403,10 @@ class HubCoordinator:
 
 def _alike(a: UsbDevice, b: UsbDevice) -> bool:
     return (a.usb_id, a.serial) == (b.usb_id, b.serial)
+
+
+def _bus(name: str) -> str:
+    return str(sort_key(name)[0])
 
 
 def _ns(seconds: float) -> int:

@@ -10,6 +10,7 @@ from monstertruck_drivers.usb.tree import (
     DEVICES,
     Node,
     UsbDevice,
+    at_present,
     parent_of,
     place,
     port_directory,
@@ -85,6 +86,9 @@ class PortPower:
     async def cycle(self, name: str) -> None:
         """Switch the port ``name`` hangs on off and on; its device vanishes and comes back.
 
+        Args:
+            name: of the device's place, by topology or the kernel's.
+
         Raises:
             DeviceError: switching is not configured, a hub hangs there, or the machine refused.
             BusyError: too soon after the last cycle of this port.
@@ -92,6 +96,7 @@ class PortPower:
         method = self.config.method
         if method is None:
             raise DeviceError("no method to switch USB ports is configured (power.method)")
+        name = await self._present_name(name)
         device = await self._machine.offload(lambda: read_device(self._machine.sysfs, name))
         if parent_of(name) is None or (device is not None and device.hub):
             raise DeviceError(f"{name} is a hub: only ports of single devices are switched")
@@ -110,11 +115,12 @@ class PortPower:
         )
 
     async def switch_off(self, name: str) -> None:
-        """Take the power from the port ``name`` hangs on, until it is cycled.
+        """Take the power from the port ``name`` hangs on, until it is cycled; ``name`` as for ``cycle``.
 
         Raises:
             DeviceError: the machine refused.
         """
+        name = await self._present_name(name)
         try:
             if self.config.method is CycleMethod.UHUBCTL:
                 await self._uhubctl(name, "off")
@@ -123,6 +129,9 @@ class PortPower:
         except OSError as error:
             raise DeviceError(f"{place(name)} cannot be switched off: {error}") from error
         self._events(Reason.PORT_OFF, Severity.WARNING, "usb", f"{place(name)} was switched off, and stays off")
+
+    async def _present_name(self, name: str) -> str:
+        return await self._machine.offload(lambda: at_present(self._machine.sysfs, name))
 
     def _pace(self, name: str) -> None:
         now = self._machine.clock.now()
@@ -237,8 +246,8 @@ class HubNode:
             raise
 
     async def _look(self) -> Node:
-        config = self._config
-        device = await self._machine.offload(lambda: read_device(self._machine.sysfs, config.device))
+        config, sysfs = self._config, self._machine.sysfs
+        device = await self._machine.offload(lambda: read_device(sysfs, at_present(sysfs, config.device)))
         if device is None:
             raise DeviceLostError(f"{self.name}: not plugged in")
         if config.usb_id is not None and device.usb_id != config.usb_id:

@@ -3,13 +3,15 @@
 Names are the kernel's: ``usb1`` is the root hub of bus 1, ``1-2`` hangs on its port 2, ``1-2.3`` on port 3 of the
 hub there; ``1-2.3:1.0`` is interface 0 of that device in configuration 1, and ``1-2:1.0/1-2-port3`` the port itself.
 
-Numbers of buses follow the order in which their controllers were found, which may differ between two boots. Names by
-topology do not change: udev's ``ID_PATH`` names the controller instead, as in ``pci-0000:00:14.0-usb-0:2.3``.
+Numbers of buses follow the order in which their controllers were found, which may differ between two boots, and after a
+controller's restart. Names by topology do not change: udev's ``ID_PATH`` names the controller instead, as in
+``pci-0000:00:14.0-usb-0:2.3``.
 """
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from monstertruck_drivers.computer import Sysfs
 
@@ -55,6 +57,8 @@ class UsbDevice:
     nodes: tuple[Node, ...]
     held: frozenset[int] = frozenset()
     """Interfaces that a program has taken from the kernel's drivers, through usbfs."""
+    speed: int = 0
+    """Megabits per second; 0 = unknown. Distinguishes the two root hubs of a USB 3 controller."""
 
     def find(self, kind: str, interface: int = 0) -> Node | None:
         """First node of ``kind`` on ``interface``."""
@@ -73,6 +77,27 @@ class TreeSnapshot:
     devices: dict[str, UsbDevice]
     over_current: dict[str, int]
     """Over-current conditions a port has counted since its hub came, by the name a device there has."""
+
+    def at_present(self, name: str) -> str:
+        """See the function of this name."""
+        return _at_present(name, self.roots(), lambda place: place in self.devices)
+
+    def roots(self) -> "list[Root]":
+        """Root hubs whose controller is known."""
+        return [
+            Root(device.speed, name, device.serial)
+            for name, device in self.devices.items()
+            if device.serial and _ROOT.fullmatch(name)
+        ]
+
+
+class Root(NamedTuple):
+    """A root hub."""
+
+    speed: int
+    """Megabits per second."""
+    name: str
+    controller: str
 
 
 def device_name(hub: str, port: int) -> str:
@@ -147,23 +172,43 @@ def topology_of(sysfs: Sysfs, name: str) -> str:
     return f"{kind}-{controller}-usb-0:{'0' if root == name else name.partition('-')[2]}"
 
 
-def at_this_boot(sysfs: Sysfs, name: str) -> str:
+def at_present(sysfs: Sysfs, name: str) -> str:
     """The kernel's present name of a place that is named by topology; ``name`` itself where it is none, or not there.
 
     A controller of USB 3 has two root hubs: the one where something is there, else the one of USB 2.
     """
+    if not is_topology(name):
+        return name
+    roots = [
+        Root(sysfs.number(f"{DEVICES}/{root}/speed") or 0, root, controller)
+        for root in sysfs.names(DEVICES)
+        if _ROOT.fullmatch(root) and (controller := sysfs.text(f"{DEVICES}/{root}/serial"))
+    ]
+    return _at_present(name, roots, lambda place: sysfs.text(f"{DEVICES}/{place}/devnum") is not None)
+
+
+def _at_present(name: str, roots: list[Root], is_there: Callable[[str], bool]) -> str:
     topology = _BY_TOPOLOGY.fullmatch(name)
     if topology is None:
         return name
-    roots = [
-        (sysfs.number(f"{DEVICES}/{root}/speed") or 0, root)
-        for root in sysfs.names(DEVICES)
-        if _ROOT.fullmatch(root) and f"-{topology['controller']}".endswith(f"-{sysfs.text(f'{DEVICES}/{root}/serial')}")
-    ]
     ports = topology["ports"]
-    places = [root if ports == "0" else f"{root[3:]}-{ports}" for _, root in sorted(roots)]
-    there = (place for place in places if sysfs.text(f"{DEVICES}/{place}/devnum") is not None)
-    return next(there, places[0] if places else name)
+    places = [
+        root.name if ports == "0" else f"{root.name[3:]}-{ports}"
+        for root in sorted(roots)
+        if f"-{topology['controller']}".endswith(f"-{root.controller}")
+    ]
+    return next(filter(is_there, places), places[0] if places else name)
+
+
+def renumbered(name: str, buses: Mapping[str, str]) -> str:
+    """The name that a place has after buses got other numbers.
+
+    Args:
+        name: one of the kernel's.
+        buses: new number by old one.
+    """
+    prefix, number, ports = re.split(r"(\d+)", name, maxsplit=1)
+    return f"{prefix}{buses.get(number, number)}{ports}"
 
 
 def read_tree(sysfs: Sysfs) -> TreeSnapshot:
@@ -211,6 +256,7 @@ def _read_device(sysfs: Sysfs, name: str, interfaces: list[str]) -> UsbDevice | 
             for entry in interfaces
             if "DRIVER=usbfs" in (sysfs.text(f"{DEVICES}/{entry}/uevent") or "").splitlines()
         ),
+        speed=sysfs.number(f"{path}/speed") or 0,
     )
 
 

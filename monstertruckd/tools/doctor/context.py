@@ -181,7 +181,7 @@ class HostContext:
             path = self.at(port.path)
             return path if path.exists() else None
         sysfs = self.computer.machine.sysfs
-        device = read_device(sysfs, port.at_this_boot(sysfs).device)
+        device = read_device(sysfs, port.at_present(sysfs).device)
         found = device.find("video4linux" if camera else "tty", port.interface) if device is not None else None
         return self.computer.machine.dev / found.name if found is not None else None
 

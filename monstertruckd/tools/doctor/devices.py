@@ -29,7 +29,7 @@ def wiring(context: HostContext) -> Iterator[Finding]:
         return
     sysfs = context.computer.machine.sysfs
     tree = read_tree(sysfs)
-    devices = context.config.devices.at_this_boot(sysfs).present()
+    devices = context.config.devices.at_present(sysfs).present()
     taken = {device.port.device for device in devices.values() if isinstance(device.port, UsbPortConfig)}
     for role, device in devices.items():
         if isinstance(device.port, UsbPortConfig):
@@ -118,7 +118,7 @@ async def handshakes(context: HostContext) -> AsyncIterator[Finding]:
         return
     plugged = {
         role: (device, node)
-        for role, device in context.config.devices.at_this_boot(context.computer.machine.sysfs).present().items()
+        for role, device in context.config.devices.at_present(context.computer.machine.sysfs).present().items()
         if (node := context.node(device.port, camera=device.kind.opens == "video")) is not None
     }
     for found in await asyncio.gather(*(_handshake(context, role, *ends) for role, ends in plugged.items())):

@@ -58,7 +58,8 @@ def calibration(context: HostContext) -> Iterator[Finding]:
     plugged = {
         role: device.serial
         for role, entry in ports.items()
-        if isinstance(entry.port, UsbPortConfig) and (device := tree.devices.get(entry.port.device)) is not None
+        if isinstance(entry.port, UsbPortConfig)
+        and (device := tree.devices.get(tree.at_present(entry.port.device))) is not None
     }
     serials = {role: serial for role, serial in plugged.items() if serial is not None}
     for name, result in file.results.items():

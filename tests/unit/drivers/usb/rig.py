@@ -2,7 +2,7 @@
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -26,9 +26,22 @@ PORTS = {
 }
 
 
-def emulated_truck(folder: Path) -> tuple[EmulatedUsb, dict[str, MemoryPort]]:
-    """Two hubs; the first carries four of five serial devices, the second the compass and a camera."""
+CONTROLLER = "0000:00:14.0"
+"""Controller of bus 1."""
+BY_TOPOLOGY = {
+    role: port.model_copy(update={"hub": f"pci-{CONTROLLER}-usb-0:{port.hub[2:]}"}) for role, port in PORTS.items()
+}
+
+
+def emulated_truck(folder: Path, *controllers: str) -> tuple[EmulatedUsb, dict[str, MemoryPort]]:
+    """Two hubs; the first carries four of five serial devices, the second the compass and a camera.
+
+    Args:
+        folder: of the machine.
+        controllers: of the buses, from 1 on.
+    """
     usb = EmulatedUsb(folder)
+    usb.controllers |= dict(enumerate(controllers, 1))
     cables = {role: MemoryPort(role) for role in PORTS}
     usb.add_hub("1-1")
     usb.add_hub("1-2")
@@ -74,20 +87,23 @@ class Events:
 class Bench:
     """Everything of one machine; the service runs inside ``watching``."""
 
-    def __init__(self, folder: Path, clock: Clock, config: UsbConfig | None = None) -> None:
+    def __init__(
+        self, folder: Path, clock: Clock, config: UsbConfig | None = None, places: Mapping[str, UsbPortConfig] = PORTS
+    ) -> None:
         self.clock = clock
-        self.usb, self.cables = emulated_truck(folder)
+        self.usb, self.cables = emulated_truck(folder, *[CONTROLLER] * (places is BY_TOPOLOGY))
         self.config = config or UsbConfig()
+        self.places = places
         self.machine = self.usb.machine(clock)
         self.events = Events()
         self.out = Kept()
-        self.hubs = HubCoordinator(self.config, PORTS, clock, self.events)
+        self.hubs = HubCoordinator(self.config, places, clock, self.events)
         self.power = PortPower(self.config.power, self.machine, self.events)
         self.service = UsbService(self.config, self.machine, self.hubs, self.usb.watcher, self.out, self.events)
         self.ports = {role: self.port(role) for role in PORTS}
 
     def port(self, role: str, **changes: Any) -> HubPort:
-        place = PORTS[role].model_copy(update=changes)
+        place = self.places[role].model_copy(update=changes)
         return HubPort(place, self.machine, self.events, self.hubs, self.power, role)
 
     @contextlib.asynccontextmanager
@@ -133,12 +149,17 @@ class Bench:
 
 
 def play(
-    folder: Path, scene: Callable[[Bench], Awaitable[None]], config: UsbConfig | None = None, *, watched: bool = True
+    folder: Path,
+    scene: Callable[[Bench], Awaitable[None]],
+    config: UsbConfig | None = None,
+    places: Mapping[str, UsbPortConfig] = PORTS,
+    *,
+    watched: bool = True,
 ) -> Bench:
     """Run ``scene`` on a virtual clock, with the service running unless stated otherwise."""
 
     async def main(clock: VirtualClock) -> Bench:
-        bench = Bench(folder, clock, config)
+        bench = Bench(folder, clock, config, places)
         if watched:
             async with bench.watching():
                 await scene(bench)

@@ -146,7 +146,7 @@ def test_the_cable_is_named_by_topology_where_the_controller_is_known(tmp_path: 
         bench.usb.plug("1-1.3")
         port = await finding
         assert (port.hub, port.port) == ("pci-0000:00:14.0-usb-0:1", 3)
-        assert port.at_this_boot(bench.machine.sysfs).device == "1-1.3"
+        assert port.at_present(bench.machine.sysfs).device == "1-1.3"
         assert 'hub: "pci-0000:00:14.0-usb-0:1", port: 3' in config_line(port)
 
     play(tmp_path, scene, watched=False)
