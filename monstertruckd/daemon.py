@@ -20,23 +20,15 @@ from monstertruck_drivers.computer import Computer
 from monstertruck_drivers.epos.config import EposConfig
 from monstertruck_drivers.link import Port
 from monstertruck_drivers.maestro.config import MaestroConfig
-from monstertruck_estimation.points.service import PointService, register_point_calls
-from monstertruck_estimation.slam.service import SlamService
 from monstertruck_kinematics.chassis import Chassis
-from monstertruck_planners.behave.service import BehaviourService, register_behaviour_calls
-from monstertruck_planners.explore.service import ExplorerService
-from monstertruck_planners.goals.service import GoalService, register_goal_calls
-from monstertruck_planners.missions.service import MissionService
 from monstertruck_planners.steps import CODEC
-from monstertruck_planners.track.paths import PathService, register_path_calls
 from monstertruck_runtime.actors.actor import ActorFactory
 from monstertruck_runtime.actors.remote import RPC as REMOTE_STEP
 from monstertruck_runtime.actors.remote import RemoteWorkQueue
 from monstertruck_runtime.clock import Clock, VirtualClock
 from monstertruck_runtime.errors import ConfigError, InputError
 from monstertruck_runtime.mailbox import latest
-from monstertruck_runtime.ports import EventSink, Handler
-from monstertruck_runtime.requests import register_numbered
+from monstertruck_runtime.ports import EventSink, Handler, ServesCalls
 from monstertruck_runtime.service import OnBug, RestartPolicy, Scope, Service, scope, supervise
 from monstertruck_runtime.slowness import SlowComputer, factor_of
 from monstertruck_runtime.threads import Offload, in_daemon_thread, in_thread, inline
@@ -44,11 +36,11 @@ from monstertruck_schemas import topics
 from monstertruck_schemas.event import CALL_TEXT, Call, Severity
 from monstertruck_schemas.health import ServiceHealth, ServiceState
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import ExploreRequest, GoalRequest, MissionRequest
+from monstertruck_schemas.req import GoalRequest
 from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.topics import TOPICS, Topic, Writer
 from monstertruckd.assembly.devices import Cabling, build_drivers, measures_battery, of_duty, sensor_services
-from monstertruckd.assembly.estimation import Body, build_estimation
+from monstertruckd.assembly.estimation import Body, build_estimation, build_slam
 from monstertruckd.assembly.planning import build_planners
 from monstertruckd.bus.local import Bus, Tap
 from monstertruckd.bus.peers import PeerService, PeerSubscriber
@@ -182,22 +174,14 @@ class Daemon:
             if self._seed is None:
                 self._start(gate, StallWatch(self.clock, self.gate.ticks, self.config.state_directory / "stalls"))
             self._start_drivers(sensors, OnBug.FAIL, Duty.SENSOR, Duty.MONITOR)
-            save_map = self._start_estimation(estimation)
+            slam = build_slam(self.config, self.bus, self.clock, self._nonce)
+            parts = (self.config, self.bus, self.clock, self._body, self._actors)
+            for service in build_estimation(*parts, slam, self._nonce):
+                self._start_serving(estimation, service)
             for service in self._peer_services():
                 self._start(estimation, service)
-            for service in build_planners(self.config, self.bus, self.clock, self._body, self._actors, save_map):
-                self._start(planners, service)
-                calls = ServiceCalls(self.rpc, self._board, service.name)
-                if isinstance(service, PathService):
-                    register_path_calls(calls, service)
-                if isinstance(service, GoalService):
-                    register_goal_calls(calls, service, self.clock)
-                if isinstance(service, ExplorerService):
-                    register_numbered(calls, "explore", ExploreRequest, service.take)
-                if isinstance(service, MissionService):
-                    register_numbered(calls, "mission", MissionRequest, service.take, service.kept)
-                if isinstance(service, BehaviourService):
-                    register_behaviour_calls(calls, service)
+            for service in build_planners(*parts, None if slam is None else slam.save_soon):
+                self._start_serving(planners, service)
             if self._notify is not None:
                 self._notify.up()
             await stop.wait()
@@ -206,18 +190,6 @@ class Daemon:
             self.gate.shut_down()
 
     # The scopes' contents
-
-    def _start_estimation(self, estimation: Scope) -> Callable[[], bool] | None:
-        """Start estimation; returns the function that saves the map, None if no map is made."""
-        save_map: Callable[[], bool] | None = None
-        estimators = build_estimation(self.config, self.bus, self.clock, self._body, self._actors, self._nonce)
-        for service in estimators:
-            self._start(estimation, service)
-            if isinstance(service, SlamService):
-                save_map = service.save_soon
-            if isinstance(service, PointService):
-                register_point_calls(ServiceCalls(self.rpc, self._board, service.name), service)
-        return save_map
 
     def _peer_services(self) -> Iterator[Service]:
         """Services that receive the poses of other robots; on the virtual clock nothing comes over Zenoh."""
@@ -298,6 +270,12 @@ class Daemon:
         rng = np.random.default_rng(self._rng.integers(2**63))
         work = supervise(service, policy or RestartPolicy(), self.clock, self._board.report, rng, on_bug)
         where.start(service.name, work if self.slow is None else self.slow.service(service.name, work))
+
+    def _start_serving(self, where: Scope, service: Service) -> None:
+        """Start a service and its remote calls, which are refused once it has failed for good."""
+        self._start(where, service)
+        if isinstance(service, ServesCalls):
+            service.register(ServiceCalls(self.rpc, self._board, service.name))
 
     def _start_drivers(self, where: Scope, on_bug: OnBug, *duties: Duty) -> None:
         devices = self.config.devices.present()

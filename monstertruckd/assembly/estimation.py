@@ -84,7 +84,13 @@ def sensor_mounts(config: TruckConfig) -> dict[str, Mount]:
 
 
 def build_estimation(
-    config: TruckConfig, bus: Bus, clock: Clock, body: Body, actors: ActorFactory, run: str = ""
+    config: TruckConfig,
+    bus: Bus,
+    clock: Clock,
+    body: Body,
+    actors: ActorFactory,
+    slam: SlamService | None,
+    run: str = "",
 ) -> Iterator[Service]:
     """Transforms always; odometry where the robot can drive and steer. ``run`` names this run in saved maps."""
     mounts = {name: mount(name, (m.x, m.y, m.z), (m.roll, m.pitch, m.yaw)) for name, m in sensor_mounts(config).items()}
@@ -92,7 +98,6 @@ def build_estimation(
     if joints is not None and DeviceRole.LIDAR in mounts:
         lidar = mounts[DeviceRole.LIDAR]
         mounts[DeviceRole.LIDAR] = compose(invert(joints), lidar)
-    slam = _build_slam(config, bus, clock, run)
     yield TransformService(
         list(mounts.values()),
         clock,
@@ -235,7 +240,8 @@ def _build_points(
     )
 
 
-def _build_slam(config: TruckConfig, bus: Bus, clock: Clock, run: str) -> SlamService | None:
+def build_slam(config: TruckConfig, bus: Bus, clock: Clock, run: str = "") -> SlamService | None:
+    """Where the robot makes a map, or finds its place in one. ``run`` names this run in saved maps."""
     devices = config.devices
     if config.slam is None or devices.lidar is None:
         return None

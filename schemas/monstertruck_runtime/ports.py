@@ -1,7 +1,7 @@
 """The narrow interfaces services see of the rest: publish, subscribe, report."""
 
 from collections.abc import Awaitable, Callable
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 from monstertruck_runtime.mailbox import Delivery, Mailbox
 from monstertruck_schemas.base import Message
@@ -88,3 +88,11 @@ class RpcRegistry(Protocol):
 
         Calls that only read, or come many times a second, are not ``recorded``.
         """
+
+
+@runtime_checkable
+class ServesCalls(Protocol):
+    """A service that serves remote calls."""
+
+    def register(self, rpc: RpcRegistry) -> None:
+        """Serve its calls by ``rpc``."""

@@ -1,7 +1,7 @@
 """Messages of the ``plan`` group: paths, tracker progress, and the planners' drive requests."""
 
 from enum import StrEnum
-from typing import Annotated, Final, Literal
+from typing import Annotated, Final, Literal, Protocol
 
 import numpy as np
 from pydantic import Field
@@ -73,6 +73,38 @@ class TrackerState(Message):
     axles: AxleResponse | None = None
 
 
+class TaskState(Protocol):
+    """What the report on any task has: a goal, an exploration, a mission or a behaviour."""
+
+    @property
+    def number(self) -> int:
+        """Counts the tasks of its kind since the start of the daemon; 0 = none yet."""
+
+    @property
+    def source(self) -> str:
+        """Who requested it."""
+
+    @property
+    def running(self) -> bool:
+        """Whether it has not ended."""
+
+    @property
+    def activity(self) -> str:
+        """Say in words that it runs."""
+
+    @property
+    def outcome(self) -> Reason:
+        """DRIVING while it runs, then how it ended."""
+
+    @property
+    def text(self) -> str:
+        """The outcome in words."""
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds since it was started."""
+
+
 class GoalPhase(StrEnum):
     """What is being done about a goal."""
 
@@ -109,6 +141,16 @@ class GoalState(Message):
     recoveries: Annotated[int, Field(ge=0)] = 0
     """Recovery behaviours run so far."""
 
+    @property
+    def running(self) -> bool:
+        """Whether it has not ended."""
+        return self.phase is not GoalPhase.IDLE
+
+    @property
+    def activity(self) -> str:
+        """Say in words that it runs."""
+        return f"goal {self.number} of {self.source} is pursued"
+
 
 class BehaviourState(Message):
     """Progress of a behaviour, in the ``frame`` of odometry."""
@@ -133,6 +175,11 @@ class BehaviourState(Message):
     """Metres by odometry since it was started."""
     values: dict[str, float] = Field(default_factory=dict)
     """Measurements of its kind, such as the distance from a wall, m."""
+
+    @property
+    def activity(self) -> str:
+        """Say in words that it runs."""
+        return f"the behaviour {self.behaviour} of {self.source} is running"
 
 
 class ExplorationPhase(StrEnum):
@@ -191,6 +238,11 @@ class ExplorationState(Message):
         """Whether it has not ended."""
         return self.phase is not ExplorationPhase.IDLE
 
+    @property
+    def activity(self) -> str:
+        """Say in words that it runs."""
+        return f"the exploration of {self.source} is running"
+
 
 class MissionState(Message):
     """Progress of a mission."""
@@ -220,6 +272,11 @@ class MissionState(Message):
     """The outcome in words; while it runs what the present step waits for."""
     elapsed: Annotated[float, Field(ge=0)] = 0.0
     """Seconds since it was started or resumed."""
+
+    @property
+    def activity(self) -> str:
+        """Say in words that it runs."""
+        return f"the mission of {self.source} is running"
 
 
 class StabiliserCommand(Message):

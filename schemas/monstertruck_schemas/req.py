@@ -178,6 +178,21 @@ class ControlRequest(Request):
     """Of a hand-over: source that may drive then."""
 
 
+class Verb(StrEnum):
+    """What a request asks of a task server; the orders of every kind of task mean one of these."""
+
+    START = "start"
+    RESUME = "resume"
+    """Go on after a pause."""
+    PAUSE = "pause"
+    STOP = "stop"
+
+    @property
+    def moves(self) -> bool:
+        """Whether the robot may drive off for it."""
+        return self in (Verb.START, Verb.RESUME)
+
+
 class Waypoint(Schema):
     """A place to pass on the way to a goal."""
 
@@ -196,6 +211,16 @@ class GoalRequest(Request):
     waypoints: Annotated[tuple[Waypoint, ...], Field(max_length=32)] = ()
     """Passed in this order before it."""
 
+    @property
+    def verb(self) -> Verb:
+        """What it asks of the task server."""
+        return Verb.START
+
+    @property
+    def own(self) -> bool:
+        """Whether it is meant for a task of the same program only."""
+        return False
+
 
 class GoalOrder(StrEnum):
     """What can be asked about the present goal."""
@@ -211,6 +236,11 @@ class GoalControl(Request):
     order: GoalOrder
     own: bool = False
     """Only a goal that the same program sent."""
+
+    @property
+    def verb(self) -> Verb:
+        """What it asks of the task server."""
+        return Verb.STOP if self.order is GoalOrder.CANCEL else Verb(self.order)
 
 
 class BehaviourOrder(StrEnum):
@@ -230,6 +260,11 @@ class BehaviourRequest(Request):
     """For a start: settings that replace the configured ones for this run."""
     own: bool = False
     """Of a stop: only a behaviour that the same program started."""
+
+    @property
+    def verb(self) -> Verb:
+        """What it asks of the task server."""
+        return Verb(self.order)
 
 
 class ExploreOrder(StrEnum):
@@ -252,6 +287,11 @@ class ExploreRequest(Request):
     own: bool = False
     """Of a stop: only an exploration that the same program started."""
 
+    @property
+    def verb(self) -> Verb:
+        """What it asks of the task server."""
+        return Verb(self.order)
+
 
 class MissionOrder(StrEnum):
     """What can be asked about missions."""
@@ -271,6 +311,11 @@ class MissionRequest(Request):
     """For a resume: the robot is not where the mission was interrupted, and its pose is right."""
     own: bool = False
     """Of a stop: only a mission that the same program started and that runs."""
+
+    @property
+    def verb(self) -> Verb:
+        """What it asks of the task server: one that a restart interrupted is started from its present step."""
+        return Verb.STOP if self.order is MissionOrder.STOP else Verb.START
 
 
 class PathRequest(Request):

@@ -26,7 +26,7 @@ from monstertruck_schemas.req import GoalControl, GoalRequest
 from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.topics import Topic
 from monstertruckd.assembly.devices import scan_publisher
-from monstertruckd.assembly.estimation import Body, build_estimation
+from monstertruckd.assembly.estimation import Body, build_estimation, build_slam
 from monstertruckd.assembly.planning import build_planners
 from monstertruckd.bus.local import Bus
 from monstertruckd.config.truck import PlacementConfig, TruckConfig
@@ -302,10 +302,7 @@ class Chain:
         self._asked[call.source] += 1
         request = call.request(gate, instant, self._asked[call.source])
         with Pace().borrowed(instant), suppress(RequestRefusedError):
-            if isinstance(request, GoalRequest):
-                self._goals.take(request)
-            else:
-                self._goals.control(request)
+            self._goals.tasks.take(request)
 
     async def _lead(self, output: LogMessage) -> None:
         """A recorded path that was not computed is given, for the truck drove it."""
@@ -336,7 +333,9 @@ class Chain:
         body = Body.of(config)
         places = ReplayedActors(self._clock, self._goal_record, self._book)
         compared = config.model_copy(update={"consistency": None})  # what it finds depends on no other output
-        yield from build_estimation(compared, self.bus, self._clock, body, places)
+        yield from build_estimation(
+            compared, self.bus, self._clock, body, places, build_slam(compared, self.bus, self._clock)
+        )
         planners = build_planners(config, self.bus, self._clock, body, places)
         wanted = TICKS.keys() if config.planner is None else {*TICKS, PathService.name}
         yield from (service for service in planners if service.name in wanted)

@@ -409,29 +409,21 @@ class PointService:
             raise NotFoundError(f"no picture of a point of interest {name!r}")
         return tracked.picture
 
+    def register(self, rpc: RpcRegistry) -> None:
+        """Serve ``points``, answered for a mark by its place, and ``point_picture``, which takes a point's ``name``."""
+
+        async def points(payload: dict[str, Any]) -> dict[str, Any]:
+            place = self.take(parse_request(PointRequest, payload))
+            await self.kept()
+            return {} if place is None else dict(zip(("x", "y", "yaw"), place, strict=True))
+
+        async def point_picture(payload: dict[str, Any]) -> dict[str, Any]:
+            data = self.picture(str(payload.get("name", "")))
+            return {"jpeg": base64.b64encode(data).decode("ascii")}
+
+        rpc.register("points", points)
+        rpc.register("point_picture", point_picture, AccessRole.OBSERVER, recorded=False)
+
 
 def _apart(one: Vector, other: Vector) -> bool:
     return max(abs(one[0] - other[0]), abs(one[1] - other[1]), abs(math.remainder(one[2] - other[2], math.tau))) > MOVED
-
-
-def register_point_calls(rpc: RpcRegistry, service: PointService) -> None:
-    """Serve ``points`` and ``point_picture``.
-
-    The first takes a ``PointRequest`` and answers a mark by its place, the second takes the ``name`` of a point.
-
-    Args:
-        rpc: where.
-        service: what keeps them.
-    """
-
-    async def points(payload: dict[str, Any]) -> dict[str, Any]:
-        place = service.take(parse_request(PointRequest, payload))
-        await service.kept()
-        return {} if place is None else dict(zip(("x", "y", "yaw"), place, strict=True))
-
-    async def point_picture(payload: dict[str, Any]) -> dict[str, Any]:
-        data = service.picture(str(payload.get("name", "")))
-        return {"jpeg": base64.b64encode(data).decode("ascii")}
-
-    rpc.register("points", points)
-    rpc.register("point_picture", point_picture, AccessRole.OBSERVER, recorded=False)

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from operator import attrgetter
 from typing import Any, Final
 
 from pydantic import ValidationError
@@ -17,16 +18,17 @@ from monstertruck_planners.behave.api import (
     RequestedMotion,
 )
 from monstertruck_planners.behave.catalog import BEHAVIOURS
+from monstertruck_planners.tasks import TaskServer
 from monstertruck_runtime.clock import SECOND, Clock, Schedule
 from monstertruck_runtime.errors import InputError, NotFoundError, RequestRefusedError
 from monstertruck_runtime.mailbox import latest
 from monstertruck_runtime.ports import BusPort, EventSink, Publisher, Ready, RpcRegistry, Subscription
-from monstertruck_runtime.requests import Sequences, does_not_drive, examine, planner_request, register_numbered
+from monstertruck_runtime.requests import does_not_drive, planner_request
 from monstertruck_schemas.base import Message, first_mistake
 from monstertruck_schemas.event import Severity
-from monstertruck_schemas.plan import BehaviourState, GoalPhase, GoalState, TrackerState
+from monstertruck_schemas.plan import BehaviourState, GoalState, TrackerState
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import BehaviourOrder, BehaviourRequest, DriveRequest, RequestedTwist
+from monstertruck_schemas.req import BehaviourRequest, DriveRequest, RequestedTwist
 from monstertruck_schemas.roles import AccessRole, ServiceName
 from monstertruck_schemas.state import GateMode, GateState, Odometry
 from monstertruck_schemas.topics import BEHAVIOUR, GATE, GOAL, ODOMETRY, TRACKER, Writer
@@ -37,6 +39,8 @@ LEASE: Final = 0.3
 """Lease of each drive request, s."""
 REPORT: Final = SECOND // 5
 """Period of reports without a change, ns."""
+CHANGES: Final = ("number", "running", "phase", "outcome")
+"""Fields of the report whose change is reported at once."""
 DISOBEYED: Final = 2.0
 """Seconds of requested but not executed motion after which a behaviour gives up."""
 SETTLE: Final = 1.0
@@ -86,6 +90,8 @@ class BehaviourService:
     """
 
     name = SOURCE
+    noun = "behaviour"
+    resumable = False
 
     def __init__(
         self,
@@ -96,7 +102,7 @@ class BehaviourService:
         max_age: float,
         body: BehaviourBody,
     ) -> None:
-        self.configs, self._clock, self._drive, self._max_age, self._body = configs, clock, drive, max_age, body
+        self.configs, self._clock, self._drive, self._body = configs, clock, drive, body
         reads = [BEHAVIOURS.implementation(config).reads for config in configs.values()]
         topics = {topic.name: topic for some in reads for topic in some}
         self._read: dict[str, Subscription[Any]] = {
@@ -106,18 +112,24 @@ class BehaviourService:
         self._odometry: Subscription[Odometry] = bus.subscribe(ODOMETRY, latest())
         self._goal: Subscription[GoalState] = bus.subscribe(GOAL, latest())
         self._tracker: Subscription[TrackerState] = bus.subscribe(TRACKER, latest())
-        self._out: Publisher[BehaviourState] = bus.publisher(BEHAVIOUR, Writer.PLANNER)
         self._events: EventSink = bus.event_sink()
-        self._sequences = Sequences(max_age)
+        self.tasks = TaskServer[BehaviourRequest, tuple[BehaviourConfig, Behaviour], BehaviourState](
+            self,
+            clock,
+            self._gate,
+            max_age,
+            bus.publisher(BEHAVIOUR, Writer.PLANNER),
+            changes=CHANGES,
+            period=REPORT,
+            others=(self._goal,),
+            drives=attrgetter("accepts_motion"),
+        )
         self._run: BehaviourRun | None = None
-        self._program: tuple[str, str | None] | None = None
-        """Which started it."""
         self._pose: Odometry | None = None
-        self._reported: BehaviourState | None = None
 
     async def run(self, ready: Ready) -> None:
         """Serve until cancelled."""
-        self._report(self._clock.now())
+        self.tasks.report()
         ready()
         rate = max((config.rate for config in self.configs.values()), default=IDLE_RATE)
         schedule, due = Schedule(self._clock, rate), 0.0
@@ -132,7 +144,7 @@ class BehaviourService:
             else:
                 due = 0.0
                 self._settle(now)
-            self._report(now)
+            self.tasks.report()
 
     # Requests
 
@@ -160,56 +172,46 @@ class BehaviourService:
         except ValueError as error:
             raise InputError(f"settings: {error}") from error
 
-    def take(self, request: BehaviourRequest) -> int:
-        """Carry out a request; returns the number of the behaviour it started or stopped.
+    @property
+    def running(self) -> bool:
+        """Whether a behaviour runs."""
+        return self._run is not None and self._run.running
+
+    def accept(self, request: BehaviourRequest) -> tuple[BehaviourConfig, Behaviour]:
+        """The settings of a run, and the behaviour with them.
 
         Raises:
             NotFoundError: no such behaviour is configured.
-            RequestRefusedError: the sender may not, or it cannot be done now.
+            InputError: the settings are wrong, or not complete; the text names the first key.
+            RequestRefusedError: the body cannot do that, a path is followed, or what the behaviour reads does not come.
         """
-        now, starts = self._clock.now(), request.order is BehaviourOrder.START
-        gate = self._gate.latest
-        examine(request, gate, self._sequences, now, self._max_age if starts else None)
-        return self._start(request, gate, now) if starts else self._stop(request, now)
-
-    def _start(self, request: BehaviourRequest, gate: GateState | None, now: int) -> int:
-        name, run = request.behaviour, self._run
-        config, behaviour = self._configured(name, request.settings)
-        if run is not None and run.running:
-            raise RequestRefusedError(
-                Reason.BUSY, f"the behaviour {run.name} of {run.source} is running, stop it first"
-            )
-        moves = gate is not None and gate.mode.accepts_motion
-        if (other := self._other_planner(now)) is not None:
-            raise RequestRefusedError(Reason.BUSY, other if moves else f"{other} as soon as the robot is armed")
+        config, behaviour = self._configured(request.behaviour, request.settings)
+        now, gate = self._clock.now(), self._gate.latest
+        if (path := self._path(now)) is not None:
+            moves = gate is not None and gate.mode.accepts_motion
+            raise RequestRefusedError(Reason.BUSY, path if moves else f"{path} as soon as the robot is armed")
         if (stale := self._stale(behaviour, now)) is not None:
             raise RequestRefusedError(Reason.INPUT_STALE, stale)
-        if not moves:  # the last one: for this a client arms it
-            raise does_not_drive(gate)
-        number = 1 if run is None else run.number + 1
+        return config, behaviour
+
+    def begin(self, accepted: tuple[BehaviourConfig, Behaviour], request: BehaviourRequest, number: int) -> None:
+        """Run a behaviour from here on."""
+        name, (config, behaviour) = request.behaviour, accepted
+        now = self._clock.now()
         self._run = BehaviourRun(number, name, config, behaviour, request.source, now, behaviour.begin())
-        self._program, self._pose = request.program, self._odometry.latest
+        self._pose = self._odometry.latest
         self._events(Reason.BEHAVIOUR_STARTED, Severity.INFO, SOURCE, f"{name} started by {request.source}")
-        self._report(now)
-        return number
 
-    def _stop(self, request: BehaviourRequest, now: int) -> int:
-        run = self._run
-        if run is not None and run.running and request.own and request.program != self._program:
-            raise RequestRefusedError(Reason.NOT_FOUND, f"the behaviour {run.name} of {run.source} is running")
-        if run is None or not run.running or request.behaviour not in ("", run.name):
-            name = request.behaviour
-            text = f"the behaviour {name} is not running" if name else "no behaviour is running"
-            raise RequestRefusedError(Reason.NOT_FOUND, text)
-        self._end(run, Reason.CANCELLED, f"stopped by {request.source}", now)
-        self._report(now)
-        return run.number
+    def control(self, request: BehaviourRequest) -> None:
+        """Stop the behaviour, if it is the one that is named."""
+        assert self._run is not None
+        if request.behaviour not in ("", self._run.name):
+            raise RequestRefusedError(Reason.NOT_FOUND, f"the behaviour {request.behaviour} is not running")
+        self._end(self._run, Reason.CANCELLED, f"stopped by {request.source}", self._clock.now())
 
-    def _other_planner(self, now: int) -> str | None:
-        """What else asks for motion."""
-        goal, tracker = self._goal.latest, self._tracker.latest
-        if goal is not None and goal.phase is not GoalPhase.IDLE:
-            return f"goal {goal.number} of {goal.source} is pursued, cancel it first"
+    def _path(self, now: int) -> str | None:
+        """The path that is followed, in words."""
+        tracker = self._tracker.latest
         following = tracker is not None and now - tracker.received <= TRACKER.fresh_for() * SECOND
         if following and tracker is not None and tracker.outcome is Reason.DRIVING:
             return f"the path {tracker.path!r} is followed"
@@ -243,7 +245,7 @@ class BehaviourService:
             return error.refusal, str(error)
         if gate.mode is GateMode.STOPPING and Reason.STOPPED in gate.reasons:
             return Reason.CANCELLED, "the robot was ordered to stop"
-        if (other := self._other_planner(now)) is not None:
+        if (other := self.tasks.other() or self._path(now)) is not None:
             return Reason.BUSY, other
         if (stale := self._stale(run.behaviour, now)) is not None:
             return Reason.INPUT_STALE, stale
@@ -303,17 +305,8 @@ class BehaviourService:
         seq = self._drive.next_seq()
         self._drive.put(planner_request(seq, gate, now, SOURCE, LEASE, speed=0.0, front=0.0, twist=twist))
 
-    def _report(self, now: int) -> None:
-        state, before = self._state(now), self._reported
-        changed = before is None or any(
-            getattr(before, name) != getattr(state, name) for name in ("number", "running", "phase", "outcome")
-        )
-        if before is not None and not changed and (not state.running or now - before.stamp < REPORT):
-            return
-        self._reported = state.model_copy(update={"seq": self._out.next_seq()})
-        self._out.put(self._reported)
-
-    def _state(self, now: int) -> BehaviourState:
+    def state(self, now: int) -> BehaviourState:
+        """The report on the newest behaviour."""
         run = self._run
         if run is None:
             return BehaviourState(stamp=now, received=now, seq=0, frame="odom")
@@ -335,6 +328,15 @@ class BehaviourService:
             values=dict(run.values or {}),
         )
 
+    def register(self, rpc: RpcRegistry) -> None:
+        """Serve ``behave``, and ``behaviours``, the list of those configured."""
+
+        async def behaviours(_: dict[str, Any]) -> dict[str, Any]:
+            return {name: {"kind": one.kind, "doc": BEHAVIOURS[one.kind].doc} for name, one in self.configs.items()}
+
+        self.tasks.register(rpc, "behave", BehaviourRequest)
+        rpc.register("behaviours", behaviours, AccessRole.OBSERVER, recorded=False)
+
 
 def _with_settings(config: BehaviourConfig, settings: Mapping[str, Any]) -> BehaviourConfig:
     """Settings with those that are given for one run.
@@ -350,20 +352,3 @@ def _with_settings(config: BehaviourConfig, settings: Mapping[str, Any]) -> Beha
         return type(config).model_validate({**config.model_dump(), **settings})
     except ValidationError as error:
         raise InputError(first_mistake(error, "settings")) from None
-
-
-def register_behaviour_calls(rpc: RpcRegistry, service: BehaviourService) -> None:
-    """Serve ``behave``, whose payload is a ``BehaviourRequest``, and ``behaviours``, the list of those configured.
-
-    Args:
-        rpc: where.
-        service: what runs them.
-    """
-
-    async def behaviours(_: dict[str, Any]) -> dict[str, Any]:
-        return {
-            name: {"kind": config.kind, "doc": BEHAVIOURS[config.kind].doc} for name, config in service.configs.items()
-        }
-
-    register_numbered(rpc, "behave", BehaviourRequest, service.take)
-    rpc.register("behaviours", behaviours, AccessRole.OBSERVER, recorded=False)

@@ -13,19 +13,20 @@ from monstertruck_planners.explore.exchange import ExploreAnswer, ExploreSetup, 
 from monstertruck_planners.explore.exploration import Action, Cancel, Choose, Exploration, Go, Notice, Observed, Save
 from monstertruck_planners.goals.exchange import Pose, pose_of
 from monstertruck_planners.goals.service import GoalService
+from monstertruck_planners.tasks import TaskServer
 from monstertruck_runtime.actors.actor import Actor
 from monstertruck_runtime.clock import SECOND, Clock, Schedule
 from monstertruck_runtime.errors import RequestRefusedError, TruckError
 from monstertruck_runtime.mailbox import Mailbox
-from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
-from monstertruck_runtime.requests import Sequences, does_not_drive, examine, inner_request
+from monstertruck_runtime.ports import EventSink, Publisher, Ready, RpcRegistry, Subscription
+from monstertruck_runtime.requests import inner_request
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.event import Event, Severity
 from monstertruck_schemas.health import NO_PLACE, HealthTable, ServiceState, SlamHealth
 from monstertruck_schemas.plan import ExplorationPhase, ExplorationState, GoalPhase, GoalState
 from monstertruck_schemas.points import PointKind, PointsOfInterest
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import ExploreOrder, ExploreRequest, GoalControl, GoalOrder, GoalRequest
+from monstertruck_schemas.req import ExploreRequest, GoalControl, GoalOrder, GoalRequest
 from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.sensor import Battery, BatteryLevel
 from monstertruck_schemas.state import GateMode, GateState, Grid, Odometry
@@ -78,6 +79,8 @@ class ExplorerService:
     """
 
     name = SOURCE
+    noun = "exploration"
+    resumable = False
 
     def __init__(
         self,
@@ -93,12 +96,12 @@ class ExplorerService:
         events: EventSink,
     ) -> None:
         self._setup, self._config, self._clock, self._place = setup, setup.config, clock, actor
-        self._goals, self._save, self._max_age = goals, save, max_age
-        self._in, self._out, self._events = inputs, state, events
-        self._sequences = Sequences(max_age)
+        self._goals, self._save = goals, save
+        self._in, self._events = inputs, events
+        self.tasks = TaskServer[ExploreRequest, Pose, ExplorationState](
+            self, clock, inputs.gate, max_age, state, changes=CHANGES, period=REPORT, others=(inputs.goal,)
+        )
         self._run: Exploration | None = None
-        self._program: tuple[str, str | None] | None = None
-        """Which started it."""
         self._tiles: deque[Grid] = deque(maxlen=TILES)
         self._whole: Grid | None = None
         self._sent_whole: Grid | None = None
@@ -116,13 +119,12 @@ class ExplorerService:
         self._saves: int | None = None
         """Since when the map is being saved, ns."""
         self._cannot_save = False
-        self._reported: ExplorationState | None = None
 
     async def run(self, ready: Ready) -> None:
         """Serve until cancelled."""
         async with self._place as actor, asyncio.TaskGroup() as tasks:
             self._actor, self._tasks, self._fresh = actor, tasks, True
-            self._report(self._clock.now())
+            self.tasks.report()
             ready()
             schedule = Schedule(self._clock, RATE)
             try:
@@ -134,49 +136,56 @@ class ExplorerService:
 
     # Requests
 
-    def take(self, request: ExploreRequest) -> int:
-        """Carry out a request; returns the number of the exploration it started or ended.
+    @property
+    def running(self) -> bool:
+        """Whether an exploration runs."""
+        return self._run is not None and self._run.running
+
+    def accept(self, request: ExploreRequest) -> Pose:
+        """Where an exploration would begin.
 
         Raises:
-            RequestRefusedError: the sender may not, or it cannot be done now.
+            RequestRefusedError: the pose is not known, or the robot keeps no points of interest to be found.
         """
-        starts, now, run = request.order is ExploreOrder.START, self._clock.now(), self._run
-        gate = self._in.gate.latest
-        examine(request, gate, self._sequences, now, self._max_age if starts else None)
-        running = run is not None and run.running
-        if not starts:
-            if run is None or not running:
-                raise RequestRefusedError(Reason.NOT_FOUND, "no exploration is running")
-            if request.own and request.program != self._program:
-                raise RequestRefusedError(Reason.NOT_FOUND, f"the exploration of {run.source} is running")
-            self._do(exploration.stop(run, request.source, now / SECOND))
-            return run.number
-        if running and run is not None:
-            raise RequestRefusedError(Reason.BUSY, f"the exploration of {run.source} is running, stop it first")
-        goal = self._in.goal.latest
-        if goal is not None and goal.phase is not GoalPhase.IDLE:
-            raise RequestRefusedError(Reason.BUSY, f"goal {goal.number} of {goal.source} is pursued, cancel it first")
         if request.find is not None and self._in.points is None:
             raise RequestRefusedError(Reason.NOT_SUPPORTED, "this robot keeps no points of interest: section `points`")
-        if (pose := self._pose(now)) is None:
+        if (pose := self._pose(self._clock.now())) is None:
             raise RequestRefusedError(
                 Reason.NO_MAP, "no pose in a map yet; `monstertruckd status` shows if slam is ready"
             )
-        if gate is None or not gate.mode.active:  # the last one: for this a client arms it
-            raise does_not_drive(gate)
+        return pose
+
+    def begin(self, accepted: Pose, request: ExploreRequest, number: int) -> None:
+        """Explore from a pose on."""
         self._fresh, self._goal, self._refused, self._saves = True, None, None, None
         self._deciding = None  # of the exploration before: its answer is not one to this
+        goal, config = self._in.goal.latest, self._config
         self._others = 0 if goal is None else goal.number
-        self._program = request.program
-        home = self._config.home if request.home is None else request.home
-        number = 1 if run is None else run.number + 1
-        budget = request.budget or self._config.budget
         self._do(
             exploration.begin(
-                number, request.source, pose, now / SECOND, self._config, home=home, budget=budget, find=request.find
+                number,
+                request.source,
+                accepted,
+                self._clock.now() / SECOND,
+                config,
+                home=config.home if request.home is None else request.home,
+                budget=request.budget or config.budget,
+                find=request.find,
             )
         )
-        return number
+
+    def control(self, request: ExploreRequest) -> None:
+        """End the exploration; the map is saved first."""
+        assert self._run is not None
+        self._do(exploration.stop(self._run, request.source, self._clock.now() / SECOND))
+
+    def register(self, rpc: RpcRegistry) -> None:
+        """Serve ``explore``."""
+        self.tasks.register(rpc, "explore", ExploreRequest)
+
+    def state(self, now: int) -> ExplorationState:
+        """The report on the newest exploration."""
+        return state_of(self._run, self._config.kind, now)
 
     # Observations
 
@@ -188,7 +197,7 @@ class ExplorerService:
             self._do(exploration.tick(run, self._observe(now, saved, failure), self._config))
         run = self._run
         self._goals.hold(SOURCE, on=run is not None and run.running and run.phase is not ExplorationPhase.SAVING)
-        self._report(now)
+        self.tasks.report()
 
     def _keep_map(self) -> None:
         whole = self._in.grid.latest
@@ -300,7 +309,7 @@ class ExplorerService:
                 case Save():
                     self._saves, self._cannot_save = self._clock.now(), self._save is None or not self._save()
         if actions:
-            self._report(self._clock.now())
+            self.tasks.report()
 
     def _choose(self, run: Exploration) -> None:
         assert self._tasks is not None
@@ -348,7 +357,7 @@ class ExplorerService:
         x, y, yaw = pose
         self._refused = None
         try:
-            self._goal = self._goals.take(
+            self._goal = self._goals.tasks.take(
                 GoalRequest(**self._header(), frame="map", goal=Pose2D(x=x, y=y, yaw=math.remainder(yaw, math.tau)))
             )
         except RequestRefusedError as error:
@@ -362,16 +371,7 @@ class ExplorerService:
             return
         self._goal = None
         with suppress(RequestRefusedError):  # it has ended, or is somebody else's, since that was published
-            self._goals.control(GoalControl(**self._header(), order=GoalOrder.CANCEL, own=True))
-
-    def _report(self, now: int) -> None:
-        state = state_of(self._run, self._config.kind, now)
-        before = self._reported
-        unchanged = before is not None and all(getattr(before, name) == getattr(state, name) for name in CHANGES)
-        if before is not None and unchanged and (now - before.stamp < REPORT or not state.running):
-            return
-        self._reported = state.model_copy(update={"seq": self._out.next_seq()})
-        self._out.put(self._reported)
+            self._goals.tasks.take(GoalControl(**self._header(), order=GoalOrder.CANCEL, own=True))
 
 
 def state_of(run: Exploration | None, kind: str, now: int) -> ExplorationState:

@@ -3,8 +3,7 @@
 import asyncio
 import math
 from collections import deque
-from collections.abc import Callable
-from typing import Any, Final, TypeVar
+from typing import Any, Final
 
 import numpy as np
 
@@ -15,6 +14,7 @@ from monstertruck_planners.goals.deformation import RouteDeformation, event_of
 from monstertruck_planners.goals.exchange import (
     DeformAnswer,
     Finding,
+    Place,
     PlanAnswer,
     PlanTask,
     Pose,
@@ -36,16 +36,17 @@ from monstertruck_planners.goals.path_publisher import (
     path_blocked,
     poses_ahead,
 )
+from monstertruck_planners.tasks import TaskServer
 from monstertruck_runtime.actors.actor import Actor
 from monstertruck_runtime.clock import SECOND, Clock, Schedule
 from monstertruck_runtime.errors import RequestRefusedError, TruckError
 from monstertruck_runtime.ports import Ready, RpcRegistry
-from monstertruck_runtime.requests import Sequences, examine, parse_request
+from monstertruck_runtime.requests import parse_request
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.event import Severity
-from monstertruck_schemas.plan import MAX_COORDINATE, BehaviourState, GoalPhase, GoalState
+from monstertruck_schemas.plan import MAX_COORDINATE, GoalPhase, GoalState
 from monstertruck_schemas.reasons import Reason, in_words
-from monstertruck_schemas.req import GoalControl, GoalOrder, GoalRequest, Request
+from monstertruck_schemas.req import GoalControl, GoalOrder, GoalRequest
 from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.state import GateMode, GateState, Grid, Ground, Odometry
@@ -66,7 +67,8 @@ SEEN_TURN: Final = 0.4
 JUMP: Final = 0.5
 """Distance between the poses of two ticks that counts as a jump, m: the kept scans are dropped."""
 
-R = TypeVar("R", bound=Request)
+Route = tuple[Pose, tuple[Place, ...]]
+"""A goal, and what is passed before it."""
 
 
 class GoalService:
@@ -87,6 +89,8 @@ class GoalService:
     """
 
     name = ServiceName.GOALS.value
+    noun = "goal"
+    resumable = False
 
     def __init__(
         self,
@@ -101,16 +105,23 @@ class GoalService:
         deformation: RouteDeformation | None = None,
     ) -> None:
         self._setup, self._config, self._clock = setup, setup.config, clock
-        self._in, self._out, self._max_age = inputs, outputs, max_age
+        self._in, self._out = inputs, outputs
         self._place, self._deformation = actor, deformation
-        self._sequences = {"goal": Sequences(max_age), "goal_control": Sequences(max_age)}
+        self.tasks = TaskServer[GoalRequest | GoalControl, Route, GoalState](
+            self,
+            clock,
+            inputs.gate,
+            max_age,
+            outputs.state,
+            changes=CHANGES,
+            period=REPORT,
+            others=() if inputs.behaviour is None else (inputs.behaviour,),
+            replaces=True,
+            drives=lambda _: True,
+        )
         self._goal: GoalRun | None = None
-        self._program: tuple[str, str | None] | None = None
-        """Which sent it."""
-        self._number = 0
         self._held: set[str] = set()
         self._paths = PathPublisher(clock, inputs, outputs, deceleration)
-        self._reported: GoalState | None = None
         self._planning: asyncio.Task[PlanAnswer] | None = None
         self._actor: Actor | None = None
         self._trouble: TruckError | None = None
@@ -124,7 +135,6 @@ class GoalService:
         self._seen: deque[tuple[Pose, Array]] = deque(maxlen=SEEN)
         """Poses and returns in base of scans since the last plan."""
         self._before: Pose | None = None
-        self._changed = asyncio.Event()
 
     async def run(self, ready: Ready) -> None:
         """Serve goals until cancelled.
@@ -142,7 +152,7 @@ class GoalService:
                 self._actor, self._tasks, self._fresh, self._sent_grid = actor, tasks, True, None
                 if self._deformation is not None:
                     tasks.create_task(self._deformation.run(self._on_deformed))
-                self._report(self._clock.now())
+                self.tasks.report()
                 ready()
                 await self._serve()
 
@@ -156,25 +166,27 @@ class GoalService:
     # Requests
 
     def _take_requests(self) -> None:
-        for goal in self._in.goals.drain():
-            self._answer(self.take, goal, "goal")
-        for control in self._in.controls.drain():
-            self._answer(self.control, control, control.order)
+        """Carry out requests that came by topic: a refusal becomes an event."""
+        requests: list[GoalRequest | GoalControl] = [*self._in.goals.drain(), *self._in.controls.drain()]
+        for request in requests:
+            try:
+                self.tasks.take(request)
+            except RequestRefusedError as error:
+                name = request.order if isinstance(request, GoalControl) else self.noun
+                self._out.events(error.refusal, Severity.WARNING, request.source, f"{name} refused: {error}")
 
-    def _answer(self, handler: Callable[[R], object], request: R, name: str) -> None:
-        """Handle a request that came by topic: a refusal becomes an event."""
-        try:
-            handler(request)
-        except RequestRefusedError as error:
-            self._out.events(error.refusal, Severity.WARNING, request.source, f"{name} refused: {error}")
+    @property
+    def running(self) -> bool:
+        """Whether a goal is pursued."""
+        return self._goal is not None and self._goal.active
 
-    def take(self, request: GoalRequest) -> int:
-        """Accept a goal; returns its number. Its route is planned afterwards.
+    def accept(self, request: GoalRequest | GoalControl) -> Route:
+        """Check a goal, whose route is planned once it has begun.
 
         Raises:
-            RequestRefusedError: the sender is not permitted, the goal is not valid, or the emergency stop is latched.
+            RequestRefusedError: the goal is not valid, there is no planner or pose, or the emergency stop is latched.
         """
-        self._examine(request, "goal", moves=True)
+        assert isinstance(request, GoalRequest)
         if self._actor is None and self._trouble is not None:
             why = str(self._trouble).partition("\n")[0]
             raise RequestRefusedError(self._trouble.reason, f"the planner does not start: {why}")
@@ -197,25 +209,20 @@ class GoalService:
             raise RequestRefusedError(Reason.BAD_INPUT, f"goal: expected at most {MAX_COORDINATE:g} m and rad")
         if _estopped(self._in.gate.latest):
             raise RequestRefusedError(Reason.ESTOPPED)
+        return goal, via
+
+    def begin(self, accepted: Route, request: GoalRequest | GoalControl, number: int) -> None:
+        """Pursue a goal in place of the present one."""
         if self._goal is not None and self._goal.active:
             self._do(goal_run.order(self._goal, GoalOrder.CANCEL, request.source, self._seconds()))
         self._paths.end_other("standstill")
-        self._number, self._program = self._number + 1, request.program
-        self._do(goal_run.begin(self._number, goal, request.source, self._seconds(), via))
-        return self._number
+        goal, via = accepted
+        self._do(goal_run.begin(number, goal, request.source, self._seconds(), via))
 
-    def control(self, request: GoalControl) -> None:
-        """Pause, resume or cancel the present goal.
-
-        Raises:
-            RequestRefusedError: the sender is not permitted, or there is no goal.
-        """
-        self._examine(request, "goal_control", moves=request.order is GoalOrder.RESUME)
-        if self._goal is None or not self._goal.active:
-            raise RequestRefusedError(Reason.NOT_FOUND, f"{request.order}: no goal is being pursued")
-        if request.own and request.program != self._program:
-            text = f"{request.order}: goal {self._goal.number} of {self._goal.source} is pursued"
-            raise RequestRefusedError(Reason.NOT_FOUND, text)
+    def control(self, request: GoalRequest | GoalControl) -> None:
+        """Pause, resume or cancel the present goal."""
+        assert isinstance(request, GoalControl)
+        assert self._goal is not None
         if request.order is GoalOrder.RESUME and self._goal.phase is GoalPhase.PAUSED:
             self._paths.end_other("standstill")
         self._do(goal_run.order(self._goal, request.order, request.source, self._seconds()))
@@ -240,26 +247,13 @@ class GoalService:
         Raises:
             RequestRefusedError: none does, or another goal has taken its place.
         """
-        while (state := self._reported) is None or (state.number == number and _undecided(state)):
-            await self._changed.wait()
+        while (state := self.tasks.reported) is None or (state.number == number and _undecided(state)):
+            await self.tasks.next_report()
         if state.number != number:
             raise RequestRefusedError(Reason.CANCELLED, f"another goal of {state.source} took its place")
         if state.routes == 0 and state.phase is GoalPhase.IDLE:
             raise RequestRefusedError(state.outcome, state.text)
         return state
-
-    def _examine(self, request: Request, kind: str, *, moves: bool) -> None:
-        examine(
-            request, self._in.gate.latest, self._sequences[kind], self._clock.now(), self._max_age if moves else None
-        )
-        if moves and (behaviour := self._behaviour()) is not None:
-            text = f"the behaviour {behaviour.behaviour} of {behaviour.source} is running, stop it first"
-            raise RequestRefusedError(Reason.BUSY, text)
-
-    def _behaviour(self) -> BehaviourState | None:
-        """The behaviour that runs."""
-        state = None if self._in.behaviour is None else self._in.behaviour.latest
-        return state if state is not None and state.running else None
 
     # Observations
 
@@ -275,9 +269,9 @@ class GoalService:
                 self._do(goal_run.tick(run, self._observe(now), self._config))
             if self._goal is not None and self._goal.active and self._goal.phase is not GoalPhase.PAUSED:
                 self._paths.stand_still()
-        elif self._held and self._behaviour() is None:
+        elif self._held and self.tasks.other() is None:
             self._paths.stand_still()
-        self._report(now)
+        self.tasks.report()
 
     def _observe(self, now: int) -> Observations:
         odometry, gate, followed = self._odometry(now), self._in.gate.latest, self._paths.followed
@@ -365,7 +359,7 @@ class GoalService:
                 case Halt():
                     self._halt()
         if actions:
-            self._report(self._clock.now())
+            self.tasks.report()
 
     def _plan(self, run: GoalRun, plan: Plan) -> None:
         now = self._clock.now()
@@ -417,7 +411,7 @@ class GoalService:
             deformation.end()
             if run.planned == "route":
                 deformation.begin(answer)
-        self._paths.follow(answer, f"goal-{self._number}")
+        self._paths.follow(answer, f"goal-{run.number}")
 
     def _on_deformed(self, was: Finding, answer: DeformAnswer) -> None:
         """Follow the deformed route."""
@@ -425,7 +419,7 @@ class GoalService:
         assert deformation is not None
         if followed is None or run is None or run.phase is GoalPhase.BACKING_OUT:
             return
-        before, name = followed.before + followed.along(self._in.tracker.latest), f"goal-{self._number}"
+        before, name = followed.before + followed.along(self._in.tracker.latest), f"goal-{run.number}"
         if answer.path is not None:
             self._paths.follow(answer.path, f"{name}-deformed", before)
         elif answer.finding == "free" and was not in ("idle", "free"):
@@ -439,22 +433,34 @@ class GoalService:
     def _halt(self) -> None:
         if self._deformation is not None:
             self._deformation.end()
-        self._paths.halt(f"halt-{self._number}")
+        self._paths.halt(f"halt-{0 if self._goal is None else self._goal.number}")
 
-    def _report(self, now: int) -> None:
+    def state(self, now: int) -> GoalState:
+        """The report on the newest goal."""
         left = 0.0 if self._deformation is None else self._deformation.left
-        state = goal_state(self._goal, now, self._paths.followed, self._in, left)
-        before = self._reported
-        unchanged = before is not None and all(getattr(before, name) == getattr(state, name) for name in CHANGES)
-        if before is not None and unchanged and (now - before.stamp < REPORT or state.phase is GoalPhase.IDLE):
-            return
-        self._reported = state.model_copy(update={"seq": self._out.state.next_seq()})
-        self._out.state.put(self._reported)
-        changed, self._changed = self._changed, asyncio.Event()
-        changed.set()
+        return goal_state(self._goal, now, self._paths.followed, self._in, left)
 
     def _seconds(self) -> float:
         return self._clock.now() / SECOND
+
+    def register(self, rpc: RpcRegistry) -> None:
+        """Serve ``goal``, answered once the first route is known, and ``goal_control``."""
+
+        async def goal(payload: dict[str, Any]) -> dict[str, Any]:
+            number = self.tasks.take(parse_request(GoalRequest, payload))
+            try:
+                async with self._clock.deadline(FIRST_ROUTE):
+                    state = await self.settled(number)
+            except TimeoutError:
+                return {"number": number, "planned": False}
+            return {"number": number, "planned": True, "length": state.remaining}
+
+        async def control(payload: dict[str, Any]) -> dict[str, Any]:
+            self.tasks.take(parse_request(GoalControl, payload))
+            return {}
+
+        rpc.register("goal", goal)
+        rpc.register("goal_control", control)
 
 
 def _estopped(gate: GateState | None) -> bool:
@@ -508,29 +514,3 @@ def goal_state(
         routes=run.routes,
         recoveries=run.recoveries,
     )
-
-
-def register_goal_calls(rpc: RpcRegistry, service: GoalService, clock: Clock) -> None:
-    """Serve ``goal`` and ``goal_control``; their payloads are a ``GoalRequest`` and a ``GoalControl``.
-
-    Args:
-        rpc: where.
-        service: what pursues goals.
-        clock: time.
-    """
-
-    async def goal(payload: dict[str, Any]) -> dict[str, Any]:
-        number = service.take(parse_request(GoalRequest, payload))
-        try:
-            async with clock.deadline(FIRST_ROUTE):
-                state = await service.settled(number)
-        except TimeoutError:
-            return {"number": number, "planned": False}
-        return {"number": number, "planned": True, "length": state.remaining}
-
-    async def control(payload: dict[str, Any]) -> dict[str, Any]:
-        service.control(parse_request(GoalControl, payload))
-        return {}
-
-    rpc.register("goal", goal)
-    rpc.register("goal_control", control)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, assert_never
+from typing import Any, Final, TypeVar, assert_never
 
 from monstertruck_planners.behave.service import BehaviourService
 from monstertruck_planners.explore.service import ExplorerService
@@ -21,11 +21,12 @@ from monstertruck_planners.missions.progress import (
     after,
     outcome,
 )
+from monstertruck_planners.tasks import R, TaskServer
 from monstertruck_runtime.clock import SECOND, Clock, Schedule
 from monstertruck_runtime.errors import InputError, NotFoundError, RequestRefusedError, TruckError, disk_reason
 from monstertruck_runtime.outside import contents, reading
-from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
-from monstertruck_runtime.requests import Sequences, does_not_drive, examine, inner_request
+from monstertruck_runtime.ports import EventSink, Publisher, Ready, RpcRegistry, Subscription
+from monstertruck_runtime.requests import does_not_drive, inner_request
 from monstertruck_runtime.small_files import remove_file, replace_file
 from monstertruck_runtime.threads import Offload
 from monstertruck_schemas.base import Pose2D
@@ -44,7 +45,7 @@ from monstertruck_schemas.mission import (
     ReturnStep,
     WaitStep,
 )
-from monstertruck_schemas.plan import BehaviourState, ExplorationState, GoalPhase, GoalState, MissionState
+from monstertruck_schemas.plan import BehaviourState, ExplorationState, GoalPhase, GoalState, MissionState, TaskState
 from monstertruck_schemas.points import PointsOfInterest
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import (
@@ -62,6 +63,8 @@ from monstertruck_schemas.req import (
 from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.state import GateState, Odometry
 from monstertruck_schemas.topics import ODOMETRY
+
+T = TypeVar("T", GoalState, ExplorationState, BehaviourState)
 
 SOURCE: Final = ServiceName.MISSIONS.value
 """Source of the goals, behaviours and explorations of a mission."""
@@ -131,6 +134,7 @@ class MissionService:
     """
 
     name = SOURCE
+    noun = "mission"
 
     def __init__(
         self,
@@ -147,13 +151,20 @@ class MissionService:
     ) -> None:
         self._parts, self._clock, self._file, self._offload = parts, clock, file, offload
         self._localised = localised
-        self._max_age, self._in, self._out, self._events = max_age, inputs, state, events
-        self._sequences = Sequences(max_age)
+        self._in, self._events = inputs, events
+        self.tasks = TaskServer[MissionRequest, MissionProgress, MissionState](
+            self,
+            clock,
+            inputs.gate,
+            max_age,
+            state,
+            changes=CHANGES,
+            period=REPORT,
+            others=(inputs.goal, inputs.behaviour, inputs.explore),
+            own=OWN,
+        )
         self._seq = 0
-        self._number = 0
         self._source = ""
-        self._program: tuple[str, str | None] | None = None
-        """Which started it."""
         self._progress: MissionProgress | None = None
         self._began = 0
         self._end: StepEnd | None = None
@@ -170,8 +181,7 @@ class MissionService:
         self._noted: Pose | None = None
         """Where the robot was when that was last kept."""
         self._task: asyncio.Task[None] | None = None
-        self._tasks: asyncio.TaskGroup | None = None
-        self._reported: MissionState | None = None
+        self._group: asyncio.TaskGroup | None = None
 
     async def run(self, ready: Ready) -> None:
         """Serve until cancelled; what runs then can be resumed after a restart."""
@@ -182,61 +192,65 @@ class MissionService:
         if (saved := self._interrupted) is not None:
             text = f"{saved.mission.name} was interrupted {_where(saved)}; it can be resumed"
             self._events(Reason.MISSION_INCOMPLETE, Severity.WARNING, SOURCE, text)
-        async with asyncio.TaskGroup() as tasks:
-            self._tasks = tasks
-            self._report(self._clock.now())
+        async with asyncio.TaskGroup() as self._group:
+            self.tasks.report()
             ready()
             schedule = Schedule(self._clock, RATE)
             try:
                 while True:
                     await schedule.next()
-                    self._report(self._clock.now())
+                    self.tasks.report()
                     await self._note_place()
             finally:
                 self._parts.goals.hold(SOURCE, on=False)
 
     # Requests
 
-    def take(self, request: MissionRequest) -> int:
-        """Carry out a request; returns the number of the mission it started or ended.
+    @property
+    def running(self) -> bool:
+        """Whether a mission is being done."""
+        return self._task is not None and not self._task.done()
+
+    @property
+    def resumable(self) -> bool:
+        """Whether a restart interrupted one."""
+        return self._interrupted is not None
+
+    def accept(self, request: MissionRequest) -> MissionProgress:
+        """Check a mission and where the robot is; returns what is to be done of it.
 
         Raises:
-            RequestRefusedError: the sender may not, or it cannot be done now.
+            RequestRefusedError: the pose is not known, or the robot is not where the mission was interrupted.
             NotFoundError: steps need what the robot does not have.
             InputError: a start without a mission, or steps with settings that their behaviours do not take.
         """
-        starts, now, gate = request.order is not MissionOrder.STOP, self._clock.now(), self._in.gate.latest
-        examine(request, gate, self._sequences, now, self._max_age if starts else None)
-        running = self._task is not None and not self._task.done()
-        if not starts:
-            if request.own and not (running and request.program == self._program):
-                raise RequestRefusedError(Reason.NOT_FOUND, f"no mission of {request.source} is running")
-            if running and self._task is not None:
-                self._stop(self._task, request.source)
-            elif self._interrupted is not None:
-                self._drop(self._interrupted, request.source)
-            else:
-                raise RequestRefusedError(Reason.NOT_FOUND, "no mission is running")
-            return self._number
-        if running:
-            raise RequestRefusedError(Reason.BUSY, f"the mission of {self._source} is running, stop it first")
-        if (other := self._other()) is not None:
-            raise RequestRefusedError(Reason.BUSY, f"{other}, stop it first")
-        progress = self._begin(request)
+        progress = self._progress_of(request)
         self._check(progress.mission)
-        if gate is None or not gate.mode.active:  # the last one: for this a client arms it
-            raise does_not_drive(gate)
-        assert self._tasks is not None
-        self._number, self._source, self._progress = self._number + 1, request.source, progress
-        self._program, self._began, self._end = request.program, now, None
+        return progress
+
+    def begin(self, accepted: MissionProgress, request: MissionRequest, number: int) -> None:
+        """Do a mission from its present step on."""
+        assert self._group is not None
+        self._source, self._progress = request.source, accepted
+        self._began, self._end = self._clock.now(), None
         self._interrupted, self._failed = None, ""
-        text = f"{progress.mission.name}, {len(progress.mission.steps)} steps, asked for by {request.source}"
-        if progress.index > 0:
-            text += f", from step {progress.index + 1} on"
+        text = f"{accepted.mission.name}, {len(accepted.mission.steps)} steps, asked for by {request.source}"
+        if accepted.index > 0:
+            text += f", from step {accepted.index + 1} on"
         self._events(Reason.MISSION_STARTED, Severity.INFO, SOURCE, text)
-        self._keeping = self._tasks.create_task(self._save(progress))
-        self._task = self._tasks.create_task(self._do_all(progress))
-        return self._number
+        self._keeping = self._group.create_task(self._save(accepted))
+        self._task = self._group.create_task(self._do_all(accepted))
+
+    def control(self, request: MissionRequest) -> None:
+        """Stop the mission, or give up the one that was interrupted."""
+        if self._task is not None and self.running:
+            self._stop(self._task, request.source)
+        elif self._interrupted is not None:
+            self._drop(self._interrupted, request.source)
+
+    def register(self, rpc: RpcRegistry) -> None:
+        """Serve ``mission``, answered once the request outlasts a restart."""
+        self.tasks.register(rpc, "mission", MissionRequest, self.kept)
 
     async def kept(self) -> None:
         """Wait until the newest request outlasts a restart, or could not be written, which an event reports."""
@@ -245,22 +259,21 @@ class MissionService:
 
     def _stop(self, task: asyncio.Task[None], source: str) -> None:
         """End the mission that ``task`` does; its end may have been reported already."""
-        assert self._tasks is not None
+        assert self._group is not None
         if self._end is not None:
             return
         self._finish(StepEnd(Reason.CANCELLED, f"stopped by {source}"))
         task.cancel()
-        self._keeping = self._tasks.create_task(self._forget())
+        self._keeping = self._group.create_task(self._forget())
 
     def _drop(self, interrupted: SavedProgress, source: str) -> None:
         """Forget a mission that nobody wants to resume."""
-        assert self._tasks is not None
+        assert self._group is not None
         self._interrupted = None
         self._events(Reason.CANCELLED, Severity.INFO, SOURCE, f"{interrupted.mission.name}: given up by {source}")
-        self._keeping = self._tasks.create_task(self._forget())
-        self._report(self._clock.now())
+        self._keeping = self._group.create_task(self._forget())
 
-    def _begin(self, request: MissionRequest) -> MissionProgress:
+    def _progress_of(self, request: MissionRequest) -> MissionProgress:
         resumed = self._interrupted if request.order is MissionOrder.RESUME else None
         if resumed is None and request.order is MissionOrder.RESUME:
             raise RequestRefusedError(Reason.NOT_FOUND, "no mission was interrupted")
@@ -315,7 +328,7 @@ class MissionService:
         try:
             while following in ("step", "again", "return"):
                 self._progress, self._waits = progress, ""
-                self._report(self._clock.now())
+                self.tasks.report()
                 step = ReturnStep(do="return") if progress.returning else progress.step
                 at = f"step {progress.index + 1} of {len(progress.mission.steps)}: {progress.doing}"
                 self._events(Reason.MISSION_STEP, Severity.INFO, SOURCE, at)
@@ -339,7 +352,7 @@ class MissionService:
         severity = Severity.INFO if end.reason.exit_code == 0 else Severity.WARNING
         self._end = end
         self._events(end.reason, severity, SOURCE, end.text)
-        self._report(self._clock.now())
+        self.tasks.report()
 
     async def _limited(self, step: AnyStep, progress: MissionProgress) -> StepEnd:
         if step.limit is None:
@@ -384,7 +397,7 @@ class MissionService:
     async def _wait(self, seconds: float) -> StepEnd:
         until = self._clock.now() + round(seconds * SECOND)
         while (left := until - self._clock.now()) > 0:
-            if (other := self._other()) is not None:
+            if (other := self.tasks.other()) is not None:
                 return StepEnd(Reason.CANCELLED, other)
             gate = self._in.gate.latest
             if gate is None or not gate.mode.active:
@@ -420,27 +433,87 @@ class MissionService:
 
     async def _go(self, where: Callable[[], Pose], via: tuple[tuple[float, float], ...] = ()) -> StepEnd:
         waypoints = tuple(Waypoint(x=a, y=b) for a, b in via)
-        goals = self._parts.goals
 
-        def take() -> int:
+        def start() -> GoalRequest | GoalControl:
             x, y, yaw = where()
             goal = Pose2D(x=x, y=y, yaw=math.remainder(yaw, math.tau))
-            return goals.take(GoalRequest(**self._header(), frame="map", goal=goal, waypoints=waypoints))
+            return GoalRequest(**self._header(), frame="map", goal=goal, waypoints=waypoints)
 
-        number = await self._taken(take)
+        def stop() -> GoalRequest | GoalControl:
+            return GoalControl(**self._header(), order=GoalOrder.CANCEL, own=True)
 
-        def end() -> StepEnd | None:
-            goal = self._in.goal.latest
-            if goal is None or goal.number < number:
+        return await self._task_of(self._parts.goals.tasks, start, stop, self._in.goal)
+
+    async def _explore(self, step: ExploreStep) -> StepEnd:
+        assert self._parts.explorer is not None
+        what: dict[str, Any] = {"home": step.home, "budget": step.budget, "find": step.find}
+
+        def start() -> ExploreRequest:
+            return ExploreRequest(**self._header(), order=ExploreOrder.START, **what)
+
+        def stop() -> ExploreRequest:
+            return ExploreRequest(**self._header(), order=ExploreOrder.STOP, own=True)
+
+        return await self._task_of(self._parts.explorer.tasks, start, stop, self._in.explore)
+
+    async def _behave(self, name: str, settings: dict[str, Any], distance: float | None) -> StepEnd:
+        assert self._parts.behaviours is not None
+        what: dict[str, Any] = {"behaviour": name, "settings": settings}
+
+        def start() -> BehaviourRequest:
+            return BehaviourRequest(**self._header(), order=BehaviourOrder.START, **what)
+
+        def stop() -> BehaviourRequest:
+            stopping: dict[str, Any] = {"order": BehaviourOrder.STOP, "behaviour": name, "own": True}
+            return BehaviourRequest(**self._header(), **stopping)
+
+        def enough(state: BehaviourState) -> StepEnd | None:
+            if distance is None or state.travelled < distance:
                 return None
-            if goal.number > number:
-                return StepEnd(Reason.CANCELLED, f"the goal of {goal.source} is pursued now")
-            return StepEnd(goal.outcome, goal.text) if goal.phase is GoalPhase.IDLE else None
+            return StepEnd(Reason.BEHAVIOUR_DONE, f"{state.travelled:.2f} m")
 
-        def stop() -> None:
-            goals.control(GoalControl(**self._header(), order=GoalOrder.CANCEL, own=True))
+        return await self._task_of(self._parts.behaviours.tasks, start, stop, self._in.behaviour, enough)
 
-        return await self._until(end, stop, self._in.goal)
+    async def _task_of(
+        self,
+        server: TaskServer[R, Any, Any],
+        start: Callable[[], R],
+        stop: Callable[[], R],
+        reports: Subscription[T],
+        enough: Callable[[T], StepEnd | None] = lambda _: None,
+    ) -> StepEnd:
+        """Have another service do a task, and return how it ended.
+
+        Args:
+            server: of its kind of task.
+            start: makes the request.
+            stop: makes the request to stop it, which is sent when this is cancelled, out of time, or ``enough``.
+            reports: of that service.
+            enough: the end of a running one that has done what is wanted.
+
+        Raises:
+            TruckError: it was refused.
+        """
+        number = await self._taken(lambda: server.take(start()))
+        schedule, newest, silent = Schedule(self._clock, RATE), reports.latest, 0
+        ended: StepEnd | None = None
+        try:
+            while (ended := _end_of(reports.latest, number, server.noun)) is None:
+                state = reports.latest
+                if state is not None and state.number == number and (done := enough(state)) is not None:
+                    return done
+                # Counted by checks: while this process stands, as in a suspended computer, nobody can report.
+                self._wait_for_resume()
+                silent = silent + 1 if state is newest else 0
+                newest = state
+                if silent > SILENT * RATE:
+                    return StepEnd(Reason.SERVICE_FAILED, f"nothing was reported on it for {SILENT:g} s")
+                await schedule.next()
+        finally:
+            if ended is None:
+                with contextlib.suppress(TruckError):
+                    server.take(stop())
+        return ended
 
     async def _taken(self, take: Callable[[], int]) -> int:
         """Number of what ``take`` requests; it is requested again while what refuses it passes.
@@ -450,7 +523,7 @@ class MissionService:
         """
         until, refused = self._clock.now() + PATIENCE * SECOND, False
         while True:
-            if (other := self._other()) is not None:
+            if (other := self.tasks.other()) is not None:
                 raise RequestRefusedError(Reason.CANCELLED, other)
             try:
                 number = take()
@@ -463,86 +536,6 @@ class MissionService:
                     self._waits = str(error)
                 refused = True
             await self._clock.sleep(AGAIN)
-
-    def _other(self) -> str | None:
-        """What somebody else has the robot do."""
-        goal, behaviour, exploration = self._in.goal.latest, self._in.behaviour.latest, self._in.explore.latest
-        if goal is not None and goal.phase is not GoalPhase.IDLE and goal.source not in OWN:
-            return f"goal {goal.number} of {goal.source} is pursued"
-        if behaviour is not None and behaviour.running and behaviour.source != SOURCE:
-            return f"the behaviour {behaviour.behaviour} of {behaviour.source} is running"
-        if exploration is not None and exploration.running and exploration.source != SOURCE:
-            return f"the exploration of {exploration.source} is running"
-        return None
-
-    async def _explore(self, step: ExploreStep) -> StepEnd:
-        explorer = self._parts.explorer
-        assert explorer is not None
-        what: dict[str, Any] = {"home": step.home, "budget": step.budget, "find": step.find}
-        number = await self._taken(
-            lambda: explorer.take(ExploreRequest(**self._header(), order=ExploreOrder.START, **what))
-        )
-
-        def end() -> StepEnd | None:
-            state = self._in.explore.latest
-            if state is None or state.number < number:
-                return None
-            if state.number > number:
-                return StepEnd(Reason.CANCELLED, f"{state.source} started another exploration")
-            return None if state.running else StepEnd(state.outcome, state.text)
-
-        def stop() -> None:
-            explorer.take(ExploreRequest(**self._header(), order=ExploreOrder.STOP, own=True))
-
-        return await self._until(end, stop, self._in.explore)
-
-    async def _behave(self, name: str, settings: dict[str, Any], distance: float | None) -> StepEnd:
-        behaviours = self._parts.behaviours
-        assert behaviours is not None
-        what: dict[str, Any] = {"behaviour": name, "settings": settings}
-        number = await self._taken(
-            lambda: behaviours.take(BehaviourRequest(**self._header(), order=BehaviourOrder.START, **what))
-        )
-
-        def stop() -> None:
-            stopping: dict[str, Any] = {"order": BehaviourOrder.STOP, "behaviour": name, "own": True}
-            behaviours.take(BehaviourRequest(**self._header(), **stopping))
-
-        def end() -> StepEnd | None:
-            state = self._in.behaviour.latest
-            if state is None or state.number < number:
-                return None
-            if state.number > number:
-                return StepEnd(Reason.CANCELLED, f"{state.source} started another behaviour")
-            if not state.running:
-                return StepEnd(state.outcome, state.text)
-            if distance is None or state.travelled < distance:
-                return None
-            stop()
-            return StepEnd(Reason.BEHAVIOUR_DONE, f"{state.travelled:.2f} m")
-
-        return await self._until(end, stop, self._in.behaviour)
-
-    async def _until(
-        self, end: Callable[[], StepEnd | None], stop: Callable[[], object], reports: Subscription[Any]
-    ) -> StepEnd:
-        """Wait for an end; cancelled, out of time or without ``reports``, have it stopped."""
-        schedule, newest, silent = Schedule(self._clock, RATE), reports.latest, 0
-        ended: StepEnd | None = None
-        try:
-            while (ended := end()) is None:
-                # Counted by checks: while this process stands, as in a suspended computer, nobody can report.
-                self._wait_for_resume()
-                silent = silent + 1 if reports.latest is newest else 0
-                newest = reports.latest
-                if silent > SILENT * RATE:
-                    return StepEnd(Reason.SERVICE_FAILED, f"nothing was reported on it for {SILENT:g} s")
-                await schedule.next()
-        finally:
-            if ended is None:
-                with contextlib.suppress(TruckError):
-                    stop()
-        return ended
 
     def _wait_for_resume(self) -> None:
         """Have the step's limit not run while its goal is paused; called with every check."""
@@ -604,17 +597,9 @@ class MissionService:
 
     # Reports
 
-    def _report(self, now: int) -> None:
-        state = self._state(now)
-        before = self._reported
-        unchanged = before is not None and all(getattr(before, name) == getattr(state, name) for name in CHANGES)
-        if before is not None and unchanged and (now - before.stamp < REPORT or not state.running):
-            return
-        self._reported = state.model_copy(update={"seq": self._out.next_seq()})
-        self._out.put(self._reported)
-
-    def _state(self, now: int) -> MissionState:
-        header: dict[str, Any] = {"stamp": now, "received": now, "seq": 0, "frame": "map", "number": self._number}
+    def state(self, now: int) -> MissionState:
+        """The report on the newest mission."""
+        header: dict[str, Any] = {"stamp": now, "received": now, "seq": 0, "frame": "map", "number": self.tasks.number}
         if self._interrupted is not None:
             saved = self._interrupted
             return MissionState(
@@ -632,6 +617,15 @@ class MissionService:
             outcome=Reason.DRIVING if end is None else end.reason, text=self._waits if end is None else end.text,
             elapsed=(now - self._began) / SECOND,
         )  # fmt: skip
+
+
+def _end_of(state: TaskState | None, number: int, noun: str) -> StepEnd | None:
+    """How task ``number`` of a kind ended, by the newest report; None while it runs."""
+    if state is None or state.number < number:
+        return None
+    if state.number > number:
+        return StepEnd(Reason.CANCELLED, f"{state.source} started another {noun}")
+    return None if state.running else StepEnd(state.outcome, state.text)
 
 
 def _where(saved: SavedProgress) -> str:

@@ -183,17 +183,16 @@ class PathService:
             raise RequestRefusedError(Reason.BUSY, f"the robot is {gate.mode}, stop it first")
         behaviour = self._behaviour.latest
         if behaviour is not None and behaviour.running:
-            raise RequestRefusedError(Reason.BUSY, f"the behaviour {behaviour.behaviour} is running, stop it first")
+            raise RequestRefusedError(Reason.BUSY, f"{behaviour.activity}, stop it first")
 
     def _publish(self, path: Path) -> None:
         now = self._clock.now()
         self._out.put(path.model_copy(update={"stamp": now, "received": now, "seq": self._out.next_seq()}))
 
+    def register(self, rpc: RpcRegistry) -> None:
+        """Serve ``start_path``, whose payload is a ``PathStart``; the answer has the ``path`` that is followed."""
 
-def register_path_calls(rpc: RpcRegistry, service: PathService) -> None:
-    """Serve ``start_path``, whose payload is a ``PathStart``; the answer has the ``path`` that is followed."""
+        async def start_path(payload: dict[str, Any]) -> dict[str, Any]:
+            return {"path": self.start(parse_request(PathStart, payload))}
 
-    async def start_path(payload: dict[str, Any]) -> dict[str, Any]:
-        return {"path": service.start(parse_request(PathStart, payload))}
-
-    rpc.register("start_path", start_path)
+        rpc.register("start_path", start_path)

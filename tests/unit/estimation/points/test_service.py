@@ -17,7 +17,6 @@ from monstertruck_estimation.points.service import (
     PointFolders,
     PointInputs,
     PointService,
-    register_point_calls,
 )
 from monstertruck_runtime.actors.actor import LoopActor
 from monstertruck_runtime.clock import run_virtual
@@ -67,7 +66,7 @@ class Rig:
             events=lambda reason, *args, **_: self.events.append((reason, args[-1])),
             folders=PointFolders(load=load, save=folder), offload=inline, max_age=5.0,
         )  # fmt: skip
-        register_point_calls(self.calls, self.service)
+        self.service.register(self.calls)
 
     async def drive(self, seconds: float, *, tilt: float = 0.0, show: bytes = SEEN) -> None:
         for i in range(round(seconds / 0.05)):

@@ -20,7 +20,7 @@ from monstertruck_schemas.event import Event, Severity
 from monstertruck_schemas.health import ServiceHealth, ServiceState
 from monstertruck_schemas.plan import GoalPhase, GoalState
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import ExploreOrder, ExploreRequest
+from monstertruck_schemas.req import ExploreOrder, ExploreRequest, GoalControl
 from monstertruck_schemas.state import GateMode, GateState, Odometry
 
 DECIDING = 0.3
@@ -131,51 +131,27 @@ def test_a_goal_that_has_ended_since_the_newest_report_is_not_cancelled_once_mor
     goal = GoalState(stamp=0, received=0, seq=0, frame="map", number=3, source="explorer", phase=GoalPhase.DRIVING)
     service._in = SimpleNamespace(goal=SimpleNamespace(latest=goal), gate=SimpleNamespace(latest=None))
     service._seq, service._goal, service._clock = 0, 3, SimpleNamespace(now=lambda: 0)
-    service._goals = SimpleNamespace(control=control)
+    service._goals = SimpleNamespace(tasks=SimpleNamespace(take=control))
     service._cancel()
     assert service._goal is None
 
 
-def test_a_robot_is_only_said_to_be_disarmed_if_nothing_else_is_in_the_way(monkeypatch: pytest.MonkeyPatch):
-    service = ExplorerService.__new__(ExplorerService)
-    monkeypatch.setattr("monstertruck_planners.explore.service.examine", lambda *_: None)
-    disarmed = SimpleNamespace(mode=SimpleNamespace(active=False), worst=Reason.DISARMED, why="")
-    pose = (1.0, 2.0, 0.0)
-    service._pose = lambda _: pose
-    service._run, service._clock, service._sequences, service._max_age = None, SimpleNamespace(now=lambda: 0), None, 0.5
-    service._in = SimpleNamespace(gate=SimpleNamespace(latest=disarmed), goal=SimpleNamespace(latest=None), points=None)
+def test_what_an_exploration_needs_is_checked_before_it_begins():
+    service, pose = ExplorerService.__new__(ExplorerService), (1.0, 2.0, 0.0)
+    service._pose, service._clock = lambda _: pose, SimpleNamespace(now=lambda: 0)
+    service._in = SimpleNamespace(points=None)
 
-    def start(**more: int) -> Reason:
-        with pytest.raises(RequestRefusedError) as refused:
-            service.take(ExploreRequest(**inner_request(1, None, 0, "ann"), order=ExploreOrder.START, **more))
-        return refused.value.refusal
+    def start(**more: int) -> ExploreRequest:
+        return ExploreRequest(**inner_request(1, None, 0, "ann"), order=ExploreOrder.START, **more)
 
-    assert start() is Reason.DISARMED
-    assert start(find=3) is Reason.NOT_SUPPORTED
+    assert service.accept(start()) == pose
+    with pytest.raises(RequestRefusedError) as refused:
+        service.accept(start(find=3))
+    assert refused.value.refusal is Reason.NOT_SUPPORTED
     pose = None
-    assert start() is Reason.NO_MAP
-
-
-def test_who_stops_only_its_own_stops_nobody_elses(monkeypatch: pytest.MonkeyPatch):
-    service, ended = ExplorerService.__new__(ExplorerService), []
-    monkeypatch.setattr("monstertruck_planners.explore.service.examine", lambda *_: None)
-    monkeypatch.setattr("monstertruck_planners.explore.service.exploration.stop", lambda _, source, __: source)
-    service._run = SimpleNamespace(running=True, source="ann", number=1)
-    service._program, service._do = ("ann", "one"), ended.append
-    service._in, service._clock = SimpleNamespace(gate=SimpleNamespace(latest=None)), SimpleNamespace(now=lambda: 0)
-    service._sequences, service._max_age = None, 0.5
-
-    def stop(source: str, instance: str) -> None:
-        header = inner_request(1, None, 0, source) | {"instance": instance}
-        service.take(ExploreRequest(**header, order=ExploreOrder.STOP, own=True))
-
-    for program in (("bob", "one"), ("ann", "another")):
-        with pytest.raises(RequestRefusedError, match="the exploration of ann is running") as refused:
-            stop(*program)
-        assert refused.value.refusal is Reason.NOT_FOUND
-    assert ended == []
-    stop("ann", "one")
-    assert ended == ["ann"]
+    with pytest.raises(RequestRefusedError) as refused:
+        service.accept(start())
+    assert refused.value.refusal is Reason.NO_MAP
 
 
 def test_the_answer_to_a_question_of_the_exploration_before_is_none():
@@ -192,8 +168,8 @@ def test_the_answer_to_a_question_of_the_exploration_before_is_none():
         none = newest(latest=None)
         service = ExplorerService(
             ExploreSetup(InformationConfig(), Footprint(), 0.5), clock, worker,
-            newest(take=lambda goal: sent.append(goal.goal.x) or len(sent), control=lambda _: None,
-                   hold=lambda *_, **__: None),
+            newest(tasks=newest(take=lambda asked: isinstance(asked, GoalControl) or sent.append(asked.goal.x)
+                                or len(sent)), hold=lambda *_, **__: None),
             None, max_age=1.0,
             inputs=ExplorerInputs(
                 gate=Live(gate, clock), pose=Live(pose, clock), goal=none, grid=none, tiles=Mailbox(fifo(8)),
@@ -205,7 +181,7 @@ def test_the_answer_to_a_question_of_the_exploration_before_is_none():
 
         def order(what: ExploreOrder, seq: int) -> None:
             header = inner_request(seq, service._in.gate.latest, clock.now(), "ann")
-            service.take(ExploreRequest(**header, order=what))
+            service.tasks.take(ExploreRequest(**header, order=what))
 
         running = asyncio.create_task(service.run(lambda: None))
         await clock.sleep(0.1)

@@ -17,29 +17,29 @@ from monstertruck_runtime.clock import run_virtual
 from monstertruck_runtime.errors import InputError, RequestRefusedError, WorkerError
 from monstertruck_runtime.mailbox import Mailbox, latest
 from monstertruck_runtime.requests import inner_request
+from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.plan import GoalPhase, GoalState
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import GoalControl, GoalOrder
+from monstertruck_schemas.req import GoalRequest
 from tests.unit.planners.kit import scanned_on_the_move
+
+GOAL = GoalRequest(**inner_request(1, None, 0, "ann"), goal=Pose2D(x=1.0, y=0.0, yaw=0.0))
 
 
 @pytest.mark.parametrize(
     ("actor", "reason", "text"),
     [(None, Reason.PLANNER_STARTING, "the planner is starting"), (object(), Reason.NO_MAP, "no pose yet")],
 )
-def test_a_goal_that_comes_too_early_is_refused_by_what_is_missing(
-    actor: object, reason: Reason, text: str, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_goal_that_comes_too_early_is_refused_by_what_is_missing(actor: object, reason: Reason, text: str):
     service = GoalService.__new__(GoalService)
-    monkeypatch.setattr(service, "_examine", lambda *_, **__: None)
     service._actor, service._trouble = actor, None
     service._in = SimpleNamespace(pose=SimpleNamespace(latest=None), slam=None)
     with pytest.raises(RequestRefusedError, match=text) as refused:
-        service.take(None)
+        service.accept(GOAL)
     assert refused.value.refusal is reason
 
 
-def test_a_planner_that_cannot_start_is_not_said_to_be_starting(monkeypatch: pytest.MonkeyPatch):
+def test_a_planner_that_cannot_start_is_not_said_to_be_starting():
     error = "worker goals raised ImportError: libLLVM.so: cannot open"
 
     class Broken:
@@ -53,60 +53,23 @@ def test_a_planner_that_cannot_start_is_not_said_to_be_starting(monkeypatch: pyt
             raise WorkerError(f"{error}\nTraceback (most recent call last):")
 
     service = GoalService.__new__(GoalService)
-    monkeypatch.setattr(service, "_examine", lambda *_, **__: None)
     service._place, service._actor, service._trouble = Broken(), None, None
     with pytest.raises(WorkerError):
         asyncio.run(service.run(lambda: pytest.fail("it is not ready")))
     with pytest.raises(RequestRefusedError, match=rf"^the planner does not start: {error}$") as refused:
-        service.take(None)
+        service.accept(GOAL)
     assert refused.value.refusal is Reason.WORKER_DIED
-
-
-def test_a_running_behaviour_excludes_a_goal_and_lets_one_be_cancelled(monkeypatch: pytest.MonkeyPatch):
-    service = GoalService.__new__(GoalService)
-    monkeypatch.setattr("monstertruck_planners.goals.service.examine", lambda *_: None)
-    running = SimpleNamespace(running=True, behaviour="wall", source="ann")
-    service._in = SimpleNamespace(behaviour=SimpleNamespace(latest=running), gate=SimpleNamespace(latest=None))
-    service._sequences, service._max_age = {"goal": None}, 0.5
-    service._clock = SimpleNamespace(now=lambda: 0)
-    with pytest.raises(RequestRefusedError, match="the behaviour wall of ann is running") as refused:
-        service._examine(None, "goal", moves=True)
-    assert refused.value.refusal is Reason.BUSY
-    service._examine(None, "goal", moves=False)
-    running.running = False
-    service._examine(None, "goal", moves=True)
-
-
-def test_who_cancels_only_its_own_cancels_nobody_elses(monkeypatch: pytest.MonkeyPatch):
-    service, done = GoalService.__new__(GoalService), []
-    monkeypatch.setattr(service, "_examine", lambda *_, **__: None)
-    monkeypatch.setattr("monstertruck_planners.goals.service.goal_run.order", lambda _, what, *__: what)
-    service._goal, service._program = SimpleNamespace(active=True, number=3, source="ann"), ("ann", "one")
-    service._do, service._clock = done.append, SimpleNamespace(now=lambda: 0)
-
-    def cancel(source: str, instance: str) -> None:
-        header = inner_request(1, None, 0, source) | {"instance": instance}
-        service.control(GoalControl(**header, order=GoalOrder.CANCEL, own=True))
-
-    for program in (("bob", "one"), ("ann", "another")):
-        with pytest.raises(RequestRefusedError, match="goal 3 of ann is pursued") as refused:
-            cancel(*program)
-        assert refused.value.refusal is Reason.NOT_FOUND
-    assert done == []
-    cancel("ann", "one")
-    assert done == [GoalOrder.CANCEL]
 
 
 def test_who_holds_the_truck_between_goals_does_not_stop_a_behaviour():
     still = []
     service = GoalService.__new__(GoalService)
     service._goal, service._held = None, {"missions"}
-    service._keep_scan = service._report = lambda _: None
+    service._keep_scan, behaviour = lambda _: None, None
+    service.tasks = SimpleNamespace(report=lambda: None, other=lambda: behaviour)
     service._paths = SimpleNamespace(stand_still=lambda: still.append(1))
-    state = SimpleNamespace(running=False)
-    service._in = SimpleNamespace(behaviour=SimpleNamespace(latest=state))
     service._tick(0)
-    state.running = True
+    behaviour = "the behaviour wall of ann is running"
     service._tick(1)
     assert still == [1]
 
@@ -114,13 +77,13 @@ def test_who_holds_the_truck_between_goals_does_not_stop_a_behaviour():
 def test_who_waits_for_the_way_to_a_goal_is_not_informed_of_another_goals_way():
     async def main() -> None:
         service = GoalService.__new__(GoalService)
-        service._changed = asyncio.Event()
+        changed = asyncio.Event()
         state = GoalState(stamp=0, received=0, seq=0, frame="map", number=1, phase=GoalPhase.PLANNING)
-        service._reported = state
+        service.tasks = SimpleNamespace(reported=state, next_report=changed.wait)
         waiting = asyncio.create_task(service.settled(1))
         await asyncio.sleep(0)
-        service._reported = state.model_copy(update={"number": 2})
-        service._changed.set()
+        service.tasks.reported = state.model_copy(update={"number": 2})
+        changed.set()
         with pytest.raises(RequestRefusedError, match="another goal") as refused:
             await waiting
         assert refused.value.refusal is Reason.CANCELLED

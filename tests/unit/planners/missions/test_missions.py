@@ -20,7 +20,7 @@ from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.mission import Mission
 from monstertruck_schemas.plan import BehaviourState, ExplorationPhase, ExplorationState, GoalPhase, GoalState
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import BehaviourOrder, GoalOrder, MissionOrder, MissionRequest, Role
+from monstertruck_schemas.req import BehaviourOrder, GoalControl, GoalOrder, MissionOrder, MissionRequest, Role
 
 GO = {"do": "goto", "x": 1.0, "y": 0.0, "yaw": 0.0}
 WAIT = {"do": "wait", "seconds": 3.0}
@@ -129,8 +129,10 @@ def test_a_line_says_all_that_a_step_does():
 class Behaviours:
     """A robot that is busy at first, and whose behaviours take a second."""
 
+    noun = "behaviour"
+
     def __init__(self, robot: "Pretended", busy: int) -> None:
-        self._robot, self._busy, self.asked = robot, busy, []
+        self._robot, self._busy, self.asked, self.tasks = robot, busy, [], self
 
     def take(self, request) -> int:
         assert request.own is (request.order is BehaviourOrder.STOP)
@@ -161,9 +163,12 @@ class Behaviours:
 class Pretended:
     """A robot whose goals end on request."""
 
+    noun = "goal"
+
     def __init__(
         self, clock: VirtualClock, file: Path | None = None, *, localised: bool = False, busy: int = 0, offload=inline
     ) -> None:
+        self.tasks = self
         self.clock, self.number, self.reached = clock, 0, [Reason.GOAL_REACHED] * 99
         topics = ("gate", "pose", "goal", "behaviour", "explore", "points", "slam")
         self.latest = dict.fromkeys(topics)
@@ -185,7 +190,12 @@ class Pretended:
         return type("Box", (), {"latest": property(lambda _: self.latest[name])})()
 
     def take(self, request):
-        """As the goal service."""
+        """As the goal service's task server."""
+        if isinstance(request, GoalControl):
+            assert (request.order, request.own) == (GoalOrder.CANCEL, True)
+            self.task.cancel()
+            self._say(GoalPhase.IDLE, Reason.CANCELLED)
+            return self.number
         if self.refusals:
             raise self.refusals.pop(0)
         self.number += 1
@@ -193,11 +203,6 @@ class Pretended:
         self._say(GoalPhase.DRIVING, Reason.DRIVING)
         self.task = asyncio.get_running_loop().call_later(2.0, self._say, GoalPhase.IDLE, self.reached.pop(0))
         return self.number
-
-    def control(self, request):
-        assert (request.order, request.own) == (GoalOrder.CANCEL, True)
-        self.task.cancel()
-        self._say(GoalPhase.IDLE, Reason.CANCELLED)
 
     def hold(self, who: str, *, on: bool):
         (self.held.add if on else self.held.discard)(who)
@@ -220,7 +225,7 @@ class Pretended:
             stamp=now, received=now, seq=self.seq, source=source, role=Role.STATION, lease=1.0, nonce="n",
             gate_stamp=now, order=order, moved=moved, own=own, mission=mission(*steps, **more) if steps else None,
         )  # fmt: skip
-        return self.service.take(request)
+        return self.service.tasks.take(request)
 
 
 def played(story, file: Path | None = None, **more) -> Pretended:
@@ -472,11 +477,11 @@ def test_who_stops_only_its_own_ends_no_mission_of_others_and_gives_none_up(tmp_
     file.write_text(SavedProgress.of(progress(GO), "ann").model_dump_json())
 
     async def story(robot: Pretended) -> None:
-        with pytest.raises(RequestRefusedError, match="no mission of ann is running"):
+        with pytest.raises(RequestRefusedError, match="no mission is running"):
             robot.order(MissionOrder.STOP, own=True)
         robot.order(MissionOrder.RESUME)
         await robot.clock.sleep(0.5)
-        with pytest.raises(RequestRefusedError, match="no mission of bob is running") as refused:
+        with pytest.raises(RequestRefusedError, match="the mission of ann is running") as refused:
             robot.order(MissionOrder.STOP, own=True, source="bob")
         assert refused.value.refusal is Reason.NOT_FOUND
         assert robot.reports[-1].running

@@ -1,0 +1,203 @@
+"""Tasks: what the robot does on request until it ends, one of each kind at a time.
+
+A goal, an exploration, a mission and a behaviour (a move is one) are tasks. Every service that does one kind is a
+`Task`; its `TaskServer` does what is the same for all of them, in this order:
+
+1. A request is examined: who may ask, whether it is fresh, whether its number has been used.
+2. To start one, nothing else may drive the robot, the service must `accept` the request, and the robot must be armed.
+   That is checked last: a client arms a robot that is refused for nothing else.
+3. It gets the next number and `begin` runs. From then on the service reports by `state`, which the server publishes at
+   once when something of interest changes, and otherwise periodically.
+4. Pause, resume and stop go to `control`; a program may ask for its own task only.
+
+An emergency stop ends a task through the gate's state, which each service observes. A task that a restart interrupted
+is `resumable` where the service keeps its progress.
+"""
+
+import asyncio
+from collections import defaultdict
+from collections.abc import Awaitable, Callable, Collection
+from operator import attrgetter
+from typing import Final, Generic, Protocol, TypeVar
+
+from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.errors import RequestRefusedError
+from monstertruck_runtime.ports import Publisher, RpcRegistry, Subscription
+from monstertruck_runtime.requests import Sequences, does_not_drive, examine, register_numbered
+from monstertruck_schemas.plan import (
+    BehaviourState,
+    ExplorationState,
+    GoalState,
+    MissionState,
+    TaskState,
+)
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import (
+    BehaviourRequest,
+    ExploreRequest,
+    GoalControl,
+    GoalRequest,
+    MissionRequest,
+    Verb,
+)
+from monstertruck_schemas.state import GateMode, GateState
+
+R = TypeVar("R", GoalRequest | GoalControl, BehaviourRequest, ExploreRequest, MissionRequest)
+S = TypeVar("S", GoalState, BehaviourState, ExplorationState, MissionState)
+P = TypeVar("P")
+R_contra = TypeVar("R_contra", contravariant=True)
+S_co = TypeVar("S_co", covariant=True)
+
+Rival = Subscription[GoalState] | Subscription[BehaviourState] | Subscription[ExplorationState]
+NOBODY: Final[frozenset[str]] = frozenset()
+
+
+class Task(Protocol[R_contra, P, S_co]):
+    """One kind of task, as the service that does it tells its server."""
+
+    noun: str
+    """What one is called in messages, such as "exploration"."""
+
+    @property
+    def running(self) -> bool:
+        """Whether one runs."""
+
+    @property
+    def resumable(self) -> bool:
+        """Whether a restart of the daemon interrupted one, which can be resumed or given up."""
+
+    def accept(self, request: R_contra) -> P:
+        """Check a request to start one; nothing has changed if it is refused.
+
+        Raises:
+            TruckError: it cannot be done now, or not at all.
+        """
+
+    def begin(self, accepted: P, request: R_contra, number: int) -> None:
+        """Start what was accepted."""
+
+    def control(self, request: R_contra) -> None:
+        """Pause, resume or stop the one that runs, or give up the one that can be resumed.
+
+        Raises:
+            RequestRefusedError: why not.
+        """
+
+    def state(self, now: int) -> S_co:
+        """The report at ``now``, ns, with sequence number 0."""
+
+
+class TaskServer(Generic[R, P, S]):
+    """Starts, stops and reports the tasks of one kind.
+
+    Args:
+        task: the service that does them.
+        clock: time.
+        gate: newest state of the gate.
+        max_age: see ``GateConfig.max_request_age``.
+        out: where they are reported.
+        changes: fields of the report whose change is published at once.
+        period: between reports of a running task without a change, ns.
+        others: reports on tasks that exclude these.
+        own: sources whose tasks do not exclude them.
+        replaces: a new task replaces the running one instead of being refused.
+        drives: modes of the gate in which one can be started.
+    """
+
+    def __init__(
+        self,
+        task: Task[R, P, S],
+        clock: Clock,
+        gate: Subscription[GateState],
+        max_age: float,
+        out: Publisher[S],
+        *,
+        changes: tuple[str, ...],
+        period: int,
+        others: tuple[Rival, ...] = (),
+        own: Collection[str] = NOBODY,
+        replaces: bool = False,
+        drives: Callable[[GateMode], bool] = attrgetter("active"),
+    ) -> None:
+        self._task: Task[R, P, S] = task
+        self._out: Publisher[S] = out
+        self._clock, self._gate, self._max_age = clock, gate, max_age
+        self._changes, self._period, self._others, self._own = changes, period, others, own
+        self._replaces, self._drives = replaces, drives
+        self.noun = task.noun
+        self._sequences: defaultdict[type, Sequences] = defaultdict(lambda: Sequences(max_age))
+        self._program: tuple[str, str | None] | None = None
+        self._changed = asyncio.Event()
+        self.number = 0
+        """Of the newest task."""
+        self.reported: S | None = None
+        """Newest report."""
+
+    def take(self, request: R) -> int:
+        """Carry out a request; returns the number of the task that it starts, or is about.
+
+        Raises:
+            RequestRefusedError: the sender may not, or it cannot be done now.
+            TruckError: the service does not accept it.
+        """
+        gate, verb = self._gate.latest, request.verb
+        limit = self._max_age if verb.moves else None
+        examine(request, gate, self._sequences[type(request)], self._clock.now(), limit)
+        if verb.moves:
+            self._require_free(verb)
+        if verb is Verb.START:
+            self._start(request, gate)
+        else:
+            self._require_present(request)
+            self._task.control(request)
+        self.report()
+        return self.number
+
+    def other(self) -> str | None:
+        """What another source has the robot do, in words."""
+        states: list[TaskState | None] = [topic.latest for topic in self._others]
+        running = (state for state in states if state is not None and state.running and state.source not in self._own)
+        return next((state.activity for state in running), None)
+
+    def report(self) -> None:
+        """Publish the state if it has changed, or is due."""
+        now, before = self._clock.now(), self.reported
+        state = self._task.state(now)
+        same = before is not None and all(getattr(before, name) == getattr(state, name) for name in self._changes)
+        if before is not None and same and (not state.running or now - before.stamp < self._period):
+            return
+        self.reported = state.model_copy(update={"seq": self._out.next_seq()})
+        self._out.put(self.reported)
+        changed, self._changed = self._changed, asyncio.Event()
+        changed.set()
+
+    async def next_report(self) -> None:
+        """Wait until something is reported."""
+        await self._changed.wait()
+
+    def register(
+        self, rpc: RpcRegistry, call: str, model: type[R], kept: Callable[[], Awaitable[object]] | None = None
+    ) -> None:
+        """Serve the remote ``call``; see ``register_numbered``."""
+        register_numbered(rpc, call, model, self.take, kept)
+
+    def _start(self, request: R, gate: GateState | None) -> None:
+        accepted = self._task.accept(request)
+        if gate is None or not self._drives(gate.mode):
+            raise does_not_drive(gate)
+        self.number, self._program = self.number + 1, request.program
+        self._task.begin(accepted, request, self.number)
+
+    def _require_free(self, verb: Verb) -> None:
+        activity = self.other()
+        if activity is None and verb is Verb.START and self._task.running and not self._replaces:
+            activity = self._task.state(self._clock.now()).activity
+        if activity is not None:
+            raise RequestRefusedError(Reason.BUSY, f"{activity}, stop it first")
+
+    def _require_present(self, request: R) -> None:
+        """Require a task for the request to be about, of the same program if it says so."""
+        if not self._task.running and (request.own or not self._task.resumable):
+            raise RequestRefusedError(Reason.NOT_FOUND, f"no {self._task.noun} is running")
+        if request.own and request.program != self._program:
+            raise RequestRefusedError(Reason.NOT_FOUND, self._task.state(self._clock.now()).activity)
