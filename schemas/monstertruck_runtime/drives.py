@@ -1,10 +1,14 @@
-"""One drive to a goal or along a path, as a client of the robot: from the request to how it ended."""
+"""A task or a drive along a path, as a client of the robot: from the request to how it ended.
+
+`run_task` is the one session of all clients with a goal, an exploration, a mission or a behaviour: it starts the task,
+arms the robot if it may, follows the reports and stops what it started when it is cancelled or the robot falls silent.
+"""
 
 import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Sequence
 from contextlib import asynccontextmanager, suppress
 from dataclasses import asdict, dataclass
-from typing import Any, Final
+from typing import Any, Final, Generic, TypeVar
 
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import SECOND, Clock
@@ -14,12 +18,22 @@ from monstertruck_runtime.presence import while_it_runs
 from monstertruck_runtime.requests import Operator
 from monstertruck_runtime.standstill import StandstillMonitor, monitor_standstill
 from monstertruck_schemas.event import Event, Severity
-from monstertruck_schemas.plan import GoalPhase, GoalState, Path, TrackerState
+from monstertruck_schemas.plan import (
+    BehaviourState,
+    ExplorationState,
+    GoalState,
+    MissionState,
+    Path,
+    TrackerState,
+)
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import GoalOrder
 from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.state import GateState
-from monstertruck_schemas.topics import EVENT, GOAL, PATH, TRACKER
+from monstertruck_schemas.topics import EVENT, GOAL, PATH, TRACKER, Topic
+
+S = TypeVar("S", GoalState, ExplorationState, MissionState, BehaviourState)
+E = TypeVar("E")
 
 LOOK: Final = 0.5
 """Half the period of reports why the truck stands, s."""
@@ -65,6 +79,72 @@ class Arrival:
         return asdict(self)
 
 
+@dataclass(frozen=True, slots=True)
+class TaskEnd(Generic[S]):
+    """How a task ended."""
+
+    reason: Reason
+    text: str
+    state: S | None
+    """Newest report on it."""
+
+
+async def run_task(
+    client: Operator,
+    topic: Topic[S],
+    needs: ServiceName,
+    start: Callable[[], Awaitable[dict[str, Any]]],
+    stop: Callable[[], Awaitable[object]],
+    show: Callable[[S], object],
+    *,
+    arm: bool,
+    waits: bool = False,
+    report: DriveReport | None = None,
+    clock: Clock | None = None,
+    to_its_end: bool = False,
+) -> TaskEnd[S]:
+    """Start a task and wait for its end; cancelled or without an answer, it is stopped, but nobody else's.
+
+    Args:
+        client: who starts it.
+        topic: of its reports.
+        needs: the service that does it.
+        start: asks for it; the answer has its ``number``.
+        stop: stops it, if this client started it.
+        show: gets every report.
+        arm: arm a robot that is disarmed.
+        waits: a task of this kind is accepted by a disarmed robot, and waits until it is armed.
+        report: is told why the robot stands, by ``clock``.
+        clock: time.
+        to_its_end: one that is cancelled ends as any other does, once the robot has stopped it.
+
+    Raises:
+        RequestRefusedError: the start or the arming was refused, the service failed, or the robot restarted.
+        NoAnswerError: the robot does not answer, or has been silent for a minute.
+    """
+    with client.subscribe(topic, fifo(256)) as states, monitor_standstill(client) as stand:
+        async with taken_back(stop):
+            number = int((await begun(client, start, stop, arm=arm and not waits))["number"])
+        async with reported(stand, clock, report):
+            return await _watched(
+                client, stand, needs, arm=arm and waits, end=lambda: _task_end(states, number, show), undo=stop,
+                to_its_end=to_its_end,
+            )  # fmt: skip
+
+
+async def _task_end(states: Mailbox[S], number: int, show: Callable[[S], object]) -> TaskEnd[S]:
+    last: S | None = None
+    async for state in states:
+        if state.number > number:
+            return TaskEnd(Reason.CANCELLED, f"{state.source} started another one", last)
+        if state.number == number:
+            show(state)
+            last = state
+            if not state.running:
+                return TaskEnd(state.outcome, state.text, state)
+    raise NoAnswerError("the link to the robot was closed")
+
+
 async def drive_to(
     driver: TruckClient,
     clock: Clock,
@@ -74,21 +154,22 @@ async def drive_to(
     arm: bool,
     report: DriveReport = SILENT,
 ) -> Arrival:
-    """Send a goal and wait for its end; cancelled or without an answer, it cancels the goal, but nobody else's.
+    """Send a goal and wait for its end. Raises as ``run_task`` does."""
+    length = 0.0
 
-    Raises:
-        RequestRefusedError: the goal or the arming was refused, the goal service failed, or the robot restarted.
-        NoAnswerError: the robot does not answer, or has been silent for a minute.
-    """
-    with driver.subscribe(GOAL, fifo(256)) as states, monitor_standstill(driver) as stand:
+    def show(state: GoalState) -> None:
+        nonlocal length
+        length = length or state.remaining
+        if length and state.running:
+            report.under_way("to the goal", max(1.0 - state.remaining / length, 0.0))
 
-        async def cancel() -> None:
-            await driver.goal_control(GoalOrder.CANCEL, own=True)
-
-        async with taken_back(cancel):
-            number = await _taken_on(driver, clock, goal, via, report)
-        end = _goal_end(states, number, report)
-        return await _watched(driver, clock, stand, ServiceName.GOALS, arm=arm, end=end, undo=cancel, report=report)
+    end = await run_task(
+        driver, GOAL, ServiceName.GOALS, lambda: _taken_on(driver, clock, goal, via, report),
+        lambda: driver.goal_control(GoalOrder.CANCEL, own=True), show, arm=arm, waits=True,
+        report=report, clock=clock,
+    )  # fmt: skip
+    state = end.state or GoalState(stamp=0, received=0, seq=0)
+    return Arrival(end.reason, end.text, length, state.elapsed, state.routes, state.recoveries)
 
 
 async def _taken_on(
@@ -97,8 +178,8 @@ async def _taken_on(
     goal: tuple[float, float, float],
     via: Sequence[tuple[float, ...]],
     report: DriveReport,
-) -> int:
-    """Number of the goal; while the planner is starting it is sent again and again.
+) -> dict[str, Any]:
+    """Answer to the goal; while the planner is starting it is sent again and again.
 
     Raises:
         RequestRefusedError: for another reason, or the planner takes longer than ``PLANNER_START``.
@@ -107,7 +188,7 @@ async def _taken_on(
     began = clock.now()
     while True:
         try:
-            return int((await driver.goal(goal, via=via))["number"])
+            return await driver.goal(goal, via=via)
         except RequestRefusedError as refused:
             waited = (clock.now() - began) / SECOND
             if refused.refusal is not Reason.PLANNER_STARTING or waited > PLANNER_START:
@@ -125,21 +206,6 @@ async def taken_back(undo: Callable[[], Awaitable[object]]) -> AsyncIterator[Non
         with suppress(TruckError):
             await undo()
         raise
-
-
-async def _goal_end(states: Mailbox[GoalState], number: int, report: DriveReport) -> Arrival:
-    length = 0.0
-    async for state in states:
-        if state.number > number:
-            return Arrival(Reason.CANCELLED, f"{state.source} sent another goal", length, 0.0)
-        if state.number < number:
-            continue
-        if state.phase is GoalPhase.IDLE:
-            return Arrival(state.outcome, state.text, length, state.elapsed, state.routes, state.recoveries)
-        length = length or state.remaining
-        if length:
-            report.under_way("to the goal", max(1.0 - state.remaining / length, 0.0))
-    raise NoAnswerError("the link to the robot was closed")
 
 
 async def follow(driver: TruckClient, clock: Clock, path: Path, *, arm: bool, report: DriveReport = SILENT) -> Arrival:
@@ -168,9 +234,12 @@ async def follow(driver: TruckClient, clock: Clock, path: Path, *, arm: bool, re
             if _followed(present, path.name):
                 await driver.stop()
 
-        end = _path_end(clock, states, present, path.name, report)
         try:
-            return await _watched(driver, clock, stand, ServiceName.TRACKER, arm=arm, end=end, undo=stop, report=report)
+            async with reported(stand, clock, report):
+                return await _watched(
+                    driver, stand, ServiceName.TRACKER, arm=arm, undo=stop,
+                    end=lambda: _path_end(clock, states, present, path.name, report),
+                )  # fmt: skip
         finally:
             if _followed(present, path.name):
                 with suppress(TruckError):
@@ -204,8 +273,11 @@ async def drive_configured(
             if _followed(present, followed):
                 await driver.stop()
 
-        end = _first(_path_end(clock, states, present, followed, report), _disarmed(clock, stand))
-        return await _watched(driver, clock, stand, ServiceName.TRACKER, arm=False, end=end, undo=stop, report=report)
+        async with reported(stand, clock, report):
+            return await _watched(
+                driver, stand, ServiceName.TRACKER, arm=False, undo=stop,
+                end=lambda: _first(_path_end(clock, states, present, followed, report), _disarmed(clock, stand)),
+            )  # fmt: skip
 
 
 async def begun(
@@ -338,19 +410,17 @@ async def _path_end(
 
 
 async def _watched(
-    driver: TruckClient,
-    clock: Clock,
+    driver: Operator,
     stand: StandstillMonitor,
     needs: ServiceName,
     *,
     arm: bool,
-    end: Awaitable[Arrival],
+    end: Callable[[], Awaitable[E]],
     undo: Callable[[], Awaitable[object]],
-    report: DriveReport,
-) -> Arrival:
-    """Wait for the end and report why the truck stands meanwhile; ``undo`` if cancelled or refused."""
-    watching = asyncio.create_task(_say_why_it_stands(stand, clock, report))
-    ending = asyncio.ensure_future(while_it_runs(driver, end, needs))
+    to_its_end: bool = False,
+) -> E:
+    """Wait for the end; ``undo`` if cancelled or refused, but not of a robot that restarted: it may go on with it."""
+    ending = asyncio.ensure_future(while_it_runs(driver, end(), needs))
     try:
         if arm and not ((state := stand.gate.latest) is not None and state.mode.active):
             # A truck that is armed already may have set off.
@@ -360,20 +430,35 @@ async def _watched(
             except RequestRefusedError as error:
                 raise RequestRefusedError(error.refusal, f"arm refused: {error}") from None
         return await ending
-    except TruckError:
-        with suppress(TruckError):  # that it failed says more than that it cannot be taken back either
-            await undo()
+    except TruckError as error:
+        if not isinstance(error, RequestRefusedError) or error.refusal is not Reason.SHUTDOWN:
+            with suppress(TruckError):  # that it failed says more than that it cannot be taken back either
+                await undo()
         raise
-    except BaseException:
+    except BaseException as error:
         try:
             await undo()
         except RequestRefusedError as refused:
             if refused.refusal is not Reason.NOT_FOUND:  # it has just ended by itself
                 raise
+        if to_its_end and isinstance(error, asyncio.CancelledError):
+            return await while_it_runs(driver, end(), needs)
         raise
     finally:
-        watching.cancel()
         ending.cancel()
+
+
+@asynccontextmanager
+async def reported(stand: StandstillMonitor, clock: Clock | None, report: DriveReport | None) -> AsyncIterator[None]:
+    """Tell ``report`` meanwhile why the truck stands."""
+    watching = None
+    if clock is not None and report is not None:
+        watching = asyncio.create_task(_say_why_it_stands(stand, clock, report))
+    try:
+        yield
+    finally:
+        if watching is not None:
+            watching.cancel()
 
 
 async def _say_why_it_stands(stand: StandstillMonitor, clock: Clock, report: DriveReport) -> None:

@@ -1,30 +1,24 @@
 """A behaviour, an exploration or a mission from its start to its end, as a client of the robot."""
 
-import asyncio
-from collections.abc import Awaitable, Callable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Final, TypeVar
+from typing import Any, Final
 
 from monstertruck_runtime.client import TruckClient
-from monstertruck_runtime.drives import begun
-from monstertruck_runtime.errors import NoAnswerError, TruckError
-from monstertruck_runtime.mailbox import Mailbox, fifo
-from monstertruck_runtime.presence import while_it_runs
+from monstertruck_runtime.drives import TaskEnd, run_task
 from monstertruck_runtime.requests import Operator
 from monstertruck_runtime.standstill import StandstillMonitor, monitor_standstill
 from monstertruck_schemas.mission import Mission
-from monstertruck_schemas.plan import BehaviourState, ExplorationPhase, ExplorationState, MissionState
+from monstertruck_schemas.plan import ExplorationPhase, ExplorationState, MissionState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import BehaviourOrder, ExploreOrder, MissionOrder
 from monstertruck_schemas.roles import ServiceName
-from monstertruck_schemas.topics import BEHAVIOUR, EXPLORE, MISSION, Topic
+from monstertruck_schemas.topics import BEHAVIOUR, EXPLORE, MISSION
 from monstertruckd.tools.cli.output import progress, with_remedy
 
 EVERY: Final = 5.0
 """Seconds between two lines on an exploration that does the same all the time."""
 
-S = TypeVar("S", BehaviourState, ExplorationState, MissionState)
 Report = Callable[[str], object]
 """Gets a line of progress now and then."""
 
@@ -38,24 +32,30 @@ class RunEnd:
     figures: dict[str, Any]
     """Figures of its last report: seconds ``elapsed``, and what else its kind has."""
 
+    @classmethod
+    def of(cls, end: TaskEnd[Any], *figures: str) -> "RunEnd":
+        """With these figures of a task's last report."""
+        state = end.state
+        return cls(end.reason, end.text, {} if state is None else {name: getattr(state, name) for name in figures})
+
     def as_json(self) -> dict[str, Any]:
         """Everything as plain data."""
         return {"reason": self.reason, "text": self.text, **self.figures}
 
 
 async def run_behaviour(client: Operator, name: str, *, arm: bool, settings: Mapping[str, Any] | None = None) -> RunEnd:
-    """Start a behaviour and wait for its end, see ``_run``; ``settings`` replace the configured ones."""
+    """Start a behaviour and wait for its end, see ``run_task``; ``settings`` replace the configured ones."""
     with progress(name) as bar:
-        return await _run(
+        end = await run_task(
             client,
             BEHAVIOUR,
             ServiceName.BEHAVIOURS,
             lambda: client.behave(BehaviourOrder.START, name, settings),
             lambda: client.behave(BehaviourOrder.STOP, name, own=True),
             lambda state: bar(state.elapsed, f"{name}: {state.phase or 'begins'}, {state.travelled:.1f} m"),
-            ("behaviour", "elapsed", "travelled", "values"),
             arm=arm,
         )
+    return RunEnd.of(end, "behaviour", "elapsed", "travelled", "values")
 
 
 async def run_exploration(
@@ -67,7 +67,7 @@ async def run_exploration(
     arm: bool,
     report: Report | None = None,
 ) -> RunEnd:
-    """Start an exploration and wait for its end, see ``_run``; its arguments are those of ``TruckClient.explore``.
+    """Start an exploration and wait for its end, see ``run_task``; its arguments are those of ``TruckClient.explore``.
 
     Cancelled, it waits until the map is saved, and its end says where.
     """
@@ -84,23 +84,23 @@ async def run_exploration(
             report(progress_line(state, stands))
 
     with monitor_standstill(client) as stand:
-        return await _run(
+        end = await run_task(
             client,
             EXPLORE,
             ServiceName.EXPLORER,
             lambda: client.explore(ExploreOrder.START, home=home, budget=budget, find=find),
             lambda: client.explore(ExploreOrder.STOP, own=True),
             show,
-            ("elapsed", "travelled", "known", "goals", "found"),
             arm=arm,
             to_its_end=True,
         )
+    return RunEnd.of(end, "elapsed", "travelled", "known", "goals", "found")
 
 
 async def run_mission(
     client: TruckClient, mission: Mission | None, *, arm: bool, moved: bool = False, report: Report | None = None
 ) -> RunEnd:
-    """Start a mission and wait for its end, see ``_run``.
+    """Start a mission and wait for its end, see ``run_task``.
 
     Args:
         client: of the robot.
@@ -133,16 +133,16 @@ async def run_mission(
             report(f"{state.elapsed:6.0f} s  {line}")
 
     with monitor_standstill(client) as stand:
-        return await _run(
+        end = await run_task(
             client,
             MISSION,
             ServiceName.MISSIONS,
             lambda: client.mission(order, mission, moved=moved),
             lambda: client.mission(MissionOrder.STOP, own=True),
             show,
-            ("name", "elapsed", "step", "failures"),
             arm=arm,
         )
+    return RunEnd.of(end, "name", "elapsed", "step", "failures")
 
 
 def _failed(before: MissionState, state: MissionState) -> list[str]:
@@ -155,53 +155,6 @@ def _why_it_stands(stand: StandstillMonitor) -> str:
     """Why the gate lets the robot not drive, and the command that helps; nothing where it does."""
     why, held = stand.why(), stand.gate.latest
     return with_remedy(held.worst, why) if why and held is not None else ""
-
-
-async def _run(
-    client: Operator,
-    topic: Topic[S],
-    needs: ServiceName,
-    start: Callable[[], Awaitable[dict[str, Any]]],
-    stop: Callable[[], Awaitable[object]],
-    show: Callable[[S], None],
-    figures: tuple[str, ...],
-    *,
-    arm: bool,
-    to_its_end: bool = False,
-) -> RunEnd:
-    """Start a run and wait for its end; cancelled or without an answer, it is stopped, but nobody else's.
-
-    With ``to_its_end`` one that is cancelled ends as any other does, once the robot has stopped it.
-
-    Raises:
-        RequestRefusedError: the start or the arming was refused, the service failed, or the robot restarted.
-        NoAnswerError: the robot does not answer, or has been silent for a minute.
-    """
-    with client.subscribe(topic, fifo(256)) as states:
-        number: int | None = None
-        try:
-            number = int((await begun(client, start, stop, arm=arm))["number"])
-            return await while_it_runs(client, _followed(states, number, show, figures), needs)
-        except BaseException as error:
-            if not isinstance(error, TruckError) or isinstance(error, NoAnswerError):
-                with suppress(TruckError):
-                    await stop()
-                    if to_its_end and number is not None and isinstance(error, asyncio.CancelledError):
-                        return await while_it_runs(client, _followed(states, number, show, figures), needs)
-            raise
-
-
-async def _followed(states: Mailbox[S], number: int, show: Callable[[S], None], figures: tuple[str, ...]) -> RunEnd:
-    last: dict[str, Any] = {}
-    async for state in states:
-        if state.number > number:
-            return RunEnd(Reason.CANCELLED, f"{state.source} started another one", last)
-        if state.number == number:
-            show(state)
-            last = {name: getattr(state, name) for name in figures}
-            if not state.running:
-                return RunEnd(state.outcome, state.text, last)
-    raise NoAnswerError("the link to the robot was closed")
 
 
 def progress_line(state: ExplorationState, stands: str = "") -> str:
