@@ -209,15 +209,18 @@ def _prepare(ranges, start, increment, shortest, longest, beam_time, mount, twis
     normals = np.empty((n, 2))
     variances = np.empty((n, 2))
     extents = np.zeros(n)
+    joined = np.zeros(n + 1, np.bool_)  # with the point before
+    for i in range(1, n):
+        joined[i] = _joined(points, beams, reach, abs(increment), i - 1, i)
     for i in range(n):
-        _surface(points, origins, beams, reach, abs(increment), i, normals, variances, extents)
+        _surface(points, origins, joined, reach, abs(increment), i, normals, variances, extents)
     return points, normals, variances, extents
 
 
 @njit(cache=True)
 def _joined(points, beams, reach, increment, a, b):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
     """Whether the neighbouring points ``a`` and ``b`` plausibly lie on one surface."""
-    gap = abs(beams[b] - beams[a])
+    gap = beams[b] - beams[a]
     if gap > 3:
         return False
     r = min(reach[a], reach[b])
@@ -226,36 +229,34 @@ def _joined(points, beams, reach, increment, a, b):  # type: ignore[no-untyped-d
 
 
 @njit(cache=True)
-def _surface(points, origins, beams, reach, increment, i, normals, variances, extents):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+def _surface(points, origins, joined, reach, increment, i, normals, variances, extents):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
     """Normal and variances of point ``i`` from its neighbours in beam order."""
-    n = points.shape[0]
     noise = RANGE_NOISE + RELATIVE_NOISE * reach[i]
     spacing = reach[i] * increment
     window = max(REACH, 2.5 * spacing)
     sx, sy, sxx, sxy, syy = 0.0, 0.0, 0.0, 0.0, 0.0
     count = 1
     px, py = points[i, 0], points[i, 1]
-    nearest, furthest = 1e9, 0.0
+    closest, square, furthest = i, 1e18, 0.0
     for side in (-1, 1):
-        j = i
-        while True:
-            k = j + side
-            if k < 0 or k >= n or not _joined(points, beams, reach, increment, j, k):
-                break
+        k = i + side
+        while joined[max(k, k - side)]:
             dx, dy = points[k, 0] - px, points[k, 1] - py
-            d = math.hypot(dx, dy)
-            nearest = min(nearest, d)
-            if j == i:
-                furthest = max(furthest, d)
-            elif d > window:
+            xx, yy = dx * dx, dy * dy
+            if xx + yy < square:
+                closest, square = k, xx + yy
+            if k == i + side:
+                furthest = max(furthest, math.hypot(dx, dy))
+            elif xx + yy > window * window:
                 break
             sx += dx
             sy += dy
-            sxx += dx * dx
+            sxx += xx
             sxy += dx * dy
-            syy += dy * dy
+            syy += yy
             count += 1
-            j = k
+            k += side
+    nearest = math.hypot(points[closest, 0] - px, points[closest, 1] - py) if closest != i else 1e9
     bx, by = origins[i, 0] - px, origins[i, 1] - py
     length = math.hypot(bx, by)
     if length < 1e-9:
