@@ -10,14 +10,14 @@ from typing import Protocol
 
 import numpy as np
 
-from monstertruck_kinematics.elementary import Array, KinematicsError, Real, larger, require_finite, require_within
+from monstertruck_kinematics.elementary import KinematicsError, Real, require_finite
 from monstertruck_kinematics.wheels import Wheel
 
 Twist = tuple[Real, Real, Real]
 
 
 class Drive(Protocol):
-    """A drive family with its dimensions and limits."""
+    """A drive family with its dimensions."""
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -27,34 +27,14 @@ class Drive(Protocol):
         """Twist that a command produces."""
 
     def inverse(self, twist: Sequence[Real]) -> tuple[Real, ...]:
-        """Command that produces a twist, without regard to limits.
+        """Command that produces a twist.
 
         Raises:
             KinematicsError: the family cannot produce this twist (the component is named), or NaN.
         """
 
-    def limited(self, command: Sequence[Real]) -> tuple[Real, ...]:
-        """Command within the limits, on the same path (curvature and side) as far as the steering allows."""
-
-    def jacobian(self, command: Sequence[Real]) -> Array:
-        """(3, m, ...) derivative of the twist by the command."""
-
     def wheels(self, command: Sequence[float]) -> tuple[Wheel, ...]:
         """The wheels at a command's steering angles, for ``wheels.analyse``."""
-
-
-def scaled_to(values: Sequence[Real], limit: float) -> Real:
-    """Largest common factor, at most 1, that brings every value within +-limit."""
-    largest = abs(values[0])
-    for value in values[1:]:
-        largest = larger(largest, abs(value))
-    return 1.0 / larger(largest / limit, 1.0)
-
-
-def scaled_alike(values: Sequence[Real], limit: float) -> tuple[Real, ...]:
-    """All values scaled by one factor, at most 1, so that they are within +-limit: same path, slower."""
-    factor = scaled_to(values, limit)
-    return tuple(value * factor for value in values)
 
 
 def refuse(name: str, value: Real, scale: Real, why: str) -> None:
@@ -80,23 +60,6 @@ def unpacked(values: Sequence[Real], names: tuple[str, ...]) -> tuple[Real, ...]
     for name, value in zip(names, values, strict=True):
         require_finite(name, value)
     return tuple(values)
-
-
-def require_limit(name: str, value: float, high: float = float("inf")) -> None:
-    """Refuse a limit that is NaN, not above 0, or above ``high``.
-
-    Raises:
-        KinematicsError: naming the field.
-    """
-    require_within(name, value, 0.0, high)
-    if value == 0.0:
-        raise KinematicsError(f"{name} is 0: expected a limit above 0")
-
-
-def stacked(rows: Sequence[Sequence[Real | float]]) -> Array:
-    """(3, m, ...) array from rows of entries that broadcast."""
-    flat = np.broadcast_arrays(*[np.asarray(entry, dtype=np.float64) for row in rows for entry in row])
-    return np.array(flat).reshape(len(rows), len(rows[0]), *flat[0].shape)
 
 
 TWIST = ("vx", "vy", "wz")

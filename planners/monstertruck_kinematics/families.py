@@ -1,7 +1,6 @@
 """Drive families by name, so that a configuration can choose one."""
 
 import inspect
-import math
 from collections.abc import Callable
 
 from monstertruck_kinematics.drive import Drive
@@ -16,16 +15,12 @@ def _four_wheel_steer(
     track: float = 0.26,
     cg_split: float = 0.5,
     radius: float = 0.075,
-    max_steer: float = 0.4,
-    max_speed: float = math.inf,
 ) -> Drive:
-    return FourWheelSteer(FourWheelSteering(wheelbase, track, cg_split), radius, max_steer, max_speed)
+    return FourWheelSteer(FourWheelSteering(wheelbase, track, cg_split), radius)
 
 
-def _independent_steer(
-    wheelbase: float = 0.32, track: float = 0.26, radius: float = 0.075, max_speed: float = math.inf
-) -> Drive:
-    return IndependentSteer(FourWheelSteering(wheelbase, track).wheel_positions, radius, max_speed)
+def _independent_steer(wheelbase: float = 0.32, track: float = 0.26, radius: float = 0.075) -> Drive:
+    return IndependentSteer(FourWheelSteering(wheelbase, track).wheel_positions, radius)
 
 
 def _skid_steer(
@@ -36,9 +31,8 @@ def _skid_steer(
     rear: float = 0.0305,
     gain_left: float = 1.0,
     gain_right: float = 1.0,
-    max_rate: float = math.inf,
 ) -> Drive:
-    return SkidSteer(radius, half_track, -half_track, icr_x, gain_left, gain_right, max_rate, front, rear)
+    return SkidSteer(radius, half_track, -half_track, icr_x, gain_left, gain_right, front, rear)
 
 
 FAMILIES: dict[str, Callable[..., Drive]] = {

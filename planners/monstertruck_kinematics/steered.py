@@ -11,10 +11,6 @@ from monstertruck_kinematics.drive import (
     TWIST,
     Twist,
     refuse,
-    require_limit,
-    scaled_alike,
-    scaled_to,
-    stacked,
     unpacked,
 )
 from monstertruck_kinematics.elementary import (
@@ -22,12 +18,10 @@ from monstertruck_kinematics.elementary import (
     KinematicsError,
     Real,
     atan2,
-    clip,
     cos,
     hypot,
     require_positive,
     require_within,
-    secant,
     sign,
     sin,
     tan,
@@ -47,18 +41,14 @@ class Bicycle:
         wheelbase: l, m.
         driven: wheel whose speed u is the input.
         radius: of the wheels, m.
-        max_steer: of the front wheel, rad: below pi/2 if rear-driven, up to pi/2 if front-driven (turns on the spot).
-        max_speed: of the driven wheel, m/s.
 
     Raises:
-        KinematicsError: a length is not above 0, or a limit out of range.
+        KinematicsError: a length is not above 0.
     """
 
     wheelbase: float = 0.32
     driven: Literal["front", "rear"] = "rear"
     radius: float = 0.075
-    max_steer: float = 0.6
-    max_speed: float = math.inf
 
     inputs = ("speed", "steer")
 
@@ -67,8 +57,6 @@ class Bicycle:
         require_positive("radius", self.radius)
         if self.driven not in ("front", "rear"):
             raise KinematicsError(f"driven is {self.driven!r}: expected front or rear")
-        require_limit("max_steer", self.max_steer, math.pi / 2.0 if self.driven == "front" else MAX_AXLE_ANGLE)
-        require_limit("max_speed", self.max_speed)
 
     def forward(self, command: Sequence[Real]) -> Twist[Real]:
         """Twist of the rear axle's middle from (speed of the driven wheel, steering angle)."""
@@ -90,24 +78,6 @@ class Bicycle:
         require_within("steer that vx, wz need", steer, -MAX_AXLE_ANGLE, MAX_AXLE_ANGLE)
         return vx, steer
 
-    def limited(self, command: Sequence[Real]) -> tuple[Real, ...]:
-        """Steering angle clipped, speed of the driven wheel clipped: same path unless it is too tight."""
-        speed, steer = unpacked(command, self.inputs)
-        return clip(speed, -self.max_speed, self.max_speed), clip(steer, -self.max_steer, self.max_steer)
-
-    def jacobian(self, command: Sequence[Real]) -> Array:
-        """By (speed, steer)."""
-        speed, steer = unpacked(command, self.inputs)
-        zero = 0.0 * (speed + steer)
-        c, s = cos(steer), sin(steer)
-        if self.driven == "front":
-            return stacked(
-                [[c, -speed * s], [zero, zero], [s / self.wheelbase, speed * c / self.wheelbase]],
-            )
-        return stacked(
-            [[zero + 1.0, zero], [zero, zero], [s / c / self.wheelbase, speed / (c * c * self.wheelbase)]],
-        )
-
     def wheels(self, command: Sequence[float]) -> tuple[Wheel, ...]:
         """The two wheels."""
         _, steer = unpacked(command, self.inputs)
@@ -125,13 +95,10 @@ class Tricycle(Bicycle):
         wheelbase: d, from the rear axle to the front wheel, m.
         driven: front for the lecture's tricycle.
         radius: of the wheels, m.
-        max_steer: rad.
-        max_speed: of the front wheel, m/s.
         track: between the rear wheels, m.
     """
 
     driven: Literal["front", "rear"] = "front"
-    max_steer: float = 1.4
     track: float = 0.26
 
     def __post_init__(self) -> None:
@@ -161,25 +128,19 @@ class Ackermann:
         wheelbase: L, m.
         track: w, m.
         radius: of the wheels, m.
-        max_steer: of the front axle's bicycle angle, rad.
-        max_speed: of the reference point, m/s.
 
     Raises:
-        KinematicsError: a length is not above 0, or a limit out of range.
+        KinematicsError: a length is not above 0.
     """
 
     wheelbase: float = 0.32
     track: float = 0.26
     radius: float = 0.075
-    max_steer: float = 0.4
-    max_speed: float = math.inf
 
     inputs = ("speed", "steer")
 
     def __post_init__(self) -> None:
         require_positive("radius", self.radius)
-        require_limit("max_steer", self.max_steer, MAX_AXLE_ANGLE)
-        require_limit("max_speed", self.max_speed)
         _ = self.geometry
 
     @property
@@ -199,35 +160,10 @@ class Ackermann:
         speed, steer, _ = self.geometry.steer_for_twist(vx, 0.0 * vx, wz)
         return speed, steer
 
-    def limited(self, command: Sequence[Real]) -> tuple[Real, ...]:
-        """Angle clipped, speed scaled."""
-        speed, steer = unpacked(command, self.inputs)
-        return speed * scaled_to((speed,), self.max_speed), clip(steer, -self.max_steer, self.max_steer)
-
-    def jacobian(self, command: Sequence[Real]) -> Array:
-        """By (speed, steer)."""
-        return Bicycle(self.wheelbase).jacobian(command)
-
     def front_angles(self, steer: Real) -> tuple[Real, Real]:
         """Front wheel angles (left, right): tan = L/(R -+ w/2) (2.10, 2.11); the sign of R says which is inner."""
         left, right, _, _ = self.geometry.wheel_angles(steer, 0.0 * steer)
         return left, right
-
-    def wheel_rates(self, command: Sequence[Real]) -> tuple[Real, Real, Real, Real]:
-        """Rates of all four wheels, rad/s (2.18-2.26): front left, front right, rear left, rear right."""
-        speed, steer = unpacked(command, self.inputs)
-        fl, fr, rl, rr = self.geometry.wheel_speeds(speed, steer, 0.0 * steer)
-        return fl / self.radius, fr / self.radius, rl / self.radius, rr / self.radius
-
-    def steer_from_wheels(self, left: Real, right: Real) -> Real:
-        """Bicycle angle of two front wheels: the mean of the tangents that each wheel alone gives the bicycle.
-
-        For ideal wheels both are the same and cot d = (cot d_l + cot d_r)/2 (2.13), defined at 0 too. Other wheels have
-        no common ICR, and their least-squares motion another angle: see ``truck.LinkedAxles``.
-        """
-        tan_l, tan_r = tan(left), tan(right)
-        half = 0.5 * self.track / self.wheelbase
-        return atan2(0.5 * (tan_l / (1.0 + half * tan_l) + tan_r / (1.0 - half * tan_r)), 1.0 + 0.0 * tan_l)
 
     def defect(self, left: Real, right: Real) -> Real:
         """Violation of Ackermann's condition by two front wheels, cot d_r - cot d_l = w/L (2.12): 0 if ideal.
@@ -260,8 +196,6 @@ class FourWheelSteer:
     Args:
         geometry: wheelbase, track and reference point.
         radius: of the wheels, m.
-        max_steer: of either axle, rad.
-        max_speed: of the reference point, m/s.
 
     Raises:
         KinematicsError: a field is out of range.
@@ -269,15 +203,11 @@ class FourWheelSteer:
 
     geometry: FourWheelSteering = field(default_factory=FourWheelSteering)
     radius: float = 0.075
-    max_steer: float = 0.4
-    max_speed: float = math.inf
 
     inputs = ("speed", "front", "rear")
 
     def __post_init__(self) -> None:
         require_positive("radius", self.radius)
-        require_limit("max_steer", self.max_steer, MAX_AXLE_ANGLE)
-        require_limit("max_speed", self.max_speed)
 
     def forward(self, command: Sequence[Real]) -> Twist[Real]:
         """Twist from (speed, front, rear): see ``FourWheelSteering.body_twist``."""
@@ -288,34 +218,6 @@ class FourWheelSteer:
         """(speed, front, rear) through the common ICR."""
         vx, vy, wz = unpacked(twist, TWIST)
         return self.geometry.steer_for_twist(vx, vy, wz)
-
-    def limited(self, command: Sequence[Real]) -> tuple[Real, ...]:
-        """Angles within the limit that keep the curvature, then the sideslip; speed clipped."""
-        speed, front, rear = unpacked(command, self.inputs)
-        front_kept, rear_kept = self.geometry.limit_keeping_curvature(front, rear, self.max_steer)
-        return clip(speed, -self.max_speed, self.max_speed), front_kept, rear_kept
-
-    def jacobian(self, command: Sequence[Real]) -> Array:
-        """By (speed, front, rear)."""
-        speed, front, rear = unpacked(command, self.inputs)
-        vx, vy, wz = self.geometry.body_twist(speed, front, rear)
-        length = self.geometry.wheelbase
-        tan_f, tan_r = tan(front), tan(rear)
-        tan_b = self.geometry.tan_sideslip(tan_f, tan_r)
-        cos_b = 1.0 / secant(tan_b)
-        columns = [(cos_b, cos_b * tan_b, cos_b * (tan_f - tan_r) / length)]
-        for tangent, share, side in ((tan_f, self.geometry.l_r, 1.0), (tan_r, self.geometry.l_f, -1.0)):
-            slope = 1.0 + tangent * tangent
-            lean = slope * share / length
-            fading = -tan_b * cos_b * cos_b * lean
-            columns.append((vx * fading, vy * fading + vx * lean, wz * fading + side * vx * slope / length))
-        return stacked(list(zip(*columns, strict=True)))
-
-    def wheel_rates(self, command: Sequence[Real]) -> tuple[Real, Real, Real, Real]:
-        """Rates of the four wheels, rad/s (2.47-2.50)."""
-        speed, front, rear = unpacked(command, self.inputs)
-        fl, fr, rl, rr = self.geometry.wheel_speeds(speed, front, rear)
-        return fl / self.radius, fr / self.radius, rl / self.radius, rr / self.radius
 
     def wheels(self, command: Sequence[float]) -> tuple[Wheel, ...]:
         """The four wheels at their angles through the common ICR."""
@@ -337,7 +239,6 @@ class IndependentSteer:
     Args:
         positions: (x, y) of the wheels, m; at least two at different places.
         radius: of the wheels, m.
-        max_speed: of a wheel, m/s.
 
     Raises:
         KinematicsError: fewer than two places, or a field out of range.
@@ -345,12 +246,10 @@ class IndependentSteer:
 
     positions: tuple[tuple[float, float], ...] = ((0.16, 0.13), (0.16, -0.13), (-0.16, 0.13), (-0.16, -0.13))
     radius: float = 0.075
-    max_speed: float = math.inf
     _solver: Array = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         require_positive("radius", self.radius)
-        require_limit("max_speed", self.max_speed)
         if len(set(self.positions)) < 2:
             raise KinematicsError(f"positions has {len(set(self.positions))} places: expected two or more")
         rows = [row for x, y in self.positions for row in ([1.0, 0.0, -y], [0.0, 1.0, x])]
@@ -385,28 +284,6 @@ class IndependentSteer:
             speeds.append(facing * hypot(ahead, aside))
         return tuple(angles + speeds)
 
-    def limited(self, command: Sequence[Real]) -> tuple[Real, ...]:
-        """All speeds scaled alike: same path, slower."""
-        values = unpacked(command, self.inputs)
-        count = len(self.positions)
-        return values[:count] + scaled_alike(values[count:], self.max_speed)
-
-    def jacobian(self, command: Sequence[Real]) -> Array:
-        """By all angles, then all speeds."""
-        values = unpacked(command, self.inputs)
-        count = len(self.positions)
-        rows: list[list[Real]] = []
-        for k in range(3):
-            by_angle: list[Real] = []
-            by_speed: list[Real] = []
-            for i, (steer, speed) in enumerate(zip(values[:count], values[count:], strict=True)):
-                ahead, aside = float(self._solver[k, 2 * i]), float(self._solver[k, 2 * i + 1])
-                c, s = cos(steer), sin(steer)
-                by_angle.append(speed * (aside * c - ahead * s))
-                by_speed.append(ahead * c + aside * s)
-            rows.append(by_angle + by_speed)
-        return stacked(rows)
-
     def wheels(self, command: Sequence[float]) -> tuple[Wheel, ...]:
         """The wheels at the command's angles."""
         values = unpacked(command, self.inputs)
@@ -426,8 +303,6 @@ class Synchro:
     Args:
         wheel_radius: m.
         circle: radius of the circle (an equilateral triangle) that carries the three wheels, m.
-        max_rate: of the wheels, rad/s.
-        max_turn: of the wheels' direction, rad/s.
 
     Raises:
         KinematicsError: a field is not above 0.
@@ -435,16 +310,12 @@ class Synchro:
 
     wheel_radius: float = 0.05
     circle: float = 0.2
-    max_rate: float = math.inf
-    max_turn: float = math.inf
 
     inputs = ("roll", "turn")
 
     def __post_init__(self) -> None:
         require_positive("wheel_radius", self.wheel_radius)
         require_positive("circle", self.circle)
-        require_limit("max_rate", self.max_rate)
-        require_limit("max_turn", self.max_turn)
 
     def forward(self, command: Sequence[Real]) -> Twist[Real]:
         """(v, 0, omega) in the wheels' frame from the rolling rate and the turning rate, rad/s."""
@@ -456,18 +327,6 @@ class Synchro:
         vx, vy, wz = unpacked(twist, TWIST)
         refuse("vy", vy, vx, "the wheels cannot move sideways")
         return vx / self.wheel_radius, wz
-
-    def limited(self, command: Sequence[Real]) -> tuple[Real, ...]:
-        """Both rates scaled alike: same path, slower."""
-        roll, turn = unpacked(command, self.inputs)
-        factor = scaled_to((roll / self.max_rate, turn / self.max_turn), 1.0)
-        return roll * factor, turn * factor
-
-    def jacobian(self, command: Sequence[Real]) -> Array:
-        """Constant."""
-        roll, _ = unpacked(command, self.inputs)
-        zero = 0.0 * roll
-        return stacked([[zero + self.wheel_radius, zero], [zero, zero], [zero, zero + 1.0]])
 
     def platform_twist(self, command: Sequence[Real], direction: Real) -> Twist[Real]:
         """Twist of the platform when its wheels point along ``direction`` in its frame: it translates only."""

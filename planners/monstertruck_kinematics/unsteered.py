@@ -3,40 +3,21 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 
-from monstertruck_kinematics.drive import TWIST, Drive, Twist, refuse, require_limit, scaled_alike, stacked, unpacked
+from monstertruck_kinematics.drive import TWIST, Twist, refuse, unpacked
 from monstertruck_kinematics.elementary import Array, KinematicsError, Real, require_finite, require_positive
 from monstertruck_kinematics.wheels import CasterWheel, FixedWheel, SwedishWheel, Wheel, rolling_matrix
 
 
-class UnsteeredDrive(Drive, Protocol):
-    """A drive whose command is its wheels' rates: the twist is linear in them."""
-
-    max_rate: float
-
-    def limited(self, command: Sequence[Real]) -> tuple[Real, ...]:
-        """All rates scaled alike: same path, slower."""
-        return scaled_alike(unpacked(command, self.inputs), self.max_rate)
-
-    def jacobian(self, command: Sequence[Real]) -> Array:
-        """Constant: the twists of single wheels at 1 rad/s."""
-        rates = unpacked(command, self.inputs)
-        alone = np.eye(len(rates)).tolist()
-        columns = [self.forward([on + 0.0 * rate for on, rate in zip(row, rates, strict=True)]) for row in alone]
-        return stacked(list(zip(*columns, strict=True)))
-
-
 @dataclass(frozen=True)
-class Differential(UnsteeredDrive):
+class Differential:
     """Differential drive about the middle of its axle: v = r (w_R + w_L)/2, omega = r (w_R - w_L)/track.
 
     Args:
         radius: of the wheels, m.
         track: distance between the wheels, m.
-        max_rate: of a wheel, rad/s.
 
     Raises:
         KinematicsError: a field is not above 0.
@@ -44,14 +25,12 @@ class Differential(UnsteeredDrive):
 
     radius: float = 0.1
     track: float = 0.3
-    max_rate: float = math.inf
 
     inputs = ("left", "right")
 
     def __post_init__(self) -> None:
         require_positive("radius", self.radius)
         require_positive("track", self.track)
-        require_limit("max_rate", self.max_rate)
 
     def forward(self, command: Sequence[Real]) -> Twist[Real]:
         """Twist from the wheel rates (left, right)."""
@@ -81,7 +60,7 @@ class Differential(UnsteeredDrive):
 
 
 @dataclass(frozen=True)
-class SkidSteer(UnsteeredDrive):
+class SkidSteer:
     """Skid-steer drive (skid-steer paper, eqs. 1-11, and their extension by ICR parameters).
 
     One model covers four cases. Each side's tread moves as if it turned about its own ICR on the lateral axis: at the
@@ -98,7 +77,6 @@ class SkidSteer(UnsteeredDrive):
         icr_x: longitudinal position x_ICR of the ICRs, m.
         gain_left: effective over nominal radius, slip included, of the left side.
         gain_right: of the right side.
-        max_rate: of a wheel, rad/s.
         front: b, distance of the front wheels ahead of the reference point, m.
         rear: a, distance of the rear wheels behind it, m; unlike ``front`` where the mass lies off the middle.
 
@@ -112,7 +90,6 @@ class SkidSteer(UnsteeredDrive):
     icr_x: float = 0.0
     gain_left: float = 1.0
     gain_right: float = 1.0
-    max_rate: float = math.inf
     front: float = 0.0305
     rear: float = 0.0305
 
@@ -125,7 +102,6 @@ class SkidSteer(UnsteeredDrive):
             require_finite(name, getattr(self, name))
         if self.icr_left <= self.icr_right:
             raise KinematicsError(f"icr_left is {self.icr_left}: expected more than icr_right, {self.icr_right}")
-        require_limit("max_rate", self.max_rate)
 
     @classmethod
     def ideal(cls, radius: float, half_track: float) -> "SkidSteer":
@@ -169,28 +145,25 @@ class SkidSteer(UnsteeredDrive):
 
 
 @dataclass(frozen=True)
-class SwedishDrive(UnsteeredDrive):
+class SwedishDrive:
     """Any set of driven Swedish wheels.
 
     With more than three wheels a command may contradict itself; forward is then the least-squares twist.
 
     Args:
         swedish: the wheels; the command is their rates in this order, rad/s.
-        max_rate: of a wheel, rad/s.
 
     Raises:
         KinematicsError: the wheels cannot drive every direction (all in line, or fewer than three).
     """
 
     swedish: tuple[SwedishWheel, ...]
-    max_rate: float = math.inf
     rates_of_twist: Array = field(init=False, repr=False, compare=False)
     """(m, 3): wheel rates for a unit of each twist component."""
     twist_of_rates: Array = field(init=False, repr=False, compare=False)
     """(3, m): its pseudo-inverse."""
 
     def __post_init__(self) -> None:
-        require_limit("max_rate", self.max_rate)
         matrix = rolling_matrix(self.swedish)
         size = max(math.hypot(w.x, w.y) for w in self.swedish) or 1.0
         if np.linalg.matrix_rank(matrix / [1.0, 1.0, size], tol=1e-9 * float(np.abs(matrix).max())) < 3:
@@ -221,14 +194,13 @@ class SwedishDrive(UnsteeredDrive):
         return self.swedish
 
 
-def omni(circle: float = 0.2, wheel_radius: float = 0.05, count: int = 3, max_rate: float = math.inf) -> SwedishDrive:
+def omni(circle: float = 0.2, wheel_radius: float = 0.05, count: int = 3) -> SwedishDrive:
     """Robot with ``count`` 90 deg Swedish wheels spaced evenly on a circle, rolling along it.
 
     Args:
         circle: radius of the circle, m.
         wheel_radius: m.
         count: of wheels, three or more.
-        max_rate: of a wheel, rad/s.
 
     Raises:
         KinematicsError: fewer than three wheels, or a length not above 0.
@@ -241,19 +213,16 @@ def omni(circle: float = 0.2, wheel_radius: float = 0.05, count: int = 3, max_ra
         SwedishWheel(f"wheel {i + 1}", circle * math.cos(a), circle * math.sin(a), wheel_radius, a + math.pi / 2.0)
         for i, a in enumerate(angles)
     )
-    return SwedishDrive(wheels, max_rate)
+    return SwedishDrive(wheels)
 
 
-def mecanum(
-    wheelbase: float = 0.32, track: float = 0.26, wheel_radius: float = 0.05, max_rate: float = math.inf
-) -> SwedishDrive:
+def mecanum(wheelbase: float = 0.32, track: float = 0.26, wheel_radius: float = 0.05) -> SwedishDrive:
     """Four mecanum wheels whose rollers, seen from above, form an X (a driven front left wheel pushes to the right).
 
     Args:
         wheelbase: m.
         track: m.
         wheel_radius: m.
-        max_rate: of a wheel, rad/s.
 
     Raises:
         KinematicsError: a length is not above 0.
@@ -269,7 +238,6 @@ def mecanum(
     )
     return SwedishDrive(
         tuple(SwedishWheel(name, x, y, wheel_radius, 0.0, turn * math.pi / 4.0) for name, x, y, turn in corners),
-        max_rate,
     )
 
 

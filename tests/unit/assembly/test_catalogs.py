@@ -1,6 +1,8 @@
 """The tables of plug-ins as a whole."""
 
 import json
+import re
+from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
@@ -14,6 +16,7 @@ from tests.plugin_kit import install
 
 __all__ = ["install"]
 
+ROOT = Path(__file__).parents[3]
 ROWS = [(table, name) for table in TABLES if isinstance(table, Catalog) for name in table if table.origin(name) == OURS]
 
 TRACKER = """
@@ -51,3 +54,17 @@ def test_plugins_are_listed_with_their_origin_and_what_is_wrong_with_them(instal
     assert rows["other"]["error"] == "kind other: No module named 'other_missing'"
     assert rows["gone"]["error"] == "AttributeError: module 'other' has no attribute 'GONE'"
     assert "No module named 'other_missing'" in CliRunner().invoke(app, ["plugins"]).stdout
+
+
+PLUGINS = [(table, name) for table, name in ROWS if table is not catalogs.DEVICES]
+
+
+@pytest.mark.parametrize(("table", "name"), PLUGINS, ids=lambda value: value if isinstance(value, str) else value.group)
+def test_every_kind_of_ours_has_a_user(table, name):
+    def named(pattern: str, *files: str) -> list[str]:
+        paths = (path for glob in files for path in ROOT.glob(glob))
+        return [path.name for path in paths if re.search(pattern, path.read_text())]
+
+    word = rf"\b{name}\b"
+    users = named(rf"\b(kind: {name})\b", "configs/**/*.yaml") + named(rf"`{word}`|kind: {word}", "docs/*.md")
+    assert users, "no shipped configuration and no page uses it: it gets a user, or goes"

@@ -1,7 +1,5 @@
 """Drive families by name."""
 
-import math
-
 import pytest
 
 from monstertruck_kinematics.elementary import KinematicsError
@@ -20,13 +18,13 @@ def test_every_family_builds_stands_and_knows_its_wheels(kind):
 
 
 def test_parameters_reach_the_robot():
-    truck = build_drive("truck", wheelbase=0.4, cg_split=0.25, max_steer=0.3)
+    truck = build_drive("truck", wheelbase=0.4, cg_split=0.25, radius=0.08)
     assert isinstance(truck, FourWheelSteer)
-    assert (truck.geometry.l_f, truck.max_steer) == (0.1, 0.3)
+    assert (truck.geometry.l_f, truck.radius) == (0.1, 0.08)
     assert build_drive("tricycle", driven="rear") == Tricycle(driven="rear")
     assert build_drive("skid_steer", half_track=0.1) == SkidSteer(0.021, 0.1, -0.1)
     assert len(build_drive("independent", track=1.0).wheels((0.0,) * 8)) == 4
-    assert parameters_of("differential") == {"radius": 0.1, "track": 0.3, "max_rate": math.inf}
+    assert parameters_of("differential") == {"radius": 0.1, "track": 0.3}
 
 
 def test_typos_are_named():

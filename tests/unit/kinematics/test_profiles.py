@@ -20,7 +20,7 @@ from monstertruck_kinematics.unsteered import Differential, SkidSteer, mecanum, 
 ARCS = (BasicMove.arc(1.0, 0.8), BasicMove.arc(-1.0, -0.5), BasicMove.straight(0.6))
 ROBOTS = {
     "differential": (Differential(), (*ARCS, BasicMove.spot(1.0))),
-    "tricycle": (Tricycle(max_steer=math.pi / 2), (*ARCS, BasicMove.spot(-1.0))),
+    "tricycle": (Tricycle(), (*ARCS, BasicMove.spot(-1.0))),
     "bicycle": (Bicycle(), ARCS),
     "ackermann": (Ackermann(), ARCS),
     "four-wheel steer": (FourWheelSteer(), ARCS),

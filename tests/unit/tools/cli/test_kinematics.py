@@ -29,7 +29,6 @@ def test_show_lists_every_family_and_one_in_detail():
     listed = {row["family"]: row for row in run_json("show")}
     assert listed["truck"]["class"] == [1, 2]
     assert listed["mecanum"]["non_holonomic"] is False
-    assert listed["synchro"]["parameters"]["max_rate"] is None  # no limit
     assert "tricycle" in run("show")
     (one,) = run_json("show", "truck", "-s", "track=0.3")
     assert one["parameters"]["track"] == 0.3
