@@ -42,7 +42,7 @@ class ConsistencyCheck(Check):
 
     def reason(self, now: int) -> Iterator[Reason]:
         """Doubts about sensors whose silence stops the robot."""
-        doubts = [doubt for doubt in self._doubts() if self._stops(doubt.sensor) and not self._only_slows(doubt)]
+        doubts = [doubt for doubt in self._doubts() if self._stops(doubt.sensor) and not self._is_expected(doubt)]
         yield from dict.fromkeys(_reason(doubt) for doubt in doubts)
 
     def limit(self, now: int, courses: Sequence[Course] | None) -> Iterator[PaceLimit]:
@@ -55,7 +55,7 @@ class ConsistencyCheck(Check):
             slow = config.unwitnessed * (config.speed if ahead else config.reverse_speed)
             if not self._witnessed(now):
                 yield PaceLimit(Reason.UNWITNESSED, slow)
-            if any(map(self._only_slows, self._doubts())):
+            if any(map(self._is_expected, self._doubts())):
                 yield PaceLimit(Reason.SENSORS_DISAGREE, slow)
 
     def describe(self, reason: Reason, now: int, since: int) -> Iterator[Cause]:
@@ -81,13 +81,9 @@ class ConsistencyCheck(Check):
             if not doubt.kind.lasting or (active and doubt.since > self._settled):
                 yield doubt
 
-    def _only_slows(self, doubt: Doubt) -> bool:
-        """Whether the robot goes on slowly in spite of this doubt.
-
-        A delay of the scans is too uncertain to stop for: it has been found with sensors that were right, on straight
-        moves from rest. A robot that is armed to calibrate its sensors is expected to have wrong ones.
-        """
-        return doubt.kind is DoubtKind.DELAY or (self.view.calibrates and doubt.kind is DoubtKind.MOTION)
+    def _is_expected(self, doubt: Doubt) -> bool:
+        """Whether a robot that is armed to calibrate its sensors goes on slowly in spite of this doubt."""
+        return self.view.calibrates and _reason(doubt) is Reason.SENSORS_DISAGREE
 
     def _witnessed(self, now: int) -> bool:
         newest = self._newest

@@ -101,7 +101,7 @@ def test_a_goal_ends_when_the_truck_is_carried_to_where_it_does_not_know_its_pla
     async def story(trip: Trip) -> None:
         await trip.arm()
         await trip.operator.behave(BehaviourOrder.START, "move", {"length": 1.1, "speed": 0.2})
-        await trip.clock.sleep(10.0)  # the move, at half the pace if scans seem late
+        await trip.clock.sleep(7.5)
         await trip.goal(6.5, 3.9, 0.0)
         await trip.arm()
         await trip.clock.sleep(0.5)

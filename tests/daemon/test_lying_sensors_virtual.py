@@ -8,7 +8,9 @@ from monstertruck_schemas.reasons import Reason
 pytestmark = [pytest.mark.virtual, pytest.mark.timeout(300)]
 
 
-@pytest.mark.parametrize(("case", "world", "seed"), [("repeated", "loop", 1), ("noisy", "rooms", 1)])
+@pytest.mark.parametrize(
+    ("case", "world", "seed"), [("repeated", "loop", 1), ("noisy", "rooms", 1), ("late", "loop", 0)]
+)
 def test_scans_that_do_not_follow_the_truck(case, world, seed):
     outcome = trial(CASES[case], world, seed)
     assert not outcome.contact

@@ -1,74 +1,148 @@
-"""How much the content of the scans lags behind the robot's motion: their motions compared at shifted times.
+"""How much the content of the scans lags behind the robot's motion: a likelihood for every lag.
 
-A robot that sets off, turns or brakes shows the delay: the scans' steps fit the other measure's steps of some time ago
-better than those of now. Steady motion says nothing. Distances and turns are scaled freely, for wheels slip.
+The places by the scans (distance and yaw since the first one) are compared with those by another measure some time
+earlier. What both may be wrong by is the covariance of their difference: ``Errors`` give the scale, slip that changes
+along the way, each place, a constant bend and drift; the registration gives its deviations; the offset is unknown.
+So only motion that changes tells lags apart, as much as its change stands out of these errors. A lag is found where
+the best one beyond the tolerated explains the scans so much better than all tolerated ones that chance does not.
 """
 
+import math
+from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
 
+from monstertruck_estimation.consistency.comparison import Errors
 from monstertruck_estimation.consistency.tracks import MotionTrack
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND
 
 SHIFT: Final = SECOND // 10
-"""Step of the delays that are tried, ns."""
+"""Step of the lags that are tried, ns."""
 LONGEST: Final = 12
-"""Greatest delay that is tried, in ``SHIFT``."""
-NOISE: Final = (0.006, 0.006)
-"""Standard deviation of a step by the scans, m and rad."""
-SPREAD: Final = 0.1
-"""Its share of the step."""
-SCALE: Final = (0.6, 1.4)
-"""Limits of the scale."""
+"""Greatest lag that is tried, in ``SHIFT``."""
+SIGMAS: Final = 5.0
+"""Standard deviations by which all tolerated lags must be rejected: chance does it once in 3 million looks."""
+GREATEST: Final = 2.0
+"""Greatest errors of a measure that works, in standard deviations."""
 FEWEST: Final = 12
-"""Steps that are compared at least."""
-CLEARLY: Final = 0.7
-"""Share of the squared error without a delay beyond the tolerated one below which that with a delay is clear."""
-EXCESS: Final = 25.0
-"""Least difference of both, in mean squared errors of a step that the delay leaves, or variances of its noise."""
+"""Places that are compared at least."""
+SLIP_LENGTH: Final = 0.1
+"""Distance (m) or turn (rad) along which slip stays the same."""
+OFFSET: Final = 1.0
+"""Standard deviation of the place at the beginning, m or rad: it is not known."""
+
+
+class ScanStep(NamedTuple):
+    """Motion between two scans."""
+
+    since: int
+    """Ns."""
+    stamp: int
+    """Ns."""
+    moved: tuple[float, float]
+    """Distance ahead (m) and turn (rad)."""
+    deviations: tuple[float, float]
+    """Of the place at ``stamp``, see ``StepOutput.deviations``."""
+
+
+@dataclass(frozen=True, slots=True)
+class LagQuestion:
+    """Motion by the scans and by other measures, of which the lag is to be found; light enough for the event loop."""
+
+    stamp: int
+    """Ns."""
+    tolerated: int
+    """Greatest lag that is none, in ``SHIFT``."""
+    steps: tuple[ScanStep, ...]
+    """Of the scans, one after the other."""
+    others: tuple[tuple[Errors, Array], ...]
+    """Of every other measure its errors and its motion during the newest steps, shape (lags, n, 3), each lag earlier
+    than the one before."""
 
 
 class Delay(NamedTuple):
-    """A delay of the scans."""
+    """A lag of the scans."""
 
     seconds: float
-    error: float
-    """Share of the squared error that it leaves."""
+    sigmas: float
+    """By which all tolerated lags are rejected."""
 
 
-def scan_delay(steps: list[tuple[int, int, float, float]], track: MotionTrack, tolerated: float) -> Delay | None:
-    """Delay of the scans against ``track``, where it is clearly more than ``tolerated`` (s).
+def lag_question(steps: list[ScanStep], others: list[tuple[Errors, MotionTrack]], tolerated: float) -> LagQuestion:
+    """Collect what tells the lag.
 
     Args:
-        steps: of the scans: stamps of the earlier and the later one (ns), distance ahead (m) and turn (rad).
-        track: of another measure.
-        tolerated: delay that is none, s.
+        steps: of the scans, one after the other, at least one.
+        others: other measures of the same motion.
+        tolerated: lag that is none, s.
     """
-    reach = LONGEST * SHIFT
-    usable = [row for row in steps if track.covers(row[0] - reach, row[1])]
-    if len(usable) < FEWEST:
-        return None
-    ends = np.array([row[:2] for row in usable])
-    scans = np.array([row[2:] for row in usable])
-    deviations = np.sqrt(np.square(NOISE) + np.square(SPREAD * scans))
-    shifts = SHIFT * np.arange(LONGEST + 1)
-    others = track.motions(ends[None, :, 0] - shifts[:, None], ends[None, :, 1] - shifts[:, None])[..., (0, 2)]
-    errors = _errors(scans, deviations, others)
-    allowed = int(tolerated * SECOND / SHIFT) + 1
-    best = int(np.argmin(errors))
-    least = float(errors[:allowed].min())
-    left = float(errors[best])
-    if best < allowed or left > CLEARLY * least or least - left < EXCESS * max(left / len(usable), 1.0):
-        return None
-    return Delay(best * SHIFT / SECOND, float(errors[best]) / least)
+    shifts = SHIFT * np.arange(LONGEST + 1)[:, None]
+    known = []
+    for errors, track in others:
+        usable = np.array([row[:2] for row in steps if track.covers(row.since - LONGEST * SHIFT, row.stamp)])
+        if len(usable) >= FEWEST:
+            known.append((errors, track.motions(usable[None, :, 0] - shifts, usable[None, :, 1] - shifts)))
+    return LagQuestion(steps[-1].stamp, int(tolerated * SECOND / SHIFT), tuple(steps), tuple(known))
 
 
-def _errors(scans: Array, deviations: Array, others: Array) -> Array:
-    """Sums of squared differences in variances, (k,), for others, (k, n, 2), each column scaled as fits best."""
-    weights = 1.0 / np.square(deviations)
-    energy = np.sum(weights * np.square(others), axis=1)
-    scale = np.clip(np.sum(weights * scans * others, axis=1) / np.maximum(energy, 1e-9), *SCALE)
-    sums: Array = np.sum(weights * np.square(scans - scale[:, None, :] * others), axis=(1, 2))
-    return sums
+def scan_delay(question: LagQuestion) -> Delay | None:
+    """Lag of the scans behind all other measures, where it is more than tolerated beyond chance."""
+    cost, squares, places = np.zeros(LONGEST + 1), np.zeros(LONGEST + 1), 0
+    for errors, moved in question.others:
+        steps = question.steps[-moved.shape[1] :]
+        for axis in _axes(errors):
+            mahalanobis, volume = _fit(steps, moved, axis)
+            cost += mahalanobis + volume
+            squares += mahalanobis
+            places += len(steps)
+    best, allowed = int(np.argmin(cost)), question.tolerated + 1
+    if not places or best < allowed:
+        return None
+    # Errors that are greater than stated everywhere make every difference less certain.
+    inflation = max(1.0, float(squares[best]) / places)
+    sigmas = math.sqrt(float(cost[:allowed].min() - cost[best]) / inflation)
+    return Delay(best * SHIFT / SECOND, sigmas) if sigmas >= SIGMAS else None
+
+
+class _Axis(NamedTuple):
+    """Greatest errors of the distance ahead or of the turn."""
+
+    place: int
+    """0 = distance, 1 = turn."""
+    share: float
+    constant: float
+    """m or rad."""
+    bend: float = 0.0
+    """rad/m."""
+    drift: float = 0.0
+    """rad/s."""
+
+
+def _axes(errors: Errors) -> list[_Axis]:
+    turn = _Axis(1, *errors.turn, errors.bend, errors.drift)
+    return [turn] if errors.way is None else [_Axis(0, *errors.way), turn]
+
+
+def _fit(steps: tuple[ScanStep, ...], moved: Array, axis: _Axis) -> tuple[Array, Array]:
+    """For every lag, (k,): squared Mahalanobis distance of the places by both measures, and log determinant."""
+    shown = np.cumsum([step.moved[axis.place] for step in steps])
+    seen = np.square([step.deviations[axis.place] for step in steps])
+    seconds = np.array([(step.stamp - steps[0].since) / SECOND for step in steps])
+    along = moved[..., 2 * axis.place]
+    places, lengths = np.cumsum(along, axis=1), np.cumsum(np.abs(along), axis=1)
+    ways = np.cumsum(np.hypot(moved[..., 0], moved[..., 1]), axis=1)
+    slip = SLIP_LENGTH * np.minimum(lengths[:, :, None], lengths[:, None, :])
+    greatest = np.square(axis.share) * (_outer(places) + slip)
+    greatest += np.square(axis.bend) * _outer(ways) + np.square(axis.drift) * _outer(seconds[None])
+    greatest += np.square(axis.constant) * np.eye(len(steps))
+    root = np.linalg.cholesky(greatest / GREATEST**2 + np.square(OFFSET) + np.diag(seen))
+    white = np.linalg.solve(root, (shown - places)[..., None])[..., 0]
+    volume = 2.0 * np.sum(np.log(np.diagonal(root, axis1=1, axis2=2)), axis=1)
+    return np.sum(np.square(white), axis=1), volume
+
+
+def _outer(values: Array) -> Array:
+    product: Array = values[:, :, None] * values[:, None, :]
+    return product

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Final
 
+from monstertruck_estimation.consistency.delay import Delay, LagQuestion
 from monstertruck_estimation.consistency.tracks import Vector
 from monstertruck_estimation.slam.worker_io import ScanInput
 
@@ -31,6 +32,7 @@ class StepInput:
     anew: bool = False
     """Forget the scans before."""
     claim: Claim | None = None
+    lag: LagQuestion | None = None
 
 
 REFUTING: Final = 12
@@ -71,9 +73,14 @@ class StepOutput:
     """Stamp of the scan before; None = there is a gap: the motion since then is not known."""
     motion: Vector = (0.0, 0.0, 0.0)
     """Base at ``stamp`` in base at ``since``."""
+    deviations: tuple[float, float] = (1.0, 1.0)
+    """Standard deviations of the place ahead (m) and of the yaw (rad) at ``stamp``, against a scan that is kept for
+    some steps: errors of one step are those of the next one with the other sign."""
     overlap: float = 0.0
     """Share of the points that fit the scan before."""
     verdict: ScanVerdict | None = None
     """Of the claim; None without one, and where the earlier scan is not known any more."""
     front: str = ""
     """Scan odometry that is used."""
+    delay: Delay | None = None
+    """Answer to the question for the lag."""

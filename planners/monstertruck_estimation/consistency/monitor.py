@@ -22,7 +22,7 @@ from monstertruck_estimation.consistency.comparison import (
     way_limit,
 )
 from monstertruck_estimation.consistency.config import ConsistencyConfig
-from monstertruck_estimation.consistency.delay import scan_delay
+from monstertruck_estimation.consistency.delay import FEWEST, Delay, LagQuestion, ScanStep, lag_question
 from monstertruck_estimation.consistency.exchange import Claim, StepOutput
 from monstertruck_estimation.consistency.repeats import RepeatDetector, WholeRepeats
 from monstertruck_estimation.consistency.tracks import STILL, MotionTrack, Vector
@@ -39,6 +39,8 @@ DELAY_PERIOD: Final = SECOND // 4
 """Time between two looks at the delay of the scans, ns."""
 DELAY_OVER: Final = 4 * SECOND
 """Time over which it is determined, ns."""
+WITNESSES: Final = (Measure.WHEELS, Measure.GYRO, Measure.ENCODERS)
+"""Measures that show at what time the motion changes."""
 GAP: Final = SECOND // 2
 """Headings and rates further apart are not joined, ns."""
 IN_USE: Final = 2 * SECOND
@@ -77,6 +79,7 @@ class ConsistencyMonitor:
         self._config, self._sensors = config, sensors
         self._errors = errors_of(config)
         self._tracks = {measure: MotionTrack() for measure in sensors}
+        self._witnesses = [measure for measure in WITNESSES if measure in sensors]
         self._sampled: dict[Measure, int] = {}
         self._heading: tuple[int, float] | None = None
         self._rate: tuple[int, float] | None = None
@@ -87,8 +90,8 @@ class ConsistencyMonitor:
         """Stamps of scans whose motion is known."""
         self._intervals: deque[float] = deque([0.0], maxlen=INTERVALS)
         """Between the newest scans, s."""
-        self._steps: deque[tuple[int, int, float, float]] = deque()
-        self._delayed_at, self._delays = 0, 0
+        self._steps: deque[ScanStep] = deque()
+        self._delayed_at = 0
         self._active_since: int | None = None
         self._doubted: frozenset[Measure] = frozenset()
         """At the comparison before."""
@@ -156,14 +159,17 @@ class ConsistencyMonitor:
             self._pending, self._doubted = None, frozenset()
         else:
             track.add(output.stamp, output.motion)
-            self._steps.append((output.since, output.stamp, output.motion[0], output.motion[2]))
-            while output.stamp - self._steps[0][0] > DELAY_OVER:
+            moved = output.motion[0], output.motion[2]
+            self._steps.append(ScanStep(output.since, output.stamp, moved, output.deviations))
+            while output.stamp - self._steps[0].since > DELAY_OVER:
                 self._steps.popleft()
         self._scans.append(output.stamp)
         if output.verdict is not None and self._pending is not None:
             if output.verdict.refuted:
                 self._accuse(output.stamp, self._pending.found)
             self._pending = None
+        if output.delay is not None and self._active_since is not None:
+            self._take_delay(output.stamp, output.delay)
         self._compare(output.stamp)
 
     def observe_value(self, sensor: str, field: str, stamp: int, value: float) -> None:
@@ -187,7 +193,7 @@ class ConsistencyMonitor:
     def activate(self, now: int | None) -> None:
         """The robot was armed at ``now`` (ns): findings about motion end. None: disarmed, nothing is compared."""
         self._active_since = now
-        self._pending, self._doubted, self._delays = None, frozenset(), 0
+        self._pending, self._doubted = None, frozenset()
         self._steps.clear()
         if now is not None:
             self._found.clear()
@@ -305,21 +311,25 @@ class ConsistencyMonitor:
                 return
             yield scans[at]
 
-    def look_for_delay(self) -> None:
-        """Compare the content of the newest scans with earlier motion of the wheels: to be called now and then."""
-        stamp = self._sampled.get(Measure.SCANS, 0)
-        if self._active_since is None or stamp - self._delayed_at < DELAY_PERIOD:
-            return
-        self._delayed_at = stamp
-        steps = [step for step in self._steps if step[0] >= self._active_since]
+    def lag(self) -> LagQuestion | None:
+        """The motion of the newest scans, and of other measures before, that tells how much the scans lag behind."""
+        if not self._steps or self._active_since is None:
+            return None
+        if self._steps[-1].stamp - self._delayed_at < DELAY_PERIOD:
+            return None
+        self._delayed_at = self._steps[-1].stamp
+        steps = [step for step in self._steps if step.since >= self._active_since]
         interval, tolerated = max(self._intervals), self._config.delay
         tolerated += interval if interval > tolerated else 0.0  # stamps of sparse scans are no better
-        delay = scan_delay(steps, self._tracks[Measure.WHEELS], tolerated)
-        self._delays = 0 if delay is None else self._delays + 1
-        if delay is None or self._delays < 2:
-            return
-        lidar, wheels = self._sensors[Measure.SCANS], self._sensors[Measure.WHEELS]
-        text = f"what the scans show lags {delay.seconds:.1f} s behind the wheels: {self._config.delay:g} s tolerated"
+        others = [(self._errors[measure], self._tracks[measure]) for measure in self._witnesses]
+        return lag_question(steps, others, tolerated) if len(steps) >= FEWEST else None
+
+    def _take_delay(self, stamp: int, delay: Delay) -> None:
+        lidar, (first, *_) = self._sensors[Measure.SCANS], self._witnesses
+        text = (
+            f"what the scans show lags {delay.seconds:.1f} s behind the {' and the '.join(self._witnesses)}: "
+            f"{self._config.delay:g} s tolerated"
+        )
         self._found.setdefault(
             lidar,
             Doubt(
@@ -327,7 +337,7 @@ class ConsistencyMonitor:
                 kind=DoubtKind.DELAY,
                 since=stamp,
                 text=text,
-                against=wheels,
+                against=self._sensors[first],
                 difference=delay.seconds,
                 limit=self._config.delay,
             ),

@@ -2,20 +2,22 @@
 
 ``monstertruck_estimation.consistency.scan_odometry:ScanMotionStep``; a step's input is a ``StepInput``, its output a
 ``StepOutput``. kiss-icp (Vizzo et al. 2023) registers each scan to its own voxel map, starting at the motion before;
-without it ours registers the scan to the last one that was kept.
+our registration to the last scan that was kept refines its pose, and does without it where it is not installed.
 """
 
 import math
 from collections import deque
+from dataclasses import replace
 from importlib.util import find_spec
-from typing import Final, Protocol
+from typing import Final
 
 import numpy as np
 
+from monstertruck_estimation.consistency.delay import scan_delay
 from monstertruck_estimation.consistency.exchange import Claim, ScanVerdict, StepInput, StepOutput
 from monstertruck_estimation.consistency.tracks import KEPT
 from monstertruck_estimation.se2 import between, compose
-from monstertruck_estimation.slam.registration import Cloud, fitting, measure, register
+from monstertruck_estimation.slam.registration import Cloud, Fit, fitting, measure, register
 from monstertruck_estimation.slam.scans import Scan, prepare_input
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND
@@ -32,49 +34,13 @@ THINNED: Final = 0.06
 """About one point per square of this edge is registered, m."""
 MOST_POINTS: Final = 300
 KEEP_WAY: Final = 0.3
-"""Distance after which our own odometry keeps another scan, m."""
+"""Distance after which another scan is the reference, m."""
 KEEP_TURN: Final = 0.35
-"""Turn after which it does, rad."""
+"""Turn after which it is, rad."""
 STEPS: Final = 10
 """Steps by which a motion over a window is refined: scan odometry drifts."""
 REMEMBERED: Final = 128
 """Scans kept for claims."""
-
-
-class Front(Protocol):
-    """A scan odometry."""
-
-    def begin(self, scan: Scan, pose: Array) -> None:
-        """Forget everything, and begin with ``scan`` at ``pose``."""
-
-    def match(self, scan: Scan, guess: Array) -> Array:
-        """Pose of the next scan, shape (3,), from a guess."""
-
-    def keep(self, scan: Scan, pose: Array) -> None:
-        """Take the scan, whose pose is accepted, into the map."""
-
-
-class OwnFront:
-    """Registers each scan to the last one kept; a scan is kept when the robot has moved on."""
-
-    def __init__(self) -> None:
-        self._cloud: Cloud | None = None
-        self._pose = np.zeros(3)
-
-    def begin(self, scan: Scan, pose: Array) -> None:
-        """See ``Front``."""
-        self._cloud, self._pose = Cloud.of(scan), pose
-
-    def match(self, scan: Scan, guess: Array) -> Array:
-        """See ``Front``."""
-        assert self._cloud is not None
-        return compose(self._pose, register(scan, self._cloud, between(self._pose, guess)).pose)
-
-    def keep(self, scan: Scan, pose: Array) -> None:
-        """See ``Front``."""
-        moved = between(self._pose, pose)
-        if math.hypot(moved[0], moved[1]) > KEEP_WAY or abs(moved[2]) > KEEP_TURN:
-            self.begin(scan, pose)
 
 
 class KissFront:
@@ -86,40 +52,46 @@ class KissFront:
         self._map = KissMap()
 
     def begin(self, scan: Scan, pose: Array) -> None:
-        """See ``Front``."""
+        """Forget everything, and begin with ``scan`` at ``pose``, shape (3,)."""
         self._map.clear()
-        self._map.update(scan.points, pose)
+        self.keep(scan, pose)
 
     def match(self, scan: Scan, guess: Array) -> Array:
-        """See ``Front``."""
+        """Pose of the next scan, shape (3,), from a guess."""
         return self._map.align(scan.points, guess)
 
     def keep(self, scan: Scan, pose: Array) -> None:
-        """See ``Front``."""
+        """Take the scan, whose pose is accepted, into the map."""
         self._map.update(scan.points, pose)
 
 
-def front_of(kind: str) -> tuple[str, Front]:
+def front_of(kind: str) -> tuple[str, KissFront | None]:
     """The scan odometry of this name, or ours where kiss-icp is not installed, with its name."""
     if kind == "kiss" and find_spec("kiss_icp") is not None:
         return "kiss", KissFront()
-    return "own", OwnFront()
+    return "own", None
 
 
 class ScanMotionStep:
     """Motion from scan to scan."""
 
     def __init__(self) -> None:
-        self._front: tuple[str, Front] | None = None
+        self._front: tuple[str, KissFront | None] | None = None
         self._pose = np.zeros(3)
         self._motion, self._seconds = np.zeros(3), 0.0
         """Newest motion and the time it took."""
         self._last: tuple[int, Cloud] | None = None
+        self._reference: tuple[Cloud, Array] | None = None
+        """The scan that others are registered to, and its pose."""
         self._kept: deque[tuple[int, Scan, Array]] = deque(maxlen=REMEMBERED)
         """Stamp, scan and its pose."""
 
     def step(self, inputs: StepInput) -> StepOutput:
         """Take one scan."""
+        output = self._take(inputs)
+        return output if inputs.lag is None else replace(output, delay=scan_delay(inputs.lag))
+
+    def _take(self, inputs: StepInput) -> StepOutput:
         if self._front is None:
             self._front = front_of(inputs.front)
         name, front = self._front
@@ -140,37 +112,61 @@ class ScanMotionStep:
         cloud = Cloud.of(whole)
         self._last = stamp, cloud
         if found is None or last is None:
-            front.begin(scan, self._pose)
+            self._begin(front, scan, self._pose)
             self._motion, self._seconds = np.zeros(3), 0.0
             self._kept.clear()
             self._kept.append((stamp, whole, self._pose))
             return StepOutput(stamp, None, front=name)
-        motion, overlap = found
+        motion, overlap, deviations = found
         self._pose = compose(self._pose, motion)
-        front.keep(scan, self._pose)
+        self._keep(front, scan)
         self._motion, self._seconds = motion, dt
         self._kept.append((stamp, whole, self._pose))
         while stamp - self._kept[0][0] > KEPT:
             self._kept.popleft()
         verdict = None if inputs.claim is None else self._judged(whole, inputs.claim)
         x, y, yaw = motion.tolist()
-        return StepOutput(stamp, last[0], (x, y, yaw), overlap, verdict, name)
+        return StepOutput(stamp, last[0], (x, y, yaw), deviations, overlap, verdict, name)
+
+    def _begin(self, front: KissFront | None, scan: Scan, pose: Array) -> None:
+        self._reference = Cloud.of(scan), pose
+        if front is not None:
+            front.begin(scan, pose)
+
+    def _keep(self, front: KissFront | None, scan: Scan) -> None:
+        if front is not None:
+            front.keep(scan, self._pose)
+        assert self._reference is not None
+        moved = between(self._reference[1], self._pose)
+        if math.hypot(moved[0], moved[1]) > KEEP_WAY or abs(moved[2]) > KEEP_TURN:
+            self._reference = Cloud.of(scan), self._pose
 
     def _found(
-        self, front: Front, scan: Scan, whole: Scan, before: Cloud, lasting: Array
-    ) -> tuple[Array, float] | None:
-        """Motion since the scan before, and its overlap; None where no motion fits."""
-        motion = between(self._pose, front.match(scan, compose(self._pose, lasting)))
-        overlap = measure(whole, before, motion).overlap if np.isfinite(motion).all() else 0.0
-        if overlap < FITS:
-            # The velocity did not last, or the map holds what is no longer there.
-            tries = [register(whole, before, start) for start in (np.zeros(3), lasting)]
-            best = max(tries, key=lambda fit: fit.overlap)
-            motion, overlap = best.pose, best.overlap
-            if overlap < FITS:
-                return None
-            front.begin(scan, compose(self._pose, motion))
-        return motion, overlap
+        self, front: KissFront | None, scan: Scan, whole: Scan, before: Cloud, lasting: Array
+    ) -> tuple[Array, float, tuple[float, float]] | None:
+        """Motion since the scan before, its overlap and deviations; None where no motion fits.
+
+        kiss-icp's pairs of points on walls along the way hold the robot back by up to 0.1 m while it starts: its pose
+        is where the registration to the reference begins, whose pairs slide along surfaces.
+        """
+        assert self._reference is not None
+        cloud, origin = self._reference
+        guess = compose(self._pose, lasting)
+        if front is not None:
+            guess = front.match(scan, guess)
+        fit = register(scan, cloud, between(origin, guess)) if np.isfinite(guess).all() else None
+        if fit is not None and np.isfinite(fit.pose).all():
+            motion = between(self._pose, compose(origin, fit.pose))
+            overlap = measure(whole, before, motion).overlap
+            if overlap >= FITS:
+                return motion, overlap, deviations_of(fit)
+        # The velocity did not last, or the map holds what is no longer there.
+        tries = [register(whole, before, start) for start in (np.zeros(3), lasting)]
+        best = max(tries, key=lambda fit: fit.overlap)
+        if best.overlap < FITS:
+            return None
+        self._begin(front, scan, compose(self._pose, best.pose))
+        return best.pose, best.overlap, deviations_of(best)
 
     def _judged(self, scan: Scan, claim: Claim) -> ScanVerdict | None:
         earlier = next((kept for kept in self._kept if kept[0] == claim.since), None)
@@ -185,6 +181,14 @@ class ScanMotionStep:
         fits = max((fitting(scan, cloud, pose) for pose in (claimed, *near)), key=np.count_nonzero)
         alone, own_alone, misfits = map(np.count_nonzero, (fits & ~fits_own, fits_own & ~fits, ~fits_own))
         return ScanVerdict(claimed=int(alone), own=int(own_alone), misfits=int(misfits))
+
+
+def deviations_of(fit: Fit) -> tuple[float, float]:
+    """Standard deviations of a registered pose ahead (m) and of its yaw (rad); 1 where nothing constrains it."""
+    covariance = np.linalg.inv(fit.information + np.eye(3))
+    c, s = math.cos(fit.pose[2]), math.sin(fit.pose[2])
+    ahead = c * c * covariance[0, 0] + 2 * c * s * covariance[0, 1] + s * s * covariance[1, 1]
+    return math.sqrt(ahead), math.sqrt(covariance[2, 2])
 
 
 def _is_near(pose: Array, claimed: Array, errors: tuple[float, float]) -> bool:

@@ -156,7 +156,6 @@ class ConsistencyService:
         self._take_gate()
         self._take_wheels()
         self._take_others()
-        self.monitor.look_for_delay()
         self._publish()
 
     def _take_gate(self) -> None:
@@ -242,7 +241,8 @@ class ConsistencyService:
         inputs = replace(ScanInput.of(scan, setup.mount.planar), slopes=slopes, height=height)
         anew, self._anew = self._anew, False
         front = self._config.scans or "own"
-        return StepInput(inputs, front, anew, None if anew else self.monitor.claim(scan.stamp))
+        monitor = self.monitor
+        return StepInput(inputs, front, anew, None if anew else monitor.claim(scan.stamp), monitor.lag())
 
     # What follows
 

@@ -77,8 +77,7 @@ def drive(walls, poses, lies=None, front="own", sensors=SENSORS, config=None, gy
                 range_max=30.0,
             )
             monitor.observe_whole("lidar", stamp, beams.tobytes() if np.isfinite(beams).sum() > 20 else None)
-            monitor.observe_scan(odometry.step(StepInput(scan, front, claim=monitor.claim(stamp))))
-        monitor.look_for_delay()
+            monitor.observe_scan(odometry.step(StepInput(scan, front, claim=monitor.claim(stamp), lag=monitor.lag())))
         for doubt in monitor.findings():
             trial.found.setdefault(doubt.sensor, doubt)
             trial.at.setdefault(doubt.sensor, way)
