@@ -18,8 +18,8 @@ from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.topics import CMD_STEERING, COMPASS
 from monstertruckd.recorder.chunks import records_in, unpacked
 from monstertruckd.recorder.config import Compression
+from monstertruckd.recorder.frames import MAGIC
 from monstertruckd.recorder.log_file import LogEntry, LogFile
-from monstertruckd.recorder.reader import MAGIC
 from monstertruckd.recorder.repair import recover
 
 CHUNKS: Final = 8

@@ -2,145 +2,53 @@
 
 import itertools
 import json
-import os
-import struct
 import zlib
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO, Final
 
-import zstandard
 from mcap.data_stream import ReadDataStream
-from mcap.exceptions import EndOfFile, McapError
+from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, Header, McapRecord, Metadata, Schema, Statistics
+from mcap.records import Attachment, Channel, Chunk, Header, McapRecord, Metadata, Schema
 from mcap.records import Message as McapMessage
 
 from monstertruck_runtime import wire
 from monstertruck_runtime.errors import ConfigError, InputError, NotFoundError
-from monstertruck_runtime.outside import MEGABYTE, MOST_UNPACKED
-from monstertruck_runtime.small_files import require_file
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.topics import BY_NAME
-from monstertruckd.recorder.chunks import LIMIT, records_in, unpacked
-from monstertruckd.recorder.log_file import DAMAGED, LOG_OFFSET, TIMES
-
-MAGIC: Final = b"\x89MCAP0\r\n"
-
-DAMAGE: Final = (
-    McapError,
-    zstandard.ZstdError,
-    struct.error,
-    ValueError,
-    RuntimeError,
-    LookupError,
-    MemoryError,
-    OverflowError,
-    OSError,
+from monstertruckd.recorder.chunks import records_in, unpacked
+from monstertruckd.recorder.frames import (
+    CHECKSUM,
+    DAMAGE,
+    MAGIC,
+    PRIVATE,
+    checked_attachment,
+    digest_of,
+    index_is_sound,
+    open_file,
+    read_frame,
+    read_statistics,
 )
-"""What the libraries raise on bytes that are no MCAP record (lz4: RuntimeError; bad checksums: ValueError)."""
-
-_END: Final = struct.Struct("<BQQQI8s")
-"""Footer and magic: opcode, length, where the summary and its offsets begin, checksum."""
-
-_FOOTER_LENGTH: Final = struct.calcsize("<QQI")
-_UNSUMMED: Final = struct.calcsize("<I8s")
-_HEAD: Final = struct.Struct("<BQ")
-"""Head of a record: opcode, length of the content."""
-CHECKSUM: Final = struct.Struct("<I")
-_PIECE: Final = 1 << 20
-
-
-def is_finished(path: Path) -> bool:
-    """Whether the file ends as a finished log does."""
-    with path.open("rb") as file:
-        size = file.seek(0, os.SEEK_END)
-        file.seek(-min(size, len(MAGIC)), os.SEEK_END)
-        return size > len(MAGIC) and file.read() == MAGIC
-
-
-def index_is_sound(file: BinaryIO) -> bool:
-    """Whether a log is finished, and its index at the end, if it has one, is what the checksum says.
-
-    Args:
-        file: of the log; its position is another one afterwards.
-    """
-    size = file.seek(0, os.SEEK_END)
-    file.seek(-min(size, _END.size), os.SEEK_END)
-    end = file.read()
-    if len(end) < _END.size:
-        return False
-    opcode, length, start, _, checksum, magic = _END.unpack(end)
-    if (opcode, length, magic) != (Opcode.FOOTER, _FOOTER_LENGTH, MAGIC) or start > size - _END.size:
-        return False
-    return not (start and checksum) or _checksum(file, start, size - _UNSUMMED) == checksum
-
-
-def _checksum(file: BinaryIO, begin: int, end: int) -> int:
-    """Of the bytes from ``begin`` up to ``end``, which may be more than fit into memory."""
-    file.seek(begin)
-    value = 0
-    for at in range(begin, end, _PIECE):
-        value = zlib.crc32(file.read(min(_PIECE, end - at)), value)
-    return value
-
-
-def read_frame(file: BinaryIO, size: int) -> tuple[int, bytes, bytes]:
-    """Opcode, head and content of the next record of a file of ``size`` bytes.
-
-    Raises:
-        EndOfFile: it is not all there.
-        McapError: it is longer than ``MOST_UNPACKED``.
-    """
-    head = file.read(_HEAD.size)
-    if len(head) < _HEAD.size:
-        raise EndOfFile
-    opcode, length = _HEAD.unpack(head)
-    if length > size - file.tell():
-        raise EndOfFile
-    if length > MOST_UNPACKED:
-        raise McapError(f"a record of {length / MEGABYTE:.0f} MB: {LIMIT}")
-    return opcode, head, file.read(length)
-
-
-def read_statistics(file: BinaryIO, size: int) -> Statistics | None:
-    """Of a sound index that begins where ``file`` stands; None if it has none."""
-    while True:
-        opcode, _, content = read_frame(file, size)
-        if opcode == Opcode.STATISTICS:
-            found: Statistics = Statistics.read(ReadDataStream(BytesIO(content)))
-            return found
-        if opcode == Opcode.FOOTER:
-            return None
-
+from monstertruckd.recorder.log_file import DAMAGED, LOG_OFFSET, TIMES
+from monstertruckd.recorder.salvage import ChannelFacts, Salvage
+from monstertruckd.recorder.verdict import Verdict, judged, repetition
 
 CONFIG: Final = "config.json"
 """The attachment with the daemon's configuration."""
 
-PRIVATE: Final = 0x80
-"""Opcodes from here on are private ones; unknown ones below are damage."""
+_BEYOND: Final = 1 << 16
+"""Numbers of schemas in a file are below."""
 _PLAIN: Final[dict[int, Any]] = {
     Opcode.HEADER: Header,
     Opcode.SCHEMA: Schema,
     Opcode.CHANNEL: Channel,
     Opcode.METADATA: Metadata,
 }
-
-
-def checked_attachment(record: Attachment, content: bytes) -> Attachment:
-    """Return an attachment, renamed if its checksum, which mcap does not verify, is wrong.
-
-    Args:
-        record: the attachment.
-        content: of its record in the file.
-    """
-    (expected,) = CHECKSUM.unpack(content[-CHECKSUM.size :])
-    if expected in (0, zlib.crc32(content[: -CHECKSUM.size])):
-        return record
-    return replace(record, name=record.name + DAMAGED, media_type="application/octet-stream")
 
 
 def spare_log(output: Path) -> None:
@@ -153,24 +61,6 @@ def spare_log(output: Path) -> None:
         with output.open("rb") as file:
             if file.read(len(MAGIC)) == MAGIC:
                 raise InputError(f"{output}: is a log, which is not overwritten; name another file")
-
-
-def open_file(path: Path) -> BinaryIO:
-    """Open a log for reading, whatever is in it.
-
-    Raises:
-        NotFoundError: no such file.
-        InputError: it is a folder, or cannot be read.
-    """
-    try:
-        require_file(path)
-        return path.open("rb")
-    except FileNotFoundError:
-        raise NotFoundError(f"{path}: no such log") from None
-    except IsADirectoryError:
-        raise InputError(f"{path}: a folder; `monstertruckd log list {path}` lists the logs in it") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,7 +91,7 @@ class LogMessage:
 
 
 class LogReader:
-    """Iterates over a log, once or again; a damaged file ends at its first error.
+    """Iterates over a log, once or again; of a damaged file, over every whole chunk, as ``recover`` keeps them.
 
     Args:
         path: an MCAP file.
@@ -214,22 +104,30 @@ class LogReader:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.damage: str | None = None
-        """After an iteration to the end: why messages are missing; None if none is known to be."""
+        """After an iteration to the end: why messages are missing, how many and when; None if none is known to be."""
         self.flaws: list[str] = []
         """What else an iteration to the end found damaged; it costs no message."""
+        self.verdict: Verdict | None = None
+        """Figures of the damage; None if the last iteration met none on its way to the index."""
         self.position = 0
         """Bytes an iteration has read so far, for progress bars."""
         self.log_offset = 0
         """The file's log times minus daemon times, ns, once an iteration has passed the metadata."""
         with open_file(path) as file:
-            head = file.read(len(MAGIC))
-        if not MAGIC.startswith(head):
-            raise InputError(f"{path}: not an MCAP log")
+            if not MAGIC.startswith(file.read(len(MAGIC))) and Salvage(file).strange:
+                raise InputError(f"{path}: not an MCAP log")
 
     def __iter__(self) -> Iterator[LogMessage]:
+        return self._messages(self.records())
+
+    def before_damage(self) -> Iterator[LogMessage]:
+        """The messages up to the first error, for what a gap would make meaningless."""
+        return self._messages(self.records(past_damage=False))
+
+    def _messages(self, records: Iterator[McapRecord]) -> Iterator[LogMessage]:
         schemas: dict[int, Schema] = {}
         channels: dict[int, Channel] = {}
-        for record in self.records():
+        for record in records:
             if isinstance(record, Schema):
                 schemas[record.id] = record
             elif isinstance(record, Channel):
@@ -246,43 +144,69 @@ class LogReader:
                     schema.name if schema else "",
                 )
 
-    def records(self) -> Iterator[McapRecord]:
-        """Every MCAP record before the index, up to the first error, chunks opened; channels precede their messages.
+    def records(self, *, past_damage: bool = True) -> Iterator[McapRecord]:
+        """Every whole MCAP record before the index, chunks opened; channels precede their messages.
 
         Their times are as they are in the file; see ``log_offset``.
+
+        Args:
+            past_damage: go on behind an error.
         """
-        self.damage, self.flaws, self.log_offset = None, [], 0
+        self.damage, self.flaws, self.verdict, self.log_offset = None, [], None, 0
         size = self.size
         with self.path.open("rb") as file:
             try:
-                yield from self._records(file, size)
+                yield from self._sound(file, size)
             except DAMAGE as error:
                 why = str(error) if type(error) is McapError else type(error).__name__
-                self.damage = f"ends or is damaged after byte {self.position} of {size} ({why})"
+                text = f"is damaged at byte {self.position} of {size} ({why})"
+                if past_damage:
+                    yield from self._salvaged(file, text)
+                else:
+                    self.damage = text
+            self.position = size
 
-    def _records(self, file: BinaryIO, size: int) -> Iterator[McapRecord]:
-        """The same, but raises one of ``DAMAGE`` at the first error, whose record begins at ``position``."""
-        channels: set[int] = set()
+    def _sound(self, file: BinaryIO, size: int) -> Iterator[McapRecord]:
+        """The same of a sound log; raises one of ``DAMAGE`` at the first error, whose record begins at ``position``."""
+        channels, seen = set[int](), set[bytes]()
         given: Counter[type[McapRecord]] = Counter()
-        self.position = 0
-        summed = zlib.crc32(file.read(len(MAGIC)))
+        self.position, repeated = 0, 0
+        begin = file.read(len(MAGIC))
+        if begin != MAGIC:
+            raise McapError("zeros" if begin and not any(begin) else "no begin of a log")
+        summed = zlib.crc32(begin)
         while True:
             self.position = file.tell()
             opcode, head, content = read_frame(file, size)
             if opcode == Opcode.DATA_END:
                 self._end(file, size, content, summed, given)
-                self.position = size
+                if repeated:
+                    self.flaws.append(repetition(repeated))
                 return
             summed = zlib.crc32(content, zlib.crc32(head, summed))
+            if opcode == Opcode.CHUNK:
+                digest = digest_of(opcode, content)
+                if digest in seen:
+                    repeated += 1
+                    continue
+                seen.add(digest)
             for record in self._opened(opcode, content):
                 if isinstance(record, Channel):
                     channels.add(record.id)
                 elif isinstance(record, McapMessage) and record.channel_id not in channels:
                     raise McapError(f"message of an unknown channel {record.channel_id}")
-                elif isinstance(record, Metadata) and record.name == TIMES:
-                    self.log_offset = int(record.metadata.get(LOG_OFFSET, "0"))
+                self._learn(record)
                 given[type(record)] += 1
                 yield record
+
+    def _learn(self, record: McapRecord) -> None:
+        """Note of which clock the times are.
+
+        Raises:
+            ValueError: the offset is no number.
+        """
+        if isinstance(record, Metadata) and record.name == TIMES:
+            self.log_offset = int(record.metadata.get(LOG_OFFSET, "0"))
 
     def _opened(self, opcode: int, content: bytes) -> Iterable[McapRecord]:
         """Records of one record of the data section (those of a chunk)."""
@@ -299,7 +223,7 @@ class LogReader:
         if opcode == 0:  # no opcode: the zeros of a file that a power cut left without its content
             raise McapError("zeros")
         if opcode != Opcode.MESSAGE_INDEX and opcode < PRIVATE:
-            self.flaws.append(f"holds a damaged record at byte {self.position}")
+            raise McapError(f"no record of the data section: {opcode}")
         return ()
 
     def _checked(self, record: Attachment, content: bytes) -> Attachment:
@@ -324,20 +248,48 @@ class LogReader:
         if statistics is None:
             return
         if given[McapMessage] != statistics.message_count:
-            self.damage = f"holds {given[McapMessage]} of {statistics.message_count} messages"
+            raise McapError(f"{given[McapMessage]} of {statistics.message_count} messages")
         if (given[Attachment], given[Metadata]) != (statistics.attachment_count, statistics.metadata_count):
             self.flaws.append("lacks an attachment or metadata")
+
+    def _salvaged(self, file: BinaryIO, first: str) -> Iterator[McapRecord]:
+        """Whatever is whole from ``position`` on, and what is lost.
+
+        Args:
+            file: the log.
+            first: what is wrong there.
+        """
+        salvage = Salvage(file)
+        introduced: set[int] = set()
+        for record in salvage.records(self.position):
+            if isinstance(record, tuple):
+                message, facts = record
+                if message.channel_id not in introduced:
+                    introduced.add(message.channel_id)
+                    yield from _introduction(message.channel_id, facts)
+                yield message
+            else:
+                with suppress(ValueError):
+                    self._learn(record)
+                yield record
+        self.verdict = judged(salvage)
+        self.flaws = []
+        text = f"{first}, {self.verdict.damage or 'is sound'}"
+        if self.verdict.costs:
+            self.damage = f"{text}: {self.verdict.losses}"
+        else:
+            self.flaws.append(text)
 
     def preamble(self) -> Iterator[McapRecord]:
         """The records before the first message: the recorder writes attachments and metadata there.
 
         What an iteration to the end found wrong stays known.
         """
-        damage, flaws = self.damage, self.flaws
+        known = self.damage, self.flaws, self.verdict
         try:
             yield from itertools.takewhile(lambda record: not isinstance(record, McapMessage), self.records())
         finally:
-            self.damage, self.flaws = damage, flaws
+            self.damage, self.flaws, self.verdict = known
 
     def config(self) -> dict[str, Any]:
         """The attached configuration as plain values; empty where there is none. Raises as ``attached_config`` does."""
@@ -360,6 +312,22 @@ class LogReader:
     def metadata(self) -> dict[str, dict[str, str]]:
         """Metadata records of the preamble, by name."""
         return {record.name: dict(record.metadata) for record in self.preamble() if isinstance(record, Metadata)}
+
+
+def _introduction(number: int, facts: ChannelFacts) -> Iterator[Schema | Channel]:
+    """A channel that may not have been introduced yet, with its schema, under a number that no file can hold."""
+    schema = 0
+    if facts.schema is not None:
+        schema = _BEYOND + number
+        name, encoding, data = facts.schema
+        yield Schema(id=schema, name=name, encoding=encoding, data=data)
+    yield Channel(
+        id=number,
+        topic=facts.topic,
+        message_encoding=facts.message_encoding,
+        metadata=dict(facts.metadata),
+        schema_id=schema,
+    )
 
 
 def attached_config(log: Path, attachments: Mapping[str, bytes]) -> dict[str, Any] | None:

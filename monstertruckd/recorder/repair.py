@@ -13,20 +13,20 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import BinaryIO, Final
 
 from mcap.records import Attachment, Header, Metadata
 from mcap.writer import Writer
 
-from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError, TruckError
 from monstertruck_runtime.outside import reading
 from monstertruck_runtime.small_files import sync_folder
+from monstertruckd.recorder.frames import is_finished, open_file
 from monstertruckd.recorder.log_file import CHANNELS, DAMAGED
-from monstertruckd.recorder.reader import is_finished, open_file
 from monstertruckd.recorder.salvage import ChannelFacts, Salvage
+from monstertruckd.recorder.verdict import Verdict, judged
 
 log = logging.getLogger(__name__)
 
@@ -35,40 +35,20 @@ RECOVERED: Final = "recovered"
 """Metadata record of a repaired log: of which log it is, and what is lost."""
 
 
-@dataclass(frozen=True, slots=True)
-class Recovery:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Recovery(Verdict):
     """Outcome of one repair."""
 
     path: Path
     """The repaired file; the log itself if it was sound."""
-    messages: int
-    """Kept."""
-    lost: int = 0
-    """Messages that are lost."""
-    counted: bool = True
-    """``lost`` is all; if not, the log has no sound index, and more may be lost."""
-    spans: tuple[tuple[float, float | None], ...] = ()
-    """Times in which messages are lost, s after the log's first message; None = to its end."""
-    repeated: int = 0
-    """Chunks that the log held twice."""
-    damage: str | None = None
-    """What was wrong with the original; None when it was sound."""
     original: Path | None = None
     """Where the damaged log is kept; None when it was sound, or is where it was."""
 
     def __str__(self) -> str:
         if self.damage is None:
             return f"{self.path}: {self.messages} messages kept, was sound"
-        least = "" if self.counted else "at least "
-        text = f"{self.path}: {self.messages} messages kept, {least}{self.lost} lost"
-        if self.spans:
-            text += " (" + ", ".join(_span_text(*span) for span in self.spans) + " after its begin)"
-        text += f"; it {self.damage}"
+        text = f"{self.path}: {self.messages} messages kept, {self.losses}; it {self.damage}"
         return text if self.original is None else f"{text}; the original is {self.original}"
-
-
-def _span_text(start: float, end: float | None) -> str:
-    return f"from {start:.1f} s on" if end is None else f"{start:.1f} to {end:.1f} s"
 
 
 def in_use(path: Path) -> bool:
@@ -110,11 +90,15 @@ def recover(source: str | Path, target: str | Path, stop: threading.Event | None
                 os.fsync(output.fileno())
             if in_place and done.damage is None:
                 part.unlink()
-                return replace(done, path=source)
+                return _recovery(done, source)
             kept = _keep(source) if in_place else None
             part.replace(target)
             sync_folder(target.parent)
-    return replace(done, path=target, original=kept)
+    return _recovery(done, target, kept)
+
+
+def _recovery(done: Verdict, path: Path, original: Path | None = None) -> Recovery:
+    return Recovery(**asdict(done), path=path, original=original)
 
 
 @contextmanager
@@ -179,11 +163,10 @@ def _lock(file: BinaryIO, how: int) -> bool:
     return True
 
 
-def _copy(salvage: Salvage, source: Path, output: BinaryIO, stop: threading.Event | None) -> Recovery:
+def _copy(salvage: Salvage, source: Path, output: BinaryIO, stop: threading.Event | None) -> Verdict:
     """Copy all whole records and note in the metadata ``recovered`` what is lost."""
     writer = Writer(output)
     registered = _Registered(writer)
-    first: int | None = None
     started = False
     for record in salvage.records():
         if stop is not None and stop.is_set():
@@ -194,7 +177,6 @@ def _copy(salvage: Salvage, source: Path, output: BinaryIO, stop: threading.Even
             started = True
         if isinstance(record, tuple):
             message, facts = record
-            first = message.log_time if first is None else min(first, message.log_time)
             channel = registered.channel(message.channel_id, facts)
             writer.add_message(channel, message.log_time, message.data, message.publish_time, message.sequence)
         elif isinstance(record, Attachment):
@@ -203,11 +185,10 @@ def _copy(salvage: Salvage, source: Path, output: BinaryIO, stop: threading.Even
             writer.add_metadata(record.name, dict(record.metadata))
     if not started:
         writer.start()
-    done = _judged(salvage, source, first)
+    done = judged(salvage)
     if done.damage is not None:
         notes = {"log": source.name, "damage": done.damage, "kept": done.messages, "lost": done.lost}
-        spans = ", ".join(_span_text(*span) for span in done.spans)
-        writer.add_metadata(RECOVERED, {name: str(value) for name, value in notes.items()} | {"spans": spans})
+        writer.add_metadata(RECOVERED, {name: str(value) for name, value in notes.items()} | {"spans": done.times})
     writer.finish()  # type: ignore[no-untyped-call]
     return done
 
@@ -230,44 +211,6 @@ class _Registered:
                 facts.topic, facts.message_encoding, schema, dict(facts.metadata)
             )
         return self._channels[number, facts]
-
-
-def _judged(salvage: Salvage, source: Path, first: int | None) -> Recovery:
-    """What is kept and lost, after all records were given.
-
-    Args:
-        salvage: of the log.
-        source: the log.
-        first: log time of the first message that is kept, ns.
-    """
-    spans = salvage.spans()
-    begin = min((time for time in (first, *(span.start for span in spans)) if time is not None), default=0)
-    damage = list(salvage.flaws)
-    if salvage.gaps:
-        damage.append(f"cannot be read in {salvage.gaps} place{'s' if salvage.gaps > 1 else ''}")
-    if salvage.repeated:
-        damage.append(f"holds {salvage.repeated} chunk{'s' if salvage.repeated > 1 else ''} twice")
-    if not salvage.ended:
-        damage.append("has no end")
-    elif not salvage.indexed:
-        damage.append("has a damaged index")
-    elif salvage.lost:
-        damage.append(f"holds {salvage.messages} of {salvage.messages + salvage.lost} messages")
-    elif salvage.lacking:
-        damage.append("lacks an attachment or metadata")
-    return Recovery(
-        source,
-        salvage.messages,
-        salvage.lost,
-        salvage.counted,
-        tuple((_seconds(span.start, begin) or 0.0, _seconds(span.end, begin)) for span in spans),
-        salvage.repeated,
-        ", ".join(damage) or None,
-    )
-
-
-def _seconds(time: int | None, begin: int) -> float | None:
-    return None if time is None else (time - begin) / SECOND
 
 
 NICENESS = 15

@@ -13,7 +13,6 @@ import struct
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from hashlib import blake2b
 from io import BytesIO
 from typing import Any, BinaryIO, Final, NamedTuple
 
@@ -39,8 +38,8 @@ from monstertruck_runtime import wire
 from monstertruck_runtime.outside import MOST_UNPACKED
 from monstertruck_schemas.topics import BY_NAME
 from monstertruckd.recorder.chunks import records_in, unpacked
+from monstertruckd.recorder.frames import DAMAGE, MAGIC, PRIVATE, checked_attachment, digest_of, index_is_sound
 from monstertruckd.recorder.log_file import CHANNELS
-from monstertruckd.recorder.reader import DAMAGE, MAGIC, PRIVATE, checked_attachment, index_is_sound
 
 _HEAD: Final = struct.Struct("<BQ")
 _CANDIDATE: Final = re.compile(rb"[\x01-\x0f].{5}\x00\x00\x00", re.DOTALL)
@@ -48,8 +47,6 @@ _CANDIDATE: Final = re.compile(rb"[\x01-\x0f].{5}\x00\x00\x00", re.DOTALL)
 _CHUNK_CANDIDATE: Final = re.compile(rb"(?=\x06.{5}\x00\x00\x00)", re.DOTALL)
 _CHUNK_HEAD: Final = struct.Struct("<QQQII")
 """First and last log time, size unpacked, checksum, length of the compression's name."""
-_TIMES: Final = 16
-"""Bytes of its two times."""
 _SIZE: Final = struct.Struct("<Q")
 _INDEX_HEAD: Final = struct.Struct("<HI")
 _INDEX_ENTRY: Final = 16
@@ -148,6 +145,8 @@ class Salvage:
         """The file ends as a finished log does."""
         self.messages = 0
         """Messages given so far."""
+        self.first: int | None = None
+        """Least log time of the messages given so far, ns."""
         self.flaws: list[str] = []
         """Damage that costs no message, found so far."""
         self._spans: list[Span] = []
@@ -155,8 +154,12 @@ class Salvage:
 
     @property
     def strange(self) -> bool:
-        """Whether this is no log at all: another begin, and nothing of a log behind it."""
-        return not MAGIC.startswith(self._data.at(0, len(MAGIC))) and not any(self._found.parts)
+        """Whether this is no log at all: another begin, and nothing of a log behind it.
+
+        One of zeros is what a power cut leaves of a log that was never synced.
+        """
+        begin = self._data.at(0, len(MAGIC))
+        return not (MAGIC.startswith(begin) or any(self._found.parts)) and any(begin)
 
     @property
     def gaps(self) -> int:
@@ -210,8 +213,12 @@ class Salvage:
                 alone = False
         return spans
 
-    def records(self) -> Iterator[tuple[Message, ChannelFacts] | Attachment | Metadata | Header]:
-        """Yield headers, attachments, metadata, and messages with their channel, in the order of the file."""
+    def records(self, begin: int = 0) -> Iterator[tuple[Message, ChannelFacts] | Attachment | Metadata | Header]:
+        """Yield headers, attachments, metadata, and messages with their channel, in the order of the file.
+
+        Args:
+            begin: byte from which on they are yielded; those before it are counted.
+        """
         newest: int | None = None
         gap = False
         for part in self._found.parts:
@@ -224,9 +231,11 @@ class Salvage:
                         self._spans.append(Span(newest, record.log_time))
                         gap = False
                     newest = max(record.log_time, newest or 0)
+                    self.first = record.log_time if self.first is None else min(self.first, record.log_time)
                     self.messages += 1
-                    yield record, self._facts(record.channel_id)
-                elif isinstance(record, Header | Attachment | Metadata):
+                    if part.offset >= begin:
+                        yield record, self._facts(record.channel_id)
+                elif isinstance(record, Header | Attachment | Metadata) and part.offset >= begin:
                     yield record
         if gap or not self.ended:
             self._spans.append(Span(newest, None))
@@ -521,8 +530,7 @@ class _Scan:
             self._found.sealed.learn(record)
 
     def _is_new(self, part: _WholeRecord) -> bool:
-        begin = _TIMES if part.opcode == Opcode.CHUNK else 0  # no checksum covers a chunk's times
-        digest = blake2b(part.content(self._data)[begin:], digest_size=16).digest()
+        digest = digest_of(part.opcode, part.content(self._data))
         new = digest not in self._seen
         self._seen.add(digest)
         return new

@@ -19,7 +19,8 @@ from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError, NotFoundError, TruckError
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.topics import BY_NAME, CLOCK
-from monstertruckd.recorder.reader import DAMAGE, LogMessage, LogReader, index_is_sound
+from monstertruckd.recorder.frames import DAMAGE, index_is_sound
+from monstertruckd.recorder.reader import LogMessage, LogReader
 
 _EVERY = 1000
 """Messages between two calls of a progress function."""

@@ -19,7 +19,8 @@ from monstertruck_runtime.outside import lines_of, reading
 from monstertruck_runtime.small_files import require_file
 from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.state import Odometry
-from monstertruckd.recorder.reader import MAGIC, LogReader, open_log
+from monstertruckd.recorder.frames import MAGIC
+from monstertruckd.recorder.reader import LogReader, open_log
 
 BEGIN: Final = SECOND
 """Stamp of the first scan of a log with times of another origin, ns."""

@@ -12,7 +12,8 @@ from mcap.records import Attachment, Channel, Message, Metadata, Schema
 
 from monstertruck_runtime.clock import SECOND, is_date
 from monstertruck_runtime.errors import ConfigError, InputError, NotFoundError
-from monstertruckd.recorder.reader import DAMAGE, LogReader, index_is_sound, is_finished
+from monstertruckd.recorder.frames import DAMAGE, index_is_sound, is_finished
+from monstertruckd.recorder.reader import LogReader
 from monstertruckd.recorder.repair import in_use
 from monstertruckd.tools.logs.messages import first_offset, real_offset, utc
 
@@ -21,9 +22,10 @@ def info(path: str | Path) -> dict[str, Any]:
     """Contents of a log as plain JSON-able values.
 
     Returns:
-        ``path``, ``size`` (bytes), ``damage`` (text or None), ``messages``, ``start``/``end`` (ns of daemon time or
-        None), ``duration`` (s), ``topics`` (name to ``messages``, ``rate`` in Hz or None, ``bytes``, ``schema``,
-        ``start``, ``end``), ``attachments`` (name to bytes), ``metadata`` (name to text values).
+        ``path``, ``size`` (bytes), ``damage`` (text or None), ``lost`` (messages known to be), ``spans`` (their times,
+        s after the first message; None = to the end), ``messages``, ``start``/``end`` (ns of daemon time or None),
+        ``duration`` (s), ``topics`` (name to ``messages``, ``rate`` in Hz or None, ``bytes``, ``schema``, ``start``,
+        ``end``), ``attachments`` (name to bytes), ``metadata`` (name to text values).
 
     Raises:
         NotFoundError: no such file.
@@ -57,6 +59,7 @@ def info(path: str | Path) -> dict[str, Any]:
     for row in topics.values():
         if row["messages"] > 1 and row["end"] > row["start"]:
             row["rate"] = (row["messages"] - 1) * SECOND / (row["end"] - row["start"])
+    verdict = reader.verdict
     used = [row for row in topics.values() if row["messages"]]
     start = min((row["start"] for row in used), default=None)
     end = max((row["end"] for row in used), default=None)
@@ -64,6 +67,8 @@ def info(path: str | Path) -> dict[str, Any]:
         "path": str(path),
         "size": Path(path).stat().st_size,
         "damage": reader.fault,
+        "lost": 0 if verdict is None else verdict.lost,
+        "spans": [] if verdict is None else [list(span) for span in verdict.spans],
         "messages": sum(row["messages"] for row in used),
         "start": start,
         "end": end,

@@ -113,7 +113,7 @@ class RunLog:
             if (missing := self._missing_before(number)) is not None:
                 self.damage = f"{missing} is not there: the run is known up to it alone"
                 return
-            for entry in reader:
+            for entry in reader.before_damage():
                 if self._until is not None and entry.log_time > self._until:
                     return
                 if entry.sequence > newest.get(entry.topic, -1) or number == 0:

@@ -316,7 +316,7 @@ async def test_a_recording_is_played_paused_and_gone_through_by_its_time_bar():
 
 
 async def test_a_cut_recording_is_called_so(monkeypatch):
-    for fault in (None, "ends or is damaged after byte 87 of 3000"):
+    for fault in (None, "is damaged at byte 87 of 3000 (zeros)"):
         monkeypatch.setattr(RecordedDrive, "fault", fault)
         feed, viewer = ReplayFeed("truck run-1", Path("run-1.mcap"), RecordedDrive, WallClock()), Viewer()
         feed.attach(viewer)

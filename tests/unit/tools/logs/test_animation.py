@@ -66,7 +66,7 @@ def test_a_cut_log_is_drawn_and_ends_with_its_own_exit_code(tmp_path: Path):
     log.write_bytes(GOLDEN.read_bytes()[: GOLDEN.stat().st_size * 2 // 3])
     done = CliRunner().invoke(app, ["animate", str(log), str(tmp_path / "cut.gif"), "--width", "64"])
     assert done.exit_code == 9
-    assert "cut.mcap: ends or is damaged after byte" in done.output
+    assert "cut.mcap: is damaged at byte" in done.output
 
 
 def test_the_command_says_what_it_wrote(tmp_path: Path):

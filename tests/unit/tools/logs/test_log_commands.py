@@ -137,7 +137,7 @@ def damaged(tmp_path):
         ("view", "--save", "view.rrd"),
     ],
 )
-def test_a_damaged_log_is_used_up_to_its_damage_and_has_an_exit_code(damaged, tmp_path, monkeypatch, arguments):
+def test_a_damaged_log_is_used_as_far_as_it_is_whole_and_has_an_exit_code(damaged, tmp_path, monkeypatch, arguments):
     monkeypatch.chdir(tmp_path)
     done = run(arguments[0], damaged, *arguments[1:])
     assert done.exit_code == Reason.LOG_DAMAGED.exit_code
@@ -145,7 +145,7 @@ def test_a_damaged_log_is_used_up_to_its_damage_and_has_an_exit_code(damaged, tm
         assert done.stderr == ""
     else:
         assert done.stderr.count("\n") == 1
-        assert f"{damaged}: ends or is damaged after byte" in done.stderr
+        assert f"{damaged}: is damaged at byte" in done.stderr
         assert len(done.stderr) < 300
         assert len(list(tmp_path.iterdir())) == 2
 

@@ -35,19 +35,25 @@ def test_unfinished_log_is_read_up_to_its_end(cut, master):
     found = [(m.topic, m.log_time, m.decode()) for m in reader]
     assert 0 < len(found) < len(master[1])
     assert found == master[1][: len(found)]
-    assert "damaged after byte" in reader.damage
-    assert str(cut.stat().st_size) in reader.damage
+    place = f" of {cut.stat().st_size} (EndOfFile), cannot be read in 1 place, has no end"
+    assert f"{place}: perhaps some lost (from " in reader.damage
+    assert reader.damage.endswith(" s on after its begin)")
 
 
-def test_flipped_byte_ends_the_reading_there(log, master):
+def test_a_flipped_byte_costs_its_chunk_alone(log, master):
     data = bytearray(log.read_bytes())
     data[len(data) // 2] ^= 0xFF
     log.write_bytes(data)
     reader = open_log(log)
     found = [(m.topic, m.log_time, m.decode()) for m in reader]
-    assert found == master[1][: len(found)]
-    assert len(found) < len(master[1])
-    assert reader.damage is not None
+    assert found[0] == master[1][0]
+    assert found[-1] == master[1][-1]
+    missing = [message for message in master[1] if message not in found]
+    assert len(found) + len(missing) == len(master[1])
+    first = (missing[0][1] - SECOND) / SECOND
+    assert f"{len(missing)} lost ({first:.1f} to " in reader.damage
+    assert (reader.verdict.lost, reader.verdict.counted) == (len(missing), True)
+    assert (info(log)["lost"], info(log)["spans"]) == (len(missing), [list(span) for span in reader.verdict.spans])
 
 
 @pytest.mark.parametrize("use", [open_log, info, lambda p: recover(p, p), lambda p: export_csv(p, p.parent / "out")])
@@ -73,6 +79,20 @@ def test_log_that_died_at_birth_reads_as_empty(tmp_path):
     assert info(file)["damage"] is None
 
 
+@pytest.mark.parametrize("size", [7, 4096, 3_000_000])
+def test_a_log_of_zeros_reads_as_empty_and_is_repaired(tmp_path, size):
+    """What a power cut leaves of a log that was never synced."""
+    file = tmp_path / "run.mcap"
+    file.write_bytes(bytes(size))
+    reader = open_log(file)
+    assert list(reader) == []
+    assert "(zeros)" in reader.damage
+    (done,) = recover_directory(tmp_path)
+    assert (done.messages, done.original) == (0, tmp_path / "run.mcap.damaged")
+    assert done.original.read_bytes() == bytes(size)
+    assert info(file)["damage"] is None
+
+
 def test_message_without_its_channel_counts_as_damage(tmp_path):
     file = tmp_path / "odd.mcap"
     with file.open("wb") as output:
@@ -80,7 +100,7 @@ def test_message_without_its_channel_counts_as_damage(tmp_path):
         writer.start()
         writer.add_message(7, 1, b"x", 1)
     reader = open_log(file)
-    assert list(reader) == []
+    assert [(message.topic, message.payload) for message in reader] == [("unknown/channel-7", b"x")]
     assert "message of an unknown channel" in reader.damage
 
 

@@ -107,7 +107,7 @@ def test_a_flipped_byte_of_the_file_is_damage(tmp_path, share):
     log.write_bytes(data)
     check = computed_again(log)
     assert check.reason is Reason.LOG_DAMAGED
-    assert "damaged after byte" in check.damage
+    assert "is damaged at byte" in check.damage
     assert check.compared > 100
     assert check.agrees  # as far as it goes
 

@@ -96,7 +96,7 @@ def test_a_damaged_part_ends_the_run(parts):
     parts[1].write_bytes(data)
     check = computed_again(parts[0])
     assert check.reason is Reason.LOG_DAMAGED
-    assert check.damage.startswith(f"{parts[1].name} ends or is damaged after byte")
+    assert check.damage.startswith(f"{parts[1].name} is damaged at byte")
     assert check.agrees
 
 

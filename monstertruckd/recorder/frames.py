@@ -1,0 +1,152 @@
+"""Records of MCAP files: where each begins and ends, and which checksums hold."""
+
+import os
+import struct
+import zlib
+from dataclasses import replace
+from hashlib import blake2b
+from io import BytesIO
+from pathlib import Path
+from typing import BinaryIO, Final
+
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import EndOfFile, McapError
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Statistics
+
+from monstertruck_runtime.errors import InputError, NotFoundError
+from monstertruck_runtime.outside import MEGABYTE, MOST_UNPACKED
+from monstertruck_runtime.small_files import require_file
+from monstertruckd.recorder.chunks import LIMIT
+from monstertruckd.recorder.log_file import DAMAGED
+
+MAGIC: Final = b"\x89MCAP0\r\n"
+
+DAMAGE: Final = (
+    McapError,
+    zstandard.ZstdError,
+    struct.error,
+    ValueError,
+    RuntimeError,
+    LookupError,
+    MemoryError,
+    OverflowError,
+    OSError,
+)
+"""What the libraries raise on bytes that are no MCAP record (lz4: RuntimeError; bad checksums: ValueError)."""
+
+_END: Final = struct.Struct("<BQQQI8s")
+"""Footer and magic: opcode, length, where the summary and its offsets begin, checksum."""
+
+_FOOTER_LENGTH: Final = struct.calcsize("<QQI")
+_UNSUMMED: Final = struct.calcsize("<I8s")
+_HEAD: Final = struct.Struct("<BQ")
+"""Head of a record: opcode, length of the content."""
+CHECKSUM: Final = struct.Struct("<I")
+_PIECE: Final = 1 << 20
+_TIMES: Final = 16
+"""Bytes of a chunk's two times."""
+
+PRIVATE: Final = 0x80
+"""Opcodes from here on are private ones; unknown ones below are damage."""
+
+
+def is_finished(path: Path) -> bool:
+    """Whether the file ends as a finished log does."""
+    with path.open("rb") as file:
+        size = file.seek(0, os.SEEK_END)
+        file.seek(-min(size, len(MAGIC)), os.SEEK_END)
+        return size > len(MAGIC) and file.read() == MAGIC
+
+
+def index_is_sound(file: BinaryIO) -> bool:
+    """Whether a log is finished, and its index at the end, if it has one, is what the checksum says.
+
+    Args:
+        file: of the log; its position is another one afterwards.
+    """
+    size = file.seek(0, os.SEEK_END)
+    file.seek(-min(size, _END.size), os.SEEK_END)
+    end = file.read()
+    if len(end) < _END.size:
+        return False
+    opcode, length, start, _, checksum, magic = _END.unpack(end)
+    if (opcode, length, magic) != (Opcode.FOOTER, _FOOTER_LENGTH, MAGIC) or start > size - _END.size:
+        return False
+    return not (start and checksum) or _checksum(file, start, size - _UNSUMMED) == checksum
+
+
+def _checksum(file: BinaryIO, begin: int, end: int) -> int:
+    """Of the bytes from ``begin`` up to ``end``, which may be more than fit into memory."""
+    file.seek(begin)
+    value = 0
+    for at in range(begin, end, _PIECE):
+        value = zlib.crc32(file.read(min(_PIECE, end - at)), value)
+    return value
+
+
+def read_frame(file: BinaryIO, size: int) -> tuple[int, bytes, bytes]:
+    """Opcode, head and content of the next record of a file of ``size`` bytes.
+
+    Raises:
+        EndOfFile: it is not all there.
+        McapError: it is longer than ``MOST_UNPACKED``.
+    """
+    head = file.read(_HEAD.size)
+    if len(head) < _HEAD.size:
+        raise EndOfFile
+    opcode, length = _HEAD.unpack(head)
+    if length > size - file.tell():
+        raise EndOfFile
+    if length > MOST_UNPACKED:
+        raise McapError(f"a record of {length / MEGABYTE:.0f} MB: {LIMIT}")
+    return opcode, head, file.read(length)
+
+
+def read_statistics(file: BinaryIO, size: int) -> Statistics | None:
+    """Of a sound index that begins where ``file`` stands; None if it has none."""
+    while True:
+        opcode, _, content = read_frame(file, size)
+        if opcode == Opcode.STATISTICS:
+            found: Statistics = Statistics.read(ReadDataStream(BytesIO(content)))
+            return found
+        if opcode == Opcode.FOOTER:
+            return None
+
+
+def digest_of(opcode: int, content: bytes) -> bytes:
+    """Digest of a record, by which it is known when it is there again."""
+    begin = _TIMES if opcode == Opcode.CHUNK else 0  # no checksum covers a chunk's times
+    return blake2b(content[begin:], digest_size=16).digest()
+
+
+def checked_attachment(record: Attachment, content: bytes) -> Attachment:
+    """Return an attachment, renamed if its checksum, which mcap does not verify, is wrong.
+
+    Args:
+        record: the attachment.
+        content: of its record in the file.
+    """
+    (expected,) = CHECKSUM.unpack(content[-CHECKSUM.size :])
+    if expected in (0, zlib.crc32(content[: -CHECKSUM.size])):
+        return record
+    return replace(record, name=record.name + DAMAGED, media_type="application/octet-stream")
+
+
+def open_file(path: Path) -> BinaryIO:
+    """Open a log for reading, whatever is in it.
+
+    Raises:
+        NotFoundError: no such file.
+        InputError: it is a folder, or cannot be read.
+    """
+    try:
+        require_file(path)
+        return path.open("rb")
+    except FileNotFoundError:
+        raise NotFoundError(f"{path}: no such log") from None
+    except IsADirectoryError:
+        raise InputError(f"{path}: a folder; `monstertruckd log list {path}` lists the logs in it") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from None

@@ -1,0 +1,82 @@
+"""What a damaged log has kept and lost, in figures and words: the same for the reader and for the repair."""
+
+from dataclasses import dataclass
+
+from monstertruck_runtime.clock import SECOND
+from monstertruckd.recorder.salvage import Salvage
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What is known of a log after all of it was read."""
+
+    messages: int
+    """Kept."""
+    lost: int = 0
+    """Messages that are lost."""
+    counted: bool = True
+    """``lost`` is all; if not, the log has no sound index, and more may be lost."""
+    spans: tuple[tuple[float, float | None], ...] = ()
+    """Times in which messages are lost, s after the log's first message; None = to its end."""
+    repeated: int = 0
+    """Chunks that the log held twice."""
+    damage: str | None = None
+    """What is wrong with the log; None when it is sound."""
+
+    @property
+    def costs(self) -> bool:
+        """Whether messages are lost, or may be."""
+        return self.lost > 0 or not self.counted
+
+    @property
+    def losses(self) -> str:
+        """Number and times of lost messages, e.g. ``at least 20 lost (2.9 to 4.0 s after its begin)``."""
+        text = (
+            f"{self.lost} lost" if self.counted else f"at least {self.lost} lost" if self.lost else "perhaps some lost"
+        )
+        return f"{text} ({self.times} after its begin)" if self.spans else text
+
+    @property
+    def times(self) -> str:
+        """Times of lost messages."""
+        return ", ".join(_span_text(*span) for span in self.spans)
+
+
+def _span_text(start: float, end: float | None) -> str:
+    return f"from {start:.1f} s on" if end is None else f"{start:.1f} to {end:.1f} s"
+
+
+def repetition(chunks: int) -> str:
+    """Return what is wrong with a log that holds ``chunks`` twice."""
+    return f"holds {chunks} chunk{'s' if chunks > 1 else ''} twice"
+
+
+def judged(salvage: Salvage) -> Verdict:
+    """Return what is kept and lost, after all of the salvage's records were given."""
+    spans = salvage.spans()
+    begin = min((time for time in (salvage.first, *(span.start for span in spans)) if time is not None), default=0)
+    damage = list(salvage.flaws)
+    if salvage.gaps:
+        damage.append(f"cannot be read in {salvage.gaps} place{'s' if salvage.gaps > 1 else ''}")
+    if salvage.repeated:
+        damage.append(repetition(salvage.repeated))
+    if not salvage.ended:
+        damage.append("has no end")
+    elif not salvage.indexed:
+        damage.append("has a damaged index")
+    elif salvage.lost:
+        damage.append(f"holds {salvage.messages} of {salvage.messages + salvage.lost} messages")
+    elif salvage.lacking:
+        damage.append("lacks an attachment or metadata")
+    return Verdict(
+        salvage.messages,
+        salvage.lost,
+        salvage.counted,
+        tuple((_seconds(span.start, begin) or 0.0, _seconds(span.end, begin)) for span in spans),
+        salvage.repeated,
+        ", ".join(damage) or None,
+    )
+
+
+def _seconds(time: int | None, begin: int) -> float | None:
+    return None if time is None else (time - begin) / SECOND
