@@ -7,7 +7,7 @@ order, so the gate commands neutral while actuators and recorder still listen.
 import asyncio
 import dataclasses
 import secrets
-from collections.abc import AsyncIterator, Callable, Iterator, Mapping
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path
 from types import MappingProxyType
@@ -51,6 +51,7 @@ from monstertruckd.config.calibration import CalibrationStore
 from monstertruckd.config.expiry import CalibrationWatch, DistanceCounter
 from monstertruckd.config.live import LiveConfig
 from monstertruckd.config.load import Tree, resolved
+from monstertruckd.config.start import LeftOut
 from monstertruckd.config.truck import TruckConfig
 from monstertruckd.gate.core import Gate
 from monstertruckd.gate.latch import EstopLatch, Latch, MemoryLatch, marks_folder
@@ -64,6 +65,8 @@ from monstertruckd.recorder.black_box import BlackBox
 from monstertruckd.recorder.recorder import LogDigest, Recorder
 from monstertruckd.recorder.recordings import Recordings
 
+STOPPED: Final = "the emergency stop is latched until you clear it"
+"""What follows of a file that is left out."""
 LONGEST_WARNING: Final = 200
 """Characters of a warning that is acknowledged."""
 
@@ -81,6 +84,7 @@ class Daemon:
             nothing but the log is left: no Zenoh, no latch file. For the virtual clock.
         environment: what systemd gives a service: socket and watchdog period (``NOTIFY_SOCKET``, ``WATCHDOG_USEC``),
             ``RUNTIME_DIRECTORY``.
+        left_out: files that the start goes on without; the emergency stop is latched then, until an operator clears it.
     """
 
     def __init__(
@@ -93,12 +97,14 @@ class Daemon:
         tree: Tree | None = None,
         seed: int | None = None,
         environment: Mapping[str, str] = MappingProxyType({}),
+        left_out: Sequence[LeftOut] = (),
     ) -> None:
         self.config = config
         self.clock = clock
         self.bus = Bus(clock, config.zenoh.gather_seconds)
         self.digest = LogDigest()
         self._seed = seed
+        self._left_out = tuple(left_out)
         self._offload: Offload = in_thread if seed is None else inline
         self._rng = np.random.default_rng(seed)
         self._nonce = secrets.token_hex(8) if seed is None else self._rng.bytes(8).hex()
@@ -167,6 +173,7 @@ class Daemon:
             scope("estimation") as estimation,
             scope("planners") as planners,
         ):
+            self._say_what_is_left_out()
             self._start_drivers(actuators, OnBug.EXIT, Duty.ACTUATOR)
             self._start(gate, self.gate, OnBug.EXIT)
             self._start(gate, self._calibration)
@@ -246,6 +253,10 @@ class Daemon:
                 after.callback(box.freeze)
                 after.callback(self._tap(box.record).close)
             yield
+
+    def _say_what_is_left_out(self) -> None:
+        for source, text in self._left_out:
+            self._events(Reason.FILE_DAMAGED, Severity.WARNING, source, f"{text}; {STOPPED}")
 
     def _tap(self, record: Callable[[Topic[Any], int, bytes, int], None]) -> Tap:
         """Hands everything that is logged to ``record``."""
@@ -341,7 +352,7 @@ class Daemon:
             services=sensor_services(config),
             nonce=self._nonce,
             battery_measured=measures_battery(config),
-            latched=latch.engaged(),
+            latched=latch.engaged() or bool(self._left_out),
             sonars=self._body.sonars,
             peers=self._body.peers,
             compared=True,
@@ -395,7 +406,11 @@ class Daemon:
             attachments=self._attachments,
             digest=self.digest if self._seed is not None else None,
             deterministic=self._seed is not None,
+            on_repair=self._log_repaired if self._seed is None else None,
         )
+
+    def _log_repaired(self, text: str) -> None:
+        self._events(Reason.LOG_DAMAGED, Severity.WARNING, "recorder", text)
 
     def _build_black_box(self) -> BlackBox | None:
         folder = self.config.black_box_folder

@@ -16,7 +16,8 @@ from monstertruck_runtime.small_files import remove_leftovers
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.topics import TOPICS
 from monstertruckd.assembly.catalogs import TABLES
-from monstertruckd.config.load import load_truck
+from monstertruckd.config.load import load_config
+from monstertruckd.config.start import started
 from monstertruckd.config.truck import TruckConfig
 from monstertruckd.daemon import Daemon
 from monstertruckd.host.logging_queue import start_logging
@@ -28,11 +29,11 @@ def run_daemon(config_file: Path, *, verbose: bool) -> Reason:
     """Run the daemon of ``config_file`` until SIGTERM or SIGINT; returns why it ended.
 
     Raises:
-        ConfigError: the configuration was refused.
+        ConfigError: the configuration was refused, or its calibration is of another truck.
         BusyError: another daemon runs this robot or holds the endpoint.
         PortBusyError: another process holds an actuator's port.
     """
-    config, tree = load_truck(config_file)
+    config, tree, left_out = started(*load_config(config_file, TruckConfig))
     faulthandler.enable()
     listener = start_logging(verbose=verbose)
     log.info("calibration: %s", tree.calibration or f"none in {config.calibration_folder}")
@@ -48,7 +49,7 @@ def run_daemon(config_file: Path, *, verbose: bool) -> Reason:
         stop = asyncio.Event()
         for number in (signal.SIGTERM, signal.SIGINT):
             asyncio.get_running_loop().add_signal_handler(number, stop.set)
-        daemon = Daemon(config, clock, tree=tree, environment=os.environ)
+        daemon = Daemon(config, clock, tree=tree, environment=os.environ, left_out=left_out)
         for topic in TOPICS:
             wire.schema(topic)  # built once, before the control tick would wait for it
         settle()

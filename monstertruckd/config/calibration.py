@@ -18,7 +18,7 @@ import numpy as np
 from pydantic import AfterValidator, Field, ValidationError
 
 from monstertruck_runtime.clock import SECOND
-from monstertruck_runtime.errors import ConfigError, NotFoundError
+from monstertruck_runtime.errors import ConfigError, NotFoundError, UnusableFileError
 from monstertruck_runtime.outside import cause_of
 from monstertruck_runtime.small_files import make_folder, replace_file, require_file
 from monstertruck_schemas.base import Schema, first_mistake
@@ -244,7 +244,7 @@ class CalibrationStore:
         except Exception as error:
             what = error.strerror if isinstance(error, OSError) else cause_of(error)
             msg = f"{path}: no usable calibration: {what}; move it away to go back to the one before"
-            raise ConfigError(msg) from error
+            raise UnusableFileError(path, msg) from error
         if file.robot != self._robot:
             raise ConfigError(f"{path}: robot: is the calibration of {file.robot!r}, this is {self._robot!r}")
         return file

@@ -7,7 +7,6 @@ number, where USB states one) or is on another port.
 
 import itertools
 import json
-import logging
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +20,7 @@ from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import disk_reason
 from monstertruck_runtime.mailbox import latest
 from monstertruck_runtime.ports import EventSink, Ready
-from monstertruck_runtime.small_files import make_folder, replace_file
+from monstertruck_runtime.small_files import make_folder, put_aside, replace_file
 from monstertruck_runtime.threads import Offload
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.health import CalibrationHealth, CalibrationState
@@ -44,8 +43,6 @@ from monstertruck_schemas.usb import UsbTree
 from monstertruckd.bus.local import Bus
 from monstertruckd.config.calibration import Estimate, Grade, Result, ValidUntil, WizardName, utc
 from monstertruckd.config.truck import TruckConfig
-
-log = logging.getLogger(__name__)
 
 DAY: Final = 86_400 * SECOND
 """ns."""
@@ -240,8 +237,12 @@ class DistanceCounter:
     metres: float = 0.0
     written: float = 0.0
 
-    def load(self) -> None:
-        """Read it; a missing file begins at 0, and so does, as the log says, one that cannot be read or is damaged."""
+    def load(self) -> str:
+        """Read it; a missing file begins at 0, and so does one that cannot be read or is damaged.
+
+        Returns:
+            What is wrong with the file; empty for a sound or a missing one.
+        """
         self.metres, wrong = 0.0, ""
         try:
             metres = float(json.loads(self.file.read_text(encoding="utf-8"))["metres"]) if self.file else 0.0
@@ -252,9 +253,8 @@ class DistanceCounter:
             wrong = f"cannot be read: {error.strerror}"
         except (ValueError, LookupError, TypeError, OverflowError, RecursionError):
             wrong = "is damaged"
-        if wrong:
-            log.warning("%s: %s: the way driven begins at 0, and no calibration ends by it before", self.file, wrong)
         self.written = self.metres
+        return wrong and f"{self.file}: {wrong}"
 
     def save(self) -> None:
         """Write it, whole or not at all.
@@ -306,6 +306,14 @@ class CalibrationWatch:
         self._expired: frozenset[str] = frozenset()
         self._serials: dict[str, str] = {}
 
+    async def _begin(self) -> None:
+        """Read the distance; a damaged file is kept beside the new one."""
+        wrong, file = await self._offload(self.odometer.load), self.odometer.file
+        if wrong and file is not None:
+            where = await self._offload(lambda: put_aside(file))
+            text = f"{wrong}: the distance driven begins at 0, no calibration expires by it before; {where}"
+            self._events(Reason.FILE_DAMAGED, Severity.WARNING, self.name, text)
+
     def stamped(self, result: Result) -> Result:
         """As it is saved now."""
         return stamped(result, self._config, self._real(), self.odometer.metres, self._serials)
@@ -317,7 +325,7 @@ class CalibrationWatch:
 
     async def run(self, ready: Ready) -> None:
         """Run until cancelled; the distance is saved at the end."""
-        await self._offload(self.odometer.load)
+        await self._begin()
         self._expired = frozenset()
         self._look()
         ready()

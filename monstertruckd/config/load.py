@@ -8,7 +8,7 @@ import difflib
 import io
 import json
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -24,7 +24,7 @@ from ruamel.yaml.nodes import CollectionNode, MappingNode, Node, ScalarNode, Seq
 from ruamel.yaml.reader import ReaderError
 
 from monstertruck_runtime.endpoints import emulated_ports
-from monstertruck_runtime.errors import ConfigError
+from monstertruck_runtime.errors import ConfigError, UnusableFileError
 from monstertruck_runtime.map_folders import SAVES, folder_of
 from monstertruck_runtime.map_folders import YAML as MAP_YAML
 from monstertruck_runtime.plugins import models_in
@@ -123,19 +123,25 @@ def resolved(config: Schema) -> dict[str, Any]:
 # Saved settings and calibration
 
 
-def calibrated(config: T, tree: Tree) -> tuple[T, Tree]:
+def calibrated(config: T, tree: Tree, without: Collection[Path] = ()) -> tuple[T, Tree]:
     """The configuration with the settings that were saved while the robot ran and the newest calibration, and the tree.
 
     The tree has each value's origin. Both are validated together, as they were when they were saved: what bounds a
     setting may be a calibrated value.
 
+    Args:
+        config: without either.
+        tree: its values.
+        without: files of either that are left out.
+
     Raises:
-        ConfigError: one of their files is damaged, or of another truck, or the configuration refuses a value.
+        UnusableFileError: one of their files is damaged, or the configuration refuses a value of it.
+        ConfigError: the calibration is of another truck, or its folder cannot be read.
     """
     saved = SavedSettings(config.state_directory, config.robot)
-    settings = saved.values()
+    settings = {} if saved.path in without else saved.values()
     store = CalibrationStore(config.calibration_folder, config.robot)
-    path = store.newest()
+    path = next((path for path in reversed(store.files()) if path not in without), None)
     if path is None and not settings:
         return config, tree
     data, origins, sources, left = config.model_dump(), dict(tree.origins), list[str](), list[str]()
@@ -145,15 +151,32 @@ def calibrated(config: T, tree: Tree) -> tuple[T, Tree]:
         sources.append(str(saved.path))
     if path is not None:
         results = store.load(path).results
-        put_values(data, results.values(), path)
-        left = unused(config, results.values())
-        origins |= _calibrated_origins(results, load_tree(path).origins)
+        try:
+            put_values(data, results.values(), path)
+            left = unused(config, results.values())
+            origins |= _calibrated_origins(results, load_tree(path).origins)
+        except ConfigError as error:
+            raise UnusableFileError(path, str(error)) from error
         sources.append(str(path))
     try:
         changed = type(config).model_validate(data)
     except ValidationError as error:
-        raise ConfigError(f"{' with '.join(sources)}: {first_mistake(error)}") from error
+        refused = saved.path
+        if path is not None and (not settings or not _is_valid(config, store.load(path).results.values(), path)):
+            refused = path
+        raise UnusableFileError(refused, f"{' with '.join(sources)}: {first_mistake(error)}") from error
     return changed, Tree(tree.data, origins, tree.files, calibration=path, unused=left)
+
+
+def _is_valid(config: TruckConfig, results: Collection[Result], path: Path) -> bool:
+    """Whether the configuration takes a calibration without saved settings."""
+    data = config.model_dump()
+    put_values(data, results, path)
+    try:
+        type(config).model_validate(data)
+    except ValidationError:
+        return False
+    return True
 
 
 def _calibrated_origins(results: Mapping[WizardName, Result], lines: Mapping[Key, Origin]) -> dict[Key, Origin]:
@@ -181,26 +204,33 @@ class SavedSettings:
         """Saved values by dotted key, each with its line; empty without a file.
 
         Raises:
-            ConfigError: the file is damaged; names the line.
+            UnusableFileError: the file is damaged; names the line.
         """
-        if not self.path.exists():
+        origins = dict[Key, Origin]()
+        try:
+            self.path.stat()
+        except FileNotFoundError:
             return {}
-        root, origins = self._text().root, dict[Key, Origin]()
-        content = {} if root is None else _build(root, _Builder(self.path, origins), ())
+        except OSError:
+            pass  # ``YamlText`` says why
+        try:
+            root = self._text().root
+            content = {} if root is None else _build(root, _Builder(self.path, origins), ())
+        except ConfigError as error:
+            raise UnusableFileError(self.path, str(error)) from error
         return {".".join(key): (value, origins[key].line) for key, value in _leaves(content, ())}
 
     def put(self, values: Mapping[str, tuple[LiveValue, int]], config: TruckConfig, data: dict[str, Any]) -> None:
         """Merge saved values into a configuration's data before validation.
 
         Raises:
-            ConfigError: one is no live setting of the configuration; names the line.
+            UnusableFileError: one is no live setting of the configuration; names the line.
         """
         known = {setting.key for setting in live_settings(config)}
         for key, (_, line) in values.items():
             if key not in known:
-                raise ConfigError(
-                    f"{self.path}:{line}: {key}: cannot be changed while the robot runs; remove it from this file"
-                )
+                wrong = "cannot be changed while the robot runs; remove it from this file"
+                raise UnusableFileError(self.path, f"{self.path}:{line}: {key}: {wrong}")
         put_settings(data, {key: value for key, (value, _) in values.items()})
 
     def save(self, values: Mapping[str, LiveValue]) -> None:

@@ -30,8 +30,10 @@ LASTS: Final = 3
 """Seconds with late ticks after which the log says that the computer is busy: a start has some."""
 SAY_AGAIN: Final = 60.0
 """Seconds until it says so again."""
-DEGRADED: Final = frozenset({Reason.SLOW_LINK})
+PASSING: Final = frozenset({Reason.SLOW_LINK})
 """Reasons of a service that works, but badly: its warning says so, its information that it is over."""
+LASTING: Final = frozenset({Reason.FILE_DAMAGED, Reason.LOG_DAMAGED})
+"""Reasons of a service that goes on without something: its warning says so until the daemon ends."""
 
 
 class HealthBoard:
@@ -70,15 +72,18 @@ class HealthBoard:
         self._down: dict[str, set[Reason]] = {}
         """Services that do not work, with the causes that were reported since they did."""
         self._degraded: dict[str, Event] = {}
+        self._damaged: dict[str, Event] = {}
 
     def observe_event(self, event: Event) -> None:
         """Take any service's event: its row names what it suffers from until it says that it is over, or restarts."""
-        if event.reason not in DEGRADED:
-            return
-        if event.severity is Severity.INFO:
+        if event.reason in PASSING and event.severity is Severity.INFO:
             self._degraded.pop(event.source, None)
-        else:
+        elif event.reason in PASSING:
             self._degraded[event.source] = event
+        elif event.reason in LASTING and event.severity is not Severity.INFO:
+            self._damaged[event.source] = event
+        else:
+            return
         self._publish()
 
     def report(self, row: ServiceHealth) -> None:
@@ -114,7 +119,8 @@ class HealthBoard:
     def _with_reason(self, row: ServiceHealth) -> ServiceHealth:
         if row.state is ServiceState.STARTING and (why := self._waiting(row.name)) is not None:
             return row.model_copy(update={"detail": why})
-        if row.state is ServiceState.READY and (event := self._degraded.get(row.name)) is not None:
+        event = self._degraded.get(row.name) or self._damaged.get(row.name)
+        if row.state is ServiceState.READY and event is not None:
             return row.model_copy(update={"reason": event.reason, "detail": event.text})
         return row
 

@@ -17,9 +17,8 @@ from mcap.records import Attachment, Statistics
 
 from monstertruck_runtime.errors import InputError, NotFoundError
 from monstertruck_runtime.outside import MEGABYTE, MOST_UNPACKED
-from monstertruck_runtime.small_files import require_file
+from monstertruck_runtime.small_files import DAMAGED, require_file
 from monstertruckd.recorder.chunks import LIMIT
-from monstertruckd.recorder.log_file import DAMAGED
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 

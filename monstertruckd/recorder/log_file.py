@@ -16,7 +16,7 @@ from mcap.writer import CompressionType, Writer
 
 from monstertruck_runtime import wire
 from monstertruck_runtime.clock import is_date
-from monstertruck_runtime.small_files import make_folder, sync_folder
+from monstertruck_runtime.small_files import DAMAGED, make_folder, sync_folder
 from monstertruck_schemas.topics import Topic
 from monstertruckd import __version__
 from monstertruckd.recorder.config import Compression
@@ -56,8 +56,6 @@ class Channels:
 
 NAME: Final = re.compile(r"run-(\d{6,})-(\d{3,})\.mcap")
 """Name of a log: run and part."""
-DAMAGED: Final = ".damaged"
-"""Appended to the name of a log that was repaired, and of an attachment whose checksum is wrong."""
 DAMAGED_NAME: Final = re.compile(re.escape(DAMAGED) + r"(-\d+)?$")
 """End of the name of a damaged original: the second one of a log is NAME.damaged-2."""
 

@@ -19,6 +19,7 @@ from mcap.records import Message as McapMessage
 
 from monstertruck_runtime import wire
 from monstertruck_runtime.errors import ConfigError, InputError, NotFoundError
+from monstertruck_runtime.small_files import DAMAGED
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.topics import BY_NAME
 from monstertruckd.recorder.chunks import records_in, unpacked
@@ -34,7 +35,7 @@ from monstertruckd.recorder.frames import (
     read_frame,
     read_statistics,
 )
-from monstertruckd.recorder.log_file import DAMAGED, LOG_OFFSET, TIMES
+from monstertruckd.recorder.log_file import LOG_OFFSET, TIMES
 from monstertruckd.recorder.salvage import ChannelFacts, Salvage
 from monstertruckd.recorder.verdict import Verdict, judged, repetition
 

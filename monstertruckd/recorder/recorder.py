@@ -8,6 +8,7 @@ import struct
 import subprocess
 import threading
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
@@ -21,7 +22,7 @@ from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.topics import TOPICS, Topic
 from monstertruckd.recorder.config import RecorderConfig
 from monstertruckd.recorder.log_file import DAMAGED_NAME, LogEntry, LogFile, LogFolder, log_offset
-from monstertruckd.recorder.repair import in_use, start_repair
+from monstertruckd.recorder.repair import in_use, repairs, start_repair
 
 _DIGEST_FRAME = struct.Struct("<qII")
 
@@ -197,6 +198,7 @@ _BATCH_SECONDS: Final = 0.05
 """A batch is handed over after this time even if it is not full."""
 
 FailureSink = Callable[[Reason, str], None]
+RepairSink = Callable[[str], None]
 
 
 class Recorder:
@@ -215,6 +217,7 @@ class Recorder:
         digest: updated with every recorded message, in the thread.
         deterministic: for the virtual clock: ``record`` waits for the disk instead of dropping, chunks are closed
             by log time alone, and ``health`` names no file, so that two runs of one seed record the same.
+        on_repair: called on the event loop with words about every repair of an unfinished log.
     """
 
     name = ServiceName.RECORDER.value
@@ -229,7 +232,9 @@ class Recorder:
         metadata: Mapping[str, str] | None = None,
         digest: LogDigest | None = None,
         deterministic: bool = False,
+        on_repair: RepairSink | None = None,
     ) -> None:
+        self._on_repair = on_repair
         self._config = config
         self._clock = clock
         self._on_failure = on_failure
@@ -355,10 +360,20 @@ class Recorder:
 
     def _start_repair(self) -> "subprocess.Popen[bytes] | None":
         try:
-            return start_repair(Path(self._config.directory))
+            process = start_repair(Path(self._config.directory))
         except OSError as error:
             log.warning("unfinished logs are not repaired: %s", error)
             return None
+        if process is not None:
+            threading.Thread(target=self._report, args=(process,), name="repairs", daemon=True).start()
+        return process
+
+    def _report(self, process: "subprocess.Popen[bytes]") -> None:
+        """A thread: hand on what the repair says."""
+        with suppress(RuntimeError):  # the loop has ended
+            for outcome in repairs(process):
+                if self._on_repair is not None:
+                    self._loop.call_soon_threadsafe(self._on_repair, outcome)
 
     def _write(self, writer: LogWriter) -> None:
         for topic in TOPICS:

@@ -5,14 +5,14 @@ this as a process of its own: a thread would compete with the control loop for t
 """
 
 import fcntl
-import itertools
+import json
 import logging
 import os
 import subprocess
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import BinaryIO, Final
@@ -22,9 +22,9 @@ from mcap.writer import Writer
 
 from monstertruck_runtime.errors import InputError, TruckError
 from monstertruck_runtime.outside import reading
-from monstertruck_runtime.small_files import sync_folder
+from monstertruck_runtime.small_files import damaged_names, sync_folder
 from monstertruckd.recorder.frames import is_finished, open_file
-from monstertruckd.recorder.log_file import CHANNELS, DAMAGED
+from monstertruckd.recorder.log_file import CHANNELS
 from monstertruckd.recorder.salvage import ChannelFacts, Salvage
 from monstertruckd.recorder.verdict import Verdict, judged
 
@@ -117,8 +117,7 @@ def _written(target: Path) -> Iterator[Path]:
 
 def _keep(source: Path) -> Path:
     """Give a damaged log a second name, under which it stays; a repair that was cut off may have done so."""
-    for number in itertools.count(1):
-        kept = source.with_name(source.name + DAMAGED + (f"-{number}" if number > 1 else ""))
+    for kept in damaged_names(source):
         if not os.path.lexists(kept):
             kept.hardlink_to(source)
             sync_folder(source.parent)
@@ -130,7 +129,11 @@ def _keep(source: Path) -> Path:
 
 def recover_directory(directory: Path, stop: threading.Event | None = None) -> list[Recovery]:
     """Repair every unfinished log of a folder in place; files in use and other files are skipped."""
-    done = []
+    return [outcome for outcome in _repairs(directory, stop) if isinstance(outcome, Recovery)]
+
+
+def _repairs(directory: Path, stop: threading.Event | None = None) -> Iterator[Recovery | TruckError | OSError]:
+    """Outcome of every unfinished log of a folder, logged as well."""
     for path in sorted(directory.glob("*.mcap")):
         try:
             if not _unfinished(path):
@@ -138,12 +141,12 @@ def recover_directory(directory: Path, stop: threading.Event | None = None) -> l
             recovery = recover(path, path, stop)
         except (TruckError, OSError) as error:
             log.warning("not repaired: %s", error)
+            yield error
         else:
             log.log(logging.WARNING if recovery.lost else logging.INFO, "repaired %s", recovery)
-            done.append(recovery)
+            yield recovery
         if stop is not None and stop.is_set():
             break
-    return done
 
 
 def _unfinished(path: Path) -> bool:
@@ -225,7 +228,15 @@ def start_repair(folder: Path) -> "subprocess.Popen[bytes] | None":
     if not any(_may_wait(path) for path in folder.glob("*.mcap")):
         return None
     command = [sys.executable, "-m", "monstertruckd.recorder.repair", str(folder)]
-    return subprocess.Popen(command, stdin=subprocess.DEVNULL)  # noqa: S603  # our own module, no shell
+    return subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE)  # noqa: S603  # our own module
+
+
+def repairs(process: "subprocess.Popen[bytes]") -> Iterator[str]:
+    """Yield what the process says of every log, until it ends."""
+    assert process.stdout is not None
+    for line in process.stdout:
+        with suppress(ValueError):
+            yield str(json.loads(line))
 
 
 def _may_wait(path: Path) -> bool:
@@ -237,10 +248,13 @@ def _may_wait(path: Path) -> bool:
 
 
 def main(folder: Path) -> None:
-    """Repair ``folder``."""
+    """Repair ``folder``; standard output has the outcome for each log, as a JSON string on a line."""
     os.nice(NICENESS)
     logging.basicConfig(level=logging.INFO, format="%(levelname)-7s %(name)s: %(message)s")
-    recover_directory(folder)
+    for outcome in _repairs(folder):
+        text = f"repaired {outcome}" if isinstance(outcome, Recovery) else f"not repaired: {outcome}"
+        sys.stdout.write(json.dumps(text) + "\n")
+        sys.stdout.flush()
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """The error tree: every expected failure of the project derives from ``TruckError`` and knows its reason."""
 
 import errno
+from pathlib import Path
 from typing import ClassVar
 
 from monstertruck_schemas.reasons import Reason
@@ -16,6 +17,19 @@ class ConfigError(TruckError):
     """A configuration was refused; the text names file, line, key and what was expected."""
 
     reason = Reason.BAD_CONFIG
+
+
+class UnusableFileError(ConfigError):
+    """A file that the robot wrote itself, as saved settings or a calibration, cannot be used.
+
+    Args:
+        file: which.
+        why: text that names file, place and what was expected.
+    """
+
+    def __init__(self, file: Path, why: str) -> None:
+        super().__init__(why)
+        self.file = file
 
 
 class InputError(TruckError):

@@ -2,6 +2,7 @@
 
 import errno
 import fcntl
+import itertools
 import os
 import stat
 import tempfile
@@ -12,6 +13,9 @@ from typing import Final
 
 SCRATCH: Final = ".new~"
 """End of the names of files that are being written; of a killed writer they are left."""
+
+DAMAGED: Final = ".damaged"
+"""Appended to the name of a file that is kept for what may still be read of it."""
 
 
 def text_of(file: Path) -> str | None:
@@ -102,6 +106,23 @@ def remove_file(path: Path) -> None:
     path.unlink(missing_ok=True)
     if path.parent.exists():
         sync_folder(path.parent)
+
+
+def damaged_names(path: Path) -> Iterator[Path]:
+    """Names under which damaged files of this name are kept: NAME.damaged, NAME.damaged-2 and so on."""
+    for number in itertools.count(1):
+        yield path.with_name(path.name + DAMAGED + (f"-{number}" if number > 1 else ""))
+
+
+def put_aside(path: Path) -> str:
+    """Rename a damaged file to the first free one of ``damaged_names``; returns words about where it is kept."""
+    try:
+        kept = next(name for name in damaged_names(path) if not os.path.lexists(name))
+        path.rename(kept)
+        sync_folder(path.parent)
+    except OSError as error:
+        return f"the file cannot be renamed: {error.strerror}"
+    return f"the file is kept as {kept.name}"
 
 
 def make_folder(path: Path, mode: int = 0o777) -> None:

@@ -63,10 +63,10 @@ def test_a_damaged_save_is_named_and_the_one_before_is_read_if_it_is_whole(tmp_p
     drive = driven("slam.yaml", story, slam={"mode": "localisation", "map": tmp_path})
     (slam,) = said
     if harmed == 1:
-        (text,) = {event.text for event in drive.events if event.reason is Reason.BAD_INPUT}
+        (text,) = {event.text for event in drive.events if event.reason is Reason.FILE_DAMAGED}
         assert text.endswith("expected 1138 as in manifest.json; an older save is read")
         assert drive.health
-        assert slam.state is ServiceState.READY
+        assert (slam.state, slam.reason) == (ServiceState.READY, Reason.FILE_DAMAGED)
     else:
         assert (slam.state, slam.restarts, slam.reason) == (ServiceState.FAILED, 0, Reason.BAD_INPUT)
         assert slam.detail.count("as in manifest.json") == 2

@@ -163,6 +163,7 @@ SYMPTOMS: Final = (
             "disk_full": "As above.",
             "recording_failed": "The card may be worn out: take a new one.",
             "log_damaged": "`monstertruckd log recover`.",
+            "file_damaged": "Its values are those of before, or none: see what the event names, then clear the stop.",
             "link_weak": "",
             "link_down": "",
             "link_open": "Anybody can listen: use WPA2, and certificates.",

@@ -306,7 +306,7 @@ class PointService:
         try:
             self._map.load(await self._offload(lambda: files.load(folder)))
         except InputError as error:
-            self._events(Reason.BAD_INPUT, Severity.WARNING, self.name, f"{error}; points are not saved over it")
+            self._events(Reason.FILE_DAMAGED, Severity.WARNING, self.name, f"{error}; points are not saved over it")
             if folder == self._folders.save:
                 self._folders = PointFolders(folder)
         self._dirty = dict.fromkeys(self._map.points)

@@ -341,7 +341,7 @@ class SlamService:
             self._skip(outputs.refused)
         self._report_saved(outputs)
         for remark in outputs.remarks:
-            self._events(Reason.BAD_INPUT, Severity.WARNING, self.name, remark)
+            self._events(Reason.FILE_DAMAGED, Severity.WARNING, self.name, remark)
         if outputs.bases is not None:
             rows = zip(self._sent_instants, outputs.bases.tolist(), strict=True)
             self._bases = {at: (x, y, yaw) for at, (x, y, yaw) in rows if x == x}  # NaN: not known

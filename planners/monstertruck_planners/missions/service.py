@@ -27,7 +27,7 @@ from monstertruck_runtime.errors import InputError, NotFoundError, RequestRefuse
 from monstertruck_runtime.outside import contents, reading
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, RpcRegistry, Subscription
 from monstertruck_runtime.requests import does_not_drive, inner_request
-from monstertruck_runtime.small_files import remove_file, replace_file
+from monstertruck_runtime.small_files import put_aside, remove_file, replace_file
 from monstertruck_runtime.threads import Offload
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.event import Severity
@@ -188,7 +188,7 @@ class MissionService:
         try:
             self._interrupted = await self._offload(self._load)
         except InputError as error:
-            self._events(Reason.BAD_INPUT, Severity.WARNING, SOURCE, str(error))
+            await self._say_damaged(str(error))
         if (saved := self._interrupted) is not None:
             text = f"{saved.mission.name} was interrupted {_where(saved)}; it can be resumed"
             self._events(Reason.MISSION_INCOMPLETE, Severity.WARNING, SOURCE, text)
@@ -569,6 +569,12 @@ class MissionService:
             if file is None or not file.exists():
                 return None
             return SavedProgress.model_validate_json(contents(file, expected, MOST_BYTES))
+
+    async def _say_damaged(self, why: str) -> None:
+        if (file := self._file) is not None:
+            where = await self._offload(lambda: put_aside(file))
+            text = f"{why}; what was interrupted cannot be resumed; {where}"
+            self._events(Reason.FILE_DAMAGED, Severity.WARNING, SOURCE, text)
 
     async def _save(self, progress: MissionProgress) -> None:
         self._noted = self._pose() or self._noted

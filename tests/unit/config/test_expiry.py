@@ -1,6 +1,7 @@
 """Grades and validity of calibrations."""
 
 import asyncio
+import contextlib
 import errno
 import os
 from dataclasses import replace
@@ -93,26 +94,42 @@ def test_what_rests_on_it_is_named():
         *(f'{{"metres": {value}}}' for value in ('"x"', "NaN", "1e999", "-1", "1" + 400 * "0")),
     ],
 )
-def test_a_damaged_odometer_begins_at_nothing_and_says_so(text, tmp_path, caplog):
+def test_a_damaged_odometer_begins_at_nothing_and_says_so(text, tmp_path):
     file = tmp_path / "odometer.json"
     odometer = DistanceCounter(file)
-    odometer.load()
-    assert not caplog.messages  # a new robot
+    assert odometer.load() == ""  # a new robot
     file.write_text(text)
-    odometer.load()
+    assert odometer.load() == f"{file}: is damaged"
     assert odometer.metres == 0.0
-    (said,) = caplog.messages
-    assert said.startswith(f"{file}: is damaged")
     replace(odometer, metres=12.34).save()
     odometer.load()
     assert odometer.metres == 12.3
 
 
-def test_an_odometer_that_cannot_be_read_is_no_new_robot(tmp_path, caplog):
+def test_an_odometer_that_cannot_be_read_is_no_new_robot(tmp_path):
     file = tmp_path / "odometer.json"
     file.symlink_to(file.name)
-    DistanceCounter(file).load()
-    assert caplog.messages[0].startswith(f"{file}: cannot be read: Too many levels of symbolic links: the way driven")
+    assert DistanceCounter(file).load() == f"{file}: cannot be read: Too many levels of symbolic links"
+
+
+def test_a_damaged_odometer_is_kept_and_an_event(tmp_path):
+    file = tmp_path / "odometer.json"
+    file.write_text("{")
+    events: list[tuple[Reason, str, str]] = []
+
+    async def main(clock: VirtualClock) -> None:
+        sink = lambda *args, **_: events.append((args[0], args[2], args[3]))  # noqa: E731
+        watch = CalibrationWatch(TRUCK, {}, Bus(clock), clock, sink, inline, DistanceCounter(file))
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(0.1):
+                await watch.run(lambda: None)
+
+    run_virtual(main)
+    ((reason, source, text),) = events
+    assert (reason, source) == (Reason.FILE_DAMAGED, "calibration")
+    assert text.startswith(f"{file}: is damaged")
+    assert text.endswith("the file is kept as odometer.json.damaged")
+    assert (tmp_path / "odometer.json.damaged").read_text() == "{"
 
 
 @pytest.mark.parametrize(("code", "reason"), [(errno.ENOSPC, Reason.DISK_FULL), (errno.EROFS, Reason.RECORDING_FAILED)])

@@ -54,6 +54,16 @@ def test_it_is_forgotten_when_the_link_is_quick_again_or_the_service_starts_anew
     assert after(READY, SLOW, row(ServiceState.STARTING), READY)["drive"] == (Reason.OK, "")
 
 
+@pytest.mark.parametrize("reason", [Reason.FILE_DAMAGED, Reason.LOG_DAMAGED])
+def test_a_damaged_file_is_named_until_the_daemon_ends(reason):
+    found, other = event(reason, Severity.WARNING), event(reason, Severity.INFO)
+    assert after(found, row(ServiceState.STARTING), READY)["drive"][0] is reason
+    assert after(READY, found, other)["drive"][0] is reason, "another file is sound"
+    assert after(READY, other)["drive"][0] is Reason.OK
+    assert after(READY, found, SLOW)["drive"][0] is Reason.SLOW_LINK
+    assert after(READY, found, SLOW, event(Reason.SLOW_LINK, Severity.INFO))["drive"][0] is reason
+
+
 def test_a_loss_is_worse_and_other_events_are_no_state():
     lost = row(ServiceState.BACKOFF, reason=Reason.DEVICE_LOST)
     assert after(READY, SLOW, lost)["drive"][0] is Reason.DEVICE_LOST

@@ -156,7 +156,7 @@ def test_a_damaged_grid_is_an_event_and_the_ground_unknown(tmp_path):
         return rig.events
 
     ((reason, _, source, text),) = run_virtual(main)
-    assert (reason, source) == (Reason.BAD_INPUT, "ground")
+    assert (reason, source) == (Reason.FILE_DAMAGED, "ground")
     assert text.endswith("; the ground counts as unknown")
 
 

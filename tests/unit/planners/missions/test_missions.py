@@ -687,9 +687,11 @@ def test_a_damaged_file_is_reported_from_the_loop_and_forgotten(tmp_path: Path, 
 
     assert not run_virtual(main, start=SECOND).reports[-1].resumable
     ((within, reason, said),) = by
-    assert (within, reason) == (0, Reason.BAD_INPUT)
+    assert (within, reason) == (0, Reason.FILE_DAMAGED)
     assert str(file) in said
     assert what in said
+    assert said.endswith("the file is kept as mission.json.damaged")
+    assert (file.parent / "mission.json.damaged").exists()
 
 
 def test_all_that_the_robot_cannot_do_is_named_before_it_sets_off():
