@@ -224,7 +224,7 @@ def main() -> None:
         source.path
         for source in files
         if source.lines < SHORT
-        and not source.path.endswith("__init__.py")
+        and not source.path.endswith(("__init__.py", "_pb2.py"))
         and len(read_by[module_of(source.path)]) == 1
     )
     rest = sum(source.lines for source in files if source.path.startswith(REST))

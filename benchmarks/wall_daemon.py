@@ -27,7 +27,7 @@ from wall_parts.arena import study
 from wall_parts.daemon import DaemonLap, FaultRun, broken, lap, tuned
 
 from monstertruck_schemas.reasons import Reason
-from monstertruckd.tools.tune.plots import draw
+from monstertruckd.tools.tune.runs import draw
 
 METHODS: Final = {"1, amended": "wall", "2": "switching", "3": "line"}
 SIDES: Final = "left", "right"

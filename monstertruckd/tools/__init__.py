@@ -1,1 +1,1 @@
-"""What is not the daemon: command line, calibration, logs, drills, doctor, installation, demo."""
+"""What is not the daemon: one room for each job, and `cli`, whose commands open them."""

@@ -114,7 +114,7 @@ async def run_task(
         show: gets every report.
         arm: arm a robot that is disarmed.
         waits: a task of this kind is accepted by a disarmed robot, and waits until it is armed.
-        report: is told why the robot stands, by ``clock``.
+        report: gets why the robot stands, by ``clock``.
         clock: time.
         to_its_end: one that is cancelled ends as any other does, once the robot has stopped it.
 

@@ -4,10 +4,15 @@ It is not authenticated, for the robot's nonce is not known yet: the robot takes
 """
 
 import json
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from getopt import GetoptError, gnu_getopt
 from typing import Final
 
 import zenoh
 
+from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT, nearest
+from monstertruck_runtime.errors import TruckError
 from monstertruck_runtime.stations import own_source, session_config, tls_for
 
 ENCODING: Final = "application/json;monstertruck.ControlRequest;v=1"
@@ -49,3 +54,33 @@ def send_estop(robot: str, endpoint: str, timeout: float) -> zenoh.Session:
         express=True,
     )
     return session
+
+
+TIMEOUT: Final = 0.5
+"""Seconds to wait for the link; the ordinary command waits longer."""
+
+
+@contextmanager
+def early_estop(arguments: Sequence[str]) -> Iterator[None]:
+    """Send an emergency stop by the arguments of ``estop``; the session is open while the context lasts.
+
+    What goes wrong is left to the ordinary command, which orders again and says so.
+    """
+    session = None
+    with suppress(GetoptError, TruckError, zenoh.ZError):
+        session = _send(arguments)
+    try:
+        yield
+    finally:
+        if session is not None:
+            session.close()  # type: ignore[no-untyped-call]
+
+
+def _send(arguments: Sequence[str]) -> zenoh.Session | None:
+    options, others = gnu_getopt(list(arguments), "r:e:h", ["robot=", "endpoint=", "json", "help"])
+    given = dict(options)
+    if others or not given.keys().isdisjoint(("-h", "--help")):
+        return None
+    robot = given.get("-r") or given.get("--robot") or "truck"
+    endpoint = given.get("-e") or given.get("--endpoint") or DEFAULT_ENDPOINT
+    return send_estop(robot, nearest(endpoint), TIMEOUT)

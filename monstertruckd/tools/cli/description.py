@@ -2,12 +2,18 @@
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from monstertruck_runtime.errors import InputError
 from monstertruckd.tools.cli.options import ConfigArgument
 from monstertruckd.tools.cli.output import needs_extra
+
+if TYPE_CHECKING:
+    from monstertruck_kinematics.description import Description, Mechanics
+    from monstertruck_sim.world.config import SimTruckConfig
+    from monstertruckd.config.truck import TruckConfig
 
 
 class DescriptionFormat(StrEnum):
@@ -31,7 +37,6 @@ def description(
     """
     from monstertruck_kinematics.description import urdf
     from monstertruckd.tools.simulation.config import load_robot
-    from monstertruckd.tools.simulation.description import described, model_text
 
     robot, _ = load_robot(config)
     if form is DescriptionFormat.MJCF:
@@ -44,3 +49,54 @@ def description(
     else:
         with output.open("x", encoding="utf-8") as file:
             file.write(text)
+
+
+def described(config: "TruckConfig") -> "Description":
+    """The robot with the frames of its sensors.
+
+    Raises:
+        InputError: its body has no description.
+    """
+    from monstertruck_kinematics.description import SensorFrame
+    from monstertruck_sim.world.mechanics import description as describe
+    from monstertruckd.assembly.estimation import sensor_mounts
+
+    truck, parts = _parts(config)
+    sensors = tuple(
+        SensorFrame(name, (m.x, m.y, m.z), (m.roll, m.pitch, m.yaw)) for name, m in sensor_mounts(config).items()
+    )
+    return describe(truck, parts, sensors)
+
+
+def model_text(config: "TruckConfig") -> str:
+    """The robot on level ground as MJCF."""
+    from monstertruck_sim.world3d.engine import drive_line
+    from monstertruck_sim.world3d.model import EMPTY, mjcf
+
+    truck, parts = _parts(config)
+    return mjcf(described(config), drive_line(truck, parts), parts.friction, EMPTY) + "\n"
+
+
+def _parts(config: "TruckConfig") -> "tuple[SimTruckConfig, Mechanics]":
+    """Body and dimensions as the daemon has them; masses and springs as simulated."""
+    from monstertruck_sim.world.config import SOLID_BODIES, WorldConfig
+    from monstertruck_sim.world.mechanics import mechanics
+    from monstertruckd.tools.simulation.config import SimulatedTruckConfig
+
+    if config.body.kind not in SOLID_BODIES:
+        raise InputError(f"body {config.body.kind}: has no description; expected one of {', '.join(SOLID_BODIES)}")
+    world = config.sim.world if isinstance(config, SimulatedTruckConfig) else WorldConfig()
+    geometry = config.geometry
+    mass = world.truck.mass if isinstance(config, SimulatedTruckConfig) else geometry.mass
+    truck = world.truck.model_copy(
+        update={
+            "body": config.body,
+            "wheelbase": geometry.wheelbase,
+            "track": geometry.track,
+            "wheel_radius": geometry.wheel_radius,
+            "length": geometry.length,
+            "width": geometry.width,
+            "mass": mass,
+        }
+    )
+    return truck, mechanics(truck, world.mechanics)

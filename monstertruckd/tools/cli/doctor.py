@@ -51,7 +51,7 @@ def doctor(
     With --drive the daemon has to run: the drive goes through its gate, as any operator's does.
     """
     from monstertruck_runtime.clock import run_wall
-    from monstertruckd.tools.doctor.checks import examine
+    from monstertruckd.tools.doctor import examine
     from monstertruckd.tools.doctor.context import first_failure, inspect
     from monstertruckd.tools.install.files import Program
 

@@ -12,7 +12,6 @@ from monstertruckd.tools.cli import (
     devices,
     doctor,
     drill,
-    drive,
     explore,
     goto,
     kinematics,
@@ -72,7 +71,7 @@ app.command("reasons")(robot.reasons)
 app.command("plugins")(robot.plugins)
 app.command("status")(live.status)
 app.command("echo")(live.echo)
-app.command("drive")(drive.drive)
+app.command("drive")(orders.drive)
 app.command("arm")(orders.arm)
 app.command("disarm")(orders.disarm)
 app.command("estop")(orders.estop)

@@ -1,7 +1,12 @@
 """``monstertruckd points``: points of interest in the map: list, export, go to, mark, remove."""
 
+import csv
+import io
+import json
+import math
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
@@ -25,6 +30,8 @@ MapOption = Annotated[
     Path | None, typer.Option("--map", help="Folder of a saved map, instead of a robot.", show_default=False)
 ]
 WITHOUT = "keeps no points of interest"
+FORMATS: Final = (".csv", ".geojson", ".yaml")
+COLUMNS: Final = ("name", "kind", "tag", "x_m", "y_m", "z_m", "yaw_rad", "sigma_m", "sigma_yaw_rad", "sightings")
 WAIT = 3.0
 """Seconds to wait for the robot's list."""
 
@@ -37,8 +44,6 @@ def list_command(
     json_output: JsonOption = False,
 ) -> None:
     """Print all points of interest."""
-    from monstertruckd.tools.cli.points_files import row_of
-
     points = _points(map_folder, robot, endpoint)
     if json_output:
         print_json([point.model_dump(mode="json") for point in points])
@@ -58,7 +63,6 @@ def export_command(
 ) -> None:
     """Write all points of interest to a file, whose ending says how."""
     from monstertruck_runtime.small_files import replace_file
-    from monstertruckd.tools.cli.points_files import FORMATS, text_of
 
     if file.suffix not in FORMATS:
         raise InputError(f"{file}: expected a name that ends with one of {', '.join(FORMATS)}")
@@ -154,3 +158,45 @@ async def _newest(client: "TruckClient", clock: Clock) -> "list[PointOfInterest]
         except TimeoutError:
             text = f"no list of points of interest within {WAIT:g} s"
             raise NoAnswerError(text + await not_ready(client)) from None
+
+
+def row_of(point: "PointOfInterest") -> tuple[str, ...]:
+    """Name and numbers for a table."""
+    from monstertruck_schemas.base import position_deviation
+
+    place = (f"{value:z.2f}" for value in (point.x, point.y, point.yaw))
+    return point.name, *place, f"{100 * position_deviation(point.covariance):.1f}", str(point.sightings)
+
+
+def values_of(point: "PointOfInterest") -> dict[str, Any]:
+    """What is exported, by ``COLUMNS``."""
+    from monstertruck_schemas.base import position_deviation
+
+    yaw_sigma = math.sqrt(float(point.covariance[8]))
+    numbers = (point.x, point.y, point.z, point.yaw, position_deviation(point.covariance), yaw_sigma)
+    values = (point.name, point.kind.value, point.tag, *(round(number, 4) for number in numbers), point.sightings)
+    return dict(zip(COLUMNS, values, strict=True))
+
+
+def text_of(points: Sequence["PointOfInterest"], ending: str) -> str:
+    """Points as a file of one of ``FORMATS``: GeoJSON has coordinates in the map's metres."""
+    from monstertruck_runtime.yaml_files import yaml_text
+
+    rows = [values_of(point) for point in points]
+    if ending == ".csv":
+        out = io.StringIO()
+        writer = csv.DictWriter(out, COLUMNS, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+        return out.getvalue()
+    if ending == ".yaml":
+        return yaml_text({"frame": "map", "points": rows})
+    features = [
+        {
+            "type": "Feature",
+            "geometry": {"type": "Point", "coordinates": [row["x_m"], row["y_m"], row["z_m"]]},
+            "properties": {name: value for name, value in row.items() if name not in ("x_m", "y_m", "z_m")},
+        }
+        for row in rows
+    ]
+    return json.dumps({"type": "FeatureCollection", "features": features}, indent=1) + "\n"

@@ -34,7 +34,7 @@ def wall_command(
 
     if plot is not None:
         with needs_extra("plot"):
-            from monstertruckd.tools.tune.plots import require_drawable
+            from monstertruckd.tools.tune.runs import require_drawable
 
             require_drawable(plot)
     runs: list[TuningRun] = []
@@ -55,7 +55,7 @@ def wall_command(
         best = with_robot(main, robot, endpoint)
     finally:
         if plot is not None and runs:
-            from monstertruckd.tools.tune.plots import draw
+            from monstertruckd.tools.tune.runs import draw
 
             draw(runs, plot)
             remark(f"wrote {plot}")

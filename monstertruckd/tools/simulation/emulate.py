@@ -1,19 +1,47 @@
-"""``monstertruckd emulate``: one emulated device on a pty, in the default world."""
+"""``monstertruckd emulate``, one emulated device on a pty, and the names of all emulated devices on this computer."""
 
 import asyncio
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from collections.abc import AsyncIterator, Iterator
+from contextlib import ExitStack, asynccontextmanager, contextmanager
 from pathlib import Path
 
-from monstertruck_drivers.cable import PtyPort
+from monstertruck_drivers.cable import PtyPort, reserved
 from monstertruck_drivers.catalog import DEVICES, DeviceKind
 from monstertruck_drivers.emulation import EmulatorSetup
 from monstertruck_runtime.clock import Clock
-from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.endpoints import make_private, runtime_folder
+from monstertruck_runtime.errors import InputError, NotPermittedError
 from monstertruck_sim.console import Emulated
 from monstertruck_sim.world.config import WorldConfig
 from monstertruck_sim.world.world import World
-from monstertruckd.tools.simulation.ports import claimed
+
+
+@contextmanager
+def claimed(*links: Path) -> Iterator[None]:
+    """Keep the names of links for this program while the context lasts; their folders are made.
+
+    The folder of this user's own, where ports hang that no configuration names, lets nobody else in.
+
+    Raises:
+        NotPermittedError: this user may not make a link there, or others may in the folder of this user's own.
+        BusyError: another program serves one of them.
+        InputError: something else than a link has the name.
+        OSError: a link cannot be made there.
+    """
+    with ExitStack() as stack:
+        try:
+            if any(runtime_folder() in link.parents for link in links):
+                make_private(runtime_folder())
+            for link in links:
+                link.parent.mkdir(parents=True, exist_ok=True)
+            stack.enter_context(reserved(*links))
+        except PermissionError as error:
+            raise NotPermittedError(f"{error.filename}: this user may not make a port there") from error
+        except OSError as error:
+            if error.errno is None:
+                raise NotPermittedError(str(error)) from None
+            raise
+        yield
 
 
 @asynccontextmanager

@@ -32,8 +32,8 @@ from monstertruck_sim.world.config import HeldBoard
 from monstertruck_sim.world.scene import Surroundings
 from monstertruck_sim.world.world import World
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, needs_computer
+from monstertruckd.tools.simulation.emulate import claimed
 from monstertruckd.tools.simulation.fleet import shared_scene
-from monstertruckd.tools.simulation.ports import claimed
 from monstertruckd.tools.simulation.program import program
 from monstertruckd.tools.simulation.tape import EmulatedTape
 
@@ -280,7 +280,7 @@ async def _see(clock: Clock, config: SimulatedTruckConfig, world: World) -> None
 
 async def _watch(clock: Clock, world: World, camera: CeilingCamera, board: HeldBoard | None, seed: int) -> None:
     """Serve a camera of the stand."""
-    from monstertruck_sim.world3d.ceiling import CeilingView  # noqa: PLC0415  # the library of an extra
+    from monstertruck_sim.world3d.camera import CeilingView  # noqa: PLC0415  # the library of an extra
 
     camera.port.parent.mkdir(parents=True, exist_ok=True)
     port = PtyPort(camera.port)

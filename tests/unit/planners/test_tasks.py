@@ -18,14 +18,14 @@ PERIOD = SECOND // 2
 
 
 class Digging:
-    """A service that digs, says what it was told, and can be resumed after a restart if it says so."""
+    """A service that digs, records what it is asked for, and can be resumed after a restart if it says so."""
 
     noun = "excavation"
     running = resumable = False
 
     def __init__(self) -> None:
         self.now = SECOND
-        self.told: list[tuple[object, ...]] = []
+        self.asked: list[tuple[object, ...]] = []
         self.newest = ExplorationState(stamp=0, received=0, seq=0, frame="map")
         self.refusal: Exception | None = None
         self.gate = self.topic(
@@ -55,14 +55,14 @@ class Digging:
         return "spade"
 
     def begin(self, accepted: str, request: ExploreRequest, number: int) -> None:
-        self.told.append((accepted, request.source, number))
+        self.asked.append((accepted, request.source, number))
         self.newest = self.newest.model_copy(
             update={"number": number, "source": request.source, "phase": ExplorationPhase.DRIVING}
         )
         self.running = True
 
     def control(self, request: ExploreRequest) -> None:
-        self.told.append((request.order, request.source))
+        self.asked.append((request.order, request.source))
         self.newest = self.newest.model_copy(update={"phase": ExplorationPhase.IDLE})
         self.running = False
 
@@ -75,10 +75,10 @@ class Digging:
         return self.tasks.take(ExploreRequest(**header, order=ExploreOrder(order), own=own))
 
     def refused(self, *args: object, **more: object) -> tuple[Reason, str]:
-        told = list(self.told)
+        asked = list(self.asked)
         with pytest.raises(RequestRefusedError) as error:
             self.ask(*args, **more)
-        assert self.told == told, "nothing has changed"
+        assert self.asked == asked, "nothing has changed"
         return error.value.refusal, str(error.value)
 
 
@@ -92,7 +92,7 @@ def test_a_task_gets_a_number_and_is_stopped_by_anybody_unless_it_is_to_be_the_p
     assert digging.refused("stop") == (Reason.NOT_FOUND, "no excavation is running")
     digging.ask("start")
     assert digging.ask("stop", "bob") == 2
-    assert digging.told == [
+    assert digging.asked == [
         ("spade", "ann", 1), (ExploreOrder.STOP, "ann"), ("spade", "ann", 2), (ExploreOrder.STOP, "bob")
     ]  # fmt: skip
 
@@ -133,7 +133,7 @@ def test_what_a_restart_interrupted_is_given_up_but_not_by_who_stops_only_its_ow
     digging.resumable = True
     assert digging.refused("stop", own=True)[0] is Reason.NOT_FOUND
     digging.ask("stop")
-    assert digging.told == [(ExploreOrder.STOP, "ann")]
+    assert digging.asked == [(ExploreOrder.STOP, "ann")]
 
 
 def test_a_request_of_another_run_or_that_is_too_old_moves_nothing_and_an_old_stop_stops():

@@ -12,9 +12,9 @@ from monstertruck_drivers.config import PortConfig
 from monstertruck_runtime.clock import WallClock
 from monstertruck_runtime.errors import BusyError, ConfigError, InputError, NotPermittedError
 from monstertruckd.config.load import load_truck
-from monstertruckd.tools.simulation import ports
+from monstertruckd.tools.simulation import emulate as ports
 from monstertruckd.tools.simulation.config import load_simulated
-from monstertruckd.tools.simulation.ports import claimed
+from monstertruckd.tools.simulation.emulate import claimed
 from monstertruckd.tools.simulation.simulate import serve
 
 CONFIGS = Path(__file__).resolve().parents[3] / "configs"

@@ -13,7 +13,6 @@ from monstertruck_runtime.early_estop import ENCODING, estop_payload
 from monstertruck_runtime.mailbox import fifo
 from monstertruck_schemas.req import ControlRequest, Order
 from monstertruck_schemas.topics import REQ_CONTROL, estop_key
-from monstertruckd.tools.cli import early_estop as early
 from tests.bus_kit import free_endpoint, running_robot
 
 
@@ -27,7 +26,7 @@ def test_key_encoding_and_order_are_those_of_the_topic():
 
 def test_nothing_heavy_is_loaded_for_it():
     heavy = "asyncio typer pydantic numpy google uvloop monstertruck_schemas.topics"
-    code = f"import sys, {early.__name__}; print([name for name in '{heavy}'.split() if name in sys.modules])"
+    code = f"import sys, {early_estop.__name__}; print([name for name in '{heavy}'.split() if name in sys.modules])"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
 
 
@@ -57,9 +56,9 @@ def test_the_options_are_those_of_the_command(
         orders.append((robot, endpoint))
         return Session()
 
-    monkeypatch.setattr(early, "send_estop", send)
-    monkeypatch.setattr(early, "nearest", lambda endpoint: endpoint)
-    with early.early_estop(arguments):
+    monkeypatch.setattr(early_estop, "send_estop", send)
+    monkeypatch.setattr(early_estop, "nearest", lambda endpoint: endpoint)
+    with early_estop.early_estop(arguments):
         assert not closed
     assert orders == ([] if sent is None else [sent])
     assert closed == [True] * len(orders)

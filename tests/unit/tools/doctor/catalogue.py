@@ -23,7 +23,7 @@ from monstertruckd.config.expiry import stamped
 from monstertruckd.recorder.config import RecorderConfig
 from monstertruckd.recorder.log_file import LogEntry
 from monstertruckd.recorder.recorder import LogWriter
-from monstertruckd.tools.doctor.checks import examine
+from monstertruckd.tools.doctor import examine
 from monstertruckd.tools.doctor.context import Account, Finding, Level, inspect
 from monstertruckd.tools.install.plan import RULES, UNIT
 from tests.unit.tools.doctor.kit import NOW, EmulatedHost, emulated

@@ -19,9 +19,8 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import BehaviourOrder
 from monstertruck_schemas.topics import BEHAVIOUR, GATE
 from monstertruckd.tools.cli.main import app
-from monstertruckd.tools.tune.plots import draw
 from monstertruckd.tools.tune.recipe import CALM, MOST, OVERSHOOTS, RunVerdict, judged, recipe
-from monstertruckd.tools.tune.runs import tune
+from monstertruckd.tools.tune.runs import draw, tune
 from tests.bus_kit import gate_state
 from tests.unit.planners.behave.wall_kit import Robot, drive
 
