@@ -14,7 +14,7 @@ that several computers can share the work: the files of ``--resume`` of the part
 import argparse
 import json
 import sys
-from collections import Counter, defaultdict
+from collections import defaultdict
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -22,8 +22,10 @@ from typing import Any
 import numpy as np
 
 from monstertruckd.config.load import load_config
-from monstertruckd.tools.drill.campaign import Campaign, CampaignReport, TrialOutcome
-from monstertruckd.tools.drill.random_drill import Drill, DrillReport, FaultOutcome, default_jobs
+from monstertruckd.tools.drill.campaign import Campaign, CampaignReport
+from monstertruckd.tools.drill.legs import default_jobs
+from monstertruckd.tools.drill.random_drill import Drill, DrillReport, FaultOutcome
+from monstertruckd.tools.drill.summary import by_family, troubles
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -58,26 +60,14 @@ def table(report: DrillReport) -> None:
 
 def family_table(report: CampaignReport) -> None:
     """One row for every family; seconds to the reason."""
-    families: dict[str, list[TrialOutcome]] = defaultdict(list)
-    for outcome in report.outcomes:
-        for family in outcome.families:
-            families[family].append(outcome)
     print("| family | trials | with a reason | reason | s, p50 | greatest | unsafe | stuck |")
     print("|---|---:|---:|---|---:|---:|---:|---:|")
-    for family, outcomes in sorted(families.items()):
-        # Of a pair the reason may be the other fault's.
-        times = [o.reason_s for o in outcomes if o.reason_s is not None and o.families[0] == family]
-        named = Counter(o.reason for o in outcomes if o.reason is not None and o.families[0] == family)
-        middle, most = (f"{np.median(times):.2f}", f"{max(times):.2f}") if times else ("-", "-")
-        reason = named.most_common(1)[0][0] if named else "-"
-        unsafe, stuck = sum(o.unsafe for o in outcomes), sum(bool(o.stuck) for o in outcomes)
-        print(f"| {family} | {len(outcomes)} | {len(times)} | {reason} | {middle} | {most} | {unsafe} | {stuck} |")
-    for outcome in report.outcomes:
-        where = f"trial {outcome.number}, {'reverse' if outcome.reverse else 'forwards'}, {' + '.join(outcome.faults)}"
-        for violation in outcome.violations:
-            print(f"{where}: after {violation.seconds:.2f} s {violation.rule}: {violation.text}")
-        if outcome.stuck:
-            print(f"{where}: not back: {', '.join(outcome.stuck)}")
+    for row in by_family(report.outcomes):
+        middle, most = ("-" if s is None else f"{s:.2f}" for s in (row.reason_p50_s, row.reason_max_s))
+        cells = row.family, row.trials, row.noticed, row.reason or "-", middle, most, row.unsafe, row.stuck
+        print(f"| {' | '.join(map(str, cells))} |")
+    for line in troubles(report.outcomes):
+        print(line)
 
 
 def drill_families(arguments: argparse.Namespace) -> int:

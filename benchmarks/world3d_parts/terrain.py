@@ -22,7 +22,8 @@ from monstertruck_sim.world.world import World
 from monstertruck_sim.world3d.ground import ground_heights
 from monstertruck_sim.world3d.plant import RigidPlant
 from monstertruckd.config.load import load_config
-from monstertruckd.tools.drill.random_drill import Drill, default_jobs
+from monstertruckd.tools.drill.legs import default_jobs
+from monstertruckd.tools.drill.random_drill import Drill
 from monstertruckd.tools.drill.truck import DrillTruck
 from monstertruckd.tools.simulation.config import DEADMAN_LINE, SimulatedTruckConfig, with_overlay
 

@@ -13,7 +13,7 @@ import pytest
 
 from monstertruck_runtime.errors import InputError, NoAnswerError
 from monstertruckd.config.load import load_config
-from monstertruckd.tools.drill import random_drill
+from monstertruckd.tools.drill import legs
 from monstertruckd.tools.drill.random_drill import Drill, DrillReport, FaultOutcome, run_leg
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
 from tests.daemon.wall_kit import ROOT
@@ -84,12 +84,12 @@ def test_the_number_of_processes_and_the_order_do_not_matter():
 
 def test_a_leg_of_another_version_is_refused(monkeypatch: pytest.MonkeyPatch):
     (leg,) = drill(1).legs()
-    monkeypatch.setattr(random_drill, "__version__", "9.9.9")
+    monkeypatch.setattr(legs, "__version__", "9.9.9")
     with pytest.raises(InputError, match=r"sent to a worker with version 9\.9\.9"):
         run_leg(leg)
 
 
 def test_without_a_scheduler_it_says_so(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(random_drill, "CONNECT", 0.2)
+    monkeypatch.setattr(legs, "CONNECT", 0.2)
     with pytest.raises(NoAnswerError, match=r"tcp://127.0.0.1:1: no dask scheduler answers"):
         drill(1).run(cluster="tcp://127.0.0.1:1")

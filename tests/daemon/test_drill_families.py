@@ -13,13 +13,16 @@ import pytest
 from monstertruck_drivers.cable import MemoryPort
 from monstertruck_runtime.clock import VirtualClock, run_virtual
 from monstertruck_runtime.errors import InputError
+from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order
 from monstertruck_schemas.state import GateMode
 from monstertruck_sim.families import families
+from monstertruck_sim.faults import apply, place_obstacle
 from monstertruck_sim.world.obstacles import Disc
 from monstertruck_sim.world.world import World
+from monstertruckd.bus.local import Bus
 from monstertruckd.config.load import load_config
-from monstertruckd.tools.drill.campaign import LEG, Campaign, TrialOutcome, run_trials
+from monstertruckd.tools.drill.campaign import LEG, Campaign, TrialOutcome, drives_again, run_trials
 from monstertruckd.tools.drill.judge import WorldJudge
 from monstertruckd.tools.drill.observer import Observer
 from monstertruckd.tools.drill.random_drill import wired
@@ -114,6 +117,23 @@ async def hits_behind(scene: Scene) -> None:
     await scene.clock.sleep(2.5)
 
 
+async def hits_behind_on_confirmed_ground(scene: Scene) -> None:
+    scene.judge.arm()
+    scene.post(0.05, behind=True)
+    scene.motor(-2_000)
+    for _ in range(30):
+        scene.judge.confirm()
+        await scene.clock.sleep(0.1)
+    assert scene.judge.confirmed_contacts == 1
+
+
+async def hits_behind_long_after_a_confirmation(scene: Scene) -> None:
+    scene.judge.confirm()
+    await scene.clock.sleep(0.6)
+    await hits_behind(scene)
+    assert scene.judge.confirmed_contacts == 0
+
+
 async def leaves_a_target(scene: Scene) -> None:
     """Held by hand it stands; the motor still wants to turn."""
     scene.judge.forbid()
@@ -174,6 +194,8 @@ def judged(run: Callable[[Scene], object]) -> WorldJudge:
         (sets_off_again, {"motion"}),
         (hits_ahead, {"contact"}),
         (hits_behind, {"contact"}),
+        (hits_behind_long_after_a_confirmation, {"contact"}),
+        (hits_behind_on_confirmed_ground, set()),
         (leaves_a_target, {"left behind"}),
         (stops, set()),
         (coasts, set()),
@@ -212,6 +234,67 @@ def test_a_wanderer_drives_in_both_directions_and_steers_in_every_way() -> None:
             assert await truck.until(truck.drives, 15.0, Order.ARM)
             station.choose(backwards=True)
             assert await truck.until(lambda: truck.speed < -0.03, 5.0, Order.ARM)
+
+    run_virtual(main)
+
+
+@pytest.mark.parametrize("name", sorted(path.stem for path in (CONFIGS / "robots").glob("*.yaml")))
+def test_a_wanderer_asks_a_body_for_nothing_impossible_and_for_all_that_it_can_do(name: str) -> None:
+    config = load_config(CONFIGS / "robots" / f"{name}.yaml", SimulatedTruckConfig)[0]
+    chassis = config.chassis()
+
+    async def main(clock: VirtualClock) -> set[tuple[bool, ...]]:
+        station = Wanderer(Bus(clock), clock, config, np.random.default_rng(1), lambda: None)
+        twists = set()
+        for _ in range(300):
+            station.choose()
+            if station.twist is None:
+                assert chassis.refusal(station.front, station.rear) is None
+                continue
+            assert (station.speed, station.front, station.rear) == (0.0, 0.0, 0.0)
+            twist = station.twist.vx, station.twist.vy, station.twist.wz
+            chassis.possible(twist)
+            twists.add(tuple(map(bool, twist)))
+        return twists
+
+    sideways = {(False, True, False)} if name in {"mecanum", "omni", "independent"} else set()
+    turns = (
+        {(False, False, True)} if sideways or name in {"differential", "skid_steer", "skid_stand", "sonar"} else set()
+    )
+    assert run_virtual(main) == turns | sideways
+
+
+def test_a_wanderer_that_is_refused_unseen_ground_holds_the_second_control_after_a_while() -> None:
+    async def main(clock: VirtualClock) -> None:
+        config = with_overlay(wired(demo()), {"tracker": None, "path": None})
+        async with DrillTruck.running(config, clock, wander=np.random.default_rng(2), judged=True) as truck:
+            station, judge = truck.station, truck.judge
+            assert isinstance(station, Wanderer)
+            assert judge is not None
+            station.choose(backwards=True)  # it has just been armed: nothing behind it has been seen
+            assert await truck.until(lambda: truck.speed < -0.03, 5.0, Order.ARM)
+            assert truck.gate is not None
+            assert Reason.UNSEEN_DRIVE in truck.gate.reasons
+            station.run_up(6.0)
+            begin = judge.place
+            assert await truck.until(lambda: math.dist(judge.place, begin) > 0.7, 6.0, Order.ARM)
+            station.choose(backwards=True)
+            assert await truck.until(lambda: truck.speed < -0.06, 2.0, Order.ARM), "over ground that it has seen"
+            assert not station.unseen
+
+    run_virtual(main)
+
+
+def test_an_operator_takes_over_where_something_is_in_the_way_of_a_tracker() -> None:
+    async def main(clock: VirtualClock) -> None:
+        wander = np.random.default_rng(2)
+        async with DrillTruck.running(wired(demo()), clock, wander=wander, judged=True, by_hand=False) as truck:
+            assert await truck.until(truck.drives, 15.0, Order.ARM)
+            await truck.order(Order.DISARM)
+            await clock.sleep(1.0)
+            await apply(place_obstacle(0.1), truck.rig.context)
+            assert await drives_again(truck)
+            assert truck.by_hand
 
     run_virtual(main)
 

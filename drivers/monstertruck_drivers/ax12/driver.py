@@ -165,12 +165,10 @@ class Joint:
         return self._strays >= STRAYS
 
     async def _stop_straying(self, session: Ax12Session, present: Present) -> None:
-        """Take the unit's torque away for the longest rest."""
+        """Take the unit's torque away for a rest."""
         await session.write(self.id, p.TORQUE_ENABLE, b"\x00")
-        self._strays = 0
-        self.torque, self._outage = TorqueState.LIMP, True
-        self._hold_at = self._clock.now() + round(self._config.alarm.rest_max * SECOND)
-        text = f"turned to {present.position} by itself, its goal is {self._goal}: no torque"
+        self._strays, rest = 0, self._rested()
+        text = f"turned to {present.position} by itself, its goal is {self._goal}: no torque for {rest:g} s"
         self._report(Reason.UNCOMMANDED_MOTION, Severity.ERROR, text, position=present.position, goal=self._goal)
 
     async def _look_after(self, session: Ax12Session, present: Present, error: Alarm) -> None:
@@ -210,17 +208,22 @@ class Joint:
             self._report(Reason.DEVICE_READY, Severity.INFO, "holds again")
 
     def _go_limp(self) -> None:
-        """Rest, the longer the sooner it tripped again."""
+        """The unit took its torque away itself: rest."""
+        reported, rest = self._outage, self._rested()
+        if not reported:
+            text = f"limp after {alarm_names(self._error)}: rests {rest:g} s"
+            self._report(Reason.DEVICE_FAULT, Severity.ERROR, text, error=int(self._error))
+
+    def _rested(self) -> float:
+        """Begin a rest, the longer the sooner it is needed again; return its length, s."""
         alarm, now = self._config.alarm, self._clock.now()
         if self._held_at is not None and now - self._held_at >= alarm.settled_after * SECOND:
             self._rest = alarm.rest
-        self.torque = TorqueState.LIMP
-        self._hold_at = now + round(self._rest * SECOND)
-        if not self._outage:
-            text = f"limp after {alarm_names(self._error)}: rests {self._rest:g} s"
-            self._report(Reason.DEVICE_FAULT, Severity.ERROR, text, error=int(self._error))
-        self._outage = True
-        self._rest = min(2 * self._rest, alarm.rest_max)
+        rest = self._rest
+        self.torque, self._outage = TorqueState.LIMP, True
+        self._hold_at = now + round(rest * SECOND)
+        self._rest = min(2 * rest, alarm.rest_max)
+        return rest
 
     def _miss(self, why: str) -> None:
         self._misses += 1

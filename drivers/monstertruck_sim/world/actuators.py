@@ -14,7 +14,8 @@ class Shaft:
 
     def __init__(self, config: MotorConfig) -> None:
         self._config = config
-        self._target: float | None = None
+        self.target: float | None = None
+        """Speed that it ramps towards, rpm; None = the power stage is off."""
         self._acceleration = 0.0
         self.turns = 0.0
         self.rpm = 0.0
@@ -26,24 +27,24 @@ class Shaft:
 
     def command(self, target_rpm: float | None, accel_rpm_s: float) -> None:
         """Ramp towards a speed; None switches the power stage off."""
-        if self._target is None:
+        if self.target is None:
             self.demand_rpm = self.rpm
-        self._target = target_rpm
+        self.target = target_rpm
         self._acceleration = abs(accel_rpm_s)
 
     @property
     def powered(self) -> bool:
         """Whether the power stage is on."""
-        return self._target is not None
+        return self.target is not None
 
     def step(self, dt: float) -> None:
         """Move on by dt seconds."""
         before = self.rpm
-        if self._target is None:
+        if self.target is None:
             self.demand_rpm = 0.0
             rpm = _towards(before, 0.0, self._config.coast_rpm_s * dt)
         else:
-            demand = self.demand_rpm = _towards(self.demand_rpm, self._target, self._acceleration * dt)
+            demand = self.demand_rpm = _towards(self.demand_rpm, self.target, self._acceleration * dt)
             rpm = demand + (before - demand) * exp(-dt / self._config.lag)
             if demand == 0.0 and abs(rpm) < 0.5:
                 rpm = 0.0

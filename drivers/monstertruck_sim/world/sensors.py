@@ -233,6 +233,11 @@ class SimulatedMotor:
         self._plant.advance(time_ns)
         self._plant.shafts[self._shaft].command(None if target_rpm is None else self._sign * target_rpm, accel_rpm_s)
 
+    @property
+    def target_rpm(self) -> float:
+        """Speed that the controller asks for; 0 while the power stage is off."""
+        return self._sign * (self._plant.shafts[self._shaft].target or 0.0)
+
     def reading(self, time_ns: int) -> MotorReading:
         """State at ``time_ns``."""
         self._plant.advance(time_ns)

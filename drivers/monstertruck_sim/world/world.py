@@ -12,7 +12,6 @@ from monstertruck_drivers.emulation import (
     Horn,
     ImuSource,
     JointSource,
-    MotorPlant,
     RangeSource,
     ServoPlant,
     SonarSource,
@@ -88,7 +87,7 @@ class World:
         self._horns = Horn(pitch.zero, pitch.direction), Horn(roll.zero, roll.direction)
         self.view = make_view(config, self._plant, cast, self.scene, seed)
         self._lidar.board_at = self.view.board_at
-        self.motors: tuple[MotorPlant, ...] = tuple(
+        self.motors: tuple[SimulatedMotor, ...] = tuple(
             SimulatedMotor(self._plant, config.truck.motor, noise_seed, i) for i in range(len(self._plant.shafts))
         )
         self._battery_input = config.battery.channel

@@ -1,8 +1,8 @@
 """``monstertruckd drill``: seeded faults on an emulated truck, and a scored report."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
@@ -11,8 +11,10 @@ from monstertruckd.tools.cli.output import JsonOption, console, needs_extra, pri
 from monstertruckd.tools.shipped import shipped
 
 if TYPE_CHECKING:
-    from monstertruckd.tools.drill.random_drill import Drill, DrillReport, FaultOutcome
+    from monstertruckd.tools.drill.campaign import CampaignReport
+    from monstertruckd.tools.drill.random_drill import DrillReport, FaultOutcome
 
+Report = TypeVar("Report", "DrillReport", "CampaignReport")
 FULL_CONFIG = shipped("configs/full.yaml")
 
 
@@ -21,6 +23,9 @@ def drill(
     seed: Annotated[int, typer.Option(min=0, help="Which faults, when, for how long.")] = 1,
     count: Annotated[int, typer.Option(min=1, help="How many.")] = 50,
     config: SimulatedOption = FULL_CONFIG,
+    families: Annotated[
+        bool, typer.Option(help="Falsify any signal of any device and ignore commands, singly and in pairs.")
+    ] = False,
     jobs: Annotated[int | None, typer.Option(min=1, help="Processes; default: all cores but one.")] = None,
     cluster: Annotated[
         str | None,
@@ -34,37 +39,78 @@ def drill(
 ) -> None:
     """Inject random faults into the emulated robot while it drives, and score its reactions.
 
-    Everything runs on a virtual clock, with the deadman line wired. Exit code 1 if any motion was unsafe or any service
-    did not recover.
+    Everything runs on a virtual clock, with the deadman line wired. With --families an operator drives at random, and
+    the simulated world alone judges. Exit code 1 if any motion was unsafe or any service did not recover.
     """
-    from monstertruckd.tools.drill.random_drill import Drill, default_jobs
+    from monstertruckd.tools.drill.campaign import Campaign
+    from monstertruckd.tools.drill.legs import default_jobs
+    from monstertruckd.tools.drill.random_drill import Drill
     from monstertruckd.tools.simulation.config import load_simulated
 
-    drill = Drill(seed, count, load_simulated(config))
-    report = _run(drill, jobs or default_jobs(), cluster, resume)
-    if json_output:
-        print_json(report.as_json() | {"unguarded": drill.unguarded})
+    truck = load_simulated(config)
+    if families:
+        found = _run("trials", Campaign(seed, count, truck).run, count, jobs or default_jobs(), cluster, resume)
+        _show_families(found, json_output=json_output)
+        unsafe, stuck = found.unsafe, found.stuck
     else:
-        _print(report)
-        if drill.unguarded:
-            names = ", ".join(drill.unguarded)
-            console().print(
-                f"no fault cut off {names}: without a deadman line nothing stops a motor that is not reached"
-            )
-    if report.unsafe or report.stuck:
+        drill = Drill(seed, count, truck)
+        report = _run("faults", drill.run, count, jobs or default_jobs(), cluster, resume)
+        _show(report, drill.unguarded, json_output=json_output)
+        unsafe, stuck = report.unsafe, report.stuck
+    if unsafe or stuck:
         raise typer.Exit(1)
 
 
-def _run(drill: "Drill", jobs: int, cluster: str | None, resume: Path | None) -> "DrillReport":
+def _run(
+    what: str, run: Callable[..., Report], count: int, jobs: int, cluster: str | None, resume: Path | None
+) -> Report:
     finished = 0
-    with progress("faults", drill.count) as done:
+    with progress(what, count) as done:
 
-        def show(outcomes: "Sequence[FaultOutcome]") -> None:
+        def show(outcomes: Sequence[Any]) -> None:
             nonlocal finished
             finished += len(outcomes)
             done(finished)
 
-        return drill.run(jobs=jobs, cluster=cluster, resume=resume, report=show)
+        return run(jobs=jobs, cluster=cluster, resume=resume, report=show)
+
+
+def _show_families(report: "CampaignReport", *, json_output: bool) -> None:
+    from monstertruckd.tools.drill.summary import by_family, troubles
+
+    if json_output:
+        print_json(report.as_json())
+        return
+    numbers = ("trials", "noticed", "p50 s", "max s", "unsafe", "stuck")
+    rows = [
+        (
+            *map(str, (row.trials, row.noticed)),
+            *map(_seconds, (row.reason_p50_s, row.reason_max_s)),
+            *map(str, (row.unsafe, row.stuck)),
+            row.reason or "-",
+            row.family,
+        )
+        for row in by_family(report.outcomes)
+    ]
+    print_table((*numbers, "reason", "family"), rows, right=numbers)
+    out, figures = console(), report.figures()
+    for line in troubles(report.outcomes):
+        out.print(line, style="red")
+    out.print(
+        f"{figures['trials']} trials, {figures['pairs']} of two faults, {figures['reverse']} in reverse: "
+        f"{report.unsafe} with unsafe motion, {report.stuck} not recovered; "
+        f"recovered after {_seconds(figures['recovery_p50_s'])} s (p50), {_seconds(figures['recovery_p99_s'])} s (p99)"
+    )
+
+
+def _show(report: "DrillReport", unguarded: Sequence[str], *, json_output: bool) -> None:
+    if json_output:
+        print_json(report.as_json() | {"unguarded": unguarded})
+        return
+    _print(report)
+    if unguarded:
+        names = ", ".join(unguarded)
+        console().print(f"no fault cut off {names}: without a deadman line nothing stops a motor that is not reached")
 
 
 def _print(report: "DrillReport") -> None:

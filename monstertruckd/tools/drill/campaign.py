@@ -8,9 +8,8 @@ As in ``random_drill`` a drill consists of legs, each with a truck, a clock and 
 """
 
 import asyncio
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
+import math
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -26,18 +25,14 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order
 from monstertruck_sim.families import families
 from monstertruck_sim.faults import Fault, FaultCatalog, FaultKind, SimContext, apply
+from monstertruckd.tools.drill.legs import DrillLeg, check_version, leg_alone, run_legs, truck_of_leg
 from monstertruckd.tools.drill.observer import Violation
 from monstertruckd.tools.drill.random_drill import (
     OBSTACLE,
     QUIET,
     TIMEOUT,
     TRACKER_IN_WORKER,
-    DrillLeg,
-    LegFile,
     check_drivable,
-    check_version,
-    leg_alone,
-    on_cluster,
     reasons_of,
     unguarded,
     wired,
@@ -63,6 +58,11 @@ MOVES: Final = 0.03
 """True speed of a robot that drives, m/s; slower than it backs into ground that it knows little of."""
 RECORDS: Final = 5
 """One of so many trucks records, and its disk may become full."""
+RUN_UP: Final = 0.7
+"""Distance that the operator drives straight ahead before it reverses, m: a robot that has just been armed knows
+nothing of the ground behind it."""
+RUN_UP_TIME: Final = 6.0
+"""Seconds after which it reverses without."""
 TURNS: Final = 2.0
 """Seconds in which the operator tries to drive in the direction of the trial."""
 SETTLES: Final = 1.5
@@ -110,6 +110,8 @@ class TrialOutcome:
     stuck: tuple[str, ...] = ()
     """Services that did not recover, or reasons that keep it from driving."""
     violations: tuple[Violation, ...] = ()
+    confirmed_contacts: int = 0
+    """Contacts while the operator confirmed unseen ground."""
 
     @property
     def unsafe(self) -> bool:
@@ -132,6 +134,16 @@ class CampaignReport:
     seed: int
     outcomes: tuple[TrialOutcome, ...]
 
+    @property
+    def unsafe(self) -> int:
+        """Trials with unsafe motion."""
+        return sum(outcome.unsafe for outcome in self.outcomes)
+
+    @property
+    def stuck(self) -> int:
+        """Trials after which the robot did not recover."""
+        return sum(bool(outcome.stuck) for outcome in self.outcomes)
+
     def figures(self) -> dict[str, Any]:
         """The totals."""
         recovered = [o.recovered_s for o in self.outcomes if o.recovered_s]
@@ -141,9 +153,10 @@ class CampaignReport:
             "pairs": sum(len(o.faults) > 1 for o in self.outcomes),
             "reverse": sum(o.reverse for o in self.outcomes),
             "families": len({family for o in self.outcomes for family in o.families}),
-            "unsafe": sum(o.unsafe for o in self.outcomes),
+            "unsafe": self.unsafe,
             "contacts": sum(o.contact for o in self.outcomes),
-            "stuck": sum(bool(o.stuck) for o in self.outcomes),
+            "confirmed_contacts": sum(o.confirmed_contacts for o in self.outcomes),
+            "stuck": self.stuck,
             "recovery_p50_s": float(np.percentile(recovered, 50)) if recovered else None,
             "recovery_p99_s": float(np.percentile(recovered, 99)) if recovered else None,
             "travelled_max_m": max((o.travelled for o in self.outcomes), default=0.0),
@@ -190,33 +203,8 @@ class Campaign:
         resume: Path | None = None,
         report: Callable[[list[TrialOutcome]], None] = lambda _: None,
     ) -> CampaignReport:
-        """Run all of it; arguments and errors as of ``Drill.run``. Files of several parts add up when joined."""
-        legs = self.legs()
-        file = None if resume is None else LegFile(resume, legs[0], OUTCOMES)
-        known = {} if file is None else {leg.number: found for leg in legs if (found := file.outcomes(leg))}
-        outcomes: list[TrialOutcome] = []
-        with _parts([leg for leg in legs if leg.number not in known], jobs, cluster) as parts:
-            for leg in legs:
-                part = known.get(leg.number)
-                if part is None:
-                    part = next(parts)
-                    if file is not None:
-                        file.add(leg, part)
-                report(part)
-                outcomes += part
-        return CampaignReport(self.seed, tuple(outcomes))
-
-
-@contextmanager
-def _parts(legs: list[DrillLeg], jobs: int, cluster: str | None) -> Iterator[Iterator[list[TrialOutcome]]]:
-    if cluster is not None:
-        with on_cluster(cluster, run_trials, legs) as parts:
-            yield parts
-    elif jobs == 1:
-        yield map(run_trials, legs)
-    else:
-        with ProcessPoolExecutor(min(jobs, max(1, len(legs)))) as pool:
-            yield pool.map(run_trials, legs)
+        """Run all of it; arguments and errors as of ``run_legs``. Files of several parts add up when joined."""
+        return CampaignReport(self.seed, run_legs(self.legs(), run_trials, OUTCOMES, jobs, cluster, resume, report))
 
 
 def run_trials(leg: DrillLeg) -> list[TrialOutcome]:
@@ -244,21 +232,18 @@ class _Leg:
             base = with_overlay(base, BY_HAND)
         elif leg.number // FOLLOWS % 2:
             base, self._workers = with_overlay(base, TRACKER_IN_WORKER), (TRACKING,)
-        if leg.number % RECORDS:
-            base = base.model_copy(update={"recorder": None, "blackbox": None})
-        recorder = base.recorder.model_copy(update={"directory": folder}) if base.recorder else None
-        seed = int(self._rng.integers(2**31))
-        self._config = base.model_copy(
-            update={"recorder": recorder, "sim": base.sim.model_copy(update={"seed": seed, "drill": None})}
-        )
+        records = None if leg.number % RECORDS else folder
+        self._config = truck_of_leg(base, int(self._rng.integers(2**31)), records)
         self._outcomes: list[TrialOutcome] = []
 
     async def run(self) -> list[TrialOutcome]:
         """All trials."""
         while len(self._outcomes) < self._leg.count:
             before = len(self._outcomes)
-            wander = None if self._follows else self._rng.spawn(1)[0]
-            async with DrillTruck.running(self._config, self._clock, wander=wander, judged=True) as truck:
+            wander, by_hand = self._rng.spawn(1)[0], not self._follows
+            async with DrillTruck.running(
+                self._config, self._clock, wander=wander, judged=True, by_hand=by_hand
+            ) as truck:
                 await self._drive_on(truck)
             if len(self._outcomes) == before:  # a new truck cannot be driven either
                 self._outcomes.append(TrialOutcome(self._number, (), (), self._follows, False, stuck=("drive",)))
@@ -277,7 +262,7 @@ class _Leg:
         )  # what is said while nothing is wrong
         draw = _Draw(truck, self._rng, self._workers)
         while len(self._outcomes) < self._leg.count:
-            if not await _arm(truck):
+            if truck.by_hand is self._follows or not await _arm(truck):
                 return
             usual |= {reason for report in truck.reports() for reason in reasons_of(report)}
             outcome = await _try(truck, draw(), self._rng, usual, self._number)
@@ -292,7 +277,7 @@ class _Draw:
     def __init__(self, truck: DrillTruck, rng: np.random.Generator, workers: tuple[str, ...]) -> None:
         config = truck.rig.config
         self._rng = rng
-        self._backwards = isinstance(truck.station, Wanderer)
+        self._backwards = truck.by_hand
         self._by_role: dict[str, list[Any]] = {}
         for family in families(truck.rig.robot, used=True):
             self._by_role.setdefault(family.role, []).append(family)
@@ -332,12 +317,33 @@ async def _arm(truck: DrillTruck) -> bool:
     return await truck.until(lambda: abs(truck.speed) > MOVES, TIMEOUT, Order.ARM)
 
 
+async def drives_again(truck: DrillTruck) -> bool:
+    """Whether it sets off; an operator takes over where something is in the way of a tracker."""
+    if await _arm(truck):
+        return True
+    if truck.by_hand or not _blocked(truck):
+        return False
+    truck.by_hand = True
+    return await _arm(truck)
+
+
 async def _turn(truck: DrillTruck, trial: Trial) -> None:
     """Let the operator drive in the direction of the trial, if it can."""
-    if isinstance(truck.station, Wanderer):
-        truck.station.choose(backwards=trial.backwards)
-        await truck.until(lambda: abs(truck.speed) > MOVES and (truck.speed < 0) is trial.backwards, TURNS, Order.ARM)
-        truck.station.backwards = None
+    station, judge = truck.station, truck.judge
+    assert judge is not None
+    if not truck.by_hand or not isinstance(station, Wanderer):
+        return
+    if trial.backwards:
+        station.run_up(RUN_UP_TIME)
+        begin = judge.place
+        await truck.until(lambda: math.dist(judge.place, begin) > RUN_UP or _blocked(truck), RUN_UP_TIME, Order.ARM)
+    station.choose(backwards=trial.backwards)
+    await truck.until(lambda: abs(truck.speed) > MOVES and (truck.speed < 0) is trial.backwards, TURNS, Order.ARM)
+    station.backwards = None
+
+
+def _blocked(truck: DrillTruck) -> bool:
+    return truck.gate is not None and Reason.OBSTACLE_STOP in truck.gate.reasons
 
 
 async def _try(
@@ -347,6 +353,7 @@ async def _try(
     clock, judge = truck.clock, truck.judge
     assert judge is not None
     await _turn(truck, trial)
+    followed = not truck.by_hand
     await clock.sleep(float(rng.uniform(*CRUISE)))
     truck.reports()
     judge.begin()
@@ -359,8 +366,8 @@ async def _try(
         if fault is trial.faults[-1]:
             judge.forbid()
             stopping = asyncio.create_task(truck.order(order), name="stopping")
-            if truck.station is not None:
-                truck.station.silent = True
+            assert truck.station is not None
+            truck.station.silent = True
             await clock.sleep(SETTLES)
             travelled, standstill = judge.travelled, judge.standstill
         await apply(fault.end, context)
@@ -375,14 +382,14 @@ async def _try(
     judge.look()
     judge.check_left()
     stuck = truck.blockers() or ("daemon",) if not recovered else ()
-    if not stuck and not judge.violations and not await _arm(truck):
+    if not stuck and not judge.violations and not await drives_again(truck):
         stuck = tuple(truck.gate.reasons) if truck.gate is not None else ("gate",)
         stuck = stuck or ("stands",)
     return TrialOutcome(
         number,
         tuple(fault.name for fault in trial.faults),
         trial.families,
-        not isinstance(truck.station, Wanderer),
+        followed,
         reverse,
         reason,
         reason_s,
@@ -391,6 +398,7 @@ async def _try(
         None if stuck else seconds,
         stuck,
         judge.violations,
+        judge.confirmed_contacts,
     )
 
 

@@ -15,6 +15,8 @@ MAY_TRAVEL: Final = 0.3
 """Distance that a robot may travel while nothing permits motion, m."""
 MAY_MOVE: Final = 1.0
 """Seconds for which a robot may still move once nothing permits motion."""
+CONFIRMED: Final = 0.5
+"""Seconds after which the confirmation of an operator no longer counts: the robot has stopped by then."""
 STANDS_FOR: Final = 0.2
 """Seconds without motion after which a robot stands: braked, it rocks on its tyres."""
 
@@ -24,6 +26,7 @@ class WorldJudge:
 
     Motion is permitted from the operator's order to arm until one to disarm or stop. Three things are unsafe: contact
     with anything, motion that is not permitted beyond ``MAY_TRAVEL`` or ``MAY_MOVE``, and what a fault leaves behind.
+    Contacts that begin while the operator confirms unseen ground are counted apart.
 
     Args:
         world: the simulated world.
@@ -43,6 +46,11 @@ class WorldJudge:
         self._still_since: int | None = None
         self._travelled = 0.0
         self._place: tuple[float, float] | None = None
+        self._confirmed: int | None = None
+        """Newest confirmation of the operator, ns."""
+        self._touches = False
+        self.confirmed_contacts = 0
+        """Contacts since ``begin`` that began while the operator confirmed unseen ground."""
 
     async def run(self) -> None:
         """Look fifty times a second until cancelled."""
@@ -67,6 +75,11 @@ class WorldJudge:
         """A trial begins."""
         self._began = self._clock.now()
         self._violations.clear()
+        self.confirmed_contacts = 0
+
+    def confirm(self) -> None:
+        """The operator holds the second control, to drive into ground that the robot has not seen."""
+        self._confirmed = self._clock.now()
 
     # What came of it
 
@@ -79,6 +92,11 @@ class WorldJudge:
     def travelled(self) -> float:
         """Distance travelled since motion was forbidden, m."""
         return self._travelled
+
+    @property
+    def place(self) -> tuple[float, float]:
+        """True place of the robot at the newest look, m."""
+        return self._place or (0.0, 0.0)
 
     @property
     def standstill(self) -> float | None:
@@ -96,8 +114,9 @@ class WorldJudge:
         twist = self._world.plant.twist
         moves = math.hypot(*twist[:2]) > AT_REST or abs(twist[2]) > 10 * AT_REST
         self._still_since = None if moves else self._still_since or now
-        if truth.stuck:
-            self._blame("contact", f"ran into something at ({truth.x:.2f}, {truth.y:.2f}) m")
+        if truth.stuck and not self._touches:
+            self._touch(now, f"ran into something at ({truth.x:.2f}, {truth.y:.2f}) m")
+        self._touches = truth.stuck
         if self._forbidden is None:
             return
         if self._stood is None and self._still_since is not None:
@@ -118,6 +137,12 @@ class WorldJudge:
             demand = motor.reading(self._clock.now()).demand_rpm
             if demand != 0.0:
                 self._blame("left behind", f"motor {shaft + 1} is still asked for {demand:.0f} rpm")
+
+    def _touch(self, now: int, text: str) -> None:
+        if self._confirmed is not None and now - self._confirmed <= CONFIRMED * SECOND:
+            self.confirmed_contacts += 1
+        else:
+            self._blame("contact", text)
 
     def _blame(self, rule: str, text: str) -> None:
         self._violations.setdefault(rule, Violation((self._clock.now() - self._began) / SECOND, rule, text))

@@ -16,6 +16,7 @@ from typing import Final, Protocol
 import numpy as np
 
 from monstertruck_drivers.cable import MemoryPort
+from monstertruck_drivers.config import kind_of
 from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos.protocol import Control, FrameError, Opcode, decode_body, join
 from monstertruck_drivers.maestro.protocol import Code, Decoder, ServoCommand
@@ -71,6 +72,10 @@ REVERSES_BELOW: Final = 0.05
 MOTORS: Final = (*SHAFTS, DeviceRole.WHEELS)
 """Roles of motor controllers."""
 WIRES: Final = (*MOTORS, DeviceRole.STEERING, DeviceRole.LIDAR, DeviceRole.COMPASS)
+EPOS: Final = "epos"
+"""Kind of motor controller whose wire is read, and whose quick-stop input the deadman line is wired to."""
+MAESTRO: Final = "maestro"
+"""Kind of servo controller whose wire is read, and whose output is the deadman line."""
 STOP_CONTROLS: Final = frozenset((Control.QUICK_STOP, Control.DISABLE_VOLTAGE, Control.HALT))
 
 
@@ -226,7 +231,7 @@ class _ObeyedOrders(MotorWire):
         self.forget()
         now = self._clock.now()
         for shaft in self._shafts:
-            speed = self._world.motors[shaft].reading(now).demand_rpm / self._rpm
+            speed = self._world.motors[shaft].target_rpm / self._rpm
             if speed != self._newest[shaft]:
                 self._newest[shaft] = speed
                 yield now, shaft, speed
@@ -242,7 +247,7 @@ def _motor_wires(
     for role, device in config.devices.present().items():
         if role in SHAFTS:
             shaft = SHAFTS.index(DeviceRole(role))
-            known = device.driver.kind == "epos"
+            known = device.driver.kind == EPOS
             wires.append(
                 _EposWire(taps[role], shaft, rpm) if known else _ObeyedOrders(taps[role], world, [shaft], rpm, clock)
             )
@@ -255,6 +260,67 @@ def _motor_wires(
                 else _ObeyedOrders(taps[role], world, shafts, rpm, clock)
             )
     return wires
+
+
+class ServoWire(Protocol):
+    """What a servo controller is asked for; takes every request once."""
+
+    def read(self) -> Iterator[tuple[int, float]]:
+        """(channel, us) of what has come since the last call."""
+
+
+class _MaestroWire:
+    """The bytes to a Maestro.
+
+    Args:
+        tap: its cable.
+        crc: whether commands have a check sum.
+        asked: called with the channel and the instant, ns, of each request for a position or voltage.
+    """
+
+    def __init__(self, tap: WireTap, *, crc: bool, asked: Callable[[int, int], None]) -> None:
+        self._tap, self._decoder, self._asked = tap, Decoder(crc=crc), asked
+
+    def read(self) -> Iterator[tuple[int, float]]:
+        """See ``ServoWire``."""
+        received, self._tap.to_device[:] = list(self._tap.to_device), []
+        self._tap.to_host.clear()
+        for instant, data in received:
+            for command in self._decoder.feed(data):
+                if not isinstance(command, ServoCommand):
+                    continue
+                if command.code is Code.SET_TARGET and command.value:
+                    yield command.data[0], command.value / 4
+                elif command.code is Code.GET_POSITION:
+                    self._asked(command.data[0], instant)
+
+
+class _SentPulses:
+    """A servo controller whose protocol is not known here: the pulses that it sends, by the world.
+
+    Args:
+        tap: its cable.
+        world: of the servos.
+        channels: of its servos.
+        clock: time.
+    """
+
+    def __init__(self, tap: WireTap, world: World, channels: Iterable[int], clock: Clock) -> None:
+        self._tap, self._world, self._clock = tap, world, clock
+        self._newest: dict[int, float | None] = dict.fromkeys(channels)
+
+    def read(self) -> Iterator[tuple[int, float]]:
+        """See ``ServoWire``."""
+        self._tap.to_device.clear()
+        self._tap.to_host.clear()
+        source, now = self._world.plant.pulses, self._clock.now()
+        if source is None:
+            return
+        for channel, before in self._newest.items():
+            pulse = source.pulse_us(channel, now)
+            if pulse is not None and pulse != before:
+                self._newest[channel] = pulse
+                yield channel, pulse
 
 
 @dataclass(frozen=True, slots=True)
@@ -642,6 +708,21 @@ def _contact(seen: Observation) -> Broken:
         yield "contact", "ran into something"
 
 
+def _servo_wire(
+    config: SimulatedTruckConfig, tap: WireTap, world: World, clock: Clock
+) -> tuple[ServoWire, tuple[Rule, ...]]:
+    """Wire of the servo controller, and the rules on what else it measures."""
+    assert config.devices.steering is not None
+    driver, gate = config.devices.steering.driver, config.gate
+    if kind_of(driver).name != MAESTRO:
+        return _SentPulses(tap, world, (servo.channel for servo in driver.servos), clock), ()
+    if driver.battery is None:
+        return _MaestroWire(tap, crc=driver.use_crc, asked=lambda _channel, _instant: None), ()
+    limits = gate.battery.stale_after, 0.0 if gate.battery.critical else gate.battery_low_speed
+    battery = _Battery(tap, driver.battery.channel, limits)
+    return _MaestroWire(tap, crc=driver.use_crc, asked=battery.ask), (battery,)
+
+
 class Observer:
     """Checks the invariants of one truck, and measures how it reacts; ``begin`` and ``end_fault`` bound one fault.
 
@@ -670,20 +751,17 @@ class Observer:
         self._target = [0.0] * len(chassis.shafts)
         self._standstill = _Standstill()
         self._turning = _Turning(self._steering, world)
-        self._battery: _Battery | None = None
+        self._servos: ServoWire | None = None
         rules: list[Rule] = [
             self._standstill,
             _Speeds(chassis, gate.reverse_speed, gate.speed),
             _Ramp(_accelerations(chassis, gate)),
             _HeldShaft(world),
         ]
-        if (servos := config.devices.steering) is not None:
-            self._maestro = Decoder(crc=servos.driver.use_crc)
+        if config.devices.steering is not None:
             rules.append(_Pulses(config, self._steering))
-            if (pack := servos.driver.battery) is not None:
-                limits = gate.battery.stale_after, 0.0 if gate.battery.critical else gate.battery_low_speed
-                self._battery = _Battery(taps[DeviceRole.STEERING], pack.channel, limits)
-                rules.append(self._battery)
+            self._servos, battery = _servo_wire(config, taps[DeviceRole.STEERING], world, clock)
+            rules += battery
         rules += [self._turning, _Silence(_indispensable(config, taps)), _contact]
         if config.devices.lidar is not None:
             rules.append(_Ahead(config, world))
@@ -777,7 +855,8 @@ class Observer:
         for _, shaft, speed in targets:
             self._target[shaft] = speed
         twist = self._world.plant.twist
-        seen = Observation(now, truth, twist, targets, tuple(self._target), tuple(self._new_pulses()))
+        pulses = () if self._servos is None else tuple(self._servos.read())
+        seen = Observation(now, truth, twist, targets, tuple(self._target), pulses)
         for rule in self._rules:
             for name, text in rule(seen):
                 self._violations.setdefault(name, Violation((now - self._standstill.began) / SECOND, name, text))
@@ -788,21 +867,6 @@ class Observer:
                 self._fresh.append((instant, shaft, speed))
                 if speed == 0 and instant >= self._standstill.began:
                     self._stops.setdefault(shaft, instant)
-
-    def _new_pulses(self) -> Iterator[tuple[int, float]]:
-        tap = self._taps.get(DeviceRole.STEERING)
-        if tap is None:
-            return
-        received, tap.to_device[:] = list(tap.to_device), []
-        tap.to_host.clear()
-        for instant, data in received:
-            for command in self._maestro.feed(data):
-                if not isinstance(command, ServoCommand):
-                    continue
-                if command.code is Code.SET_TARGET and command.value:
-                    yield command.data[0], command.value / 4
-                elif command.code is Code.GET_POSITION and self._battery is not None:
-                    self._battery.ask(command.data[0], instant)
 
 
 def _indispensable(config: SimulatedTruckConfig, taps: Mapping[str, WireTap]) -> Iterator[tuple[str, WireTap, float]]:

@@ -5,27 +5,20 @@ seed, so that legs can run in parallel, here or on a cluster, and still give the
 """
 
 import asyncio
-import hashlib
-import importlib.util
-import json
-import logging
-import os
-import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Final, Generic, TypeVar
+from typing import Any, Final
 
 import numpy as np
 from pydantic import TypeAdapter
 
+from monstertruck_drivers.config import kind_of
 from monstertruck_drivers.maestro.protocol import CHANNELS
 from monstertruck_planners.steps import TRACKING
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
-from monstertruck_runtime.errors import InputError, NoAnswerError, WorkerError
+from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.event import Event, Severity
 from monstertruck_schemas.health import HealthTable
 from monstertruck_schemas.reasons import Reason
@@ -33,17 +26,11 @@ from monstertruck_schemas.req import Order
 from monstertruck_schemas.roles import SHAFTS
 from monstertruck_schemas.state import GateState
 from monstertruck_sim.faults import CatalogFault, FaultCatalog, FaultKind, apply
-from monstertruckd import __version__
-from monstertruckd.tools.drill.observer import STOPS_WITHIN, Violation
+from monstertruckd.tools.drill.legs import DrillLeg, check_version, leg_alone, run_legs, truck_of_leg
+from monstertruckd.tools.drill.observer import EPOS, MAESTRO, STOPS_WITHIN, Violation
 from monstertruckd.tools.drill.truck import OPTIONAL, DrillTruck
 from monstertruckd.tools.simulation.config import DEADMAN_LINE, SimulatedTruckConfig, with_overlay
 
-T = TypeVar("T")
-U = TypeVar("U")
-Outcome = TypeVar("Outcome")
-
-CONNECT: Final = 10.0
-"""Seconds in which the scheduler of a cluster must answer."""
 LEG: Final = 25
 """Faults of one truck."""
 TIMEOUT: Final = 15.0
@@ -69,8 +56,6 @@ DEADMAN: Final[dict[str, Any]] = {"map": None, **DEADMAN_LINE}
 """Overlay of a truck: the deadman line, and no map; see ``wired``."""
 TRACKER_IN_WORKER: Final[dict[str, Any]] = {"placement": {"tracker": "worker"}}
 """Overlay of every second truck."""
-SERVOS: Final = "maestro"
-"""Kind of servo controller whose wire the observer reads."""
 STILL_STOPS: Final = 0.05
 """True speed of a truck that may not be armed yet, m/s."""
 
@@ -78,7 +63,11 @@ STILL_STOPS: Final = 0.05
 def wired(config: SimulatedTruckConfig) -> SimulatedTruckConfig:
     """The robot without a map, with the deadman line where a servo controller has an output for it."""
     plain, steering = with_overlay(config, {"map": None}), config.devices.steering
-    if steering is None or not config.devices.present().keys() & set(SHAFTS):
+    if (
+        steering is None
+        or kind_of(steering.driver).name != MAESTRO
+        or not config.devices.present().keys() & set(SHAFTS)
+    ):
         return plain
     servos = steering.driver
     used = {servo.channel for servo in servos.servos} | ({servos.battery.channel} if servos.battery else set())
@@ -91,15 +80,13 @@ def wired(config: SimulatedTruckConfig) -> SimulatedTruckConfig:
 def unguarded(config: SimulatedTruckConfig) -> tuple[str, ...]:
     """Motor controllers that nothing stops while they cannot be reached.
 
-    The EPOS has no watchdog on RS232: without the deadman line it keeps its last speed. Steppers have one.
+    The EPOS has no watchdog on RS232: without the deadman line it keeps its last speed, and of a kind that is not known
+    here the same is assumed. Steppers have a watchdog.
     """
-    roles = config.devices.present()
-    return () if config.sim.deadman_wired else tuple(role.value for role in SHAFTS if role in roles)
-
-
-def default_jobs() -> int:
-    """Processes of a drill: one core is left for whoever works on the computer."""
-    return max(len(os.sched_getaffinity(0)) - 1, 1)
+    devices = config.devices.present()
+    drives = {role.value: devices[role].driver.kind for role in SHAFTS if role in devices}
+    wired_to = {EPOS} if config.sim.deadman_wired else set()
+    return tuple(role for role, kind in drives.items() if kind not in wired_to)
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,19 +184,6 @@ class DrillReport:
         }
 
 
-@dataclass(frozen=True, slots=True)
-class DrillLeg:
-    """One truck's share of a drill; can be sent to another process."""
-
-    config: dict[str, Any]
-    """Configuration of the simulated truck, as plain values."""
-    seed: int
-    number: int
-    count: int
-    version: str = __version__
-    """Version of the program; another one would give another report."""
-
-
 def check_drivable(config: SimulatedTruckConfig) -> None:
     """Refuse a robot without motors.
 
@@ -230,16 +204,11 @@ class Drill:
         leg: faults of one truck.
 
     Raises:
-        InputError: nothing drives the robot, or the observer does not know its devices.
+        InputError: nothing drives the robot, or its tracker has no path.
     """
 
     def __init__(self, seed: int, count: int, config: SimulatedTruckConfig, *, leg: int = LEG) -> None:
         check_drivable(config)
-        steering = config.devices.steering
-        if steering is not None and steering.driver.kind != SERVOS:
-            raise InputError(
-                f"devices.steering: the observer reads the wire of {SERVOS}, not of {steering.driver.kind}"
-            )
         if config.tracker is not None and config.path is None:
             raise InputError(f"path: {config.robot} has none: expected one that its tracker follows; or no tracker")
         self.seed = seed
@@ -265,160 +234,11 @@ class Drill:
         resume: Path | None = None,
         report: Callable[[list[FaultOutcome]], None] = lambda _: None,
     ) -> DrillReport:
-        """Run all of it.
-
-        Args:
-            jobs: processes; 1 = this one alone.
-            cluster: address of a dask scheduler, whose workers run it instead.
-            resume: file of the outcomes: legs that are in it are not run again, the others are added.
-            report: called with the outcomes of each leg, in the order of their numbers.
-
-        Raises:
-            InputError: see ``LegFile`` and ``on_cluster``.
-            NoAnswerError, WorkerError: see ``on_cluster``.
-        """
-        legs = self.legs()
-        file = None if resume is None else LegFile(resume, legs[0], _OUTCOMES)
-        known = {} if file is None else {leg.number: found for leg in legs if (found := file.outcomes(leg))}
-        outcomes: list[FaultOutcome] = []
-        with self._parts([leg for leg in legs if leg.number not in known], jobs, cluster) as parts:
-            for leg in legs:
-                part = known.get(leg.number)
-                if part is None:
-                    part = next(parts)
-                    if file is not None:
-                        file.add(leg, part)
-                report(part)
-                outcomes += part
-        return DrillReport(self.seed, tuple(outcomes))
-
-    @contextmanager
-    def _parts(self, legs: list[DrillLeg], jobs: int, cluster: str | None) -> Iterator[Iterator[list[FaultOutcome]]]:
-        if cluster is not None:
-            with on_cluster(cluster, run_leg, legs) as parts:
-                yield parts
-        elif jobs == 1:
-            yield map(run_leg, legs)
-        else:
-            with ProcessPoolExecutor(min(jobs, max(1, len(legs)))) as pool:
-                yield pool.map(run_leg, legs)
-
-
-class LegFile(Generic[Outcome]):
-    """Outcomes of the finished legs of a drill, one JSON object a line, so that an interrupted drill goes on.
-
-    Args:
-        path: the file; made where there is none.
-        leg: any one of the drill.
-        adapter: of a leg's outcomes.
-
-    Raises:
-        InputError: it cannot be read or written, or is of another drill or program.
-    """
-
-    def __init__(self, path: Path, leg: DrillLeg, adapter: TypeAdapter[list[Outcome]]) -> None:
-        self._adapter = adapter
-        self._path = path
-        self._header = {"seed": leg.seed, "program": _digest(leg.config)}
-        self._found: dict[tuple[int, int], list[Outcome]] = {}
-        self._end = 0
-        """Bytes of whole lines: an interrupted program leaves part of one."""
-        try:
-            with path.open("a+b") as file:  # before the first leg, not after it: it must be possible to write
-                file.seek(0)
-                data = file.read()
-        except OSError as error:
-            raise InputError(f"{path}: {error.strerror}") from error
-        self._end = data.rfind(b"\n") + 1
-        for number, line in enumerate(data[: self._end].splitlines(), 1):
-            self._read(line, number)
-
-    def _read(self, line: bytes, number: int) -> None:
-        try:
-            row = json.loads(line)
-            header = {key: row[key] for key in self._header}
-            outcomes = self._adapter.validate_python(row["outcomes"], strict=False)
-            leg = int(row["leg"]), int(row["count"])
-        except (ValueError, TypeError, KeyError) as error:
-            raise InputError(f"{self._path}: line {number} is no leg of a drill") from error
-        if header != self._header:
-            text = f"{self._path}: line {number} is of seed {header['seed']}, or of another program or configuration"
-            raise InputError(f"{text}: expected seed {self._header['seed']} and the same program")
-        self._found[leg] = outcomes
-
-    def outcomes(self, leg: DrillLeg) -> list[Outcome] | None:
-        """Those of a finished leg; None if it has to be run."""
-        return self._found.get((leg.number, leg.count))
-
-    def add(self, leg: DrillLeg, outcomes: list[Outcome]) -> None:
-        """Append a finished leg.
-
-        Raises:
-            InputError: the file cannot be written.
-        """
-        row = {**self._header, "leg": leg.number, "count": leg.count}
-        line = json.dumps(row | {"outcomes": self._adapter.dump_python(outcomes, mode="json")}).encode() + b"\n"
-        try:
-            with self._path.open("r+b") as file:
-                file.seek(self._end)
-                file.write(line)
-                file.truncate()
-                file.flush()
-                os.fsync(file.fileno())
-        except OSError as error:
-            raise InputError(f"{self._path}: {error.strerror}") from error
-        self._end += len(line)
+        """Run all of it; arguments and errors as of ``run_legs``."""
+        return DrillReport(self.seed, run_legs(self.legs(), run_leg, _OUTCOMES, jobs, cluster, resume, report))
 
 
 _OUTCOMES: Final = TypeAdapter(list[FaultOutcome])
-PACKAGES: Final = (
-    "monstertruck_schemas",
-    "monstertruck_runtime",
-    "monstertruck_kinematics",
-    "monstertruck_estimation",
-    "monstertruck_planners",
-    "monstertruck_drivers",
-    "monstertruck_sim",
-    "monstertruckd",
-)
-
-
-def _digest(config: dict[str, Any]) -> str:
-    """Of everything that decides the outcome of a leg but seed and number: the configuration and our sources."""
-    digest = hashlib.blake2b(repr(config).encode(), digest_size=12)
-    for package in PACKAGES:
-        spec = importlib.util.find_spec(package)
-        assert spec is not None
-        for folder in spec.submodule_search_locations or ():
-            for source in sorted(Path(folder).rglob("*.py")):
-                digest.update(source.read_bytes())
-    return digest.hexdigest()
-
-
-_ALONE: Final = threading.Lock()
-"""A leg silences the log of its process; a worker of a cluster may have several threads."""
-
-
-@contextmanager
-def leg_alone() -> Iterator[None]:
-    """One leg at a time in this process, without its log."""
-    with _ALONE:
-        quiet = logging.root.manager.disable
-        logging.disable(logging.CRITICAL)
-        try:
-            yield
-        finally:
-            logging.disable(quiet)
-
-
-def check_version(leg: DrillLeg) -> None:
-    """Refuse a leg of another version of the program.
-
-    Raises:
-        InputError: another version made it.
-    """
-    if leg.version != __version__:
-        raise InputError(f"a drill of version {leg.version} was sent to a worker with version {__version__}")
 
 
 def run_leg(leg: DrillLeg) -> list[FaultOutcome]:
@@ -448,11 +268,7 @@ class _LegRun:
         )
         self._faults = _draw(catalog, leg.count, self._rng)
         records = any(fault.kind is FaultKind.DISK_FULL for fault in self._faults)
-        recorder = base.recorder.model_copy(update={"directory": folder}) if records and base.recorder else None
-        seed = int(self._rng.integers(2**31))
-        self._config = base.model_copy(
-            update={"recorder": recorder, "sim": base.sim.model_copy(update={"seed": seed, "drill": None})}
-        )
+        self._config = truck_of_leg(base, int(self._rng.integers(2**31)), folder if records else None)
         self._outcomes: list[FaultOutcome] = []
 
     async def run(self) -> list[FaultOutcome]:
@@ -561,39 +377,3 @@ def reasons_of(report: Event | GateState | HealthTable) -> Iterator[Reason]:
         case HealthTable():
             named = (service.reason for service in report.services if service.name not in OPTIONAL)
     yield from (reason for reason in named if reason not in QUIET)
-
-
-@contextmanager
-def on_cluster(address: str, step: Callable[[T], U], inputs: Sequence[T]) -> Iterator[Iterator[U]]:
-    """Results of ``step`` in the order of ``inputs``; those of a worker that dies are computed by another one.
-
-    Args:
-        address: of the scheduler, ``tcp://HOST:PORT``.
-        step: importable on the workers.
-        inputs: one each.
-
-    Raises:
-        InputError: dask.distributed is not installed.
-        NoAnswerError: no scheduler answers.
-        WorkerError: workers died of one input three times in a row.
-        Exception: what ``step`` raised.
-    """
-    try:
-        from distributed import Client, KilledWorker  # noqa: PLC0415  # an extra
-    except ImportError as error:
-        raise InputError("--cluster needs dask.distributed: install monstertruckd[cluster]") from error
-    try:
-        client = Client(address, timeout=CONNECT)
-    except (OSError, ValueError) as error:
-        raise NoAnswerError(f"{address}: no dask scheduler answers: {error}") from error
-    with client:
-        futures = client.map(step, inputs, pure=False)
-
-        def results() -> Iterator[U]:
-            try:
-                for future in futures:
-                    yield future.result()
-            except KilledWorker as error:
-                raise WorkerError(f"{address}: {error}") from error
-
-        yield results()

@@ -2,19 +2,23 @@
 
 import asyncio
 import math
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from contextlib import asynccontextmanager, suppress
 from typing import Final, Self
 
 import numpy as np
 
+from monstertruck_kinematics.chassis import Chassis
+from monstertruck_kinematics.drive import Twist
+from monstertruck_kinematics.elementary import KinematicsError
 from monstertruck_runtime.clock import SECOND, VirtualClock, on_computer
 from monstertruck_runtime.errors import TruckError
 from monstertruck_runtime.mailbox import fifo, latest
 from monstertruck_schemas import topics
 from monstertruck_schemas.event import Event
 from monstertruck_schemas.health import HealthTable, ServiceState
-from monstertruck_schemas.req import DriveRequest, Order, Role
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import DriveRequest, Order, RequestedTwist, Role
 from monstertruck_schemas.state import GateMode, GateState
 from monstertruckd.bus.local import Bus
 from monstertruckd.daemon import Daemon
@@ -53,6 +57,10 @@ class DrivingStation:
         self.front = front
         self.rear = 0.0
         """Angle of its rear axle, rad."""
+        self.unseen = False
+        """The operator holds the second control, which lets the robot drive into unseen ground."""
+        self.twist: RequestedTwist | None = None
+        """Requested instead of speed and angles, which are 0 then."""
         self._clock = clock
         self._seq = 0
         self.attach(bus)
@@ -88,33 +96,67 @@ class DrivingStation:
             speed=self.speed,
             front=self.front,
             rear=self.rear,
+            twist=self.twist,
+            unseen=self.unseen,
         )
         inject = self._bus.inject
         asyncio.get_running_loop().call_soon(lambda: inject(topics.REQ_DRIVE, request), context=on_computer())
 
 
-STEERING: Final = ("front", "counter", "crab", "free")
-"""Ways of a wanderer to steer: front axle alone, both against each other, both alike, each by itself."""
+STEERING: Final[Mapping[str, tuple[str, ...]]] = {
+    "both": ("front", "counter", "crab", "free"),
+    "front": ("front",),
+    "parallel": ("crab",),
+}
+"""Ways of a wanderer to steer, by a body's freedom: front axle alone, both against each other, both alike, each by
+itself."""
+TURN: Final = (0.0, 0.0, 0.5)
+SIDEWAYS: Final = (0.0, 0.1, 0.0)
+TWISTS: Final = 0.3
+"""Share of motions on the spot or sideways, of a body that can do them."""
 LEG_TIME: Final = (0.4, 2.0)
 """Seconds for which a wanderer keeps a speed and its angles."""
+PATIENCE: Final = 0.5
+"""Seconds for which a wanderer that is refused unseen ground waits before it holds the second control."""
+
+
+def _can(chassis: Chassis, twist: Twist[float]) -> bool:
+    with suppress(KinematicsError):
+        chassis.possible(twist)
+        return True
+    return False
 
 
 class Wanderer(DrivingStation):
     """A station that drives at random, in both directions and with all ways to steer.
+
+    Where the gate stops before unseen ground it holds the second control after a while, until it drives elsewhere.
 
     Args:
         bus: of the daemon.
         clock: time.
         config: limits of the robot.
         rng: randomness.
+        confirm: called with each request into unseen ground that it confirms.
     """
 
-    def __init__(self, bus: Bus, clock: VirtualClock, config: SimulatedTruckConfig, rng: np.random.Generator) -> None:
+    def __init__(
+        self,
+        bus: Bus,
+        clock: VirtualClock,
+        config: SimulatedTruckConfig,
+        rng: np.random.Generator,
+        confirm: Callable[[], None],
+    ) -> None:
         super().__init__(bus, clock)
         self._rng = rng
+        self._confirm = confirm
+        self._refused_since: int | None = None
         self._limits = config.gate.reverse_speed, config.gate.speed
         self._angle = config.gate.angle
-        self._rear_steers = len(config.sim.world.truck.chassis().straight) > 1
+        chassis = config.sim.world.truck.chassis()
+        self._steering = STEERING[chassis.freedom]
+        self._twists = tuple(twist for twist in (TURN, SIDEWAYS) if _can(chassis, twist))
         self._until = 0
         self.backwards: bool | None = None
         """Only backwards or forwards from now on; None = either."""
@@ -126,15 +168,37 @@ class Wanderer(DrivingStation):
         back = bool(rng.random() < 0.5) if backwards is None else backwards
         self.speed = float(rng.uniform(0.4, 1.0)) * self._limits[not back] * (-1 if back else 1)
         self.front = float(rng.uniform(-1.0, 1.0)) * self._angle
-        steering = STEERING[rng.integers(len(STEERING))] if self._rear_steers else "front"
+        steering = self._steering[rng.integers(len(self._steering))]
         free = float(rng.uniform(-1.0, 1.0)) * self._angle
         self.rear = {"front": 0.0, "counter": -self.front, "crab": self.front, "free": free}[steering]
+        self.twist = None
+        if backwards is None and self._twists and rng.random() < TWISTS:
+            vx, vy, wz = float(rng.uniform(-1.0, 1.0)) * np.array(self._twists[rng.integers(len(self._twists))])
+            self.speed = self.front = self.rear = 0.0
+            self.twist = RequestedTwist(vx=float(vx), vy=float(vy), wz=float(wz))
+        self.unseen, self._refused_since = False, None
         self._until = self._clock.now() + round(float(rng.uniform(*LEG_TIME)) * SECOND)
+
+    def run_up(self, seconds: float) -> None:
+        """Drive straight ahead, at most so long."""
+        self.choose(backwards=False)
+        self.speed, self.front, self.rear = self._limits[1], 0.0, 0.0
+        self._until = self._clock.now() + round(seconds * SECOND)
 
     def send(self) -> None:
         """One request, unless it is silent; now and then of another motion."""
-        if self._clock.now() >= self._until:
+        now = self._clock.now()
+        if now >= self._until:
             self.choose(backwards=self.backwards)
+        gate = self._gate.latest
+        if gate is None or Reason.UNSEEN_STOP not in gate.reasons:
+            self._refused_since = None
+        elif self._refused_since is None:
+            self._refused_since = now
+        elif now - self._refused_since >= PATIENCE * SECOND:
+            self.unseen = True
+        if self.unseen and not self.silent:
+            self._confirm()
         super().send()
 
 
@@ -144,8 +208,9 @@ class DrillTruck:
     Args:
         rig: not running yet.
         by_station: a station drives it, in a circle.
-        wander: randomness of a station that drives it at random instead.
+        wander: randomness of a station that drives it at random instead; of a judged one.
         judged: only the world's truth is looked at, by a ``WorldJudge``.
+        by_hand: the station drives from the beginning; otherwise a tracker does until the attribute is set.
     """
 
     def __init__(
@@ -155,8 +220,11 @@ class DrillTruck:
         by_station: bool = False,
         wander: np.random.Generator | None = None,
         judged: bool = False,
+        by_hand: bool = True,
     ) -> None:
         self.rig = rig
+        self.by_hand = by_hand
+        """The operator at the station drives."""
         self.clock = rig.clock
         self.judge = WorldJudge(rig.world, rig.clock) if judged else None
         self._observer = None if judged else Observer(rig.config, rig.world, rig.ports, rig.clock)
@@ -165,7 +233,8 @@ class DrillTruck:
         self._heard: Daemon | None = None
         self.listen()
         if wander is not None:
-            self.station = Wanderer(rig.bus, rig.clock, rig.config, wander)
+            assert self.judge is not None
+            self.station = Wanderer(rig.bus, rig.clock, rig.config, wander, self.judge.confirm)
         elif by_station:
             angle = min(math.atan(rig.config.geometry.wheelbase / CIRCLE), rig.config.gate.angle)
             self.station = DrivingStation(rig.bus, rig.clock, STATION_SPEED * rig.config.gate.speed, angle)
@@ -205,6 +274,7 @@ class DrillTruck:
         by_station: bool = False,
         wander: np.random.Generator | None = None,
         judged: bool = False,
+        by_hand: bool = True,
     ) -> AsyncIterator[Self]:
         """World, daemon and observer run while the context lasts; arguments as of the class.
 
@@ -212,7 +282,7 @@ class DrillTruck:
             BaseException: what ended the daemon early.
         """
         rig = VirtualRig(config, clock)
-        truck = cls(rig, by_station=by_station, wander=wander, judged=judged)
+        truck = cls(rig, by_station=by_station, wander=wander, judged=judged, by_hand=by_hand)
         watching = truck.observer if truck.judge is None else truck.judge
         async with rig.running():
             observing = asyncio.create_task(watching.run(), name="observer")
@@ -246,7 +316,7 @@ class DrillTruck:
         while self.clock.now() < end and not self.rig.daemon_ended:
             if condition():
                 return True
-            if order is not None and self.station is not None:  # a stick at rest, until it is armed
+            if order is not None and self.station is not None and self.by_hand:  # a stick at rest, until it is armed
                 self.station.silent = self.gate is None or not self.gate.mode.active
             if order is not None and self.gate is not None and not self.gate.mode.active:
                 await self.order(order)

@@ -27,6 +27,22 @@ def test_a_unit_that_drives_itself_away_from_its_goal_loses_its_torque_within_0_
     on_bench(test)
 
 
+def test_it_gets_its_torque_back_after_a_rest_that_doubles_when_it_strays_again():
+    async def test(rig: Rig) -> None:
+        async with rig.driving():
+            await rig.settle(0.3)
+            for rest, goal in ((3.0, "420"), (6.0, "600")):
+                rig.bus.inject("stray", "1", goal)
+                await rig.settle(rest - 0.1)
+                assert rig.out.kept[-1].pitch_joint.torque is TorqueState.LIMP
+                rig.bus.inject("stray", "1", "off")
+                await rig.settle(0.4)
+                assert rig.out.kept[-1].pitch_joint.torque is TorqueState.HOLDING
+            assert rig.events.reasons() == 2 * [Reason.UNCOMMANDED_MOTION, Reason.DEVICE_READY]
+
+    on_bench(test)
+
+
 def test_a_load_that_pushes_a_joint_away_from_its_goal_is_no_motion_of_its_own():
     pushes = [0.0]
 

@@ -8,12 +8,15 @@ from typing import Any
 
 import pytest
 
+from monstertruck_schemas.reasons import Reason
 from monstertruck_sim.faults import FaultKind
 from monstertruckd.tools.cli import drill as command
 from monstertruckd.tools.cli.main import main
-from monstertruckd.tools.drill import random_drill
+from monstertruckd.tools.drill import legs
+from monstertruckd.tools.drill.campaign import Campaign, CampaignReport, TrialOutcome
+from monstertruckd.tools.drill.legs import default_jobs
 from monstertruckd.tools.drill.observer import Violation
-from monstertruckd.tools.drill.random_drill import Drill, DrillReport, FaultOutcome, default_jobs
+from monstertruckd.tools.drill.random_drill import Drill, DrillReport, FaultOutcome
 
 DEMO = Path(__file__).resolve().parents[4] / "configs" / "demo.yaml"
 SAFE = FaultOutcome(
@@ -60,6 +63,60 @@ def test_json_holds_the_figures(monkeypatch: pytest.MonkeyPatch, capsys: pytest.
     assert report["outcomes"][0]["fault"] == "stall: lidar"
 
 
+TRIALS = (
+    TrialOutcome(
+        0,
+        ("drive position_actual scaled", "memory full"),
+        ("drive position_actual scaled", "memory full"),
+        False,
+        True,
+        reason=Reason.SENSORS_DISAGREE,
+        reason_s=0.4,
+        recovered_s=0.7,
+    ),
+    TrialOutcome(
+        1,
+        ("lidar range frozen",),
+        ("lidar range frozen",),
+        False,
+        False,
+        stuck=("scan_stale",),
+        violations=(Violation(1.2, "contact", "ran into something"),),
+    ),
+)
+
+
+def run_families(monkeypatch: pytest.MonkeyPatch, outcomes: tuple[TrialOutcome, ...], *arguments: str) -> int:
+    monkeypatch.setattr(Campaign, "run", lambda self, **_: CampaignReport(self.seed, outcomes))
+    monkeypatch.setattr(sys, "argv", ["monstertruckd", "drill", "--families", "--config", str(DEMO), *arguments])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    return int(ended.value.code or 0)
+
+
+def test_families_are_summarised_one_by_one_and_troubles_named(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    assert run_families(monkeypatch, TRIALS) == 1
+    lines = capsys.readouterr().out.splitlines()
+    (scaled,) = (line.split() for line in lines if line.endswith("drive position_actual scaled"))
+    assert scaled[:7] == ["1", "1", "0.40", "0.40", "0", "0", "sensors_disagree"]
+    (full,) = (line.split() for line in lines if line.endswith("  memory full"))
+    assert full[:4] == ["1", "0", "-", "-"], "the reason is the other fault's"
+    text = " ".join(lines)
+    assert "trial 1, forwards, lidar range frozen: after 1.20 s contact: ran into something" in text
+    assert "trial 1, forwards, lidar range frozen: not recovered: scan_stale" in text
+    assert "2 trials, 1 of two faults, 1 in reverse: 1 with unsafe motion, 1 not recovered" in text
+
+
+def test_safe_families_are_exit_code_0_and_json_holds_the_figures(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    assert run_families(monkeypatch, TRIALS[:1], "--json", "--seed", "5") == 0
+    report = json.loads(capsys.readouterr().out)
+    assert (report["seed"], report["trials"], report["pairs"], report["stuck"]) == (5, 1, 1, 0)
+
+
 def test_the_default_truck_is_shipped():
     assert command.FULL_CONFIG.exists()
 
@@ -85,9 +142,7 @@ def test_a_core_is_left_by_default(monkeypatch: pytest.MonkeyPatch):
 
 def test_a_cluster_runs_it_where_one_is_named(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
     asked: list[object] = []
-    monkeypatch.setattr(
-        random_drill, "on_cluster", lambda address, *_: asked.append(address) or nullcontext(iter([[SAFE]]))
-    )
+    monkeypatch.setattr(legs, "on_cluster", lambda address, *_: asked.append(address) or nullcontext(iter([[SAFE]])))
     monkeypatch.setattr(
         sys, "argv", ["monstertruckd", "drill", "--config", str(DEMO), "--count", "1", "--cluster", "tcp://h:8786"]
     )

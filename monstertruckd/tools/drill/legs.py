@@ -1,0 +1,259 @@
+"""The legs of a drill: each one truck's share, run here, in several processes or on a cluster, and kept in a file."""
+
+import hashlib
+import importlib.util
+import json
+import logging
+import os
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, Generic, TypeVar
+
+from pydantic import TypeAdapter
+
+from monstertruck_runtime.errors import InputError, NoAnswerError, WorkerError
+from monstertruckd import __version__
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig
+
+T = TypeVar("T")
+U = TypeVar("U")
+Outcome = TypeVar("Outcome")
+
+CONNECT: Final = 10.0
+"""Seconds in which the scheduler of a cluster must answer."""
+
+
+def default_jobs() -> int:
+    """Processes of a drill: one core is left for whoever works on the computer."""
+    return max(len(os.sched_getaffinity(0)) - 1, 1)
+
+
+@dataclass(frozen=True, slots=True)
+class DrillLeg:
+    """One truck's share of a drill; can be sent to another process."""
+
+    config: dict[str, Any]
+    """Configuration of the simulated truck, as plain values."""
+    seed: int
+    number: int
+    count: int
+    version: str = __version__
+    """Version of the program; another one would give another report."""
+
+
+def truck_of_leg(config: SimulatedTruckConfig, seed: int, records: str | None) -> SimulatedTruckConfig:
+    """The robot of a leg, with its own seed and no drill of its own; it records to the folder ``records``, if any."""
+    keeps = config.recorder is not None and records is not None
+    recorder = config.recorder.model_copy(update={"directory": records}) if config.recorder and keeps else None
+    blackbox = config.blackbox if keeps else None
+    sim = config.sim.model_copy(update={"seed": seed, "drill": None})
+    return config.model_copy(update={"recorder": recorder, "blackbox": blackbox, "sim": sim})
+
+
+class LegFile(Generic[Outcome]):
+    """Outcomes of the finished legs of a drill, one JSON object a line, so that an interrupted drill goes on.
+
+    Args:
+        path: the file; made where there is none.
+        leg: any one of the drill.
+        adapter: of a leg's outcomes.
+
+    Raises:
+        InputError: it cannot be read or written, or is of another drill or program.
+    """
+
+    def __init__(self, path: Path, leg: DrillLeg, adapter: TypeAdapter[list[Outcome]]) -> None:
+        self._adapter = adapter
+        self._path = path
+        self._header = {"seed": leg.seed, "program": _digest(leg.config)}
+        self._found: dict[tuple[int, int], list[Outcome]] = {}
+        self._end = 0
+        """Bytes of whole lines: an interrupted program leaves part of one."""
+        try:
+            with path.open("a+b") as file:  # before the first leg, not after it: it must be possible to write
+                file.seek(0)
+                data = file.read()
+        except OSError as error:
+            raise InputError(f"{path}: {error.strerror}") from error
+        self._end = data.rfind(b"\n") + 1
+        for number, line in enumerate(data[: self._end].splitlines(), 1):
+            self._read(line, number)
+
+    def _read(self, line: bytes, number: int) -> None:
+        try:
+            row = json.loads(line)
+            header = {key: row[key] for key in self._header}
+            outcomes = self._adapter.validate_python(row["outcomes"], strict=False)
+            leg = int(row["leg"]), int(row["count"])
+        except (ValueError, TypeError, KeyError) as error:
+            raise InputError(f"{self._path}: line {number} is no leg of a drill") from error
+        if header != self._header:
+            text = f"{self._path}: line {number} is of seed {header['seed']}, or of another program or configuration"
+            raise InputError(f"{text}: expected seed {self._header['seed']} and the same program")
+        self._found[leg] = outcomes
+
+    def outcomes(self, leg: DrillLeg) -> list[Outcome] | None:
+        """Those of a finished leg; None if it has to be run."""
+        return self._found.get((leg.number, leg.count))
+
+    def add(self, leg: DrillLeg, outcomes: list[Outcome]) -> None:
+        """Append a finished leg.
+
+        Raises:
+            InputError: the file cannot be written.
+        """
+        row = {**self._header, "leg": leg.number, "count": leg.count}
+        line = json.dumps(row | {"outcomes": self._adapter.dump_python(outcomes, mode="json")}).encode() + b"\n"
+        try:
+            with self._path.open("r+b") as file:
+                file.seek(self._end)
+                file.write(line)
+                file.truncate()
+                file.flush()
+                os.fsync(file.fileno())
+        except OSError as error:
+            raise InputError(f"{self._path}: {error.strerror}") from error
+        self._end += len(line)
+
+
+PACKAGES: Final = (
+    "monstertruck_schemas",
+    "monstertruck_runtime",
+    "monstertruck_kinematics",
+    "monstertruck_estimation",
+    "monstertruck_planners",
+    "monstertruck_drivers",
+    "monstertruck_sim",
+    "monstertruckd",
+)
+
+
+def _digest(config: dict[str, Any]) -> str:
+    """Of everything that decides the outcome of a leg but seed and number: the configuration and our sources."""
+    digest = hashlib.blake2b(repr(config).encode(), digest_size=12)
+    for package in PACKAGES:
+        spec = importlib.util.find_spec(package)
+        assert spec is not None
+        for folder in spec.submodule_search_locations or ():
+            for source in sorted(Path(folder).rglob("*.py")):
+                digest.update(source.read_bytes())
+    return digest.hexdigest()
+
+
+_ALONE: Final = threading.Lock()
+"""A leg silences the log of its process; a worker of a cluster may have several threads."""
+
+
+@contextmanager
+def leg_alone() -> Iterator[None]:
+    """One leg at a time in this process, without its log."""
+    with _ALONE:
+        quiet = logging.root.manager.disable
+        logging.disable(logging.CRITICAL)
+        try:
+            yield
+        finally:
+            logging.disable(quiet)
+
+
+def check_version(leg: DrillLeg) -> None:
+    """Refuse a leg of another version of the program.
+
+    Raises:
+        InputError: another version made it.
+    """
+    if leg.version != __version__:
+        raise InputError(f"a drill of version {leg.version} was sent to a worker with version {__version__}")
+
+
+def run_legs(
+    legs: Sequence[DrillLeg],
+    step: Callable[[DrillLeg], list[Outcome]],
+    adapter: TypeAdapter[list[Outcome]],
+    jobs: int = 1,
+    cluster: str | None = None,
+    resume: Path | None = None,
+    report: Callable[[list[Outcome]], None] = lambda _: None,
+) -> tuple[Outcome, ...]:
+    """Return the outcomes of all legs in the order of their numbers.
+
+    Args:
+        legs: at least one.
+        step: runs one of them; a function of a module.
+        adapter: of a leg's outcomes.
+        jobs: processes; 1 = this one alone.
+        cluster: address of a dask scheduler, whose workers run them instead.
+        resume: file of the outcomes: legs that are in it are not run again, the others are added.
+        report: called with the outcomes of each leg.
+
+    Raises:
+        InputError: see ``LegFile`` and ``on_cluster``.
+        NoAnswerError, WorkerError: see ``on_cluster``.
+    """
+    file = None if resume is None else LegFile(resume, legs[0], adapter)
+    known = {} if file is None else {leg.number: found for leg in legs if (found := file.outcomes(leg))}
+    outcomes: list[Outcome] = []
+    with _parts([leg for leg in legs if leg.number not in known], step, jobs, cluster) as parts:
+        for leg in legs:
+            part = known.get(leg.number)
+            if part is None:
+                part = next(parts)
+                if file is not None:
+                    file.add(leg, part)
+            report(part)
+            outcomes += part
+    return tuple(outcomes)
+
+
+@contextmanager
+def _parts(
+    legs: Sequence[DrillLeg], step: Callable[[DrillLeg], list[Outcome]], jobs: int, cluster: str | None
+) -> Iterator[Iterator[list[Outcome]]]:
+    if cluster is not None:
+        with on_cluster(cluster, step, legs) as parts:
+            yield parts
+    elif jobs == 1:
+        yield map(step, legs)
+    else:
+        with ProcessPoolExecutor(min(jobs, max(1, len(legs)))) as pool:
+            yield pool.map(step, legs)
+
+
+@contextmanager
+def on_cluster(address: str, step: Callable[[T], U], inputs: Sequence[T]) -> Iterator[Iterator[U]]:
+    """Results of ``step`` in the order of ``inputs``; those of a worker that dies are computed by another one.
+
+    Args:
+        address: of the scheduler, ``tcp://HOST:PORT``.
+        step: importable on the workers.
+        inputs: one each.
+
+    Raises:
+        InputError: dask.distributed is not installed.
+        NoAnswerError: no scheduler answers.
+        WorkerError: workers died of one input three times in a row.
+        Exception: what ``step`` raised.
+    """
+    try:
+        from distributed import Client, KilledWorker  # noqa: PLC0415  # an extra
+    except ImportError as error:
+        raise InputError("--cluster needs dask.distributed: install monstertruckd[cluster]") from error
+    try:
+        client = Client(address, timeout=CONNECT)
+    except (OSError, ValueError) as error:
+        raise NoAnswerError(f"{address}: no dask scheduler answers: {error}") from error
+    with client:
+        futures = client.map(step, inputs, pure=False)
+
+        def results() -> Iterator[U]:
+            try:
+                for future in futures:
+                    yield future.result()
+            except KilledWorker as error:
+                raise WorkerError(f"{address}: {error}") from error
+
+        yield results()

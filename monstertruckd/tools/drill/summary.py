@@ -1,0 +1,62 @@
+"""What a drill of families found, family by family."""
+
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from monstertruck_schemas.reasons import Reason
+from monstertruckd.tools.drill.campaign import TrialOutcome
+
+
+@dataclass(frozen=True, slots=True)
+class FamilySummary:
+    """Trials of one family."""
+
+    family: str
+    trials: int
+    noticed: int
+    """Trials with a reason of its own: as the first fault of a trial."""
+    reason: Reason | None
+    """The most frequent one of them."""
+    reason_p50_s: float | None
+    reason_max_s: float | None
+    """Seconds from the fault to the reason."""
+    unsafe: int
+    stuck: int
+
+
+def by_family(outcomes: Iterable[TrialOutcome]) -> list[FamilySummary]:
+    """One summary for each family that was tried, by name."""
+    found: dict[str, list[TrialOutcome]] = defaultdict(list)
+    for outcome in outcomes:
+        for family in dict.fromkeys(outcome.families):
+            found[family].append(outcome)
+    return [_summary(family, tried) for family, tried in sorted(found.items())]
+
+
+def _summary(family: str, outcomes: list[TrialOutcome]) -> FamilySummary:
+    own = [o for o in outcomes if o.families[0] == family and o.reason is not None]  # of a pair it may be the other's
+    times = [o.reason_s for o in own if o.reason_s is not None]
+    reasons = Counter(o.reason for o in own).most_common(1)
+    return FamilySummary(
+        family,
+        len(outcomes),
+        len(own),
+        reasons[0][0] if reasons else None,
+        float(np.median(times)) if times else None,
+        max(times, default=None),
+        sum(o.unsafe for o in outcomes),
+        sum(bool(o.stuck) for o in outcomes),
+    )
+
+
+def troubles(outcomes: Iterable[TrialOutcome]) -> Iterator[str]:
+    """One line for each unsafe event and each robot that did not recover."""
+    for outcome in outcomes:
+        where = f"trial {outcome.number}, {'reverse' if outcome.reverse else 'forwards'}, {' + '.join(outcome.faults)}"
+        for violation in outcome.violations:
+            yield f"{where}: after {violation.seconds:.2f} s {violation.rule}: {violation.text}"
+        if outcome.stuck:
+            yield f"{where}: not recovered: {', '.join(outcome.stuck)}"
