@@ -6,8 +6,9 @@
 Every mutant of the sources in ``TARGETS`` (operators: ``mutation_parts/mutants.py``; a second set, other mistakes:
 ``second.py``), or a seeded sample of them, meets
 the unit tests that reach its function: those that found others there first, then those that reach its line, then the
-quick ones; which tests reach a line is measured once with coverage contexts. Mutants at a line that runs on import meet
-all tests of their part, those that reach a line with the same names first. A mutant with which one test, or all of
+quick ones; which tests reach a line is measured with coverage contexts and kept for each file of tests, so that a run
+after a change measures those of the changed files alone. Mutants at a line that runs on import meet all tests of their
+part, those that reach a line with the same names first. A mutant with which one test, or all of
 them, take more than three times their time and 10 s is judged once more with ``PATIENCE`` times as long, and counted
 apart if that is not enough either. Mutants are judged in the order drawn, so those
 of a run that ended early (``--minutes``) are a sample as well. Results are kept, so an interrupted run goes on;
@@ -33,6 +34,7 @@ from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from queue import SimpleQueue
+from typing import Any
 
 import numpy as np
 
@@ -80,6 +82,8 @@ COMMON = frozenset(("self", "Final", "None", "True", "False", "float", "Annotate
 """Words that say nothing about what a line is for."""
 NO_TEST = "no test reaches it"
 OUTPUT = ROOT / "runs" / "mutation.jsonl"
+BASELINES = ROOT / "runs" / "mutation_baseline"
+"""What each file of tests reaches, by the digest of it and of what it rests on."""
 
 
 SETS = {"first": mutants, "second": second_mutants}
@@ -152,11 +156,54 @@ json.dump({"lines": lines, "seconds": reported.seconds, "failed": reported.faile
 """
 
 
-def measured(out: Path, tests: Iterable[str]) -> Baseline:
-    """Run tests once."""
+def baseline_of(folders: Iterable[str], scratch: Path) -> Baseline:
+    """What the tests of some folders reach; those of files that are as they were are not run again."""
+    files = [path for folder in sorted(folders) for path in sorted((ROOT / folder).rglob("test_*.py"))]
+    kept = {path: BASELINES / f"{_digest_of(path)}.json" for path in files}
+    if todo := [path for path in files if not kept[path].exists()]:
+        found = _measured(scratch / "baseline.json", todo)
+        BASELINES.mkdir(parents=True, exist_ok=True)
+        for path in todo:
+            own = _of_file(found, str(path.relative_to(ROOT)))
+            kept[path].write_text(json.dumps(own), encoding="utf-8")
+    lines: dict[str, dict[int, list[str]]] = {file: {} for file in TARGETS}
+    seconds: dict[str, float] = {}
+    for path in files:
+        own = json.loads(kept[path].read_text(encoding="utf-8"))
+        seconds |= own["seconds"]
+        for file, by_line in own["lines"].items():
+            for line, tests in by_line.items():
+                known = lines[file].setdefault(int(line), [])
+                known += [test for test in tests if test or "" not in known]
+    return Baseline(lines, seconds)
+
+
+def _digest_of(path: Path) -> str:
+    """Name of what a file of tests reaches: it follows from the tests, what they stand on, and the targets."""
+    digest = hashlib.blake2s(digest_size=12)
+    common = (other for other in path.parent.glob("*.py") if not other.name.startswith("test_"))
+    for source in (path, *sorted(common), *sorted((ROOT / "tests").glob("*.py")), *(ROOT / file for file in TARGETS)):
+        digest.update(source.read_bytes())
+    return digest.hexdigest()
+
+
+def _of_file(found: dict[str, dict[str, Any]], file: str) -> dict[str, Any]:
+    """The share of one file of tests; what runs on import belongs to all of them."""
+    lines = {
+        target: {line: [t for t in tests if not t or t.startswith(f"{file}::")] for line, tests in by_line.items()}
+        for target, by_line in found["lines"].items()
+    }
+    return {
+        "lines": {target: {n: tests for n, tests in by_line.items() if tests} for target, by_line in lines.items()},
+        "seconds": {test: spent for test, spent in found["seconds"].items() if test.startswith(f"{file}::")},
+    }
+
+
+def _measured(out: Path, tests: Iterable[Path]) -> dict[str, dict[str, Any]]:
+    """Run files of tests once: lines by target with the tests that reach them, and the seconds of every test."""
     files = [str(ROOT / file) for file in TARGETS]
     subprocess.run(
-        [sys.executable, "-c", MEASURE, str(out), json.dumps(files), json.dumps([*OPTIONS, *tests])],
+        [sys.executable, "-c", MEASURE, str(out), json.dumps(files), json.dumps([*OPTIONS, *map(str, tests)])],
         cwd=ROOT, check=True, stdout=subprocess.DEVNULL,
     )  # fmt: skip
     found = json.loads(out.read_text(encoding="utf-8"))
@@ -165,12 +212,11 @@ def measured(out: Path, tests: Iterable[str]) -> Baseline:
         print(f"left out, for they fail without any fault: {', '.join(sorted(failed))}", file=sys.stderr)
     lines = {
         str(Path(file).relative_to(ROOT)): {
-            int(line): [test for test in reached if test not in failed] for line, reached in by_line.items()
+            line: [test for test in reached if test not in failed] for line, reached in by_line.items()
         }
         for file, by_line in found["lines"].items()
     }
-    seconds = {test: spent for test, spent in found["seconds"].items() if test not in failed}
-    return Baseline({file: lines.get(file, {}) for file in TARGETS}, seconds)
+    return {"lines": lines, "seconds": {t: spent for t, spent in found["seconds"].items() if t not in failed}}
 
 
 def interval(killed: int, total: int) -> tuple[float, float]:
@@ -215,7 +261,7 @@ def judged(
     """Verdict of every mutant that the time allows, and the test that found it."""
     end = time.monotonic() + 60 * options.minutes
     tests = sorted({test for mutant in todo for test in TARGETS[mutant.file]})
-    baseline = measured(scratch / "baseline.json", tests)
+    baseline = baseline_of(tests, scratch)
     print(f"{len(baseline.seconds)} tests, {sum(baseline.seconds.values()):.0f} s", file=sys.stderr)
     every = {file: (ROOT / file).read_bytes() for file in TARGETS}
     idle: SimpleQueue[dict[str, Server]] = SimpleQueue()
