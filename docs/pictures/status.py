@@ -54,7 +54,7 @@ def screen(config: str, story: Callable[..., Any], width: int, height: int, fold
 
     async def main(clock: VirtualClock) -> str:
         clock.step_real(REAL / SECOND)
-        state = ScreenState(f"{loaded.robot} on this computer", clock.now())
+        state = ScreenState(f"{loaded.robot} on rover", clock.now())
         rig = VirtualRig(with_overlay(loaded, overlay), clock)
         async with rig.running():
             operator = LocalOperator(rig.daemon, clock)

@@ -1,16 +1,13 @@
 """Robots and processes that hold a port of this computer, by Zenoh's liveliness and the kernel's tables."""
 
-import json
+import pwd
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
-import zenoh
-
-from monstertruck_runtime.endpoints import LOCAL_HOSTS, UNIX, host_of, port_of, protocol_of
-from monstertruck_runtime.stations import session_config
-from monstertruck_schemas.topics import alive_key
+from monstertruck_runtime.endpoints import EVERYWHERE, LOCAL_HOSTS, UNIX, host_of, port_of, protocol_of
+from monstertruck_runtime.robots import robots_at
 
 LISTENING: Final = "0A"
 """State of a listening socket in ``/proc/net/tcp`` (Linux, include/net/tcp_states.h)."""
@@ -18,36 +15,24 @@ SOCKET: Final = "socket:["
 """Beginning of a link in ``/proc/PID/fd`` that leads to a socket; its number and a bracket follow."""
 LONGEST: Final = 160
 """Characters of a command line that are shown."""
-LOOK: Final = 0.5
-"""Timeout of a liveliness query (s)."""
 
 
 def holder_of(endpoints: Iterable[str], proc: Path = Path("/proc")) -> str:
     """Describe who listens at one of ``endpoints``: robots by name, process by number and command line.
 
     Returns:
-        For example ``robot 'truck', process 4711 (monstertruckd run --config demo.yaml)``; ``another program`` where
-        neither can be seen.
+        For example ``robot 'truck', process 4711 (monstertruckd run --config demo.yaml)``; of a process that this user
+        may not look into ``a program of user 'ann'``, or ``another program``.
     """
     places = list(endpoints)
-    return ", ".join((*_robots(places), *_processes(places, proc))) or "another program"
-
-
-def robots_at(endpoint: str, timeout: float = LOOK) -> list[str]:
-    """Names of the robots that answer at an endpoint; empty if nothing does, or if it requires a certificate."""
-    config = session_config(endpoint, timeout, None)
-    try:
-        with zenoh.open(zenoh.Config.from_json5(json.dumps(config))) as session:
-            replies = session.liveliness().get(alive_key("*"), timeout=timeout)
-            return sorted({str(reply.ok.key_expr).split("/")[1] for reply in replies if reply.ok is not None})
-    except zenoh.ZError:
-        return []
+    processes = [*_processes(places, proc)] or [*_owners(places, proc)]
+    return ", ".join((*_robots(places), *processes)) or "another program"
 
 
 def _robots(endpoints: list[str]) -> Iterator[str]:
     names: dict[str, None] = {}
     for endpoint in endpoints:
-        local = protocol_of(endpoint) == "tcp" and host_of(endpoint) in (*LOCAL_HOSTS, "0.0.0.0", "::")  # noqa: S104
+        local = protocol_of(endpoint) == "tcp" and host_of(endpoint) in (*LOCAL_HOSTS, *EVERYWHERE)
         if endpoint.startswith(UNIX) or local:
             names |= dict.fromkeys(robots_at(f"tcp/127.0.0.1:{port_of(endpoint)}" if local else endpoint))
     yield from (f"robot {name!r}" for name in names)
@@ -60,16 +45,35 @@ def _processes(endpoints: list[str], proc: Path) -> Iterator[str]:
             yield f"process {folder.name} ({_command_line(folder)})"
 
 
+def _owners(endpoints: list[str], proc: Path) -> Iterator[str]:
+    """Users whose programs listen at one of the ports."""
+    users = dict.fromkeys(int(row[7]) for endpoint in endpoints for row in _listening(endpoint, proc))
+    yield from (f"a program of user {_user(number)!r}" for number in users)
+
+
+def _user(number: int) -> str:
+    try:
+        return pwd.getpwuid(number).pw_name
+    except KeyError:
+        return str(number)
+
+
 def _inodes(endpoint: str, proc: Path) -> Iterator[str]:
     """Sockets that listen at an endpoint, by the kernel's numbers."""
     if endpoint.startswith(UNIX):
         path = endpoint.removeprefix(UNIX)
         rows = _rows(proc / "net" / "unix")
         yield from (row[6] for row in rows if len(row) > 7 and row[7] == path)
-    elif (port := port_of(endpoint)) is not None:
-        for table in ("tcp", "tcp6"):
-            rows = _rows(proc / "net" / table)
-            yield from (row[9] for row in rows if row[3] == LISTENING and int(row[1].rpartition(":")[2], 16) == port)
+    else:
+        yield from (row[9] for row in _listening(endpoint, proc))
+
+
+def _listening(endpoint: str, proc: Path) -> Iterator[list[str]]:
+    """Rows of the kernel's tables for what listens at a port."""
+    port = port_of(endpoint)
+    for table in ("tcp", "tcp6"):
+        rows = _rows(proc / "net" / table)
+        yield from (row for row in rows if row[3] == LISTENING and int(row[1].rpartition(":")[2], 16) == port)
 
 
 def _rows(table: Path) -> list[list[str]]:

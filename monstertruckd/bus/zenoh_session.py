@@ -7,6 +7,7 @@ Opening and closing block, so a thread does them.
 import asyncio
 import logging
 import re
+import socket
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, closing
 from functools import partial
@@ -18,7 +19,7 @@ from zenoh import ext
 
 from monstertruck_runtime import wire
 from monstertruck_runtime.clock import Clock
-from monstertruck_runtime.endpoints import UNIX, make_private
+from monstertruck_runtime.endpoints import UNIX, announce, make_private
 from monstertruck_runtime.errors import BusyError, ConfigError
 from monstertruck_runtime.ports import Ready
 from monstertruck_runtime.threads import ThreadHop, in_thread
@@ -93,6 +94,7 @@ class ZenohBridge:
         self._clock = clock
         self._rpc = rpc
         self._sessions: list[tuple[Listener, zenoh.Session]] = []
+        self._announced: list[socket.socket] = []
         rpc.register("topics", self._topics, AccessRole.OBSERVER, recorded=False)
 
     async def open(self) -> None:
@@ -174,6 +176,7 @@ class ZenohBridge:
                 if listener.connect and self._runs_elsewhere(listener):
                     msg = f"another daemon already runs robot {self._robot!r} behind {', '.join(listener.connect)}"
                     raise BusyError(msg)
+                self._announced += announce(listener.listen)
         except BaseException:
             self._close()
             raise
@@ -182,6 +185,8 @@ class ZenohBridge:
         while self._sessions:
             _, session = self._sessions.pop()
             session.close()  # type: ignore[no-untyped-call]
+        while self._announced:
+            self._announced.pop().close()
 
     def _open_listener(self, listener: Listener) -> zenoh.Session:
         where = ", ".join(listener.listen)

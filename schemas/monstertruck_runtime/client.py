@@ -26,6 +26,7 @@ from monstertruck_runtime.errors import (
 )
 from monstertruck_runtime.mailbox import Delivery, Mailbox, latest
 from monstertruck_runtime.requests import Operator
+from monstertruck_runtime.robots import only_robot
 from monstertruck_runtime.stations import ClientTls, own_source, require_certificates, session_config, tls_for
 from monstertruck_runtime.threads import ThreadHop, in_daemon_thread, in_thread
 from monstertruck_schemas.base import Message
@@ -89,6 +90,10 @@ def in_network_thread(take: Callable[[zenoh.Sample], object]) -> "handlers.Callb
     return handlers.Callback(receive, indirect=False)
 
 
+def _arguments_for(robot: str, endpoint: str) -> str:
+    return f"{robot!r}, {endpoint!r}"
+
+
 class Watched(Generic[M]):
     """The newest message of a topic; a context manager that ends the subscription.
 
@@ -128,12 +133,13 @@ class Watched(Generic[M]):
 class TruckClient(Operator):
     """Session with one robot; an async context manager.
 
-    It never listens and never discovers: it connects to one endpoint, and reconnects when the robot restarts.
+    It never listens: it connects to one endpoint, and reconnects when the robot restarts.
     Messages that cannot be decoded are logged and skipped.
 
     Args:
-        robot: name in the keys ``mt/<robot>/...``.
-        endpoint: where the robot listens, e.g. ``tcp/192.168.1.7:7447``.
+        robot: name in the keys ``mt/<robot>/...``; None = ``truck``.
+        endpoint: where the robot listens, e.g. ``tcp/192.168.1.7:7447``; None = port 7447 of this computer, where only
+            one robot of this computer could be meant.
         source: this program's name in requests; default ``user@host:pid``. With a certificate it is the common name,
             or that with a colon and anything behind it, which is the default: requests under other names never arrive.
         role: of its requests; decides their priority.
@@ -147,8 +153,8 @@ class TruckClient(Operator):
 
     def __init__(
         self,
-        robot: str = "truck",
-        endpoint: str = DEFAULT_ENDPOINT,
+        robot: str | None = None,
+        endpoint: str | None = None,
         *,
         source: str | None = None,
         role: Role = Role.STATION,
@@ -156,8 +162,9 @@ class TruckClient(Operator):
         timeout: float = 2.5,
         tls: ClientTls | None = None,
     ) -> None:
-        self.robot = robot
-        self.endpoint = endpoint
+        self.robot = robot or "truck"
+        self.endpoint = endpoint or DEFAULT_ENDPOINT
+        self._choose = None if endpoint is not None else partial(only_robot, robot, _arguments_for)
         self._named = source is not None
         self.source = source or own_source()
         if not SOURCE_NAME.fullmatch(self.source):
@@ -180,6 +187,7 @@ class TruckClient(Operator):
         """Connect to the endpoint.
 
         Raises:
+            InputError: no endpoint is named, and several robots of this computer could be meant; lists them.
             NotFoundError: nothing answers there, or a file of the certificate is missing.
             NotPermittedError: others may read the certificate's key, the source is not the certificate's, or a
                 certificate is refused.
@@ -555,6 +563,8 @@ class TruckClient(Operator):
             await in_daemon_thread(session.close)  # also at the program's end, when pools take nothing any more
 
     def _open(self) -> None:
+        if self._choose is not None:
+            self.endpoint = self._choose()
         tls = self._tls or tls_for(self.endpoint)
         if tls is not None:
             self._take_name(tls.owner())

@@ -15,6 +15,10 @@ UNIX: Final = "unixsock-stream/"
 _ADDRESSED: Final = ("tcp", "tls", "udp", "quic", "ws")
 """Protocols whose addresses are a host and a port."""
 _OTHERS: Final = ("unixsock-stream", "unixpipe", "vsock", "serial")
+ANNOUNCED: Final = "monstertruckd/"
+"""Beginning of the abstract Unix socket by which every user of this computer sees a daemon; its port follows."""
+EVERYWHERE: Final = ("0.0.0.0", "::")  # noqa: S104
+"""Addresses at which a program listens on all interfaces."""
 ANSWERS_WITHIN: Final = 0.2
 """Timeout of a connection to a program on this machine (s)."""
 _LAST_PORT: Final = 65_535
@@ -84,17 +88,52 @@ def nearest(endpoint: str, environment: Mapping[str, str] = os.environ) -> str:
 
 
 def local_endpoints(environment: Mapping[str, str] = os.environ) -> list[str]:
-    """Endpoints of the daemons that answer on this machine: the default port, then Unix sockets by port.
+    """Endpoints of the daemons that answer on this machine, by port, the default port first.
 
-    Sockets are those of this user and of the service; a daemon of another user is found at the default port only.
+    Unix sockets are those of this user and of the service; a daemon of another user is reached by its port.
     """
-    ports = {path.stem for folder in (runtime_folder(environment), SERVICE_FOLDER) for path in folder.glob("*.sock")}
-    usual = port_of(DEFAULT_ENDPOINT)
-    others = sorted(int(port) for port in ports if port.isdecimal() and int(port) != usual)
-    found = [nearest(endpoint_of("tcp", LOCAL_HOSTS[0], port), environment) for port in others]
-    first = nearest(DEFAULT_ENDPOINT, environment)
-    there = first.startswith(UNIX) or _listens(LOCAL_HOSTS[0], usual or 0)
-    return [*([first] if there else []), *(endpoint for endpoint in found if endpoint.startswith(UNIX))]
+    folders = runtime_folder(environment), SERVICE_FOLDER
+    ports = {path.stem for folder in folders for path in folder.glob("*.sock")} | announced_ports()
+    usual = port_of(DEFAULT_ENDPOINT) or 0
+    others = sorted({int(port) for port in ports if port.isdecimal()} - {usual})
+    found = [(port, nearest(endpoint_of("tcp", LOCAL_HOSTS[0], port), environment)) for port in (usual, *others)]
+    return [endpoint for port, endpoint in found if endpoint.startswith(UNIX) or _listens(LOCAL_HOSTS[0], port)]
+
+
+def announce(listen: Iterable[str]) -> list[socket.socket]:
+    """Let every user of this computer see a daemon's ports, without reading its folders, until the sockets are closed.
+
+    Args:
+        listen: endpoints of the daemon. Those that need a certificate, or are for other computers, are left out.
+
+    Returns:
+        Sockets that hold the names; the kernel drops those of a process that ends. A name that another program holds
+        is left to it.
+    """
+    ports = {
+        port_of(endpoint)
+        for endpoint in listen
+        if protocol_of(endpoint) == "tcp" and host_of(endpoint) in (*LOCAL_HOSTS, *EVERYWHERE)
+    }
+    held = []
+    for port in ports:
+        name = socket.socket(socket.AF_UNIX)
+        try:
+            name.bind(f"\0{ANNOUNCED}{port}")
+        except OSError:
+            name.close()
+        else:
+            held.append(name)
+    return held
+
+
+def announced_ports(table: Path = Path("/proc/net/unix")) -> set[str]:
+    """Ports of the daemons that announce them, of every user."""
+    try:
+        names = (line.rpartition(" ")[2] for line in table.read_text(errors="replace").splitlines())
+    except OSError:
+        return set()
+    return {name.removeprefix(f"@{ANNOUNCED}") for name in names if name.startswith(f"@{ANNOUNCED}")}
 
 
 def public(endpoint: str) -> str:

@@ -18,7 +18,6 @@ import uvloop
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import Clock, WallClock
 from monstertruck_runtime.drives import Arrival, drive_to, follow
-from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError
 from monstertruck_runtime.mailbox import fifo, latest
 from monstertruck_schemas.base import Message
@@ -44,16 +43,16 @@ class Truck:
     Ctrl-C during ``goto`` cancels the goal.
 
     Args:
-        robot: name in the keys ``mt/<robot>/...``.
-        endpoint: where the robot listens.
+        robot: name in the keys ``mt/<robot>/...``; None = ``truck``.
+        endpoint: where the robot listens; see ``TruckClient``.
         source: this program's name in requests; see ``TruckClient``.
         timeout: seconds to wait for the link and for answers.
     """
 
     def __init__(
         self,
-        robot: str = "truck",
-        endpoint: str = DEFAULT_ENDPOINT,
+        robot: str | None = None,
+        endpoint: str | None = None,
         *,
         source: str | None = None,
         timeout: float = 6.0,

@@ -125,6 +125,7 @@ async def test_the_truck_moves_while_a_key_is_held_and_silence_stops_it(tmp_path
             odometry = client.subscribe(topics.ODOMETRY, latest())
             await _wrong_requests_move_nothing(made, client, gate, odometry)
             async with driving(made) as terminal:
+                assert robot_on_host("truck", made.endpoint).encode() in terminal.shown
                 await _drive_off(terminal, gate, odometry)
                 await _stopped_and_disarmed(gate, odometry)
 

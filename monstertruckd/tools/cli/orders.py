@@ -14,11 +14,12 @@ import typer
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT, local_endpoints, robot_on_host
 from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError, TruckError
+from monstertruck_runtime.robots import robots_here
 from monstertruck_schemas.reasons import Reason, in_words
 from monstertruckd.tools.cli.connection import with_robot
 from monstertruckd.tools.cli.options import EndpointOption, RobotOption
 from monstertruckd.tools.cli.output import JsonOption, finish, on_terminal, print_json, remark, until_stopped
-from monstertruckd.tools.cli.places import options_for, robots_here
+from monstertruckd.tools.cli.places import options_for
 from monstertruckd.tools.driving.modes import SPEEDS, SteeringMode
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from rich.live import Live
 
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import SECOND, Clock
-from monstertruck_runtime.endpoints import UNIX
+from monstertruck_runtime.endpoints import robot_on_host
 from monstertruck_runtime.errors import NoAnswerError, NotFoundError
 from monstertruck_runtime.mailbox import fifo, latest
 from monstertruck_schemas import topics
@@ -33,7 +33,7 @@ class Follower:
     """
 
     def __init__(self, client: TruckClient, clock: Clock, state: ScreenState | None = None) -> None:
-        self.state = state or ScreenState(f"{client.robot} {place(client.endpoint)}", clock.now())
+        self.state = state or ScreenState(robot_on_host(client.robot, client.endpoint), clock.now())
         self._clock = clock
         self._newest = [client.subscribe(topic, latest()) for topic in SHOWN.values()]
         self._events = client.subscribe(topics.EVENT, fifo(64))
@@ -60,14 +60,9 @@ class Follower:
             self.state.take(event, self._clock.now() + self._clock.real_offset())
 
 
-def place(endpoint: str) -> str:
-    """Where a robot is, short enough for a title: its Unix socket is a long path that says nothing else."""
-    return "on this computer" if endpoint.startswith(UNIX) else f"at {endpoint}"
-
-
 async def watch(clock: Clock, robot: str, endpoint: str) -> None:
     """Draw the screen until cancelled; a robot that is not there, or goes, is waited for."""
-    state = ScreenState(f"{robot} {place(endpoint)}", clock.now())
+    state = ScreenState(robot_on_host(robot, endpoint), clock.now())
     following = asyncio.create_task(_follow(clock, robot, endpoint, state))
     try:
         with Live(console=Console(), screen=True, auto_refresh=False) as live:

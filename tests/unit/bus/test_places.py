@@ -7,12 +7,13 @@ import pytest
 
 from monstertruck_runtime import endpoints
 from monstertruck_runtime.client import TruckClient
-from monstertruck_runtime.endpoints import local_endpoints, nearest
+from monstertruck_runtime.endpoints import announce, announced_ports, local_endpoints, nearest, port_of
 from monstertruck_runtime.errors import NotFoundError
 from monstertruck_runtime.mailbox import fifo
+from monstertruck_runtime.robots import robots_at
 from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.topics import GATE, Writer
-from monstertruckd.bus.port_holder import holder_of, robots_at
+from monstertruckd.bus.port_holder import holder_of
 from tests.bus_kit import free_endpoint, gate_state, running_robot
 from tests.unit.bus.test_zenoh_session import raw_session
 
@@ -70,6 +71,7 @@ async def test_a_socket_left_over_is_taken_again():
 
 async def test_two_daemons_on_one_computer_are_both_found(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
+    monkeypatch.setattr(endpoints, "announced_ports", set)  # those of other tests
     async with running_robot() as first, running_robot(robot="second") as second:
         monkeypatch.setattr(endpoints, "DEFAULT_ENDPOINT", first.endpoint)
         found = local_endpoints()
@@ -78,8 +80,32 @@ async def test_two_daemons_on_one_computer_are_both_found(monkeypatch: pytest.Mo
         assert (await asyncio.to_thread(holder_of, found)).startswith("robot 'truck', robot 'second', process ")
         other = free_endpoint()
         monkeypatch.setattr(endpoints, "DEFAULT_ENDPOINT", other)
-        assert len(local_endpoints()) == 2, "nobody answers at the default port"
+        assert sorted(local_endpoints()) == sorted(found), "nobody answers at the default port"
     assert local_endpoints() == []
-    async with running_robot(local_socket=False) as foreign:
-        monkeypatch.setattr(endpoints, "DEFAULT_ENDPOINT", foreign.endpoint)
-        assert local_endpoints() == [foreign.endpoint], "of another user, without a socket for this one"
+
+
+async def test_daemons_of_other_users_are_found_by_what_they_announce(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    """This user may not look into the folder of their sockets."""
+    monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path / "theirs"))
+    async with running_robot(robot="second") as foreign:
+        monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path / "ours"))
+        assert foreign.endpoint in local_endpoints()
+        assert await asyncio.to_thread(robots_at, foreign.endpoint) == ["second"]
+        (again,) = announce([foreign.endpoint, free_endpoint()])
+        again.close()
+    assert foreign.endpoint not in local_endpoints()
+
+
+def test_only_what_can_be_asked_from_this_computer_is_announced():
+    free = port_of(free_endpoint())
+    before = announced_ports()
+    assert announce([f"tls/127.0.0.1:{free}", f"tcp/192.0.2.7:{free}", f"unixsock-stream//run/{free}.sock"]) == []
+    for host in ("0.0.0.0", "[::]", "localhost"):
+        (held,) = announce([f"tcp/{host}:{free}"])
+        with held:
+            assert announced_ports() >= {str(free)}
+    assert str(free) not in before | announced_ports()
+
+
+def test_a_computer_without_the_kernels_table_shows_none(tmp_path: Path):
+    assert announced_ports(tmp_path / "unix") == set()

@@ -1,8 +1,12 @@
 """The message of a daemon whose port is taken: by which process, and by which robot."""
 
 import os
+import pwd
 import socket
 from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
 
 from monstertruckd.bus.port_holder import holder_of
 
@@ -33,9 +37,15 @@ def table(proc: Path, *rows: str) -> None:
 ROW = "0: 0100007F:1D17 00000000:0000 {state} 00000000:00000000 00:00000000 00000000  1000        0 4711 1"
 
 
-def test_only_who_listens_counts_and_what_cannot_be_seen_is_another_program(tmp_path: Path):
+def test_of_what_cannot_be_seen_its_user_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(pwd, "getpwuid", {1000: SimpleNamespace(pw_name="ann")}.__getitem__)
+    table(tmp_path, ROW.format(state="0A"), ROW.format(state="0A").replace("1000", "1001"))
+    said = "a program of user 'ann', a program of user '1001'"
+    assert holder_of(["tcp/192.0.2.7:7447"], tmp_path) == said
+
+
+def test_only_who_listens_counts(tmp_path: Path):
     table(tmp_path, ROW.format(state="0A"))
-    assert holder_of(["tcp/192.0.2.7:7447"], tmp_path) == "another program"
     fds = tmp_path / "52" / "fd"
     fds.mkdir(parents=True)
     (fds / "3").symlink_to("socket:[4711]")

@@ -285,11 +285,12 @@ async def test_a_device_that_takes_nothing_is_not_sent_old_set_points(line: Line
     port = SerialPort(line.path)
     link = await port.open()
     sent = 0
-    while not link.is_lost:
-        link.write(b"set")
-        sent += 1
-        kernel.untaken += 3
-        await asyncio.sleep(0.02)
+    async with asyncio.timeout(5):
+        while not link.is_lost:
+            link.write(b"set")
+            sent += 1
+            kernel.untaken += 3
+            await asyncio.sleep(0.02)
     assert sent * 0.02 <= MAX_AGE + 0.2
     with pytest.raises(DeviceWedgedError, match="taken no bytes"):
         await link.read()
@@ -311,10 +312,11 @@ async def test_what_a_full_line_does_not_take_is_dropped_when_it_is_old(line: Li
     link = await SerialPort(line.path).open()
     set_point = b"0123456789" * 100
     sent = 0
-    while not link.is_lost:
-        link.write(set_point)
-        sent += len(set_point)
-        await asyncio.sleep(0.005)
+    async with asyncio.timeout(5):
+        while not link.is_lost:
+            link.write(set_point)
+            sent += len(set_point)
+            await asyncio.sleep(0.005)
     with pytest.raises(DeviceWedgedError):
         link.write(set_point)
     await asyncio.sleep(0.1)

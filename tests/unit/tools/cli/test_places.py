@@ -1,14 +1,19 @@
 """Commands that name no endpoint: with several robots on this computer they say which there are, and reach none."""
 
+import asyncio
+from collections.abc import Callable
 from typing import Any
 
 import pytest
 from typer.testing import CliRunner
 
+from monstertruck_runtime import client, robots
+from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT, public, robot_on_host
-from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.errors import InputError, NotFoundError
+from monstertruck_runtime.truck import Truck
 from monstertruck_schemas.reasons import Reason
-from monstertruckd.tools.cli import options, orders, places
+from monstertruckd.tools.cli import options, orders
 from monstertruckd.tools.cli.main import app
 
 SOCKETS = {"truck": "unixsock-stream//run/x/7447.sock", "second": "unixsock-stream//run/x/7448.sock"}
@@ -18,13 +23,13 @@ SOCKETS = {"truck": "unixsock-stream//run/x/7447.sock", "second": "unixsock-stre
 def reached(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str]]:
     """Two robots on this computer; what commands reach is kept, and nothing is done."""
     found: list[tuple[str, str]] = []
-    monkeypatch.setattr(places, "local_endpoints", lambda: list(SOCKETS.values()))
+    monkeypatch.setattr(robots, "local_endpoints", lambda: list(SOCKETS.values()))
     monkeypatch.setattr(orders, "local_endpoints", lambda: list(SOCKETS.values()))
-    for module in (places, options):
+    for module in (robots, options):
         monkeypatch.setattr(
             module, "nearest", lambda endpoint: SOCKETS["truck"] if endpoint == DEFAULT_ENDPOINT else endpoint
         )
-    monkeypatch.setattr(places, "robots_here", lambda: list(SOCKETS.items()))
+    monkeypatch.setattr(robots, "robots_here", lambda: list(SOCKETS.items()))
     monkeypatch.setattr(orders, "robots_here", lambda: list(SOCKETS.items()))
 
     def stop(_: Any, robot: str, endpoint: str, *__: Any, **___: Any) -> None:
@@ -64,17 +69,77 @@ def test_a_name_or_an_endpoint_tells_them_apart(words: list[str], expected: tupl
 
 
 def test_robots_of_one_name_are_listed_with_their_endpoints(reached: list, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(places, "robots_here", lambda: [("truck", endpoint) for endpoint in SOCKETS.values()])
+    monkeypatch.setattr(robots, "robots_here", lambda: [("truck", endpoint) for endpoint in SOCKETS.values()])
     done = CliRunner().invoke(app, ["disarm", "--robot", "truck"])
     assert "--robot truck --endpoint tcp/127.0.0.1:7448" in " ".join(done.output.split())
     assert reached == []
 
 
 def test_one_robot_needs_no_name_and_no_question(reached: list, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(places, "local_endpoints", lambda: [SOCKETS["truck"]])
-    monkeypatch.setattr(places, "robots_here", lambda: pytest.fail("asked for nothing"))
+    monkeypatch.setattr(robots, "local_endpoints", lambda: [SOCKETS["truck"]])
+    monkeypatch.setattr(robots, "robots_here", lambda: pytest.fail("asked for nothing"))
     CliRunner().invoke(app, ["disarm"])
     assert reached == [("truck", SOCKETS["truck"])]
+
+
+@pytest.mark.parametrize("listens", [False, True], ids=["no program", "another program"])
+def test_a_robot_elsewhere_is_named_but_not_reached_unasked(
+    listens: bool, reached: list, monkeypatch: pytest.MonkeyPatch
+):
+    """At the default port nothing listens, or a program that is no robot."""
+    monkeypatch.setattr(robots, "nearest", lambda endpoint: endpoint)
+    there = [*[DEFAULT_ENDPOINT] * listens, SOCKETS["second"]]
+    monkeypatch.setattr(robots, "local_endpoints", lambda: there)
+    monkeypatch.setattr(robots, "robots_here", lambda: [("second", SOCKETS["second"])])
+    done = CliRunner().invoke(app, ["disarm"])
+    assert done.exit_code == Reason.BAD_INPUT.exit_code
+    assert " ".join(done.output.split()) == (
+        f"no robot answers at {DEFAULT_ENDPOINT}; another one does on this computer: "
+        "--robot second --endpoint tcp/127.0.0.1:7448"
+    )
+    assert reached == []
+    CliRunner().invoke(app, ["disarm", "--robot", "second"])
+    assert reached == [("second", SOCKETS["second"])]
+
+
+def test_nobody_answers_on_this_computer(reached: list, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(robots, "nearest", lambda endpoint: endpoint)
+    monkeypatch.setattr(robots, "local_endpoints", list)
+    CliRunner().invoke(app, ["disarm"])
+    assert reached == [("truck", DEFAULT_ENDPOINT)]
+
+
+# Scripts
+
+
+@pytest.mark.parametrize("make", [TruckClient, Truck])
+def test_a_script_that_could_mean_two_robots_is_refused_with_the_list(make: Callable[[], Any], reached: list):
+    def enter() -> None:
+        if make is Truck:
+            with Truck():
+                pass
+        else:
+            asyncio.run(TruckClient().__aenter__())
+
+    with pytest.raises(InputError) as refused:
+        enter()
+    assert str(refused.value) == (
+        "2 robots answer on this computer; choose one: 'truck', 'tcp/127.0.0.1:7447', 'second', 'tcp/127.0.0.1:7448'"
+    )
+
+
+def test_a_script_reaches_the_robot_that_it_names(reached: list, monkeypatch: pytest.MonkeyPatch):
+    opened: list[str] = []
+
+    def config(endpoint: str, *_: Any) -> Any:
+        opened.append(endpoint)
+        raise NotFoundError("reached")
+
+    monkeypatch.setattr(client, "session_config", config)
+    for made in (TruckClient("second"), TruckClient(endpoint="tcp/127.0.0.1:7450"), TruckClient("a", "tcp/b:1")):
+        with pytest.raises(NotFoundError, match="reached"):
+            asyncio.run(made.__aenter__())
+    assert opened == [SOCKETS["second"], "tcp/127.0.0.1:7450", "tcp/b:1"]
 
 
 def test_an_emergency_stop_is_never_refused_and_names_who_was_not_stopped(

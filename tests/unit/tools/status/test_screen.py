@@ -17,7 +17,7 @@ from monstertruck_schemas.req import Role
 from monstertruck_schemas.sensor import Attitude, Battery, BatteryLevel, LaserScan, SonarEcho, SonarRanges
 from monstertruck_schemas.state import GateMode, GateState, Odometry, Transforms
 from monstertruckd.tools.status.screen import ScreenState, draw
-from monstertruckd.tools.status.watch import place, plain
+from monstertruckd.tools.status.watch import plain
 
 HEADER = {"stamp": 10**9, "received": 10**9, "seq": 0}
 
@@ -378,11 +378,6 @@ def test_the_newest_events_are_whole():
     for _ in range(2):
         state.take(event(long))
     assert " ".join(shown(state).export_text().replace("│", " ").split()).count(f"gate: {long} [tilt_slow]") == 1
-
-
-def test_the_title_has_room_for_the_robots_name():
-    assert place("unixsock-stream//tmp/monstertruckd-1000/7447.sock") == "on this computer"
-    assert place("tcp/192.168.1.20:7447") == "at tcp/192.168.1.20:7447"
 
 
 def test_without_events_the_scan_has_their_room():

@@ -1,0 +1,54 @@
+"""Robots that answer on this computer: which one is meant where no endpoint is named."""
+
+import json
+from collections.abc import Callable
+from typing import Final
+
+from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT, local_endpoints, nearest, public
+from monstertruck_runtime.errors import InputError
+
+LOOK: Final = 0.5
+"""Timeout of a liveliness query (s)."""
+
+
+def robots_at(endpoint: str, timeout: float = LOOK) -> list[str]:
+    """Names of the robots that answer at an endpoint; empty if nothing does, or if it requires a certificate."""
+    import zenoh  # noqa: PLC0415 - takes longer than a command's other work, and is rarely needed
+
+    from monstertruck_runtime.stations import session_config  # noqa: PLC0415
+    from monstertruck_schemas.topics import alive_key  # noqa: PLC0415
+
+    config = session_config(endpoint, timeout, None)
+    try:
+        with zenoh.open(zenoh.Config.from_json5(json.dumps(config))) as session:
+            replies = session.liveliness().get(alive_key("*"), timeout=timeout)
+            return sorted({str(reply.ok.key_expr).split("/")[1] for reply in replies if reply.ok is not None})
+    except zenoh.ZError:
+        return []
+
+
+def robots_here() -> list[tuple[str, str]]:
+    """Robots of this computer's daemons with their endpoints, the default port first; asking takes up to a second."""
+    return [(robot, endpoint) for endpoint in local_endpoints() for robot in robots_at(endpoint)]
+
+
+def only_robot(name: str | None, choice: Callable[[str, str], str]) -> str:
+    """Endpoint where none is named: the default port, unless robots of other ports could be meant.
+
+    Args:
+        name: of the robot; None if it is not named either.
+        choice: says in words how a robot is chosen, by its name and endpoint.
+
+    Raises:
+        InputError: several robots could be meant, or none answers at the default port; lists those that answer.
+    """
+    default = nearest(DEFAULT_ENDPOINT)
+    if set(local_endpoints()) <= {default}:
+        return default
+    there = [row for row in robots_here() if name in (None, row[0])]
+    rows = ", ".join(choice(robot, public(endpoint)) for robot, endpoint in there)
+    if len(there) > 1:
+        raise InputError(f"{len(there)} robots answer on this computer; choose one: {rows}")
+    if name is None and there and there[0][1] != default:
+        raise InputError(f"no robot answers at {DEFAULT_ENDPOINT}; another one does on this computer: {rows}")
+    return there[0][1] if there else default
