@@ -18,7 +18,7 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap
-from ruamel.yaml.composer import Composer, ComposerError, MaxDepthExceededError
+from ruamel.yaml.composer import MaxDepthExceededError
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.nodes import CollectionNode, MappingNode, Node, ScalarNode, SequenceNode
 from ruamel.yaml.reader import ReaderError
@@ -29,6 +29,7 @@ from monstertruck_runtime.map_folders import SAVES, folder_of
 from monstertruck_runtime.map_folders import YAML as MAP_YAML
 from monstertruck_runtime.plugins import models_in
 from monstertruck_runtime.small_files import make_folder, replace_file, require_file
+from monstertruck_runtime.yaml_files import DEEPEST, MOST_BYTES, bounded_yaml
 from monstertruck_schemas.base import LiveValue, Schema, field_docs, first_mistake, live_settings
 from monstertruckd.config.calibration import CalibrationStore, Result, WizardName, in_order, put_values, unused
 from monstertruckd.config.real_ports import mixed
@@ -44,10 +45,6 @@ PLACEHOLDER = "{robot}"
 HEAD: Final = (
     "Settings changed while the robot ran (monstertruckd set --save); they replace those of the configuration."
 )
-MOST_BYTES: Final = 1_000_000
-"""Size of one file at most."""
-DEEPEST: Final = 50
-"""Nesting of sections and lists, at most."""
 MOST_NODES: Final = 5_000
 """Keys and values in the text of one file, at most: read in a quarter of a second; a full configuration has some
 hundreds."""
@@ -441,26 +438,9 @@ def _build_mapping(node: Node, builder: _Builder, key: Key) -> dict[str, Any]:
 # YAML text
 
 
-class _CountingComposer(Composer):
-    """Builds the nodes of one document, until there are too many."""
-
-    count = 0
-
-    def compose_node(self, parent: Any, index: Any) -> Any:
-        """One node with all below it."""
-        self.count += 1
-        if self.count > MOST_NODES:
-            place = self.parser.peek_event().start_mark
-            raise ComposerError(None, None, f"more than {MOST_NODES} keys and values", place)
-        return super().compose_node(parent, index)
-
-
 def reader() -> YAML:
-    """Reads one document of plain data."""
-    yaml = YAML(typ="safe", pure=True)
-    yaml.max_depth = DEEPEST
-    yaml.Composer = _CountingComposer
-    return yaml
+    """Reads one document of plain data; ``_build`` bounds what is behind aliases, and names it."""
+    return bounded_yaml(MOST_NODES, expand=False)
 
 
 def node_kind(node: Node) -> str:

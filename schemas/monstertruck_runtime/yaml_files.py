@@ -1,6 +1,7 @@
 """YAML 1.2 files of plain data."""
 
 import io
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -22,10 +23,17 @@ _EXPECTED: Final = "YAML"
 
 
 class _BoundedComposer(Composer):
-    """Builds the nodes of one document, until they are too many."""
+    """Builds the nodes of one document, until they are too many.
 
-    def __init__(self, loader: Any = None) -> None:
+    Args:
+        loader: of the document.
+        most: nodes.
+        expand: count what is behind an alias each time; otherwise the reader bounds it.
+    """
+
+    def __init__(self, loader: Any = None, *, most: int, expand: bool) -> None:
         super().__init__(loader)
+        self._most, self._expand = most, expand
         self._count = 0
         self._sizes: dict[int, int] = {}
         """Nodes in each complete node, by its id."""
@@ -36,15 +44,23 @@ class _BoundedComposer(Composer):
         before = self._count
         self._count += 1
         node = super().compose_node(parent, index)
-        if alias:
+        if alias and self._expand:
             if id(node) not in self._sizes:
                 raise ComposerError(None, None, "an alias inside its own anchor", place)
             self._count += self._sizes[id(node)]
-        else:
+        elif not alias:
             self._sizes[id(node)] = self._count - before
-        if self._count > MOST_NODES:
-            raise ComposerError(None, None, f"more than {MOST_NODES} keys and values", place)
+        if self._count > self._most:
+            raise ComposerError(None, None, f"more than {self._most} keys and values", place)
         return node
+
+
+def bounded_yaml(most: int = MOST_NODES, *, expand: bool = True) -> YAML:
+    """Return a reader of one document of plain data with bounds of depth and size; see ``_BoundedComposer``."""
+    yaml = YAML(typ="safe", pure=True)
+    yaml.max_depth = DEEPEST
+    yaml.Composer = partial(_BoundedComposer, most=most, expand=expand)  # type: ignore[assignment]  # it is only called
+    return yaml
 
 
 def read_yaml(path: Path) -> Any:
@@ -54,12 +70,9 @@ def read_yaml(path: Path) -> Any:
         InputError: it cannot be read, is not YAML, or is too long or nested too deeply.
     """
     text = text_of(path, _EXPECTED, MOST_BYTES)
-    yaml = YAML(typ="safe", pure=True)
-    yaml.max_depth = DEEPEST
-    yaml.Composer = _BoundedComposer
     with reading(path, _EXPECTED):
         try:
-            return yaml.load(text)
+            return bounded_yaml().load(text)
         except MarkedYAMLError as error:
             line = error.problem_mark.line + 1 if error.problem_mark else 1
             too_deep = isinstance(error, MaxDepthExceededError)
