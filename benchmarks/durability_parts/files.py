@@ -17,6 +17,8 @@ import traceback
 import warnings
 from collections import Counter
 from collections.abc import Callable
+from contextlib import AbstractContextManager
+from functools import cache
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -25,12 +27,15 @@ from PIL import Image
 
 from benchmarks.durability_parts import maps
 from benchmarks.durability_parts.damage import made
+from benchmarks.durability_parts.state import missions
 from monstertruck_drivers.hokuyo_urg.recording import RecordedRanges
 from monstertruck_estimation.ground.grid import GroundGrid
 from monstertruck_estimation.points import files as points
 from monstertruck_estimation.slam import storage
 from monstertruck_estimation.slam.storage import surface_elements
+from monstertruck_planners.missions.progress import MissionProgress, SavedProgress
 from monstertruck_planners.track.paths import load_path
+from monstertruck_runtime.clock import WallClock
 from monstertruck_runtime.errors import TruckError
 from monstertruck_runtime.map_files import load_map
 from monstertruck_schemas.mission import Mission
@@ -40,17 +45,29 @@ from monstertruck_sim.world.terrain import load_profile
 from monstertruck_sim.world3d.ground import _pictured, scenery
 from monstertruckd.config.calibration import CalibrationStore
 from monstertruckd.config.expiry import DistanceCounter
-from monstertruckd.config.load import load_config, load_truck
+from monstertruckd.config.load import SavedSettings, Tree, load_config, load_truck
+from monstertruckd.config.start import started
 from monstertruckd.recorder.config import Compression
+from monstertruckd.recorder.reader import open_log
 from monstertruckd.recorder.repair import recover
+from monstertruckd.station.replay import ReplayFeed
 from monstertruckd.station.users import StationUsers, add_user
+from monstertruckd.tools.cli import logs as cli_logs
 from monstertruckd.tools.cli.kinematics import _read_trajectory, _read_wheels
+from monstertruckd.tools.demo.runs import free_endpoint
 from monstertruckd.tools.driving.gamepad import read_mapping
-from monstertruckd.tools.logs.export import export_csv
+from monstertruckd.tools.logs.animation import animate
+from monstertruckd.tools.logs.export import export_csv, export_mcap, export_npz
+from monstertruckd.tools.logs.messages import Selection
+from monstertruckd.tools.logs.replay import replay_log
 from monstertruckd.tools.logs.report.collect import collect
+from monstertruckd.tools.logs.rerun_view import convert
+from monstertruckd.tools.logs.ros2 import export_ros2
 from monstertruckd.tools.logs.scans import read_scans
 from monstertruckd.tools.logs.summary import info
 from monstertruckd.tools.security import certificates
+from monstertruckd.tools.security.folder import Folder
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 from monstertruckd.tools.stand import calibration as stand
 
 SECONDS: Final = 5.0
@@ -59,6 +76,10 @@ SHOWN: Final = 30
 """Faults that are printed, one of each kind and place."""
 WORDS: Final = (b"-1", b"0", b"1e999", b"nan", b"null", b"[]", b"{}", b"''", b"true", b"4294967296", b"1e-320", b"\xff")
 """What numbers and words are replaced by."""
+RUN: Final = 1.0
+"""Seconds of the log of a drive."""
+AT_ONCE: Final = 1e12
+"""Speed of a replay that waits for no message, whatever time it has."""
 DATA: Final = Path(__file__).parents[2] / "tests" / "data"
 CONFIGS: Final = Path(__file__).parents[2] / "configs"
 
@@ -85,6 +106,12 @@ def kinds() -> dict[str, Kind]:
         "saved map": Kind(_saved, _read_saved, 4),
         "log": Kind(_log, _read_log, 3),
         "log of a run": Kind(_run, _read_run, 1),
+        "log replayed": Kind(_run, _read_replayed, 1),
+        "log on the page": Kind(_run, _read_page, 1),
+        "log viewed": Kind(_run, _read_viewed, 1),
+        "log animated": Kind(_run, _read_animated, 1),
+        "log exported": Kind(_run, _read_exported, 1),
+        "log as ROS 2 bag": Kind(_run, _read_bag, 1),
         "scans npz": Kind(_npz, lambda it: read_scans(it / "log.npz"), 3),
         "scans CARMEN": Kind(_carmen, lambda it: read_scans(it / "log.log")),
         "scans CARMEN, packed": Kind(_carmen_packed, lambda it: read_scans(it / "log.gz")),
@@ -94,11 +121,14 @@ def kinds() -> dict[str, Kind]:
         "wheels": Kind(_wheels, lambda it: _read_wheels(it / "w.yaml")),
         "mission": Kind(_mission, lambda it: load_config(it / "m.yaml", Mission), 3),
         "configuration": Kind(_config, lambda it: load_truck(it / "truck.yaml"), 1),
+        "live settings": Kind(_settings, _read_settings, 3),
+        "saved mission": Kind(_progress, _read_progress),
         "users": Kind(_users, _read_users),
         "gamepad": Kind(_gamepad, lambda it: read_mapping(it / "pad.yaml")),
         "profile": Kind(_profile, lambda it: load_profile(it / "h.profile.yaml")),
         "height picture": Kind(_heights, _read_heights),
         "mjcf": Kind(_mjcf, lambda it: scenery(it / "s.xml"), 3),
+        "stations": Kind(_stations, lambda it: Folder(it / "security").register()),
         "certificate": Kind(_certificate, lambda it: certificates.load(it / "c.pem", it / "k.pem"), 3),
         "calibration": Kind(_calibration, _read_calibration, 3),
         "stand": Kind(_stand, lambda it: stand.load(it / "stand.json")),
@@ -155,14 +185,51 @@ def _read_log(folder: Path) -> None:
 
 
 def _run(folder: Path) -> None:
-    shutil.copy(max(DATA.glob("golden/*/run.mcap")), folder / "log.mcap")
+    """The begin of a drive, with all its topics."""
+    export_mcap(max(DATA.glob("golden/*/run.mcap")), folder / "log.mcap", Selection(end=RUN))
 
 
 def _read_run(folder: Path) -> None:
     info(folder / "log.mcap")
     read_scans(folder / "log.mcap")
-    collect(folder / "log.mcap")
-    export_csv(folder / "log.mcap", folder / "out")
+    with as_a_command(folder / "log.mcap"):
+        collect(folder / "log.mcap")
+
+
+def as_a_command(log: Path) -> AbstractContextManager[object]:
+    """The door through which every command on logs looks at one."""
+    return cli_logs.reading_log("read", log)
+
+
+def _read_replayed(folder: Path) -> None:
+    with as_a_command(folder / "log.mcap"):
+        replay_log(folder / "log.mcap", "truck", free_endpoint(), AT_ONCE, None)
+
+
+def _read_page(folder: Path) -> None:
+    ReplayFeed("log", folder / "log.mcap", open_log, WallClock())
+
+
+def _read_viewed(folder: Path) -> None:
+    with as_a_command(folder / "log.mcap"):
+        convert(open_log(folder / "log.mcap"), folder / "log.rrd")
+
+
+def _read_animated(folder: Path) -> None:
+    with as_a_command(folder / "log.mcap"):
+        animate(open_log(folder / "log.mcap"), folder / "log.gif", speed=8.0, width=64)
+
+
+def _read_exported(folder: Path) -> None:
+    with as_a_command(folder / "log.mcap"):
+        export_csv(folder / "log.mcap", folder / "csv")
+        export_npz(folder / "log.mcap", folder / "npz")
+        export_mcap(folder / "log.mcap", folder / "dated.mcap")
+
+
+def _read_bag(folder: Path) -> None:
+    with as_a_command(folder / "log.mcap"):
+        export_ros2(folder / "log.mcap", folder / "bag")
 
 
 def _npz(folder: Path) -> None:
@@ -208,6 +275,38 @@ def _config(folder: Path) -> None:
     text = (CONFIGS / "demo.yaml").read_text(encoding="utf-8")
     text = text.replace("include: ", f"include: {CONFIGS}/").replace(" paths/", f" {CONFIGS}/paths/")
     (folder / "truck.yaml").write_text(text, encoding="utf-8")
+
+
+@cache
+def _demo() -> tuple[SimulatedTruckConfig, Tree]:
+    return load_config(CONFIGS / "demo.yaml", SimulatedTruckConfig)
+
+
+def _settings(folder: Path) -> None:
+    SavedSettings(folder, "truck").save({"gate.speed": 0.15, "gate.obstacle.ahead": 0.1})
+
+
+def _read_settings(folder: Path) -> None:
+    config, tree = _demo()
+    started(config.model_copy(update={"state_directory": folder}), tree)
+
+
+def _progress(folder: Path) -> None:
+    _mission(folder)
+    mission, _ = load_config(folder / "m.yaml", Mission)
+    progress = SavedProgress.of(MissionProgress(mission, (0.0, 0.0, 0.0), 1), "ann")
+    (folder / "m.yaml").unlink()
+    (folder / "mission.json").write_text(progress.model_dump_json())
+
+
+def _read_progress(folder: Path) -> None:
+    missions(folder / "mission.json")._load()  # noqa: SLF001 - as the service's start does
+
+
+def _stations(folder: Path) -> None:
+    certified = Folder(folder / "security")
+    certified.init("truck", ("127.0.0.1",), folder / "security" / "robot", 1_700_000_000)
+    certified.add("station", None, None, 1_700_000_000)
 
 
 def _users(folder: Path) -> None:

@@ -3,13 +3,14 @@
 import asyncio
 import random
 from collections.abc import Iterator
+from dataclasses import fields
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Final
 
 from benchmarks.durability_parts.subject import Death, Subject
 from monstertruck_planners.missions.progress import MissionProgress
-from monstertruck_planners.missions.service import MissionService
+from monstertruck_planners.missions.service import MissionInputs, MissionService
 from monstertruck_runtime.clock import SECOND, WallClock
 from monstertruck_runtime.small_files import SCRATCH, remove_leftovers
 from monstertruck_runtime.threads import inline
@@ -75,22 +76,22 @@ def _check_settings(folder: Path, acknowledged: list[str], _: Death) -> str | No
 # Missions
 
 
-def _missions(folder: Path) -> MissionService:
-    """The service with what it needs to keep a mission."""
+def missions(file: Path) -> MissionService:
+    """The service with what it needs to keep a mission in ``file``."""
     nothing: Any = SimpleNamespace(latest=None)
-    inputs: Any = SimpleNamespace(pose=nothing)
+    inputs: Any = SimpleNamespace(**dict.fromkeys((field.name for field in fields(MissionInputs)), nothing))
 
     def report(reason: object, severity: object, source: str, text: str = "", **_: object) -> None:
         raise OSError(text)
 
     return MissionService(
-        nothing, WallClock(), file=folder / "state" / "mission.json", localised=False, offload=inline, max_age=1.0,
+        nothing, WallClock(), file=file, localised=False, offload=inline, max_age=1.0,
         inputs=inputs, state=nothing, events=report,
     )  # fmt: skip
 
 
 def _write_missions(folder: Path, seed: int) -> Iterator[str]:
-    service, number = _missions(folder), 0
+    service, number = missions(folder / "state" / "mission.json"), 0
     (folder / "state").mkdir()
     EstopLatch(folder / "state" / "estop", folder).prepare()
     while True:
@@ -107,7 +108,7 @@ def _write_missions(folder: Path, seed: int) -> Iterator[str]:
 
 def _check_missions(folder: Path, acknowledged: list[str], _: Death) -> str | None:
     wrong = _tidy(folder / "state")
-    saved = _missions(folder)._load()  # noqa: SLF001 - as the service's start does
+    saved = missions(folder / "state" / "mission.json")._load()  # noqa: SLF001 - as the service's start does
     if saved is not None and saved.mission.name != f"m{saved.index + 1}":
         return f"mixed: {saved.mission.name} at step {saved.index + 1}"
     found = 0 if saved is None else saved.index + 1

@@ -206,7 +206,7 @@ def report_command(
     """Write one HTML page about a log: path, states, events, signals, health, losses. It needs no network."""
     from monstertruckd.tools.logs.report import report
 
-    with _reading("report", log) as done:
+    with reading_log("report", log) as done:
         written = report(log, output, done)
     if json_output:
         print_json(written.figures())
@@ -235,7 +235,7 @@ def export_command(
     with needs_extra("logs"):
         export = _exporter(form)
     reader = open_log(log)
-    with _reading("export", log) as done:
+    with reading_log("export", log) as done:
         files = export(reader, output, selection, done)
     if not files:
         remark(f"{log}: {selection.nothing}")
@@ -261,7 +261,7 @@ def animate_command(
     with needs_extra("logs"):
         from monstertruckd.tools.logs.animation import animate
     reader = open_log(log)
-    with _reading("animate", log) as done:
+    with reading_log("animate", log) as done:
         figures = animate(reader, output, speed=speed, width=width, report=done)
     if json_output:
         print_json({"file": str(output), **figures})
@@ -288,7 +288,7 @@ def view_command(
     reader = open_log(log)
     with TemporaryDirectory(prefix="monstertruckd-") as scratch:
         recording = save or Path(scratch) / f"{log.stem}.rrd"
-        with _reading("convert", log) as done:
+        with reading_log("convert", log) as done:
             convert(reader, recording, selection, done)
         if save is None:
             show(recording)
@@ -312,7 +312,7 @@ def finish_log(log: Path, fault: str | None) -> None:
 
 
 @contextmanager
-def _reading(what: str, log: Path) -> "Iterator[Progress]":
+def reading_log(what: str, log: Path) -> "Iterator[Progress]":
     """Progress over the bytes of a log, and the door for whatever is in it."""
     from monstertruck_runtime.outside import reading
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
-from monstertruckd.tools.cli.logs import LogArgument, TopicsOption, finish_log
+from monstertruckd.tools.cli.logs import LogArgument, TopicsOption, finish_log, reading_log
 from monstertruckd.tools.cli.output import JsonOption, finish, print_json, print_table, progress, remark
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ def replay(
     from monstertruckd.recorder.reader import open_log
     from monstertruckd.tools.logs.replay import replay_log
 
-    with suppress(KeyboardInterrupt), progress("replay", log.stat().st_size if log.exists() else None) as done:
+    with suppress(KeyboardInterrupt), reading_log("replay", log) as done:
         reader = open_log(log)
         count = replay_log(reader, robot, endpoint, speed, topics, done)
         remark(f"{count} messages replayed")

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
-from monstertruckd.tools.cli.logs import finish_log
+from monstertruckd.tools.cli.logs import finish_log, reading_log
 from monstertruckd.tools.cli.options import EndpointOption
 from monstertruckd.tools.cli.output import JsonOption, command_group, needs_extra, print_json, print_table, remark
 
@@ -115,7 +115,8 @@ def analyse_command(
     from monstertruckd.tools.stand.analysis import as_values, errors_of, tracker_errors
 
     reader = open_log(log)
-    found, tracker = errors_of(reader), tracker_errors(reader)
+    with reading_log("analyse", log):
+        found, tracker = errors_of(reader), tracker_errors(reader)
     if json_output:
         print_json({"estimates": as_values(found), "tracker": tracker})
     else:
