@@ -8,7 +8,7 @@ What is unsafe is judged by an observer that sees only bytes on the wires of dri
 ``--families`` draws from the families that the devices' own signals have, too: each value falsified, each command
 ignored, singles and pairs, in both directions, judged by the world's truth alone. ``--from`` begins at that trial, so
 that several computers can share the work: the files of ``--resume`` of the parts, joined, are one of the whole.
-``--robot`` is a file of configs/robots, without its suffix.
+``--robot`` is a file of configs or configs/robots, without its suffix: ``goals`` drives to goals of its planner.
 """
 
 import argparse
@@ -72,8 +72,9 @@ def family_table(report: CampaignReport) -> None:
 
 def drill_families(arguments: argparse.Namespace) -> int:
     """Drill families; 0 = all goals met."""
-    name = "full" if arguments.robot is None else f"robots/{arguments.robot}"
-    config = load_config(ROOT / "configs" / f"{name}.yaml", SimulatedTruckConfig)[0]
+    name = arguments.robot or "full"
+    folder = ROOT / "configs" if (ROOT / "configs" / f"{name}.yaml").exists() else ROOT / "configs" / "robots"
+    config = load_config(folder / f"{name}.yaml", SimulatedTruckConfig)[0]
     count = arguments.count or FAMILY_TRIALS
     began = perf_counter()
     report = Campaign(arguments.seed, count, config, first=arguments.first).run(
@@ -85,7 +86,7 @@ def drill_families(arguments: argparse.Namespace) -> int:
     least = {"trials": FAMILY_TRIALS, "pairs": 4000, "reverse": 2000} if arguments.robot is None else {"trials": 1000}
     met = all((figures[key] or 0) <= goal for key, goal in most.items())
     met = met and all(figures[key] >= goal for key, goal in least.items())
-    write(f"drill_families_{name.removeprefix('robots/')}", report.as_json())
+    write(f"drill_families_{name}", report.as_json())
     print(json.dumps({"bench": "drill_families", "figures": figures, "goals": most | least, "met": met}))
     return 0 if met else 1
 
@@ -103,7 +104,7 @@ def main() -> int:
     parser.add_argument("--count", type=int, help="1000; 10000 of families")
     parser.add_argument("--families", action="store_true", help="falsify signals of devices and commands to them")
     parser.add_argument("--from", type=int, default=0, dest="first", metavar="N", help="of families: first trial")
-    parser.add_argument("--robot", metavar="NAME", help="of families: of configs/robots instead of configs/full.yaml")
+    parser.add_argument("--robot", metavar="NAME", help="of families: of configs or configs/robots instead of full")
     parser.add_argument("--jobs", type=int, default=default_jobs())
     parser.add_argument("--cluster", metavar="ADDRESS", help="dask scheduler whose workers run it")
     parser.add_argument(

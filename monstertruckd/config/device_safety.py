@@ -104,7 +104,7 @@ def beyond_devices(devices: Devices, monitors: Monitors, standstill: float, body
             if driver.standstill_rpm > at_rest:
                 name = f"devices.{role}.driver.standstill_rpm"
                 yield f"{name} {driver.standstill_rpm}: at most {at_rest}, gate.standstill"
-    for place, pack in _packs(devices, monitors):
+    for place, pack in packs(devices, monitors):
         yield from _beyond_cells(place, pack)
 
 
@@ -126,7 +126,7 @@ def weakened_devices(devices: Devices, monitors: Monitors) -> Iterator[str]:
                 yield f"{place}.deadman_feed always: the deadman line guards against a dead process only"
             if driver.battery is None and monitors.battery is None:
                 yield f"{place}.battery null: an empty battery is not noticed"
-    for place, pack in _packs(devices, monitors):
+    for place, pack in packs(devices, monitors):
         yield from _weaker(place, pack, _usual_pack(pack))
 
 
@@ -142,7 +142,7 @@ def _usual_pack(pack: PackConfig) -> PackConfig:
     return usual.model_copy(update={name: round(getattr(usual, name) * share, 6) for name in BY_CELLS})
 
 
-def _packs(devices: Devices, monitors: Monitors) -> Iterator[tuple[str, PackConfig]]:
+def packs(devices: Devices, monitors: Monitors) -> Iterator[tuple[str, PackConfig]]:
     """Whatever measures the battery, with its place in the configuration."""
     steering: Device[Any] | None = devices.steering
     battery = None if steering is None else getattr(steering.driver, "battery", None)

@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -11,8 +12,9 @@ import numpy as np
 import pytest
 
 from monstertruck_drivers.cable import MemoryPort
-from monstertruck_runtime.clock import VirtualClock, run_virtual
+from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.errors import InputError
+from monstertruck_schemas import topics
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order
 from monstertruck_schemas.state import GateMode
@@ -22,7 +24,7 @@ from monstertruck_sim.world.obstacles import Disc
 from monstertruck_sim.world.world import World
 from monstertruckd.bus.local import Bus
 from monstertruckd.config.load import load_config
-from monstertruckd.tools.drill.campaign import LEG, Campaign, TrialOutcome, drives_again, run_trials
+from monstertruckd.tools.drill.campaign import LEG, Campaign, TrialOutcome, drives_again, recovers, run_trials
 from monstertruckd.tools.drill.judge import WorldJudge
 from monstertruckd.tools.drill.observer import Observer
 from monstertruckd.tools.drill.random_drill import wired
@@ -295,6 +297,51 @@ def test_an_operator_takes_over_where_something_is_in_the_way_of_a_tracker() -> 
             await apply(place_obstacle(0.1), truck.rig.context)
             assert await drives_again(truck)
             assert truck.by_hand
+
+    run_virtual(main)
+
+
+def test_an_operator_gives_the_planner_one_goal_after_another() -> None:
+    config = load_config(CONFIGS / "goals.yaml", SimulatedTruckConfig)[0].model_copy(update={"recorder": None})
+
+    async def main(clock: VirtualClock) -> None:
+        wander = np.random.default_rng(2)
+        async with DrillTruck.running(wired(config), clock, wander=wander, judged=True, by_hand=False) as truck:
+            assert await truck.until(truck.drives, 30.0, Order.ARM)
+            first = truck.rig.bus.newest(topics.GOAL)
+            assert first is not None
+            await truck.operator.call("goal_control", {**await truck.operator.header(), "order": "cancel"})
+            await clock.sleep(1.5)
+            second = truck.rig.bus.newest(topics.GOAL)
+            assert second is not None
+            assert second.number > first.number
+            assert second.goal != first.goal
+
+    run_virtual(main)
+
+
+def test_a_robot_with_a_planner_is_driven_by_hand_in_most_legs_and_to_goals_in_every_fourth() -> None:
+    config = load_config(CONFIGS / "goals.yaml", SimulatedTruckConfig)[0].model_copy(update={"recorder": None})
+    legs = Campaign(3, 4 * LEG, config).legs()
+    followed = [run_trials(replace(leg, count=1))[0].followed for leg in legs[2:]]
+    assert followed == [False, True]
+
+
+def test_a_pack_that_seemed_critical_keeps_a_robot_waiting_and_is_not_stuck(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("monstertruckd.tools.drill.campaign.TIMEOUT", 5.0)
+    config = load_config(CONFIGS / "full.yaml", SimulatedTruckConfig)[0].model_copy(update={"recorder": None})
+
+    async def main(clock: VirtualClock) -> None:
+        async with DrillTruck.running(wired(config), clock, wander=np.random.default_rng(2), judged=True) as truck:
+            assert await truck.until(truck.drives, 15.0, Order.ARM)
+            channel = config.devices.steering.driver.battery.channel  # type: ignore[union-attr]
+            signals = truck.rig.context.signals("steering")
+            signals.inject(f"position_{channel}", "scaled", "0.75")
+            assert await truck.until(lambda: Reason.BATTERY_CRITICAL in truck.blockers(), 20.0)
+            signals.inject(f"position_{channel}", "off")
+            begin = clock.now()
+            assert await recovers(truck)
+            assert (clock.now() - begin) / SECOND > 6.0
 
     run_virtual(main)
 

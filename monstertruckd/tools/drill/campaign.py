@@ -25,6 +25,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order
 from monstertruck_sim.families import families
 from monstertruck_sim.faults import Fault, FaultCatalog, FaultKind, SimContext, apply
+from monstertruckd.config.device_safety import packs
 from monstertruckd.tools.drill.legs import DrillLeg, check_version, leg_alone, run_legs, truck_of_leg
 from monstertruckd.tools.drill.observer import Violation
 from monstertruckd.tools.drill.random_drill import (
@@ -53,7 +54,7 @@ BETWEEN: Final = (0.0, 1.0)
 CRUISE: Final = (0.1, 0.7)
 """Seconds of driving before the first fault."""
 FOLLOWS: Final = 4
-"""Of so many trucks one is driven by its tracker, where it has one."""
+"""Of so many trucks one is driven by its tracker, along its path or to goals of its planner, where it has one."""
 MOVES: Final = 0.03
 """True speed of a robot that drives, m/s; slower than it backs into ground that it knows little of."""
 RECORDS: Final = 5
@@ -69,7 +70,12 @@ SETTLES: Final = 1.5
 """Seconds from the order that stops to the end of the faults; more than the judge lets a robot move."""
 ESTOPS: Final = 5
 """Every so many trials end with an emergency stop, the others with a disarm order."""
-BY_HAND: Final[dict[str, Any]] = {"tracker": None, "path": None}
+BY_HAND: Final[dict[str, Any]] = {
+    "explorer": None,
+    "planner": None,
+    "tracker": None,
+    "path": None,
+}
 """Overlay of a truck that an operator drives."""
 
 
@@ -226,7 +232,8 @@ class _Leg:
         self._clock = clock
         self._rng = np.random.default_rng([leg.seed, leg.number, 1])
         base = wired(SimulatedTruckConfig.model_validate(leg.config))
-        self._follows = base.tracker is not None and base.path is not None and leg.number % FOLLOWS == FOLLOWS - 1
+        driven = base.tracker is not None and (base.path is not None or base.planner is not None)
+        self._follows = driven and leg.number % FOLLOWS == FOLLOWS - 1
         self._workers: tuple[str, ...] = ()
         if not self._follows:
             base = with_overlay(base, BY_HAND)
@@ -377,7 +384,7 @@ async def _try(
     ended = clock.now()
     await stopping
     reason, reason_s = _first_reason(truck, set(usual), began)
-    recovered = await truck.until(lambda: not truck.blockers(), TIMEOUT, Order.RESET)  # the gate may have stopped it
+    recovered = await recovers(truck)
     seconds = (clock.now() - ended) / SECOND
     judge.look()
     judge.check_left()
@@ -400,6 +407,18 @@ async def _try(
         judge.violations,
         judge.confirmed_contacts,
     )
+
+
+async def recovers(truck: DrillTruck) -> bool:
+    """Whether the robot can be driven again; the operator resets what the gate has stopped.
+
+    A pack that once was critical, if only by a false reading, has to be better for ``clear_after``.
+    """
+    if await truck.until(lambda: not truck.blockers(), TIMEOUT, Order.RESET):
+        return True
+    config, waits = truck.rig.config, Reason.BATTERY_CRITICAL in truck.blockers()
+    clear_after = max((pack.clear_after for _, pack in packs(config.devices, config.monitors)), default=0.0)
+    return waits and await truck.until(lambda: not truck.blockers(), clear_after, Order.RESET)
 
 
 def _first_reason(truck: DrillTruck, usual: set[Reason], began: int) -> tuple[Reason | None, float | None]:

@@ -14,12 +14,15 @@ from monstertruck_kinematics.elementary import KinematicsError
 from monstertruck_runtime.clock import SECOND, VirtualClock, on_computer
 from monstertruck_runtime.errors import TruckError
 from monstertruck_runtime.mailbox import fifo, latest
+from monstertruck_runtime.map_files import FREE
 from monstertruck_schemas import topics
 from monstertruck_schemas.event import Event
 from monstertruck_schemas.health import HealthTable, ServiceState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import DriveRequest, Order, RequestedTwist, Role
 from monstertruck_schemas.state import GateMode, GateState
+from monstertruck_schemas.topics import GOAL
+from monstertruck_sim.world.built_in import BUILT_IN
 from monstertruckd.bus.local import Bus
 from monstertruckd.daemon import Daemon
 from monstertruckd.tools.drill.judge import WorldJudge
@@ -36,6 +39,8 @@ STATION_SPEED: Final = 0.8
 """Speed that the station requests, as a share of the gate's limit."""
 REQUESTS: Final = 0.05
 """Seconds from one request of a station to the next."""
+GIVES: Final = 0.5
+"""Seconds from one look of a giver of goals to the next."""
 OPTIONAL: Final = frozenset({"recorder"})
 """Services that a fault may end for the rest of a run: driving goes on without."""
 
@@ -202,6 +207,34 @@ class Wanderer(DrivingStation):
         super().send()
 
 
+class GoalGiver:
+    """An operator that gives the planner one goal after another, at random free places of the world.
+
+    Args:
+        truck: whose planner drives.
+        rng: randomness.
+    """
+
+    def __init__(self, truck: "DrillTruck", rng: np.random.Generator) -> None:
+        self._truck = truck
+        self._rng = rng
+        known = BUILT_IN[truck.rig.config.sim.world.map]().map
+        rows, columns = np.nonzero(known.cells == FREE)
+        self._places = np.column_stack((columns, rows)) * known.resolution + np.array(known.origin[:2])
+
+    async def run(self) -> None:
+        """Give a goal whenever the robot is armed and has none, until cancelled; the planner may refuse it."""
+        while True:
+            truck = self._truck
+            goal = truck.rig.bus.newest(GOAL)
+            if truck.gate is not None and truck.gate.mode.active and not (goal is not None and goal.running):
+                x, y = self._places[self._rng.integers(len(self._places))].tolist()
+                with suppress(TruckError):
+                    pose = {"x": x, "y": y, "yaw": float(self._rng.uniform(-math.pi, math.pi))}
+                    await truck.operator.call("goal", {**await truck.operator.header(), "frame": "map", "goal": pose})
+            await truck.clock.sleep(GIVES)
+
+
 class DrillTruck:
     """One rig with its operator and observer.
 
@@ -286,12 +319,15 @@ class DrillTruck:
         watching = truck.observer if truck.judge is None else truck.judge
         async with rig.running():
             observing = asyncio.create_task(watching.run(), name="observer")
-            asking = None if truck.station is None else asyncio.create_task(truck.station.run(), name="station")
+            operators = [] if truck.station is None else [truck.station.run()]
+            if wander is not None and not by_hand and config.planner is not None:
+                operators.append(GoalGiver(truck, wander.spawn(1)[0]).run())
+            asking = [asyncio.create_task(operator, name="operator") for operator in operators]
             try:
                 yield truck
             finally:
-                if asking is not None:
-                    asking.cancel()
+                for task in asking:
+                    task.cancel()
                 observing.cancel()
                 with suppress(asyncio.CancelledError):
                     await observing  # an observer that broke has seen nothing
