@@ -306,7 +306,9 @@ def replayed(path: Path) -> tuple[int, float, float]:
         last = stamp
         shown = np.where(ranges[k] < longest, ranges[k], np.inf)
         scan = ScanInput(stamp, shown, -math.pi / 2, step, 0.02, longest)
-        output = odometry.step(StepInput(scan, "kiss", claim=monitor.claim(stamp), lag=monitor.lag()))
+        output = odometry.step(
+            StepInput(scan, "kiss", claim=monitor.claim(stamp), lag=monitor.lag(), rest=monitor.rest_claim())
+        )
         compared += 0.0 if output.since is None else (output.stamp - output.since) / SECOND
         monitor.observe_scan(output)
         if monitor.findings():

@@ -40,6 +40,11 @@ READS_REST = {
     "drive": "signal velocity_actual scaled 0; signal velocity_averaged scaled 0; ",
     "wheels": "".join(f"signal rate_{motor} scaled 0; " for motor in (1, 2, 3, 4)),
 }
+READS_NOTHING = {
+    "drive": "signal position_actual frozen; signal velocity_actual scaled 0; signal velocity_averaged scaled 0; ",
+    "wheels": "".join(f"signal position_{motor} frozen; signal rate_{motor} scaled 0; " for motor in (1, 2, 3, 4)),
+}
+BLIND = "runs, position and velocity read rest"
 RUNAWAYS: dict[str, tuple[str, tuple[Moment, ...]]] = {
     "ignores slower targets": ("runaway ignore", AFTER),
     "creeps": ("runaway creep CREEP", (*AFTER, Moment.ARMED)),
@@ -47,6 +52,7 @@ RUNAWAYS: dict[str, tuple[str, tuple[Moment, ...]]] = {
     "runs the other way": ("runaway run BACK", (Moment.DRIVING, Moment.ARMED, Moment.ESTOP)),
     "reverses sign": ("runaway reverse", (Moment.DRIVING,)),
     "position runs, velocity reads 0": ("STILL runaway creep CREEP", (Moment.ARMED, Moment.ESTOP)),
+    BLIND: ("BLIND runaway creep CREEP", (Moment.ARMED, Moment.ESTOP)),
     "turns without its power stage": ("runaway run CREEP line", (Moment.DISARMED, Moment.ESTOP)),
 }
 """Commands of the fault console by the runaway's name, and when it shows."""
@@ -79,6 +85,8 @@ def cases(robots: list[str], seeds: int) -> Iterator[Case]:
         epos = ROBOTS[name].role == "drive"
         for runaway, (_, moments) in RUNAWAYS.items():
             beyond = runaway == "turns without its power stage"
+            if runaway == BLIND and name in ("sonar", "skid_stand"):
+                continue  # no lidar and no free wheels: nothing but the drive measures distances
             if beyond and name in ("sonar", "skid_steer", "skid_stand"):
                 continue  # no servo controller, so no line
             for moment in moments:
@@ -90,6 +98,7 @@ def trial(case: Case) -> Outcome:
     """Run one trial."""
     robot = ROBOTS[case.robot]
     fault = RUNAWAYS[case.runaway][0].replace("STILL ", READS_REST[robot.role])
+    fault = fault.replace("BLIND ", READS_NOTHING[robot.role])
     return run(robot, with_speeds(robot, fault), case.moment, line=case.line, seed=case.seed)
 
 

@@ -21,9 +21,9 @@ from monstertruck_schemas.base import Message
 from monstertruck_schemas.event import Measurement
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.roles import DeviceRole
-from monstertruck_schemas.sensor import DriveFeedback, DriveMode, Imu, WheelEncoders
-from monstertruck_schemas.state import GateMode
-from monstertruck_schemas.topics import DRIVES, ENCODERS, IMU, Topic
+from monstertruck_schemas.sensor import DriveFeedback, DriveMode, Imu, StabiliserFeedback, WheelEncoders
+from monstertruck_schemas.state import Consistency, GateMode, UnshownMotion
+from monstertruck_schemas.topics import CONSISTENCY, DRIVES, ENCODERS, IMU, SCAN, STABILISER, Topic
 from monstertruckd.gate.checks import Check, GateView, Tick
 from monstertruckd.gate.config import RunawayConfig
 
@@ -44,6 +44,7 @@ class RunawayKind(StrEnum):
     OPPOSITE = "turns against its order"
     VELOCITY_LIES = "turns by its position while its velocity reads 0"
     BODY_MOVES = "stands by its own measure while the body moves"
+    STRAYS = "turned away from its goal by itself"
 
 
 class Runaway(NamedTuple):
@@ -58,6 +59,13 @@ class Runaway(NamedTuple):
     """Least speed that its orders allowed, m/s."""
     high: float
     """Greatest one, m/s."""
+
+    @property
+    def text(self) -> str:
+        """In words."""
+        if self.kind is RunawayKind.STRAYS:
+            return f"{self.source} {self.kind}"
+        return f"{self.source} {self.kind} at {self.measured:.3f} m/s"
 
 
 class _Order(NamedTuple):
@@ -305,6 +313,26 @@ class BodyWatch:
         self._travel = 0.0
         return Runaway(RunawayKind.BODY_MOVES, self._source, speed, 0.0, 0.0)
 
+    def observe_window(
+        self, since: int, stamp: int, moved: float, config: RunawayConfig, *, stood: int, now: int, driven: bool
+    ) -> Runaway | None:
+        """Take the motion over a time that follows the one before; returns what nobody commanded.
+
+        Args:
+            since: beginning of the time, ns.
+            stamp: its end, ns.
+            moved: distance of the body, m.
+            config: limits.
+            stood: since when the robot is to stand, ns.
+            now: until when the motion goes on alike, ns.
+            driven: a motor may be what moves the robot.
+        """
+        self._stamp, self.runs = stamp, driven
+        speed = moved / (stamp - since) * SECOND
+        if not driven or speed * (now - max(since, stood)) / SECOND <= config.body_distance:
+            return None
+        return Runaway(RunawayKind.BODY_MOVES, self._source, speed, 0.0, 0.0)
+
     def expire(self, now: int) -> None:
         """Forget the motion of a sample that is too old at ``now``, ns."""
         if self._stamp is not None and now - self._stamp > self._fresh_for:
@@ -335,7 +363,7 @@ class RunawayCheck(Check):
     """
 
     reasons = (Reason.UNCOMMANDED_MOTION,)
-    reads = (IMU, ENCODERS)
+    reads = (IMU, ENCODERS, CONSISTENCY, STABILISER)
 
     def __init__(self, view: GateView, config: RunawayConfig) -> None:
         super().__init__(view)
@@ -343,7 +371,11 @@ class RunawayCheck(Check):
         self._shafts = [ShaftWatch(topic.name.rpartition("/")[2]) for topic in DRIVES[: len(view.chassis.shafts)]]
         self._wheels = BodyWatch(DeviceRole.ENCODERS.value, ENCODERS.fresh_for())
         self._gyro = BodyWatch(DeviceRole.IMU.value, IMU.fresh_for())
+        self._scans = BodyWatch(DeviceRole.LIDAR.value, SCAN.fresh_for())
+        self._bodies = self._wheels, self._gyro, self._scans
         self._encoders: WheelEncoders | None = None
+        self._strays = 0
+        """Of the joints of the lidar's mount, as they count them."""
         self._commanded = 0
         """When motion was commanded last, ns."""
         self._halted = 0
@@ -367,10 +399,14 @@ class RunawayCheck(Check):
                 rate = seen.angular_velocity
                 turning = math.hypot(rate.x, rate.y, rate.z)
                 self._take_body(self._gyro, seen, turning * self.view.footprint.half_width)
+            case Consistency(unshown=UnshownMotion() as motion):
+                self._take_unshown(motion, seen.received)
+            case StabiliserFeedback():
+                self._take_joints(seen)
 
     def _command(self, now: int) -> None:
-        self._wheels.expire(now)
-        self._gyro.expire(now)
+        for body in self._bodies:
+            body.expire(now)
         if self.view.mode.active:
             self._halted = now
         for watch, speed in zip(self._shafts, self.view.motion.shaft_speeds, strict=True):
@@ -393,13 +429,33 @@ class RunawayCheck(Check):
         rate = turned / ((encoders.stamp - before.stamp) / SECOND)
         self._take_body(self._wheels, encoders, rate * self.view.chassis.drivetrain.wheel_radius)
 
+    @property
+    def _obeyed(self) -> int:
+        """When every drive has had the time to obey the newest order to stand, ns."""
+        limits = self.view.config
+        return self._commanded + round((limits.reaction + limits.speed / limits.deceleration) * SECOND)
+
     def _take_body(self, watch: BodyWatch, seen: Message, speed: float) -> None:
-        limits, now = self.view.config, seen.received
-        obeyed = self._commanded + round((limits.reaction + limits.speed / limits.deceleration) * SECOND)
+        standstill, now = self.view.config.standstill, seen.received
         found = watch.observe(
-            seen.stamp, speed, self._config, limits.standstill, standing=now > obeyed, driven=self._pulled(now)
+            seen.stamp, speed, self._config, standstill, standing=now > self._obeyed, driven=self._pulled(now)
         )
         self._take(found, now)
+
+    def _take_unshown(self, motion: UnshownMotion, now: int) -> None:
+        moved = max(motion.distance, abs(motion.turn) * self.view.footprint.half_width)
+        found = self._scans.observe_window(
+            motion.since, motion.stamp, moved, self._config, stood=self._obeyed, now=now, driven=self._pulled(now)
+        )
+        self._take(found, now)
+
+    def _take_joints(self, seen: StabiliserFeedback) -> None:
+        """A joint that strays has no torque already; the drives need no more than the stop."""
+        before, self._strays = self._strays, seen.pitch_joint.strays + seen.roll_joint.strays
+        if self._strays > before:
+            self._found = Runaway(RunawayKind.STRAYS, DeviceRole.STABILISER.value, 0.0, 0.0, 0.0)
+            self._count += 1
+            self._step = max(self._step, Escalation.QUICK_STOP)
 
     def _pulled(self, now: int) -> bool:
         fresh = bool(self.view.samples.shaft_speeds(now))
@@ -428,7 +484,7 @@ class RunawayCheck(Check):
 
     @property
     def _body_moves(self) -> bool:
-        return self._wheels.runs or self._gyro.runs
+        return any(watch.runs for watch in self._bodies)
 
     @property
     def findings(self) -> int:
@@ -455,11 +511,11 @@ class RunawayCheck(Check):
             Escalation.POWER_OFF: "quick stop does not help: power stage off",
             Escalation.PORT_OFF: "nothing helps: switch the motors off by hand",
         }
-        return f"{found.source} {found.kind} at {found.measured:.3f} m/s; {done[self._step]}"
+        return f"{found.text}; {done[self._step]}"
 
     def figures(self, reason: Reason, now: int) -> Iterator[Measurement]:
         """Measured speed and what the orders allowed."""
-        if (found := self._found) is not None:
+        if (found := self._found) is not None and found.kind is not RunawayKind.STRAYS:
             limit = found.high if found.measured >= 0.0 else found.low
             yield Measurement(name="speed", value=found.measured, unit="m/s", limit=limit)
 

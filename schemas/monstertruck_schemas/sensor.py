@@ -245,6 +245,8 @@ class StabiliserJoint(Schema):
     """Supply at the unit, V."""
     temperature: float | None = None
     """Degree Celsius."""
+    strays: Annotated[int, Field(ge=0)] = 0
+    """Times that the unit drove itself away from its goal and lost its torque, since the driver's start."""
 
 
 class StabiliserFeedback(Message):

@@ -173,14 +173,34 @@ class Doubt(Schema):
     """Tolerated difference, in the same unit."""
 
 
+class UnshownMotion(Schema):
+    """Motion of the body, by the scans, while its wheels show standstill; the points of the scans prove it.
+
+    One follows the other: none counts a motion twice.
+    """
+
+    since: Nanoseconds
+    """Stamp of the earlier scan."""
+    stamp: Nanoseconds
+    """Stamp of the newest scan."""
+    distance: Annotated[float, Field(ge=0)]
+    """Distance from where it was, m."""
+    turn: float
+    """Turn since then, rad."""
+
+
 class Consistency(Message):
     """Comparison of the robot's independent measures of motion. Retained."""
 
     measures: tuple[str, ...]
     """Measures in use: wheels, scans, gyro, compass, encoders."""
+    distances: tuple[str, ...] | None = None
+    """Those of them that measure distances, not turns alone; None = not said."""
     doubts: tuple[Doubt, ...] = ()
     scans: str | None = None
     """Scan odometry in use: kiss or own; None = none."""
+    unshown: UnshownMotion | None = None
+    """Motion of the body that the wheels do not show; None = none."""
 
 
 class GateMode(StrEnum):

@@ -2,7 +2,7 @@
 
 import pytest
 
-from benchmarks.runaway import READS_REST
+from benchmarks.runaway import READS_NOTHING, READS_REST
 from benchmarks.runaway_parts.trial import Moment, Outcome, Robot, run, with_speeds
 from monstertruck_schemas.state import GateMode
 
@@ -72,6 +72,14 @@ def test_stop_and_disarm_are_answered_only_when_the_truck_stands(order: Moment):
 )
 def test_faster_than_ordered_the_other_way_and_a_velocity_that_lies_are_found(fault: str, moment: Moment):
     is_found(tried(DEMO, fault, moment))
+
+
+@pytest.mark.parametrize("moment", [Moment.ARMED, Moment.ESTOP])
+@pytest.mark.parametrize("robot", [DEMO, TRICYCLE], ids=["scans", "scans and free wheels"])
+def test_a_drive_that_reads_rest_while_it_turns_is_found_by_what_does_not_come_from_it(robot: Robot, moment: Moment):
+    outcome = tried(robot, READS_NOTHING["drive"] + CREEPS, moment)
+    is_found(outcome, 1.3)
+    assert outcome.travelled <= 0.3
 
 
 def test_a_power_stage_that_is_off_and_turns_the_motor_all_the_same_is_found_and_stopped_by_the_line():

@@ -57,6 +57,8 @@ class Joint:
         self._source = source
         self._rest = config.alarm.rest
         self._held_at: int | None = None
+        self._strays = 0
+        """Times that the unit drove itself away from its goal."""
         self.forget()
 
     def forget(self) -> None:
@@ -74,7 +76,7 @@ class Joint:
         self._outage = False
         self._goal: int | None = None
         """Newest goal sent, steps."""
-        self._strays = 0
+        self._straying = 0
         """Newest readings in which it drove itself away from its goal."""
 
     # What is known
@@ -93,7 +95,7 @@ class Joint:
         """For the message; signs of the joint angle."""
         present = self._present
         if present is None:
-            return StabiliserJoint(torque=self.torque)
+            return StabiliserJoint(torque=self.torque, strays=self._strays)
         sign = self._joint.direction
         return StabiliserJoint(
             torque=self.torque,
@@ -102,6 +104,7 @@ class Joint:
             load=sign * present.load * p.LOAD_UNIT,
             voltage=present.voltage * p.VOLT_UNIT,
             temperature=float(present.temperature),
+            strays=self._strays,
         )
 
     # Exchanges
@@ -157,17 +160,18 @@ class Joint:
     def _is_straying(self, before: Present, present: Present) -> bool:
         """Whether the unit drives itself away from its goal, in ``STRAYS`` readings one after the other."""
         if self.torque is not TorqueState.HOLDING or self._goal is None:
-            self._strays = 0
+            self._straying = 0
             return False
         gap, gap_before = present.position - self._goal, before.position - self._goal
         driven = present.load * gap > 0 and abs(gap) > max(abs(gap_before), self._config.margin)
-        self._strays = self._strays + 1 if driven else 0
-        return self._strays >= STRAYS
+        self._straying = self._straying + 1 if driven else 0
+        return self._straying >= STRAYS
 
     async def _stop_straying(self, session: Ax12Session, present: Present) -> None:
         """Take the unit's torque away for a rest."""
         await session.write(self.id, p.TORQUE_ENABLE, b"\x00")
-        self._strays, rest = 0, self._rested()
+        self._straying, rest = 0, self._rested()
+        self._strays += 1
         text = f"turned to {present.position} by itself, its goal is {self._goal}: no torque for {rest:g} s"
         self._report(Reason.UNCOMMANDED_MOTION, Severity.ERROR, text, position=present.position, goal=self._goal)
 

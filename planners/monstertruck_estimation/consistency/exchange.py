@@ -33,6 +33,8 @@ class StepInput:
     """Forget the scans before."""
     claim: Claim | None = None
     lag: LagQuestion | None = None
+    rest: Claim | None = None
+    """That the robot stands."""
 
 
 REFUTING: Final = 12
@@ -80,6 +82,8 @@ class StepOutput:
     """Share of the points that fit the scan before."""
     verdict: ScanVerdict | None = None
     """Of the claim; None without one, and where the earlier scan is not known any more."""
+    rest: ScanVerdict | None = None
+    """Of the claim that the robot stands, likewise."""
     front: str = ""
     """Scan odometry that is used."""
     delay: Delay | None = None

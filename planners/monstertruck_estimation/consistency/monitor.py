@@ -25,11 +25,12 @@ from monstertruck_estimation.consistency.config import ConsistencyConfig
 from monstertruck_estimation.consistency.delay import FEWEST, Delay, LagQuestion, ScanStep, lag_question
 from monstertruck_estimation.consistency.exchange import Claim, StepOutput
 from monstertruck_estimation.consistency.repeats import RepeatDetector, WholeRepeats
+from monstertruck_estimation.consistency.rest import RestWatch
 from monstertruck_estimation.consistency.tracks import STILL, MotionTrack, Vector
 from monstertruck_estimation.transforms import wrap_angle
 from monstertruck_estimation.wheel_motion import WheelIncrement
 from monstertruck_runtime.clock import SECOND
-from monstertruck_schemas.state import Doubt, DoubtKind
+from monstertruck_schemas.state import Doubt, DoubtKind, UnshownMotion
 
 WINDOWS: Final = (0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 5.0, 8.0)
 """Times over which motions are compared, s, up to the configured one."""
@@ -95,6 +96,7 @@ class ConsistencyMonitor:
         self._active_since: int | None = None
         self._doubted: frozenset[Measure] = frozenset()
         """At the comparison before."""
+        self._resting = RestWatch(self._tracks[Measure.SCANS]) if Measure.SCANS in sensors else None
         self._pending: _OpenDisagreement | None = None
         self._asked = 0
         self._found: dict[str, Doubt] = {}
@@ -164,6 +166,8 @@ class ConsistencyMonitor:
             while output.stamp - self._steps[0].since > DELAY_OVER:
                 self._steps.popleft()
         self._scans.append(output.stamp)
+        if self._resting is not None:
+            self._resting.observe(output, still=self.still(output.stamp))
         if output.verdict is not None and self._pending is not None:
             if output.verdict.refuted:
                 self._accuse(output.stamp, self._pending.found)
@@ -210,6 +214,15 @@ class ConsistencyMonitor:
         ways = self._errors[pending.claimant].way is not None
         return Claim(pending.since, motion[:2] if ways else None, motion[2], pending.errors)
 
+    def rest_claim(self) -> Claim | None:
+        """That the robot stands as its wheels do, where the scans are to judge it."""
+        return None if self._resting is None else self._resting.claim()
+
+    @property
+    def unshown(self) -> UnshownMotion | None:
+        """Motion of the body that its wheels do not show, at the newest scan."""
+        return None if self._resting is None else self._resting.motion
+
     def findings(self) -> tuple[Doubt, ...]:
         """What is wrong at present."""
         return (*self._found.values(), *self._frozen.values())
@@ -217,6 +230,10 @@ class ConsistencyMonitor:
     def in_use(self, now: int) -> tuple[Measure, ...]:
         """Measures with samples of late."""
         return tuple(one for one in self._sensors if now - self._sampled.get(one, -IN_USE) < IN_USE)
+
+    def measures_way(self, measure: Measure) -> bool:
+        """Whether a measure is one of distances, too."""
+        return self._errors[measure].way is not None
 
     def still(self, stamp: int) -> bool:
         """Whether the wheels stood shortly before ``stamp``, ns."""

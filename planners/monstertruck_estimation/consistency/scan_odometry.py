@@ -124,9 +124,9 @@ class ScanMotionStep:
         self._kept.append((stamp, whole, self._pose))
         while stamp - self._kept[0][0] > KEPT:
             self._kept.popleft()
-        verdict = None if inputs.claim is None else self._judged(whole, inputs.claim)
+        verdict, rest = (self._judged(whole, claim) for claim in (inputs.claim, inputs.rest))
         x, y, yaw = motion.tolist()
-        return StepOutput(stamp, last[0], (x, y, yaw), deviations, overlap, verdict, name)
+        return StepOutput(stamp, last[0], (x, y, yaw), deviations, overlap, verdict, rest, name)
 
     def _begin(self, front: KissFront | None, scan: Scan, pose: Array) -> None:
         self._reference = Cloud.of(scan), pose
@@ -168,7 +168,9 @@ class ScanMotionStep:
         self._begin(front, scan, compose(self._pose, best.pose))
         return best.pose, best.overlap, deviations_of(best)
 
-    def _judged(self, scan: Scan, claim: Claim) -> ScanVerdict | None:
+    def _judged(self, scan: Scan, claim: Claim | None) -> ScanVerdict | None:
+        if claim is None:
+            return None
         earlier = next((kept for kept in self._kept if kept[0] == claim.since), None)
         if earlier is None:
             return None

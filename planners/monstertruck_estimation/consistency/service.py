@@ -242,7 +242,9 @@ class ConsistencyService:
         anew, self._anew = self._anew, False
         front = self._config.scans or "own"
         monitor = self.monitor
-        return StepInput(inputs, front, anew, None if anew else monitor.claim(scan.stamp), monitor.lag())
+        if anew:
+            return StepInput(inputs, front, anew=True)
+        return StepInput(inputs, front, claim=monitor.claim(scan.stamp), lag=monitor.lag(), rest=monitor.rest_claim())
 
     # What follows
 
@@ -257,8 +259,10 @@ class ConsistencyService:
         if self._doubts and not doubts:
             self._events(Reason.SENSORS_AGREE, Severity.INFO, self.name, ", ".join(sorted(known)))
         self._doubts = doubts
-        measures = tuple(measure.value for measure in self.monitor.in_use(now))
-        visible = (measures, tuple((doubt.sensor, doubt.since) for doubt in doubts), self._front)
+        used, unshown = self.monitor.in_use(now), self.monitor.unshown
+        measures = tuple(measure.value for measure in used)
+        distances = tuple(measure.value for measure in used if self.monitor.measures_way(measure))
+        visible = (measures, tuple((doubt.sensor, doubt.since) for doubt in doubts), self._front, unshown)
         if visible == self._published and now - self._published_at < PERIOD:
             return
         self._published, self._published_at = visible, now
@@ -268,7 +272,9 @@ class ConsistencyService:
                 received=now,
                 seq=self._out.next_seq(),
                 measures=measures,
+                distances=distances,
                 doubts=doubts,
                 scans=self._front,
+                unshown=unshown,
             )
         )

@@ -10,8 +10,16 @@ from monstertruck_schemas.cmd import DriveAction
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order
-from monstertruck_schemas.sensor import DriveMode, Imu, Vector3, WheelEncoders
-from monstertruck_schemas.state import GateMode
+from monstertruck_schemas.sensor import (
+    DriveMode,
+    Imu,
+    StabiliserFeedback,
+    StabiliserJoint,
+    TorqueState,
+    Vector3,
+    WheelEncoders,
+)
+from monstertruck_schemas.state import Consistency, GateMode, UnshownMotion
 from monstertruckd.gate.config import GateConfig, RunawayConfig
 from monstertruckd.gate.runaway import MAX_ORDERS, RunawayKind, ShaftBounds, ShaftWatch
 from tests.unit.gate.rig import DRIVETRAIN, Rig, feedback, header
@@ -400,6 +408,61 @@ def test_free_wheels_that_roll_as_ordered_and_unwind_after_a_stop_are_none():
         turned(rig, angle)
         rig.tick()
     assert not rig.reported(Reason.UNCOMMANDED_MOTION)
+
+
+def shown(rig, since, distance, turn=0.0):
+    """The scans prove that the body has moved since ``since``, ns."""
+    motion = UnshownMotion(since=since, stamp=rig.now, distance=distance, turn=turn)
+    rig.gate.observe(Consistency(**header(rig.now), measures=("wheels", "scans"), unshown=motion), topics.CONSISTENCY)
+
+
+@pytest.mark.parametrize(("distance", "turn"), [(0.2, 0.0), (0.0, 1.0)])
+@pytest.mark.parametrize("current", [0.3, 0.0])
+def test_motion_that_the_scans_alone_show_is_found_if_a_motor_may_make_it(distance, turn, current):
+    rig = Rig().armed()
+    rig.current, rig.driver = current, {"speed": 0.0}
+    rig.tick(30)
+    since = rig.now
+    rig.tick(25)
+    shown(rig, since, distance / 2, turn / 2)
+    rig.tick()
+    events = rig.reported(Reason.UNCOMMANDED_MOTION)
+    assert bool(events) is (current > 0)
+    assert (rig.out.mode is GateMode.ESTOPPED) is (current > 0)
+    if current:
+        assert events[0].text.startswith("lidar stands by its own measure while the body moves")
+
+
+def test_motion_from_before_the_drives_obeyed_does_not_count():
+    rig = Rig().driving()
+    rig.current = 0.3
+    since = rig.now
+    rig.tick(40)
+    rig.driver = {"speed": 0.0}
+    rig.tick(30)
+    shown(rig, since, 0.04 * (rig.now - since) / SECOND)
+    rig.tick()
+    assert not rig.reported(Reason.UNCOMMANDED_MOTION)
+
+
+def test_a_joint_that_strays_keeps_the_robot_from_being_armed_until_an_operator_clears_it():
+    rig = Rig().armed()
+    joint = StabiliserJoint(torque=TorqueState.HOLDING)
+    stray = joint.model_copy(update={"torque": TorqueState.LIMP, "strays": 1})
+    for pitch in (joint, stray, stray):
+        message = StabiliserFeedback(**header(rig.now), pitch_joint=pitch, roll_joint=joint)
+        rig.gate.observe(message, topics.STABILISER)
+        rig.tick()
+    event = rig.reported(Reason.UNCOMMANDED_MOTION)[-1]
+    assert event.text == "stabiliser turned away from its goal by itself; quick stop"
+    assert rig.out.action is DriveAction.QUICK_STOP
+    assert rig.out.mode is GateMode.ESTOPPED
+    assert rig.order(Order.ARM) is Reason.ESTOPPED
+    rig.order(Order.RESET)
+    rig.tick(2)
+    assert Reason.UNCOMMANDED_MOTION not in rig.out.reasons
+    rig.tick(60)
+    assert rig.order(Order.ARM) is Reason.OK
 
 
 def test_it_can_be_configured_not_to_look():

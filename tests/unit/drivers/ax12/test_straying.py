@@ -19,6 +19,7 @@ def test_a_unit_that_drives_itself_away_from_its_goal_loses_its_torque_within_0_
             await rig.settle(0.2)
             assert rig.events.reasons() == [Reason.UNCOMMANDED_MOTION]
             assert rig.out.kept[-1].pitch_joint.torque is TorqueState.LIMP
+            assert (rig.out.kept[-1].pitch_joint.strays, rig.out.kept[-1].roll_joint.strays) == (1, 0)
             assert rig.out.kept[-1].roll_joint.torque is TorqueState.HOLDING
             stands = rig.joint("pitch")
             await rig.settle(1.0)

@@ -5,13 +5,16 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from monstertruck_estimation.consistency.config import ConsistencyConfig
 from monstertruck_estimation.consistency.exchange import StepInput
+from monstertruck_estimation.consistency.monitor import ConsistencyMonitor
 from monstertruck_estimation.consistency.scan_odometry import ScanMotionStep
 from monstertruck_estimation.se2 import between
 from monstertruck_estimation.slam.worker_io import ScanInput
+from monstertruck_estimation.wheel_motion import WheelIncrement
 from monstertruck_runtime.clock import SECOND
-from tests.unit.estimation.consistency.kit import PERIOD, straight
-from tests.unit.estimation.slam.kit import CORRIDOR, HALL, LIDAR, ROOM, ranges
+from tests.unit.estimation.consistency.kit import PERIOD, SENSORS, straight
+from tests.unit.estimation.slam.kit import CORRIDOR, HALL, LIDAR, ROOM, box, ranges
 
 
 def outputs(walls, poses, front):
@@ -44,3 +47,43 @@ def test_it_states_what_nothing_constrains():
     assert hall.deviations[0] < 0.03
     assert corridor.deviations[0] > 5 * hall.deviations[0]
     assert corridor.deviations[1] < 0.02
+
+
+def watched(poses, walls=HALL, crowd=None):
+    """What the scans show while the wheels read rest, in a robot that nobody has armed; the last of ``poses``."""
+    rng, monitor, shown = np.random.default_rng(3), ConsistencyMonitor(ConsistencyConfig(), SENSORS), []
+    odometry = ScanMotionStep()
+    for k, pose in enumerate(poses):
+        stamp = SECOND + k * PERIOD
+        seen = walls if crowd is None else [*walls, *crowd(k)]
+        monitor.observe_wheels(WheelIncrement(stamp - PERIOD, stamp, (0.0, 0.0, 0.0), 0.0, (), ()))
+        scan = ScanInput(
+            stamp=stamp,
+            ranges=ranges(seen, pose, noise=0.01, rng=rng),
+            start_angle=LIDAR.start_angle,
+            angle_increment=LIDAR.angle_increment,
+            range_min=0.02,
+            range_max=30.0,
+        )
+        monitor.observe_scan(odometry.step(StepInput(scan, "own", rest=monitor.rest_claim())))
+        shown.append(monitor.unshown)
+    return shown
+
+
+@pytest.mark.parametrize(("speed", "turn"), [(0.1, 0.0), (0.03, 0.0), (0.0, 0.3)])
+def test_a_body_that_moves_while_its_wheels_read_rest_is_shown(speed, turn):
+    shown = watched(straight(speed=speed, seconds=9.0, start=(-4.5, 2.0, 0.0), turn=turn))
+    assert not any(shown[:20])
+    first, newest = [motion for motion in shown if motion is not None][:2]
+    assert newest.since == first.stamp, "none counts twice"
+    seconds = (newest.stamp - newest.since) / SECOND
+    assert newest.distance == pytest.approx(speed * seconds, abs=0.03)
+    assert newest.turn == pytest.approx(turn * seconds, abs=0.05)
+
+
+def test_a_body_that_stands_is_not_shown_to_move_though_people_walk_by():
+    def crowd(k):
+        return [wall for j in range(4) for wall in box(-2.0 + 0.05 * k + j, 1.0, -1.8 + 0.05 * k + j, 1.3)]
+
+    assert not any(watched(np.array([(0.0, 1.4, 1.0)] * 80), ROOM, crowd))
+    assert not any(watched(np.array([(0.0, 0.0, 0.0)] * 80), CORRIDOR))
