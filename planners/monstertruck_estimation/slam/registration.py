@@ -178,9 +178,13 @@ def _nearest(
     cx = np.int64(math.floor(x / CELL))
     cy = np.int64(math.floor(y / CELL))
     best, found = reach * reach, -1
-    for gx in range(cx - 1, cx + 2):
-        for gy in range(cy - 1, cy + 2):
-            b = _bucket(gx, gy, mask)
+    for ax in (0, -1, 1):  # the cell of the point first: few others are as near as what it holds
+        wx = 0.0 if ax == 0 else abs(x - (cx + max(ax, 0)) * CELL)
+        for ay in (0, -1, 1):
+            wy = 0.0 if ay == 0 else abs(y - (cy + max(ay, 0)) * CELL)
+            if wx * wx + wy * wy >= best:
+                continue
+            b = _bucket(cx + ax, cy + ay, mask)
             for k in range(starts[b], starts[b + 1]):
                 j = order[k]
                 dx, dy = points[j, 0] - x, points[j, 1] - y
