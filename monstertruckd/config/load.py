@@ -9,7 +9,7 @@ import io
 import json
 import os
 from collections.abc import Callable, Collection, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Final, Literal, Self, TypeVar, get_args, get_origin
@@ -77,6 +77,8 @@ class Tree:
     origins: dict[Key, Origin] = field(default_factory=dict)
     files: list[Path] = field(default_factory=list)
     """The file itself, then every file it depends on by relative names; resolved."""
+    maps: list[Path] = field(default_factory=list)
+    """Folders and YAML files of maps among what it depends on by relative names."""
     calibration: Path | None = None
     """Calibration file whose values replace those of the configuration, if there is one."""
     unused: list[str] = field(default_factory=list)
@@ -162,7 +164,7 @@ def calibrated(config: T, tree: Tree, without: Collection[Path] = ()) -> tuple[T
         if path is not None and (not settings or not _is_valid(config, store.load(path).results.values(), path)):
             refused = path
         raise UnusableFileError(refused, f"{' with '.join(sources)}: {first_mistake(error)}") from error
-    return changed, Tree(tree.data, origins, tree.files, calibration=path, unused=left)
+    return changed, replace(tree, origins=origins, calibration=path, unused=left)
 
 
 def _is_valid(config: TruckConfig, results: Collection[Result], path: Path) -> bool:
@@ -677,17 +679,19 @@ def _locate_files(tree: Tree, keys: tuple[tuple[str, ...], ...]) -> None:
             continue
         origin = tree.origins[key]
         file = (origin.file.parent / name).resolve()
+        ours = origin.file.resolve() in tree.files and not Path(name).is_absolute()
         saved = folder_of(file) if key[-1] == "map" else None
         if saved is not None and ((saved / SAVES).is_dir() or (saved / MAP_YAML).is_file()):
             section[key[-1]] = str(saved)
+            tree.maps += [saved] if ours else []
             continue
         if not file.is_file():
             in_folder = "expected a file, found a folder" if saved is None else "no saved map in this folder"
             problem = in_folder if file.is_dir() else "no such file"
             raise ConfigError(f"{origin}: {'.'.join(key)}: {problem}: {file}")
         section[key[-1]] = str(file)
-        if origin.file.resolve() in tree.files and not Path(name).is_absolute():
-            tree.files.append(file)
+        if ours:
+            (tree.maps if key[-1] == "map" else tree.files).append(file)
 
 
 def _give_ports(data: dict[str, Any]) -> None:

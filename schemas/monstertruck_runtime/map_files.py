@@ -127,6 +127,24 @@ def _load(path: Path) -> WorldMap:
     return WorldMap(cells, resolution, origin, others, tuple(remarks))
 
 
+def files_of(place: Path) -> list[Path]:
+    """Return the files that ``load_map`` needs of a map: those of the newest whole save, or YAML and image.
+
+    An image that the YAML names by an absolute path stays where it is, and is left out.
+
+    Raises:
+        InputError: see ``load_map``.
+    """
+    folder = folder_of(place)
+    if folder is None:
+        keys, _ = _read_keys(place)
+        image = _image_of(place, keys["image"])
+        return [place] if Path(keys["image"]).is_absolute() and image.exists() else [place, image]
+    with opened(folder) as save:
+        kept = [save.folder] if save.beside is None else [save.folder, save.beside]
+        return [file for part in kept for file in sorted(part.iterdir()) if file.is_file()]
+
+
 def turned(
     cells: NDArray[np.int8], resolution: float, origin: tuple[float, float, float]
 ) -> tuple[NDArray[np.int8], tuple[float, float]]:

@@ -166,7 +166,7 @@ def _change(root: Path, file: PlannedFile) -> Change:
         raise InputError(f"{place}: expected a file; move away what is there")
     if file.target is not None:
         return Change.SAME if place.is_symlink() and place.readlink() == file.target else Change.CHANGED
-    return Change.SAME if not place.is_symlink() and place.read_text(errors="replace") == file.text else Change.CHANGED
+    return Change.SAME if not place.is_symlink() and place.read_bytes() == file.content else Change.CHANGED
 
 
 def _refuse_masked(root: Path, report: InstallReport) -> None:
@@ -188,7 +188,7 @@ def _write(root: Path, file: PlannedFile, report: InstallReport) -> None:
     # The file behind a link stays where it is anyway.
     if file.keep_previous and report.changes[file.path] is Change.CHANGED and not place.is_symlink():
         report.previous.append(file.path.with_name(_keep(place).name))
-    replace_file(place, file.text, follow_links=False)
+    replace_file(place, file.content, follow_links=False)
 
 
 def _keep(place: Path) -> Path:

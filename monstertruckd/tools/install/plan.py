@@ -1,5 +1,6 @@
 """The contents of an installation: files, and programs to notify about them."""
 
+import itertools
 import os
 import re
 from collections.abc import Sequence
@@ -9,6 +10,8 @@ from typing import Final
 
 from monstertruck_drivers.usb.config import CycleMethod, UsbPortConfig
 from monstertruck_runtime.errors import ConfigError, InputError, NotFoundError
+from monstertruck_runtime.map_files import files_of
+from monstertruck_runtime.map_folders import MANIFEST, SAVES
 from monstertruck_runtime.small_files import text_of
 from monstertruckd.config.load import load_truck
 from monstertruckd.config.truck import TruckConfig
@@ -50,9 +53,16 @@ class PlannedFile:
 
     path: Path
     text: str = ""
+    data: bytes | None = None
+    """Content that is no text."""
     target: Path | None = None
     keep_previous: bool = False
     """An operator may have edited it: the old one is kept next to the new one."""
+
+    @property
+    def content(self) -> bytes:
+        """What the file holds."""
+        return self.text.encode() if self.data is None else self.data
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +99,7 @@ def plan(config_file: Path | None, user: str | None, program: Program, root: Pat
     config, tree = load_truck(source)
     if "sim" in tree.data:
         raise ConfigError(f"{source}: sim: is a simulated robot; a service drives a real one")
-    installed, copies = _placed(tree.files, below(root, FOLDER))
+    installed, copies = _placed(tree.files, tree.maps, below(root, FOLDER))
     return InstallPlan(
         (
             *copies,
@@ -126,22 +136,45 @@ def below(root: Path, path: Path) -> Path:
     return root / path.relative_to("/")
 
 
-def _placed(files: Sequence[Path], folder: Path) -> tuple[Path, tuple[PlannedFile, ...]]:
+def _placed(files: Sequence[Path], maps: Sequence[Path], folder: Path) -> tuple[Path, tuple[PlannedFile, ...]]:
     """Where the configuration will be, and what must be copied for that; all files keep their place to each other.
 
     Args:
         files: of the configuration, its own first; what it names absolutely stays where it is.
+        maps: that it names.
         folder: of installed configurations.
+
+    Raises:
+        InputError: a map cannot be read.
     """
     source = files[0]
     if source.is_relative_to(folder.resolve()):
         return FOLDER / source.relative_to(folder.resolve()), ()
-    common = Path(os.path.commonpath([file.parent for file in files]))
+    of_maps = {place: files_of(place) for place in maps}
+    common = Path(os.path.commonpath([file.parent for file in (*files, *maps, *itertools.chain(*of_maps.values()))]))
     copies = [
         PlannedFile(FOLDER / file.relative_to(common), file.read_text(encoding="utf-8"), keep_previous=True)
         for file in dict.fromkeys(files)
     ]
+    for place, parts in of_maps.items():
+        saved = parts[0].parent
+        numbered = saved.parent.name == SAVES and saved.is_relative_to(place)
+        there = _save_name(saved, folder / place.relative_to(common) / SAVES) if numbered else ""
+        for file in parts:
+            name = place / SAVES / there / file.name if numbered else file
+            copies.append(PlannedFile(FOLDER / name.relative_to(common), data=file.read_bytes()))
     return copies[0].path, tuple(copies)
+
+
+def _save_name(saved: Path, saves: Path) -> str:
+    """Number under which a save is installed: above those that are installed, as the newest of them is read."""
+    others = sorted((path for path in saves.glob("[0-9]*") if path.is_dir()), key=lambda path: int(path.name))
+    if not others:
+        return saved.name
+    newest = others[-1] / MANIFEST
+    if newest.is_file() and newest.read_bytes() == (saved / MANIFEST).read_bytes():
+        return others[-1].name
+    return f"{max(int(others[-1].name) + 1, int(saved.name)):06d}"
 
 
 def _notes(config: TruckConfig) -> list[str]:

@@ -4,7 +4,9 @@ While the route is free it is driven as it was planned: the local planner is use
 it until the truck is back on it.
 """
 
+import logging
 import math
+from pathlib import Path
 from typing import Annotated, Final
 
 import numpy as np
@@ -36,6 +38,8 @@ from monstertruck_runtime.map_files import load_map
 from monstertruck_schemas.base import Schema
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import NO_ECHO, VALID_BEAM, LaserScan
+
+log = logging.getLogger(__name__)
 
 _NEWEST_DECIDES = (2, -2, 1)
 """Steps of a hit and of a pass, and the limit: one scan changes any cell to either."""
@@ -190,7 +194,7 @@ class DeformStep:
         """Take in a scan, and say what becomes of the route.
 
         Raises:
-            InputError: no setup came first, no deformer is configured, or the map is not readable.
+            InputError: no setup came first, or no deformer is configured.
         """
         if task.setup is not None:
             self._set_up(task.setup)
@@ -226,8 +230,7 @@ class DeformStep:
         self._planner = make_local_planner(self._vehicle, config.local_planner)
         self._window = Window()
         if config.map is not None:
-            world = load_map(config.map)
-            self._walls = DistanceField(world.cells >= OCCUPIED, world.resolution, (*world.origin, 0.0))
+            self._walls = _walls_of(config.map)
 
     def _begin(self, route: LocalRoute) -> None:
         self._route, self._place = route, 0
@@ -296,6 +299,16 @@ class DeformStep:
             return DeformAnswer(number, "kept", result.reason, result.text, self._place, result.complete)
         answer = answer_of(path, cost=path.length)
         return DeformAnswer(number, "new", result.reason, result.text, self._place, result.complete, answer)
+
+
+def _walls_of(place: Path) -> DistanceField | None:
+    """Distances to the obstacles of a map; None if it cannot be read: then no obstacle counts as a known wall."""
+    try:
+        world = load_map(place)
+    except InputError as error:
+        log.warning("%s; routes are deformed by what the lidar sees alone", error)
+        return None
+    return DistanceField(world.cells >= OCCUPIED, world.resolution, (*world.origin, 0.0))
 
 
 def blind_beams(scan: LaserScan) -> NDArray[np.intp]:

@@ -182,6 +182,18 @@ def test_the_place_on_the_route_does_not_go_beyond_a_cusp_that_is_not_reached():
     assert places == [0, 8, 16, 20, 26, 34]
 
 
+def test_with_a_map_that_cannot_be_read_only_what_is_seen_counts(tmp_path, caplog):
+    file = tmp_path / "map.yaml"
+    file.write_text("image: [\n")
+    step, task = begun()
+    assert task.setup is not None
+    setup = replace(task.setup, config=PlannerConfig(local_planner=RsbandConfig(), map=file))
+    answer = step.step(replace(task, setup=setup, grid=None))
+    assert (answer.finding, answer.number) == ("free", 1)
+    (said,) = caplog.messages
+    assert str(file) in said
+
+
 def test_a_setup_with_a_deformer_comes_first():
     step, first = begun()
     with pytest.raises(InputError, match="setup"):

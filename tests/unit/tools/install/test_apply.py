@@ -6,9 +6,13 @@ import subprocess
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from monstertruck_runtime.errors import CommandFailedError, ConfigError, NotFoundError, NotPermittedError
+from monstertruck_runtime.map_files import WorldMap, load_map, map_content, save_map
+from monstertruck_runtime.map_folders import write_save
+from monstertruckd.config.load import load_truck
 from monstertruckd.tools.install import apply
 from monstertruckd.tools.install.apply import Change, InstallReport, install, run_command, uninstall
 from monstertruckd.tools.install.plan import AFTER_INSTALL, AFTER_REMOVAL, BEFORE_REMOVAL
@@ -205,6 +209,52 @@ def test_files_of_a_configuration_keep_their_places(tmp_path: Path):
     copied = [planned.path for planned in truck_plan(tmp_path / "root", main).files if planned.keep_previous]
     places = [str(path.relative_to("/etc/monstertruckd")) for path in copied]
     assert places == ["robots/mine.yaml", "parts/a.yaml", "lap.csv"]
+
+
+def mapped(folder: Path, name: str) -> Path:
+    """A configuration beside a folder of maps, with the map that it names."""
+    main = folder / "mine.yaml"
+    main.write_text(f"include: [{TRUCK}]\nplanner: {{map: {name}}}\nversion: 2\n")
+    return main
+
+
+def world(cells: int) -> WorldMap:
+    grid = np.zeros((20, 30), np.int8)
+    grid[:, :cells] = 100
+    return WorldMap(grid, 0.05, (-1.0, -2.0))
+
+
+def saved_map(place: Path, cells: int) -> None:
+    text, picture = map_content(world(cells), "map.png")
+    write_save(place, {"map.yaml": text.encode(), "map.png": picture}, run="one")
+
+
+@pytest.mark.parametrize("name", ["maps/lab", "maps/lab/map.yaml", "maps/plain.yaml"])
+def test_a_map_is_copied_whole(tmp_path: Path, name: str):
+    (tmp_path / "maps").mkdir()
+    saved_map(tmp_path / "maps" / "lab", 3)
+    save_map(world(3), tmp_path / "maps" / "plain.yaml")
+    root = tmp_path / "root"
+    main = mapped(tmp_path, name)
+    install(truck_plan(root, main), root)
+    found = load_map(root / "etc" / "monstertruckd" / name)
+    assert (found.cells == load_map(tmp_path / name).cells).all()
+    config, _ = load_truck(root / "etc" / "monstertruckd" / "mine.yaml")
+    assert config.planner is not None
+    assert (load_map(config.planner.map).cells == found.cells).all()
+    assert not install(truck_plan(root, main), root).changed, "nothing is to be done twice"
+
+
+def test_another_map_of_the_folder_replaces_the_installed_one(tmp_path: Path):
+    (tmp_path / "maps").mkdir()
+    root, lab = tmp_path / "root", tmp_path / "maps" / "lab"
+    for cells in (3, 4, 5):
+        saved_map(lab, cells)
+        install(truck_plan(root, mapped(tmp_path, "maps/lab")), root)
+    shutil.rmtree(lab)
+    saved_map(lab, 6)
+    install(truck_plan(root, mapped(tmp_path, "maps/lab")), root)
+    assert np.count_nonzero(load_map(root / "etc" / "monstertruckd" / "maps" / "lab").cells) == 6 * 20
 
 
 @pytest.mark.skipif(shutil.which("systemd-sysusers") is None or os.geteuid() != 0, reason="needs systemd and root")
