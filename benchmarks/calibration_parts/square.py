@@ -20,9 +20,10 @@ from monstertruck_runtime.errors import TruckError
 from monstertruck_schemas import topics
 from monstertruckd.config.calibration import CalibrationStore, Result, with_values
 from monstertruckd.config.load import load_config
+from monstertruckd.config.wizards import WizardRun
 from monstertruckd.tools.calibrate.motion import Mover
-from monstertruckd.tools.calibrate.sequence import SequenceStep, missing
 from monstertruckd.tools.calibrate.steps import MoveRecord, MoveStep
+from monstertruckd.tools.calibrate.wizard import missing
 from monstertruckd.tools.cli.calibrate import wizard_of
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
@@ -53,7 +54,7 @@ def results_of(config: SimulatedTruckConfig) -> list[Result]:
     return [] if current is None else list(current.results.values())
 
 
-def left(config: SimulatedTruckConfig) -> list[SequenceStep]:
+def left(config: SimulatedTruckConfig) -> list[WizardRun]:
     """Wizards that it still needs."""
     return missing(config, {result.wizard: result for result in results_of(config)})
 
@@ -61,9 +62,12 @@ def left(config: SimulatedTruckConfig) -> list[SequenceStep]:
 def step(config: SimulatedTruckConfig, seed: int) -> None:
     """Run the next wizard."""
     (first, *_) = left(config)
-    rng = np.random.default_rng([seed, 32, len(results_of(config)), first.rough])
+    rng = np.random.default_rng([seed, 32, len(results_of(config)), first.step.rough])
     session = run_session(config, wizard_of(first), rng)
-    print(f"truck {seed}: {first.name}{' (rough)' if first.rough else ''}: {session.seconds / 60:.1f} min", flush=True)
+    print(
+        f"truck {seed}: {first.name}{' (rough)' if first.step.rough else ''}: {session.seconds / 60:.1f} min",
+        flush=True,
+    )
 
 
 def signs(results: Sequence[Result]) -> list[Result]:

@@ -22,9 +22,9 @@ from monstertruck_runtime.errors import ConfigError, NotFoundError, UnusableFile
 from monstertruck_runtime.outside import cause_of
 from monstertruck_runtime.small_files import make_folder, replace_file, require_file
 from monstertruck_schemas.base import Schema, first_mistake
-from monstertruck_schemas.body import LensConfig, Mount, TurnDeficitConfig
 from monstertruckd.config.renamed import fits, present_key
 from monstertruckd.config.truck import TruckConfig
+from monstertruckd.config.wizards import WIZARDS
 
 C = TypeVar("C", bound=TruckConfig)
 
@@ -36,62 +36,20 @@ MOST_BYTES: Final = 1_000_000
 
 Value = bool | int | float
 Grade = Literal["A", "B", "C"]
-WizardName = Literal[
-    "battery", "compass", "drive", "steering", "odometry", "lidar", "imu", "slip", "sonar", "stabiliser", "camera"
-]
 
-STEERING: Final = "devices.steering.driver"
-COMPASS: Final = "devices.compass.driver.iron"
-LIDAR: Final = "devices.lidar.mount"
-IMU: Final = "devices.imu.driver.correction"
-STABILISER: Final = "devices.stabiliser.driver"
-SONAR: Final = "devices.sonar.driver"
-CAMERA_LENS: Final = "devices.camera.driver.lens"
-CAMERA_MOUNT: Final = "devices.camera.mount"
 
-KEYS: Final[dict[WizardName, tuple[str, ...]]] = {
-    "battery": (
-        f"{STEERING}.battery.gain",
-        f"{STEERING}.battery.offset",
-        "monitors.battery.divider",
-        "monitors.battery.offset",
-    ),
-    "compass": tuple(f"{COMPASS}.{name}" for name in ("hard_x", "hard_y", "soft_xx", "soft_xy", "soft_yy")),
-    "drive": ("geometry.drive_ratio", "devices.drive.driver.inverted"),
-    "steering": (
-        *(
-            f"{STEERING}.{axle}.{name}"
-            for axle in ("front", "rear")
-            for name in ("centre_us", "scale_us_per_deg", "direction", "min_us", "max_us")
-        ),
-        f"{STEERING}.dead_time",
-        f"{STEERING}.lag",
-        *(f"body.turn_deficit.{name}" for name in TurnDeficitConfig.model_fields),
-    ),
-    "odometry": (
-        "geometry.drive_ratio",
-        "geometry.wheelbase",
-        f"{STEERING}.front.centre_us",
-        f"{STEERING}.rear.centre_us",
-    ),
-    "lidar": tuple(f"{LIDAR}.{name}" for name in ("x", "y", "yaw", "roll", "pitch")),
-    "imu": tuple(f"{IMU}.{name}" for name in ("rate_x", "rate_y", "rate_z", "rate_scale", "force_x", "force_y")),
-    "slip": tuple(f"body.{name}" for name in ("icr_left", "icr_right", "icr_x", "gain_left", "gain_right")),
-    "sonar": (
-        f"{SONAR}.field_of_view",
-        f"{SONAR}.speed_of_sound",
-        *(f"{SONAR}.sonars.*.mount.{name}" for name in ("x", "y", "yaw")),
-    ),
-    "stabiliser": tuple(
-        f"{STABILISER}.{joint}.{name}" for joint in ("pitch", "roll") for name in ("zero", "direction")
-    ),
-    "camera": (
-        *(f"{CAMERA_LENS}.{name}" for name in LensConfig.model_fields),
-        *(f"{CAMERA_MOUNT}.{name}" for name in Mount.model_fields),
-    ),
-}
-"""Values of the configuration that each wizard may set, ``*`` for any one name; a calibration never touches any other.
-Where two wizards measure the same value, the newer measurement counts."""
+def _known(name: str) -> str:
+    """Name of a wizard.
+
+    Raises:
+        ValueError: there is none of it.
+    """
+    if name not in WIZARDS:
+        raise ValueError(f"expected one of {', '.join(WIZARDS)}")
+    return name
+
+
+WizardName = Annotated[str, AfterValidator(_known)]
 
 
 def _date(text: str) -> str:
@@ -400,9 +358,9 @@ def _section(data: dict[str, Any], key: str) -> dict[str, Any] | None:
 
 
 def may_set(wizard: WizardName, key: str) -> bool:
-    """Whether a wizard may set a value of the configuration, by ``KEYS``."""
+    """Whether a wizard may set a value of the configuration, by ``WizardKind.keys``."""
     names = key.split(".")
-    return any(fits(names, pattern) for pattern in KEYS[wizard])
+    return any(fits(names, pattern) for pattern in WIZARDS[wizard].keys)
 
 
 def value_at(config: Mapping[str, Any], key: str) -> Value | None:

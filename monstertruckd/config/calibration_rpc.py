@@ -3,7 +3,7 @@
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Final, get_args
+from typing import Any, Final
 
 from pydantic import ValidationError
 
@@ -17,8 +17,9 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.state import GateMode
 from monstertruckd.bus.rpc import Rpc
-from monstertruckd.config.calibration import CalibrationStore, Result, WizardName, unused, with_values
+from monstertruckd.config.calibration import CalibrationStore, Result, unused, with_values
 from monstertruckd.config.truck import TruckConfig
+from monstertruckd.config.wizards import WIZARDS
 
 SHOW: Final = "calibration"
 SAVE: Final = "calibration_save"
@@ -86,10 +87,9 @@ def register(
         return answer | {"result": saved.model_dump(mode="json")}
 
     async def undo(payload: dict[str, Any]) -> dict[str, Any]:
-        wizard: WizardName | None = next((n for n in get_args(WizardName) if n == payload.get("wizard")), None)
-        if wizard is None:
-            known = ", ".join(get_args(WizardName))
-            raise InputError(f"wizard: expected one of {known}, got {payload.get('wizard')!r}")
+        wizard = payload.get("wizard")
+        if not isinstance(wizard, str) or wizard not in WIZARDS:
+            raise InputError(f"wizard: expected one of {', '.join(WIZARDS)}, got {wizard!r}")
         at_rest()
         path = await offload(lambda: store.undo(wizard, real_time()))
         return announced(path, f"calibration of {wizard} undone", payload.get("source"))

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Final, NamedTuple
+from typing import Final
 
 import numpy as np
 
@@ -25,24 +25,18 @@ from monstertruck_runtime.threads import Offload
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.health import CalibrationHealth, CalibrationState
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.roles import DeviceRole, ServiceName
+from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.topics import (
-    BATTERY,
     CALIBRATION,
-    COMPASS,
     DRIVE,
-    ODOMETRY,
-    POINTS,
-    POSE,
-    SONAR,
     USB,
-    Topic,
     Writer,
 )
 from monstertruck_schemas.usb import UsbTree
 from monstertruckd.bus.local import Bus
 from monstertruckd.config.calibration import Estimate, Grade, Result, ValidUntil, WizardName, utc
 from monstertruckd.config.truck import TruckConfig
+from monstertruckd.config.wizards import WIZARDS
 
 DAY: Final = 86_400 * SECOND
 """ns."""
@@ -57,97 +51,10 @@ WORTH_WRITING: Final = 1.0
 _UNKNOWN: Final[Mapping[str, str]] = MappingProxyType({})
 
 
-class Lifetime(NamedTuple):
-    """How long what a wizard measured counts."""
-
-    days: int
-    metres: float | None
-    """Distance driven, m; None: not limited."""
-    role: DeviceRole
-    """Device that was measured."""
-    topics: tuple[Topic[Any], ...]
-    """What rests on it."""
-
-
-_MOTION = (ODOMETRY, POSE)
-LIFETIMES: Final[dict[WizardName, Lifetime]] = {
-    "battery": Lifetime(365, None, DeviceRole.STEERING, (BATTERY,)),
-    "compass": Lifetime(90, None, DeviceRole.COMPASS, (COMPASS, *_MOTION)),
-    "drive": Lifetime(180, 20_000.0, DeviceRole.DRIVE, _MOTION),
-    "steering": Lifetime(90, 10_000.0, DeviceRole.STEERING, _MOTION),
-    "odometry": Lifetime(180, 20_000.0, DeviceRole.DRIVE, _MOTION),
-    "lidar": Lifetime(180, 20_000.0, DeviceRole.LIDAR, (POSE,)),
-    "imu": Lifetime(90, None, DeviceRole.IMU, _MOTION),
-    "slip": Lifetime(90, 5_000.0, DeviceRole.WHEELS, _MOTION),
-    "stabiliser": Lifetime(180, 20_000.0, DeviceRole.STABILISER, (POSE,)),
-    "sonar": Lifetime(180, 20_000.0, DeviceRole.SONAR, (SONAR,)),
-    "camera": Lifetime(365, 20_000.0, DeviceRole.CAMERA, (POINTS,)),
-}
-"""By experience of such parts, none of it measured: tyres wear, linkages and mounts are knocked, iron changes."""
-
-
-class Goal(NamedTuple):
-    """Half-width that is meant."""
-
-    half: float
-    share: bool = False
-    """Of the value."""
-
-
-GOALS: Final[dict[str, Goal]] = {
-    "battery.gain": Goal(0.02, share=True),
-    "battery.offset": Goal(0.1),
-    "compass.hard_x": Goal(0.87),
-    "compass.hard_y": Goal(0.87),
-    "compass.soft_xx": Goal(0.035),
-    "compass.soft_yy": Goal(0.035),
-    "drive.drive_ratio": Goal(0.01, share=True),
-    "steering.front_centre": Goal(8.5),
-    "steering.rear_centre": Goal(8.5),
-    "steering.front_scale": Goal(0.025, share=True),
-    "steering.rear_scale": Goal(0.025, share=True),
-    "steering.delay": Goal(0.015),
-    "odometry.drive_ratio": Goal(0.01, share=True),
-    "odometry.wheelbase": Goal(0.01, share=True),
-    "odometry.offset": Goal(0.5),
-    "lidar.x": Goal(0.010),
-    "lidar.y": Goal(0.010),
-    "lidar.yaw": Goal(0.0087),
-    "lidar.roll": Goal(0.0087),
-    "lidar.pitch": Goal(0.0087),
-    "imu.rate_z": Goal(0.002),
-    "imu.rate_scale": Goal(0.01, share=True),
-    "slip.icr_left": Goal(0.03, share=True),
-    "slip.icr_right": Goal(0.03, share=True),
-    "slip.gain_left": Goal(0.01, share=True),
-    "slip.gain_right": Goal(0.01, share=True),
-    "stabiliser.pitch_zero": Goal(3.4),
-    "stabiliser.roll_zero": Goal(3.4),
-    "sonar.cone": Goal(0.035),
-    "sonar.speed_of_sound": Goal(0.01, share=True),
-    "sonar.*_x": Goal(0.015),
-    "sonar.*_y": Goal(0.015),
-    "sonar.*_yaw": Goal(0.052),
-    "camera.focal_x": Goal(0.01, share=True),
-    "camera.focal_y": Goal(0.01, share=True),
-    "camera.centre_x": Goal(4.6),
-    "camera.centre_y": Goal(4.6),
-    "camera.x": Goal(0.015),
-    "camera.y": Goal(0.015),
-    "camera.z": Goal(0.015),
-    "camera.yaw": Goal(0.0087),
-    "camera.pitch": Goal(0.0087),
-    "camera.roll": Goal(0.0087),
-}
-"""Of the intervals, in the estimates' units: 1 % of ways, 0.5 degrees of steering (8.5 us), 2 degrees by iron
-in a horizontal field of 25 uT, 10 mm and 0.5 degrees of the lidar, 15 mm and 3 degrees of any sonar, 1
-degree (3.4 steps) of the stabiliser, 15 mm and 0.5 degrees (4.6 of 522 pixels) of the camera, 0.1 V."""
-
-
 def grade(wizard: WizardName, estimate: Estimate) -> Grade | None:
     """A: the interval is as narrow as meant; B: at most twice as wide; C: wider. None: it has no goal."""
-    of_each = f"{wizard}.*_{estimate.name.rpartition('_')[2]}"
-    goal = GOALS.get(f"{wizard}.{estimate.name}", GOALS.get(of_each))
+    goals = WIZARDS[wizard].goals
+    goal = goals.get(estimate.name, goals.get(f"*_{estimate.name.rpartition('_')[2]}"))
     if goal is None or estimate.low is None or estimate.high is None:
         return None
     half = (estimate.high - estimate.low) / 2
@@ -175,7 +82,7 @@ def stamped(
     result: Result, config: TruckConfig, real_ns: int, odometer: float, serials: Mapping[str, str] = _UNKNOWN
 ) -> Result:
     """A result with grades and validity of its estimates, as it is saved now; ``serials`` as far as they are known."""
-    life = LIFETIMES[result.wizard]
+    life = WIZARDS[result.wizard].lifetime
     until = ValidUntil(
         date=utc(real_ns + life.days * DAY),
         odometer=None if life.metres is None else odometer + life.metres,
@@ -199,7 +106,7 @@ def state_of(
 ) -> CalibrationState:
     """Grade and validity of a result now; ``serials`` as far as they are known."""
     ends = [e.valid_until for e in result.estimates if e.valid_until is not None]
-    life = LIFETIMES[result.wizard]
+    life = WIZARDS[result.wizard].lifetime
     until = min((end.date for end in ends), default=_later(result.date, life.days))
     ways = [end.odometer for end in ends if end.odometer is not None]
     left = min(ways) - odometer if ways else None
@@ -382,5 +289,4 @@ class CalibrationWatch:
 
 def degraded_topics(expired: Iterable[str]) -> frozenset[str]:
     """Topics that rest on expired wizards' results."""
-    lives = (life for wizard, life in LIFETIMES.items() if wizard in set(expired))
-    return frozenset(topic.name for life in lives for topic in life.topics)
+    return frozenset(topic for name in expired for topic in WIZARDS[name].lifetime.topics)

@@ -6,7 +6,7 @@ between full and empty, so a second reading usually comes days later: readings a
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar, Final
+from typing import ClassVar, Final, Self
 
 import numpy as np
 
@@ -15,7 +15,8 @@ from monstertruck_runtime.errors import InputError, RequestRefusedError
 from monstertruck_schemas import topics
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import Battery
-from monstertruckd.config.calibration import STEERING, Result, WizardName
+from monstertruckd.config.calibration import Result, WizardName
+from monstertruckd.config.wizards import STEERING
 from monstertruckd.tools.calibrate.statistics import NORMAL, Interval, estimated
 from monstertruckd.tools.calibrate.steps import Collect, Confirm, Number
 from monstertruckd.tools.calibrate.wizard import WizardContext
@@ -56,6 +57,11 @@ class BatteryWizard:
     samples: int = 50
     fresh: bool = False
     """Forget the readings of earlier runs"""
+
+    @classmethod
+    def of(cls, meter_error: float, meter_digits: float, fresh: bool) -> Self:
+        """With the command's options: the meter's proportional and constant error."""
+        return cls(meter_error, meter_digits, fresh=fresh)
 
     async def __call__(self, context: WizardContext) -> Result:
         """Measure."""

@@ -7,7 +7,7 @@ Nothing drives; the board is held still for a moment, again and again another wa
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Final
+from typing import Any, ClassVar, Final, Self
 
 import cv2
 import numpy as np
@@ -22,7 +22,8 @@ from monstertruck_schemas.board import BoardConfig
 from monstertruck_schemas.body import LensConfig
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import CompressedImage
-from monstertruckd.config.calibration import CAMERA_LENS, CAMERA_MOUNT, Estimate, Result, WizardName
+from monstertruckd.config.calibration import Estimate, Result, WizardName
+from monstertruckd.config.wizards import CAMERA_LENS, CAMERA_MOUNT
 from monstertruckd.tools.calibrate.board_mount import NAMES, LidarPlace, fit_mount, line_on_board
 from monstertruckd.tools.calibrate.board_views import BoardGuide, BoardView
 from monstertruckd.tools.calibrate.lidar import joint_angles
@@ -58,6 +59,18 @@ class CameraWizard:
     """Fit the mount, too, where the robot has a lidar"""
     patience: float = 60.0
     """Seconds without anything new that end it"""
+
+    @classmethod
+    def of(cls, columns: int, rows: int, square: float, marker: float, lens_only: bool, patience: float) -> Self:
+        """With the command's options; lengths in m.
+
+        Raises:
+            InputError: a marker does not lie in its square.
+        """
+        if marker >= square:
+            text = f"expected less than --square {1000 * square:g}, in which it lies"
+            raise InputError(f"--marker {1000 * marker:g}: {text}")
+        return cls(BoardConfig(columns=columns, rows=rows, square=square, marker=marker), not lens_only, patience)
 
     async def __call__(self, context: WizardContext) -> Result:
         """Measure."""

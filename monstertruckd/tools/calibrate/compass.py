@@ -18,7 +18,8 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.fitting import FitResult, least_squares
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas import topics
-from monstertruckd.config.calibration import COMPASS, Estimate, Result, WizardName
+from monstertruckd.config.calibration import Estimate, Result, WizardName
+from monstertruckd.config.wizards import COMPASS
 from monstertruckd.tools.calibrate.statistics import NORMAL, Interval, correlation_factor, estimated, mean_angle
 from monstertruckd.tools.calibrate.steps import MoveRecord, MoveStep
 from monstertruckd.tools.calibrate.wizard import CLEAR, WizardContext

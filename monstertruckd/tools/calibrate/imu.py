@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Final
+from typing import ClassVar, Final, Self
 
 import numpy as np
 
@@ -13,7 +13,8 @@ from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas import topics
 from monstertruck_schemas.sensor import Attitude, Imu
-from monstertruckd.config.calibration import IMU, Result, WizardName
+from monstertruckd.config.calibration import Result, WizardName
+from monstertruckd.config.wizards import IMU
 from monstertruckd.tools.calibrate.statistics import NORMAL, Interval, correlation_factor, estimated, known_errors
 from monstertruckd.tools.calibrate.steering_model import HEADING
 from monstertruckd.tools.calibrate.steps import Collect, MoveRecord, MoveStep
@@ -84,6 +85,11 @@ class ImuWizard:
     """Circles to each side"""
     turns: bool = True
     """Drive circles for the scale; otherwise biases only, and nothing moves"""
+
+    @classmethod
+    def of(cls, rounds: int, still: bool) -> Self:
+        """With the command's options."""
+        return cls(rounds, turns=not still)
 
     async def __call__(self, context: WizardContext) -> Result:
         """Measure."""

@@ -29,7 +29,8 @@ from monstertruck_runtime.errors import InputError, RequestRefusedError
 from monstertruck_schemas import topics
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import VALID_BEAM, LaserScan
-from monstertruckd.config.calibration import LIDAR, Estimate, Result, WizardName
+from monstertruckd.config.calibration import Estimate, Result, WizardName
+from monstertruckd.config.wizards import LIDAR
 from monstertruckd.tools.calibrate.statistics import NORMAL, Interval, correlation_factor, estimated, known_errors
 from monstertruckd.tools.calibrate.steering_model import AXLES, EYE
 from monstertruckd.tools.calibrate.steps import Collect, MoveRecord, MoveStep, Number

@@ -19,7 +19,8 @@ from monstertruck_kinematics.elementary import Array, sinc
 from monstertruck_kinematics.fitting import FitResult, least_squares
 from monstertruck_runtime.errors import InputError, RequestRefusedError
 from monstertruck_schemas.reasons import Reason
-from monstertruckd.config.calibration import STEERING, Estimate, Result, WizardName
+from monstertruckd.config.calibration import Estimate, Result, WizardName
+from monstertruckd.config.wizards import STEERING
 from monstertruckd.tools.calibrate.statistics import Interval, estimated, known_errors
 from monstertruckd.tools.calibrate.steering_model import AXLES, EYE, SLIP, Maps, SteeringModel, SteeringRun
 from monstertruckd.tools.calibrate.steps import Confirm, MoveRecord, MoveStep, Number

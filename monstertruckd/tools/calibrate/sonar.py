@@ -23,7 +23,8 @@ from monstertruck_kinematics.fitting import FitResult, least_squares
 from monstertruck_runtime.errors import InputError, RequestRefusedError
 from monstertruck_schemas import topics
 from monstertruck_schemas.reasons import Reason
-from monstertruckd.config.calibration import SONAR, Result, WizardName
+from monstertruckd.config.calibration import Result, WizardName
+from monstertruckd.config.wizards import SONAR, TURN_IN_A_METRE
 from monstertruckd.tools.calibrate.statistics import Interval, estimated, known_errors, mean_angle
 from monstertruckd.tools.calibrate.steps import Confirm, MoveRecord, MoveStep, Number
 from monstertruckd.tools.calibrate.wizard import CLEAR, WizardContext
@@ -60,8 +61,6 @@ BODY: Final = 0.3
 """Greatest difference of a range from the wall's distance of the robot's middle, m."""
 ASTRAY: Final = 0.4
 """Angle between the middle of the echoes and that of those that are due, rad, that no mount is off by."""
-BODIES: Final = ("differential", "skid_steer", "truck")
-"""Bodies that turn within a metre."""
 COMMON: Final = 5
 """Parameters before those of the arcs: distance and direction of the wall, half the cone, factors of the ranges and of
 the distance by odometry."""
@@ -142,7 +141,7 @@ class SonarWizard:
         device = config.devices.sonar
         if device is None or not isinstance(device.driver, Srf08Config):
             raise RequestRefusedError(Reason.NOT_SUPPORTED, "this robot has no array of sonars whose places it states")
-        if config.body.kind not in BODIES:
+        if config.body.kind not in TURN_IN_A_METRE:
             raise RequestRefusedError(Reason.NOT_SUPPORTED, f"body {config.body.kind}: its arcs are too wide")
         settings = device.driver
         await context.confirm(_PARK)

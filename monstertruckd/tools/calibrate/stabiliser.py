@@ -23,7 +23,8 @@ from monstertruck_runtime.errors import InputError, RequestRefusedError
 from monstertruck_schemas import topics
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import VALID_BEAM, Attitude, LaserScan, StabiliserFeedback
-from monstertruckd.config.calibration import STABILISER, Estimate, Result, WizardName
+from monstertruckd.config.calibration import Estimate, Result, WizardName
+from monstertruckd.config.wizards import STABILISER
 from monstertruckd.tools.calibrate.lidar import FLAT, HEIGHTS, beam_distance, beam_tilt
 from monstertruckd.tools.calibrate.statistics import NORMAL, Interval
 from monstertruckd.tools.calibrate.steps import Collect, Confirm

@@ -16,7 +16,8 @@ from monstertruck_kinematics.chassis import TruckChassis
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.errors import InputError, RequestRefusedError
 from monstertruck_schemas.reasons import Reason
-from monstertruckd.config.calibration import STEERING, Estimate, Result, WizardName
+from monstertruckd.config.calibration import Estimate, Result, WizardName
+from monstertruckd.config.wizards import STEERING
 from monstertruckd.tools.calibrate.statistics import NORMAL, Interval, estimated
 from monstertruckd.tools.calibrate.steering_model import AXLES, SLIP, Maps, SteeringModel, SteeringRun, half_widths
 from monstertruckd.tools.calibrate.steps import Confirm, MoveStep, Number

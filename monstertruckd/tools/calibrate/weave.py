@@ -22,7 +22,8 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.sensor import Attitude
-from monstertruckd.config.calibration import STEERING, Estimate
+from monstertruckd.config.calibration import Estimate
+from monstertruckd.config.wizards import STEERING
 from monstertruckd.tools.calibrate.response import ResponseFit, Steps, unexplained
 from monstertruckd.tools.calibrate.steps import MoveRecord, MoveStep
 

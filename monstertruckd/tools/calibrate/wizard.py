@@ -7,7 +7,7 @@ the calibration unchanged; the gate stops the truck as it does for any operator 
 """
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from contextlib import ExitStack
 from types import MappingProxyType
 from typing import Any, ClassVar, Final, Protocol, TypeVar
@@ -22,6 +22,7 @@ from monstertruckd.config.calibration import Result, Value, WizardName, value_at
 from monstertruckd.config.calibration_rpc import SAVE
 from monstertruckd.config.expiry import state_of
 from monstertruckd.config.truck import TruckConfig
+from monstertruckd.config.wizards import WizardRun, sequence
 from monstertruckd.tools.calibrate.motion import Mover
 from monstertruckd.tools.calibrate.steps import Collect, Confirm, MoveRecord, MoveStep, Number, Panel, WatchStep
 
@@ -203,3 +204,22 @@ async def calibrate(
     result = await wizard(context)
     saved = await truck.call(SAVE, {"result": result.model_dump(mode="json"), "source": truck.source})
     return Result.model_validate_json(json.dumps(saved["result"])), str(saved["file"])
+
+
+def missing(config: TruckConfig, results: Mapping[str, Result], expired: Collection[str] = ()) -> list[WizardRun]:
+    """Return the runs of wizards that a robot still needs, in the order in which each can use the results before it.
+
+    Args:
+        config: of the robot.
+        results: of the wizards so far.
+        expired: wizards whose results no longer count.
+    """
+    found = []
+    for run in sequence():
+        wizard, step = run
+        result = results.get(wizard.name)
+        done = result is not None and result.estimate(step.complete) is not None
+        needed = wizard.fits(config) and step.fits(config)
+        if needed and not (done and (step.rough or wizard.name not in expired)):
+            found.append(run)
+    return found

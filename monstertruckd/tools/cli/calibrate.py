@@ -1,6 +1,8 @@
 """``monstertruckd calibrate``: the wizards, what they found so far, and the way back."""
 
+import inspect
 import sys
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
@@ -8,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 import typer
 
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT, robot_on_host
+from monstertruckd.config.wizards import WIZARDS, WizardKind, WizardOption, WizardRun
 from monstertruckd.tools.cli.connection import robot_config, with_robot
 from monstertruckd.tools.cli.options import EndpointOption, RobotOption, complete_config, with_parameters
 from monstertruckd.tools.cli.output import (
@@ -22,13 +25,12 @@ from monstertruckd.tools.cli.output import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Mapping
 
     from monstertruck_runtime.client import TruckClient
     from monstertruck_runtime.clock import Clock
-    from monstertruckd.config.calibration import CalibrationFile, CalibrationStore, Estimate, Result, WizardName
+    from monstertruckd.config.calibration import CalibrationFile, CalibrationStore, Estimate, Result
     from monstertruckd.config.truck import TruckConfig
-    from monstertruckd.tools.calibrate.sequence import SequenceStep
     from monstertruckd.tools.calibrate.steps import Panel
     from monstertruckd.tools.calibrate.wizard import Wizard
 
@@ -36,9 +38,6 @@ app = command_group("Calibrate this robot: guided, step by step; Ctrl-C gives up
 
 TIMEOUT: Final = 10.0
 """Seconds to wait for the link and for answers."""
-
-WIZARDS: "dict[str, Callable[..., Wizard]]" = {}
-"""What makes each from the options of its command, by name."""
 
 YesOption = Annotated[bool, typer.Option("--yes", "-y", help="Answer yes wherever something is to be done.")]
 AnswerOption = Annotated[
@@ -65,8 +64,8 @@ class _Call:
     json_output: bool = False
 
 
-def _wizard(make: "Callable[..., Wizard]") -> "Callable[..., Wizard]":
-    """Add a command that has the wizard's own options, which ``make`` takes, and those that all share."""
+def _add_command(kind: WizardKind) -> None:
+    """Add the command of a wizard, with its own options and those that all share."""
 
     def command(
         *,
@@ -81,186 +80,50 @@ def _wizard(make: "Callable[..., Wizard]") -> "Callable[..., Wizard]":
     ) -> None:
         from monstertruckd.tools.cli.calibrate_panel import TerminalPanel
 
-        wizard, call = make(**own), _Call(robot, endpoint, config, json_output)
+        call = _Call(robot, endpoint, config, json_output)
         if undo:
-            _undo(wizard.name, call)
+            _undo(kind.name, call)
             return
+        wizard = _made(kind, own)
         with TerminalPanel(answer or [], yes=yes) as panel:
             _run(wizard, call, panel)
 
-    WIZARDS[make.__name__] = make
-    app.command(make.__name__)(with_parameters(command, make, command))
-    return make
+    def options(**_: Any) -> None:
+        pass
+
+    options.__doc__ = kind.doc
+    options.__signature__ = inspect.Signature([_parameter(option) for option in kind.options])  # type: ignore[attr-defined]
+    app.command(kind.name)(with_parameters(command, options, command))
 
 
-@_wizard
-def drive(
-    runs: Annotated[int, typer.Option(min=3, max=50, help="Taped runs.")] = 4,
-    metres: Annotated[float, typer.Option(min=0.5, max=20, help="Length of a run.")] = 2.0,
-    tape_error: Annotated[float, typer.Option(min=0.1, max=50, help="Standard error of one tape reading, mm.")] = 2.0,
-    sign_only: Annotated[bool, typer.Option("--sign-only", help="End once it is clear where forward is.")] = False,
-) -> "Wizard":
-    """Which way is forward, and how far a turn of the motor goes: runs along a tape.
-
-    Asks `clear`, `forward` and, for each run, `mark` and `distance` (m), and without a compass `straight` (yes or no).
-    """
-    from monstertruckd.tools.calibrate.drive import DriveWizard
-
-    return DriveWizard(runs, metres, tape_error / 1000, sign_only=sign_only)
+def _parameter(option: WizardOption) -> inspect.Parameter:
+    """An option as a parameter of a command; of a flag there is no opposite."""
+    name, kind = option.name, type(option.default)
+    flags = (f"--{name.replace('_', '-')}",) if kind is bool else ()
+    limits = {} if kind in (bool, str) else {"min": option.low, "max": option.high}
+    annotation = Annotated[kind, typer.Option(*flags, help=option.help, **limits)]  # type: ignore[valid-type]
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=option.default, annotation=annotation)
 
 
-@_wizard
-def steering(
-    rough: Annotated[
-        bool, typer.Option("--rough", help="Directions and a first centre: before the compass is calibrated.")
-    ] = False,
-    strings: Annotated[int, typer.Option(min=0, max=20, help="Straight runs along a string; 0 = there is none.")] = 3,
-    string_error: Annotated[
-        float, typer.Option(min=0.5, max=50, help="Standard error of the string's direction, mm per m.")
-    ] = 3.5,
-) -> "Wizard":
-    """Centre, direction, travel and pulse map of both axles: arcs, circles, and straights along a string.
+def _made(kind: WizardKind, given: "Mapping[str, Any]") -> "Wizard":
+    """The wizard with these options.
 
-    Asks `clear` and, for each string, `string` and `offset` (cm).
-    """
-    from monstertruckd.tools.calibrate.steering import SteeringWizard
-
-    return SteeringWizard(rough, strings, string_error / 1000)
-
-
-@_wizard
-def compass() -> "Wizard":
-    """The robot's own magnetism, hard and soft iron: a circle forward and back. Asks `clear`."""
-    from monstertruckd.tools.calibrate.compass import CompassWizard
-
-    return CompassWizard()
-
-
-@_wizard
-def battery(
-    meter_error: Annotated[float, typer.Option(min=0, max=10, help="Proportional error of the meter, percent.")] = 0.5,
-    meter_digits: Annotated[float, typer.Option(min=0, max=1, help="Constant error of the meter, V.")] = 0.02,
-    fresh: Annotated[bool, typer.Option("--fresh", help="Forget the readings of earlier runs.")] = False,
-) -> "Wizard":
-    """Scale of the battery voltage from a multimeter; nothing moves.
-
-    Asks `meter` (V) and `another` (yes or no), until that is no.
-    """
-    from monstertruckd.tools.calibrate.battery import BatteryWizard
-
-    return BatteryWizard(meter_error / 100, meter_digits, fresh=fresh)
-
-
-@_wizard
-def odometry(
-    rounds: Annotated[int, typer.Option(min=1, max=10, help="Squares to each side.")] = 1,
-    side: Annotated[float, typer.Option(min=0.5, max=10, help="Straight part of a side, m.")] = 1.5,
-    tape_error: Annotated[float, typer.Option(min=0.1, max=50, help="Standard error of one tape reading, mm.")] = 2.0,
-    string_error: Annotated[
-        float, typer.Option(min=0.5, max=50, help="Standard error of the string's direction, mm per m.")
-    ] = 3.5,
-) -> "Wizard":
-    """Distance scale, wheelbase and steering offset of dead reckoning: squares driven to both sides.
-
-    Asks `clear` and, for each square, `mark`, `side` (m), `ahead` and `left` (cm).
-    """
-    from monstertruckd.tools.calibrate.odometry import OdometryWizard
-
-    return OdometryWizard(rounds, side, tape_error / 1000, string_error / 1000)
-
-
-@_wizard
-def lidar(
-    rounds: Annotated[int, typer.Option(min=1, max=10, help="Full circles to each side, in quarters.")] = 1,
-    heights: Annotated[bool, typer.Option("--heights", help="Ask for the beam's heights: pitch and roll.")] = False,
-    tape_error: Annotated[float, typer.Option(min=0.1, max=50, help="Standard error of a height, mm.")] = 2.0,
-) -> "Wizard":
-    """Where the lidar sits on the body, and its clock against odometry's: quarter circles and straights.
-
-    Asks with heights `centre`, `ahead` and `left` (cm), and `clear`.
-    """
-    from monstertruckd.tools.calibrate.lidar import LidarWizard
-
-    return LidarWizard(rounds, heights, tape_error / 1000)
-
-
-@_wizard
-def imu(
-    rounds: Annotated[int, typer.Option(min=1, max=10, help="Full circles to each side.")] = 2,
-    still: Annotated[bool, typer.Option("--still", help="Biases only: nothing moves, the scale stays.")] = False,
-) -> "Wizard":
-    """Biases of the inertial unit at rest, and the scale of its yaw rate from full circles. Asks `clear`."""
-    from monstertruckd.tools.calibrate.imu import ImuWizard
-
-    return ImuWizard(rounds, turns=not still)
-
-
-@_wizard
-def slip(
-    by: Annotated[str, typer.Option(help="What says where the robot is: stand, or pose (in its map).")] = "stand",
-    rounds: Annotated[int, typer.Option(min=1, max=20, help="Times that each arc is driven to and fro.")] = 2,
-) -> "Wizard":
-    """Turning centres and wheels of a skid-steer body: arcs seen by a test stand, or in the map. Asks `clear`."""
-    from monstertruck_runtime.errors import InputError
-    from monstertruckd.tools.calibrate.slip import OBSERVERS, SlipWizard
-
-    if by not in OBSERVERS:
-        raise InputError(f"--by {by}: expected one of {', '.join(OBSERVERS)}")
-    return SlipWizard("pose" if by == "pose" else "stand", rounds)
-
-
-@_wizard
-def sonar(
-    turn: Annotated[float, typer.Option(min=190, max=720, help="Turn of each arc, degrees.")] = 360.0,
-    tape_error: Annotated[float, typer.Option(min=0.1, max=50, help="Standard error of the distance, mm.")] = 2.0,
-) -> "Wizard":
-    """Where the sonars sit and look, their cones, and the speed of sound: arcs beside a flat wall.
-
-    Asks `park`, `wall` (m) and `clear`.
-    """
-    import math
-
-    from monstertruckd.tools.calibrate.sonar import SonarWizard
-
-    return SonarWizard(math.radians(turn), tape_error=tape_error / 1000)
-
-
-@_wizard
-def stabiliser(
-    tape_error: Annotated[float, typer.Option(min=0.1, max=50, help="Standard error of a height, mm.")] = 2.0,
-) -> "Wizard":
-    """Zero and direction of both servos below the lidar: heights of its beam, then blocks under the wheels.
-
-    Nothing drives. Asks `level`, `centre`, `ahead`, `left` (cm), `nose` and `side`.
-    """
-    from monstertruckd.tools.calibrate.stabiliser import StabiliserWizard
-
-    return StabiliserWizard(tape_error / 1000)
-
-
-@_wizard
-def camera(
-    columns: Annotated[int, typer.Option(min=4, max=30, help="Squares of the board, across.")] = 8,
-    rows: Annotated[int, typer.Option(min=4, max=30, help="Squares of the board, down.")] = 6,
-    square: Annotated[float, typer.Option(min=5, max=1000, help="Side of a square as printed, mm.")] = 40.0,
-    marker: Annotated[float, typer.Option(min=4, max=1000, help="Side of a marker as printed, mm.")] = 30.0,
-    lens_only: Annotated[bool, typer.Option("--lens-only", help="Calibrate the lens only, not the mount.")] = False,
-    patience: Annotated[float, typer.Option(min=5, max=3600, help="Seconds without anything new that end it.")] = 60.0,
-) -> "Wizard":
-    """Lens of the camera, and where it sits against the lidar: a printed board held before both.
-
-    Nothing drives. Asks `board`; `stand print` makes the board.
+    Raises:
+        InputError: an option is none of its choices, or they do not fit together.
     """
     from monstertruck_runtime.errors import InputError
-    from monstertruck_schemas.board import BoardConfig
 
-    if marker >= square:
-        raise InputError(f"--marker {marker:g}: expected less than --square {square:g}, in which it lies")
-    with needs_extra("vision"):
-        from monstertruckd.tools.calibrate.camera import CameraWizard
+    for option in kind.options:
+        if option.choices and given.get(option.name, option.default) not in option.choices:
+            text = f"expected one of {', '.join(option.choices)}"
+            raise InputError(f"--{option.name} {given[option.name]}: {text}")
+    with needs_extra(kind.extra) if kind.extra is not None else nullcontext():
+        wizard: Wizard = kind.make(**given)
+    return wizard
 
-    board = BoardConfig(columns=columns, rows=rows, square=square / 1000, marker=marker / 1000)
-    return CameraWizard(board, lidar=not lens_only, patience=patience)
+
+for _kind in WIZARDS.values():
+    _add_command(_kind)
 
 
 @app.command("all")
@@ -286,7 +149,7 @@ def all_(
         while True:
             steps, waiting = run_wall(lambda clock: _steps_left(call, clock))
             if dry_run or not steps:
-                names = ", ".join(f"{step.name}{' (first look)' if step.rough else ''}" for step in steps)
+                names = ", ".join(f"{run.name}{' (first look)' if run.step.rough else ''}" for run in steps)
                 print(f"still to be calibrated: {names}" if names else "everything is calibrated, nothing expired")
                 return
             if waiting:
@@ -298,22 +161,16 @@ def all_(
             _run(wizard_of(steps[0]), call, panel)
 
 
-def wizard_of(step: "SequenceStep") -> "Wizard":
-    """The wizard of a step of ``calibrate all``, with its own defaults."""
-    if step.name == "drive":
-        return drive(sign_only=step.rough)
-    if step.name == "steering":
-        return steering(rough=step.rough)
-    if step.name == "lidar":
-        return lidar(heights=step.heights)
-    return WIZARDS[step.name]()
+def wizard_of(run: WizardRun) -> "Wizard":
+    """The wizard of a run of ``calibrate all``, with its own defaults."""
+    return _made(run.wizard, run.step.options)
 
 
-async def _steps_left(call: _Call, clock: "Clock") -> "tuple[list[SequenceStep], bool]":
+async def _steps_left(call: _Call, clock: "Clock") -> "tuple[list[WizardRun], bool]":
     """Steps that are still to be done, and whether the daemon runs on an older calibration than there is."""
     from monstertruck_schemas.topics import CALIBRATION
     from monstertruckd.config.calibration_rpc import SHOW
-    from monstertruckd.tools.calibrate.sequence import missing
+    from monstertruckd.tools.calibrate.wizard import missing
 
     async with _client(call.robot, call.endpoint, clock) as client:
         config = await robot_config(client)
@@ -397,7 +254,7 @@ async def _run_wizard(wizard: "Wizard", call: _Call, clock: "Clock", panel: "Pan
         return await calibrate(wizard, client, panel, clock, config, known)
 
 
-def _undo(name: "WizardName", call: _Call) -> None:
+def _undo(name: str, call: _Call) -> None:
     from monstertruck_runtime.clock import WallClock
     from monstertruckd.config.calibration_rpc import UNDO
 

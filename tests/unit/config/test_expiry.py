@@ -12,18 +12,18 @@ import pytest
 from monstertruck_drivers.config import PortConfig
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.mailbox import latest
+from monstertruck_runtime.plugins import load
 from monstertruck_runtime.threads import inline
 from monstertruck_schemas import topics
 from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.roles import DeviceRole
 from monstertruck_schemas.sensor import Battery, BatteryLevel, DriveFeedback, DriveMode
-from monstertruck_schemas.topics import Writer
+from monstertruck_schemas.topics import BY_NAME, Writer
 from monstertruck_schemas.usb import UsbNode, UsbState, UsbTree
 from monstertruckd.bus.local import Bus
-from monstertruckd.config.calibration import KEYS, Estimate, Result, utc
+from monstertruckd.config.calibration import Estimate, Result, utc
 from monstertruckd.config.expiry import (
     DAY,
-    GOALS,
-    LIFETIMES,
     CalibrationWatch,
     DistanceCounter,
     degraded_topics,
@@ -34,6 +34,7 @@ from monstertruckd.config.expiry import (
 )
 from monstertruckd.config.load import load_config
 from monstertruckd.config.truck import TruckConfig
+from monstertruckd.config.wizards import WIZARDS
 
 TRUCK = load_config(Path(__file__).resolve().parents[3] / "configs" / "truck.yaml", TruckConfig)[0]
 NOW = 1_700_000_000 * SECOND
@@ -44,9 +45,12 @@ def result(half=2.0, wizard="drive", name="drive_ratio"):
     return Result(wizard=wizard, measured="test", estimates=(estimate,), date=utc(NOW))
 
 
-def test_every_wizard_has_a_lifetime_and_goals():
-    assert LIFETIMES.keys() == KEYS.keys()
-    assert {name.partition(".")[0] for name in GOALS} == KEYS.keys()
+def test_every_wizard_names_devices_topics_and_estimates_that_there_are():
+    for wizard in WIZARDS.values():
+        assert wizard.lifetime.role in set(DeviceRole)
+        assert set(wizard.lifetime.topics) <= BY_NAME.keys()
+        assert {step.complete for step in wizard.steps} - {"inverted"} <= wizard.goals.keys()
+        assert callable(load(wizard.procedure))
 
 
 @pytest.mark.parametrize(("half", "letter"), [(5.9, "A"), (6.1, "B"), (11.9, "B"), (12.1, "C")])
@@ -62,7 +66,7 @@ def test_what_has_no_interval_has_no_grade():
 
 def test_time_way_and_another_part_end_it():
     saved = stamped(result(), TRUCK, NOW, 1000.0)
-    life = LIFETIMES["drive"]
+    life = WIZARDS["drive"].lifetime
     assert state_of(saved, TRUCK, NOW, 1000.0).expired == ""
     assert state_of(saved, TRUCK, NOW, 1000.0).metres_left == life.metres
     assert "counted until" in state_of(saved, TRUCK, NOW + (life.days + 1) * DAY, 1000.0).expired

@@ -11,11 +11,12 @@ from monstertruck_estimation.fusion.config import FusionConfig
 from monstertruck_runtime.errors import ConfigError, InputError
 from monstertruck_runtime.plugins import models_in
 from monstertruck_schemas.base import live_settings
-from monstertruckd.config.calibration import KEYS, WizardName, may_set, value_at
+from monstertruckd.config.calibration import WizardName, may_set, value_at
 from monstertruckd.config.load import SavedSettings, Step, YamlText, load_config, load_tree, load_truck, resolved
 from monstertruckd.config.migrate import carry_out, plan
 from monstertruckd.config.renamed import RENAMED, present_key
 from monstertruckd.config.truck import TruckConfig
+from monstertruckd.config.wizards import WIZARDS
 from monstertruckd.tools.replay_check.recorded import recorded_config
 from tests.unit.config.test_loading import Root
 
@@ -282,7 +283,7 @@ def test_settings_and_calibration_of_0_1_0_are_read(state: Path):
 def test_files_of_0_1_0_above_name_every_renamed_key_that_may_stand_there(state: Path):
     live = {setting.key for setting in live_settings(load_truck(state.parent / "truck.yaml")[0])}
     assert {old for old in RENAMED[1] if present_key(old) in live} == {"gate.obstacle.beside"}
-    assert not [old for old in RENAMED[1] if any(may_set(wizard, present_key(old)) for wizard in KEYS)]
+    assert not [old for old in RENAMED[1] if any(may_set(wizard, present_key(old)) for wizard in WIZARDS)]
 
 
 def test_a_key_renamed_below_any_name_is_so_in_all_files(state: Path, monkeypatch: pytest.MonkeyPatch):

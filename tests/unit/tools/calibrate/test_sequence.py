@@ -7,10 +7,12 @@ from typer.testing import CliRunner
 from monstertruckd.config.calibration import Estimate, Result
 from monstertruckd.config.load import load_config
 from monstertruckd.config.truck import TruckConfig
-from monstertruckd.tools.calibrate.sequence import ORDER, missing
+from monstertruckd.config.wizards import sequence
 from monstertruckd.tools.calibrate.steps import Number
+from monstertruckd.tools.calibrate.wizard import missing
 from monstertruckd.tools.cli import calibrate
 
+ORDER = list(sequence())
 CONFIGS = Path(__file__).resolve().parents[4] / "configs"
 TRUCK = load_config(CONFIGS / "truck.yaml", TruckConfig)[0]
 
@@ -45,7 +47,7 @@ def test_what_is_fresh_is_skipped_and_a_first_look_is_taken_once():
     results = {"battery": result("battery", "gain"), "drive": result("drive", "inverted")}
     left = missing(TRUCK, results)
     assert names(left) == ["steering", "compass", "drive", "steering", "odometry", "stabiliser", "lidar", "camera"]
-    assert [step.rough for step in left[:1]] == [True]
+    assert [run.step.rough for run in left[:1]] == [True]
     results["drive"] = result("drive", "inverted", "drive_ratio")
     assert "drive" not in names(missing(TRUCK, results))
 
@@ -84,10 +86,10 @@ def test_answers_given_beforehand_are_taken_in_the_order_of_asking_over_all_wiza
 
 
 def test_what_has_expired_is_measured_again_without_a_first_look():
-    results = {step.name: result(step.name, "inverted", "front_centre", step.complete) for step in ORDER}
+    results = {run.name: result(run.name, "inverted", "front_centre", run.step.complete) for run in ORDER}
     assert missing(TRUCK, results) == []
     (again,) = missing(TRUCK, results, {"drive"})
-    assert (again.name, again.rough) == ("drive", False)
+    assert (again.name, again.step.rough) == ("drive", False)
 
 
 def test_every_step_has_its_wizard():

@@ -11,7 +11,7 @@ from monstertruck_kinematics.chassis import Dimensions, TruckChassis, truck_chas
 from monstertruck_kinematics.polynomials import F_CORRECTED, G_PRINTED, AxlePolynomials, SteeringPolynomials, mirrored
 from monstertruck_kinematics.truck import DriveTrain
 from monstertruck_runtime.errors import InputError
-from monstertruckd.config.calibration import KEYS
+from monstertruck_schemas.body import TurnDeficitConfig
 from monstertruckd.tools.calibrate import steering
 from monstertruckd.tools.calibrate.steering import AxleTravel, SteeringWizard, _deficits, _rough, steered_senses
 from monstertruckd.tools.calibrate.steering_model import Maps, SteeringModel, SteeringRun, half_widths
@@ -269,5 +269,5 @@ def test_what_servos_shall_do_is_commanded_by_the_believed_maps():
 def test_every_coefficient_is_saved_with_its_interval():
     fit = MODEL.fit(session(TRUE), BELIEVED)
     estimates = _deficits(Maps.from_parameters(fit.parameters), half_widths(fit)[4:], 10, "noise")
-    assert [e.key for e in estimates] == [key for key in KEYS["steering"] if key.startswith("body.turn_deficit.")]
+    assert [e.key for e in estimates] == [f"body.turn_deficit.{name}" for name in TurnDeficitConfig.model_fields]
     assert all(e.low is not None and e.high is not None and e.low < 0 < e.high for e in estimates)

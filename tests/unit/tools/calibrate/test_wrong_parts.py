@@ -2,12 +2,12 @@
 
 import pytest
 
-from monstertruckd.config.calibration import KEYS
+from monstertruckd.config.wizards import WIZARDS
 from tests.calibration_wrong import WRONG, noticed
 
 
 def test_every_wizard_has_one():
-    assert WRONG.keys() == KEYS.keys()
+    assert WRONG.keys() == WIZARDS.keys()
 
 
 @pytest.mark.parametrize("wizard", WRONG)

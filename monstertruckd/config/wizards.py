@@ -1,0 +1,439 @@
+"""The calibration wizards, each declared once: keys, lifetime, what it needs, its options and its place in the order.
+
+Everything else follows from these rows: what a calibration may change (`calibration.py`), grades and expiry
+(`expiry.py`), the commands `calibrate NAME` and `calibrate all`. The procedure itself is a class in
+`monstertruckd/tools/calibrate/`, which is loaded when the wizard runs. Nothing is imported here, for every command line
+loads this table.
+"""
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+if TYPE_CHECKING:
+    from monstertruckd.config.truck import TruckConfig
+
+STEERING: Final = "devices.steering.driver"
+COMPASS: Final = "devices.compass.driver.iron"
+LIDAR: Final = "devices.lidar.mount"
+IMU: Final = "devices.imu.driver.correction"
+STABILISER: Final = "devices.stabiliser.driver"
+SONAR: Final = "devices.sonar.driver"
+CAMERA_LENS: Final = "devices.camera.driver.lens"
+CAMERA_MOUNT: Final = "devices.camera.mount"
+
+TURN_IN_A_METRE: Final = ("differential", "skid_steer", "truck")
+"""Bodies that turn within a metre."""
+MOTION: Final = ("state/odometry", "state/pose")
+TAPE: Final = "Standard error of one tape reading, mm."
+HEIGHT: Final = "Standard error of a height, mm."
+STRING: Final = "Standard error of the string's direction, mm per m."
+
+
+class Lifetime(NamedTuple):
+    """How long what a wizard measured counts."""
+
+    days: int
+    metres: float | None
+    """Distance driven, m; None: not limited."""
+    role: str
+    """Device that was measured."""
+    topics: tuple[str, ...]
+    """What rests on it."""
+
+
+class Goal(NamedTuple):
+    """Half-width of an interval that is meant, in the estimate's unit."""
+
+    half: float
+    share: bool = False
+    """Of the value."""
+
+
+class WizardOption(NamedTuple):
+    """An option of the wizard's command, and the field of its procedure that it sets."""
+
+    name: str
+    default: float | bool | str
+    """Its type is the option's: int, float, bool (a flag) or str (one of ``choices``)."""
+    help: str
+    low: float | None = None
+    high: float | None = None
+    scale: float = 1.0
+    """Of the option's unit in that of the field."""
+    choices: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class SequenceStep:
+    """One run of a wizard in ``calibrate all``."""
+
+    complete: str
+    """Estimate that its result has once this step is done."""
+    needs: tuple[str, ...] = ()
+    """Steps that come before it where the robot has them, ``wizard.complete``."""
+    rough: bool = False
+    """A first measurement, on which the others rest: skipped once there is any result of this wizard."""
+    options: Mapping[str, Any] = field(default_factory=dict)
+    """Other than the defaults."""
+    fits: Callable[["TruckConfig"], bool] = lambda _: True
+    """Whether this step, and not another one of the wizard, is for the robot."""
+
+
+@dataclass(frozen=True, slots=True)
+class WizardKind:
+    """One calibration wizard."""
+
+    name: str
+    doc: str
+    """Help of its command: what it finds and does, and the names of its questions."""
+    procedure: str
+    """Place ``module:Class`` of what measures; built from the options by its ``of``, if it has one."""
+    keys: tuple[str, ...]
+    """Values of the configuration that it may set, ``*`` for any one name; a calibration never touches any other. Where
+    two wizards measure the same value, the newer measurement counts."""
+    lifetime: Lifetime
+    """By experience of such parts, none of it measured: tyres wear, linkages and mounts are knocked, iron changes."""
+    goals: Mapping[str, Goal]
+    """By the estimate's name, ``*_x`` for each that ends so."""
+    steps: tuple[SequenceStep, ...]
+    fits: Callable[["TruckConfig"], bool]
+    """Whether a robot has what it measures."""
+    options: tuple[WizardOption, ...] = ()
+    extra: str | None = None
+    """Extra of the distribution without which the procedure does not load."""
+
+    def make(self, **given: Any) -> Any:
+        """Return the procedure with these options.
+
+        Raises:
+            InputError: options do not fit together.
+        """
+        module, _, name = self.procedure.partition(":")
+        procedure = getattr(import_module(module), name)
+        scaled = {
+            option.name: value if option.scale == 1.0 else value * option.scale
+            for option in self.options
+            if (value := given.get(option.name, option.default)) is not None
+        }
+        return getattr(procedure, "of", procedure)(**scaled)
+
+
+def _truck_with(*roles: str) -> Callable[["TruckConfig"], bool]:
+    return lambda config: config.body.kind == "truck" and set(roles) <= config.devices.present().keys()
+
+
+def _measures_battery(config: "TruckConfig") -> bool:
+    steering = config.devices.steering
+    return config.monitors.battery is not None or (steering is not None and steering.driver.battery is not None)
+
+
+def _has_lens(config: "TruckConfig") -> bool:
+    return getattr(getattr(config.devices.camera, "driver", None), "lens", None) is not None
+
+
+_ROWS: Final = (
+    WizardKind(
+        name="battery",
+        doc="""Scale of the battery voltage from a multimeter; nothing moves.
+
+        Asks `meter` (V) and `another` (yes or no), until that is no.
+        """,
+        procedure="monstertruckd.tools.calibrate.battery:BatteryWizard",
+        keys=(
+            f"{STEERING}.battery.gain",
+            f"{STEERING}.battery.offset",
+            "monitors.battery.divider",
+            "monitors.battery.offset",
+        ),
+        lifetime=Lifetime(365, None, "steering", ("sensor/battery",)),
+        goals={"gain": Goal(0.02, share=True), "offset": Goal(0.1)},
+        steps=(SequenceStep("gain"),),
+        fits=_measures_battery,
+        options=(
+            WizardOption("meter_error", 0.5, "Proportional error of the meter, percent.", 0, 10, scale=1e-2),
+            WizardOption("meter_digits", 0.02, "Constant error of the meter, V.", 0, 1),
+            WizardOption("fresh", False, "Forget the readings of earlier runs."),
+        ),
+    ),
+    WizardKind(
+        name="drive",
+        doc="""Which way is forward, and how far a turn of the motor goes: runs along a tape.
+
+        Asks `clear`, `forward` and, for each run, `mark` and `distance` (m), and without a compass `straight` (yes or
+        no).
+        """,
+        procedure="monstertruckd.tools.calibrate.drive:DriveWizard",
+        keys=("geometry.drive_ratio", "devices.drive.driver.inverted"),
+        lifetime=Lifetime(180, 20_000.0, "drive", MOTION),
+        goals={"drive_ratio": Goal(0.01, share=True)},
+        steps=(
+            SequenceStep("inverted", rough=True, options={"sign_only": True}),
+            SequenceStep("drive_ratio", needs=("compass.hard_x",)),
+        ),
+        fits=_truck_with("drive"),
+        options=(
+            WizardOption("runs", 4, "Taped runs.", 3, 50),
+            WizardOption("metres", 2.0, "Length of a run.", 0.5, 20),
+            WizardOption("tape_error", 2.0, TAPE, 0.1, 50, scale=1e-3),
+            WizardOption("sign_only", False, "End once it is clear where forward is."),
+        ),
+    ),
+    WizardKind(
+        name="steering",
+        doc="""Centre, direction, travel and pulse map of both axles: arcs, circles, and straights along a string.
+
+        Asks `clear` and, for each string, `string` and `offset` (cm).
+        """,
+        procedure="monstertruckd.tools.calibrate.steering:SteeringWizard",
+        keys=(
+            *(
+                f"{STEERING}.{axle}.{name}"
+                for axle in ("front", "rear")
+                for name in ("centre_us", "scale_us_per_deg", "direction", "min_us", "max_us")
+            ),
+            f"{STEERING}.dead_time",
+            f"{STEERING}.lag",
+            "body.turn_deficit.*",
+        ),
+        lifetime=Lifetime(90, 10_000.0, "steering", MOTION),
+        goals={  # 0.5 degrees are 8.5 us
+            "front_centre": Goal(8.5),
+            "rear_centre": Goal(8.5),
+            "front_scale": Goal(0.025, share=True),
+            "rear_scale": Goal(0.025, share=True),
+            "delay": Goal(0.015),
+        },
+        steps=(
+            SequenceStep("front_centre", needs=("drive.inverted",), rough=True, options={"rough": True}),
+            SequenceStep("front_scale", needs=("drive.drive_ratio", "compass.hard_x")),
+        ),
+        fits=_truck_with("steering", "compass", "drive"),
+        options=(
+            WizardOption("rough", False, "Directions and a first centre: before the compass is calibrated."),
+            WizardOption("strings", 3, "Straight runs along a string; 0 = there is none.", 0, 20),
+            WizardOption("string_error", 3.5, STRING, 0.5, 50, scale=1e-3),
+        ),
+    ),
+    WizardKind(
+        name="compass",
+        doc="The robot's own magnetism, hard and soft iron: a circle forward and back. Asks `clear`.",
+        procedure="monstertruckd.tools.calibrate.compass:CompassWizard",
+        keys=tuple(f"{COMPASS}.{name}" for name in ("hard_x", "hard_y", "soft_xx", "soft_xy", "soft_yy")),
+        lifetime=Lifetime(90, None, "compass", ("sensor/compass", *MOTION)),
+        goals={  # 2 degrees in a horizontal field of 25 uT
+            "hard_x": Goal(0.87),
+            "hard_y": Goal(0.87),
+            "soft_xx": Goal(0.035),
+            "soft_yy": Goal(0.035),
+        },
+        steps=(SequenceStep("hard_x", needs=("steering.front_centre",)),),
+        fits=_truck_with("compass"),
+    ),
+    WizardKind(
+        name="odometry",
+        doc="""Distance scale, wheelbase and steering offset of dead reckoning: squares driven to both sides.
+
+        Asks `clear` and, for each square, `mark`, `side` (m), `ahead` and `left` (cm).
+        """,
+        procedure="monstertruckd.tools.calibrate.odometry:OdometryWizard",
+        keys=(
+            "geometry.drive_ratio",
+            "geometry.wheelbase",
+            f"{STEERING}.front.centre_us",
+            f"{STEERING}.rear.centre_us",
+        ),
+        lifetime=Lifetime(180, 20_000.0, "drive", MOTION),
+        goals={
+            "drive_ratio": Goal(0.01, share=True),
+            "wheelbase": Goal(0.01, share=True),
+            "offset": Goal(0.5),
+        },
+        steps=(SequenceStep("wheelbase", needs=("steering.front_scale",)),),
+        fits=_truck_with("steering", "compass", "drive"),
+        options=(
+            WizardOption("rounds", 1, "Squares to each side.", 1, 10),
+            WizardOption("side", 1.5, "Straight part of a side, m.", 0.5, 10),
+            WizardOption("tape_error", 2.0, TAPE, 0.1, 50, scale=1e-3),
+            WizardOption("string_error", 3.5, STRING, 0.5, 50, scale=1e-3),
+        ),
+    ),
+    WizardKind(
+        name="lidar",
+        doc="""Where the lidar sits on the body, and its clock against odometry's: quarter circles and straights.
+
+        Asks with heights `centre`, `ahead` and `left` (cm), and `clear`.
+        """,
+        procedure="monstertruckd.tools.calibrate.lidar:LidarWizard",
+        keys=tuple(f"{LIDAR}.{name}" for name in ("x", "y", "yaw", "roll", "pitch")),
+        lifetime=Lifetime(180, 20_000.0, "lidar", ("state/pose",)),
+        goals={
+            "x": Goal(0.010),
+            "y": Goal(0.010),
+            "yaw": Goal(0.0087),
+            "roll": Goal(0.0087),
+            "pitch": Goal(0.0087),
+        },
+        steps=(  # how level it is, too, where no stabiliser levels it, whose zeros are that
+            SequenceStep(
+                "pitch",
+                needs=("odometry.wheelbase",),
+                options={"heights": True},
+                fits=lambda config: config.devices.stabiliser is None,
+            ),
+            SequenceStep(
+                "x",
+                needs=("odometry.wheelbase", "stabiliser.pitch_zero"),
+                fits=lambda config: config.devices.stabiliser is not None,
+            ),
+        ),
+        fits=_truck_with("lidar", "compass"),
+        options=(
+            WizardOption("rounds", 1, "Full circles to each side, in quarters.", 1, 10),
+            WizardOption("heights", False, "Ask for the beam's heights: pitch and roll."),
+            WizardOption("tape_error", 2.0, HEIGHT, 0.1, 50, scale=1e-3),
+        ),
+    ),
+    WizardKind(
+        name="imu",
+        doc="Biases of the inertial unit at rest, and the scale of its yaw rate from full circles. Asks `clear`.",
+        procedure="monstertruckd.tools.calibrate.imu:ImuWizard",
+        keys=tuple(f"{IMU}.{name}" for name in ("rate_x", "rate_y", "rate_z", "rate_scale", "force_x", "force_y")),
+        lifetime=Lifetime(90, None, "imu", MOTION),
+        goals={"rate_z": Goal(0.002), "rate_scale": Goal(0.01, share=True)},
+        steps=(SequenceStep("rate_scale", needs=("odometry.wheelbase",)),),
+        fits=_truck_with("imu"),
+        options=(
+            WizardOption("rounds", 2, "Full circles to each side.", 1, 10),
+            WizardOption("still", False, "Biases only: nothing moves, the scale stays."),
+        ),
+    ),
+    WizardKind(
+        name="slip",
+        doc="Turning centres and wheels of a skid-steer body: arcs seen by a test stand, or in the map. Asks `clear`.",
+        procedure="monstertruckd.tools.calibrate.slip:SlipWizard",
+        keys=tuple(f"body.{name}" for name in ("icr_left", "icr_right", "icr_x", "gain_left", "gain_right")),
+        lifetime=Lifetime(90, 5_000.0, "wheels", MOTION),
+        goals={
+            "icr_left": Goal(0.03, share=True),
+            "icr_right": Goal(0.03, share=True),
+            "gain_left": Goal(0.01, share=True),
+            "gain_right": Goal(0.01, share=True),
+        },
+        steps=(SequenceStep("icr_left"),),
+        fits=lambda config: config.body.kind == "skid_steer" and config.stand != "none",
+        options=(
+            WizardOption(
+                "by", "stand", "What says where the robot is: stand, or pose (in its map).", choices=("stand", "pose")
+            ),
+            WizardOption("rounds", 2, "Times that each arc is driven to and fro.", 1, 20),
+        ),
+    ),
+    WizardKind(
+        name="sonar",
+        doc="""Where the sonars sit and look, their cones, and the speed of sound: arcs beside a flat wall.
+
+        Asks `park`, `wall` (m) and `clear`.
+        """,
+        procedure="monstertruckd.tools.calibrate.sonar:SonarWizard",
+        keys=(
+            f"{SONAR}.field_of_view",
+            f"{SONAR}.speed_of_sound",
+            *(f"{SONAR}.sonars.*.mount.{name}" for name in ("x", "y", "yaw")),
+        ),
+        lifetime=Lifetime(180, 20_000.0, "sonar", ("sensor/sonar",)),
+        goals={
+            "cone": Goal(0.035),
+            "speed_of_sound": Goal(0.01, share=True),
+            "*_x": Goal(0.015),
+            "*_y": Goal(0.015),
+            "*_yaw": Goal(0.052),
+        },
+        steps=(SequenceStep("cone", needs=("odometry.wheelbase", "slip.icr_left")),),
+        fits=lambda config: "sonar" in config.devices.present() and config.body.kind in TURN_IN_A_METRE,
+        options=(
+            WizardOption("turn", 360.0, "Turn of each arc, degrees.", 190, 720, scale=math.pi / 180),
+            WizardOption("tape_error", 2.0, "Standard error of the distance, mm.", 0.1, 50, scale=1e-3),
+        ),
+    ),
+    WizardKind(
+        name="stabiliser",
+        doc="""Zero and direction of both servos below the lidar: heights of its beam, then blocks under the wheels.
+
+        Nothing drives. Asks `level`, `centre`, `ahead`, `left` (cm), `nose` and `side`.
+        """,
+        procedure="monstertruckd.tools.calibrate.stabiliser:StabiliserWizard",
+        keys=tuple(f"{STABILISER}.{joint}.{name}" for joint in ("pitch", "roll") for name in ("zero", "direction")),
+        lifetime=Lifetime(180, 20_000.0, "stabiliser", ("state/pose",)),
+        goals={"pitch_zero": Goal(3.4), "roll_zero": Goal(3.4)},  # 1 degree
+        steps=(SequenceStep("pitch_zero", needs=("odometry.wheelbase",)),),
+        fits=lambda config: {"stabiliser", "compass", "lidar"} <= config.devices.present().keys(),
+        options=(WizardOption("tape_error", 2.0, HEIGHT, 0.1, 50, scale=1e-3),),
+    ),
+    WizardKind(
+        name="camera",
+        doc="""Lens of the camera, and where it sits against the lidar: a printed board held before both.
+
+        Nothing drives. Asks `board`; `stand print` makes the board.
+        """,
+        procedure="monstertruckd.tools.calibrate.camera:CameraWizard",
+        keys=(f"{CAMERA_LENS}.*", f"{CAMERA_MOUNT}.*"),
+        lifetime=Lifetime(365, 20_000.0, "camera", ("state/points",)),
+        goals={
+            "focal_x": Goal(0.01, share=True),
+            "focal_y": Goal(0.01, share=True),
+            "centre_x": Goal(4.6),  # 0.5 degrees are 4.6 of 522 pixels
+            "centre_y": Goal(4.6),
+            "x": Goal(0.015),
+            "y": Goal(0.015),
+            "z": Goal(0.015),
+            "yaw": Goal(0.0087),
+            "pitch": Goal(0.0087),
+            "roll": Goal(0.0087),
+        },
+        steps=(SequenceStep("focal_x", needs=("lidar.pitch", "lidar.x")),),
+        fits=_has_lens,
+        options=(
+            WizardOption("columns", 8, "Squares of the board, across.", 4, 30),
+            WizardOption("rows", 6, "Squares of the board, down.", 4, 30),
+            WizardOption("square", 40.0, "Side of a square as printed, mm.", 5, 1000, scale=1e-3),
+            WizardOption("marker", 30.0, "Side of a marker as printed, mm.", 4, 1000, scale=1e-3),
+            WizardOption("lens_only", False, "Calibrate the lens only, not the mount."),
+            WizardOption("patience", 60.0, "Seconds without anything new that end it.", 5, 3600),
+        ),
+        extra="vision",
+    ),
+)
+
+WIZARDS: Final[Mapping[str, WizardKind]] = {row.name: row for row in _ROWS}
+"""By name, in the order of the commands."""
+
+
+class WizardRun(NamedTuple):
+    """A step of a wizard in ``calibrate all``."""
+
+    wizard: WizardKind
+    step: SequenceStep
+
+    @property
+    def name(self) -> str:
+        """Of the wizard."""
+        return self.wizard.name
+
+
+def sequence() -> Iterator[WizardRun]:
+    """Yield all steps in the order of ``calibrate all``: after those they need, else in the order of the wizards."""
+    runs = {f"{row.name}.{step.complete}": WizardRun(row, step) for row in _ROWS for step in row.steps}
+    done: set[str] = set()
+
+    def visit(name: str) -> Iterator[WizardRun]:
+        if name not in done:
+            done.add(name)
+            for needed in runs[name].step.needs:
+                yield from visit(needed)
+            yield runs[name]
+
+    for name in runs:
+        yield from visit(name)
