@@ -107,11 +107,11 @@ def _written(target: Path) -> Iterator[Path]:
     part = target.with_name(target.name + _PART)
     try:
         yield part
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise InputError(f"{target}: cannot be written: {error.strerror}") from error
-    except BaseException:
-        part.unlink(missing_ok=True)
+    except BaseException as error:
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            raise InputError(f"{target}: cannot be written: {error.strerror}") from error
         raise
 
 

@@ -7,7 +7,7 @@ import os
 import stat
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Final
 
@@ -206,6 +206,7 @@ def whole_file(path: Path) -> Iterator[Path]:
     """Yield where to write a file of any length: ``.part`` behind its name, which it takes once the body ends.
 
     If the body fails, what it wrote is removed, and a file of that name stays as it was. File and folder are synced.
+    A failure of the system that names no file, as that of a full disk, is given the name of this one.
 
     Raises:
         OSError: ``path`` is a folder, a device or the like, or cannot be replaced.
@@ -219,7 +220,10 @@ def whole_file(path: Path) -> Iterator[Path]:
         with part.open("rb") as file:
             os.fsync(file.fileno())
         part.replace(place)
-    except BaseException:
-        part.unlink(missing_ok=True)
+    except BaseException as error:
+        if isinstance(error, OSError) and error.filename is None:
+            error.filename = str(path)
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
         raise
     sync_folder(place.parent)

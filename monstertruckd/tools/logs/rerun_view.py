@@ -87,11 +87,12 @@ def convert(
 
 
 def _record(reader: LogReader, output: Path, offset: int, selection: Selection, progress: Progress | None) -> None:
-    with rr.RecordingStream(APPLICATION, recording_id=reader.path.stem) as stream:
+    name, stem = (os.fsencode(text).decode(errors="backslashreplace") for text in (reader.path.name, reader.path.stem))
+    with rr.RecordingStream(APPLICATION, recording_id=stem) as stream:
         stream.set_log_time_enabled(False)
         stream.set_log_tick_enabled(False)
         stream.save(output)
-        stream.send_recording_name(reader.path.name)
+        stream.send_recording_name(name)
         scene = Scene(stream, offset)
         scene.truck(reader)
         for entry, message in selection.of(reader, progress):

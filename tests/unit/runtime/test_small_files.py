@@ -9,9 +9,11 @@ from pathlib import Path
 
 import pytest
 
+from monstertruck_runtime import small_files
 from monstertruck_runtime.small_files import (
     make_folder,
     number_of,
+    put_aside,
     remove_file,
     remove_leftovers,
     replace_file,
@@ -96,6 +98,44 @@ def test_a_file_that_is_written_piece_by_piece_is_there_as_a_whole_or_not_at_all
     with pytest.raises(KeyboardInterrupt):
         broken_off()
     assert [(path, path.read_text()) for path in tmp_path.iterdir()] == [(file, "b")]
+
+
+def test_a_full_disk_names_the_file(tmp_path: Path):
+    def written() -> None:
+        with whole_file(tmp_path / "file"):
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    with pytest.raises(OSError, match=r"No space left on device: '.*/file'"):
+        written()
+
+
+def test_a_disk_that_takes_nothing_keeps_its_own_words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Nothing can be removed there either."""
+
+    def refuse(*_: object, **__: object) -> None:
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    monkeypatch.setattr(small_files.Path, "unlink", refuse)
+
+    def written() -> None:
+        with whole_file(tmp_path / "file"):
+            raise OSError(errno.EIO, "Input/output error")
+
+    with pytest.raises(OSError, match="Input/output error"):
+        written()
+
+
+def test_damaged_files_are_kept_side_by_side(tmp_path: Path):
+    file = tmp_path / "estop"
+    for content in ("a", "b"):
+        file.write_text(content)
+        said = put_aside(file)
+    assert said == "the file is kept as estop.damaged-2"
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {
+        "estop.damaged": "a",
+        "estop.damaged-2": "b",
+    }
+    assert put_aside(file) == "the file cannot be renamed: No such file or directory"
 
 
 def test_a_file_takes_the_place_of_no_folder_and_no_pipe_and_a_link_to_one_stays(tmp_path: Path):

@@ -1,4 +1,5 @@
 import csv
+import errno
 import fcntl
 import json
 import math
@@ -14,6 +15,7 @@ from monstertruck_runtime import wire
 from monstertruck_runtime.clock import SECOND, WallClock
 from monstertruck_runtime.errors import InputError, NotFoundError
 from monstertruck_schemas import topics as t
+from monstertruckd.recorder import repair
 from monstertruckd.recorder.log_file import LogEntry, LogFile
 from monstertruckd.recorder.reader import open_log
 from monstertruckd.recorder.repair import recover, recover_directory
@@ -185,6 +187,16 @@ def test_recovery_leaves_the_original_when_it_cannot_write(cut, tmp_path):
     with pytest.raises(InputError, match="cannot be written"):
         recover(cut, tmp_path / "nowhere" / "fixed.mcap")
     assert cut.exists()
+
+
+def test_a_repair_on_a_disk_that_takes_nothing_names_the_log(cut, monkeypatch):
+    def refuse(*_: object, **__: object) -> None:
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    monkeypatch.setattr(repair.os, "fsync", refuse)
+    monkeypatch.setattr(repair.Path, "unlink", refuse)
+    with pytest.raises(InputError, match=rf"{cut.name}: cannot be written: Read-only file system"):
+        recover(cut, cut)
 
 
 def test_abandoned_recovery_leaves_the_original_and_no_rest(cut):

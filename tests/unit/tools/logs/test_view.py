@@ -155,6 +155,13 @@ def test_golden_logs_convert(golden, tmp_path):
     } <= found.keys()
 
 
+def test_a_name_that_is_no_text_is_shown_as_far_as_it_is(log, tmp_path, capfd):
+    odd = log.with_name(os.fsdecode(b"dr\xffve\n.mcap"))
+    odd.write_bytes(log.read_bytes())
+    assert convert(odd, tmp_path / "odd.rrd").stat().st_size > 0
+    assert capfd.readouterr().err == ""
+
+
 def test_errors_name_the_file(log, tmp_path):
     with pytest.raises(NotFoundError, match=r"gone\.mcap: no such log"):
         convert(tmp_path / "gone.mcap", tmp_path / "x.rrd")
