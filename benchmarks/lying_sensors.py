@@ -2,13 +2,13 @@
 
     python benchmarks/lying_sensors.py [--seeds 5] [--case NAME ...] [--world NAME ...]
     python benchmarks/lying_sensors.py --quiet [--seconds 60]
-    python benchmarks/lying_sensors.py --logs FOLDER
+    python benchmarks/lying_sensors.py --logs FOLDER [--log NAME ...]
 
 On the virtual clock an operator drives the emulated truck straight ahead by hand, at its greatest speed, towards a post
 that is 0.9 m before its bumper when the lie begins; with some seeds it begins before the truck is armed, with others
-while it drives. In the cases of the compass and of the wheels' slip the truck follows the demo's lap. Judged by the
-world alone: contact is an outline in a wall or in the post, noticed is a stop or a refusal to arm with
-``sensors_disagree`` or ``sensor_frozen``.
+while it drives. In the cases ``mirrored`` and ``compass`` the truck follows the demo's lap, in ``goal-...`` planner and
+tracker take it to a goal, in ``slam-...`` it maps while it follows the lap. Judged by the world alone: contact is an
+outline in a wall or in the post, noticed is a stop or a refusal to arm with ``sensors_disagree`` or ``sensor_frozen``.
 
     repeated   one revolution again and again, with fresh stamps
     noisy      the same, with new noise
@@ -19,7 +19,8 @@ world alone: contact is an outline in a wall or in the post, noticed is a stop o
     compass    all values of the compass repeat
 
 ``--quiet`` drives shipped configurations without a fault, and with wheels that slip by 30 %, and counts alarms.
-``--logs`` replays recorded logs (``.npz`` with t, ranges and odom) through the pure core. The last line is JSON.
+``--logs`` replays recorded logs (``.npz`` with t, ranges and odom; ``.dat.gz`` of a URG-04LX with wheel ticks) through
+the pure core; *compared* are the seconds between scans that overlap. The last line is JSON.
 """
 
 import argparse
@@ -28,9 +29,10 @@ import math
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from enum import StrEnum
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -42,6 +44,7 @@ from monstertruck_estimation.consistency.scan_odometry import ScanMotionStep
 from monstertruck_estimation.se2 import between
 from monstertruck_estimation.slam.worker_io import ScanInput
 from monstertruck_estimation.wheel_motion import WheelIncrement
+from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.errors import RequestRefusedError
 from monstertruck_runtime.mailbox import fifo
@@ -82,6 +85,19 @@ def commanded(role: str, line: str) -> Lie:
     return lambda context: context.command(role, line)
 
 
+class Drive(StrEnum):
+    """How the truck drives."""
+
+    HAND = "hand"
+    """Straight ahead, by an operator."""
+    LAP = "lap"
+    """The demo's lap; there is no post."""
+    GOAL = "goal"
+    """To a goal straight ahead, planned over the map of the rooms."""
+    SLAM = "slam"
+    """The demo's lap while it maps."""
+
+
 @dataclass(frozen=True, slots=True)
 class Case:
     """One way to lie."""
@@ -89,15 +105,14 @@ class Case:
     start: Lie | None = None
     overlay: dict[str, Any] | None = None
     """What is wrong in the world from the beginning."""
-    lap: bool = False
-    """The truck follows the demo's lap; there is no post."""
+    drive: Drive = Drive.HAND
     settled: bool = False
     """It begins long before the truck is armed: its own beginning does not give it away."""
 
 
 SHAFT: Final = ("position_actual", "velocity_actual", "velocity_averaged")
 """What the drive controller says of its shaft."""
-CASES: Final = {
+CASES: dict[str, Case] = {
     "repeated": Case(falsified("lidar", ("range", "frozen"))),
     "noisy": Case(falsified("lidar", ("range", "frozen"), ("range", "noisy", "6"))),
     "late": Case(falsified("lidar", ("range", "delayed", "0.8")), settled=True),
@@ -105,9 +120,16 @@ CASES: Final = {
     "halved": Case(falsified("lidar", ("range", "scaled", "0.5"))),
     "half-odometry": Case(falsified("drive", *((signal, "scaled", "0.5") for signal in SHAFT))),
     "turned": Case(overlay={"sim": {"world": {"lidar": {"yaw": 0.5}}}}),
-    "mirrored": Case(falsified("lidar", ("range", "mirrored")), lap=True),
-    "compass": Case(commanded("compass", "frozen on"), lap=True),
+    "mirrored": Case(falsified("lidar", ("range", "mirrored")), drive=Drive.LAP),
+    "compass": Case(commanded("compass", "frozen on"), drive=Drive.LAP),
 }
+CASES |= {
+    f"{drive}-{name}": replace(CASES[name], drive=drive)
+    for drive in (Drive.GOAL, Drive.SLAM)
+    for name in ("repeated", "noisy", "late", "doubled")
+}
+HOME: Final = {Drive.LAP: "loop", Drive.SLAM: "loop", Drive.GOAL: "rooms"}
+"""The world of those that do not drive in every one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +147,7 @@ class Outcome:
 def trial(case: Case, world: str, seed: int) -> Outcome:
     """Drive towards a post, or along the lap, with a sensor that lies."""
     rng = np.random.default_rng(seed)
-    name = "demo.yaml" if world == "loop" else "goals.yaml"
+    name = "slam.yaml" if case.drive is Drive.SLAM else "demo.yaml" if world == "loop" else "goals.yaml"
     config = load_config(CONFIGS / name, SimulatedTruckConfig)[0]
     x, y, yaw = BUILT_IN[world]().start
     start = {"x": x + float(rng.uniform(0, 0.1)), "y": y + float(rng.uniform(-0.04, 0.04)), "yaw": yaw}
@@ -135,8 +157,11 @@ def trial(case: Case, world: str, seed: int) -> Outcome:
         "odometry": {"start": start},
         "sim": {"seed": seed + 1, "world": {"map": world}},
     }
-    if not case.lap:
+    if case.drive is Drive.HAND:
         overlay |= {"path": None, "tracker": None, "planner": None}
+    if case.drive is Drive.GOAL:
+        overlay |= {"planner": {"route": {"effort": 3000, "margin": 0.04}}}
+        overlay |= {"placement": {"planner": "loop", "local_planner": "loop"}}
     config = with_overlay(with_overlay(config, overlay), case.overlay or {})
 
     async def main(clock: VirtualClock) -> Outcome:
@@ -176,6 +201,8 @@ class _Driver:
                     driven=0.0,
                     reason=refused.refusal.value,
                 )
+            if self._case.drive is Drive.GOAL:
+                await self._start()
             if not self._early and not self._case.settled:
                 await self._drive(1.5)
                 began = clock.now()
@@ -186,8 +213,15 @@ class _Driver:
         self._gate.drain()
         if self._case.start is not None:
             self._case.start(self._context)
-        if not self._case.lap:
+        if self._case.drive is not Drive.LAP:
             place_obstacle(GAP)(self._context)
+
+    async def _start(self) -> None:
+        """Ask for a goal 4 m ahead."""
+        truth = self._rig.world.truth(self._clock.now())
+        goal = {"x": truth.x + 4.0 * math.cos(truth.yaw), "y": truth.y + 4.0 * math.sin(truth.yaw), "yaw": truth.yaw}
+        request = {**await self._operator.header(), "frame": "map", "goal": goal}
+        await self._operator.call("goal", request)
 
     async def _drive(self, seconds: float) -> None:
         until = self._clock.now() + round(seconds * SECOND)
@@ -196,7 +230,7 @@ class _Driver:
             await self._clock.sleep(PERIOD)
 
     async def _ask(self) -> None:
-        if self._case.lap:
+        if self._case.drive is not Drive.HAND:
             return
         request = DriveRequest(**await self._operator.header(0.25), speed=0.3, front=0.0, rear=0.0)
         self._rig.bus.inject(topics.REQ_DRIVE, request)
@@ -236,10 +270,18 @@ QUIET: Final[dict[str, dict[str, Any]]] = {
     "fusion.yaml": {},
     "full.yaml": {},
     "ramp.yaml": {},
+    "points.yaml": {},
+    "goals.yaml": {},
+    "explore.yaml": {},
     "full3d.yaml": {},
     **{f"robots/{path.name}": {} for path in sorted((CONFIGS / "robots").glob("*.yaml")) if path.stem != "hall"},
 }
 """Shipped configurations that drive by themselves once they are armed, and what is changed in them."""
+STARTS: Final[dict[str, tuple[str, dict[str, Any]]]] = {
+    "goals.yaml": ("goal", {"frame": "map", "goal": {"x": 8.5, "y": 6.0, "yaw": 0.0}}),
+    "explore.yaml": ("explore", {"order": "start"}),
+}
+"""What those are asked for that do not drive by themselves."""
 SLIP: Final = {"sim": {"world": {"truck": {"motor": {"ratio": 644.0 / 0.7}}}}}
 """Wheels of which the robot moves 0.7 of the distance."""
 
@@ -265,10 +307,13 @@ def quiet(name: str, seconds: float, overlay: dict[str, Any]) -> Quiet:
         async with rig.running():
             await clock.sleep(2.0)
             await operator.arm()
+            if name in STARTS:
+                call, request = STARTS[name]
+                await operator.call(call, {**await operator.header(), **request})
             before = rig.world.truth(clock.now())
             until, number = clock.now() + round(seconds * SECOND), 0
             while clock.now() < until:
-                if config.tracker is None and config.path is None:
+                if config.tracker is None and config.path is None and name not in STARTS:
                     number += 1
                     front = 0.2 * math.sin(number / 40)
                     request = DriveRequest(**await operator.header(0.25), speed=0.2, front=front, rear=0.0)
@@ -284,35 +329,83 @@ def quiet(name: str, seconds: float, overlay: dict[str, Any]) -> Quiet:
     return run_virtual(main, start=SECOND)
 
 
-def replayed(path: Path) -> tuple[int, float, float]:
+class Recording(NamedTuple):
+    """A recorded log."""
+
+    stamps: Array
+    """Shape (n,), s."""
+    ranges: Array
+    """Shape (n, beams), m; infinite where there is no echo."""
+    odom: Array
+    """Shape (n, 3): dead reckoning, m and rad."""
+    start: float
+    """Angle of the first beam, rad."""
+    step: float
+    """Angle between beams, rad."""
+    mount: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Of the lidar, m and rad."""
+    time_step: float = 0.0
+    """Time between beams, s."""
+
+
+URG_STEP: Final = 2.0 * math.pi / 1024
+"""Angle between beams of a URG-04LX, rad; beam 341 points ahead."""
+URG_WHEELS: Final = 2.26e-4, 7.2e-4
+"""Metres and radians per tick of the wheels of that log, measured against its lidar."""
+
+
+def recorded(path: Path) -> Recording:
+    """Read a log."""
+    if path.suffix == ".npz":
+        log = np.load(path)
+        ranges, beams = log["ranges"].astype(float), log["ranges"].shape[1]
+        longest = float(log["range_max"]) if "range_max" in log else float(np.max(ranges)) * 0.98
+        step = math.pi / 180 if beams == 180 else math.pi / (beams - 1)
+        return Recording(
+            log["t"],
+            np.where(ranges < longest, ranges, np.inf),
+            log["odom"],
+            float(log["start_angle"]) if "start_angle" in log else -math.pi / 2,
+            float(log["angle_increment"]) if "angle_increment" in log else step,
+            tuple(log["mount"].tolist()) if "mount" in log else (0.0, 0.0, 0.0),
+            float(log["time_increment"]) if "time_increment" in log else 0.0,
+        )
+    rows = np.loadtxt(path)
+    left, right = (np.diff(rows[:, column], prepend=rows[0, column]) for column in (2, 3))
+    yaw = np.cumsum(URG_WHEELS[1] * (right - left))
+    way = URG_WHEELS[0] * (left + right) / 2
+    odom = np.column_stack((np.cumsum(way * np.cos(yaw)), np.cumsum(way * np.sin(yaw)), yaw))
+    ranges = rows[:, 24:] / 1000.0
+    ranges[ranges < 0.02] = np.nan
+    return Recording(rows[:, 0] * 1e-6, ranges, odom, -341 * URG_STEP, URG_STEP, (0.145, 0.0, 0.0))
+
+
+def replayed(log: Recording) -> tuple[list[str], float, float]:
     """Alarms of a recorded log, its duration and how much of it was compared, s."""
-    log = np.load(path)
-    stamps, ranges, odom = log["t"] - log["t"][0] + 1.0, log["ranges"].astype(float), log["odom"]
-    count = ranges.shape[1]
-    step = math.pi / 180 if count == 180 else math.pi / (count - 1)
-    longest = float(np.max(ranges)) * 0.98
+    stamps = log.stamps - log.stamps[0] + 1.0
+    longest = float(np.max(log.ranges[np.isfinite(log.ranges)]))
     monitor = ConsistencyMonitor(ConsistencyConfig(), {Measure.WHEELS: "drive", Measure.SCANS: "lidar"})
-    odometry, alarms, compared, last = ScanMotionStep(), 0, 0.0, 0
+    odometry, alarms, compared, last = ScanMotionStep(), [], 0.0, 0
     monitor.activate(0)
     for k, seconds in enumerate(stamps):
         stamp = int(seconds * SECOND)
         if stamp <= last:
             continue
         if k:
-            dt, (x, y, turn) = (stamp - last) / SECOND, between(odom[k - 1], odom[k]).tolist()
+            dt, (x, y, turn) = (stamp - last) / SECOND, between(log.odom[k - 1], log.odom[k]).tolist()
             c, s = math.cos(turn / 2), math.sin(turn / 2)
             twist = (c * x + s * y) / dt, (c * y - s * x) / dt, turn / dt
             monitor.observe_wheels(WheelIncrement(last, stamp, twist, abs(x), (), ()))
         last = stamp
-        shown = np.where(ranges[k] < longest, ranges[k], np.inf)
-        scan = ScanInput(stamp, shown, -math.pi / 2, step, 0.02, longest)
-        output = odometry.step(
-            StepInput(scan, "kiss", claim=monitor.claim(stamp), lag=monitor.lag(), rest=monitor.rest_claim())
-        )
+        scan = ScanInput(stamp, log.ranges[k], log.start, log.step, 0.02, longest, log.time_step, mount=log.mount)
+        claim, rest = monitor.claim(stamp), monitor.rest_claim()
+        output = odometry.step(StepInput(scan, "kiss", claim=claim, lag=monitor.lag(), rest=rest))
         compared += 0.0 if output.since is None else (output.stamp - output.since) / SECOND
         monitor.observe_scan(output)
-        if monitor.findings():
-            alarms += 1
+        if monitor.unshown is not None:
+            alarms.append(f"{seconds - 1.0:.1f} s: moves {monitor.unshown.distance:.2f} m while its wheels stand")
+        if found := monitor.findings():
+            alarms += [f"{seconds - 1.0:.1f} s: {doubt.sensor}: {doubt.text}" for doubt in found]
             monitor.activate(stamp)
     return alarms, float(stamps[-1] - stamps[0]), compared
 
@@ -327,7 +420,11 @@ def lies(cases: list[str], worlds: list[str], seeds: int) -> dict[str, Any]:
     figures: dict[str, Any] = {}
     for name in cases:
         case = CASES[name]
-        outcomes = [trial(case, world, seed) for world in (["loop"] if case.lap else worlds) for seed in range(seeds)]
+        outcomes = [
+            trial(case, world, seed)
+            for world in ([HOME[case.drive]] if case.drive in HOME else worlds)
+            for seed in range(seeds)
+        ]
         times = [one.noticed for one in outcomes if one.noticed is not None]
         figures[name] = {
             "trials": len(outcomes),
@@ -350,14 +447,17 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=60.0, help="of each of them")
     parser.add_argument("--only", action="append", help="of the shipped configurations, by name")
     parser.add_argument("--logs", type=Path, help="folder of recorded logs")
+    parser.add_argument("--log", action="append", help="of these logs, by file name")
     args = parser.parse_args()
     began = time.monotonic()
     figures: dict[str, Any] = {}
     if args.logs is not None:
-        for path in sorted(args.logs.glob("*.npz")):
-            alarms, duration, compared = replayed(path)
-            figures[path.stem] = {"alarms": alarms, "seconds": round(duration), "compared": round(compared)}
-            _say(f"{path.stem:20} {figures[path.stem]}")
+        files = sorted((*args.logs.glob("*.npz"), *args.logs.glob("*.dat.gz")))
+        for path in (path for path in files if not args.log or path.name in args.log):
+            alarms, duration, compared = replayed(recorded(path))
+            row = {"alarms": len(alarms), "seconds": round(duration), "compared": round(compared)}
+            figures[path.name] = row
+            _say(f"{path.name:24} {row} {'; '.join(alarms)}")
         met = not any(one["alarms"] for one in figures.values())
         goals: dict[str, Any] = {"alarms": 0}
     elif args.quiet:

@@ -78,6 +78,8 @@ class StepOutput:
     deviations: tuple[float, float] = (1.0, 1.0)
     """Standard deviations of the place ahead (m) and of the yaw (rad) at ``stamp``, against a scan that is kept for
     some steps: errors of one step are those of the next one with the other sign."""
+    scatter: tuple[float, float] = (0.0, 0.0)
+    """The same by how much the newest motions differ from each other: no robot goes to and fro from scan to scan."""
     overlap: float = 0.0
     """Share of the points that fit the scan before."""
     verdict: ScanVerdict | None = None
@@ -88,3 +90,8 @@ class StepOutput:
     """Scan odometry that is used."""
     delay: Delay | None = None
     """Answer to the question for the lag."""
+
+    @property
+    def errors(self) -> tuple[float, float]:
+        """Standard deviations of the place ahead (m) and of the yaw (rad): as stated or as they scatter."""
+        return max(self.deviations[0], self.scatter[0]), max(self.deviations[1], self.scatter[1])

@@ -8,7 +8,7 @@ nothing; one about a repeated value ends with the repetition.
 
 import math
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterator
 from typing import Final, NamedTuple
 
 from monstertruck_estimation.consistency.comparison import (
@@ -22,7 +22,7 @@ from monstertruck_estimation.consistency.comparison import (
     way_limit,
 )
 from monstertruck_estimation.consistency.config import ConsistencyConfig
-from monstertruck_estimation.consistency.delay import FEWEST, Delay, LagQuestion, ScanStep, lag_question
+from monstertruck_estimation.consistency.delay import FEWEST, GREATEST, Delay, LagQuestion, ScanStep, lag_question
 from monstertruck_estimation.consistency.exchange import Claim, StepOutput
 from monstertruck_estimation.consistency.repeats import RepeatDetector, WholeRepeats
 from monstertruck_estimation.consistency.rest import RestWatch
@@ -92,6 +92,8 @@ class ConsistencyMonitor:
         self._intervals: deque[float] = deque([0.0], maxlen=INTERVALS)
         """Between the newest scans, s."""
         self._steps: deque[ScanStep] = deque()
+        self._scatter = 0.0, 0.0
+        """Of the newest motions by the scans, m and rad."""
         self._delayed_at = 0
         self._active_since: int | None = None
         self._doubted: frozenset[Measure] = frozenset()
@@ -162,7 +164,8 @@ class ConsistencyMonitor:
         else:
             track.add(output.stamp, output.motion)
             moved = output.motion[0], output.motion[2]
-            self._steps.append(ScanStep(output.since, output.stamp, moved, output.deviations))
+            self._scatter = output.scatter
+            self._steps.append(ScanStep(output.since, output.stamp, moved, output.errors))
             while output.stamp - self._steps[0].since > DELAY_OVER:
                 self._steps.popleft()
         self._scans.append(output.stamp)
@@ -287,11 +290,12 @@ class ConsistencyMonitor:
         elif self._pending is None and stamp - self._asked >= AGAIN:
             self._pending, self._asked = _OpenDisagreement(begun, lasting, claimant, errors), stamp
 
-    def _slack(self, motions: Iterable[Measure], since: int, stamp: int) -> tuple[float, float]:
+    def _slack(self, motions: Collection[Measure], since: int, stamp: int) -> tuple[float, float]:
         """What delays and errors of the stamps explain of a difference, m and rad.
 
         A constant delay costs what the speed has changed; an error of a stamp, the distance travelled meanwhile. Stamps
-        of sparse scans, or of scans in bursts, are no better than the interval between them.
+        of sparse scans, or of scans in bursts, are no better than the interval between them. Scans whose motions
+        scatter more than they state are that uncertain.
         """
         interval, delay = max(self._intervals), self._config.delay
         error = interval if interval > delay else STAMP
@@ -300,7 +304,12 @@ class ConsistencyMonitor:
             max(delay * abs(end[axis] - begin[axis]) + error * max(begin[axis], end[axis]) for begin, end in paces)
             for axis in (0, 1)
         )
-        return way, turn
+        if Measure.SCANS not in motions:
+            return way, turn
+        # Among people who walk with the robot the registration jumps from one to the next.
+        errors, scatter = self._errors[Measure.SCANS], [GREATEST * math.sqrt(2.0) * one for one in self._scatter]
+        stated = 0.0 if errors.way is None else errors.way[1]
+        return way + max(0.0, scatter[0] - stated), turn + max(0.0, scatter[1] - errors.turn[1])
 
     def _tolerated(self, window: Motions, found: Disagreement) -> tuple[float, float]:
         """How far the true motion may be from the claimed one, m and rad."""

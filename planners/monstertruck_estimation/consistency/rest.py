@@ -48,7 +48,7 @@ class RestWatch:
         self._rest.append(output.stamp)
         while output.stamp - self._rest[0] > OVER:
             self._rest.popleft()
-        self._deviations = output.deviations
+        self._deviations = output.errors
         if asked is None or output.rest is None or not output.rest.refuted:
             return
         motion = self._track.motion(asked, output.stamp)

@@ -7,6 +7,7 @@ our registration to the last scan that was kept refines its pose, and does witho
 
 import math
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import replace
 from importlib.util import find_spec
 from typing import Final
@@ -39,6 +40,8 @@ KEEP_TURN: Final = 0.35
 """Turn after which it is, rad."""
 STEPS: Final = 10
 """Steps by which a motion over a window is refined: scan odometry drifts."""
+SCATTERED: Final = 20
+"""Newest changes of the motion whose scatter is measured."""
 REMEMBERED: Final = 128
 """Scans kept for claims."""
 
@@ -80,6 +83,8 @@ class ScanMotionStep:
         self._pose = np.zeros(3)
         self._motion, self._seconds = np.zeros(3), 0.0
         """Newest motion and the time it took."""
+        self._changes: deque[tuple[float, float]] = deque(maxlen=SCATTERED)
+        """From one motion to the next, m^2 and rad^2."""
         self._last: tuple[int, Cloud] | None = None
         self._reference: tuple[Cloud, Array] | None = None
         """The scan that others are registered to, and its pose."""
@@ -114,19 +119,24 @@ class ScanMotionStep:
         if found is None or last is None:
             self._begin(front, scan, self._pose)
             self._motion, self._seconds = np.zeros(3), 0.0
+            self._changes.clear()
             self._kept.clear()
             self._kept.append((stamp, whole, self._pose))
             return StepOutput(stamp, None, front=name)
         motion, overlap, deviations = found
         self._pose = compose(self._pose, motion)
         self._keep(front, scan)
+        if share:
+            changed = motion - lasting
+            self._changes.append((float(changed[:2] @ changed[:2]), float(changed[2] ** 2)))
         self._motion, self._seconds = motion, dt
         self._kept.append((stamp, whole, self._pose))
         while stamp - self._kept[0][0] > KEPT:
             self._kept.popleft()
         verdict, rest = (self._judged(whole, claim) for claim in (inputs.claim, inputs.rest))
         x, y, yaw = motion.tolist()
-        return StepOutput(stamp, last[0], (x, y, yaw), deviations, overlap, verdict, rest, name)
+        scatter = scatter_of(self._changes)
+        return StepOutput(stamp, last[0], (x, y, yaw), deviations, scatter, overlap, verdict, rest, name)
 
     def _begin(self, front: KissFront | None, scan: Scan, pose: Array) -> None:
         self._reference = Cloud.of(scan), pose
@@ -191,6 +201,14 @@ def deviations_of(fit: Fit) -> tuple[float, float]:
     c, s = math.cos(fit.pose[2]), math.sin(fit.pose[2])
     ahead = c * c * covariance[0, 0] + 2 * c * s * covariance[0, 1] + s * s * covariance[1, 1]
     return math.sqrt(ahead), math.sqrt(covariance[2, 2])
+
+
+def scatter_of(changes: Sequence[tuple[float, float]]) -> tuple[float, float]:
+    """Standard deviations (m, rad) of places whose second differences have these squares; 6 variances each."""
+    if not changes:
+        return 0.0, 0.0
+    ahead, turn = (math.sqrt(math.fsum(squares) / len(changes) / 6) for squares in zip(*changes, strict=True))
+    return ahead, turn
 
 
 def _is_near(pose: Array, claimed: Array, errors: tuple[float, float]) -> bool:

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from monstertruck_estimation.consistency.config import ConsistencyConfig
-from monstertruck_estimation.consistency.exchange import StepInput
+from monstertruck_estimation.consistency.exchange import ScanVerdict, StepInput, StepOutput
 from monstertruck_estimation.consistency.monitor import ConsistencyMonitor
-from monstertruck_estimation.consistency.scan_odometry import ScanMotionStep
+from monstertruck_estimation.consistency.scan_odometry import ScanMotionStep, scatter_of
 from monstertruck_estimation.se2 import between
 from monstertruck_estimation.slam.worker_io import ScanInput
 from monstertruck_estimation.wheel_motion import WheelIncrement
@@ -87,3 +87,32 @@ def test_a_body_that_stands_is_not_shown_to_move_though_people_walk_by():
 
     assert not any(watched(np.array([(0.0, 1.4, 1.0)] * 80), ROOM, crowd))
     assert not any(watched(np.array([(0.0, 0.0, 0.0)] * 80), CORRIDOR))
+
+
+def test_motions_that_jump_to_and_fro_state_their_scatter():
+    """Along a corridor the registration jumps from one person who walks there to the next."""
+    rng = np.random.default_rng(4)
+    noise = rng.normal(0.0, 0.1, 200)
+    changes = [(float(change**2), 0.0) for change in np.diff(noise, 2)]
+    assert scatter_of(changes)[0] == pytest.approx(0.1, rel=0.15)
+    assert scatter_of([]) == (0.0, 0.0)
+    *_, newest = outputs(HALL, straight(), "own")
+    assert newest.scatter[0] < 0.02
+    assert newest.scatter[1] < 0.01
+
+
+@pytest.mark.parametrize("scatter", [0.0, 0.1])
+def test_scans_whose_motions_scatter_contradict_only_what_stands_out(scatter):
+    monitor = ConsistencyMonitor(ConsistencyConfig(), SENSORS)
+    monitor.activate(1)
+    for k in range(15):
+        stamp = SECOND + k * PERIOD
+        monitor.observe_wheels(WheelIncrement(stamp - PERIOD, stamp, (0.5, 0.0, 0.0), 0.05, (), ()))
+        asked = monitor.claim(stamp)
+        refuted = None if asked is None else ScanVerdict(claimed=1, own=23, misfits=11)
+        since = None if k == 0 else stamp - PERIOD
+        moved = (0.02 if k % 2 else 0.0, 0.0, 0.0)
+        monitor.observe_scan(StepOutput(stamp, since, moved, (0.01, 0.005), (scatter, 0.0), verdict=refuted))
+        if monitor.findings():
+            break
+    assert bool(monitor.findings()) is (scatter == 0.0)
