@@ -25,22 +25,36 @@ from monstertruck_planners.track.paths import PathService, load_path
 from monstertruck_planners.track.service import TrackerService, TrackSetup
 from monstertruck_runtime.actors.actor import ActorFactory
 from monstertruck_runtime.clock import Clock, VirtualClock
+from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.mailbox import fifo, latest
 from monstertruck_runtime.plugins import kind_of
-from monstertruck_runtime.ports import Publisher, Subscription
+from monstertruck_runtime.ports import EventSink, Publisher, Subscription
 from monstertruck_runtime.service import Service
 from monstertruck_runtime.threads import in_thread, inline
 from monstertruck_schemas import topics
+from monstertruck_schemas.event import Severity
 from monstertruck_schemas.plan import Path
+from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import DriveRequest
+from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.topics import Writer
 from monstertruckd.assembly.estimation import Body
 from monstertruckd.bus.local import Bus
-from monstertruckd.config.truck import TruckConfig
+from monstertruckd.config.truck import PathConfig, TruckConfig
 from monstertruckd.recorder.picture import MapService
 
 STEP_DEADLINE: Final = 5.0
 """Seconds after which a tracker elsewhere is given up; the gate stops the truck long before."""
+
+
+def _drawn(config: PathConfig, frame: str, events: EventSink) -> Path | None:
+    """The configured path; None, and an event, if its file cannot be used."""
+    try:
+        return load_path(config.file, closed=config.closed, frame=frame)
+    except InputError as error:
+        text = f"{error}; the robot starts without this path"
+        events(Reason.FILE_DAMAGED, Severity.WARNING, ServiceName.PATH.value, text)
+        return None
 
 
 def build_planners(
@@ -63,11 +77,8 @@ def build_planners(
         tracker = config.tracker.model_copy(update={"angle": min(config.tracker.angle, body.chassis.reached_angle)})
         paths = bus.publisher(topics.PATH, Writer.PLANNER)
         frame = "odom" if config.slam is None else "map"
-        drawn = None
-        if config.path is not None:
-            drawn = load_path(config.path.file, closed=config.path.closed, frame=frame)
         yield PathService(
-            drawn,
+            None if config.path is None else _drawn(config.path, frame, bus.event_sink()),
             config.emulated,
             clock,
             bus.subscribe(topics.REQ_PATH, fifo(4)),

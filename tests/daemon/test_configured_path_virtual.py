@@ -11,6 +11,9 @@ import pytest
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.drives import drive_configured
 from monstertruck_runtime.errors import NotFoundError, RequestRefusedError
+from monstertruck_runtime.mailbox import latest
+from monstertruck_schemas import topics
+from monstertruck_schemas.health import ServiceHealth, ServiceState
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.config.load import load_config
 from monstertruckd.config.truck import TruckConfig
@@ -31,6 +34,26 @@ def path(tmp_path: Path) -> Path:
     rows = (CONFIGS / "paths" / "loop.csv").read_text().splitlines(keepends=True)
     (tmp_path / "loop.csv").write_text("".join(rows[: round(LENGTH / 0.05) + 2]))
     return tmp_path / "loop.csv"
+
+
+def test_a_path_that_cannot_be_read_is_left_out_and_said(path: Path):
+    path.write_bytes(bytes(100))
+    overlay = {"recorder": None, "blackbox": None, "map": None, "path": {"file": path, "closed": False}}
+    config = with_overlay(load_config(CONFIGS / "demo.yaml", SimulatedTruckConfig)[0], overlay)
+    found: list[ServiceHealth] = []
+
+    async def main(clock: VirtualClock) -> None:
+        rig = VirtualRig(config, clock)
+        async with rig.running():
+            with rig.bus.subscribe(topics.HEALTH, latest()) as health:
+                await clock.sleep(3.0)
+                assert health.latest is not None
+                found.extend(row for row in health.latest.services if row.name == "path")
+
+    run_virtual(main)
+    (row,) = found
+    assert (row.state, row.reason) == (ServiceState.READY, Reason.FILE_DAMAGED)
+    assert str(path) in row.detail
 
 
 def driven(path: Path, scenario: Any) -> float:
