@@ -4,7 +4,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruck_runtime.errors import NotFoundError
 from monstertruckd.tools.cli.connection import require_section, with_robot
@@ -13,6 +12,7 @@ from monstertruckd.tools.cli.output import JsonOption, command_group, print_end,
 
 if TYPE_CHECKING:
     from monstertruck_runtime.client import TruckClient
+    from monstertruck_runtime.clock import Clock
     from monstertruckd.tools.cli.runs import RunEnd
 
 app = command_group("Behaviours: motion in reaction to sensors, without a path, such as following a wall.")
@@ -27,7 +27,7 @@ def list_command(
 ) -> None:
     """Print the behaviours that the robot's configuration has."""
 
-    async def main(client: "TruckClient", _: Clock) -> dict[str, Any]:
+    async def main(client: "TruckClient", _: "Clock") -> dict[str, Any]:
         try:
             return await client.call("behaviours")
         except NotFoundError:
@@ -55,7 +55,7 @@ def start_command(
     """Start a behaviour and follow it to its end, whose reason is the exit code. Ctrl-C stops it."""
     from monstertruckd.tools.cli.runs import run_behaviour
 
-    async def main(client: "TruckClient", _: Clock) -> "RunEnd":
+    async def main(client: "TruckClient", _: "Clock") -> "RunEnd":
         known = await require_section(client, "behaviours", WITHOUT)
         if name not in known:
             raise NotFoundError(f"no behaviour {name!r}: expected one of {', '.join(known)}")
@@ -70,7 +70,7 @@ def stop_command(robot: RobotOption = "truck", endpoint: EndpointOption = DEFAUL
     """Stop the behaviour that runs."""
     from monstertruck_schemas.req import BehaviourOrder
 
-    async def main(client: "TruckClient", _: Clock) -> None:
+    async def main(client: "TruckClient", _: "Clock") -> None:
         await require_section(client, "behaviours", WITHOUT)
         await client.behave(BehaviourOrder.STOP)
 

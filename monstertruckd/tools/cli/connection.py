@@ -1,18 +1,17 @@
 """A command's connection to one robot."""
 
-import asyncio
 import json
 from collections.abc import Callable, Coroutine
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
-from monstertruck_runtime.clock import Clock, run_wall
 from monstertruck_runtime.endpoints import robot_on_host
 from monstertruck_runtime.errors import NotFoundError, TruckError
 from monstertruckd.tools.cli.output import remark
 
 if TYPE_CHECKING:
     from monstertruck_runtime.client import TruckClient
+    from monstertruck_runtime.clock import Clock
     from monstertruckd.config.truck import TruckConfig
 
 T = TypeVar("T")
@@ -41,9 +40,12 @@ def with_robot(
     Raises:
         NotFoundError: no robot answers there.
     """
-    from monstertruck_runtime.client import TruckClient
+    import asyncio
 
-    async def session(clock: Clock) -> T:
+    from monstertruck_runtime.client import TruckClient
+    from monstertruck_runtime.clock import run_wall
+
+    async def session(clock: "Clock") -> T:
         waiting = asyncio.create_task(_say_waiting(robot, endpoint, clock))
         try:
             async with TruckClient(robot, endpoint, clock=clock, timeout=timeout) as client:
@@ -57,7 +59,7 @@ def with_robot(
     return run_wall(session)
 
 
-async def _say_waiting(robot: str, endpoint: str, clock: Clock) -> None:
+async def _say_waiting(robot: str, endpoint: str, clock: "Clock") -> None:
     await clock.sleep(SOON)
     remark(f"waiting for robot {robot!r} at {endpoint} ...")
 

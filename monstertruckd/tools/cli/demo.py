@@ -3,11 +3,10 @@
 import itertools
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import ConfigError, InputError
 from monstertruck_runtime.small_files import require_place
 from monstertruckd.tools.cli.options import SimulatedOption
@@ -24,6 +23,9 @@ from monstertruckd.tools.cli.output import (
     until_stopped,
 )
 from monstertruckd.tools.shipped import shipped
+
+if TYPE_CHECKING:
+    from monstertruck_runtime.clock import Clock
 
 DEMO_CONFIG = shipped("configs/demo.yaml")
 
@@ -134,7 +136,7 @@ def simulate(
     simulated = as_fleet([load_simulated(file) for file in files])
     code = 0
 
-    async def main(clock: Clock) -> None:
+    async def main(clock: "Clock") -> None:
         nonlocal code
         code = await serve(clock, simulated, print_words, truth, files if run else ())
 

@@ -3,11 +3,10 @@
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
-from monstertruck_runtime.clock import Clock, run_wall
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.tools.cli.options import complete_device
 from monstertruckd.tools.cli.output import (
@@ -20,6 +19,9 @@ from monstertruckd.tools.cli.output import (
     remark,
     until_stopped,
 )
+
+if TYPE_CHECKING:
+    from monstertruck_runtime.clock import Clock
 
 DeviceArgument = Annotated[
     str,
@@ -59,7 +61,7 @@ def emulate(
 
     port = link or emulated_ports(ROBOT) / DEVICES.named(device).role.name
 
-    async def main(clock: Clock) -> None:
+    async def main(clock: "Clock") -> None:
         async with emulate_device(device, port, clock, seed) as emulated:
             remark(f"{device} on {port}; faults on standard input, Ctrl-C ends")
             if (limits := OWN_CLIENTS.get(DEVICES.named(device).opens)) is not None:
@@ -84,6 +86,7 @@ def probe(
     from monstertruck_drivers.computer import ROOT, Computer
     from monstertruck_drivers.link import BAUD
     from monstertruck_drivers.tty import SerialPort
+    from monstertruck_runtime.clock import run_wall
     from monstertruck_runtime.errors import InputError, NotFoundError
 
     kind = DEVICES.named(device)
@@ -92,7 +95,7 @@ def probe(
     if kind.opens == "computer" and port is not None:
         raise InputError(f"{device}: is the computer's own and hangs on no port; leave out --port")
 
-    async def main(clock: Clock) -> dict[str, Any]:
+    async def main(clock: "Clock") -> dict[str, Any]:
         where: Any = Computer.at(ROOT, clock)
         if kind.opens == "video":
             where = str(port or "/dev/video*")

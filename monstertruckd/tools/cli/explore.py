@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruck_runtime.errors import InputError
 from monstertruckd.tools.cli.connection import require_section, with_robot
@@ -14,6 +13,7 @@ from monstertruckd.tools.cli.output import JsonOption, print_end, print_words
 
 if TYPE_CHECKING:
     from monstertruck_runtime.client import TruckClient
+    from monstertruck_runtime.clock import Clock
     from monstertruckd.tools.cli.runs import RunEnd
 
 UNITS: Final = {"": 1.0, "s": 1.0, "min": 60.0, "h": 3600.0}
@@ -61,7 +61,7 @@ def explore(
 
     seconds = None if budget is None else seconds_of(budget)
 
-    async def main(client: "TruckClient", _: Clock) -> "RunEnd | None":
+    async def main(client: "TruckClient", _: "Clock") -> "RunEnd | None":
         await require_section(client, "explorer", "does not explore")
         if stop:
             await client.explore(ExploreOrder.STOP)

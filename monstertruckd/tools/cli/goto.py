@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruckd.tools.cli.connection import require_section, with_robot
 from monstertruckd.tools.cli.options import EndpointOption, RobotOption, ViaOption, parse_pose, require_finite
@@ -13,6 +12,7 @@ from monstertruckd.tools.cli.output import JsonOption, print_end, print_json
 
 if TYPE_CHECKING:
     from monstertruck_runtime.client import TruckClient
+    from monstertruck_runtime.clock import Clock
     from monstertruck_runtime.drives import Arrival
 
 ROUTE_TIMEOUT: Final = 6.0
@@ -41,7 +41,7 @@ def goto(
     places = [parse_pose(text, yaw_needed=False) for text in via or ()]
     require_finite((x, y, yaw), *places)
 
-    async def main(client: "TruckClient", clock: Clock) -> "Arrival":
+    async def main(client: "TruckClient", clock: "Clock") -> "Arrival":
         await require_section(client, "planner", "has no planner")
         with on_the_terminal() as report:
             return await drive_to(client, clock, (x, y, yaw), places, arm=arm, report=report)
@@ -69,7 +69,7 @@ def track(
 
     path = load_path(file, closed=closed)
 
-    async def main(client: "TruckClient", clock: Clock) -> "Arrival":
+    async def main(client: "TruckClient", clock: "Clock") -> "Arrival":
         localised = (await client.call("config")).get("slam") is not None
         there = path.model_copy(update={"frame": "map" if localised else "odom"})
         with on_the_terminal() as report:
@@ -96,7 +96,7 @@ def path(
     from monstertruck_runtime.drives import drive_configured
     from monstertruckd.tools.cli.goto_session import on_the_terminal
 
-    async def main(client: "TruckClient", clock: Clock) -> "Arrival | str":
+    async def main(client: "TruckClient", clock: "Clock") -> "Arrival | str":
         configured = Path((await require_section(client, "path", "has no path"))["file"]).stem
         if name is None:
             return configured

@@ -1,13 +1,11 @@
 """Commands that watch a running robot: the live screen, and plain messages."""
 
-import asyncio
 import math
 import sys
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
-from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruck_runtime.errors import NoAnswerError
 from monstertruckd.tools.cli.connection import not_ready
@@ -16,6 +14,7 @@ from monstertruckd.tools.cli.output import JsonOption, on_terminal, print_json, 
 
 if TYPE_CHECKING:
     from monstertruck_runtime.client import TruckClient
+    from monstertruck_runtime.clock import Clock
     from monstertruck_schemas.topics import Topic
 
 SILENCE: Final = 2.0
@@ -51,6 +50,8 @@ def echo(
     json_output: JsonOption = False,
 ) -> None:
     """Print a topic's messages as they come, one JSON object per line; on a terminal long lists are cut short."""
+    import asyncio
+
     from monstertruck_runtime.client import TruckClient
     from monstertruck_runtime.mailbox import fifo
     from monstertruck_schemas.topics import BY_NAME
@@ -60,7 +61,7 @@ def echo(
     row = BY_NAME[topic]
     short = on_terminal(sys.stdout) and not json_output
 
-    async def main(clock: Clock) -> None:
+    async def main(clock: "Clock") -> None:
         async with TruckClient(robot, endpoint, clock=clock) as client:
             with client.subscribe(row, fifo(256)) as messages:
                 waiting = asyncio.create_task(_explain_silence(client, clock, row))
@@ -80,7 +81,7 @@ def echo(
     until_stopped(main)
 
 
-async def _explain_silence(client: "TruckClient", clock: Clock, topic: "Topic[Any]") -> None:
+async def _explain_silence(client: "TruckClient", clock: "Clock", topic: "Topic[Any]") -> None:
     from monstertruck_schemas.topics import Writer
 
     await clock.sleep(SILENCE)

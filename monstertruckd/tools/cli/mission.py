@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruck_runtime.errors import ConfigError, InputError, NotFoundError
 from monstertruckd.tools.cli.connection import require_section, with_robot
@@ -14,6 +13,7 @@ from monstertruckd.tools.cli.output import JsonOption, command_group, print_end,
 
 if TYPE_CHECKING:
     from monstertruck_runtime.client import TruckClient
+    from monstertruck_runtime.clock import Clock
     from monstertruck_schemas.mission import Mission
     from monstertruckd.tools.cli.runs import RunEnd
 
@@ -44,7 +44,7 @@ def run_command(
         raise InputError("--moved: expected with --resume only")
     mission = None if file is None else load(file)
 
-    async def main(client: "TruckClient", _: Clock) -> "RunEnd":
+    async def main(client: "TruckClient", _: "Clock") -> "RunEnd":
         await require_section(client, "planner", WITHOUT)
         return await run_mission(client, mission, arm=arm, moved=moved, report=None if json_output else print_words)
 
@@ -108,7 +108,7 @@ def stop_command(robot: RobotOption = "truck", endpoint: EndpointOption = DEFAUL
     """End the mission that runs; the robot brakes and stands."""
     from monstertruck_schemas.req import MissionOrder
 
-    async def main(client: "TruckClient", _: Clock) -> None:
+    async def main(client: "TruckClient", _: "Clock") -> None:
         await require_section(client, "planner", WITHOUT)
         await client.mission(MissionOrder.STOP)
 

@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruck_runtime.errors import InputError
 from monstertruckd.tools.cli.connection import with_robot
@@ -14,6 +13,7 @@ from monstertruckd.tools.cli.output import JsonOption, print_end
 
 if TYPE_CHECKING:
     from monstertruck_runtime.client import TruckClient
+    from monstertruck_runtime.clock import Clock
     from monstertruckd.tools.cli.runs import RunEnd
 
 
@@ -66,7 +66,7 @@ def move(
     settings = {name: value for name, value in given.items() if value is not None}
     _check(settings)
 
-    async def main(client: "TruckClient", _: Clock) -> "RunEnd":
+    async def main(client: "TruckClient", _: "Clock") -> "RunEnd":
         return await run_behaviour(client, "move", arm=arm, settings=settings)
 
     end = with_robot(main, robot, endpoint, orders=True)

@@ -1,6 +1,5 @@
 """``arm``, ``disarm``, ``estop``, ``reset``: one order each, whose outcome is the exit code; ``drive`` by hand."""
 
-import asyncio
 import math
 import sys
 from collections.abc import Iterator
@@ -11,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT, local_endpoints, robot_on_host
 from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError, TruckError
 from monstertruck_runtime.robots import robots_here
@@ -24,6 +22,7 @@ from monstertruckd.tools.driving.modes import SPEEDS, SteeringMode
 
 if TYPE_CHECKING:
     from monstertruck_runtime.client import TruckClient
+    from monstertruck_runtime.clock import Clock
     from monstertruck_schemas.req import Order
     from monstertruck_schemas.state import GateState
 
@@ -65,6 +64,8 @@ async def give(client: "TruckClient", order: "Order", *, hold: bool = False) -> 
         NoAnswerError: no answer in time.
         NotFoundError: the robot is not there.
     """
+    import asyncio
+
     from monstertruck_schemas.req import Order
     from monstertruck_schemas.topics import GATE
 
@@ -97,6 +98,8 @@ async def _announce(client: "TruckClient", *, hold: bool) -> None:
 
 async def _set_off(client: "TruckClient", gate: "GateState | None") -> list[str]:
     """Who drives as soon as the robot is armed: those who ask for it now, and the tracker if it has a path."""
+    import asyncio
+
     from monstertruck_runtime.mailbox import latest
     from monstertruck_schemas.topics import TRACKER
 
@@ -115,7 +118,7 @@ def _run(name: str, robot: str, endpoint: str, *, json_output: bool, hold: bool 
 
     order = Order(name)
 
-    async def main(client: "TruckClient", _: Clock) -> OrderOutcome:
+    async def main(client: "TruckClient", _: "Clock") -> OrderOutcome:
         if order is Order.ARM:
             await _announce(client, hold=hold)
         return await give(client, order, hold=hold)

@@ -24,7 +24,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Protocol, TextIO, cast
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from monstertruck_runtime.clock import WallClock, run_wall
 from monstertruck_runtime.errors import NotInstalledError, RequestRefusedError, TruckError, disk_reason
 from monstertruck_schemas.reasons import Reason
 
@@ -33,6 +32,8 @@ if TYPE_CHECKING:
     from typer._click import Context
     from typer.core import TyperOption
     from typer.models import CommandFunctionType
+
+    from monstertruck_runtime.clock import WallClock
 
 PIPE_WIDTH: Final = 200
 """Width of text that does not go to a terminal: wide enough to cut nothing."""
@@ -298,8 +299,10 @@ def print_end(reason: Reason, text: str, values: Mapping[str, Any], *, json_outp
     finish(reason, whole)
 
 
-def until_stopped(main: Callable[[WallClock], Coroutine[Any, Any, None]]) -> None:
+def until_stopped(main: "Callable[[WallClock], Coroutine[Any, Any, None]]") -> None:
     """Run ``main(clock)`` until it returns, or until Ctrl-C or SIGTERM: its ordinary ends."""
+    from monstertruck_runtime.clock import run_wall
+
     with suppress(KeyboardInterrupt):
         run_wall(main)
 

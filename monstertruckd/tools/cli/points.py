@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
-from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruck_runtime.errors import InputError, NoAnswerError, NotFoundError
 from monstertruckd.tools.cli.connection import not_ready, require_section, with_robot
@@ -20,6 +19,7 @@ from monstertruckd.tools.cli.output import JsonOption, command_group, print_end,
 
 if TYPE_CHECKING:
     from monstertruck_runtime.client import TruckClient
+    from monstertruck_runtime.clock import Clock
     from monstertruck_runtime.drives import Arrival
     from monstertruck_schemas.points import PointOfInterest, PointOrder
 
@@ -84,7 +84,7 @@ def goto_command(
     from monstertruck_runtime.drives import drive_to
     from monstertruckd.tools.cli.goto_session import on_the_terminal
 
-    async def main(client: "TruckClient", clock: Clock) -> "Arrival":
+    async def main(client: "TruckClient", clock: "Clock") -> "Arrival":
         named = {point.name: point for point in await _newest(client, clock)}
         if name not in named:
             known = f"expected one of {', '.join(named)}" if named else "none is known"
@@ -139,14 +139,14 @@ def _points(folder: Path | None, robot: str, endpoint: str) -> "list[PointOfInte
 
 
 def _order(order: "PointOrder", robot: str, endpoint: str, *what: Any) -> dict[str, Any]:
-    async def main(client: "TruckClient", _: Clock) -> dict[str, Any]:
+    async def main(client: "TruckClient", _: "Clock") -> dict[str, Any]:
         await require_section(client, "points", WITHOUT)
         return await client.point(order, *what)
 
     return with_robot(main, robot, endpoint, orders=True)
 
 
-async def _newest(client: "TruckClient", clock: Clock) -> "list[PointOfInterest]":
+async def _newest(client: "TruckClient", clock: "Clock") -> "list[PointOfInterest]":
     from monstertruck_runtime.mailbox import latest
     from monstertruck_schemas.topics import POINTS
 

@@ -1,14 +1,16 @@
 """Commands of the robot: run the daemon or its remote planner, print the tables of topics and reasons."""
 
 from functools import partial
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruckd.tools.cli.options import ConfigOption, EndpointOption, RobotOption
 from monstertruckd.tools.cli.output import JsonOption, needs_extra, print_json, print_table, until_stopped
+
+if TYPE_CHECKING:
+    from monstertruck_runtime.clock import Clock
 
 VerboseOption = Annotated[bool, typer.Option("--verbose", "-v", help="Log debug messages, too.")]
 
@@ -110,7 +112,7 @@ def plan_server(robot: RobotOption = "truck", endpoint: EndpointOption = DEFAULT
     from monstertruck_runtime.actors.remote import POLL, serve
     from monstertruck_runtime.client import TruckClient
 
-    async def main(clock: Clock) -> None:
+    async def main(clock: "Clock") -> None:
         connect = partial(TruckClient, robot, endpoint, clock=clock, timeout=2 * POLL)
         await serve(clock, connect, STEPS, CODEC)
 

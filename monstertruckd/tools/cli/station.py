@@ -1,20 +1,20 @@
 """``monstertruckd station``: the operator's web page."""
 
-import asyncio
-import ssl
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from monstertruck_runtime.clock import WallClock
 from monstertruck_runtime.endpoints import is_endpoint
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.roles import AccessRole
 from monstertruckd.tools.cli.output import needs_extra, remark, until_stopped
 
 if TYPE_CHECKING:
+    from ssl import SSLContext
+
+    from monstertruck_runtime.clock import WallClock
     from monstertruckd.station.address import RobotAddress
 
 
@@ -62,6 +62,8 @@ def station(
     It is a client of the robots like any other, and asks nothing of the internet. Beyond the loopback
     interface the page is served by TLS only, and to users who log in.
     """
+    import asyncio
+
     from monstertruckd.recorder.reader import open_log
     from monstertruckd.station import users as station_users
     from monstertruckd.station.address import RobotAddress
@@ -82,7 +84,7 @@ def station(
     if (foxglove or foxglove_drive or rerun) and not addresses:
         raise typer.BadParameter("a viewer shows one robot: expected --robot NAME@ENDPOINT")
 
-    async def serve(clock: WallClock) -> None:
+    async def serve(clock: "WallClock") -> None:
         page = Station(addresses, clock, place, routers or (), open_log)
         jobs = [page.run(lambda: remark(f"station: {place.url}"))]
         if foxglove or foxglove_drive:
@@ -94,7 +96,7 @@ def station(
     until_stopped(serve)
 
 
-async def _foxglove(address: "RobotAddress", clock: WallClock, port: int, *, drives: bool) -> None:
+async def _foxglove(address: "RobotAddress", clock: "WallClock", port: int, *, drives: bool) -> None:
     with needs_extra("viewers"):
         from monstertruckd.station.foxglove import LAYOUT, FoxgloveServer
 
@@ -102,7 +104,7 @@ async def _foxglove(address: "RobotAddress", clock: WallClock, port: int, *, dri
     await server.run(lambda: remark(f"Foxglove: ws://127.0.0.1:{server.port}, layout {LAYOUT}"))
 
 
-async def _rerun(address: "RobotAddress", clock: WallClock) -> None:
+async def _rerun(address: "RobotAddress", clock: "WallClock") -> None:
     from monstertruckd.tools.logs.live_process import VIEWER, show_live
 
     with needs_extra("viewers"):
@@ -112,12 +114,14 @@ async def _rerun(address: "RobotAddress", clock: WallClock) -> None:
     await show_live(address.name, address.endpoint, clock)
 
 
-def _tls(certificate: Path | None, key: Path | None) -> ssl.SSLContext | None:
+def _tls(certificate: Path | None, key: Path | None) -> "SSLContext | None":
     """Of the page; TLS 1.2 at least.
 
     Raises:
         InputError: a file is missing, or they do not belong together.
     """
+    import ssl
+
     if certificate is None and key is None:
         return None
     if certificate is None or key is None:

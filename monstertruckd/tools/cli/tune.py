@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruck_runtime.errors import InputError, NotFoundError
 from monstertruckd.tools.cli.connection import require_section, with_robot
@@ -14,6 +13,7 @@ from monstertruckd.tools.cli.output import command_group, needs_extra, print_tab
 
 if TYPE_CHECKING:
     from monstertruck_runtime.client import TruckClient
+    from monstertruck_runtime.clock import Clock
     from monstertruckd.tools.tune.recipe import WallGains
     from monstertruckd.tools.tune.runs import TuningRun
 
@@ -43,7 +43,7 @@ def wall_command(
         runs.append(run)
         remark(run.text)
 
-    async def main(client: "TruckClient", clock: Clock) -> "WallGains | None":
+    async def main(client: "TruckClient", clock: "Clock") -> "WallGains | None":
         config = (await require_section(client, "behaviours", "has no behaviours")).get(name)
         if config is None:
             raise NotFoundError(f"no behaviour {name!r}: see `monstertruckd behave list`")

@@ -6,7 +6,6 @@ from typing import Annotated
 
 import typer
 
-from monstertruck_runtime.clock import run_wall
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruckd.tools.cli.connection import with_robot
 from monstertruckd.tools.cli.options import EndpointOption, RobotOption, complete_role
@@ -20,6 +19,7 @@ def usb(
     json_output: JsonOption = False,
 ) -> None:
     """USB hubs, ports and devices of a running robot: what hangs where, its role, state and replugs."""
+    from monstertruck_runtime.clock import run_wall
     from monstertruckd.tools.cli.usb_tree import draw, local_tree, plain, robot_tree
 
     nodes = run_wall(local_tree) if local else with_robot(lambda client, _: robot_tree(client), robot, endpoint)
@@ -49,6 +49,7 @@ def find_port(
     """Unplug the cable: this names its hub and port and prints the line for the configuration."""
     from monstertruck_drivers.computer import Machine
     from monstertruck_drivers.config import Devices
+    from monstertruck_runtime.clock import run_wall
     from monstertruck_runtime.errors import InputError
     from monstertruckd.tools.cli.find_port import config_line, find_cable, require_place, write_port
 
