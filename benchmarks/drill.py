@@ -25,7 +25,7 @@ from monstertruckd.config.load import load_config
 from monstertruckd.tools.drill.campaign import Campaign, CampaignReport
 from monstertruckd.tools.drill.legs import default_jobs
 from monstertruckd.tools.drill.random_drill import Drill, DrillReport, FaultOutcome
-from monstertruckd.tools.drill.summary import by_family, troubles
+from monstertruckd.tools.drill.summary import by_family, troubles, without_reason
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -62,11 +62,12 @@ def family_table(report: CampaignReport) -> None:
     """One row for every family; seconds to the reason."""
     print("| family | trials | with a reason | reason | s, p50 | greatest | unsafe | stuck |")
     print("|---|---:|---:|---|---:|---:|---:|---:|")
-    for row in by_family(report.outcomes):
+    summaries = by_family(report.outcomes)
+    for row in summaries:
         middle, most = ("-" if s is None else f"{s:.2f}" for s in (row.reason_p50_s, row.reason_max_s))
         cells = row.family, row.trials, row.noticed, row.reason or "-", middle, most, row.unsafe, row.stuck
         print(f"| {' | '.join(map(str, cells))} |")
-    for line in troubles(report.outcomes):
+    for line in (*without_reason(summaries), *troubles(report.outcomes)):
         print(line)
 
 

@@ -76,11 +76,12 @@ def _run(
 
 
 def _show_families(report: "CampaignReport", *, json_output: bool) -> None:
-    from monstertruckd.tools.drill.summary import by_family, troubles
+    from monstertruckd.tools.drill.summary import by_family, troubles, without_reason
 
     if json_output:
         print_json(report.as_json())
         return
+    summaries = by_family(report.outcomes)
     numbers = ("trials", "noticed", "p50 s", "max s", "unsafe", "stuck")
     rows = [
         (
@@ -90,10 +91,12 @@ def _show_families(report: "CampaignReport", *, json_output: bool) -> None:
             row.reason or "-",
             row.family,
         )
-        for row in by_family(report.outcomes)
+        for row in summaries
     ]
     print_table((*numbers, "reason", "family"), rows, right=numbers)
     out, figures = console(), report.figures()
+    for line in without_reason(summaries):
+        out.print(line)
     for line in troubles(report.outcomes):
         out.print(line, style="red")
     out.print(

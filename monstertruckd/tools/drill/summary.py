@@ -8,6 +8,7 @@ import numpy as np
 
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.tools.drill.campaign import TrialOutcome
+from monstertruckd.tools.drill.unrevealed import explained
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,6 +51,15 @@ def _summary(family: str, outcomes: list[TrialOutcome]) -> FamilySummary:
         sum(o.unsafe for o in outcomes),
         sum(bool(o.stuck) for o in outcomes),
     )
+
+
+def without_reason(summaries: Iterable[FamilySummary]) -> Iterator[str]:
+    """Lines on the families that no reason followed: what limits those that nothing reveals, and the others by name."""
+    by_row, others = explained(summary.family for summary in summaries if not summary.noticed)
+    for row, families in by_row.items():
+        yield f"nothing reveals {', '.join(families)}: {row.why}; limit: {row.limit}"
+    if others:
+        yield f"no reason within the trial: {', '.join(others)}"
 
 
 def troubles(outcomes: Iterable[TrialOutcome]) -> Iterator[str]:
