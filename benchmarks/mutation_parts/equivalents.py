@@ -18,6 +18,7 @@ EQUIVALENTS: Final[dict[str, str]] = {
     f"{GATE}obstacles.py::ObstacleGuard.delay: 0 -> (1)": NANOSECOND,
     f"{GATE}obstacles.py::ObstacleGuard.free_distance: self._checked != rounded -> True": CACHE,
     f"{GATE}obstacles.py::ObstacleGuard.free_distance: self._checked = rounded -> pass": CACHE,
+    f"{GATE}obstacles.py::ObstacleGuard.__init__: self._free = math.inf -> self._free = None": CACHE,
     f"{GATE}visibility.py::Visibility.observe: geometry != self._geometry -> True": CACHE,
     f"{GATE}visibility.py::Visibility.__init__: 0 -> (1)": UNREAD,
     f"{GATE}visibility.py::_sector: bearings + math.pi -> ((bearings) - (math.pi))": "a whole turn, modulo turns",

@@ -122,7 +122,8 @@ class _Second(Finder):
         zero = isinstance(limit, ast.Constant) and not limit.value
         if len(node.ops) == 1 and isinstance(node.ops[0], LIMITS) and not zero:
             left, sign = self.text(node.left), self.text(node)[len(self.text(node.left)) :].split()[0]
-            for change in (f"* {SHIFT}", f"/ {SHIFT}"):
+            counts = left.startswith("len(")
+            for change in ("+ 1", "- 1") if counts else (f"* {SHIFT}", f"/ {SHIFT}"):
                 self.add("shifted", node, f"({left}) {sign} ({self.text(limit)}) {change}")
         self.generic_visit(node)
 

@@ -26,6 +26,7 @@ def changes(source: str, operator: str) -> set[tuple[str, str]]:
         ("exchanged", "f(x=c, y=d)", {("f(x=c, y=d)", "(f(x=d, y=c))")}),
         ("exchanged", "max(a, b)", set()),
         ("shifted", "a < b", {("a < b", "((a) < (b) * 1.1)"), ("a < b", "((a) < (b) / 1.1)")}),
+        ("shifted", "len(a) < b", {("len(a) < b", "((len(a)) < (b) + 1)"), ("len(a) < b", "((len(a)) < (b) - 1)")}),
         ("shifted", "a[0]", {("0", "(-1)")}),
         ("shifted", "a[1:]", {("a[1:]", "(a[(1) + 1:])")}),
         ("unreturned", "def f():\n    return a", {("return a", "return None")}),

@@ -21,7 +21,7 @@ from monstertruck_schemas.sensor import (
 )
 from monstertruck_schemas.state import Consistency, GateMode, UnshownMotion
 from monstertruckd.gate.config import GateConfig, RunawayConfig
-from monstertruckd.gate.runaway import MAX_ORDERS, RunawayKind, ShaftBounds, ShaftWatch
+from monstertruckd.gate.runaway import MAX_ORDERS, BodyWatch, RunawayKind, ShaftBounds, ShaftWatch
 from tests.unit.gate.rig import DRIVETRAIN, Rig, feedback, header
 
 CONFIG, GATE = RunawayConfig(), GateConfig()
@@ -191,6 +191,27 @@ def test_the_current_of_another_mode_shows_nothing():
     assert shaft.run(1.0) == [], "it coasts, and its current has not been read yet"
 
 
+@pytest.mark.parametrize(("share", "pulls"), [(0.95, False), (1.0, False), (1.01, True), (-1.01, True)])
+def test_a_current_above_that_of_an_idle_motor_may_move_the_body(share, pulls):
+    shaft = Shaft(current=share * CONFIG.idle_current)
+    shaft.run(0.2)
+    assert shaft.watch.pulls(CONFIG, fresh=True) is pulls
+
+
+def test_the_bounds_of_a_shaft_that_was_never_ordered_are_standstill():
+    bounds = ShaftBounds()
+    assert (bounds.low, bounds.high, bounds.furthest, bounds.rearmost, bounds.ordered) == (0.0,) * 5
+
+
+@pytest.mark.parametrize(("share", "found"), [(0.95, False), (1.0, True), (-1.0, True)])
+def test_a_body_moves_from_the_speed_of_standstill_on(share, found):
+    watch, results = BodyWatch("imu", 0.5), []
+    for tick in range(600):
+        speed = share * GATE.standstill
+        results.append(watch.observe(tick * TICK, speed, CONFIG, GATE.standstill, standing=True, driven=True))
+    assert any(results) is found
+
+
 # What is none
 
 
@@ -247,6 +268,7 @@ def test_a_drive_that_does_not_stop_after_an_emergency_stop_loses_its_power_stag
     (event,) = rig.reported(Reason.UNCOMMANDED_MOTION)
     assert event.severity is Severity.ERROR
     assert "power stage off" in event.text
+    assert f"drive {RunawayKind.DOES_NOT_STOP} at 0.15" in event.text
     assert event.values["speed"] == pytest.approx(0.15)
     assert rig.out.action is DriveAction.DISABLE
     assert rig.trips[-1].reason is Reason.UNCOMMANDED_MOTION
@@ -377,6 +399,16 @@ def test_a_body_that_moves_while_its_drive_reads_standstill_is_found(speed, wz):
     rig.tick(30)
     assert moved(rig, speed, wz) <= 0.5
     assert "stands by its own measure" in rig.reported(Reason.UNCOMMANDED_MOTION)[0].text
+
+
+def test_a_body_that_moves_is_found_after_days_as_well():
+    rig = Rig()
+    rig.now = 10**6 * SECOND
+    rig.armed()
+    rig.current = 0.3
+    rig.driver = {"speed": 0.0}
+    rig.tick(30)
+    assert moved(rig, 0.2) <= 0.5
 
 
 def test_a_body_that_moves_after_a_stop_while_the_drive_is_lost_is_found():
