@@ -6,6 +6,7 @@ GATE: Final = "monstertruckd/gate/"
 DRIVE: Final = "drivers/monstertruck_drivers/epos/driver.py"
 EXCHANGE: Final = "drivers/monstertruck_drivers/epos/exchange.py"
 NANOSECOND: Final = "a nanosecond, at the very beginning of time"
+TINY: Final = "a pace of a micrometre a second"
 UNREAD: Final = "set before it is read"
 ROUNDED: Final = "a difference of rounded distances is never exactly 3 cm"
 CACHE: Final = "the cached value is computed once more"
@@ -19,6 +20,8 @@ EQUIVALENTS: Final[dict[str, str]] = {
     f"{GATE}obstacles.py::ObstacleGuard.free_distance: self._checked != rounded -> True": CACHE,
     f"{GATE}obstacles.py::ObstacleGuard.free_distance: self._checked = rounded -> pass": CACHE,
     f"{GATE}obstacles.py::ObstacleGuard.__init__: self._free = math.inf -> self._free = None": CACHE,
+    f"{GATE}limiter.py::CommandLimiter.aim: pace >= LEAST -> ((pace) >= (LEAST) / 1.1)": TINY,
+    f"{GATE}limiter.py::CommandLimiter.aim: pace >= LEAST -> ((pace) >= (LEAST) * 1.1)": TINY,
     f"{GATE}visibility.py::Visibility.observe: geometry != self._geometry -> True": CACHE,
     f"{GATE}visibility.py::Visibility.__init__: 0 -> (1)": UNREAD,
     f"{GATE}visibility.py::_sector: bearings + math.pi -> ((bearings) - (math.pi))": "a whole turn, modulo turns",

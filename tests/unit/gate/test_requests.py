@@ -192,6 +192,23 @@ def test_of_two_who_stop_each_has_to_know_of_the_other():
     assert rig.order(Order.ARM, source="bob", gate_stamp=between) is Reason.OK
 
 
+def test_who_stops_twice_has_to_know_of_the_other_stop_alone():
+    rig = Rig()
+    rig.tick(5)
+    before = rig.now
+    rig.tick()
+    rig.order(Order.STOP, source="ann")
+    between = rig.now
+    for _ in range(2):
+        rig.tick()
+        rig.order(Order.STOP, source="bob")
+    rig.tick()
+    assert rig.order(Order.ARM, source="bob", gate_stamp=before) is Reason.BAD_SEQUENCE
+    rig.tick()
+    assert rig.events[-1].text == "ann has ordered a stop meanwhile"
+    assert rig.order(Order.ARM, source="bob", gate_stamp=between) is Reason.OK
+
+
 def test_planners_need_no_gate_stamp():
     assert Rig().armed().drive(**TRACK, gate_stamp=None) is Reason.OK
 
