@@ -8,7 +8,7 @@ speed and commanded axle angles. ``ShaftCheck`` finds a shaft that is blocked.
 import math
 from collections import deque
 from collections.abc import Iterator
-from typing import Any, Final
+from typing import Any, Final, Generic, Protocol, TypeVar
 
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.base import Message
@@ -29,7 +29,43 @@ GAP: Final = SECOND // 2
 """Headings further apart than this are not compared, ns."""
 
 
-class SteeringCheck(Check):
+class Comparison(Protocol):
+    """Compares commands with measurements; ``contradicts`` stays until ``reset``."""
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether the measurements contradict the commands."""
+
+    def reset(self) -> None:
+        """Start over."""
+
+
+C = TypeVar("C", bound=Comparison)
+
+
+class FollowingCheck(Check, Generic[C]):
+    """One reason as long as a comparison contradicts.
+
+    Args:
+        view: what it may look at.
+        comparison: of commands and measurements.
+    """
+
+    def __init__(self, view: GateView, comparison: C) -> None:
+        super().__init__(view)
+        self._comparison = comparison
+
+    def reason(self, now: int) -> Iterator[Reason]:
+        """A contradiction since the robot was armed."""
+        if self._comparison.contradicts:
+            yield from self.reasons
+
+    def reset(self) -> None:
+        """Only driving can show whether it works again."""
+        self._comparison.reset()
+
+
+class SteeringCheck(FollowingCheck["TurnComparison"]):
     """The compass contradicts wheels and steering: the servos do not follow their commands.
 
     Args:
@@ -40,8 +76,7 @@ class SteeringCheck(Check):
     reasons = (Reason.STEERING_DEAD,)
 
     def __init__(self, view: GateView, config: SteeringCheckConfig) -> None:
-        super().__init__(view)
-        self._turns = TurnComparison(config)
+        super().__init__(view, TurnComparison(config))
 
     def observe(self, seen: Message | Tick, topic: Topic[Any] | None) -> None:
         """Compare a heading with what wheels and steering say at that time."""
@@ -50,24 +85,15 @@ class SteeringCheck(Check):
         now, samples = seen.received, self.view.samples
         trusted = seen.tilt_valid and not seen.heading_disturbed and samples.steering_fresh(now)
         heading = seen.heading if trusted and self.view.mode.active else None
-        self._turns.observe(seen.stamp, heading, samples.speed(now), samples.turn_rate(now))
-
-    def reason(self, now: int) -> Iterator[Reason]:
-        """A contradiction since the robot was armed."""
-        if self._turns.dead:
-            yield Reason.STEERING_DEAD
+        self._comparison.observe(seen.stamp, heading, samples.speed(now), samples.turn_rate(now))
 
     def figures(self, reason: Reason, now: int) -> Iterator[Measurement]:
         """Difference of the turns."""
-        turns = self._turns
+        turns = self._comparison
         yield Measurement(name="yaw difference", value=turns.difference, unit="rad", limit=turns.config.tolerance)
 
-    def reset(self) -> None:
-        """Only driving can show whether it works again."""
-        self._turns.reset()
 
-
-class ShaftCheck(Check):
+class ShaftCheck(FollowingCheck["ShaftComparison"]):
     """A driven shaft does not turn although it is commanded to.
 
     Args:
@@ -78,32 +104,22 @@ class ShaftCheck(Check):
     reasons = (Reason.SHAFT_BLOCKED,)
 
     def __init__(self, view: GateView, config: ShaftCheckConfig) -> None:
-        super().__init__(view)
-        self._shafts = ShaftComparison(config)
+        super().__init__(view, ShaftComparison(config))
 
     def observe(self, seen: Message | Tick, topic: Topic[Any] | None) -> None:
         """Compare a shaft's speed with its command."""
         if isinstance(seen, DriveFeedback) and topic is not None:
             shaft = DRIVES.index(topic)
             measured = self.view.chassis.drivetrain.speed(seen.velocity)
-            self._shafts.observe(seen, shaft, self.view.motion.shaft_speeds[shaft], measured)
-
-    def reason(self, now: int) -> Iterator[Reason]:
-        """A shaft that was blocked since the robot was armed."""
-        if self._shafts.blocked is not None:
-            yield Reason.SHAFT_BLOCKED
+            self._comparison.observe(seen, shaft, self.view.motion.shaft_speeds[shaft], measured)
 
     def figures(self, reason: Reason, now: int) -> Iterator[Measurement]:
         """Current of its motor."""
-        yield Measurement(name="motor current", value=self._shafts.current, unit="A")
-
-    def reset(self) -> None:
-        """Only driving can show whether it turns again."""
-        self._shafts.reset()
+        yield Measurement(name="motor current", value=self._comparison.current, unit="A")
 
 
 class TurnComparison:
-    """Compares the turn commanded with the turn measured over a sliding window; ``dead`` stays until ``reset``.
+    """Compares the turn commanded with the turn measured over a sliding window; ``contradicts`` stays until ``reset``.
 
     Args:
         config: window and tolerance.
@@ -114,7 +130,7 @@ class TurnComparison:
         self._window: deque[tuple[int, float, float]] = deque()
         """(ns, turn by the commands, turn by the compass) since a common origin, rad, left positive."""
         self._heading = 0.0
-        self.dead = False
+        self.contradicts = False
         """The steering does not follow its commands."""
         self.difference = 0.0
         """Turn measured less turn commanded over the window, rad."""
@@ -122,7 +138,7 @@ class TurnComparison:
     def reset(self) -> None:
         """Start over."""
         self._window.clear()
-        self.dead = False
+        self.contradicts = False
         self.difference = 0.0
 
     def observe(self, stamp: int, heading: float | None, speed: float | None, rate: float) -> None:
@@ -164,7 +180,7 @@ class TurnComparison:
         commanded, measured = commanded_now - commanded_then, measured_now - measured_then
         self.difference = measured - commanded
         allowed = self.config.tolerance + self.config.share * max(abs(commanded), abs(measured))
-        self.dead |= abs(self.difference) > allowed
+        self.contradicts |= abs(self.difference) > allowed
 
 
 class ShaftComparison:
@@ -185,6 +201,11 @@ class ShaftComparison:
         """Newest measured current of each, A."""
         self.blocked: int | None = None
         """The shaft that does not turn."""
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether a shaft is blocked."""
+        return self.blocked is not None
 
     def reset(self) -> None:
         """Start over."""

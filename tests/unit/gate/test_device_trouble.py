@@ -251,5 +251,5 @@ def test_of_two_shafts_the_second_one_alone_stops_the_robot():
     robot._obey = held_second
     robot.tick(40)
     assert robot.reported(Reason.SHAFT_BLOCKED)
-    assert check_of(robot.gate, ShaftCheck)._shafts.blocked in (1, None)
+    assert check_of(robot.gate, ShaftCheck)._comparison.blocked in (1, None)
     assert robot.trips[-1].reason is Reason.SHAFT_BLOCKED

@@ -59,7 +59,7 @@ def set_to(**values):
 
 
 def kill_the_steering(rig):
-    check_of(rig.gate, SteeringCheck)._turns.dead = True
+    check_of(rig.gate, SteeringCheck)._comparison.contradicts = True
 
 
 def stall(rig):

@@ -25,7 +25,7 @@ def drive(check, seconds, *, turning=1.0, speed=SPEED, heading=0.0, rate=RATE, s
         at = step * PERIOD / SECOND
         measured = (heading - turning * RATE * at) % (2 * math.pi)
         check.observe(start + step * PERIOD, measured, speed, rate)
-        if check.dead:
+        if check.contradicts:
             return at
     return None
 
@@ -45,7 +45,7 @@ def test_one_that_does_not_is_found_within_a_second_and_a_half(check, turning):
     found = drive(check, 20.0, turning=turning)
     assert found is not None
     assert found < 1.5
-    assert check.dead
+    assert check.contradicts
 
 
 def test_turning_without_being_commanded_to_is_found(check):
@@ -59,7 +59,7 @@ def test_standing_still_proves_nothing(check):
 def test_a_reset_forgets(check):
     drive(check, 5.0, turning=0.0)
     check.reset()
-    assert (check.dead, check.difference) == (False, 0.0)
+    assert (check.contradicts, check.difference) == (False, 0.0)
     assert drive(check, 5.0, start=60 * SECOND) is None
 
 
@@ -67,7 +67,7 @@ def test_a_reset_forgets_what_was_compared_just_before(check):
     found = drive(check, 5.0, turning=0.0)
     check.reset()
     check.observe(round(found * SECOND) + PERIOD, 0.0, SPEED, RATE)
-    assert not check.dead
+    assert not check.contradicts
 
 
 def test_a_heading_that_jumps_is_the_compass(check):
@@ -80,20 +80,20 @@ def test_what_is_not_known_is_not_judged(check, heading, speed):
     for step in range(200):
         unknown = step % 5 == 0
         check.observe(step * PERIOD, heading if unknown else 0.0, speed if unknown else SPEED, RATE)
-    assert not check.dead
+    assert not check.contradicts
 
 
 def test_headings_far_apart_are_not_compared(check):
     for step in range(20):
         check.observe(step * SECOND, 0.0, SPEED, RATE)
-    assert not check.dead
+    assert not check.contradicts
 
 
 def turned(check, commanded, measured, seconds=0.4, speed=SPEED):
     """Two headings ``seconds`` apart, the turns between them in rad, left positive."""
     check.observe(0, 1.0, speed, 0.0)
     check.observe(round(seconds * SECOND), 1.0 - measured, speed, commanded / seconds)
-    return check.dead
+    return check.contradicts
 
 
 @pytest.mark.parametrize("sign", [1, -1])
@@ -132,7 +132,7 @@ def test_what_lies_before_a_jump_is_not_compared_with_what_comes_after(check):
     turn(1.0, 1)
     turn(-0.13, 10)
     assert check.difference == pytest.approx(-0.13)
-    assert not check.dead
+    assert not check.contradicts
 
 
 def test_headings_half_a_second_apart_are_compared_and_no_further(check):
@@ -154,7 +154,7 @@ def test_what_lies_before_a_heading_that_is_not_known_is_forgotten(check):
     check.observe(SECOND // 10, None, SPEED, 0.0)
     check.observe(SECOND // 5, 0.7, SPEED, 0.0)
     assert check.difference == 0.0
-    assert not check.dead
+    assert not check.contradicts
 
 
 def test_turns_are_compared_over_the_window_and_not_longer(check):
@@ -172,14 +172,14 @@ def test_turns_are_compared_over_the_window_and_not_longer(check):
 def test_dead_steering_stays_so_until_the_reset(check):
     drive(check, 5.0, turning=0.0)
     drive(check, 5.0, start=60 * SECOND)
-    assert check.dead
+    assert check.contradicts
 
 
 def test_headings_out_of_order_are_not_compared(check):
     check.observe(SECOND, 1.0, SPEED, 0.0)
     check.observe(SECOND - 1, 0.2, SPEED, 0.0)
     check.observe(SECOND - 1, 0.9, SPEED, 0.0)
-    assert not check.dead
+    assert not check.contradicts
     assert check.difference == 0.0
 
 
@@ -246,7 +246,7 @@ def test_a_heading_is_judged_if_it_and_the_steering_are_known_while_the_truck_is
     if not steering:
         rig.now += SECOND
     headings = []
-    turns = check_of(rig.gate, SteeringCheck)._turns
+    turns = check_of(rig.gate, SteeringCheck)._comparison
     monkeypatch.setattr(turns, "observe", lambda _stamp, heading, *_: headings.append(heading))
     show(rig.gate, Attitude(**header(rig.now), **({"heading": 0.5, "roll": 0.0, "pitch": 0.0} | changes)))
     assert headings == ([0.5] if judged and armed else [None])
