@@ -69,7 +69,9 @@ class ConsistencyCheck(Check):
             yield Cause(reason=reason, source=doubt.sensor, since=doubt.since, text=text, measurements=(figure,))
 
     def text(self, reason: Reason) -> str:
-        """Names both sensors and their difference."""
+        """Names both sensors and their difference, or what the robot lacks."""
+        if reason is Reason.UNWITNESSED:
+            return self._lacking()
         texts = [f"{doubt.sensor}: {doubt.text}" for doubt in self._doubts() if _reason(doubt) is reason]
         return "; ".join(texts) or reason.text
 
@@ -84,6 +86,17 @@ class ConsistencyCheck(Check):
     def _is_expected(self, doubt: Doubt) -> bool:
         """Whether a robot that is armed to calibrate its sensors goes on slowly in spite of this doubt."""
         return self.view.calibrates and _reason(doubt) is Reason.SENSORS_DISAGREE
+
+    def _lacking(self) -> str:
+        newest = self._newest
+        if newest is None or newest.distances is None:
+            return Reason.UNWITNESSED.text
+        kinds = (
+            ("distance", newest.distances, "a lidar or encoders of free wheels"),
+            ("yaw", newest.measures, "a compass, an IMU or a lidar"),
+        )
+        lacks = [f"{kind} ({cure})" for kind, measures, cure in kinds if len(measures) < ENOUGH]
+        return f"no second sensor measures {' and '.join(lacks)}" if lacks else "the comparison of sensors is silent"
 
     def _witnessed(self, now: int) -> bool:
         newest = self._newest

@@ -29,8 +29,9 @@ class Rig:
         samples, motion = Samples(limits, CHASSIS, SERVICES), Motion(limits, CHASSIS)
         self.check = ConsistencyCheck(GateView(limits, CHASSIS, Footprint(), samples, motion, self.states))
 
-    def say(self, *doubts, measures=("wheels", "scans"), at=NOW):
-        message = Consistency(stamp=at, received=at, seq=0, frame="base", measures=measures, doubts=doubts)
+    def say(self, *doubts, measures=("wheels", "scans"), distances=None, at=NOW):
+        known = {"measures": measures, "distances": distances, "doubts": doubts}
+        message = Consistency(stamp=at, received=at, seq=0, frame="base", **known)
         self.check.observe(message, CONSISTENCY)
 
     def arm(self, at):
@@ -105,6 +106,21 @@ def test_without_a_second_measure_the_speed_limits_are_halved():
     rig.say()
     assert rig.limits() == {}
     assert rig.limits(at=NOW + 4 * SECOND) == {Reason.UNWITNESSED: config.speed / 2}
+
+
+@pytest.mark.parametrize(
+    ("measures", "distances", "text"),
+    [
+        (("wheels",), ("wheels",), "measures distance (a lidar or encoders of free wheels) and yaw (a compass, an IMU"),
+        (("wheels", "gyro"), ("wheels",), "measures distance (a lidar or encoders of free wheels)"),
+        (("wheels", "scans"), ("wheels", "scans"), "the comparison of sensors is silent"),
+        (("wheels",), None, Reason.UNWITNESSED.text),
+    ],
+)
+def test_it_says_what_the_robot_lacks(measures, distances, text):
+    rig = Rig()
+    rig.say(measures=measures, distances=distances)
+    assert text in rig.check.text(Reason.UNWITNESSED)
 
 
 def test_a_robot_armed_to_calibrate_is_slowed_by_measures_that_disagree_and_stopped_by_frozen_ones():
