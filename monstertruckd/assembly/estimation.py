@@ -160,6 +160,7 @@ def _build_consistency(
             encoders=None if devices.encoders is None else bus.subscribe(topics.ENCODERS, fifo(ODOMETRIES)),
             battery=bus.subscribe(topics.BATTERY, fifo(SCANS)) if measures_battery(config) else None,
             camera=None if devices.camera is None else bus.subscribe(topics.CAMERA, fifo(SCANS)),
+            stand=bus.subscribe(topics.STAND_POSE, fifo(ODOMETRIES)) if config.stand == "overhead" else None,
         ),
         scans=scans,
         inertial=None if axes is None else Inertial(GyroConfig(), axes),

@@ -169,7 +169,8 @@ class TruckConfig(Schema):
     calibration: Path | None = None
     """Folder of the calibration files; null = `calibration` in the state directory"""
     stand: Literal["none", "simulator", "overhead"] = "none"
-    """Source of the true pose on `mt/stand/sensor/pose_<robot>`: recorded only, nothing in the robot reads it"""
+    """Source of the true pose on `mt/stand/sensor/pose_<robot>`: recorded; of cameras, the
+    consistency check alone reads it"""
     sim: Any = None
     """The simulated side; `simulate` and `config show` check it, the daemon does not read it"""
 

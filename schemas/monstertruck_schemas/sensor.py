@@ -267,7 +267,8 @@ class StabiliserFeedback(Message):
 class StandPose(Message):
     """Pose of a robot as a test stand saw it from outside; ``frame`` is the stand's own, whose origin is its middle.
 
-    For studies and for judging estimates: no estimator, planner or gate reads it.
+    For studies and for judging estimates: no estimator and no planner reads it. The consistency check compares what
+    cameras see with the robot's own measures of its motion.
     """
 
     pose: Pose2D

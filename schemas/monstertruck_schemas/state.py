@@ -193,7 +193,7 @@ class Consistency(Message):
     """Comparison of the robot's independent measures of motion. Retained."""
 
     measures: tuple[str, ...]
-    """Measures in use: wheels, scans, gyro, compass, encoders."""
+    """Measures in use: wheels, scans, gyro, compass, encoders, stand."""
     distances: tuple[str, ...] | None = None
     """Those of them that measure distances, not turns alone; None = not said."""
     doubts: tuple[Doubt, ...] = ()

@@ -325,7 +325,7 @@ STAND_POSE: Final = Topic(
     "stand/pose",
     StandPose,
     W.STAND,
-    "Pose of the robot as a test stand sees it; recorded with the robot's topics, read by none of its parts",
+    "Pose of the robot as a test stand sees it; recorded with the robot's topics, read by its consistency check alone",
     20,
     place="stand/sensor/pose_{robot}",
 )

@@ -26,10 +26,11 @@ from monstertruck_estimation.consistency.delay import FEWEST, GREATEST, Delay, L
 from monstertruck_estimation.consistency.exchange import Claim, StepOutput
 from monstertruck_estimation.consistency.repeats import RepeatDetector, WholeRepeats
 from monstertruck_estimation.consistency.rest import RestWatch
-from monstertruck_estimation.consistency.tracks import STILL, MotionTrack, Vector
+from monstertruck_estimation.consistency.tracks import STILL, MotionTrack, Vector, between
 from monstertruck_estimation.transforms import wrap_angle
 from monstertruck_estimation.wheel_motion import WheelIncrement
 from monstertruck_runtime.clock import SECOND
+from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.state import Doubt, DoubtKind, UnshownMotion
 
 WINDOWS: Final = (0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 5.0, 8.0)
@@ -40,7 +41,7 @@ DELAY_PERIOD: Final = SECOND // 4
 """Time between two looks at the delay of the scans, ns."""
 DELAY_OVER: Final = 4 * SECOND
 """Time over which it is determined, ns."""
-WITNESSES: Final = (Measure.WHEELS, Measure.GYRO, Measure.ENCODERS)
+WITNESSES: Final = (Measure.WHEELS, Measure.GYRO, Measure.ENCODERS, Measure.STAND)
 """Measures that show at what time the motion changes."""
 GAP: Final = SECOND // 2
 """Headings and rates further apart are not joined, ns."""
@@ -82,6 +83,8 @@ class ConsistencyMonitor:
         self._tracks = {measure: MotionTrack() for measure in sensors}
         self._witnesses = [measure for measure in WITNESSES if measure in sensors]
         self._sampled: dict[Measure, int] = {}
+        self._seen: tuple[int, Vector] | None = None
+        """By the stand."""
         self._heading: tuple[int, float] | None = None
         self._rate: tuple[int, float] | None = None
         self._bias: float | None = None
@@ -127,6 +130,18 @@ class ConsistencyMonitor:
         """Take the motion of free wheels since their reading before, m and rad; ``stamp`` in ns."""
         self._sampled[Measure.ENCODERS] = stamp
         self._tracks[Measure.ENCODERS].add(stamp, motion)
+
+    def observe_stand(self, stamp: int, pose: Pose2D) -> None:
+        """Take the robot's pose as cameras over it see it; ``stamp`` in ns."""
+        seen = pose.x, pose.y, pose.yaw
+        before, self._seen = self._seen, (stamp, seen)
+        self._sampled[Measure.STAND] = stamp
+        track = self._tracks[Measure.STAND]
+        if before is None or not 0 < stamp - before[0] <= GAP:
+            track.begin(stamp)
+        else:
+            x, y, turn = between(before[1], seen)
+            track.add(stamp, (x, y, float(wrap_angle(turn))))
 
     def observe_heading(self, stamp: int, yaw: float | None) -> None:
         """Take a heading, counter-clockwise, rad; None = the compass says itself that it is disturbed."""

@@ -32,6 +32,7 @@ from monstertruck_schemas.sensor import (
     DriveFeedback,
     Imu,
     LaserScan,
+    StandPose,
     SteeringFeedback,
     WheelEncoders,
 )
@@ -65,6 +66,8 @@ class ConsistencyInputs:
     encoders: Mailbox[WheelEncoders] | None
     battery: Mailbox[Battery] | None
     camera: Mailbox[CompressedImage] | None
+    stand: Mailbox[StandPose] | None = None
+    """Cameras over the robot; a simulated world's truth is no measure."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,6 +120,7 @@ class ConsistencyService:
             (Measure.GYRO, DeviceRole.IMU, inertial is not None),
             (Measure.COMPASS, DeviceRole.COMPASS, inputs.compass is not None),
             (Measure.ENCODERS, DeviceRole.ENCODERS, inputs.encoders is not None),
+            (Measure.STAND, Measure.STAND.value, inputs.stand is not None),
         )
         self.monitor = ConsistencyMonitor(config, {measure: role for measure, role, there in measured if there})
         self._wheels = WheelMotion(chassis, MAX_SPEED)
@@ -194,6 +198,9 @@ class ConsistencyService:
                 monitor.observe_value(DeviceRole.IMU, field.replace("_", " "), imu.stamp, getattr(imu, field).z)
         for reading in () if inputs.encoders is None else inputs.encoders.drain():
             self._roll(reading)
+        for seen in () if inputs.stand is None else inputs.stand.drain():
+            if seen.observer == "overhead":
+                monitor.observe_stand(seen.stamp, seen.pose)
         for battery in () if inputs.battery is None else inputs.battery.drain():
             monitor.observe_value(DeviceRole.BATTERY, "voltage", battery.stamp, battery.raw_voltage)
         for image in () if inputs.camera is None else inputs.camera.drain():

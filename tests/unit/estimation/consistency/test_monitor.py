@@ -10,8 +10,9 @@ from monstertruck_estimation.consistency.config import ConsistencyConfig
 from monstertruck_estimation.consistency.monitor import ConsistencyMonitor
 from monstertruck_estimation.wheel_motion import WheelIncrement
 from monstertruck_runtime.clock import SECOND
+from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.state import DoubtKind
-from tests.unit.estimation.consistency.kit import SENSORS, Lies, drive, straight
+from tests.unit.estimation.consistency.kit import PERIOD, SENSORS, Lies, drive, straight
 from tests.unit.estimation.slam.kit import CORRIDOR, HALL, LIDAR, ROOM, box, ranges, rounds
 
 WITH_COMPASS = {**SENSORS, Measure.COMPASS: "compass"}
@@ -129,3 +130,20 @@ def test_measures_in_use_are_those_with_samples_of_late():
     monitor.observe_heading(SECOND, 0.0)
     assert monitor.in_use(2 * SECOND) == (Measure.COMPASS,)
     assert monitor.in_use(5 * SECOND) == ()
+
+
+def test_a_stand_that_sees_the_robot_shows_wheels_that_lie():
+    """The wheels show half of the distance."""
+    sensors = {Measure.WHEELS: "drive", Measure.STAND: "stand"}
+    poses, monitor = straight(seconds=6.0), ConsistencyMonitor(ConsistencyConfig(), sensors)
+    monitor.activate(1)
+    for k, pose in enumerate(poses):
+        stamp = SECOND + k * PERIOD
+        x, y, yaw = pose.tolist()
+        speed = 0.0 if k == 0 else 5.0 * (x - float(poses[k - 1][0]))
+        monitor.observe_stand(stamp, Pose2D(x=x, y=y, yaw=yaw))
+        monitor.observe_wheels(WheelIncrement(stamp - PERIOD, stamp, (speed, 0.0, 0.0), abs(speed) / 10, (), ()))
+    assert monitor.in_use(stamp) == (Measure.WHEELS, Measure.STAND)
+    (found,) = [doubt for doubt in monitor.findings() if doubt.sensor == "drive"]
+    assert found.against == "stand"
+    assert "by the stand" in found.text
