@@ -346,6 +346,23 @@ def test_a_pack_that_seemed_critical_keeps_a_robot_waiting_and_is_not_stuck(monk
     run_virtual(main)
 
 
+def test_a_robot_whose_stabiliser_turned_by_itself_recovers_once_an_operator_has_reset_it() -> None:
+    config = load_config(CONFIGS / "full.yaml", SimulatedTruckConfig)[0].model_copy(update={"recorder": None})
+    config = with_overlay(wired(config), {"tracker": None, "path": None})
+
+    async def main(clock: VirtualClock) -> None:
+        async with DrillTruck.running(config, clock, wander=np.random.default_rng(2), judged=True) as truck:
+            assert await truck.until(truck.drives, 15.0, Order.ARM)
+            signals = truck.rig.context.signals("stabiliser")
+            signals.inject("goal_position_2", "scaled", "2.5")
+            assert await truck.until(lambda: Reason.UNCOMMANDED_MOTION in truck.blockers(), 3.0)
+            signals.inject("goal_position_2", "off")
+            assert await recovers(truck)
+            assert await drives_again(truck)
+
+    run_virtual(main)
+
+
 # A stalled computer
 
 
