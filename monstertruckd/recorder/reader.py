@@ -115,7 +115,8 @@ class LogReader:
         self.log_offset = 0
         """The file's log times minus daemon times, ns, once an iteration has passed the metadata."""
         with open_file(path) as file:
-            if not MAGIC.startswith(file.read(len(MAGIC))) and Salvage(file).strange:
+            head = file.read(len(MAGIC))
+            if not MAGIC.startswith(head) and (not _resembles(head) or Salvage(file).strange):
                 raise InputError(f"{path}: not an MCAP log")
 
     def __iter__(self) -> Iterator[LogMessage]:
@@ -313,6 +314,11 @@ class LogReader:
     def metadata(self) -> dict[str, dict[str, str]]:
         """Metadata records of the preamble, by name."""
         return {record.name: dict(record.metadata) for record in self.preamble() if isinstance(record, Metadata)}
+
+
+def _resembles(head: bytes) -> bool:
+    """Whether the begin of a log may have become this: part of it is there, or a hole."""
+    return not any(head) or any(one == other for one, other in zip(head, MAGIC, strict=False))
 
 
 def _introduction(number: int, facts: ChannelFacts) -> Iterator[Schema | Channel]:

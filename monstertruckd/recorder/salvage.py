@@ -11,7 +11,7 @@ import os
 import re
 import struct
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from io import BytesIO
 from typing import Any, BinaryIO, Final, NamedTuple
@@ -150,6 +150,10 @@ class Salvage:
         self.flaws: list[str] = []
         """Damage that costs no message, found so far."""
         self._spans: list[Span] = []
+        self._newest: int | None = None
+        """Greatest log time of the messages given so far, ns."""
+        self._gap = False
+        """Nothing was given since the last gap."""
         self._found = _Scan(self._data, trusted=self.indexed).run()
 
     @property
@@ -219,26 +223,36 @@ class Salvage:
         Args:
             begin: byte from which on they are yielded; those before it are counted.
         """
-        newest: int | None = None
-        gap = False
+        self._newest, self._gap = None, False
         for part in self._found.parts:
             if part is None:
-                gap = True
+                self._gap = True
+                continue
+            times = self._found.times.get(part.offset)
+            if times is not None and part.offset < begin:
+                self._count(times)
                 continue
             for record in self._opened(part):
                 if isinstance(record, Message):
-                    if gap:
-                        self._spans.append(Span(newest, record.log_time))
-                        gap = False
-                    newest = max(record.log_time, newest or 0)
-                    self.first = record.log_time if self.first is None else min(self.first, record.log_time)
-                    self.messages += 1
+                    at = record.log_time
+                    self._count(_Times(1, at, at, at))
                     if part.offset >= begin:
                         yield record, self._facts(record.channel_id)
                 elif isinstance(record, Header | Attachment | Metadata) and part.offset >= begin:
                     yield record
-        if gap or not self.ended:
-            self._spans.append(Span(newest, None))
+        if self._gap or not self.ended:
+            self._spans.append(Span(self._newest, None))
+
+    def _count(self, times: "_Times") -> None:
+        """Note messages that are there."""
+        if not times.messages:
+            return
+        if self._gap:
+            self._spans.append(Span(self._newest, times.begin))
+            self._gap = False
+        self._newest = max(times.newest, self._newest or 0)
+        self.first = times.first if self.first is None else min(self.first, times.first)
+        self.messages += times.messages
 
     def _opened(self, part: "_WholeRecord") -> Iterator[McapRecord]:
         record = part.read(self._data)
@@ -309,6 +323,23 @@ class _WholeRecord(NamedTuple):
         return record
 
 
+class _Times(NamedTuple):
+    """Log times of messages, ns."""
+
+    messages: int
+    begin: int
+    """Of the first one in the file."""
+    first: int
+    """The least."""
+    newest: int
+    """The greatest."""
+
+    @classmethod
+    def of(cls, times: Sequence[int]) -> "_Times":
+        """Of messages in their order."""
+        return cls(len(times), times[0], min(times), max(times)) if times else cls(0, 0, 0, 0)
+
+
 @dataclass(slots=True)
 class _KnownChannels:
     """Schemas and channels by number; the first one of a number stands."""
@@ -336,6 +367,8 @@ class _Found:
     """Of records without a checksum."""
     names: dict[int, str] = field(default_factory=dict)
     """Topics by channel, from the recorder's metadata."""
+    times: dict[int, _Times] = field(default_factory=dict)
+    """Of the messages of each whole chunk, by the chunk's offset."""
     chunks: list[tuple[int, int, int]] = field(default_factory=list)
     """First and last log time, and size, of whole chunks."""
     expected: list[ChunkIndex] = field(default_factory=list)
@@ -526,8 +559,12 @@ class _Scan:
         self._found.parts.append(part)
         chunk = part.read(self._data)
         self._found.chunks.append((chunk.message_start_time, chunk.message_end_time, chunk.uncompressed_size))
+        times = list[int]()
         for record in records_in(unpacked(chunk)):
             self._found.sealed.learn(record)
+            if isinstance(record, Message):
+                times.append(record.log_time)
+        self._found.times[part.offset] = _Times.of(times)
 
     def _is_new(self, part: _WholeRecord) -> bool:
         digest = digest_of(part.opcode, part.content(self._data))

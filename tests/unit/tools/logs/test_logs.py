@@ -189,6 +189,17 @@ def test_recovery_leaves_the_original_when_it_cannot_write(cut, tmp_path):
     assert cut.exists()
 
 
+@pytest.mark.parametrize("head", [b"\0", b"\x89"])
+def test_a_log_whose_begin_is_damaged_is_read(log, master, head):
+    """A bit of its mark has flipped, or the disk lost its first block."""
+    data = log.read_bytes()
+    log.write_bytes(head + bytes(7) + data[8:])
+    reader = open_log(log)
+    assert len(list(reader)) == len(master[1])
+    assert reader.damage is None
+    assert reader.fault.startswith("is damaged at byte 0 of ")
+
+
 def test_a_repair_on_a_disk_that_takes_nothing_names_the_log(cut, monkeypatch):
     def refuse(*_: object, **__: object) -> None:
         raise OSError(errno.EROFS, "Read-only file system")
