@@ -30,7 +30,16 @@ from monstertruck_drivers.tty import MAX_AGE, SerialPort
 from monstertruck_drivers.usb.config import CycleMethod, PowerConfig, UsbConfig, UsbPortConfig
 from monstertruck_drivers.usb.hub import HubCoordinator, UsbService
 from monstertruck_drivers.usb.port import HubPort, PortPower
-from monstertruck_drivers.usb.tree import at_present, parent_of, port_directory, port_of, read_tree, topology_of
+from monstertruck_drivers.usb.tree import (
+    DEVICES,
+    ancestors,
+    at_present,
+    parent_of,
+    port_directory,
+    port_of,
+    read_tree,
+    topology_of,
+)
 from monstertruck_runtime.clock import WallClock
 from monstertruck_runtime.errors import DeviceError, DeviceLostError, PortBusyError
 from monstertruck_runtime.mailbox import Mailbox, latest
@@ -251,7 +260,7 @@ async def open_and_close() -> dict[str, Any]:
 
 
 async def deaf() -> dict[str, Any]:
-    """A device that takes nothing: its link ends, its port is wedged, and opens again once the kernel lets go."""
+    """A device that takes nothing: its link ends, its port is wedged, for the doctor too, until the kernel lets go."""
     node = tty_of(by_id(GADGET))
     assert node is not None
     port = SerialPort(node)
@@ -262,6 +271,7 @@ async def deaf() -> dict[str, Any]:
         sent += 1
         await asyncio.sleep(0.02)
     gave_up = time.monotonic() - begin
+    doctor = asyncio.create_task(doctors_handshakes())
     reasons: list[str] = []
     begin = time.monotonic()
     while time.monotonic() - begin < 60:
@@ -274,7 +284,10 @@ async def deaf() -> dict[str, Any]:
             break
     free_after = time.monotonic() - begin
     ok = link.is_lost and gave_up < 1.0 and set(reasons) == {"device_wedged"} and free_after < 45
-    return {"ok": ok, "gave_up_s": gave_up, "sent": sent, "free_after_s": free_after, "refused": len(reasons)}
+    seen = await doctor
+    ok = ok and seen.get("steering handshake") == "device_wedged"
+    found = {"gave_up_s": gave_up, "sent": sent, "free_after_s": free_after, "refused": len(reasons)}
+    return {"ok": ok, **found, "doctor": seen}
 
 
 async def listens_again() -> dict[str, Any]:
@@ -524,17 +537,9 @@ def doctors_context() -> HostContext:
     return inspect(ROOT, Program.present(), Path("/run/truck/truck.yaml"), 0, CLOCK)
 
 
-async def doctor() -> dict[str, Any]:
-    """The doctor's handshake names a wedged port."""
-    node = tty_of(by_id(GADGET))
-    assert node is not None
-    link = await SerialPort(node).open()
-    while not link.is_lost:
-        link.write(b"x" * 64)
-        await asyncio.sleep(0.02)
-    found = {one.check: one.reason.value async for one in handshakes(doctors_context())}
-    await until(lambda: not closing(), 45)
-    return {"ok": found.get("steering handshake") == "device_wedged", "found": found}
+async def doctors_handshakes() -> dict[str, str]:
+    """Reasons that the doctor's handshakes end with."""
+    return {one.check: one.reason.value async for one in handshakes(doctors_context())}
 
 
 async def topology() -> dict[str, Any]:
@@ -543,6 +548,28 @@ async def topology() -> dict[str, Any]:
     shown = await printed("udevadm", "info", f"/sys/bus/usb/devices/{by_serial('SNs1')}")
     ok = all(at_present(MACHINE.sysfs, long) == name for name, long in names.items())
     return {"ok": ok and f"ID_PATH={names[by_serial('SNs1')]}" in shown, "names": names}
+
+
+async def renumbered_buses() -> dict[str, Any]:
+    """Controllers are found again in another order: a port by topology opens on a bus with another number."""
+    sysfs = MACHINE.sysfs
+    before = by_serial("SNs1")
+    topology = topology_of(sysfs, before)
+    port = HubPort(place(topology), MACHINE, Events())
+    link = await port.open()
+    roots = {name: [*ancestors(name)][-1] for name in (before, by_id("1d6b:0104"))}
+    serials = [str(sysfs.text(f"{DEVICES}/{root}/serial")) for root in roots.values()]
+    drivers = [*zip(("pci/drivers/xhci_hcd", "platform/drivers/dummy_hcd"), serials, strict=True)]
+    for driver, controller in drivers:
+        await asyncio.to_thread(sysfs.write, f"bus/{driver}/unbind", controller)
+    await until(lambda: link.is_lost, 20)
+    for driver, controller in reversed(drivers):
+        await asyncio.to_thread(sysfs.write, f"bus/{driver}/bind", controller)
+    await until(lambda: tty_of(at_present(sysfs, topology)) is not None, RETURN)
+    (await port.open()).close()
+    after = by_serial("SNs1")
+    ok = before != after == at_present(sysfs, topology) and before.partition("-")[2] == after.partition("-")[2]
+    return {"ok": ok, "before": before, "after": after, "topology": topology}
 
 
 async def control() -> dict[str, Any]:
@@ -558,6 +585,6 @@ async def control() -> dict[str, Any]:
 async def run_all() -> None:
     """One after the other."""
     acts = (control, tree, topology, open_and_close, udev_rules, foreign_opener, brltty, drivers, hub_pulled)
-    acts += (unplugged_in_mid_write, port_power, deaf, listens_again, doctor, reopened_by_another_name)
+    acts += (unplugged_in_mid_write, port_power, deaf, listens_again, reopened_by_another_name, renumbered_buses)
     for act in acts:
         await situation(act.__name__, act)

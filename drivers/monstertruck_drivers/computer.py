@@ -11,7 +11,7 @@ from typing import Any, Final, Protocol, Self
 from monstertruck_drivers.tty import OpenSerial, SerialPort
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import DeviceError
-from monstertruck_runtime.threads import Offload, in_thread
+from monstertruck_runtime.threads import Offload, in_daemon_thread
 
 
 class Sysfs:
@@ -159,7 +159,9 @@ class Machine:
     clock: Clock
     sysfs: Sysfs = field(default_factory=Sysfs)
     dev: Path = Path("/dev")
-    offload: Offload = in_thread
+    offload: Offload = in_daemon_thread
+    """Where its files are read and written: attributes of a device that hangs wait for it, some for half a minute, so
+    that neither other look-ups nor the end of a driver may wait for them."""
     run: Callable[[Sequence[str]], Awaitable[tuple[int, str]]] = run_command
     serial: OpenSerial = SerialPort
     """Makes the port of a serial node."""

@@ -255,6 +255,23 @@ class _Tty(serial.Serial):
         if not (name in ("timeout", "write_timeout") and self.is_open and value == getattr(self, name)):
             super().__setattr__(name, value)
 
+    def write(self, data: Any) -> int:
+        """Write once; pyserial's own ``write`` repeats it as long as nothing fits, which stops the event loop.
+
+        Returns:
+            Bytes that fitted.
+
+        Raises:
+            BlockingIOError: none did.
+            serial.SerialException: the port is gone.
+        """
+        try:
+            return os.write(self.fileno(), data)
+        except BlockingIOError:
+            raise
+        except OSError as error:
+            raise serial.SerialException(error.errno, error.strerror) from error
+
     def untaken(self) -> int:
         """Bytes that the kernel still has for the device."""
         try:
@@ -320,7 +337,7 @@ class _SerialProtocol(asyncio.Protocol):
             return
         if self._transport.get_write_buffer_size() == 0:
             try:
-                data = data[os.write(self._tty.fileno(), data) :]
+                data = data[self._tty.write(data) :]
             except BlockingIOError:  # not one byte fits
                 pass
             except OSError as error:  # the transport would call it a fatal error of ours
@@ -335,9 +352,12 @@ class _SerialProtocol(asyncio.Protocol):
         self._untaken = self._tty.untaken()
 
     def _check_age(self) -> None:
-        """Give the device up if its line has been full for too long."""
+        """Give the device up if its line has been full for too long.
+
+        Also after an error of reading, when the transport wants to send what it still has before it ends.
+        """
         self._alarm = None
-        if self._transport.get_write_buffer_size() == 0 or self._transport.is_closing():
+        if self._transport.get_write_buffer_size() == 0:
             return
         left = self._full_since + MAX_AGE - self._loop.time()
         if left > 0:

@@ -1,5 +1,6 @@
 """A port named by hub and port number: its present node is opened, its adapter made quick, its power switched."""
 
+from threading import Lock
 from typing import Final
 
 from monstertruck_drivers.computer import Machine, Sysfs
@@ -82,6 +83,8 @@ class PortPower:
         self._machine = machine
         self._events = events
         self._cycles: dict[str, tuple[int, int]] = {}
+        self._writing = Lock()
+        """Keeps writes in their order, also after a caller was cancelled."""
 
     async def cycle(self, name: str) -> None:
         """Switch the port ``name`` hangs on off and on; its device vanishes and comes back.
@@ -156,14 +159,15 @@ class PortPower:
         sysfs = self._machine.sysfs
 
         def write() -> None:
-            for attribute in attributes:
-                sysfs.write(attribute, value)
+            with self._writing:
+                for attribute in attributes:
+                    sysfs.write(attribute, value)
 
         await self._machine.offload(write)
 
     async def _toggle(self, attributes: list[str], off: str, on: str, seconds: float) -> None:
-        await self._write_all(attributes, off)
         try:
+            await self._write_all(attributes, off)
             await self._machine.clock.sleep(seconds)
         finally:
             await self._write_all(attributes, on)
