@@ -366,7 +366,11 @@ class Daemon:
             self.clock,
             {topic: bus.subscribe(topic, latest()) for topic in gate.reads},
             GateOutputs(
-                drives, steering, bus.publisher(topics.GATE, Writer.GATE), bus.publisher(topics.STOP, Writer.GATE)
+                drives,
+                steering,
+                bus.publisher(topics.GATE, Writer.GATE),
+                bus.publisher(topics.STOP, Writer.GATE),
+                bus.publisher(topics.SEEN, Writer.GATE),
             ),
             self._events,
             latch,

@@ -194,6 +194,7 @@ def build_goals(
         footprint,
         mount,
         cusp_clearance=obstacle.side_clearance + obstacle.ahead,
+        seen_for=obstacle.memory_time if obstacle.unseen == "stop" else None,
         timed=not isinstance(clock, VirtualClock),
     )
     return GoalService(
@@ -221,6 +222,7 @@ def build_goals(
             ground=bus.subscribe(topics.GROUND, latest()),
             behaviour=bus.subscribe(topics.BEHAVIOUR, latest()),
             slam=bus.subscribe(topics.SLAM, latest()) if mapped else None,
+            seen=bus.subscribe(topics.SEEN, latest()) if lidar is not None else None,
         ),
         outputs=GoalOutputs(path, planner_request, bus.publisher(topics.GOAL, Writer.PLANNER), bus.event_sink()),
         deformation=_deformation(config, setup, bus, clock, actors),

@@ -109,6 +109,9 @@ class ObstacleLimits(Schema):
     """Age up to which earlier scans count, s: people may step onto ground that was free."""
     memory_distance: NotNegative = 2.0
     """Travelled distance for which the points of earlier scans guard the truck where its lidar does not look, m."""
+    memory_deviation: Annotated[float, Field(gt=0, le=0.5)] = 0.1
+    """Growth of the odometry's standard deviation from which on earlier scans no longer count, m: their places are that
+    much less certain."""
     open_ground: bool = False
     """Whether a scan without any range counts as free ground; otherwise it is not valid."""
 
@@ -401,6 +404,7 @@ WEAKER_ABOVE: Final = (
     "obstacle.deceleration",
     "obstacle.unseen_speed",
     "obstacle.memory_time",
+    "obstacle.memory_deviation",
     "sonar.stale_after",
     "sonar.unseen_speed",
     "unwitnessed",

@@ -11,7 +11,7 @@ source may continue; a fault longer than ``disarm_after``, or one of ``DISARMING
 
 import math
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Generator, Iterator, Mapping
 from types import MappingProxyType
 from typing import Any, Final, NamedTuple, assert_never
 
@@ -41,6 +41,7 @@ from monstertruckd.gate.own_checks import OwnCheck
 from monstertruckd.gate.peers import PeerCheck
 from monstertruckd.gate.runaway import RunawayCheck
 from monstertruckd.gate.samples import STALE_SENSORS, Samples
+from monstertruckd.gate.scan_memory import Survey
 from monstertruckd.gate.sensors import (
     DRIVE_LOSSES,
     BatteryCheck,
@@ -228,6 +229,7 @@ class Gate:
                 *(OwnCheck(view, name, settings) for name, settings in own.items()),
             )
         )
+        self._obstacles = next((check for check in self._checks if isinstance(check, ObstacleCheck)), None)
         self._outages = Outages(services)
         self._stops = StopLog(self._outages)
         self._known: dict[Reason, int] = {}
@@ -271,6 +273,10 @@ class Gate:
         """Topics whose newest message is to be shown to it before every tick, in this order."""
         drives = DRIVES[: len(self._chassis.shafts)]
         return tuple(dict.fromkeys((SCAN, COMPASS, *drives, STEERING, BATTERY, *self._checks.reads)))
+
+    def survey(self) -> Generator[None, None, Survey | None] | None:
+        """Ground around the robot that its lidar has seen, in short steps; None without a lidar that guards it."""
+        return None if self._obstacles is None else self._obstacles.guard.memory.survey()
 
     def observe(self, message: Message, topic: Topic[Any]) -> None:
         """Take the newest message of a topic; of health tables every one, for a later one may hide a restart.

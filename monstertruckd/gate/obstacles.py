@@ -23,13 +23,14 @@ from monstertruck_schemas.base import Message
 from monstertruck_schemas.event import Measurement
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import LaserScan
-from monstertruck_schemas.topics import Topic
+from monstertruck_schemas.state import Odometry
+from monstertruck_schemas.topics import ODOMETRY, Topic
 from monstertruckd.gate.approach import Approach, comfortable_speed, reach, stopping
 from monstertruckd.gate.checks import Check, GateView, PaceLimit, Tick
 from monstertruckd.gate.config import GateConfig, InForce
 from monstertruckd.gate.motion import AHEAD, Course
 from monstertruckd.gate.samples import age
-from monstertruckd.gate.scan_memory import ScanMemory
+from monstertruckd.gate.scan_memory import DRIFT, ScanMemory
 from monstertruckd.gate.visibility import Sectors, Visibility
 
 POSES: Final = 20
@@ -40,6 +41,9 @@ TWIST_STEP: Final = 0.005
 
 GROUND_STEP: Final = 2
 """The ground is checked at every second pose."""
+
+FINER: Final = 4
+"""Parts of the distance between two of these in which the edge of seen ground is found."""
 
 SWEEPS: Final = 256
 """Sweeps cached."""
@@ -112,9 +116,8 @@ class ObstacleGuard:
         self._footprint = footprint
         self._scan_points = points
         self._visibility = Visibility(footprint, points.mount, limits.config.obstacle.seen)
-        self._memory = ScanMemory(
-            footprint, points.mount, limits.config.obstacle.memory_distance, limits.config.obstacle.memory_time
-        )
+        kept = limits.config.obstacle
+        self.memory = ScanMemory(footprint, points.mount, kept.memory_distance, kept.memory_time, kept.memory_deviation)
         self._points = np.empty((0, 2))
         self._stamp = 0
         self.unseen: float | None = 0.0
@@ -142,7 +145,7 @@ class ObstacleGuard:
         before = self._near
         self._near = self._reach + self._footprint.circumscribed_radius + config.obstacle.side_clearance
         if self._near > before:
-            self._memory.forget()
+            self.memory.forget()
         self._sweep = lru_cache(SWEEPS)(self._swept)
         self._checked = None
 
@@ -159,9 +162,9 @@ class ObstacleGuard:
         """The body moved with ``twist`` for the ``dt`` s until ``now``, ns; None = it is not known how."""
         self._follow_limits()
         if twist is None:
-            self._memory.forget()
+            self.memory.forget()
         else:
-            self._memory.move(now, twist, dt)
+            self.memory.move(now, twist, dt)
 
     def observe(self, scan: LaserScan) -> None:
         """Take a scan."""
@@ -171,7 +174,7 @@ class ObstacleGuard:
         age = self._visibility.age(self._points, scan.stamp)
         # What was seen in a sector stays while the sector is not seen, until that is too old.
         self._points = np.concatenate((near, self._points[(age > 0) & (age <= self._keep)]))
-        self._memory.observe(scan, near)
+        self.memory.observe(scan, near)
         self._stamp = min(scan.stamp, scan.received)  # a sensor's clock may run ahead; nothing arrives before it is
         self._checked = None
 
@@ -187,7 +190,7 @@ class ObstacleGuard:
             self._checked = rounded
             self._update_unseen(rounded)
             hidden = [twist for twist in rounded if twist[0] * TWIST_STEP < AHEAD]
-            behind = self._memory.points() if hidden else None
+            behind = self.memory.points() if hidden else None
             self._free = min(self._free_distance(*twist, behind) for twist in rounded)
             self.known = self.known_aside = math.inf
             if behind is not None:
@@ -234,14 +237,30 @@ class ObstacleGuard:
         before = np.concatenate([sweep.before for sweep in sweeps])
         turns = [math.hypot(*twist[:2]) * TWIST_STEP < AHEAD for twist in twists]
         turning = np.repeat(turns, [len(sweep.ground) for sweep in sweeps])
-        hidden = ~self._memory.seen(ground)
+        hidden = ~self.memory.seen(ground)
         back = np.repeat([twist[0] < 0 for twist in twists], [len(sweep.ground) for sweep in sweeps]) & ~turning
         self.known = float(before[hidden & back].min(initial=math.inf))
+        if math.isfinite(self.known):
+            reverse = [twist for twist in twists if twist[0] < 0]
+            self.known += min(map(self._further, reverse))
         self.known_aside = float(before[hidden & ~back].min(initial=math.inf))
         reached = hidden & turning & (before < self._free)
         near = on_body(self._footprint, measured, self._reach + DEPTH) & ~on_body(self._footprint, measured, 0.0)
         apart = ((ground[reached][:, None] - measured[near]) ** 2).sum(axis=2).min(axis=1, initial=math.inf)
         self._free = float(before[reached][apart < DEPTH**2].min(initial=self._free))
+
+    def _further(self, twist: tuple[int, int, int]) -> float:
+        """Distance beyond ``known`` for which a motion still stays on seen ground, below that between two poses, m."""
+        x, y, turn = (part * TWIST_STEP for part in twist)
+        step = GROUND_STEP * float(self._sweep(*twist).distances[1]) / FINER
+        poses = swept_poses((x, y, turn), self.known + np.linspace(0.0, (FINER - 1) * step, FINER))
+        outline = at_poses(self._outline, poses[1:])
+        seen = self.memory.seen(outline.reshape(-1, 2)).reshape(FINER - 1, -1).all(axis=1)
+        return step * (FINER - 1 if seen.all() else int(np.argmin(seen)))
+
+    def allowed_before_unseen(self, now: int) -> float:
+        """Greatest pace from which the body stops comfortably on ground that was seen, m/s."""
+        return comfortable_speed(self.known - DRIFT, self.delay(now), self._limits.config.obstacle.deceleration)
 
     def allowed_speed(self, free: float, now: int) -> float:
         """Greatest pace from which the body stops comfortably within ``free`` metres, m/s."""
@@ -274,6 +293,7 @@ class ObstacleCheck(Check):
         Reason.UNSEEN_DRIVE,
         Reason.UNSEEN_SLOW,
     )
+    reads = (ODOMETRY,)
 
     def __init__(self, view: GateView, points: ScanPoints) -> None:
         super().__init__(view)
@@ -291,11 +311,15 @@ class ObstacleCheck(Check):
         """Take valid scans, and the motion of the body at every tick."""
         view = self.view
         if isinstance(seen, Tick):
-            # A robot that is not armed may be carried.
-            twist = view.samples.twist(seen.now) if view.mode.active else None
-            self.guard.move(seen.now, twist, seen.elapsed / SECOND)
+            # A robot that is not armed may be pushed or carried; what it saw counts while its wheels stand.
+            known = view.mode.active or view.samples.at_rest(seen.now)
+            self.guard.move(seen.now, view.samples.twist(seen.now) if known else None, seen.elapsed / SECOND)
         elif isinstance(seen, LaserScan) and seen is view.samples.scan:
+            if not view.mode.active:
+                self.guard.memory.rest(seen)
             self.guard.observe(seen)
+        elif isinstance(seen, Odometry) and topic is ODOMETRY:
+            self.guard.memory.doubt(seen.pose_covariance)
 
     def limit(self, now: int, courses: Sequence[Course] | None) -> Iterator[PaceLimit]:
         """Sweep along the motions, and along those of the measured steering angles."""
@@ -321,7 +345,7 @@ class ObstacleCheck(Check):
         aside = max(guard.allowed_speed(guard.known_aside, now), slow)
         if aside < fastest:
             yield PaceLimit(Reason.UNSEEN_SLOW, aside)
-        yield from self._into_unseen(guard.allowed_speed(guard.known, now), fastest)
+        yield from self._into_unseen(guard.allowed_before_unseen(now), fastest)
         self._approach.judge(now, twists, lambda speed: guard.too_near(free, speed, now))
 
     def _into_unseen(self, allowed: float, fastest: float) -> Iterator[PaceLimit]:
@@ -345,8 +369,7 @@ class ObstacleCheck(Check):
         if reason is Reason.LIDAR_BLIND:
             yield Measurement(name="unseen", value=self.guard.unseen, unit="s", limit=config.scan.stale_after)
         elif reason is Reason.UNSEEN_STOP:
-            keep = config.obstacle.ahead
-            yield Measurement(name="seen distance", value=_finite(self.guard.known), unit="m", limit=keep)
+            yield Measurement(name="seen distance", value=_finite(self.guard.known), unit="m", limit=DRIFT)
         elif reason is Reason.OBSTACLE_STOP:
             yield self._approach.free_distance(age(self.view.samples.scan, now))
 

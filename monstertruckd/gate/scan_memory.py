@@ -2,7 +2,7 @@
 
 import math
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Generator, Iterable, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -13,6 +13,7 @@ from monstertruck_kinematics.drive import Twist
 from monstertruck_kinematics.elementary import Array, integrate
 from monstertruck_planners.collision import Footprint, beyond, on_body, placed, points_relative, relative
 from monstertruck_runtime.clock import SECOND
+from monstertruck_schemas.base import position_deviation
 from monstertruck_schemas.sensor import NO_ECHO, VALID_BEAM, LaserScan
 
 MEMORY_STEP: Final = 0.1
@@ -26,11 +27,23 @@ than a truck's length in half of all directions."""
 VIEWS: Final = 32
 """The most of them: at 0.21 m/s the truck takes 21 in 30 s."""
 DRIFT: Final = 0.03
-"""Ground this near to where the body stood counts as free, m: the error of dead reckoning."""
+"""Ground this near to where the body stood counts as free, m: the error of dead reckoning; less by as much as the
+pose's standard deviation has grown since, beyond the padding of the footprint."""
 FIELD_EDGE: Final = 0.1
 """Remembered points this near to the edge of the lidar's field are kept, rad: the error of the dead-reckoned yaw."""
 POSES_KEPT: Final = 64
 """Ticks whose pose is kept, to place a scan where it was taken."""
+STANDING: Final = 0.001
+"""Distance travelled between two scans by a body that stands, m: rounding of its velocity."""
+LEVER: Final = 1.0
+"""Distance at which an error of the heading displaces remembered ground, m: a truck's length and what it stops in."""
+MAP_SIZE: Final = 64
+MAP_CELL: Final = 0.05
+"""Cells on each side of a survey, and their size, m: what a truck covers in reverse until it has seen more."""
+CHANGED: Final = 0.1
+"""Difference of a beam from that of an earlier scan that neither noise nor rounding makes, m."""
+ELSEWHERE: Final = 0.3
+"""Share of the beams with a range that differ so once a robot was carried; people who pass change fewer."""
 
 Pose = tuple[float, float, float]
 
@@ -49,6 +62,18 @@ class _Taken(NamedTuple):
     """Its returns near the body in the frame of the memory, shape (n, 2), m."""
     free: Array
     """Free distance of every beam, m; padded with a 0 before the first and after the last."""
+    variance: float
+    """Of the pose in odometry when it was taken, m^2."""
+
+
+class Survey(NamedTuple):
+    """Which ground around a body counts as seen, and for how long."""
+
+    stamp: int
+    """Of the scan whose base is its frame, ns."""
+    ages: NDArray[np.int8]
+    """Shape (MAP_SIZE, MAP_SIZE), row 0 at the lowest y, the middle at base: age of the newest view in percent of the
+    age up to which views count; -1 = not seen."""
 
 
 class ScanMemory:
@@ -59,13 +84,19 @@ class ScanMemory:
         mount: pose of the lidar in base, m, m, rad.
         distance: travelled distance for which points are remembered, m.
         time: age up to which scans are remembered, s.
+        deviation: growth of the pose's standard deviation up to which scans are remembered, m.
     """
 
-    def __init__(self, footprint: Footprint, mount: Pose, distance: float, time: float) -> None:
+    def __init__(
+        self, footprint: Footprint, mount: Pose, distance: float, time: float, deviation: float = math.inf
+    ) -> None:
         self._footprint = footprint
         self._mount = mount
         self._distance = distance
         self._time = round(time * SECOND)
+        self._variance_kept = deviation**2
+        self._variance = 0.0
+        self._rested: LaserScan | None = None
         self.forget()
 
     def forget(self) -> None:
@@ -80,9 +111,22 @@ class ScanMemory:
     def move(self, now: int, twist: Twist[float], dt: float) -> None:
         """The body moved with ``twist``, m/s and rad/s, for the ``dt`` s until ``now``, ns."""
         if twist != STILL:
+            self._rested = None
             self._pose = integrate(self._pose, *twist, dt)
             self._travelled += self._footprint.corner_speed(twist) * dt
         self._ticks.append((now, self._pose, self._travelled))
+
+    def doubt(self, covariance: Array) -> None:
+        """Take the covariance of the pose in odometry, row-major of (x, y, yaw), shape (9,), m^2, m rad, rad^2."""
+        self._variance = position_deviation(covariance) ** 2 + LEVER**2 * float(covariance[8])
+
+    def rest(self, scan: LaserScan) -> None:
+        """Take a scan of a robot whose wheels stand and that may be carried; forget everything once it was."""
+        if self._rested is None:
+            self._rested = scan
+        elif elsewhere(self._rested, scan):
+            self.forget()
+            self._rested = scan
 
     def observe(self, scan: LaserScan, points: Array) -> None:
         """Take a scan.
@@ -97,10 +141,16 @@ class ScanMemory:
         there = placed(np.column_stack((points, np.zeros(len(points)))), pose)[:, :2]
         (lidar,) = placed(np.array([self._mount]), pose).tolist()
         free = np.where((scan.codes == VALID_BEAM) | (scan.codes <= NO_ECHO), scan.ranges, 0.0)
-        self._newest = _Taken(scan, pose, tuple(lidar), travelled, there, np.pad(free, 1))
-        if not self._taken or travelled - self._taken[-1].travelled >= MEMORY_STEP:
+        self._newest = _Taken(scan, pose, tuple(lidar), travelled, there, np.pad(free, 1), self._variance)
+        # What a body that stands sees does not age; what its first scan there saw may be out of sight since.
+        stood = [travelled - scan.travelled < STANDING for scan in (*self._taken, self._newest)[-3:-1]]
+        if stood == [True, True]:
+            self._taken[-1] = self._newest
+        elif stood[-1:] == [True] or not stood or travelled - self._taken[-1].travelled >= MEMORY_STEP:
             self._taken.append(self._newest)
-        if not self._views or _apart(pose, self._views[-1].pose) >= VIEW_STEP:
+        if self._views and travelled - self._views[-1].travelled < STANDING:
+            self._views[-1] = self._newest
+        elif not self._views or _apart(pose, self._views[-1].pose) >= VIEW_STEP:
             self._views.append(self._newest)
 
     def points(self) -> Array:
@@ -118,7 +168,12 @@ class ScanMemory:
         return points[~on_body(self._footprint, points, 0.0)]
 
     def _fresh(self, kept: Iterable[_Taken], newest: _Taken) -> list[_Taken]:
-        return [taken for taken in kept if newest.scan.stamp - taken.scan.stamp < self._time]
+        return [
+            taken
+            for taken in kept
+            if newest.scan.stamp - taken.scan.stamp < self._time
+            and newest.variance - taken.variance < self._variance_kept
+        ]
 
     def seen(self, points: Array) -> NDArray[np.bool_]:
         """Which of the points (n, 2), in base as of the newest scan, m, lie on ground that was seen free."""
@@ -126,14 +181,49 @@ class ScanMemory:
         if newest is None:
             return np.zeros(len(points), np.bool_)
         there = placed(np.column_stack((points, np.zeros(len(points)))), newest.pose)[:, :2]
-        taken = newest, *self._fresh(self._views, newest)
+        return np.asarray(self._free((newest, *self._fresh(self._views, newest)), there).any(axis=0))
+
+    def survey(self) -> Generator[None, None, Survey | None]:
+        """Ground around the body that counts as seen, in steps that take well below a millisecond each."""
+        newest = self._newest
+        if newest is None:
+            return None
+        middle = (np.arange(MAP_SIZE) + 0.5 - MAP_SIZE / 2) * MAP_CELL
+        cells = np.column_stack((np.tile(middle, MAP_SIZE), np.repeat(middle, MAP_SIZE), np.zeros(MAP_SIZE**2)))
+        there = placed(cells, newest.pose)[:, :2]
+        ages = np.full(len(there), -1, np.int8)
+        for view in (*self._fresh(self._views, newest), newest):  # the newest last
+            (seen,) = self._free((view,), there)
+            ages[seen] = min(100 * (newest.scan.stamp - view.scan.stamp) // self._time, 100)
+            yield
+        return Survey(newest.scan.stamp, ages.reshape(MAP_SIZE, MAP_SIZE))
+
+    def _free(self, taken: Sequence[_Taken], there: Array) -> NDArray[np.bool_]:
+        """Which points (n, 2) of the memory's frame each scan saw free, or the body stood on there; shape (m, n)."""
         beams, distances = _beams(taken, there)
         ends = np.cumsum([len(scan.free) for scan in taken])[:, None]
         starts = np.concatenate(([[0]], ends[:-1]))
         free = np.concatenate([scan.free for scan in taken])[np.clip(starts + 1 + beams, starts, ends - 1)]
         beyond_x, beyond_y = beyond(self._footprint, np.array([scan.pose for scan in taken]), there)
-        seen = (free > distances) | ((beyond_x < DRIFT) & (beyond_y < DRIFT))
-        return np.asarray(seen.any(axis=0))
+        newest = taken[0] if self._newest is None else self._newest
+        gained = np.array([max(newest.variance - scan.variance, 0.0) for scan in taken])
+        unsure = np.sqrt(gained)[:, None]
+        known = np.maximum(beyond_x, beyond_y) < DRIFT - np.maximum(unsure - self._footprint.padding, 0.0)
+        return np.asarray((free > distances + unsure) | known)
+
+
+def elsewhere(before: LaserScan, now: LaserScan) -> bool:
+    """Whether two scans of a robot whose wheels stood were taken in different places."""
+    if len(before.ranges) != len(now.ranges):
+        return True
+    measured = [scan.codes == VALID_BEAM for scan in (before, now)]
+    first, second = (
+        np.where(valid, scan.ranges, scan.range_max) for valid, scan in zip(measured, (before, now), strict=True)
+    )
+    told = [valid | (scan.codes <= NO_ECHO) for valid, scan in zip(measured, (before, now), strict=True)]
+    compared = told[0] & told[1] & (measured[0] | measured[1])
+    differ = compared & (np.abs(first - second) > CHANGED)
+    return bool(np.count_nonzero(differ) > ELSEWHERE * np.count_nonzero(compared))
 
 
 def spaced(points: Array, spacing: float) -> Array:

@@ -2,7 +2,7 @@
 
 import asyncio
 import logging
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Generator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final, TypeVar, assert_never
@@ -15,19 +15,20 @@ from monstertruck_runtime.mailbox import fifo
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, RpcRegistry, Subscription
 from monstertruck_runtime.requests import parse_request
 from monstertruck_runtime.threads import Offload, in_thread
-from monstertruck_schemas.base import Twist2D, servo_fields
+from monstertruck_schemas.base import Pose2D, Twist2D, servo_fields
 from monstertruck_schemas.cmd import DriveCommand, SteeringCommand
 from monstertruck_schemas.event import Event, Severity, Stop
 from monstertruck_schemas.health import HealthTable
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import STARTING, ControlRequest, DriveRequest, Order
 from monstertruck_schemas.roles import AccessRole, ServiceName
-from monstertruck_schemas.state import GateMode, GateState
+from monstertruck_schemas.state import GateMode, GateState, Grid
 from monstertruck_schemas.topics import EVENT, GATE, HEALTH, REQ_CONTROL, Topic
 from monstertruckd.bus.local import Bus
 from monstertruckd.gate.config import GateConfig
 from monstertruckd.gate.core import Decision, Gate, GateOutput
 from monstertruckd.gate.latch import Latch
+from monstertruckd.gate.scan_memory import MAP_CELL, MAP_SIZE, Survey
 
 log = logging.getLogger(__name__)
 
@@ -35,6 +36,9 @@ T = TypeVar("T")
 
 STATE_PERIOD: Final = SECOND // 10
 """``state/gate`` is published on every change and at least this often, ns."""
+
+SURVEY_PERIOD: Final = SECOND
+"""``state/seen`` is published this often, or as soon as it is complete, ns."""
 
 LATCH_RETRY: Final = 1.0
 """Seconds between two tries to store the latch, or its mark."""
@@ -86,6 +90,7 @@ class GateOutputs:
     steering: Publisher[SteeringCommand]
     state: Publisher[GateState]
     stops: Publisher[Stop]
+    seen: Publisher[Grid]
 
 
 class GateService:
@@ -147,6 +152,10 @@ class GateService:
         self._bug: Exception | None = None
         self._published: tuple[object, ...] = ()
         self._published_at = 0
+        self._survey: Generator[None, None, Survey | None] | None = None
+        """In the making, one step a tick."""
+        self._surveyed = -SURVEY_PERIOD
+        """When it began, ns."""
         self._feeds = [_Feed(topic, subscription, gate.observe) for topic, subscription in inputs.items()]
 
     def configure(self, config: GateConfig, weakened: tuple[str, ...]) -> None:
@@ -266,6 +275,20 @@ class GateService:
         for feed in self._feeds:
             feed.poll()
         self._publish(self._gate.tick(now), now)
+        self._continue_survey(now)
+
+    def _continue_survey(self, now: int) -> None:
+        """Compute the ground that was seen one step further, and publish it at the end."""
+        if self._survey is None:
+            if now - self._surveyed >= SURVEY_PERIOD:
+                self._survey, self._surveyed = self._gate.survey(), now
+            return
+        try:
+            next(self._survey)
+        except StopIteration as done:
+            self._survey = None
+            if done.value is not None:
+                self._outputs.seen.put(_grid(done.value, now, self._outputs.seen.next_seq()))
 
     def _publish(self, output: GateOutput, now: int) -> None:
         steering = self._outputs.steering
@@ -475,3 +498,19 @@ def _is_carried_out(order: Order, state: GateState) -> bool:
             return True
         case _:
             assert_never(order)
+
+
+def _grid(survey: Survey, now: int, seq: int) -> Grid:
+    """A survey as a message."""
+    corner = -MAP_SIZE / 2 * MAP_CELL
+    return Grid(
+        stamp=survey.stamp,
+        received=now,
+        seq=seq,
+        frame="base",
+        resolution=MAP_CELL,
+        width=MAP_SIZE,
+        height=MAP_SIZE,
+        origin=Pose2D(x=corner, y=corner, yaw=0.0),
+        cells=survey.ages.ravel(),
+    )

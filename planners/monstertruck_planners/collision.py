@@ -413,6 +413,7 @@ class DistanceField:
         resolution: metres per cell.
         origin: pose (x, y, yaw) of the outer corner of cell (0, 0).
         previous: of the same place before: only the surroundings of what differs are computed again.
+        unseen: shape of ``occupied``: ground that nothing may reverse onto; None: none.
 
     Raises:
         InputError: a grid that is not two-dimensional, or empty, or a resolution not above zero.
@@ -424,6 +425,7 @@ class DistanceField:
         resolution: float,
         origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
         previous: "DistanceField | None" = None,
+        unseen: NDArray[np.bool_] | None = None,
     ) -> None:
         if occupied.ndim != 2 or occupied.size == 0 or not resolution > 0:
             msg = (
@@ -442,17 +444,24 @@ class DistanceField:
             self._update(previous)
         else:
             self._compute()
+        self._unseen = np.empty((0, 0), np.float32), np.empty((0, 0), np.bool_)
+        if unseen is not None and unseen.any():
+            ground = np.pad(unseen, 1)
+            self._unseen = self._distances(ground), ground
 
     def same_place(self, shape: tuple[int, ...], resolution: float, origin: tuple[float, float, float]) -> bool:
         """Whether this field is of a grid of that shape (with its ring), resolution and origin."""
         return (self._occupied.shape, self.resolution, self.origin) == (shape, resolution, origin)
 
     def _compute(self) -> None:
+        self._distance = self._distances(self._occupied)
+
+    def _distances(self, cells: NDArray[np.bool_]) -> NDArray[np.float32]:
         from monstertruck_planners.distance_kernels import fill_distances  # noqa: PLC0415 - workers only
 
-        whole = (0, 0, *self._occupied.shape)
-        self._distance = np.empty(self._occupied.shape, np.float32)
-        fill_distances(self._occupied, self.resolution, whole, whole, self._distance)
+        whole, distances = (0, 0, *cells.shape), np.empty(cells.shape, np.float32)
+        fill_distances(cells, self.resolution, whole, whole, distances)
+        return distances
 
     def _update(self, previous: "DistanceField") -> None:
         from monstertruck_planners.distance_kernels import update_distances  # noqa: PLC0415 - workers only
@@ -488,7 +497,8 @@ class DistanceField:
         x, y, yaw = self.origin
         c, s = math.cos(yaw), math.sin(yaw)
         res = self.resolution
-        return FieldData(self._distance, self._occupied, res, x - res * (c - s), y - res * (s + c), c, s)
+        corner = x - res * (c - s), y - res * (s + c)
+        return FieldData(self._distance, self._occupied, res, *corner, c, s, *self._unseen)
 
     def lookup(self, points: Array) -> Array:
         """Distance to the nearest occupied cell centre, bilinear between cell centres.

@@ -29,6 +29,9 @@ class FieldData(NamedTuple):
     cos: float
     sin: float
     """Pose of the outer corner of the ringed grid's cell (0, 0)."""
+    unseen_distance: NDArray[np.float32]
+    unseen: NDArray[np.bool_]
+    """As ``distance`` and ``occupied``, of ground that nothing may reverse onto; empty arrays: none."""
 
 
 class FootprintData(NamedTuple):
@@ -137,6 +140,18 @@ def safe_distance(field: FieldData, footprint: FootprintData, margin: float, x: 
 
 
 @njit(cache=True)
+def unseen_distance(field: FieldData, footprint: FootprintData, x: float, y: float, yaw: float) -> float:
+    """As ``safe_distance``, to ground that nothing may reverse onto: cells whose middle the footprint would cover."""
+    if field.unseen.size == 0:
+        return 1e9
+    ground = FieldData(
+        field.unseen_distance, field.unseen, field.resolution, field.x, field.y, field.cos, field.sin,
+        field.unseen_distance, field.unseen,
+    )  # fmt: skip
+    return safe_distance(ground, footprint, -HALF_DIAGONAL * field.resolution, x, y, yaw)
+
+
+@njit(cache=True)
 def free_poses(field: FieldData, footprint: FootprintData, margin: float, poses: Array) -> NDArray[np.bool_]:
     """Whether each pose (m, 3) is free."""
     result = np.empty(len(poses), np.bool_)
@@ -152,6 +167,8 @@ def segment_free(
 ) -> bool:  # fmt: skip
     """Whether a motion segment (signed length, curvature, sideslip) is free all the way, its end included.
 
+    Backward it must not cover ground that nothing may reverse onto.
+
     The test advances as far as the safe distance allows, and by ``step`` metres at least (a quarter of it with
     sideslip, where corners leave gaps between two poses).
     """
@@ -164,6 +181,8 @@ def segment_free(
     while True:
         px, py, pyaw = advance(x, y, yaw, sign * travelled, curvature, sideslip)
         safe = safe_distance(field, footprint, margin, px, py, pyaw)
+        if safe >= 0.0 and sign < 0.0:
+            safe = min(safe, unseen_distance(field, footprint, px, py, pyaw))
         if safe < 0.0:
             return False
         if travelled >= total:

@@ -241,6 +241,16 @@ CONSISTENCY: Final = Topic(
 GATE: Final = Topic(
     "state/gate", GateState, W.GATE, "Safety gate: mode, holder, limits, reasons", 10, stale_after=0.5, retained=True
 )
+SEEN: Final = Topic(
+    "state/seen",
+    Grid,
+    W.GATE,
+    "Ground around the robot into which it may reverse: -1 not seen, else the age of the newest view in percent of "
+    "gate.obstacle.memory_time; its frame is base at the stamp",
+    1,
+    retained=True,
+    foxglove="foxglove.Grid",
+)
 CLOCK: Final = Topic("state/clock", ClockOffset, W.DAEMON, "Real time minus daemon time", 1, retained=True)
 
 PATH: Final = Topic("plan/path", Path, W.PLANNER, "Path being tracked", retained=True, foxglove="foxglove.PosesInFrame")

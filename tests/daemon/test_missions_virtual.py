@@ -51,8 +51,7 @@ def test_a_mission_is_driven_and_followed():
             ends.append(await run_mission(client, mission, arm=True, report=lines.append))
             ends.append(states.latest)
 
-    # The mission begins nose-in, with no ground seen behind the truck.
-    rig = travel(story, gate={"obstacle": {"unseen": "slow"}})
+    rig = travel(story)
     end, state = ends
     assert end.reason is Reason.MISSION_INCOMPLETE, end.text
     assert (end.figures["failures"], end.figures["step"]) == (1, 6)
@@ -122,9 +121,5 @@ def test_armed_for_a_mission_it_does_not_drive_its_own_path_before_that_begins(t
             assert (await run_mission(client, mission, arm=True)).reason is Reason.MISSION_DONE
         await trip.clock.sleep(3.0)
 
-    truth = travel(
-        story,
-        path={"file": own_path(tmp_path), "closed": False},
-        gate={"obstacle": {"unseen": "slow"}},  # its goal lies behind the place where it starts
-    ).truth.array()
+    truth = travel(story, path={"file": own_path(tmp_path), "closed": False}).truth.array()
     assert abs(truth[:, 1] - 1.0).max() < 0.04

@@ -6,7 +6,7 @@ Three things differ. Speeds follow from the axle angles by the truck's kinematic
 sqrt(1 / (1 + tan b)) for cos b. A side is the whole side, not three points of it. And the path is checked as a whole.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -62,8 +62,9 @@ def blocked_sides(footprint: Footprint, points: Array, room: float) -> Sides:
 
 
 def escape(
-    config: EscapeConfig, geometry: FourWheelSteering, footprint: Footprint, points: Array, *, crab: bool, rear: bool
-) -> Escape | None:
+    config: EscapeConfig, geometry: FourWheelSteering, footprint: Footprint, points: Array, *, crab: bool, rear: bool,
+    unseen: Array | None = None,
+) -> Escape | None:  # fmt: skip
     """The escape motion, or None if both ends are blocked or it is too short.
 
     Args:
@@ -73,6 +74,7 @@ def escape(
         points: shape (n, 2), obstacles in the base frame, m.
         crab: the vehicle can set both axles alike.
         rear: the rear axle steers.
+        unseen: shape (n, 2), ground in the base frame onto which it must not back, m.
     """
     sides = blocked_sides(footprint, points, config.room)
     ahead, behind = not sides.front, not sides.rear
@@ -83,6 +85,8 @@ def escape(
     for direction in directions:
         for angle in dict.fromkeys((away, 0.0)):
             found = _motion(config, geometry, footprint, points, direction, angle, crab=crab and config.crab, rear=rear)
+            if found is not None and direction < 0 and unseen is not None:
+                found = _before(found, first_contact(footprint, found.poses, unseen, -footprint.padding))
             if found is not None:
                 return found
     return None
@@ -98,8 +102,10 @@ def _motion(
     distances = direction * np.arange(0.0, config.distance + STEP / 2, STEP)
     poses = swept_poses(geometry.body_twist(1.0, front, behind), distances)
     contact = first_contact(footprint, poses, points, config.margin)
-    if contact is not None:
-        poses = poses[:contact]
-    if (len(poses) - 1) * STEP < SHORTEST:
-        return None
-    return Escape(poses, direction, steering)
+    return _before(Escape(poses, direction, steering), contact)
+
+
+def _before(motion: Escape, contact: int | None) -> Escape | None:
+    """A motion up to the pose before a contact; None if that is too short."""
+    poses = motion.poses[:contact]
+    return replace(motion, poses=poses) if (len(poses) - 1) * STEP >= SHORTEST else None

@@ -30,6 +30,8 @@ class Setup:
     """Pose of the lidar in base."""
     cusp_clearance: float = 0.0
     """Clearance that the gate demands at a cusp, m."""
+    seen_for: float | None = None
+    """Age up to which seen ground counts as seen by the gate, s; None = it lets the robot reverse anywhere."""
     timed: bool = False
     """Whether the route planner works for its time or for its effort: only the latter is reproducible."""
 
@@ -42,6 +44,20 @@ class SeenScan:
     """Shape (n, 2): its returns, m."""
     sensor: Array
     """Shape (2,): where it was taken, m."""
+
+
+@dataclass(frozen=True, slots=True)
+class SeenGround:
+    """Ground that the gate remembers as seen."""
+
+    grid: Grid
+    """See ``topics.SEEN``."""
+    pose: Pose
+    """Of the grid's frame in the map's frame."""
+    field: tuple[float, float]
+    """Least and greatest bearing that the lidar measures, rad."""
+    reach: float
+    """Its range, m."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +86,8 @@ class PlanTask:
     """Standard deviation of the position, m."""
     seen: tuple[SeenScan, ...] = ()
     """Scans taken since the task before, oldest first."""
+    ground_seen: SeenGround | None = None
+    """None = not known: routes may reverse anywhere."""
 
 
 @dataclass(frozen=True, slots=True)

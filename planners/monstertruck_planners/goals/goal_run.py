@@ -24,6 +24,7 @@ REFUSED: Final = frozenset(
         Reason.NOT_FINITE,
         Reason.BAD_INPUT,
         Reason.NO_MAP,
+        Reason.UNSEEN_STOP,
     }
 )
 """Why a goal is refused if its first route fails; later on these may be passing trouble."""
@@ -31,7 +32,7 @@ REFUSED: Final = frozenset(
 ENDED: Final = frozenset({Reason.GOAL_REACHED, Reason.GOAL_MISSED})
 """What the tracker says at the end of a path."""
 
-LEFT: Final = frozenset({Reason.PATH_LOST, Reason.CUSP_MISSED})
+LEFT: Final = frozenset({Reason.PATH_LOST, Reason.CUSP_MISSED, Reason.UNSEEN_STOP})
 """What it says where it leaves a path, to be planned again from there."""
 
 SHORTEST: Final = 0.01
@@ -100,6 +101,8 @@ class Observations:
     """Metres of the route ahead."""
     blocked: bool = False
     """The newest scan shows something on the way ahead."""
+    unseen: bool = False
+    """The gate stops the truck before ground that no sensor has seen."""
     estopped: bool = False
     """The emergency stop is latched."""
     placeless: str = ""
@@ -258,13 +261,17 @@ def _drive(run: GoalRun, observed: Observations, config: PlannerConfig) -> Step:
         run = replace(run, best=observed.along, moved=observed.now)
     if not backing:
         run = _progressed(run, observed.left, config)
-    run = replace(run, blocked_scans=run.blocked_scans + 1 if observed.blocked else 0)
-    if run.blocked_scans >= config.blocked_scans and not backing:
-        text = "the newest scan shows something on the route"
+    run = replace(run, blocked_scans=run.blocked_scans + 1 if observed.blocked or observed.unseen else 0)
+    if run.blocked_scans >= config.blocked_scans and (observed.unseen or not backing):
+        reason, text = Reason.PATH_BLOCKED, "the newest scan shows something on the route"
+        if observed.unseen:
+            if not run.via and observed.pose is not None and _error(observed.pose, run.goal, config) <= 1.0:
+                return _arrived(replace(run, misses=MISSES), observed, config)
+            reason, text = Reason.UNSEEN_STOP, "the route leads back onto ground that no sensor has seen"
         run = replace(run, blocks=run.blocks + 1, blocked_scans=0)
         if run.blocks > BLOCKS:
-            return _recover(run, Reason.PATH_BLOCKED, text, config)
-        report = Report(Reason.PATH_BLOCKED, Severity.WARNING, f"goal {run.number}: {text}; plans anew")
+            return _recover(run, reason, text, config)
+        report = Report(reason, Severity.WARNING, f"goal {run.number}: {text}; plans anew")
         return _with(_plan(run, config), report)
     if observed.now - run.moved > config.stuck:
         return _recover(run, Reason.STUCK, f"no progress for {config.stuck:g} s", config)
@@ -292,7 +299,7 @@ def _arrived(run: GoalRun, observed: Observations, config: PlannerConfig) -> Ste
     assert observed.pose is not None
     away, turned = apart(observed.pose, run.goal)
     off = f"{away:.3f} m and {turned:.3f} rad away"
-    error = max(away / config.position_tolerance, turned / config.yaw_tolerance)
+    error = _error(observed.pose, run.goal, config)
     before = max(config.aim, min(run.error, 1.0))
     wanted = 1.0 if run.misses >= MISSES else config.aim if run.misses < config.corrections else before
     if run.via:
@@ -349,6 +356,12 @@ def _with(step: Step, *before: Action) -> Step:
 def _end(run: GoalRun, reason: Reason, text: str, severity: Severity = Severity.WARNING) -> Step:
     ended = replace(_enter(run, GoalPhase.IDLE), outcome=reason, text=text)
     return ended, (Halt(), Report(reason, severity, f"goal {run.number}: {text}"))
+
+
+def _error(pose: Pose, goal: Pose, config: PlannerConfig) -> float:
+    """How far a pose is off a goal, as the greater share of its tolerances."""
+    away, turned = apart(pose, goal)
+    return max(away / config.position_tolerance, turned / config.yaw_tolerance)
 
 
 def apart(a: Pose, b: Pose) -> tuple[float, float]:

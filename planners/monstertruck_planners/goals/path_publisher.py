@@ -50,6 +50,7 @@ class GoalInputs:
     ground: Subscription[Ground] | None = None
     behaviour: Subscription[BehaviourState] | None = None
     slam: Subscription[SlamHealth] | None = None
+    seen: Subscription[Grid] | None = None
 
 
 @dataclass(frozen=True, slots=True)

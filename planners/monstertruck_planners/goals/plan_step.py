@@ -28,6 +28,7 @@ from monstertruck_planners.collision import (
 )
 from monstertruck_planners.goals.escape import escape
 from monstertruck_planners.goals.exchange import PlanAnswer, PlanTask, Pose, Setup, explained_within
+from monstertruck_planners.goals.unseen import Unseen, unseen_around
 from monstertruck_planners.route.api import Clock, RouteMap, RoutePlanner, RouteResult, Vehicle, make_planner, warm_up
 from monstertruck_planners.route.config import GoalConfig, GridAstarConfig, HybridConfig, LatticeConfig
 from monstertruck_planners.route.departure import leaving
@@ -49,6 +50,12 @@ SAMPLE: Final = 0.05
 """Metres between two poses of an answer."""
 SQUARE: Final = 0.05
 """Side of the squares by which obstacles that are not in the map are remembered, m."""
+UNSEEN_ROUNDS: Final = 2
+"""Routes planned around unseen ground, at most; each closes more of it."""
+LOOKOUTS: Final = 4
+"""Places to look at it from to which a route is planned, at most."""
+BACKWARD: Final = 5.0
+"""Weight of a metre backward where those are chosen: the robot comes to them forward."""
 NEARBY: Final = 1.5
 """Distance within which obstacles count when backing out, and are kept, m."""
 
@@ -177,12 +184,9 @@ class StaticMap:
 
     def with_points(self, points: Array) -> Cells:
         """Cells with the points' ones occupied."""
-        column, row = (np.floor(v / self.resolution).astype(np.int64) for v in points_relative(points, self.origin).T)
-        rows, columns = self.cells.shape
-        inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
-        cells = self.cells.copy()
-        cells[row[inside], column[inside]] = 100
-        return cells
+        return np.where(
+            marked(np.zeros(self.cells.shape, np.bool_), points, self.resolution, self.origin), 100, self.cells
+        )
 
     def obstacles(self, cells: Cells, pose: Pose, reach: float) -> Array:
         """Centres of the occupied cells round a pose, shape (n, 2), in the frame of the pose."""
@@ -191,6 +195,15 @@ class StaticMap:
         flat = np.column_stack((centres, np.zeros(len(centres))))
         there = points_relative(placed(flat, self.origin)[:, :2], pose)
         return np.asarray(there[np.hypot(there[:, 0], there[:, 1]) < reach])
+
+
+def marked(cells: NDArray[np.bool_], points: Array, resolution: float, origin: Pose) -> NDArray[np.bool_]:
+    """Cells of a grid (rows, columns) with those set that hold a point; points (n, 2) in the frame of ``origin``."""
+    column, row = (np.floor(v / resolution).astype(np.int64) for v in points_relative(points, origin).T)
+    rows, columns = cells.shape
+    inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
+    cells[row[inside], column[inside]] = True
+    return cells
 
 
 def standing_free(
@@ -276,6 +289,8 @@ class PlanningStep:
         self._route_map: RouteMap | None = None
         self._memory = ObstacleMemory(SQUARE)
         self._route: MotionPath | None = None
+        self._closed: Array = np.empty((0, 2))
+        """Shape (k, 2), m: unseen places onto which the present route must not reverse."""
         self._now: Clock | None = None
 
     def step(self, task: PlanTask) -> PlanAnswer:
@@ -341,6 +356,63 @@ class PlanningStep:
         memory.drop_explained(lambda places: static_map.unexplained(places, tolerance))
 
     def _plan(self, static_map: StaticMap, task: PlanTask) -> PlanAnswer:
+        """A route that does not reverse onto unseen ground, or one to where that can be seen.
+
+        What one route would cover is closed to the next.
+        """
+        self._closed = np.empty((0, 2))
+        answer = self._plan_known(static_map, task)
+        unseen = self._unseen(task)
+        if unseen is None or not answer.drivable or not len(met := self._met(unseen, answer)):
+            return answer
+        x, y = met.mean(axis=0).tolist()
+        for _ in range(UNSEEN_ROUNDS):
+            self._closed, self._route = np.vstack((self._closed, met)), None
+            answer = self._plan_known(static_map, task)
+            if answer.poses is None:
+                break
+            if not len(met := self._met(unseen, answer)):
+                return answer
+        self._route = None
+        look = self._look(static_map, task, unseen)
+        remedy = "drive it forward by hand first, or back with the second control"
+        text = f"every way found leads back onto ground that no sensor has seen, at {x:.1f}, {y:.1f}: {remedy}"
+        return look or PlanAnswer(Reason.UNSEEN_STOP, text)
+
+    def _look(self, static_map: StaticMap, task: PlanTask, unseen: Unseen) -> PlanAnswer | None:
+        """A route to a place from which the closed ground can be seen; None if none was found."""
+        assert self._route_map is not None
+        lookouts = unseen.lookouts(self._closed, self._route_map.field, self._planner.config.margin)
+        if not len(lookouts):
+            return None
+        ahead = replace(self._vehicle.reeds_shepp(), reverse_cost=BACKWARD)
+        there = np.array([self._vehicle.reference_pose(pose) for pose in lookouts])
+        far = ahead.distance(np.tile(self._vehicle.reference_pose(task.pose), (len(there), 1)), there)
+        for index in np.argsort(far)[:LOOKOUTS].tolist():
+            x, y, yaw = lookouts[index].tolist()
+            answer = self._plan_known(static_map, replace(task, goal=(x, y, yaw), via=()))
+            self._route = None
+            if answer.poses is not None and not len(self._met(unseen, answer)):
+                text = f"{answer.length:.2f} m to look at ground that no sensor has seen"
+                return replace(answer, text=text, complete=False)
+        return None
+
+    def _met(self, unseen: Unseen, answer: PlanAnswer) -> Array:
+        """See ``Unseen.met``."""
+        assert self._route_map is not None
+        return unseen.met(answer, self._route_map.field)
+
+    def _unseen(self, task: PlanTask) -> Unseen | None:
+        """Unseen ground around the robot; None where it may reverse anywhere."""
+        assert self._setup is not None
+        seen, keep = task.ground_seen, self._setup.seen_for
+        return (
+            None
+            if seen is None or keep is None
+            else unseen_around(seen, keep, self._setup.lidar, self._setup.footprint)
+        )
+
+    def _plan_known(self, static_map: StaticMap, task: PlanTask) -> PlanAnswer:
         """A route that does not reverse into suspended places: those near it count again, then all."""
         answer = self._plan_once(static_map, task)
         for nearby in (NEARBY, math.inf):
@@ -416,7 +488,14 @@ class PlanningStep:
             tilt,
             roughness,
             previous=self._route_map,
+            unseen=self._closed_cells(cells.shape, static_map.resolution, static_map.origin),
         )
+
+    def _closed_cells(self, shape: tuple[int, ...], resolution: float, origin: Pose) -> NDArray[np.bool_] | None:
+        """Cells of a grid with the closed unseen places; None without any."""
+        if not len(self._closed):
+            return None
+        return marked(np.zeros(shape, np.bool_), self._closed, resolution, origin)
 
     def _standing(self, static_map: StaticMap, cells: Cells, pose: Pose) -> RouteMap:
         """The map with the ground under the truck free, and with a margin if the truck is at its edge."""
@@ -438,6 +517,7 @@ class PlanningStep:
             None if tilt is None else np.pad(tilt, margin),
             None if roughness is None else np.pad(roughness, margin),
             previous=self._route_map,
+            unseen=self._closed_cells(freed.shape, static_map.resolution, origin),
         )
 
     def _clearance(self, route_map: RouteMap, answer: PlanAnswer) -> Array:
@@ -465,15 +545,21 @@ class PlanningStep:
             near,
             crab=config.steering == "4ws",
             rear=config.steering != "2ws",
+            unseen=self._unseen_near(task),
         )
         self._route = None
         if found is None:
-            return PlanAnswer(Reason.STUCK, "both ends of the robot are blocked")
+            return PlanAnswer(Reason.STUCK, "both ends of the robot are blocked, or ground there was not seen")
         steering: tuple[Steering, ...] = (found.steering,) * len(found.poses)
         poses = placed(found.poses, task.pose)
         length = float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum())
         directions = np.full(len(poses), float(found.direction))
         return PlanAnswer(Reason.OK, "", poses, directions, steering, length, length)
+
+    def _unseen_near(self, task: PlanTask) -> Array:
+        """Unseen places around the robot, in base, shape (n, 2), m."""
+        unseen = self._unseen(task)
+        return np.empty((0, 2)) if unseen is None else unseen.near(task.pose)
 
 
 def answer_of(path: MotionPath, cost: float, *, kept: bool = False) -> PlanAnswer:

@@ -18,6 +18,7 @@ from monstertruck_planners.goals.exchange import (
     PlanAnswer,
     PlanTask,
     Pose,
+    SeenGround,
     SeenScan,
     Setup,
     level,
@@ -64,6 +65,8 @@ SEEN_STEP: Final = 0.25
 """Distance between two of them, m."""
 SEEN_TURN: Final = 0.4
 """Turn between two of them, rad."""
+TRAIL: Final = 4 * SECOND
+"""Time for which poses are kept, to place the ground seen, which is surveyed for a second, ns."""
 JUMP: Final = 0.5
 """Distance between the poses of two ticks that counts as a jump, m: the kept scans are dropped."""
 
@@ -134,6 +137,8 @@ class GoalService:
         self._points: Array = np.empty((0, 2))
         self._seen: deque[tuple[Pose, Array]] = deque(maxlen=SEEN)
         """Poses and returns in base of scans since the last plan."""
+        self._trail: deque[tuple[int, Pose]] = deque()
+        """Times (ns) and poses of the last ticks."""
         self._before: Pose | None = None
 
     async def run(self, ready: Ready) -> None:
@@ -292,6 +297,7 @@ class GoalService:
             along=along if followed is None else followed.before + along,
             left=self._left(followed, along),
             blocked=odometry is not None and followed is not None and self._blocked(followed, along, odometry, now),
+            unseen=gate is not None and followed is not None and Reason.UNSEEN_STOP in gate.reasons,
             held="" if gate is None else in_words(gate.hindrances),
         )
 
@@ -321,9 +327,13 @@ class GoalService:
         return path_blocked(self._setup.footprint, ahead, points, pose)
 
     def _keep_scan(self, now: int) -> None:
-        """Keep scans along the motion for the next plan, which then knows what is behind the truck."""
+        """Keep poses and scans along the motion for the next plan, which then knows what is behind the truck."""
         odometry = self._odometry(now)
         pose = None if odometry is None else pose_of(odometry)
+        if odometry is not None and pose is not None:
+            self._trail.append((odometry.stamp, pose))
+        while self._trail and now - self._trail[0][0] > TRAIL:
+            self._trail.popleft()
         if pose is None or self._before is None or math.dist(pose[:2], self._before[:2]) > JUMP:
             self._seen.clear()
         self._before = pose
@@ -331,6 +341,17 @@ class GoalService:
             return
         if len(points := self._scan(odometry, now)):
             self._seen.append((pose, points))
+
+    def _ground_seen(self) -> SeenGround | None:
+        """The newest survey of seen ground; None if there is none, or nobody asks for it."""
+        grid = None if self._in.seen is None else self._in.seen.latest
+        scan = None if self._in.scan is None else self._in.scan.latest
+        if self._setup.seen_for is None or grid is None or scan is None or not self._trail:
+            return None
+        at, pose = min(self._trail, key=lambda kept: abs(kept[0] - grid.stamp))
+        if abs(at - grid.stamp) > TRAIL:
+            return None
+        return SeenGround(grid, pose, (scan.start_angle, scan.end_angle), scan.range_max)
 
     def _scan(self, odometry: Odometry, now: int) -> Array:
         """Returns of the newest scan in base as it is now; none if it is old or tilted."""
@@ -389,6 +410,7 @@ class GoalService:
             via=run.via,
             deviation=odometry.position_deviation,
             seen=seen,
+            ground_seen=self._ground_seen(),
         )
         self._fresh, self._sent_grid, self._sent_ground = False, grid, ground
         self._planning = self._tasks.create_task(self._ask(task))

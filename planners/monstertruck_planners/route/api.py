@@ -91,18 +91,19 @@ class RouteMap:
     def from_cells(
         cls, cells: NDArray[np.int8], resolution: float, origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
         unknown: Unknown = "blocked", tilt: Array | None = None, roughness: Array | None = None,
-        previous: "RouteMap | None" = None,
+        previous: "RouteMap | None" = None, unseen: NDArray[np.bool_] | None = None,
     ) -> "RouteMap":  # fmt: skip
         """Map of cells (rows, columns), -1 unknown, 0 free to 100 occupied, row 0 at the lowest y.
 
-        ``previous`` is the map before: what was computed for it is kept where nothing differs.
+        ``previous`` is the map before: what was computed for it is kept where nothing differs. Nothing reverses onto
+        the cells ``unseen``.
         """
         occupied = cells >= OCCUPIED
-        unseen = cells < 0
+        missing = cells < 0
         if unknown == "blocked":
-            occupied = occupied | unseen
-        distances = DistanceField(occupied, resolution, origin, previous.field if previous else None)
-        result = cls(distances, unseen if unknown == "dear" else None, tilt, roughness)
+            occupied = occupied | missing
+        distances = DistanceField(occupied, resolution, origin, previous.field if previous else None, unseen)
+        result = cls(distances, missing if unknown == "dear" else None, tilt, roughness)
         if previous is not None and distances.changes is not None:
             result._take_over(previous, distances.changes)
         return result

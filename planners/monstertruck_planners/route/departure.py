@@ -18,7 +18,13 @@ from numba import njit
 from numpy.typing import ArrayLike
 
 from monstertruck_kinematics.elementary import Array
-from monstertruck_planners.collision_kernels import FieldData, FootprintData, safe_distance, segment_free
+from monstertruck_planners.collision_kernels import (
+    FieldData,
+    FootprintData,
+    safe_distance,
+    segment_free,
+    unseen_distance,
+)
 from monstertruck_planners.route import heuristic
 from monstertruck_planners.route.api import (
     Budget,
@@ -119,7 +125,7 @@ def _drive_off(
     for k in range(1, int(LONGEST / CHECK) + 1):
         x, y, yaw = advance(pose[0], pose[1], pose[2], sign * k * CHECK, segment[1], segment[2])
         now = _level(field, footprint, x, y, yaw, known, max(best - dip, 0), wanted)
-        if now < 0:
+        if now < 0 or (sign < 0.0 and unseen_distance(field, footprint, x, y, yaw) < 0.0):
             break
         free, known, best = k * CHECK, now, max(best, now)
         if now >= wanted and free >= SHORTEST:
@@ -155,7 +161,7 @@ def _to_room(
             travelled = before + abs(length) * k / pieces
             px, py, pyaw = advance(x, y, yaw, length * k / pieces, curvature, sideslip)
             level = _level(field, footprint, px, py, pyaw, max(level, 0), 0, wanted)
-            if level < 0:
+            if level < 0 or (length < 0.0 and unseen_distance(field, footprint, px, py, pyaw) < 0.0):
                 return -1.0, fall
             best = max(best, level)
             fall = max(fall, best - level)

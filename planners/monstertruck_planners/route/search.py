@@ -8,7 +8,13 @@ from numba import njit
 from numpy.typing import NDArray
 
 from monstertruck_kinematics.elementary import Array
-from monstertruck_planners.collision_kernels import FieldData, FootprintData, safe_distance, segment_free
+from monstertruck_planners.collision_kernels import (
+    FieldData,
+    FootprintData,
+    safe_distance,
+    segment_free,
+    unseen_distance,
+)
 from monstertruck_planners.route.motion import advance
 
 IntArray = NDArray[np.int64]
@@ -213,6 +219,8 @@ def free_length(
     while travelled <= longest:
         x, y, yaw = advance(pose[0], pose[1], pose[2], sign * travelled, segment[1], segment[2])
         safe = safe_distance(field, footprint, model.margin, x, y, yaw)
+        if safe >= 0.0 and sign < 0.0:
+            safe = min(safe, unseen_distance(field, footprint, x, y, yaw))
         if safe < 0.0:
             break
         free = travelled

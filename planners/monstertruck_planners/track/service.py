@@ -48,6 +48,8 @@ MOVED: Final = 0.01
 TURNED: Final = 0.02
 """The same for a turn, rad."""
 
+UNSEEN_AFTER: Final = SECOND
+"""Time before unseen ground after which a path is left, ns: no waiting changes what was seen there."""
 STUCK_AFTER: Final = 1.0
 """Distance commanded without progress after which the truck is stuck, m."""
 PROGRESS: Final = 0.2
@@ -164,6 +166,8 @@ class TrackingStep:
         """Pose from which the path was joined; None if it has to be joined again."""
         self._outcome = Reason.DRIVING
         self._progress_checker = _ProgressChecker()
+        self._unseen: int | None = None
+        """Since when the gate has stopped the truck before unseen ground, ns."""
         self._reported = Reason.DRIVING
         """Outcome of the newest event since the path came or the truck was armed."""
         self._active = False
@@ -215,16 +219,35 @@ class TrackingStep:
         stuck = self._progress_checker.stuck(now, at[:2], along, gate if obeyed else None)
         if stuck and command.outcome is Reason.DRIVING:
             command.speed, command.outcome = 0.0, Reason.STUCK
+        text = ""
+        if self._before_unseen(now, gate, driving=obeyed and command.outcome is Reason.DRIVING):
+            reached = path.length - along <= self._config.goal_tolerance
+            command.speed, command.outcome = 0.0, Reason.GOAL_REACHED if reached else Reason.UNSEEN_STOP
+            text = (
+                ""
+                if reached
+                else f"path {path.name!r} leads back onto ground that no sensor has seen, from {at[0]:.2f}, {at[1]:.2f}"
+            )
         if active := gate.mode.active:
             self._progress = command.progress
         self._outcome = command.outcome
         if command.outcome is not self._reported and (self._active or command.outcome is not Reason.DRIVING):
             self._reported = command.outcome
             severity = Severity.INFO if command.outcome in (Reason.DRIVING, Reason.GOAL_REACHED) else Severity.WARNING
-            self._report(command.outcome, severity, path=path.name, cross_track=command.cross_track)
+            self._report(command.outcome, severity, text, path=path.name, cross_track=command.cross_track)
         axles = self._axles()
         drive = active and (command.outcome is Reason.DRIVING or abs(pose.twist.vx) > AT_REST)
         return TrackOutput(command, drive, path.frame, path.name, along, path.length, axles, self._drain())
+
+    def _before_unseen(self, now: int, gate: GateState, *, driving: bool) -> bool:
+        """Whether the gate has stopped the truck before unseen ground for some time; from then on until armed again."""
+        if self._outcome is Reason.UNSEEN_STOP:
+            return True
+        if not driving or Reason.UNSEEN_STOP not in gate.reasons:
+            self._unseen = None
+            return False
+        self._unseen = self._unseen or now
+        return now - self._unseen >= UNSEEN_AFTER
 
     def _axles(self) -> AxleResponse:
         """Measured response of the axles; reports a difference from the configured one."""
@@ -268,7 +291,7 @@ class TrackingStep:
         else:
             self._reported = Reason.DRIVING
         self._followed, self._path, self._outcome, self._begun = path, None, Reason.DRIVING, here
-        self._progress_checker = _ProgressChecker()
+        self._progress_checker, self._unseen = _ProgressChecker(), None
         try:
             if path.frame != pose.frame:
                 msg = f"path {path.name!r} is in frame {path.frame!r}: expected {pose.frame!r}"

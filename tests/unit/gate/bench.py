@@ -51,7 +51,7 @@ class Bench:
         self.clock = clock
         self.latch = latch or MemoryLatch()
         self.scan, self.attitude, self.drive, self.steering, self.battery = (Inbox() for _ in range(5))
-        self.out = GateOutputs((Outbox(),), Outbox(), state or Outbox(), Outbox())
+        self.out = GateOutputs((Outbox(),), Outbox(), state or Outbox(), Outbox(), Outbox())
         self.events = []
         self.readies = 0
         self.speed = 0.0

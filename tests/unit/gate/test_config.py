@@ -47,6 +47,7 @@ DELIVERED = {
         "confirmed_speed": 0.05,
         "memory_time": 30.0,
         "memory_distance": 2.0,
+        "memory_deviation": 0.1,
         "open_ground": False,
     },
     "runaway": {"distance": 0.01, "body_distance": 0.05, "idle_current": 0.05},

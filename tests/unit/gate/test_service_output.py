@@ -133,7 +133,7 @@ def test_events_and_stops_go_out_under_the_gates_name():
 
 def test_every_shaft_gets_its_own_command():
     async def main(clock):
-        outputs = GateOutputs((Outbox(), Outbox()), Outbox(), Outbox(), Outbox())
+        outputs = GateOutputs((Outbox(), Outbox()), Outbox(), Outbox(), Outbox(), Outbox())
         inputs = {topic: Inbox() for topic in topics.DRIVES[:2]}
         gate = make_gate(chassis=BODIES["differential"])
         taken = []

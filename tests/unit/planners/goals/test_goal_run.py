@@ -78,7 +78,9 @@ def test_a_goal_is_planned_followed_and_reached():
     assert run.step(answer=WAY) == ()
 
 
-@pytest.mark.parametrize("reason", [Reason.GOAL_BLOCKED, Reason.GOAL_OUTSIDE, Reason.GOAL_UNREACHABLE])
+@pytest.mark.parametrize(
+    "reason", [Reason.GOAL_BLOCKED, Reason.GOAL_OUTSIDE, Reason.GOAL_UNREACHABLE, Reason.UNSEEN_STOP]
+)
 def test_a_goal_without_a_way_is_refused_at_once(reason: Reason):
     run = SteppedRun()
     run.step(answer=PlanAnswer(reason, "why"))
@@ -150,6 +152,35 @@ def test_an_obstacle_on_the_way_is_planned_round_while_the_truck_drives_on():
     assert run.step(CONFIG.blocked_scans - 1, blocked=True, along=0.2) == ()
     actions = run.step(blocked=True, along=0.3)
     assert (reported(actions), Plan() in actions, Halt() in actions) == ([Reason.PATH_BLOCKED], True, False)
+
+
+def test_before_unseen_ground_it_plans_anew_and_at_last_gives_up():
+    run = SteppedRun(PlannerConfig(recovery=("replan",)))
+    run.step(answer=WAY)
+    for _ in range(goal_run.BLOCKS):
+        assert reported(run.step(3, unseen=True)) == [Reason.UNSEEN_STOP]
+        assert (run.phase, run.done[-1]) == (GoalPhase.PLANNING, Plan())
+        run.step(answer=WAY)
+    assert reported(run.step(3, unseen=True)) == [Reason.RECOVERING]
+    run.step(answer=WAY)
+    run.step(3, unseen=True)
+    assert (run.run.outcome, run.run.active) == (Reason.UNSEEN_STOP, False)
+
+
+def test_before_unseen_ground_within_the_tolerance_it_has_arrived():
+    run = SteppedRun()
+    run.step(answer=WAY)
+    assert reported(run.step(3, unseen=True, pose=(1.85, 0.0, 0.1))) == [Reason.GOAL_REACHED]
+    assert not run.run.active
+
+
+def test_what_backs_out_onto_unseen_ground_plans_anew():
+    run = SteppedRun()
+    run.run = replace(run.run, planned="escape")
+    run.step(answer=WAY)
+    assert run.phase is GoalPhase.BACKING_OUT
+    run.step(3, unseen=True)
+    assert (run.phase, run.run.planned) == (GoalPhase.PLANNING, "route")
 
 
 def test_the_recovery_behaviours_are_tried_in_order_and_then_the_goal_is_given_up():

@@ -12,6 +12,7 @@ from monstertruck_planners.track.pure_pursuit import PurePursuit
 from monstertruck_planners.track.segments import SegmentedPath
 from monstertruck_planners.track.service import (
     STUCK_AFTER,
+    UNSEEN_AFTER,
     Newest,
     TrackerService,
     TrackingStep,
@@ -436,10 +437,12 @@ def test_a_narrow_place_ahead_slows_it_down_while_the_scan_is_fresh():
     on_bench(scenario, path(straight(4.0)), with_scan=True)
 
 
-def driven(way: float, asked: float, seconds: float, *, again: bool = False) -> tuple[list[TrackOutput], TrackingStep]:
+def driven(
+    way: float, asked: float, seconds: float, *, again: bool = False, at: float = 0.0, reasons: tuple[Reason, ...] = ()
+) -> tuple[list[TrackOutput], TrackingStep]:
     """Outputs of a truck that comes ``way`` m/s along a straight where the gate lets it drive ``asked`` m/s."""
     setup = TrackSetup(PurePursuitConfig(), FourWheelSteering(), Footprint(), (0.14, 0.0, 0.0))
-    step, route, outputs = TrackingStep(setup), path(straight(9.0)), []
+    step, route, outputs = TrackingStep(setup), path(straight(9.0 if not at else 0.3)), []
 
     def stand(now: int, mode: GateMode, x: float) -> None:
         head = {"stamp": now, "received": now, "seq": 0}
@@ -447,17 +450,37 @@ def driven(way: float, asked: float, seconds: float, *, again: bool = False) -> 
         twist = Twist2D(vx=0.0, vy=0.0, wz=0.0)
         pose = Odometry(**head, frame="odom", pose=Pose2D(x=x, y=0.0, yaw=0.0), twist=twist, **covariance)
         gate = GateState(
-            **head, mode=mode, nonce="n1", speed_limit=0.2, holder="tracker", twist=Twist2D(vx=asked, vy=0.0, wz=0.0)
-        )
+            **head, mode=mode, nonce="n1", speed_limit=0.2, holder="tracker", twist=Twist2D(vx=asked, vy=0.0, wz=0.0),
+            reasons=reasons,
+        )  # fmt: skip
         outputs.append(step.step(now, Newest(pose, route, gate)))
 
-    stand(0, GateMode.DISARMED, 0.0)
+    stand(0, GateMode.DISARMED, at)
     for tick in range(1, round(50 * seconds)):
-        stand(tick * SECOND // 50, GateMode.DRIVING, way * tick / 50)
+        stand(tick * SECOND // 50, GateMode.DRIVING, at + way * tick / 50)
     if again:
         stand(10**11, GateMode.DISARMED, way * seconds)
         stand(10**11 + SECOND // 50, GateMode.DRIVING, way * seconds)
     return outputs, step
+
+
+def test_a_path_that_leads_back_onto_unseen_ground_ends_within_seconds_and_says_where():
+    outputs, _ = driven(0.0, 0.0, 3.0, again=True, reasons=(Reason.UNSEEN_STOP,))
+    outcomes = [output.command.outcome for output in outputs]
+    first = outcomes.index(Reason.UNSEEN_STOP)
+    assert first / 50 == pytest.approx(UNSEEN_AFTER / SECOND, abs=0.05)
+    assert set(outcomes[first:-1]) == {Reason.UNSEEN_STOP}
+    assert all(output.command.speed == 0.0 and not output.drive for output in outputs[first:-1])
+    (event,) = [event for output in outputs for event in output.events if event.reason is Reason.UNSEEN_STOP]
+    assert "no sensor has seen, from 0.00, 0.00" in event.text
+    assert outcomes[-1] is Reason.DRIVING, "armed again it tries again"
+
+
+def test_a_path_is_driven_if_only_its_tolerance_is_left_before_unseen_ground():
+    outputs, _ = driven(
+        0.0, 0.0, 2.0, at=0.3 - PurePursuitConfig().goal_tolerance + 0.005, reasons=(Reason.UNSEEN_STOP,)
+    )
+    assert outputs[-1].command.outcome is Reason.GOAL_REACHED
 
 
 def test_a_truck_that_pushes_against_something_unseen_stops_and_says_so_once_and_begins_anew_when_armed():
