@@ -138,6 +138,21 @@ class ShaftCheckConfig(Schema):
     """A shaft slower than this share of its command does not turn."""
 
 
+class ContactConfig(Schema):
+    """When a robot that an operator drives into unseen ground has touched something, and how far it backs off."""
+
+    current: Annotated[float, Field(gt=0, le=1)] = 0.15
+    """Rise of a motor's current above that of rolling, A: less than half of what it rises by until the clutch slips."""
+    rolling: Annotated[float, Field(gt=0, le=2)] = 0.25
+    """Current of rolling until the robot has measured it, A."""
+    share: Annotated[float, Field(gt=0, lt=1)] = 0.3
+    """Shafts, free wheels and turns slower than this share of what is commanded are held."""
+    within: Annotated[float, Field(gt=0, le=0.3)] = 0.15
+    """Time for which they have to be, s."""
+    back_off: Annotated[float, Field(gt=0, le=0.2)] = 0.03
+    """Distance backed off, m."""
+
+
 class RunawayConfig(Schema):
     """When a motor turns as nobody commanded."""
 
@@ -212,6 +227,8 @@ class GateConfig(Schema):
     tilt: TiltLimits = TiltLimits()
     turning: SteeringCheckConfig | None = SteeringCheckConfig()
     """Compass against steering, finds servos without supply; null = off."""
+    contact: ContactConfig | None = ContactConfig()
+    """Contact while an operator drives into unseen ground; null = off."""
     blocked: ShaftCheckConfig | None = ShaftCheckConfig()
     """Commanded against measured speed of each driven shaft, finds blocked ones; null = off."""
     runaway: RunawayConfig | None = RunawayConfig()
@@ -410,6 +427,9 @@ WEAKER_ABOVE: Final = (
     "unwitnessed",
     "blocked.within",
     "blocked.speed",
+    "contact.current",
+    "contact.rolling",
+    "contact.within",
     "runaway.distance",
     "runaway.body_distance",
     "runaway.idle_current",
@@ -429,6 +449,8 @@ WEAKER_BELOW: Final = (
     "obstacle.seen",
     "sonar.core",
     "blocked.share",
+    "contact.share",
+    "contact.back_off",
     "short_faults_within",
 )
 """Settings of the gate that are weaker the less they are."""
@@ -447,6 +469,8 @@ def weakened(config: GateConfig) -> tuple[str, ...]:
         texts.append("gate.turning null: servos without supply are not noticed")
     if config.blocked is None:
         texts.append("gate.blocked null: a blocked shaft is not noticed")
+    if config.contact is None:
+        texts.append("gate.contact null: a contact in unseen ground is not noticed")
     if config.runaway is None:
         texts.append("gate.runaway null: a motor that does not obey is not noticed")
     if config.obstacle.unseen == "slow":

@@ -33,6 +33,7 @@ from monstertruckd.gate.catalog import CheckConfig
 from monstertruckd.gate.checks import Check, Checks, GateView, Tick
 from monstertruckd.gate.config import GateConfig, InForce
 from monstertruckd.gate.consistency import ConsistencyCheck
+from monstertruckd.gate.contact import ContactCheck
 from monstertruckd.gate.following import ShaftCheck, SteeringCheck
 from monstertruckd.gate.limiter import CommandLimiter
 from monstertruckd.gate.motion import Motion
@@ -76,6 +77,7 @@ HALTS: Final = frozenset(
     {
         Reason.OBSTACLE_STOP,
         Reason.UNSEEN_STOP,
+        Reason.CONTACT,
         Reason.LIDAR_BLIND,
         Reason.SONAR_STALE,
         Reason.SONAR_BLIND,
@@ -221,10 +223,12 @@ class Gate:
         self._motion = Motion(self._limits, chassis)
         view = GateView(self._limits, chassis, footprint, self._samples, self._motion, self._states)
         self._limiter = CommandLimiter(view)
+        self._contact = None if config.contact is None else ContactCheck(view, config.contact)
         self._checks = Checks(
             (
                 *sensor_checks(view, battery_measured=battery_measured, compared=compared),
                 self._limiter,
+                *(() if self._contact is None else (self._contact,)),
                 *obstacle_checks(view, points, sonars, peers),
                 *(OwnCheck(view, name, settings) for name, settings in own.items()),
             )
@@ -501,7 +505,10 @@ class Gate:
         self._advance(now, blocks)
         self._confirm(now)
         holder = self._states.holder
-        courses = self._limiter.aim(now, dt, None if holder is None else holder.request)
+        request = None if holder is None else holder.request
+        if request is not None and self._contact is not None:
+            request = self._contact.instead(request, now)
+        courses = self._limiter.aim(now, dt, request)
         limits = self._checks.limits(now, courses)
         self._limiter.advance(dt, limits)
         if holder is not None:

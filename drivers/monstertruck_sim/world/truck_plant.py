@@ -160,13 +160,20 @@ class TruckPlant(Plant):
         if depth > 0.0 and depth >= self._contact(*self._pose):
             self.on_blocked(pose, twist)
             self._stuck_at = self._pose
-            self._wheel_speeds = [0.0] * len(self.shafts)
+            self._hold_wheels()
             self._twist = (0.0, 0.0, 0.0)
         else:
             self._pose, self._twist = pose, twist
             if self._stuck_at and hypot(pose[0] - self._stuck_at[0], pose[1] - self._stuck_at[1]) > _FREED:
                 self._stuck_at = None
         self._attitude = self._tilt(self._elapsed, *self._pose)
+
+    def _hold_wheels(self) -> None:
+        """The body stands against something: the motors go on and wind up until their clutches give."""
+        for i, speed in enumerate(self._wheel_speeds):
+            if speed:
+                self._pulls[i], self._slipping[i] = copysign(self.config.motor.clutch_force, speed), True
+        self._wheel_speeds = [0.0] * len(self.shafts)
 
 
 class _Steering:

@@ -1,0 +1,243 @@
+"""Contact with what no sensor has seen, while an operator drives there knowingly: noticed, and backed off from.
+
+Each measure tells that something holds the body although its wheels are driven: a motor draws more than rolling needs,
+a shaft or a free wheel is slower than commanded, or the body turns less than commanded. They are compared while the
+commanded motion is steady, since a motor that accelerates its gears draws as much as one that pushes. The gate then
+drives the last motion the other way for a few centimetres, and stands until the operator releases the stick or asks for
+another direction.
+"""
+
+import math
+from collections import deque
+from collections.abc import Iterator, Sequence
+from statistics import median
+from typing import Any, Final, NamedTuple
+
+from monstertruck_kinematics.chassis import STILL
+from monstertruck_kinematics.drive import Twist
+from monstertruck_runtime.clock import SECOND
+from monstertruck_schemas.base import Message
+from monstertruck_schemas.event import Measurement
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import DriveRequest
+from monstertruck_schemas.sensor import DriveFeedback, DriveMode, Imu, WheelEncoders
+from monstertruck_schemas.topics import DRIVES, ENCODERS, IMU, Topic
+from monstertruckd.gate.checks import Check, GateView, PaceLimit, Tick
+from monstertruckd.gate.config import ContactConfig
+from monstertruckd.gate.motion import Course, scaled
+
+SETTLED: Final = SECOND // 10
+"""Time for which a shaft has to have its commanded speed before anything is compared, ns."""
+REACHED: Final = 0.8
+"""Share of its commanded speed at which a shaft has it: a drive that is switched on follows half a second later."""
+STEADY: Final = 1e-3
+"""Commanded velocities that differ by less are one motion, m/s and rad/s."""
+LEARNED: Final = 20
+"""Currents of rolling that are kept for each motor."""
+ENOUGH: Final = 3
+"""Currents from which that of rolling is known."""
+TURNING: Final = 0.1
+"""Slower commanded turns are not compared, rad/s."""
+LEAST: Final = 1e-6
+"""A smaller pace is none, m/s."""
+PATIENCE: Final = 2.0
+"""The robot gives up backing off after this many times the time that the distance takes."""
+
+
+class Finding(NamedTuple):
+    """What told of a contact."""
+
+    name: str
+    """Of the figure."""
+    value: float
+    unit: str
+    limit: float
+
+
+class Lasting:
+    """A condition that has to hold for some time, by the stamps of what shows it."""
+
+    def __init__(self) -> None:
+        self._since: int | None = None
+
+    def holds(self, now: int, within: float, *, true: bool) -> bool:
+        """Whether it has held for ``within`` s at ``now``, ns."""
+        if not true:
+            self._since = None
+            return False
+        self._since = now if self._since is None else self._since
+        return now - self._since >= within * SECOND
+
+
+class ContactCheck(Check):
+    """Something holds the body of a robot that an operator drives into unseen ground.
+
+    Args:
+        view: what it may look at.
+        config: limits, and how far it backs off.
+    """
+
+    reasons = (Reason.CONTACT,)
+    reads = (IMU, ENCODERS)
+
+    def __init__(self, view: GateView, config: ContactConfig) -> None:
+        super().__init__(view)
+        self._config = config
+        self._steady: Twist[float] = STILL
+        """Commanded motion."""
+        self._reached: dict[int, int] = {}
+        """Since when each shaft has had its commanded speed, ns."""
+        self._rolling: dict[int, deque[float]] = {}
+        """Currents of every motor while the robot rolled freely, along its motion, A."""
+        self._slow: dict[str, Lasting] = {}
+        self._encoders: WheelEncoders | None = None
+        self._request: DriveRequest | None = None
+        """The holder's newest."""
+        self._touched: DriveRequest | None = None
+        """What was asked for when the robot touched something; None = it does not."""
+        self._finding: Finding | None = None
+        self._began = 0
+        """When it began to back off, ns."""
+        self._backed = 0.0
+        """How far, m."""
+
+    def observe(self, seen: Message | Tick, topic: Topic[Any] | None) -> None:
+        """Take the commanded motion of the newest tick, or a measure of the real one."""
+        match seen:
+            case Tick():
+                self._follow(seen)
+            case DriveFeedback() if topic is not None:
+                self._take_drive(seen, DRIVES.index(topic))
+            case WheelEncoders():
+                self._take_encoders(seen)
+            case Imu():
+                self._take_gyro(seen)
+
+    def instead(self, request: DriveRequest, now: int) -> DriveRequest:
+        """What the gate drives: the holder's request, or after a contact its counterpart."""
+        self._request = request
+        touched = self._touched
+        if touched is None:
+            return request
+        if not any(request.numbers.values()) or not self._same_direction(request, touched):
+            self._touched = None
+            return request
+        return self._opposite(touched) if self._backing(now) else request
+
+    def limit(self, now: int, courses: Sequence[Course] | None) -> Iterator[PaceLimit]:
+        """Slow while it backs off, then standstill."""
+        if courses is None:
+            self._touched = self._request = None
+        elif self._touched is not None:
+            yield PaceLimit(Reason.CONTACT, self.view.config.obstacle.confirmed_speed if self._backing(now) else 0.0)
+
+    def figures(self, reason: Reason, now: int) -> Iterator[Measurement]:
+        """What told of it."""
+        if (found := self._finding) is not None:
+            yield Measurement(name=found.name, value=found.value, unit=found.unit, limit=found.limit)
+
+    def reset(self) -> None:
+        """The robot may be moved by hand."""
+        self._touched = self._finding = None
+
+    # The commanded motion
+
+    def _follow(self, tick: Tick) -> None:
+        twist = self.view.motion.twist
+        if max(abs(new - old) for new, old in zip(twist, self._steady, strict=True)) > STEADY:
+            self._steady = twist
+            self._reached.clear()
+            self._slow.clear()
+        if self._touched is not None:
+            speeds = self.view.samples.shaft_speeds(tick.now)
+            away = self._away(self.view.motion.shaft_speeds)
+            self._backed += away * max(map(abs, speeds), default=0.0) * tick.elapsed / SECOND
+
+    def _away(self, speeds: Sequence[float]) -> bool:
+        """Whether commanded shaft speeds lead away from what was touched."""
+        assert self._touched is not None
+        towards = self.view.chassis.shafts_along(self.view.motion.target(self._touched).twist, *self.view.motion.angles)
+        return sum(speed * other for speed, other in zip(speeds, towards, strict=True)) < 0.0
+
+    def _backing(self, now: int) -> bool:
+        """Whether it has not come far enough away yet."""
+        distance = self._config.back_off
+        longest = PATIENCE * distance / self.view.config.obstacle.confirmed_speed
+        return self._backed < distance and now - self._began < longest * SECOND
+
+    def _same_direction(self, request: DriveRequest, other: DriveRequest) -> bool:
+        one, two = (self.view.motion.target(each).twist for each in (request, other))
+        return sum(a * b for a, b in zip(one, two, strict=True)) > 0.0
+
+    def _opposite(self, request: DriveRequest) -> DriveRequest:
+        """The motion of a request the other way, slowly."""
+        target = self.view.motion.target(request)
+        share = -self.view.config.obstacle.confirmed_speed / max(
+            self.view.motion.pace(target.twist, target.shafts), 1e-6
+        )
+        if request.twist is not None:
+            vx, vy, wz = scaled((request.twist.vx, request.twist.vy, request.twist.wz), share)
+            return request.model_copy(update={"twist": request.twist.model_copy(update={"vx": vx, "vy": vy, "wz": wz})})
+        if request.shafts is not None:
+            return request.model_copy(update={"shafts": tuple(share * rate for rate in request.shafts)})
+        return request.model_copy(update={"speed": share * request.speed})
+
+    # The measures
+
+    def _driven(self, stamp: int) -> bool:
+        """Whether all shafts have had the speeds of a steady motion for some time at ``stamp``, ns."""
+        reached = self._reached.values()
+        return len(reached) == len(self.view.motion.shaft_speeds) and stamp - max(reached) >= SETTLED
+
+    def _take_drive(self, feedback: DriveFeedback, shaft: int) -> None:
+        commanded = self.view.motion.shaft_speeds[shaft]
+        if self._touched is not None or feedback.mode is not DriveMode.ENABLED or not commanded:
+            self._reached.pop(shaft, None)
+            return
+        sign = math.copysign(1.0, commanded)
+        measured = sign * self.view.chassis.drivetrain.speed(feedback.velocity)
+        if measured >= REACHED * abs(commanded):
+            self._reached.setdefault(shaft, feedback.stamp)
+        if feedback.stamp - self._reached.get(shaft, feedback.stamp) < SETTLED:
+            return
+        self._compare(f"shaft {shaft}", feedback, measured, abs(commanded))
+        if feedback.current is not None:
+            known = self._rolling.setdefault(shaft, deque(maxlen=LEARNED))
+            usual = median(known) if len(known) >= ENOUGH else self._config.rolling
+            limit, load = usual + self._config.current, sign * feedback.current
+            if load > limit:
+                self._touch(Finding("motor current", load, "A", limit), feedback.received)
+            else:
+                known.append(load)
+
+    def _take_encoders(self, encoders: WheelEncoders) -> None:
+        before, self._encoders = self._encoders, encoders
+        if before is None or encoders.stamp <= before.stamp or not self._driven(before.stamp):
+            self._slow.pop("free wheels", None)
+            return
+        seconds, radius = (encoders.stamp - before.stamp) / SECOND, self.view.chassis.drivetrain.wheel_radius
+        turned = max(abs(encoders.left - before.left), abs(encoders.right - before.right))
+        vx, vy, _ = self._steady
+        self._compare("free wheels", encoders, turned * radius / seconds, math.hypot(vx, vy))
+
+    def _take_gyro(self, imu: Imu) -> None:
+        expected = abs(self._steady[2])
+        if not self._driven(imu.stamp) or expected < TURNING:
+            self._slow.pop("body", None)
+            return
+        rate = imu.angular_velocity
+        self._compare("body", imu, math.hypot(rate.x, rate.y, rate.z), expected, "rad/s")
+
+    def _compare(self, name: str, seen: Message, measured: float, expected: float, unit: str = "m/s") -> None:
+        """Something that is held is much slower than expected, for some time."""
+        least = self._config.share * expected
+        slow = self._slow.setdefault(name, Lasting())
+        if slow.holds(seen.stamp, self._config.within, true=measured < least):
+            self._touch(Finding(f"speed of {name}", measured, unit, least), seen.received)
+
+    def _touch(self, found: Finding, now: int) -> None:
+        """A measure tells of a contact; it counts while an operator drives into unseen ground."""
+        if self.view.confirmed and self._request is not None:
+            self._touched, self._finding, self._began, self._backed = self._request, found, now, 0.0
+            self._reached.clear()
+            self._slow.clear()

@@ -1,0 +1,191 @@
+"""What tells that something holds a robot that drives into unseen ground, and how it leaves it."""
+
+import math
+from functools import partial
+
+import pytest
+
+from monstertruck_schemas import topics
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.sensor import Imu, Vector3, WheelEncoders
+from monstertruckd.gate.config import ContactConfig, GateConfig, weakened
+from monstertruckd.gate.contact import ContactCheck
+from tests.unit.gate.rig import DRIVETRAIN, Rig, check_of, header
+
+ROLLING, PUSHING = 0.15, 0.54
+
+
+class Backing(Rig):
+    """A truck that an operator backs into unseen ground; its drive measures currents."""
+
+    def __init__(self, **config):
+        super().__init__(**config)
+        self.armed()
+        self.load = ROLLING
+        self.driver = {"speed": -0.15, "unseen": True}
+        self.extra = lambda: None
+        sense = self.sense
+
+        def measured():
+            self.current = math.copysign(self.load, self.speed) if self.speed else 0.0
+            sense()
+            self.extra()
+
+        self.sense = measured
+
+    def until(self, reason, ticks=100):
+        """Seconds until a reason is given; None: it is not."""
+        for tick in range(ticks):
+            self.tick()
+            if reason in self.out.reasons:
+                return tick / 50
+        return None
+
+
+def backing(**config):
+    rig = Backing(**config)
+    rig.tick(50)
+    assert rig.out.reasons == (Reason.UNSEEN_DRIVE,)
+    assert rig.speed == pytest.approx(-0.05)
+    return rig
+
+
+def test_a_motor_that_pushes_is_noticed_within_three_tenths_of_a_second_and_backed_off_from():
+    rig = backing()
+    rig.load = PUSHING
+    assert rig.until(Reason.CONTACT) <= 0.3
+    assert rig.trips[-1].reason is Reason.CONTACT
+    (figure,) = rig.trips[-1].causes[0].measurements
+    assert (figure.name, figure.value, figure.unit) == ("motor current", pytest.approx(PUSHING), "A")
+    assert figure.limit == pytest.approx(ROLLING + ContactConfig().current)
+    rig.load, before = ROLLING, rig.travelled
+    rig.tick(20)
+    assert rig.out.speeds[0] == pytest.approx(0.05), "the other way"
+    rig.tick(60)
+    assert rig.out.speeds[0] == 0.0
+    assert rig.travelled - before == pytest.approx(ContactConfig().back_off, abs=0.01)
+    rig.tick(100)
+    assert rig.out.speeds[0] == 0.0, "until the operator asks for something else"
+    assert Reason.CONTACT in rig.out.reasons
+
+
+@pytest.mark.parametrize("asked", [0.0, 0.1])
+def test_an_operator_who_lets_go_or_drives_away_decides_again(asked):
+    rig = backing()
+    rig.load = PUSHING
+    rig.until(Reason.CONTACT)
+    rig.load = ROLLING
+    rig.driver = {"speed": asked, "unseen": True}
+    rig.tick(40)
+    assert rig.out.speeds[0] == pytest.approx(asked)
+    rig.driver = {"speed": -0.15, "unseen": True}
+    rig.tick(60)
+    assert rig.out.speeds[0] == pytest.approx(-0.05)
+    rig.load = PUSHING
+    assert rig.until(Reason.CONTACT) is not None, "and it is noticed again"
+
+
+def test_a_drive_that_is_switched_on_while_it_accelerates_is_not_taken_for_a_contact():
+    rig = Backing()
+    rig.load = PUSHING
+    obey, held = rig._obey, 25
+
+    def late():
+        nonlocal held
+        held -= 1
+        if held < 0:
+            obey()
+            rig.load = PUSHING if abs(rig.speed) < 0.04 else ROLLING
+
+    rig._obey = late
+    rig.tick(100)
+    assert rig.out.reasons == (Reason.UNSEEN_DRIVE,)
+
+
+def test_the_current_of_rolling_is_learned():
+    rig = Backing(contact={"rolling": 0.6})
+    rig.load = 0.5  # a stiff robot
+    rig.tick(100)
+    assert rig.out.reasons == (Reason.UNSEEN_DRIVE,)
+    rig.load = 0.5 + ContactConfig().current + 0.02
+    assert rig.until(Reason.CONTACT) is not None
+
+
+def test_before_the_current_of_rolling_is_known_a_setting_stands_for_it():
+    rig = Backing()
+    rig.load = PUSHING
+    assert rig.until(Reason.CONTACT) is not None
+
+
+def test_a_motor_that_stalls_is_noticed():
+    rig = backing()
+    rig._obey = lambda: None
+    rig.load, rig.speed = ROLLING, 0.0
+    assert rig.until(Reason.CONTACT) <= 0.3
+    (figure,) = check_of(rig.gate, ContactCheck).figures(Reason.CONTACT, rig.now)
+    assert (figure.name, figure.value) == ("speed of shaft 0", 0.0)
+
+
+def test_only_an_operator_who_holds_the_second_control_is_backed_off():
+    rig = Backing(obstacle={"unseen": "slow"})
+    rig.driver = {"speed": -0.15}
+    rig.tick(50)
+    rig.load = PUSHING
+    assert rig.until(Reason.CONTACT) is None
+
+
+def test_free_wheels_that_stand_are_noticed():
+    rig = backing()
+    angle = [0.0]
+
+    def encoders():
+        rig.gate.observe(WheelEncoders(**header(rig.now), left=angle[0], right=angle[0]), topics.ENCODERS)
+
+    rig.extra = encoders
+    for _ in range(50):
+        angle[0] += rig.speed * 0.02 / rig.gate._chassis.drivetrain.wheel_radius
+        rig.tick()
+    assert rig.out.reasons == (Reason.UNSEEN_DRIVE,)
+    assert rig.until(Reason.CONTACT) <= 0.3
+    assert rig.trips[-1].causes[0].measurements[0].name == "speed of free wheels"
+
+
+def test_a_body_that_does_not_turn_is_noticed():
+    rig = Backing()
+    rig.driver = {"speed": -0.15, "front": 0.4, "rear": -0.4, "unseen": True}
+    turning = [True]
+
+    def gyro():
+        rate = rig.out.twist[2] if rig.out and turning[0] else 0.0
+        zero = Vector3(x=0.0, y=0.0, z=0.0)
+        imu = Imu(**header(rig.now), angular_velocity=Vector3(x=0.0, y=0.0, z=rate), linear_acceleration=zero)
+        rig.gate.observe(imu, topics.IMU)
+
+    rig.extra = gyro
+    rig.tick(100)
+    assert Reason.CONTACT not in rig.out.reasons
+    assert abs(rig.out.twist[2]) > 0.1
+    turning[0] = False
+    assert rig.until(Reason.CONTACT) <= 0.3
+    assert rig.trips[-1].causes[0].measurements[0].name == "speed of body"
+
+
+@pytest.mark.parametrize("driver", [{"vx": -0.15, "unseen": True}, (-0.15 / DRIVETRAIN.wheel_radius,)])
+def test_it_backs_off_in_every_form_of_request(driver):
+    rig = Backing()
+    rig.roll = partial(rig.roll, unseen=True)
+    rig.driver = driver
+    rig.tick(60)
+    assert rig.out.reasons[:1] == (Reason.UNSEEN_DRIVE,)
+    rig.load = PUSHING
+    assert rig.until(Reason.CONTACT) is not None
+    rig.load = ROLLING
+    rig.tick(15)
+    assert rig.out.speeds == pytest.approx((0.05,))
+
+
+def test_without_the_check_nothing_is_noticed_and_the_robot_says_so():
+    rig = backing(contact=None)
+    rig.load = PUSHING
+    assert rig.until(Reason.CONTACT) is None
+    assert "gate.contact null: a contact in unseen ground is not noticed" in weakened(GateConfig(contact=None))
