@@ -94,7 +94,7 @@ class Reason(StrEnum):
     UNSEEN_SLOW = "unseen_slow", 76, "ground that no scan has seen lately: speed limited"
     UNSEEN_STOP = "unseen_stop", 16, "ground ahead that no sensor has seen lately: hold the second control to drive on"
     UNSEEN_DRIVE = "unseen_drive", 17, "driving into unseen ground"
-    CONTACT = "contact", 19, "touched what no sensor has seen: backs off and waits for another direction"
+    CONTACT = "contact", 0, "touched what no sensor has seen: backs off and waits for another direction"
     SONAR_STALE = "sonar_stale", 78, "no fresh ranges of the sonars"
     SONAR_BLIND = "sonar_blind", 79, "the sonar that looks where the robot goes does not answer"
     SONAR_SLOW = "sonar_slow", 69, "no sonar sees all of where the robot goes: speed limited"
