@@ -50,7 +50,6 @@ SYMPTOMS: Final = (
             "lidar_blind": "As above; something hangs before it?",
             "unseen_stop": "No sensor has seen the ground there lately: drive forward, or hold the second control.",
             "unseen_drive": "",
-            "contact": "It drove against something unseen: release the stick, then drive another way.",
             "unseen_slow": "It drives where no sensor looks: turn it round.",
             "sonar_slow": "",
             "own_check": "A check of section `checks` holds it: the event names the check.",
