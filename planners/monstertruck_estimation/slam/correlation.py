@@ -386,19 +386,21 @@ def _average(
     for i in range(n + 1):
         if i == n or i == 0 or keys[i] != keys[i - 1]:
             if r >= 0:
-                p[r] /= total
-                v[r] /= total
-                length = np.hypot(m[r, 0], m[r, 1])
-                m[r] /= max(length, 1e-12)
+                length = max(np.hypot(m[r, 0], m[r, 1]), 1e-12)
+                for c in range(2):
+                    p[r, c] /= total
+                    v[r, c] /= total
+                    m[r, c] /= length
             if i == n:
                 break
             r += 1
             total = 0.0
         k = order[i]
         w = 1.0 / variances[k, 0]
-        p[r] += w * points[k]
-        m[r] += w * normals[k]
-        v[r] += w * variances[k]
+        for c in range(2):
+            p[r, c] += w * points[k, c]
+            m[r, c] += w * normals[k, c]
+            v[r, c] += w * variances[k, c]
         e[r] = max(e[r], extents[k])
         total += w
     return p, m, v, e

@@ -3,7 +3,7 @@
 import itertools
 import math
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,6 +73,8 @@ class EdgeList:
         self._spread = GrowingArray(2)
         self._loop = GrowingArray(dtype=bool)
         self._odometry = GrowingArray(dtype=bool)
+        self.revision = 0
+        """Number of changes so far."""
 
     def add(
         self,
@@ -86,6 +88,7 @@ class EdgeList:
         odometry: bool = False,
     ) -> None:
         """Add an edge; ``spread`` are its variances (m^2, rad^2) in the bound of the drift."""
+        self.revision += 1
         self._ends.append((origin, target))
         self._measured.append(measured)
         self._information.append(information)
@@ -95,16 +98,19 @@ class EdgeList:
 
     def keep(self, kept: NDArray[np.bool_] | slice) -> None:
         """Remove all edges but the marked ones."""
+        self.revision += 1
         for rows in (self._ends, self._measured, self._information, self._spread, self._loop, self._odometry):
             rows.set(rows.view[kept])
 
     def loosen(self, kept: NDArray[np.bool_]) -> None:
         """Multiply the standard deviations of the marked edges by ``LOOSENED``."""
+        self.revision += 1
         self._information.view[kept] /= LOOSENED**2
         self._spread.view[kept] *= LOOSENED**2
 
     def replace(self, edges: Edges, spread: Array, odometry: NDArray[np.bool_]) -> None:
         """Replace all edges."""
+        self.revision += 1
         self._ends.set(np.stack((edges.origin, edges.target), axis=1))
         self._measured.set(edges.measured)
         self._information.set(edges.information)
@@ -243,6 +249,17 @@ class Join:
     """Keyframes there were."""
 
 
+class _Drift(NamedTuple):
+    """Drift against one keyframe, and what it was computed from."""
+
+    poses: Array
+    """Replaced as a whole by every change."""
+    revision: int
+    """Of the edges."""
+    source: int
+    bound: tuple[Array, Array]
+
+
 class KeyframeMap:
     """Keyframes with their poses in map and the pose graph between them.
 
@@ -259,6 +276,7 @@ class KeyframeMap:
         """Shape (n,): the submap of every keyframe, by the number of its first one; 0 = the map."""
         self.doubtful: list[Join] = []
         """Joins, in their order, that what the robot saw since then has not confirmed yet."""
+        self._drift: _Drift | None = None
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -351,8 +369,15 @@ class KeyframeMap:
         return True
 
     def drift(self, source: int) -> tuple[Array, Array]:
-        """Bound of the drift against ``source``: covariances in its frame, and summed variances."""
-        return drift(self.poses, self.edges.edges(), self.edges.spread, source)
+        """Bound of the drift against ``source``: covariances in its frame, and summed variances.
+
+        The newest one is kept, as several parts of a step ask for it.
+        """
+        known, revision = self._drift, self.edges.revision
+        if known is None or known.poses is not self.poses or known[1:3] != (revision, source):
+            bound = drift(self.poses, self.edges.edges(), self.edges.spread, source)
+            known = self._drift = _Drift(self.poses, revision, source, bound)
+        return known.bound
 
     def well_known(self, source: int) -> Numbers:
         """Numbers, rising, of the keyframes whose drift against ``source`` is below ``local_spread``."""

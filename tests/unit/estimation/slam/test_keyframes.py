@@ -5,7 +5,8 @@ import pytest
 
 from monstertruck_estimation.se2 import between
 from monstertruck_estimation.slam import keyframes
-from monstertruck_estimation.slam.keyframes import Trajectory
+from monstertruck_estimation.slam.graph import drift
+from monstertruck_estimation.slam.keyframes import LOOSENED, Trajectory
 from monstertruck_estimation.slam.mapping import Mapper
 from tests.unit.estimation.slam.kit import rounds, scan
 from tests.unit.estimation.slam.test_relocation import HALL
@@ -95,3 +96,24 @@ def test_poses_at_any_instant_move_with_the_keyframes_and_are_unknown_off_the_ma
         joined[:] = True
         joined[lost] = False
         assert np.isnan(trail.at(asked, keys, joined)[2]).all(), "one end of the line is nowhere"
+
+
+def test_the_drift_is_computed_once_until_poses_or_edges_change(monkeypatch: pytest.MonkeyPatch):
+    mapper, computed = Mapper(), []
+    for k, pose in enumerate(rounds(40, 0.5, 3.6, 2.2)):
+        mapper.step(scan(HALL, pose), k * 10**8, pose)
+    keys, newest = mapper.map, len(mapper.map) - 1
+    monkeypatch.setattr(keyframes, "drift", lambda *inputs: computed.append(inputs) or drift(*inputs))
+    keys.drift(0)
+    first, _ = keys.drift(newest)
+    assert keys.drift(newest)[0] is first
+    assert len(computed) == 2
+    keys.poses = keys.poses + np.array((1.0, 0.0, 0.0))
+    keys.drift(newest)
+    assert len(computed) == 3
+    keys.edges.loosen(np.ones(len(keys.edges), bool))
+    assert keys.drift(newest)[0][0, 2, 2] == pytest.approx(first[0, 2, 2] * LOOSENED**2)
+    count = len(keys.edges)
+    keys.edges.keep(slice(1, count))
+    keys.drift(newest)
+    assert len(computed) == 5
