@@ -4,18 +4,22 @@ import asyncio
 import contextlib
 import errno
 import struct
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from mmap import mmap
 from typing import Any, Final, Self
 
 from monstertruck_drivers.webcam import v4l2
 from monstertruck_drivers.webcam.source import SET_FORMAT, CameraFrame, Mode, device_error
 from monstertruck_runtime.errors import DeviceError, DeviceLostError, DeviceMismatchError
-from monstertruck_runtime.threads import Offload, in_thread
+from monstertruck_runtime.threads import Offload, in_daemon_thread
 
 ENUMERATION_LIMIT: Final = 256
 """Rows at most: a broken driver may never say that there are no more."""
+PATIENCE: Final = 2.0
+"""Seconds that the end of a session waits for its camera to be let go."""
 
 
 class V4l2Source:
@@ -25,11 +29,12 @@ class V4l2Source:
         pattern: node, symlink or glob pattern, such as ``/dev/v4l/by-path/*usb-0:1.2:1.0-video-index*``. A camera has
             several nodes; of those that fit, the first one that captures motion JPEG is taken.
         kernel: system calls.
-        offload: where setting up and letting go is done: control transfers over USB take tens of milliseconds.
+        offload: where setting up and letting go is done: control transfers over USB take tens of milliseconds, and 5 s
+            each where the camera does not answer.
     """
 
     def __init__(
-        self, pattern: str = "/dev/video*", kernel: v4l2.Kernel | None = None, offload: Offload = in_thread
+        self, pattern: str = "/dev/video*", kernel: v4l2.Kernel | None = None, offload: Offload = in_daemon_thread
     ) -> None:
         self.name = pattern
         self._kernel = kernel or v4l2.Kernel()
@@ -37,14 +42,12 @@ class V4l2Source:
 
     async def open(self, mode: Mode, buffers: int) -> "V4l2Stream":
         """Start the camera, see ``FrameSource``."""
-        started: list[Camera] = []
+        starting = _Starting(self.name, self._kernel, mode, buffers)
         try:
-            await self._offload(lambda: started.append(Camera.start(self.name, self._kernel, mode, buffers)))
+            return V4l2Stream(await self._offload(starting.run), self._offload)
         except asyncio.CancelledError:
-            for camera in started:
-                await self._offload(camera.stop)
+            starting.give_up()
             raise
-        return V4l2Stream(started[0], self._offload)
 
 
 class Camera:
@@ -129,6 +132,39 @@ class Camera:
                 self._kernel.ioctl(self.fd, v4l2.QBUF, v4l2.buffer(index))
 
 
+class _Starting:
+    """Start of a camera, which the kernel may complete only after its caller was cancelled.
+
+    Args:
+        pattern: see ``V4l2Source``.
+        kernel: system calls.
+        mode: wanted.
+        buffers: how many.
+    """
+
+    def __init__(self, pattern: str, kernel: v4l2.Kernel, mode: Mode, buffers: int) -> None:
+        self._start = partial(Camera.start, pattern, kernel, mode, buffers)
+        self._lock = threading.Lock()
+        self._is_given_up = False
+        self._camera: Camera | None = None
+
+    def run(self) -> Camera:
+        """Start it; blocks."""
+        camera = self._start()
+        with self._lock:
+            self._camera = camera
+            if self._is_given_up:
+                camera.stop()
+        return camera
+
+    def give_up(self) -> None:
+        """Let the camera go, now or as soon as it has started."""
+        with self._lock:
+            self._is_given_up = True
+            if self._camera is not None:
+                threading.Thread(target=self._camera.stop, name="camera", daemon=True).start()
+
+
 class V4l2Stream:
     """Newest picture of a streaming camera."""
 
@@ -156,8 +192,13 @@ class V4l2Stream:
         return self
 
     async def __aexit__(self, *_: object) -> None:
+        """Let the camera go; waits only briefly for one that does not answer the kernel."""
         self._loop.remove_reader(self._camera.fd)
-        await self._offload(self._camera.stop)
+        stopping = asyncio.ensure_future(self._offload(self._camera.stop))
+        try:
+            await asyncio.wait([stopping], timeout=PATIENCE)
+        finally:
+            stopping.cancel()
 
     def _readable(self) -> None:
         try:

@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from monstertruck_drivers.webcam import v4l2
+from monstertruck_drivers.webcam import v4l2, v4l2_source
 from monstertruck_drivers.webcam.probe import probe
 from monstertruck_drivers.webcam.rendered_source import PathSource
 from monstertruck_drivers.webcam.source import Mode
@@ -192,12 +192,48 @@ async def test_cancelled_while_the_kernel_is_slow_the_camera_is_let_go():
     while v4l2.STREAMON not in kernel.requests:
         await asyncio.sleep(0.001)
     task.cancel()
-    await asyncio.sleep(0.01)
+    done, _ = await asyncio.wait([task], timeout=1)
+    assert task in done, "the driver ends although the kernel does not"
+    assert task.cancelled()
     go.set()
-    with pytest.raises(asyncio.CancelledError):
-        await task
+    await let_go(kernel)
+
+
+async def let_go(kernel: FakeKernel) -> None:
     node = kernel.by_path["/dev/video0"]
-    assert (node.opened, node.mapped, node.streaming) == (0, 0, False)
+    async with asyncio.timeout(5):
+        while (node.opened, node.mapped, node.streaming) != (0, 0, False):
+            await asyncio.sleep(0.005)
+
+
+async def test_cancelled_in_the_instant_in_which_it_has_started_the_camera_is_let_go():
+    kernel = FakeKernel(video0=Node())
+
+    async def offload(function):
+        function()
+        raise asyncio.CancelledError
+
+    with pytest.raises(asyncio.CancelledError):
+        await V4l2Source("/dev/video*", kernel, offload).open(MODE, 4)
+    await let_go(kernel)
+
+
+async def test_a_camera_that_does_not_stop_is_not_waited_for(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(v4l2_source, "PATIENCE", 0.05)
+    go = threading.Event()
+
+    class Stuck(FakeKernel):
+        def _streamoff(self, node: Node, data: bytes) -> None:
+            go.wait(5)
+            super()._streamoff(node, data)
+
+    kernel = Stuck(video0=Node())
+    async with asyncio.timeout(1):
+        async with await V4l2Source("/dev/video*", kernel).open(MODE, 4):
+            pass
+    assert kernel.by_path["/dev/video0"].opened
+    go.set()
+    await let_go(kernel)
 
 
 async def test_setting_up_is_never_done_on_the_loop():
