@@ -356,6 +356,7 @@ class Recorder:
             if repair is not None:
                 repair.terminate()
                 repair.wait()
+                self._reporting.join()
             self._loop.call_soon_threadsafe(self._done.set_result, None)
 
     def _start_repair(self) -> "subprocess.Popen[bytes] | None":
@@ -365,7 +366,8 @@ class Recorder:
             log.warning("unfinished logs are not repaired: %s", error)
             return None
         if process is not None:
-            threading.Thread(target=self._report, args=(process,), name="repairs", daemon=True).start()
+            self._reporting = threading.Thread(target=self._report, args=(process,), name="repairs", daemon=True)
+            self._reporting.start()
         return process
 
     def _report(self, process: "subprocess.Popen[bytes]") -> None:

@@ -234,9 +234,10 @@ def start_repair(folder: Path) -> "subprocess.Popen[bytes] | None":
 def repairs(process: "subprocess.Popen[bytes]") -> Iterator[str]:
     """Yield what the process says of every log, until it ends."""
     assert process.stdout is not None
-    for line in process.stdout:
-        with suppress(ValueError):
-            yield str(json.loads(line))
+    with process.stdout as lines:
+        for line in lines:
+            with suppress(ValueError):
+                yield str(json.loads(line))
 
 
 def _may_wait(path: Path) -> bool:

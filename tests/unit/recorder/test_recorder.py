@@ -464,13 +464,16 @@ def test_unfinished_logs_are_repaired_at_start(config, failures):
     whole = list(open_log(path))
     path.write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3])
 
+    said = []
+
     async def main(clock):
-        async with Recorder(config, clock, failures), clock.deadline(10):
-            reader = open_log(path)
-            while list(reader) and reader.damage is not None:
+        async with Recorder(config, clock, failures, on_repair=said.append), clock.deadline(30):
+            while not said:
                 await clock.sleep(0.02)
 
     run_wall(main)
+    assert said[0].startswith(f"repaired {path}: ")
+    assert said[0].endswith(f"; the original is {path}.damaged")
     saved = list(open_log(path))
     assert len(whole) > len(saved) > len(whole) // 3
     assert saved == whole[: len(saved)]

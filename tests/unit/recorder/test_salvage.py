@@ -129,6 +129,11 @@ def test_a_chunk_that_is_there_twice_is_kept_once(tmp_path, logs):
     chunk = log.chunks[2][0]
     end = log.data.index(chunk) + len(chunk)
     file.write_bytes(log.data[:end] + chunk + log.data[end:])
+    reader = open_log(file)
+    assert [(one.topic, one.payload) for one in reader] == [
+        (topic, data) for _, rows in log.chunks for topic, _, data in rows
+    ]
+    assert reader.fault == "has a damaged index, holds 1 chunk twice"
     done = recover(file, file)
     assert read(file) == [row for _, rows in log.chunks for row in rows]
     assert done.repeated == 1
