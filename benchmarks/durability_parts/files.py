@@ -110,8 +110,10 @@ def kinds() -> dict[str, Kind]:
         "log on the page": Kind(_run, _read_page, 1),
         "log viewed": Kind(_run, _read_viewed, 1),
         "log animated": Kind(_run, _read_animated, 1),
-        "log exported": Kind(_run, _read_exported, 1),
-        "log as ROS 2 bag": Kind(_run, _read_bag, 1),
+        "log as CSV": Kind(_run, _exported(lambda it: export_csv(it / "log.mcap", it / "csv")), 1),
+        "log as npz": Kind(_run, _exported(lambda it: export_npz(it / "log.mcap", it / "npz")), 1),
+        "log as MCAP": Kind(_run, _exported(lambda it: export_mcap(it / "log.mcap", it / "dated.mcap")), 1),
+        "log as ROS 2 bag": Kind(_run, _exported(lambda it: export_ros2(it / "log.mcap", it / "bag")), 1),
         "scans npz": Kind(_npz, lambda it: read_scans(it / "log.npz"), 3),
         "scans CARMEN": Kind(_carmen, lambda it: read_scans(it / "log.log")),
         "scans CARMEN, packed": Kind(_carmen_packed, lambda it: read_scans(it / "log.gz")),
@@ -220,16 +222,14 @@ def _read_animated(folder: Path) -> None:
         animate(open_log(folder / "log.mcap"), folder / "log.gif", speed=8.0, width=64)
 
 
-def _read_exported(folder: Path) -> None:
-    with as_a_command(folder / "log.mcap"):
-        export_csv(folder / "log.mcap", folder / "csv")
-        export_npz(folder / "log.mcap", folder / "npz")
-        export_mcap(folder / "log.mcap", folder / "dated.mcap")
+def _exported(export: Callable[[Path], object]) -> Callable[[Path], None]:
+    """Return what exports the log of a folder as the command does."""
 
+    def read(folder: Path) -> None:
+        with as_a_command(folder / "log.mcap"):
+            export(folder)
 
-def _read_bag(folder: Path) -> None:
-    with as_a_command(folder / "log.mcap"):
-        export_ros2(folder / "log.mcap", folder / "bag")
+    return read
 
 
 def _npz(folder: Path) -> None:
