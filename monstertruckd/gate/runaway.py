@@ -327,10 +327,14 @@ class BodyWatch:
             now: until when the motion goes on alike, ns.
             driven: a motor may be what moves the robot.
         """
-        self._stamp, self.runs = stamp, driven
+        goes_on, self._stamp, self.runs = since == self._stamp, stamp, driven
         speed = moved / (stamp - since) * SECOND
-        if not driven or speed * (now - max(since, stood)) / SECOND <= config.body_distance:
+        if not goes_on or not driven:
+            self._travel = 0.0
+        self._travel += speed * max(0, stamp - max(since, stood)) / SECOND
+        if not driven or self._travel + speed * (now - max(stamp, stood)) / SECOND <= config.body_distance:
             return None
+        self._travel = 0.0
         return Runaway(RunawayKind.BODY_MOVES, self._source, speed, 0.0, 0.0)
 
     def expire(self, now: int) -> None:
@@ -467,7 +471,9 @@ class RunawayCheck(Check):
         self._found = found
         self._count += 1
         stopped = now - self._halted > self.view.config.reaction * SECOND
-        least = Escalation.POWER_OFF if stopped else Escalation.QUICK_STOP
+        # A drive that reads standstill while the body moves cannot confirm a quick stop either.
+        blind = found.kind is RunawayKind.BODY_MOVES
+        least = Escalation.POWER_OFF if stopped or blind else Escalation.QUICK_STOP
         self._step = Escalation(min(max(self._step + 1, least), Escalation.PORT_OFF))
 
     # What it says

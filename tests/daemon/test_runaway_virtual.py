@@ -79,6 +79,7 @@ def test_faster_than_ordered_the_other_way_and_a_velocity_that_lies_are_found(fa
 def test_a_drive_that_reads_rest_while_it_turns_is_found_by_what_does_not_come_from_it(robot: Robot, moment: Moment):
     outcome = tried(robot, READS_NOTHING["drive"] + CREEPS, moment)
     is_found(outcome, 1.3)
+    assert not outcome.powered
     assert outcome.travelled <= 0.3
 
 

@@ -465,6 +465,22 @@ def test_motion_that_the_scans_alone_show_is_found_if_a_motor_may_make_it(distan
         assert events[0].text.startswith("lidar stands by its own measure while the body moves")
 
 
+def test_short_motions_of_the_scans_that_follow_each_other_count_together():
+    """A robot that turns about one wheel moves little before its points prove it."""
+    rig = Rig().armed()
+    rig.current, rig.driver = 0.3, {"speed": 0.0}
+    rig.tick(30)
+    for apart in (5, 0):
+        since = rig.now
+        for _ in range(3):
+            rig.tick(15)
+            stamp = rig.now
+            shown(rig, since + apart, 0.02)
+            since = stamp
+        rig.tick()
+        assert bool(rig.reported(Reason.UNCOMMANDED_MOTION)) is (apart == 0)
+
+
 def test_motion_from_before_the_drives_obeyed_does_not_count():
     rig = Rig().driving()
     rig.current = 0.3
