@@ -39,7 +39,7 @@ def charge_of(cell_volts: float) -> float:
     return float(np.interp(cell_volts, _CELL_VOLTS, _CHARGES))
 
 
-class Verdict(NamedTuple):
+class BatteryVerdict(NamedTuple):
     """What is known of the battery after a sample."""
 
     level: BatteryLevel
@@ -68,7 +68,7 @@ class BatteryJudge:
         self._clear = Dwell(config.clear_after)
         self._over = ThresholdAlarm(Threshold(config.overcharged, config.overcharged_clear, config.overcharged_after))
 
-    def update(self, time_ns: int, voltage: float, current: float | None = None) -> Verdict:
+    def update(self, time_ns: int, voltage: float, current: float | None = None) -> BatteryVerdict:
         """Take one sample.
 
         Args:
@@ -86,17 +86,17 @@ class BatteryJudge:
         sag = min(abs(current or 0.0) * self._config.resistance, self._config.max_compensation)
         self._samples.append((volts, volts + sag))
         if len(self._samples) < WINDOW:
-            return Verdict(self._level)
+            return BatteryVerdict(self._level)
         loaded, rest = (statistics.median(column) for column in zip(*self._samples, strict=True))
         if not self._config.plausible_min <= loaded <= self._config.plausible_max:
             # Nothing measured during the fault may count; the samples stay, so that its end is noticed.
             samples = self._samples
             self._reset()
             self._samples = samples
-            return Verdict(BatteryLevel.SENSOR_FAULT)
+            return BatteryVerdict(BatteryLevel.SENSOR_FAULT)
         self._smooth = self._smoothed((loaded, rest), elapsed / SECOND)
         self._level = self._judge(time_ns, loaded, rest)
-        return Verdict(self._level, *self._smooth)
+        return BatteryVerdict(self._level, *self._smooth)
 
     def _smoothed(self, new: tuple[float, float], elapsed: float) -> tuple[float, float]:
         if self._smooth is None or self._config.smoothing == 0:

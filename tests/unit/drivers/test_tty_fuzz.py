@@ -35,7 +35,7 @@ SOON = 2 * MAX_AGE + 0.5
 
 
 class Kernel:
-    """Calls on the ports of one test, which fail or wait as told."""
+    """Calls on the ports of one test, which fail or wait as the test says."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.lets_go = threading.Event()
