@@ -44,8 +44,8 @@ PATIENCE: Final = 2.0
 """The robot gives up backing off after this many times the time that the distance takes."""
 
 
-class Finding(NamedTuple):
-    """What told of a contact."""
+class ContactFinding(NamedTuple):
+    """What showed a contact."""
 
     name: str
     """Of the figure."""
@@ -95,7 +95,7 @@ class ContactCheck(Check):
         """The holder's newest."""
         self._touched: DriveRequest | None = None
         """What was asked for when the robot touched something; None = it does not."""
-        self._finding: Finding | None = None
+        self._finding: ContactFinding | None = None
         self._began = 0
         """When it began to back off, ns."""
         self._backed = 0.0
@@ -132,7 +132,7 @@ class ContactCheck(Check):
             yield PaceLimit(Reason.CONTACT, self.view.config.obstacle.confirmed_speed if self._backing(now) else 0.0)
 
     def figures(self, reason: Reason, now: int) -> Iterator[Measurement]:
-        """What told of it."""
+        """What showed it."""
         if (found := self._finding) is not None:
             yield Measurement(name=found.name, value=found.value, unit=found.unit, limit=found.limit)
 
@@ -206,7 +206,7 @@ class ContactCheck(Check):
             usual = median(known) if len(known) >= ENOUGH else self._config.rolling
             limit, load = usual + self._config.current, sign * feedback.current
             if load > limit:
-                self._touch(Finding("motor current", load, "A", limit), feedback.received)
+                self._touch(ContactFinding("motor current", load, "A", limit), feedback.received)
             else:
                 known.append(load)
 
@@ -233,9 +233,9 @@ class ContactCheck(Check):
         least = self._config.share * expected
         slow = self._slow.setdefault(name, Lasting())
         if slow.holds(seen.stamp, self._config.within, true=measured < least):
-            self._touch(Finding(f"speed of {name}", measured, unit, least), seen.received)
+            self._touch(ContactFinding(f"speed of {name}", measured, unit, least), seen.received)
 
-    def _touch(self, found: Finding, now: int) -> None:
+    def _touch(self, found: ContactFinding, now: int) -> None:
         """A measure tells of a contact; it counts while an operator drives into unseen ground."""
         if self.view.confirmed and self._request is not None:
             self._touched, self._finding, self._began, self._backed = self._request, found, now, 0.0

@@ -42,7 +42,7 @@ from monstertruckd.gate.own_checks import OwnCheck
 from monstertruckd.gate.peers import PeerCheck
 from monstertruckd.gate.runaway import RunawayCheck
 from monstertruckd.gate.samples import STALE_SENSORS, Samples
-from monstertruckd.gate.scan_memory import Survey
+from monstertruckd.gate.scan_memory import GroundSurvey
 from monstertruckd.gate.sensors import (
     DRIVE_LOSSES,
     BatteryCheck,
@@ -278,7 +278,7 @@ class Gate:
         drives = DRIVES[: len(self._chassis.shafts)]
         return tuple(dict.fromkeys((SCAN, COMPASS, *drives, STEERING, BATTERY, *self._checks.reads)))
 
-    def survey(self) -> Generator[None, None, Survey | None] | None:
+    def survey(self) -> Generator[None, None, GroundSurvey | None] | None:
         """Ground around the robot that its lidar has seen, in short steps; None without a lidar that guards it."""
         return None if self._obstacles is None else self._obstacles.guard.memory.survey()
 

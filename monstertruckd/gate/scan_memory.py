@@ -66,7 +66,7 @@ class _Taken(NamedTuple):
     """Of the pose in odometry when it was taken, m^2."""
 
 
-class Survey(NamedTuple):
+class GroundSurvey(NamedTuple):
     """Which ground around a body counts as seen, and for how long."""
 
     stamp: int
@@ -183,7 +183,7 @@ class ScanMemory:
         there = placed(np.column_stack((points, np.zeros(len(points)))), newest.pose)[:, :2]
         return np.asarray(self._free((newest, *self._fresh(self._views, newest)), there).any(axis=0))
 
-    def survey(self) -> Generator[None, None, Survey | None]:
+    def survey(self) -> Generator[None, None, GroundSurvey | None]:
         """Ground around the body that counts as seen, in steps that take well below a millisecond each."""
         newest = self._newest
         if newest is None:
@@ -196,7 +196,7 @@ class ScanMemory:
             (seen,) = self._free((view,), there)
             ages[seen] = min(100 * (newest.scan.stamp - view.scan.stamp) // self._time, 100)
             yield
-        return Survey(newest.scan.stamp, ages.reshape(MAP_SIZE, MAP_SIZE))
+        return GroundSurvey(newest.scan.stamp, ages.reshape(MAP_SIZE, MAP_SIZE))
 
     def _free(self, taken: Sequence[_Taken], there: Array) -> NDArray[np.bool_]:
         """Which points (n, 2) of the memory's frame each scan saw free, or the body stood on there; shape (m, n)."""
@@ -220,8 +220,8 @@ def elsewhere(before: LaserScan, now: LaserScan) -> bool:
     first, second = (
         np.where(valid, scan.ranges, scan.range_max) for valid, scan in zip(measured, (before, now), strict=True)
     )
-    told = [valid | (scan.codes <= NO_ECHO) for valid, scan in zip(measured, (before, now), strict=True)]
-    compared = told[0] & told[1] & (measured[0] | measured[1])
+    known = [valid | (scan.codes <= NO_ECHO) for valid, scan in zip(measured, (before, now), strict=True)]
+    compared = known[0] & known[1] & (measured[0] | measured[1])
     differ = compared & (np.abs(first - second) > CHANGED)
     return bool(np.count_nonzero(differ) > ELSEWHERE * np.count_nonzero(compared))
 

@@ -28,7 +28,7 @@ from monstertruckd.bus.local import Bus
 from monstertruckd.gate.config import GateConfig
 from monstertruckd.gate.core import Decision, Gate, GateOutput
 from monstertruckd.gate.latch import Latch
-from monstertruckd.gate.scan_memory import MAP_CELL, MAP_SIZE, Survey
+from monstertruckd.gate.scan_memory import MAP_CELL, MAP_SIZE, GroundSurvey
 
 log = logging.getLogger(__name__)
 
@@ -152,7 +152,7 @@ class GateService:
         self._bug: Exception | None = None
         self._published: tuple[object, ...] = ()
         self._published_at = 0
-        self._survey: Generator[None, None, Survey | None] | None = None
+        self._survey: Generator[None, None, GroundSurvey | None] | None = None
         """In the making, one step a tick."""
         self._surveyed = -SURVEY_PERIOD
         """When it began, ns."""
@@ -500,7 +500,7 @@ def _is_carried_out(order: Order, state: GateState) -> bool:
             assert_never(order)
 
 
-def _grid(survey: Survey, now: int, seq: int) -> Grid:
+def _grid(survey: GroundSurvey, now: int, seq: int) -> Grid:
     """A survey as a message."""
     corner = -MAP_SIZE / 2 * MAP_CELL
     return Grid(

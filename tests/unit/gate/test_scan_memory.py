@@ -498,7 +498,7 @@ def test_a_truck_whose_wheels_are_not_heard_may_have_been_moved():
     assert backs_up(rig) == (Reason.UNSEEN_STOP,)
 
 
-def test_scans_of_another_place_are_told_from_those_of_people_who_pass():
+def test_scans_of_another_place_differ_from_those_of_people_who_pass():
     here = wall(SECOND, 2.0)
     assert not elsewhere(here, wall(SECOND, 2.05)), "noise"
     assert elsewhere(here, wall(SECOND, 1.7))
