@@ -37,6 +37,8 @@ ADAPTERS = {"s1": ("h1", 1), "s2": ("h1", 2), "s3": ("h2", 1)}
 """FTDI adapters: hub and port."""
 HUBS = {"h1": 1, "h2": 2}
 """Hubs: port of the root hub."""
+CMDLINE = "console=ttyS0 panic=1 quiet net.ifnames=0 no_timer_check"
+"""Parameters of the kernel. Its check of the timer panics where this computer is too busy for ten ticks in time."""
 INIT = """#!/bin/busybox sh
 /bin/busybox --install -s /bin
 mount -t proc proc /proc; mount -t sysfs sys /sys; mount -t devtmpfs dev /dev
@@ -215,7 +217,7 @@ def booted(unpacked: Path, image: Path, folder: Path, lines: dict[str, Path]) ->
     (vmlinuz,) = unpacked.glob("boot/vmlinuz-*")
     command = ["qemu-system-x86_64", "-accel", "tcg,thread=multi", "-cpu", "max"]
     command += ["-smp", "2", "-m", "2048", "-display", "none", "-no-reboot", "-serial", f"file:{folder / 'serial.txt'}"]
-    command += ["-kernel", str(vmlinuz), "-initrd", str(image), "-append", "console=ttyS0 panic=1 quiet net.ifnames=0"]
+    command += ["-kernel", str(vmlinuz), "-initrd", str(image), "-append", CMDLINE]
     command += ["-virtfs", "local,path=/,mount_tag=root,security_model=none,readonly=on,multidevs=remap"]
     command += ["-virtfs", f"local,path={share},mount_tag=share,security_model=none"]
     command += ["-qmp", f"unix:{monitor},server=on,wait=off", "-device", "qemu-xhci,id=x,p2=8,p3=8"]

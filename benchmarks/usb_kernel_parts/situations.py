@@ -31,8 +31,6 @@ from monstertruck_drivers.usb.config import CycleMethod, PowerConfig, UsbConfig,
 from monstertruck_drivers.usb.hub import HubCoordinator, UsbService
 from monstertruck_drivers.usb.port import HubPort, PortPower
 from monstertruck_drivers.usb.tree import (
-    DEVICES,
-    ancestors,
     at_present,
     parent_of,
     port_directory,
@@ -550,28 +548,6 @@ async def topology() -> dict[str, Any]:
     return {"ok": ok and f"ID_PATH={names[by_serial('SNs1')]}" in shown, "names": names}
 
 
-async def renumbered_buses() -> dict[str, Any]:
-    """Controllers are found again in another order: a port by topology opens on a bus with another number."""
-    sysfs = MACHINE.sysfs
-    before = by_serial("SNs1")
-    topology = topology_of(sysfs, before)
-    port = HubPort(place(topology), MACHINE, Events())
-    link = await port.open()
-    roots = {name: [*ancestors(name)][-1] for name in (before, by_id("1d6b:0104"))}
-    serials = [str(sysfs.text(f"{DEVICES}/{root}/serial")) for root in roots.values()]
-    drivers = [*zip(("pci/drivers/xhci_hcd", "platform/drivers/dummy_hcd"), serials, strict=True)]
-    for driver, controller in drivers:
-        await asyncio.to_thread(sysfs.write, f"bus/{driver}/unbind", controller)
-    await until(lambda: link.is_lost, 20)
-    for driver, controller in reversed(drivers):
-        await asyncio.to_thread(sysfs.write, f"bus/{driver}/bind", controller)
-    await until(lambda: tty_of(at_present(sysfs, topology)) is not None, RETURN)
-    (await port.open()).close()
-    after = by_serial("SNs1")
-    ok = before != after == at_present(sysfs, topology) and before.partition("-")[2] == after.partition("-")[2]
-    return {"ok": ok, "before": before, "after": after, "topology": topology}
-
-
 async def control() -> dict[str, Any]:
     """A call of a library that sleeps for 50 ms on the loop: the measurement has to see it."""
     master, slave = pty.openpty()
@@ -585,6 +561,6 @@ async def control() -> dict[str, Any]:
 async def run_all() -> None:
     """One after the other."""
     acts = (control, tree, topology, open_and_close, udev_rules, foreign_opener, brltty, drivers, hub_pulled)
-    acts += (unplugged_in_mid_write, port_power, deaf, listens_again, reopened_by_another_name, renumbered_buses)
+    acts += (unplugged_in_mid_write, port_power, deaf, listens_again, reopened_by_another_name)
     for act in acts:
         await situation(act.__name__, act)
