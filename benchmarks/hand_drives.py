@@ -165,7 +165,7 @@ async def drive(
             try:
                 await hand.order(Order.ARM)
             except RequestRefusedError as refused:
-                out.reasons[f"not armed: {refused.reason}"] += 1
+                out.reasons[f"not armed: {refused.refusal}"] += 1
         request = DriveRequest(**await hand.header(0.25), speed=speed, front=front, rear=rear, unseen=unseen)
         rig.bus.inject(topics.REQ_DRIVE, request)
         await clock.sleep_until(now + round(PERIOD * SECOND))
