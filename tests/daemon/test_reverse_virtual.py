@@ -9,9 +9,11 @@ from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.mailbox import fifo
 from monstertruck_schemas import topics
 from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import DriveRequest, Order, Role
 from monstertruck_sim.world.obstacles import Disc
 from monstertruckd.config.load import load_config
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
+from monstertruckd.tools.simulation.operator import LocalOperator
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 from tests.calibration_kit import LocalTruck
 from tests.daemon.test_saturation_virtual import NOMINAL
@@ -54,3 +56,38 @@ def test_the_truck_does_not_back_into_a_post_that_it_has_passed():
                 return {reason for state in gate.drain() for reason in state.reasons}
 
     assert Reason.OBSTACLE_STOP in run_virtual(main, start=SECOND)
+
+
+def test_a_contact_in_a_confirmed_drive_is_noticed_within_three_tenths_of_a_second_and_backed_off():
+    config = load_config(YARD, SimulatedTruckConfig)[0].model_copy(update={"recorder": None})
+
+    async def main(clock: VirtualClock) -> tuple[float, float]:
+        rig = VirtualRig(config, clock)
+        with rig.bus.subscribe(topics.GATE, fifo(4096)) as gate:
+            async with rig.running():
+                await clock.sleep(3.0)
+                hand = LocalOperator(rig.daemon, clock, "hand", Role.GAMEPAD)
+                start = rig.world.truth(clock.now())
+                cos, sin = math.cos(start.yaw), math.sin(start.yaw)
+                rig.world.add(clock.now(), Disc(start.x - 0.4 * cos, start.y - 0.4 * sin, 0.05))
+                await hand.order(Order.ARM)
+                touched = noticed = None
+                place = (start.x, start.y)
+                for _ in range(200):
+                    header = await hand.header(0.25)
+                    motion = {"speed": -0.1, "front": 0.0, "rear": 0.0, "unseen": True}
+                    rig.bus.inject(topics.REQ_DRIVE, DriveRequest(**header, **motion))
+                    await clock.sleep(0.05)
+                    true = rig.world.truth(clock.now())
+                    if true.stuck and touched is None:
+                        touched, place = clock.now(), (true.x, true.y)
+                    if noticed is None and any(Reason.CONTACT in state.reasons for state in gate.drain()):
+                        noticed = clock.now()
+                assert touched is not None
+                assert noticed is not None
+                end = rig.world.truth(clock.now())
+                return (noticed - touched) / SECOND, math.dist((end.x, end.y), place)
+
+    seconds, metres = run_virtual(main, start=SECOND)
+    assert 0.0 <= seconds <= 0.3
+    assert metres == pytest.approx(0.03, abs=0.015)
