@@ -9,7 +9,7 @@ from typing import Final
 
 from monstertruck_estimation.body_tilt import GRAVITY, Tilt
 from monstertruck_estimation.gyro import Gyro, GyroConfig
-from monstertruck_estimation.transforms import Quaternion, Vector, added, rotate
+from monstertruck_estimation.transforms import Quaternion, Xyz, added, rotate
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.mailbox import Mailbox
 from monstertruck_runtime.ports import EventSink
@@ -33,11 +33,11 @@ class InertialTilt:
     """The vertical in base, by angular velocities and specific forces in base."""
 
     def __init__(self) -> None:
-        self._up: Vector | None = None
+        self._up: Xyz | None = None
         self._stamp = 0
         self._felt = 0
 
-    def observe(self, stamp: int, rate: Vector, force: Vector) -> None:
+    def observe(self, stamp: int, rate: Xyz, force: Xyz) -> None:
         """Take a measurement at ``stamp``, ns: rad/s and m/s^2; one that is not later is passed over."""
         dt = (stamp - self._stamp) / SECOND
         if self._up is not None and dt <= 0.0:
@@ -61,7 +61,7 @@ class InertialTilt:
         x, y, z = self._up
         return Tilt(math.atan2(y, z), -math.asin(x))
 
-    def yaw_rate(self, rate: Vector) -> float:
+    def yaw_rate(self, rate: Xyz) -> float:
         """Rate of the heading at an angular velocity of base, rad/s; about its z axis where the tilt is not known."""
         if self._up is None or self._up[2] < STEEPEST:
             return rate[2]
@@ -92,7 +92,7 @@ class Inertial:
         self.vertical.observe(imu.stamp, rate, force)
         return self.vertical.yaw_rate(rate)
 
-    def _in_base(self, vector: Vector3) -> Vector:
+    def _in_base(self, vector: Vector3) -> Xyz:
         x, y, z = self._axes
         return added(added(_scaled(x, vector.x), _scaled(y, vector.y)), _scaled(z, vector.z))
 
@@ -132,9 +132,9 @@ class InertialInput:
             self._events(Reason.IMU_DISAGREES, Severity.WARNING, self._source, text, difference=off)
 
 
-def _scaled(vector: Vector, by: float) -> Vector:
+def _scaled(vector: Xyz, by: float) -> Xyz:
     return vector[0] * by, vector[1] * by, vector[2] * by
 
 
-def _cross(a: Vector, b: Vector) -> Vector:
+def _cross(a: Xyz, b: Xyz) -> Xyz:
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]

@@ -20,6 +20,7 @@ from monstertruck_estimation.transforms import Quaternion, wrap_angle
 from monstertruck_estimation.wheel_motion import WheelIncrement, WheelMotion
 from monstertruck_kinematics.chassis import Chassis
 from monstertruck_kinematics.elementary import Array, integrate, integration_jacobians
+from monstertruck_kinematics.se2 import Pose2, Twist2
 from monstertruck_runtime.clock import ESTIMATES, SECOND, Clock, Schedule
 from monstertruck_runtime.mailbox import fifo, latest
 from monstertruck_runtime.ports import BusPort, EventSink, Publisher, Ready, Subscription
@@ -30,9 +31,6 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.sensor import Attitude, DriveFeedback, SteeringFeedback
 from monstertruck_schemas.state import Odometry
-
-Vector = tuple[float, float, float]
-
 
 STILL: Final = 0.02
 """Distance from the start up to which the truck counts as standing there, m."""
@@ -131,9 +129,9 @@ class OdometryConfig(OdometrySettings):
 class OdometryEstimate:
     """Pose of base in odom, twist in base, at one instant."""
 
-    pose: Vector
+    pose: Pose2
     """x, y (m), yaw (rad, in [-pi, pi])."""
-    twist: Vector
+    twist: Pose2
     """vx, vy (m/s), wz (rad/s)."""
     pose_covariance: Array
     """Shape (9,), row-major."""
@@ -182,7 +180,7 @@ class DeadReckoning:
     def __init__(self, config: OdometryConfig, chassis: Chassis, inertial: Inertial | None = None) -> None:
         self._config = config
         self._chassis = chassis
-        self._pose: Vector = (config.start.x, config.start.y, config.start.yaw)
+        self._pose: Pose2 = (config.start.x, config.start.y, config.start.yaw)
         self._covariance = PlanarCovariance()
         self._slip = (config.distance_noise**2, config.lateral_noise**2, config.yaw_noise**2)
         self._drift = PlanarCovariance(xx=config.speed_noise**2, yy=config.speed_noise**2, ww=config.turn_noise**2)
@@ -218,7 +216,7 @@ class DeadReckoning:
         return self._wheels.stamp
 
     @property
-    def _twist(self) -> Vector:
+    def _twist(self) -> Twist2:
         """With which the pose is predicted."""
         return self._wheels.twist
 

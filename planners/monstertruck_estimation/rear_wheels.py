@@ -20,10 +20,10 @@ from monstertruck_estimation.odometry import (
     OdometryContext,
     OdometryService,
     PlanarCovariance,
-    Vector,
 )
 from monstertruck_estimation.wheel_motion import WheelIncrement
 from monstertruck_kinematics.chassis import TricycleChassis
+from monstertruck_kinematics.se2 import Pose2, Twist2
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.mailbox import Mailbox, fifo
@@ -285,7 +285,7 @@ class RearWheelReckoning(DeadReckoning):
         self._front = 0.0
         self._increments: deque[EncoderIncrement] = deque(maxlen=KEPT)
         self._rolls: deque[WheelIncrement] = deque(maxlen=KEPT)
-        self._kept: deque[tuple[int, Vector, PlanarCovariance]] = deque(maxlen=KEPT)
+        self._kept: deque[tuple[int, Pose2, PlanarCovariance]] = deque(maxlen=KEPT)
         """(ns, pose, covariance) before each motion."""
         self._at: int | None = None
         """Instant of the pose, ns."""
@@ -319,7 +319,7 @@ class RearWheelReckoning(DeadReckoning):
         return self._at or 0
 
     @property
-    def _twist(self) -> Vector:
+    def _twist(self) -> Twist2:
         return self._wheels.twist if self._carrying is None else self._carrying.twist
 
     @property

@@ -16,7 +16,7 @@ from monstertruck_schemas.sensor import StabiliserFeedback
 from monstertruck_schemas.state import Odometry, Transform, Transforms
 
 Quaternion = tuple[float, float, float, float]
-Vector = tuple[float, float, float]
+Xyz = tuple[float, float, float]
 
 IDENTITY: Final[Quaternion] = (0.0, 0.0, 0.0, 1.0)
 
@@ -71,7 +71,7 @@ def conjugate(rotation: Quaternion) -> Quaternion:
     return -x, -y, -z, w
 
 
-def rotate(rotation: Quaternion, vector: Vector) -> Vector:
+def rotate(rotation: Quaternion, vector: Xyz) -> Xyz:
     """Vector of the child frame in the parent frame."""
     x, y, z, _ = multiply(multiply(rotation, (*vector, 0.0)), conjugate(rotation))
     return x, y, z
@@ -102,12 +102,12 @@ def invert(transform: Transform) -> Transform:
     )
 
 
-def mount(child: str, position: Vector, rpy: Vector = (0.0, 0.0, 0.0), parent: str = "base") -> Transform:
+def mount(child: str, position: Xyz, rpy: Xyz = (0.0, 0.0, 0.0), parent: str = "base") -> Transform:
     """Fixed pose of a sensor: position in m, roll, pitch, yaw in rad."""
     return Transform(parent=parent, child=child, stamp=FIXED, translation=position, rotation=quaternion_from_rpy(*rpy))
 
 
-def planar(parent: str, child: str, stamp: int, pose: Vector) -> Transform:
+def planar(parent: str, child: str, stamp: int, pose: Xyz) -> Transform:
     """Transform of a planar pose (x, y, yaw)."""
     x, y, yaw = pose
     return Transform(
@@ -115,13 +115,13 @@ def planar(parent: str, child: str, stamp: int, pose: Vector) -> Transform:
     )
 
 
-def planar_pose(transform: Transform) -> Vector:
+def planar_pose(transform: Transform) -> Xyz:
     """x, y (m) and yaw (rad) of a transform, seen from above."""
     x, y, _ = transform.translation
     return x, y, yaw_of(transform.rotation)
 
 
-def added(a: Vector, b: Vector) -> Vector:
+def added(a: Xyz, b: Xyz) -> Xyz:
     """Sum of two vectors."""
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 

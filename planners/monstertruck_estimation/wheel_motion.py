@@ -11,10 +11,9 @@ import numpy as np
 
 from monstertruck_kinematics.chassis import Angles, Chassis, Speeds
 from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.se2 import Pose2, Twist2
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.sensor import DriveFeedback, SteeringFeedback
-
-Vector = tuple[float, float, float]
 
 _ANGLE_STEP = 1e-4
 
@@ -27,7 +26,7 @@ class WheelIncrement:
     """ns."""
     stamp: int
     """ns."""
-    twist: Vector
+    twist: Pose2
     """Mean vx, vy (m/s) and wz (rad/s) in between."""
     distance: float
     """Travelled by the fastest shaft, m, not negative."""
@@ -75,7 +74,7 @@ class WheelMotion:
         return self._angles[0]
 
     @property
-    def twist(self) -> Vector:
+    def twist(self) -> Twist2:
         """Velocity (vx, vy, wz) at the newest pace and the newest steering angles; m/s, rad/s."""
         return self._chassis.twist(self._pace, *self._angles)
 
@@ -112,7 +111,7 @@ class WheelMotion:
         return WheelIncrement(since, stamp, self._chassis.twist(self._pace, *angles), distance, self._pace, angles)
 
 
-def increment_covariance(chassis: Chassis, roll: WheelIncrement, shaft: float, angle: float, slip: Vector) -> Array:
+def increment_covariance(chassis: Chassis, roll: WheelIncrement, shaft: float, angle: float, slip: Pose2) -> Array:
     """Covariance of the motion (dx, dy, dyaw) of ``roll`` in base, shape (3, 3); m and rad.
 
     It grows with the distance, not with the number of readings.

@@ -20,7 +20,7 @@ from monstertruck_drivers.os4000.protocol import (
     Fields,
     Key,
     Sentence,
-    Vector,
+    Xyz,
     build,
     frame,
 )
@@ -326,11 +326,11 @@ class Os4000Emulator:
         line = build(sentence, mask=Fields(self.settings.fields))
         return _replace_field(line, *self._spoiled) if self._spoiled is not None else line
 
-    def _reported(self, name: str, vector: Vector) -> Vector:
+    def _reported(self, name: str, vector: Xyz) -> Xyz:
         x, y, z = (self.signals.report(f"{name}_{axis}", value) for axis, value in zip("xyz", vector, strict=True))
         return x, y, z
 
-    def _noisy(self, vector: Vector, sigma: float) -> Vector:
+    def _noisy(self, vector: Xyz, sigma: float) -> Xyz:
         dx, dy, dz = self._rng.standard_normal(3).tolist()
         return vector[0] + sigma * dx, vector[1] + sigma * dy, vector[2] + sigma * dz
 

@@ -57,7 +57,7 @@ class Key(IntEnum):
 
 FORMAT_TAGGED: Final = 1
 
-Vector = tuple[float, float, float]
+Xyz = tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,10 +74,10 @@ class Sentence:
     """Degrees Celsius."""
     depth: float | None = None
     field_length: float | None = None
-    field: Vector | None = None
+    field: Xyz | None = None
     """Milligauss, if the unit was calibrated with the local field strength."""
     acceleration_length: float | None = None
-    acceleration: Vector | None = None
+    acceleration: Xyz | None = None
     """In g."""
 
     @property
@@ -146,7 +146,7 @@ def parse(line: bytes) -> Sentence:
     )
 
 
-def _vector(values: dict[str, float | None], tag: str) -> Vector | None:
+def _vector(values: dict[str, float | None], tag: str) -> Xyz | None:
     x, y, z = (values.get(tag + axis) for axis in "xyz")
     return None if x is None or y is None or z is None else (x, y, z)
 

@@ -4,7 +4,7 @@ from typing import Final, NamedTuple
 
 from monstertruck_drivers.link import Link, Port
 from monstertruck_drivers.wt61.config import ImuCorrection, Wt61Config
-from monstertruck_drivers.wt61.protocol import RATE, TOGGLE_SLEEP, Vector, Wt61Kind, Wt61Packet, Wt61Parser
+from monstertruck_drivers.wt61.protocol import RATE, TOGGLE_SLEEP, Wt61Kind, Wt61Packet, Wt61Parser, Xyz
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError, WrongDeviceError
 from monstertruck_runtime.ports import EventSink, Publisher, Ready
@@ -161,18 +161,18 @@ class Wt61Driver:
         )
 
 
-def _mean(vectors: list[Vector]) -> Vector:
+def _mean(vectors: list[Xyz]) -> Xyz:
     x, y, z = (sum(axis) / len(vectors) for axis in zip(*vectors, strict=True))
     return x, y, z
 
 
-def corrected_rate(rate: Vector, by: ImuCorrection) -> Vector3:
+def corrected_rate(rate: Xyz, by: ImuCorrection) -> Vector3:
     """Angular velocity without its biases, rad/s."""
     x, y, z = rate
     return Vector3(x=x - by.rate_x, y=y - by.rate_y, z=(z - by.rate_z) * by.rate_scale)
 
 
-def corrected_force(force: Vector, by: ImuCorrection) -> Vector3:
+def corrected_force(force: Xyz, by: ImuCorrection) -> Vector3:
     """Specific force without its biases, m/s^2."""
     x, y, z = force
     return Vector3(x=x - by.force_x, y=y - by.force_y, z=z)

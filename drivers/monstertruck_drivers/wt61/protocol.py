@@ -32,7 +32,7 @@ class Wt61Kind(IntEnum):
     ANGLE = 0x53
 
 
-Vector = tuple[float, float, float]
+Xyz = tuple[float, float, float]
 
 
 class Wt61Packet(NamedTuple):
@@ -45,12 +45,12 @@ class Wt61Packet(NamedTuple):
     temperature: int
 
     @property
-    def acceleration(self) -> Vector:
+    def acceleration(self) -> Xyz:
         """m/s^2."""
         return self.x * _ACCELERATION, self.y * _ACCELERATION, self.z * _ACCELERATION
 
     @property
-    def angular_velocity(self) -> Vector:
+    def angular_velocity(self) -> Xyz:
         """rad/s."""
         return self.x * _RATE, self.y * _RATE, self.z * _RATE
 
@@ -70,7 +70,7 @@ def build(packet: Wt61Packet) -> bytes:
     return body + bytes((sum(body) & 0xFF,))
 
 
-def measured(kind: Wt61Kind, vector: Vector, celsius: float) -> Wt61Packet:
+def measured(kind: Wt61Kind, vector: Xyz, celsius: float) -> Wt61Packet:
     """Packet of a measurement in SI units, clipped to the unit's range."""
     unit = _ACCELERATION if kind is Wt61Kind.ACCELERATION else _RATE
     x, y, z = (max(-_MOST, min(_MOST, round(value / unit))) for value in vector)

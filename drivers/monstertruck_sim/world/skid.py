@@ -7,10 +7,9 @@ whenever it reversed, and its circles wandered. Body parameters (turning centres
 from math import copysign, cos, sin
 from typing import Final
 
+from monstertruck_kinematics.se2 import Twist2
 from monstertruck_sim.world.config import SkidModelConfig
 from monstertruck_sim.world.noise import SKID, generator
-
-Twist = tuple[float, float, float]
 
 ROLLING: Final = 1e-3
 """Slower robots stand, m/s."""
@@ -40,7 +39,7 @@ class SkidEffects:
         gains = self._config.wheel_gains
         return [speed * gain for speed, gain in zip(speeds, gains, strict=True)] if gains else speeds
 
-    def twist(self, twist: Twist, yaw: float, dt: float) -> Twist:
+    def twist(self, twist: Twist2, yaw: float, dt: float) -> Twist2:
         """Velocity of the body, from what its wheels make of it; m/s, rad/s."""
         vx, vy, wz = twist
         if abs(vx) > ROLLING:

@@ -12,7 +12,7 @@ from itertools import combinations
 from typing import NamedTuple
 
 from monstertruck_estimation.consistency.config import ConsistencyConfig
-from monstertruck_estimation.consistency.tracks import Vector
+from monstertruck_kinematics.se2 import Pose2
 from monstertruck_runtime.clock import SECOND
 
 
@@ -77,7 +77,7 @@ class Motions(NamedTuple):
     """Ns."""
     stamp: int
     """Ns."""
-    motions: Mapping[Measure, Vector]
+    motions: Mapping[Measure, Pose2]
     """Base at ``stamp`` in base at ``since``; only the yaw counts of those that measure turns alone."""
     slack: tuple[float, float]
     """What tolerated delays and errors of the stamps explain, m and rad."""

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from typing import Final
 
 from monstertruck_estimation.consistency.delay import Delay, LagQuestion
-from monstertruck_estimation.consistency.tracks import Vector
 from monstertruck_estimation.slam.worker_io import ScanInput
+from monstertruck_kinematics.se2 import Pose2
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +73,7 @@ class StepOutput:
     """Ns."""
     since: int | None
     """Stamp of the scan before; None = there is a gap: the motion since then is not known."""
-    motion: Vector = (0.0, 0.0, 0.0)
+    motion: Pose2 = (0.0, 0.0, 0.0)
     """Base at ``stamp`` in base at ``since``."""
     deviations: tuple[float, float] = (1.0, 1.0)
     """Standard deviations of the place ahead (m) and of the yaw (rad) at ``stamp``, against a scan that is kept for

@@ -26,9 +26,10 @@ from monstertruck_estimation.consistency.delay import FEWEST, GREATEST, Delay, L
 from monstertruck_estimation.consistency.exchange import Claim, StepOutput
 from monstertruck_estimation.consistency.repeats import RepeatDetector, WholeRepeats
 from monstertruck_estimation.consistency.rest import RestWatch
-from monstertruck_estimation.consistency.tracks import STILL, MotionTrack, Vector, between
+from monstertruck_estimation.consistency.tracks import STILL, MotionTrack, between
 from monstertruck_estimation.transforms import wrap_angle
 from monstertruck_estimation.wheel_motion import WheelIncrement
+from monstertruck_kinematics.se2 import Pose2
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.state import Doubt, DoubtKind, UnshownMotion
@@ -83,7 +84,7 @@ class ConsistencyMonitor:
         self._tracks = {measure: MotionTrack() for measure in sensors}
         self._witnesses = [measure for measure in WITNESSES if measure in sensors]
         self._sampled: dict[Measure, int] = {}
-        self._seen: tuple[int, Vector] | None = None
+        self._seen: tuple[int, Pose2] | None = None
         """By the stand."""
         self._heading: tuple[int, float] | None = None
         self._rate: tuple[int, float] | None = None
@@ -126,7 +127,7 @@ class ConsistencyMonitor:
         if Measure.SCANS not in self._sensors:
             self._compare(roll.stamp)
 
-    def observe_encoders(self, stamp: int, motion: Vector) -> None:
+    def observe_encoders(self, stamp: int, motion: Pose2) -> None:
         """Take the motion of free wheels since their reading before, m and rad; ``stamp`` in ns."""
         self._sampled[Measure.ENCODERS] = stamp
         self._tracks[Measure.ENCODERS].add(stamp, motion)

@@ -8,10 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.se2 import Pose2
 from monstertruck_runtime.clock import SECOND
-
-Vector = tuple[float, float, float]
-"""x, y (m) and yaw (rad)."""
 
 KEPT: Final = 9 * SECOND
 """Time for which motion is kept at least, ns; half as long again at most."""
@@ -23,7 +21,7 @@ STILL: Final = 0.02, 0.02
 """Speed (m/s) and turn rate (rad/s) up to which the robot stands."""
 
 
-def between(origin: Vector, target: Vector) -> Vector:
+def between(origin: Pose2, target: Pose2) -> Pose2:
     """Pose ``target`` in the frame of ``origin``; the yaw is not wrapped."""
     c, s = cos(origin[2]), sin(origin[2])
     dx, dy = target[0] - origin[0], target[1] - origin[1]
@@ -35,7 +33,7 @@ class MotionTrack:
 
     def __init__(self) -> None:
         self._stamps: list[int] = []
-        self._poses: list[Vector] = []
+        self._poses: list[Pose2] = []
 
     def begin(self, stamp: int) -> None:
         """Forget what was before ``stamp``, ns: there is a gap."""
@@ -45,7 +43,7 @@ class MotionTrack:
         """Forget everything."""
         self._stamps, self._poses = [], []
 
-    def add(self, stamp: int, motion: Vector) -> None:
+    def add(self, stamp: int, motion: Pose2) -> None:
         """Take the motion since the newest sample, in the base frame of that; not later than it: passed over."""
         if not self._stamps:
             self.begin(stamp)
@@ -69,7 +67,7 @@ class MotionTrack:
         stamps = self._stamps
         return len(stamps) > 1 and stamps[0] <= since and stamp <= stamps[-1] + AHEAD
 
-    def motion(self, since: int, stamp: int) -> Vector | None:
+    def motion(self, since: int, stamp: int) -> Pose2 | None:
         """Pose of base at ``stamp`` in base at ``since``, both ns; None where it is not known."""
         return between(self._at(since), self._at(stamp)) if self.covers(since, stamp) else None
 
@@ -96,7 +94,7 @@ class MotionTrack:
         seconds = (at - since) / SECOND
         return (motion[0] ** 2 + motion[1] ** 2) ** 0.5 / seconds, abs(motion[2]) / seconds
 
-    def _at(self, stamp: int) -> Vector:
+    def _at(self, stamp: int) -> Pose2:
         stamps, poses = self._stamps, self._poses
         after = min(max(bisect_left(stamps, stamp), 1), len(stamps) - 1)
         begin, end = stamps[after - 1], stamps[after]

@@ -16,6 +16,7 @@ import numpy as np
 
 from monstertruck_kinematics.elementary import Array, clip
 from monstertruck_kinematics.profiles import CubicRamp, TimedRamp, shortest_ramp
+from monstertruck_kinematics.se2 import Pose2
 from monstertruck_planners.behave.api import BehaviourStep, Inputs, RequestedMotion
 from monstertruck_planners.behave.wall.config import WallLineConfig
 from monstertruck_planners.behave.wall.echoes import (
@@ -107,7 +108,6 @@ STANDSTILL: Final = TimedRamp(0.0, CubicRamp(0.0, 0.0, 1.0))
 Fit = Literal["beside", "left", "right", "turned"]
 """Lines that are fitted: the wall beside; one ahead by the sonars of either side; the one to which it turns."""
 Phase = Literal["settle", "search", "brake", "turn", "follow", "stop"]
-Pose = tuple[float, float, float]
 
 
 class SonarMount(NamedTuple):
@@ -128,9 +128,9 @@ class LineState(NamedTuple):
 
     phase: Phase = "settle"
     mounts: tuple[SonarMount, ...] = ()
-    poses: tuple[tuple[int, Pose, float], ...] = ()
+    poses: tuple[tuple[int, Pose2, float], ...] = ()
     """Poses of the last second by the odometry, with their stamps and speeds, m/s."""
-    pose: Pose = (0.0, 0.0, 0.0)
+    pose: Pose2 = (0.0, 0.0, 0.0)
     """Where the body is."""
     heard: int = -1
     """Stamp of the newest echoes taken in."""
@@ -632,13 +632,13 @@ def _fresh(echoes: Array, state: LineState) -> Array:
     return echoes[echoes[:, 6] > (state.before or 0.0) - FRESH]
 
 
-def _at(poses: tuple[tuple[int, Pose, float], ...], stamp: int, play: float) -> tuple[Pose, float]:
+def _at(poses: tuple[tuple[int, Pose2, float], ...], stamp: int, play: float) -> tuple[Pose2, float]:
     """Pose and speed of the body at a time: its place and speed are those of the odometry ``play`` earlier."""
     (x, y, _), speed = _between(poses, stamp - round(play * SECOND))
     return (x, y, _between(poses, stamp)[0][2]), speed
 
 
-def _between(poses: tuple[tuple[int, Pose, float], ...], stamp: int) -> tuple[Pose, float]:
+def _between(poses: tuple[tuple[int, Pose2, float], ...], stamp: int) -> tuple[Pose2, float]:
     """Pose and speed at a time, between two that are known; the newest or oldest ones outside them."""
     if stamp >= poses[-1][0]:
         return poses[-1][1:]
