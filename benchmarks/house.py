@@ -5,9 +5,11 @@
 Reads the sources as text and syntax trees; nothing is imported or run. Counted are the files that git tracks in the
 packages of the project, without tests, benchmarks and docs. ``--list`` prints what was counted. The last line is JSON.
 
-A *module number* is an assignment at module level whose value is made of numbers: a literal, arithmetic with a literal,
-or a tuple of these. A *reader* of a file is a file of the packages that imports it. *Core* is what a robot needs to own
-its devices, estimate, map, plan, track, be stopped, be recorded and be operated; ``REST`` names everything else.
+*Places to change* are counted by a present example of each kind: the files of the packages that name it, its own among
+them, so what one more of the kind would touch. A *module number* is an assignment at module level whose value is made
+of numbers: a literal, arithmetic with a literal, or a tuple of these. A *reader* of a file is a file of the packages
+that imports it. *Core* is what a robot needs to own its devices, estimate, map, plan, track, be stopped, be recorded
+and be operated; ``REST`` names everything else.
 """
 
 import argparse
@@ -18,7 +20,7 @@ import subprocess
 from collections import Counter, defaultdict
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 ROOT: Final = Path(__file__).resolve().parents[1]
 PACKAGES: Final = ("monstertruckd", "drivers", "planners", "schemas")
@@ -65,6 +67,18 @@ PATH_TYPE: Final = re.compile(
 )
 POSE_TYPE: Final = re.compile(r"_?(Pose|Pose2|Pose2D|Twist|Twist2|Vector)")
 MESSAGES: Final = "schemas/monstertruck_schemas/"
+EXAMPLES: Final = {
+    "wizard": r"ImuWizard",
+    "tracker": r"[Ss]tanley",
+    "explorer": r"TourConfig|:Tour\b|class Tour\b",
+    "motor_controller": r"[Rr]obo[Cc]law",
+    "body": r"Synchro\b|SynchroChassis|\"synchro\"",
+    "task": r"ExplorerService|ExplorationState|ExploreRequest|ExploreOrder",
+    "sensor_role": r"\bENCODERS\b|devices\.encoders|FreeEncoders|encoders:",
+}
+"""A present example of each kind of change, by the names that belong to it alone."""
+PLACES: Final = {"wizard": 2, "tracker": 3, "motor_controller": 1, "body": 2, "task": 2, "sensor_role": 4}
+"""Files that a change may touch, a folder of its own counted as one."""
 PLACES_OF_PATHS: Final = ("planners/", MESSAGES)
 """Where classes of such names are paths to be driven, not names of files."""
 
@@ -230,8 +244,10 @@ def main() -> None:
     rest = sum(source.lines for source in files if source.path.startswith(REST))
     cell, page = longest_cell()
     alike = {name: count for name, count in homes.items() if count > NAMED_ALIKE}
+    changes = places(files)
     if options.list:
         for title, rows in (
+            *((f"places to change for one more {kind}", names) for kind, names in changes.items()),
             ("path types", paths),
             ("pose types", poses),
             ("conversions", converting),
@@ -241,7 +257,7 @@ def main() -> None:
         ):
             print(f"\n{title}: {len(rows)}", *rows, sep="\n  ")
         print(f"\nlongest table cell: {cell} characters in {page}\n")
-    figures = {
+    figures: dict[str, Any] = {
         "files": len(files),
         "lines": lines,
         "core_lines": lines - rest,
@@ -257,10 +273,28 @@ def main() -> None:
         "conversions": len(converting),
         "short_files_with_one_reader": len(lonely),
         "longest_cell": cell,
+        "places_to_change": {kind: len(names) for kind, names in changes.items()},
     }
-    goals = {**LIMITS, "module_numbers_of_one_name": 0, "short_files_with_one_reader": 0, "longest_cell": CELL}
+    goals: dict[str, Any] = {
+        **LIMITS,
+        "module_numbers_of_one_name": 0,
+        "short_files_with_one_reader": 0,
+        "longest_cell": CELL,
+    }
     met = all(figures[name] <= goal for name, goal in goals.items())
+    met = met and all(len(changes[kind]) <= goal for kind, goal in PLACES.items())
+    goals["places_to_change"] = PLACES
     print(json.dumps({"bench": "house", "figures": figures, "goals": goals, "met": met}))
+
+
+def places(files: list[Source]) -> dict[str, list[str]]:
+    """Return, for each kind of change, the files that name its example; a folder of its own counts as one."""
+    found = {}
+    for kind, pattern in EXAMPLES.items():
+        named_in = [source.path for source in files if re.search(pattern, (ROOT / source.path).read_text())]
+        own = {str(Path(path).parent) for path in named_in if re.search(pattern, Path(path).parent.name)}
+        found[kind] = sorted({next((folder for folder in own if path.startswith(folder)), path) for path in named_in})
+    return found
 
 
 def by_size(counts: dict[str, float] | dict[str, int]) -> list[tuple[str, float]]:
