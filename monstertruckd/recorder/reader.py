@@ -35,9 +35,9 @@ from monstertruckd.recorder.frames import (
     read_frame,
     read_statistics,
 )
+from monstertruckd.recorder.log_damage import LogDamage, judged, repetition
 from monstertruckd.recorder.log_file import LOG_OFFSET, TIMES
 from monstertruckd.recorder.salvage import ChannelFacts, Salvage
-from monstertruckd.recorder.verdict import Verdict, judged, repetition
 
 CONFIG: Final = "config.json"
 """The attachment with the daemon's configuration."""
@@ -108,7 +108,7 @@ class LogReader:
         """After an iteration to the end: why messages are missing, how many and when; None if none is known to be."""
         self.flaws: list[str] = []
         """What else an iteration to the end found damaged; it costs no message."""
-        self.verdict: Verdict | None = None
+        self.verdict: LogDamage | None = None
         """Figures of the damage; None if the last iteration met none on its way to the index."""
         self.position = 0
         """Bytes an iteration has read so far, for progress bars."""

@@ -24,9 +24,9 @@ from monstertruck_runtime.errors import InputError, TruckError
 from monstertruck_runtime.outside import reading
 from monstertruck_runtime.small_files import damaged_names, sync_folder
 from monstertruckd.recorder.frames import is_finished, open_file
+from monstertruckd.recorder.log_damage import LogDamage, judged
 from monstertruckd.recorder.log_file import CHANNELS
 from monstertruckd.recorder.salvage import ChannelFacts, Salvage
-from monstertruckd.recorder.verdict import Verdict, judged
 
 log = logging.getLogger(__name__)
 
@@ -36,7 +36,7 @@ RECOVERED: Final = "recovered"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Recovery(Verdict):
+class Recovery(LogDamage):
     """Outcome of one repair."""
 
     path: Path
@@ -97,7 +97,7 @@ def recover(source: str | Path, target: str | Path, stop: threading.Event | None
     return _recovery(done, target, kept)
 
 
-def _recovery(done: Verdict, path: Path, original: Path | None = None) -> Recovery:
+def _recovery(done: LogDamage, path: Path, original: Path | None = None) -> Recovery:
     return Recovery(**asdict(done), path=path, original=original)
 
 
@@ -166,7 +166,7 @@ def _lock(file: BinaryIO, how: int) -> bool:
     return True
 
 
-def _copy(salvage: Salvage, source: Path, output: BinaryIO, stop: threading.Event | None) -> Verdict:
+def _copy(salvage: Salvage, source: Path, output: BinaryIO, stop: threading.Event | None) -> LogDamage:
     """Copy all whole records and note in the metadata ``recovered`` what is lost."""
     writer = Writer(output)
     registered = _Registered(writer)

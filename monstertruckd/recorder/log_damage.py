@@ -7,7 +7,7 @@ from monstertruckd.recorder.salvage import Salvage
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class LogDamage:
     """What is known of a log after all of it was read."""
 
     messages: int
@@ -51,7 +51,7 @@ def repetition(chunks: int) -> str:
     return f"holds {chunks} chunk{'s' if chunks > 1 else ''} twice"
 
 
-def judged(salvage: Salvage) -> Verdict:
+def judged(salvage: Salvage) -> LogDamage:
     """Return what is kept and lost, after all of the salvage's records were given."""
     spans = salvage.spans()
     begin = min((time for time in (salvage.first, *(span.start for span in spans)) if time is not None), default=0)
@@ -68,7 +68,7 @@ def judged(salvage: Salvage) -> Verdict:
         damage.append(f"holds {salvage.messages} of {salvage.messages + salvage.lost} messages")
     elif salvage.lacking:
         damage.append("lacks an attachment or metadata")
-    return Verdict(
+    return LogDamage(
         salvage.messages,
         salvage.lost,
         salvage.counted,
